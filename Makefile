@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+# `make` alone tells what there is.
+
+CARGO ?= $(shell command -v cargo || echo "$$HOME/.cargo/bin/cargo")
+CARGO_TARGET_DIR ?= target
+PINION = $(CARGO_TARGET_DIR)/release/pinion
+# Options for `pinion sim`, such as ARGS="-I /tmp/klipper_host_sim".
+ARGS ?=
+# Root may run in real time: what else the computer does then disturbs nothing.
+REALTIME = $(if $(filter 0,$(shell id -u)),-r)
+
+PREFIX ?= /usr/local
+DESTDIR ?=
+UNITDIR ?= $(PREFIX)/lib/systemd/system
+SYSUSERSDIR ?= $(PREFIX)/lib/sysusers.d
+TMPFILESDIR ?= $(PREFIX)/lib/tmpfiles.d
+# udev does not look below /usr/local.
+UDEVDIR ?= $(if $(filter /usr,$(PREFIX)),/usr/lib/udev,/etc/udev)/rules.d
+MANDIR ?= $(PREFIX)/share/man
+DEB_FOLDER ?= $(CARGO_TARGET_DIR)/deb
+
+export CARGO_TARGET_DIR
+
+.DEFAULT_GOAL = help
+.PHONY: help run demo test lab lab-pi bench check build install install-program install-system uninstall deb clean
+.PHONY: system-packages cargo
+
+help:
+	@echo 'make run      build, home and heat a simulated printer, then serve a real host until Ctrl-C'
+	@echo 'make demo     the same without serving; fails if anything shown was not right'
+	@echo 'make test     all tests, with those against real kernel drivers in a virtual machine'
+	@echo 'make lab      only the latter'
+	@echo 'make lab-pi   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
+	@echo 'make bench    the benchmarks'
+	@echo 'make check    formatting, lints, documentation, man pages'
+	@echo 'make build    the program: $(PINION)'
+	@echo 'make install  program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
+	@echo 'make deb      a Debian package in $(DEB_FOLDER)'
+	@echo 'make clean    remove what was built'
+
+run: build
+	@$(PINION) sim $(REALTIME) $(ARGS)
+
+demo: build
+	@$(PINION) sim --demo $(REALTIME) $(ARGS)
+
+build: system-packages
+	@$(CARGO) build --release --locked --quiet
+
+test: cargo
+	@scripts/system-packages lab
+	$(CARGO) test --locked
+ifeq ($(shell uname -m),x86_64)
+	$(CARGO) test --locked --test lab
+else
+	@echo 'NOT RUN: the tests in the virtual machine, which need an x86-64 computer' >&2
+endif
+
+lab: cargo
+	@scripts/system-packages lab
+	$(CARGO) test --locked --test lab
+
+lab-pi: cargo
+	@scripts/system-packages build
+	$(CARGO) test --locked --test lab_pi
+
+bench: system-packages
+	$(CARGO) bench --locked
+
+check: system-packages
+	$(CARGO) fmt --check
+	$(CARGO) clippy --locked --all-targets -- -D warnings
+	RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links' $(CARGO) doc --locked --no-deps --document-private-items --quiet
+	$(CARGO) build --locked --quiet
+	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
+
+system-packages: cargo
+	@scripts/system-packages build
+
+cargo:
+	@command -v $(CARGO) >/dev/null || { \
+	    echo 'There is no cargo: install Rust 1.85 or later (rustup), then try again.' >&2; exit 1; }
+
+# Root installs what was built before: no compiler runs as root.
+install: install-program install-system
+
+install-program:
+	@test -x $(PINION) || { echo 'There is nothing to install yet: run make build first.' >&2; exit 1; }
+	install -D -m 755 $(PINION) $(DESTDIR)$(PREFIX)/bin/pinion
+	install -D -m 644 man/pinion.1 $(DESTDIR)$(MANDIR)/man1/pinion.1
+	install -D -m 644 man/pinion-mcu.service.8 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
+
+install-system:
+	install -d $(DESTDIR)$(UNITDIR)
+	sed 's|/usr/bin/pinion|$(PREFIX)/bin/pinion|' systemd/pinion-mcu.service >$(DESTDIR)$(UNITDIR)/pinion-mcu.service
+	chmod 644 $(DESTDIR)$(UNITDIR)/pinion-mcu.service
+	install -D -m 644 systemd/pinion-mcu.sysusers $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf
+	install -D -m 644 systemd/pinion-mcu.tmpfiles $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf
+	install -D -m 644 udev/60-pinion-mcu.rules $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules
+	test -e $(DESTDIR)/etc/default/pinion-mcu || \
+	    install -D -m 644 systemd/pinion-mcu.default $(DESTDIR)/etc/default/pinion-mcu
+ifeq ($(DESTDIR),)
+	systemd-sysusers $(SYSUSERSDIR)/pinion-mcu.conf
+	-systemctl daemon-reload
+	-udevadm control --reload && udevadm trigger --subsystem-match=gpio --subsystem-match=spidev \
+	    --subsystem-match=i2c-dev --subsystem-match=pwm --subsystem-match=watchdog
+	@echo 'Installed. Start it, now and at every boot: systemctl enable --now pinion-mcu'
+endif
+
+uninstall:
+ifeq ($(DESTDIR),)
+	-systemctl disable --now pinion-mcu
+endif
+	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
+	    $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf \
+	    $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules $(DESTDIR)/etc/default/pinion-mcu \
+	    $(DESTDIR)$(MANDIR)/man1/pinion.1 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
+
+# Rust is rustup's, of which dpkg knows nothing: -d leaves the build dependencies to us.
+deb: system-packages
+	@scripts/build-deb $(DEB_FOLDER)
+
+clean:
+	$(CARGO) clean

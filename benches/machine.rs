@@ -1,0 +1,172 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the machine itself costs, in virtual time and with lines that do nothing: decoding and
+//! dispatch of commands, a step's event, the dictionary.
+
+#[path = "../tests/machine/bench.rs"]
+#[allow(dead_code)]
+mod bench;
+#[path = "../tests/machine/rig.rs"]
+#[allow(dead_code)]
+mod rig;
+
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use bench::{Bench, FakeBoard};
+use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use pinion::board::{Attachment, Bias, Board, Input, Output, Pin, PwmConfig, Range, SpiConfig};
+use pinion::feature::FEATURES;
+use pinion::mcu::{Dialect, MOVE_COUNT};
+use pinion::shutdown::Shutdown;
+use pinion::wire::block::PAYLOAD_MAX;
+use rig::Rig;
+
+/// The bench's board with outputs that do nothing: what is left is the machine.
+struct Quiet(FakeBoard);
+
+struct QuietOutput;
+
+impl Output for QuietOutput {
+    fn write(&mut self, value: bool) -> Result<(), Shutdown> {
+        black_box(value);
+        Ok(())
+    }
+}
+
+impl Board for Quiet {
+    fn describe(&self) -> String {
+        self.0.describe()
+    }
+    fn pins(&self) -> Vec<Range> {
+        self.0.pins()
+    }
+    fn spi_buses(&self) -> Vec<Range> {
+        self.0.spi_buses()
+    }
+    fn output(&mut self, _: Pin, _: bool, _: bool) -> Result<Box<dyn Output>, Shutdown> {
+        Ok(Box::new(QuietOutput))
+    }
+    fn input(&mut self, pin: Pin, bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
+        self.0.input(pin, bias)
+    }
+    fn adc(&mut self, pin: Pin) -> Result<Attachment, Shutdown> {
+        self.0.adc(pin)
+    }
+    fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown> {
+        self.0.spi(config)
+    }
+    fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown> {
+        self.0.pwm(config)
+    }
+    fn reset(&mut self) {
+        self.0.reset();
+    }
+}
+
+fn quiet(bench: Bench) -> Quiet {
+    Quiet(FakeBoard(bench))
+}
+
+/// `steppers` steppers whose moves are queued by the caller.
+fn machine(steppers: u8, invert_step: i8) -> Rig {
+    let mut rig = Rig::on_board(10_000_000, quiet);
+    let objects: Vec<String> = (0..steppers)
+        .map(|oid| {
+            format!("config_stepper oid={oid} step_pin=0 dir_pin=1 invert_step={invert_step} step_pulse_ticks=100")
+        })
+        .collect();
+    rig.configure(&objects.iter().map(String::as_str).collect::<Vec<_>>());
+    rig
+}
+
+/// As many of a command as a message block takes.
+fn block(rig: &Rig, command: &str) -> (Vec<u8>, usize) {
+    let command = rig.encode(command);
+    let count = PAYLOAD_MAX / command.len();
+    (command.repeat(count), count)
+}
+
+/// Decoding and dispatch, commands a second.
+fn commands(c: &mut Criterion) {
+    let mut group = c.benchmark_group("command");
+
+    let mut rig = machine(1, -1);
+    let (payload, count) = block(&rig, "debug_nop");
+    group.throughput(Throughput::Elements(count as u64));
+    group.bench_function("debug_nop, a block full", |b| b.iter(|| rig.execute(black_box(&payload))));
+
+    let (payload, count) = block(&rig, "queue_step oid=0 interval=20000 count=1 add=3");
+    let blocks = usize::from(MOVE_COUNT) / count;
+    group.throughput(Throughput::Elements((blocks * count) as u64));
+    // The steps that empty the queue again are another benchmark's.
+    group.bench_function("queue_step, a queue full", |b| {
+        b.iter_custom(|iterations| {
+            let mut spent = Duration::ZERO;
+            for _ in 0..iterations {
+                let now = rig.now();
+                rig.send(&format!("reset_step_clock oid=0 clock=@{now}"));
+                let begin = Instant::now();
+                for _ in 0..blocks {
+                    rig.execute(black_box(&payload));
+                }
+                spent += begin.elapsed();
+                rig.run_until(now + 20_000 * (blocks * count) as u64);
+                rig.forget_responses();
+            }
+            spent
+        });
+    });
+    group.finish();
+    assert!(!rig.mcu.is_shutdown());
+}
+
+/// An edge of a step pin, between the clock's reading and the next timer.
+fn steps(c: &mut Criterion) {
+    let mut group = c.benchmark_group("step edge");
+    group.throughput(Throughput::Elements(1));
+    for (name, steppers, invert_step) in [
+        ("one stepper, both edges", 1, -1),
+        ("one stepper, pulses", 1, 0),
+        ("three steppers, both edges", 3, -1),
+        ("eight steppers, both edges", 8, -1),
+    ] {
+        let mut rig = machine(steppers, invert_step);
+        group.bench_function(name, |b| {
+            b.iter_custom(|iterations| {
+                let mut spent = Duration::ZERO;
+                let mut left = iterations.div_ceil(u64::from(steppers)) as u32;
+                while left > 0 {
+                    let count = left.min(30_000);
+                    let now = rig.now();
+                    for oid in 0..steppers {
+                        let interval = 1000 + u32::from(oid);
+                        rig.send(&format!("reset_step_clock oid={oid} clock=@{now}"));
+                        rig.send(&format!("queue_step oid={oid} interval={interval} count={count} add=0"));
+                    }
+                    let begin = Instant::now();
+                    for _ in 0..count * u32::from(steppers) {
+                        if let Some(next) = rig.mcu.run_timers() {
+                            rig.jump(next);
+                        }
+                    }
+                    spent += begin.elapsed();
+                    rig.run_until(now + 100_000_000);
+                    rig.forget_responses();
+                    left -= count;
+                }
+                spent
+            });
+        });
+        assert!(!rig.mcu.is_shutdown());
+    }
+    group.finish();
+}
+
+/// The numbering of all messages, and their publication as compressed JSON.
+fn dictionary(c: &mut Criterion) {
+    let board = FakeBoard(Rig::new().bench);
+    c.bench_function("dictionary", |b| b.iter(|| Dialect::new(FEATURES, black_box(&board)).unwrap()));
+}
+
+criterion_group!(benches, commands, steps, dictionary);
+criterion_main!(benches);

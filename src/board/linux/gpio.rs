@@ -1,0 +1,504 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! GPIO lines of the character device.
+//!
+//! A pull resistor can not be verified: the kernel takes `ENOTSUPP` from a driver that has none
+//! for success, and what it tells of a line is what was asked for. So a resistor is refused
+//! where the kernel refuses it and on the chips in [`WITHOUT_BIAS`], which are known to have
+//! none; on any other chip it is as good as its driver's word.
+
+#![forbid(unsafe_code)]
+
+use std::error::Error as _;
+use std::fmt;
+use std::fs;
+use std::io;
+use std::os::fd::{AsRawFd, RawFd};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use gpio_cdev::{LineDirection, LineHandle, LineRequestFlags};
+use nix::unistd::{Gid, Group, User, geteuid};
+
+use crate::board::{Bias, Input, Output};
+use crate::shutdown::{Reason, Shutdown};
+
+/// What the kernel shows as the holder of our lines.
+const CONSUMER: &str = "pinion";
+/// GPIOHANDLE_REQUEST_BIAS_PULL_UP and _DOWN (Linux 5.5), which gpio-cdev does not name.
+const PULL_UP: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 5);
+const PULL_DOWN: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 6);
+/// What a driver answers for what it does not have (include/linux/errno.h).
+const ENOTSUPP: i32 = 524;
+/// Labels' beginnings of chips whose drivers lack a resistor, and which they lack.
+const WITHOUT_BIAS: [(&str, &[Bias]); 4] = [
+    ("raspberrypi-exp-gpio", &[Bias::PullUp, Bias::PullDown]),
+    ("brcmvirt-gpio", &[Bias::PullUp, Bias::PullDown]),
+    ("pcf857", &[Bias::PullUp, Bias::PullDown]),
+    ("mcp23", &[Bias::PullDown]),
+];
+
+/// A GPIO chip as it was found.
+#[derive(Clone, Debug)]
+pub struct Chip {
+    /// The number of `/dev/gpiochip<n>`.
+    pub number: u32,
+    /// The driver's label, such as `pinctrl-bcm2835`.
+    pub label: String,
+    /// Its lines by offset.
+    pub lines: Vec<Line>,
+}
+
+/// A line as it was found.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Line {
+    /// The board's name for it.
+    pub name: Option<String>,
+    /// Whether it drives.
+    pub output: bool,
+    /// Whether someone holds it.
+    pub held: bool,
+    /// Who, as far as the kernel tells.
+    pub consumer: Option<String>,
+}
+
+/// The chips of this machine by number, and what is wrong with those that can not be read.
+///
+/// A node that is a second name of another chip (`/dev/gpiochip4` on a Raspberry Pi 5) is left
+/// out: its lines have the other's names. Its numbers work all the same.
+pub fn scan(dev: &Path) -> (Vec<Chip>, Vec<String>) {
+    let mut chips = Vec::new();
+    let mut problems = Vec::new();
+    for number in nodes(dev) {
+        let path = node(dev, number);
+        let chip = match gpio_cdev::Chip::new(&path) {
+            Ok(chip) => chip,
+            Err(error) => {
+                problems.push(cannot_open(&path, errno(&error)));
+                continue;
+            }
+        };
+        if chip.name() != format!("gpiochip{number}") {
+            continue;
+        }
+        let lines = chip.lines().map(|line| look_at(&line)).collect();
+        chips.push(Chip { number, label: chip.label().to_owned(), lines });
+    }
+    (chips, problems)
+}
+
+/// The numbers of the chips in `dev`, counted up.
+fn nodes(dev: &Path) -> Vec<u32> {
+    let mut numbers: Vec<u32> = fs::read_dir(dev)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|entry| entry.file_name().to_str()?.strip_prefix("gpiochip")?.parse().ok())
+        .collect();
+    numbers.sort_unstable();
+    numbers
+}
+
+fn node(dev: &Path, number: u32) -> PathBuf {
+    dev.join(format!("gpiochip{number}"))
+}
+
+fn look_at(line: &gpio_cdev::Line) -> Line {
+    // A line that tells nothing is still a line.
+    line.info().map_or_else(
+        |_| Line::default(),
+        |info| Line {
+            name: info.name().map(str::to_owned),
+            output: info.direction() == LineDirection::Out,
+            // The flag says "in use", by the kernel or by a program.
+            held: info.is_kernel(),
+            consumer: info.consumer().map(str::to_owned),
+        },
+    )
+}
+
+/// A line of an open chip.
+pub struct Handle {
+    line: gpio_cdev::Line,
+    subject: Subject,
+}
+
+/// Opens `/dev/gpiochip<number>` and picks a line. `refused` is the reason if the chip has no
+/// such line.
+pub fn open(dev: &Path, number: u32, offset: u32, refused: Reason) -> Result<Handle, Shutdown> {
+    let path = node(dev, number);
+    let mut chip = gpio_cdev::Chip::new(&path).map_err(|error| match errno(&error) {
+        libc::ENOENT => Shutdown::because(Reason::ChipMissing, missing(&path, &scan(dev).0)),
+        code => Shutdown::because(Reason::ChipOpen, cannot_open(&path, code)),
+    })?;
+    let subject = Subject { chip: chip.name().to_owned(), label: chip.label().to_owned(), offset, name: None };
+    let lines = chip.num_lines();
+    let line = chip.get_line(offset).map_err(|_| Shutdown::because(refused, subject.beyond(lines)))?;
+    let name = look_at(&line).name;
+    Ok(Handle { line, subject: Subject { name, ..subject } })
+}
+
+impl Handle {
+    /// The line's identity, by whatever number it was asked for.
+    pub fn key(&self) -> (String, u32) {
+        (self.subject.chip.clone(), self.subject.offset)
+    }
+
+    /// For errors about this line.
+    pub fn subject(&self) -> &Subject {
+        &self.subject
+    }
+
+    /// Takes the line as an output that stands at `value` from the first.
+    pub fn output(self, value: bool) -> Result<OutputLine, Shutdown> {
+        let handle = self
+            .line
+            .request(LineRequestFlags::OUTPUT, value.into(), CONSUMER)
+            .map_err(|error| self.refusal(Reason::OutputLine, errno(&error), Bias::None))?;
+        Ok(OutputLine { handle, subject: self.subject })
+    }
+
+    /// Takes the line as an input.
+    pub fn input(self, bias: Bias) -> Result<InputLine, Shutdown> {
+        if lacks(&self.subject.label, bias) {
+            return Err(Shutdown::because(Reason::InputLine, self.subject.no_bias(bias)));
+        }
+        let pull = match bias {
+            Bias::None => LineRequestFlags::empty(),
+            Bias::PullUp => PULL_UP,
+            Bias::PullDown => PULL_DOWN,
+        };
+        let handle = self
+            .line
+            .request(LineRequestFlags::INPUT | pull, 0, CONSUMER)
+            .map_err(|error| self.refusal(Reason::InputLine, errno(&error), bias))?;
+        Ok(InputLine { handle, subject: self.subject })
+    }
+
+    fn refusal(&self, reason: Reason, code: i32, bias: Bias) -> Shutdown {
+        let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+        let found = look_at(&self.line);
+        let action = match reason {
+            Reason::OutputLine => "an output",
+            _ => "an input",
+        };
+        Shutdown::because(reason, self.subject.refusal(action, code, bias, &found, &release))
+    }
+}
+
+/// An output line that we hold.
+pub struct OutputLine {
+    handle: LineHandle,
+    subject: Subject,
+}
+
+impl AsRawFd for OutputLine {
+    fn as_raw_fd(&self) -> RawFd {
+        self.handle.as_raw_fd()
+    }
+}
+
+impl Output for OutputLine {
+    fn write(&mut self, value: bool) -> Result<(), Shutdown> {
+        self.handle
+            .set_value(value.into())
+            .map_err(|error| Shutdown::because(Reason::LineWrite, self.subject.lost("written", errno(&error))))
+    }
+}
+
+/// An input line that we hold.
+pub struct InputLine {
+    handle: LineHandle,
+    subject: Subject,
+}
+
+impl Input for InputLine {
+    fn read(&mut self) -> Result<bool, Shutdown> {
+        match self.handle.get_value() {
+            Ok(value) => Ok(value != 0),
+            Err(error) => Err(Shutdown::because(Reason::LineRead, self.subject.lost("read", errno(&error)))),
+        }
+    }
+}
+
+/// A line in an error.
+#[derive(Clone, Debug)]
+pub struct Subject {
+    chip: String,
+    label: String,
+    offset: u32,
+    name: Option<String>,
+}
+
+impl fmt::Display for Subject {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} line {}", self.chip, self.offset)?;
+        match &self.name {
+            Some(name) => write!(f, " ({name})"),
+            None => Ok(()),
+        }
+    }
+}
+
+impl Subject {
+    /// The line was claimed as one thing and then as another.
+    pub fn claimed_twice(&self, first: &str, second: &str) -> String {
+        format!(
+            "{self} is claimed twice: as {first} and as {second} in this configuration: a pin \
+             may have several names, change one of the two to another pin"
+        )
+    }
+
+    fn beyond(&self, lines: u32) -> String {
+        let last = lines.saturating_sub(1);
+        format!(
+            "{} ({}) has no line {}, its lines are 0 to {last}: choose another pin (pinion pins \
+             lists them)",
+            self.chip, self.label, self.offset
+        )
+    }
+
+    fn no_bias(&self, bias: Bias) -> String {
+        let (pull, sign) = pull(bias);
+        format!(
+            "{self} has no {pull} resistor ({} offers none): solder one and write the pin \
+             without the {sign}, or choose another pin",
+            self.label
+        )
+    }
+
+    fn lost(&self, what: &str, code: i32) -> String {
+        format!(
+            "{self} can no longer be {what}: {}: its chip or driver is gone, look at the kernel's \
+             log (dmesg), then FIRMWARE_RESTART",
+            text(code)
+        )
+    }
+
+    fn refusal(&self, action: &str, code: i32, bias: Bias, found: &Line, release: &str) -> String {
+        let (pull, _) = pull(bias);
+        match code {
+            libc::EBUSY => {
+                let holder = match &found.consumer {
+                    Some(consumer) => format!("\"{consumer}\""),
+                    None => "the kernel".to_owned(),
+                };
+                format!(
+                    "{self} is in use by {holder}: free it or choose another pin (pinion pins \
+                     lists them)"
+                )
+            }
+            libc::EINVAL if bias != Bias::None && before(release, (5, 5)) => format!(
+                "{self} can not have a {pull} resistor: Linux {} knows none before 5.5: update \
+                 the kernel, or solder one",
+                release.trim_end()
+            ),
+            ENOTSUPP | libc::EOPNOTSUPP | libc::ENOSYS if bias != Bias::None => self.no_bias(bias),
+            libc::EINVAL => format!(
+                "{self} is refused as {action} by the driver of {}: the pin has another function \
+                 or is reserved: free it in the device tree, or choose another pin",
+                self.label
+            ),
+            libc::EIO | libc::EPERM | ENOTSUPP | libc::EOPNOTSUPP => format!(
+                "{self} can not be {action}: {}: the chip {} does not offer it: choose another pin",
+                text(code),
+                self.label
+            ),
+            _ => format!(
+                "{self} can not be had as {action}: {}: look at the kernel's log (dmesg), or \
+                 choose another pin",
+                text(code)
+            ),
+        }
+    }
+}
+
+/// A resistor's name, and the sign that asks for it in a configuration.
+fn pull(bias: Bias) -> (&'static str, char) {
+    match bias {
+        Bias::PullDown => ("pull-down", '~'),
+        Bias::PullUp | Bias::None => ("pull-up", '^'),
+    }
+}
+
+/// Whether the chip is known to ignore this resistor.
+fn lacks(label: &str, bias: Bias) -> bool {
+    WITHOUT_BIAS.iter().any(|(chip, lacking)| label.starts_with(chip) && lacking.contains(&bias))
+}
+
+/// Whether a kernel's release, such as `5.4.0-rpi`, comes before a version.
+fn before(release: &str, version: (u32, u32)) -> bool {
+    let mut numbers = release.split(|c: char| !c.is_ascii_digit()).map_while(|n| n.parse::<u32>().ok());
+    match (numbers.next(), numbers.next()) {
+        (Some(major), Some(minor)) => (major, minor) < version,
+        _ => false,
+    }
+}
+
+fn missing(path: &Path, chips: &[Chip]) -> String {
+    let known: Vec<String> = chips.iter().map(|chip| format!("gpiochip{} ({})", chip.number, chip.label)).collect();
+    let known = match known.is_empty() {
+        true => "no GPIO chip that can be opened".to_owned(),
+        false => known.join(", "),
+    };
+    format!(
+        "there is no {}: this machine has {known}: write the pin with one of these (pinion pins \
+         lists them)",
+        path.display()
+    )
+}
+
+fn cannot_open(path: &Path, code: i32) -> String {
+    match code {
+        libc::EACCES | libc::EPERM => not_permitted(path),
+        libc::ENOTTY => format!("{} is not a GPIO chip: remove it and let the kernel make the node", path.display()),
+        _ => format!("{} can not be opened: {}: look at the kernel's log (dmesg)", path.display(), text(code)),
+    }
+}
+
+/// Says to whom a device node belongs and how to be let in.
+pub(super) fn not_permitted(path: &Path) -> String {
+    let who = User::from_uid(geteuid()).ok().flatten().map_or_else(|| format!("user {}", geteuid()), |user| user.name);
+    let (mode, group) = match fs::metadata(path) {
+        Ok(node) => {
+            let gid = Gid::from_raw(node.gid());
+            let group = Group::from_gid(gid).ok().flatten();
+            (node.mode(), group.map_or_else(|| gid.to_string(), |g| g.name))
+        }
+        Err(_) => (0, String::new()),
+    };
+    permission_text(path, &who, mode, &group)
+}
+
+fn permission_text(path: &Path, who: &str, mode: u32, group: &str) -> String {
+    let path = path.display();
+    if mode & 0o060 == 0o060 && group != "root" {
+        format!(
+            "{who} may not open {path}, which belongs to group {group}: \"sudo usermod -aG \
+             {group} {who}\" and start Pinion again"
+        )
+    } else {
+        format!(
+            "{who} may not open {path}, which is root's alone: give it to a group with a udev \
+             rule, or run Pinion as root"
+        )
+    }
+}
+
+/// The error number of a call that has just failed.
+///
+/// gpio-cdev hides the number in a type of its own version of nix; but it does nothing between
+/// the failing call and its return, so the thread still has it.
+fn errno(error: &gpio_cdev::Error) -> i32 {
+    let last = io::Error::last_os_error().raw_os_error();
+    error
+        .source()
+        .and_then(|source| source.downcast_ref::<io::Error>())
+        .and_then(io::Error::raw_os_error)
+        .or(last)
+        .unwrap_or_default()
+}
+
+/// What an error number means, in lower case to stand in a sentence.
+pub(super) fn text(code: i32) -> String {
+    match code {
+        ENOTSUPP => "not supported by the driver (error 524)".to_owned(),
+        _ => io::Error::from_raw_os_error(code).to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn gpio17() -> Subject {
+        Subject { chip: "gpiochip0".into(), label: "pinctrl-bcm2835".into(), offset: 17, name: Some("GPIO17".into()) }
+    }
+
+    fn refusal(code: i32, bias: Bias, consumer: Option<&str>, release: &str) -> String {
+        let found = Line { consumer: consumer.map(str::to_owned), ..Line::default() };
+        gpio17().refusal("an input", code, bias, &found, release)
+    }
+
+    #[test]
+    fn a_held_line_names_its_holder() {
+        assert_eq!(
+            refusal(libc::EBUSY, Bias::None, Some("spi0 CS1"), "6.6.0"),
+            "gpiochip0 line 17 (GPIO17) is in use by \"spi0 CS1\": free it or choose another pin \
+             (pinion pins lists them)"
+        );
+        assert!(refusal(libc::EBUSY, Bias::PullUp, None, "6.6.0").contains("by the kernel:"));
+    }
+
+    #[test]
+    fn a_refused_resistor_says_why() {
+        assert_eq!(
+            refusal(libc::EINVAL, Bias::PullUp, None, "5.4.83-v7l+\n"),
+            "gpiochip0 line 17 (GPIO17) can not have a pull-up resistor: Linux 5.4.83-v7l+ knows \
+             none before 5.5: update the kernel, or solder one"
+        );
+        let driver = refusal(ENOTSUPP, Bias::PullDown, None, "6.6.0");
+        assert!(driver.contains("no pull-down resistor"), "{driver}");
+        assert!(driver.contains("without the ~"), "{driver}");
+        let reserved = refusal(libc::EINVAL, Bias::PullUp, None, "6.6.0");
+        assert!(reserved.contains("another function"), "{reserved}");
+    }
+
+    #[test]
+    fn chips_known_to_ignore_a_resistor() {
+        assert!(lacks("raspberrypi-exp-gpio", Bias::PullUp));
+        assert!(lacks("mcp23017", Bias::PullDown));
+        assert!(!lacks("mcp23017", Bias::PullUp));
+        assert!(!lacks("raspberrypi-exp-gpio", Bias::None));
+        assert!(!lacks("pinctrl-bcm2835", Bias::PullDown));
+    }
+
+    #[test]
+    fn kernel_releases() {
+        assert!(before("5.4.0", (5, 5)) && before("4.19.0-rc1", (5, 5)));
+        assert!(!before("5.5.0", (5, 5)) && !before("6.1-rpi", (5, 5)));
+        assert!(!before("", (5, 5)) && !before("six.one", (5, 5)));
+    }
+
+    #[test]
+    fn a_missing_chip_lists_those_that_are_there() {
+        let chip = |number, label: &str| Chip { number, label: label.into(), lines: vec![] };
+        let path = Path::new("/dev/gpiochip5");
+        assert_eq!(
+            missing(path, &[chip(0, "pinctrl-rp1"), chip(10, "gpio-brcmstb@107d508500")]),
+            "there is no /dev/gpiochip5: this machine has gpiochip0 (pinctrl-rp1), gpiochip10 \
+             (gpio-brcmstb@107d508500): write the pin with one of these (pinion pins lists them)"
+        );
+        assert!(missing(path, &[]).contains("no GPIO chip"));
+    }
+
+    #[test]
+    fn a_forbidden_node_names_its_group() {
+        let path = Path::new("/dev/gpiochip0");
+        assert_eq!(
+            permission_text(path, "pi", 0o660, "gpio"),
+            "pi may not open /dev/gpiochip0, which belongs to group gpio: \"sudo usermod -aG gpio \
+             pi\" and start Pinion again"
+        );
+        assert!(permission_text(path, "pi", 0o600, "root").contains("udev"));
+    }
+
+    #[test]
+    fn a_line_beyond_the_chip() {
+        assert!(gpio17().beyond(8).contains("no line 17, its lines are 0 to 7"));
+    }
+
+    #[test]
+    fn a_missing_chip_is_told_from_one_that_is_none() {
+        let dev = tempfile::tempdir().unwrap();
+        let open = |chip| open(dev.path(), chip, 0, Reason::NotOutput).err().unwrap();
+        assert_eq!(open(3).reason, Reason::ChipMissing);
+        fs::write(dev.path().join("gpiochip3"), "").unwrap();
+        let none = open(3);
+        assert_eq!(none.reason, Reason::ChipOpen);
+        assert!(none.to_string().contains("is not a GPIO chip"), "{none}");
+        assert_eq!(nodes(dev.path()), [3]);
+        let (chips, problems) = scan(dev.path());
+        assert!(chips.is_empty());
+        assert_eq!(problems.len(), 1);
+    }
+}

@@ -1,0 +1,310 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The pins and buses of this computer.
+
+#![forbid(unsafe_code)]
+
+use std::collections::{BTreeSet, HashMap};
+use std::os::fd::AsRawFd;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::AtomicU8;
+
+use industrial_io::Context;
+
+use super::{Attachment, Bias, Board, Guard, Input, Output, Pin, PwmConfig, Range, SpiConfig};
+use crate::shutdown::{Reason, Shutdown};
+use pins::{Names, Target};
+
+pub mod adc;
+pub mod gpio;
+pub mod pins;
+mod pwm;
+pub mod spi;
+
+const DEV: &str = "/dev";
+const PWM: &str = "/sys/class/pwm";
+const IIO: &str = "/sys/bus/iio/devices";
+
+/// What this machine has.
+#[derive(Debug, Default)]
+pub struct Inventory {
+    /// GPIO chips.
+    pub chips: Vec<gpio::Chip>,
+    /// ADCs.
+    pub adcs: Vec<adc::Adc>,
+    /// SPI device nodes.
+    pub spi: Vec<spi::Node>,
+    /// What is there and can not be used, and the remedy.
+    pub problems: Vec<String>,
+    pub(crate) context: Option<Context>,
+}
+
+impl Inventory {
+    /// Looks around. Nothing has to be there.
+    pub fn scan() -> Inventory {
+        let dev = Path::new(DEV);
+        let (chips, problems) = gpio::scan(dev);
+        let mut inventory = Inventory { chips, spi: spi::scan(dev), problems, ..Inventory::default() };
+        match adc::context(Path::new(IIO)) {
+            Ok(context) => {
+                inventory.adcs = context.as_ref().map(adc::scan).unwrap_or_default();
+                inventory.context = context;
+            }
+            Err(problem) => inventory.problems.push(problem),
+        }
+        inventory
+    }
+
+    /// A channel of `iio:device<device>` to read from, if it is there.
+    pub fn adc(&self, device: u32, id: &str) -> Option<adc::Reader> {
+        adc::Reader::open(self.context.as_ref()?, device, id)
+    }
+
+    /// One line: each thing, and how many pins it has.
+    pub fn describe(&self) -> String {
+        let chips = self.chips.iter().map(|chip| {
+            let lines = chip.lines.len();
+            format!("gpiochip{} {} ({lines} lines)", chip.number, chip.label)
+        });
+        let adcs = self.adcs.iter().map(|adc| {
+            let channels = adc.channels.len();
+            format!("iio {} ({channels} channels)", adc.name)
+        });
+        let nodes: Vec<String> = self.spi.iter().map(spi::Node::to_string).collect();
+        let parts = [chips.collect::<Vec<_>>().join(", "), adcs.collect::<Vec<_>>().join(", "), nodes.join(" ")];
+        let parts: Vec<String> = parts.into_iter().filter(|part| !part.is_empty()).collect();
+        match parts.is_empty() {
+            true => "linux: no GPIO chip, ADC or SPI device is to be seen".to_owned(),
+            false => format!("linux: {}", parts.join("; ")),
+        }
+    }
+}
+
+/// The board that is this computer.
+pub struct LinuxBoard {
+    inventory: Inventory,
+    names: Names,
+    guard: Option<Box<dyn Guard>>,
+    /// Lines in use by chip name and offset, and as what.
+    claims: HashMap<(String, u32), &'static str>,
+    /// The present SPI mode of each node in use.
+    spi_modes: HashMap<spi::Node, Arc<AtomicU8>>,
+    /// IIO devices of which the log knows that they tell no resolution.
+    assumed: BTreeSet<u32>,
+    dev: PathBuf,
+}
+
+impl LinuxBoard {
+    /// Looks around and publishes what is there. `guard` copies every output line.
+    pub fn new(guard: Option<Box<dyn Guard>>) -> LinuxBoard {
+        let inventory = Inventory::scan();
+        for problem in &inventory.problems {
+            log::warn!("{problem}");
+        }
+        LinuxBoard {
+            names: Names::of(&inventory),
+            inventory,
+            guard,
+            claims: HashMap::new(),
+            spi_modes: HashMap::new(),
+            assumed: BTreeSet::new(),
+            dev: DEV.into(),
+        }
+    }
+
+    /// The line of a pin that nothing of ours has claimed yet.
+    fn unclaimed(
+        &self,
+        pin: Pin,
+        wanted: &'static str,
+        no_line: Reason,
+        refused: Reason,
+    ) -> Result<gpio::Handle, Shutdown> {
+        let Target::Line { chip, offset } = Target::of(pin) else {
+            let detail = format!("{} can not be {wanted}: choose a GPIO pin (pinion pins lists them)", Target::of(pin));
+            return Err(Shutdown::because(no_line, detail));
+        };
+        let handle = gpio::open(&self.dev, chip, offset, refused)?;
+        match self.claims.get(&handle.key()) {
+            Some(first) => {
+                let detail = handle.subject().claimed_twice(first, wanted);
+                Err(Shutdown::because(refused, detail))
+            }
+            None => Ok(handle),
+        }
+    }
+
+    /// The device's number and the channel's name for a pin.
+    fn channel(&self, pin: Pin) -> Result<(u32, String), Shutdown> {
+        match Target::of(pin) {
+            Target::Analog(n) => Ok((0, format!("voltage{n}"))),
+            Target::Channel { device, position } => {
+                let adc = self.inventory.adcs.iter().find(|adc| adc.number == device);
+                let channel = adc.and_then(|adc| adc.channels.get(position as usize));
+                channel.map(|channel| (device, channel.id.clone())).ok_or_else(|| {
+                    let detail = adc::missing(device, &format!("channel {position}"), &self.inventory.adcs);
+                    Shutdown::because(Reason::AdcOpen, detail)
+                })
+            }
+            other => {
+                let detail = format!("{other} is no ADC channel: choose an analog pin (pinion pins lists them)");
+                Err(Shutdown::because(Reason::AdcOpen, detail))
+            }
+        }
+    }
+}
+
+impl Board for LinuxBoard {
+    fn describe(&self) -> String {
+        self.inventory.describe()
+    }
+
+    fn pins(&self) -> Vec<Range> {
+        self.names.ranges()
+    }
+
+    fn spi_buses(&self) -> Vec<Range> {
+        spi::ranges(&self.inventory.spi)
+    }
+
+    fn output(&mut self, pin: Pin, value: bool, shutdown_value: bool) -> Result<Box<dyn Output>, Shutdown> {
+        let wanted = "an output";
+        let handle = self.unclaimed(pin, wanted, Reason::NotOutput, Reason::OutputLine)?;
+        let key = handle.key();
+        let line = handle.output(value)?;
+        if let Some(guard) = &mut self.guard {
+            guard.output(line.as_raw_fd(), shutdown_value).map_err(|error| {
+                let detail = format!("the guardian does not take {} line {}: {error}: restart Pinion", key.0, key.1);
+                Shutdown::because(Reason::GuardianLost, detail)
+            })?;
+        }
+        self.claims.insert(key, wanted);
+        Ok(Box::new(line))
+    }
+
+    fn input(&mut self, pin: Pin, bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
+        let wanted = "an input";
+        let handle = self.unclaimed(pin, wanted, Reason::NotInput, Reason::InputLine)?;
+        let key = handle.key();
+        let line = handle.input(bias)?;
+        self.claims.insert(key, wanted);
+        Ok(Box::new(line))
+    }
+
+    fn adc(&mut self, pin: Pin) -> Result<Attachment, Shutdown> {
+        let (device, id) = self.channel(pin)?;
+        if self.inventory.adc(device, &id).is_none() {
+            // Its driver may have come up after us; the numbers that were published stay.
+            self.inventory.context =
+                adc::context(Path::new(IIO)).map_err(|problem| Shutdown::because(Reason::AdcOpen, problem))?;
+        }
+        let reader = self.inventory.adc(device, &id).ok_or_else(|| {
+            let context = self.inventory.context.as_ref();
+            let present = context.map(adc::scan).unwrap_or_default();
+            Shutdown::because(Reason::AdcOpen, adc::missing(device, &id, &present))
+        })?;
+        if reader.format().is_none() && self.assumed.insert(device) {
+            log::info!("iio:device{device} does not tell its resolution: 12 bits are assumed");
+        }
+        Ok(Attachment::Worker { bus: format!("iio:device{device}"), device: Box::new(reader) })
+    }
+
+    fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown> {
+        let node = spi::Node::of(config.bus);
+        let mode = self.spi_modes.entry(node).or_default().clone();
+        let device = spi::Spi::open(&self.dev, node, config.mode, config.rate_hz, config.chip_select, mode)?;
+        Ok(Attachment::Worker { bus: format!("spi{}", node.bus), device: Box::new(device) })
+    }
+
+    fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown> {
+        let Target::Pwm { chip, channel } = Target::of(config.pin) else {
+            let detail = format!("{} has no hardware PWM: choose pwmchipC/pwmN", Target::of(config.pin));
+            return Err(Shutdown::because(Reason::PwmConfig, detail));
+        };
+        let channel = pwm::Channel { chip, channel };
+        let device = pwm::Pwm::open(Path::new(PWM), channel, &config)?;
+        if let Some(guard) = &mut self.guard {
+            device.guard(&mut **guard, config.shutdown_value).map_err(|error| {
+                let detail = format!("the guardian does not take {channel}: {error}: restart Pinion");
+                Shutdown::because(Reason::GuardianLost, detail)
+            })?;
+        }
+        Ok(Attachment::Worker { bus: "pwm".into(), device: Box::new(device) })
+    }
+
+    fn reset(&mut self) {
+        if let Some(guard) = &mut self.guard {
+            if let Err(error) = guard.release() {
+                log::error!("the guardian does not give back the lines: {error}: restart Pinion");
+            }
+        }
+        self.claims.clear();
+        self.spi_modes.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn board(dev: &Path) -> LinuxBoard {
+        let inventory = Inventory::default();
+        LinuxBoard {
+            names: Names::of(&inventory),
+            inventory,
+            guard: None,
+            claims: HashMap::new(),
+            spi_modes: HashMap::new(),
+            assumed: BTreeSet::new(),
+            dev: dev.into(),
+        }
+    }
+
+    #[test]
+    fn a_pin_of_another_kind() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let error = board.output(Pin(4097), true, false).err().unwrap();
+        assert_eq!(
+            error.to_string(),
+            "Not an output pin: analog1 (an ADC channel) can not be an output: choose a GPIO pin \
+             (pinion pins lists them)"
+        );
+        let error = board.input(Pin(3000), Bias::None).err().unwrap();
+        assert_eq!(error.reason, Reason::NotInput);
+        let error = board.adc(Pin(17)).err().unwrap();
+        assert_eq!(error.reason, Reason::AdcOpen);
+        assert!(error.to_string().contains("gpiochip0 line 17 is no ADC channel"), "{error}");
+    }
+
+    #[test]
+    fn nothing_is_there() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let error = board.output(Pin(5 * 288), true, false).err().unwrap();
+        assert_eq!(error.reason, Reason::ChipMissing);
+        assert!(error.to_string().contains("gpiochip5: this machine has no GPIO chip"), "{error}");
+        assert_eq!(board.pins().len(), 19);
+        assert_eq!(board.spi_buses().len(), 8);
+        assert!(board.describe().starts_with("linux: no GPIO"));
+    }
+
+    #[test]
+    fn a_description_of_what_is_there() {
+        let inventory = Inventory {
+            chips: vec![gpio::Chip {
+                number: 0,
+                label: "pinctrl-bcm2835".into(),
+                lines: vec![gpio::Line::default(); 54],
+            }],
+            adcs: vec![adc::Adc { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
+            spi: vec![spi::Node::of(0), spi::Node::of(1)],
+            ..Inventory::default()
+        };
+        assert_eq!(
+            inventory.describe(),
+            "linux: gpiochip0 pinctrl-bcm2835 (54 lines); iio ads1115 (0 channels); spidev0.0 \
+             spidev0.1"
+        );
+    }
+}

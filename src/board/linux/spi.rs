@@ -1,0 +1,265 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! SPI devices of spidev.
+
+#![forbid(unsafe_code)]
+
+use std::fmt;
+use std::fs;
+use std::io;
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU8, Ordering};
+
+use linux_embedded_hal::SpidevDevice;
+use linux_embedded_hal::spidev::{SpiModeFlags, SpidevOptions, SpidevTransfer};
+
+use super::gpio::not_permitted;
+use crate::board::{Buffer, ChipSelect, Device, Range};
+use crate::shutdown::{Reason, Shutdown};
+
+/// Buses with numbers of the C program.
+const BUSES: u32 = 8;
+/// Chip selects of each that have names.
+const BUS_NODES: u32 = 16;
+
+/// A device node `/dev/spidev<bus>.<select>`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Node {
+    /// The controller.
+    pub bus: u32,
+    /// Its chip select.
+    pub select: u32,
+}
+
+impl Node {
+    /// The node of a bus number on the wire, which is the C program's.
+    pub fn of(number: u32) -> Node {
+        Node { bus: number >> 8, select: number & 0xff }
+    }
+
+    /// The number on the wire, if it has one.
+    pub fn number(self) -> Option<u32> {
+        let fits = self.select <= 0xff && self.bus <= u32::MAX >> 8;
+        fits.then_some(self.bus << 8 | self.select)
+    }
+
+    fn parse(name: &str) -> Option<Node> {
+        let (bus, select) = name.strip_prefix("spidev")?.split_once('.')?;
+        Some(Node { bus: bus.parse().ok()?, select: select.parse().ok()? })
+    }
+}
+
+impl fmt::Display for Node {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "spidev{}.{}", self.bus, self.select)
+    }
+}
+
+/// The nodes in `dev`, in order.
+pub fn scan(dev: &Path) -> Vec<Node> {
+    let mut nodes: Vec<Node> = fs::read_dir(dev)
+        .into_iter()
+        .flatten()
+        .flatten()
+        .filter_map(|entry| Node::parse(entry.file_name().to_str()?))
+        .collect();
+    nodes.sort_unstable();
+    nodes
+}
+
+/// The dictionary's enumeration `spi_bus`: the C program's, and the nodes beyond it.
+pub fn ranges(nodes: &[Node]) -> Vec<Range> {
+    let c_program = (0..BUSES).map(|bus| Range { name: format!("spidev{bus}.0"), first: bus << 8, count: BUS_NODES });
+    let further = nodes
+        .iter()
+        .filter(|node| node.bus >= BUSES || node.select >= BUS_NODES)
+        .filter_map(|node| Some(Range { name: node.to_string(), first: node.number()?, count: 1 }));
+    c_program.chain(further).collect()
+}
+
+/// An open SPI device.
+pub struct Spi {
+    device: SpidevDevice,
+    node: Node,
+    mode: u8,
+    rate_hz: u32,
+    chip_select: Option<ChipSelect>,
+    /// The node's present mode. Chips that share a node, told apart by lines of our own, may
+    /// differ in their mode, and the kernel keeps one for the node. One worker runs them all.
+    node_mode: Arc<AtomicU8>,
+}
+
+impl Spi {
+    /// Opens a node and sets its rate and mode. `node_mode` is common to all who use the node.
+    pub fn open(
+        dev: &Path,
+        node: Node,
+        mode: u8,
+        rate_hz: u32,
+        chip_select: Option<ChipSelect>,
+        node_mode: Arc<AtomicU8>,
+    ) -> Result<Spi, Shutdown> {
+        let path = dev.join(node.to_string());
+        let device = SpidevDevice::open(&path).map_err(|error| {
+            let detail = cannot_open(&path, error.inner(), &scan(dev));
+            Shutdown::because(Reason::SpiOpen, detail)
+        })?;
+        let mut spi = Spi { device, node, mode, rate_hz, chip_select, node_mode };
+        spi.device.configure(SpidevOptions::new().max_speed_hz(rate_hz)).map_err(|error| {
+            let detail = format!("/dev/{node} refuses {rate_hz} Hz: {error}: choose another spi_speed");
+            Shutdown::because(Reason::SpiSpeed, detail)
+        })?;
+        spi.set_mode()?;
+        Ok(spi)
+    }
+
+    /// Sets all the node's mode bits, as the C program does; the kernel keeps the sense of a
+    /// chip select line that it knows of.
+    fn set_mode(&mut self) -> Result<(), Shutdown> {
+        let flags = SpiModeFlags::from_bits_retain(self.mode.into());
+        self.device.configure(SpidevOptions::new().mode(flags)).map_err(|error| {
+            let detail = format!(
+                "/dev/{} refuses SPI mode {}: {error}: its controller can not serve this \
+                     chip, choose another bus",
+                self.node, self.mode
+            );
+            Shutdown::because(Reason::SpiMode, detail)
+        })?;
+        self.node_mode.store(self.mode, Ordering::Relaxed);
+        Ok(())
+    }
+
+    fn transfer(&mut self, bytes: &mut [u8]) -> Result<(), Shutdown> {
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        if self.node_mode.load(Ordering::Relaxed) != self.mode {
+            self.set_mode()?;
+        }
+        let mut transfer = SpidevTransfer::read_write_in_place(bytes);
+        transfer.speed_hz = self.rate_hz;
+        transfer.bits_per_word = 8;
+        self.device.transfer(&mut transfer).map_err(|error| {
+            let detail = format!(
+                "/dev/{} failed to transfer {} bytes at {} Hz: {error}: look at the kernel's log \
+                 (dmesg), try a lower spi_speed",
+                self.node,
+                bytes.len(),
+                self.rate_hz
+            );
+            Shutdown::because(Reason::SpiTransfer, detail)
+        })
+    }
+}
+
+impl Device for Spi {
+    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
+        if let Some(chip_select) = &mut self.chip_select {
+            chip_select.select(true)?;
+        }
+        let transferred = self.transfer(data.as_mut_slice());
+        if let Some(chip_select) = &mut self.chip_select {
+            chip_select.select(false)?;
+        }
+        transferred
+    }
+}
+
+fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> String {
+    match error.kind() {
+        io::ErrorKind::NotFound => {
+            let known: Vec<String> = nodes.iter().map(Node::to_string).collect();
+            let known = match known.is_empty() {
+                true => "this machine has no spidev node".to_owned(),
+                false => format!("this machine has {}", known.join(", ")),
+            };
+            format!(
+                "there is no {}: {known}: enable the bus (on a Raspberry Pi \"dtparam=spi=on\" in \
+                 config.txt), or change spi_bus",
+                path.display()
+            )
+        }
+        io::ErrorKind::PermissionDenied => not_permitted(path),
+        _ => format!("{} can not be opened: {error}: look at the kernel's log (dmesg)", path.display()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::board::Output;
+    use std::sync::Mutex;
+
+    #[test]
+    fn numbers_are_the_c_program_s() {
+        assert_eq!(Node { bus: 1, select: 2 }.number(), Some(258));
+        assert_eq!(Node::of(258), Node { bus: 1, select: 2 });
+        assert_eq!(Node { bus: 0, select: 256 }.number(), None);
+    }
+
+    #[test]
+    fn nodes_beyond_the_c_program_s_ranges_are_published() {
+        let nodes = [Node { bus: 0, select: 0 }, Node { bus: 10, select: 0 }];
+        let ranges = ranges(&nodes);
+        assert_eq!(ranges.len(), 9);
+        assert_eq!(ranges[8], Range { name: "spidev10.0".into(), first: 2560, count: 1 });
+    }
+
+    #[test]
+    fn names_of_nodes() {
+        assert_eq!(Node::parse("spidev10.1"), Some(Node { bus: 10, select: 1 }));
+        for name in ["spidev", "spidev0", "spidev0.", "spidevx.0", "i2c-0"] {
+            assert_eq!(Node::parse(name), None);
+        }
+    }
+
+    fn open(dev: &Path, chip_select: Option<ChipSelect>) -> Result<Spi, Shutdown> {
+        let node_mode = Arc::new(AtomicU8::new(0));
+        Spi::open(dev, Node::of(0), 3, 1_000_000, chip_select, node_mode)
+    }
+
+    #[test]
+    fn a_missing_node_lists_those_that_are_there() {
+        let dev = tempfile::tempdir().unwrap();
+        fs::write(dev.path().join("spidev1.2"), "").unwrap();
+        let error = open(dev.path(), None).err().unwrap();
+        assert_eq!(error.reason, Reason::SpiOpen);
+        assert!(error.to_string().contains("this machine has spidev1.2: enable"), "{error}");
+    }
+
+    #[test]
+    fn a_node_that_is_no_spidev() {
+        let dev = tempfile::tempdir().unwrap();
+        fs::write(dev.path().join("spidev0.0"), "").unwrap();
+        let error = open(dev.path(), None).err().unwrap();
+        assert_eq!(error.reason, Reason::SpiSpeed);
+        assert!(error.to_string().contains("/dev/spidev0.0 refuses 1000000 Hz"), "{error}");
+    }
+
+    struct Recorder(Arc<Mutex<Vec<bool>>>);
+
+    impl Output for Recorder {
+        fn write(&mut self, value: bool) -> Result<(), Shutdown> {
+            self.0.lock().unwrap().push(value);
+            Ok(())
+        }
+    }
+
+    #[test]
+    fn a_failed_transfer_still_deselects_the_chip() {
+        let node = tempfile::NamedTempFile::new().unwrap();
+        let writes = Arc::new(Mutex::new(Vec::new()));
+        let mut spi = Spi {
+            device: SpidevDevice::open(node.path()).unwrap(),
+            node: Node::of(0),
+            mode: 0,
+            rate_hz: 1000,
+            chip_select: Some(ChipSelect { line: Box::new(Recorder(writes.clone())), active_high: false }),
+            node_mode: Arc::new(AtomicU8::new(0)),
+        };
+        let error = spi.run(&mut Buffer::new(&[1, 2])).err().unwrap();
+        assert_eq!(error.reason, Reason::SpiTransfer);
+        assert!(error.to_string().contains("/dev/spidev0.0"), "{error}");
+        assert_eq!(*writes.lock().unwrap(), [false, true]);
+    }
+}

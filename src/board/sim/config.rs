@@ -1,0 +1,589 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The simulated printer's description: TOML in, checked values out.
+
+use std::collections::HashSet;
+use std::fmt;
+use std::fs;
+use std::path::Path;
+
+use serde::Deserialize;
+
+use super::thermistor::Thermistor;
+
+/// What is wrong with a description, in one line: file, key, cause, remedy.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct SimError(String);
+
+impl fmt::Display for SimError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for SimError {}
+
+/// A pin as the description names it: `x_step`, or `!x_step` with its polarity turned around.
+#[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
+#[serde(try_from = "String")]
+pub struct PinName {
+    /// The name that the board publishes.
+    pub name: String,
+    /// Whether a low level means on.
+    pub inverted: bool,
+}
+
+impl TryFrom<String> for PinName {
+    type Error = String;
+    fn try_from(text: String) -> Result<PinName, String> {
+        let (name, inverted) = match text.strip_prefix('!') {
+            Some(name) => (name, true),
+            None => (text.as_str(), false),
+        };
+        if is_word(name) {
+            Ok(PinName { name: name.to_owned(), inverted })
+        } else {
+            Err(format!(
+                "`{text}` is no pin name: use letters, digits, `_`, `-`, `.` and `/`, with `!` \
+                 in front to invert"
+            ))
+        }
+    }
+}
+
+impl fmt::Display for PinName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(if self.inverted { "!" } else { "" })?;
+        f.write_str(&self.name)
+    }
+}
+
+/// Whether klippy takes `text` for a pin and for the name of a section.
+fn is_word(text: &str) -> bool {
+    !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || "_-./".contains(c))
+}
+
+/// A simulated printer.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SimConfig {
+    /// Start value of the sensors' noise: the same seed gives the same readings.
+    #[serde(default)]
+    pub seed: u64,
+    /// What printer.cfg allows the motion.
+    #[serde(default)]
+    pub limits: Limits,
+    /// The axes; `x`, `y`, `z` and `extruder` are those of a cartesian printer.
+    #[serde(default, rename = "axis")]
+    pub axes: Vec<AxisConfig>,
+    /// The heaters with their sensors.
+    #[serde(default, rename = "heater")]
+    pub heaters: Vec<HeaterConfig>,
+    /// The fans.
+    #[serde(default, rename = "fan")]
+    pub fans: Vec<FanConfig>,
+    /// Lights, which the host may dim.
+    #[serde(default, rename = "led")]
+    pub leds: Vec<OutputConfig>,
+    /// Outputs that switch something that needs no simulation.
+    #[serde(default, rename = "output")]
+    pub outputs: Vec<OutputConfig>,
+    /// Inputs that stay at one level: buttons, a filament sensor.
+    #[serde(default, rename = "input")]
+    pub inputs: Vec<InputConfig>,
+}
+
+/// What printer.cfg allows the motion; the simulated axes follow at any speed.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Highest speed of the head.
+    pub velocity_mm_per_s: f64,
+    /// Highest acceleration of the head.
+    pub accel_mm_per_s2: f64,
+    /// Highest speed of the z axis.
+    pub z_velocity_mm_per_s: f64,
+    /// Highest acceleration of the z axis.
+    pub z_accel_mm_per_s2: f64,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits {
+            velocity_mm_per_s: 300.0,
+            accel_mm_per_s2: 3000.0,
+            z_velocity_mm_per_s: 15.0,
+            z_accel_mm_per_s2: 100.0,
+        }
+    }
+}
+
+/// The end of an axis at which its endstop sits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum End {
+    /// At 0 mm.
+    Min,
+    /// At `travel_mm`.
+    Max,
+}
+
+/// A stepper motor and what it moves.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AxisConfig {
+    /// Such as `x`.
+    pub name: String,
+    /// Each rising edge is a step.
+    pub step_pin: PinName,
+    /// High counts up.
+    pub dir_pin: PinName,
+    /// The motor is held, and moves, while this is high; without it, always.
+    pub enable_pin: Option<PinName>,
+    /// Whether the falling edge of the step pin is a step too.
+    #[serde(default)]
+    pub step_both_edges: bool,
+    /// Steps in a millimetre.
+    pub steps_per_mm: f64,
+    /// Steps in a full step of a motor with 200 of them, for printer.cfg.
+    #[serde(default = "default_microsteps")]
+    pub microsteps: u32,
+    /// The axis goes from 0 to here; without it, on for ever.
+    pub travel_mm: Option<f64>,
+    /// How far beyond its travel the axis moves before it hits something and loses steps.
+    #[serde(default = "default_overtravel_mm")]
+    pub overtravel_mm: f64,
+    /// Where the axis stands at first.
+    #[serde(default)]
+    pub start_mm: f64,
+    /// High at and beyond the endstop's end of the travel.
+    pub endstop_pin: Option<PinName>,
+    /// The endstop's end.
+    #[serde(default = "default_end")]
+    pub endstop_at: End,
+    /// Speed of homing, for printer.cfg.
+    #[serde(default = "default_homing_mm_per_s")]
+    pub homing_mm_per_s: f64,
+}
+
+fn default_microsteps() -> u32 {
+    16
+}
+
+fn default_overtravel_mm() -> f64 {
+    2.0
+}
+
+fn default_end() -> End {
+    End::Min
+}
+
+fn default_homing_mm_per_s() -> f64 {
+    5.0
+}
+
+/// A heater, the mass that it heats, and the thermistor in it.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HeaterConfig {
+    /// Such as `extruder` or `heater_bed`.
+    pub name: String,
+    /// Power is on while this is high.
+    pub pin: PinName,
+    /// The ADC channel of the thermistor.
+    pub sensor_pin: PinName,
+    /// Power while on.
+    pub heater_watts: f64,
+    /// Heat capacity of the heated mass.
+    pub heat_capacity_j_per_k: f64,
+    /// Heat lost to the surroundings for each kelvin above them.
+    pub loss_w_per_k: f64,
+    /// Time constant with which the sensor follows the heated mass; 0 for at once.
+    #[serde(default)]
+    pub sensor_lag_s: f64,
+    /// Temperature of the surroundings.
+    #[serde(default = "default_ambient_celsius")]
+    pub ambient_celsius: f64,
+    /// Temperature at first; the surroundings' if it is not told.
+    pub start_celsius: Option<f64>,
+    /// Below this the host stops, for printer.cfg.
+    #[serde(default)]
+    pub min_celsius: f64,
+    /// Above this the host stops, for printer.cfg.
+    pub max_celsius: f64,
+    /// Standard deviation of a reading, in counts of the ADC.
+    #[serde(default)]
+    pub noise_counts: f64,
+    /// Resistor from the ADC's input to its reference.
+    #[serde(default = "default_pullup_ohm")]
+    pub pullup_ohm: f64,
+    /// The thermistor's resistance at one temperature (with `beta_k`) or at three.
+    pub points_celsius_ohm: Vec<(f64, f64)>,
+    /// The thermistor's beta.
+    pub beta_k: Option<f64>,
+}
+
+fn default_ambient_celsius() -> f64 {
+    25.0
+}
+
+fn default_pullup_ohm() -> f64 {
+    4700.0
+}
+
+/// A fan that takes its time to spin up and down.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FanConfig {
+    /// Such as `fan`, which is the part's cooling fan.
+    pub name: String,
+    /// Power is on while this is high.
+    pub pin: PinName,
+    /// If there is one, it must be high too.
+    pub enable_pin: Option<PinName>,
+    /// High for the first half of each pulse.
+    pub tachometer_pin: Option<PinName>,
+    /// Pulses of the tachometer in a revolution.
+    #[serde(default = "default_pulses_per_revolution")]
+    pub pulses_per_revolution: u32,
+    /// Speed at full power.
+    pub max_rpm: f64,
+    /// Time constant with which the speed follows the power.
+    #[serde(default = "default_spin_up_s")]
+    pub spin_up_s: f64,
+}
+
+fn default_pulses_per_revolution() -> u32 {
+    2
+}
+
+fn default_spin_up_s() -> f64 {
+    0.5
+}
+
+/// An output that switches a light or something that needs no simulation.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OutputConfig {
+    /// Such as `light`.
+    pub name: String,
+    /// On while high.
+    pub pin: PinName,
+}
+
+/// An input that stays at one level.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InputConfig {
+    /// Such as `filament`.
+    pub name: String,
+    /// The input.
+    pub pin: PinName,
+    /// Whether it is on.
+    pub level: bool,
+}
+
+/// The default printer's description; a test holds it to be right.
+const DEFAULT: &str = include_str!("default.toml");
+
+/// What a key may be set to.
+enum Bound {
+    Any,
+    NotNegative,
+    AboveZero,
+}
+
+impl SimConfig {
+    /// The description of [`SimConfig::default_printer`], with comments: a start for one's own.
+    pub const fn default_toml() -> &'static str {
+        DEFAULT
+    }
+
+    /// A cartesian printer with a hot end, a heated bed, a fan, a light and a filament sensor.
+    pub fn default_printer() -> SimConfig {
+        match SimConfig::parse(DEFAULT, "the built-in printer") {
+            Ok(config) => config,
+            Err(error) => unreachable!("{error}"),
+        }
+    }
+
+    /// Reads a description from a file.
+    pub fn load(path: &Path) -> Result<SimConfig, SimError> {
+        let file = path.display();
+        let text = fs::read_to_string(path).map_err(|error| {
+            SimError(format!(
+                "{file}: {error}: name a readable TOML file, or take `--board sim` for the \
+                 built-in printer"
+            ))
+        })?;
+        SimConfig::parse(&text, &file.to_string())
+    }
+
+    /// Reads a description; `origin` is how an error calls it.
+    pub fn parse(text: &str, origin: &str) -> Result<SimConfig, SimError> {
+        let config: SimConfig = toml::from_str(text).map_err(|error| {
+            let (line, key) = place(text, error.span().map_or(0, |span| span.start));
+            let key = key.map_or_else(String::new, |key| format!(", key `{key}`"));
+            let cause = error.message().replace('\n', " ");
+            SimError(format!("{origin} line {line}{key}: {cause}: correct it"))
+        })?;
+        config.validate().map_err(|SimError(cause)| SimError(format!("{origin}: {cause}")))?;
+        Ok(config)
+    }
+
+    /// Whether the values make a printer.
+    pub(super) fn validate(&self) -> Result<(), SimError> {
+        use Bound::{AboveZero, Any, NotNegative};
+        let limits = &self.limits;
+        check("[limits]", "velocity_mm_per_s", limits.velocity_mm_per_s, AboveZero)?;
+        check("[limits]", "accel_mm_per_s2", limits.accel_mm_per_s2, AboveZero)?;
+        check("[limits]", "z_velocity_mm_per_s", limits.z_velocity_mm_per_s, AboveZero)?;
+        check("[limits]", "z_accel_mm_per_s2", limits.z_accel_mm_per_s2, AboveZero)?;
+        let mut pins = HashSet::new();
+        let mut pin = |whose: &str, key: &str, pin: Option<&PinName>| match pin {
+            Some(pin) if !pins.insert(pin.name.clone()) => {
+                wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name")
+            }
+            _ => Ok(()),
+        };
+        let unique = |kind: &str, names: Vec<&String>| {
+            let mut seen = HashSet::new();
+            names.into_iter().try_for_each(|name| {
+                if !is_word(name) {
+                    wrong(kind, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
+                } else if !seen.insert(name) {
+                    wrong(kind, "name", &format!("two are called `{name}`"), "rename one")
+                } else {
+                    Ok(())
+                }
+            })
+        };
+        unique("[[axis]]", self.axes.iter().map(|axis| &axis.name).collect())?;
+        unique("[[heater]]", self.heaters.iter().map(|heater| &heater.name).collect())?;
+        unique("[[fan]]", self.fans.iter().map(|fan| &fan.name).collect())?;
+        unique("[[led]]", self.leds.iter().map(|led| &led.name).collect())?;
+        unique("[[output]]", self.outputs.iter().map(|output| &output.name).collect())?;
+        unique("[[input]]", self.inputs.iter().map(|input| &input.name).collect())?;
+
+        for axis in &self.axes {
+            let whose = &format!("axis `{}`", axis.name);
+            pin(whose, "step_pin", Some(&axis.step_pin))?;
+            pin(whose, "dir_pin", Some(&axis.dir_pin))?;
+            pin(whose, "enable_pin", axis.enable_pin.as_ref())?;
+            pin(whose, "endstop_pin", axis.endstop_pin.as_ref())?;
+            check(whose, "steps_per_mm", axis.steps_per_mm, AboveZero)?;
+            check(whose, "microsteps", axis.microsteps.into(), AboveZero)?;
+            check(whose, "overtravel_mm", axis.overtravel_mm, NotNegative)?;
+            check(whose, "start_mm", axis.start_mm, Any)?;
+            check(whose, "homing_mm_per_s", axis.homing_mm_per_s, AboveZero)?;
+            match axis.travel_mm {
+                Some(travel_mm) => {
+                    check(whose, "travel_mm", travel_mm, AboveZero)?;
+                    let free = -axis.overtravel_mm..=travel_mm + axis.overtravel_mm;
+                    if !free.contains(&axis.start_mm) {
+                        return wrong(
+                            whose,
+                            "start_mm",
+                            &format!("{} is out of its reach", axis.start_mm),
+                            &format!("start between 0 and {travel_mm}"),
+                        );
+                    }
+                }
+                None if axis.endstop_pin.is_some() => {
+                    return wrong(
+                        whose,
+                        "travel_mm",
+                        "an axis with an endstop needs it",
+                        "add it, or remove `endstop_pin`",
+                    );
+                }
+                None => {}
+            }
+        }
+        for heater in &self.heaters {
+            let whose = &format!("heater `{}`", heater.name);
+            pin(whose, "pin", Some(&heater.pin))?;
+            pin(whose, "sensor_pin", Some(&heater.sensor_pin))?;
+            if heater.sensor_pin.inverted {
+                return wrong(whose, "sensor_pin", "an analog pin has no polarity", "remove the `!`");
+            }
+            check(whose, "heater_watts", heater.heater_watts, AboveZero)?;
+            check(whose, "heat_capacity_j_per_k", heater.heat_capacity_j_per_k, AboveZero)?;
+            check(whose, "loss_w_per_k", heater.loss_w_per_k, AboveZero)?;
+            check(whose, "sensor_lag_s", heater.sensor_lag_s, NotNegative)?;
+            let time_constant_s = heater.heat_capacity_j_per_k / heater.loss_w_per_k;
+            if heater.sensor_lag_s > time_constant_s / 2.0 {
+                return wrong(
+                    whose,
+                    "sensor_lag_s",
+                    &format!("{} is slower than the heater itself", heater.sensor_lag_s),
+                    &format!("stay below {:.1}", time_constant_s / 2.0),
+                );
+            }
+            let absolute_zero = -Thermistor::KELVIN;
+            for (key, celsius) in [
+                ("ambient_celsius", heater.ambient_celsius),
+                ("start_celsius", heater.start_celsius()),
+                ("min_celsius", heater.min_celsius),
+            ] {
+                check(whose, key, celsius, Any)?;
+                if celsius <= absolute_zero {
+                    return wrong(whose, key, &format!("{celsius} is below absolute zero"), "use degrees Celsius");
+                }
+            }
+            check(whose, "max_celsius", heater.max_celsius, Any)?;
+            if heater.max_celsius <= heater.min_celsius {
+                return wrong(
+                    whose,
+                    "max_celsius",
+                    &format!("{} is not above min_celsius", heater.max_celsius),
+                    "raise it",
+                );
+            }
+            check(whose, "noise_counts", heater.noise_counts, NotNegative)?;
+            check(whose, "pullup_ohm", heater.pullup_ohm, AboveZero)?;
+            heater.thermistor()?;
+        }
+        for fan in &self.fans {
+            let whose = &format!("fan `{}`", fan.name);
+            pin(whose, "pin", Some(&fan.pin))?;
+            pin(whose, "enable_pin", fan.enable_pin.as_ref())?;
+            pin(whose, "tachometer_pin", fan.tachometer_pin.as_ref())?;
+            check(whose, "pulses_per_revolution", fan.pulses_per_revolution.into(), AboveZero)?;
+            check(whose, "max_rpm", fan.max_rpm, AboveZero)?;
+            check(whose, "spin_up_s", fan.spin_up_s, AboveZero)?;
+        }
+        for led in &self.leds {
+            pin(&format!("led `{}`", led.name), "pin", Some(&led.pin))?;
+        }
+        for output in &self.outputs {
+            pin(&format!("output `{}`", output.name), "pin", Some(&output.pin))?;
+        }
+        for input in &self.inputs {
+            pin(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
+        }
+        Ok(())
+    }
+}
+
+impl HeaterConfig {
+    /// The temperature at first.
+    pub(super) fn start_celsius(&self) -> f64 {
+        self.start_celsius.unwrap_or(self.ambient_celsius)
+    }
+
+    /// Its thermistor.
+    pub(super) fn thermistor(&self) -> Result<Thermistor, SimError> {
+        Thermistor::new(self)
+            .map_err(|(key, cause, remedy)| fault(&format!("heater `{}`", self.name), key, cause, remedy))
+    }
+}
+
+/// The error of a key.
+fn fault(whose: &str, key: &str, cause: &str, remedy: &str) -> SimError {
+    SimError(format!("{whose}, key `{key}`: {cause}: {remedy}"))
+}
+
+/// The error of a key, as a result.
+fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), SimError> {
+    Err(fault(whose, key, cause, remedy))
+}
+
+/// Numbers beyond this describe no printer, and would overflow a position or a time.
+const MAX_NUMBER: f64 = 1e9;
+
+/// Whether a number is within its bound.
+fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimError> {
+    let fault = match bound {
+        _ if !(-MAX_NUMBER..=MAX_NUMBER).contains(&value) => "is out of range",
+        Bound::NotNegative if value < 0.0 => "is below zero",
+        Bound::AboveZero if value < 1.0 / MAX_NUMBER => "is not above zero",
+        _ => return Ok(()),
+    };
+    wrong(whose, key, &format!("{value} {fault}"), "set a value of the printer's")
+}
+
+/// The line of a byte of the text, and the key whose value is there.
+fn place(text: &str, at: usize) -> (usize, Option<&str>) {
+    let before = text.get(..at).unwrap_or(text);
+    let line = before.matches('\n').count() + 1;
+    let key = before.rsplit_once('=').and_then(|(keys, value)| {
+        // On a later line, the value has to be a list that goes on.
+        let open = value.matches('[').count() > value.matches(']').count();
+        let goes_on = value.trim_start().starts_with('[') && open;
+        if value.contains('\n') && !goes_on {
+            return None;
+        }
+        keys.trim_end().rsplit([' ', ',', '{', '\n', '\t']).next().filter(|key| is_word(key))
+    });
+    (line, key)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The error of the default printer with its first `from` replaced by `to`.
+    fn error_of(from: &str, to: &str) -> String {
+        assert!(DEFAULT.contains(from), "{from}");
+        let text = DEFAULT.replacen(from, to, 1);
+        match SimConfig::parse(&text, "my.toml") {
+            Ok(_) => panic!("accepted {to}"),
+            Err(error) => error.to_string(),
+        }
+    }
+
+    #[test]
+    fn the_default_printer_is_sound() {
+        let config = SimConfig::default_printer();
+        assert_eq!(config.axes.len(), 4);
+        assert_eq!(config.heaters.len(), 2);
+    }
+
+    #[test]
+    fn an_error_is_one_line_with_file_key_and_remedy() {
+        for (from, to, key, cause) in [
+            ("travel_mm = 220.0", "travel = 220.0", "`travel`", "unknown field"),
+            ("steps_per_mm = 80.0\n", "", "`steps_per_mm`", "missing field"),
+            ("steps_per_mm = 80.0", "steps_per_mm = \"many\"", "`steps_per_mm`", "invalid type"),
+            ("steps_per_mm = 80.0", "steps_per_mm = -80.0", "`steps_per_mm`", "not above zero"),
+            ("steps_per_mm = 80.0", "steps_per_mm = nan", "`steps_per_mm`", "out of range"),
+            ("microsteps = 16", "microsteps = 0", "`microsteps`", "not above zero"),
+            ("start_mm = 60.0", "start_mm = 600.0", "`start_mm`", "out of its reach"),
+            ("travel_mm = 220.0\n", "", "`travel_mm`", "an axis with an endstop needs it"),
+            ("\"y_step\"", "\"x_step\"", "`step_pin`", "`x_step` has a use already"),
+            ("\"x_step\"", "\"x step\"", "`step_pin`", "no pin name"),
+            ("\"x_step\"", "\"^x_step\"", "`step_pin`", "no pin name"),
+            ("name = \"y\"", "name = \"x\"", "`name`", "two are called `x`"),
+            ("endstop_at = \"min\"", "endstop_at = \"left\"", "`endstop_at`", "unknown variant"),
+            ("\"hotend_sensor\"", "\"!hotend_sensor\"", "`sensor_pin`", "no polarity"),
+            ("sensor_lag_s = 1.0", "sensor_lag_s = 60.0", "`sensor_lag_s`", "slower than"),
+            ("max_celsius = 280.0", "max_celsius = -1", "`max_celsius`", "not above min"),
+            ("beta_k = 3950.0\n", "", "`beta_k`", "one point"),
+            ("beta_k = 3950.0", "beta_k = 0.0", "`beta_k`", "above zero"),
+            (", [150.0, 1641.9]", "", "`points_celsius_ohm`", "two"),
+            ("1641.9", "-1", "`points_celsius_ohm`", "above zero"),
+            ("[25.0, 100000.0]", "[25.0, true]", "`points_celsius_ohm`", "invalid type"),
+            ("seed = 1", "seed = = 1", "`seed`", ""),
+            ("[[25.0, 100000.0], [150", "[[25.0, 100000.0],\n[true", "`points_celsius_ohm`", ""),
+        ] {
+            let error = error_of(from, to);
+            assert!(error.starts_with("my.toml"), "{error}");
+            assert!(error.contains(key), "{error}");
+            assert!(error.contains(cause), "{error}");
+            assert!(!error.contains('\n'), "{error}");
+        }
+    }
+
+    #[test]
+    fn a_missing_file_is_named() {
+        let error = SimConfig::load(Path::new("/nonexistent/printer.toml"));
+        let error = error.map_or_else(|error| error.to_string(), |_| String::new());
+        assert!(error.starts_with("/nonexistent/printer.toml: "), "{error}");
+    }
+
+    #[test]
+    fn an_empty_description_is_a_board_without_pins() {
+        let config = SimConfig::parse("", "empty.toml");
+        assert!(config.is_ok_and(|config| config.axes.is_empty()));
+    }
+}

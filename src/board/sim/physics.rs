@@ -1,0 +1,374 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the pins move, heat and spin.
+//!
+//! One thread, the core, drives the pins; any thread may look. Nothing here locks, blocks or
+//! allocates: a state changes only when a pin does, and what lies between two changes is solved
+//! exactly by whoever asks.
+
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
+
+use super::config::{AxisConfig, End, FanConfig, HeaterConfig};
+use super::thermistor::Thermistor;
+use crate::time::{CLOCK_FREQ, Clock};
+
+/// Seconds from `earlier` to `later`; none if they are the other way round.
+fn seconds(earlier: Clock, later: Clock) -> f64 {
+    later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
+}
+
+/// A few words that belong together: the core writes them, any thread reads them whole.
+///
+/// A sequence lock: the version is odd while the words change, and a reader takes them again if
+/// the version was odd or has changed. The writer never waits.
+#[derive(Debug)]
+struct Together<const N: usize> {
+    version: AtomicU64,
+    words: [AtomicU64; N],
+}
+
+impl<const N: usize> Together<N> {
+    fn new(words: [u64; N]) -> Together<N> {
+        Together { version: AtomicU64::new(0), words: words.map(AtomicU64::new) }
+    }
+
+    fn load(&self) -> [u64; N] {
+        loop {
+            let before = self.version.load(Ordering::Acquire);
+            let words = std::array::from_fn(|i| self.words[i].load(Ordering::Relaxed));
+            fence(Ordering::Acquire);
+            if before & 1 == 0 && before == self.version.load(Ordering::Relaxed) {
+                return words;
+            }
+            std::thread::yield_now();
+        }
+    }
+
+    /// Only one thread may store.
+    fn store(&self, words: [u64; N]) {
+        let version = self.version.load(Ordering::Relaxed);
+        self.version.store(version | 1, Ordering::Relaxed);
+        fence(Ordering::Release);
+        for (word, value) in self.words.iter().zip(words) {
+            word.store(value, Ordering::Relaxed);
+        }
+        self.version.store((version | 1).wrapping_add(1), Ordering::Release);
+    }
+}
+
+/// A stepper motor and what it moves.
+#[derive(Debug)]
+pub struct Axis {
+    pub name: String,
+    pub both_edges: bool,
+    pub travel_mm: Option<f64>,
+    steps_per_mm: f64,
+    /// The steps at which it hits something.
+    hard_limits: Option<(i64, i64)>,
+    /// The endstop's end, and the step from which on it is closed.
+    endstop: Option<(End, i64)>,
+    forward: AtomicBool,
+    enabled: AtomicBool,
+    position: AtomicI64,
+    lost_steps: AtomicU64,
+}
+
+impl Axis {
+    pub fn new(config: &AxisConfig) -> Axis {
+        // The bounds on the description keep this below 2^63.
+        let steps = |mm: f64| (mm * config.steps_per_mm).round() as i64;
+        Axis {
+            name: config.name.clone(),
+            both_edges: config.step_both_edges,
+            travel_mm: config.travel_mm,
+            steps_per_mm: config.steps_per_mm,
+            hard_limits: config.travel_mm.map(|travel_mm| {
+                let over_mm = config.overtravel_mm;
+                (steps(-over_mm), steps(travel_mm + over_mm))
+            }),
+            endstop: config.endstop_pin.as_ref().map(|_| match config.endstop_at {
+                End::Min => (End::Min, 0),
+                End::Max => (End::Max, steps(config.travel_mm.unwrap_or(0.0))),
+            }),
+            forward: AtomicBool::new(false),
+            enabled: AtomicBool::new(config.enable_pin.is_none()),
+            position: AtomicI64::new(steps(config.start_mm)),
+            lost_steps: AtomicU64::new(0),
+        }
+    }
+
+    pub fn set_forward(&self, forward: bool) {
+        self.forward.store(forward, Ordering::Relaxed);
+    }
+
+    pub fn set_enabled(&self, enabled: bool) {
+        self.enabled.store(enabled, Ordering::Relaxed);
+    }
+
+    pub fn is_enabled(&self) -> bool {
+        self.enabled.load(Ordering::Relaxed)
+    }
+
+    /// An edge that is a step.
+    pub fn step(&self) {
+        if !self.is_enabled() {
+            return;
+        }
+        let position = self.position.load(Ordering::Relaxed);
+        let next = position.wrapping_add(if self.forward.load(Ordering::Relaxed) { 1 } else { -1 });
+        match self.hard_limits {
+            Some((min, max)) if !(min..=max).contains(&next) => {
+                let lost = self.lost_steps.load(Ordering::Relaxed);
+                self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
+            }
+            _ => self.position.store(next, Ordering::Relaxed),
+        }
+    }
+
+    pub fn position_steps(&self) -> i64 {
+        self.position.load(Ordering::Relaxed)
+    }
+
+    pub fn position_mm(&self) -> f64 {
+        self.position_steps() as f64 / self.steps_per_mm
+    }
+
+    pub fn lost_steps(&self) -> u64 {
+        self.lost_steps.load(Ordering::Relaxed)
+    }
+
+    /// Whether the endstop is closed; none without an endstop.
+    pub fn endstop(&self) -> Option<bool> {
+        let position = self.position_steps();
+        self.endstop.map(|(end, at)| match end {
+            End::Min => position <= at,
+            End::Max => position >= at,
+        })
+    }
+}
+
+/// A heater, the mass that it heats, and the sensor in it.
+///
+/// The mass: `C dT/dt = P - L (T - Ta)` with the power `P` on or off, so from one change to the
+/// next `T(t) = T∞ + (T0 - T∞) exp(-t L/C)` with `T∞ = Ta + P/L`. The sensor follows it:
+/// `τ dS/dt = T - S`, a second exponential.
+#[derive(Debug)]
+pub struct Heater {
+    pub name: String,
+    pub thermistor: Thermistor,
+    pub noise_counts: f64,
+    ambient_celsius: f64,
+    /// What the temperature rises to above the surroundings at full power.
+    rise_k: f64,
+    time_constant_s: f64,
+    sensor_lag_s: f64,
+    /// Since when, the mass's and the sensor's temperature then, and whether power is on.
+    state: Together<4>,
+}
+
+/// A heater at one instant.
+#[derive(Clone, Copy, Debug)]
+pub struct Heat {
+    /// Temperature of the heated mass.
+    pub celsius: f64,
+    /// Temperature of the sensor.
+    pub sensor_celsius: f64,
+    /// Whether power is on.
+    pub on: bool,
+}
+
+impl Heater {
+    pub fn new(config: &HeaterConfig, thermistor: Thermistor, now: Clock) -> Heater {
+        let start = config.start_celsius().to_bits();
+        Heater {
+            name: config.name.clone(),
+            thermistor,
+            noise_counts: config.noise_counts,
+            ambient_celsius: config.ambient_celsius,
+            rise_k: config.heater_watts / config.loss_w_per_k,
+            time_constant_s: config.heat_capacity_j_per_k / config.loss_w_per_k,
+            sensor_lag_s: config.sensor_lag_s,
+            state: Together::new([now.ticks(), start, start, 0]),
+        }
+    }
+
+    pub fn at(&self, now: Clock) -> Heat {
+        let [since, celsius, sensor_celsius, on] = self.state.load();
+        let on = on != 0;
+        let elapsed_s = seconds(Clock::from_ticks(since), now);
+        let end = self.ambient_celsius + if on { self.rise_k } else { 0.0 };
+        let mass_k = f64::from_bits(celsius) - end;
+        let decay = (-elapsed_s / self.time_constant_s).exp();
+        let celsius = end + mass_k * decay;
+        let sensor_celsius = if self.sensor_lag_s > 0.0 {
+            // The part of the sensor's distance that goes with the mass, and the part that goes
+            // by itself.
+            let slow_k = mass_k * self.time_constant_s / (self.time_constant_s - self.sensor_lag_s);
+            let fast_k = f64::from_bits(sensor_celsius) - end - slow_k;
+            end + slow_k * decay + fast_k * (-elapsed_s / self.sensor_lag_s).exp()
+        } else {
+            celsius
+        };
+        Heat { celsius, sensor_celsius, on }
+    }
+
+    pub fn switch(&self, on: bool, now: Clock) {
+        let heat = self.at(now);
+        self.state.store([now.ticks(), heat.celsius.to_bits(), heat.sensor_celsius.to_bits(), on.into()]);
+    }
+}
+
+/// A fan. Its speed follows its power as a heater's temperature does: `n(t) = n∞ + (n0 - n∞)
+/// exp(-t/τ)`; the angle is the integral of that.
+#[derive(Debug)]
+pub struct Fan {
+    pub name: String,
+    max_rpm: f64,
+    spin_up_s: f64,
+    pulses_per_revolution: f64,
+    /// Since when, the speed (rpm) and the angle (revolutions) then, and the [`Switch`]es.
+    state: Together<4>,
+}
+
+/// What must be on for a fan to have power.
+#[derive(Clone, Copy, Debug)]
+pub enum Switch {
+    /// Its pin.
+    Power = 1,
+    /// Its enable pin.
+    Enable = 2,
+}
+
+impl Fan {
+    const POWERED: u64 = Switch::Power as u64 | Switch::Enable as u64;
+
+    pub fn new(config: &FanConfig, now: Clock) -> Fan {
+        let always_enabled = match config.enable_pin {
+            Some(_) => 0,
+            None => Switch::Enable as u64,
+        };
+        let standstill = 0f64.to_bits();
+        Fan {
+            name: config.name.clone(),
+            max_rpm: config.max_rpm,
+            spin_up_s: config.spin_up_s,
+            pulses_per_revolution: config.pulses_per_revolution.into(),
+            state: Together::new([now.ticks(), standstill, standstill, always_enabled]),
+        }
+    }
+
+    /// Speed (rpm), angle (revolutions) and switches.
+    fn at(&self, now: Clock) -> (f64, f64, u64) {
+        let [since, rpm, turns, switches] = self.state.load();
+        let elapsed_s = seconds(Clock::from_ticks(since), now);
+        let end_rpm = if switches == Fan::POWERED { self.max_rpm } else { 0.0 };
+        let excess_rpm = f64::from_bits(rpm) - end_rpm;
+        let decay = (-elapsed_s / self.spin_up_s).exp();
+        let minutes = (end_rpm * elapsed_s + excess_rpm * self.spin_up_s * (1.0 - decay)) / 60.0;
+        (end_rpm + excess_rpm * decay, f64::from_bits(turns) + minutes, switches)
+    }
+
+    pub fn rpm(&self, now: Clock) -> f64 {
+        self.at(now).0
+    }
+
+    /// The tachometer: high for the first half of each pulse.
+    pub fn tachometer(&self, now: Clock) -> bool {
+        (self.at(now).1 * self.pulses_per_revolution).fract() < 0.5
+    }
+
+    pub fn switch(&self, switch: Switch, on: bool, now: Clock) {
+        let (rpm, turns, switches) = self.at(now);
+        let switch = switch as u64;
+        let switches = if on { switches | switch } else { switches & !switch };
+        // Whole turns do not show, and an angle that stays small stays exact.
+        self.state.store([now.ticks(), rpm.to_bits(), turns.fract().to_bits(), switches]);
+    }
+}
+
+/// A light, or anything else that is on or off.
+#[derive(Debug)]
+pub struct Lamp {
+    pub name: String,
+    on: AtomicBool,
+}
+
+impl Lamp {
+    pub fn new(name: &str) -> Lamp {
+        Lamp { name: name.to_owned(), on: AtomicBool::new(false) }
+    }
+
+    pub fn is_on(&self) -> bool {
+        self.on.load(Ordering::Relaxed)
+    }
+
+    pub fn switch(&self, on: bool) {
+        self.on.store(on, Ordering::Relaxed);
+    }
+}
+
+/// Noise of the normal kind, the same for the same seed.
+#[derive(Clone, Debug)]
+pub struct Noise(u64);
+
+impl Noise {
+    pub fn new(seed: u64) -> Noise {
+        Noise(seed)
+    }
+
+    /// A draw with mean 0 and standard deviation 1: the sum of four uniform ones, which is within
+    /// 3.5 and close to normal. The bits are SplitMix64's (Steele, Lea, Flood, 2014).
+    pub fn draw(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        let mut bits = self.0;
+        bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        bits ^= bits >> 31;
+        let sum: u64 = (0..4).map(|quarter| (bits >> (16 * quarter)) & 0xffff).sum();
+        // Each uniform draw has variance 1/12, their sum 1/3.
+        (sum as f64 / 65_536.0 - 2.0) * 3f64.sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Arc;
+    use std::sync::atomic::AtomicBool;
+
+    #[test]
+    fn words_that_belong_together_are_never_seen_apart() {
+        let words = Arc::new(Together::new([0; 4]));
+        let done = Arc::new(AtomicBool::new(false));
+        let reader = std::thread::spawn({
+            let (words, done) = (words.clone(), done.clone());
+            move || {
+                let mut reads = 0;
+                while !done.load(Ordering::Acquire) || reads == 0 {
+                    let seen = words.load();
+                    assert!(seen.iter().all(|&word| word == seen[0]), "{seen:?}");
+                    reads += 1;
+                }
+            }
+        });
+        for i in 0..200_000 {
+            words.store([i; 4]);
+        }
+        done.store(true, Ordering::Release);
+        assert!(reader.join().is_ok());
+    }
+
+    #[test]
+    fn noise_is_normal_and_the_same_each_time() {
+        let draws = |seed| {
+            let mut noise = Noise::new(seed);
+            (0..100_000).map(|_| noise.draw()).collect::<Vec<f64>>()
+        };
+        let first = draws(7);
+        assert_eq!(first, draws(7));
+        assert_ne!(first, draws(8));
+        let mean = first.iter().sum::<f64>() / first.len() as f64;
+        let variance = first.iter().map(|x| x * x).sum::<f64>() / first.len() as f64;
+        assert!(mean.abs() < 0.02, "{mean}");
+        assert!((variance - 1.0).abs() < 0.02, "{variance}");
+    }
+}

@@ -1,0 +1,474 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+use super::*;
+use crate::time::{CLOCK_FREQ, VirtualClock};
+
+/// A board in virtual time.
+struct Bench {
+    board: SimBoard,
+    probe: SimProbe,
+    clock: VirtualClock,
+}
+
+impl Bench {
+    fn new(config: SimConfig) -> Bench {
+        let clock = VirtualClock::at(Clock::from_ticks(0));
+        let board = SimBoard::new(config, Arc::new(clock.clone())).unwrap();
+        Bench { probe: board.probe(), board, clock }
+    }
+
+    fn advance(&self, seconds: f64) {
+        let ticks = (seconds * f64::from(CLOCK_FREQ)).round() as u64;
+        self.clock.set(Clock::from_ticks(self.clock.now().ticks() + ticks));
+    }
+
+    fn pin(&self, name: &str) -> Pin {
+        let pins = self.board.pins();
+        Pin(pins.iter().find(|range| range.name == name).unwrap().first)
+    }
+
+    fn output(&mut self, name: &str, value: bool) -> Box<dyn Output> {
+        let pin = self.pin(name);
+        self.board.output(pin, value, value).unwrap()
+    }
+
+    fn input(&mut self, name: &str) -> Box<dyn Input> {
+        let pin = self.pin(name);
+        self.board.input(pin, Bias::PullUp).unwrap()
+    }
+
+    fn adc(&mut self, name: &str) -> Adc {
+        let pin = self.pin(name);
+        match self.board.adc(pin).unwrap() {
+            Attachment::Inline(device) => Adc(device),
+            Attachment::Worker { .. } => panic!("{name} is not inline"),
+        }
+    }
+
+    fn axis(&self, name: &str) -> AxisView<'_> {
+        self.probe.axis(name).unwrap()
+    }
+}
+
+struct Adc(Box<dyn Device>);
+
+impl Adc {
+    fn read(&mut self) -> u16 {
+        let mut data = Buffer::EMPTY;
+        self.0.run(&mut data).unwrap();
+        u16::from_le_bytes(data.as_slice().try_into().unwrap())
+    }
+}
+
+fn pulse(step: &mut dyn Output) {
+    step.write(true).unwrap();
+    step.write(false).unwrap();
+}
+
+/// klippy's conversion for the thermistor of a heater.
+fn celsius_of(heater: &HeaterConfig, counts: f64) -> f64 {
+    let thermistor = heater.thermistor().unwrap();
+    let (mut low, mut high) = (-50.0, 500.0);
+    for _ in 0..60 {
+        let middle = (low + high) / 2.0;
+        if thermistor.fraction(middle) * 4095.0 > counts {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    low
+}
+
+#[test]
+fn homing_closes_the_endstop_at_the_exact_step() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut step = bench.output("x_step", false);
+    let mut dir = bench.output("x_dir", false);
+    let mut enable = bench.output("x_enable", true);
+    let mut endstop = bench.input("x_endstop");
+    dir.write(false).unwrap();
+    enable.write(false).unwrap();
+    let start = 60 * 80;
+    for i in 1..=start {
+        assert!(!endstop.read().unwrap(), "closed after {} steps", i - 1);
+        pulse(&mut *step);
+    }
+    assert!(endstop.read().unwrap());
+    assert_eq!(bench.axis("x").position_mm, 0.0);
+    assert_eq!(bench.axis("x").endstop, Some(true));
+    // Back off: open at the first step.
+    dir.write(true).unwrap();
+    pulse(&mut *step);
+    assert!(!endstop.read().unwrap());
+    assert_eq!(bench.axis("x").lost_steps, 0);
+}
+
+#[test]
+fn an_endstop_at_the_maximum_closes_there_and_may_be_inverted() {
+    let mut config = SimConfig::default_printer();
+    config.axes[0].endstop_at = End::Max;
+    config.axes[0].travel_mm = Some(61.0);
+    config.axes[0].endstop_pin = PinName::try_from("!x_endstop".to_owned()).ok();
+    let mut bench = Bench::new(config);
+    let mut step = bench.output("x_step", false);
+    let _dir = bench.output("x_dir", true);
+    let _enable = bench.output("x_enable", false);
+    let mut endstop = bench.input("x_endstop");
+    for _ in 0..80 {
+        assert!(endstop.read().unwrap());
+        pulse(&mut *step);
+    }
+    assert!(!endstop.read().unwrap());
+    assert_eq!(bench.axis("x").position_mm, 61.0);
+}
+
+#[test]
+fn an_axis_stays_at_its_hard_limit_and_counts_lost_steps() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut step = bench.output("z_step", false);
+    let mut dir = bench.output("z_dir", false);
+    let _enable = bench.output("z_enable", false);
+    // From 12 mm to the end 2 mm below zero, and 7 steps more.
+    for _ in 0..14 * 400 + 7 {
+        pulse(&mut *step);
+    }
+    assert_eq!(bench.axis("z").position_mm, -2.0);
+    assert_eq!(bench.axis("z").lost_steps, 7);
+    dir.write(true).unwrap();
+    pulse(&mut *step);
+    assert_eq!(bench.axis("z").position_mm, -2.0 + 1.0 / 400.0);
+}
+
+#[test]
+fn an_axis_moves_only_while_its_motor_is_enabled() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut step = bench.output("x_step", false);
+    let mut enable = bench.output("x_enable", true);
+    assert!(!bench.axis("x").enabled);
+    pulse(&mut *step);
+    assert_eq!(bench.axis("x").position_mm, 60.0);
+    enable.write(false).unwrap();
+    assert!(bench.axis("x").enabled);
+    pulse(&mut *step);
+    assert_eq!(bench.axis("x").position_mm, 60.0 - 1.0 / 80.0);
+    assert_eq!(bench.axis("x").lost_steps, 0);
+}
+
+#[test]
+fn both_edges_step_if_the_description_says_so() {
+    let mut config = SimConfig::default_printer();
+    config.axes[0].step_both_edges = true;
+    config.axes[1].dir_pin.inverted = true;
+    let mut bench = Bench::new(config);
+    // The claim of a line is no edge, whatever its level.
+    let mut x_step = bench.output("x_step", true);
+    let mut y_step = bench.output("y_step", false);
+    let _enable = [bench.output("x_enable", false), bench.output("y_enable", false)];
+    let _dir = [bench.output("x_dir", true), bench.output("y_dir", false)];
+    for value in [true, false, false, true] {
+        x_step.write(value).unwrap();
+        y_step.write(value).unwrap();
+    }
+    assert_eq!(bench.axis("x").position_mm, 60.0 + 2.0 / 80.0);
+    assert_eq!(bench.axis("y").position_mm, 45.0 + 2.0 / 80.0);
+}
+
+#[test]
+fn a_heater_follows_the_analytic_curve() {
+    let config = SimConfig::default_printer();
+    let bed = config.heaters[1].clone();
+    let mut bench = Bench::new(config);
+    let mut power = bench.output("bed_heater", false);
+    bench.advance(10.0);
+    power.write(true).unwrap();
+    let (p, l, c) = (bed.heater_watts, bed.loss_w_per_k, bed.heat_capacity_j_per_k);
+    let ambient = bed.ambient_celsius;
+    let warm = |t: f64| ambient + p / l * (1.0 - (-l * t / c).exp());
+    for t in 1..=90 {
+        bench.advance(1.0);
+        // Looking and writing the same value change nothing.
+        power.write(true).unwrap();
+        let celsius = bench.probe.heater("heater_bed").unwrap().celsius;
+        assert!((celsius - warm(f64::from(t))).abs() < 1e-9, "{t} s: {celsius}");
+    }
+    power.write(false).unwrap();
+    bench.advance(100.0);
+    let celsius = bench.probe.heater("heater_bed").unwrap().celsius;
+    let cooled = ambient + (warm(90.0) - ambient) * (-l * 100.0 / c).exp();
+    assert!((celsius - cooled).abs() < 1e-9);
+}
+
+#[test]
+fn a_sensor_lags_as_the_differential_equation_says() {
+    let config = SimConfig::default_printer();
+    let hot_end = config.heaters[0].clone();
+    let mut bench = Bench::new(config);
+    let mut power = bench.output("hotend_heater", true);
+    let (mut mass, mut sensor) = (hot_end.ambient_celsius, hot_end.ambient_celsius);
+    for i in 0..6 {
+        let on = i % 2 == 0;
+        power.write(on).unwrap();
+        let watts = if on { hot_end.heater_watts } else { 0.0 };
+        // Euler's method in small steps.
+        let dt = 1e-5;
+        for _ in 0..200_000 {
+            let loss = hot_end.loss_w_per_k * (mass - hot_end.ambient_celsius);
+            sensor += (mass - sensor) / hot_end.sensor_lag_s * dt;
+            mass += (watts - loss) / hot_end.heat_capacity_j_per_k * dt;
+        }
+        bench.advance(2.0);
+        let view = bench.probe.heater("extruder").unwrap();
+        assert!((view.celsius - mass).abs() < 1e-3, "{view:?} {mass}");
+        assert!((view.sensor_celsius - sensor).abs() < 1e-3, "{view:?} {sensor}");
+    }
+}
+
+#[test]
+fn half_a_duty_cycle_is_half_the_power() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut power = bench.output("bed_heater", false);
+    for _ in 0..20_000 {
+        power.write(true).unwrap();
+        bench.advance(0.05);
+        power.write(false).unwrap();
+        bench.advance(0.05);
+    }
+    // 2000 s are eight time constants.
+    let celsius = bench.probe.heater("heater_bed").unwrap().celsius;
+    let end = 25.0 + 220.0 / 1.6 / 2.0;
+    assert!((celsius - end).abs() < 0.05, "{celsius} {end}");
+}
+
+#[test]
+fn a_reading_is_the_temperature_with_seeded_noise() {
+    let config = SimConfig::default_printer();
+    let heater = config.heaters[0].clone();
+    let mut readings = Vec::new();
+    for _ in 0..2 {
+        let mut bench = Bench::new(config.clone());
+        let mut adc = bench.adc("hotend_sensor");
+        let mut power = bench.output("hotend_heater", true);
+        bench.advance(45.0);
+        power.write(false).unwrap();
+        let counts: Vec<u16> = (0..1000).map(|_| adc.read()).collect();
+        let mean = counts.iter().map(|&count| f64::from(count)).sum::<f64>() / 1000.0;
+        let truth = bench.probe.heater("extruder").unwrap().sensor_celsius;
+        assert!((celsius_of(&heater, mean) - truth).abs() < 0.1);
+        assert!(counts.iter().any(|count| *count != counts[0]), "no noise");
+        readings.push(counts);
+    }
+    assert_eq!(readings[0], readings[1]);
+}
+
+#[test]
+fn reset_frees_the_pins_and_the_physics_goes_on() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut power = bench.output("bed_heater", true);
+    let mut step = bench.output("x_step", false);
+    let enable = bench.output("x_enable", false);
+    bench.advance(60.0);
+    pulse(&mut *step);
+    power.write(false).unwrap();
+    let before = bench.probe.heater("heater_bed").unwrap();
+    let (celsius, position_mm) = (before.celsius, bench.axis("x").position_mm);
+    assert!(celsius > 40.0);
+    drop((power, step, enable));
+    bench.board.reset();
+    assert_eq!(bench.probe.heater("heater_bed").unwrap().celsius, celsius);
+    assert_eq!(bench.axis("x").position_mm, position_mm);
+    bench.output("bed_heater", false);
+    bench.advance(60.0);
+    let cooled = bench.probe.heater("heater_bed").unwrap().celsius;
+    assert!(cooled < celsius && cooled > 25.0);
+}
+
+#[test]
+fn a_wrong_pin_says_which_and_what_to_do() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let board = &mut bench.board;
+    let pin = |name: &str, board: &SimBoard| {
+        let pins = board.pins();
+        Pin(pins.iter().find(|range| range.name == name).unwrap().first)
+    };
+    let (step, endstop) = (pin("x_step", board), pin("x_endstop", board));
+    let sensor = pin("bed_sensor", board);
+    let nowhere = Pin(u32::MAX);
+    assert!(board.output(step, false, false).is_ok());
+    assert!(board.input(endstop, Bias::None).is_ok());
+    assert!(board.adc(sensor).is_ok());
+    let errors = [
+        (board.output(nowhere, false, false).err(), Reason::NotOutput, "no pin 4294967295"),
+        (board.output(endstop, false, false).err(), Reason::NotOutput, "x_endstop"),
+        (board.output(sensor, false, false).err(), Reason::NotOutput, "bed_sensor"),
+        (board.output(step, false, false).err(), Reason::OutputLine, "x_step"),
+        (board.input(nowhere, Bias::None).err(), Reason::NotInput, "no pin 4294967295"),
+        (board.input(step, Bias::None).err(), Reason::NotInput, "x_step"),
+        (board.input(endstop, Bias::None).err(), Reason::InputLine, "x_endstop"),
+        (board.adc(nowhere).err(), Reason::AdcOpen, "no pin 4294967295"),
+        (board.adc(endstop).err(), Reason::AdcOpen, "x_endstop"),
+        (board.adc(sensor).err(), Reason::AdcOpen, "bed_sensor"),
+    ];
+    for (error, reason, subject) in errors {
+        let error = error.unwrap();
+        assert_eq!(error.reason, reason);
+        let detail = error.detail.unwrap();
+        assert!(detail.contains(subject), "{detail}");
+        assert!(detail.contains(": "), "{detail}");
+    }
+}
+
+#[test]
+fn a_fan_spins_up_and_its_tachometer_counts_the_turns() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut tachometer = bench.input("fan_tachometer");
+    let mut fan = bench.output("fan", true);
+    bench.advance(0.4);
+    let rpm = bench.probe.fan("fan").unwrap().rpm;
+    assert!((rpm - 4500.0 * (1.0 - (-1f64).exp())).abs() < 1e-6);
+    bench.advance(10.0);
+    // 4500 rpm are 75 turns, 150 pulses, 300 edges a second; klippy polls each 1.5 ms.
+    let mut edges = 0;
+    let mut last = tachometer.read().unwrap();
+    for _ in 0..20_000 {
+        bench.advance(0.0015);
+        let level = tachometer.read().unwrap();
+        edges += u32::from(level != last);
+        last = level;
+    }
+    assert!(edges.abs_diff(300 * 30) <= 1, "{edges}");
+    // Not where a whole number of turns would leave it on an edge.
+    bench.advance(0.001);
+    fan.write(false).unwrap();
+    bench.advance(10.0);
+    assert!(bench.probe.fan("fan").unwrap().rpm < 1e-6);
+    let stopped = tachometer.read().unwrap();
+    for _ in 0..100 {
+        bench.advance(0.1);
+        assert_eq!(tachometer.read().unwrap(), stopped);
+    }
+}
+
+#[test]
+fn a_fan_with_an_enable_pin_needs_both() {
+    let mut config = SimConfig::default_printer();
+    config.fans[0].enable_pin = PinName::try_from("!fan_enable".to_owned()).ok();
+    let mut bench = Bench::new(config);
+    let _fan = bench.output("fan", true);
+    bench.advance(5.0);
+    assert_eq!(bench.probe.fan("fan").unwrap().rpm, 0.0);
+    let mut enable = bench.output("fan_enable", true);
+    enable.write(false).unwrap();
+    bench.advance(5.0);
+    assert!(bench.probe.fan("fan").unwrap().rpm > 4490.0);
+}
+
+#[test]
+fn lights_and_fixed_inputs() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut led = bench.output("led", false);
+    assert!(!bench.probe.output("light").unwrap().on);
+    led.write(true).unwrap();
+    assert!(bench.probe.output("light").unwrap().on);
+    assert!(bench.input("filament_sensor").read().unwrap());
+}
+
+#[test]
+fn the_spi_bus_sends_back_what_it_is_sent() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let open =
+        |bench: &mut Bench, bus, mode| bench.board.spi(SpiConfig { bus, mode, rate_hz: 1_000_000, chip_select: None });
+    let bus = bench.board.spi_buses()[0].first;
+    match open(&mut bench, bus, 3).unwrap() {
+        Attachment::Worker { bus, mut device } => {
+            assert_eq!(bus, "spi0");
+            let mut data = Buffer::new(b"pinion");
+            device.run(&mut data).unwrap();
+            assert_eq!(data.as_slice(), b"pinion");
+        }
+        Attachment::Inline(_) => panic!("not on a worker"),
+    }
+    assert!(open(&mut bench, 1, 0).is_err_and(|error| error.reason == Reason::SpiOpen));
+    assert!(open(&mut bench, 0, 4).is_err_and(|error| error.reason == Reason::InvalidSpi));
+}
+
+#[test]
+fn every_pin_has_its_own_name_and_number_and_stands_in_printer_cfg() {
+    let config = SimConfig::default_printer();
+    let cfg = printer_cfg(&config, "/tmp/klipper_host_mcu");
+    assert!(cfg.contains("serial: /tmp/klipper_host_mcu\n"));
+    let bench = Bench::new(config);
+    let pins = bench.board.pins();
+    for (number, range) in (0..).zip(&pins) {
+        assert_eq!((range.first, range.count), (number, 1));
+        let named = cfg.split([' ', '!', '\n']).any(|word| word == range.name);
+        assert!(named, "{} is not in\n{cfg}", range.name);
+    }
+    let names: HashSet<&String> = pins.iter().map(|range| &range.name).collect();
+    assert_eq!(names.len(), pins.len());
+}
+
+#[test]
+fn printer_cfg_moves_as_far_as_the_board() {
+    let mut config = SimConfig::default_printer();
+    config.axes[1].step_both_edges = true;
+    let cfg = printer_cfg(&config, "/tmp/pty");
+    // 200 full steps of 16 microsteps a turn, 80 or 400 steps a millimetre.
+    for (section, expected) in [("x", "40"), ("y", "80"), ("z", "8")] {
+        let section = cfg.split(&format!("[stepper_{section}]\n")).nth(1).unwrap();
+        let section = section.split("\n\n").next().unwrap();
+        assert!(section.contains(&format!("rotation_distance: {expected}\n")), "{section}");
+        assert!(section.contains("microsteps: 16\n"));
+    }
+}
+
+/// klippy's heater loop (`klippy/extras/heaters.py`: `ControlPID`, the soft PWM, its delays)
+/// around the board, with the parameters that printer.cfg has.
+#[test]
+fn klippy_holds_the_targets_and_finds_no_fault_with_the_heaters() {
+    for (index, pin, sensor, target, seconds) in
+        [(0, "hotend_heater", "hotend_sensor", 200.0, 45.0..75.0), (1, "bed_heater", "bed_sensor", 60.0, 60.0..90.0)]
+    {
+        let config = SimConfig::default_printer();
+        let heater = config.heaters[index].clone();
+        let gains = printer_cfg::Gains::of(&heater);
+        let [kp, ki, kd] = [gains.kp, gains.ki, gains.kd].map(|gain| gain / 255.0);
+        let mut bench = Bench::new(config);
+        let mut power = bench.output(pin, false);
+        let mut adc = bench.adc(sensor);
+        let (mut last, mut slope, mut integral) = (25.0, 0.0, 0.0);
+        let (mut duty, mut reached, mut hottest, mut coldest) = (0.0, None, 0f64, f64::MAX);
+        for report in 0..1000 {
+            let now = 0.3 * f64::from(report);
+            let samples: u16 = (0..8).map(|_| adc.read()).sum();
+            let celsius = celsius_of(&heater, f64::from(samples) / 8.0);
+            slope = slope * 0.7 + (celsius - last);
+            last = celsius;
+            let error = target - celsius;
+            let next_integral = (integral + error * 0.3).clamp(0.0, 1.0 / ki);
+            let output: f64 = kp * error + ki * next_integral - kd * slope;
+            if (0.0..=1.0).contains(&output) {
+                integral = next_integral;
+            }
+            // What klippy decides now is in force 0.3 s later.
+            let in_force = std::mem::replace(&mut duty, output.clamp(0.0, 1.0));
+            for _ in 0..3 {
+                power.write(in_force > 0.0).unwrap();
+                bench.advance(0.1 * in_force);
+                power.write(in_force >= 1.0).unwrap();
+                bench.advance(0.1 * (1.0 - in_force));
+            }
+            let truth = bench.probe.heaters().nth(index).unwrap().celsius;
+            hottest = hottest.max(truth);
+            if error.abs() <= 1.0 && slope.abs() <= 0.1 && reached.is_none() {
+                reached = Some(now);
+            }
+            if reached.is_some_and(|reached| now > reached + 5.0) {
+                coldest = coldest.min(truth);
+            }
+        }
+        let name = &heater.name;
+        assert!(reached.is_some_and(|s| seconds.contains(&s)), "{name}: {reached:?} s");
+        assert!(hottest < target + 2.0, "{name}: {hottest}");
+        assert!(coldest > target - 2.0, "{name}: {coldest}");
+    }
+}

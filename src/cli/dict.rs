@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion dict`: the data dictionary as a file.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io::{self, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use clap::Args;
+
+use crate::feature::FEATURES;
+use crate::mcu::Dialect;
+use crate::time::Monotonic;
+
+use super::failed;
+use super::run::BoardName;
+
+/// Options of `pinion dict`.
+#[derive(Args, Clone, Debug)]
+pub struct DictArgs {
+    /// Write to FILE instead of stdout
+    #[arg(short = 'o', value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// The board whose pins the dictionary names: linux, sim or sim:FILE.toml
+    #[arg(long, value_name = "BOARD", default_value = "linux")]
+    board: BoardName,
+}
+
+/// Prints the dictionary as JSON.
+pub fn run(args: &DictArgs) -> ExitCode {
+    match dictionary(args).and_then(|json| put(args, &json)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(error),
+    }
+}
+
+fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
+    let board = args.board.open(Arc::new(Monotonic::start()), None)?;
+    let dialect = Dialect::new(FEATURES, &*board).map_err(|error| error.to_string())?;
+    dialect.dictionary().json().map_err(|error| error.to_string())
+}
+
+fn put(args: &DictArgs, json: &[u8]) -> Result<(), String> {
+    match &args.output {
+        Some(path) => fs::write(path, json).map_err(|error| format!("{} can not be written: {error}", path.display())),
+        None => io::stdout().write_all(json).map_err(|error| format!("stdout: {error}")),
+    }
+}

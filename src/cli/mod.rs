@@ -1,0 +1,96 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The program's subcommands.
+
+#![forbid(unsafe_code)]
+
+use std::io::Write as _;
+use std::process::ExitCode;
+
+use clap::{Args, Parser, Subcommand};
+use log::LevelFilter;
+
+pub mod dict;
+pub mod latency;
+pub mod pins;
+pub mod run;
+pub mod sim;
+
+/// A Klipper micro-controller made of a Linux process.
+///
+/// Without a subcommand it runs as `pinion run` does: the command line of Klipper's own
+/// klipper_mcu (-r -w -I PATH) works unchanged.
+#[derive(Parser, Debug)]
+#[command(name = "pinion", version, max_term_width = 100, args_conflicts_with_subcommands = true)]
+pub struct Cli {
+    #[command(subcommand)]
+    command: Option<Command>,
+    #[command(flatten)]
+    run: run::RunArgs,
+    #[command(flatten)]
+    log: LogArgs,
+}
+
+/// What goes to the log (stderr).
+#[derive(Args, Debug, Clone)]
+struct LogArgs {
+    /// How much to log: error, warn, info, debug, trace or off
+    #[arg(long, value_name = "LEVEL", default_value = "info", global = true)]
+    log_level: LevelFilter,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Serve a Klipper host on a pty (the default)
+    Run(run::RunArgs),
+    /// List this machine's GPIO lines, ADC channels and SPI buses, as printer.cfg names them
+    Pins(pins::PinsArgs),
+    /// Print the data dictionary, as klippy's batch mode takes it with -d
+    Dict(dict::DictArgs),
+    /// Measure how late this machine wakes up, and say what that is good for
+    Latency(latency::LatencyArgs),
+    /// Show the simulated printer at work, or print its printer.cfg
+    Sim(sim::SimArgs),
+}
+
+/// Runs the program with the process's arguments.
+pub fn main() -> ExitCode {
+    let cli = Cli::parse();
+    start_log(cli.log.log_level);
+    match cli.command {
+        None => run::run(&cli.run),
+        Some(Command::Run(args)) => run::run(&args),
+        Some(Command::Pins(args)) => pins::run(&args),
+        Some(Command::Dict(args)) => dict::run(&args),
+        Some(Command::Latency(args)) => latency::run(&args),
+        Some(Command::Sim(args)) => sim::run(&args),
+    }
+}
+
+/// One line an event on stderr: for the journal with its level's prefix (sd-daemon(3)), for
+/// people with the seconds since the kernel's start, which are the machine's own clock.
+fn start_log(level: LevelFilter) {
+    let journal = std::env::var_os("JOURNAL_STREAM").is_some();
+    env_logger::Builder::new()
+        .filter_level(level)
+        .format(move |out, record| {
+            if journal {
+                let priority = match record.level() {
+                    log::Level::Error => 3,
+                    log::Level::Warn => 4,
+                    log::Level::Info => 6,
+                    log::Level::Debug | log::Level::Trace => 7,
+                };
+                writeln!(out, "<{priority}>{}", record.args())
+            } else {
+                let now = crate::time::monotonic().as_secs_f64();
+                writeln!(out, "[{now:12.6}] {:5} {}", record.level(), record.args())
+            }
+        })
+        .init();
+}
+
+/// Says on stderr why a subcommand failed.
+fn failed(error: impl std::fmt::Display) -> ExitCode {
+    log::error!("{error}");
+    ExitCode::FAILURE
+}

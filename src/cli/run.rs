@@ -1,0 +1,136 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion run`: serve a host.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use clap::Args;
+
+use crate::board::linux::LinuxBoard;
+use crate::board::sim::{SimBoard, SimConfig, SimError};
+use crate::board::{Board, Guard};
+use crate::runtime::wakeup::MarginLimits;
+use crate::runtime::{self, Access, Guardian, Options};
+use crate::time::{Monotonic, TimeSource};
+
+use super::failed;
+
+/// What -w feeds.
+const WATCHDOG: &str = "/dev/watchdog";
+
+/// Options of `pinion run`, and of `pinion` alone.
+#[derive(Args, Clone, Debug)]
+pub struct RunArgs {
+    /// Where to put the link to the pty that the host opens
+    #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
+    link: PathBuf,
+    /// Run in real time: SCHED_FIFO and locked memory
+    #[arg(short = 'r')]
+    realtime: bool,
+    /// Run the core on this processor only
+    #[arg(long, value_name = "N")]
+    cpu: Option<usize>,
+    /// How early, at most, the core may wake for a timer and spin the rest: it learns how early
+    /// it has to. 0 saves power and makes steps late
+    #[arg(long, value_name = "US", default_value_t = 200, value_parser = clap::value_parser!(u32).range(0..=10_000))]
+    margin: u32,
+    /// Feed the hardware watchdog /dev/watchdog
+    #[arg(short = 'w')]
+    watchdog: bool,
+    /// Permission bits of the pty, octal
+    #[arg(short = 'm', value_name = "MODE", default_value = "0660", value_parser = mode)]
+    mode: u32,
+    /// Group of the pty, by name or number
+    #[arg(short = 'g', value_name = "GROUP", default_value = "tty")]
+    group: String,
+    /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml
+    #[arg(long, value_name = "BOARD", default_value = "linux")]
+    board: BoardName,
+}
+
+fn mode(text: &str) -> Result<u32, String> {
+    match u32::from_str_radix(text, 8) {
+        Ok(mode) if mode <= 0o777 => Ok(mode),
+        _ => Err("an octal number up to 0777 is wanted, such as 0660".into()),
+    }
+}
+
+/// Which board, as the command line names it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum BoardName {
+    /// This machine's pins.
+    Linux,
+    /// The simulated printer: the default one, or that of a TOML file.
+    Sim(Option<PathBuf>),
+}
+
+impl FromStr for BoardName {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<BoardName, String> {
+        match text.split_once(':') {
+            None if text == "linux" => Ok(BoardName::Linux),
+            None if text == "sim" => Ok(BoardName::Sim(None)),
+            Some(("sim", file)) if !file.is_empty() => Ok(BoardName::Sim(Some(file.into()))),
+            _ => Err("there are the boards linux, sim and sim:FILE.toml".into()),
+        }
+    }
+}
+
+impl BoardName {
+    /// The board itself; `guard` copies its outputs.
+    pub fn open(&self, clock: Arc<dyn TimeSource>, guard: Option<Box<dyn Guard>>) -> Result<Box<dyn Board>, String> {
+        match self {
+            BoardName::Linux => Ok(Box::new(LinuxBoard::new(guard))),
+            BoardName::Sim(file) => {
+                let board = sim_config(file.as_deref()).and_then(|config| SimBoard::new(config, clock));
+                Ok(Box::new(board.map_err(|error| error.to_string())?))
+            }
+        }
+    }
+}
+
+/// The description of a simulated printer: that of a file, or the default one.
+pub fn sim_config(file: Option<&Path>) -> Result<SimConfig, SimError> {
+    file.map_or_else(|| Ok(SimConfig::default_printer()), SimConfig::load)
+}
+
+impl RunArgs {
+    /// What the runtime needs to know.
+    pub fn options(&self) -> Options {
+        Options {
+            link: self.link.clone(),
+            access: Access { mode: self.mode, group: Some(self.group.clone()) },
+            realtime: self.realtime,
+            cpu: self.cpu,
+            margin: MarginLimits::up_to_us(self.margin),
+            watchdog: self.watchdog.then(|| WATCHDOG.into()),
+        }
+    }
+}
+
+/// Serves until SIGTERM or SIGINT.
+pub fn run(args: &RunArgs) -> ExitCode {
+    // Before anything that starts a thread. A simulated printer needs none.
+    let guardian = match args.board {
+        BoardName::Linux => Some(Guardian::start(args.realtime)),
+        BoardName::Sim(_) => None,
+    };
+    let guardian = match guardian.transpose() {
+        Ok(guardian) => guardian,
+        Err(error) => return failed(error),
+    };
+    let clock = Monotonic::start();
+    let board = match args.board.open(Arc::new(clock), guardian.as_ref().map(Guardian::guard)) {
+        Ok(board) => board,
+        Err(error) => return failed(error),
+    };
+    match runtime::run(&args.options(), board, clock, guardian, || ()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(error),
+    }
+}

@@ -1,0 +1,222 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim`: the simulated printer, shown at work by our own host client.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use clap::Args;
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::getpid;
+
+use crate::board::sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
+use crate::host::Client;
+use crate::host::demo::{AxisPlan, HeaterPlan, Lines, Pin, Plan, Report, demonstrate};
+use crate::host::heater::{Goal, Thermistor};
+use crate::host::picture;
+use crate::runtime::wakeup::MarginLimits;
+use crate::runtime::{self, Access, Options};
+use crate::time::Monotonic;
+
+use super::failed;
+use super::run::sim_config;
+
+/// Options of `pinion sim`.
+#[derive(Args, Clone, Debug)]
+pub struct SimArgs {
+    /// The printer's description; the built-in printer if left out
+    #[arg(value_name = "FILE.toml")]
+    file: Option<PathBuf>,
+    /// Print the printer.cfg that matches the printer, and end
+    #[arg(long)]
+    print_config: bool,
+    /// Print the built-in printer's description, a start for one's own, and end
+    #[arg(long, conflicts_with = "print_config")]
+    print_board: bool,
+    /// End after the demonstration, with status 0 if all that it showed was right
+    #[arg(long)]
+    demo: bool,
+    /// Draw the homing: position, endstop and step rate over time
+    #[arg(long, value_name = "FILE.svg")]
+    picture: Option<PathBuf>,
+    /// Run in real time: SCHED_FIFO and locked memory
+    #[arg(short = 'r')]
+    realtime: bool,
+    /// Where to put the link to the pty that the host opens
+    #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
+    link: PathBuf,
+}
+
+/// Shows the printer at work and goes on serving it, or prints its configuration.
+pub fn run(args: &SimArgs) -> ExitCode {
+    let config = match sim_config(args.file.as_deref()) {
+        Ok(config) => config,
+        Err(error) => return failed(error),
+    };
+    if args.print_board {
+        print!("{}", SimConfig::default_toml());
+        return ExitCode::SUCCESS;
+    }
+    if args.print_config {
+        print!("{}", printer_cfg(&config, &args.link.to_string_lossy()));
+        return ExitCode::SUCCESS;
+    }
+    let plan = plan(&config);
+    let clock = Monotonic::start();
+    let board = match SimBoard::new(config, Arc::new(clock)) {
+        Ok(board) => board,
+        Err(error) => return failed(error),
+    };
+    let probe = board.probe();
+    let options = Options {
+        link: args.link.clone(),
+        access: Access { mode: 0o660, group: Some("tty".into()) },
+        realtime: args.realtime,
+        cpu: None,
+        margin: MarginLimits::default(),
+        watchdog: None,
+    };
+    let right = Arc::new(AtomicBool::new(false));
+    let ready = {
+        let (args, right) = (args.clone(), right.clone());
+        move || {
+            let shown = thread::Builder::new().name("demo".into()).spawn(move || show(&args, &plan, &probe, &right));
+            if let Err(error) = shown {
+                log::error!("the demonstration can not be started: {error}");
+            }
+        }
+    };
+    match runtime::run(&options, Box::new(board), clock, None, ready) {
+        Ok(()) if args.demo && !right.load(Ordering::SeqCst) => ExitCode::FAILURE,
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(error),
+    }
+}
+
+/// Shows the printer at work, then asks the program to end or says how to go on.
+fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool) {
+    match demonstration(args, plan, probe) {
+        Ok(all_right) => right.store(all_right, Ordering::SeqCst),
+        Err(error) => log::error!("the demonstration: {error}"),
+    }
+    if args.demo {
+        // Our own orderly end, as by Ctrl-C.
+        if let Err(error) = kill(getpid(), Signal::SIGTERM) {
+            log::error!("ending: {error}");
+        }
+        return;
+    }
+    let file = args.file.as_ref().map_or(String::new(), |file| format!(" {}", file.display()));
+    println!(
+        "\nThe simulated printer goes on until Ctrl-C. To connect a Klipper host:\n  \
+         pinion sim{file} -I {link} --print-config > printer.cfg\n  \
+         klippy.py printer.cfg",
+        link = args.link.display()
+    );
+}
+
+fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
+    let mut client = Client::connect(&args.link, Duration::from_secs(5)).map_err(|error| error.to_string())?;
+    let report = demonstrate(&mut client, plan, &mut Lines::stdout()).map_err(|error| error.to_string())?;
+    if let Some(path) = &args.picture {
+        draw(path, &report)?;
+    }
+    // The next host finds the machine as if it had just been started.
+    client.reset().map_err(|error| error.to_string())?;
+    for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
+        println!(
+            "       the printer's {} axis stands at {:.3} mm, {} steps lost",
+            axis.name, axis.position_mm, axis.lost_steps
+        );
+    }
+    for heater in probe.heaters() {
+        println!("       the printer's {} is at {:.1} C", heater.name, heater.celsius);
+    }
+    let lost: u64 = probe.axes().map(|axis| axis.lost_steps).sum();
+    let all_right = report.passed() && lost == 0;
+    println!("{}", if all_right { "all of it was right" } else { "NOT all of it was right" });
+    Ok(all_right)
+}
+
+fn draw(path: &Path, report: &Report) -> Result<(), String> {
+    fs::write(path, picture::homing(report))
+        .map_err(|error| format!("{} can not be written: {error}", path.display()))?;
+    println!("drawn: {}", path.display());
+    Ok(())
+}
+
+/// What the host client is told of the printer.
+fn plan(config: &SimConfig) -> Plan {
+    Plan {
+        axes: config.axes.iter().filter_map(axis).collect(),
+        heater: config.heaters.iter().find(|heater| heater.name == "heater_bed").and_then(heater),
+    }
+}
+
+fn pin(name: &PinName) -> Pin {
+    Pin { name: name.name.clone(), invert: name.inverted }
+}
+
+/// An axis that can be homed.
+fn axis(axis: &AxisConfig) -> Option<AxisPlan> {
+    let travel_mm = axis.travel_mm?;
+    Some(AxisPlan {
+        name: axis.name.clone(),
+        step: pin(&axis.step_pin),
+        dir: pin(&axis.dir_pin),
+        enable: axis.enable_pin.as_ref().map(pin),
+        endstop: pin(axis.endstop_pin.as_ref()?),
+        endstop_pull: 0,
+        steps_per_mm: axis.steps_per_mm,
+        both_edges: axis.step_both_edges,
+        pulse_us: 2.0,
+        travel_mm,
+        start_mm: Some(match axis.endstop_at {
+            End::Min => axis.start_mm,
+            End::Max => travel_mm - axis.start_mm,
+        }),
+        home_positive: axis.endstop_at == End::Max,
+        speed_mm_s: axis.homing_mm_per_s,
+        acceleration_mm_s2: 20.0 * axis.homing_mm_per_s,
+        retract_mm: 5.0,
+    })
+}
+
+/// A heater whose sensor the host client can read.
+fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
+    let pullup_ohms = heater.pullup_ohm;
+    let thermistor = match (heater.points_celsius_ohm.as_slice(), heater.beta_k) {
+        ([(at_c, ohms), ..], Some(beta_k)) => Thermistor::Beta { pullup_ohms, at_c: *at_c, ohms: *ohms, beta_k },
+        ([a, b, c], None) => Thermistor::Points { pullup_ohms, points: [*a, *b, *c] },
+        _ => return None,
+    };
+    Some(HeaterPlan {
+        name: heater.name.clone(),
+        heater: pin(&heater.pin),
+        sensor: heater.sensor_pin.name.clone(),
+        thermistor,
+        min_c: heater.min_celsius,
+        max_c: heater.max_celsius,
+        // Half a minute's heating of the built-in bed.
+        goal: Goal { target_c: heater.ambient_celsius + 20.0, tolerance_c: 1.0, hold_s: 3.0, timeout_s: 180.0 },
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_plan_has_every_axis_with_an_endstop_and_the_bed() {
+        let plan = plan(&SimConfig::default_printer());
+        let names: Vec<&str> = plan.axes.iter().map(|axis| axis.name.as_str()).collect();
+        assert_eq!(names, ["x", "y", "z"]);
+        assert_eq!(plan.heater.map(|heater| heater.name), Some("heater_bed".into()));
+    }
+}

@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The features of the machine, one file each, and the list of them all.
+
+#![forbid(unsafe_code)]
+
+use crate::mcu::{Feature, base};
+use crate::wire::format::same;
+
+mod analog_in;
+mod digital_out;
+mod endstop;
+mod pwm_out;
+mod spi;
+mod stepper;
+mod trsync;
+
+/// Every feature. What is not listed is not in the dictionary.
+pub const FEATURES: &[Feature] = &[
+    base::FEATURE,
+    digital_out::FEATURE,
+    pwm_out::FEATURE,
+    stepper::FEATURE,
+    endstop::FEATURE,
+    trsync::FEATURE,
+    analog_in::FEATURE,
+    spi::FEATURE,
+];
+
+/// The place of a response in the list of all, found by the compiler.
+const fn response_index(format: &str) -> usize {
+    let mut index = 0;
+    let mut feature = 0;
+    while feature < FEATURES.len() {
+        let responses = FEATURES[feature].responses;
+        let mut response = 0;
+        while response < responses.len() {
+            if same(responses[response], format) {
+                return index;
+            }
+            index += 1;
+            response += 1;
+        }
+        feature += 1;
+    }
+    panic!("the response is not listed by any feature")
+}

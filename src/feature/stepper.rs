@@ -1,0 +1,278 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Steppers: queued moves, step pulses or both-edge steps, direction changes with their set-up
+//! time, a stop by a trsync.
+
+#![forbid(unsafe_code)]
+
+use crate::board::Pin;
+use crate::mcu::{
+    Command, Constant, Feature, Line, Mcu, MoveQueue, Next, Object, Oid, Response, TimerId, WireClock, command,
+    response,
+};
+use crate::shutdown::{Reason, Shutdown};
+use crate::time::{Clock, Ticks};
+
+use super::trsync::Trsync;
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "stepper",
+    commands: &[
+        CONFIG_STEPPER,
+        QUEUE_STEP,
+        SET_NEXT_STEP_DIR,
+        RESET_STEP_CLOCK,
+        STEPPER_GET_POSITION,
+        STEPPER_STOP_ON_TRIGGER,
+    ],
+    responses: &[Position::FORMAT],
+    constants: &[("STEPPER_STEP_BOTH_EDGE", Constant::Number(1))],
+};
+
+response! {
+    /// Steps since the configuration, forwards less backwards.
+    "stepper_position oid=%c pos=%i"
+    pub(super) struct Position { oid: Oid, pos: i32 }
+}
+
+/// `count` steps, the first `interval` ticks after the step before, each interval longer by
+/// `add` than the one before.
+struct Move {
+    interval: u32,
+    count: u16,
+    add: i16,
+    reverses: bool,
+}
+
+struct Stepper {
+    step: Line,
+    dir: Line,
+    /// The step pin's idle level.
+    invert_step: bool,
+    /// Every edge is a step, rather than a rising one followed by an unstep.
+    both_edges: bool,
+    pulse_ticks: Ticks,
+    late_limit: Ticks,
+    queue: MoveQueue<Move>,
+    /// Edges of the present move still to come; zero while idle.
+    edges: u32,
+    interval: u32,
+    add: i16,
+    /// When the present or last step is due.
+    next_step: Clock,
+    /// A reversal waits for this event, the end of the last step's pulse.
+    reverse_pending: bool,
+    /// Where the stepper stands after the present move. While the direction is reversed it
+    /// counts down from zero, so that a step always adds one.
+    position: u32,
+    last_dir: bool,
+    next_dir: bool,
+    /// After a stop, steps are dropped until the host sets a new clock.
+    need_reset: bool,
+}
+
+/// Keeps the position's top bit free to tell the direction.
+const POSITION_BIAS: u32 = 0x4000_0000;
+
+impl Stepper {
+    fn timer(oid: Oid) -> TimerId {
+        TimerId::new(oid, 0)
+    }
+
+    /// Takes the next move. `earliest` is when its first edge may come at the earliest, if the
+    /// stepper is running.
+    fn load(&mut self, mcu: &mut Mcu, earliest: Option<Clock>) -> Result<Next, Shutdown> {
+        let Some(Move { interval, count, add, reverses }) = self.queue.pop(&mut mcu.moves) else {
+            self.edges = 0;
+            return Ok(Next::Done);
+        };
+        self.position = if reverses { self.position.wrapping_neg() } else { self.position };
+        self.position = self.position.wrapping_add(u32::from(count));
+        self.add = add;
+        self.interval = interval.wrapping_add_signed(i32::from(add));
+        self.edges = u32::from(count) << u32::from(!self.both_edges);
+        let Some(earliest) = earliest else {
+            // After a long pause the interval has wrapped, and the step's clock is right.
+            let clock = self.next_step.wire().wrapping_add(interval);
+            self.next_step = mcu.instant(WireClock(clock));
+            if reverses {
+                self.dir.toggle()?;
+            }
+            return Ok(Next::At(self.next_step));
+        };
+        self.next_step = self.next_step.displaced(interval);
+        let early = earliest.since(self.next_step);
+        if early > i64::from(self.late_limit.0) {
+            return Err(Shutdown::because(
+                Reason::StepperPast,
+                format!(
+                    "a step is {} us late: more steps a second are asked for than the step pulse of {} ticks and this machine allow: lower the speed, the microsteps or step_pulse_duration",
+                    early / i64::from(Ticks::from_us(1).0),
+                    self.pulse_ticks.0
+                ),
+            ));
+        }
+        if reverses {
+            if self.both_edges {
+                // The last step's pulse must end before the direction changes.
+                self.reverse_pending = true;
+                return Ok(Next::At(earliest));
+            }
+            return self.reverse(mcu);
+        }
+        Ok(Next::At(self.next_step.max(earliest)))
+    }
+
+    /// Changes the direction and leaves it its set-up time.
+    fn reverse(&mut self, mcu: &mut Mcu) -> Result<Next, Shutdown> {
+        self.dir.toggle()?;
+        let earliest = mcu.now() + self.pulse_ticks;
+        Ok(Next::At(self.next_step.max(earliest)))
+    }
+
+    /// The position that the host knows: after the steps that were made.
+    fn position(&self) -> u32 {
+        let to_come = self.edges >> u32::from(!self.both_edges);
+        let position = self.position.wrapping_sub(to_come);
+        if position & 0x8000_0000 != 0 { position.wrapping_neg() } else { position }
+    }
+
+    fn stop(&mut self, mcu: &mut Mcu) -> Result<(), Shutdown> {
+        self.position = self.position().wrapping_neg();
+        self.edges = 0;
+        self.reverse_pending = false;
+        self.last_dir = false;
+        self.next_dir = false;
+        self.need_reset = true;
+        self.queue.clear(&mut mcu.moves);
+        let dir = self.dir.write(false);
+        if !self.both_edges {
+            self.step.write(self.invert_step)?;
+        }
+        dir
+    }
+
+    fn queue(&mut self, mcu: &mut Mcu, oid: Oid, mut item: Move) -> Result<(), Shutdown> {
+        if item.count == 0 {
+            return Err(Shutdown::by_host(Reason::InvalidCount, "queue_step asks for no steps"));
+        }
+        if self.edges == 0 && self.need_reset {
+            return Ok(());
+        }
+        item.reverses = self.last_dir != self.next_dir;
+        self.last_dir = self.next_dir;
+        self.queue.push(&mut mcu.moves, item)?;
+        if self.edges > 0 {
+            return Ok(());
+        }
+        match self.load(mcu, None)? {
+            Next::At(at) => mcu.schedule(Self::timer(oid), at),
+            Next::Done => Ok(()),
+        }
+    }
+}
+
+impl Object for Stepper {
+    fn kind(&self) -> &'static str {
+        "stepper"
+    }
+
+    #[inline]
+    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
+        if self.reverse_pending {
+            self.reverse_pending = false;
+            return self.reverse(mcu);
+        }
+        self.step.toggle()?;
+        // Counted from a reading after the edge was written: a write may be slow.
+        let earliest = mcu.now() + self.pulse_ticks;
+        let edges = self.edges.saturating_sub(1);
+        if edges & 1 != 0 && !self.both_edges {
+            self.edges = edges;
+            return Ok(Next::At(earliest));
+        }
+        if edges > 0 {
+            self.edges = edges;
+            self.next_step = self.next_step.displaced(self.interval);
+            self.interval = self.interval.wrapping_add_signed(i32::from(self.add));
+            return Ok(Next::At(self.next_step.max(earliest)));
+        }
+        self.load(mcu, Some(earliest))
+    }
+
+    fn triggered(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        mcu.cancel(Self::timer(oid));
+        self.stop(mcu)
+    }
+
+    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) -> Result<(), Shutdown> {
+        self.stop(mcu)
+    }
+}
+
+const CONFIG_STEPPER: Command = command!(
+    "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u",
+    |mcu, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
+        let idle = invert_step > 0;
+        let step = mcu.output(step_pin, idle, idle)?;
+        let dir = mcu.output(dir_pin, false, false)?;
+        let stepper = Stepper {
+            step,
+            dir,
+            invert_step: idle,
+            both_edges: invert_step < 0,
+            pulse_ticks: step_pulse_ticks,
+            late_limit: mcu.board.step_late_limit(),
+            queue: MoveQueue::default(),
+            edges: 0,
+            interval: 0,
+            add: 0,
+            next_step: Clock::EPOCH,
+            reverse_pending: false,
+            position: POSITION_BIAS.wrapping_neg(),
+            last_dir: false,
+            next_dir: false,
+            need_reset: false,
+        };
+        mcu.assign(oid, stepper)
+    }
+);
+
+const QUEUE_STEP: Command = command!(
+    "queue_step oid=%c interval=%u count=%hu add=%hi",
+    |mcu, oid: Oid, interval: u32, count: u16, add: i16| {
+        let item = Move { interval, count, add, reverses: false };
+        mcu.with::<Stepper, _>(oid, |stepper, mcu| stepper.queue(mcu, oid, item))
+    }
+);
+
+const SET_NEXT_STEP_DIR: Command = command!("set_next_step_dir oid=%c dir=%c", |mcu, oid: Oid, dir: bool| {
+    mcu.with::<Stepper, _>(oid, |stepper, _| {
+        stepper.next_dir = dir;
+        Ok(())
+    })
+});
+
+const RESET_STEP_CLOCK: Command = command!("reset_step_clock oid=%c clock=%u", |mcu, oid: Oid, clock: WireClock| {
+    let clock = mcu.instant(clock);
+    mcu.with::<Stepper, _>(oid, |stepper, _| {
+        if stepper.edges > 0 {
+            return Err(Shutdown::by_host(Reason::ResetWhileStepping, "reset_step_clock came while steps are queued"));
+        }
+        stepper.next_step = clock;
+        stepper.need_reset = false;
+        Ok(())
+    })
+});
+
+const STEPPER_GET_POSITION: Command = command!("stepper_get_position oid=%c", |mcu, oid: Oid| {
+    mcu.with::<Stepper, _>(oid, |stepper, mcu| {
+        mcu.send(Position { oid, pos: stepper.position().wrapping_sub(POSITION_BIAS) as i32 });
+        Ok(())
+    })
+});
+
+const STEPPER_STOP_ON_TRIGGER: Command =
+    command!("stepper_stop_on_trigger oid=%c trsync_oid=%c", |mcu, oid: Oid, trsync_oid: Oid| {
+        mcu.with::<Stepper, _>(oid, |_, _| Ok(()))?;
+        Trsync::add_signal(mcu, trsync_oid, oid)
+    });

@@ -1,0 +1,159 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Trsync: a trigger that stops several steppers at once, with a time-out and reports.
+
+#![forbid(unsafe_code)]
+
+use crate::mcu::{Command, Feature, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response};
+use crate::shutdown::{Reason, Shutdown};
+use crate::time::{Clock, Ticks};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "trsync",
+    commands: &[CONFIG_TRSYNC, TRSYNC_START, TRSYNC_SET_TIMEOUT, TRSYNC_TRIGGER],
+    responses: &[State::FORMAT],
+    constants: &[],
+};
+
+response! {
+    /// Whether the trigger may still come, or why it came.
+    "trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u"
+    pub(super) struct State { oid: Oid, can_trigger: bool, trigger_reason: u8, clock: Clock }
+}
+
+pub(super) struct Trsync {
+    can_trigger: bool,
+    report_ticks: Ticks,
+    trigger_reason: u8,
+    expire_reason: u8,
+    /// The objects that wait for the trigger.
+    signals: Vec<Oid>,
+}
+
+/// No object waits for two triggers, so this many signals never allocate.
+const SIGNALS_MAX: usize = 256;
+
+const REPORT: u8 = 0;
+const EXPIRE: u8 = 1;
+
+impl Trsync {
+    /// Pulls the trigger: every object that waits for it is told, and the host.
+    pub(super) fn trigger(&mut self, mcu: &mut Mcu, oid: Oid, reason: u8) -> Result<(), Shutdown> {
+        if self.pull(mcu, reason)? {
+            self.report(mcu, oid);
+        }
+        Ok(())
+    }
+
+    /// Pulls the trigger, if it was not pulled before.
+    fn pull(&mut self, mcu: &mut Mcu, reason: u8) -> Result<bool, Shutdown> {
+        let pulled = std::mem::take(&mut self.can_trigger);
+        if pulled {
+            self.trigger_reason = reason;
+            while let Some(signal) = self.signals.pop() {
+                mcu.trigger(signal)?;
+            }
+        }
+        Ok(pulled)
+    }
+
+    fn report(&self, mcu: &mut Mcu, oid: Oid) {
+        let clock = mcu.now();
+        mcu.send(State { oid, can_trigger: self.can_trigger, trigger_reason: self.trigger_reason, clock });
+    }
+
+    /// Lets an object wait for the trigger.
+    pub(super) fn add_signal(mcu: &mut Mcu, trsync: Oid, waiting: Oid) -> Result<(), Shutdown> {
+        if mcu.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
+            return Err(Shutdown::by_host(
+                Reason::SignalActive,
+                format_args!("stepper oid {} already waits for a trigger", waiting.0),
+            ));
+        }
+        mcu.with::<Trsync, _>(trsync, |trsync, _| {
+            trsync.signals.push(waiting);
+            Ok(())
+        })
+    }
+
+    fn clear(&mut self, mcu: &mut Mcu, oid: Oid) {
+        mcu.cancel(TimerId::new(oid, REPORT));
+        mcu.cancel(TimerId::new(oid, EXPIRE));
+        self.signals.clear();
+        self.can_trigger = false;
+        self.trigger_reason = 0;
+        self.expire_reason = 0;
+    }
+}
+
+impl Object for Trsync {
+    fn kind(&self) -> &'static str {
+        "trsync"
+    }
+
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+        if timer.which() == EXPIRE {
+            self.trigger(mcu, oid, self.expire_reason)?;
+            return Ok(Next::Done);
+        }
+        self.report(mcu, oid);
+        Ok(Next::At(at + self.report_ticks))
+    }
+
+    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        self.clear(mcu, oid);
+        Ok(())
+    }
+}
+
+const CONFIG_TRSYNC: Command = command!("config_trsync oid=%c", |mcu, oid: Oid| {
+    let trsync = Trsync {
+        can_trigger: false,
+        report_ticks: Ticks(0),
+        trigger_reason: 0,
+        expire_reason: 0,
+        signals: Vec::with_capacity(SIGNALS_MAX),
+    };
+    mcu.assign(oid, trsync)
+});
+
+const TRSYNC_START: Command = command!(
+    "trsync_start oid=%c report_clock=%u report_ticks=%u expire_reason=%c",
+    |mcu, oid: Oid, report_clock: WireClock, report_ticks: Ticks, expire_reason: u8| {
+        let report_at = mcu.instant(report_clock);
+        mcu.with::<Trsync, _>(oid, |trsync, mcu| {
+            trsync.clear(mcu, oid);
+            trsync.can_trigger = true;
+            trsync.report_ticks = report_ticks;
+            trsync.expire_reason = expire_reason;
+            match report_ticks {
+                Ticks(0) => Ok(()),
+                _ => mcu.schedule(TimerId::new(oid, REPORT), report_at),
+            }
+        })
+    }
+);
+
+const TRSYNC_SET_TIMEOUT: Command =
+    command!("trsync_set_timeout oid=%c clock=%u", |mcu, oid: Oid, clock: WireClock| {
+        let expire_at = mcu.instant(clock);
+        mcu.with::<Trsync, _>(oid, |trsync, mcu| {
+            if !trsync.can_trigger {
+                return Ok(());
+            }
+            mcu.cancel(TimerId::new(oid, EXPIRE));
+            mcu.schedule(TimerId::new(oid, EXPIRE), expire_at)
+        })
+    });
+
+const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", |mcu, oid: Oid, reason: u8| {
+    mcu.with::<Trsync, _>(oid, |trsync, mcu| {
+        trsync.pull(mcu, reason)?;
+        mcu.cancel(TimerId::new(oid, REPORT));
+        mcu.cancel(TimerId::new(oid, EXPIRE));
+        let trigger_reason = trsync.trigger_reason;
+        // The host asked, it need not be told when: clock 0, as in the firmware.
+        mcu.send(State { oid, can_trigger: false, trigger_reason, clock: Clock::EPOCH });
+        Ok(())
+    })
+});

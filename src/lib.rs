@@ -1,0 +1,27 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Pinion: a Klipper micro-controller made of a Linux process.
+//!
+//! The layers, lower never imports higher (docs/architecture.md):
+//!
+//! - [`cli`]: the program's subcommands
+//! - [`runtime`]: threads, pty, real time, signals
+//! - [`feature`]: one file per Klipper feature, and the list of them all
+//! - [`mcu`]: the machine: oids, timers, move queue, shutdown
+//! - [`board`]: what the machine asks of the hardware; the linux and the sim board
+//! - [`wire`]: bytes only: VLQ, CRC, message blocks, formats, dictionary
+//! - [`time`], [`shutdown`], [`lateness`]: the words that all layers share; `sys` holds every `unsafe`
+//!
+//! [`host`] is the other end of the wire: a small client for demonstrations and tests.
+
+pub mod board;
+pub mod cli;
+pub mod feature;
+pub mod host;
+pub mod lateness;
+pub mod mcu;
+pub mod runtime;
+pub mod shutdown;
+#[allow(unsafe_code)]
+mod sys;
+pub mod time;
+pub mod wire;

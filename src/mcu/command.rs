@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Declarations: a command's or response's format, its typed parameters and its handler stand
+//! together, and a disagreement between them is a build error.
+
+#![forbid(unsafe_code)]
+
+use crate::shutdown::{Reason, Shutdown};
+use crate::wire::Malformed;
+use crate::wire::vlq::{Reader, Writer};
+
+use super::Mcu;
+
+impl From<Malformed> for Shutdown {
+    fn from(_: Malformed) -> Shutdown {
+        Reason::CommandParser.into()
+    }
+}
+
+/// Decodes a command's parameters and runs it.
+pub type Handler = fn(&mut Mcu, &mut Reader<'_>) -> Result<(), Shutdown>;
+
+/// A command that the host may send.
+pub struct Command {
+    /// Name, parameters and their conversions, exactly as klippy looks them up.
+    pub format: &'static str,
+    /// Whether it also runs after a shutdown.
+    pub in_shutdown: bool,
+    /// What it does.
+    pub handler: Handler,
+}
+
+impl Command {
+    /// Lets the command run after a shutdown too (`HF_IN_SHUTDOWN`).
+    pub const fn allowed_in_shutdown(mut self) -> Command {
+        self.in_shutdown = true;
+        self
+    }
+}
+
+/// A message to the host.
+pub trait Response {
+    /// Name, parameters and their conversions.
+    const FORMAT: &'static str;
+    /// Its place in the list of all responses, in the order of the features.
+    const INDEX: usize;
+    /// Appends the parameters.
+    fn encode(&self, writer: &mut Writer);
+}
+
+/// A constant of the dictionary.
+pub enum Constant {
+    /// A number.
+    Number(u32),
+    /// A text.
+    Text(&'static str),
+}
+
+/// What a feature adds to the dictionary.
+pub struct Feature {
+    /// Its name.
+    pub name: &'static str,
+    /// Its commands.
+    pub commands: &'static [Command],
+    /// The formats of its responses.
+    pub responses: &'static [&'static str],
+    /// Its constants.
+    pub constants: &'static [(&'static str, Constant)],
+}
+
+/// Declares a command: its format, and a closure with the machine and the typed parameters.
+macro_rules! command {
+    ($format:literal, |$mcu:ident $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
+        const {
+            assert!(
+                $crate::wire::format::agrees($format, &[$($crate::wire::format::Spec {
+                    name: stringify!($arg),
+                    conversions: <$t as $crate::wire::format::Arg>::CONVERSIONS,
+                }),*]),
+                concat!("handler arguments disagree with \"", $format, "\"")
+            )
+        };
+        fn handler(
+            $mcu: &mut $crate::mcu::Mcu,
+            args: &mut $crate::wire::vlq::Reader<'_>,
+        ) -> Result<(), $crate::shutdown::Shutdown> {
+            $(let $arg = <$t as $crate::wire::format::Arg>::decode(args)?;)*
+            let _ = args;
+            $body
+        }
+        $crate::mcu::Command { format: $format, in_shutdown: false, handler }
+    }};
+}
+
+/// Declares a response as a struct. The module above must have a `response_index`, which finds
+/// its format in the list of responses; one that is not listed is a build error.
+macro_rules! response {
+    ($(#[$doc:meta])* $format:literal $vis:vis struct $name:ident $(<$life:lifetime>)? {
+        $($field:ident: $t:ty),* $(,)?
+    }) => {
+        $(#[$doc])*
+        $vis struct $name $(<$life>)? { $(pub(crate) $field: $t),* }
+
+        impl $(<$life>)? $crate::mcu::Response for $name $(<$life>)? {
+            const FORMAT: &'static str = {
+                assert!(
+                    $crate::wire::format::agrees($format, &[$($crate::wire::format::Spec {
+                        name: stringify!($field),
+                        conversions: <$t as $crate::wire::format::Field>::CONVERSIONS,
+                    }),*]),
+                    concat!("fields disagree with \"", $format, "\"")
+                );
+                $format
+            };
+            const INDEX: usize = super::response_index($format);
+            fn encode(&self, writer: &mut $crate::wire::vlq::Writer) {
+                $($crate::wire::format::Field::encode(&self.$field, writer);)*
+                let _ = writer;
+            }
+        }
+    };
+}
+
+pub(crate) use {command, response};

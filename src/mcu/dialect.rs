@@ -1,0 +1,150 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The ids of all messages, and the dictionary that tells them to the host.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+
+use serde_json::{Value, json};
+
+use crate::board::{Board, Range};
+use crate::shutdown::{Reason, Shutdown};
+use crate::wire::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
+use crate::wire::format::{self, Conversion};
+use crate::wire::vlq::Reader;
+
+use super::command::{Constant, Feature, Handler};
+
+/// A command as it is found by its id.
+pub(super) struct Entry {
+    pub(super) format: &'static str,
+    pub(super) handler: Handler,
+    pub(super) in_shutdown: bool,
+    conversions: Box<[Conversion]>,
+}
+
+impl Entry {
+    /// Takes the parameters off the reader without running the command.
+    pub(super) fn skip(&self, reader: &mut Reader<'_>) -> Result<(), Shutdown> {
+        for conversion in &self.conversions {
+            conversion.skip(reader)?;
+        }
+        Ok(())
+    }
+}
+
+/// The messages that a host may exchange with the machine, by their ids.
+pub struct Dialect {
+    /// By id; ids are counted up from `identify`'s.
+    commands: Vec<Option<Entry>>,
+    /// By [`super::Response::INDEX`].
+    response_ids: Vec<u32>,
+    /// What is published.
+    dictionary: Dictionary,
+    compressed: Vec<u8>,
+}
+
+impl Dialect {
+    /// Numbers the messages of `features` and publishes them with the board's names.
+    pub fn new(features: &[Feature], board: &dyn Board) -> io::Result<Dialect> {
+        let mut dictionary = Dictionary {
+            app: "Pinion".into(),
+            build_versions: concat!("rustc: ", env!("CARGO_PKG_RUST_VERSION"), " or later").into(),
+            license: "GNU GPLv3".into(),
+            version: concat!("pinion-", env!("CARGO_PKG_VERSION")).into(),
+            ..Dictionary::default()
+        };
+        let mut commands = vec![None, None];
+        let mut response_ids = Vec::new();
+        for command in features.iter().flat_map(|feature| feature.commands) {
+            let name = format::name(command.format);
+            let conversions = format::parameters(command.format)
+                .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
+            let entry = Entry {
+                format: command.format,
+                handler: command.handler,
+                in_shutdown: command.in_shutdown,
+                conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
+            };
+            let id = if name == "identify" {
+                IDENTIFY_ID as usize
+            } else {
+                commands.push(None);
+                commands.len() - 1
+            };
+            commands[id] = Some(entry);
+            dictionary.commands.insert(command.format.into(), json!(id));
+        }
+        let mut next_id = commands.len() as i32;
+        for response in features.iter().flat_map(|feature| feature.responses) {
+            let id = if format::name(response) == "identify_response" {
+                IDENTIFY_RESPONSE_ID
+            } else {
+                next_id += 1;
+                next_id - 1
+            };
+            response_ids.push(id as u32);
+            dictionary.responses.insert((*response).into(), json!(id));
+        }
+        for (name, constant) in features.iter().flat_map(|feature| feature.constants) {
+            let value = match constant {
+                Constant::Number(number) => json!(number),
+                Constant::Text(text) => json!(text),
+            };
+            dictionary.config.insert((*name).into(), value);
+        }
+        let reasons = Reason::ALL.iter().map(|reason| (reason.text().into(), json!(*reason as u8)));
+        for (name, values) in [
+            ("pin", names(board.pins())),
+            ("spi_bus", names(board.spi_buses())),
+            ("static_string_id", reasons.collect()),
+        ] {
+            dictionary.enumerations.insert(name.into(), Value::Object(values));
+        }
+        let compressed = dictionary.compress()?;
+        Ok(Dialect { commands, response_ids, dictionary, compressed })
+    }
+
+    /// The dictionary.
+    pub fn dictionary(&self) -> &Dictionary {
+        &self.dictionary
+    }
+
+    /// The dictionary as `identify` serves it.
+    pub fn compressed(&self) -> &[u8] {
+        &self.compressed
+    }
+
+    /// The id of the response of type `R`.
+    pub fn response_id<R: super::Response>(&self) -> u32 {
+        self.response_ids[R::INDEX]
+    }
+
+    /// The id of the command with this format.
+    pub fn command_id(&self, format: &str) -> Option<u32> {
+        self.dictionary.commands.get(format)?.as_u64().map(|id| id as u32)
+    }
+
+    #[inline]
+    pub(super) fn command(&self, id: u32) -> Result<&Entry, Shutdown> {
+        match self.commands.get(id as usize) {
+            Some(Some(entry)) => Ok(entry),
+            _ => Err(Shutdown::because(
+                Reason::InvalidCommand,
+                format!(
+                    "the host sent command {id}, which the dictionary does not have: restart the host so that it reads the dictionary anew"
+                ),
+            )),
+        }
+    }
+}
+
+fn names(ranges: Vec<Range>) -> serde_json::Map<String, Value> {
+    ranges
+        .into_iter()
+        .map(|range| match range.count {
+            1 => (range.name, json!(range.first)),
+            count => (range.name, json!([range.first, count])),
+        })
+        .collect()
+}

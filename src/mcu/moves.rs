@@ -1,0 +1,97 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The move queue: a fixed number of moves, shared by all objects that queue something.
+
+#![forbid(unsafe_code)]
+
+use std::collections::VecDeque;
+
+use crate::shutdown::{Reason, Shutdown};
+
+/// How many moves there are (`move_count`), as in the firmware on Linux.
+pub const MOVE_COUNT: u16 = 1024;
+
+/// Counts the moves that are free. None are before `finalize_config`.
+#[derive(Debug, Default)]
+pub struct MovePool {
+    free: u16,
+    pub(super) count: u16,
+}
+
+impl MovePool {
+    pub(super) fn finalize(&mut self) {
+        self.count = MOVE_COUNT;
+        self.free = MOVE_COUNT;
+    }
+}
+
+/// One object's queued moves. It never holds more than the pool has, so it never allocates
+/// after its making.
+#[derive(Debug)]
+pub struct MoveQueue<T>(VecDeque<T>);
+
+impl<T> Default for MoveQueue<T> {
+    fn default() -> MoveQueue<T> {
+        MoveQueue(VecDeque::with_capacity(usize::from(MOVE_COUNT)))
+    }
+}
+
+impl<T> MoveQueue<T> {
+    /// Appends a move, or says that all are taken.
+    #[inline]
+    pub fn push(&mut self, pool: &mut MovePool, item: T) -> Result<(), Shutdown> {
+        pool.free = pool.free.checked_sub(1).ok_or_else(|| overflow(pool.count))?;
+        self.0.push_back(item);
+        Ok(())
+    }
+
+    /// Takes the oldest move and frees its place.
+    #[inline]
+    pub fn pop(&mut self, pool: &mut MovePool) -> Option<T> {
+        let item = self.0.pop_front()?;
+        pool.free += 1;
+        Some(item)
+    }
+
+    /// The oldest move.
+    pub fn first(&self) -> Option<&T> {
+        self.0.front()
+    }
+
+    /// Whether nothing is queued.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Frees every place.
+    pub fn clear(&mut self, pool: &mut MovePool) {
+        pool.free += self.0.len() as u16;
+        self.0.clear();
+    }
+}
+
+#[cold]
+fn overflow(count: u16) -> Shutdown {
+    Shutdown::by_host(Reason::MoveQueueOverflow, format_args!("more than the {count} moves of move_count are queued"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_queues_share_one_pool() {
+        let mut pool = MovePool::default();
+        let (mut a, mut b) = (MoveQueue::default(), MoveQueue::default());
+        assert_eq!(a.push(&mut pool, 0).unwrap_err().reason, Reason::MoveQueueOverflow);
+        pool.finalize();
+        for i in 0..MOVE_COUNT - 1 {
+            a.push(&mut pool, i).unwrap();
+        }
+        b.push(&mut pool, 7).unwrap();
+        assert_eq!(b.push(&mut pool, 8).unwrap_err().reason, Reason::MoveQueueOverflow);
+        assert_eq!(a.pop(&mut pool), Some(0));
+        b.push(&mut pool, 8).unwrap();
+        a.clear(&mut pool);
+        assert_eq!(pool.free, MOVE_COUNT - 2);
+    }
+}

@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The timers that wait: an ordered queue keyed by instant and insertion order.
+
+#![forbid(unsafe_code)]
+
+use crate::time::Clock;
+
+use super::Oid;
+
+/// Which timer: an object's, or the machine's own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TimerId {
+    /// The object; the machine's own timer has none.
+    oid: Option<Oid>,
+    which: u8,
+}
+
+impl TimerId {
+    /// The machine's own timer, which sends `stats`.
+    pub(super) const STATS: TimerId = TimerId { oid: None, which: 0 };
+
+    /// Timer number `which` of an object.
+    pub const fn new(oid: Oid, which: u8) -> TimerId {
+        TimerId { oid: Some(oid), which }
+    }
+
+    /// The object whose timer it is.
+    pub const fn oid(self) -> Option<Oid> {
+        self.oid
+    }
+
+    /// The timer's number within its object.
+    pub const fn which(self) -> u8 {
+        self.which
+    }
+}
+
+/// Few timers run at once (a few dozen), so a sorted array beats cleverer queues.
+#[derive(Debug)]
+pub(super) struct Timers {
+    /// The next timer is the last: taking it moves nothing.
+    waiting: Vec<(Clock, TimerId)>,
+}
+
+impl Timers {
+    /// A queue that takes `capacity` timers without allocating.
+    pub(super) fn with_capacity(capacity: usize) -> Timers {
+        Timers { waiting: Vec::with_capacity(capacity) }
+    }
+
+    pub(super) fn reserve(&mut self, capacity: usize) {
+        self.waiting.reserve(capacity.saturating_sub(self.waiting.len()));
+    }
+
+    /// The next timer's instant.
+    #[inline]
+    pub(super) fn next(&self) -> Option<Clock> {
+        self.waiting.last().map(|(at, _)| *at)
+    }
+
+    #[inline]
+    pub(super) fn pop(&mut self) -> Option<(Clock, TimerId)> {
+        self.waiting.pop()
+    }
+
+    /// Inserts a timer behind those of the same instant.
+    #[inline]
+    pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
+        let mut place = self.waiting.len();
+        while place > 0 && self.waiting[place - 1].0 <= at {
+            place -= 1;
+        }
+        self.waiting.insert(place, (at, timer));
+    }
+
+    pub(super) fn remove(&mut self, timer: TimerId) {
+        self.waiting.retain(|(_, waiting)| *waiting != timer);
+    }
+
+    pub(super) fn clear(&mut self) {
+        self.waiting.retain(|(_, timer)| *timer == TimerId::STATS);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn timers_come_by_instant_and_then_by_insertion(instants in proptest::collection::vec(0u64..20, 0..100)) {
+            let mut timers = Timers::with_capacity(0);
+            let mut expected: Vec<(Clock, TimerId)> = instants
+                .iter()
+                .enumerate()
+                .map(|(i, at)| (Clock::from_ticks(*at), TimerId::new(Oid(i as u8), 0)))
+                .collect();
+            for (at, timer) in &expected {
+                timers.insert(*at, *timer);
+            }
+            expected.sort_by_key(|(at, _)| *at);
+            let got: Vec<_> = std::iter::from_fn(|| timers.pop()).collect();
+            prop_assert_eq!(got, expected);
+        }
+    }
+}

@@ -1,0 +1,160 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Stays clear of the kernel's real-time throttle.
+//!
+//! A SCHED_FIFO thread that runs for more than `sched_rt_runtime_us` of a
+//! `sched_rt_period_us` is stopped for the rest of the period (Documentation/scheduler/
+//! sched-rt-group.rst): 50 ms in every second, which a print does not survive. So the core
+//! looks at its own running time, as the kernel counts it, and spends a little of a busy second
+//! as SCHED_OTHER, which is never throttled.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::time::Duration;
+
+use crate::time::{Clock, NS_PER_TICK, Ticks};
+
+/// What the core should run as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Class {
+    Fifo,
+    Other,
+}
+
+/// A bucket of running time as SCHED_FIFO: it fills at a share of real time and drains while
+/// the core runs as SCHED_FIFO. Whatever the phase of the kernel's period, a period sees at
+/// most the share and a full bucket.
+#[derive(Debug)]
+pub(super) struct Budget {
+    class: Class,
+    /// In 1/1024 ticks.
+    level: i64,
+    full: i64,
+    /// Filled by this much of 1024 a tick.
+    share: i64,
+    looked: Clock,
+    /// The running time then.
+    ran: Duration,
+}
+
+/// How often to look. The kernel counts the way into a sleep and out of it as running, too,
+/// which the core's own clock readings do not tell; its count costs a system call.
+const LOOK_TICKS: i64 = 50_000;
+
+const FINE: i64 = 1024;
+
+/// The throttle as the kernel tells it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Throttle {
+    pub(super) runtime_us: u32,
+    pub(super) period_us: u32,
+}
+
+impl Throttle {
+    /// The throttle in force; none if it is switched off or the kernel has none.
+    pub(super) fn read() -> Option<Throttle> {
+        let read = |name: &str| fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse().ok();
+        // -1 switches it off, and is no u32.
+        let throttle = Throttle { runtime_us: read("sched_rt_runtime_us")?, period_us: read("sched_rt_period_us")? };
+        (throttle.runtime_us < throttle.period_us).then_some(throttle)
+    }
+}
+
+impl Budget {
+    /// A full budget for a thread that runs as SCHED_FIFO. A twentieth of the allowance is
+    /// left to the kernel's own accounting, another is the bucket.
+    pub(super) fn new(throttle: Throttle, now: Clock, ran: Duration) -> Budget {
+        let allowance = i64::from(throttle.runtime_us) * FINE / i64::from(throttle.period_us.max(1));
+        let full = i64::from(throttle.runtime_us) * i64::from(Ticks::from_us(1).0) * FINE / 20;
+        Budget { class: Class::Fifo, level: full, full, share: allowance * 9 / 10, looked: now, ran }
+    }
+
+    /// Whether it is time to [`Budget::look`].
+    #[inline]
+    pub(super) fn is_due(&self, now: Clock) -> bool {
+        now.since(self.looked) >= LOOK_TICKS
+    }
+
+    /// The thread ran for that long in its life so far: whether its class is to change.
+    pub(super) fn look(&mut self, now: Clock, ran: Duration) -> Option<Class> {
+        let span = now.since(self.looked).clamp(0, 1 << 40);
+        let spent = ran.saturating_sub(self.ran).as_nanos() as i64 / NS_PER_TICK as i64;
+        self.looked = now;
+        self.ran = ran;
+        let drain = if self.class == Class::Fifo { spent * FINE } else { 0 };
+        self.level = (self.level + span * self.share - drain).min(self.full);
+        let class = match self.class {
+            Class::Fifo if self.level <= 0 => Class::Other,
+            Class::Other if self.level >= self.full / 2 => Class::Fifo,
+            _ => return None,
+        };
+        self.class = class;
+        Some(class)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const THROTTLE: Throttle = Throttle { runtime_us: 950_000, period_us: 1_000_000 };
+    const SECOND: u64 = 50_000_000;
+
+    /// The spans in which a core with these running and sleeping spans runs as SCHED_FIFO.
+    fn fifo_spans(spans: &[(u64, u64)], seconds: u64) -> Vec<(u64, u64)> {
+        let mut budget = Budget::new(THROTTLE, Clock::from_ticks(0), Duration::ZERO);
+        let (mut now, mut ran, mut class, mut fifo) = (0, 0, Class::Fifo, Vec::new());
+        for (run, sleep) in spans.iter().cycle() {
+            if now > seconds * SECOND {
+                break;
+            }
+            // The core looks at its budget at least every 100 us while it runs.
+            let mut left = *run;
+            while left > 0 {
+                let slice = left.min(5_000);
+                if class == Class::Fifo {
+                    fifo.push((now, now + slice));
+                }
+                now += slice;
+                ran += slice;
+                left -= slice;
+                if budget.is_due(Clock::from_ticks(now)) {
+                    let ran = Duration::from_nanos(ran * NS_PER_TICK);
+                    class = budget.look(Clock::from_ticks(now), ran).unwrap_or(class);
+                }
+            }
+            now += sleep;
+        }
+        fifo
+    }
+
+    fn used(spans: &[(u64, u64)], from: u64) -> u64 {
+        let to = from + SECOND;
+        spans.iter().map(|(start, end)| (*end).min(to).saturating_sub((*start).max(from))).sum()
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(32))]
+        #[test]
+        fn no_second_of_any_phase_meets_the_throttle(spans in proptest::collection::vec((1u64..30_000_000, 0u64..3_000_000), 1..20)) {
+            let fifo = fifo_spans(&spans, 6);
+            for from in (0..5 * SECOND).step_by(SECOND as usize / 20) {
+                prop_assert!(used(&fifo, from) < SECOND * 95 / 100, "from {}", from);
+            }
+        }
+    }
+
+    #[test]
+    fn a_core_that_never_sleeps_is_fifo_for_most_of_the_time() {
+        let fifo = fifo_spans(&[(SECOND, 0)], 6);
+        assert!(used(&fifo, 3 * SECOND) > SECOND * 80 / 100);
+    }
+
+    #[test]
+    fn a_core_that_sleeps_a_quarter_is_never_taken_out() {
+        let fifo = fifo_spans(&[(75_000, 25_000)], 6);
+        let ran: u64 = fifo.iter().map(|(start, end)| end - start).sum();
+        assert!(ran >= 6 * SECOND * 74 / 100);
+    }
+}

@@ -1,0 +1,170 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The program at work: threads, pty, real time, signals.
+//!
+//! ```text
+//! host <-pty-> link ==ring of blocks==> core ==ring of jobs==> one worker per bus
+//!                   <==ring of bytes===      <==ring of answers==
+//! ```
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::thread;
+
+use log::{error, info, warn};
+use rtrb::RingBuffer;
+
+use crate::board::Board;
+use crate::feature::FEATURES;
+use crate::mcu::{Dialect, Mcu};
+use crate::time::{Monotonic, TimeSource};
+
+mod budget;
+mod core;
+pub mod guardian;
+mod link;
+mod notify;
+mod outlet;
+mod pty;
+pub mod realtime;
+mod signals;
+pub mod wakeup;
+mod watchdog;
+mod workers;
+
+pub use guardian::Guardian;
+pub use pty::Access;
+
+use self::core::{Core, Request};
+use guardian::Pulse;
+use link::{End, Link, Parts};
+use notify::Notify;
+use outlet::{LinkWake, Progress};
+use pty::Pty;
+use realtime::{Pinning, Role, Scheduling};
+use signals::Signals;
+use wakeup::{MarginLimits, Waiter};
+use watchdog::{JobClocks, Vigil, Watchdog};
+use workers::Threads;
+
+/// Blocks between link and core: four times what a host may have under way.
+const REQUESTS: usize = 256;
+
+/// How the program runs.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Where the link to the pty stands.
+    pub link: PathBuf,
+    /// Who may open the pty.
+    pub access: Access,
+    /// Whether to ask for real-time scheduling.
+    pub realtime: bool,
+    /// How early the core may wake for a timer.
+    pub margin: MarginLimits,
+    /// The hardware watchdog to feed.
+    pub watchdog: Option<PathBuf>,
+    /// The processor that the core runs on, and nowhere else.
+    pub cpu: Option<usize>,
+}
+
+/// Serves a host on a pty until SIGTERM or SIGINT; calls `ready` once a host may come.
+/// `guardian` is that of the board's outputs.
+pub fn run(
+    options: &Options,
+    board: Box<dyn Board>,
+    clock: Monotonic,
+    guardian: Option<Guardian>,
+    ready: impl FnOnce(),
+) -> io::Result<()> {
+    let pulse = guardian.as_ref().map_or_else(Pulse::new, |guardian| Ok(guardian.pulse()))?;
+    let pinning = options.cpu.map(Pinning::new).transpose()?;
+    let pty = Pty::open(&options.link, &options.access)?;
+    let signals = Signals::new()?;
+    let notify = Notify::from_env()?;
+    info!("board {}", board.describe());
+    let dialect = Arc::new(Dialect::new(FEATURES, &*board)?);
+    let clock: Arc<dyn TimeSource> = Arc::new(clock);
+    let wake = Arc::new(LinkWake::new()?);
+    let progress = Arc::new(Progress::default());
+    let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
+    let (requests, inbox) = RingBuffer::new(REQUESTS);
+
+    // Last of what may fail: once open it resets the machine, unless we end in order.
+    let watchdog = options.watchdog.as_deref().map(Watchdog::open).transpose()?;
+
+    let (realtime, margin) = (options.realtime, options.margin);
+    if realtime {
+        realtime::lock_memory();
+    }
+    let jobs = JobClocks::default();
+    let (core_dialect, core_clock, core_jobs) = (dialect.clone(), clock.clone(), jobs.clone());
+    let (core_progress, core_wake) = (progress.clone(), wake.clone());
+    let core = thread::Builder::new().name("core".into()).spawn(move || {
+        if let Some(Err(error)) = pinning.map(|pinning| pinning.pin()) {
+            warn!("--cpu: the core is not pinned: {error}");
+        }
+        let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };
+        let prepare = Arc::new(move || {
+            // A thread inherits the processor of the one that starts it; without success it
+            // shares the core's.
+            let _ = pinning.map(|pinning| pinning.unpin());
+            if realtime {
+                realtime::enter(Role::Worker);
+            }
+        });
+        let workers = Box::new(Threads::new(thread::current(), prepare, core_jobs));
+        let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
+        let waiter = Waiter::new(core_clock.clone(), margin, scheduling);
+        Core::new(self::core::Parts {
+            mcu,
+            clock: core_clock,
+            requests: inbox,
+            waiter,
+            pulse,
+            progress: core_progress,
+            wake: core_wake,
+        })
+        .run();
+    })?;
+
+    info!("serving on {} ({})", options.link.display(), pty.device().display());
+    let mut link = Link::new(Parts {
+        pty,
+        clock,
+        dialect,
+        requests,
+        core: core.thread().clone(),
+        inlet,
+        progress,
+        wake,
+        signals,
+        guardian: guardian.as_ref().map(Guardian::socket),
+        vigil: Vigil::new(watchdog, notify, notify::watchdog_interval(), pulse, jobs),
+    });
+    if realtime {
+        realtime::enter(Role::Link);
+    }
+    ready();
+    let served = link.run();
+    if let Err(error) = &served {
+        error!("the pty failed: {error}");
+    }
+    link.stopping();
+    link.request(Request::Quit);
+    let in_order = core.join().is_ok();
+    let vigil = link.finish();
+    if !in_order {
+        // The guardian drives the outputs.
+        return Err(io::Error::other("the core ended by a panic: please report it with the lines above"));
+    }
+    if let Some(guardian) = guardian {
+        guardian.goodbye();
+    }
+    vigil.end();
+    match served? {
+        End::Asked => Ok(()),
+        End::GuardianLost => Err(io::Error::other("the guardian is gone")),
+    }
+}

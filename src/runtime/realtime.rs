@@ -1,0 +1,289 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Real time: scheduling class, locked memory, timer slack, processor. What is not permitted is
+//! told with the limit and the remedy, and the program runs on without it.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::hint;
+use std::io;
+
+use log::{info, warn};
+use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
+use nix::sys::mman::{MlockAllFlags, mlockall};
+use nix::sys::prctl;
+use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
+use nix::unistd::Pid;
+
+use crate::sys;
+
+use super::budget::Class;
+
+/// What a thread does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Role {
+    /// Owns the machine.
+    Core,
+    /// Talks to the host.
+    Link,
+    /// Talks to a bus.
+    Worker,
+}
+
+/// Half of the highest priority, as the C program has it; the others stand below the core.
+fn priority(role: Role) -> i32 {
+    match role {
+        Role::Core => 49,
+        Role::Link => 45,
+        Role::Worker => 40,
+    }
+}
+
+/// The guardian must get its turn when the core takes every turn.
+const GUARDIAN_PRIORITY: i32 = 50;
+/// MCL_ONFAULT (linux/mman.h): lock pages as they are touched, as the libraries that libiio
+/// drags in would otherwise take 40 MB.
+const MCL_ONFAULT: i32 = 4;
+/// As much of a stack as any thread of ours uses.
+const STACK_BYTES: usize = 256 * 1024;
+/// The calling thread.
+const MYSELF: Pid = Pid::from_raw(0);
+/// Capabilities (linux/capability.h).
+const CAP_IPC_LOCK: u32 = 14;
+const CAP_SYS_NICE: u32 = 23;
+
+fn lock_flags() -> MlockAllFlags {
+    MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE | MlockAllFlags::from_bits_retain(MCL_ONFAULT)
+}
+
+/// Keeps every page that was touched in memory.
+pub fn lock_memory() {
+    let limit = limit(Resource::RLIMIT_MEMLOCK);
+    // Within a limit, what is mapped later would fail for want of room: threads, for one.
+    let locked = match limit != RLIM_INFINITY && !has_capability(CAP_IPC_LOCK) {
+        true => Err(memory_refusal(limit)),
+        false => mlockall(lock_flags()).map_err(|error| error.to_string()),
+    };
+    if let Err(why) = locked {
+        warn!("memory is not locked: {why}; steps may be late when memory is short");
+    }
+}
+
+fn memory_refusal(limit: u64) -> String {
+    format!(
+        "the limit is {} KiB: set LimitMEMLOCK=infinity in the service (ulimit -l unlimited in a shell), or grant \
+         CAP_IPC_LOCK",
+        limit / 1024
+    )
+}
+
+/// How a thread is scheduled.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Scheduling {
+    /// SCHED_FIFO.
+    RealTime,
+    /// As every program.
+    Ordinary,
+}
+
+/// Gives the calling thread its real-time priority, if that is permitted.
+pub fn enter(role: Role) -> Scheduling {
+    touch_stack();
+    // Before 6.13 a futex wait has the default slack even under SCHED_FIFO.
+    if let Err(error) = prctl::set_timerslack(1) {
+        warn!("timer slack: {error}");
+    }
+    match sys::set_fifo(priority(role)) {
+        Ok(()) => {
+            if role == Role::Core {
+                info!("real time: SCHED_FIFO, priority {}", priority(role));
+            }
+            Scheduling::RealTime
+        }
+        Err(error) => {
+            // The others fare alike.
+            if role == Role::Core {
+                warn!("no real-time scheduling: {}; steps may be late", refusal(&error));
+            }
+            Scheduling::Ordinary
+        }
+    }
+}
+
+/// Makes the calling thread an ordinary one again.
+pub fn leave() {
+    // To give up a privilege is always permitted.
+    let _ = sys::set_other();
+}
+
+/// Changes the core's class. What was permitted at the start is permitted still; if not, the
+/// core goes on as it is.
+pub(super) fn change(class: Class) {
+    let _ = match class {
+        Class::Fifo => sys::set_fifo(priority(Role::Core)),
+        Class::Other => sys::set_other(),
+    };
+}
+
+/// Puts the guardian above the core, its memory locked. The program tells what is not permitted.
+pub(super) fn enter_guardian() {
+    touch_stack();
+    let _ = mlockall(lock_flags());
+    let _ = sys::set_fifo(GUARDIAN_PRIORITY).or_else(|_| sys::set_fifo(priority(Role::Core)));
+}
+
+/// Has the kernel provide the stack before it is needed.
+#[inline(never)]
+fn touch_stack() {
+    hint::black_box(&mut [0u8; STACK_BYTES]);
+}
+
+/// What keeps this process from real-time scheduling, and the remedy.
+fn refusal(error: &io::Error) -> String {
+    scheduling_refusal(error, limit(Resource::RLIMIT_RTPRIO), has_capability(CAP_SYS_NICE), group_runtime_us())
+}
+
+fn scheduling_refusal(error: &io::Error, limit: u64, capable: bool, group_runtime_us: Option<i64>) -> String {
+    if error.raw_os_error() != Some(libc::EPERM) {
+        return format!("{error}: look at the kernel's log (dmesg)");
+    }
+    if group_runtime_us == Some(0) {
+        return "this process's control group has no real-time budget (CONFIG_RT_GROUP_SCHED, cpu.rt_runtime_us is 0): \
+                write a budget such as 950000 there and into the groups above, or sysctl \
+                kernel.sched_rt_runtime_us=-1"
+            .into();
+    }
+    let wanted = GUARDIAN_PRIORITY as u64;
+    if !capable && limit < wanted {
+        return format!(
+            "the limit of real-time priorities is {limit} and CAP_SYS_NICE is missing: set LimitRTPRIO={wanted} in the \
+             service (rtprio in /etc/security/limits.conf for a shell), or grant CAP_SYS_NICE, or run as root"
+        );
+    }
+    format!("{error}: a container or a security module forbids it: allow sched_setscheduler there (CAP_SYS_NICE)")
+}
+
+fn limit(resource: Resource) -> u64 {
+    getrlimit(resource).map_or(0, |(soft, _)| soft)
+}
+
+fn has_capability(number: u32) -> bool {
+    let status = fs::read_to_string("/proc/self/status").unwrap_or_default();
+    effective_capabilities(&status) >> number & 1 == 1
+}
+
+fn effective_capabilities(status: &str) -> u64 {
+    let line = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
+    line.and_then(|bits| u64::from_str_radix(bits.trim(), 16).ok()).unwrap_or(0)
+}
+
+/// The real-time budget of this process's control group, where the kernel has such a thing.
+fn group_runtime_us() -> Option<i64> {
+    let groups = fs::read_to_string("/proc/self/cgroup").ok()?;
+    let group = cpu_group(&groups)?;
+    let folders = ["/sys/fs/cgroup/cpu", "/sys/fs/cgroup/cpu,cpuacct"];
+    folders
+        .iter()
+        .find_map(|folder| fs::read_to_string(format!("{folder}{group}/cpu.rt_runtime_us")).ok()?.trim().parse().ok())
+}
+
+/// The path of the group that the `cpu` controller of the first generation has this process in.
+fn cpu_group(groups: &str) -> Option<&str> {
+    groups.lines().find_map(|line| {
+        let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
+        controllers.split(',').any(|name| name == "cpu").then_some(path.trim_end_matches('/'))
+    })
+}
+
+/// The processor of the core, and those of all others.
+#[derive(Clone, Copy)]
+pub(super) struct Pinning {
+    cpu: usize,
+    present: CpuSet,
+}
+
+impl Pinning {
+    /// The core is to run on processor `cpu`; an error if it can not. Leaves the calling thread
+    /// where it is.
+    pub(super) fn new(cpu: usize) -> io::Result<Pinning> {
+        let pinning = Pinning { cpu, present: sched_getaffinity(MYSELF)? };
+        let tried = pinning.pin();
+        pinning.unpin()?;
+        tried.map(|()| pinning).map_err(|_| {
+            let known = (0..CpuSet::count()).filter(|cpu| pinning.present.is_set(*cpu) == Ok(true));
+            let known: Vec<String> = known.map(|cpu| cpu.to_string()).collect();
+            io::Error::other(format!("--cpu {cpu}: there is no such processor: choose one of {}", known.join(", ")))
+        })
+    }
+
+    /// Has the calling thread, which is the core, run on its processor only.
+    pub(super) fn pin(&self) -> io::Result<()> {
+        let mut cpus = CpuSet::new();
+        cpus.set(self.cpu)?;
+        Ok(sched_setaffinity(MYSELF, &cpus)?)
+    }
+
+    /// Has the calling thread, which the core started, run on any.
+    pub(super) fn unpin(&self) -> io::Result<()> {
+        Ok(sched_setaffinity(MYSELF, &self.present)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_keeps_us_from_real_time() {
+        let eperm = io::Error::from_raw_os_error(libc::EPERM);
+        let text = scheduling_refusal(&eperm, 0, false, None);
+        assert!(
+            text.starts_with("the limit of real-time priorities is 0 and CAP_SYS_NICE is missing: set LimitRTPRIO=50"),
+            "{text}"
+        );
+        let text = scheduling_refusal(&eperm, 99, true, Some(0));
+        assert!(text.contains("cpu.rt_runtime_us is 0"), "{text}");
+        let text = scheduling_refusal(&eperm, 0, true, Some(950_000));
+        assert!(text.contains("a container or a security module"), "{text}");
+        let einval = io::Error::from_raw_os_error(libc::EINVAL);
+        assert!(scheduling_refusal(&einval, 0, false, None).contains("dmesg"));
+    }
+
+    #[test]
+    fn what_keeps_memory_from_being_locked() {
+        let text = memory_refusal(8 << 20);
+        assert!(text.starts_with("the limit is 8192 KiB: set LimitMEMLOCK=infinity"), "{text}");
+    }
+
+    #[test]
+    fn capabilities() {
+        let status = "Name:\tpinion\nCapPrm:\t0\nCapEff:\t0000000000804000\n";
+        let bits = effective_capabilities(status);
+        assert_eq!(bits, 1 << CAP_SYS_NICE | 1 << CAP_IPC_LOCK);
+        assert_eq!(effective_capabilities(""), 0);
+    }
+
+    #[test]
+    fn control_groups() {
+        let first = "12:pids:/\n4:cpu,cpuacct:/system.slice/pinion.service\n0::/init.scope\n";
+        assert_eq!(cpu_group(first), Some("/system.slice/pinion.service"));
+        assert_eq!(cpu_group("3:cpuset:/\n0::/system.slice\n"), None);
+        assert_eq!(cpu_group("4:cpu:/\n"), Some(""));
+    }
+
+    #[test]
+    fn processors() {
+        let before = sched_getaffinity(MYSELF).unwrap();
+        let first = (0..CpuSet::count()).find(|cpu| before.is_set(*cpu) == Ok(true)).unwrap();
+        let pinning = Pinning::new(first).unwrap();
+        assert_eq!(sched_getaffinity(MYSELF), Ok(before));
+        pinning.pin().unwrap();
+        let inherited = std::thread::spawn(move || {
+            pinning.unpin().unwrap();
+            sched_getaffinity(MYSELF)
+        });
+        assert_eq!(inherited.join().unwrap(), Ok(before));
+        let error = Pinning::new(100_000).err().unwrap().to_string();
+        assert!(error.starts_with("--cpu 100000: there is no such processor: choose one of "), "{error}");
+    }
+}

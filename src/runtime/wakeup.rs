@@ -1,0 +1,234 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! How the core waits: asleep until a learned margin before the instant, then spinning.
+//!
+//! The margin follows the upper quantile of the wake-ups' lateness, so that most wake-ups come
+//! before the instant and an edge is late by the clock's own reading only.
+
+#![forbid(unsafe_code)]
+
+use std::hint;
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use nix::time::{ClockId, clock_gettime};
+
+use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
+
+use super::budget::{Budget, Throttle};
+use super::realtime::{self, Scheduling};
+
+/// The margin's bounds.
+#[derive(Clone, Copy, Debug)]
+pub struct MarginLimits {
+    /// The least, which keeps the margin alive when wake-ups are quick.
+    pub min: Ticks,
+    /// The most: what a wake-up of this machine may cost in spinning.
+    pub max: Ticks,
+}
+
+impl Default for MarginLimits {
+    fn default() -> MarginLimits {
+        MarginLimits::up_to_us(200)
+    }
+}
+
+impl MarginLimits {
+    /// At most `us` microseconds; less than 5 only if that is asked for.
+    pub const fn up_to_us(us: u32) -> MarginLimits {
+        MarginLimits { min: Ticks::from_us(if us < 5 { us } else { 5 }), max: Ticks::from_us(us) }
+    }
+}
+
+/// Learns how early to wake.
+#[derive(Debug)]
+pub struct Margin {
+    limits: MarginLimits,
+    /// In 1/256 ticks.
+    fine: i64,
+    /// Waits since the last wake-up that were too short to sleep.
+    unslept: u32,
+}
+
+/// After so many waits too short to sleep a smaller margin is tried.
+const UNSLEPT_MAX: u32 = 500;
+/// One wake-up in this many may come after the instant.
+const LATE_SHARE: i64 = 50;
+const FINE: i64 = 256;
+
+impl Margin {
+    /// A margin that starts in the middle of its bounds.
+    pub fn new(limits: MarginLimits) -> Margin {
+        Margin { limits, fine: (i64::from(limits.min.0) + i64::from(limits.max.0)) / 2 * FINE, unslept: 0 }
+    }
+
+    /// How long before an instant to wake.
+    pub fn get(&self) -> Ticks {
+        Ticks((self.fine / FINE) as u32)
+    }
+
+    /// Learns from a wake-up that came `late` after it was asked for: up by a step if the
+    /// margin did not cover it, down by a fiftieth of one if it did, which balances where one
+    /// wake-up in fifty is later.
+    pub fn learn(&mut self, late: i64) {
+        let present = self.fine / FINE;
+        // Steps in proportion: quick to follow a load, fine when there is none.
+        let step = present.max(64) * FINE / 24;
+        self.displace(if late > present { step } else { -step / LATE_SHARE });
+    }
+
+    /// A wait was too short to sleep, so that nothing was learned. A margin above the step
+    /// interval would else stay there, and the core would never sleep.
+    fn unslept(&mut self) {
+        self.unslept += 1;
+        if self.unslept >= UNSLEPT_MAX {
+            self.displace(-self.fine / 8);
+        }
+    }
+
+    fn displace(&mut self, by: i64) {
+        self.unslept = 0;
+        self.fine = (self.fine + by).clamp(i64::from(self.limits.min.0) * FINE, i64::from(self.limits.max.0) * FINE);
+    }
+}
+
+/// How long the calling thread ran so far, as the kernel counts it.
+fn running_time() -> Duration {
+    // clock_gettime(2) fails for an unknown clock or a bad pointer only.
+    clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map_or(Duration::ZERO, Duration::from)
+}
+
+/// Why a wait ended.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Woken {
+    /// The instant came.
+    Due,
+    /// Something else is to be done.
+    Called,
+}
+
+/// Waits as the core does.
+pub struct Waiter {
+    clock: Arc<dyn TimeSource>,
+    margin: Margin,
+    /// Of a thread that runs as SCHED_FIFO under a throttle.
+    budget: Option<Budget>,
+}
+
+impl Waiter {
+    /// A waiter for the calling thread, which runs as `scheduling` says.
+    pub fn new(clock: Arc<dyn TimeSource>, limits: MarginLimits, scheduling: Scheduling) -> Waiter {
+        let throttle = if scheduling == Scheduling::RealTime { Throttle::read() } else { None };
+        let budget = throttle.map(|throttle| Budget::new(throttle, clock.now(), running_time()));
+        Waiter { clock, margin: Margin::new(limits), budget }
+    }
+
+    /// The margin as it was learned.
+    pub fn margin(&self) -> Ticks {
+        self.margin.get()
+    }
+
+    /// The thread ran until now. Past its budget it goes on as SCHED_OTHER.
+    #[inline]
+    pub fn ran(&mut self, now: Clock) {
+        let Some(budget) = self.budget.as_mut().filter(|budget| budget.is_due(now)) else { return };
+        if let Some(class) = budget.look(now, running_time()) {
+            realtime::change(class);
+        }
+    }
+
+    /// Sleeps for that long or until the thread is unparked, without spinning.
+    pub fn nap(&mut self, span: Duration) {
+        self.ran(self.clock.now());
+        thread::park_timeout(span);
+    }
+
+    /// Waits for `deadline`, or until `called` says that there is something to do; whoever
+    /// changes what it looks at unparks this thread. Without a deadline it waits for the call
+    /// only.
+    pub fn wait(&mut self, deadline: Option<Clock>, mut called: impl FnMut() -> bool) -> Woken {
+        let Some(deadline) = deadline else {
+            while !called() {
+                thread::park();
+            }
+            return Woken::Called;
+        };
+        let mut now = self.clock.now();
+        let mut slept = deadline.since(now) < i64::from(self.margin.limits.min.0);
+        loop {
+            if called() {
+                return Woken::Called;
+            }
+            let early = self.margin.get();
+            let asleep = deadline.since(now) - i64::from(early.0);
+            if asleep <= 0 {
+                break;
+            }
+            slept = true;
+            self.ran(now);
+            thread::park_timeout(Duration::from_nanos(asleep as u64 * NS_PER_TICK));
+            now = self.clock.now();
+            let late = i64::from(early.0) - deadline.since(now);
+            // Woken before its time: by a call, which says nothing of the margin.
+            if late >= 0 {
+                self.margin.learn(late);
+            }
+        }
+        if !slept {
+            self.margin.unslept();
+        }
+        while self.clock.now() < deadline {
+            if called() {
+                return Woken::Called;
+            }
+            hint::spin_loop();
+        }
+        Woken::Due
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_margin_settles_where_one_wake_up_in_fifty_is_later() {
+        let mut margin = Margin::new(MarginLimits::default());
+        let mut later = 0;
+        // Lateness spread evenly over 0..2000 ticks by a full-period generator.
+        let mut random = 1u64;
+        for round in 0..200_000 {
+            random = random.wrapping_mul(6364136223846793005).wrapping_add(1442695040888963407);
+            let late = (random >> 33) as i64 % 2000;
+            if round >= 100_000 && late > i64::from(margin.get().0) {
+                later += 1;
+            }
+            margin.learn(late);
+        }
+        assert!((1_000..4_000).contains(&later), "{later} of 100000 were later");
+    }
+
+    #[test]
+    fn a_margin_that_allows_no_sleep_shrinks() {
+        let mut margin = Margin::new(MarginLimits::default());
+        let start = margin.get();
+        for _ in 0..UNSLEPT_MAX {
+            margin.unslept();
+        }
+        assert_eq!(margin.get().0, start.0 - start.0.div_ceil(8));
+    }
+
+    #[test]
+    fn the_margin_stays_within_its_bounds() {
+        let limits = MarginLimits { min: Ticks(50), max: Ticks(500) };
+        let mut margin = Margin::new(limits);
+        for _ in 0..10_000 {
+            margin.learn(1_000_000);
+        }
+        assert_eq!(margin.get(), limits.max);
+        for _ in 0..100_000 {
+            margin.learn(0);
+        }
+        assert_eq!(margin.get(), limits.min);
+    }
+}

@@ -1,0 +1,145 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Every `unsafe` of the project: system calls that no crate of ours wraps.
+
+use std::fs;
+use std::io::{self, IoSliceMut};
+use std::num::NonZeroUsize;
+use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::AtomicU32;
+
+use nix::cmsg_space;
+use nix::sys::mman::{MapFlags, ProtFlags, mmap_anonymous};
+use nix::sys::signal::{SigHandler, Signal, signal};
+use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg};
+use nix::unistd::{ForkResult, Pid};
+
+/// Puts the calling thread into SCHED_FIFO at `priority` (1 to 99).
+pub(crate) fn set_fifo(priority: i32) -> io::Result<()> {
+    set_scheduler(libc::SCHED_FIFO, priority)
+}
+
+/// Puts the calling thread into SCHED_OTHER.
+pub(crate) fn set_other() -> io::Result<()> {
+    set_scheduler(libc::SCHED_OTHER, 0)
+}
+
+fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
+    let param = libc::sched_param { sched_priority: priority };
+    // SAFETY: `param` lives through the call, which only reads it; 0 is the calling thread.
+    match unsafe { libc::sched_setscheduler(0, policy, &param) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+/// Words that stay common to this process and to those that it forks.
+pub(crate) const SHARED_WORDS: usize = 4;
+
+/// A page of zeros that stays common to this process and to those that it forks. It is never
+/// given back.
+pub(crate) fn shared_words() -> io::Result<&'static [AtomicU32; SHARED_WORDS]> {
+    let length = NonZeroUsize::MIN.saturating_add(size_of::<[AtomicU32; SHARED_WORDS]>() - 1);
+    // SAFETY: a new anonymous mapping at an address of the kernel's choice touches no memory
+    // that is in use.
+    let page =
+        unsafe { mmap_anonymous(None, length, ProtFlags::PROT_READ | ProtFlags::PROT_WRITE, MapFlags::MAP_SHARED) }?;
+    // SAFETY: the mapping is long enough, aligned to a page, zeroed (a valid value of the
+    // atomics) and never unmapped; other processes change it through atomics only.
+    Ok(unsafe { page.cast::<[AtomicU32; SHARED_WORDS]>().as_ref() })
+}
+
+/// Threads that a process may have which forks. A test runs in a thread of its own, while the
+/// first one waits and holds no lock.
+const THREADS: usize = if cfg!(test) { 2 } else { 1 };
+
+/// Forks a process that runs `child` and ends with the status that it returns. An error if
+/// this process has other threads: the child would miss them, and the locks that they hold.
+pub(crate) fn fork(child: impl FnOnce() -> i32) -> io::Result<Pid> {
+    if fs::read_dir("/proc/self/task")?.count() > THREADS {
+        return Err(io::Error::other("threads have been started already"));
+    }
+    // SAFETY: this is the only thread, so the child is a whole copy of the process.
+    match unsafe { nix::unistd::fork() }? {
+        ForkResult::Parent { child } => Ok(child),
+        ForkResult::Child => {
+            let status = catch_unwind(AssertUnwindSafe(child)).unwrap_or(101);
+            // SAFETY: ends the process, without the parent's exit handlers.
+            unsafe { libc::_exit(status) }
+        }
+    }
+}
+
+/// Has this process ignore a signal.
+pub(crate) fn ignore(ignored: Signal) -> io::Result<()> {
+    // SAFETY: no handler is installed.
+    unsafe { signal(ignored, SigHandler::SigIgn) }?;
+    Ok(())
+}
+
+/// A descriptor that is readable once process `pid` has ended (Linux 5.3).
+pub(crate) fn pidfd(pid: Pid) -> io::Result<OwnedFd> {
+    // SAFETY: the call takes two numbers.
+    match unsafe { libc::syscall(libc::SYS_pidfd_open, pid.as_raw(), 0) } {
+        -1 => Err(io::Error::last_os_error()),
+        // SAFETY: a new descriptor that nobody else knows of; descriptors fit an i32.
+        fd => Ok(unsafe { OwnedFd::from_raw_fd(fd as i32) }),
+    }
+}
+
+/// Receives a message and the descriptor that may come with it; 0 bytes are the other end's end.
+pub(crate) fn receive(socket: BorrowedFd<'_>, buffer: &mut [u8]) -> io::Result<(usize, Option<OwnedFd>)> {
+    let mut control = cmsg_space!([i32; 1]);
+    let mut pieces = [IoSliceMut::new(buffer)];
+    let message = recvmsg::<()>(socket.as_raw_fd(), &mut pieces, Some(&mut control), MsgFlags::MSG_CMSG_CLOEXEC)?;
+    let mut received = None;
+    for control in message.cmsgs()? {
+        if let ControlMessageOwned::ScmRights(fds) = control {
+            for fd in fds {
+                // SAFETY: the kernel has just made this descriptor for us.
+                received = Some(unsafe { OwnedFd::from_raw_fd(fd) });
+            }
+        }
+    }
+    Ok((message.bytes, received))
+}
+
+/// `struct gpiohandle_data` (linux/gpio.h): the values of a line handle's lines.
+#[repr(C)]
+pub(crate) struct LineValues([u8; 64]);
+
+mod request {
+    nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
+    nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
+}
+
+/// Drives the only line of a handle of the GPIO character device.
+pub(crate) fn set_line(line: BorrowedFd<'_>, value: bool) -> io::Result<()> {
+    let mut values = LineValues([0; 64]);
+    values.0[0] = value.into();
+    // SAFETY: the request takes a `struct gpiohandle_data`, which lives through the call.
+    unsafe { request::gpiohandle_set_line_values(line.as_raw_fd(), &mut values) }?;
+    Ok(())
+}
+
+/// After how many seconds without food a hardware watchdog resets the machine.
+pub(crate) fn watchdog_timeout_s(watchdog: BorrowedFd<'_>) -> io::Result<i32> {
+    let mut seconds = 0;
+    // SAFETY: the request writes an int, which lives through the call.
+    unsafe { request::wdioc_gettimeout(watchdog.as_raw_fd(), &mut seconds) }?;
+    Ok(seconds)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn line_values_are_laid_out_as_the_kernel_has_them() {
+        assert_eq!(size_of::<LineValues>(), 64);
+        // GPIOHANDLE_SET_LINE_VALUES_IOCTL.
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x09, size_of::<LineValues>()), 0xC040_B409);
+        // WDIOC_GETTIMEOUT.
+        assert_eq!(nix::request_code_read!(b'W', 7, size_of::<i32>()), 0x8004_5707);
+    }
+}

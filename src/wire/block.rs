@@ -1,0 +1,277 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Message blocks: length, sequence, payload, CRC, sync (docs/Protocol.md, "Message blocks").
+
+#![forbid(unsafe_code)]
+
+use super::crc::crc16_ccitt;
+
+/// Bytes of an empty block.
+pub const BLOCK_MIN: usize = 5;
+/// Bytes of the longest block.
+pub const BLOCK_MAX: usize = 64;
+/// Payload bytes of the longest block.
+pub const PAYLOAD_MAX: usize = BLOCK_MAX - BLOCK_MIN;
+
+const HEADER_BYTES: usize = 2;
+const TRAILER_BYTES: usize = 3;
+const SYNC: u8 = 0x7e;
+/// The high half of the sequence byte, both ways.
+const DESTINATION: u8 = 0x10;
+const SEQUENCE_MASK: u8 = 0x0f;
+
+/// A block's place in the order of blocks, modulo 16.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Default)]
+pub struct Sequence(u8);
+
+impl Sequence {
+    /// The sequence number after `count` blocks.
+    pub const fn after(count: u32) -> Sequence {
+        Sequence(count as u8 & SEQUENCE_MASK)
+    }
+
+    /// The block after this one.
+    pub const fn next(self) -> Sequence {
+        Sequence((self.0 + 1) & SEQUENCE_MASK)
+    }
+}
+
+/// Appends a block with `payload` to `out`. A payload over [`PAYLOAD_MAX`] bytes does not fit
+/// a block and is left out.
+pub fn frame(payload: &[u8], sequence: Sequence, out: &mut Vec<u8>) {
+    if payload.len() > PAYLOAD_MAX {
+        return;
+    }
+    let start = out.len();
+    out.push((payload.len() + BLOCK_MIN) as u8);
+    out.push(DESTINATION | sequence.0);
+    out.extend_from_slice(payload);
+    let crc = crc16_ccitt(&out[start..]);
+    out.extend_from_slice(&crc.to_be_bytes());
+    out.push(SYNC);
+}
+
+/// What stands at the front of some bytes.
+#[derive(Debug, PartialEq, Eq)]
+enum Front<'a> {
+    Incomplete,
+    Block(Sequence, &'a [u8]),
+    Garbage,
+}
+
+fn front(bytes: &[u8]) -> Front<'_> {
+    if bytes.len() < BLOCK_MIN {
+        return Front::Incomplete;
+    }
+    let len = usize::from(bytes[0]);
+    if !(BLOCK_MIN..=BLOCK_MAX).contains(&len) || bytes[1] & !SEQUENCE_MASK != DESTINATION {
+        return Front::Garbage;
+    }
+    let Some(block) = bytes.get(..len) else {
+        return Front::Incomplete;
+    };
+    let (checked, trailer) = block.split_at(len - TRAILER_BYTES);
+    let crc = u16::from_be_bytes([trailer[0], trailer[1]]);
+    if trailer[2] != SYNC || crc16_ccitt(checked) != crc {
+        return Front::Garbage;
+    }
+    Front::Block(Sequence(bytes[1] & SEQUENCE_MASK), &checked[HEADER_BYTES..])
+}
+
+/// What a [`Resync`] found at the front of its bytes.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Found<'a> {
+    /// The bytes end before a block does.
+    Nothing,
+    /// An intact block.
+    Block(Sequence, &'a [u8]),
+    /// Bytes that belong to no block. `first` tells a run of them once.
+    Garbage {
+        /// Whether an intact block came since the last garbage.
+        first: bool,
+    },
+}
+
+/// Finds blocks in a stream and its way back to them after garbage.
+#[derive(Debug, Default)]
+pub struct Resync {
+    need_sync: bool,
+    need_valid: bool,
+}
+
+impl Resync {
+    /// How many bytes to take off the front of `bytes`, and what they were.
+    pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Found<'a>) {
+        if !self.need_sync {
+            match front(bytes) {
+                Front::Incomplete => return (0, Found::Nothing),
+                Front::Block(sequence, payload) => {
+                    self.need_valid = false;
+                    return (payload.len() + BLOCK_MIN, Found::Block(sequence, payload));
+                }
+                // Sync bytes between blocks say nothing of a loss.
+                Front::Garbage if bytes[0] == SYNC => return (1, Found::Garbage { first: false }),
+                Front::Garbage => self.need_sync = true,
+            }
+        } else if bytes.is_empty() {
+            return (0, Found::Nothing);
+        }
+        let taken = match bytes.iter().position(|byte| *byte == SYNC) {
+            Some(at) => {
+                self.need_sync = false;
+                at + 1
+            }
+            None => bytes.len(),
+        };
+        let first = !self.need_valid;
+        self.need_valid = true;
+        (taken, Found::Garbage { first })
+    }
+}
+
+/// What the micro-controller makes of the bytes it received.
+#[derive(Debug, PartialEq, Eq)]
+pub enum Received<'a> {
+    /// The bytes end before a block does.
+    Nothing,
+    /// The expected block's payload, to be run and acknowledged.
+    Payload(&'a [u8]),
+    /// A block out of order or a first sign of garbage, to be answered by a NAK: an empty
+    /// block that repeats the expected sequence number.
+    Nak,
+    /// Nothing to answer.
+    Skip,
+}
+
+/// The micro-controller's end of the wire: takes blocks in order only.
+#[derive(Debug, Default)]
+pub struct Receiver {
+    resync: Resync,
+    expected: Sequence,
+}
+
+impl Receiver {
+    /// How many bytes to take off the front of `bytes`, and what is to be done about them.
+    pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Received<'a>) {
+        let (taken, found) = self.resync.next(bytes);
+        let received = match found {
+            Found::Nothing => Received::Nothing,
+            Found::Block(sequence, payload) if sequence == self.expected => {
+                self.expected = sequence.next();
+                Received::Payload(payload)
+            }
+            Found::Block(..) | Found::Garbage { first: true } => Received::Nak,
+            Found::Garbage { first: false } => Received::Skip,
+        };
+        (taken, received)
+    }
+
+    /// The sequence number that the next block must have. Every block sent carries it, which
+    /// acknowledges all blocks before.
+    pub fn expected(&self) -> Sequence {
+        self.expected
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn block(payload: &[u8], sequence: u8) -> Vec<u8> {
+        let mut out = Vec::new();
+        frame(payload, Sequence(sequence), &mut out);
+        out
+    }
+
+    /// Feeds the stream in pieces of the given sizes, as a pty might deliver it.
+    fn receive(receiver: &mut Receiver, stream: &[u8], pieces: &[usize]) -> (Vec<Vec<u8>>, usize) {
+        let (mut buffer, mut payloads, mut naks) = (Vec::new(), Vec::new(), 0);
+        let mut sizes = pieces.iter().copied().cycle();
+        let mut stream = stream;
+        while !stream.is_empty() {
+            let (piece, rest) = stream.split_at(sizes.next().unwrap_or(64).clamp(1, stream.len()));
+            buffer.extend_from_slice(piece);
+            stream = rest;
+            loop {
+                let (taken, received) = receiver.next(&buffer);
+                match received {
+                    Received::Nothing => break,
+                    Received::Payload(payload) => payloads.push(payload.to_vec()),
+                    Received::Nak => naks += 1,
+                    Received::Skip => {}
+                }
+                buffer.drain(..taken);
+            }
+        }
+        (payloads, naks)
+    }
+
+    fn payloads() -> impl Strategy<Value = Vec<Vec<u8>>> {
+        proptest::collection::vec(proptest::collection::vec(any::<u8>(), 0..=PAYLOAD_MAX), 0..40)
+    }
+
+    proptest! {
+        #[test]
+        fn blocks_arrive_whole_however_they_are_cut(sent in payloads(), pieces in proptest::collection::vec(1usize..200, 1..20)) {
+            let stream: Vec<u8> = sent.iter().enumerate().flat_map(|(i, p)| block(p, i as u8 & 15)).collect();
+            let (got, naks) = receive(&mut Receiver::default(), &stream, &pieces);
+            prop_assert_eq!(got, sent);
+            prop_assert_eq!(naks, 0);
+        }
+
+        #[test]
+        fn any_bytes_at_all_then_a_block_is_found_again(noise: Vec<u8>, payload in proptest::collection::vec(any::<u8>(), 0..=PAYLOAD_MAX)) {
+            let mut receiver = Receiver::default();
+            let mut stream = noise;
+            // A block cut off by the noise swallows at most its own length.
+            stream.extend_from_slice(&[SYNC; BLOCK_MAX]);
+            receive(&mut receiver, &stream, &[7, 64]);
+            let sequence = receiver.expected().0;
+            let (got, _) = receive(&mut receiver, &block(&payload, sequence), &[64]);
+            prop_assert_eq!(got, vec![payload]);
+        }
+
+        #[test]
+        fn a_flipped_bit_is_never_taken_for_a_block(payload in proptest::collection::vec(any::<u8>(), 0..=PAYLOAD_MAX), bit in 0usize..BLOCK_MAX * 8) {
+            let mut stream = block(&payload, 0);
+            let bit = bit % (stream.len() * 8);
+            stream[bit / 8] ^= 1 << (bit % 8);
+            let mut receiver = Receiver::default();
+            let (got, _) = receive(&mut receiver, &stream, &[64]);
+            prop_assert!(got.is_empty());
+        }
+    }
+
+    #[test]
+    fn a_duplicate_and_a_gap_are_refused_with_a_nak() {
+        let mut receiver = Receiver::default();
+        let stream = [block(b"a", 0), block(b"a", 0), block(b"c", 2), block(b"b", 1)].concat();
+        let (got, naks) = receive(&mut receiver, &stream, &[64]);
+        assert_eq!(got, [b"a".to_vec(), b"b".to_vec()]);
+        assert_eq!(naks, 2);
+        assert_eq!(receiver.expected(), Sequence(2));
+    }
+
+    #[test]
+    fn a_run_of_garbage_is_answered_once() {
+        let mut receiver = Receiver::default();
+        let (got, naks) = receive(&mut receiver, b"garbage\x7emore garbage\x7eand more\x7e", &[5]);
+        assert!(got.is_empty());
+        assert_eq!(naks, 1);
+    }
+
+    #[test]
+    fn sync_bytes_between_blocks_are_no_garbage() {
+        let stream = [vec![SYNC; 9], block(b"a", 0), vec![SYNC], block(b"b", 1)].concat();
+        let (got, naks) = receive(&mut Receiver::default(), &stream, &[64]);
+        assert_eq!((got.len(), naks), (2, 0));
+    }
+
+    #[test]
+    fn the_bytes_of_a_block_are_those_of_klippy() {
+        // An ack and `identify offset=0 count=40`, encoded by klippy's msgproto.
+        assert_eq!(block(&[], 1), [0x05, 0x11, 0x8f, 0x08, 0x7e]);
+        assert_eq!(block(&[1, 0, 40], 2), [0x08, 0x12, 0x01, 0x00, 0x28, 0x67, 0xe9, 0x7e]);
+        assert_eq!(Sequence(15).next(), Sequence(0));
+    }
+}

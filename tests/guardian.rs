@@ -1,0 +1,104 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The program and its guardian, from outside.
+
+use std::fs;
+use std::io::Read;
+use std::path::PathBuf;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+
+struct Program {
+    child: Child,
+    link: PathBuf,
+    _folder: tempfile::TempDir,
+}
+
+impl Program {
+    fn start() -> Program {
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("pty");
+        let group = nix::unistd::getgid().to_string();
+        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            .args(["run", "-g", &group, "-I"])
+            .arg(&link)
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let program = Program { child, link, _folder: folder };
+        wait_until("the link appears", || program.link.exists());
+        program
+    }
+
+    fn pid(&self) -> Pid {
+        Pid::from_raw(self.child.id() as i32)
+    }
+
+    fn guardian(&self) -> Pid {
+        let pid = self.child.id();
+        let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).unwrap();
+        let named =
+            |pid: &&str| fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|c| c == "pinion-guardian\n");
+        Pid::from_raw(children.split_whitespace().find(named).expect("a guardian").parse().unwrap())
+    }
+
+    fn end(mut self) -> (ExitStatus, String) {
+        let mut log = String::new();
+        self.child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+        (self.child.wait().unwrap(), log)
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // After a failed assertion it still runs.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn wait_until(what: &str, condition: impl Fn() -> bool) {
+    let until = Instant::now() + Duration::from_secs(20);
+    while !condition() {
+        assert!(Instant::now() < until, "waited in vain: {what}");
+        thread::sleep(Duration::from_millis(5));
+    }
+}
+
+fn exists(pid: Pid) -> bool {
+    fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| !stat.contains(") Z "))
+}
+
+#[test]
+fn a_program_without_its_guardian_shuts_down_and_fails() {
+    let program = Program::start();
+    kill(program.guardian(), Signal::SIGKILL).unwrap();
+    let (status, log) = program.end();
+    assert_eq!(status.code(), Some(1), "{log}");
+    assert!(log.contains("shutdown: Guardian process lost: somebody killed the guardian"), "{log}");
+}
+
+#[test]
+fn a_signal_to_both_processes_ends_both_in_order() {
+    let program = Program::start();
+    let guardian = program.guardian();
+    // As a service manager does.
+    kill(guardian, Signal::SIGTERM).unwrap();
+    kill(program.pid(), Signal::SIGTERM).unwrap();
+    let (status, log) = program.end();
+    assert!(status.success(), "{log}");
+    assert!(!exists(guardian));
+    assert!(!log.contains("guardian"), "{log}");
+}
+
+#[test]
+fn the_guardian_ends_with_a_killed_program() {
+    let program = Program::start();
+    let guardian = program.guardian();
+    kill(program.pid(), Signal::SIGKILL).unwrap();
+    program.end();
+    wait_until("the guardian ends", || !exists(guardian));
+}

@@ -1,0 +1,235 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A simulated printer with a klippy, spoken to over klippy's API socket.
+
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::os::unix::net::UnixStream;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use tempfile::TempDir;
+
+/// Heating takes real time; a machine under load takes more.
+const PATIENCE: Duration = Duration::from_secs(180);
+/// klippy starts within seconds.
+const START: Duration = Duration::from_secs(40);
+
+/// The Python that runs klippy.
+pub fn python() -> String {
+    std::env::var("KLIPPER_PYTHON").unwrap_or_else(|_| "python3".into())
+}
+
+pub struct Printer {
+    checkout: PathBuf,
+    folder: TempDir,
+    pinion: Child,
+    host: Option<Child>,
+    api: Option<UnixStream>,
+    next_id: u64,
+}
+
+impl Printer {
+    /// A printer whose klippy is ready.
+    pub fn start(checkout: &Path) -> Printer {
+        let mut printer = Printer::start_with(checkout, |config| config);
+        printer.until_state("ready");
+        printer
+    }
+
+    /// A printer whose configuration was changed.
+    pub fn start_with(checkout: &Path, change: impl FnOnce(String) -> String) -> Printer {
+        // klippy knows a pseudo terminal by the beginning of its path.
+        let folder = tempfile::Builder::new().prefix("klipper_host_").tempdir_in("/tmp").unwrap();
+        let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            .args(["run", "-r", "--board", "sim", "-I"])
+            .arg(folder.path().join("tty"))
+            .stderr(File::create(folder.path().join("pinion.log")).unwrap())
+            .spawn()
+            .unwrap();
+        let mut printer = Printer { checkout: checkout.into(), folder, pinion, host: None, api: None, next_id: 0 };
+        printer.until("the pty", |printer| fs::read_link(printer.path("tty")).is_ok());
+        printer.configure(change);
+        printer.start_host();
+        printer
+    }
+
+    fn path(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    /// Writes the printer's configuration, changed.
+    pub fn configure(&mut self, change: impl FnOnce(String) -> String) {
+        let printed = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            .args(["sim", "--print-config", "-I"])
+            .arg(self.path("tty"))
+            .output()
+            .unwrap();
+        let config = change(String::from_utf8(printed.stdout).unwrap());
+        fs::write(self.path("printer.cfg"), config).unwrap();
+    }
+
+    pub fn start_host(&mut self) {
+        let _ = fs::remove_file(self.path("api"));
+        let host = Command::new(python())
+            .arg(self.checkout.join("klippy/klippy.py"))
+            .arg(self.path("printer.cfg"))
+            .arg("-a")
+            .arg(self.path("api"))
+            .arg("-l")
+            .arg(self.path("klippy.log"))
+            .arg("-I")
+            .arg(self.path("input"))
+            .stdout(Stdio::null())
+            .stderr(Stdio::null())
+            .spawn()
+            .unwrap();
+        self.host = Some(host);
+        self.until("klippy's API", |printer| UnixStream::connect(printer.path("api")).is_ok());
+        self.api = Some(UnixStream::connect(self.path("api")).unwrap());
+    }
+
+    /// kill -9.
+    pub fn kill_host(&mut self) {
+        let mut host = self.host.take().unwrap();
+        host.kill().unwrap();
+        host.wait().unwrap();
+    }
+
+    fn call(&mut self, method: &str, params: Value) -> Result<Value, String> {
+        self.next_id += 1;
+        let request = json!({ "id": self.next_id, "method": method, "params": params });
+        let api = self.api.as_mut().unwrap();
+        api.set_read_timeout(Some(PATIENCE)).unwrap();
+        api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
+        loop {
+            let mut message = Vec::new();
+            loop {
+                let mut byte = [0];
+                api.read_exact(&mut byte).map_err(|error| error.to_string())?;
+                if byte[0] == 3 {
+                    break;
+                }
+                message.push(byte[0]);
+            }
+            let answer: Value = serde_json::from_slice(&message).unwrap();
+            if answer["id"] == self.next_id {
+                return match &answer["error"] {
+                    Value::Null => Ok(answer["result"].clone()),
+                    error => Err(error.to_string()),
+                };
+            }
+        }
+    }
+
+    /// Runs G-code to its end.
+    #[track_caller]
+    pub fn gcode(&mut self, script: &str) {
+        if let Err(error) = self.call("gcode/script", json!({ "script": script })) {
+            panic!("{script}: {error}\n{}", self.log());
+        }
+    }
+
+    /// Runs G-code that stops the printer.
+    pub fn stop(&mut self, script: &str) {
+        // klippy answers or not, as it is stopped.
+        let _ = self.call("gcode/script", json!({ "script": script }));
+        self.until_state("shutdown");
+    }
+
+    /// Runs FIRMWARE_RESTART or RESTART and waits until klippy is ready again.
+    #[track_caller]
+    pub fn restart(&mut self, command: &str) {
+        let _ = self.call("gcode/script", json!({ "script": command }));
+        // It goes away first.
+        thread::sleep(Duration::from_millis(500));
+        self.until_state("ready");
+    }
+
+    pub fn state(&mut self) -> String {
+        if let Ok(info) = self.call("info", json!({})) {
+            return info["state"].as_str().unwrap_or_default().to_owned();
+        }
+        match UnixStream::connect(self.path("api")) {
+            Ok(api) => self.api = Some(api),
+            Err(_) => thread::sleep(Duration::from_millis(100)),
+        }
+        "startup".into()
+    }
+
+    /// The state in which klippy's start ends.
+    pub fn settled(&mut self) -> String {
+        let end = Instant::now() + START;
+        loop {
+            let state = self.state();
+            if state != "startup" || Instant::now() > end {
+                return state;
+            }
+            thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// What klippy says of its state.
+    fn why(&mut self) -> String {
+        let info = self.call("info", json!({})).unwrap_or_default();
+        info["state_message"].as_str().unwrap_or_default().to_owned()
+    }
+
+    #[track_caller]
+    pub fn until_state(&mut self, wanted: &str) {
+        let end = Instant::now() + START;
+        loop {
+            let state = self.state();
+            if state == wanted {
+                return;
+            }
+            assert!(Instant::now() < end, "klippy is in {state}, not in {wanted}: {}\n{}", self.why(), self.log());
+            thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// The status of one of klippy's objects.
+    pub fn object(&mut self, name: &str) -> Value {
+        let answer = self.call("objects/query", json!({ "objects": { name: null } })).unwrap();
+        answer["status"][name].clone()
+    }
+
+    /// Waits until a heater warms.
+    pub fn until_heating(&mut self, heater: &str) {
+        let end = Instant::now() + PATIENCE;
+        while self.object(heater)["temperature"].as_f64().is_none_or(|celsius| celsius < 30.0) {
+            assert!(Instant::now() < end, "{heater} stays cold\n{}", self.log());
+            thread::sleep(Duration::from_millis(100));
+        }
+    }
+
+    /// Pinion's log.
+    pub fn log(&self) -> String {
+        fs::read_to_string(self.path("pinion.log")).unwrap()
+    }
+
+    #[track_caller]
+    pub fn until_logged(&mut self, text: &str) {
+        self.until(text, |printer| printer.log().contains(text));
+    }
+
+    #[track_caller]
+    fn until(&mut self, what: &str, done: impl Fn(&Printer) -> bool) {
+        let end = Instant::now() + PATIENCE;
+        while !done(self) {
+            assert!(Instant::now() < end, "waited in vain for {what}\n{}", self.log());
+            thread::sleep(Duration::from_millis(50));
+        }
+    }
+}
+
+impl Drop for Printer {
+    fn drop(&mut self) {
+        for child in self.host.iter_mut().chain([&mut self.pinion]) {
+            let _ = child.kill();
+            let _ = child.wait();
+        }
+    }
+}

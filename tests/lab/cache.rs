@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The folder that keeps what is expensive to make. Deleting it is always safe.
+
+use std::env;
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+
+use nix::fcntl::{Flock, FlockArg};
+use tempfile::TempDir;
+
+/// `$PINION_LAB_CACHE`, or `lab` in cargo's target folder.
+pub struct Cache {
+    root: PathBuf,
+}
+
+impl Cache {
+    pub fn open() -> Result<Cache, String> {
+        let root = match env::var_os("PINION_LAB_CACHE") {
+            Some(folder) => PathBuf::from(folder),
+            None => Path::new(env!("CARGO_TARGET_TMPDIR")).with_file_name("lab"),
+        };
+        let runs = root.join("runs");
+        fs::create_dir_all(&runs).map_err(|error| format!("cannot create {}: {error}", runs.display()))?;
+        // The kernel's makefiles run elsewhere.
+        let root = root.canonicalize().map_err(|error| error.to_string())?;
+        Ok(Cache { root })
+    }
+
+    pub fn root(&self) -> &Path {
+        &self.root
+    }
+
+    /// Held while something is made, so that two runs do not make it at once.
+    pub fn lock(&self) -> Result<Flock<File>, String> {
+        let path = self.root.join("lock");
+        let file = File::create(&path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
+        Flock::lock(file, FlockArg::LockExclusive)
+            .map_err(|(_, error)| format!("cannot lock {}: {error}", path.display()))
+    }
+
+    /// A folder for one machine's files, which goes when it is dropped.
+    pub fn run_folder(&self) -> Result<TempDir, String> {
+        tempfile::tempdir_in(self.root.join("runs"))
+            .map_err(|error| format!("cannot create a folder for the run: {error}"))
+    }
+}

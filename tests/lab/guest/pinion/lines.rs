@@ -1,0 +1,191 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Pinion's outputs and inputs on GPIO chips, and why it refuses some.
+
+use nix::sys::signal::Signal;
+use pinion::host::Client;
+
+use crate::gpio_sim::GpioSim;
+use crate::program::{Program, configure, refusal, run, shutdown_of};
+use crate::sysfs;
+use crate::uapi::{self, BIAS_DISABLE, BIAS_PULL_DOWN, BIAS_PULL_UP};
+
+fn output(oid: usize, pin: &str) -> String {
+    format!("config_digital_out oid={oid} pin={pin} value=0 default_value=0 max_duration=0")
+}
+
+fn input(oid: usize, pin: &str, pull_up: i8) -> String {
+    format!("config_endstop oid={oid} pin={pin} pull_up={pull_up}")
+}
+
+fn sees_high(client: &mut Client, oid: u8) -> bool {
+    let args = [("oid", oid.into())];
+    let state = client.query("endstop_query_state", &args, "endstop_state", Some(oid)).expect("a state");
+    state.flag("pin_value").expect("a level")
+}
+
+#[test]
+fn lines_are_found_by_number_by_name_and_by_the_chips_label() {
+    let plain = GpioSim::new("plain", 8);
+    let named = GpioSim::builder("pinctrl-lab", 64).name(17, "GPIO17").name(63, "HEATER").build();
+    let program = Program::start();
+    let client = &mut program.connect();
+    let by_number = format!("{}/gpio3", plain.chip_name());
+    let names = [by_number.as_str(), "plain/gpio7", "GPIO17", "HEATER", "pinctrl-lab/gpio40"];
+    let lines = [(&plain, 3), (&plain, 7), (&named, 17), (&named, 63), (&named, 40)];
+    configure(client, 5, &names.iter().enumerate().map(|(oid, name)| output(oid, name)).collect::<Vec<_>>());
+    for (oid, (sim, offset)) in lines.into_iter().enumerate() {
+        assert_eq!(uapi::line_info(&sim.path(), offset).consumer, "pinion");
+        for value in [1, 0] {
+            run(client, &format!("update_digital_out oid={oid} value={value}"));
+            let levels = lines.map(|(sim, offset)| sim.level(offset));
+            let expected = [0, 1, 2, 3, 4].map(|other| other == oid && value == 1);
+            assert_eq!(levels, expected, "{}", names[oid]);
+        }
+    }
+}
+
+#[test]
+fn an_output_stands_at_its_first_value_and_a_line_set_once_is_taken_over() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    let high = "config_digital_out oid=0 pin=lab/gpio1 value=1 default_value=0 max_duration=0";
+    configure(
+        client,
+        2,
+        &[
+            "set_digital_out pin=lab/gpio0 value=1",
+            "set_digital_out pin=lab/gpio2 value=1",
+            high,
+            &output(1, "lab/gpio2"),
+        ],
+    );
+    assert_eq!([0, 1, 2, 3].map(|offset| sim.level(offset)), [true, true, false, false]);
+}
+
+#[test]
+fn inputs_have_the_bias_that_was_asked_for() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 3, &[input(0, "lab/gpio0", 1), input(1, "lab/gpio1", -1), input(2, "lab/gpio2", 0)]);
+    let all = BIAS_PULL_UP | BIAS_PULL_DOWN | BIAS_DISABLE;
+    let biases = [0, 1, 2].map(|offset| uapi::line_info(&sim.path(), offset).flags & all);
+    assert_eq!(biases, [BIAS_PULL_UP, BIAS_PULL_DOWN, 0]);
+    assert_eq!([0, 1].map(|oid| sees_high(client, oid)), [true, false]);
+    for up in [true, false, true] {
+        for oid in 0..3 {
+            sim.pull(oid.into(), up);
+            assert_eq!(sees_high(client, oid), up);
+        }
+    }
+}
+
+#[test]
+fn a_line_in_use_is_refused_and_its_holder_named() {
+    let sim = GpioSim::builder("lab", 8).name(4, "HEATER").hog(6, "spi0 CS1").build();
+    let mut chip = gpio_cdev::Chip::new(sim.path()).expect("the chip");
+    let held = chip.get_line(4).and_then(|line| line.request(gpio_cdev::LineRequestFlags::INPUT, 0, "octoprint"));
+    let held = held.expect("a free line");
+    let program = Program::start();
+    let client = &mut program.connect();
+    let line = |offset| format!("{} line {offset}", sim.chip_name());
+
+    assert_eq!(refusal(client, 1, &[output(0, "HEATER")]), "Unable to open out GPIO chip line");
+    program.wait_for_line(&["Unable to open out GPIO chip line", &line(4), "(HEATER)", "in use by \"octoprint\""]);
+    assert_eq!(refusal(client, 1, &[input(0, "HEATER", 0)]), "Unable to open in GPIO chip line");
+    program.wait_for_line(&["Unable to open in GPIO chip line", &line(4), "(HEATER)", "in use by \"octoprint\""]);
+    assert_eq!(refusal(client, 1, &[output(0, "lab/gpio6")]), "Unable to open out GPIO chip line");
+    program.wait_for_line(&[&line(6), "in use by \"spi0 CS1\""]);
+
+    drop(held);
+    configure(client, 1, &[output(0, "HEATER")]);
+    let second = Program::start();
+    assert_eq!(refusal(&mut second.connect(), 1, &[output(0, "HEATER")]), "Unable to open out GPIO chip line");
+    second.wait_for_line(&[&line(4), "in use by \"pinion\""]);
+}
+
+#[test]
+fn pins_that_can_not_be_are_refused_and_the_log_says_why() {
+    let sim = GpioSim::builder("lab", 8).name(1, "FAN").build();
+    let program = Program::start();
+    let client = &mut program.connect();
+    let chip = sim.chip_name();
+    let twice = |other| [output(0, "FAN"), output(1, other)];
+    for other in ["FAN", "lab/gpio1", &format!("{chip}/gpio1")] {
+        assert_eq!(refusal(client, 2, &twice(other)), "Unable to open out GPIO chip line", "{other}");
+    }
+    program.wait_for_line(&[chip, "line 1 (FAN) is claimed twice: as an output and as an output"]);
+    assert_eq!(refusal(client, 2, &[output(0, "FAN"), input(1, "FAN", 1)]), "Unable to open in GPIO chip line");
+    program.wait_for_line(&[chip, "line 1 (FAN) is claimed twice: as an output and as an input"]);
+
+    assert_eq!(refusal(client, 1, &[output(0, "gpiochip7/gpio3")]), "GPIO chip device not found");
+    program.wait_for_line(&["there is no /dev/gpiochip7", &format!("{chip} (lab)")]);
+    let beyond = format!("{chip}/gpio8");
+    assert_eq!(refusal(client, 1, &[output(0, &beyond)]), "Unable to open out GPIO chip line");
+    assert_eq!(refusal(client, 1, &[input(0, &beyond, 0)]), "Unable to open in GPIO chip line");
+    program.wait_for_line(&[chip, "(lab) has no line 8, its lines are 0 to 7"]);
+    assert_eq!(refusal(client, 1, &[output(0, "analog1")]), "Not an output pin");
+    program.wait_for_line(&["analog1 (an ADC channel) can not be an output"]);
+    assert_eq!(refusal(client, 1, &[input(0, "pwmchip0/pwm1", 0)]), "Not an input pin");
+    program.wait_for_line(&["pwmchip0/pwm1 (hardware PWM) can not be an input"]);
+    assert_eq!(
+        refusal(client, 1, &["config_digital_out oid=0 pin=3000 value=0 default_value=0 max_duration=0"]),
+        "Not an output pin"
+    );
+    program.wait_for_line(&["pin number 3000 (no pin has it)"]);
+
+    configure(client, 2, &[output(0, "FAN"), input(1, "lab/gpio2", 1)]);
+}
+
+#[test]
+fn a_chip_that_goes_away_stops_the_machine_and_a_reset_starts_anew() {
+    let (kept, first, second) =
+        (GpioSim::new("kept", 8), GpioSim::builder("first", 8).name(2, "FAN").build(), GpioSim::new("second", 8));
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    let pulses = |pin: &str| {
+        [output(0, pin), output(1, "kept/gpio0"), "set_digital_out_pwm_cycle oid=0 cycle_ticks=500000".to_owned()]
+    };
+    let pulse = |client: &mut Client| {
+        run(client, "update_digital_out oid=1 value=1");
+        let at = client.clock_in(0.1).expect("the clock").wire();
+        run(client, &format!("queue_digital_out oid=0 clock={at} on_ticks=250000"));
+    };
+    configure(client, 2, &pulses("FAN"));
+    pulse(client);
+    assert!(kept.level(0));
+    first.unplug();
+    assert_eq!(shutdown_of(client), "GPIO line write failed");
+    program.wait_for_line(&["GPIO line write failed", first.chip_name(), "line 2 (FAN) can no longer be written"]);
+    assert!(!kept.level(0), "the other chip's output is at its default");
+    assert!(program.is_running());
+
+    configure(client, 3, &[output(0, "kept/gpio0"), input(1, "second/gpio1", 1), "config_trsync oid=2".to_owned()]);
+    assert!(sees_high(client, 1));
+    second.unplug();
+    client.send_line("endstop_query_state oid=1").expect("a session");
+    assert_eq!(shutdown_of(client), "GPIO line read failed");
+    program.wait_for_line(&["GPIO line read failed", second.chip_name(), "line 1 can no longer be read"]);
+    configure(client, 2, &pulses("kept/gpio1"));
+    pulse(client);
+    sysfs::wait_until("pulses are seen", || kept.level(1));
+    assert!(program.is_running());
+}
+
+#[test]
+fn after_a_kill_a_restart_claims_the_lines() {
+    let sim = GpioSim::new("lab", 8);
+    let config = [output(0, "lab/gpio0"), input(1, "lab/gpio1", 1)];
+    let mut program = Program::start();
+    configure(&mut program.connect(), 2, &config);
+    program.kill();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 2, &config);
+    run(client, "update_digital_out oid=0 value=1");
+    assert!(sim.level(0));
+    program.signal(Signal::SIGTERM);
+    assert!(program.wait().success());
+    assert_eq!(uapi::line_info(&sim.path(), 0).consumer, "");
+}

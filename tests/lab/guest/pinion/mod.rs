@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Pinion itself at work on these drivers: `pinion run`, and a host on its pty.
+
+// What tests share.
+mod outputs;
+
+mod analog;
+mod guardian;
+mod hard_pwm;
+mod homing;
+mod lines;
+mod pins;
+mod safe_state;
+mod spi;
+mod steps;
+mod watchdog;

@@ -1,0 +1,187 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The kernel's interfaces, bare: what a test sees through them owes nothing to
+//! the code that it tests.
+#![allow(unsafe_code)]
+
+use std::fs::File;
+use std::io;
+use std::mem;
+use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::path::Path;
+
+use super::sysfs;
+
+pub const BIAS_PULL_UP: u32 = 1 << 5;
+pub const BIAS_PULL_DOWN: u32 = 1 << 6;
+pub const BIAS_DISABLE: u32 = 1 << 7;
+
+/// `struct gpioline_info`.
+#[repr(C)]
+struct RawLineInfo {
+    offset: u32,
+    flags: u32,
+    name: [u8; 32],
+    consumer: [u8; 32],
+}
+
+nix::ioctl_readwrite!(gpio_get_lineinfo, 0xb4, 0x02, RawLineInfo);
+
+/// A GPIO line as the kernel describes it, `flags` being `GPIOLINE_FLAG_*`.
+#[derive(Debug)]
+pub struct LineInfo {
+    pub flags: u32,
+    pub name: String,
+    pub consumer: String,
+}
+
+pub fn line_info(chip: &Path, offset: u32) -> LineInfo {
+    let file = open(chip);
+    let mut info = RawLineInfo { offset, flags: 0, name: [0; 32], consumer: [0; 32] };
+    // SAFETY: the structure is the one that this ioctl fills.
+    unsafe { gpio_get_lineinfo(file.as_raw_fd(), &mut info) }.expect("line information");
+    LineInfo { flags: info.flags, name: text(&info.name), consumer: text(&info.consumer) }
+}
+
+/// `struct spi_ioc_transfer`.
+#[repr(C)]
+#[derive(Default)]
+struct RawSpiTransfer {
+    tx_buf: u64,
+    rx_buf: u64,
+    len: u32,
+    speed_hz: u32,
+    delay_us: u16,
+    bits_per_word: u8,
+    cs_change: u8,
+    tx_nbits: u8,
+    rx_nbits: u8,
+    word_delay_us: u8,
+    pad: u8,
+}
+
+nix::ioctl_write_ptr!(spi_write_mode, b'k', 1, u8);
+nix::ioctl_write_buf!(spi_message, b'k', 0, RawSpiTransfer);
+
+/// Sends in this mode, and returns what came back meanwhile.
+pub fn spi_transfer(device: &str, mode: u8, speed_hz: u32, sent: &[u8]) -> nix::Result<Vec<u8>> {
+    let file = open(device.as_ref());
+    let mut received = vec![0; sent.len()];
+    let transfer = RawSpiTransfer {
+        tx_buf: sent.as_ptr().addr() as u64,
+        rx_buf: received.as_mut_ptr().addr() as u64,
+        len: u32::try_from(sent.len()).expect("a short transfer"),
+        speed_hz,
+        ..RawSpiTransfer::default()
+    };
+    // SAFETY: the mode outlives the call; the buffers are as long as the transfer
+    // says, and outlive it too.
+    unsafe {
+        spi_write_mode(file.as_raw_fd(), &mode)?;
+        spi_message(file.as_raw_fd(), &[transfer])?;
+    }
+    Ok(received)
+}
+
+/// `struct i2c_msg`.
+#[repr(C)]
+struct RawI2cMessage {
+    address: u16,
+    flags: u16,
+    len: u16,
+    buf: *mut u8,
+}
+
+/// `struct i2c_rdwr_ioctl_data`.
+#[repr(C)]
+struct RawI2cTransfer {
+    messages: *mut RawI2cMessage,
+    count: u32,
+}
+
+const I2C_READ: u16 = 1;
+
+nix::ioctl_write_ptr_bad!(i2c_rdwr, 0x0707, RawI2cTransfer);
+
+/// Writes, then reads so many bytes after a repeated start.
+pub fn i2c_transfer(device: &Path, address: u16, written: &[u8], read_len: usize) -> nix::Result<Vec<u8>> {
+    let file = open(device);
+    let mut written = written.to_vec();
+    let mut read = vec![0; read_len];
+    let message = |flags, bytes: &mut Vec<u8>| RawI2cMessage {
+        address,
+        flags,
+        len: u16::try_from(bytes.len()).expect("a short transfer"),
+        buf: bytes.as_mut_ptr(),
+    };
+    let mut messages = vec![message(0, &mut written)];
+    if read_len > 0 {
+        messages.push(message(I2C_READ, &mut read));
+    }
+    let transfer =
+        RawI2cTransfer { messages: messages.as_mut_ptr(), count: u32::try_from(messages.len()).expect("two at most") };
+    // SAFETY: the messages point into buffers that are as long as they say, and
+    // outlive the call.
+    unsafe { i2c_rdwr(file.as_raw_fd(), &transfer) }?;
+    Ok(read)
+}
+
+nix::ioctl_readwrite!(watchdog_settimeout, b'W', 6, i32);
+
+/// How long the watchdog may go unfed.
+pub fn set_watchdog_timeout(watchdog: &File, seconds: u32) {
+    let mut seconds = seconds.try_into().expect("not a century");
+    // SAFETY: the integer is the one that this ioctl takes and fills.
+    unsafe { watchdog_settimeout(watchdog.as_raw_fd(), &mut seconds) }.expect("a timeout that it takes");
+}
+
+/// A raw CAN socket on the interface.
+pub struct CanSocket(OwnedFd);
+
+impl CanSocket {
+    pub fn open(interface: &str) -> CanSocket {
+        let index = sysfs::read(format!("/sys/class/net/{interface}/ifindex"));
+        // SAFETY: a plain system call; the descriptor it returns is ours.
+        let socket = unsafe {
+            let fd = libc::socket(libc::PF_CAN, libc::SOCK_RAW | libc::SOCK_CLOEXEC, libc::CAN_RAW);
+            assert!(fd >= 0, "CAN socket: {}", io::Error::last_os_error());
+            OwnedFd::from_raw_fd(fd)
+        };
+        // SAFETY: all zeros is a valid address, and it is passed with its size.
+        let status = unsafe {
+            let mut address: libc::sockaddr_can = mem::zeroed();
+            address.can_family = libc::AF_CAN as libc::sa_family_t;
+            address.can_ifindex = index.parse().expect("a number");
+            libc::bind(socket.as_raw_fd(), (&raw const address).cast(), mem::size_of_val(&address) as libc::socklen_t)
+        };
+        assert_eq!(status, 0, "binding a CAN socket: {}", io::Error::last_os_error());
+        CanSocket(socket)
+    }
+
+    pub fn send(&self, id: u32, data: &[u8]) {
+        // `struct can_frame`: identifier, length, three reserved bytes, data.
+        let mut frame = [0; 16];
+        frame[..4].copy_from_slice(&id.to_ne_bytes());
+        frame[4] = u8::try_from(data.len()).expect("eight bytes at most");
+        frame[8..8 + data.len()].copy_from_slice(data);
+        let count = nix::unistd::write(&self.0, &frame).expect("sending a frame");
+        assert_eq!(count, frame.len());
+    }
+
+    pub fn receive(&self) -> (u32, Vec<u8>) {
+        let mut frame = [0; 16];
+        let count = nix::unistd::read(&self.0, &mut frame).expect("receiving a frame");
+        assert_eq!(count, frame.len());
+        let [a, b, c, d, len, ..] = frame;
+        (u32::from_ne_bytes([a, b, c, d]), frame[8..8 + usize::from(len)].to_vec())
+    }
+}
+
+fn open(path: &Path) -> File {
+    sysfs::assert_in_guest();
+    File::options().read(true).write(true).open(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+fn text(bytes: &[u8]) -> String {
+    let end = bytes.iter().position(|&byte| byte == 0).unwrap_or(bytes.len());
+    String::from_utf8_lossy(&bytes[..end]).into_owned()
+}

@@ -1,0 +1,91 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The test program that runs in the guest: cargo's test target `guest`, with
+//! `pinion` itself and the libraries that both need.
+
+use std::env;
+use std::ffi::OsStr;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use super::initramfs::Archive;
+use super::process;
+
+/// Programs of the host that busybox has no equivalent of.
+const HOST_PROGRAMS: [&str; 1] = ["/usr/bin/chrt"];
+
+pub struct GuestProgram {
+    path: PathBuf,
+}
+
+impl GuestProgram {
+    /// Has cargo build it, in the profile that this harness was built in.
+    pub fn build() -> Result<GuestProgram, String> {
+        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
+        cargo.current_dir(env!("CARGO_MANIFEST_DIR"));
+        cargo.args(["test", "--no-run", "--test", "guest", "--message-format", "json"]);
+        let profile = pinion().parent().and_then(Path::file_name).and_then(OsStr::to_str);
+        match profile {
+            Some("debug") | None => {}
+            Some(profile) => drop(cargo.args(["--profile", profile])),
+        }
+        let messages = process::output(&mut cargo)?;
+        messages
+            .lines()
+            .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+            .find(|message| message["target"]["name"] == "guest" && message["executable"].is_string())
+            .and_then(|message| message["executable"].as_str().map(PathBuf::from))
+            .map(|path| GuestProgram { path })
+            .ok_or_else(|| "cargo built no test target `guest`".into())
+    }
+
+    /// The names of its tests, in libtest's order.
+    pub fn tests(&self) -> Result<Vec<String>, String> {
+        let list = process::output(Command::new(&self.path).args(["--list", "--format", "terse"]))?;
+        Ok(list.lines().filter_map(|line| line.strip_suffix(": test")).map(str::to_owned).collect())
+    }
+
+    /// The second part of the guest's root folder: init and the programs, with
+    /// their libraries at the paths where the host's loader looks for them.
+    pub fn payload(&self) -> Result<Vec<u8>, String> {
+        let stripped = tempfile::tempdir().map_err(|error| error.to_string())?;
+        let mut archive = Archive::default();
+        archive.program("/init", include_bytes!("init.sh"));
+        for (name, program) in [("guest", self.path.as_path()), ("pinion", pinion())] {
+            let copy = stripped.path().join(name);
+            process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(&copy).arg(program))?;
+            archive.copy(&format!("/bin/{name}"), &copy)?;
+        }
+        for program in HOST_PROGRAMS.map(Path::new) {
+            let name = program.file_name().unwrap_or_default().to_string_lossy();
+            archive.copy(&format!("/bin/{name}"), program)?;
+        }
+        let programs = [self.path.as_path(), pinion()];
+        for library in libraries(programs.into_iter().chain(HOST_PROGRAMS.map(Path::new)))? {
+            let content = fs::read(&library).map_err(|error| format!("cannot read {library}: {error}"))?;
+            archive.program(&library, &content);
+        }
+        Ok(archive.finish())
+    }
+}
+
+fn pinion() -> &'static Path {
+    Path::new(env!("CARGO_BIN_EXE_pinion"))
+}
+
+/// The paths that the loader finds, itself among them.
+fn libraries<'a>(programs: impl Iterator<Item = &'a Path>) -> Result<Vec<String>, String> {
+    let mut libraries = Vec::new();
+    for program in programs {
+        // "name => /path (address)", or "/path (address)" for the loader.
+        let list = process::output(Command::new("ldd").arg(program))?;
+        let found = list.split_whitespace().filter(|word| word.starts_with('/'));
+        libraries.extend(found.map(str::to_owned));
+        if let Some(line) = list.lines().find(|line| line.contains("not found")) {
+            return Err(format!("{} lacks a library: {line}", program.display()));
+        }
+    }
+    libraries.sort();
+    libraries.dedup();
+    Ok(libraries)
+}

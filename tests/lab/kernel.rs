@@ -1,0 +1,506 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What a machine boots: Debian's own kernel, those of its modules that the tests
+//! use, and the modules of `tests/lab/modules` built for it.
+//!
+//! Modules fit one exact kernel, so every version is taken from what apt offers.
+//! Packages are unpacked below the cache, never installed.
+
+use std::fs;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::io;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::str::FromStr;
+
+use super::cache::Cache;
+use super::initramfs::Archive;
+use super::{process, tools};
+
+/// The kernels that Debian offers and Pinion meets.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Flavour {
+    Stock,
+    /// PREEMPT_RT.
+    Rt,
+}
+
+impl Flavour {
+    pub const ALL: [Flavour; 2] = [Flavour::Stock, Flavour::Rt];
+
+    pub fn name(self) -> &'static str {
+        match self {
+            Flavour::Stock => "stock",
+            Flavour::Rt => "rt",
+        }
+    }
+
+    /// The name under which a test is reported.
+    pub fn name_of(self, test: &str) -> String {
+        format!("{}::{test}", self.name())
+    }
+
+    /// The package which always depends on the newest kernel.
+    fn package(self) -> &'static str {
+        match self {
+            Flavour::Stock => "linux-image-amd64",
+            Flavour::Rt => "linux-image-rt-amd64",
+        }
+    }
+}
+
+impl FromStr for Flavour {
+    type Err = String;
+
+    fn from_str(name: &str) -> Result<Flavour, String> {
+        Flavour::ALL
+            .into_iter()
+            .find(|flavour| flavour.name() == name)
+            .ok_or_else(|| format!("no flavour is called {name}: stock or rt"))
+    }
+}
+
+/// Loaded in this order, with options. What they depend on comes before them.
+const MODULES: [(&str, &str); 17] = [
+    ("virtio_pci", ""),
+    ("9pnet_virtio", ""),
+    ("9p", ""),
+    ("gpio-sim", ""),
+    ("iio_dummy", ""),
+    ("iio_dummy_evgen", ""),
+    ("mock_adc", ""),
+    ("mock_spi", ""),
+    ("i2c-dev", ""),
+    ("mock_i2c", ""),
+    ("mock_pwm", ""),
+    ("w1_therm", ""),
+    ("mock_w1", ""),
+    ("vcan", ""),
+    ("can-raw", ""),
+    // A watchdog that nobody feeds says so, and the other tests go on.
+    ("softdog", "soft_noboot=1"),
+    ("i2c-stub", "chip_addr=0x1c"),
+];
+
+/// The parts of an image package that hold these modules.
+const IMAGE_PARTS: [&str; 13] = [
+    "*/modules.builtin",
+    "*/drivers/i2c/*",
+    "*/drivers/iio/*",
+    "*/net/can/*",
+    "*/drivers/virtio/*",
+    "*/drivers/w1/*",
+    "*/drivers/watchdog/*",
+    "*/fs/9p/*",
+    "*/fs/configfs/*",
+    "*/fs/fscache/*",
+    "*/fs/netfs/*",
+    "*/net/9p/*",
+    "./boot/vmlinuz-*",
+];
+
+/// Upstream's mocks and what they include. Folders stand for all their files.
+const UPSTREAM: [&str; 6] = [
+    "kernel/irq/irq_sim.c",
+    "drivers/gpio/gpio-sim.c",
+    "drivers/gpio/gpiolib.h",
+    "drivers/iio/dummy",
+    "drivers/iio/industrialio-configfs.c",
+    "drivers/iio/industrialio-sw-device.c",
+];
+
+/// A module that is made of a source of the same name needs that source renamed.
+const UPSTREAM_RENAMED: [(&str, &str); 2] =
+    [("gpio-sim.c", "gpio-sim-main.c"), ("iio_dummy_evgen.c", "iio_dummy_evgen-main.c")];
+
+/// A kernel, ready to boot.
+pub struct Kernel {
+    /// As `uname -r` prints it.
+    pub release: String,
+    pub vmlinux: PathBuf,
+    /// Busybox, the modules, and `/lab/modules`, the list in loading order.
+    pub initramfs: PathBuf,
+}
+
+impl Kernel {
+    /// Makes what the cache does not hold yet.
+    pub fn prepare(flavour: Flavour, offers: &Offers, cache: &Cache) -> Result<Kernel, String> {
+        let _lock = cache.lock()?;
+        let newest = offers.newest(flavour)?;
+        let release = newest.dependency("linux-image-")?.replace("linux-image-", "");
+        let version = newest.field("Version")?;
+        let of_version = cache.root().join(format!("linux-{version}"));
+        let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/lab/modules");
+        let folder = of_version.join(format!("{}-{:016x}", flavour.name(), key(&sources)?));
+        if !folder.exists() {
+            eprintln!("lab: building Linux {release}, version {version}");
+            build(&release, &of_version.join("tree"), &sources, &folder)?;
+            remove_others(cache.root(), "linux-", &of_version)?;
+            remove_others(&of_version, &format!("{}-", flavour.name()), &folder)?;
+        }
+        Ok(Kernel { release, vmlinux: folder.join("vmlinux"), initramfs: folder.join("initramfs") })
+    }
+}
+
+/// The newest kernels that apt offers.
+pub struct Offers {
+    packages: Vec<Fields>,
+}
+
+impl Offers {
+    pub fn ask() -> Result<Offers, String> {
+        let names = Flavour::ALL.map(Flavour::package);
+        let packages = Fields::of(&names).or_else(|_| {
+            tools::update_package_lists()?;
+            Fields::of(&names)
+        })?;
+        Ok(Offers { packages })
+    }
+
+    fn newest(&self, flavour: Flavour) -> Result<&Fields, String> {
+        self.packages
+            .iter()
+            .find(|fields| fields.field("Package").is_ok_and(|name| name == flavour.package()))
+            .ok_or_else(|| format!("apt offers no {}", flavour.package()))
+    }
+}
+
+/// The names that apt gives to what one kernel is built of.
+struct Packages {
+    image: String,
+    headers: String,
+    headers_common: String,
+    kbuild: String,
+    source: String,
+    compiler: String,
+}
+
+impl Packages {
+    fn of(release: &str) -> Result<Packages, String> {
+        let headers = format!("linux-headers-{release}");
+        let fields = Fields::of(&[&headers])?.pop().ok_or_else(|| format!("apt offers no {headers}"))?;
+        let kbuild = fields.dependency("linux-kbuild-")?;
+        // linux-compiler-gcc-12-x86 stands for gcc-12.
+        let compiler = fields.dependency("linux-compiler-")?;
+        let compiler = compiler.trim_start_matches("linux-compiler-").trim_end_matches("-x86");
+        Ok(Packages {
+            image: format!("linux-image-{release}"),
+            headers_common: fields.dependency("linux-headers-")?,
+            source: kbuild.replace("linux-kbuild-", "linux-source-"),
+            compiler: compiler.to_owned(),
+            headers,
+            kbuild,
+        })
+    }
+}
+
+/// What apt knows of a package.
+struct Fields(String);
+
+impl Fields {
+    fn of(packages: &[&str]) -> Result<Vec<Fields>, String> {
+        let mut show = Command::new("apt-cache");
+        show.args(["show", "--no-all-versions"]).args(packages);
+        let text =
+            process::output(&mut show).map_err(|cause| format!("apt offers no {}: {cause}", packages.join(" or ")))?;
+        Ok(text.trim_end().split("\n\n").map(|stanza| Fields(stanza.to_owned())).collect())
+    }
+
+    fn field(&self, name: &str) -> Result<&str, String> {
+        self.0
+            .lines()
+            .find_map(|line| line.strip_prefix(name)?.strip_prefix(": "))
+            .ok_or_else(|| format!("apt says nothing of {name} in:\n{}", self.0))
+    }
+
+    fn dependency(&self, prefix: &str) -> Result<String, String> {
+        self.field("Depends")?
+            .split(", ")
+            .filter_map(|dependency| dependency.split(' ').next())
+            .find(|name| name.starts_with(prefix))
+            .map(str::to_owned)
+            .ok_or_else(|| {
+                format!("no {prefix}*, which the lab knows from Debian 12, among the dependencies of:\n{}", self.0)
+            })
+    }
+}
+
+/// Changes with everything that a prepared kernel is made of, save its version.
+fn key(sources: &Path) -> Result<u64, String> {
+    let mut hasher = DefaultHasher::new();
+    include_str!("kernel.rs").hash(&mut hasher);
+    include_str!("initramfs.rs").hash(&mut hasher);
+    for path in files(sources)? {
+        path.file_name().hash(&mut hasher);
+        read(&path)?.hash(&mut hasher);
+    }
+    Ok(hasher.finish())
+}
+
+fn build(release: &str, tree: &Path, sources: &Path, folder: &Path) -> Result<(), String> {
+    let packages = Packages::of(release)?;
+    tools::install(&[(&packages.compiler, &packages.compiler)])?;
+    unpack(&packages, tree)?;
+
+    let partial = folder.with_extension("partial");
+    let modules = partial.join("modules");
+    remove(&partial)?;
+    copy_files(sources, &modules)?;
+    copy_files(&tree.join("upstream"), &modules.join("upstream"))?;
+    let headers = tree.join("usr/src");
+    process::run(
+        Command::new("make")
+            .arg("-C")
+            .arg(headers.join(&packages.headers))
+            // The one that the headers include has an absolute path of the host.
+            .arg("-f")
+            .arg(headers.join(&packages.headers_common).join("Makefile"))
+            .arg(format!("M={}", modules.display()))
+            .args(["-s", "-j2", "modules"]),
+    )?;
+
+    let image = tree.join("lib/modules").join(release);
+    archive_modules(&image, &modules, tree, &partial.join("initramfs"))?;
+    let vmlinuz = tree.join(format!("boot/vmlinuz-{release}"));
+    extract_vmlinux(&vmlinuz, &partial.join("vmlinux"))?;
+    remove(&modules)?;
+    fs::rename(&partial, folder).map_err(|error| describe("rename", &partial, &error))
+}
+
+/// Downloads and unpacks what the tree lacks; flavours share much of it.
+fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
+    let stamps = tree.join("unpacked");
+    let archives = tree.join("archives");
+    create(&stamps)?;
+    create(&archives)?;
+    let all = [
+        (&packages.image, &IMAGE_PARTS[..]),
+        (&packages.headers, &["./usr/*"]),
+        (&packages.headers_common, &["./usr/*"]),
+        (&packages.kbuild, &["./usr/*"]),
+        (&packages.source, &["./usr/src/*"]),
+        (&"busybox-static".to_owned(), &["./bin/busybox"]),
+    ];
+    // A stamp tells which parts were unpacked.
+    let is_missing = |(package, parts): &(&String, &[&str])| {
+        !fs::read_to_string(stamps.join(package)).is_ok_and(|stamp| stamp == parts.join(" "))
+    };
+    let missing: Vec<_> = all.into_iter().filter(is_missing).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let download = || {
+        process::run(
+            Command::new("apt-get")
+                .args(["download", "-qq"])
+                .args(missing.iter().map(|(package, _)| package))
+                .current_dir(&archives),
+        )
+    };
+    // The archives drop a version soon after a newer one has come.
+    download().or_else(|_| tools::update_package_lists().and_then(|()| download()))?;
+
+    for (package, parts) in missing {
+        let archive = files(&archives)?
+            .into_iter()
+            .find(|path| file_name(path).starts_with(&format!("{package}_")))
+            .ok_or_else(|| format!("apt-get download left no archive of {package}"))?;
+        let mut words = vec![path_str(&archive)?, path_str(tree)?];
+        words.extend(parts.iter());
+        process::pipeline(
+            r#"archive=$1 tree=$2; shift 2
+               dpkg-deb --fsys-tarfile "$archive" | tar -x -C "$tree" --wildcards "$@""#,
+            &words,
+        )?;
+        if *package == packages.source {
+            unpack_upstream(&packages.source, tree)?;
+        }
+        fs::write(stamps.join(package), parts.join(" "))
+            .map_err(|error| describe("write", &stamps.join(package), &error))?;
+        remove(&archive)?;
+    }
+    Ok(())
+}
+
+/// A few files of the whole kernel's sources, side by side in `upstream`.
+fn unpack_upstream(package: &str, tree: &Path) -> Result<(), String> {
+    let tarball = tree.join(format!("usr/src/{package}.tar.xz"));
+    let upstream = tree.join("upstream");
+    create(&upstream)?;
+    let members = UPSTREAM.map(|path| format!("{package}/{path}"));
+    let mut words = vec![path_str(&tarball)?, path_str(&upstream)?];
+    words.extend(members.iter().map(String::as_str));
+    // tar stops after the last member, and xz with it, by a signal: no pipeline.
+    process::pipeline(
+        r#"tarball=$1 upstream=$2; shift 2
+           tar -x -f <(xz -dc -T0 "$tarball") -C "$upstream" \
+               --occurrence=1 --transform 's,.*/,,' "$@""#,
+        &words,
+    )?;
+    for (from, to) in UPSTREAM_RENAMED {
+        fs::rename(upstream.join(from), upstream.join(to))
+            .map_err(|error| describe("rename", &upstream.join(from), &error))?;
+    }
+    remove(&tarball)
+}
+
+/// The plain ELF boots by PVH, and spares an emulated processor the unpacking.
+fn extract_vmlinux(vmlinuz: &Path, vmlinux: &Path) -> Result<(), String> {
+    const XZ_MAGIC: &[u8] = b"\xfd7zXZ\0";
+    let image = read(vmlinuz)?;
+    let start = image
+        .windows(XZ_MAGIC.len())
+        .position(|window| window == XZ_MAGIC)
+        .ok_or_else(|| format!("{} is not packed by xz", vmlinuz.display()))?;
+    let packed = vmlinux.with_extension("xz");
+    fs::write(&packed, &image[start..]).map_err(|error| describe("write", &packed, &error))?;
+    // What follows the packed kernel in the image makes xz fail after it.
+    process::pipeline(
+        r#"xz -dc --single-stream "$1" >"$2" 2>/dev/null || true; strip "$2""#,
+        &[path_str(&packed)?, path_str(vmlinux)?],
+    )?;
+    remove(&packed)
+}
+
+fn archive_modules(image: &Path, ours: &Path, tree: &Path, to: &Path) -> Result<(), String> {
+    let built_in = fs::read_to_string(image.join("modules.builtin"))
+        .map_err(|error| describe("read", &image.join("modules.builtin"), &error))?;
+    let built_in = built_in.lines().map(|line| module_name(Path::new(line))).collect();
+    let mut loader = Loader { paths: Vec::new(), built_in, order: Vec::new() };
+    // Ours come first: they are found before a module of the same name.
+    find_modules(ours, &mut loader.paths)?;
+    find_modules(image, &mut loader.paths)?;
+    for (module, options) in MODULES {
+        loader.load(&module.replace('-', "_"), options)?;
+    }
+
+    let mut archive = Archive::default();
+    for folder in ["/dev", "/proc", "/sys", "/tmp", "/run", "/root", "/etc"] {
+        archive.folder(folder);
+    }
+    archive.copy("/bin/busybox", &tree.join("bin/busybox"))?;
+    archive.symlink("/bin/sh", "busybox");
+    let mut list = String::new();
+    for (path, options) in &loader.order {
+        let inside = format!("/lab/modules.d/{}", file_name(path));
+        process::run(Command::new("strip").arg("--strip-debug").arg(path))?;
+        archive.copy(&inside, path)?;
+        list += &format!("{inside} {options}\n");
+    }
+    archive.file("/lab/modules", list.as_bytes());
+    fs::write(to, archive.finish()).map_err(|error| describe("write", to, &error))
+}
+
+/// Puts modules into an order in which they can be loaded.
+struct Loader {
+    paths: Vec<PathBuf>,
+    built_in: Vec<String>,
+    order: Vec<(PathBuf, &'static str)>,
+}
+
+impl Loader {
+    fn load(&mut self, module: &str, options: &'static str) -> Result<(), String> {
+        let is_loaded = |(path, _): &(PathBuf, _)| module_name(path) == module;
+        if self.order.iter().any(is_loaded) || self.built_in.iter().any(|name| name == module) {
+            return Ok(());
+        }
+        let path = self
+            .paths
+            .iter()
+            .find(|path| module_name(path) == module)
+            .ok_or_else(|| format!("the kernel has no module {module} among {IMAGE_PARTS:?}"))?
+            .clone();
+        for dependency in dependencies(&path)? {
+            self.load(&dependency, "")?;
+        }
+        self.order.push((path, options));
+        Ok(())
+    }
+}
+
+/// A module's own words: packages hold no modules.dep.
+fn dependencies(module: &Path) -> Result<Vec<String>, String> {
+    const KEY: &[u8] = b"\0depends=";
+    let content = read(module)?;
+    let Some(at) = content.windows(KEY.len()).position(|window| window == KEY) else {
+        return Ok(Vec::new());
+    };
+    let value = &content[at + KEY.len()..];
+    let end = value.iter().position(|&byte| byte == 0).unwrap_or(value.len());
+    Ok(String::from_utf8_lossy(&value[..end])
+        .split(',')
+        .filter(|name| !name.is_empty())
+        .map(|name| name.replace('-', "_"))
+        .collect())
+}
+
+fn find_modules(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), String> {
+    for path in entries(folder)? {
+        if path.is_dir() {
+            find_modules(&path, found)?;
+        } else if path.extension().is_some_and(|extension| extension == "ko") {
+            found.push(path);
+        }
+    }
+    Ok(())
+}
+
+/// As the kernel writes it: without its path, and with underscores.
+fn module_name(path: &Path) -> String {
+    path.file_stem().unwrap_or_default().to_string_lossy().replace('-', "_")
+}
+
+/// Removes what earlier versions left.
+fn remove_others(folder: &Path, prefix: &str, keep: &Path) -> Result<(), String> {
+    entries(folder)?
+        .iter()
+        .filter(|path| *path != keep && file_name(path).starts_with(prefix))
+        .try_for_each(|path| remove(path))
+}
+
+fn entries(folder: &Path) -> Result<Vec<PathBuf>, String> {
+    let list = || -> io::Result<Vec<PathBuf>> { fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect() };
+    let mut paths = list().map_err(|error| describe("read", folder, &error))?;
+    paths.sort();
+    Ok(paths)
+}
+
+fn files(folder: &Path) -> Result<Vec<PathBuf>, String> {
+    Ok(entries(folder)?.into_iter().filter(|path| path.is_file()).collect())
+}
+
+fn file_name(path: &Path) -> String {
+    path.file_name().unwrap_or_default().to_string_lossy().into_owned()
+}
+
+fn path_str(path: &Path) -> Result<&str, String> {
+    path.to_str().ok_or_else(|| format!("{} is not UTF-8", path.display()))
+}
+
+fn read(path: &Path) -> Result<Vec<u8>, String> {
+    fs::read(path).map_err(|error| describe("read", path, &error))
+}
+
+fn create(folder: &Path) -> Result<(), String> {
+    fs::create_dir_all(folder).map_err(|error| describe("create", folder, &error))
+}
+
+fn copy_files(from: &Path, to: &Path) -> Result<(), String> {
+    create(to)?;
+    for path in files(from)? {
+        fs::copy(&path, to.join(file_name(&path))).map_err(|error| describe("copy", &path, &error))?;
+    }
+    Ok(())
+}
+
+/// A file or a whole folder; neither need exist.
+fn remove(path: &Path) -> Result<(), String> {
+    let removed = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
+    match removed {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => Err(describe("remove", path, &error)),
+        _ => Ok(()),
+    }
+}
+
+fn describe(action: &str, path: &Path, error: &io::Error) -> String {
+    format!("cannot {action} {}: {error}", path.display())
+}

@@ -1,0 +1,36 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Other programs, with errors that tell what was run and what it said.
+
+use std::process::{Command, Output, Stdio};
+
+/// What the command printed; its output and standard error are in the error.
+pub fn output(command: &mut Command) -> Result<String, String> {
+    let output = finished(command)?;
+    String::from_utf8(output.stdout).map_err(|_| format!("{command:?} did not print text"))
+}
+
+/// Runs the command for its effect.
+pub fn run(command: &mut Command) -> Result<(), String> {
+    finished(command).map(drop)
+}
+
+fn finished(command: &mut Command) -> Result<Output, String> {
+    let output = command.stdin(Stdio::null()).output().map_err(|error| format!("cannot run {command:?}: {error}"))?;
+    if output.status.success() {
+        return Ok(output);
+    }
+    Err(format!(
+        "{command:?} failed, {}\n{}{}",
+        output.status,
+        String::from_utf8_lossy(&output.stdout),
+        String::from_utf8_lossy(&output.stderr)
+    ))
+}
+
+/// Runs a shell pipeline which fails if any part of it does. The words come in as
+/// `$1`, `$2` and so on, and need no quoting.
+pub fn pipeline(script: &str, words: &[&str]) -> Result<(), String> {
+    let mut bash = Command::new("bash");
+    bash.args(["-o", "pipefail", "-euc", script, "lab"]).args(words);
+    run(&mut bash)
+}

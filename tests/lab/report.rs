@@ -1,0 +1,73 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the run prints, in libtest's form.
+
+use std::time::Instant;
+
+use super::vm::Run;
+
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    Passed,
+    Failed,
+}
+
+pub struct Report {
+    started: Instant,
+    planned: usize,
+    passed: usize,
+    /// Name and output.
+    failures: Vec<(String, String)>,
+    filtered_out: usize,
+    show_output: bool,
+}
+
+impl Report {
+    pub fn new(runs: &[Run], filtered_out: usize, show_output: bool) -> Report {
+        let planned = runs.iter().map(|run| run.tests.len()).sum();
+        println!("\nrunning {planned} test{}", if planned == 1 { "" } else { "s" });
+        Report { started: Instant::now(), planned, passed: 0, failures: Vec::new(), filtered_out, show_output }
+    }
+
+    /// Takes a test's result.
+    pub fn test(&mut self, name: &str, outcome: Outcome, output: &str) {
+        if self.show_output {
+            println!("---- {name} ----\n{}", output.trim_end());
+        }
+        match outcome {
+            Outcome::Passed => {
+                println!("test {name} ... ok");
+                self.passed += 1;
+            }
+            Outcome::Failed => {
+                println!("test {name} ... FAILED");
+                self.failures.push((name.to_owned(), output.to_owned()));
+            }
+        }
+    }
+
+    /// Prints the rest. Whether every test that was planned has passed.
+    pub fn finish(mut self) -> bool {
+        if !self.failures.is_empty() {
+            println!("\nfailures:\n");
+            for (name, output) in &self.failures {
+                println!("---- {name} ----\n{}\n", output.trim_end());
+            }
+            self.failures.sort();
+            println!("\nfailures:");
+            for (name, _) in &self.failures {
+                println!("    {name}");
+            }
+        }
+        let ok = self.passed == self.planned;
+        println!(
+            "\ntest result: {}. {} passed; {} failed; 0 ignored; 0 measured; {} filtered out; \
+             finished in {:.2}s\n",
+            if ok { "ok" } else { "FAILED" },
+            self.passed,
+            self.planned - self.passed,
+            self.filtered_out,
+            self.started.elapsed().as_secs_f64()
+        );
+        ok
+    }
+}

@@ -1,0 +1,64 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The programs that the lab runs on the host.
+
+use std::env;
+use std::process::Command;
+
+use super::process;
+
+/// Program and the Debian package that has it. The compiler is the kernel's
+/// choice: see [`super::kernel`].
+const TOOLS: [(&str, &str); 6] = [
+    ("qemu-system-x86_64", "qemu-system-x86"),
+    ("make", "make"),
+    ("strip", "binutils"),
+    ("tar", "tar"),
+    ("xz", "xz-utils"),
+    ("ldd", "libc-bin"),
+];
+
+/// Sees to it that every program is there.
+pub fn ensure() -> Result<(), String> {
+    if !cfg!(target_arch = "x86_64") {
+        return Err("the guest is an x86-64 machine and runs the host's own programs: \
+             build for x86_64 to run the lab"
+            .into());
+    }
+    if !has("apt-get") || !has("dpkg-deb") {
+        return Err("the lab takes its kernels out of Debian 12's packages, \
+             and this machine has no apt-get and dpkg-deb"
+            .into());
+    }
+    install(&TOOLS)
+}
+
+/// Installs the packages of those programs that are missing.
+pub fn install(tools: &[(&str, &str)]) -> Result<(), String> {
+    let missing: Vec<&str> = tools.iter().filter(|(program, _)| !has(program)).map(|(_, package)| *package).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let packages = missing.join(" ");
+    if !nix::unistd::geteuid().is_root() {
+        return Err(format!("the lab needs: sudo apt-get install {packages}"));
+    }
+    eprintln!("lab: installing {packages}");
+    update_package_lists()?;
+    process::run(
+        Command::new("apt-get")
+            .args(["install", "-qq", "-y", "--no-install-recommends"])
+            .args(missing)
+            .env("DEBIAN_FRONTEND", "noninteractive"),
+    )
+    .map_err(|cause| format!("the lab needs the packages {packages}: {cause}"))
+}
+
+/// What apt offers may be older than what its archives still hold.
+pub fn update_package_lists() -> Result<(), String> {
+    process::run(Command::new("apt-get").args(["update", "-qq"]))
+}
+
+fn has(program: &str) -> bool {
+    let path = env::var_os("PATH").unwrap_or_default();
+    env::split_paths(&path).any(|folder| folder.join(program).exists())
+}

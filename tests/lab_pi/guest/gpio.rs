@@ -1,0 +1,111 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Outputs and inputs of pinctrl-bcm2835, seen and driven from outside.
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use gpio_cdev::Chip;
+use pinion::host::Client;
+use pinion::host::config::Config;
+use pinion::host::motion::Endstop;
+
+use super::outside::Outside;
+use super::program::Pinion;
+
+const OUTPUT: u32 = 22;
+const INPUT: u32 = 24;
+
+/// Waits for what another process does.
+fn until(what: &str, mut condition: impl FnMut() -> bool) {
+    let end = Instant::now() + Duration::from_secs(10);
+    while !condition() {
+        assert!(Instant::now() < end, "waited in vain: {what}");
+        thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// One output with these levels at its beginning and in a shutdown.
+fn configure(client: &mut Client, value: u8, default_value: u8) -> u8 {
+    let mut config = Config::default();
+    let oid = config.oid().unwrap();
+    config.add(format!(
+        "config_digital_out oid={oid} pin=gpio{OUTPUT} value={value} default_value={default_value} max_duration=0"
+    ));
+    config.apply(client).expect("a configuration");
+    oid
+}
+
+#[test]
+fn the_chip_is_the_real_driver() {
+    let mut chip = Chip::new("/dev/gpiochip0").expect("the chip");
+    assert_eq!((chip.label(), chip.num_lines()), ("pinctrl-bcm2835", 54));
+    let line = chip.get_line(17).and_then(|line| line.info()).expect("the line");
+    assert_eq!(line.name(), Some("GPIO17"));
+}
+
+#[test]
+fn lines_go_by_number_by_name_and_by_chip() {
+    let pinion = Pinion::start();
+    let client = pinion.client();
+    let command = |pin: &str| {
+        let line = format!("config_digital_out oid=0 pin={pin} value=0 default_value=0 max_duration=0");
+        client.messages().encode_line(&line).expect("a pin")
+    };
+    for name in ["gpiochip0/gpio17", "GPIO17", "pinctrl-bcm2835/gpio17"] {
+        assert_eq!(command(name), command("gpio17"), "{name}");
+    }
+}
+
+#[test]
+fn an_output_is_seen_from_outside() {
+    let mut outside = Outside::new();
+    let pinion = Pinion::start();
+    let mut client = pinion.client();
+    let oid = configure(&mut client, 1, 0);
+    assert!(outside.level(OUTPUT), "its first level is the configured one");
+    for value in [0u8, 1, 0, 1] {
+        client.send("update_digital_out", &[("oid", oid.into()), ("value", value.into())]).unwrap();
+        until("the output follows", || outside.level(OUTPUT) == (value == 1));
+    }
+    assert_eq!(outside.edges(OUTPUT), "0101");
+}
+
+#[test]
+fn a_stop_drives_an_output_to_its_shutdown_value() {
+    let mut outside = Outside::new();
+    let pinion = Pinion::start();
+    let mut client = pinion.client();
+    configure(&mut client, 0, 1);
+    assert!(!outside.level(OUTPUT));
+    client.emergency_stop().expect("a shutdown");
+    until("the output rises", || outside.level(OUTPUT));
+    assert_eq!(outside.edges(OUTPUT), "1");
+}
+
+#[test]
+fn the_guardian_drives_an_output_when_pinion_is_killed() {
+    let mut outside = Outside::new();
+    let mut pinion = Pinion::start();
+    let mut client = pinion.client();
+    configure(&mut client, 1, 0);
+    assert!(outside.level(OUTPUT));
+    pinion.kill();
+    until("the output falls", || !outside.level(OUTPUT));
+}
+
+#[test]
+fn an_endstop_is_driven_from_outside() {
+    let mut outside = Outside::new();
+    outside.drive(INPUT, false);
+    let pinion = Pinion::start();
+    let mut client = pinion.client();
+    for pull in [0, 1, -1] {
+        let mut config = Config::default();
+        let endstop = Endstop::configure(&mut config, &format!("gpio{INPUT}"), pull, false).unwrap();
+        config.apply(&mut client).expect("a configuration");
+        for level in [false, true, false] {
+            outside.drive(INPUT, level);
+            assert_eq!(endstop.triggered(&mut client).unwrap(), level, "pull {pull}");
+        }
+    }
+}

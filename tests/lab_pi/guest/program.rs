@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion run` on the Pi's own pins.
+
+use std::fs::{self, File};
+use std::path::Path;
+use std::process::{Child, Command};
+use std::time::Duration;
+
+use pinion::host::Client;
+
+const LINK: &str = "/tmp/tty";
+const LOG: &str = "/tmp/log";
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A running `pinion`, ended on drop. What it logged is printed then.
+pub struct Pinion(Child);
+
+impl Pinion {
+    /// As it runs on a printer: in real time.
+    pub fn start() -> Pinion {
+        let _ = fs::remove_file(LINK);
+        let log = File::create(LOG).expect("the log");
+        let child = Command::new("pinion").args(["run", "-r", "-I", LINK]).stderr(log).spawn();
+        Pinion(child.expect("pinion on the path"))
+    }
+
+    pub fn client(&self) -> Client {
+        Client::connect(Path::new(LINK), PATIENCE).expect("a micro-controller")
+    }
+
+    /// With SIGKILL.
+    pub fn kill(&mut self) {
+        self.0.kill().expect("a running program");
+        self.0.wait().expect("its end");
+    }
+}
+
+impl Drop for Pinion {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+        println!("--- pinion's log\n{}---", fs::read_to_string(LOG).unwrap_or_default());
+    }
+}

@@ -1,0 +1,61 @@
+#!/bin/busybox sh
+# SPDX-License-Identifier: GPL-3.0-or-later
+# The first process of the emulated Pi. It speaks to the host by lines on the console
+# that begin with "lab-pi: "; tests do the same (guest/outside.rs).
+export PATH=/bin HOME=/root TERM=vt100
+/bin/busybox --install -s /bin
+mount -t proc proc /proc
+mount -t sysfs sysfs /sys
+mount -t devtmpfs devtmpfs /dev
+mkdir -p /dev/pts /dev/shm
+mount -t devpts devpts /dev/pts
+mount -t tmpfs tmpfs /dev/shm
+mount -t tmpfs tmpfs /tmp
+mount -t tmpfs tmpfs /run
+exec </dev/console >/dev/console 2>&1
+mkdir -p /etc
+echo 'tty:x:5:' >/etc/group
+# Tests write to hardware as root; they look for this before they do.
+: >/run/pinion-lab
+
+say() {
+	echo "lab-pi: $*"
+}
+
+if [ -n "$LAB_SHELL" ]; then
+	echo "Linux $(uname -rv) on $(tr '\0' '\n' </proc/device-tree/model)"
+	echo "Programs: pinion, and guest_pi whose tests need the host. Ctrl-A X ends the guest."
+	setsid cttyhack sh -l
+	sync
+	poweroff -f
+fi
+
+stty raw -echo
+# Keeps the processor from idling, in which time would pass at the host's pace: see TIME
+# in machine.rs. Everything is on one processor; two would take turns of milliseconds.
+taskset -p 1 $$ >/dev/null
+(while :; do :; done) &
+renice -n 19 -p $!
+# What was asked for, as libtest's words, one on each line.
+set --
+while read -r word; do
+	set -- "$@" "$word"
+done </lab/filters
+guest_pi --list --format terse "$@" | sed -n 's/: test$//p' >/tmp/plan
+say plan $(cat /tmp/plan)
+while read -r test <&3; do
+	say begin "$test"
+	timeout -s KILL 30 guest_pi --exact "$test" --nocapture </dev/null 2>&1
+	status=$?
+	[ $status = 137 ] && echo "killed: it took longer than 30 s"
+	# A fault of the driver's.
+	if dmesg -c | grep -E 'BUG:|WARNING:|Oops|Internal error'; then
+		status=99
+	fi
+	say end "$test" $status
+done 3</tmp/plan
+say done
+# The host ends the machine, which cannot do that itself.
+while :; do
+	sleep 60
+done

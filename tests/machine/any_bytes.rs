@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Whatever a host sends, the machine is there afterwards.
+
+use pinion::wire::block::PAYLOAD_MAX;
+use pinion::wire::format::{self, Conversion};
+use pinion::wire::vlq::Writer;
+use proptest::collection::vec;
+use proptest::prelude::*;
+
+use crate::bench::ANALOG;
+use crate::rig::Rig;
+
+const OBJECTS: &[&str] = &[
+    "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=100",
+    "config_stepper oid=1 step_pin=3 dir_pin=4 invert_step=-1 step_pulse_ticks=0",
+    "config_endstop oid=2 pin=5 pull_up=1",
+    "config_trsync oid=3",
+    "config_digital_out oid=4 pin=6 value=0 default_value=1 max_duration=100000",
+    "set_digital_out_pwm_cycle oid=4 cycle_ticks=1000",
+    "config_analog_in oid=5 pin=400",
+    "config_spi oid=6 pin=7 cs_active_high=0",
+    "spi_set_bus oid=6 spi_bus=0 mode=0 rate=1000000",
+    "config_spi_shutdown oid=7 spi_oid=6 shutdown_msg=01",
+];
+
+#[derive(Clone, Debug)]
+enum Action {
+    /// Any bytes at all.
+    Bytes(Vec<u8>),
+    /// A command of the dictionary with these values.
+    Command(usize, Vec<u32>, Vec<u8>),
+    Turns(u32),
+    Stall(u64),
+}
+
+/// Values at which something might break, and those that make sense.
+fn value() -> impl Strategy<Value = u32> {
+    prop_oneof![
+        4 => 0u32..8,
+        1 => prop::sample::select(vec![255, 256, 1000, 65535, 65536, 1 << 31, (1 << 31) - 1, u32::MAX, u32::MAX - 1]),
+        // Clocks around the rig's beginning.
+        2 => 10_000_000u32..10_500_000,
+        1 => any::<u32>(),
+    ]
+}
+
+fn action() -> impl Strategy<Value = Action> {
+    prop_oneof![
+        2 => vec(any::<u8>(), 0..=PAYLOAD_MAX).prop_map(Action::Bytes),
+        10 => (any::<usize>(), vec(value(), 9), vec(any::<u8>(), 0..40))
+            .prop_map(|(which, values, bytes)| Action::Command(which, values, bytes)),
+        5 => (1u32..30).prop_map(Action::Turns),
+        1 => (0u64..10_000_000).prop_map(Action::Stall),
+    ]
+}
+
+fn command(rig: &Rig, which: usize, values: &[u32], bytes: &[u8]) -> Vec<u8> {
+    let commands = &rig.dictionary().commands;
+    let format = commands.keys().nth(which % commands.len()).unwrap();
+    let mut writer = Writer::default();
+    writer.int(rig.dialect().command_id(format).unwrap());
+    for ((_, conversion), value) in format::parameters(format).unwrap().iter().zip(values) {
+        match conversion {
+            Conversion::Bytes => writer.string(bytes),
+            _ => writer.int(*value),
+        }
+    }
+    writer.payload().unwrap().to_vec()
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 400, ..ProptestConfig::default() })]
+
+    #[test]
+    fn no_bytes_break_the_machine(workers in prop::option::of(0u32..50_000), actions in vec(action(), 1..60)) {
+        let mut rig = Rig::new();
+        rig.bench.state().answer_ticks = workers;
+        rig.bench.script_adc(ANALOG, &[1000, 2000, 60_000, 0]);
+        rig.bench.script_input(5, &[(100_000, 1), (100_700, 0), (200_000, 1)]);
+        rig.configure(OBJECTS);
+        for action in &actions {
+            match action {
+                Action::Bytes(bytes) => rig.execute(bytes),
+                Action::Command(which, values, bytes) => {
+                    let payload = command(&rig, *which, values, bytes);
+                    rig.execute(&payload);
+                }
+                Action::Turns(turns) => rig.run_turns(*turns),
+                Action::Stall(ticks) => rig.stall_until(rig.now() + ticks),
+            }
+            // Every response has the form that the dictionary says.
+            rig.everything();
+        }
+        prop_assert!(rig.ask("get_config").starts_with("config is_config="));
+        rig.send_all(&["emergency_stop", "config_reset"]);
+        rig.everything();
+        rig.configure(OBJECTS);
+        prop_assert_eq!(rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024");
+        // And it works: a step comes on its tick.
+        rig.edges(1);
+        let now = rig.now();
+        rig.send(&format!("reset_step_clock oid=0 clock=@{now}"));
+        rig.send("queue_step oid=0 interval=1000 count=1 add=0");
+        rig.run_until(now + 5000);
+        prop_assert_eq!(rig.edges(1), [(now + 1000, 1), (now + 1100, 0)]);
+    }
+}

@@ -1,0 +1,64 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Hardware PWM outputs, checked tick by tick.
+
+use crate::bench::PWM;
+use crate::rig::Rig;
+
+/// A heater on hardware PWM: off by default, to be refreshed every 100000 ticks.
+const HEATER: &str = "config_pwm_out oid=0 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=100000";
+
+fn values(rig: &Rig) -> Vec<(u64, u16)> {
+    std::mem::take(&mut rig.bench.state().pwm_values).into_iter().map(|(_, at, value)| (at, value)).collect()
+}
+
+#[test]
+fn values_come_on_their_ticks() {
+    let mut rig = Rig::configured(&[HEATER]);
+    assert_eq!(values(&rig).len(), 1, "the first value");
+    rig.send_all(&[
+        "queue_pwm_out oid=0 clock=@1000 value=16384",
+        "queue_pwm_out oid=0 clock=@1001 value=32768",
+        "queue_pwm_out oid=0 clock=@90000 value=0",
+    ]);
+    rig.run_until(1_000_000);
+    assert_eq!(values(&rig), [(1000, 16384), (1001, 32768), (90_000, 0)]);
+    assert_eq!(rig.shutdown(), None);
+}
+
+#[test]
+fn a_host_that_falls_silent_is_noticed_after_max_duration_and_the_output_goes_off() {
+    let mut rig = Rig::configured(&[HEATER]);
+    values(&rig);
+    rig.send("queue_pwm_out oid=0 clock=@1000 value=16384");
+    rig.run_until(100_999);
+    assert_eq!(rig.shutdown(), None);
+    rig.run_until(200_000);
+    assert_eq!(rig.shutdown().as_deref(), Some("Missed scheduling of next hard pwm event"));
+    assert_eq!(values(&rig), [(1000, 16384), (101_000, 0)]);
+}
+
+#[test]
+fn a_change_beyond_max_duration_is_refused() {
+    let text = "Scheduled pwm event will exceed max_duration";
+    let mut rig = Rig::configured(&[HEATER]);
+    rig.send_all(&["queue_pwm_out oid=0 clock=@1000 value=1", "queue_pwm_out oid=0 clock=@101001 value=1"]);
+    rig.run_until(2_000);
+    assert_eq!(rig.shutdown().as_deref(), Some(text));
+
+    let mut rig = Rig::configured(&[HEATER]);
+    rig.send("queue_pwm_out oid=0 clock=@1000 value=1");
+    rig.run_until(2_000);
+    rig.send("queue_pwm_out oid=0 clock=@101001 value=1");
+    assert_eq!(rig.shutdown().as_deref(), Some(text));
+}
+
+#[test]
+fn a_channel_that_fails_stops_the_machine() {
+    let mut rig = Rig::configured(&[HEATER]);
+    rig.bench.state().broken.insert(PWM);
+    rig.send("queue_pwm_out oid=0 clock=@1000 value=1");
+    rig.run_until(2_000);
+    assert_eq!(rig.shutdown().as_deref(), Some("PWM write failed"));
+    let notes = rig.notes();
+    assert!(notes.iter().any(|note| note.starts_with("trouble: PWM write failed")), "it is still on: {notes:?}");
+}

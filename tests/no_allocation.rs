@@ -1,0 +1,174 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A whole print allocates nothing in the core once the machine is configured: an allocation
+//! may wait for a lock or for the kernel, and a step would wait with it.
+
+#[path = "machine/bench.rs"]
+#[allow(dead_code)]
+mod bench;
+#[path = "machine/rig.rs"]
+#[allow(dead_code)]
+mod rig;
+
+use std::alloc::{GlobalAlloc, Layout, System};
+use std::cell::Cell;
+
+use bench::ANALOG;
+use rig::Rig;
+
+/// The system's allocator, which counts for the thread that asks it to.
+struct Counting;
+
+thread_local! {
+    static COUNTS: Cell<bool> = const { Cell::new(false) };
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+fn count() {
+    if COUNTS.get() {
+        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
+    }
+}
+
+// SAFETY: every call goes to the system's allocator as it came. The counters are plain cells of
+// the thread, made without an allocation and without a destructor.
+#[allow(unsafe_code)]
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        count();
+        // SAFETY: the caller keeps the contract of `alloc`.
+        unsafe { System.alloc(layout) }
+    }
+
+    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
+        count();
+        // SAFETY: the caller keeps the contract of `dealloc`.
+        unsafe { System.dealloc(ptr, layout) }
+    }
+
+    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
+        count();
+        // SAFETY: the caller keeps the contract of `realloc`.
+        unsafe { System.realloc(ptr, layout, new_size) }
+    }
+}
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+/// Runs `core` and counts what it allocates and frees.
+fn allocations(core: impl FnOnce()) -> u64 {
+    ALLOCATIONS.set(0);
+    COUNTS.set(true);
+    core();
+    COUNTS.set(false);
+    ALLOCATIONS.get()
+}
+
+/// Commands at instants, as a host sends them: ahead of their time.
+struct Print {
+    rig: Rig,
+    counted: u64,
+}
+
+impl Print {
+    fn send(&mut self, command: &str) {
+        let payload = self.rig.encode(command);
+        self.counted += allocations(|| self.rig.execute(&payload));
+    }
+
+    fn run_until(&mut self, ticks: u64) {
+        self.counted += allocations(|| self.rig.run_until(ticks));
+        // The bench's own records have their limits.
+        self.rig.bench.forget_edges();
+    }
+}
+
+const STEPPERS: [u8; 3] = [0, 1, 2];
+
+const OBJECTS: &[&str] = &[
+    "config_stepper oid=0 step_pin=0 dir_pin=1 invert_step=0 step_pulse_ticks=100",
+    "config_stepper oid=1 step_pin=2 dir_pin=3 invert_step=1 step_pulse_ticks=100",
+    "config_stepper oid=2 step_pin=4 dir_pin=5 invert_step=-1 step_pulse_ticks=0",
+    "config_endstop oid=3 pin=6 pull_up=1",
+    "config_trsync oid=4",
+    "config_digital_out oid=5 pin=7 value=0 default_value=0 max_duration=150000000",
+    "set_digital_out_pwm_cycle oid=5 cycle_ticks=500000",
+    "config_analog_in oid=6 pin=400",
+    "config_spi oid=7 pin=8 cs_active_high=0",
+    "spi_set_bus oid=7 spi_bus=0 mode=0 rate=1000000",
+    "config_pwm_out oid=8 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0",
+];
+
+/// Homes, heats, prints for half a minute and homes again.
+fn print(rig: Rig) -> Print {
+    let mut print = Print { rig, counted: 0 };
+    print.rig.bench.script_adc(ANALOG, &[500]);
+    print.rig.bench.script_input(6, &[(9_000_000, 1), (30_000_000, 0), (1_470_000_000, 1)]);
+    print.send("query_analog_in oid=6 clock=@100000 sample_ticks=50000 sample_count=8 rest_ticks=15000000 bytes_per_report=48 min_value=0 max_value=65535 range_check_count=4");
+    print.home(5_000_000);
+    assert_eq!(print.rig.ask("endstop_query_state oid=3").split(' ').nth(2), Some("homing=1"));
+    let mut at = 40_000_000;
+    for oid in STEPPERS {
+        print.send(&format!("reset_step_clock oid={oid} clock=@{at}"));
+    }
+    for n in 0..2000u64 {
+        for oid in STEPPERS {
+            print.send(&format!("set_next_step_dir oid={oid} dir={}", n / 7 % 2));
+            print.send(&format!("queue_step oid={oid} interval=20000 count=10 add={}", n % 10));
+            print.send(&format!("queue_step oid={oid} interval=25000 count=20 add=-{}", n % 10));
+        }
+        if n % 50 == 0 {
+            print.send(&format!("queue_digital_out oid=5 clock=@{at} on_ticks={}", 100 * n));
+            print.send(&format!("queue_pwm_out oid=8 clock=@{at} value={n}"));
+            print.send("spi_transfer oid=7 data=0102030405");
+            for command in ["get_clock", "get_uptime", "get_config", "debug_ping data=01", "stepper_get_position oid=0"]
+            {
+                print.send(command);
+            }
+            print.rig.everything();
+        }
+        at += 700_000;
+        print.run_until(at - 10_000_000);
+    }
+    print.send(&format!("queue_digital_out oid=5 clock=@{at} on_ticks=0"));
+    print.run_until(at + 10_000_000);
+    print.home(at + 20_000_000);
+    print
+}
+
+impl Print {
+    fn home(&mut self, at: u64) {
+        self.send(&format!("trsync_start oid=4 report_clock=@{at} report_ticks=1000000 expire_reason=4"));
+        self.send(&format!("trsync_set_timeout oid=4 clock=@{}", at + 500_000_000));
+        for oid in STEPPERS {
+            self.send(&format!("stepper_stop_on_trigger oid={oid} trsync_oid=4"));
+            self.send(&format!("reset_step_clock oid={oid} clock=@{at}"));
+            self.send(&format!("queue_step oid={oid} interval=10000 count=65535 add=0"));
+        }
+        self.send(&format!(
+            "endstop_home oid=3 clock=@{at} sample_ticks=750 sample_count=4 rest_ticks=20000 pin_value=1 trsync_oid=4 trigger_reason=1"
+        ));
+        self.run_until(at + 20_000_000);
+        self.send("trsync_trigger oid=4 reason=2");
+        let reports = self.rig.everything();
+        assert!(reports.iter().any(|report| report.contains("can_trigger=0 trigger_reason=1")), "{reports:?}");
+        for oid in STEPPERS {
+            self.send(&format!("stepper_get_position oid={oid}"));
+        }
+    }
+}
+
+#[test]
+fn a_print_allocates_nothing_once_configured() {
+    for rig in [Rig::configured(OBJECTS), Rig::with_workers(40_000, OBJECTS)] {
+        let print = print(rig);
+        assert_eq!(print.rig.notes().len(), 1, "configured, and nothing else");
+        assert_eq!(print.counted, 0);
+    }
+}
+
+#[test]
+fn the_counter_counts() {
+    // Out of the optimiser's sight, which would leave the pair out.
+    assert_eq!(allocations(|| drop(std::hint::black_box(Box::new(1)))), 2);
+}

@@ -1,0 +1,165 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What a host may send wrong: each ends in the firmware's shutdown text, a log line that
+//! names the thing and the remedy, and a process that is there for the next FIRMWARE_RESTART.
+
+use std::time::{Duration, Instant};
+
+use pinion::host::Client;
+use pinion::wire::block::Sequence;
+
+use crate::process::{PATIENCE, Pinion};
+
+/// Sends the lines to a machine with `oids` ids; it must stop for `reason` and log each of
+/// `words` in one line. Then a reset must make it new.
+#[track_caller]
+fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
+    let mut client = pinion.client();
+    if client.status().unwrap().is_shutdown || client.status().unwrap().is_config {
+        client.reset().unwrap();
+    }
+    client.send_line("allocate_oids count=8").unwrap();
+    for line in lines {
+        client.send_line(line).unwrap();
+    }
+    let told = client.wait_shutdown(PATIENCE).unwrap();
+    assert_eq!(told.as_deref(), Some(reason), "{:?}", lines.last());
+    let line = || pinion.logged(&format!("shutdown: {reason}: "));
+    pinion.until(&format!("a line with {words:?}"), || words.iter().all(|word| line().contains(word)));
+    restarts(&mut client);
+}
+
+#[track_caller]
+fn restarts(client: &mut Client) {
+    client.reset().unwrap();
+    let status = client.status().unwrap();
+    assert!(!status.is_shutdown && !status.is_config);
+}
+
+const OUTPUT: &str = "config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=50000000";
+const STEPPER: &str = "config_stepper oid=1 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100";
+
+#[test]
+fn wrong_pins() {
+    let pinion = Pinion::simulated(&[]);
+    stops(
+        &pinion,
+        &["config_digital_out oid=0 pin=4711 value=0 default_value=0 max_duration=0"],
+        "Not an output pin",
+        &["4711"],
+    );
+    stops(&pinion, &["config_endstop oid=0 pin=x_step pull_up=1"], "Not an input pin", &["x_step"]);
+    stops(&pinion, &["config_analog_in oid=0 pin=led"], "Unable to open adc device", &["led"]);
+    let twice = [OUTPUT, "config_digital_out oid=2 pin=led value=0 default_value=0 max_duration=0"];
+    stops(&pinion, &twice, "Unable to open out GPIO chip line", &["led"]);
+}
+
+#[test]
+fn a_chip_that_is_missing() {
+    let pinion = Pinion::start(&["run"]);
+    pinion.wait_for_link();
+    let line = "config_digital_out oid=0 pin=gpiochip7/gpio5 value=0 default_value=0 max_duration=0";
+    stops(&pinion, &[line], "GPIO chip device not found", &["gpiochip7"]);
+}
+
+#[test]
+fn wrong_oids() {
+    let pinion = Pinion::simulated(&[]);
+    stops(&pinion, &["update_digital_out oid=3 value=1"], "Invalid oid type", &["oid 3"]);
+    stops(&pinion, &[OUTPUT, "queue_step oid=0 interval=1 count=1 add=0"], "Invalid oid type", &["oid 0"]);
+    let beyond = "config_digital_out oid=8 pin=led value=0 default_value=0 max_duration=0";
+    stops(&pinion, &[beyond], "Can't assign oid", &["oid 8"]);
+}
+
+#[test]
+fn wrong_times() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    let past = client.clock_in(-1.0).unwrap().wire();
+    let far = client.clock_in(30.0).unwrap().wire();
+    drop(client);
+    let configured = [OUTPUT, STEPPER, "finalize_config crc=1"];
+    let with = |line: String| -> Vec<String> { configured.iter().map(|line| line.to_string()).chain([line]).collect() };
+    let stops = |lines: Vec<String>, reason: &str, words: &[&str]| {
+        let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
+        stops(&pinion, &lines, reason, words);
+    };
+    stops(with(format!("queue_digital_out oid=0 clock={past} on_ticks=1")), "Timer too close", &["us after its time"]);
+    let mut lines = with(format!("reset_step_clock oid=1 clock={past}"));
+    lines.push("queue_step oid=1 interval=10 count=1 add=0".into());
+    stops(lines, "Timer too close", &["overloaded"]);
+    let mut lines = with(format!("reset_step_clock oid=1 clock={far}"));
+    lines.extend((0..1026).map(|_| "queue_step oid=1 interval=50000 count=1 add=0".into()));
+    stops(lines, "Move queue overflow", &[]);
+}
+
+#[test]
+fn a_reading_out_of_range() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    let soon = client.clock_in(0.2).unwrap().wire();
+    drop(client);
+    let query = format!(
+        "query_analog_in oid=2 clock={soon} sample_ticks=50000 sample_count=4 rest_ticks=5000000 \
+         bytes_per_report=2 min_value=0 max_value=1 range_check_count=2"
+    );
+    let lines = ["config_analog_in oid=2 pin=bed_sensor", "finalize_config crc=1", &query];
+    stops(&pinion, &lines, "ADC out of range", &["oid 2", "sensor"]);
+}
+
+#[test]
+fn memory_is_not_poked() {
+    let pinion = Pinion::simulated(&[]);
+    let reason = "Memory access is not available on Linux";
+    stops(&pinion, &["debug_read order=2 addr=0"], reason, &["debug_read"]);
+    stops(&pinion, &["debug_write order=2 addr=0 val=1"], reason, &["debug_write"]);
+}
+
+#[test]
+fn commands_that_are_none_and_commands_cut_short() {
+    let pinion = Pinion::simulated(&[]);
+    for (payload, reason) in [(&[0x5f, 0x01][..], "Invalid command"), (&[0x0e, 0x00][..], "Command parser error")] {
+        let mut client = pinion.client();
+        client.link().send(payload).unwrap();
+        assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some(reason));
+        pinion.logged(&format!("shutdown: {reason}: "));
+        restarts(&mut client);
+    }
+}
+
+#[test]
+fn garbage_truncated_and_endless_blocks_are_answered_by_a_nak_and_overcome() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    client.status().unwrap();
+    for noise in [
+        &b"\x40\x10 a block that promises more than it holds"[..],
+        &[0xff; 5000],
+        &[0x7e; 300],
+        b"\x05\x10\x00\x00\x7e",
+        b"FORCE_SHUTDOWN",
+    ] {
+        client.link().port().queue(noise);
+        // A sync byte ends whatever the noise began.
+        client.link().port().queue(&[0x7e; 64]);
+        assert!(!client.status().unwrap().is_shutdown);
+    }
+}
+
+#[test]
+fn a_block_out_of_order_is_answered_by_a_nak() {
+    let pinion = Pinion::simulated(&[]);
+    let mut port = pinion.port();
+    // Nothing was sent before: the machine expects number 0.
+    port.queue_block(&[], Sequence::default().next());
+    let mut until = Instant::now() + PATIENCE;
+    let mut empty = 0;
+    while let Some((sequence, payload)) = port.wait_block(until).unwrap() {
+        assert_eq!(sequence, Sequence::default());
+        // A machine that was just made says `starting`.
+        if payload.is_empty() {
+            empty += 1;
+            until = Instant::now() + Duration::from_millis(50);
+        }
+    }
+    assert_eq!(empty, 1, "one NAK");
+}

@@ -1,0 +1,144 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The pty, its link, hosts that come and go, signals.
+
+use std::fs;
+use std::io::Write;
+use std::os::unix::fs::{MetadataExt, symlink};
+
+use nix::sys::signal::Signal;
+use pinion::host::Error;
+use pinion::host::config::Config;
+use pinion::wire::block::{Sequence, frame};
+
+use crate::process::{PATIENCE, Pinion, exists};
+
+#[test]
+fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
+    let folder = tempfile::tempdir().unwrap();
+    symlink("/dev/pts/no-longer-there", folder.path().join("tty")).unwrap();
+    let mut pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    let link = pinion.link();
+    pinion.logged("serving on");
+    assert!(fs::metadata(&link).is_ok(), "the link leads to a terminal");
+    pinion.client();
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0));
+    assert!(!exists(&link));
+}
+
+#[test]
+fn a_regular_file_in_the_links_place_is_an_error_and_is_left_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("tty"), "mine").unwrap();
+    let mut pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    assert_eq!(pinion.end().code(), Some(1));
+    assert!(pinion.log().contains("no symbolic link"), "{}", pinion.log());
+    assert_eq!(fs::read_to_string(pinion.link()).unwrap(), "mine");
+}
+
+#[test]
+fn a_link_that_was_taken_over_is_left_alone() {
+    let mut pinion = Pinion::simulated(&[]);
+    fs::remove_file(pinion.link()).unwrap();
+    symlink("/dev/null", pinion.link()).unwrap();
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0));
+    assert!(exists(&pinion.link()));
+}
+
+#[test]
+fn the_command_line_of_klipper_mcu_works_as_it_is() {
+    let mut pinion = Pinion::start(&["-r", "--board", "sim"]);
+    pinion.wait_for_link();
+    pinion.client().status().unwrap();
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0));
+}
+
+#[test]
+fn mode_and_group_of_the_pty_are_as_asked() {
+    let group = nix::unistd::getegid().to_string();
+    let pinion = Pinion::simulated(&["-m", "0606", "-g", &group]);
+    let device = fs::metadata(pinion.link()).unwrap();
+    assert_eq!(device.mode() & 0o777, 0o606);
+    assert_eq!(device.gid().to_string(), group);
+
+    let mut refused = Pinion::start(&["run", "--board", "sim", "-g", "no-such-group"]);
+    assert_eq!(refused.end().code(), Some(1));
+    assert!(refused.log().contains("no group no-such-group"), "{}", refused.log());
+}
+
+#[test]
+fn a_host_that_goes_away_and_comes_back_finds_the_machine_as_it_left_it() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    Config::default().apply(&mut client).unwrap();
+    pinion.logged("host attached");
+    drop(client);
+    pinion.logged("host gone");
+    assert!(pinion.client().status().unwrap().is_config);
+}
+
+#[test]
+fn force_shutdown_stops_the_machine_and_a_reset_starts_it_anew() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    fs::OpenOptions::new().write(true).open(pinion.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
+    let reason = client.wait_shutdown(PATIENCE).unwrap();
+    assert_eq!(reason.as_deref(), Some("Force shutdown command"));
+    client.reset().unwrap();
+    assert!(!client.status().unwrap().is_shutdown);
+}
+
+#[test]
+fn sigterm_tells_the_host_and_drives_outputs_to_their_shutdown_values() {
+    let mut pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    client.send_line("allocate_oids count=1").unwrap();
+    client.send_line("config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0").unwrap();
+    client.send_line("finalize_config crc=1").unwrap();
+    client.send_line("update_digital_out oid=0 value=1").unwrap();
+    client.link().settle().unwrap();
+    pinion.signal(Signal::SIGTERM);
+    // The news and the closed terminal race; both tell the host.
+    match client.wait_shutdown(PATIENCE) {
+        Ok(reason) => assert_eq!(reason.as_deref(), Some("Force shutdown command")),
+        Err(error) => assert!(matches!(error, Error::Io { .. } | Error::Closed { .. }), "{error}"),
+    }
+    assert_eq!(pinion.end().code(), Some(0));
+}
+
+#[test]
+fn sigusr1_tells_how_late_timers_were() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.logged("serving on");
+    pinion.signal(Signal::SIGUSR1);
+    assert!(pinion.logged("timers:").contains("late by p50"));
+    pinion.client().status().unwrap();
+}
+
+#[test]
+fn a_host_that_never_reads_neither_blocks_the_machine_nor_makes_it_grow() {
+    let pinion = Pinion::simulated(&[]);
+    let get_uptime = pinion.client().messages().encode("get_uptime", &[]).unwrap();
+    let before = pinion.private_kb();
+    let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
+    let (done, finished) = std::sync::mpsc::channel();
+    std::thread::spawn(move || {
+        // Who does not read does not know the expected number: all sixteen are tried in turn.
+        let (mut blocks, mut sequence) = (Vec::new(), Sequence::default());
+        for _ in 0..16 {
+            frame(&get_uptime, sequence, &mut blocks);
+            sequence = sequence.next();
+        }
+        for _ in 0..5_000 {
+            tty.write_all(&blocks).unwrap();
+        }
+        done.send(()).unwrap();
+        // The terminal stays open: a host that hangs is no host that is gone.
+        std::thread::park();
+    });
+    finished.recv_timeout(PATIENCE).expect("the machine takes commands in");
+    let grown = pinion.private_kb().saturating_sub(before);
+    assert!(grown < 2048, "grew by {grown} kB");
+}

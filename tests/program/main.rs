@@ -1,0 +1,7 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The program from outside, over a real pty, with our own host client.
+
+mod bad_input;
+mod commands;
+mod life;
+mod process;

@@ -1,0 +1,148 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The program as a process of its own, with a pty and a log.
+
+use std::fs::{self, File};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use pinion::host::Client;
+use pinion::host::serial::Port;
+use tempfile::TempDir;
+
+/// Long enough for any machine; nothing here measures speed.
+pub const PATIENCE: Duration = Duration::from_secs(30);
+
+/// A running `pinion`, ended on drop.
+pub struct Pinion {
+    child: Child,
+    folder: TempDir,
+}
+
+impl Pinion {
+    /// `pinion run` on the simulated printer.
+    pub fn simulated(args: &[&str]) -> Pinion {
+        let pinion = Pinion::start(&[&["run", "--board", "sim"], args].concat());
+        pinion.wait_for_link();
+        pinion
+    }
+
+    /// `pinion` with these arguments and `-I` with a path of its own.
+    pub fn start(args: &[&str]) -> Pinion {
+        let folder = tempfile::tempdir().unwrap();
+        Pinion::start_in(folder, args)
+    }
+
+    /// The same, in a folder that was prepared.
+    pub fn start_in(folder: TempDir, args: &[&str]) -> Pinion {
+        let log = File::create(folder.path().join("log")).unwrap();
+        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            .args(args)
+            .arg("-I")
+            .arg(folder.path().join("tty"))
+            .env_remove("JOURNAL_STREAM")
+            .stdout(File::create(folder.path().join("out")).unwrap())
+            .stderr(log)
+            .spawn()
+            .unwrap();
+        Pinion { child, folder }
+    }
+
+    pub fn link(&self) -> PathBuf {
+        self.folder.path().join("tty")
+    }
+
+    pub fn log(&self) -> String {
+        fs::read_to_string(self.folder.path().join("log")).unwrap()
+    }
+
+    pub fn out(&self) -> String {
+        fs::read_to_string(self.folder.path().join("out")).unwrap()
+    }
+
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    pub fn wait_for_link(&self) {
+        self.until("the link", || fs::read_link(self.link()).is_ok());
+    }
+
+    /// Waits until the log has a line with this text, and returns the last of them.
+    #[track_caller]
+    pub fn logged(&self, text: &str) -> String {
+        let line = || self.log().lines().rfind(|line| line.contains(text)).map(str::to_owned);
+        self.until(&format!("a log line with \"{text}\""), || line().is_some());
+        line().unwrap()
+    }
+
+    #[track_caller]
+    pub fn until(&self, what: &str, done: impl Fn() -> bool) {
+        let end = Instant::now() + PATIENCE;
+        while !done() {
+            assert!(Instant::now() < end, "waited in vain for {what}; the log:\n{}", self.log());
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    pub fn client(&self) -> Client {
+        Client::connect(&self.link(), PATIENCE).unwrap()
+    }
+
+    pub fn port(&self) -> Port {
+        Port::open(&self.link()).unwrap()
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        kill(Pid::from_raw(self.pid() as i32), signal).unwrap();
+    }
+
+    /// Waits for the program's end.
+    pub fn end(&mut self) -> ExitStatus {
+        let end = Instant::now() + 4 * PATIENCE;
+        loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                return status;
+            }
+            assert!(Instant::now() < end, "the program does not end; the log:\n{}", self.log());
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    /// Memory of its own, in kB.
+    pub fn private_kb(&self) -> u64 {
+        let rollup = fs::read_to_string(format!("/proc/{}/smaps_rollup", self.pid())).unwrap();
+        let field = |name: &str| {
+            let line = rollup.lines().find(|line| line.starts_with(name)).unwrap();
+            line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
+        };
+        field("Private_Dirty:") + field("Private_Clean:")
+    }
+}
+
+impl Drop for Pinion {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// A folder with a file in it.
+pub fn folder_with(name: &str, text: &str) -> (TempDir, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join(name);
+    fs::write(&path, text).unwrap();
+    (folder, path)
+}
+
+/// Runs `pinion` to its end.
+pub fn output(args: &[&str]) -> std::process::Output {
+    Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).output().unwrap()
+}
+
+pub fn exists(path: &Path) -> bool {
+    fs::symlink_metadata(path).is_ok()
+}
