@@ -410,6 +410,7 @@ impl Link {
 
     /// One round of writing, waiting, reading, acknowledging and sending again.
     fn exchange(&mut self, until: Instant) -> Result<(), Error> {
+        self.port.write_some()?;
         // What still waits to be written must not be sent again before it was.
         let timed = !self.sent.is_empty() && self.port.output.is_empty();
         let until = if timed { until.min(self.retransmit_at) } else { until };
@@ -553,6 +554,13 @@ mod tests {
         assert_eq!(got, numbered(100));
         assert!(traffic.naks > 0, "{traffic:?}");
         assert!(traffic.blocks_again >= 3, "{traffic:?}");
+    }
+
+    #[test]
+    fn the_last_block_lost_twice_is_sent_a_third_time() {
+        let (got, traffic) = deliver(&[(9, Fault::Drop), (10, Fault::Drop)], 10);
+        assert_eq!(got, numbered(10));
+        assert!(traffic.blocks_again >= 2, "{traffic:?}");
     }
 
     #[test]
