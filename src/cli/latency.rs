@@ -15,7 +15,7 @@ use std::time::Duration;
 use clap::Args;
 
 use crate::lateness::{Lateness, us};
-use crate::runtime::realtime::{self, Role, Scheduling};
+use crate::runtime::realtime::{self, Processors, Role, Scheduling};
 use crate::runtime::wakeup::{MarginLimits, Waiter};
 use crate::time::{Clock, Monotonic, Ticks, TimeSource};
 
@@ -48,12 +48,17 @@ struct Half {
 /// Measures, prints and judges.
 pub fn run(args: &LatencyArgs) -> ExitCode {
     let span = Duration::from_secs(args.seconds.into()) / 2;
+    let processors = match Processors::new(None) {
+        Ok(processors) => processors,
+        Err(error) => return failed(format!("the processors can not be told: {error}")),
+    };
     let measured = thread::Builder::new().name("core".into()).spawn(move || {
         realtime::lock_memory();
         let scheduling = realtime::enter(Role::Core);
-        let idle = measure("idle", span, scheduling);
+        let new_waiter = |clock, limits| Waiter::new(clock, limits, scheduling, processors);
+        let idle = measure("idle", span, new_waiter);
         let load = Load::start();
-        let loaded = measure("under load", span, scheduling);
+        let loaded = measure("under load", span, new_waiter);
         drop(load);
         (scheduling, [idle, loaded])
     });
@@ -76,26 +81,23 @@ pub fn run(args: &LatencyArgs) -> ExitCode {
     }
 }
 
-fn measure(name: &'static str, span: Duration, scheduling: Scheduling) -> Half {
+fn measure(
+    name: &'static str,
+    span: Duration,
+    new_waiter: impl Fn(Arc<dyn TimeSource>, MarginLimits) -> Waiter,
+) -> Half {
     let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
     let end = clock.now().ticks() + (span.as_nanos() / 20) as u64;
     let mut half = Half { name, wakeup: Lateness::default(), edge: Lateness::default(), margin: Ticks(0) };
     // A quarter with bare sleeps, the rest with the program's own waiting.
     let bare_end = clock.now().ticks() + (span.as_nanos() / 80) as u64;
     let bare = MarginLimits { min: Ticks(0), max: Ticks(0) };
-    run_for(&clock, bare, scheduling, bare_end, &mut half.wakeup);
-    half.margin = run_for(&clock, MarginLimits::default(), scheduling, end, &mut half.edge);
+    run_for(&clock, new_waiter(clock.clone(), bare), bare_end, &mut half.wakeup);
+    half.margin = run_for(&clock, new_waiter(clock.clone(), MarginLimits::default()), end, &mut half.edge);
     half
 }
 
-fn run_for(
-    clock: &Arc<dyn TimeSource>,
-    limits: MarginLimits,
-    scheduling: Scheduling,
-    end: u64,
-    lateness: &mut Lateness,
-) -> Ticks {
-    let mut waiter = Waiter::new(clock.clone(), limits, scheduling);
+fn run_for(clock: &Arc<dyn TimeSource>, mut waiter: Waiter, end: u64, lateness: &mut Lateness) -> Ticks {
     let mut at = clock.now() + PERIOD;
     while at < Clock::from_ticks(end) {
         waiter.wait(Some(at), || false);

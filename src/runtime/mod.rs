@@ -43,7 +43,7 @@ use link::{End, Link, Parts};
 use notify::Notify;
 use outlet::{LinkWake, Progress};
 use pty::Pty;
-use realtime::{Pinning, Role, Scheduling};
+use realtime::{Processors, Role, Scheduling};
 use signals::Signals;
 use wakeup::{MarginLimits, Waiter};
 use watchdog::{JobClocks, Vigil, Watchdog};
@@ -79,7 +79,7 @@ pub fn run(
     ready: impl FnOnce(),
 ) -> io::Result<()> {
     let pulse = guardian.as_ref().map_or_else(Pulse::new, |guardian| Ok(guardian.pulse()))?;
-    let pinning = options.cpu.map(Pinning::new).transpose()?;
+    let processors = Processors::new(options.cpu)?;
     let pty = Pty::open(&options.link, &options.access)?;
     let signals = Signals::new()?;
     let notify = Notify::from_env()?;
@@ -102,21 +102,20 @@ pub fn run(
     let (core_dialect, core_clock, core_jobs) = (dialect.clone(), clock.clone(), jobs.clone());
     let (core_progress, core_wake) = (progress.clone(), wake.clone());
     let core = thread::Builder::new().name("core".into()).spawn(move || {
-        if let Some(Err(error)) = pinning.map(|pinning| pinning.pin()) {
+        if let Err(error) = processors.confine() {
             warn!("--cpu: the core is not pinned: {error}");
         }
         let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };
         let prepare = Arc::new(move || {
-            // A thread inherits the processor of the one that starts it; without success it
-            // shares the core's.
-            let _ = pinning.map(|pinning| pinning.unpin());
+            // A thread inherits the processors of the one that starts it.
+            processors.free();
             if realtime {
                 realtime::enter(Role::Worker);
             }
         });
         let workers = Box::new(Threads::new(thread::current(), prepare, core_jobs));
         let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
-        let waiter = Waiter::new(core_clock.clone(), margin, scheduling);
+        let waiter = Waiter::new(core_clock.clone(), margin, scheduling, processors);
         Core::new(self::core::Parts {
             mcu,
             clock: core_clock,

@@ -8,8 +8,8 @@ use std::fs;
 use std::hint;
 use std::io;
 
-use log::{info, warn};
-use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
+use log::{debug, info, warn};
+use nix::sched::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
 use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::sys::prctl;
 use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
@@ -39,6 +39,8 @@ fn priority(role: Role) -> i32 {
     }
 }
 
+/// The core's claim against ordinary threads, the strongest.
+const NICE: i32 = -20;
 /// The guardian must get its turn when the core takes every turn.
 const GUARDIAN_PRIORITY: i32 = 50;
 /// MCL_ONFAULT (linux/mman.h): lock pages as they are touched, as the libraries that libiio
@@ -97,6 +99,10 @@ pub fn enter(role: Role) -> Scheduling {
         Ok(()) => {
             if role == Role::Core {
                 info!("real time: SCHED_FIFO, priority {}", priority(role));
+                // For when it has to go on as SCHED_OTHER.
+                if let Err(error) = sys::set_nice(NICE) {
+                    debug!("nice {NICE}: {error}");
+                }
             }
             Scheduling::RealTime
         }
@@ -113,7 +119,7 @@ pub fn enter(role: Role) -> Scheduling {
 /// Makes the calling thread an ordinary one again.
 pub fn leave() {
     // To give up a privilege is always permitted.
-    let _ = sys::set_other();
+    let _ = sys::set_other().and_then(|()| sys::set_nice(0));
 }
 
 /// Changes the core's class. What was permitted at the start is permitted still; if not, the
@@ -195,37 +201,52 @@ fn cpu_group(groups: &str) -> Option<&str> {
     })
 }
 
-/// The processor of the core, and those of all others.
+/// The processors that this process may use, and the one that its core is to keep to.
 #[derive(Clone, Copy)]
-pub(super) struct Pinning {
-    cpu: usize,
+pub struct Processors {
     present: CpuSet,
+    core: Option<usize>,
 }
 
-impl Pinning {
-    /// The core is to run on processor `cpu`; an error if it can not. Leaves the calling thread
-    /// where it is.
-    pub(super) fn new(cpu: usize) -> io::Result<Pinning> {
-        let pinning = Pinning { cpu, present: sched_getaffinity(MYSELF)? };
-        let tried = pinning.pin();
-        pinning.unpin()?;
-        tried.map(|()| pinning).map_err(|_| {
-            let known = (0..CpuSet::count()).filter(|cpu| pinning.present.is_set(*cpu) == Ok(true));
+impl Processors {
+    /// Those of the calling thread, the core on any or on one of them only; an error if there is
+    /// no such processor. Leaves the calling thread where it is.
+    pub fn new(core: Option<usize>) -> io::Result<Processors> {
+        let processors = Processors { present: sched_getaffinity(MYSELF)?, core };
+        let Some(cpu) = core else { return Ok(processors) };
+        let tried = processors.confine();
+        sched_setaffinity(MYSELF, &processors.present)?;
+        tried.map(|()| processors).map_err(|_| {
+            let known = (0..CpuSet::count()).filter(|cpu| processors.present.is_set(*cpu) == Ok(true));
             let known: Vec<String> = known.map(|cpu| cpu.to_string()).collect();
             io::Error::other(format!("--cpu {cpu}: there is no such processor: choose one of {}", known.join(", ")))
         })
     }
 
-    /// Has the calling thread, which is the core, run on its processor only.
-    pub(super) fn pin(&self) -> io::Result<()> {
+    /// Keeps the calling thread, which is the core, to its processor if it is to have one.
+    pub(super) fn confine(&self) -> io::Result<()> {
+        let Some(cpu) = self.core else { return Ok(()) };
         let mut cpus = CpuSet::new();
-        cpus.set(self.cpu)?;
+        cpus.set(cpu)?;
         Ok(sched_setaffinity(MYSELF, &cpus)?)
     }
 
-    /// Has the calling thread, which the core started, run on any.
-    pub(super) fn unpin(&self) -> io::Result<()> {
-        Ok(sched_setaffinity(MYSELF, &self.present)?)
+    /// Lets the calling thread, which the core started, run on any.
+    pub(super) fn free(&self) {
+        // Without success it shares the core's.
+        let _ = sched_setaffinity(MYSELF, &self.present);
+    }
+
+    /// Moves the calling thread, which is the core, off its present processor. Whether there was
+    /// another.
+    pub(super) fn change(&self) -> bool {
+        let mut others = self.present;
+        // The set without a processor is empty where there is one only, which the kernel refuses.
+        self.core.is_none()
+            && sched_getcpu()
+                .and_then(|cpu| others.unset(cpu))
+                .and_then(|()| sched_setaffinity(MYSELF, &others))
+                .is_ok()
     }
 }
 
@@ -274,16 +295,31 @@ mod tests {
     #[test]
     fn processors() {
         let before = sched_getaffinity(MYSELF).unwrap();
-        let first = (0..CpuSet::count()).find(|cpu| before.is_set(*cpu) == Ok(true)).unwrap();
-        let pinning = Pinning::new(first).unwrap();
+        let present: Vec<usize> = (0..CpuSet::count()).filter(|cpu| before.is_set(*cpu) == Ok(true)).collect();
+        let pinned = Processors::new(Some(present[0])).unwrap();
         assert_eq!(sched_getaffinity(MYSELF), Ok(before));
-        pinning.pin().unwrap();
+        pinned.confine().unwrap();
+        assert!(!pinned.change());
         let inherited = std::thread::spawn(move || {
-            pinning.unpin().unwrap();
+            pinned.free();
             sched_getaffinity(MYSELF)
         });
         assert_eq!(inherited.join().unwrap(), Ok(before));
-        let error = Pinning::new(100_000).err().unwrap().to_string();
+        pinned.free();
+
+        let any = Processors::new(None).unwrap();
+        any.confine().unwrap();
+        assert_eq!(sched_getaffinity(MYSELF), Ok(before));
+        for _ in 0..10 {
+            let cpu = sched_getcpu().unwrap();
+            // It may have been moved between the two looks, but not to where it must not be.
+            assert_eq!(any.change(), present.len() > 1);
+            if present.len() == 2 {
+                assert_ne!(sched_getaffinity(MYSELF).unwrap(), before, "left processor {cpu}");
+            }
+        }
+
+        let error = Processors::new(Some(100_000)).err().unwrap().to_string();
         assert!(error.starts_with("--cpu 100000: there is no such processor: choose one of "), "{error}");
     }
 }

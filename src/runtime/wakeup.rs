@@ -15,8 +15,8 @@ use nix::time::{ClockId, clock_gettime};
 
 use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 
-use super::budget::{Budget, Throttle};
-use super::realtime::{self, Scheduling};
+use super::budget::{Budget, Class, Throttle};
+use super::realtime::{self, Processors, Scheduling};
 
 /// The margin's bounds.
 #[derive(Clone, Copy, Debug)]
@@ -111,16 +111,22 @@ pub enum Woken {
 pub struct Waiter {
     clock: Arc<dyn TimeSource>,
     margin: Margin,
+    processors: Processors,
     /// Of a thread that runs as SCHED_FIFO under a throttle.
     budget: Option<Budget>,
 }
 
 impl Waiter {
-    /// A waiter for the calling thread, which runs as `scheduling` says.
-    pub fn new(clock: Arc<dyn TimeSource>, limits: MarginLimits, scheduling: Scheduling) -> Waiter {
+    /// A waiter for the calling thread, which runs as `scheduling` says on `processors`.
+    pub fn new(
+        clock: Arc<dyn TimeSource>,
+        limits: MarginLimits,
+        scheduling: Scheduling,
+        processors: Processors,
+    ) -> Waiter {
         let throttle = if scheduling == Scheduling::RealTime { Throttle::read() } else { None };
         let budget = throttle.map(|throttle| Budget::new(throttle, clock.now(), running_time()));
-        Waiter { clock, margin: Margin::new(limits), budget }
+        Waiter { clock, margin: Margin::new(limits), processors, budget }
     }
 
     /// The margin as it was learned.
@@ -128,12 +134,15 @@ impl Waiter {
         self.margin.get()
     }
 
-    /// The thread ran until now. Past its budget it goes on as SCHED_OTHER.
+    /// The thread ran until now. Past its budget it goes on on another processor, or as
+    /// SCHED_OTHER.
     #[inline]
     pub fn ran(&mut self, now: Clock) {
         let Some(budget) = self.budget.as_mut().filter(|budget| budget.is_due(now)) else { return };
-        if let Some(class) = budget.look(now, running_time()) {
-            realtime::change(class);
+        match budget.look(now, running_time()) {
+            Some(Class::Other) if self.processors.change() => budget.moved(),
+            Some(class) => realtime::change(class),
+            None => {}
         }
     }
 
@@ -189,7 +198,11 @@ impl Waiter {
 
 #[cfg(test)]
 mod tests {
+    use nix::sched::sched_getaffinity;
+    use nix::unistd::Pid;
+
     use super::*;
+    use crate::time::Monotonic;
 
     #[test]
     fn the_margin_settles_where_one_wake_up_in_fifty_is_later() {
@@ -216,6 +229,23 @@ mod tests {
             margin.unslept();
         }
         assert_eq!(margin.get().0, start.0 - start.0.div_ceil(8));
+    }
+
+    #[test]
+    fn past_its_budget_the_thread_moves_to_another_processor() {
+        let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
+        let processors = Processors::new(None).unwrap();
+        let limits = MarginLimits::default();
+        let mut waiter = Waiter::new(clock.clone(), limits, Scheduling::Ordinary, processors);
+        let meagre = Throttle { runtime_us: 100, period_us: 1_000_000 };
+        waiter.budget = Some(Budget::new(meagre, clock.now(), running_time()));
+        let before = sched_getaffinity(Pid::from_raw(0)).unwrap();
+        let several = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
+        let start = running_time();
+        while running_time() < start + Duration::from_millis(2) {
+            waiter.ran(clock.now());
+        }
+        assert_eq!(sched_getaffinity(Pid::from_raw(0)) != Ok(before), several);
     }
 
     #[test]

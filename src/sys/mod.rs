@@ -33,6 +33,16 @@ fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
     }
 }
 
+/// Gives the calling thread a nice value (-20 to 19), which counts while it is SCHED_OTHER
+/// (setpriority(2), "C library/kernel differences": per thread).
+pub(crate) fn set_nice(value: i32) -> io::Result<()> {
+    // SAFETY: takes no pointers; 0 is the calling thread.
+    match unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, value) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
 /// Words that stay common to this process and to those that it forks.
 pub(crate) const SHARED_WORDS: usize = 4;
 
