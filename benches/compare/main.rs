@@ -10,6 +10,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::iter;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
@@ -127,6 +128,7 @@ fn measure(options: &Options) -> Result<(), String> {
 /// One line of the table, measured in a program of its own start.
 #[derive(Debug)]
 enum Case {
+    Floor,
     Steps { rate_khz: u32, steppers: usize, transfers: bool },
     RoundTrip,
     Commands { realtime: bool },
@@ -141,7 +143,7 @@ fn cases(measure: Measure, options: &Options) -> Vec<Case> {
         STEPPERS.iter().flat_map(|s| options.rates.iter().map(move |rate| case(*s, *rate))).collect()
     };
     match measure {
-        Measure::Lateness => steps(false),
+        Measure::Lateness => iter::once(Case::Floor).chain(steps(false)).collect(),
         Measure::Transfers => steps(true),
         Measure::Roundtrip => vec![Case::RoundTrip],
         Measure::Commands => vec![Case::Commands { realtime: false }, Case::Commands { realtime: true }],
@@ -162,16 +164,24 @@ impl Case {
     fn measure(&self, rig: &Rig, program: &Program, quick: bool, run: &mut Run<'_>) -> Result<(), String> {
         let seconds = if quick { 3.0 } else { 10.0 };
         let realtime = Launch { realtime: true, ..Launch::default() };
+        let mut quantiles = |group: &str, case: &str, late: &dyn Fn(f64) -> f64| {
+            for (name, share) in [("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999), ("max", 1.0)] {
+                run.add(group, case, name, "us", late(share));
+            }
+        };
         match *self {
+            Case::Floor => {
+                let late_ns = rig.floor_ns(seconds)?;
+                let group = "Lateness of a loop that only waits, measured before each program";
+                quantiles(group, "50 k/s", &|share| table::quantile(&late_ns, share) as f64 / 1e3);
+            }
             Case::Steps { rate_khz, steppers, transfers } => {
                 let load = Load::steady(rate_khz * 1_000, steppers, transfers, seconds);
                 let outcome = steps::run(rig, program, &load)?;
                 let case = format!("{rate_khz} k/s, {}", plural(steppers));
                 let beside = if transfers { " beside 4 ms SPI transfers" } else { "" };
                 let group = format!("Lateness of step edges{beside}");
-                for (name, share) in [("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999), ("max", 1.0)] {
-                    run.add(&group, &case, name, "us", outcome.late_us(share));
-                }
+                quantiles(&group, &case, &|share| outcome.late_us(share));
                 if let Some(reason) = &outcome.shutdown {
                     run.note(&group, &case, &format!("stopped after {:.1} s: {reason}", outcome.lasted_s));
                 } else if !transfers {

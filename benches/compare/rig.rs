@@ -58,20 +58,38 @@ pub struct Launch {
 pub struct Rig {
     dir: PathBuf,
     standin: PathBuf,
+    floor: PathBuf,
     syscall: bool,
 }
 
 impl Rig {
-    /// Builds the stand-in, and gives this process a /dev and /sys of its own.
+    /// Builds the C files, and gives this process a /dev and /sys of its own.
     pub fn new(syscall: bool) -> Result<Rig, String> {
         if !geteuid().is_root() {
             return Err("root is needed, for a /dev of our own and for real time: sudo -E cargo bench ...".into());
         }
         let dir = Path::new(env!("CARGO_TARGET_TMPDIR")).join("compare");
         fs::create_dir_all(&dir).map_err(|error| format!("{}: {error}", dir.display()))?;
-        let standin = build(&dir)?;
+        let standin = build(&dir, "standin", &["-shared", "-fPIC"])?;
+        let floor = build(&dir, "floor", &[])?;
         separate(&dir)?;
-        Ok(Rig { dir: dir.join("run"), standin, syscall })
+        Ok(Rig { dir: dir.join("run"), standin, floor, syscall })
+    }
+
+    /// How late, in ns, a loop is here that only waits, for so many seconds.
+    pub fn floor_ns(&self, seconds: f64) -> Result<Vec<i64>, String> {
+        let failed = |why: String| format!("{}: {why}", self.floor.display());
+        let output = Command::new(&self.floor)
+            .arg((seconds as u32).to_string())
+            .output()
+            .map_err(|error| failed(error.to_string()))?;
+        if !output.status.success() {
+            return Err(failed(String::from_utf8_lossy(&output.stderr).into_owned()));
+        }
+        let mut late: Vec<i64> =
+            String::from_utf8_lossy(&output.stdout).lines().filter_map(|line| line.parse().ok()).collect();
+        late.sort_unstable();
+        Ok(late)
     }
 
     /// Starts a program and waits until its terminal is there.
@@ -161,15 +179,18 @@ impl Drop for Running {
     }
 }
 
-fn build(dir: &Path) -> Result<PathBuf, String> {
-    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/compare/standin.c");
-    let library = dir.join("standin.so");
+/// Compiles one of this bench's C files.
+fn build(dir: &Path, name: &str, flags: &[&str]) -> Result<PathBuf, String> {
+    let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/compare").join(name).with_extension("c");
+    let binary = dir.join(name);
     let built = Command::new("cc")
-        .args(["-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC", "-o"])
-        .args([&library, &source])
+        .args(["-O2", "-Wall", "-Wextra", "-Werror"])
+        .args(flags)
+        .arg("-o")
+        .args([&binary, &source])
         .status()
         .map_err(|error| format!("cc: {error}; install a C compiler"))?;
-    if built.success() { Ok(library) } else { Err(format!("{} does not compile", source.display())) }
+    if built.success() { Ok(binary) } else { Err(format!("{} does not compile", source.display())) }
 }
 
 /// Enters a mount namespace whose /dev and /sys hold what the programs look for.
