@@ -100,8 +100,8 @@ const CONFIG_PWM_OUT: Command = command!(
     "config_pwm_out oid=%c pin=%u cycle_ticks=%u value=%hu default_value=%hu max_duration=%u",
     |mcu, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
         mcu.vacant(oid)?;
-        let attachment = mcu.board.pwm(PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value })?;
-        let device = mcu.attach(attachment)?;
+        let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
+        let device = mcu.pwm(oid, config)?;
         mcu.assign(oid, PwmOut { device, default_value, max_duration, queue: MoveQueue::default(), end: None })
     }
 );
@@ -114,7 +114,5 @@ const QUEUE_PWM_OUT: Command =
 
 const SET_PWM_OUT: Command =
     command!("set_pwm_out pin=%u cycle_ticks=%u value=%hu", |mcu, pin: Pin, cycle_ticks: Ticks, value: u16| {
-        // No object owns it: the channel keeps its value as long as the machine has it.
-        let attachment = mcu.board.pwm(PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value })?;
-        mcu.attach(attachment).map(drop)
+        mcu.set_pwm(PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value })
     });

@@ -9,7 +9,7 @@
 use std::any::Any;
 use std::sync::Arc;
 
-use crate::board::{Attachment, Board, Buffer, Device, Output, Pin};
+use crate::board::{Attachment, Board, Buffer, Device, Output, Pin, PwmConfig};
 use crate::lateness::Lateness;
 use crate::shutdown::{Reason, Shutdown};
 use crate::time::{Clock, Ticks, TimeSource};
@@ -41,6 +41,12 @@ const fn response_index(format: &str) -> usize {
 /// An object's id.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Oid(pub u8);
+
+impl Oid {
+    /// What `set_digital_out` and `set_pwm_out` set belongs to no object. `allocate_oids` counts
+    /// to 255 at most, so none can have this.
+    const NOBODY: Oid = Oid(u8::MAX);
+}
 
 impl Arg<'_> for Oid {
     const CONVERSIONS: &'static [&'static str] = &["%c"];
@@ -271,8 +277,10 @@ pub struct Mcu {
     last_read: Clock,
     devices: Vec<Place>,
     completions: Vec<Completion>,
-    /// Lines set once by `set_digital_out`, which no object owns.
-    set_lines: Vec<(Pin, Line)>,
+    /// Lines set by `set_digital_out`, which no object owns, and their shutdown values.
+    set_lines: Vec<(Pin, bool, Line)>,
+    /// Hardware PWM channels in use, and whose they are.
+    channels: Vec<(Pin, Oid, DeviceId)>,
     config_crc: u32,
     halted: Option<Reason>,
     halting: bool,
@@ -307,6 +315,7 @@ impl Mcu {
             devices: Vec::new(),
             completions: Vec::new(),
             set_lines: Vec::new(),
+            channels: Vec::new(),
             config_crc: 0,
             halted: None,
             halting: false,
@@ -472,8 +481,9 @@ impl Mcu {
         }
     }
 
-    /// Says whether a new object may be put under `oid`: to be asked before an output is driven,
-    /// which nothing would drive back at the shutdown without its object.
+    /// Says whether a new object may be put under `oid`: to be asked before a pin is claimed. To
+    /// claim one opens files, for which the steps of a configured machine would wait, and nothing
+    /// would drive back at the shutdown an output that has no object.
     pub fn vacant(&self, oid: Oid) -> Result<(), Shutdown> {
         let taken = |why: &str| Err(Shutdown::by_host(Reason::CannotAssignOid, format_args!("oid {} is {why}", oid.0)));
         match self.objects.get(usize::from(oid.0)) {
@@ -493,11 +503,12 @@ impl Mcu {
 
     // ---- lines and devices
 
-    /// Claims an output line. A line that `set_digital_out` holds is taken over.
+    /// Claims an output line. One that `set_digital_out` holds is taken over, if it belongs where
+    /// it was set to.
     pub fn output(&mut self, pin: Pin, value: bool, shutdown_value: bool) -> Result<Line, Shutdown> {
-        let set = self.set_lines.iter().position(|(held, _)| *held == pin);
+        let set = self.set_lines.iter().position(|(held, belongs, _)| *held == pin && *belongs == shutdown_value);
         if let Some(set) = set {
-            let (_, mut line) = self.set_lines.swap_remove(set);
+            let (_, _, mut line) = self.set_lines.swap_remove(set);
             line.write(value)?;
             return Ok(line);
         }
@@ -506,10 +517,78 @@ impl Mcu {
     }
 
     /// Drives a line that no object owns, and holds it until an object claims it.
+    ///
+    /// The firmware takes this at any time, and so does this machine for a line that it holds.
+    /// To claim one opens files and waits for the guardian: that is refused after
+    /// `finalize_config`, as it would keep steps waiting. klippy sets its lines before.
     pub fn set_line(&mut self, pin: Pin, value: bool) -> Result<(), Shutdown> {
+        if let Some((_, _, line)) = self.set_lines.iter_mut().find(|(held, ..)| *held == pin) {
+            return line.write(value);
+        }
+        if self.is_finalized() {
+            return Err(self.set_too_late(Reason::OutputLine, "set_digital_out", pin));
+        }
         let line = self.output(pin, value, value)?;
-        self.set_lines.push((pin, line));
+        self.set_lines.push((pin, value, line));
         Ok(())
+    }
+
+    /// Claims a hardware PWM channel for an object.
+    pub fn pwm(&mut self, owner: Oid, config: PwmConfig) -> Result<DeviceId, Shutdown> {
+        if let Some((first, _)) = self.channel(config.pin) {
+            return Err(self.channel_taken(config.pin, first, owner));
+        }
+        let attachment = self.board.pwm(config)?;
+        let device = self.attach(attachment)?;
+        self.channels.push((config.pin, owner, device));
+        Ok(device)
+    }
+
+    /// Sets a hardware PWM channel that no object owns: it keeps its value, at a shutdown too.
+    ///
+    /// As with [`Mcu::set_line`] a channel that is held may be set anew at any time, by the
+    /// worker that has its files; others are refused after `finalize_config`.
+    pub fn set_pwm(&mut self, config: PwmConfig) -> Result<(), Shutdown> {
+        match self.channel(config.pin) {
+            Some((Oid::NOBODY, device)) => {
+                let [v0, v1] = config.value.to_le_bytes();
+                let [c0, c1, c2, c3] = config.cycle.0.to_le_bytes();
+                self.submit(device, Ticket { oid: Oid::NOBODY, tag: 0 }, Buffer::new(&[v0, v1, c0, c1, c2, c3]))
+            }
+            None if self.is_finalized() => Err(self.set_too_late(Reason::PwmConfig, "set_pwm_out", config.pin)),
+            _ => self.pwm(Oid::NOBODY, config).map(drop),
+        }
+    }
+
+    /// Whose a channel is, if it is in use.
+    fn channel(&self, pin: Pin) -> Option<(Oid, DeviceId)> {
+        self.channels.iter().find(|(held, ..)| *held == pin).map(|(_, owner, device)| (*owner, *device))
+    }
+
+    #[cold]
+    fn channel_taken(&self, pin: Pin, first: Oid, second: Oid) -> Shutdown {
+        let user = |oid: Oid| match oid {
+            Oid::NOBODY => "set_pwm_out".to_owned(),
+            Oid(oid) => format!("PWM output oid {oid}"),
+        };
+        let (name, first, second) = (self.name(pin), user(first), user(second));
+        let detail =
+            format!("{name} is claimed twice: by {first} and by {second}: change one of the two to another pin");
+        Shutdown::because(Reason::PwmConfig, detail)
+    }
+
+    #[cold]
+    fn set_too_late(&self, reason: Reason, command: &str, pin: Pin) -> Shutdown {
+        let name = self.name(pin);
+        Shutdown::by_host(
+            reason,
+            format_args!("{command} wants {name} after finalize_config, and did not set it before"),
+        )
+    }
+
+    /// What the dictionary calls a pin.
+    fn name(&self, pin: Pin) -> String {
+        self.board.pins().iter().find_map(|range| range.name_of(pin.0)).unwrap_or(format!("pin number {}", pin.0))
     }
 
     /// Takes a device in.
@@ -555,9 +634,16 @@ impl Mcu {
     fn run_completions(&mut self) {
         while let Some(Completion { ticket, result }) = self.completions.pop() {
             let slot = self.objects.get_mut(usize::from(ticket.oid.0));
-            let Some(mut object) = slot.and_then(Option::take) else { continue };
-            let done = object.completed(self, ticket, result).map_err(|stop| stop.of(object.kind(), ticket.oid.0));
-            self.put_back(ticket.oid, object);
+            let done = match slot.and_then(Option::take) {
+                Some(mut object) => {
+                    let done = object.completed(self, ticket, result);
+                    let done = done.map_err(|stop| stop.of(object.kind(), ticket.oid.0));
+                    self.put_back(ticket.oid, object);
+                    done
+                }
+                // Nobody's: only its failure tells anything.
+                None => result.map(drop).or_else(|shutdown| self.device_failed(shutdown)),
+            };
             if let Err(shutdown) = done {
                 self.shut_down(shutdown);
             }
@@ -706,7 +792,8 @@ impl Mcu {
 
     // ---- configuration
 
-    fn is_finalized(&self) -> bool {
+    /// Whether the configuration is complete.
+    pub fn is_finalized(&self) -> bool {
         self.moves.count != 0
     }
 
@@ -751,6 +838,7 @@ impl Mcu {
         self.workers.reset();
         self.completions.clear();
         self.set_lines.clear();
+        self.channels.clear();
         self.board.reset();
         self.moves = MovePool::default();
         self.config_crc = 0;
