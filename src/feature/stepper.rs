@@ -219,6 +219,7 @@ impl Object for Stepper {
 const CONFIG_STEPPER: Command = command!(
     "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u",
     |mcu, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
+        mcu.vacant(oid)?;
         let idle = invert_step > 0;
         let step = mcu.output(step_pin, idle, idle)?;
         let dir = mcu.output(dir_pin, false, false)?;
