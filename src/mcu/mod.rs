@@ -178,6 +178,10 @@ pub trait Workers: Send {
     /// Hands a job over, without waiting.
     fn submit(&mut self, job: Job) -> Result<(), Shutdown>;
 
+    /// Whether every bus has room for the jobs of one more message block, each of which is a
+    /// byte of it at least.
+    fn has_room(&self) -> bool;
+
     /// The next answer, in order among the jobs of one bus.
     fn completion(&mut self) -> Option<Completion>;
 
@@ -614,6 +618,14 @@ impl Mcu {
             }
             None => Ok(()),
         }
+    }
+
+    /// Whether the host's next block may be run. Where a bus falls behind it waits, and holds the
+    /// host back as a machine would that runs its transfers itself. The blocks of a stopped
+    /// machine ask no bus for anything.
+    #[inline]
+    pub fn has_room(&self) -> bool {
+        self.halted.is_some() || self.workers.has_room()
     }
 
     /// Whether [`Mcu::run_workers`] has something to do.

@@ -376,6 +376,10 @@ impl Workers for FakeWorkers {
         Ok(())
     }
 
+    fn has_room(&self) -> bool {
+        true
+    }
+
     fn completion(&mut self) -> Option<Completion> {
         if !self.has_completion() {
             return None;
