@@ -31,8 +31,6 @@ struct PwmOut {
     end: Option<Clock>,
 }
 
-const MAX_DURATION: Reason = Reason::PwmMaxDuration;
-
 impl PwmOut {
     fn timer(oid: Oid) -> TimerId {
         TimerId::new(oid, 0)
@@ -42,6 +40,15 @@ impl PwmOut {
         mcu.submit(self.device, Ticket { oid, tag: 0 }, Buffer::new(&value.to_le_bytes()))
     }
 
+    #[cold]
+    fn exceeds(&self) -> Shutdown {
+        let ms = self.max_duration.0 / Ticks::from_us(1000).0;
+        Shutdown::by_host(
+            Reason::PwmMaxDuration,
+            format_args!("its next change is scheduled later than its max_duration of {ms} ms"),
+        )
+    }
+
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
         let first = self.queue.is_empty();
         self.queue.push(&mut mcu.moves, Move { at, value })?;
@@ -49,7 +56,7 @@ impl PwmOut {
             return Ok(());
         }
         if self.end.take().is_some_and(|end| end < at) {
-            return Err(MAX_DURATION.into());
+            return Err(self.exceeds());
         }
         mcu.cancel(Self::timer(oid));
         mcu.schedule(Self::timer(oid), at)
@@ -67,7 +74,7 @@ impl Object for PwmOut {
             return Err(Shutdown::because(
                 Reason::MissedPwm,
                 format!(
-                    "a PWM output was not refreshed within its max_duration of {} ms: the host is overloaded or hangs",
+                    "it was not refreshed within its max_duration of {} ms: the host is overloaded or hangs",
                     self.max_duration.0 / Ticks::from_us(1000).0
                 ),
             ));
@@ -80,7 +87,7 @@ impl Object for PwmOut {
             return Ok(end.map_or(Next::Done, Next::At));
         };
         if end.is_some_and(|end| end < next) {
-            return Err(MAX_DURATION.into());
+            return Err(self.exceeds());
         }
         Ok(Next::At(next))
     }
