@@ -46,8 +46,6 @@ reasons! {
     InvalidOid = "Invalid oid type";
     /// `finalize_config` twice.
     AlreadyFinalized = "Already finalized";
-    /// A queue was asked for after `finalize_config`.
-    InvalidMoveRequest = "Invalid move request size";
     /// The host queued more moves than `move_count`.
     MoveQueueOverflow = "Move queue overflow";
     /// `update_digital_out` while changes are queued.
@@ -122,18 +120,6 @@ reasons! {
     GuardianLost = "Guardian process lost";
 }
 
-impl Reason {
-    /// What it means and what to do, for a stop that says no more about itself.
-    const fn hint(self) -> &'static str {
-        match self {
-            Reason::PwmMaxDuration => {
-                "the host wants it on for longer than its max_duration (in klippy: maximum_mcu_duration): send changes more often"
-            }
-            _ => "FIRMWARE_RESTART starts anew",
-        }
-    }
-}
-
 /// A stop of the machine: the reason, and for the log what it was about and what to do.
 ///
 /// The detail is made as the machine stops, when lateness no longer counts.
@@ -142,13 +128,13 @@ pub struct Shutdown {
     /// What goes over the wire.
     pub reason: Reason,
     /// Cause, subject and remedy, for the log.
-    pub detail: Option<Box<str>>,
+    pub detail: Box<str>,
 }
 
 impl Shutdown {
     /// A stop whose log line names the thing and the remedy.
     pub fn because(reason: Reason, detail: impl Into<Box<str>>) -> Shutdown {
-        Shutdown { reason, detail: Some(detail.into()) }
+        Shutdown { reason, detail: detail.into() }
     }
 
     /// A stop for a command that can not be right where it came.
@@ -160,24 +146,12 @@ impl Shutdown {
     /// Says which object it was about.
     #[cold]
     pub fn of(self, kind: &str, oid: u8) -> Shutdown {
-        let Shutdown { reason, detail } = self;
-        let detail = detail.as_deref().unwrap_or_else(|| reason.hint());
-        Shutdown::because(reason, format!("{kind} oid {oid}: {detail}"))
-    }
-}
-
-impl From<Reason> for Shutdown {
-    fn from(reason: Reason) -> Shutdown {
-        Shutdown { reason, detail: None }
+        Shutdown::because(self.reason, format!("{kind} oid {oid}: {}", self.detail))
     }
 }
 
 impl fmt::Display for Shutdown {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.reason.text())?;
-        match &self.detail {
-            Some(detail) => write!(f, ": {detail}"),
-            None => write!(f, ": {}", self.reason.hint()),
-        }
+        write!(f, "{}: {}", self.reason.text(), self.detail)
     }
 }

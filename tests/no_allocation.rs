@@ -97,6 +97,8 @@ const OBJECTS: &[&str] = &[
     "config_spi oid=7 pin=8 cs_active_high=0",
     "spi_set_bus oid=7 spi_bus=0 mode=0 rate=1000000",
     "config_pwm_out oid=8 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0",
+    "set_pwm_out pin=501 cycle_ticks=50000 value=0",
+    "set_digital_out pin=9 value=0",
 ];
 
 /// Homes, heats, prints for half a minute and homes again.
@@ -121,6 +123,8 @@ fn print(rig: Rig) -> Print {
             print.send(&format!("queue_digital_out oid=5 clock=@{at} on_ticks={}", 100 * n));
             print.send(&format!("queue_pwm_out oid=8 clock=@{at} value={n}"));
             print.send("spi_transfer oid=7 data=0102030405");
+            print.send(&format!("set_pwm_out pin=501 cycle_ticks=50000 value={n}"));
+            print.send(&format!("set_digital_out pin=9 value={}", n / 50 % 2));
             for command in ["get_clock", "get_uptime", "get_config", "debug_ping data=01", "stepper_get_position oid=0"]
             {
                 print.send(command);

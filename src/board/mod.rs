@@ -62,6 +62,19 @@ pub struct Range {
     pub count: u32,
 }
 
+impl Range {
+    /// The name that stands for `value`, if it is one of these.
+    pub fn name_of(&self, value: u32) -> Option<String> {
+        let at = value.checked_sub(self.first).filter(|at| *at < self.count)?;
+        if at == 0 {
+            return Some(self.name.clone());
+        }
+        let root = self.name.trim_end_matches(|c: char| c.is_ascii_digit());
+        let start: u64 = self.name[root.len()..].parse().unwrap_or(0);
+        Some(format!("{root}{}", start + u64::from(at)))
+    }
+}
+
 /// An input's resistor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bias {
@@ -185,8 +198,8 @@ pub trait Board: Send {
     /// Opens an SPI device.
     fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown>;
 
-    /// Claims a hardware PWM channel. The device takes a value in two bytes, low byte first,
-    /// of a full scale of 32768.
+    /// Claims a hardware PWM channel that is not in use. The device takes a value in two bytes,
+    /// low byte first, of a full scale of 32768; four more are a new period in ticks.
     fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown>;
 
     /// How late a step may be before the machine stops: a motor that is stepped late loses its

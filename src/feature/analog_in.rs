@@ -162,6 +162,7 @@ impl Object for AnalogIn {
 }
 
 const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mcu, oid: Oid, pin: Pin| {
+    mcu.vacant(oid)?;
     let attachment = mcu.board.adc(pin)?;
     let device = mcu.attach(attachment)?;
     let input = AnalogIn {

@@ -70,6 +70,7 @@ impl Object for Endstop {
 
 const CONFIG_ENDSTOP: Command =
     command!("config_endstop oid=%c pin=%c pull_up=%c", |mcu, oid: Oid, pin: Pin, pull_up: i8| {
+        mcu.vacant(oid)?;
         let bias = match pull_up {
             1.. => Bias::PullUp,
             0 => Bias::None,

@@ -31,8 +31,6 @@ struct PwmOut {
     end: Option<Clock>,
 }
 
-const MAX_DURATION: Reason = Reason::PwmMaxDuration;
-
 impl PwmOut {
     fn timer(oid: Oid) -> TimerId {
         TimerId::new(oid, 0)
@@ -42,6 +40,15 @@ impl PwmOut {
         mcu.submit(self.device, Ticket { oid, tag: 0 }, Buffer::new(&value.to_le_bytes()))
     }
 
+    #[cold]
+    fn exceeds(&self) -> Shutdown {
+        let ms = self.max_duration.0 / Ticks::from_us(1000).0;
+        Shutdown::by_host(
+            Reason::PwmMaxDuration,
+            format_args!("its next change is scheduled later than its max_duration of {ms} ms"),
+        )
+    }
+
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
         let first = self.queue.is_empty();
         self.queue.push(&mut mcu.moves, Move { at, value })?;
@@ -49,7 +56,7 @@ impl PwmOut {
             return Ok(());
         }
         if self.end.take().is_some_and(|end| end < at) {
-            return Err(MAX_DURATION.into());
+            return Err(self.exceeds());
         }
         mcu.cancel(Self::timer(oid));
         mcu.schedule(Self::timer(oid), at)
@@ -67,7 +74,7 @@ impl Object for PwmOut {
             return Err(Shutdown::because(
                 Reason::MissedPwm,
                 format!(
-                    "a PWM output was not refreshed within its max_duration of {} ms: the host is overloaded or hangs",
+                    "it was not refreshed within its max_duration of {} ms: the host is overloaded or hangs",
                     self.max_duration.0 / Ticks::from_us(1000).0
                 ),
             ));
@@ -80,7 +87,7 @@ impl Object for PwmOut {
             return Ok(end.map_or(Next::Done, Next::At));
         };
         if end.is_some_and(|end| end < next) {
-            return Err(MAX_DURATION.into());
+            return Err(self.exceeds());
         }
         Ok(Next::At(next))
     }
@@ -100,8 +107,8 @@ const CONFIG_PWM_OUT: Command = command!(
     "config_pwm_out oid=%c pin=%u cycle_ticks=%u value=%hu default_value=%hu max_duration=%u",
     |mcu, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
         mcu.vacant(oid)?;
-        let attachment = mcu.board.pwm(PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value })?;
-        let device = mcu.attach(attachment)?;
+        let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
+        let device = mcu.pwm(oid, config)?;
         mcu.assign(oid, PwmOut { device, default_value, max_duration, queue: MoveQueue::default(), end: None })
     }
 );
@@ -114,7 +121,5 @@ const QUEUE_PWM_OUT: Command =
 
 const SET_PWM_OUT: Command =
     command!("set_pwm_out pin=%u cycle_ticks=%u value=%hu", |mcu, pin: Pin, cycle_ticks: Ticks, value: u16| {
-        // No object owns it: the channel keeps its value as long as the machine has it.
-        let attachment = mcu.board.pwm(PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value })?;
-        mcu.attach(attachment).map(drop)
+        mcu.set_pwm(PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value })
     });

@@ -45,6 +45,10 @@ impl Spi {
         if matches!(self, Spi::Attached(_)) {
             return Err(invalid("it has a bus already"));
         }
+        // The firmware would open it even then; here steps would wait for the files.
+        if mcu.is_finalized() {
+            return Err(invalid("it gets a bus after finalize_config"));
+        }
         let chip_select = match std::mem::replace(self, Spi::Plain) {
             Spi::Selected { line, active_high } => Some(ChipSelect { line: line.into_output(), active_high }),
             _ => None,
@@ -112,6 +116,7 @@ impl Object for SpiShutdown {
 
 const CONFIG_SPI: Command =
     command!("config_spi oid=%c pin=%u cs_active_high=%c", |mcu, oid: Oid, pin: Pin, cs_active_high: bool| {
+        mcu.vacant(oid)?;
         let line = mcu.output(pin, !cs_active_high, !cs_active_high)?;
         mcu.assign(oid, Spi::Selected { line, active_high: cs_active_high })
     });

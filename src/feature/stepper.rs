@@ -99,7 +99,7 @@ impl Stepper {
             }
             return Ok(Next::At(self.next_step));
         };
-        self.next_step = self.next_step.displaced(interval);
+        self.advance(interval, earliest);
         let early = earliest.since(self.next_step);
         if early > i64::from(self.late_limit.0) {
             return Err(Shutdown::because(
@@ -120,6 +120,13 @@ impl Stepper {
             return self.reverse(mcu);
         }
         Ok(Next::At(self.next_step.max(earliest)))
+    }
+
+    /// Moves on to the step after the present one, `interval` later by a clock of 32 bits: what
+    /// is 2^31 ticks or more after `earliest` has passed, as for the firmware's comparisons.
+    #[inline]
+    fn advance(&mut self, interval: u32, earliest: Clock) {
+        self.next_step = Clock::widen(self.next_step.wire().wrapping_add(interval), earliest);
     }
 
     /// Changes the direction and leaves it its set-up time.
@@ -192,7 +199,7 @@ impl Object for Stepper {
         }
         if edges > 0 {
             self.edges = edges;
-            self.next_step = self.next_step.displaced(self.interval);
+            self.advance(self.interval, earliest);
             self.interval = self.interval.wrapping_add_signed(i32::from(self.add));
             return Ok(Next::At(self.next_step.max(earliest)));
         }
@@ -212,6 +219,7 @@ impl Object for Stepper {
 const CONFIG_STEPPER: Command = command!(
     "config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u",
     |mcu, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
+        mcu.vacant(oid)?;
         let idle = invert_step > 0;
         let step = mcu.output(step_pin, idle, idle)?;
         let dir = mcu.output(dir_pin, false, false)?;

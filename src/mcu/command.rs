@@ -11,8 +11,10 @@ use crate::wire::vlq::{Reader, Writer};
 use super::Mcu;
 
 impl From<Malformed> for Shutdown {
+    /// [`Mcu::execute`] says which command it was.
+    #[cold]
     fn from(_: Malformed) -> Shutdown {
-        Reason::CommandParser.into()
+        Shutdown::because(Reason::CommandParser, "")
     }
 }
 

@@ -6,241 +6,44 @@
 
 #![forbid(unsafe_code)]
 
-use std::any::Any;
 use std::sync::Arc;
 
-use crate::board::{Attachment, Board, Buffer, Device, Output, Pin};
+use crate::board::{Board, Pin};
 use crate::lateness::Lateness;
 use crate::shutdown::{Reason, Shutdown};
 use crate::time::{Clock, Ticks, TimeSource};
-use crate::wire::Malformed;
-use crate::wire::format::{Arg, Field};
 use crate::wire::vlq::{Reader, Writer};
 
 pub mod base;
 mod command;
+mod device;
 mod dialect;
 mod moves;
+mod object;
+mod outbox;
+mod output;
+mod parameters;
 mod stats;
 mod timers;
 
 pub use command::{Command, Constant, Feature, Handler, Response};
 pub(crate) use command::{command, response};
+pub use device::{Completion, DeviceId, Job, Ticket, Workers};
 pub use dialect::Dialect;
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
+pub use object::{Next, Object};
+pub use outbox::{Note, Outbox};
+pub use output::Line;
+pub use parameters::{Oid, WireClock};
 pub use timers::TimerId;
 
+use device::Place;
 use stats::Stats;
 use timers::Timers;
 
 /// The machine's own responses come first in the list of all.
 const fn response_index(format: &str) -> usize {
     base::response_index(format)
-}
-
-/// An object's id.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Oid(pub u8);
-
-impl Arg<'_> for Oid {
-    const CONVERSIONS: &'static [&'static str] = &["%c"];
-    #[inline]
-    fn decode(reader: &mut Reader<'_>) -> Result<Oid, Malformed> {
-        u8::decode(reader).map(Oid)
-    }
-}
-
-impl Field for Oid {
-    const CONVERSIONS: &'static [&'static str] = &["%c"];
-    fn encode(&self, writer: &mut Writer) {
-        self.0.encode(writer);
-    }
-}
-
-impl Arg<'_> for Pin {
-    // A pin under `%c` exceeds 255: the host writes every integer whole.
-    const CONVERSIONS: &'static [&'static str] = &["%u", "%c"];
-    fn decode(reader: &mut Reader<'_>) -> Result<Pin, Malformed> {
-        reader.int().map(Pin)
-    }
-}
-
-impl Arg<'_> for Ticks {
-    const CONVERSIONS: &'static [&'static str] = &["%u"];
-    #[inline]
-    fn decode(reader: &mut Reader<'_>) -> Result<Ticks, Malformed> {
-        reader.int().map(Ticks)
-    }
-}
-
-/// An instant as the host sent it, to be widened by [`Mcu::instant`].
-#[derive(Clone, Copy, Debug)]
-pub struct WireClock(pub u32);
-
-impl Arg<'_> for WireClock {
-    const CONVERSIONS: &'static [&'static str] = &["%u"];
-    fn decode(reader: &mut Reader<'_>) -> Result<WireClock, Malformed> {
-        reader.int().map(WireClock)
-    }
-}
-
-impl Field for Clock {
-    const CONVERSIONS: &'static [&'static str] = &["%u"];
-    fn encode(&self, writer: &mut Writer) {
-        writer.int(self.wire());
-    }
-}
-
-/// What becomes of a timer after its event.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Next {
-    /// It runs again at that instant.
-    At(Clock),
-    /// It is done.
-    Done,
-}
-
-/// An object that the host configured under an oid. Its methods run in the core: once
-/// configured they must not allocate, lock, log or block.
-pub trait Object: Any + Send {
-    /// What it is, for the configuration's summary: `stepper`, `digital output`.
-    fn kind(&self) -> &'static str;
-
-    /// A timer of this object is due since `at`.
-    fn event(&mut self, _mcu: &mut Mcu, _timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
-        Ok(Next::Done)
-    }
-
-    /// A device of this object answered.
-    fn completed(
-        &mut self,
-        _mcu: &mut Mcu,
-        _ticket: Ticket,
-        _result: Result<Buffer, Shutdown>,
-    ) -> Result<(), Shutdown> {
-        Ok(())
-    }
-
-    /// The trsync that this object waits for was triggered.
-    fn triggered(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<(), Shutdown> {
-        Ok(())
-    }
-
-    /// The machine stops: timers are gone, outputs go to their shutdown values.
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<(), Shutdown> {
-        Ok(())
-    }
-}
-
-/// Whom a device's answer is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Ticket {
-    /// The object that asked.
-    pub oid: Oid,
-    /// Whatever tells its requests apart.
-    pub tag: u8,
-}
-
-/// A request to a device on a worker.
-#[derive(Debug)]
-pub struct Job {
-    /// The device, as [`Workers::attach`] numbered it.
-    pub device: usize,
-    /// Whom the answer is for.
-    pub ticket: Ticket,
-    /// What the device takes.
-    pub data: Buffer,
-    /// Whether a machine that stops asks: that must find room where requests have filled the
-    /// queue, as it may switch a heater off.
-    pub stopping: bool,
-}
-
-/// A device's answer.
-#[derive(Debug)]
-pub struct Completion {
-    /// Whom it is for.
-    pub ticket: Ticket,
-    /// What the device left, or why it could not.
-    pub result: Result<Buffer, Shutdown>,
-}
-
-/// Runs the conversations of devices that take their time.
-pub trait Workers: Send {
-    /// Gives a device to the worker of its bus; returns the device's number.
-    fn attach(&mut self, bus: &str, device: Box<dyn Device>) -> Result<usize, Shutdown>;
-
-    /// Hands a job over, without waiting.
-    fn submit(&mut self, job: Job) -> Result<(), Shutdown>;
-
-    /// The next answer, in order among the jobs of one bus.
-    fn completion(&mut self) -> Option<Completion>;
-
-    /// Whether there is one.
-    fn has_completion(&self) -> bool;
-
-    /// Ends every device. No answer to an earlier job comes after this.
-    fn reset(&mut self);
-}
-
-/// Where the machine leaves what it has to say.
-pub trait Outbox: Send {
-    /// A response to the host: the payload of one message block. It is dropped if the host
-    /// does not read.
-    fn send(&mut self, payload: &[u8]);
-
-    /// Something for the log.
-    fn note(&mut self, note: Note<'_>);
-}
-
-/// Something for the log.
-#[derive(Debug)]
-pub enum Note<'a> {
-    /// The machine stopped.
-    Shutdown(&'a Shutdown),
-    /// Something else failed while it stopped.
-    Trouble(&'a Shutdown),
-    /// The host configured this many objects of each kind.
-    Configured(&'a [(&'static str, usize)]),
-    /// How late timers were since the machine was made, and how early the core now wakes for
-    /// them.
-    Lateness(&'a Lateness, Ticks),
-    /// The machine was rebuilt and waits for a configuration.
-    Reset,
-}
-
-/// A device of an object, as [`Mcu::attach`] numbered it.
-#[derive(Clone, Copy, Debug)]
-pub struct DeviceId(usize);
-
-enum Place {
-    Inline(Box<dyn Device>),
-    Worker(usize),
-}
-
-/// An output line and its present level.
-pub struct Line {
-    output: Box<dyn Output>,
-    level: bool,
-}
-
-impl Line {
-    /// Drives the line.
-    #[inline]
-    pub fn write(&mut self, level: bool) -> Result<(), Shutdown> {
-        self.level = level;
-        self.output.write(level)
-    }
-
-    /// Inverts the line.
-    #[inline]
-    pub fn toggle(&mut self) -> Result<(), Shutdown> {
-        self.write(!self.level)
-    }
-
-    /// Gives the line away.
-    pub fn into_output(self) -> Box<dyn Output> {
-        self.output
-    }
 }
 
 /// How far a timer may fall behind before the machine stops: 100 ms, as in the firmware.
@@ -271,8 +74,10 @@ pub struct Mcu {
     last_read: Clock,
     devices: Vec<Place>,
     completions: Vec<Completion>,
-    /// Lines set once by `set_digital_out`, which no object owns.
-    set_lines: Vec<(Pin, Line)>,
+    /// Lines set by `set_digital_out`, which no object owns, and their shutdown values.
+    set_lines: Vec<(Pin, bool, Line)>,
+    /// Hardware PWM channels in use, and whose they are.
+    channels: Vec<(Pin, Oid, DeviceId)>,
     config_crc: u32,
     halted: Option<Reason>,
     halting: bool,
@@ -307,6 +112,7 @@ impl Mcu {
             devices: Vec::new(),
             completions: Vec::new(),
             set_lines: Vec::new(),
+            channels: Vec::new(),
             config_crc: 0,
             halted: None,
             halting: false,
@@ -422,146 +228,6 @@ impl Mcu {
             Err(shutdown) => self.shut_down(shutdown),
         }
         self.run_completions();
-    }
-
-    // ---- objects
-
-    #[inline]
-    fn put_back(&mut self, oid: Oid, object: Box<dyn Object>) {
-        if let Some(slot) = self.objects.get_mut(usize::from(oid.0)) {
-            *slot = Some(object);
-        }
-    }
-
-    /// Lends an object of type `T` to `f`, or says that the oid is out of range or of another
-    /// kind.
-    #[inline]
-    pub fn with<T: Object, R>(
-        &mut self,
-        oid: Oid,
-        f: impl FnOnce(&mut T, &mut Mcu) -> Result<R, Shutdown>,
-    ) -> Result<R, Shutdown> {
-        let slot = self.objects.get_mut(usize::from(oid.0));
-        let Some(mut object) = slot.and_then(Option::take) else { return Err(not_configured(oid)) };
-        let any: &mut dyn Any = &mut *object;
-        let result = match any.downcast_mut::<T>() {
-            Some(inner) => f(inner, self).map_err(|stop| stop.of(object.kind(), oid.0)),
-            None => Err(not_configured(oid)),
-        };
-        self.put_back(oid, object);
-        result
-    }
-
-    /// The objects of type `T` for which `f` holds.
-    pub fn any<T: Object>(&self, mut f: impl FnMut(&T) -> bool) -> bool {
-        self.objects.iter().flatten().any(|object| {
-            let any: &dyn Any = &**object;
-            any.downcast_ref::<T>().is_some_and(&mut f)
-        })
-    }
-
-    /// Passes a trsync's trigger on to an object.
-    pub fn trigger(&mut self, oid: Oid) -> Result<(), Shutdown> {
-        match self.objects.get_mut(usize::from(oid.0)).and_then(Option::take) {
-            Some(mut object) => {
-                let result = object.triggered(self, oid);
-                self.put_back(oid, object);
-                result
-            }
-            None => Ok(()),
-        }
-    }
-
-    /// Says whether a new object may be put under `oid`: to be asked before an output is driven,
-    /// which nothing would drive back at the shutdown without its object.
-    pub fn vacant(&self, oid: Oid) -> Result<(), Shutdown> {
-        let taken = |why: &str| Err(Shutdown::by_host(Reason::CannotAssignOid, format_args!("oid {} is {why}", oid.0)));
-        match self.objects.get(usize::from(oid.0)) {
-            _ if self.is_finalized() => taken("assigned after finalize_config"),
-            Some(None) => Ok(()),
-            Some(Some(_)) => taken("assigned twice"),
-            None => taken("not below the count of allocate_oids"),
-        }
-    }
-
-    /// Puts a new object under `oid`.
-    pub fn assign(&mut self, oid: Oid, object: impl Object) -> Result<(), Shutdown> {
-        self.vacant(oid)?;
-        self.put_back(oid, Box::new(object));
-        Ok(())
-    }
-
-    // ---- lines and devices
-
-    /// Claims an output line. A line that `set_digital_out` holds is taken over.
-    pub fn output(&mut self, pin: Pin, value: bool, shutdown_value: bool) -> Result<Line, Shutdown> {
-        let set = self.set_lines.iter().position(|(held, _)| *held == pin);
-        if let Some(set) = set {
-            let (_, mut line) = self.set_lines.swap_remove(set);
-            line.write(value)?;
-            return Ok(line);
-        }
-        let output = self.board.output(pin, value, shutdown_value)?;
-        Ok(Line { output, level: value })
-    }
-
-    /// Drives a line that no object owns, and holds it until an object claims it.
-    pub fn set_line(&mut self, pin: Pin, value: bool) -> Result<(), Shutdown> {
-        let line = self.output(pin, value, value)?;
-        self.set_lines.push((pin, line));
-        Ok(())
-    }
-
-    /// Takes a device in.
-    pub fn attach(&mut self, attachment: Attachment) -> Result<DeviceId, Shutdown> {
-        self.devices.push(match attachment {
-            Attachment::Inline(device) => Place::Inline(device),
-            Attachment::Worker { bus, device } => Place::Worker(self.workers.attach(&bus, device)?),
-        });
-        Ok(DeviceId(self.devices.len() - 1))
-    }
-
-    /// Asks a device; the answer comes to [`Object::completed`].
-    pub fn submit(&mut self, device: DeviceId, ticket: Ticket, mut data: Buffer) -> Result<(), Shutdown> {
-        match self.devices.get_mut(device.0) {
-            Some(Place::Inline(device)) => {
-                let result = device.run(&mut data).map(|()| data);
-                self.completions.push(Completion { ticket, result });
-                Ok(())
-            }
-            Some(Place::Worker(device)) => {
-                let device = *device;
-                self.workers.submit(Job { device, ticket, data, stopping: self.halting })
-            }
-            None => Ok(()),
-        }
-    }
-
-    /// Whether [`Mcu::run_workers`] has something to do.
-    pub fn has_completion(&self) -> bool {
-        self.workers.has_completion()
-    }
-
-    /// Takes in the answers of devices on workers.
-    #[inline]
-    pub fn run_workers(&mut self) {
-        while let Some(completion) = self.workers.completion() {
-            self.completions.push(completion);
-            self.run_completions();
-        }
-    }
-
-    #[inline]
-    fn run_completions(&mut self) {
-        while let Some(Completion { ticket, result }) = self.completions.pop() {
-            let slot = self.objects.get_mut(usize::from(ticket.oid.0));
-            let Some(mut object) = slot.and_then(Option::take) else { continue };
-            let done = object.completed(self, ticket, result).map_err(|stop| stop.of(object.kind(), ticket.oid.0));
-            self.put_back(ticket.oid, object);
-            if let Err(shutdown) = done {
-                self.shut_down(shutdown);
-            }
-        }
     }
 
     // ---- commands and responses
@@ -706,7 +372,8 @@ impl Mcu {
 
     // ---- configuration
 
-    fn is_finalized(&self) -> bool {
+    /// Whether the configuration is complete.
+    pub fn is_finalized(&self) -> bool {
         self.moves.count != 0
     }
 
@@ -751,21 +418,11 @@ impl Mcu {
         self.workers.reset();
         self.completions.clear();
         self.set_lines.clear();
+        self.channels.clear();
         self.board.reset();
         self.moves = MovePool::default();
         self.config_crc = 0;
         self.outbox.note(Note::Reset);
         Ok(())
     }
-}
-
-#[cold]
-fn not_configured(oid: Oid) -> Shutdown {
-    Shutdown::because(
-        Reason::InvalidOid,
-        format!(
-            "oid {} is not configured, or as something else: the host's configuration is not this machine's; FIRMWARE_RESTART",
-            oid.0
-        ),
-    )
 }

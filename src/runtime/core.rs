@@ -153,7 +153,7 @@ impl Core {
                 continue;
             }
             self.mcu.account(Ticks(now.since(busy_since) as u32));
-            let (requests, mcu, pending) = (&self.requests, &self.mcu, self.block.is_some());
+            let (requests, mcu, pending) = (&mut self.requests, &self.mcu, self.block.is_some());
             let to_go = deadline.map_or(4 * FAR, |deadline| deadline.since(now));
             if to_go > FAR {
                 // Half the way leaves room for a late wake-up.
@@ -163,7 +163,7 @@ impl Core {
             }
             let woken = self.waiter.wait(deadline, || {
                 // Within reach of a timer a call has to wait its turn.
-                !near && (pending || !requests.is_empty() || mcu.has_completion())
+                !near && (pending || may_begin(requests, mcu) || mcu.has_completion())
             });
             busy_since = self.clock.now();
             if woken == Woken::Due {
@@ -175,7 +175,7 @@ impl Core {
     /// Sleeps for a span in which no timer is due, or until it is called, so that the heartbeat
     /// goes on. Unlike the wait for a timer it ends without spinning.
     fn nap(&mut self, longest: Duration) {
-        if self.block.is_none() && self.requests.is_empty() && !self.mcu.has_completion() {
+        if self.block.is_none() && !may_begin(&mut self.requests, &self.mcu) && !self.mcu.has_completion() {
             self.waiter.nap(longest);
         }
     }
@@ -192,6 +192,7 @@ impl Core {
         self.gave_way = 0;
         let (payload, mut at) = match self.block.take() {
             Some(block) => block,
+            None if !may_begin(&mut self.requests, &self.mcu) => return Turn::Idle,
             None => match self.requests.pop() {
                 Ok(Request::Run(payload)) => {
                     self.progress.begin();
@@ -237,5 +238,232 @@ impl Core {
             }
         }
         Turn::Done
+    }
+}
+
+/// Whether what comes next may be taken in: a block waits, unacknowledged, while a bus has no room
+/// for what it may ask. Not so where a request to stop waits behind it.
+fn may_begin(requests: &mut Consumer<Request>, mcu: &Mcu) -> bool {
+    !requests.is_empty() && (mcu.has_room() || is_asked_to_stop(requests))
+}
+
+#[cold]
+fn is_asked_to_stop(requests: &mut Consumer<Request>) -> bool {
+    let stops = |request: &Request| matches!(request, Request::Shutdown(_) | Request::Quit);
+    requests.read_chunk(requests.slots()).is_ok_and(|waiting| {
+        let (first, second) = waiting.as_slices();
+        first.iter().chain(second).any(stops)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Mutex;
+    use std::sync::atomic::{AtomicUsize, Ordering};
+    use std::sync::mpsc::{self, Receiver, Sender};
+    use std::thread::JoinHandle;
+    use std::time::Instant;
+
+    use rtrb::{Producer, RingBuffer};
+
+    use crate::board::{Attachment, Bias, Board, Buffer, Device, Input, Output, Pin, PwmConfig, Range, SpiConfig};
+    use crate::feature::FEATURES;
+    use crate::mcu::{Dialect, Note, Outbox};
+    use crate::runtime::realtime::Scheduling;
+    use crate::runtime::wakeup::MarginLimits;
+    use crate::runtime::watchdog::JobClocks;
+    use crate::runtime::workers::Threads;
+    use crate::time::Monotonic;
+    use crate::wire::vlq::Writer;
+
+    /// Blocks with one transfer each: more than wait for a bus.
+    const BLOCKS: u32 = 400;
+    const CONFIGURATION: u32 = 4;
+
+    /// A board with an SPI bus and nothing else.
+    struct SpiBoard(Option<Gate>);
+
+    /// A device that waits to be let go on.
+    struct Gate(Receiver<()>);
+
+    impl Device for Gate {
+        fn run(&mut self, _data: &mut Buffer) -> Result<(), Shutdown> {
+            let _ = self.0.recv();
+            Ok(())
+        }
+    }
+
+    fn nothing<T>() -> Result<T, Shutdown> {
+        Err(Shutdown::because(Reason::NotOutput, "the board has an SPI bus only"))
+    }
+
+    impl Board for SpiBoard {
+        fn describe(&self) -> String {
+            String::new()
+        }
+        fn pins(&self) -> Vec<Range> {
+            Vec::new()
+        }
+        fn spi_buses(&self) -> Vec<Range> {
+            Vec::new()
+        }
+        fn output(&mut self, _pin: Pin, _value: bool, _shutdown_value: bool) -> Result<Box<dyn Output>, Shutdown> {
+            nothing()
+        }
+        fn input(&mut self, _pin: Pin, _bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
+            nothing()
+        }
+        fn adc(&mut self, _pin: Pin) -> Result<Attachment, Shutdown> {
+            nothing()
+        }
+        fn spi(&mut self, _config: SpiConfig) -> Result<Attachment, Shutdown> {
+            let gate = self.0.take().unwrap();
+            Ok(Attachment::Worker { bus: "spi0".into(), device: Box::new(gate) })
+        }
+        fn pwm(&mut self, _config: PwmConfig) -> Result<Attachment, Shutdown> {
+            nothing()
+        }
+        fn reset(&mut self) {}
+    }
+
+    #[derive(Clone, Default)]
+    struct Heard(Arc<Mutex<Vec<Vec<u8>>>>);
+
+    impl Outbox for Heard {
+        fn send(&mut self, payload: &[u8]) {
+            self.0.lock().unwrap().push(payload.to_vec());
+        }
+        fn note(&mut self, _note: Note<'_>) {}
+    }
+
+    /// A clock that counts how often it is read, which the core does in each turn.
+    struct Counting(Monotonic, AtomicUsize);
+
+    impl TimeSource for Counting {
+        fn now(&self) -> Clock {
+            self.1.fetch_add(1, Ordering::Relaxed);
+            self.0.now()
+        }
+    }
+
+    /// A core at work, and what stands for its link.
+    struct Bench {
+        thread: JoinHandle<()>,
+        dialect: Arc<Dialect>,
+        clock: Arc<Counting>,
+        requests: Producer<Request>,
+        progress: Arc<Progress>,
+        heard: Heard,
+        gate: Sender<()>,
+    }
+
+    impl Bench {
+        /// Lets the host ask for more transfers than the bus can queue, while it does none.
+        fn overloaded() -> Bench {
+            let (gate, closed) = mpsc::channel();
+            let board = SpiBoard(Some(Gate(closed)));
+            let dialect = Arc::new(Dialect::new(FEATURES, &board).unwrap());
+            let clock = Arc::new(Counting(Monotonic::start(), AtomicUsize::new(0)));
+            let (requests, inbox) = RingBuffer::new(2 * BLOCKS as usize);
+            let progress = Arc::new(Progress::default());
+            let heard = Heard::default();
+            let (core_dialect, core_progress, core_heard) = (dialect.clone(), progress.clone(), heard.clone());
+            let core_clock: Arc<dyn TimeSource> = clock.clone();
+            let thread = thread::spawn(move || {
+                let workers = Threads::new(thread::current(), Arc::new(|| ()), JobClocks::default());
+                let mcu = Mcu::new(
+                    core_dialect,
+                    Box::new(board),
+                    core_clock.clone(),
+                    Box::new(workers),
+                    Box::new(core_heard),
+                );
+                let waiter = Waiter::new(core_clock.clone(), MarginLimits::default(), Scheduling::Ordinary);
+                let (pulse, wake) = (Pulse::new().unwrap(), Arc::new(LinkWake::new().unwrap()));
+                let (clock, progress) = (core_clock, core_progress);
+                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run();
+            });
+            let mut bench = Bench { thread, dialect, clock, requests, progress, heard, gate };
+            bench.run("allocate_oids count=%c", &[1]);
+            bench.run("config_spi_without_cs oid=%c", &[0]);
+            bench.run("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", &[0, 0, 0, 1]);
+            bench.run("finalize_config crc=%u", &[1]);
+            for n in 0..BLOCKS {
+                // The bytes: how many, and which.
+                bench.run("spi_transfer oid=%c data=%*s", &[0, 1, n % 64]);
+            }
+            bench.wait_until("the bus is full", || bench.progress.done() > CONFIGURATION + 100);
+            bench
+        }
+
+        fn run(&mut self, format: &str, parameters: &[u32]) {
+            let mut writer = Writer::default();
+            writer.int(self.dialect.command_id(format).unwrap());
+            parameters.iter().for_each(|parameter| writer.int(*parameter));
+            self.request(Request::Run(Payload::new(writer.payload().unwrap())));
+        }
+
+        fn request(&mut self, request: Request) {
+            self.requests.push(request).ok().unwrap();
+            self.thread.thread().unpark();
+        }
+
+        /// The parameters of what the core said so far in responses of this format.
+        fn said(&self, format: &str) -> Vec<Vec<u8>> {
+            let id = self.dialect.dictionary().responses[format].as_u64().unwrap();
+            let heard = self.heard.0.lock().unwrap();
+            let parameters = heard.iter().filter_map(|payload| {
+                let mut reader = Reader::new(payload);
+                (u64::from(reader.int().unwrap()) == id).then(|| reader.rest().to_vec())
+            });
+            parameters.collect()
+        }
+
+        fn shutdowns(&self) -> usize {
+            self.said("shutdown clock=%u static_string_id=%hu").len()
+        }
+
+        fn wait_until(&self, what: &str, mut holds: impl FnMut() -> bool) {
+            let end = Instant::now() + Duration::from_secs(10);
+            while !holds() {
+                assert!(Instant::now() < end, "{what}: {} blocks done", self.progress.done());
+                thread::sleep(Duration::from_millis(1));
+            }
+        }
+    }
+
+    #[test]
+    fn a_slow_bus_holds_the_host_back_and_nothing_is_lost() {
+        let mut bench = Bench::overloaded();
+        let turns = bench.clock.1.load(Ordering::Relaxed);
+        thread::sleep(2 * BEAT);
+        let (done, turns) = (bench.progress.done(), bench.clock.1.load(Ordering::Relaxed) - turns);
+        assert!(done < CONFIGURATION + BLOCKS, "{done} blocks were done");
+        assert!(turns < 10_000, "the core sleeps as it waits, and read the clock {turns} times");
+
+        (0..BLOCKS).for_each(|_| bench.gate.send(()).unwrap());
+        bench.wait_until("every block is done", || bench.progress.done() == CONFIGURATION + BLOCKS);
+        let format = "spi_transfer_response oid=%c response=%*s";
+        bench.wait_until("every answer is there", || bench.said(format).len() == BLOCKS as usize);
+        let expected: Vec<Vec<u8>> = (0..BLOCKS).map(|n| vec![0, 1, (n % 64) as u8]).collect();
+        assert_eq!(bench.said(format), expected);
+        assert_eq!(bench.shutdowns(), 0);
+        bench.request(Request::Quit);
+        bench.thread.join().unwrap();
+    }
+
+    #[test]
+    fn a_request_to_stop_does_not_wait_for_a_bus_that_hangs() {
+        for request in [Request::Quit, Request::Shutdown(Shutdown::because(Reason::ForceShutdown, "a test"))] {
+            let mut bench = Bench::overloaded();
+            bench.request(request);
+            bench.wait_until("the machine stops", || bench.shutdowns() > 0);
+            bench.wait_until("the blocks are refused", || bench.progress.done() == CONFIGURATION + BLOCKS);
+            drop(bench.gate);
+            let _ = bench.requests.push(Request::Quit);
+            bench.thread.thread().unpark();
+            bench.thread.join().unwrap();
+        }
     }
 }

@@ -41,6 +41,9 @@ const OUTPUT_BYTES: usize = 16 * 1024;
 const LINGER: Duration = Duration::from_micros(100);
 /// How long to wait for a core that has no room for requests.
 const STALL_MS: u64 = 1;
+/// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
+/// holds the blocks back.
+const REQUESTS_KEPT: usize = 8;
 /// How long a host has to read why the program ends.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -345,7 +348,7 @@ impl Link {
         let mut stalled = false;
         let handed = self.handed;
         loop {
-            if self.requests.is_full() {
+            if self.requests.slots() <= REQUESTS_KEPT {
                 stalled = taken < self.input.len();
                 break;
             }
@@ -360,7 +363,7 @@ impl Link {
                     let idle = self.progress.done() == self.handed;
                     let answer = if idle { self.known.answer(payload, || self.clock.now()) } else { None };
                     let Some(answer) = answer else {
-                        // There was room.
+                        // There is room.
                         let _ = self.requests.push(Request::Run(Payload::new(payload)));
                         self.handed = self.handed.wrapping_add(1);
                         continue;

@@ -13,6 +13,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 use crate::board::Device;
 use crate::mcu::{Completion, Job, Workers};
 use crate::shutdown::{Reason, Shutdown};
+use crate::wire::block::PAYLOAD_MAX;
 
 use super::watchdog::{JobClock, JobClocks};
 
@@ -96,6 +97,10 @@ impl Workers for Threads {
             Some(worker) => self.order(*worker, Order::Run(job)),
             None => Ok(()),
         }
+    }
+
+    fn has_room(&self) -> bool {
+        self.workers.iter().all(|worker| worker.orders.slots() >= QUEUE_SPARE + PAYLOAD_MAX)
     }
 
     fn completion(&mut self) -> Option<Completion> {

@@ -21,6 +21,7 @@ const OBJECTS: &[&str] = &[
     "config_spi oid=6 pin=7 cs_active_high=0",
     "spi_set_bus oid=6 spi_bus=0 mode=0 rate=1000000",
     "config_spi_shutdown oid=7 spi_oid=6 shutdown_msg=01",
+    "set_digital_out pin=0 value=1",
 ];
 
 #[derive(Clone, Debug)]

@@ -380,3 +380,24 @@ fn every_payload_length_fits_what_the_machine_answers() {
         format!("spi_transfer_response oid=19 response={data}")
     );
 }
+
+/// To claim a pin or to open a device takes as long as it takes.
+#[test]
+fn a_configured_machine_claims_and_opens_nothing() {
+    for (command, text) in [
+        ("config_stepper oid=1 step_pin=30 dir_pin=31 invert_step=0 step_pulse_ticks=100", "Can't assign oid"),
+        ("config_endstop oid=1 pin=30 pull_up=0", "Can't assign oid"),
+        ("config_digital_out oid=1 pin=30 value=0 default_value=0 max_duration=0", "Can't assign oid"),
+        ("config_analog_in oid=1 pin=400", "Can't assign oid"),
+        ("config_spi oid=1 pin=30 cs_active_high=0", "Can't assign oid"),
+        ("config_pwm_out oid=1 pin=500 cycle_ticks=1 value=0 default_value=0 max_duration=0", "Can't assign oid"),
+        ("spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000", "Invalid spi config"),
+        ("set_digital_out pin=30 value=1", "Unable to open out GPIO chip line"),
+        ("set_pwm_out pin=500 cycle_ticks=1 value=0", "Unable to config pwm device"),
+    ] {
+        let mut rig = Rig::configured(&["config_spi_without_cs oid=0"]);
+        rig.send(command);
+        assert_eq!(rig.shutdown().as_deref(), Some(text), "{command}");
+        assert!(rig.bench.state().claimed.is_empty(), "{command}");
+    }
+}

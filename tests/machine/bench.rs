@@ -52,6 +52,8 @@ pub struct State {
     transfers: Vec<(u32, u8, u32, Buffer)>,
     /// Every value of a PWM channel: pin, instant, value.
     pub pwm_values: Vec<(u32, u64, u16)>,
+    /// The period of each PWM channel.
+    pub pwm_cycles: HashMap<u32, u32>,
     /// How long writing a line takes.
     pub write_ticks: u32,
     /// How long a device on a worker takes to answer; without, devices answer at once.
@@ -176,6 +178,7 @@ impl Board for FakeBoard {
         vec![
             Range { name: "gpio0".into(), first: 0, count: GPIOS },
             Range { name: "analog0".into(), first: ANALOG, count: ANALOGS },
+            Range { name: "pwm0".into(), first: PWM, count: PWMS },
         ]
     }
 
@@ -214,6 +217,7 @@ impl Board for FakeBoard {
     fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown> {
         let pin = self.0.claim(config.pin, PWM..PWM + PWMS, Reason::PwmConfig, "PWM channel")?;
         let mut pwm = FakePwm { bench: self.0.clone(), pin };
+        self.0.state().pwm_cycles.insert(pin, config.cycle.0);
         pwm.run(&mut Buffer::new(&config.value.to_le_bytes()))?;
         Ok(self.0.attachment("pwm", pwm))
     }
@@ -232,8 +236,11 @@ impl Device for FakePwm {
     fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
         self.bench.broken(self.pin, Reason::PwmWrite)?;
         let at = self.bench.ticks();
-        if let [low, high] = *data.as_slice() {
-            self.bench.state().pwm_values.push((self.pin, at, u16::from_le_bytes([low, high])));
+        let (value, cycle) = data.as_slice().split_at(2);
+        let mut state = self.bench.state();
+        state.pwm_values.push((self.pin, at, u16::from_le_bytes(value.try_into().unwrap())));
+        if !cycle.is_empty() {
+            state.pwm_cycles.insert(self.pin, u32::from_le_bytes(cycle.try_into().unwrap()));
         }
         Ok(())
     }
@@ -367,6 +374,10 @@ impl Workers for FakeWorkers {
         let place = shop.ends.partition_point(|(other, ..)| *other <= end);
         shop.ends.insert(place, (end, job.device, job.ticket, job.data));
         Ok(())
+    }
+
+    fn has_room(&self) -> bool {
+        true
     }
 
     fn completion(&mut self) -> Option<Completion> {

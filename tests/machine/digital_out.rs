@@ -276,10 +276,26 @@ fn a_pin_that_is_set_once_stays_and_may_be_set_again() {
     assert!(rig.bench.level(30) && rig.bench.level(31));
     // An output takes it over without a gap.
     rig.edges(30);
-    rig.configure(&["config_digital_out oid=0 pin=30 value=1 default_value=0 max_duration=0"]);
+    rig.configure(&["config_digital_out oid=0 pin=30 value=1 default_value=1 max_duration=0"]);
     assert_eq!(rig.edges(30), []);
     rig.send("update_digital_out oid=0 value=0");
     assert!(!rig.bench.level(30));
+    // It may even be set while the machine runs, as it is held.
+    rig.send("set_digital_out pin=31 value=0");
+    assert_eq!(rig.shutdown(), None);
+    assert!(!rig.bench.level(31));
+}
+
+/// The guardian knows the line by the value that it was set to.
+#[test]
+fn a_pin_that_is_set_once_is_not_taken_over_by_an_output_that_belongs_elsewhere() {
+    let mut rig = Rig::new();
+    rig.send_all(&[
+        "allocate_oids count=1",
+        "set_digital_out pin=30 value=1",
+        "config_digital_out oid=0 pin=30 value=0 default_value=0 max_duration=0",
+    ]);
+    expect_shutdown(&rig, "Unable to open out GPIO chip line");
 }
 
 #[test]

@@ -62,3 +62,48 @@ fn a_channel_that_fails_stops_the_machine() {
     let notes = rig.notes();
     assert!(notes.iter().any(|note| note.starts_with("trouble: PWM write failed")), "it is still on: {notes:?}");
 }
+
+const SECOND: &str = "config_pwm_out oid=1 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0";
+const SET: &str = "set_pwm_out pin=500 cycle_ticks=50000 value=100";
+
+#[test]
+fn a_channel_is_not_claimed_twice() {
+    for (commands, first, second) in [
+        ([HEATER, SECOND], "PWM output oid 0", "PWM output oid 1"),
+        ([SET, SECOND], "set_pwm_out", "PWM output oid 1"),
+        ([HEATER, SET], "PWM output oid 0", "set_pwm_out"),
+    ] {
+        let mut rig = Rig::new();
+        rig.send("allocate_oids count=2");
+        rig.send_all(&commands);
+        assert_eq!(rig.shutdown().as_deref(), Some("Unable to config pwm device"));
+        let notes = rig.notes();
+        let named = |note: &String| ["pwm0", first, second, "another pin"].iter().all(|word| note.contains(word));
+        assert!(notes.iter().any(named), "{notes:?}");
+    }
+}
+
+#[test]
+fn a_channel_that_is_set_once_stays_and_may_be_set_again() {
+    let mut rig = Rig::new();
+    rig.bench.state().answer_ticks = Some(2000);
+    rig.configure(&[SET, "set_pwm_out pin=500 cycle_ticks=50000 value=200"]);
+    rig.run_until(10_000);
+    rig.send("set_pwm_out pin=500 cycle_ticks=20000 value=300");
+    rig.run_until(20_000);
+    rig.send("emergency_stop");
+    rig.run_until(30_000);
+    assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
+    // The first value is that of the claim, the others come from the worker.
+    assert_eq!(values(&rig), [(0, 100), (2000, 200), (12_000, 300)]);
+    assert_eq!(rig.bench.state().pwm_cycles[&PWM], 20_000);
+}
+
+#[test]
+fn a_channel_that_was_set_and_fails_stops_the_machine() {
+    let mut rig = Rig::with_workers(2000, &[SET]);
+    rig.bench.state().broken.insert(PWM);
+    rig.send(SET);
+    rig.run_until(10_000);
+    assert_eq!(rig.shutdown().as_deref(), Some("PWM write failed"));
+}

@@ -6,6 +6,7 @@ use crate::rig::Rig;
 
 const STEPPER: &str = "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=100";
 const OUTPUT: &str = "config_digital_out oid=3 pin=20 value=0 default_value=0 max_duration=50000";
+const PWM: &str = "config_pwm_out oid=6 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=50000";
 
 /// Runs the commands and tells what the log has of the shutdown that they end in.
 fn log_of(objects: &[&str], commands: &[&str]) -> String {
@@ -102,6 +103,17 @@ fn the_log_names_the_thing_and_the_remedy() {
             "oid 3",
             "host",
         ),
+        // PWM outputs.
+        (&[PWM], &["queue_pwm_out oid=6 clock=@1000 value=1"], "PWM output oid 6: it was not", "overloaded"),
+        (
+            &[PWM],
+            &["queue_pwm_out oid=6 clock=@1000 value=1", "queue_pwm_out oid=6 clock=@90000 value=1"],
+            "oid 6",
+            "max_duration of 1 ms",
+        ),
+        (&[PWM, "set_pwm_out pin=500 cycle_ticks=1 value=1"], &[], "pwm0", "another pin"),
+        (&[], &["set_pwm_out pin=501 cycle_ticks=1 value=1"], "pwm1", "FIRMWARE_RESTART"),
+        (&[], &["set_digital_out pin=77 value=1"], "gpio77", "FIRMWARE_RESTART"),
         // Analog inputs.
         (
             &["config_analog_in oid=4 pin=400"],

@@ -360,3 +360,44 @@ fn a_move_after_a_long_pause_starts_on_its_tick() {
         assert_eq!(rising(&rig.edges(STEP)), [1000 + pause, 1700 + pause], "pause of {pause}");
     }
 }
+
+/// The firmware compares clocks of 32 bits: a step that seems to lie in the past comes as soon as
+/// the pulse before it allows, and the one after it is counted from where it should have been.
+#[test]
+fn an_interval_that_grows_past_half_the_clocks_range_looks_past() {
+    const HALF: u64 = 1 << 31;
+    const FIRST: u64 = HALF - 32_000;
+    // A step's earliest instant is a pulse of 100 ticks after the one before.
+    for (second, expected) in [(HALF + 99, [FIRST, FIRST + HALF + 99]), (HALF + 100, [FIRST, FIRST + 100])] {
+        let mut rig = Rig::configured(&[BOTH_EDGES]);
+        rig.send("reset_step_clock oid=0 clock=@0");
+        rig.send(&format!("queue_step oid=0 interval={FIRST} count=2 add={}", second - FIRST));
+        rig.run_until(3 * HALF);
+        assert_eq!(instants(&rig.edges(STEP)), expected, "interval {second}");
+        assert_eq!(rig.shutdown(), None);
+    }
+}
+
+#[test]
+fn intervals_past_half_the_clocks_range_do_not_stall_a_move() {
+    const FIRST: u64 = (1 << 31) - 100;
+    let mut rig = Rig::configured(&[BOTH_EDGES]);
+    rig.send("reset_step_clock oid=0 clock=@0");
+    rig.send(&format!("queue_step oid=0 interval={FIRST} count=7 add=1000"));
+    rig.run_until(20 << 31);
+    // Two of the long intervals are a whole turn of the clock and a little more: every other
+    // step comes in its place again.
+    let (third, fifth, seventh) = (FIRST + 2800, FIRST + 9600, FIRST + 20_400);
+    assert_eq!(instants(&rig.edges(STEP)), [FIRST, FIRST + 100, third, third + 100, fifth, fifth + 100, seventh]);
+    assert_eq!(position(&mut rig), "stepper_position oid=0 pos=-7");
+
+    // A move that begins so late is refused.
+    let mut rig = Rig::configured(&[BOTH_EDGES]);
+    rig.send_all(&[
+        "reset_step_clock oid=0 clock=@0",
+        "queue_step oid=0 interval=1000 count=1 add=0",
+        &format!("queue_step oid=0 interval={} count=1 add=0", (1u64 << 31) + 100),
+    ]);
+    rig.run_until(5000);
+    assert_eq!(rig.shutdown().as_deref(), Some("Stepper too far in past"));
+}

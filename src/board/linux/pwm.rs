@@ -14,7 +14,7 @@ use std::time::Duration;
 
 use crate::board::{Buffer, Device, Guard, PwmConfig};
 use crate::shutdown::{Reason, Shutdown};
-use crate::time::NS_PER_TICK;
+use crate::time::{NS_PER_TICK, Ticks};
 
 /// Full scale of a PWM value (`PWM_MAX`), as the C program has it.
 const PWM_MAX: u64 = 1 << 15;
@@ -39,6 +39,7 @@ impl std::fmt::Display for Channel {
 pub(super) struct Pwm {
     channel: Channel,
     period_ns: u64,
+    period: File,
     duty: File,
     enable: File,
 }
@@ -55,14 +56,20 @@ impl Pwm {
         let duty = open("duty_cycle").map_err(|error| refused("opening duty_cycle", error))?;
         let enable = open("enable").map_err(|error| refused("opening enable", error))?;
         let period = open("period").map_err(|error| refused("opening period", error))?;
-        let period_ns = u64::from(config.cycle.0) * NS_PER_TICK;
-        let mut pwm = Pwm { channel, period_ns, duty, enable };
-        // A period below the present duty cycle is refused: zero that first.
-        let _ = pwm.duty.write_at(b"0", 0);
-        let set = period.write_all_at(period_ns.to_string().as_bytes(), 0);
-        set.map_err(|error| refused(&format!("a period of {period_ns} ns"), error))?;
+        let mut pwm = Pwm { channel, period_ns: 0, period, duty, enable };
+        pwm.set_period(config.cycle)?;
         pwm.set(config.value).map_err(|error| refused("its first value", error))?;
         Ok(pwm)
+    }
+
+    fn set_period(&mut self, cycle: Ticks) -> Result<(), Shutdown> {
+        self.period_ns = u64::from(cycle.0) * NS_PER_TICK;
+        // A period below the present duty cycle is refused: zero that first.
+        let _ = self.duty.write_at(b"0", 0);
+        self.period.write_all_at(self.period_ns.to_string().as_bytes(), 0).map_err(|error| {
+            let detail = format!("{}: a period of {} ns: {error}{}", self.channel, self.period_ns, remedy(&error));
+            Shutdown::because(Reason::PwmConfig, detail)
+        })
     }
 
     /// Lets the guardian know where the channel belongs if the program dies.
@@ -92,7 +99,14 @@ impl Pwm {
 
 impl Device for Pwm {
     fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-        let [low, high] = *data.as_slice() else { return Ok(()) };
+        let (low, high) = match *data.as_slice() {
+            [low, high] => (low, high),
+            [low, high, c0, c1, c2, c3] => {
+                self.set_period(Ticks(u32::from_le_bytes([c0, c1, c2, c3])))?;
+                (low, high)
+            }
+            _ => return Ok(()),
+        };
         self.set(u16::from_le_bytes([low, high])).map_err(|error| {
             let detail = format!("{}: {error}: did its driver go away? (ls /sys/class/pwm)", self.channel);
             Shutdown::because(Reason::PwmWrite, detail)
@@ -140,7 +154,6 @@ fn remedy(error: &io::Error) -> &'static str {
 mod tests {
     use super::*;
     use crate::board::Pin;
-    use crate::time::Ticks;
 
     const CHANNEL: Channel = Channel { chip: 0, channel: 1 };
 
@@ -179,6 +192,15 @@ mod tests {
         assert_eq!(state("duty_cycle"), "1000000");
         pwm.run(&mut Buffer::new(&0u16.to_le_bytes())).unwrap();
         assert_eq!(state("enable"), "0");
+    }
+
+    #[test]
+    fn a_value_may_come_with_a_new_period() {
+        let class = class(true);
+        let mut pwm = Pwm::open(class.path(), CHANNEL, &config(8192)).unwrap();
+        let [c0, c1, c2, c3] = Ticks::from_us(2000).0.to_le_bytes();
+        pwm.run(&mut Buffer::new(&[0, 64, c0, c1, c2, c3])).unwrap();
+        assert_eq!((read(&class, "period"), read(&class, "duty_cycle")), ("2000000".into(), "1000000".into()));
     }
 
     #[test]

@@ -55,12 +55,12 @@ fn an_output_stands_at_its_first_value_and_a_line_set_once_is_taken_over() {
         2,
         &[
             "set_digital_out pin=lab/gpio0 value=1",
-            "set_digital_out pin=lab/gpio2 value=1",
+            "set_digital_out pin=lab/gpio2 value=0",
             high,
-            &output(1, "lab/gpio2"),
+            "config_digital_out oid=1 pin=lab/gpio2 value=1 default_value=0 max_duration=0",
         ],
     );
-    assert_eq!([0, 1, 2, 3].map(|offset| sim.level(offset)), [true, true, false, false]);
+    assert_eq!([0, 1, 2, 3].map(|offset| sim.level(offset)), [true, true, true, false]);
 }
 
 #[test]
