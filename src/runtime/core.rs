@@ -270,7 +270,7 @@ mod tests {
     use crate::board::{Attachment, Bias, Board, Buffer, Device, Input, Output, Pin, PwmConfig, Range, SpiConfig};
     use crate::feature::FEATURES;
     use crate::mcu::{Dialect, Note, Outbox};
-    use crate::runtime::realtime::Scheduling;
+    use crate::runtime::realtime::{Processors, Scheduling};
     use crate::runtime::wakeup::MarginLimits;
     use crate::runtime::watchdog::JobClocks;
     use crate::runtime::workers::Threads;
@@ -379,7 +379,8 @@ mod tests {
                     Box::new(workers),
                     Box::new(core_heard),
                 );
-                let waiter = Waiter::new(core_clock.clone(), MarginLimits::default(), Scheduling::Ordinary);
+                let (limits, processors) = (MarginLimits::default(), Processors::new(None).unwrap());
+                let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
                 let (pulse, wake) = (Pulse::new().unwrap(), Arc::new(LinkWake::new().unwrap()));
                 let (clock, progress) = (core_clock, core_progress);
                 Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run();
