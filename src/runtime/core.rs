@@ -4,7 +4,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::hint;
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
@@ -149,7 +148,7 @@ impl Core {
                 continue;
             }
             if now < self.linger_until {
-                hint::spin_loop();
+                thread::yield_now();
                 continue;
             }
             self.mcu.account(Ticks(now.since(busy_since) as u32));

@@ -6,7 +6,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::hint;
 use std::io;
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::Arc;
@@ -393,7 +392,7 @@ impl Link {
         }
         let end = monotonic() + LINGER;
         while self.progress.done() != handed && monotonic() < end {
-            hint::spin_loop();
+            thread::yield_now();
         }
     }
 
