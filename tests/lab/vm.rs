@@ -31,9 +31,11 @@ const MARK: &str = "lab: ";
 /// host's clock an emulated processor would be slow, and stop whenever the host does.
 const TIME: [&str; 6] = ["-icount", "shift=1,sleep=off", "-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"];
 
-/// A panic reboots, which ends the emulator. Guards against the faults of real
-/// processors, and the ciphers' self-tests, cost an emulated one a second.
-const COMMAND_LINE: &str = "console=ttyS0 quiet panic=-1 mitigations=off cryptomgr.notests";
+/// A panic reboots, which ends the emulator. The rest is what an emulated processor would
+/// spend time on and no test is about: guards against the faults of real processors, the
+/// ciphers' self-tests, security modules, auditing, clearing of memory, looking for lockups.
+const COMMAND_LINE: &str = "console=ttyS0 quiet panic=-1 mitigations=off cryptomgr.notests lsm= audit=0 \
+     init_on_alloc=0 nowatchdog psi=0";
 
 /// The plainest is emulated fastest; random numbers must not wait for a boot that
 /// has little chance in it.
