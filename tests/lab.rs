@@ -3,22 +3,23 @@
 //! virtual machine, on each kernel flavour. docs/lab.md tells how to use it.
 //!
 //! This is the host's side, a test harness of its own. It builds what the
-//! machines boot, lists the tests that the guest binary holds, boots one machine
-//! per flavour and kind of clock, and prints each test by name as libtest does.
+//! machines boot, lists the tests that the guest binary holds, shares each flavour's
+//! among a few machines, and prints each test by name as libtest does.
 
 mod lab {
     pub mod cache;
+    pub mod emulator;
     pub mod guest_program;
     pub mod initramfs;
     pub mod kernel;
     pub mod options;
     pub mod process;
     pub mod report;
+    pub mod snapshot;
     pub mod tools;
     pub mod vm;
 }
 
-use std::collections::VecDeque;
 use std::process::ExitCode;
 use std::sync::Mutex;
 use std::thread;
@@ -28,14 +29,16 @@ use lab::guest_program::GuestProgram;
 use lab::kernel::{Flavour, Kernel, Offers};
 use lab::options::Options;
 use lab::report::Report;
-use lab::vm::{Clock, Run};
+use lab::snapshot::Snapshot;
+use lab::vm::Run;
 
 /// A failed run exits as libtest's do.
 const FAILED: u8 = 101;
 
-/// Each machine emulates two processors; more than two machines at once would
-/// only wait for each other and run into their timeouts.
-const MACHINES_AT_ONCE: usize = 2;
+/// So many at most in one machine. To start one costs as much as some tests; with
+/// more machines than processors none of those is idle while another has half of
+/// the work left.
+const TESTS_AT_A_MACHINE: usize = 32;
 
 fn main() -> ExitCode {
     match run(&Options::from_args()) {
@@ -61,15 +64,15 @@ fn run(options: &Options) -> Result<bool, String> {
     let mut runs = Vec::new();
     let mut filtered_out = 0;
     for flavour in Flavour::ALL {
-        for clock in [Clock::Host, Clock::Instructions] {
-            let of_clock = tests.iter().filter(|test| Clock::of_test(test) == clock);
-            let (selected, others): (Vec<_>, Vec<_>) =
-                of_clock.cloned().partition(|test| options.selects(flavour, test));
-            filtered_out += others.len();
-            if !selected.is_empty() {
-                runs.push(Run { flavour, clock, tests: selected });
-            }
-        }
+        let (selected, others): (Vec<_>, Vec<_>) =
+            tests.iter().cloned().partition(|test| options.selects(flavour, test));
+        filtered_out += others.len();
+        let machines = selected.len().div_ceil(TESTS_AT_A_MACHINE);
+        // By turns: the tests of one file take alike, and may be the longest.
+        runs.extend((0..machines).map(|machine| {
+            let tests = selected.iter().skip(machine).step_by(machines).cloned().collect();
+            Run { flavour, tests }
+        }));
     }
     if options.list {
         for run in &runs {
@@ -91,45 +94,67 @@ fn boot_all(runs: &[Run], program: &GuestProgram, report: &mut Report) -> Result
     lab::tools::ensure()?;
     let cache = Cache::open()?;
     let offers = Offers::ask()?;
-    let mut kernels = Vec::new();
-    for flavour in Flavour::ALL {
-        if runs.iter().any(|run| run.flavour == flavour) {
+    let flavours: Vec<Flavour> =
+        Flavour::ALL.into_iter().filter(|flavour| runs.iter().any(|run| run.flavour == *flavour)).collect();
+    let snapshots = {
+        let _lock = cache.lock()?;
+        let mut kernels = Vec::new();
+        for &flavour in &flavours {
             let kernel = Kernel::prepare(flavour, &offers, &cache)?;
             println!("{} is Linux {}", flavour.name(), kernel.release);
-            kernels.push((flavour, kernel));
+            kernels.push(kernel);
         }
-    }
-    let payload = program.payload()?;
-    // The longest first.
-    let mut order: Vec<&Run> = runs.iter().collect();
-    order.sort_by_key(|run| std::cmp::Reverse(run.tests.len()));
-    let queue = Mutex::new(VecDeque::from(order));
+        at_once(&kernels, kernels.len(), |kernel| Snapshot::prepare(kernel, program, &cache))?
+    };
+    // The slower kernel's first.
+    let order: Vec<&Run> = runs.iter().rev().collect();
     let report = Mutex::new(report);
+    // A machine emulates one processor.
+    let machines = thread::available_parallelism().map_or(1, usize::from);
+    at_once(&order, machines, |run| {
+        let index = flavours.iter().position(|flavour| *flavour == run.flavour).expect("that of a run");
+        run.perform(&snapshots[index], &cache, &report)
+    })
+    .map(drop)
+}
+
+/// What the function makes of each item, in their order; so many threads take the next one when
+/// they are done with the one before.
+fn at_once<T: Sync, R: Send>(
+    items: &[T],
+    threads: usize,
+    function: impl Fn(&T) -> Result<R, String> + Sync,
+) -> Result<Vec<R>, String> {
+    let queue = Mutex::new(items.iter().enumerate());
+    let done = Mutex::new(Vec::new());
     thread::scope(|scope| {
-        let machines: Vec<_> = (0..MACHINES_AT_ONCE)
+        let threads: Vec<_> = (0..threads)
             .map(|_| {
                 scope.spawn(|| -> Result<(), String> {
                     loop {
-                        let next = queue.lock().expect("no machine panics").pop_front();
-                        let Some(run) = next else { return Ok(()) };
-                        let (_, kernel) = kernels
-                            .iter()
-                            .find(|(flavour, _)| *flavour == run.flavour)
-                            .expect("a kernel was prepared for every run");
-                        run.boot(kernel, &payload, &cache, &report)?;
+                        let next = queue.lock().expect("it is not held in a panic").next();
+                        let Some((index, item)) = next else { return Ok(()) };
+                        let result = function(item)?;
+                        done.lock().expect("it is not held in a panic").push((index, result));
                     }
                 })
             })
             .collect();
-        machines.into_iter().try_for_each(|machine| machine.join().expect("no machine panics"))
-    })
+        threads.into_iter().try_for_each(|thread| thread.join().expect("no thread panics"))
+    })?;
+    let mut done = done.into_inner().expect("it is not held in a panic");
+    done.sort_by_key(|(index, _)| *index);
+    Ok(done.into_iter().map(|(_, result)| result).collect())
 }
 
 fn shell(options: &Options, program: &GuestProgram) -> Result<bool, String> {
     lab::tools::ensure()?;
     let cache = Cache::open()?;
     let flavour = options.flavour.unwrap_or(Flavour::Stock);
-    let kernel = Kernel::prepare(flavour, &Offers::ask()?, &cache)?;
+    let kernel = {
+        let _lock = cache.lock()?;
+        Kernel::prepare(flavour, &Offers::ask()?, &cache)?
+    };
     lab::vm::shell(&kernel, &program.payload()?, &cache)?;
     Ok(true)
 }

@@ -5,6 +5,7 @@
 use std::env;
 use std::ffi::OsStr;
 use std::fs;
+use std::hash::{Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
@@ -60,12 +61,31 @@ impl GuestProgram {
             let name = program.file_name().unwrap_or_default().to_string_lossy();
             archive.copy(&format!("/bin/{name}"), program)?;
         }
-        let programs = [self.path.as_path(), pinion()];
-        for library in libraries(programs.into_iter().chain(HOST_PROGRAMS.map(Path::new)))? {
+        for library in libraries(self.programs())? {
             let content = fs::read(&library).map_err(|error| format!("cannot read {library}: {error}"))?;
             archive.program(&library, &content);
         }
         Ok(archive.finish())
+    }
+
+    /// Changes with everything that the payload is made of.
+    pub fn hash_files(&self, hasher: &mut impl Hasher) -> Result<(), String> {
+        for source in [include_str!("guest_program.rs"), include_str!("initramfs.rs"), include_str!("init.sh")] {
+            source.hash(hasher);
+        }
+        let libraries = libraries(self.programs())?;
+        for path in self.programs().into_iter().chain(libraries.iter().map(Path::new)) {
+            let describe = |error| format!("cannot read {}: {error}", path.display());
+            let metadata = fs::metadata(path).map_err(describe)?;
+            // cargo and dpkg write a file anew: none changes without this.
+            (path, metadata.len(), metadata.modified().map_err(describe)?).hash(hasher);
+        }
+        Ok(())
+    }
+
+    fn programs(&self) -> [&Path; 3] {
+        let [chrt] = HOST_PROGRAMS.map(Path::new);
+        [&self.path, pinion(), chrt]
     }
 }
 
@@ -74,7 +94,7 @@ fn pinion() -> &'static Path {
 }
 
 /// The paths that the loader finds, itself among them.
-fn libraries<'a>(programs: impl Iterator<Item = &'a Path>) -> Result<Vec<String>, String> {
+fn libraries(programs: [&Path; 3]) -> Result<Vec<String>, String> {
     let mut libraries = Vec::new();
     for program in programs {
         // "name => /path (address)", or "/path (address)" for the loader.

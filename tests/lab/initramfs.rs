@@ -21,6 +21,18 @@ pub struct Archive {
 }
 
 impl Archive {
+    /// What every lab's guest has: folders, busybox, and what its init begins with.
+    pub fn with_busybox(busybox: &Path) -> Result<Archive, String> {
+        let mut archive = Archive::default();
+        for folder in ["/dev", "/proc", "/sys", "/tmp", "/run", "/root", "/etc"] {
+            archive.folder(folder);
+        }
+        archive.copy("/bin/busybox", busybox)?;
+        archive.symlink("/bin/sh", "busybox");
+        archive.file("/lab/start.sh", include_bytes!("start.sh"));
+        Ok(archive)
+    }
+
     pub fn folder(&mut self, path: &str) {
         self.add(path, FOLDER, b"");
     }

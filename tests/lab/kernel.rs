@@ -81,9 +81,13 @@ const MODULES: [(&str, &str); 17] = [
     ("i2c-stub", "chip_addr=0x1c"),
 ];
 
+/// Shows the plan to the guest, which loads it later than the others: see `init.sh`.
+const PLAN_READER: &str = "qemu_fw_cfg";
+
 /// The parts of an image package that hold these modules.
-const IMAGE_PARTS: [&str; 13] = [
+const IMAGE_PARTS: [&str; 14] = [
     "*/modules.builtin",
+    "*/drivers/firmware/qemu_fw_cfg.ko",
     "*/drivers/i2c/*",
     "*/drivers/iio/*",
     "*/net/can/*",
@@ -122,9 +126,13 @@ pub struct Kernel {
 }
 
 impl Kernel {
-    /// Makes what the cache does not hold yet.
+    /// What is kept of it in the cache.
+    pub fn folder(&self) -> &Path {
+        self.vmlinux.parent().expect("it is in a folder")
+    }
+
+    /// Makes what the cache does not hold yet. The caller has its lock.
     pub fn prepare(flavour: Flavour, offers: &Offers, cache: &Cache) -> Result<Kernel, String> {
-        let _lock = cache.lock()?;
         let newest = offers.newest(flavour)?;
         let release = newest.dependency("linux-image-")?.replace("linux-image-", "");
         let version = newest.field("Version")?;
@@ -229,6 +237,7 @@ fn key(sources: &Path) -> Result<u64, String> {
     let mut hasher = DefaultHasher::new();
     include_str!("kernel.rs").hash(&mut hasher);
     include_str!("initramfs.rs").hash(&mut hasher);
+    include_str!("start.sh").hash(&mut hasher);
     for path in files(sources)? {
         path.file_name().hash(&mut hasher);
         read(&path)?.hash(&mut hasher);
@@ -373,12 +382,10 @@ fn archive_modules(image: &Path, ours: &Path, tree: &Path, to: &Path) -> Result<
         loader.load(&module.replace('-', "_"), options)?;
     }
 
-    let mut archive = Archive::default();
-    for folder in ["/dev", "/proc", "/sys", "/tmp", "/run", "/root", "/etc"] {
-        archive.folder(folder);
-    }
-    archive.copy("/bin/busybox", &tree.join("bin/busybox"))?;
-    archive.symlink("/bin/sh", "busybox");
+    let mut archive = Archive::with_busybox(&tree.join("bin/busybox"))?;
+    let plan_reader = loader.find(PLAN_READER)?;
+    process::run(Command::new("strip").arg("--strip-debug").arg(&plan_reader))?;
+    archive.copy("/lab/plan.ko", &plan_reader)?;
     let mut list = String::new();
     for (path, options) in &loader.order {
         let inside = format!("/lab/modules.d/{}", file_name(path));
@@ -403,17 +410,20 @@ impl Loader {
         if self.order.iter().any(is_loaded) || self.built_in.iter().any(|name| name == module) {
             return Ok(());
         }
-        let path = self
-            .paths
-            .iter()
-            .find(|path| module_name(path) == module)
-            .ok_or_else(|| format!("the kernel has no module {module} among {IMAGE_PARTS:?}"))?
-            .clone();
+        let path = self.find(module)?;
         for dependency in dependencies(&path)? {
             self.load(&dependency, "")?;
         }
         self.order.push((path, options));
         Ok(())
+    }
+
+    fn find(&self, module: &str) -> Result<PathBuf, String> {
+        self.paths
+            .iter()
+            .find(|path| module_name(path) == module)
+            .cloned()
+            .ok_or_else(|| format!("the kernel has no module {module} among {IMAGE_PARTS:?}"))
     }
 }
 
@@ -450,7 +460,7 @@ fn module_name(path: &Path) -> String {
 }
 
 /// Removes what earlier versions left.
-fn remove_others(folder: &Path, prefix: &str, keep: &Path) -> Result<(), String> {
+pub fn remove_others(folder: &Path, prefix: &str, keep: &Path) -> Result<(), String> {
     entries(folder)?
         .iter()
         .filter(|path| *path != keep && file_name(path).starts_with(prefix))

@@ -57,13 +57,8 @@ impl Programs {
 
     /// The guest's root folder.
     pub fn initramfs(&self, sysroot: &Sysroot) -> Result<Archive, String> {
-        let mut archive = Archive::default();
-        for folder in ["/dev", "/proc", "/sys", "/tmp", "/run", "/root"] {
-            archive.folder(folder);
-        }
+        let mut archive = Archive::with_busybox(&sysroot.busybox())?;
         archive.program("/init", include_bytes!("init.sh"));
-        archive.copy("/bin/busybox", &sysroot.busybox())?;
-        archive.symlink("/bin/sh", "busybox");
         let stripped = tempfile::tempdir().map_err(|error| error.to_string())?;
         let mut libraries = BTreeMap::new();
         for (name, path) in &self.0 {

@@ -2,21 +2,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # The first process of the emulated Pi. It speaks to the host by lines on the console
 # that begin with "lab-pi: "; tests do the same (guest/outside.rs).
-export PATH=/bin HOME=/root TERM=vt100
-/bin/busybox --install -s /bin
-mount -t proc proc /proc
-mount -t sysfs sysfs /sys
-mount -t devtmpfs devtmpfs /dev
-mkdir -p /dev/pts /dev/shm
-mount -t devpts devpts /dev/pts
-mount -t tmpfs tmpfs /dev/shm
-mount -t tmpfs tmpfs /tmp
-mount -t tmpfs tmpfs /run
-exec </dev/console >/dev/console 2>&1
-mkdir -p /etc
+. /lab/start.sh
 echo 'tty:x:5:' >/etc/group
-# Tests write to hardware as root; they look for this before they do.
-: >/run/pinion-lab
 
 say() {
 	echo "lab-pi: $*"
