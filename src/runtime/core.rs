@@ -17,8 +17,8 @@ use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use crate::wire::block::PAYLOAD_MAX;
 use crate::wire::vlq::Reader;
 
-use super::guardian::{BEAT, Pulse};
 use super::outlet::{LinkWake, Progress};
+use super::pulse::{BEAT, Pulse};
 use super::wakeup::{Waiter, Woken};
 
 /// The payload of a message block on its way to the core.
@@ -58,8 +58,8 @@ pub(super) enum Request {
 
 /// A command takes a microsecond or two: within this span of a timer none is begun.
 const NEAR: Ticks = Ticks::from_us(5);
-/// A timer beyond this leaves time for a nap.
-const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64 / 2;
+/// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
+const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
 /// So long the core looks for the next command before it sleeps: hosts send in bursts, and to be
 /// woken takes as long (20 to 50 us on the machines measured). A lone processor is the host's.
 const LINGER: Ticks = Ticks::from_us(30);
@@ -114,7 +114,6 @@ impl Core {
         let mut busy_since = self.clock.now();
         let mut was_shutdown = false;
         loop {
-            self.pulse.beat(self.mcu.is_running());
             if self.mcu.is_shutdown() != was_shutdown {
                 was_shutdown = !was_shutdown;
                 if was_shutdown {
@@ -122,6 +121,7 @@ impl Core {
                 }
             }
             let next = self.mcu.run_timers();
+            self.pulse.beat(self.mcu.last_read(), self.mcu.is_running());
             self.mcu.run_workers();
             self.waiter.ran(self.mcu.last_read());
             let near = next.is_some_and(|next| next < self.mcu.last_read() + NEAR);
@@ -133,7 +133,7 @@ impl Core {
                     }
                     Turn::Quit => {
                         // Workers and devices may take their time to end.
-                        self.pulse.beat(false);
+                        self.pulse.beat(self.mcu.now(), false);
                         if !was_shutdown {
                             self.mcu.report_lateness(self.waiter.margin());
                         }
@@ -154,7 +154,7 @@ impl Core {
             }
             self.mcu.account(Ticks(now.since(busy_since) as u32));
             let (requests, mcu, pending) = (&self.requests, &self.mcu, self.block.is_some());
-            let to_go = deadline.map_or(4 * FAR, |deadline| deadline.since(now));
+            let to_go = deadline.map_or(2 * FAR, |deadline| deadline.since(now));
             if to_go > FAR {
                 // Half the way leaves room for a late wake-up.
                 self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));

@@ -28,6 +28,7 @@ mod link;
 mod notify;
 mod outlet;
 mod pty;
+mod pulse;
 pub mod realtime;
 mod signals;
 pub mod wakeup;
@@ -38,15 +39,15 @@ pub use guardian::Guardian;
 pub use pty::Access;
 
 use self::core::{Core, Request};
-use guardian::Pulse;
 use link::{End, Link, Parts};
 use notify::Notify;
 use outlet::{LinkWake, Progress};
 use pty::Pty;
+use pulse::Pulse;
 use realtime::{Pinning, Role, Scheduling};
 use signals::Signals;
 use wakeup::{MarginLimits, Waiter};
-use watchdog::{JobClocks, Vigil, Watchdog};
+use watchdog::{Vigil, Watchdog};
 use workers::Threads;
 
 /// Blocks between link and core: four times what a host may have under way.
@@ -78,7 +79,7 @@ pub fn run(
     guardian: Option<Guardian>,
     ready: impl FnOnce(),
 ) -> io::Result<()> {
-    let pulse = guardian.as_ref().map_or_else(Pulse::new, |guardian| Ok(guardian.pulse()))?;
+    let pulse = guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse()))?;
     let pinning = options.cpu.map(Pinning::new).transpose()?;
     let pty = Pty::open(&options.link, &options.access)?;
     let signals = Signals::new()?;
@@ -98,8 +99,7 @@ pub fn run(
     if realtime {
         realtime::lock_memory();
     }
-    let jobs = JobClocks::default();
-    let (core_dialect, core_clock, core_jobs) = (dialect.clone(), clock.clone(), jobs.clone());
+    let (core_dialect, core_clock) = (dialect.clone(), clock.clone());
     let (core_progress, core_wake) = (progress.clone(), wake.clone());
     let core = thread::Builder::new().name("core".into()).spawn(move || {
         if let Some(Err(error)) = pinning.map(|pinning| pinning.pin()) {
@@ -114,7 +114,7 @@ pub fn run(
                 realtime::enter(Role::Worker);
             }
         });
-        let workers = Box::new(Threads::new(thread::current(), prepare, core_jobs));
+        let workers = Box::new(Threads::new(thread::current(), prepare, pulse));
         let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
         let waiter = Waiter::new(core_clock.clone(), margin, scheduling);
         Core::new(self::core::Parts {
@@ -141,7 +141,7 @@ pub fn run(
         wake,
         signals,
         guardian: guardian.as_ref().map(Guardian::socket),
-        vigil: Vigil::new(watchdog, notify, notify::watchdog_interval(), pulse, jobs),
+        vigil: Vigil::new(watchdog, notify, notify::watchdog_interval(), pulse),
     });
     if realtime {
         realtime::enter(Role::Link);

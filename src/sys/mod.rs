@@ -34,7 +34,7 @@ fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
 }
 
 /// Words that stay common to this process and to those that it forks.
-pub(crate) const SHARED_WORDS: usize = 4;
+pub(crate) const SHARED_WORDS: usize = 1024;
 
 /// A page of zeros that stays common to this process and to those that it forks. It is never
 /// given back.
