@@ -113,7 +113,7 @@ impl RunArgs {
     }
 }
 
-/// Serves until SIGTERM or SIGINT.
+/// Serves until SIGTERM, SIGINT or SIGHUP.
 pub fn run(args: &RunArgs) -> ExitCode {
     let clock = Monotonic::start();
     // Before anything that starts a thread. A simulated printer needs none.
