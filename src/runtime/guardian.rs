@@ -540,8 +540,18 @@ mod tests {
         }
     }
 
+    /// A guarded program, which is killed with a test that fails.
+    struct Guarded(Child);
+
+    impl Drop for Guarded {
+        fn drop(&mut self) {
+            let _ = self.0.kill();
+            let _ = self.0.wait();
+        }
+    }
+
     /// This test program itself, as a program that is guarded.
-    fn start(script: &str, file: &Path) -> (Child, u32) {
+    fn start(script: &str, file: &Path) -> (Guarded, u32) {
         fs::write(file, "on ").unwrap();
         let mut child = Command::new(std::env::current_exe().unwrap())
             .args(["--ignored", "--exact", "runtime::guardian::tests::guarded_program"])
@@ -554,7 +564,7 @@ mod tests {
             .unwrap();
         let lines = BufReader::new(child.stdout.as_mut().unwrap()).lines();
         let guardian = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("guardian ")?.parse().ok());
-        (child, guardian.expect("the guarded program says who guards it"))
+        (Guarded(child), guardian.expect("the guarded program says who guards it"))
     }
 
     #[test]
@@ -617,10 +627,10 @@ mod tests {
         let comm = fs::read_to_string(format!("/proc/{guardian}/comm")).unwrap();
         assert_eq!(comm, "pinion-guardian\n");
         assert_eq!(content(&file), "on ");
-        program.kill().unwrap();
+        program.0.kill().unwrap();
         wait_until("driven", || content(&file) == "off");
         wait_until("the guardian ends", || is_gone(guardian));
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
@@ -629,7 +639,7 @@ mod tests {
         let (mut program, guardian) = start("abort", &file);
         wait_until("driven", || content(&file) == "off");
         wait_until("the guardian ends", || is_gone(guardian));
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
@@ -638,7 +648,7 @@ mod tests {
         let (_folder, file) = file();
         let (mut program, guardian) = start("hang", &file);
         wait_until("driven", || content(&file) == "off");
-        assert_eq!(program.wait().unwrap().signal(), Some(9));
+        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
         wait_until("the guardian ends", || is_gone(guardian));
     }
 
@@ -648,7 +658,7 @@ mod tests {
         let (_folder, file) = file();
         let (mut program, guardian) = start("stuck", &file);
         wait_until("driven", || content(&file) == "off");
-        assert_eq!(program.wait().unwrap().signal(), Some(9));
+        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
         wait_until("the guardian ends", || is_gone(guardian));
         let log = content(&log_of(&file));
         assert!(log.contains("the worker of pwmchip7 did not set the shutdown state within 1000 ms:"), "{log}");
@@ -665,26 +675,26 @@ mod tests {
         }
         thread::sleep(50 * MS);
         assert!(!is_gone(guardian));
-        program.kill().unwrap();
+        program.0.kill().unwrap();
         wait_until("driven", || content(&file) == "off");
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
     fn outputs_that_were_given_back_stay_as_they_are() {
         let (_folder, file) = file();
         let (mut program, guardian) = start("release", &file);
-        program.kill().unwrap();
+        program.0.kill().unwrap();
         wait_until("the guardian ends", || is_gone(guardian));
         assert_eq!(content(&file), "on ");
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
     fn after_a_goodbye_outputs_stay_as_they_are() {
         let (_folder, file) = file();
         let (mut program, guardian) = start("goodbye", &file);
-        assert!(program.wait().unwrap().success());
+        assert!(program.0.wait().unwrap().success());
         assert!(is_gone(guardian));
         assert_eq!(content(&file), "on ");
     }

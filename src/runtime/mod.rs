@@ -70,7 +70,7 @@ pub struct Options {
     pub cpu: Option<usize>,
 }
 
-/// Serves a host on a pty until SIGTERM or SIGINT; calls `ready` once a host may come.
+/// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP; calls `ready` once a host may come.
 /// `guardian` is that of the board's outputs.
 pub fn run(
     options: &Options,
@@ -91,9 +91,6 @@ pub fn run(
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
-
-    // Last of what may fail: once open it resets the machine, unless we end in order.
-    let watchdog = options.watchdog.as_deref().map(Watchdog::open).transpose()?;
 
     let (realtime, margin) = (options.realtime, options.margin);
     if realtime {
@@ -141,16 +138,20 @@ pub fn run(
         wake,
         signals,
         guardian: guardian.as_ref().map(Guardian::socket),
-        vigil: Vigil::new(watchdog, notify, notify::watchdog_interval(), pulse),
+        vigil: Vigil::new(notify, notify::watchdog_interval(), pulse),
     });
     if realtime {
         realtime::enter(Role::Link);
     }
-    ready();
-    let served = link.run();
-    if let Err(error) = &served {
-        error!("the pty failed: {error}");
-    }
+    // Last of what may fail: once open it resets the machine, unless we end in order.
+    let watched = match &options.watchdog {
+        Some(path) => Watchdog::open(path).map(|watchdog| link.feed(watchdog)),
+        None => Ok(()),
+    };
+    let served = watched.and_then(|()| {
+        ready();
+        link.run().inspect_err(|error| error!("the pty failed: {error}"))
+    });
     link.stopping();
     link.request(Request::Quit);
     let in_order = core.join().is_ok();

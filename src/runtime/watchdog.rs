@@ -87,16 +87,17 @@ pub(super) struct Vigil {
 
 impl Vigil {
     /// `notify_interval` is how often the service manager wants to be fed, if at all.
-    pub(super) fn new(
-        watchdog: Option<Watchdog>,
-        notify: Notify,
-        notify_interval: Option<Duration>,
-        pulse: Pulse,
-    ) -> Vigil {
-        let intervals = [watchdog.as_ref().map(|watchdog| watchdog.limit / 3), notify_interval];
+    pub(super) fn new(notify: Notify, notify_interval: Option<Duration>, pulse: Pulse) -> Vigil {
         // More often than the core gives a sign there is nothing new to tell.
-        let interval = intervals.into_iter().flatten().min().map(|interval| interval.max(BEAT));
-        Vigil { watchdog, notify, interval, due: monotonic(), pulse, starving: false }
+        let interval = notify_interval.map(|interval| interval.max(BEAT));
+        Vigil { watchdog: None, notify, interval, due: monotonic(), pulse, starving: false }
+    }
+
+    /// Takes a hardware watchdog in.
+    pub(super) fn feed(&mut self, watchdog: Watchdog) {
+        let interval = (watchdog.limit / 3).max(BEAT);
+        self.interval = Some(self.interval.map_or(interval, |present| present.min(interval)));
+        self.watchdog = Some(watchdog);
     }
 
     /// When to tick next.
@@ -163,7 +164,9 @@ mod tests {
         let pulse = Pulse::new(Monotonic::start()).unwrap();
         let watchdog = Watchdog::open(path).unwrap();
         let notify = Notify::from_env().unwrap();
-        (Vigil::new(Some(watchdog), notify, None, pulse), pulse)
+        let mut vigil = Vigil::new(notify, None, pulse);
+        vigil.feed(watchdog);
+        (vigil, pulse)
     }
 
     fn food(path: &Path) -> String {
