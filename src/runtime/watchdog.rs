@@ -224,11 +224,11 @@ mod tests {
         let file = tempfile::NamedTempFile::new().unwrap();
         let (mut vigil, pulse) = vigil(file.path());
         let (start, interval) = (vigil.due().unwrap(), vigil.interval.unwrap());
-        pulse.beat(pulse.at(start), false);
+        pulse.beat(pulse.at(start + Duration::from_millis(10)), false);
         for tick in 0..12 {
             vigil.tick(start + tick * interval);
         }
-        // The first is at the beat, and 30 seconds are nine intervals.
+        // The first is before the beat, and 30 seconds are nine intervals.
         assert_eq!(food(file.path()), "..........");
     }
 
