@@ -164,9 +164,9 @@ pub trait Guard: Send {
     /// Copies an output line's descriptor (a GPIO line handle of the character device).
     fn output(&mut self, line: RawFd, shutdown_value: bool) -> io::Result<()>;
 
-    /// Copies the descriptor of a file that drives an output (a PWM's duty cycle), and what is
-    /// to be written at its beginning.
-    fn file(&mut self, file: RawFd, shutdown_bytes: &[u8]) -> io::Result<()>;
+    /// Copies the descriptors of the files that drive one output (a PWM's duty cycle and its
+    /// switch), and what is to be written at the beginning of each, in this order.
+    fn files(&mut self, shutdown: &[(RawFd, &[u8])]) -> io::Result<()>;
 
     /// Gives back every copy, so that the lines can be claimed anew. When this returns, they
     /// are free.

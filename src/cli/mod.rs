@@ -56,6 +56,7 @@ enum Command {
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
     start_log(cli.log.log_level);
+    end_by_panic();
     match cli.command {
         None => run::run(&cli.run),
         Some(Command::Run(args)) => run::run(&args),
@@ -89,8 +90,48 @@ fn start_log(level: LevelFilter) {
         .init();
 }
 
+/// From now on a panic, in whatever thread, is logged and ends the process: a machine of which
+/// only the link is left would look alive to its host, its outputs as they are.
+fn end_by_panic() {
+    std::panic::set_hook(Box::new(|panic| {
+        log::error!("this is a bug in Pinion, which ends here: please report it with this line: {panic}");
+        std::process::abort();
+    }));
+}
+
 /// Says on stderr why a subcommand failed.
 fn failed(error: impl std::fmt::Display) -> ExitCode {
     log::error!("{error}");
     ExitCode::FAILURE
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::os::unix::process::ExitStatusExt;
+
+    #[test]
+    #[ignore = "started by the other test"]
+    fn panicking_thread() {
+        if std::env::var_os("PINION_TEST_PANIC").is_none() {
+            return;
+        }
+        start_log(LevelFilter::Info);
+        end_by_panic();
+        let _ = std::thread::Builder::new().name("core".into()).spawn(|| panic!("in the core"));
+        std::thread::sleep(std::time::Duration::from_secs(20));
+    }
+
+    #[test]
+    fn a_panic_in_any_thread_ends_the_process_and_is_logged() {
+        let output = std::process::Command::new(std::env::current_exe().unwrap())
+            .args(["--ignored", "--exact", "--nocapture", "cli::tests::panicking_thread"])
+            .env("PINION_TEST_PANIC", "1")
+            .output()
+            .unwrap();
+        let log = String::from_utf8_lossy(&output.stderr);
+        assert_eq!(output.status.signal(), Some(libc::SIGABRT), "{log}");
+        assert!(log.contains("ERROR this is a bug in Pinion"), "{log}");
+        assert!(log.contains("src/cli/mod.rs") && log.contains("in the core"), "{log}");
+    }
 }

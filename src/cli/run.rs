@@ -113,18 +113,18 @@ impl RunArgs {
     }
 }
 
-/// Serves until SIGTERM or SIGINT.
+/// Serves until SIGTERM, SIGINT or SIGHUP.
 pub fn run(args: &RunArgs) -> ExitCode {
+    let clock = Monotonic::start();
     // Before anything that starts a thread. A simulated printer needs none.
     let guardian = match args.board {
-        BoardName::Linux => Some(Guardian::start(args.realtime)),
+        BoardName::Linux => Some(Guardian::start(clock, args.realtime)),
         BoardName::Sim(_) => None,
     };
     let guardian = match guardian.transpose() {
         Ok(guardian) => guardian,
         Err(error) => return failed(error),
     };
-    let clock = Monotonic::start();
     let board = match args.board.open(Arc::new(clock), guardian.as_ref().map(Guardian::guard)) {
         Ok(board) => board,
         Err(error) => return failed(error),

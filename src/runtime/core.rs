@@ -16,8 +16,8 @@ use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use crate::wire::block::PAYLOAD_MAX;
 use crate::wire::vlq::Reader;
 
-use super::guardian::{BEAT, Pulse};
 use super::outlet::{LinkWake, Progress};
+use super::pulse::{BEAT, Pulse};
 use super::wakeup::{Waiter, Woken};
 
 /// The payload of a message block on its way to the core.
@@ -57,8 +57,8 @@ pub(super) enum Request {
 
 /// A command takes a microsecond or two: within this span of a timer none is begun.
 const NEAR: Ticks = Ticks::from_us(5);
-/// A timer beyond this leaves time for a nap.
-const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64 / 2;
+/// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
+const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
 /// So long the core looks for the next command before it sleeps: hosts send in bursts, and to be
 /// woken takes as long (20 to 50 us on the machines measured). A lone processor is the host's.
 const LINGER: Ticks = Ticks::from_us(30);
@@ -113,7 +113,6 @@ impl Core {
         let mut busy_since = self.clock.now();
         let mut was_shutdown = false;
         loop {
-            self.pulse.beat(self.mcu.is_running());
             if self.mcu.is_shutdown() != was_shutdown {
                 was_shutdown = !was_shutdown;
                 if was_shutdown {
@@ -121,6 +120,7 @@ impl Core {
                 }
             }
             let next = self.mcu.run_timers();
+            self.pulse.beat(self.mcu.last_read(), self.mcu.is_running());
             self.mcu.run_workers();
             self.waiter.ran(self.mcu.last_read());
             let near = next.is_some_and(|next| next < self.mcu.last_read() + NEAR);
@@ -132,7 +132,7 @@ impl Core {
                     }
                     Turn::Quit => {
                         // Workers and devices may take their time to end.
-                        self.pulse.beat(false);
+                        self.pulse.beat(self.mcu.now(), false);
                         if !was_shutdown {
                             self.mcu.report_lateness(self.waiter.margin());
                         }
@@ -153,7 +153,7 @@ impl Core {
             }
             self.mcu.account(Ticks(now.since(busy_since) as u32));
             let (requests, mcu, pending) = (&mut self.requests, &self.mcu, self.block.is_some());
-            let to_go = deadline.map_or(4 * FAR, |deadline| deadline.since(now));
+            let to_go = deadline.map_or(2 * FAR, |deadline| deadline.since(now));
             if to_go > FAR {
                 // Half the way leaves room for a late wake-up.
                 self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));
@@ -231,8 +231,9 @@ impl Core {
             self.block = Some((payload, at));
         } else {
             self.progress.finish();
-            // The next block's end will do, if there is one.
-            if self.requests.is_empty() {
+            // The next block's end will do, if there is one; but a machine that is being configured
+            // takes its time for a block.
+            if self.requests.is_empty() || !self.mcu.is_running() {
                 self.wake.wake();
             }
         }
@@ -271,7 +272,6 @@ mod tests {
     use crate::mcu::{Dialect, Note, Outbox};
     use crate::runtime::realtime::{Processors, Scheduling};
     use crate::runtime::wakeup::MarginLimits;
-    use crate::runtime::watchdog::JobClocks;
     use crate::runtime::workers::Threads;
     use crate::time::Monotonic;
     use crate::wire::vlq::Writer;
@@ -363,14 +363,16 @@ mod tests {
             let (gate, closed) = mpsc::channel();
             let board = SpiBoard(Some(Gate(closed)));
             let dialect = Arc::new(Dialect::new(FEATURES, &board).unwrap());
-            let clock = Arc::new(Counting(Monotonic::start(), AtomicUsize::new(0)));
+            let monotonic = Monotonic::start();
+            let clock = Arc::new(Counting(monotonic, AtomicUsize::new(0)));
             let (requests, inbox) = RingBuffer::new(2 * BLOCKS as usize);
             let progress = Arc::new(Progress::default());
             let heard = Heard::default();
             let (core_dialect, core_progress, core_heard) = (dialect.clone(), progress.clone(), heard.clone());
             let core_clock: Arc<dyn TimeSource> = clock.clone();
             let thread = thread::spawn(move || {
-                let workers = Threads::new(thread::current(), Arc::new(|| ()), JobClocks::default());
+                let pulse = Pulse::new(monotonic).unwrap();
+                let workers = Threads::new(thread::current(), Arc::new(|| ()), pulse);
                 let mcu = Mcu::new(
                     core_dialect,
                     Box::new(board),
@@ -380,8 +382,7 @@ mod tests {
                 );
                 let (limits, processors) = (MarginLimits::default(), Processors::new(None).unwrap());
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
-                let (pulse, wake) = (Pulse::new().unwrap(), Arc::new(LinkWake::new().unwrap()));
-                let (clock, progress) = (core_clock, core_progress);
+                let (clock, progress, wake) = (core_clock, core_progress, Arc::new(LinkWake::new().unwrap()));
                 Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run();
             });
             let mut bench = Bench { thread, dialect, clock, requests, progress, heard, gate };

@@ -7,19 +7,14 @@
 //!
 //! - when the program's end of their socket closes without a goodbye, or its pidfd says that it
 //!   is gone: SIGKILL, a crash, the OOM killer;
-//! - when the core leaves no heartbeat in a page that both share, while outputs are held.
+//! - when the core leaves no heartbeat in a page that both share (`pulse.rs`), while outputs are
+//!   held: within 600 ms of its last one while the machine runs.
 //!
 //! It drives the outputs, kills the program if that still lives (so that a core which comes back
 //! can not drive them again; what it drove meanwhile is driven back), says so in the log, and
 //! ends, which frees the lines for a restart. It has a session of its own and ignores the signals
 //! that ask a program to end, as a terminal and a service manager send them to both processes:
 //! it ends when the program says goodbye.
-//!
-//! The heartbeat's limit is what the core asks for: while the machine runs, half a second
-//! ([`RUNNING`]); else half a minute ([`IDLE`]), as opening a device or ending a bus worker may
-//! take its time, and outputs stand at their start or shutdown values then. Silence counts only
-//! as far as the guardian itself was awake to hear it, so a suspended or frozen machine is not
-//! taken for a core that hangs. The core looks up at least every [`BEAT`].
 //!
 //! Who kills the guardian stops the machine: the link notices, the machine shuts down as
 //! "Guardian process lost", and the program ends with status 1, so that the service manager
@@ -30,9 +25,9 @@
 #![forbid(unsafe_code)]
 
 use std::io::{self, IoSlice};
+use std::iter;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, mpsc};
 use std::thread;
 use std::time::Duration;
 
@@ -51,146 +46,26 @@ use nix::unistd::{Pid, alarm, chdir, getpid, getppid, setsid};
 
 use crate::board::Guard;
 use crate::sys;
-use crate::time::monotonic;
+use crate::time::{Monotonic, monotonic};
 
+use super::pulse::{Ear, Pulse};
 use super::realtime;
 
-/// How long the core may be silent while the machine runs. With [`BEAT`] and [`SLICE`] outputs
-/// are driven 450 to 550 ms after the last heartbeat.
-const RUNNING: Duration = Duration::from_millis(450);
-/// How long the core may be silent while the machine is being configured or is shut down.
-const IDLE: Duration = Duration::from_secs(30);
-/// A core with nothing to do looks up this often.
-pub(super) const BEAT: Duration = Duration::from_millis(200);
-/// The guardian looks for a heartbeat this often, while it holds outputs.
-const SLICE: Duration = Duration::from_millis(100);
 /// How long the program waits for the guardian's answer.
 const ANSWER_S: i64 = 5;
 /// How long a killed program may take to be gone.
 const END: Duration = Duration::from_secs(2);
+/// How long a driver may take to let the guardian write.
+const DRIVER: Duration = Duration::from_secs(1);
 /// The most that is written to a file.
 const FILE_BYTES: usize = 64;
 
-/// The core's heartbeat, in memory that the guardian sees.
-#[derive(Clone, Copy)]
-pub(super) struct Pulse {
-    beats: &'static AtomicU32,
-    patience_ms: &'static AtomicU32,
-}
-
-impl Pulse {
-    pub(super) fn new() -> io::Result<Pulse> {
-        let [beats, patience_ms, ..] = sys::shared_words()?;
-        let pulse = Pulse { beats, patience_ms };
-        pulse.set_patience(IDLE);
-        Ok(pulse)
-    }
-
-    fn set_patience(&self, patience: Duration) {
-        self.patience_ms.store(patience.as_millis() as u32, Ordering::Relaxed);
-    }
-
-    /// The core is alive; `running` is whether its machine is configured and not shut down. Only
-    /// the core calls this.
-    #[inline]
-    pub(super) fn beat(&self, running: bool) {
-        self.set_patience(if running { RUNNING } else { IDLE });
-        self.beats.store(self.beats.load(Ordering::Relaxed).wrapping_add(1), Ordering::Relaxed);
-    }
-}
-
-/// Listens to a heartbeat.
-pub(super) struct Ear {
-    pulse: Pulse,
-    /// What one look can add to the silence: a listener that slept through more has not heard
-    /// whether there was a beat.
-    longest: Duration,
-    beats: u32,
-    silence: Duration,
-    looked: Duration,
-}
-
-impl Ear {
-    /// Listens from `now` on.
-    pub(super) fn new(pulse: Pulse, longest: Duration, now: Duration) -> Ear {
-        Ear { pulse, longest, beats: pulse.beats.load(Ordering::Relaxed), silence: Duration::ZERO, looked: now }
-    }
-
-    /// Begins anew at `now`.
-    fn reset(&mut self, now: Duration) {
-        *self = Ear::new(self.pulse, self.longest, now);
-    }
-
-    fn patience(&self) -> Duration {
-        Duration::from_millis(self.pulse.patience_ms.load(Ordering::Relaxed).into())
-    }
-
-    /// Whether the heartbeat is missing at `now`.
-    pub(super) fn is_silent(&mut self, now: Duration) -> bool {
-        let beats = self.pulse.beats.load(Ordering::Relaxed);
-        if beats == self.beats {
-            self.silence += now.saturating_sub(self.looked).min(self.longest);
-        } else {
-            self.silence = Duration::ZERO;
-        }
-        (self.beats, self.looked) = (beats, now);
-        self.silence >= self.patience()
-    }
-
-    /// When to look again.
-    fn next_look(&self) -> Duration {
-        self.patience().saturating_sub(self.silence).min(self.longest)
-    }
-}
-
-/// An output in the guardian's hands.
-enum Held {
-    /// A GPIO line handle.
-    Line { line: OwnedFd, value: bool },
-    /// A file, and what is to be written at its beginning: the duty cycle of a PWM.
-    File { file: OwnedFd, bytes: Box<[u8]> },
-}
-
-impl Held {
-    fn drive(&self) -> io::Result<()> {
-        match self {
-            Held::Line { line, value } => sys::set_line(line.as_fd(), *value),
-            Held::File { file, bytes } => match pwrite(file, bytes, 0)? {
-                written if written == bytes.len() => Ok(()),
-                _ => Err(io::ErrorKind::WriteZero.into()),
-            },
-        }
-    }
-}
-
-/// What driving the outputs came to.
-#[derive(Default)]
-struct Driven {
-    outputs: usize,
-    failures: usize,
-    error: Option<io::Error>,
-}
-
-/// Drives every output, whatever becomes of the others. Does not allocate.
-fn drive(outputs: &[Held]) -> Driven {
-    let mut driven = Driven::default();
-    for output in outputs {
-        match output.drive() {
-            Ok(()) => driven.outputs += 1,
-            Err(error) => {
-                driven.failures += 1;
-                driven.error.get_or_insert(error);
-            }
-        }
-    }
-    driven
-}
-
-// Messages to the guardian: a kind, and with the first two a descriptor.
+// Messages to the guardian: a kind, and with the first three a descriptor.
 const LINE: u8 = 1; // then the value
 const FILE: u8 = 2; // then the bytes
-const RELEASE: u8 = 3;
-const GOODBYE: u8 = 4;
+const MORE: u8 = 3; // the same, of a further file of the same output
+const RELEASE: u8 = 4;
+const GOODBYE: u8 = 5;
 /// The guardian's answers to all but the last.
 const TAKEN: u8 = b'+';
 const REFUSED: u8 = b'-';
@@ -204,11 +79,12 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Forks the guardian: before any thread is started. With `realtime` it runs above the core.
-    pub fn start(realtime: bool) -> io::Result<Guardian> {
+    /// Forks the guardian: before any thread is started. `clock` is the core's. With `realtime`
+    /// it runs above the core.
+    pub fn start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
         let about =
             |error: io::Error| io::Error::new(error.kind(), format!("the guardian can not be started: {error}"));
-        let pulse = Pulse::new().map_err(about)?;
+        let pulse = Pulse::new(clock).map_err(about)?;
         let flags = SockFlag::SOCK_CLOEXEC;
         let (socket, theirs) =
             socketpair(AddressFamily::Unix, SockType::SeqPacket, None, flags).map_err(|error| about(error.into()))?;
@@ -223,7 +99,7 @@ impl Guardian {
             let _ = nix::unistd::close(ours);
             settle(realtime);
             let _ = send(theirs.as_raw_fd(), &[TAKEN], MsgFlags::MSG_NOSIGNAL);
-            Watcher { socket: theirs, program, pidfd, pulse, outputs: Vec::new() }.watch();
+            Watcher::new(theirs, Program { pid: program, pidfd }, pulse).watch();
             0
         })
         .map_err(about)?;
@@ -309,11 +185,12 @@ impl Guard for Lifeline {
         self.ask(&[LINE, shutdown_value.into()], Some(line))
     }
 
-    fn file(&mut self, file: RawFd, shutdown_bytes: &[u8]) -> io::Result<()> {
-        if shutdown_bytes.len() > FILE_BYTES {
+    fn files(&mut self, shutdown: &[(RawFd, &[u8])]) -> io::Result<()> {
+        if shutdown.iter().any(|(_, bytes)| bytes.len() > FILE_BYTES) {
             return Err(io::ErrorKind::InvalidInput.into());
         }
-        self.ask(&[&[FILE], shutdown_bytes].concat(), Some(file))
+        let kinds = iter::once(FILE).chain(iter::repeat(MORE));
+        kinds.zip(shutdown).try_for_each(|(kind, (file, bytes))| self.ask(&[&[kind], *bytes].concat(), Some(*file)))
     }
 
     fn release(&mut self) -> io::Result<()> {
@@ -342,12 +219,103 @@ fn settle(realtime: bool) {
     drop(drive(&[]));
 }
 
-struct Watcher {
-    socket: OwnedFd,
-    program: Pid,
+/// A GPIO line handle, and where the line belongs.
+struct Line {
+    line: OwnedFd,
+    value: bool,
+}
+
+/// What driving the outputs came to.
+#[derive(Default)]
+struct Driven {
+    outputs: usize,
+    failures: usize,
+    error: Option<io::Error>,
+}
+
+impl Driven {
+    fn count(&mut self, result: io::Result<()>) {
+        match result {
+            Ok(()) => self.outputs += 1,
+            Err(error) => {
+                self.failures += 1;
+                self.error.get_or_insert(error);
+            }
+        }
+    }
+}
+
+/// Drives every line, whatever becomes of the others. Does not allocate.
+fn drive(lines: &[Line]) -> Driven {
+    let mut driven = Driven::default();
+    for Line { line, value } in lines {
+        driven.count(sys::set_line(line.as_fd(), *value));
+    }
+    driven
+}
+
+/// An output that is driven by files, a PWM, and what is to be written at the beginning of each.
+struct Device(Vec<(OwnedFd, Box<[u8]>)>);
+
+impl Device {
+    fn drive(&self) -> io::Result<()> {
+        self.0.iter().try_for_each(|(file, bytes)| match pwrite(file, bytes, 0)? {
+            written if written == bytes.len() => Ok(()),
+            _ => Err(io::ErrorKind::WriteZero.into()),
+        })
+    }
+}
+
+/// Calls each in a thread of its own: one that never comes back keeps neither the others nor us.
+/// What they told is heard until `limit` after `meanwhile` is over.
+fn apart<F>(calls: Vec<F>, meanwhile: impl FnOnce(), limit: Duration) -> Driven
+where
+    F: FnOnce() -> io::Result<()> + Send + 'static,
+{
+    let (tell, told) = mpsc::channel();
+    let count = calls.len();
+    for call in calls {
+        let tell = tell.clone();
+        // Without a thread what it was to do is lost, and counts as unanswered.
+        let _ = thread::Builder::new().spawn(move || tell.send(call()));
+    }
+    meanwhile();
+    drop(tell);
+    let (mut driven, end) = (Driven::default(), monotonic() + limit);
+    for _ in 0..count {
+        let answer = told.recv_timeout(end.saturating_sub(monotonic()));
+        driven.count(answer.unwrap_or_else(|_| Err(io::Error::other("a driver hangs (dmesg)"))));
+    }
+    driven
+}
+
+/// The guarded program.
+struct Program {
+    pid: Pid,
     pidfd: Option<OwnedFd>,
-    pulse: Pulse,
-    outputs: Vec<Held>,
+}
+
+impl Program {
+    fn has_ended(&self) -> bool {
+        match &self.pidfd {
+            Some(pidfd) => is_readable(pidfd.as_fd()),
+            None => getppid() != self.pid,
+        }
+    }
+
+    fn kill(&self) {
+        // Its pid is its own as long as it is our parent.
+        if getppid() == self.pid {
+            let _ = kill(self.pid, Signal::SIGKILL);
+        }
+    }
+
+    fn wait_for_end(&self) {
+        let until = monotonic() + END;
+        while !self.has_ended() && monotonic() < until {
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
 }
 
 /// Why the outputs are driven.
@@ -356,26 +324,45 @@ enum Cause {
     Hangs,
 }
 
+struct Watcher {
+    socket: OwnedFd,
+    program: Program,
+    pulse: Pulse,
+    lines: Vec<Line>,
+    devices: Vec<Device>,
+}
+
 impl Watcher {
+    fn new(socket: OwnedFd, program: Program, pulse: Pulse) -> Watcher {
+        Watcher { socket, program, pulse, lines: Vec::new(), devices: Vec::new() }
+    }
+
+    fn holds_nothing(&self) -> bool {
+        self.lines.is_empty() && self.devices.is_empty()
+    }
+
     /// Watches until the program says goodbye or needs help.
     fn watch(mut self) {
-        let mut ear = Ear::new(self.pulse, SLICE, monotonic());
+        // While outputs are held.
+        let mut ear: Option<Ear> = None;
         let cause = loop {
-            let holding = !self.outputs.is_empty();
-            let timeout = holding.then(|| ear.next_look());
-            let (message, ended) = self.wait(timeout);
+            let pause = match &mut ear {
+                Some(ear) => match ear.listen(self.pulse.now()) {
+                    Some(pause) => Some(pause),
+                    None => break Cause::Hangs,
+                },
+                None => None,
+            };
+            let (message, ended) = self.wait(pause);
             if message {
                 match self.take_message() {
-                    Some(true) if !holding => ear.reset(monotonic()),
-                    Some(true) => {}
+                    Some(true) if self.holds_nothing() => ear = None,
+                    Some(true) => drop(ear.get_or_insert_with(|| Ear::new(self.pulse, self.pulse.now()))),
                     Some(false) => return,
                     None => break Cause::Died,
                 }
             } else if ended {
                 break Cause::Died;
-            }
-            if holding && ear.is_silent(monotonic()) {
-                break Cause::Hangs;
             }
         };
         self.rescue(&cause);
@@ -384,7 +371,7 @@ impl Watcher {
     /// Sleeps; then whether there is a message, and whether the program has ended.
     fn wait(&self, timeout: Option<Duration>) -> (bool, bool) {
         let timeout = timeout.map_or(PollTimeout::NONE, in_ms);
-        let pidfd = self.pidfd.as_ref().map_or(self.socket.as_fd(), AsFd::as_fd);
+        let pidfd = self.program.pidfd.as_ref().map_or(self.socket.as_fd(), AsFd::as_fd);
         let mut fds = [PollFd::new(self.socket.as_fd(), PollFlags::POLLIN), PollFd::new(pidfd, PollFlags::POLLIN)];
         if poll(&mut fds, timeout).is_err() {
             return (false, false);
@@ -408,9 +395,18 @@ impl Watcher {
         };
         match (&message[..len], descriptor) {
             ([GOODBYE], _) => return Some(false),
-            ([RELEASE], _) => self.outputs.clear(),
-            ([LINE, value], Some(line)) => self.outputs.push(Held::Line { line, value: *value != 0 }),
-            ([FILE, bytes @ ..], Some(file)) => self.outputs.push(Held::File { file, bytes: bytes.into() }),
+            ([RELEASE], _) => {
+                self.lines.clear();
+                self.devices.clear();
+            }
+            ([LINE, value], Some(line)) => self.lines.push(Line { line, value: *value != 0 }),
+            ([kind @ (FILE | MORE), bytes @ ..], Some(file)) => {
+                let write = (file, bytes.into());
+                match self.devices.last_mut().filter(|_| *kind == MORE) {
+                    Some(Device(writes)) => writes.push(write),
+                    None => self.devices.push(Device(vec![write])),
+                }
+            }
             _ => {
                 self.answer(REFUSED);
                 return Some(true);
@@ -425,35 +421,49 @@ impl Watcher {
         let _ = send(self.socket.as_raw_fd(), &[answer], MsgFlags::MSG_NOSIGNAL);
     }
 
-    fn rescue(&self, cause: &Cause) {
-        if self.outputs.is_empty() {
+    fn rescue(self, cause: &Cause) {
+        if self.holds_nothing() {
             return;
         }
-        let mut driven = drive(&self.outputs);
-        if !self.has_ended() {
-            // Its pid is its own as long as it is our parent.
-            if getppid() == self.program {
-                let _ = kill(self.program, Signal::SIGKILL);
+        let Watcher { program, pulse, lines, devices, .. } = self;
+        // Lines first: they never keep us.
+        let mut driven = drive(&lines);
+        let diagnosis = pulse.diagnosis();
+        let program = Arc::new(program);
+        let survived = !program.has_ended();
+        let calls = devices.into_iter().map(|device| {
+            let program = program.clone();
+            move || {
+                let first = device.drive();
+                if !survived {
+                    return first;
+                }
+                // What the program did meanwhile is undone.
+                program.wait_for_end();
+                device.drive()
             }
-            let until = monotonic() + END;
-            while !self.has_ended() && monotonic() < until {
-                thread::sleep(Duration::from_millis(1));
-            }
-            driven = drive(&self.outputs);
-        }
+        });
+        let of_devices = apart(
+            calls.collect(),
+            || {
+                if survived {
+                    program.kill();
+                    program.wait_for_end();
+                    driven = drive(&lines);
+                }
+            },
+            DRIVER,
+        );
         // A log that nobody reads must not keep the lines.
         alarm::set(2);
+        let pid = program.pid;
         let what = match cause {
-            Cause::Died => format!("Pinion (process {}) died: was it killed, or did it crash?", self.program),
-            Cause::Hangs => format!(
-                "the core gave no sign of life for {} ms: Pinion (process {}) is killed",
-                self.pulse.patience_ms.load(Ordering::Relaxed),
-                self.program
-            ),
+            Cause::Died => format!("Pinion (process {pid}) died: was it killed, or did it crash?"),
+            Cause::Hangs => format!("{diagnosis}: Pinion (process {pid}) is killed"),
         };
-        let Driven { outputs, failures, error } = driven;
-        let all = outputs + failures;
-        match error {
+        let outputs = driven.outputs + of_devices.outputs;
+        let all = outputs + driven.failures + of_devices.failures;
+        match driven.error.or(of_devices.error) {
             None => {
                 error!("guardian: {what}; all {all} outputs are driven to their shutdown values, start Pinion again")
             }
@@ -461,13 +471,6 @@ impl Watcher {
                 "guardian: {what}; only {outputs} of {all} outputs are driven to their shutdown values ({error}): \
                  switch the power off"
             ),
-        }
-    }
-
-    fn has_ended(&self) -> bool {
-        match &self.pidfd {
-            Some(pidfd) => is_readable(pidfd.as_fd()),
-            None => getppid() != self.program,
         }
     }
 }
@@ -486,69 +489,69 @@ pub(super) fn in_ms(timeout: Duration) -> PollTimeout {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::board::Buffer;
+    use crate::mcu::{Job, Oid, Ticket, Workers};
+    use crate::runtime::workers::Threads;
+    use crate::shutdown::Shutdown;
     use std::fs::{self, File};
     use std::io::{BufRead, BufReader};
-    use std::path::Path;
+    use std::path::{Path, PathBuf};
     use std::process::{Child, Command, Stdio};
 
     const MS: Duration = Duration::from_millis(1);
 
-    fn ear(pulse: Pulse) -> Ear {
-        Ear::new(pulse, SLICE, Duration::ZERO)
+    #[test]
+    fn a_driver_that_hangs_keeps_nobody_else() {
+        let (_release, hangs) = mpsc::channel::<()>();
+        let (done, told) = mpsc::channel();
+        let calls: Vec<Box<dyn FnOnce() -> io::Result<()> + Send>> = vec![
+            Box::new(move || hangs.recv().map_err(io::Error::other)),
+            Box::new(|| Err(Errno::ENODEV.into())),
+            Box::new(move || done.send(()).map_err(io::Error::other)),
+        ];
+        let driven = apart(calls, || told.recv().unwrap(), 100 * MS);
+        assert_eq!((driven.outputs, driven.failures), (1, 2));
+        assert_eq!(driven.error.unwrap().raw_os_error(), Some(libc::ENODEV));
     }
 
-    #[test]
-    fn a_core_that_beats_is_not_silent() {
-        let pulse = Pulse::new().unwrap();
-        let mut ear = ear(pulse);
-        for look in 1..100 {
-            if look % 4 == 0 {
-                pulse.beat(true);
+    /// A device that never is done.
+    struct Stuck;
+
+    impl crate::board::Device for Stuck {
+        fn run(&mut self, _: &mut Buffer) -> Result<(), Shutdown> {
+            loop {
+                thread::park();
             }
-            assert!(!ear.is_silent(look * 100 * MS), "look {look}");
         }
     }
 
-    #[test]
-    fn a_running_core_may_be_silent_for_450_ms() {
-        let pulse = Pulse::new().unwrap();
-        let mut ear = ear(pulse);
-        pulse.beat(true);
-        let mut now = Duration::ZERO;
-        let silent_at = loop {
-            now += ear.next_look();
-            if ear.is_silent(now) {
-                break now;
+    /// A core that gets on while a worker does not, and then stops.
+    fn stop_with_a_stuck_worker(pulse: Pulse) {
+        let mut workers = Threads::new(thread::current(), Arc::new(|| ()), pulse);
+        let device = workers.attach("pwmchip7", Box::new(Stuck)).unwrap();
+        let job = |stopping| Job { device, ticket: Ticket { oid: Oid(0), tag: 0 }, data: Buffer::new(&[0]), stopping };
+        workers.submit(job(false)).unwrap();
+        for beats in 0.. {
+            if beats == 10 {
+                workers.submit(job(true)).unwrap();
             }
-        };
-        assert_eq!(silent_at, 550 * MS);
+            pulse.beat(pulse.now(), beats < 10);
+            thread::sleep(10 * MS);
+        }
     }
 
-    #[test]
-    fn a_core_that_is_configured_may_take_its_time() {
-        let pulse = Pulse::new().unwrap();
-        let mut ear = ear(pulse);
-        pulse.beat(false);
-        let silent_at = (1..1000).map(|look| look * 100 * MS).find(|now| ear.is_silent(*now));
-        assert_eq!(silent_at, Some(IDLE + SLICE));
-    }
+    /// A guarded program, which is killed with a test that fails.
+    struct Guarded(Child);
 
-    #[test]
-    fn what_the_listener_slept_through_is_no_silence() {
-        let pulse = Pulse::new().unwrap();
-        let mut ear = ear(pulse);
-        pulse.beat(true);
-        assert!(!ear.is_silent(100 * MS));
-        // The machine stood still for a minute.
-        assert!(!ear.is_silent(Duration::from_secs(60)));
-        assert_eq!(ear.silence, SLICE);
-        // A guardian that never gets its turn in time still hears a core that hangs.
-        let looks = (61..70).take_while(|s| !ear.is_silent(Duration::from_secs(*s))).count();
-        assert_eq!(looks, 3);
+    impl Drop for Guarded {
+        fn drop(&mut self) {
+            let _ = self.0.kill();
+            let _ = self.0.wait();
+        }
     }
 
     /// This test program itself, as a program that is guarded.
-    fn start(script: &str, file: &Path) -> (Child, u32) {
+    fn start(script: &str, file: &Path) -> (Guarded, u32) {
         fs::write(file, "on ").unwrap();
         let mut child = Command::new(std::env::current_exe().unwrap())
             .args(["--ignored", "--exact", "runtime::guardian::tests::guarded_program"])
@@ -556,31 +559,33 @@ mod tests {
             .env("GUARDED_SCRIPT", script)
             .env("GUARDED_FILE", file)
             .stdout(Stdio::piped())
-            .stderr(Stdio::null())
+            .stderr(File::create(log_of(file)).unwrap())
             .spawn()
             .unwrap();
         let lines = BufReader::new(child.stdout.as_mut().unwrap()).lines();
         let guardian = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("guardian ")?.parse().ok());
-        (child, guardian.expect("the guarded program says who guards it"))
+        (Guarded(child), guardian.expect("the guarded program says who guards it"))
     }
 
     #[test]
     #[ignore = "started by other tests"]
     fn guarded_program() {
         let (Ok(script), Ok(path)) = (std::env::var("GUARDED_SCRIPT"), std::env::var("GUARDED_FILE")) else { return };
-        let guardian = Guardian::start(false).unwrap();
+        env_logger::Builder::new().filter_level(log::LevelFilter::Info).init();
+        let guardian = Guardian::start(Monotonic::start(), false).unwrap();
         let pulse = guardian.pulse();
         let mut guard = guardian.guard();
         let file = File::options().write(true).open(path).unwrap();
-        guard.file(file.as_raw_fd(), b"off").unwrap();
+        guard.files(&[(file.as_raw_fd(), b"on?"), (file.as_raw_fd(), b"off")]).unwrap();
         if script == "release" {
             guard.release().unwrap();
         }
-        pulse.beat(script == "hang");
+        pulse.beat(pulse.now(), script == "hang");
         println!("\nguardian {}", guardian.pid);
         match script.as_str() {
             "abort" => std::process::abort(),
             "goodbye" => guardian.goodbye(),
+            "stuck" => stop_with_a_stuck_worker(pulse),
             _ => loop {
                 thread::sleep(Duration::from_secs(1));
             },
@@ -604,71 +609,92 @@ mod tests {
         fs::read_to_string(file).unwrap()
     }
 
-    fn file() -> tempfile::TempPath {
-        tempfile::NamedTempFile::new().unwrap().into_temp_path()
+    /// A file, in a folder that goes with it.
+    fn file() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("output");
+        (folder, file)
+    }
+
+    fn log_of(file: &Path) -> PathBuf {
+        file.with_extension("log")
     }
 
     #[test]
     fn a_killed_program_s_outputs_go_to_their_shutdown_values() {
-        let file = file();
+        let (_folder, file) = file();
         let (mut program, guardian) = start("sleep", &file);
         let comm = fs::read_to_string(format!("/proc/{guardian}/comm")).unwrap();
         assert_eq!(comm, "pinion-guardian\n");
         assert_eq!(content(&file), "on ");
-        program.kill().unwrap();
+        program.0.kill().unwrap();
         wait_until("driven", || content(&file) == "off");
         wait_until("the guardian ends", || is_gone(guardian));
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
     fn an_aborted_program_s_outputs_go_to_their_shutdown_values() {
-        let file = file();
+        let (_folder, file) = file();
         let (mut program, guardian) = start("abort", &file);
         wait_until("driven", || content(&file) == "off");
         wait_until("the guardian ends", || is_gone(guardian));
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
     fn a_program_that_hangs_is_killed_and_its_outputs_driven() {
         use std::os::unix::process::ExitStatusExt;
-        let file = file();
+        let (_folder, file) = file();
         let (mut program, guardian) = start("hang", &file);
         wait_until("driven", || content(&file) == "off");
-        assert_eq!(program.wait().unwrap().signal(), Some(9));
+        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
         wait_until("the guardian ends", || is_gone(guardian));
     }
 
     #[test]
+    fn a_worker_that_does_not_set_the_shutdown_state_is_named_and_the_program_killed() {
+        use std::os::unix::process::ExitStatusExt;
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("stuck", &file);
+        wait_until("driven", || content(&file) == "off");
+        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
+        wait_until("the guardian ends", || is_gone(guardian));
+        let log = content(&log_of(&file));
+        assert!(log.contains("the worker of pwmchip7 did not set the shutdown state within 1000 ms:"), "{log}");
+        // Two files are one output.
+        assert!(log.contains("all 1 outputs are driven to their shutdown values"), "{log}");
+    }
+
+    #[test]
     fn signals_that_ask_a_program_to_end_leave_the_guardian_alone() {
-        let file = file();
+        let (_folder, file) = file();
         let (mut program, guardian) = start("sleep", &file);
         for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
             kill(Pid::from_raw(guardian as i32), signal).unwrap();
         }
         thread::sleep(50 * MS);
         assert!(!is_gone(guardian));
-        program.kill().unwrap();
+        program.0.kill().unwrap();
         wait_until("driven", || content(&file) == "off");
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
     fn outputs_that_were_given_back_stay_as_they_are() {
-        let file = file();
+        let (_folder, file) = file();
         let (mut program, guardian) = start("release", &file);
-        program.kill().unwrap();
+        program.0.kill().unwrap();
         wait_until("the guardian ends", || is_gone(guardian));
         assert_eq!(content(&file), "on ");
-        program.wait().unwrap();
+        program.0.wait().unwrap();
     }
 
     #[test]
     fn after_a_goodbye_outputs_stay_as_they_are() {
-        let file = file();
+        let (_folder, file) = file();
         let (mut program, guardian) = start("goodbye", &file);
-        assert!(program.wait().unwrap().success());
+        assert!(program.0.wait().unwrap().success());
         assert!(is_gone(guardian));
         assert_eq!(content(&file), "on ");
     }
@@ -678,7 +704,7 @@ mod tests {
         // libtest runs tests in threads, unless told otherwise.
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         let other = thread::spawn(move || stopped.recv());
-        let error = Guardian::start(false).err().unwrap();
+        let error = Guardian::start(Monotonic::start(), false).err().unwrap();
         assert_eq!(error.to_string(), "the guardian can not be started: threads have been started already");
         drop(stop);
         let _ = other.join();

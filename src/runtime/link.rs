@@ -25,10 +25,10 @@ use crate::wire::vlq::{Reader, Writer};
 
 use super::core::{Payload, Request};
 use super::guardian::in_ms;
-use super::outlet::{Inlet, LinkWake, Progress, Record};
+use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
 use super::signals::{Signal, Signals};
-use super::watchdog::Vigil;
+use super::watchdog::{Vigil, Watchdog};
 
 /// What a shell writes to the pty to stop the machine, as in Klipper's service file.
 const FORCE_SHUTDOWN: &[u8] = b"FORCE_SHUTDOWN\n";
@@ -183,6 +183,11 @@ impl Link {
         }
     }
 
+    /// Feeds a hardware watchdog from now on.
+    pub(super) fn feed(&mut self, watchdog: Watchdog) {
+        self.vigil.feed(watchdog);
+    }
+
     /// Serves the host until the program has to end.
     pub(super) fn run(&mut self) -> io::Result<End> {
         self.vigil.ready();
@@ -244,7 +249,8 @@ impl Link {
     fn wait(&mut self, stalled: bool) -> io::Result<Woken> {
         self.wake.sleeping();
         let full = self.output.len() >= OUTPUT_BYTES;
-        if !full && (!self.inlet.is_empty() || self.done() != self.acknowledged) {
+        let unread = !full && (self.inlet.has_response() || self.done() != self.acknowledged);
+        if unread || self.inlet.has_line() {
             self.wake.awake(false);
             return Ok(Woken { by_signal: false, by_input: true });
         }
@@ -416,6 +422,9 @@ impl Link {
 
     /// Frames what the core said and writes what the pty has room for.
     fn give_out(&mut self) {
+        while let Some((level, line)) = self.inlet.line() {
+            log!(level, "{line}");
+        }
         // What was said of these blocks is in the ring already.
         let done = self.done();
         frame_records(&mut self.inlet, self.answered, &mut self.said, &mut self.output);
@@ -438,16 +447,11 @@ impl Link {
     }
 }
 
-/// Frames what the core said as long as the host reads; lines go to the log.
+/// Frames what the core said as long as the host reads.
 fn frame_records(inlet: &mut Inlet, answered: u32, said: &mut u32, output: &mut Vec<u8>) {
     while output.len() < OUTPUT_BYTES {
-        match inlet.next() {
-            Some(Record::Response(payload, begun)) => {
-                *said = begun.wrapping_add(answered);
-                frame(payload, Sequence::after(*said), output);
-            }
-            Some(Record::Line(level, line)) => log!(level, "{line}"),
-            None => break,
-        }
+        let Some((payload, begun)) = inlet.response() else { return };
+        *said = begun.wrapping_add(answered);
+        frame(payload, Sequence::after(*said), output);
     }
 }

@@ -28,6 +28,7 @@ mod link;
 mod notify;
 mod outlet;
 mod pty;
+mod pulse;
 pub mod realtime;
 mod signals;
 pub mod wakeup;
@@ -38,15 +39,15 @@ pub use guardian::Guardian;
 pub use pty::Access;
 
 use self::core::{Core, Request};
-use guardian::Pulse;
 use link::{End, Link, Parts};
 use notify::Notify;
 use outlet::{LinkWake, Progress};
 use pty::Pty;
+use pulse::Pulse;
 use realtime::{Processors, Role, Scheduling};
 use signals::Signals;
 use wakeup::{MarginLimits, Waiter};
-use watchdog::{JobClocks, Vigil, Watchdog};
+use watchdog::{Vigil, Watchdog};
 use workers::Threads;
 
 /// Blocks between link and core: four times what a host may have under way.
@@ -69,7 +70,7 @@ pub struct Options {
     pub cpu: Option<usize>,
 }
 
-/// Serves a host on a pty until SIGTERM or SIGINT; calls `ready` once a host may come.
+/// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP; calls `ready` once a host may come.
 /// `guardian` is that of the board's outputs.
 pub fn run(
     options: &Options,
@@ -78,7 +79,7 @@ pub fn run(
     guardian: Option<Guardian>,
     ready: impl FnOnce(),
 ) -> io::Result<()> {
-    let pulse = guardian.as_ref().map_or_else(Pulse::new, |guardian| Ok(guardian.pulse()))?;
+    let pulse = guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse()))?;
     let processors = Processors::new(options.cpu)?;
     let pty = Pty::open(&options.link, &options.access)?;
     let signals = Signals::new()?;
@@ -91,15 +92,11 @@ pub fn run(
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
 
-    // Last of what may fail: once open it resets the machine, unless we end in order.
-    let watchdog = options.watchdog.as_deref().map(Watchdog::open).transpose()?;
-
     let (realtime, margin) = (options.realtime, options.margin);
     if realtime {
         realtime::lock_memory();
     }
-    let jobs = JobClocks::default();
-    let (core_dialect, core_clock, core_jobs) = (dialect.clone(), clock.clone(), jobs.clone());
+    let (core_dialect, core_clock) = (dialect.clone(), clock.clone());
     let (core_progress, core_wake) = (progress.clone(), wake.clone());
     let core = thread::Builder::new().name("core".into()).spawn(move || {
         if let Err(error) = processors.confine() {
@@ -113,7 +110,7 @@ pub fn run(
                 realtime::enter(Role::Worker);
             }
         });
-        let workers = Box::new(Threads::new(thread::current(), prepare, core_jobs));
+        let workers = Box::new(Threads::new(thread::current(), prepare, pulse));
         let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
         let waiter = Waiter::new(core_clock.clone(), margin, scheduling, processors);
         Core::new(self::core::Parts {
@@ -140,16 +137,20 @@ pub fn run(
         wake,
         signals,
         guardian: guardian.as_ref().map(Guardian::socket),
-        vigil: Vigil::new(watchdog, notify, notify::watchdog_interval(), pulse, jobs),
+        vigil: Vigil::new(notify, notify::watchdog_interval(), pulse),
     });
     if realtime {
         realtime::enter(Role::Link);
     }
-    ready();
-    let served = link.run();
-    if let Err(error) = &served {
-        error!("the pty failed: {error}");
-    }
+    // Last of what may fail: once open it resets the machine, unless we end in order.
+    let watched = match &options.watchdog {
+        Some(path) => Watchdog::open(path).map(|watchdog| link.feed(watchdog)),
+        None => Ok(()),
+    };
+    let served = watched.and_then(|()| {
+        ready();
+        link.run().inspect_err(|error| error!("the pty failed: {error}"))
+    });
     link.stopping();
     link.request(Request::Quit);
     let in_order = core.join().is_ok();

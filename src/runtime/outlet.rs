@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! From the core to the link: responses for the host and lines for the log, through a ring
-//! that neither side waits for.
+//! From the core to the link: responses for the host and lines for the log, through rings that
+//! neither side waits for. Lines have one of their own, as a host that does not read must not
+//! cost the line that says why the machine stopped.
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +12,6 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use log::Level;
 use nix::sys::eventfd::{EfdFlags, EventFd};
-use rtrb::chunks::ChunkError;
 use rtrb::{Consumer, Producer, RingBuffer};
 
 use crate::lateness::us;
@@ -21,10 +21,17 @@ use crate::shutdown::Reason;
 /// Bytes between core and link: some 1,000 responses. When the host does not read, later ones
 /// are dropped.
 const RING_BYTES: usize = 1 << 16;
-/// A record's kind, its length and the blocks begun.
-const HEAD_BYTES: usize = 7;
+/// A payload's length and the blocks begun.
+const HEAD_BYTES: usize = 6;
 /// The longest line for the log.
 const LINE_BYTES: usize = 1024;
+/// A line's level and its length.
+const LINE_HEAD_BYTES: usize = 3;
+/// Bytes of lines between core and link.
+const LINES_BYTES: usize = 1 << 15;
+/// Of these, what only a machine that stops may use: each object can have trouble with that, and
+/// the reason comes last.
+const LINES_SPARE: usize = 2 * (LINE_HEAD_BYTES + LINE_BYTES);
 
 /// Wakes the link, at the price of a system call only while it sleeps.
 pub(super) struct LinkWake {
@@ -92,70 +99,69 @@ impl Progress {
     }
 }
 
-/// What a record of the ring is.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Kind {
-    Response = 0,
-    Error = 1,
-    Warning = 2,
-    Info = 3,
-}
-
 /// The core's end.
 pub(super) struct Outlet {
-    ring: Producer<u8>,
+    responses: Producer<u8>,
+    lines: Producer<u8>,
     wake: Arc<LinkWake>,
     progress: Arc<Progress>,
 }
 
 /// The link's end.
 pub(super) struct Inlet {
-    ring: Consumer<u8>,
-    record: Vec<u8>,
+    responses: Consumer<u8>,
+    lines: Consumer<u8>,
+    payload: Vec<u8>,
 }
 
-/// Something that the core said.
-pub(super) enum Record<'a> {
-    /// A payload, and how many blocks the core had begun when it said so.
-    Response(&'a [u8], u32),
-    Line(Level, String),
-}
-
-/// Both ends of a ring.
+/// Both ends.
 pub(super) fn outlet(wake: Arc<LinkWake>, progress: Arc<Progress>) -> (Outlet, Inlet) {
-    let (producer, consumer) = RingBuffer::new(RING_BYTES);
-    (Outlet { ring: producer, wake, progress }, Inlet { ring: consumer, record: vec![0; LINE_BYTES] })
+    let (to_host, responses) = RingBuffer::new(RING_BYTES);
+    let (to_log, lines) = RingBuffer::new(LINES_BYTES);
+    let inlet = Inlet { responses, lines, payload: vec![0; usize::from(u16::MAX)] };
+    (Outlet { responses: to_host, lines: to_log, wake, progress }, inlet)
+}
+
+/// Puts a record in as a whole, or not at all.
+fn push(ring: &mut Producer<u8>, head: &[u8], bytes: &[u8]) {
+    if let Ok(chunk) = ring.write_chunk_uninit(head.len() + bytes.len()) {
+        chunk.fill_from_iter(head.iter().chain(bytes).copied());
+    }
+}
+
+/// Takes so many bytes out of a ring, if they are there.
+fn pop<'a>(ring: &mut Consumer<u8>, to: &'a mut [u8]) -> Option<&'a [u8]> {
+    let chunk = ring.read_chunk(to.len()).ok()?;
+    for (to, from) in to.iter_mut().zip(chunk) {
+        *to = from;
+    }
+    Some(to)
 }
 
 impl Outlet {
-    fn push(&mut self, kind: Kind, bytes: &[u8]) {
-        let mut head = [0; HEAD_BYTES];
-        head[0] = kind as u8;
-        head[1..3].copy_from_slice(&(bytes.len() as u16).to_le_bytes());
-        head[3..].copy_from_slice(&self.progress.begun.load(Ordering::Relaxed).to_le_bytes());
-        match self.ring.write_chunk_uninit(HEAD_BYTES + bytes.len()) {
-            Ok(chunk) => {
-                chunk.fill_from_iter(head.into_iter().chain(bytes.iter().copied()));
-            }
-            // The host does not read: what it misses is lost, as in the firmware.
-            Err(ChunkError::TooFewSlots(_)) => {}
-        }
-        self.wake.wake();
-    }
-
-    fn line(&mut self, kind: Kind, line: std::fmt::Arguments<'_>) {
+    /// What does not leave `spare` bytes free is lost.
+    fn line(&mut self, level: Level, spare: usize, line: std::fmt::Arguments<'_>) {
         let mut text = [0; LINE_BYTES];
         let mut rest = &mut text[..];
         // A line that is too long is cut.
         let _ = rest.write_fmt(line);
         let len = LINE_BYTES - rest.len();
-        self.push(kind, &text[..len]);
+        if self.lines.slots() >= LINE_HEAD_BYTES + len + spare {
+            let [low, high] = (len as u16).to_le_bytes();
+            push(&mut self.lines, &[level as u8, low, high], &text[..len]);
+        }
+        self.wake.wake();
     }
 }
 
 impl Outbox for Outlet {
     fn send(&mut self, payload: &[u8]) {
-        self.push(Kind::Response, payload);
+        let mut head = [0; HEAD_BYTES];
+        head[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
+        head[2..].copy_from_slice(&self.progress.begun.load(Ordering::Relaxed).to_le_bytes());
+        // When the host does not read, what it misses is lost, as in the firmware.
+        push(&mut self.responses, &head, payload);
+        self.wake.wake();
     }
 
     fn note(&mut self, note: Note<'_>) {
@@ -163,15 +169,23 @@ impl Outbox for Outlet {
             Note::Shutdown(shutdown) => {
                 // What somebody asked for is no error.
                 let asked = matches!(shutdown.reason, Reason::CommandRequest | Reason::ForceShutdown);
-                let kind = if asked { Kind::Warning } else { Kind::Error };
-                self.line(kind, format_args!("shutdown: {shutdown}"));
+                let level = if asked { Level::Warn } else { Level::Error };
+                self.line(level, 0, format_args!("shutdown: {shutdown}"));
             }
-            Note::Trouble(shutdown) => self.line(Kind::Error, format_args!("while shut down: {shutdown}")),
+            Note::Trouble(shutdown) => {
+                self.line(Level::Error, LINES_SPARE, format_args!("while shut down: {shutdown}"));
+            }
             Note::Lateness(lateness, margin) => {
-                self.line(Kind::Info, format_args!("timers: {lateness}; the core wakes {:.1} us early", us(margin)));
+                let margin = us(margin);
+                let line = format_args!("timers: {lateness}; the core wakes {margin:.1} us early");
+                self.line(Level::Info, LINES_SPARE, line);
             }
-            Note::Reset => self.line(Kind::Info, format_args!("configuration dropped, waiting for a new one")),
-            Note::Configured(kinds) => self.line(Kind::Info, format_args!("configured: {}", Kinds(kinds))),
+            Note::Reset => {
+                self.line(Level::Info, LINES_SPARE, format_args!("configuration dropped, waiting for a new one"));
+            }
+            Note::Configured(kinds) => {
+                self.line(Level::Info, LINES_SPARE, format_args!("configured: {}", Kinds(kinds)));
+            }
         }
     }
 }
@@ -193,31 +207,33 @@ impl std::fmt::Display for Kinds<'_> {
 }
 
 impl Inlet {
-    /// The next record, if a whole one is there.
-    pub(super) fn next(&mut self) -> Option<Record<'_>> {
+    /// The next response, and how many blocks the core had begun when it gave it.
+    pub(super) fn response(&mut self) -> Option<(&[u8], u32)> {
         let mut head = [0; HEAD_BYTES];
-        for (to, from) in head.iter_mut().zip(self.ring.read_chunk(HEAD_BYTES).ok()?) {
-            *to = from;
-        }
-        let [kind, low, high, begun @ ..] = head;
-        let len = usize::from(u16::from_le_bytes([low, high])).min(LINE_BYTES);
-        // The core commits a record as a whole.
-        let body = self.ring.read_chunk(len).ok()?;
-        for (to, from) in self.record.iter_mut().zip(body) {
-            *to = from;
-        }
-        let record = &self.record[..len];
-        let line = |level| Record::Line(level, String::from_utf8_lossy(record).into_owned());
-        Some(match kind {
-            kind if kind == Kind::Error as u8 => line(Level::Error),
-            kind if kind == Kind::Warning as u8 => line(Level::Warn),
-            kind if kind == Kind::Info as u8 => line(Level::Info),
-            _ => Record::Response(record, u32::from_le_bytes(begun)),
-        })
+        pop(&mut self.responses, &mut head)?;
+        let [low, high, begun @ ..] = head;
+        let len = usize::from(u16::from_le_bytes([low, high]));
+        Some((pop(&mut self.responses, &mut self.payload[..len])?, u32::from_le_bytes(begun)))
     }
 
-    pub(super) fn is_empty(&self) -> bool {
-        self.ring.is_empty()
+    /// The next line for the log.
+    pub(super) fn line(&mut self) -> Option<(Level, String)> {
+        let mut head = [0; LINE_HEAD_BYTES];
+        pop(&mut self.lines, &mut head)?;
+        let [level, low, high] = head;
+        let level = [Level::Error, Level::Warn].into_iter().find(|known| *known as u8 == level).unwrap_or(Level::Info);
+        let mut text = [0; LINE_BYTES];
+        let len = usize::from(u16::from_le_bytes([low, high])).min(LINE_BYTES);
+        let text = pop(&mut self.lines, &mut text[..len])?;
+        Some((level, String::from_utf8_lossy(text).into_owned()))
+    }
+
+    pub(super) fn has_response(&self) -> bool {
+        !self.responses.is_empty()
+    }
+
+    pub(super) fn has_line(&self) -> bool {
+        !self.lines.is_empty()
     }
 }
 
@@ -226,24 +242,48 @@ mod tests {
     use super::*;
     use crate::shutdown::Shutdown;
 
-    #[test]
-    fn records_come_out_as_they_went_in_and_a_full_ring_drops() {
+    fn ends() -> (Outlet, Inlet, Arc<Progress>) {
         let progress = Arc::new(Progress::default());
-        let (mut outlet, mut inlet) = outlet(Arc::new(LinkWake::new().unwrap()), progress.clone());
+        let (outlet, inlet) = outlet(Arc::new(LinkWake::new().unwrap()), progress.clone());
+        (outlet, inlet, progress)
+    }
+
+    #[test]
+    fn what_the_host_does_not_read_is_dropped_and_the_reason_of_a_stop_is_not() {
+        let (mut outlet, mut inlet, progress) = ends();
         progress.begin();
         outlet.send(b"one");
-        outlet.note(Note::Shutdown(&Shutdown::because(Reason::AdcRange, "oid 3")));
-        assert!(matches!(inlet.next(), Some(Record::Response(b"one", 1))));
-        let Some(Record::Line(Level::Error, line)) = inlet.next() else { panic!() };
-        assert_eq!(line, "shutdown: ADC out of range: oid 3");
+        assert_eq!(inlet.response(), Some((&b"one"[..], 1)));
         for _ in 0..RING_BYTES {
             outlet.send(&[7; 60]);
         }
+        outlet.note(Note::Shutdown(&Shutdown::because(Reason::AdcRange, "oid 3")));
+        assert!(inlet.has_line());
+        assert_eq!(inlet.line(), Some((Level::Error, "shutdown: ADC out of range: oid 3".into())));
+        assert_eq!(inlet.line(), None);
         let mut whole = 0;
-        while let Some(Record::Response(record, 1)) = inlet.next() {
-            assert_eq!(record, [7; 60]);
+        while let Some((response, 1)) = inlet.response() {
+            assert_eq!(response, [7; 60]);
             whole += 1;
         }
         assert_eq!(whole, RING_BYTES / (HEAD_BYTES + 60));
+        assert!(!inlet.has_response());
+    }
+
+    #[test]
+    fn troubles_leave_room_for_the_reason_of_a_stop() {
+        let (mut outlet, mut inlet, _) = ends();
+        let trouble = Shutdown::because(Reason::PwmWrite, "no ".repeat(LINE_BYTES));
+        for _ in 0..256 {
+            outlet.note(Note::Trouble(&trouble));
+        }
+        let reason = format!("M112 {}", "of this host ".repeat(LINE_BYTES));
+        outlet.note(Note::Shutdown(&Shutdown::because(Reason::CommandRequest, reason)));
+        let mut lines: Vec<_> = std::iter::from_fn(|| inlet.line()).collect();
+        let (level, line) = lines.pop().unwrap();
+        assert_eq!(level, Level::Warn);
+        assert!(line.starts_with("shutdown: Command request: M112 of this host"), "{line}");
+        assert!(lines.len() > 20);
+        assert!(lines.iter().all(|(level, line)| *level == Level::Error && line.len() == LINE_BYTES));
     }
 }

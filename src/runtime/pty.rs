@@ -95,7 +95,11 @@ impl Pty {
     pub(super) fn attached(&mut self) -> bool {
         while let Ok(events) = self.watch.read_events() {
             for event in events {
-                if event.mask.contains(AddWatchFlags::IN_OPEN) {
+                if event.mask.contains(AddWatchFlags::IN_Q_OVERFLOW) {
+                    // Who came and went is lost. A host that is there must not be left without
+                    // answers, and one that is not takes none: it is there until it closes.
+                    self.hosts = 1;
+                } else if event.mask.contains(AddWatchFlags::IN_OPEN) {
                     self.hosts += 1;
                 } else if event.mask.intersects(AddWatchFlags::IN_CLOSE) {
                     self.hosts = self.hosts.saturating_sub(1);
@@ -166,4 +170,25 @@ fn place_link(device: &Path, link: &Path) -> io::Result<()> {
         format!("the link {} can not be made (does the directory exist, and may we write there?)", link.display());
     said(std::os::unix::fs::symlink(device, &fresh), &what)?;
     said(fs::rename(&fresh, link), &what).inspect_err(|_| drop(fs::remove_file(&fresh)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::File;
+
+    #[test]
+    fn a_host_that_came_amid_too_many_events_to_count_is_there_and_can_go() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut pty = Pty::open(&folder.path().join("tty"), &Access { mode: 0o600, group: None }).unwrap();
+        let queue: usize =
+            fs::read_to_string("/proc/sys/fs/inotify/max_queued_events").unwrap().trim().parse().unwrap();
+        for _ in 0..queue / 2 + 10 {
+            drop(File::open(pty.device()).unwrap());
+        }
+        let host = File::open(pty.device()).unwrap();
+        assert!(pty.attached());
+        drop(host);
+        assert!(!pty.attached());
+    }
 }

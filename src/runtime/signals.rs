@@ -3,11 +3,12 @@
 
 #![forbid(unsafe_code)]
 
+use std::fs;
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
 
-use signal_hook::consts::{SIGINT, SIGTERM, SIGUSR1, SIGUSR2};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGUSR2};
 use signal_hook::iterator::backend::SignalDelivery;
 use signal_hook::iterator::exfiltrator::SignalOnly;
 
@@ -30,6 +31,11 @@ impl Signals {
     pub(super) fn new() -> io::Result<Signals> {
         let (read, write) = UnixStream::pair()?;
         let mut known = vec![SIGTERM, SIGINT, SIGUSR1];
+        // A terminal that hangs up ends the program, unless nohup(1) started it. (The C program
+        // dies of it, its pins as they are.)
+        if !hang_up_is_ignored(&fs::read_to_string("/proc/self/status")?) {
+            known.push(SIGHUP);
+        }
         if std::env::var_os("PINION_TEST_HANG").is_some() {
             known.push(SIGUSR2);
         }
@@ -49,5 +55,25 @@ impl Signals {
             SIGUSR2 => Signal::Hang,
             _ => Signal::End,
         })
+    }
+}
+
+/// By /proc/PID/status.
+fn hang_up_is_ignored(status: &str) -> bool {
+    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
+    let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    ignored.is_some_and(|mask| mask & 1 << (SIGHUP - 1) != 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn who_starts_the_program_may_have_hang_up_ignored() {
+        let status = |mask: &str| format!("Name:\tpinion\nSigBlk:\t0000000000000001\nSigIgn:\t{mask}\n");
+        assert!(hang_up_is_ignored(&status("0000000000001001")));
+        assert!(!hang_up_is_ignored(&status("0000000000001002")));
+        assert!(!hang_up_is_ignored("Name:\tpinion\n"));
     }
 }

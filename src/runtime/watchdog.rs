@@ -11,8 +11,6 @@ use std::fs::File;
 use std::io::{self, Write};
 use std::os::fd::AsFd;
 use std::path::Path;
-use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::Duration;
 
 use log::{error, info, warn};
@@ -20,55 +18,13 @@ use log::{error, info, warn};
 use crate::sys;
 use crate::time::monotonic;
 
-use super::guardian::{BEAT, Ear, Pulse};
 use super::notify::Notify;
+use super::pulse::{BEAT, Pulse};
 
 /// The longest that one job of a worker may take.
 const JOB: Duration = Duration::from_secs(10);
 /// The limit of a hardware watchdog that does not tell it.
 const USUAL_LIMIT: Duration = Duration::from_secs(10);
-
-/// When a worker began its present job: nanoseconds of CLOCK_MONOTONIC, 0 while it has none.
-pub(super) struct JobClock {
-    bus: String,
-    since: AtomicU64,
-}
-
-impl JobClock {
-    /// A job begins.
-    pub(super) fn begin(&self) {
-        self.since.store(monotonic().as_nanos() as u64, Ordering::Relaxed);
-    }
-
-    /// It is done.
-    pub(super) fn end(&self) {
-        self.since.store(0, Ordering::Relaxed);
-    }
-}
-
-/// The clocks of the workers that there are.
-#[derive(Clone, Default)]
-pub(super) struct JobClocks(Arc<Mutex<Vec<Weak<JobClock>>>>);
-
-impl JobClocks {
-    /// The clock of a new worker, which is forgotten once it is dropped.
-    pub(super) fn add(&self, bus: &str) -> Arc<JobClock> {
-        let clock = Arc::new(JobClock { bus: bus.into(), since: AtomicU64::new(0) });
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).push(Arc::downgrade(&clock));
-        clock
-    }
-
-    /// The bus of a worker that has been at one job for too long.
-    fn stuck(&self, now: Duration) -> Option<String> {
-        let mut clocks = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-        clocks.retain(|clock| clock.strong_count() > 0);
-        clocks.iter().filter_map(Weak::upgrade).find_map(|clock| {
-            let since = clock.since.load(Ordering::Relaxed);
-            let taken = now.saturating_sub(Duration::from_nanos(since));
-            (since != 0 && taken > JOB).then(|| clock.bus.clone())
-        })
-    }
-}
 
 /// A hardware watchdog. Dropped without [`Watchdog::close`] it goes on and resets the machine.
 pub(super) struct Watchdog {
@@ -125,26 +81,23 @@ pub(super) struct Vigil {
     /// How often they are fed; none without a watchdog.
     interval: Option<Duration>,
     due: Duration,
-    ear: Ear,
-    jobs: JobClocks,
+    pulse: Pulse,
     starving: bool,
 }
 
 impl Vigil {
     /// `notify_interval` is how often the service manager wants to be fed, if at all.
-    pub(super) fn new(
-        watchdog: Option<Watchdog>,
-        notify: Notify,
-        notify_interval: Option<Duration>,
-        pulse: Pulse,
-        jobs: JobClocks,
-    ) -> Vigil {
-        let intervals = [watchdog.as_ref().map(|watchdog| watchdog.limit / 3), notify_interval];
-        // An idle core has to get a beat in between.
-        let interval = intervals.into_iter().flatten().min().map(|interval| interval.max(BEAT * 3 / 2));
-        let now = monotonic();
-        let ear = Ear::new(pulse, Duration::MAX, now);
-        Vigil { watchdog, notify, interval, due: now, ear, jobs, starving: false }
+    pub(super) fn new(notify: Notify, notify_interval: Option<Duration>, pulse: Pulse) -> Vigil {
+        // More often than the core gives a sign there is nothing new to tell.
+        let interval = notify_interval.map(|interval| interval.max(BEAT));
+        Vigil { watchdog: None, notify, interval, due: monotonic(), pulse, starving: false }
+    }
+
+    /// Takes a hardware watchdog in.
+    pub(super) fn feed(&mut self, watchdog: Watchdog) {
+        let interval = (watchdog.limit / 3).max(BEAT);
+        self.interval = Some(self.interval.map_or(interval, |present| present.min(interval)));
+        self.watchdog = Some(watchdog);
     }
 
     /// When to tick next.
@@ -156,8 +109,9 @@ impl Vigil {
     pub(super) fn tick(&mut self, now: Duration) {
         let Some(interval) = self.interval.filter(|_| now >= self.due) else { return };
         self.due = now + interval;
-        let silent = self.ear.is_silent(now);
-        let stuck = self.jobs.stuck(now);
+        let clock = self.pulse.at(now);
+        let silent = self.pulse.is_silent(clock);
+        let stuck = self.pulse.stuck(clock, JOB);
         if !silent && stuck.is_none() {
             if std::mem::take(&mut self.starving) {
                 warn!("Pinion gets on: the watchdogs are fed again");
@@ -203,13 +157,16 @@ impl Vigil {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::time::Monotonic;
     use std::fs;
 
-    fn vigil(path: &Path, jobs: &JobClocks) -> (Vigil, Pulse) {
-        let pulse = Pulse::new().unwrap();
+    fn vigil(path: &Path) -> (Vigil, Pulse) {
+        let pulse = Pulse::new(Monotonic::start()).unwrap();
         let watchdog = Watchdog::open(path).unwrap();
         let notify = Notify::from_env().unwrap();
-        (Vigil::new(Some(watchdog), notify, None, pulse, jobs.clone()), pulse)
+        let mut vigil = Vigil::new(notify, None, pulse);
+        vigil.feed(watchdog);
+        (vigil, pulse)
     }
 
     fn food(path: &Path) -> String {
@@ -219,12 +176,12 @@ mod tests {
     #[test]
     fn fed_while_the_core_beats_and_stopped_at_an_orderly_end() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let (mut vigil, pulse) = vigil(file.path(), &JobClocks::default());
+        let (mut vigil, pulse) = vigil(file.path());
         let interval = vigil.interval.unwrap();
         assert_eq!(interval, USUAL_LIMIT / 3);
         let mut now = vigil.due().unwrap();
         for _ in 0..3 {
-            pulse.beat(true);
+            pulse.beat(pulse.at(now), true);
             vigil.tick(now);
             vigil.tick(now + interval / 2);
             now += interval;
@@ -233,7 +190,7 @@ mod tests {
         // No beat since the last meal.
         vigil.tick(now);
         assert_eq!(food(file.path()), "...");
-        pulse.beat(true);
+        pulse.beat(pulse.at(now + interval), true);
         vigil.tick(now + interval);
         vigil.end();
         assert_eq!(food(file.path()), "....V");
@@ -242,24 +199,22 @@ mod tests {
     #[test]
     fn not_fed_while_a_job_takes_too_long_and_not_stopped_by_a_crash() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let jobs = JobClocks::default();
-        let clock = jobs.add("spi0");
-        let (mut vigil, pulse) = vigil(file.path(), &jobs);
+        let (mut vigil, pulse) = vigil(file.path());
+        let clock = pulse.worker("spi0").unwrap();
         let interval = vigil.interval.unwrap();
         clock.begin();
         let start = vigil.due().unwrap();
-        for tick in 0..5 {
-            pulse.beat(true);
-            vigil.tick(start + tick * interval);
-        }
+        let mut tick = |n| {
+            let now = start + n * interval;
+            pulse.beat(pulse.at(now), true);
+            vigil.tick(now);
+        };
+        (0..5).for_each(&mut tick);
         // At 0, 3.3, 6.7 and 10 seconds, less what passed before the job began.
         assert!(["...", "...."].contains(&food(file.path()).as_str()));
         clock.end();
         let before = food(file.path()).len();
-        pulse.beat(true);
-        vigil.tick(start + 5 * interval);
-        drop(clock);
-        assert_eq!(jobs.stuck(start + 1000 * interval), None);
+        tick(5);
         drop(vigil);
         assert_eq!(food(file.path()).len(), before + 1);
     }
@@ -267,13 +222,13 @@ mod tests {
     #[test]
     fn a_core_that_is_configured_may_take_its_time() {
         let file = tempfile::NamedTempFile::new().unwrap();
-        let (mut vigil, pulse) = vigil(file.path(), &JobClocks::default());
+        let (mut vigil, pulse) = vigil(file.path());
         let (start, interval) = (vigil.due().unwrap(), vigil.interval.unwrap());
-        pulse.beat(false);
+        pulse.beat(pulse.at(start + Duration::from_millis(10)), false);
         for tick in 0..12 {
             vigil.tick(start + tick * interval);
         }
-        // The beat is heard at once, and 30 seconds are nine intervals.
+        // The first is before the beat, and 30 seconds are nine intervals.
         assert_eq!(food(file.path()), "..........");
     }
 

@@ -15,7 +15,7 @@ use crate::mcu::{Completion, Job, Workers};
 use crate::shutdown::{Reason, Shutdown};
 use crate::wire::block::PAYLOAD_MAX;
 
-use super::watchdog::{JobClock, JobClocks};
+use super::pulse::{JobClock, Pulse};
 
 /// Jobs that wait for one bus.
 const QUEUE_JOBS: usize = 256;
@@ -32,6 +32,7 @@ struct Worker {
     orders: Producer<Order>,
     answers: Consumer<Completion>,
     quit: Arc<AtomicBool>,
+    clock: Arc<JobClock>,
     thread: JoinHandle<()>,
 }
 
@@ -42,16 +43,16 @@ pub(super) type Prepare = Arc<dyn Fn() + Send + Sync>;
 pub(super) struct Threads {
     core: Thread,
     prepare: Prepare,
-    clocks: JobClocks,
+    pulse: Pulse,
     workers: Vec<Worker>,
     /// Which worker has the device.
     devices: Vec<usize>,
 }
 
 impl Threads {
-    /// Workers that wake `core` when they have an answer, and time their jobs by `clocks`.
-    pub(super) fn new(core: Thread, prepare: Prepare, clocks: JobClocks) -> Threads {
-        Threads { core, prepare, clocks, workers: Vec::new(), devices: Vec::new() }
+    /// Workers that wake `core` when they have an answer, and show in `pulse` what they are at.
+    pub(super) fn new(core: Thread, prepare: Prepare, pulse: Pulse) -> Threads {
+        Threads { core, prepare, pulse, workers: Vec::new(), devices: Vec::new() }
     }
 
     fn start(&self, bus: &str) -> Result<Worker, Shutdown> {
@@ -59,17 +60,19 @@ impl Threads {
         let (outbox, answers) = RingBuffer::new(QUEUE_JOBS + QUEUE_SPARE);
         let quit = Arc::new(AtomicBool::new(false));
         let (core, prepare, stop) = (self.core.clone(), self.prepare.clone(), quit.clone());
-        let clock = self.clocks.add(bus);
+        let clock = self.pulse.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
+        let clock = Arc::new(clock);
+        let shown = clock.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
             .spawn(move || {
                 prepare();
-                serve(inbox, outbox, &stop, &core, &clock);
+                serve(inbox, outbox, &stop, &core, &shown);
             })
             .map_err(|error| {
                 overflow(bus, &format!("its thread can not be started ({error}): raise TasksMax or ulimit -u"))
             })?;
-        Ok(Worker { bus: bus.into(), orders, answers, quit, thread })
+        Ok(Worker { bus: bus.into(), orders, answers, quit, clock, thread })
     }
 }
 
@@ -125,8 +128,15 @@ impl Workers for Threads {
 impl Threads {
     fn order(&mut self, worker: usize, order: Order) -> Result<(), Shutdown> {
         let worker = &mut self.workers[worker];
-        let kept = if matches!(&order, Order::Run(job) if job.stopping) { 0 } else { QUEUE_SPARE };
+        let stopping = matches!(&order, Order::Run(job) if job.stopping);
+        let kept = if stopping { 0 } else { QUEUE_SPARE };
+        if stopping {
+            worker.clock.owe();
+        }
         if worker.orders.slots() <= kept || worker.orders.push(order).is_err() {
+            if stopping {
+                worker.clock.pay();
+            }
             return Err(overflow(
                 &worker.bus,
                 "the bus is slower than what the host asks of it: lower the rate of the queries, or raise the bus speed",
@@ -167,11 +177,15 @@ fn serve(
             }
             Ok(Order::Run(job)) => job,
         };
-        let Job { device, ticket, mut data, .. } = job;
+        let Job { device, ticket, mut data, stopping } = job;
+        // Attached before its first job was ordered.
         let Some((_, device)) = devices.iter_mut().find(|(number, _)| *number == device) else { continue };
         clock.begin();
         let result = device.run(&mut data).map(|()| data);
         clock.end();
+        if stopping {
+            clock.pay();
+        }
         let mut completion = Completion { ticket, result };
         // The core takes answers in faster than a bus gives them.
         while let Err(rtrb::PushError::Full(back)) = answers.push(completion) {
@@ -191,6 +205,7 @@ mod tests {
     use super::*;
     use crate::board::Buffer;
     use crate::mcu::{Oid, Ticket};
+    use crate::time::Monotonic;
     use std::sync::mpsc::{self, Receiver, Sender};
 
     /// Says what it was asked, and waits to be let go on.
@@ -211,7 +226,7 @@ mod tests {
     fn a_full_queue_has_room_for_the_last_word_of_a_machine_that_stops() {
         let (release, go_on) = mpsc::channel();
         let (asked, heard) = mpsc::channel();
-        let mut threads = Threads::new(thread::current(), Arc::new(|| ()), JobClocks::default());
+        let mut threads = Threads::new(thread::current(), Arc::new(|| ()), Pulse::new(Monotonic::start()).unwrap());
         let device = threads.attach("pwm", Box::new(Slow { go_on, asked })).unwrap();
         let job = |value: u8, stopping| Job {
             device,

@@ -44,7 +44,7 @@ pub(crate) fn set_nice(value: i32) -> io::Result<()> {
 }
 
 /// Words that stay common to this process and to those that it forks.
-pub(crate) const SHARED_WORDS: usize = 4;
+pub(crate) const SHARED_WORDS: usize = 1024;
 
 /// A page of zeros that stays common to this process and to those that it forks. It is never
 /// given back.

@@ -41,7 +41,7 @@ fn a_link_that_was_taken_over_is_left_alone() {
     let mut pinion = Pinion::simulated(&[]);
     fs::remove_file(pinion.link()).unwrap();
     symlink("/dev/null", pinion.link()).unwrap();
-    pinion.signal(Signal::SIGINT);
+    pinion.signal(Signal::SIGHUP);
     assert_eq!(pinion.end().code(), Some(0));
     assert!(exists(&pinion.link()));
 }
@@ -141,4 +141,10 @@ fn a_host_that_never_reads_neither_blocks_the_machine_nor_makes_it_grow() {
     finished.recv_timeout(PATIENCE).expect("the machine takes commands in");
     let grown = pinion.private_kb().saturating_sub(before);
     assert!(grown < 2048, "grew by {grown} kB");
+    // And why the machine stops is in the log all the same. (It counts only if it is read apart
+    // from the blocks.)
+    pinion.until("the reason of the stop in the log", || {
+        fs::write(pinion.link(), "FORCE_SHUTDOWN\n").unwrap();
+        pinion.log().contains("shutdown: Force shutdown command: ")
+    });
 }

@@ -92,6 +92,7 @@ pub struct LinuxBoard {
     /// IIO devices of which the log knows that they tell no resolution.
     assumed: BTreeSet<u32>,
     dev: PathBuf,
+    pwm: PathBuf,
 }
 
 impl LinuxBoard {
@@ -109,6 +110,7 @@ impl LinuxBoard {
             spi_modes: HashMap::new(),
             assumed: BTreeSet::new(),
             dev: DEV.into(),
+            pwm: PWM.into(),
         }
     }
 
@@ -222,14 +224,15 @@ impl Board for LinuxBoard {
             return Err(Shutdown::because(Reason::PwmConfig, detail));
         };
         let channel = pwm::Channel { chip, channel };
-        let device = pwm::Pwm::open(Path::new(PWM), channel, &config)?;
+        let device = pwm::Pwm::open(&self.pwm, channel, &config)?;
         if let Some(guard) = &mut self.guard {
             device.guard(&mut **guard, config.shutdown_value).map_err(|error| {
                 let detail = format!("the guardian does not take {channel}: {error}: restart Pinion");
                 Shutdown::because(Reason::GuardianLost, detail)
             })?;
         }
-        Ok(Attachment::Worker { bus: "pwm".into(), device: Box::new(device) })
+        // Channels share their chip's driver, and it may keep whoever writes to one.
+        Ok(Attachment::Worker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
     }
 
     fn reset(&mut self) {
@@ -257,6 +260,7 @@ mod tests {
             spi_modes: HashMap::new(),
             assumed: BTreeSet::new(),
             dev: dev.into(),
+            pwm: dev.join("pwm"),
         }
     }
 
@@ -287,6 +291,28 @@ mod tests {
         assert_eq!(board.pins().len(), 19);
         assert_eq!(board.spi_buses().len(), 8);
         assert!(board.describe().starts_with("linux: no GPIO"));
+    }
+
+    #[test]
+    fn each_pwm_chip_has_a_worker_of_its_own() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let mut bus = |chip: u32, channel: u32| {
+            let folder = dev.path().join(format!("pwm/pwmchip{chip}/pwm{channel}"));
+            std::fs::create_dir_all(&folder).unwrap();
+            for name in ["period", "duty_cycle", "enable"] {
+                std::fs::write(folder.join(name), "").unwrap();
+            }
+            let names = board.pins();
+            let range = names.iter().find(|range| range.name == format!("pwmchip{chip}/pwm0")).unwrap();
+            let pin = Pin(range.first + channel);
+            let config = PwmConfig { pin, cycle: crate::time::Ticks::from_us(100), value: 0, shutdown_value: 0 };
+            match board.pwm(config).unwrap() {
+                Attachment::Worker { bus, .. } => bus,
+                Attachment::Inline(_) => panic!("a file is no matter for the core"),
+            }
+        };
+        assert_eq!((bus(0, 0), bus(0, 1), bus(1, 0)), ("pwmchip0".into(), "pwmchip0".into(), "pwmchip1".into()));
     }
 
     #[test]

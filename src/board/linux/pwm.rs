@@ -75,10 +75,10 @@ impl Pwm {
     /// Lets the guardian know where the channel belongs if the program dies.
     pub(super) fn guard(&self, guard: &mut dyn Guard, shutdown_value: u16) -> io::Result<()> {
         if shutdown_value == 0 {
-            return guard.file(self.enable.as_raw_fd(), b"0");
+            return guard.files(&[(self.enable.as_raw_fd(), b"0")]);
         }
-        guard.file(self.duty.as_raw_fd(), self.duty_ns(shutdown_value).to_string().as_bytes())?;
-        guard.file(self.enable.as_raw_fd(), b"1")
+        let duty = self.duty_ns(shutdown_value).to_string();
+        guard.files(&[(self.duty.as_raw_fd(), duty.as_bytes()), (self.enable.as_raw_fd(), b"1")])
     }
 
     fn duty_ns(&self, value: u16) -> u64 {
