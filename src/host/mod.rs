@@ -3,7 +3,8 @@
 //! tests over a real pty, for the lab and for the benches.
 //!
 //! - [`serial`]: blocks over a tty, acknowledged and sent again as klippy does
-//! - [`client`]: the dictionary, commands and responses by name, the MCU's clock
+//! - [`messages`]: commands and responses by name, as a dictionary has them
+//! - [`client`]: a session: the dictionary, commands and responses, the MCU's clock
 //! - [`config`]: oids, config commands, their check sum; resetting a machine in use
 //! - [`motion`]: step sequences, pacing them into the move queue, homing
 //! - [`heater`]: a sensor, an output and the loop between them
@@ -20,6 +21,7 @@ pub mod demo;
 #[cfg(test)]
 mod fake;
 pub mod heater;
+pub mod messages;
 pub mod motion;
 pub mod picture;
 pub mod serial;
@@ -28,7 +30,8 @@ use std::fmt;
 use std::io;
 use std::time::Duration;
 
-pub use client::{Arg, Client, Params};
+pub use client::Client;
+pub use messages::{Arg, Params};
 pub use serial::Link;
 
 /// Why the host could not do what it was asked; each prints as one line with a remedy.
