@@ -45,7 +45,7 @@ impl Peer {
         let faults = faults.to_vec();
         let peer = thread::spawn(move || serve(theirs, before, &faults, answer));
         let port = Port::from_fd(ours.into(), "fake").unwrap();
-        (peer, Link::new(port, Duration::from_secs(5)).unwrap())
+        (peer, Link::new(port, Duration::from_secs(60)).unwrap())
     }
 }
 

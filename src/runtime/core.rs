@@ -426,7 +426,7 @@ mod tests {
         }
 
         fn wait_until(&self, what: &str, mut holds: impl FnMut() -> bool) {
-            let end = Instant::now() + Duration::from_secs(10);
+            let end = Instant::now() + Duration::from_secs(60);
             while !holds() {
                 assert!(Instant::now() < end, "{what}: {} blocks done", self.progress.done());
                 thread::sleep(Duration::from_millis(1));

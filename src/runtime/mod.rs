@@ -81,8 +81,9 @@ pub fn run(
 ) -> io::Result<()> {
     let pulse = guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse()))?;
     let processors = Processors::new(options.cpu)?;
-    let pty = Pty::open(&options.link, &options.access)?;
+    // First: who sees the link may send a signal, which must not leave the link behind.
     let signals = Signals::new()?;
+    let pty = Pty::open(&options.link, &options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
     let dialect = Arc::new(Dialect::new(FEATURES, &*board)?);

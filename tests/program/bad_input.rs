@@ -9,7 +9,7 @@ use pinion::wire::block::Sequence;
 
 use crate::process::{PATIENCE, Pinion};
 
-/// Sends the lines to a machine with `oids` ids; it must stop for `reason` and log each of
+/// Sends the lines to a machine with eight ids; it must stop for `reason` and log each of
 /// `words` in one line. Then a reset must make it new.
 #[track_caller]
 fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
@@ -19,13 +19,22 @@ fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
     }
     client.send_line("allocate_oids count=8").unwrap();
     for line in lines {
-        client.send_line(line).unwrap();
+        let line = timed(&mut client, line);
+        client.send_line(&line).unwrap();
     }
     let told = client.wait_shutdown(PATIENCE).unwrap();
     assert_eq!(told.as_deref(), Some(reason), "{:?}", lines.last());
     let line = || pinion.logged(&format!("shutdown: {reason}: "));
     pinion.until(&format!("a line with {words:?}"), || words.iter().all(|word| line().contains(word)));
     restarts(&mut client);
+}
+
+/// The line with the clock that `@3` in it means: three seconds after it is sent.
+fn timed(client: &mut Client, line: &str) -> String {
+    let Some((before, after)) = line.split_once('@') else { return line.into() };
+    let (seconds, after) = after.split_once(' ').unwrap_or((after, ""));
+    let clock = client.clock_in(seconds.parse().unwrap()).unwrap().wire();
+    format!("{before}{clock} {after}")
 }
 
 #[track_caller]
@@ -73,36 +82,22 @@ fn wrong_oids() {
 #[test]
 fn wrong_times() {
     let pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    let past = client.clock_in(-1.0).unwrap().wire();
-    let far = client.clock_in(30.0).unwrap().wire();
-    drop(client);
     let configured = [OUTPUT, STEPPER, "finalize_config crc=1"];
-    let with = |line: String| -> Vec<String> { configured.iter().map(|line| line.to_string()).chain([line]).collect() };
-    let stops = |lines: Vec<String>, reason: &str, words: &[&str]| {
-        let lines: Vec<&str> = lines.iter().map(String::as_str).collect();
-        stops(&pinion, &lines, reason, words);
-    };
-    stops(with(format!("queue_digital_out oid=0 clock={past} on_ticks=1")), "Timer too close", &["us after its time"]);
-    let mut lines = with(format!("reset_step_clock oid=1 clock={past}"));
-    lines.push("queue_step oid=1 interval=10 count=1 add=0".into());
-    stops(lines, "Timer too close", &["overloaded"]);
-    let mut lines = with(format!("reset_step_clock oid=1 clock={far}"));
-    lines.extend((0..1026).map(|_| "queue_step oid=1 interval=50000 count=1 add=0".into()));
-    stops(lines, "Move queue overflow", &[]);
+    let past = ["queue_digital_out oid=0 clock=@-1 on_ticks=1"];
+    stops(&pinion, &[&configured[..], &past].concat(), "Timer too close", &["us after its time"]);
+    let past = ["reset_step_clock oid=1 clock=@-1", "queue_step oid=1 interval=10 count=1 add=0"];
+    stops(&pinion, &[&configured[..], &past].concat(), "Timer too close", &["overloaded"]);
+    let far = ["reset_step_clock oid=1 clock=@30"];
+    let many = ["queue_step oid=1 interval=50000 count=1 add=0"; 1026];
+    stops(&pinion, &[&configured[..], &far, &many].concat(), "Move queue overflow", &[]);
 }
 
 #[test]
 fn a_reading_out_of_range() {
     let pinion = Pinion::simulated(&[]);
-    let mut client = pinion.client();
-    let soon = client.clock_in(0.2).unwrap().wire();
-    drop(client);
-    let query = format!(
-        "query_analog_in oid=2 clock={soon} sample_ticks=50000 sample_count=4 rest_ticks=5000000 \
-         bytes_per_report=2 min_value=0 max_value=1 range_check_count=2"
-    );
-    let lines = ["config_analog_in oid=2 pin=bed_sensor", "finalize_config crc=1", &query];
+    let query = "query_analog_in oid=2 clock=@3 sample_ticks=50000 sample_count=4 rest_ticks=5000000 \
+                 bytes_per_report=2 min_value=0 max_value=1 range_check_count=2";
+    let lines = ["config_analog_in oid=2 pin=bed_sensor", "finalize_config crc=1", query];
     stops(&pinion, &lines, "ADC out of range", &["oid 2", "sensor"]);
 }
 

@@ -4,6 +4,7 @@
 use std::fs;
 use std::io::Write;
 use std::os::unix::fs::{MetadataExt, symlink};
+use std::time::Instant;
 
 use nix::sys::signal::Signal;
 use pinion::host::Error;
@@ -24,6 +25,22 @@ fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
     pinion.signal(Signal::SIGTERM);
     assert_eq!(pinion.end().code(), Some(0));
     assert!(!exists(&link));
+}
+
+#[test]
+fn a_signal_at_the_first_sight_of_the_link_ends_the_program_in_order() {
+    for _ in 0..10 {
+        let mut pinion = Pinion::start(&["run", "--board", "sim"]);
+        let end = Instant::now() + PATIENCE;
+        while !exists(&pinion.link()) {
+            assert!(Instant::now() < end, "no link; the log:\n{}", pinion.log());
+            // Without a pause, which would be long enough for the program to be quite ready.
+            std::thread::yield_now();
+        }
+        pinion.signal(Signal::SIGTERM);
+        assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+        assert!(!exists(&pinion.link()));
+    }
 }
 
 #[test]
