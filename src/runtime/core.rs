@@ -231,9 +231,9 @@ impl Core {
             self.block = Some((payload, at));
         } else {
             self.progress.finish();
-            // The next block's end will do, if there is one; but a machine that is being configured
-            // takes its time for a block.
-            if self.requests.is_empty() || !self.mcu.is_running() {
+            // The end of the next block will do, if that may begin; but a machine that is being
+            // configured takes its time for a block.
+            if !may_begin(&mut self.requests, &self.mcu) || !self.mcu.is_running() {
                 self.wake.wake();
             }
         }
@@ -265,6 +265,7 @@ mod tests {
     use std::thread::JoinHandle;
     use std::time::Instant;
 
+    use nix::poll::{PollFd, PollFlags, poll};
     use rtrb::{Producer, RingBuffer};
 
     use crate::board::{Attachment, Bias, Board, Buffer, Device, Input, Output, Pin, PwmConfig, Range, SpiConfig};
@@ -353,6 +354,7 @@ mod tests {
         clock: Arc<Counting>,
         requests: Producer<Request>,
         progress: Arc<Progress>,
+        wake: Arc<LinkWake>,
         heard: Heard,
         gate: Sender<()>,
     }
@@ -370,6 +372,8 @@ mod tests {
             let heard = Heard::default();
             let (core_dialect, core_progress, core_heard) = (dialect.clone(), progress.clone(), heard.clone());
             let core_clock: Arc<dyn TimeSource> = clock.clone();
+            let wake = Arc::new(LinkWake::new().unwrap());
+            let core_wake = wake.clone();
             let thread = thread::spawn(move || {
                 let pulse = Pulse::new(monotonic).unwrap();
                 let workers = Threads::new(thread::current(), Arc::new(|| ()), pulse);
@@ -382,10 +386,10 @@ mod tests {
                 );
                 let (limits, processors) = (MarginLimits::default(), Processors::new(None).unwrap());
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
-                let (clock, progress, wake) = (core_clock, core_progress, Arc::new(LinkWake::new().unwrap()));
+                let (clock, progress, wake) = (core_clock, core_progress, core_wake);
                 Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run();
             });
-            let mut bench = Bench { thread, dialect, clock, requests, progress, heard, gate };
+            let mut bench = Bench { thread, dialect, clock, requests, progress, wake, heard, gate };
             bench.run("allocate_oids count=%c", &[1]);
             bench.run("config_spi_without_cs oid=%c", &[0]);
             bench.run("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", &[0, 0, 0, 1]);
@@ -451,6 +455,23 @@ mod tests {
         assert_eq!(bench.said(format), expected);
         assert_eq!(bench.shutdowns(), 0);
         bench.request(Request::Quit);
+        bench.thread.join().unwrap();
+    }
+
+    #[test]
+    fn a_block_that_is_done_is_acknowledged_while_the_next_one_is_held_back() {
+        let mut bench = Bench::overloaded();
+        thread::sleep(2 * BEAT);
+        let done = bench.progress.done();
+        // The link sleeps, and the bus makes room for one block.
+        bench.wake.sleeping();
+        bench.gate.send(()).unwrap();
+        bench.wait_until("one block more is done", || bench.progress.done() > done);
+        let mut fds = [PollFd::new(bench.wake.event(), PollFlags::POLLIN)];
+        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
+        drop(bench.gate);
+        let _ = bench.requests.push(Request::Quit);
+        bench.thread.thread().unpark();
         bench.thread.join().unwrap();
     }
 
