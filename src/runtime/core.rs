@@ -242,14 +242,18 @@ impl Core {
 }
 
 /// Whether what comes next may be taken in: a block waits, unacknowledged, while a bus has no room
-/// for what it may ask. Not so where a request to stop waits behind it.
+/// for what it may ask. Not so where a request to stop waits behind it, be it the host's.
 fn may_begin(requests: &mut Consumer<Request>, mcu: &Mcu) -> bool {
-    !requests.is_empty() && (mcu.has_room() || is_asked_to_stop(requests))
+    !requests.is_empty() && (mcu.has_room() || is_asked_to_stop(requests, mcu))
 }
 
 #[cold]
-fn is_asked_to_stop(requests: &mut Consumer<Request>) -> bool {
-    let stops = |request: &Request| matches!(request, Request::Shutdown(_) | Request::Quit);
+fn is_asked_to_stop(requests: &mut Consumer<Request>, mcu: &Mcu) -> bool {
+    let stops = |request: &Request| match request {
+        Request::Run(payload) => mcu.is_stopped_by(payload.as_slice()),
+        Request::Shutdown(_) | Request::Quit => true,
+        Request::Report | Request::Hang => false,
+    };
     requests.read_chunk(requests.slots()).is_ok_and(|waiting| {
         let (first, second) = waiting.as_slices();
         first.iter().chain(second).any(stops)
@@ -469,6 +473,18 @@ mod tests {
         bench.wait_until("one block more is done", || bench.progress.done() > done);
         let mut fds = [PollFd::new(bench.wake.event(), PollFlags::POLLIN)];
         assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
+        drop(bench.gate);
+        let _ = bench.requests.push(Request::Quit);
+        bench.thread.thread().unpark();
+        bench.thread.join().unwrap();
+    }
+
+    #[test]
+    fn an_emergency_stop_does_not_wait_for_a_bus_that_hangs() {
+        let mut bench = Bench::overloaded();
+        bench.run("emergency_stop", &[]);
+        bench.wait_until("the machine stops", || bench.shutdowns() > 0);
+        bench.wait_until("the blocks are refused", || bench.progress.done() == CONFIGURATION + BLOCKS + 1);
         drop(bench.gate);
         let _ = bench.requests.push(Request::Quit);
         bench.thread.thread().unpark();
