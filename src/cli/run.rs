@@ -17,7 +17,7 @@ use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Guardian, Options};
 use crate::time::{Monotonic, TimeSource};
 
-use super::failed;
+use super::{end_by_panic, failed};
 
 /// What -w feeds.
 const WATCHDOG: &str = "/dev/watchdog";
@@ -115,6 +115,7 @@ impl RunArgs {
 
 /// Serves until SIGTERM, SIGINT or SIGHUP.
 pub fn run(args: &RunArgs) -> ExitCode {
+    end_by_panic();
     let clock = Monotonic::start();
     // Before anything that starts a thread. A simulated printer needs none.
     let guardian = match args.board {

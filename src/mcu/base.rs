@@ -158,7 +158,7 @@ const FINALIZE_CONFIG: Command = command!("finalize_config crc=%u", |mcu, crc: u
 
 const CONFIG_RESET: Command = command!("config_reset", |mcu| mcu.reset()).allowed_in_shutdown();
 
-const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(Shutdown::because(
+pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(Shutdown::because(
     Reason::CommandRequest,
     "the host asked for it (M112, or its log says why): FIRMWARE_RESTART once the cause is dealt with",
 )))

@@ -247,6 +247,23 @@ impl Mcu {
         self.run_completions();
     }
 
+    /// Whether a block stops the machine: the host asks for that in it, or it makes no sense.
+    #[cold]
+    pub fn is_stopped_by(&self, payload: &[u8]) -> bool {
+        let mut payload = Reader::new(payload);
+        while !payload.is_empty() {
+            match payload.int().ok().and_then(|id| self.dialect.command(id).ok()) {
+                Some(command) if command.format != base::EMERGENCY_STOP.format => {
+                    if command.skip(&mut payload).is_err() {
+                        return true;
+                    }
+                }
+                _ => return true,
+            }
+        }
+        false
+    }
+
     /// Says which command ends before its parameters do.
     #[cold]
     fn cut_short(&self, mut command: Reader<'_>) -> Shutdown {

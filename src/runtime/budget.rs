@@ -70,6 +70,11 @@ impl Budget {
         Budget { class: Class::Fifo, level: full, full, share: allowance * 9 / 10, looked: now, ran }
     }
 
+    /// Whether the thread is to run as SCHED_FIFO at present.
+    pub(super) fn is_fifo(&self) -> bool {
+        self.class == Class::Fifo
+    }
+
     /// Whether it is time to [`Budget::look`].
     #[inline]
     pub(super) fn is_due(&self, now: Clock) -> bool {

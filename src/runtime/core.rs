@@ -62,6 +62,8 @@ const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
 /// So long the core looks for the next command before it sleeps: hosts send in bursts, and to be
 /// woken takes as long (20 to 50 us on the machines measured). A lone processor is the host's.
 const LINGER: Ticks = Ticks::from_us(30);
+/// As long may another thread keep the processor of one that yields (3.5 ms were measured).
+const SLICE: Ticks = Ticks::from_us(5000);
 /// So often commands give way to timers that are near, then one gets its turn.
 const PATIENCE: u32 = 20;
 
@@ -147,7 +149,7 @@ impl Core {
                 self.gave_way += 1;
                 continue;
             }
-            if now < self.linger_until {
+            if now < self.linger_until && may_yield(self.waiter.is_realtime(), now, deadline) {
                 thread::yield_now();
                 continue;
             }
@@ -231,9 +233,9 @@ impl Core {
             self.block = Some((payload, at));
         } else {
             self.progress.finish();
-            // The next block's end will do, if there is one; but a machine that is being configured
-            // takes its time for a block.
-            if self.requests.is_empty() || !self.mcu.is_running() {
+            // The end of the next block will do, if that may begin; but a machine that is being
+            // configured takes its time for a block.
+            if !may_begin(&mut self.requests, &self.mcu) || !self.mcu.is_running() {
                 self.wake.wake();
             }
         }
@@ -241,15 +243,25 @@ impl Core {
     }
 }
 
+/// Whether to yield does not cost a timer its time: an ordinary thread may then be without a
+/// processor for as long as others' slices take, where one that wakes up is given its turn.
+fn may_yield(realtime: bool, now: Clock, deadline: Option<Clock>) -> bool {
+    realtime || deadline.is_none_or(|deadline| deadline > now + SLICE)
+}
+
 /// Whether what comes next may be taken in: a block waits, unacknowledged, while a bus has no room
-/// for what it may ask. Not so where a request to stop waits behind it.
+/// for what it may ask. Not so where a request to stop waits behind it, be it the host's.
 fn may_begin(requests: &mut Consumer<Request>, mcu: &Mcu) -> bool {
-    !requests.is_empty() && (mcu.has_room() || is_asked_to_stop(requests))
+    !requests.is_empty() && (mcu.has_room() || is_asked_to_stop(requests, mcu))
 }
 
 #[cold]
-fn is_asked_to_stop(requests: &mut Consumer<Request>) -> bool {
-    let stops = |request: &Request| matches!(request, Request::Shutdown(_) | Request::Quit);
+fn is_asked_to_stop(requests: &mut Consumer<Request>, mcu: &Mcu) -> bool {
+    let stops = |request: &Request| match request {
+        Request::Run(payload) => mcu.is_stopped_by(payload.as_slice()),
+        Request::Shutdown(_) | Request::Quit => true,
+        Request::Report | Request::Hang => false,
+    };
     requests.read_chunk(requests.slots()).is_ok_and(|waiting| {
         let (first, second) = waiting.as_slices();
         first.iter().chain(second).any(stops)
@@ -265,6 +277,7 @@ mod tests {
     use std::thread::JoinHandle;
     use std::time::Instant;
 
+    use nix::poll::{PollFd, PollFlags, poll};
     use rtrb::{Producer, RingBuffer};
 
     use crate::board::{Attachment, Bias, Board, Buffer, Device, Input, Output, Pin, PwmConfig, Range, SpiConfig};
@@ -353,6 +366,7 @@ mod tests {
         clock: Arc<Counting>,
         requests: Producer<Request>,
         progress: Arc<Progress>,
+        wake: Arc<LinkWake>,
         heard: Heard,
         gate: Sender<()>,
     }
@@ -370,6 +384,8 @@ mod tests {
             let heard = Heard::default();
             let (core_dialect, core_progress, core_heard) = (dialect.clone(), progress.clone(), heard.clone());
             let core_clock: Arc<dyn TimeSource> = clock.clone();
+            let wake = Arc::new(LinkWake::new().unwrap());
+            let core_wake = wake.clone();
             let thread = thread::spawn(move || {
                 let pulse = Pulse::new(monotonic).unwrap();
                 let workers = Threads::new(thread::current(), Arc::new(|| ()), pulse);
@@ -382,10 +398,10 @@ mod tests {
                 );
                 let (limits, processors) = (MarginLimits::default(), Processors::new(None).unwrap());
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
-                let (clock, progress, wake) = (core_clock, core_progress, Arc::new(LinkWake::new().unwrap()));
+                let (clock, progress, wake) = (core_clock, core_progress, core_wake);
                 Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run();
             });
-            let mut bench = Bench { thread, dialect, clock, requests, progress, heard, gate };
+            let mut bench = Bench { thread, dialect, clock, requests, progress, wake, heard, gate };
             bench.run("allocate_oids count=%c", &[1]);
             bench.run("config_spi_without_cs oid=%c", &[0]);
             bench.run("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", &[0, 0, 0, 1]);
@@ -451,6 +467,44 @@ mod tests {
         assert_eq!(bench.said(format), expected);
         assert_eq!(bench.shutdowns(), 0);
         bench.request(Request::Quit);
+        bench.thread.join().unwrap();
+    }
+
+    #[test]
+    fn a_block_that_is_done_is_acknowledged_while_the_next_one_is_held_back() {
+        let mut bench = Bench::overloaded();
+        thread::sleep(2 * BEAT);
+        let done = bench.progress.done();
+        // The link sleeps, and the bus makes room for one block.
+        bench.wake.sleeping();
+        bench.gate.send(()).unwrap();
+        bench.wait_until("one block more is done", || bench.progress.done() > done);
+        let mut fds = [PollFd::new(bench.wake.event(), PollFlags::POLLIN)];
+        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
+        drop(bench.gate);
+        let _ = bench.requests.push(Request::Quit);
+        bench.thread.thread().unpark();
+        bench.thread.join().unwrap();
+    }
+
+    #[test]
+    fn an_ordinary_thread_does_not_yield_with_a_timer_ahead() {
+        let now = Clock::from_ticks(0);
+        let (soon, late) = (now + Ticks::from_us(1000), now + Ticks::from_us(10_000));
+        assert!(!may_yield(false, now, Some(soon)));
+        assert!(may_yield(false, now, Some(late)) && may_yield(false, now, None));
+        assert!(may_yield(true, now, Some(soon)));
+    }
+
+    #[test]
+    fn an_emergency_stop_does_not_wait_for_a_bus_that_hangs() {
+        let mut bench = Bench::overloaded();
+        bench.run("emergency_stop", &[]);
+        bench.wait_until("the machine stops", || bench.shutdowns() > 0);
+        bench.wait_until("the blocks are refused", || bench.progress.done() == CONFIGURATION + BLOCKS + 1);
+        drop(bench.gate);
+        let _ = bench.requests.push(Request::Quit);
+        bench.thread.thread().unpark();
         bench.thread.join().unwrap();
     }
 

@@ -27,7 +27,7 @@
 use std::io::{self, IoSlice};
 use std::iter;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
-use std::sync::{Arc, mpsc};
+use std::sync::{Arc, Mutex, PoisonError, mpsc};
 use std::thread;
 use std::time::Duration;
 
@@ -267,17 +267,22 @@ impl Device {
 }
 
 /// Calls each in a thread of its own: one that never comes back keeps neither the others nor us.
-/// What they told is heard until `limit` after `meanwhile` is over.
+/// What they told is heard until `limit` after `meanwhile` is over. What gets no thread, as memory
+/// is short, is called last.
 fn apart<F>(calls: Vec<F>, meanwhile: impl FnOnce(), limit: Duration) -> Driven
 where
     F: FnOnce() -> io::Result<()> + Send + 'static,
 {
     let (tell, told) = mpsc::channel();
-    let count = calls.len();
+    let mut count = calls.len();
+    let mut left = Vec::new();
     for call in calls {
-        let tell = tell.clone();
-        // Without a thread what it was to do is lost, and counts as unanswered.
-        let _ = thread::Builder::new().spawn(move || tell.send(call()));
+        let (tell, call) = (tell.clone(), Arc::new(Mutex::new(Some(call))));
+        let theirs = call.clone();
+        if thread::Builder::new().spawn(move || take(&theirs).map(|call| tell.send(call()))).is_err() {
+            left.push(call);
+            count -= 1;
+        }
     }
     meanwhile();
     drop(tell);
@@ -286,7 +291,12 @@ where
         let answer = told.recv_timeout(end.saturating_sub(monotonic()));
         driven.count(answer.unwrap_or_else(|_| Err(io::Error::other("a driver hangs (dmesg)"))));
     }
+    left.iter().filter_map(|call| take(call)).for_each(|call| driven.count(call()));
     driven
+}
+
+fn take<T>(from: &Mutex<Option<T>>) -> Option<T> {
+    from.lock().unwrap_or_else(PoisonError::into_inner).take()
 }
 
 /// The guarded program.
@@ -493,6 +503,7 @@ mod tests {
     use crate::mcu::{Job, Oid, Ticket, Workers};
     use crate::runtime::workers::Threads;
     use crate::shutdown::Shutdown;
+    use nix::sys::resource::{Resource, setrlimit};
     use std::cell::Cell;
     use std::fs::{self, File};
     use std::io::{BufRead, BufReader};
@@ -586,6 +597,13 @@ mod tests {
     fn guarded_program() {
         let (Ok(script), Ok(path)) = (std::env::var("GUARDED_SCRIPT"), std::env::var("GUARDED_FILE")) else { return };
         env_logger::Builder::new().filter_level(log::LevelFilter::Info).init();
+        if script == "cramped" {
+            // Less than the stack of one more thread.
+            let pages: u64 =
+                fs::read_to_string("/proc/self/statm").unwrap().split(' ').next().unwrap().parse().unwrap();
+            let limit = pages * 4096 + (1 << 20);
+            setrlimit(Resource::RLIMIT_AS, limit, limit).unwrap();
+        }
         let guardian = Guardian::start(Monotonic::start(), false).unwrap();
         let pulse = guardian.pulse();
         let mut guard = guardian.guard();
@@ -645,6 +663,17 @@ mod tests {
         program.0.kill().unwrap();
         wait_until("driven", || content(&file) == "off");
         wait_until("the guardian ends", || is_gone(guardian));
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn a_guardian_without_memory_for_threads_drives_the_outputs_all_the_same() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("cramped", &file);
+        program.0.kill().unwrap();
+        wait_until("the guardian ends", || is_gone(guardian));
+        assert_eq!(content(&file), "off");
+        assert!(content(&log_of(&file)).contains("all 1 outputs are driven"));
         program.0.wait().unwrap();
     }
 

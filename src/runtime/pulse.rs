@@ -194,8 +194,13 @@ pub(super) struct JobClock {
 }
 
 impl JobClock {
-    /// A job that puts a device into its shutdown state is on its way to the worker.
-    pub(super) fn owe(&self) {
+    /// A job that puts a device into its shutdown state is on its way to the worker. The first is a
+    /// sign of life at `now`: what the core was at until then, such as a device that took seconds to
+    /// be opened, is not the worker's. Only the core calls this.
+    pub(super) fn owe(&self, now: Clock) {
+        if self.pulse.page[OWED].load(Ordering::Relaxed) == 0 {
+            self.pulse.page[STAMP].store(stamp(now), Ordering::Relaxed);
+        }
         self.slot.owed().fetch_add(1, Ordering::Release);
         self.pulse.page[OWED].fetch_add(1, Ordering::Release);
     }
@@ -374,8 +379,8 @@ mod tests {
         let (spi, pwm) = (pulse.worker("spi0").unwrap(), pulse.worker("pwmchip10").unwrap());
         pulse.beat(at(0), true);
         ear.listen(at(0)).unwrap();
-        spi.owe();
-        pwm.owe();
+        spi.owe(at(0));
+        pwm.owe(at(0));
         for ms in (0..=900).step_by(100) {
             // The core itself gets on.
             pulse.beat(at(ms), false);
@@ -394,6 +399,20 @@ mod tests {
     }
 
     #[test]
+    fn what_the_core_was_at_before_a_worker_owed_anything_does_not_count() {
+        let pulse = pulse();
+        let mut ear = Ear::new(pulse, at(0));
+        let pwm = pulse.worker("pwmchip0").unwrap();
+        // The core opens a device, in vain, and the machine stops.
+        for ms in (0..4000).step_by(500) {
+            assert!(ear.listen(at(ms)).is_some());
+        }
+        pwm.owe(at(4000));
+        let (after, _) = silent_after(&mut ear, 4000);
+        assert!((998..=1003).contains(&after), "{after} ms");
+    }
+
+    #[test]
     fn workers_come_and_go() {
         let pulse = pulse();
         let places = (SHARED_WORDS - WORKERS) / SLOT_WORDS;
@@ -407,7 +426,7 @@ mod tests {
             assert_eq!(pulse.stuck(later, Duration::from_secs(10)).as_deref(), Some("spi3"));
             workers[3].end();
             assert_eq!(pulse.stuck(later, Duration::from_secs(10)), None);
-            workers[5].owe();
+            workers[5].owe(now);
         }
         assert_eq!(pulse.patience(), IDLE);
         let long = pulse.worker("a bus whose name is longer than is shown").unwrap();

@@ -112,6 +112,7 @@ pub struct Waiter {
     clock: Arc<dyn TimeSource>,
     margin: Margin,
     processors: Processors,
+    scheduling: Scheduling,
     /// Of a thread that runs as SCHED_FIFO under a throttle.
     budget: Option<Budget>,
 }
@@ -126,12 +127,17 @@ impl Waiter {
     ) -> Waiter {
         let throttle = if scheduling == Scheduling::RealTime { Throttle::read() } else { None };
         let budget = throttle.map(|throttle| Budget::new(throttle, clock.now(), running_time()));
-        Waiter { clock, margin: Margin::new(limits), processors, budget }
+        Waiter { clock, margin: Margin::new(limits), processors, scheduling, budget }
     }
 
     /// The margin as it was learned.
     pub fn margin(&self) -> Ticks {
         self.margin.get()
+    }
+
+    /// Whether the thread runs as SCHED_FIFO at present.
+    pub fn is_realtime(&self) -> bool {
+        self.scheduling == Scheduling::RealTime && self.budget.as_ref().is_none_or(Budget::is_fifo)
     }
 
     /// The thread ran until now. Past its budget it goes on on another processor, or as

@@ -131,7 +131,7 @@ impl Threads {
         let stopping = matches!(&order, Order::Run(job) if job.stopping);
         let kept = if stopping { 0 } else { QUEUE_SPARE };
         if stopping {
-            worker.clock.owe();
+            worker.clock.owe(self.pulse.now());
         }
         if worker.orders.slots() <= kept || worker.orders.push(order).is_err() {
             if stopping {

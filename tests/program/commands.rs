@@ -133,3 +133,19 @@ fn latency_judges_the_machine() {
     }
     assert!(fs::read_to_string(svg).unwrap().ends_with("</svg>\n"));
 }
+
+#[test]
+fn a_reader_that_has_seen_enough_is_no_crash() {
+    use std::os::unix::process::ExitStatusExt;
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    let output = std::process::Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["sim", "--print-config"])
+        .stdout(writer)
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .unwrap()
+        .wait_with_output()
+        .unwrap();
+    assert_eq!(output.status.signal(), None, "{}", String::from_utf8_lossy(&output.stderr));
+}
