@@ -382,7 +382,10 @@ impl Mcu {
 
     fn allocate_oids(&mut self, count: u8) -> Result<(), Shutdown> {
         if self.oids_allocated {
-            return Err(Shutdown::by_host(Reason::OidsAllocated, "allocate_oids came twice"));
+            return Err(Shutdown::because(
+                Reason::OidsAllocated,
+                "allocate_oids came twice: a host before left its configuration unfinished, for a wrong pin or because it was killed: FIRMWARE_RESTART",
+            ));
         }
         self.oids_allocated = true;
         self.objects.resize_with(usize::from(count), || None);

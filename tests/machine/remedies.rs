@@ -44,7 +44,7 @@ fn the_log_names_the_thing_and_the_remedy() {
         (&[], &["config_trsync oid=9"], "oid 9", "FIRMWARE_RESTART"),
         (&[STEPPER], &["trsync_trigger oid=0 reason=0"], "oid 0", "FIRMWARE_RESTART"),
         (&[STEPPER], &["trsync_trigger oid=77 reason=0"], "oid 77", "FIRMWARE_RESTART"),
-        (&["allocate_oids count=1"], &[], "allocate_oids", "FIRMWARE_RESTART"),
+        (&["allocate_oids count=1"], &[], "left its configuration unfinished", "FIRMWARE_RESTART"),
         (&[], &["finalize_config crc=1"], "finalize_config", "FIRMWARE_RESTART"),
         (&[], &["config_reset"], "config_reset", "emergency_stop"),
         (&[], &["clear_shutdown"], "clear_shutdown", "not stopped"),
