@@ -92,6 +92,9 @@ pub fn us(ticks: Ticks) -> f64 {
 
 impl fmt::Display for Lateness {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.samples == 0 {
+            return f.write_str("no events");
+        }
         let q = |q| us(self.quantile(q));
         write!(
             f,
@@ -133,5 +136,13 @@ mod tests {
             assert!((exact - 1.0..exact * 1.125 + 1.0).contains(&got), "{q}: {got}");
         }
         assert_eq!((lateness.samples(), lateness.max()), (1001, Ticks(999)));
+    }
+
+    #[test]
+    fn nothing_is_said_of_how_late_nothing_was() {
+        let mut lateness = Lateness::default();
+        assert_eq!(lateness.to_string(), "no events");
+        lateness.record(50);
+        assert!(lateness.to_string().starts_with("1 events, late by p50 1.00 us"), "{lateness}");
     }
 }

@@ -145,7 +145,7 @@ impl Shutdown {
 
     /// Says which object it was about.
     #[cold]
-    pub fn of(self, kind: &str, oid: u8) -> Shutdown {
+    pub fn of(self, kind: &str, oid: impl fmt::Display) -> Shutdown {
         Shutdown::because(self.reason, format!("{kind} oid {oid}: {}", self.detail))
     }
 }

@@ -44,9 +44,9 @@ pub struct RunArgs {
     /// Permission bits of the pty, octal
     #[arg(short = 'm', value_name = "MODE", default_value = "0660", value_parser = mode)]
     mode: u32,
-    /// Group of the pty, by name or number
-    #[arg(short = 'g', value_name = "GROUP", default_value = "tty")]
-    group: String,
+    /// Group of the pty, by name or number [default: tty, where that is permitted]
+    #[arg(short = 'g', value_name = "GROUP")]
+    group: Option<String>,
     /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml
     #[arg(long, value_name = "BOARD", default_value = "linux")]
     board: BoardName,
@@ -104,7 +104,7 @@ impl RunArgs {
     pub fn options(&self) -> Options {
         Options {
             link: self.link.clone(),
-            access: Access { mode: self.mode, group: Some(self.group.clone()) },
+            access: Access { mode: self.mode, group: self.group.clone() },
             realtime: self.realtime,
             cpu: self.cpu,
             margin: MarginLimits::up_to_us(self.margin),

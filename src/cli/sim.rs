@@ -14,6 +14,7 @@ use std::time::Duration;
 use clap::Args;
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::getpid;
+use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::board::sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 use crate::host::Client;
@@ -76,17 +77,25 @@ pub fn run(args: &SimArgs) -> ExitCode {
     let probe = board.probe();
     let options = Options {
         link: args.link.clone(),
-        access: Access { mode: 0o660, group: Some("tty".into()) },
+        access: Access { mode: 0o660, group: None },
         realtime: args.realtime,
         cpu: None,
         margin: MarginLimits::default(),
         watchdog: None,
     };
     let right = Arc::new(AtomicBool::new(false));
+    // A demonstration that is interrupted has not failed.
+    let ended = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM] {
+        if let Err(error) = signal_hook::flag::register(signal, ended.clone()) {
+            return failed(format!("signals can not be taken in: {error}"));
+        }
+    }
     let ready = {
         let (args, right) = (args.clone(), right.clone());
         move || {
-            let shown = thread::Builder::new().name("demo".into()).spawn(move || show(&args, &plan, &probe, &right));
+            let shown =
+                thread::Builder::new().name("demo".into()).spawn(move || show(&args, &plan, &probe, &right, &ended));
             if let Err(error) = shown {
                 log::error!("the demonstration can not be started: {error}");
             }
@@ -100,8 +109,9 @@ pub fn run(args: &SimArgs) -> ExitCode {
 }
 
 /// Shows the printer at work, then asks the program to end or says how to go on.
-fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool) {
+fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended: &AtomicBool) {
     match demonstration(args, plan, probe) {
+        Err(_) if ended.load(Ordering::SeqCst) => return,
         Ok(all_right) => right.store(all_right, Ordering::SeqCst),
         Err(error) => log::error!("the demonstration: {error}"),
     }

@@ -183,7 +183,7 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
         report_len: 0,
         tag: 0,
     };
-    mcu.assign(oid, input)
+    mcu.assign_on(pin, oid, input)
 });
 
 const QUERY_ANALOG_IN: Command = command!(

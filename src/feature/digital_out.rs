@@ -204,7 +204,7 @@ const CONFIG_DIGITAL_OUT: Command = command!(
             wake: Clock::EPOCH,
             end: None,
         };
-        mcu.assign(oid, output)
+        mcu.assign_on(pin, oid, output)
     }
 );
 

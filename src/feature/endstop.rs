@@ -76,8 +76,8 @@ const CONFIG_ENDSTOP: Command =
             0 => Bias::None,
             _ => Bias::PullDown,
         };
-        let pin = mcu.board.input(pin, bias)?;
-        mcu.assign(oid, Endstop { pin, homing: None, next_wake: Clock::EPOCH })
+        let input = mcu.board.input(pin, bias)?;
+        mcu.assign_on(pin, oid, Endstop { pin: input, homing: None, next_wake: Clock::EPOCH })
     });
 
 const ENDSTOP_HOME: Command = command!(

@@ -109,7 +109,7 @@ const CONFIG_PWM_OUT: Command = command!(
         mcu.vacant(oid)?;
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
         let device = mcu.pwm(oid, config)?;
-        mcu.assign(oid, PwmOut { device, default_value, max_duration, queue: MoveQueue::default(), end: None })
+        mcu.assign_on(pin, oid, PwmOut { device, default_value, max_duration, queue: MoveQueue::default(), end: None })
     }
 );
 

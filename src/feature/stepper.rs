@@ -241,7 +241,7 @@ const CONFIG_STEPPER: Command = command!(
             next_dir: false,
             need_reset: false,
         };
-        mcu.assign(oid, stepper)
+        mcu.assign_on(step_pin, oid, stepper)
     }
 );
 

@@ -129,7 +129,7 @@ impl Mcu {
             let done = match slot.and_then(Option::take) {
                 Some(mut object) => {
                     let done = object.completed(self, ticket, result);
-                    let done = done.map_err(|stop| stop.of(object.kind(), ticket.oid.0));
+                    let done = done.map_err(|stop| self.blame(stop, object.kind(), ticket.oid));
                     self.put_back(ticket.oid, object);
                     done
                 }

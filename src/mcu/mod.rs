@@ -66,6 +66,8 @@ pub struct Mcu {
     outbox: Box<dyn Outbox>,
     dialect: Arc<Dialect>,
     objects: Vec<Option<Box<dyn Object>>>,
+    /// The objects that the log knows by a pin.
+    pins: Vec<(Oid, Pin)>,
     oids_allocated: bool,
     timers: Timers,
     /// The instant of the timer whose event runs: in the firmware it is still the queue's
@@ -105,6 +107,7 @@ impl Mcu {
             outbox,
             dialect,
             objects: Vec::new(),
+            pins: Vec::new(),
             oids_allocated: false,
             timers,
             running: None,
@@ -213,7 +216,7 @@ impl Mcu {
         let result = match timer.oid() {
             Some(oid) => match self.objects.get_mut(usize::from(oid.0)).and_then(Option::take) {
                 Some(mut object) => {
-                    let result = object.event(self, timer, at).map_err(|stop| stop.of(object.kind(), oid.0));
+                    let result = object.event(self, timer, at).map_err(|stop| self.blame(stop, object.kind(), oid));
                     self.put_back(oid, object);
                     result
                 }
@@ -396,7 +399,10 @@ impl Mcu {
 
     fn allocate_oids(&mut self, count: u8) -> Result<(), Shutdown> {
         if self.oids_allocated {
-            return Err(Shutdown::by_host(Reason::OidsAllocated, "allocate_oids came twice"));
+            return Err(Shutdown::because(
+                Reason::OidsAllocated,
+                "allocate_oids came twice: a host before left its configuration unfinished, for a wrong pin or because it was killed: FIRMWARE_RESTART",
+            ));
         }
         self.oids_allocated = true;
         self.objects.resize_with(usize::from(count), || None);
@@ -430,6 +436,7 @@ impl Mcu {
         })?;
         self.timers.clear();
         self.objects.clear();
+        self.pins.clear();
         self.oids_allocated = false;
         self.devices.clear();
         self.workers.reset();

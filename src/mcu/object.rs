@@ -5,7 +5,7 @@
 
 use std::any::Any;
 
-use crate::board::Buffer;
+use crate::board::{Buffer, Pin};
 use crate::shutdown::{Reason, Shutdown};
 use crate::time::Clock;
 
@@ -72,7 +72,7 @@ impl Mcu {
         let Some(mut object) = slot.and_then(Option::take) else { return Err(not_configured(oid)) };
         let any: &mut dyn Any = &mut *object;
         let result = match any.downcast_mut::<T>() {
-            Some(inner) => f(inner, self).map_err(|stop| stop.of(object.kind(), oid.0)),
+            Some(inner) => f(inner, self).map_err(|stop| self.blame(stop, object.kind(), oid)),
             None => Err(not_configured(oid)),
         };
         self.put_back(oid, object);
@@ -117,6 +117,22 @@ impl Mcu {
         self.vacant(oid)?;
         self.put_back(oid, Box::new(object));
         Ok(())
+    }
+
+    /// Puts a new object under `oid` that the log knows by its pin: an oid tells a user nothing.
+    pub fn assign_on(&mut self, pin: Pin, oid: Oid, object: impl Object) -> Result<(), Shutdown> {
+        self.assign(oid, object)?;
+        self.pins.push((oid, pin));
+        Ok(())
+    }
+
+    /// Says which object a stop was about.
+    #[cold]
+    pub(super) fn blame(&self, stop: Shutdown, kind: &str, oid: Oid) -> Shutdown {
+        match self.pins.iter().find(|(of, _)| *of == oid) {
+            Some((_, pin)) => stop.of(kind, format_args!("{} ({})", oid.0, self.name(*pin))),
+            None => stop.of(kind, oid.0),
+        }
     }
 }
 

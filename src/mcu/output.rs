@@ -120,7 +120,7 @@ impl Mcu {
     }
 
     /// What the dictionary calls a pin.
-    fn name(&self, pin: Pin) -> String {
+    pub(super) fn name(&self, pin: Pin) -> String {
         self.board.pins().iter().find_map(|range| range.name_of(pin.0)).unwrap_or(format!("pin number {}", pin.0))
     }
 }

@@ -210,7 +210,7 @@ impl Core {
                 Ok(Request::Quit) => {
                     self.mcu.shut_down(Shutdown::because(
                         Reason::ForceShutdown,
-                        "the program was asked to end; the host sees the connection close",
+                        "the program ends; the host sees the connection close",
                     ));
                     return Turn::Quit;
                 }

@@ -16,7 +16,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 
 use crate::lateness::us;
 use crate::mcu::{Note, Outbox};
-use crate::shutdown::Reason;
+use crate::shutdown::{Reason, Shutdown};
 
 /// Bytes between core and link: some 1,000 responses. When the host does not read, later ones
 /// are dropped.
@@ -167,13 +167,10 @@ impl Outbox for Outlet {
     fn note(&mut self, note: Note<'_>) {
         match note {
             Note::Shutdown(shutdown) => {
-                // What somebody asked for is no error.
-                let asked = matches!(shutdown.reason, Reason::CommandRequest | Reason::ForceShutdown);
-                let level = if asked { Level::Warn } else { Level::Error };
-                self.line(level, 0, format_args!("shutdown: {shutdown}"));
+                self.line(gravity(shutdown), 0, format_args!("shutdown: {shutdown}"));
             }
             Note::Trouble(shutdown) => {
-                self.line(Level::Error, LINES_SPARE, format_args!("while shut down: {shutdown}"));
+                self.line(gravity(shutdown), LINES_SPARE, format_args!("while shut down: {shutdown}"));
             }
             Note::Lateness(lateness, margin) => {
                 let margin = us(margin);
@@ -187,6 +184,14 @@ impl Outbox for Outlet {
                 self.line(Level::Info, LINES_SPARE, format_args!("configured: {}", Kinds(kinds)));
             }
         }
+    }
+}
+
+/// What somebody asked for is no error.
+fn gravity(shutdown: &Shutdown) -> Level {
+    match shutdown.reason {
+        Reason::CommandRequest | Reason::ForceShutdown => Level::Warn,
+        _ => Level::Error,
     }
 }
 
@@ -240,7 +245,6 @@ impl Inlet {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::shutdown::Shutdown;
 
     fn ends() -> (Outlet, Inlet, Arc<Progress>) {
         let progress = Arc::new(Progress::default());
@@ -285,5 +289,15 @@ mod tests {
         assert!(line.starts_with("shutdown: Command request: M112 of this host"), "{line}");
         assert!(lines.len() > 20);
         assert!(lines.iter().all(|(level, line)| *level == Level::Error && line.len() == LINE_BYTES));
+    }
+
+    #[test]
+    fn what_was_asked_for_is_no_error() {
+        let (mut outlet, mut inlet, _) = ends();
+        let end = Shutdown::because(Reason::ForceShutdown, "the end");
+        outlet.note(Note::Shutdown(&end));
+        outlet.note(Note::Trouble(&end));
+        assert_eq!(inlet.line(), Some((Level::Warn, "shutdown: Force shutdown command: the end".into())));
+        assert_eq!(inlet.line(), Some((Level::Warn, "while shut down: Force shutdown command: the end".into())));
     }
 }

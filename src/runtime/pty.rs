@@ -9,12 +9,16 @@ use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::{MetadataExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
+use log::warn;
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, FdFlag, OFlag, fcntl};
 use nix::pty::openpty;
 use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
 use nix::sys::termios::{FlushArg, SetArg, cfmakeraw, tcflush, tcgetattr, tcsetattr};
 use nix::unistd::{Gid, Group, chown, read, ttyname, write};
+
+/// Whose the terminal is when nobody says.
+const USUAL_GROUP: &str = "tty";
 
 /// A terminal whose slave end stands at `link`.
 pub(super) struct Pty {
@@ -33,7 +37,8 @@ pub(super) struct Pty {
 pub struct Access {
     /// Permission bits.
     pub mode: u32,
-    /// Group name; `None` leaves the system's (`tty`).
+    /// Group name or number. `None` is `tty` where that is permitted, and the system's choice
+    /// where not.
     pub group: Option<String>,
 }
 
@@ -136,7 +141,18 @@ impl Drop for Pty {
 fn grant(device: &Path, access: &Access) -> io::Result<()> {
     let about = |what: &str| format!("{what} of {}", device.display());
     said(fs::set_permissions(device, fs::Permissions::from_mode(access.mode)), &about("the mode"))?;
-    let Some(name) = &access.group else { return Ok(()) };
+    match &access.group {
+        Some(name) => give(device, name),
+        // Nobody asked for it: the C program leaves the group alone, and so runs as any user.
+        None => give(device, USUAL_GROUP).or_else(|error| {
+            let gid = fs::metadata(device)?.gid();
+            warn!("{error}: it stays with group {gid}; a klippy of another user can not open it");
+            Ok(())
+        }),
+    }
+}
+
+fn give(device: &Path, name: &str) -> io::Result<()> {
     let gid = match name.parse() {
         Ok(gid) => Gid::from_raw(gid),
         Err(_) => {
@@ -148,7 +164,10 @@ fn grant(device: &Path, access: &Access) -> io::Result<()> {
     if fs::metadata(device)?.gid() == gid.as_raw() {
         return Ok(());
     }
-    let what = format!("giving {} to the group {name} (only root or a member may)", device.display());
+    let what = format!(
+        "giving {} to the group {name} (only root or a member may: add the user to it, or choose another with -g)",
+        device.display()
+    );
     said(chown(device, None, Some(gid)), &what)
 }
 

@@ -45,7 +45,9 @@ impl Emulator {
     /// Gives the monitor a command, and returns its answer.
     pub fn ask(&mut self, command: Value) -> Result<Value, String> {
         let failed = |cause: String, emulator: &Emulator| format!("{command}: {cause}\n{}", emulator.said());
-        writeln!(self.input, "{command}").map_err(|error| failed(error.to_string(), self))?;
+        // In one piece: the monitor quits at the last brace, before a line's end that comes after.
+        let line = format!("{command}\n");
+        self.input.write_all(line.as_bytes()).map_err(|error| failed(error.to_string(), self))?;
         loop {
             let mut line = String::new();
             self.output.read_line(&mut line).map_err(|error| failed(error.to_string(), self))?;

@@ -44,7 +44,7 @@ fn the_log_names_the_thing_and_the_remedy() {
         (&[], &["config_trsync oid=9"], "oid 9", "FIRMWARE_RESTART"),
         (&[STEPPER], &["trsync_trigger oid=0 reason=0"], "oid 0", "FIRMWARE_RESTART"),
         (&[STEPPER], &["trsync_trigger oid=77 reason=0"], "oid 77", "FIRMWARE_RESTART"),
-        (&["allocate_oids count=1"], &[], "allocate_oids", "FIRMWARE_RESTART"),
+        (&["allocate_oids count=1"], &[], "left its configuration unfinished", "FIRMWARE_RESTART"),
         (&[], &["finalize_config crc=1"], "finalize_config", "FIRMWARE_RESTART"),
         (&[], &["config_reset"], "config_reset", "emergency_stop"),
         (&[], &["clear_shutdown"], "clear_shutdown", "not stopped"),
@@ -68,7 +68,7 @@ fn the_log_names_the_thing_and_the_remedy() {
                 "queue_step oid=0 interval=9000 count=1 add=0",
                 "queue_step oid=0 interval=1 count=1 add=0",
             ],
-            "stepper oid 0",
+            "stepper oid 0 (gpio1)",
             "step_pulse_duration",
         ),
         (
@@ -104,7 +104,7 @@ fn the_log_names_the_thing_and_the_remedy() {
             "host",
         ),
         // PWM outputs.
-        (&[PWM], &["queue_pwm_out oid=6 clock=@1000 value=1"], "PWM output oid 6: it was not", "overloaded"),
+        (&[PWM], &["queue_pwm_out oid=6 clock=@1000 value=1"], "PWM output oid 6 (pwm0): it was not", "overloaded"),
         (
             &[PWM],
             &["queue_pwm_out oid=6 clock=@1000 value=1", "queue_pwm_out oid=6 clock=@90000 value=1"],
@@ -120,7 +120,7 @@ fn the_log_names_the_thing_and_the_remedy() {
             &[
                 "query_analog_in oid=4 clock=@1000 sample_ticks=0 sample_count=1 rest_ticks=90000 bytes_per_report=2 min_value=10 max_value=20 range_check_count=1",
             ],
-            "oid 4: it read 9",
+            "analog input oid 4 (analog0): it read 9",
             "sensor",
         ),
         (

@@ -3,6 +3,8 @@
 
 use std::fs;
 
+use nix::sys::signal::Signal;
+
 use crate::process::{Pinion, folder_with, output};
 
 /// The built-in printer with a bed that is warm within seconds.
@@ -73,6 +75,16 @@ fn the_demonstration_fails_where_something_is_wrong() {
     let status = pinion.end();
     assert_eq!(status.code(), Some(1), "{}", pinion.out());
     assert!(pinion.out().contains("NOT all of it was right"), "{}", pinion.out());
+}
+
+#[test]
+fn a_demonstration_that_is_interrupted_ends_without_a_complaint() {
+    let mut pinion = Pinion::start(&["sim"]);
+    pinion.until("the homing", || pinion.out().contains("home x"));
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0));
+    assert!(!pinion.log().contains("ERROR"), "{}", pinion.log());
+    assert!(!pinion.out().contains("until Ctrl-C"), "{}", pinion.out());
 }
 
 #[test]
