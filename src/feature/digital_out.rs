@@ -9,6 +9,8 @@ use crate::mcu::{Command, Feature, Line, Mcu, MoveQueue, Next, Object, Oid, Time
 use crate::shutdown::{Reason, Shutdown};
 use crate::time::{Clock, Ticks};
 
+use super::{changes_too_late, not_refreshed};
+
 pub(super) const FEATURE: Feature = Feature {
     name: "digital_out",
     commands: &[CONFIG_DIGITAL_OUT, SET_DIGITAL_OUT_PWM_CYCLE, QUEUE_DIGITAL_OUT, UPDATE_DIGITAL_OUT, SET_DIGITAL_OUT],
@@ -55,13 +57,7 @@ impl DigitalOut {
     /// Applies the oldest move, due at `at`.
     fn load(&mut self, mcu: &mut Mcu, at: Clock) -> Result<Next, Shutdown> {
         let Some(Move { on_ticks, .. }) = self.queue.pop(&mut mcu.moves) else {
-            return Err(Shutdown::because(
-                Reason::MissedDigital,
-                format!(
-                    "it was not refreshed within its max_duration of {} ms: the host is overloaded or hangs",
-                    self.max_duration.0 / Ticks::from_us(1000).0
-                ),
-            ));
+            return Err(not_refreshed(Reason::MissedDigital, self.max_duration));
         };
         let on = on_ticks.0 != 0;
         self.line.write(on)?;
@@ -71,7 +67,7 @@ impl DigitalOut {
         self.end = limited.then(|| at + self.max_duration);
         if let Some(next) = self.queue.first() {
             if self.end.is_some_and(|end| end < next.at) {
-                return Err(self.exceeds());
+                return Err(changes_too_late(Reason::DigitalMaxDuration, self.max_duration));
             }
             self.end = Some(next.at);
         }
@@ -105,15 +101,6 @@ impl DigitalOut {
         Ok(self.wake_at(Some(next)))
     }
 
-    #[cold]
-    fn exceeds(&self) -> Shutdown {
-        let ms = self.max_duration.0 / Ticks::from_us(1000).0;
-        Shutdown::by_host(
-            Reason::DigitalMaxDuration,
-            format_args!("its next change is scheduled later than its max_duration of {ms} ms"),
-        )
-    }
-
     fn wake_at(&mut self, at: Option<Clock>) -> Next {
         match at {
             Some(at) => {
@@ -131,7 +118,7 @@ impl DigitalOut {
             return Ok(());
         }
         if self.end.is_some_and(|end| end < at) {
-            return Err(self.exceeds());
+            return Err(changes_too_late(Reason::DigitalMaxDuration, self.max_duration));
         }
         self.end = Some(at);
         if self.toggling && self.wake < at {

@@ -4,6 +4,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{Feature, base};
+use crate::shutdown::{Reason, Shutdown};
+use crate::time::Ticks;
 use crate::wire::format::same;
 
 mod analog_in;
@@ -43,4 +45,21 @@ const fn response_index(format: &str) -> usize {
         feature += 1;
     }
     panic!("the response is not listed by any feature")
+}
+
+/// An output with a `max_duration` got no change in time.
+#[cold]
+fn not_refreshed(reason: Reason, max_duration: Ticks) -> Shutdown {
+    let ms = max_duration.0 / Ticks::from_us(1000).0;
+    Shutdown::because(
+        reason,
+        format!("it was not refreshed within its max_duration of {ms} ms: the host is overloaded or hangs"),
+    )
+}
+
+/// An output with a `max_duration` is to change after it only.
+#[cold]
+fn changes_too_late(reason: Reason, max_duration: Ticks) -> Shutdown {
+    let ms = max_duration.0 / Ticks::from_us(1000).0;
+    Shutdown::by_host(reason, format_args!("its next change is scheduled later than its max_duration of {ms} ms"))
 }

@@ -10,6 +10,8 @@ use crate::mcu::{
 use crate::shutdown::{Reason, Shutdown};
 use crate::time::{Clock, Ticks};
 
+use super::{changes_too_late, not_refreshed};
+
 pub(super) const FEATURE: Feature = Feature {
     name: "pwm_out",
     commands: &[CONFIG_PWM_OUT, QUEUE_PWM_OUT, SET_PWM_OUT],
@@ -40,15 +42,6 @@ impl PwmOut {
         mcu.submit(self.device, Ticket { oid, tag: 0 }, Buffer::new(&value.to_le_bytes()))
     }
 
-    #[cold]
-    fn exceeds(&self) -> Shutdown {
-        let ms = self.max_duration.0 / Ticks::from_us(1000).0;
-        Shutdown::by_host(
-            Reason::PwmMaxDuration,
-            format_args!("its next change is scheduled later than its max_duration of {ms} ms"),
-        )
-    }
-
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
         let first = self.queue.is_empty();
         self.queue.push(&mut mcu.moves, Move { at, value })?;
@@ -56,7 +49,7 @@ impl PwmOut {
             return Ok(());
         }
         if self.end.take().is_some_and(|end| end < at) {
-            return Err(self.exceeds());
+            return Err(changes_too_late(Reason::PwmMaxDuration, self.max_duration));
         }
         mcu.cancel(Self::timer(oid));
         mcu.schedule(Self::timer(oid), at)
@@ -71,13 +64,7 @@ impl Object for PwmOut {
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
         let Some(oid) = timer.oid() else { return Ok(Next::Done) };
         let Some(Move { value, .. }) = self.queue.pop(&mut mcu.moves) else {
-            return Err(Shutdown::because(
-                Reason::MissedPwm,
-                format!(
-                    "it was not refreshed within its max_duration of {} ms: the host is overloaded or hangs",
-                    self.max_duration.0 / Ticks::from_us(1000).0
-                ),
-            ));
+            return Err(not_refreshed(Reason::MissedPwm, self.max_duration));
         };
         self.write(mcu, oid, value)?;
         let limited = value != self.default_value && self.max_duration.0 != 0;
@@ -87,7 +74,7 @@ impl Object for PwmOut {
             return Ok(end.map_or(Next::Done, Next::At));
         };
         if end.is_some_and(|end| end < next) {
-            return Err(self.exceeds());
+            return Err(changes_too_late(Reason::PwmMaxDuration, self.max_duration));
         }
         Ok(Next::At(next))
     }
