@@ -10,11 +10,14 @@ mod bench;
 mod rig;
 
 use std::hint::black_box;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bench::{Bench, FakeBoard};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use pinion::board::{Attachment, Bias, Board, Input, Output, Pin, PwmConfig, Range, SpiConfig};
+use pinion::board::{
+    Adc, Board, BusDevice, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+};
 use pinion::feature::FEATURES;
 use pinion::mcu::{Dialect, MOVE_COUNT};
 use pinion::shutdown::Shutdown;
@@ -24,11 +27,17 @@ use rig::Rig;
 /// The bench's board with outputs that do nothing: what is left is the machine.
 struct Quiet(FakeBoard);
 
-struct QuietOutput;
+struct QuietLine;
 
-impl Output for QuietOutput {
-    fn write(&mut self, value: bool) -> Result<(), Shutdown> {
-        black_box(value);
+impl Line for QuietLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        black_box(level);
+        Ok(())
+    }
+    fn read(&self) -> Result<bool, Shutdown> {
+        Ok(false)
+    }
+    fn set_direction(&self, _: Direction) -> Result<(), Shutdown> {
         Ok(())
     }
 }
@@ -43,19 +52,16 @@ impl Board for Quiet {
     fn spi_buses(&self) -> Vec<Range> {
         self.0.spi_buses()
     }
-    fn output(&mut self, _: Pin, _: bool, _: bool) -> Result<Box<dyn Output>, Shutdown> {
-        Ok(Box::new(QuietOutput))
+    fn line(&mut self, _: Pin, _: Direction) -> Result<ClaimedLine, Shutdown> {
+        Ok(ClaimedLine { line: Arc::new(QuietLine), sleeps_on: None })
     }
-    fn input(&mut self, pin: Pin, bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
-        self.0.input(pin, bias)
-    }
-    fn adc(&mut self, pin: Pin) -> Result<Attachment, Shutdown> {
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         self.0.adc(pin)
     }
-    fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown> {
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         self.0.spi(config)
     }
-    fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown> {
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
         self.0.pwm(config)
     }
     fn reset(&mut self) {

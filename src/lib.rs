@@ -13,6 +13,14 @@
 //!
 //! [`host`] is the other end of the wire: a small client for demonstrations and tests.
 
+// The fake board of the tests in tests/machine, which call this crate by its name.
+#[cfg(test)]
+extern crate self as pinion;
+#[cfg(test)]
+#[allow(dead_code)]
+#[path = "../tests/machine/bench.rs"]
+mod bench;
+
 pub mod board;
 pub mod cli;
 pub mod feature;

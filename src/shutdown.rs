@@ -5,148 +5,138 @@
 
 use std::fmt;
 
-macro_rules! reasons {
-    ($($(#[$doc:meta])* $name:ident = $text:literal;)*) => {
-        /// A shutdown text of the firmware. klippy shows it to the user and matches some of
-        /// them (`klippy/extras/error_mcu.py`), so the wording is Klipper's own.
-        #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-        #[repr(u8)]
-        pub enum Reason { $($(#[$doc])* $name),* }
+/// A shutdown text of the firmware, as the host sees it. klippy shows it to the user and matches
+/// some of them (`klippy/extras/error_mcu.py`), so the wording is Klipper's own.
+///
+/// [`shutdowns!`] declares one. The dictionary numbers those that the features list (its
+/// enumeration `static_string_id`).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ShutdownReason(&'static str);
 
-        impl Reason {
-            /// Every reason in the order of its id.
-            pub const ALL: &'static [Reason] = &[$(Reason::$name),*];
+impl ShutdownReason {
+    /// The reason with this text; [`shutdowns!`] lists it as well.
+    pub(crate) const fn new(text: &'static str) -> ShutdownReason {
+        ShutdownReason(text)
+    }
 
-            /// The text that the host shows.
-            pub const fn text(self) -> &'static str {
-                match self { $(Reason::$name => $text),* }
-            }
-        }
+    /// The text that the host shows.
+    pub const fn text(self) -> &'static str {
+        self.0
+    }
+}
+
+/// Declares the shutdown texts of a feature as constants, and `SHUTDOWNS`, the list of them that
+/// goes into its [`Feature`](crate::mcu::Feature).
+macro_rules! shutdowns {
+    ($($(#[$doc:meta])* $vis:vis $name:ident = $text:literal;)*) => {
+        $($(#[$doc])* $vis const $name: $crate::shutdown::ShutdownReason =
+            $crate::shutdown::ShutdownReason::new($text);)*
+        /// All of these.
+        pub(crate) const SHUTDOWNS: &[$crate::shutdown::ShutdownReason] = &[$($name),*];
     };
 }
 
-reasons! {
-    /// `clear_shutdown` while running.
-    NotShutdown = "Shutdown cleared when not shutdown";
-    /// A timer was added for an instant that has passed.
-    TimerTooClose = "Timer too close";
-    /// A command id that the dictionary does not have.
-    InvalidCommand = "Invalid command";
-    /// A command whose parameters end before it does.
-    CommandParser = "Command parser error";
-    /// `emergency_stop` (M112).
-    CommandRequest = "Command request";
-    /// `config_reset` while running.
-    ConfigResetRunning = "config_reset only available when shutdown";
-    /// `allocate_oids` twice.
-    OidsAllocated = "oids already allocated";
-    /// An oid that is out of range or taken, or a config command after `finalize_config`.
-    CannotAssignOid = "Can't assign oid";
-    /// An oid that is out of range or of another kind.
-    InvalidOid = "Invalid oid type";
-    /// `finalize_config` twice.
-    AlreadyFinalized = "Already finalized";
-    /// The host queued more moves than `move_count`.
-    MoveQueueOverflow = "Move queue overflow";
-    /// `update_digital_out` while changes are queued.
-    UpdateWithQueue = "update_digital_out not valid with active queue";
-    /// An output would stay on for longer than its `max_duration`.
-    DigitalMaxDuration = "Scheduled digital out event will exceed max_duration";
-    /// `set_digital_out_pwm_cycle` while changes are queued.
-    PwmCycleWithQueue = "Can not set soft pwm cycle ticks while updates pending";
-    /// The host did not refresh an output before its `max_duration` ran out.
-    MissedDigital = "Missed scheduling of next digital out event";
-    /// `reset_step_clock` while steps are queued.
-    ResetWhileStepping = "Can't reset time when stepper active";
-    /// `queue_step` with a count of zero.
-    InvalidCount = "Invalid count parameter";
-    /// A step over a millisecond late.
-    StepperPast = "Stepper too far in past";
-    /// `stepper_stop_on_trigger` for a stepper that already waits for a trigger.
-    SignalActive = "Can't add signal that is already active";
-    /// `bytes_per_report` above 48.
-    InvalidBytesPerReport = "Invalid analog_in bytes_per_report";
-    /// A reading outside its range, `range_check_count` times in a row.
-    AdcRange = "ADC out of range";
-    /// An SPI mode above 3, or a second bus for one device.
-    InvalidSpi = "Invalid spi config";
-    /// A timer fell over 100 ms behind.
-    TimerPast = "Rescheduled timer in the past";
-    /// `FORCE_SHUTDOWN` written to the pty, SIGTERM or SIGINT.
-    ForceShutdown = "Force shutdown command";
-    /// An SPI transfer failed.
-    SpiTransfer = "Unable to issue spi ioctl";
-    /// An SPI device that is not there or not permitted.
-    SpiOpen = "Unable to open spi device";
-    /// An SPI rate that the driver refuses.
-    SpiSpeed = "Unable to set SPI speed";
-    /// An SPI mode that the driver refuses.
-    SpiMode = "Unable to set SPI mode";
-    /// A hardware PWM channel that is not there, not permitted or refuses its period.
-    PwmConfig = "Unable to config pwm device";
-    /// A hardware PWM output would stay on for longer than its `max_duration`.
-    PwmMaxDuration = "Scheduled pwm event will exceed max_duration";
-    /// The host did not refresh a hardware PWM output in time.
-    MissedPwm = "Missed scheduling of next hard pwm event";
-    /// A hardware PWM channel can no longer be written (Pinion's own text).
-    PwmWrite = "PWM write failed";
-    /// An ADC read failed.
-    AdcRead = "Error on analog read";
-    /// An ADC channel that is not there or not permitted.
-    AdcOpen = "Unable to open adc device";
-    /// A line that can not be requested as an input.
-    InputLine = "Unable to open in GPIO chip line";
-    /// A pin number that is no input.
-    NotInput = "Not an input pin";
-    /// A line that can not be requested as an output.
-    OutputLine = "Unable to open out GPIO chip line";
-    /// A pin number that is no output.
-    NotOutput = "Not an output pin";
-    /// A chip that is there and can not be opened.
-    ChipOpen = "Unable to open GPIO chip device";
-    /// A chip that is not there.
-    ChipMissing = "GPIO chip device not found";
-    /// A line that was granted and can no longer be written (Pinion's own text: the firmware
-    /// does not notice).
-    LineWrite = "GPIO line write failed";
-    /// A line that was granted and can no longer be read (Pinion's own text).
-    LineRead = "GPIO line read failed";
-    /// `debug_read` or `debug_write` (Pinion's own text).
-    DebugMemory = "Memory access is not available on Linux";
-    /// A worker's queue is full: the bus is slower than what the host asks of it (Pinion's own
-    /// text).
-    WorkerOverflow = "Bus worker queue overflow";
-    /// The guardian process is gone (Pinion's own text).
-    GuardianLost = "Guardian process lost";
+pub(crate) use shutdowns;
+
+/// The texts of the machine itself and of its boards. Those of a feature stand in its file.
+pub mod reason {
+    shutdowns! {
+        /// `clear_shutdown` while running.
+        pub NOT_SHUTDOWN = "Shutdown cleared when not shutdown";
+        /// A timer was added for an instant that has passed.
+        pub TIMER_TOO_CLOSE = "Timer too close";
+        /// A command id that the dictionary does not have.
+        pub INVALID_COMMAND = "Invalid command";
+        /// A command whose parameters end before it does.
+        pub COMMAND_PARSER = "Command parser error";
+        /// `emergency_stop` (M112).
+        pub COMMAND_REQUEST = "Command request";
+        /// `config_reset` while running.
+        pub CONFIG_RESET_RUNNING = "config_reset only available when shutdown";
+        /// `allocate_oids` twice.
+        pub OIDS_ALLOCATED = "oids already allocated";
+        /// An oid that is out of range or taken, or a config command after `finalize_config`.
+        pub CANNOT_ASSIGN_OID = "Can't assign oid";
+        /// An oid that is out of range or of another kind.
+        pub INVALID_OID = "Invalid oid type";
+        /// `finalize_config` twice.
+        pub ALREADY_FINALIZED = "Already finalized";
+        /// The host queued more moves than `move_count`.
+        pub MOVE_QUEUE_OVERFLOW = "Move queue overflow";
+        /// A timer fell over 100 ms behind.
+        pub TIMER_PAST = "Rescheduled timer in the past";
+        /// `FORCE_SHUTDOWN` written to the pty, SIGTERM or SIGINT.
+        pub FORCE_SHUTDOWN = "Force shutdown command";
+        /// An SPI device that is not there or not permitted.
+        pub SPI_OPEN = "Unable to open spi device";
+        /// An SPI rate that the driver refuses.
+        pub SPI_SPEED = "Unable to set SPI speed";
+        /// An SPI mode that the driver refuses.
+        pub SPI_MODE = "Unable to set SPI mode";
+        /// A hardware PWM channel that is not there, not permitted or refuses its period.
+        pub PWM_CONFIG = "Unable to config pwm device";
+        /// A hardware PWM channel can no longer be written (Pinion's own text).
+        pub PWM_WRITE = "PWM write failed";
+        /// An ADC read failed.
+        pub ADC_READ = "Error on analog read";
+        /// An ADC channel that is not there or not permitted.
+        pub ADC_OPEN = "Unable to open adc device";
+        /// A line that can not be requested as an input.
+        pub INPUT_LINE = "Unable to open in GPIO chip line";
+        /// A pin number that is no input.
+        pub NOT_INPUT = "Not an input pin";
+        /// A line that can not be requested as an output.
+        pub OUTPUT_LINE = "Unable to open out GPIO chip line";
+        /// A pin number that is no output.
+        pub NOT_OUTPUT = "Not an output pin";
+        /// A chip that is there and can not be opened.
+        pub CHIP_OPEN = "Unable to open GPIO chip device";
+        /// A chip that is not there.
+        pub CHIP_MISSING = "GPIO chip device not found";
+        /// A line that was granted and can no longer be written (Pinion's own text: the firmware
+        /// does not notice).
+        pub LINE_WRITE = "GPIO line write failed";
+        /// A line that was granted and can no longer be read (Pinion's own text).
+        pub LINE_READ = "GPIO line read failed";
+        /// `debug_read` or `debug_write` (Pinion's own text).
+        pub DEBUG_MEMORY = "Memory access is not available on Linux";
+        /// A worker's queue is full: the bus is slower than what the host asks of it (Pinion's own
+        /// text).
+        pub WORKER_OVERFLOW = "Bus worker queue overflow";
+        /// A bus conversation that a command began does not end (Pinion's own text).
+        pub BUS_HANGS = "Bus does not answer";
+        /// The guardian process is gone (Pinion's own text).
+        pub GUARDIAN_LOST = "Guardian process lost";
+    }
 }
 
 /// A stop of the machine: the reason, and for the log what it was about and what to do.
 ///
 /// The detail is made as the machine stops, when lateness no longer counts.
-#[derive(Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct Shutdown {
     /// What goes over the wire.
-    pub reason: Reason,
+    pub reason: ShutdownReason,
     /// Cause, subject and remedy, for the log.
     pub detail: Box<str>,
 }
 
 impl Shutdown {
     /// A stop whose log line names the thing and the remedy.
-    pub fn because(reason: Reason, detail: impl Into<Box<str>>) -> Shutdown {
+    pub fn because(reason: ShutdownReason, detail: impl Into<Box<str>>) -> Shutdown {
         Shutdown { reason, detail: detail.into() }
     }
 
     /// A stop for a command that can not be right where it came.
     #[cold]
-    pub fn by_host(reason: Reason, what: impl fmt::Display) -> Shutdown {
+    pub fn by_host(reason: ShutdownReason, what: impl fmt::Display) -> Shutdown {
         Shutdown::because(reason, format!("{what}: a fault of the host; FIRMWARE_RESTART, and report it with its log"))
     }
 
     /// Says which object it was about.
     #[cold]
-    pub fn of(self, kind: &str, oid: impl fmt::Display) -> Shutdown {
-        Shutdown::because(self.reason, format!("{kind} oid {oid}: {}", self.detail))
+    pub fn of(self, object: &str) -> Shutdown {
+        Shutdown::because(self.reason, format!("{object}: {}", self.detail))
     }
 }
 

@@ -3,8 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::io;
-use std::os::fd::RawFd;
+use std::sync::Arc;
 
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
@@ -16,39 +15,10 @@ pub mod sim;
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Pin(pub u32);
 
-/// Bytes of a message block's parameters fit in here with room to spare.
-pub const BUFFER_BYTES: usize = 64;
-
-/// Up to [`BUFFER_BYTES`] bytes on their way to a device or back.
-#[derive(Clone, Copy, Debug)]
-pub struct Buffer {
-    len: u8,
-    bytes: [u8; BUFFER_BYTES],
-}
-
-impl Buffer {
-    /// No bytes.
-    pub const EMPTY: Buffer = Buffer { len: 0, bytes: [0; BUFFER_BYTES] };
-
-    /// A copy of `bytes`; what is past [`BUFFER_BYTES`] is left out.
-    pub fn new(bytes: &[u8]) -> Buffer {
-        let mut buffer = Buffer::EMPTY;
-        let len = bytes.len().min(BUFFER_BYTES);
-        buffer.bytes[..len].copy_from_slice(&bytes[..len]);
-        buffer.len = len as u8;
-        buffer
-    }
-
-    /// The bytes.
-    pub fn as_slice(&self) -> &[u8] {
-        &self.bytes[..usize::from(self.len)]
-    }
-
-    /// The bytes, to be changed in place.
-    pub fn as_mut_slice(&mut self) -> &mut [u8] {
-        &mut self.bytes[..usize::from(self.len)]
-    }
-}
+/// Full scale of an ADC reading (`ADC_MAX` of the dictionary).
+pub const ADC_MAX: u16 = 4095;
+/// Full scale of a PWM value (`PWM_MAX` of the dictionary).
+pub const PWM_MAX: u16 = 32768;
 
 /// A published name of the dictionary's enumerations: `count` names from `name` on (its number
 /// counts up) stand for the values from `first` on.
@@ -86,40 +56,93 @@ pub enum Bias {
     PullDown,
 }
 
-/// An output line. The core writes it: a write must not block, allocate or log.
-pub trait Output: Send {
-    /// Drives the line.
-    fn write(&mut self, value: bool) -> Result<(), Shutdown>;
-}
-
-/// An input line. The core reads it: a read must not block, allocate or log.
-pub trait Input: Send {
-    /// The line's level.
-    fn read(&mut self) -> Result<bool, Shutdown>;
-}
-
-/// Something behind a bus or a file, which may take its time.
-pub trait Device: Send {
-    /// Runs one conversation: takes the request's bytes out of `data` and leaves the reply's
-    /// there. An ADC takes none and leaves its reading, scaled to `ADC_MAX`, in two bytes,
-    /// low byte first; an SPI device replaces each byte by the one that came back.
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown>;
-}
-
-/// Where a device's conversations run.
-pub enum Attachment {
-    /// In the core, as they take no time.
-    Inline(Box<dyn Device>),
-    /// On the worker of the named bus, one at a time, in order.
-    Worker {
-        /// Such as `spi0` or `iio`.
-        bus: String,
-        /// The device.
-        device: Box<dyn Device>,
+/// What a GPIO line is claimed as.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// It drives.
+    Output {
+        /// The level from the first moment on.
+        level: bool,
+        /// Where the line belongs when the machine stops or the program dies.
+        shutdown_level: bool,
     },
+    /// It is read; a resistor that can not be had is an error.
+    Input(Bias),
 }
 
-/// A hardware PWM output's parameters; values are of a full scale of 32768.
+/// A claimed GPIO line. Whoever shares it, core or worker, has a handle of the same line.
+///
+/// Calls must not allocate or log. They must not block either, unless the board said that the
+/// line [sleeps](ClaimedLine::sleeps_on): then only a worker calls them.
+pub trait Line: Send + Sync {
+    /// Drives an output. On a line that was made an input since, it does nothing.
+    fn write(&self, level: bool) -> Result<(), Shutdown>;
+
+    /// The line's level.
+    fn read(&self) -> Result<bool, Shutdown>;
+
+    /// Makes it an output or an input, for all who share it: the last use decides, as in the
+    /// firmware, where a line that is set up again loses its earlier set-up.
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
+}
+
+/// A line as the board hands it out.
+pub struct ClaimedLine {
+    /// The line.
+    pub line: Arc<dyn Line>,
+    /// The name of its chip's worker, if calls to this chip may take their time (an expander
+    /// behind I2C, SPI or USB): the core itself must not call it.
+    pub sleeps_on: Option<String>,
+}
+
+/// An ADC channel.
+pub trait Adc: Send {
+    /// One reading in counts of 0 to [`ADC_MAX`].
+    fn read(&mut self) -> Result<u16, Shutdown>;
+}
+
+/// A hardware PWM channel.
+pub trait Pwm: Send {
+    /// Sets the share of the period that the output is on: 0 to [`PWM_MAX`].
+    fn set(&mut self, value: u16) -> Result<(), Shutdown>;
+
+    /// Sets period and share anew.
+    fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown>;
+}
+
+/// How a bus answered, in the words of the dictionary's `i2c_bus_status`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum BusStatus {
+    /// The driver failed in another way than these; SPI has no other status.
+    Failed,
+}
+
+/// A conversation that failed: what the bus said, and for the log which device, why, and what
+/// to do.
+#[derive(Debug, PartialEq)]
+pub struct BusError {
+    /// How the bus answered.
+    pub status: BusStatus,
+    /// Subject, cause and remedy.
+    pub detail: Box<str>,
+}
+
+/// One addressed chip on its bus. A worker uses it, one conversation at a time.
+pub trait BusDevice: Send {
+    /// Sends the bytes and replaces each by the one that came back meanwhile (SPI).
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError>;
+}
+
+/// Something whose calls may take their time, and the worker that makes them.
+pub struct OnWorker<T: ?Sized> {
+    /// Whatever shares a bus has its name in common, such as `spi0` or `iio:device1`: one
+    /// worker runs the conversations of a bus, one after the other.
+    pub bus: String,
+    /// The thing itself.
+    pub device: Box<T>,
+}
+
+/// A hardware PWM output's parameters; values are of a full scale of [`PWM_MAX`].
 #[derive(Clone, Copy, Debug)]
 pub struct PwmConfig {
     /// The channel.
@@ -147,30 +170,16 @@ pub struct SpiConfig {
 /// A line that selects a chip.
 pub struct ChipSelect {
     /// The line, at its idle level.
-    pub line: Box<dyn Output>,
+    pub line: Arc<dyn Line>,
     /// Whether the chip is selected by a high level.
     pub active_high: bool,
 }
 
 impl ChipSelect {
     /// Drives the line to its selected or idle level.
-    pub fn select(&mut self, selected: bool) -> Result<(), Shutdown> {
+    pub fn select(&self, selected: bool) -> Result<(), Shutdown> {
         self.line.write(selected == self.active_high)
     }
-}
-
-/// Keeps copies of the outputs, to drive them to their shutdown values if the program dies.
-pub trait Guard: Send {
-    /// Copies an output line's descriptor (a GPIO line handle of the character device).
-    fn output(&mut self, line: RawFd, shutdown_value: bool) -> io::Result<()>;
-
-    /// Copies the descriptors of the files that drive one output (a PWM's duty cycle and its
-    /// switch), and what is to be written at the beginning of each, in this order.
-    fn files(&mut self, shutdown: &[(RawFd, &[u8])]) -> io::Result<()>;
-
-    /// Gives back every copy, so that the lines can be claimed anew. When this returns, they
-    /// are free.
-    fn release(&mut self) -> io::Result<()>;
 }
 
 /// A computer with pins. Errors carry the firmware's shutdown reason, and the cause, the thing
@@ -185,22 +194,22 @@ pub trait Board: Send {
     /// The names of the dictionary's enumeration `spi_bus`.
     fn spi_buses(&self) -> Vec<Range>;
 
-    /// Claims a line and drives it to `value`. `shutdown_value` is where the line belongs
-    /// if the program dies.
-    fn output(&mut self, pin: Pin, value: bool, shutdown_value: bool) -> Result<Box<dyn Output>, Shutdown>;
+    /// The one number that stands for the line of a pin, where several may.
+    fn canonical(&self, pin: Pin) -> Pin {
+        pin
+    }
 
-    /// Claims a line as an input; a bias that can not be had is an error.
-    fn input(&mut self, pin: Pin, bias: Bias) -> Result<Box<dyn Input>, Shutdown>;
+    /// Claims a line that is not claimed yet.
+    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown>;
 
-    /// Claims an ADC channel.
-    fn adc(&mut self, pin: Pin) -> Result<Attachment, Shutdown>;
+    /// Opens an ADC channel.
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown>;
 
     /// Opens an SPI device.
-    fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown>;
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
 
-    /// Claims a hardware PWM channel that is not in use. The device takes a value in two bytes,
-    /// low byte first, of a full scale of 32768; four more are a new period in ticks.
-    fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown>;
+    /// Opens a hardware PWM channel.
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;
 
     /// How late a step may be before the machine stops: a motor that is stepped late loses its
     /// place. 1 ms, as in the firmware.

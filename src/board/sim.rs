@@ -9,9 +9,13 @@
 
 use std::collections::HashSet;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::{Attachment, Bias, Board, Buffer, ChipSelect, Device, Input, Output, Pin, PwmConfig, Range, SpiConfig};
-use crate::shutdown::{Reason, Shutdown};
+use super::{
+    Adc, Board, BusDevice, BusError, BusStatus, ChipSelect, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm,
+    PwmConfig, Range, SpiConfig,
+};
+use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
 mod config;
@@ -30,6 +34,8 @@ use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
 const LOOPBACK_BUS: &str = "spidev0.0";
 /// The worker of the bus.
 const SPI_WORKER: &str = "spi0";
+/// The worker of the thermistors.
+const ADC_WORKER: &str = "adc";
 
 /// What a pin is wired to.
 #[derive(Clone)]
@@ -66,10 +72,23 @@ impl Wire {
 }
 
 /// A pin of the board.
-struct Line {
+#[derive(Clone)]
+struct WiredPin {
     name: String,
     inverted: bool,
     wire: Wire,
+}
+
+impl WiredPin {
+    /// Says that it is no `kind` of pin.
+    fn is_no(&self, kind: &str, reason: ShutdownReason) -> Shutdown {
+        let detail = format!(
+            "pin {} of the simulated printer is an {}, no {kind}: choose another pin",
+            self.name,
+            self.wire.describe()
+        );
+        Shutdown::because(reason, detail)
+    }
 }
 
 /// Everything that moves, heats, spins and shines.
@@ -86,8 +105,9 @@ pub struct SimBoard {
     seed: u64,
     world: Arc<World>,
     /// By pin number.
-    lines: Vec<Line>,
-    claimed: HashSet<Pin>,
+    pins: Vec<WiredPin>,
+    /// ADC channels in use.
+    sensors: HashSet<Pin>,
 }
 
 impl SimBoard {
@@ -95,9 +115,9 @@ impl SimBoard {
     pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, SimError> {
         config.validate()?;
         let now = clock.now();
-        let mut lines = Vec::new();
+        let mut pins = Vec::new();
         let mut wire = |pin: Option<&PinName>, wire: Wire| {
-            lines.extend(pin.map(|pin| Line { name: pin.name.clone(), inverted: pin.inverted, wire }));
+            pins.extend(pin.map(|pin| WiredPin { name: pin.name.clone(), inverted: pin.inverted, wire }));
         };
         let mut world = World { axes: Vec::new(), heaters: Vec::new(), fans: Vec::new(), lamps: Vec::new() };
         for part in &config.axes {
@@ -129,7 +149,7 @@ impl SimBoard {
         for part in &config.inputs {
             wire(Some(&part.pin), Wire::Level(part.level));
         }
-        Ok(SimBoard { clock, seed: config.seed, world: Arc::new(world), lines, claimed: HashSet::new() })
+        Ok(SimBoard { clock, seed: config.seed, world: Arc::new(world), pins, sensors: HashSet::new() })
     }
 
     /// A view of the printer for demonstrations, drawings and tests.
@@ -137,47 +157,15 @@ impl SimBoard {
         SimProbe { world: self.world.clone(), clock: self.clock.clone() }
     }
 
-    /// Claims a pin that has to be what `pick` picks.
-    fn claim<T>(
-        &mut self,
-        pin: Pin,
-        (kind, wrong_kind, taken): (&str, Reason, Reason),
-        pick: impl FnOnce(&Line) -> Option<T>,
-    ) -> Result<T, Shutdown> {
-        let line = usize::try_from(pin.0).ok().and_then(|i| self.lines.get(i));
-        let Some(line) = line else {
-            return Err(Shutdown::because(
-                wrong_kind,
-                format!(
-                    "the simulated printer has no pin {}: name one of its {} pins (pinion sim \
-                     --print-config shows them)",
-                    pin.0,
-                    self.lines.len(),
-                ),
-            ));
-        };
-        let Some(picked) = pick(line) else {
-            return Err(Shutdown::because(
-                wrong_kind,
-                format!(
-                    "pin {} of the simulated printer is an {}, no {kind}: choose another pin",
-                    line.name,
-                    line.wire.describe(),
-                ),
-            ));
-        };
-        if !self.claimed.insert(pin) {
-            return Err(Shutdown::because(
-                taken,
-                format!(
-                    "pin {} of the simulated printer is in use already as {}: choose another pin \
-                     or remove one use",
-                    line.name,
-                    line.wire.describe(),
-                ),
-            ));
-        }
-        Ok(picked)
+    fn pin(&self, pin: Pin, no_pin: ShutdownReason) -> Result<&WiredPin, Shutdown> {
+        usize::try_from(pin.0).ok().and_then(|place| self.pins.get(place)).ok_or_else(|| {
+            let detail = format!(
+                "the simulated printer has no pin {}: name one of its {} pins (pinion sim --print-config shows them)",
+                pin.0,
+                self.pins.len(),
+            );
+            Shutdown::because(no_pin, detail)
+        })
     }
 }
 
@@ -189,69 +177,48 @@ impl Board for SimBoard {
             count(self.world.axes.len(), "axis", "axes"),
             count(self.world.heaters.len(), "heater", "heaters"),
             count(self.world.fans.len(), "fan", "fans"),
-            count(self.lines.len(), "pin", "pins"),
+            count(self.pins.len(), "pin", "pins"),
         )
     }
 
     fn pins(&self) -> Vec<Range> {
-        let range = |(first, line): (u32, &Line)| Range { name: line.name.clone(), first, count: 1 };
-        (0..).zip(&self.lines).map(range).collect()
+        let range = |(first, pin): (u32, &WiredPin)| Range { name: pin.name.clone(), first, count: 1 };
+        (0..).zip(&self.pins).map(range).collect()
     }
 
     fn spi_buses(&self) -> Vec<Range> {
         vec![Range { name: LOOPBACK_BUS.to_owned(), first: 0, count: 1 }]
     }
 
-    fn output(&mut self, pin: Pin, value: bool, _shutdown_value: bool) -> Result<Box<dyn Output>, Shutdown> {
-        let clock = self.clock.clone();
-        let kind = ("output", Reason::NotOutput, Reason::OutputLine);
-        let mut line = self.claim(pin, kind, |line| {
-            let drive = match &line.wire {
-                Wire::Step(axis) => Drive::Step {
-                    axis: axis.clone(),
-                    // The line is driven to its first level before the motor looks at it.
-                    level: value != line.inverted,
-                },
-                Wire::Direction(axis) => Drive::Direction(axis.clone()),
-                Wire::Enable(axis) => Drive::Enable(axis.clone()),
-                Wire::Heater(heater) => Drive::Heater(heater.clone(), clock),
-                Wire::Fan(fan, switch) => Drive::Fan(fan.clone(), *switch, clock),
-                Wire::Lamp(lamp) => Drive::Lamp(lamp.clone()),
-                Wire::Endstop(_) | Wire::Sensor(_) | Wire::Tachometer(_) | Wire::Level(_) => {
-                    return None;
-                }
-            };
-            Some(OutputLine { drive, inverted: line.inverted })
-        })?;
-        line.write(value)?;
-        Ok(Box::new(line))
-    }
-
     /// The parts drive their lines harder than any bias pulls.
-    fn input(&mut self, pin: Pin, _bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
-        let clock = self.clock.clone();
-        let kind = ("input", Reason::NotInput, Reason::InputLine);
-        let line = self.claim(pin, kind, |line| {
-            let sense = match &line.wire {
-                Wire::Endstop(axis) => Sense::Endstop(axis.clone()),
-                Wire::Tachometer(fan) => Sense::Tachometer(fan.clone(), clock),
-                Wire::Level(level) => Sense::Level(*level),
-                _ => return None,
-            };
-            Some(InputLine { sense, inverted: line.inverted })
-        })?;
-        Ok(Box::new(line))
+    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
+        let no_pin = match direction {
+            Direction::Output { .. } => reason::NOT_OUTPUT,
+            Direction::Input(_) => reason::NOT_INPUT,
+        };
+        let pin = self.pin(pin, no_pin)?.clone();
+        // The line stands at its first level before the motor looks at it.
+        let first = matches!(direction, Direction::Output { level, .. } if level != pin.inverted);
+        let line = SimLine { pin, on: AtomicBool::new(first), clock: self.clock.clone() };
+        line.set_direction(direction)?;
+        Ok(ClaimedLine { line: Arc::new(line), sleeps_on: None })
     }
 
-    fn adc(&mut self, pin: Pin) -> Result<Attachment, Shutdown> {
-        let clock = self.clock.clone();
-        let seed = self.seed ^ u64::from(pin.0) << 32;
-        let kind = ("ADC channel", Reason::AdcOpen, Reason::AdcOpen);
-        let sensor = self.claim(pin, kind, |line| match &line.wire {
-            Wire::Sensor(heater) => Some(Sensor { heater: heater.clone(), clock, noise: Noise::new(seed) }),
-            _ => None,
-        })?;
-        Ok(Attachment::Inline(Box::new(sensor)))
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
+        let wired = self.pin(pin, reason::ADC_OPEN)?;
+        let Wire::Sensor(heater) = &wired.wire else { return Err(wired.is_no("ADC channel", reason::ADC_OPEN)) };
+        if self.sensors.contains(&pin) {
+            let detail = format!(
+                "pin {} of the simulated printer is in use already as {}: choose another pin or remove one use",
+                wired.name,
+                wired.wire.describe()
+            );
+            return Err(Shutdown::because(reason::ADC_OPEN, detail));
+        }
+        let noise = Noise::new(self.seed ^ u64::from(pin.0) << 32);
+        let sensor = Sensor { heater: heater.clone(), clock: self.clock.clone(), noise };
+        self.sensors.insert(pin);
+        Ok(OnWorker { bus: ADC_WORKER.to_owned(), device: Box::new(sensor) })
     }
 
     /// A simulated motor follows at any pace: a computer without real time, as most that try
@@ -260,91 +227,71 @@ impl Board for SimBoard {
         Ticks::from_us(100_000)
     }
 
-    fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown> {
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
         let detail =
             format!("the simulated printer has no hardware PWM (pin number {}): leave out hardware_pwm", config.pin.0);
-        Err(Shutdown::because(Reason::PwmConfig, detail))
+        Err(Shutdown::because(reason::PWM_CONFIG, detail))
     }
 
-    fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown> {
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         if config.bus != 0 {
             return Err(Shutdown::because(
-                Reason::SpiOpen,
+                reason::SPI_OPEN,
                 format!("the simulated printer has no SPI bus {}: use {LOOPBACK_BUS}", config.bus),
             ));
         }
-        if config.mode > 3 {
-            return Err(Shutdown::because(
-                Reason::InvalidSpi,
-                format!("SPI mode {} on {LOOPBACK_BUS}: use 0 to 3", config.mode),
-            ));
-        }
-        Ok(Attachment::Worker {
-            bus: SPI_WORKER.to_owned(),
-            device: Box::new(Loopback { chip_select: config.chip_select }),
-        })
+        let device = Loopback { chip_select: config.chip_select };
+        Ok(OnWorker { bus: SPI_WORKER.to_owned(), device: Box::new(device) })
     }
 
     fn reset(&mut self) {
-        self.claimed.clear();
+        self.sensors.clear();
     }
 }
 
-/// What an output line drives.
-enum Drive {
-    Step { axis: Arc<Axis>, level: bool },
-    Direction(Arc<Axis>),
-    Enable(Arc<Axis>),
-    Heater(Arc<Heater>, Arc<dyn TimeSource>),
-    Fan(Arc<Fan>, Switch, Arc<dyn TimeSource>),
-    Lamp(Arc<Lamp>),
+/// A line of the board: what a pin is wired to, driven or sensed.
+struct SimLine {
+    pin: WiredPin,
+    /// Whether it was driven on last.
+    on: AtomicBool,
+    clock: Arc<dyn TimeSource>,
 }
 
-struct OutputLine {
-    drive: Drive,
-    inverted: bool,
-}
-
-impl Output for OutputLine {
-    fn write(&mut self, value: bool) -> Result<(), Shutdown> {
-        let on = value != self.inverted;
-        match &mut self.drive {
-            Drive::Step { axis, level } => {
-                if on != *level && (on || axis.both_edges) {
-                    axis.step();
-                }
-                *level = on;
-            }
-            Drive::Direction(axis) => axis.set_forward(on),
-            Drive::Enable(axis) => axis.set_enabled(on),
-            Drive::Heater(heater, clock) => heater.switch(on, clock.now()),
-            Drive::Fan(fan, switch, clock) => fan.switch(*switch, on, clock.now()),
-            Drive::Lamp(lamp) => lamp.switch(on),
+impl Line for SimLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        let on = level != self.pin.inverted;
+        let was_on = self.on.swap(on, Ordering::Relaxed);
+        match &self.pin.wire {
+            Wire::Step(axis) if on != was_on && (on || axis.both_edges) => axis.step(),
+            Wire::Direction(axis) => axis.set_forward(on),
+            Wire::Enable(axis) => axis.set_enabled(on),
+            Wire::Heater(heater) => heater.switch(on, self.clock.now()),
+            Wire::Fan(fan, switch) => fan.switch(*switch, on, self.clock.now()),
+            Wire::Lamp(lamp) => lamp.switch(on),
+            Wire::Step(_) | Wire::Endstop(_) | Wire::Sensor(_) | Wire::Tachometer(_) | Wire::Level(_) => {}
         }
         Ok(())
     }
-}
 
-/// What an input line senses.
-enum Sense {
-    Endstop(Arc<Axis>),
-    Tachometer(Arc<Fan>, Arc<dyn TimeSource>),
-    Level(bool),
-}
-
-struct InputLine {
-    sense: Sense,
-    inverted: bool,
-}
-
-impl Input for InputLine {
-    fn read(&mut self) -> Result<bool, Shutdown> {
-        let on = match &self.sense {
-            Sense::Endstop(axis) => axis.endstop().unwrap_or(false),
-            Sense::Tachometer(fan, clock) => fan.tachometer(clock.now()),
-            Sense::Level(level) => *level,
+    fn read(&self) -> Result<bool, Shutdown> {
+        let on = match &self.pin.wire {
+            Wire::Endstop(axis) => axis.endstop().unwrap_or(false),
+            Wire::Tachometer(fan) => fan.tachometer(self.clock.now()),
+            Wire::Level(level) => *level,
+            _ => self.on.load(Ordering::Relaxed),
         };
-        Ok(on != self.inverted)
+        Ok(on != self.pin.inverted)
+    }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let senses = matches!(self.pin.wire, Wire::Endstop(_) | Wire::Tachometer(_) | Wire::Level(_));
+        let drives = !senses && !matches!(self.pin.wire, Wire::Sensor(_));
+        match direction {
+            Direction::Output { level, .. } if drives => self.write(level),
+            Direction::Output { .. } => Err(self.pin.is_no("output", reason::NOT_OUTPUT)),
+            Direction::Input(_) if senses => Ok(()),
+            Direction::Input(_) => Err(self.pin.is_no("input", reason::NOT_INPUT)),
+        }
     }
 }
 
@@ -355,13 +302,11 @@ struct Sensor {
     noise: Noise,
 }
 
-impl Device for Sensor {
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
+impl Adc for Sensor {
+    fn read(&mut self) -> Result<u16, Shutdown> {
         let celsius = self.heater.at(self.clock.now()).sensor_celsius;
         let noise_counts = self.noise.draw() * self.heater.noise_counts;
-        let counts = self.heater.thermistor.counts(celsius, noise_counts);
-        *data = Buffer::new(&counts.to_le_bytes());
-        Ok(())
+        Ok(self.heater.thermistor.counts(celsius, noise_counts))
     }
 }
 
@@ -370,13 +315,13 @@ struct Loopback {
     chip_select: Option<ChipSelect>,
 }
 
-impl Device for Loopback {
-    fn run(&mut self, _data: &mut Buffer) -> Result<(), Shutdown> {
-        if let Some(chip_select) = &mut self.chip_select {
-            chip_select.select(true)?;
-            chip_select.select(false)?;
-        }
-        Ok(())
+impl BusDevice for Loopback {
+    fn exchange(&mut self, _bytes: &mut [u8]) -> Result<(), BusError> {
+        let Some(chip_select) = &self.chip_select else { return Ok(()) };
+        chip_select
+            .select(true)
+            .and_then(|()| chip_select.select(false))
+            .map_err(|failure| BusError { status: BusStatus::Failed, detail: failure.detail })
     }
 }
 

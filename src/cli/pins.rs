@@ -11,7 +11,7 @@ use clap::Args;
 
 use crate::board::linux::Inventory;
 use crate::board::linux::adc::Adc;
-use crate::board::linux::gpio::{Chip, Line};
+use crate::board::linux::gpio::{Chip, LineInfo};
 use crate::board::linux::pins::{Names, channel_number, line_number};
 use crate::board::linux::spi::Node;
 
@@ -62,7 +62,7 @@ fn reading(inventory: &Inventory, device: u32, id: &str) -> String {
     let Some(reader) = inventory.adc(device, id) else {
         return "gone".to_owned();
     };
-    match (reader.read_raw(), reader.read()) {
+    match (reader.read_raw(), reader.read_counts()) {
         (Ok(raw), Ok(scaled)) => format!("{raw} ({scaled} of 4095)"),
         (Err(error), _) => error.to_string(),
         (_, Err(shutdown)) => shutdown.to_string(),
@@ -118,7 +118,7 @@ fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> String {
 
 fn chip_section(chip: &Chip, names: &Names, args: &PinsArgs) -> String {
     let path = format!("gpiochip{}", chip.number);
-    let row = |(offset, line): (u32, &Line)| {
+    let row = |(offset, line): (u32, &LineInfo)| {
         let number = line_number(chip.number, offset);
         let numbered = match number {
             // The first chip's lines go by their offset.
@@ -151,7 +151,7 @@ fn chip_section(chip: &Chip, names: &Names, args: &PinsArgs) -> String {
     section(&heading, &["line", "name", "dir", "held by", "in printer.cfg"], &rows)
 }
 
-fn holder(line: &Line) -> &str {
+fn holder(line: &LineInfo) -> &str {
     match &line.consumer {
         _ if !line.held => "free",
         Some(consumer) => consumer,
@@ -213,7 +213,7 @@ mod tests {
     use crate::board::linux::adc::{Channel, Format};
 
     fn pi() -> Inventory {
-        let line = |name: &str, consumer: Option<&str>, held| Line {
+        let line = |name: &str, consumer: Option<&str>, held| LineInfo {
             name: Some(name.into()),
             output: consumer.is_some(),
             held,

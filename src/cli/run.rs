@@ -10,9 +10,9 @@ use std::sync::Arc;
 
 use clap::Args;
 
-use crate::board::linux::LinuxBoard;
+use crate::board::Board;
+use crate::board::linux::{Guard, LinuxBoard};
 use crate::board::sim::{SimBoard, SimConfig, SimError};
-use crate::board::{Board, Guard};
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Guardian, Options};
 use crate::time::{Monotonic, TimeSource};

@@ -6,20 +6,29 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{Buffer, Pin};
+use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
-    Command, Constant, DeviceId, Feature, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, command,
-    response,
+    Command, Constant, Done, Errand, Feature, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId,
+    command, response,
 };
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "analog_in",
     commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN],
     responses: &[State::FORMAT],
-    constants: &[("ADC_MAX", Constant::Number(4095))],
+    constants: &[("ADC_MAX", Constant::Number(ADC_MAX as u32))],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
 };
+
+shutdowns! {
+    /// `bytes_per_report` above 48.
+    INVALID_BYTES_PER_REPORT = "Invalid analog_in bytes_per_report";
+    /// A reading outside its range, `range_check_count` times in a row.
+    ADC_RANGE = "ADC out of range";
+}
 
 response! {
     /// Sums of readings, two bytes each, low byte first.
@@ -31,8 +40,24 @@ response! {
 const REPORT_BYTES: usize = 48;
 const SAMPLE_BYTES: usize = 2;
 
+/// One reading of a channel: there is one box for each input.
+struct Reading {
+    adc: Box<dyn Adc>,
+    counts: Result<u16, Shutdown>,
+}
+
+impl Errand for Reading {
+    fn run(&mut self) {
+        self.counts = self.adc.read();
+    }
+}
+
 struct AnalogIn {
-    device: DeviceId,
+    worker: WorkerId,
+    /// Here while the ADC is not being read.
+    reading: Option<Box<Reading>>,
+    /// Whether a sample is due while the ADC is still busy with one of an earlier query.
+    waiting: bool,
     sample_ticks: Ticks,
     sample_count: u8,
     rest_ticks: Ticks,
@@ -58,18 +83,33 @@ impl AnalogIn {
     fn restart(&mut self) {
         self.taken = 0;
         self.sum = 0;
+        self.waiting = false;
         self.tag = self.tag.wrapping_add(1);
+    }
+
+    /// Has the ADC read, as soon as it is free.
+    fn sample(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        match self.reading.take() {
+            Some(reading) => mcu.dispatch(self.worker, Ticket { oid, tag: self.tag }, reading),
+            None => {
+                self.waiting = true;
+                Ok(())
+            }
+        }
     }
 
     /// The first sample after `self.next_begin`, past the ones that the ADC was too slow for.
     fn skip_missed(&mut self, now: Clock) {
         self.next_begin = self.next_begin + self.rest_ticks;
         let behind = now.since(self.next_begin);
-        let rest = i64::from(self.rest_ticks.0);
-        if behind > 0 && rest > 0 {
-            let missed = behind as u64 / rest as u64 + 1;
-            self.next_begin = Clock::from_ticks(self.next_begin.ticks() + missed * rest as u64);
+        if behind <= 0 {
+            return;
         }
+        self.next_begin = match u64::from(self.rest_ticks.0) {
+            // As fast as the ADC reads: nothing is missed.
+            0 => now,
+            rest => Clock::from_ticks(self.next_begin.ticks() + (behind as u64 / rest + 1) * rest),
+        };
     }
 
     fn check_range(&mut self, mcu: &Mcu) -> Result<(), Shutdown> {
@@ -83,7 +123,7 @@ impl AnalogIn {
         }
         self.invalid_count = 0;
         mcu.try_shut_down(Shutdown::because(
-            Reason::AdcRange,
+            ADC_RANGE,
             format!(
                 "it read {} where {} to {} is allowed (sum of {} samples): a heater past its limits, or a sensor that is broken or unplugged",
                 self.sum, self.min_value, self.max_value, self.sample_count
@@ -110,30 +150,32 @@ impl Object for AnalogIn {
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
         self.sample_at = at;
         if let Some(oid) = timer.oid() {
-            mcu.submit(self.device, Ticket { oid, tag: self.tag }, Buffer::EMPTY)?;
+            self.sample(mcu, oid)?;
         }
         Ok(Next::Done)
     }
 
-    fn completed(&mut self, mcu: &mut Mcu, ticket: Ticket, result: Result<Buffer, Shutdown>) -> Result<(), Shutdown> {
-        let Ticket { oid, tag } = ticket;
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let tag = done.tag;
+        let Some(mut reading) = done.errand::<Reading>() else { return Ok(()) };
+        let counts = std::mem::replace(&mut reading.counts, Ok(0));
+        self.reading = Some(reading);
         if tag != self.tag {
-            return Ok(());
+            return if std::mem::take(&mut self.waiting) { self.sample(mcu, oid) } else { Ok(()) };
         }
         let timer = TimerId::new(oid, 0);
-        let value = match result.as_ref().map(Buffer::as_slice) {
-            Ok([low, high]) => u16::from_le_bytes([*low, *high]),
-            Ok(_) => 0,
-            // A stop goes on with the next reading, see `shutdown`.
-            Err(_) if !mcu.is_shutdown() => return result.map(drop),
-            Err(_) => {
+        let counts = match counts {
+            Ok(counts) => counts,
+            Err(failure) => {
+                // A stopped machine goes on with the next reading.
+                mcu.try_shut_down(failure)?;
                 self.restart();
                 self.skip_missed(mcu.now());
                 mcu.go_on(timer, self.next_begin);
                 return Ok(());
             }
         };
-        self.sum = self.sum.wrapping_add(value);
+        self.sum = self.sum.wrapping_add(counts);
         self.taken += 1;
         let now = mcu.now();
         if self.taken < self.sample_count {
@@ -148,25 +190,26 @@ impl Object for AnalogIn {
         Ok(())
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
+        // What is under way counts no more.
+        self.restart();
         // Readings without rest would keep a stopped machine busy for ever.
         if self.sample_count == 0 || self.rest_ticks == Ticks(0) {
-            return Ok(());
+            return;
         }
         // The host sees temperatures of a stopped machine too.
-        self.restart();
         self.skip_missed(mcu.now());
         mcu.go_on(TimerId::new(oid, 0), self.next_begin);
-        Ok(())
     }
 }
 
 const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mcu, oid: Oid, pin: Pin| {
     mcu.vacant(oid)?;
-    let attachment = mcu.board.adc(pin)?;
-    let device = mcu.attach(attachment)?;
+    let OnWorker { bus, device } = mcu.board()?.adc(pin)?;
     let input = AnalogIn {
-        device,
+        worker: mcu.worker(&bus)?,
+        reading: Some(Box::new(Reading { adc: device, counts: Ok(0) })),
+        waiting: false,
         sample_ticks: Ticks(0),
         sample_count: 0,
         rest_ticks: Ticks(0),
@@ -216,7 +259,7 @@ const QUERY_ANALOG_IN: Command = command!(
             }
             if usize::from(bytes_per_report) > REPORT_BYTES {
                 return Err(Shutdown::by_host(
-                    Reason::InvalidBytesPerReport,
+                    INVALID_BYTES_PER_REPORT,
                     format_args!("{bytes_per_report} bytes are asked for where a report has {REPORT_BYTES}"),
                 ));
             }

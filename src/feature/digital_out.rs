@@ -5,18 +5,31 @@
 #![forbid(unsafe_code)]
 
 use crate::board::Pin;
-use crate::mcu::{Command, Feature, Line, Mcu, MoveQueue, Next, Object, Oid, TimerId, WireClock, command};
-use crate::shutdown::{Reason, Shutdown};
+use crate::mcu::{
+    Command, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, OutputLine, Safe, Ticket, TimerId, WireClock, command,
+};
+use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
 
-use super::{changes_too_late, not_refreshed};
+use super::{changes_too_late, not_refreshed, set_too_late};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "digital_out",
     commands: &[CONFIG_DIGITAL_OUT, SET_DIGITAL_OUT_PWM_CYCLE, QUEUE_DIGITAL_OUT, UPDATE_DIGITAL_OUT, SET_DIGITAL_OUT],
-    responses: &[],
-    constants: &[],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
 };
+
+shutdowns! {
+    /// `update_digital_out` while changes are queued.
+    UPDATE_WITH_QUEUE = "update_digital_out not valid with active queue";
+    /// An output would stay on for longer than its `max_duration`.
+    DIGITAL_MAX_DURATION = "Scheduled digital out event will exceed max_duration";
+    /// `set_digital_out_pwm_cycle` while changes are queued.
+    PWM_CYCLE_WITH_QUEUE = "Can not set soft pwm cycle ticks while updates pending";
+    /// The host did not refresh an output before its `max_duration` ran out.
+    MISSED_DIGITAL = "Missed scheduling of next digital out event";
+}
 
 struct Move {
     at: Clock,
@@ -31,8 +44,10 @@ enum Phase {
     Toggle,
 }
 
+const KIND: &str = "digital output";
+
 struct DigitalOut {
-    line: Line,
+    line: OutputLine,
     default: bool,
     max_duration: Ticks,
     cycle: Ticks,
@@ -54,20 +69,24 @@ impl DigitalOut {
         TimerId::new(oid, 0)
     }
 
+    fn ticket(oid: Oid) -> Ticket {
+        Ticket { oid, tag: 0 }
+    }
+
     /// Applies the oldest move, due at `at`.
-    fn load(&mut self, mcu: &mut Mcu, at: Clock) -> Result<Next, Shutdown> {
+    fn load(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
         let Some(Move { on_ticks, .. }) = self.queue.pop(&mut mcu.moves) else {
-            return Err(not_refreshed(Reason::MissedDigital, self.max_duration));
+            return Err(not_refreshed(MISSED_DIGITAL, self.max_duration));
         };
         let on = on_ticks.0 != 0;
-        self.line.write(on)?;
+        self.line.write(mcu, Self::ticket(oid), on)?;
         self.on = on;
         self.toggling = on && on_ticks < self.cycle;
         let limited = self.max_duration.0 != 0 && (self.toggling || on != self.default);
         self.end = limited.then(|| at + self.max_duration);
         if let Some(next) = self.queue.first() {
             if self.end.is_some_and(|end| end < next.at) {
-                return Err(changes_too_late(Reason::DigitalMaxDuration, self.max_duration));
+                return Err(changes_too_late(DIGITAL_MAX_DURATION, self.max_duration));
             }
             self.end = Some(next.at);
         }
@@ -88,8 +107,8 @@ impl DigitalOut {
     }
 
     /// Pulses the pin, due at `at`.
-    fn toggle(&mut self, at: Clock) -> Result<Next, Shutdown> {
-        self.line.toggle()?;
+    fn toggle(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
+        self.line.toggle(mcu, Self::ticket(oid))?;
         self.on = !self.on;
         let mut next = at + if self.on { self.on_ticks } else { self.off_ticks };
         if let Some(end) = self.end
@@ -118,7 +137,7 @@ impl DigitalOut {
             return Ok(());
         }
         if self.end.is_some_and(|end| end < at) {
-            return Err(changes_too_late(Reason::DigitalMaxDuration, self.max_duration));
+            return Err(changes_too_late(DIGITAL_MAX_DURATION, self.max_duration));
         }
         self.end = Some(at);
         if self.toggling && self.wake < at {
@@ -134,9 +153,9 @@ impl DigitalOut {
     fn update(&mut self, mcu: &mut Mcu, oid: Oid, value: bool) -> Result<(), Shutdown> {
         mcu.cancel(Self::timer(oid));
         if !self.queue.is_empty() {
-            return Err(Shutdown::by_host(Reason::UpdateWithQueue, "update_digital_out came while changes are queued"));
+            return Err(Shutdown::by_host(UPDATE_WITH_QUEUE, "update_digital_out came while changes are queued"));
         }
-        self.line.write(value)?;
+        self.line.write(mcu, Self::ticket(oid), value)?;
         self.on = value;
         self.toggling = false;
         self.end = None;
@@ -153,22 +172,81 @@ impl DigitalOut {
 
 impl Object for DigitalOut {
     fn kind(&self) -> &'static str {
-        "digital output"
+        KIND
     }
 
-    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
         match self.phase {
-            Phase::Load => self.load(mcu, at),
-            Phase::Toggle => self.toggle(at),
+            Phase::Load => self.load(mcu, oid, at),
+            Phase::Toggle => self.toggle(mcu, oid, at),
         }
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) -> Result<(), Shutdown> {
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        match self.line.returned(mcu, Self::ticket(oid), done) {
+            Ok(true) => mcu.is_safe(oid),
+            Ok(false) => {}
+            Err(failure) => return mcu.device_failed(oid, KIND, failure),
+        }
+        Ok(())
+    }
+
+    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
         self.on = self.default;
         self.toggling = false;
         self.end = None;
         self.queue.clear(&mut mcu.moves);
-        self.line.write(self.default)
+    }
+
+    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
+        self.line.make_safe(mcu, Self::ticket(oid), self.default)
+    }
+}
+
+/// The lines that `set_digital_out` drove. No object owns them; they keep their levels, at a
+/// shutdown too.
+#[derive(Default)]
+struct SetLines(Vec<(Pin, OutputLine)>);
+
+impl SetLines {
+    /// Drives a line, and holds it from then on.
+    ///
+    /// The firmware takes this at any time, and so does this machine for a line that it holds.
+    /// To claim one opens files and waits for the guardian: that is refused after
+    /// `finalize_config`, as steps would wait with it. klippy sets its lines before.
+    fn set(&mut self, mcu: &mut Mcu, oid: Oid, pin: Pin, value: bool) -> Result<(), Shutdown> {
+        let known = self.0.iter().position(|(held, _)| *held == pin);
+        match known {
+            Some(place) if mcu.is_finalized() => self.0[place].1.write(mcu, Ticket { oid, tag: place as u8 }, value),
+            _ if mcu.is_finalized() => Err(set_too_late(mcu, reason::OUTPUT_LINE, "set_digital_out", pin)),
+            // Set up anew: where it belongs has changed, too.
+            Some(place) => {
+                self.0[place].1 = mcu.output(pin, value, value)?;
+                Ok(())
+            }
+            None if self.0.len() > usize::from(u8::MAX) => {
+                Err(Shutdown::by_host(reason::OUTPUT_LINE, "set_digital_out wants more than 256 lines"))
+            }
+            None => {
+                self.0.push((pin, mcu.output(pin, value, value)?));
+                Ok(())
+            }
+        }
+    }
+}
+
+impl Object for SetLines {
+    fn kind(&self) -> &'static str {
+        "set_digital_out"
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let ticket = Ticket { oid, tag: done.tag };
+        match self.0.get_mut(usize::from(done.tag)).map(|(_, line)| line.returned(mcu, ticket, done)) {
+            Some(Err(failure)) => mcu.device_failed(oid, self.kind(), failure),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -200,7 +278,7 @@ const SET_DIGITAL_OUT_PWM_CYCLE: Command =
         mcu.with::<DigitalOut, _>(oid, |output, _| {
             if !output.queue.is_empty() {
                 return Err(Shutdown::by_host(
-                    Reason::PwmCycleWithQueue,
+                    PWM_CYCLE_WITH_QUEUE,
                     "set_digital_out_pwm_cycle came while changes are queued",
                 ));
             }
@@ -219,5 +297,7 @@ const UPDATE_DIGITAL_OUT: Command = command!("update_digital_out oid=%c value=%c
     mcu.with::<DigitalOut, _>(oid, |output, mcu| output.update(mcu, oid, value))
 });
 
-const SET_DIGITAL_OUT: Command =
-    command!("set_digital_out pin=%u value=%c", |mcu, pin: Pin, value: bool| mcu.set_line(pin, value));
+const SET_DIGITAL_OUT: Command = command!("set_digital_out pin=%u value=%c", |mcu, pin: Pin, value: bool| {
+    let oid = mcu.own::<SetLines>();
+    mcu.with::<SetLines, _>(oid, |lines, mcu| lines.set(mcu, oid, pin, value))
+});

@@ -3,8 +3,10 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{Bias, Input, Pin};
-use crate::mcu::{Command, Feature, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response};
+use crate::board::{Bias, Pin};
+use crate::mcu::{
+    Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, command, response,
+};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
@@ -14,7 +16,7 @@ pub(super) const FEATURE: Feature = Feature {
     name: "endstop",
     commands: &[CONFIG_ENDSTOP, ENDSTOP_HOME, ENDSTOP_QUERY_STATE],
     responses: &[State::FORMAT],
-    constants: &[],
+    ..Feature::EMPTY
 };
 
 response! {
@@ -24,12 +26,19 @@ response! {
 }
 
 struct Endstop {
-    pin: Box<dyn Input>,
+    pin: InputLine,
     /// What the host asked for last; a trigger leaves it, so that it can ask when it came.
     homing: Option<Homing>,
     /// The search after the samples of the last match.
     next_wake: Clock,
+    /// The sample that is due, while its chip's worker looks.
+    due: Option<Clock>,
+    /// Whether the host waits for that look, too, and with it the commands behind its query.
+    asked: Option<Held>,
 }
+
+/// Whether commands wait.
+type Held = bool;
 
 #[derive(Clone, Copy)]
 struct Homing {
@@ -43,15 +52,27 @@ struct Homing {
     wanted: u8,
 }
 
-impl Object for Endstop {
-    fn kind(&self) -> &'static str {
-        "endstop"
+impl Endstop {
+    fn ticket(oid: Oid) -> Ticket {
+        Ticket { oid, tag: 0 }
     }
 
-    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+    /// Takes the sample that is due at `at`, now or as soon as the chip's worker has looked.
+    fn sample(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
+        match self.pin.read(mcu, Self::ticket(oid))? {
+            Some(level) => self.judge(mcu, level, at),
+            None => {
+                self.due = Some(at);
+                Ok(Next::Done)
+            }
+        }
+    }
+
+    /// Counts a sample of the instant `at`.
+    fn judge(&mut self, mcu: &mut Mcu, level: bool, at: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(Next::Done) };
         let confirming = homing.wanted < homing.sample_count;
-        if self.pin.read()? != homing.pin_value {
+        if level != homing.pin_value {
             homing.wanted = homing.sample_count;
             return Ok(Next::At(if confirming { self.next_wake } else { at + homing.rest_ticks }));
         }
@@ -66,6 +87,53 @@ impl Object for Endstop {
         mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, trigger_reason))?;
         Ok(Next::Done)
     }
+
+    fn query(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        match self.pin.read(mcu, Self::ticket(oid))? {
+            Some(level) => self.report(mcu, oid, level),
+            None => self.asked = Some(mcu.hold(oid)),
+        }
+        Ok(())
+    }
+
+    fn report(&self, mcu: &mut Mcu, oid: Oid, pin_value: bool) {
+        mcu.send(State { oid, homing: self.homing.is_some(), next_clock: self.next_wake, pin_value });
+    }
+}
+
+impl Object for Endstop {
+    fn kind(&self) -> &'static str {
+        "endstop"
+    }
+
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+        self.sample(mcu, oid, at)
+    }
+
+    /// The chip's worker has looked.
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let began = done.began;
+        let level = self.pin.returned(done).or_else(|failure| mcu.try_shut_down(failure).map(|()| false))?;
+        if let Some(held) = self.asked.take() {
+            self.report(mcu, oid, level);
+            if held {
+                mcu.release();
+            }
+        }
+        let Some(at) = self.due.take() else { return Ok(()) };
+        // A look that was under way before the sample was due says nothing of it.
+        let next = if began < at { self.sample(mcu, oid, at)? } else { self.judge(mcu, level, at)? };
+        if let Next::At(at) = next {
+            let now = mcu.now();
+            mcu.go_on(TimerId::new(oid, 0), at.max(now));
+        }
+        Ok(())
+    }
+
+    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+        self.due = None;
+    }
 }
 
 const CONFIG_ENDSTOP: Command =
@@ -76,8 +144,9 @@ const CONFIG_ENDSTOP: Command =
             0 => Bias::None,
             _ => Bias::PullDown,
         };
-        let input = mcu.board.input(pin, bias)?;
-        mcu.assign_on(pin, oid, Endstop { pin: input, homing: None, next_wake: Clock::EPOCH })
+        let input = mcu.input(pin, bias)?;
+        let endstop = Endstop { pin: input, homing: None, next_wake: Clock::EPOCH, due: None, asked: None };
+        mcu.assign_on(pin, oid, endstop)
     });
 
 const ENDSTOP_HOME: Command = command!(
@@ -95,6 +164,7 @@ const ENDSTOP_HOME: Command = command!(
         mcu.with::<Endstop, _>(oid, |endstop, mcu| {
             mcu.cancel(TimerId::new(oid, 0));
             endstop.homing = None;
+            endstop.due = None;
             if sample_count == 0 {
                 return Ok(());
             }
@@ -114,10 +184,5 @@ const ENDSTOP_HOME: Command = command!(
 );
 
 const ENDSTOP_QUERY_STATE: Command = command!("endstop_query_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Endstop, _>(oid, |endstop, mcu| {
-        let pin_value = endstop.pin.read()?;
-        let state = State { oid, homing: endstop.homing.is_some(), next_clock: endstop.next_wake, pin_value };
-        mcu.send(state);
-        Ok(())
-    })
+    mcu.with::<Endstop, _>(oid, |endstop, mcu| endstop.query(mcu, oid))
 });

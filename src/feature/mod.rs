@@ -3,8 +3,9 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Feature, base};
-use crate::shutdown::{Reason, Shutdown};
+use crate::board::Pin;
+use crate::mcu::{Feature, Mcu, base};
+use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
 use crate::wire::format::same;
 
@@ -49,7 +50,7 @@ const fn response_index(format: &str) -> usize {
 
 /// An output with a `max_duration` got no change in time.
 #[cold]
-fn not_refreshed(reason: Reason, max_duration: Ticks) -> Shutdown {
+fn not_refreshed(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     let ms = max_duration.0 / Ticks::from_us(1000).0;
     Shutdown::because(
         reason,
@@ -59,7 +60,14 @@ fn not_refreshed(reason: Reason, max_duration: Ticks) -> Shutdown {
 
 /// An output with a `max_duration` is to change after it only.
 #[cold]
-fn changes_too_late(reason: Reason, max_duration: Ticks) -> Shutdown {
+fn changes_too_late(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     let ms = max_duration.0 / Ticks::from_us(1000).0;
     Shutdown::by_host(reason, format_args!("its next change is scheduled later than its max_duration of {ms} ms"))
+}
+
+/// A pin is set without an object after `finalize_config`, and was not before.
+#[cold]
+fn set_too_late(mcu: &Mcu, reason: ShutdownReason, command: &str, pin: Pin) -> Shutdown {
+    let name = mcu.name(pin);
+    Shutdown::by_host(reason, format_args!("{command} wants {name} after finalize_config, and did not set it before"))
 }

@@ -3,21 +3,61 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{Buffer, Pin, PwmConfig};
+use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
-    Command, Constant, DeviceId, Feature, Mcu, MoveQueue, Next, Object, Oid, Ticket, TimerId, WireClock, command,
+    Command, Constant, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, Remote, Safe, Settable, Ticket, TimerId,
+    WireClock, command,
 };
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
 
-use super::{changes_too_late, not_refreshed};
+use super::{changes_too_late, not_refreshed, set_too_late};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "pwm_out",
     commands: &[CONFIG_PWM_OUT, QUEUE_PWM_OUT, SET_PWM_OUT],
-    responses: &[],
-    constants: &[("PWM_MAX", Constant::Number(32768))],
+    constants: &[("PWM_MAX", Constant::Number(PWM_MAX as u32))],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
 };
+
+shutdowns! {
+    /// A hardware PWM output would stay on for longer than its `max_duration`.
+    PWM_MAX_DURATION = "Scheduled pwm event will exceed max_duration";
+    /// The host did not refresh a hardware PWM output in time.
+    MISSED_PWM = "Missed scheduling of next hard pwm event";
+}
+
+const KIND: &str = "PWM output";
+
+/// A channel on the worker of its chip.
+struct Channel(Box<dyn Pwm>);
+
+/// What a channel is set to: a value, and with `set_pwm_out` a new period as well.
+#[derive(Clone, Copy)]
+struct Setting {
+    value: u16,
+    cycle: Option<Ticks>,
+}
+
+impl Settable for Channel {
+    type Value = Setting;
+
+    fn set(&mut self, Setting { value, cycle }: Setting) -> Result<(), Shutdown> {
+        match cycle {
+            Some(cycle) => self.0.set_cycle(cycle, value),
+            None => self.0.set(value),
+        }
+    }
+}
+
+/// Opens a channel. Several objects may have the same one, each with files of its own, as in the
+/// firmware.
+fn open(mcu: &mut Mcu, config: PwmConfig) -> Result<Remote<Channel>, Shutdown> {
+    let OnWorker { bus, device } = mcu.board()?.pwm(config)?;
+    let worker = mcu.worker(&bus)?;
+    Ok(Remote::new(worker, Channel(device), Setting { value: config.value, cycle: None }))
+}
 
 struct Move {
     at: Clock,
@@ -25,7 +65,7 @@ struct Move {
 }
 
 struct PwmOut {
-    device: DeviceId,
+    channel: Remote<Channel>,
     default_value: u16,
     max_duration: Ticks,
     queue: MoveQueue<Move>,
@@ -38,8 +78,8 @@ impl PwmOut {
         TimerId::new(oid, 0)
     }
 
-    fn write(&self, mcu: &mut Mcu, oid: Oid, value: u16) -> Result<(), Shutdown> {
-        mcu.submit(self.device, Ticket { oid, tag: 0 }, Buffer::new(&value.to_le_bytes()))
+    fn write(&mut self, mcu: &mut Mcu, oid: Oid, value: u16) -> Result<(), Shutdown> {
+        self.channel.set(mcu, Ticket { oid, tag: 0 }, Setting { value, cycle: None })
     }
 
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
@@ -49,7 +89,7 @@ impl PwmOut {
             return Ok(());
         }
         if self.end.take().is_some_and(|end| end < at) {
-            return Err(changes_too_late(Reason::PwmMaxDuration, self.max_duration));
+            return Err(changes_too_late(PWM_MAX_DURATION, self.max_duration));
         }
         mcu.cancel(Self::timer(oid));
         mcu.schedule(Self::timer(oid), at)
@@ -58,13 +98,13 @@ impl PwmOut {
 
 impl Object for PwmOut {
     fn kind(&self) -> &'static str {
-        "PWM output"
+        KIND
     }
 
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
         let Some(oid) = timer.oid() else { return Ok(Next::Done) };
         let Some(Move { value, .. }) = self.queue.pop(&mut mcu.moves) else {
-            return Err(not_refreshed(Reason::MissedPwm, self.max_duration));
+            return Err(not_refreshed(MISSED_PWM, self.max_duration));
         };
         self.write(mcu, oid, value)?;
         let limited = value != self.default_value && self.max_duration.0 != 0;
@@ -74,19 +114,74 @@ impl Object for PwmOut {
             return Ok(end.map_or(Next::Done, Next::At));
         };
         if end.is_some_and(|end| end < next) {
-            return Err(changes_too_late(Reason::PwmMaxDuration, self.max_duration));
+            return Err(changes_too_late(PWM_MAX_DURATION, self.max_duration));
         }
         Ok(Next::At(next))
     }
 
-    fn completed(&mut self, mcu: &mut Mcu, _ticket: Ticket, result: Result<Buffer, Shutdown>) -> Result<(), Shutdown> {
-        result.map(drop).or_else(|shutdown| mcu.device_failed(shutdown))
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        match self.channel.returned(mcu, Ticket { oid, tag: 0 }, done) {
+            Ok(true) => mcu.is_safe(oid),
+            Ok(false) => {}
+            Err(failure) => return mcu.device_failed(oid, KIND, failure),
+        }
+        Ok(())
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
         self.end = None;
         self.queue.clear(&mut mcu.moves);
-        self.write(mcu, oid, self.default_value)
+    }
+
+    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
+        self.write(mcu, oid, self.default_value)?;
+        Ok(Safe::Later)
+    }
+}
+
+/// The channels that `set_pwm_out` set. No object owns them; they keep their values, at a
+/// shutdown too.
+#[derive(Default)]
+struct SetChannels(Vec<(Pin, Remote<Channel>)>);
+
+impl SetChannels {
+    /// Sets a channel, and holds it from then on. As with `set_digital_out` a channel that is
+    /// held may be set anew at any time; others are refused after `finalize_config`.
+    fn set(&mut self, mcu: &mut Mcu, oid: Oid, config: PwmConfig) -> Result<(), Shutdown> {
+        let PwmConfig { pin, cycle, value, .. } = config;
+        let known = self.0.iter().position(|(held, _)| *held == pin);
+        match known {
+            Some(place) if mcu.is_finalized() => {
+                let setting = Setting { value, cycle: Some(cycle) };
+                self.0[place].1.set(mcu, Ticket { oid, tag: place as u8 }, setting)
+            }
+            _ if mcu.is_finalized() => Err(set_too_late(mcu, reason::PWM_CONFIG, "set_pwm_out", pin)),
+            Some(place) => {
+                self.0[place].1 = open(mcu, config)?;
+                Ok(())
+            }
+            None if self.0.len() > usize::from(u8::MAX) => {
+                Err(Shutdown::by_host(reason::PWM_CONFIG, "set_pwm_out wants more than 256 channels"))
+            }
+            None => {
+                self.0.push((pin, open(mcu, config)?));
+                Ok(())
+            }
+        }
+    }
+}
+
+impl Object for SetChannels {
+    fn kind(&self) -> &'static str {
+        "set_pwm_out"
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let ticket = Ticket { oid, tag: done.tag };
+        match self.0.get_mut(usize::from(done.tag)).map(|(_, channel)| channel.returned(mcu, ticket, done)) {
+            Some(Err(failure)) => mcu.device_failed(oid, self.kind(), failure),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -95,8 +190,8 @@ const CONFIG_PWM_OUT: Command = command!(
     |mcu, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
         mcu.vacant(oid)?;
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
-        let device = mcu.pwm(oid, config)?;
-        mcu.assign_on(pin, oid, PwmOut { device, default_value, max_duration, queue: MoveQueue::default(), end: None })
+        let channel = open(mcu, config)?;
+        mcu.assign_on(pin, oid, PwmOut { channel, default_value, max_duration, queue: MoveQueue::default(), end: None })
     }
 );
 
@@ -108,5 +203,7 @@ const QUEUE_PWM_OUT: Command =
 
 const SET_PWM_OUT: Command =
     command!("set_pwm_out pin=%u cycle_ticks=%u value=%hu", |mcu, pin: Pin, cycle_ticks: Ticks, value: u16| {
-        mcu.set_pwm(PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value })
+        let oid = mcu.own::<SetChannels>();
+        let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value };
+        mcu.with::<SetChannels, _>(oid, |channels, mcu| channels.set(mcu, oid, config))
     });

@@ -6,10 +6,10 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Constant, Feature, Line, Mcu, MoveQueue, Next, Object, Oid, Response, TimerId, WireClock, command,
-    response,
+    Command, Constant, Feature, Mcu, MoveQueue, Next, Object, Oid, PromptLine, Response, Safe, TimerId, WireClock,
+    command, response,
 };
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
 use super::trsync::Trsync;
@@ -26,7 +26,18 @@ pub(super) const FEATURE: Feature = Feature {
     ],
     responses: &[Position::FORMAT],
     constants: &[("STEPPER_STEP_BOTH_EDGE", Constant::Number(1))],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
 };
+
+shutdowns! {
+    /// `reset_step_clock` while steps are queued.
+    RESET_WHILE_STEPPING = "Can't reset time when stepper active";
+    /// `queue_step` with a count of zero.
+    INVALID_COUNT = "Invalid count parameter";
+    /// A step over a millisecond late.
+    STEPPER_PAST = "Stepper too far in past";
+}
 
 response! {
     /// Steps since the configuration, forwards less backwards.
@@ -44,8 +55,8 @@ struct Move {
 }
 
 struct Stepper {
-    step: Line,
-    dir: Line,
+    step: PromptLine,
+    dir: PromptLine,
     /// The step pin's idle level.
     invert_step: bool,
     /// Every edge is a step, rather than a rising one followed by an unstep.
@@ -103,7 +114,7 @@ impl Stepper {
         let early = earliest.since(self.next_step);
         if early > i64::from(self.late_limit.0) {
             return Err(Shutdown::because(
-                Reason::StepperPast,
+                STEPPER_PAST,
                 format!(
                     "a step is {} us late: more steps a second are asked for than the step pulse of {} ticks and this machine allow: lower the speed, the microsteps or step_pulse_duration",
                     early / i64::from(Ticks::from_us(1).0),
@@ -143,7 +154,7 @@ impl Stepper {
         if position & 0x8000_0000 != 0 { position.wrapping_neg() } else { position }
     }
 
-    fn stop(&mut self, mcu: &mut Mcu) -> Result<(), Shutdown> {
+    fn stop(&mut self, mcu: &mut Mcu) {
         self.position = self.position().wrapping_neg();
         self.edges = 0;
         self.reverse_pending = false;
@@ -151,6 +162,10 @@ impl Stepper {
         self.next_dir = false;
         self.need_reset = true;
         self.queue.clear(&mut mcu.moves);
+    }
+
+    /// Drives the lines to where an idle motor has them.
+    fn idle(&mut self) -> Result<(), Shutdown> {
         let dir = self.dir.write(false);
         if !self.both_edges {
             self.step.write(self.invert_step)?;
@@ -160,7 +175,7 @@ impl Stepper {
 
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, mut item: Move) -> Result<(), Shutdown> {
         if item.count == 0 {
-            return Err(Shutdown::by_host(Reason::InvalidCount, "queue_step asks for no steps"));
+            return Err(Shutdown::by_host(INVALID_COUNT, "queue_step asks for no steps"));
         }
         if self.edges == 0 && self.need_reset {
             return Ok(());
@@ -208,11 +223,16 @@ impl Object for Stepper {
 
     fn triggered(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
         mcu.cancel(Self::timer(oid));
-        self.stop(mcu)
+        self.stop(mcu);
+        self.idle()
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) -> Result<(), Shutdown> {
-        self.stop(mcu)
+    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
+        self.stop(mcu);
+    }
+
+    fn make_safe(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<Safe, Shutdown> {
+        self.idle().map(|()| Safe::Now)
     }
 }
 
@@ -221,15 +241,15 @@ const CONFIG_STEPPER: Command = command!(
     |mcu, oid: Oid, step_pin: Pin, dir_pin: Pin, invert_step: i8, step_pulse_ticks: Ticks| {
         mcu.vacant(oid)?;
         let idle = invert_step > 0;
-        let step = mcu.output(step_pin, idle, idle)?;
-        let dir = mcu.output(dir_pin, false, false)?;
+        let step = mcu.prompt_output(step_pin, "step", idle, idle)?;
+        let dir = mcu.prompt_output(dir_pin, "dir", false, false)?;
         let stepper = Stepper {
             step,
             dir,
             invert_step: idle,
             both_edges: invert_step < 0,
             pulse_ticks: step_pulse_ticks,
-            late_limit: mcu.board.step_late_limit(),
+            late_limit: mcu.step_late_limit(),
             queue: MoveQueue::default(),
             edges: 0,
             interval: 0,
@@ -264,7 +284,7 @@ const RESET_STEP_CLOCK: Command = command!("reset_step_clock oid=%c clock=%u", |
     let clock = mcu.instant(clock);
     mcu.with::<Stepper, _>(oid, |stepper, _| {
         if stepper.edges > 0 {
-            return Err(Shutdown::by_host(Reason::ResetWhileStepping, "reset_step_clock came while steps are queued"));
+            return Err(Shutdown::by_host(RESET_WHILE_STEPPING, "reset_step_clock came while steps are queued"));
         }
         stepper.next_step = clock;
         stepper.need_reset = false;

@@ -4,15 +4,21 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{Command, Feature, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response};
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "trsync",
     commands: &[CONFIG_TRSYNC, TRSYNC_START, TRSYNC_SET_TIMEOUT, TRSYNC_TRIGGER],
     responses: &[State::FORMAT],
-    constants: &[],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
 };
+
+shutdowns! {
+    /// `stepper_stop_on_trigger` for a stepper that already waits for a trigger.
+    SIGNAL_ACTIVE = "Can't add signal that is already active";
+}
 
 response! {
     /// Whether the trigger may still come, or why it came.
@@ -65,8 +71,8 @@ impl Trsync {
     pub(super) fn add_signal(mcu: &mut Mcu, trsync: Oid, waiting: Oid) -> Result<(), Shutdown> {
         if mcu.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
             return Err(Shutdown::by_host(
-                Reason::SignalActive,
-                format_args!("stepper oid {} already waits for a trigger", waiting.0),
+                SIGNAL_ACTIVE,
+                format_args!("stepper oid {waiting} already waits for a trigger"),
             ));
         }
         mcu.with::<Trsync, _>(trsync, |trsync, _| {
@@ -100,9 +106,8 @@ impl Object for Trsync {
         Ok(Next::At(at + self.report_ticks))
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
         self.clear(mcu, oid);
-        Ok(())
     }
 }
 

@@ -3,12 +3,12 @@
 
 #![forbid(unsafe_code)]
 
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, reason};
 use crate::time::{CLOCK_FREQ, Clock};
 use crate::wire::format::same;
 
 use super::stats::SUMSQ_BASE;
-use super::{Command, Constant, Feature, Response, command, response};
+use super::{Command, Constant, Enumeration, Feature, Response, command, response};
 
 /// What this file adds to the dictionary.
 pub const FEATURE: Feature = Feature {
@@ -35,6 +35,8 @@ pub const FEATURE: Feature = Feature {
         ("RECEIVE_WINDOW", Constant::Number(RECEIVE_WINDOW)),
         ("STATS_SUMSQ_BASE", Constant::Number(SUMSQ_BASE)),
     ],
+    enumerations: &[Enumeration { name: "pin", values: |board| board.pins() }],
+    shutdowns: reason::SHUTDOWNS,
 };
 
 const RESPONSES: &[&str] = &[
@@ -158,11 +160,15 @@ const FINALIZE_CONFIG: Command = command!("finalize_config crc=%u", |mcu, crc: u
 
 const CONFIG_RESET: Command = command!("config_reset", |mcu| mcu.reset()).allowed_in_shutdown();
 
-pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(Shutdown::because(
-    Reason::CommandRequest,
-    "the host asked for it (M112, or its log says why): FIRMWARE_RESTART once the cause is dealt with",
-)))
-.allowed_in_shutdown();
+pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(emergency())).allowed_in_shutdown();
+
+/// What `emergency_stop` stops the machine with.
+pub fn emergency() -> Shutdown {
+    Shutdown::because(
+        reason::COMMAND_REQUEST,
+        "the host asked for it (M112, or its log says why): FIRMWARE_RESTART once the cause is dealt with",
+    )
+}
 
 const CLEAR_SHUTDOWN: Command = command!("clear_shutdown", |mcu| mcu.clear_shutdown()).allowed_in_shutdown();
 
@@ -188,7 +194,7 @@ const DEBUG_WRITE: Command = command!("debug_write order=%c addr=%u val=%u", |_m
 
 fn debug_refused(command: &str) -> Shutdown {
     Shutdown::because(
-        Reason::DebugMemory,
+        reason::DEBUG_MEMORY,
         format!("the host sent {command}: a process of Linux does not poke memory for a host; remove the command"),
     )
 }

@@ -4,7 +4,8 @@
 
 #![forbid(unsafe_code)]
 
-use crate::shutdown::{Reason, Shutdown};
+use crate::board::{Board, Range};
+use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::wire::Malformed;
 use crate::wire::vlq::{Reader, Writer};
 
@@ -14,7 +15,7 @@ impl From<Malformed> for Shutdown {
     /// [`Mcu::execute`] says which command it was.
     #[cold]
     fn from(_: Malformed) -> Shutdown {
-        Shutdown::because(Reason::CommandParser, "")
+        Shutdown::because(reason::COMMAND_PARSER, "")
     }
 }
 
@@ -57,7 +58,16 @@ pub enum Constant {
     Text(&'static str),
 }
 
-/// What a feature adds to the dictionary.
+/// An enumeration of the dictionary: its name, and the names that stand for values, which may be
+/// the board's.
+pub struct Enumeration {
+    /// Such as `spi_bus`.
+    pub name: &'static str,
+    /// Its names.
+    pub values: fn(&dyn Board) -> Vec<Range>,
+}
+
+/// What a feature adds to the dictionary. To be filled up with [`Feature::EMPTY`].
 pub struct Feature {
     /// Its name.
     pub name: &'static str,
@@ -67,6 +77,16 @@ pub struct Feature {
     pub responses: &'static [&'static str],
     /// Its constants.
     pub constants: &'static [(&'static str, Constant)],
+    /// Its enumerations.
+    pub enumerations: &'static [Enumeration],
+    /// Its shutdown texts: the `SHUTDOWNS` that [`shutdowns!`](crate::shutdown::shutdowns) makes.
+    pub shutdowns: &'static [ShutdownReason],
+}
+
+impl Feature {
+    /// A feature that adds nothing.
+    pub const EMPTY: Feature =
+        Feature { name: "", commands: &[], responses: &[], constants: &[], enumerations: &[], shutdowns: &[] };
 }
 
 /// Declares a command: its format, and a closure with the machine and the typed parameters.

@@ -8,7 +8,7 @@ use std::io;
 use serde_json::{Value, json};
 
 use crate::board::{Board, Range};
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::wire::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
 use crate::wire::format::{self, Conversion};
 use crate::wire::vlq::Reader;
@@ -39,6 +39,8 @@ pub struct Dialect {
     commands: Vec<Option<Entry>>,
     /// By [`super::Response::INDEX`].
     response_ids: Vec<u32>,
+    /// By their number in the enumeration `static_string_id`.
+    shutdowns: Vec<ShutdownReason>,
     /// What is published.
     dictionary: Dictionary,
     compressed: Vec<u8>,
@@ -93,16 +95,15 @@ impl Dialect {
             };
             dictionary.config.insert((*name).into(), value);
         }
-        let reasons = Reason::ALL.iter().map(|reason| (reason.text().into(), json!(*reason as u8)));
-        for (name, values) in [
-            ("pin", names(board.pins())),
-            ("spi_bus", names(board.spi_buses())),
-            ("static_string_id", reasons.collect()),
-        ] {
-            dictionary.enumerations.insert(name.into(), Value::Object(values));
+        for enumeration in features.iter().flat_map(|feature| feature.enumerations) {
+            let values = names((enumeration.values)(board));
+            dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
         }
+        let shutdowns: Vec<ShutdownReason> = features.iter().flat_map(|feature| feature.shutdowns).copied().collect();
+        let texts = shutdowns.iter().zip(0..).map(|(reason, id)| (reason.text().into(), json!(id)));
+        dictionary.enumerations.insert("static_string_id".into(), Value::Object(texts.collect()));
         let compressed = dictionary.compress()?;
-        Ok(Dialect { commands, response_ids, dictionary, compressed })
+        Ok(Dialect { commands, response_ids, shutdowns, dictionary, compressed })
     }
 
     /// The dictionary.
@@ -120,9 +121,35 @@ impl Dialect {
         self.response_ids[R::INDEX]
     }
 
+    /// The number of a shutdown text.
+    pub(super) fn static_string_id(&self, reason: ShutdownReason) -> u16 {
+        // Each is listed: `shutdowns!` makes the list along with the texts.
+        self.shutdowns.iter().position(|listed| *listed == reason).unwrap_or(0) as u16
+    }
+
     /// The id of the command with this format.
     pub fn command_id(&self, format: &str) -> Option<u32> {
         self.dictionary.commands.get(format)?.as_u64().map(|id| id as u32)
+    }
+
+    /// Whether a block has the command with this id. A block that makes no sense is looked at up to
+    /// where it does not: there the machine stops.
+    pub fn contains(&self, payload: &[u8], id: u32) -> bool {
+        // Nearly always the look for the number's last byte is enough.
+        if !payload.contains(&(id as u8 & 0x7f)) {
+            return false;
+        }
+        let mut reader = Reader::new(payload);
+        while let Ok(found) = reader.int() {
+            if found == id {
+                return true;
+            }
+            let Ok(command) = self.command(found) else { return false };
+            if command.skip(&mut reader).is_err() {
+                return false;
+            }
+        }
+        false
     }
 
     #[inline]
@@ -130,7 +157,7 @@ impl Dialect {
         match self.commands.get(id as usize) {
             Some(Some(entry)) => Ok(entry),
             _ => Err(Shutdown::because(
-                Reason::InvalidCommand,
+                reason::INVALID_COMMAND,
                 format!(
                     "the host sent command {id}, which the dictionary does not have: restart the host so that it reads the dictionary anew"
                 ),
@@ -147,4 +174,35 @@ fn names(ranges: Vec<Range>) -> serde_json::Map<String, Value> {
             count => (range.name, json!([range.first, count])),
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::board::sim::{SimBoard, SimConfig};
+    use crate::feature::FEATURES;
+    use crate::time::{Clock, VirtualClock};
+    use crate::wire::vlq::Writer;
+    use std::sync::Arc;
+
+    #[test]
+    fn a_command_is_found_among_others_and_not_in_their_parameters() {
+        let clock = VirtualClock::at(Clock::from_ticks(0));
+        let board = SimBoard::new(SimConfig::default_printer(), Arc::new(clock)).unwrap();
+        let dialect = Dialect::new(FEATURES, &board).unwrap();
+        let stop = dialect.command_id("emergency_stop").unwrap();
+        let step = dialect.command_id("queue_step oid=%c interval=%u count=%hu add=%hi").unwrap();
+        let contains = |ints: &[u32]| {
+            let mut writer = Writer::default();
+            ints.iter().for_each(|int| writer.int(*int));
+            dialect.contains(writer.payload().unwrap(), stop)
+        };
+        assert!(contains(&[stop]));
+        assert!(contains(&[step, stop, stop, stop, stop, stop, step]));
+        assert!(!contains(&[step, stop, stop, stop, stop]));
+        assert!(!contains(&[step, 1, 2, 3, 4]));
+        assert!(!contains(&[]));
+        assert!(!contains(&[4711, stop]), "the machine stops at a command that there is not");
+        assert!(!contains(&[step, stop]), "and at one that is cut short");
+    }
 }

@@ -10,35 +10,42 @@ use std::sync::Arc;
 
 use crate::board::{Board, Pin};
 use crate::lateness::Lateness;
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 use crate::wire::vlq::{Reader, Writer};
 
 pub mod base;
+mod bus;
 mod command;
-mod device;
 mod dialect;
+mod errand;
+mod lines;
 mod moves;
 mod object;
 mod outbox;
-mod output;
 mod parameters;
+mod remote;
 mod stats;
+mod stop;
 mod timers;
 
-pub use command::{Command, Constant, Feature, Handler, Response};
+pub use bus::{Bus, Conversation, Talk};
+pub use command::{Command, Constant, Enumeration, Feature, Handler, Response};
 pub(crate) use command::{command, response};
-pub use device::{Completion, DeviceId, Job, Ticket, Workers};
 pub use dialect::Dialect;
+pub use errand::{Completion, Done, Errand, Job, Ticket, WorkerId, Workers};
+pub use lines::{InputLine, OutputLine, PromptLine};
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
-pub use object::{Next, Object};
+pub use object::{Next, Object, Safe};
 pub use outbox::{Note, Outbox};
-pub use output::Line;
 pub use parameters::{Oid, WireClock};
+pub use remote::{Remote, Settable};
+pub use stop::RETRY_TICKS;
 pub use timers::TimerId;
 
-use device::Place;
+use lines::Claim;
 use stats::Stats;
+use stop::{HOLD_LIMIT, Stop};
 use timers::Timers;
 
 /// The machine's own responses come first in the list of all.
@@ -48,41 +55,52 @@ const fn response_index(format: &str) -> usize {
 
 /// How far a timer may fall behind before the machine stops: 100 ms, as in the firmware.
 const LATE_LIMIT: Ticks = Ticks::from_us(100_000);
-/// Timers that may run before commands get a turn.
-const REPEAT_COUNT: u32 = 100;
+/// Timers that run before it is looked whether they fall behind, and commands get a turn
+/// (`TIMER_REPEAT_COUNT` of the firmware's linux/timer.c).
+const REPEAT_COUNT: u32 = 20;
+/// The same, where there was no command to run (`TIMER_IDLE_REPEAT_COUNT`).
+const IDLE_REPEAT_COUNT: u32 = 100;
 /// Between two `stats` responses.
 const STATS_TICKS: Ticks = Ticks::from_us(5_000_000);
-/// Two timers for each of 256 objects and one for the machine.
-const TIMERS_MAX: usize = 2 * 256 + 1;
+/// Objects with an oid.
+const OBJECTS_MAX: usize = 256;
+/// Two timers for each object and three for the machine.
+const TIMERS_MAX: usize = 2 * OBJECTS_MAX + 3;
 
 /// The machine.
 pub struct Mcu {
-    /// The boards' lines and devices.
-    pub board: Box<dyn Board>,
     /// The moves that are free.
     pub moves: MovePool,
     clock: Arc<dyn TimeSource>,
+    board: Box<dyn Board>,
     workers: Box<dyn Workers>,
     outbox: Box<dyn Outbox>,
     dialect: Arc<Dialect>,
+    /// By oid, and behind those the features' own.
     objects: Vec<Option<Box<dyn Object>>>,
+    /// What `allocate_oids` said; none before.
+    oid_count: usize,
     /// The objects that the log knows by a pin.
     pins: Vec<(Oid, Pin)>,
-    oids_allocated: bool,
+    /// The GPIO lines in use.
+    claims: Vec<Claim>,
     timers: Timers,
     /// The instant of the timer whose event runs: in the firmware it is still the queue's
     /// first, which decides whether an added timer is too close.
     running: Option<Clock>,
+    /// Whether the last timers that ran left some that were due.
+    busy: bool,
     last_read: Clock,
-    devices: Vec<Place>,
-    completions: Vec<Completion>,
-    /// Lines set by `set_digital_out`, which no object owns, and their shutdown values.
-    set_lines: Vec<(Pin, bool, Line)>,
-    /// Hardware PWM channels in use, and whose they are.
-    channels: Vec<(Pin, Oid, DeviceId)>,
+    /// Whether a command runs, or an errand that a command sent is taken in.
+    commanded: bool,
+    /// Conversations that commands wait for, and whose the last one is.
+    holds: u32,
+    held_by: Option<Oid>,
+    /// Whether a `config_reset` waits for outputs to be at their shutdown values.
+    reset_due: bool,
     config_crc: u32,
-    halted: Option<Reason>,
-    halting: bool,
+    oids_allocated: bool,
+    stop: Stop,
     stats: Stats,
     lateness: Lateness,
 }
@@ -100,25 +118,27 @@ impl Mcu {
         let mut timers = Timers::with_capacity(TIMERS_MAX);
         timers.insert(now + STATS_TICKS, TimerId::STATS);
         let mut mcu = Mcu {
-            board,
             moves: MovePool::default(),
             clock,
+            board,
             workers,
             outbox,
             dialect,
             objects: Vec::new(),
+            oid_count: 0,
             pins: Vec::new(),
-            oids_allocated: false,
+            claims: Vec::new(),
             timers,
             running: None,
+            busy: false,
             last_read: now,
-            devices: Vec::new(),
-            completions: Vec::new(),
-            set_lines: Vec::new(),
-            channels: Vec::new(),
+            commanded: false,
+            holds: 0,
+            held_by: None,
+            reset_due: false,
             config_crc: 0,
-            halted: None,
-            halting: false,
+            oids_allocated: false,
+            stop: Stop::default(),
             stats: Stats::default(),
             lateness: Lateness::default(),
         };
@@ -153,11 +173,11 @@ impl Mcu {
     pub fn schedule(&mut self, timer: TimerId, at: Clock) -> Result<(), Shutdown> {
         let first = self.running.or(self.timers.next());
         self.timers.insert(at, timer);
-        if first.is_none_or(|first| at < first) && self.halted.is_none() {
+        if first.is_none_or(|first| at < first) && self.stop.reason.is_none() {
             let late = self.now().since(at);
             if late > 0 {
                 return Err(Shutdown::because(
-                    Reason::TimerTooClose,
+                    reason::TIMER_TOO_CLOSE,
                     format!(
                         "the host asked for an event {} us after its time: the host or this machine is overloaded",
                         late as u64 / u64::from(Ticks::from_us(1).0)
@@ -184,28 +204,32 @@ impl Mcu {
         self.timers.next()
     }
 
-    /// Runs the timers that are due, some at most, so that commands get their turn. Returns
-    /// the next one's instant, which may have passed.
-    pub fn run_timers(&mut self) -> Option<Clock> {
-        for _ in 0..REPEAT_COUNT {
-            let at = self.timers.next()?;
-            if at > self.last_read && at > self.now() {
-                return Some(at);
+    /// Runs the timers that are due, some at most, so that commands get their turn. True if there
+    /// are more of them: then one command is to have its turn, if there is any.
+    ///
+    /// The firmware runs 20, looks whether they are 100 ms late, lets commands run, and if there
+    /// are none runs 100 more before it looks again; so does this machine, as where it looks
+    /// decides whether it stops.
+    pub fn run_timers(&mut self) -> bool {
+        for _ in 0..if self.busy { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
+            if self.timers.next().is_none_or(|at| at > self.last_read && at > self.now()) {
+                self.busy = false;
+                return false;
             }
             self.run_timer();
         }
-        let at = self.timers.next()?;
-        let late = self.now().since(at);
-        if late > i64::from(LATE_LIMIT.0) && self.halted.is_none() {
+        let late = self.timers.next().map_or(0, |at| self.now().since(at));
+        if late > i64::from(LATE_LIMIT.0) && self.stop.reason.is_none() {
             self.shut_down(Shutdown::because(
-                Reason::TimerPast,
+                reason::TIMER_PAST,
                 format!(
                     "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running",
                     late as u64 / u64::from(Ticks::from_us(1000).0)
                 ),
             ));
         }
-        self.timers.next()
+        self.busy = self.timers.next().is_some_and(|at| at <= self.last_read);
+        self.busy
     }
 
     #[inline]
@@ -214,7 +238,7 @@ impl Mcu {
         self.lateness.record(self.last_read.since(at));
         self.running = Some(at);
         let result = match timer.oid() {
-            Some(oid) => match self.objects.get_mut(usize::from(oid.0)).and_then(Option::take) {
+            Some(oid) => match self.take(oid) {
                 Some(mut object) => {
                     let result = object.event(self, timer, at).map_err(|stop| self.blame(stop, object.kind(), oid));
                     self.put_back(oid, object);
@@ -222,7 +246,7 @@ impl Mcu {
                 }
                 None => Ok(Next::Done),
             },
-            None => Ok(self.send_stats(at)),
+            None => Ok(self.run_own_timer(timer, at)),
         };
         self.running = None;
         match result {
@@ -230,41 +254,41 @@ impl Mcu {
             Ok(Next::Done) => {}
             Err(shutdown) => self.shut_down(shutdown),
         }
-        self.run_completions();
+    }
+
+    fn run_own_timer(&mut self, timer: TimerId, at: Clock) -> Next {
+        match timer {
+            TimerId::RETRY => self.retry(),
+            TimerId::HOLD => self.held_too_long(),
+            _ => return self.send_stats(at),
+        }
+        Next::Done
     }
 
     // ---- commands and responses
 
     /// Runs one command off the front of a block's payload. If it stops the machine, the rest
-    /// of the block is dropped, as in the firmware.
+    /// of the block is dropped, as in the firmware. None may run while the machine
+    /// [is held](Mcu::is_held).
     #[inline]
     pub fn execute(&mut self, payload: &mut Reader<'_>) {
         let command = *payload;
-        if let Err(mut shutdown) = self.try_execute(payload) {
-            if shutdown.reason == Reason::CommandParser {
+        self.busy = false;
+        self.commanded = true;
+        let done = self.try_execute(payload);
+        self.commanded = false;
+        if let Err(mut shutdown) = done {
+            if shutdown.reason == reason::COMMAND_PARSER {
                 shutdown = self.cut_short(command);
             }
             *payload = Reader::new(&[]);
             self.shut_down(shutdown);
         }
-        self.run_completions();
     }
 
-    /// Whether a block stops the machine: the host asks for that in it, or it makes no sense.
-    #[cold]
-    pub fn is_stopped_by(&self, payload: &[u8]) -> bool {
-        let mut payload = Reader::new(payload);
-        while !payload.is_empty() {
-            match payload.int().ok().and_then(|id| self.dialect.command(id).ok()) {
-                Some(command) if command.format != base::EMERGENCY_STOP.format => {
-                    if command.skip(&mut payload).is_err() {
-                        return true;
-                    }
-                }
-                _ => return true,
-            }
-        }
-        false
+    /// Whether a block asks for an emergency stop.
+    pub fn is_emergency(&self, payload: &[u8]) -> bool {
+        self.dialect.command_id(base::EMERGENCY_STOP.format).is_some_and(|id| self.dialect.contains(payload, id))
     }
 
     /// Says which command ends before its parameters do.
@@ -273,7 +297,7 @@ impl Mcu {
         let id = command.int().ok();
         let format = id.and_then(|id| self.dialect.command(id).ok()).map_or("a command's id", |entry| entry.format);
         Shutdown::because(
-            Reason::CommandParser,
+            reason::COMMAND_PARSER,
             format!(
                 "a message ends in the middle of \"{format}\": restart the host so that it reads the dictionary anew"
             ),
@@ -284,10 +308,11 @@ impl Mcu {
     fn try_execute(&mut self, payload: &mut Reader<'_>) -> Result<(), Shutdown> {
         let id = payload.int()?;
         let command = self.dialect.command(id)?;
-        match self.halted {
+        match self.stop.reason {
             Some(reason) if !command.in_shutdown => {
                 command.skip(payload)?;
-                self.send(base::IsShutdown { static_string_id: reason as u16 });
+                let static_string_id = self.dialect.static_string_id(reason);
+                self.send(base::IsShutdown { static_string_id });
                 Ok(())
             }
             _ => (command.handler)(self, payload),
@@ -317,77 +342,18 @@ impl Mcu {
 
     fn send_stats(&mut self, at: Clock) -> Next {
         let Stats { count, sum, sumsq } = std::mem::take(&mut self.stats);
+        // klippy divides by it, and a machine that stood still since the last time counted none.
+        let count = count.max(1);
         self.send(base::Stats { count, sum, sumsq });
         // A suspended machine owes no statistics of its sleep.
         let next = at + STATS_TICKS;
         Next::At(next.max(self.last_read))
     }
 
-    // ---- shutdown
-
-    /// Whether the machine is stopped.
-    pub fn is_shutdown(&self) -> bool {
-        self.halted.is_some()
-    }
-
     /// Whether the machine is configured and not stopped.
     #[inline]
     pub fn is_running(&self) -> bool {
-        self.is_finalized() && self.halted.is_none()
-    }
-
-    /// Stops the machine: timers off, outputs to their shutdown values, the host is told. The
-    /// first reason stays.
-    pub fn shut_down(&mut self, shutdown: Shutdown) {
-        if self.halting {
-            self.outbox.note(Note::Trouble(&shutdown));
-            return;
-        }
-        let clock = self.now();
-        let first = self.halted.is_none();
-        let reason = *self.halted.get_or_insert(shutdown.reason);
-        self.halting = true;
-        self.timers.clear();
-        for oid in 0..self.objects.len() {
-            let Some(mut object) = self.objects[oid].take() else { continue };
-            let done = object.shutdown(self, Oid(oid as u8));
-            self.objects[oid] = Some(object);
-            if let Err(trouble) = done {
-                self.outbox.note(Note::Trouble(&trouble));
-            }
-        }
-        self.halting = false;
-        self.send(base::ShutdownReport { clock, static_string_id: reason as u16 });
-        if first {
-            self.outbox.note(Note::Shutdown(&shutdown));
-        } else if shutdown.reason != reason {
-            // A host that stops a stopped machine says nothing new.
-            self.outbox.note(Note::Trouble(&shutdown));
-        }
-    }
-
-    /// Stops the machine, if it is not stopped already (the firmware's `try_shutdown`).
-    pub fn try_shut_down(&self, shutdown: Shutdown) -> Result<(), Shutdown> {
-        match self.halted {
-            Some(_) => Ok(()),
-            None => Err(shutdown),
-        }
-    }
-
-    /// A device failed: stops the machine, or says so in the log if that is stopped already. To
-    /// stop it anew would ask the device anew.
-    pub fn device_failed(&mut self, shutdown: Shutdown) -> Result<(), Shutdown> {
-        if self.halted.is_none() {
-            return Err(shutdown);
-        }
-        self.outbox.note(Note::Trouble(&shutdown));
-        Ok(())
-    }
-
-    fn clear_shutdown(&mut self) -> Result<(), Shutdown> {
-        self.halted.take().map(drop).ok_or_else(|| {
-            Shutdown::by_host(Reason::NotShutdown, "clear_shutdown came while the machine was not stopped")
-        })
+        self.is_finalized() && self.stop.reason.is_none()
     }
 
     // ---- configuration
@@ -400,24 +366,25 @@ impl Mcu {
     fn allocate_oids(&mut self, count: u8) -> Result<(), Shutdown> {
         if self.oids_allocated {
             return Err(Shutdown::because(
-                Reason::OidsAllocated,
+                reason::OIDS_ALLOCATED,
                 "allocate_oids came twice: a host before left its configuration unfinished, for a wrong pin or because it was killed: FIRMWARE_RESTART",
             ));
         }
         self.oids_allocated = true;
-        self.objects.resize_with(usize::from(count), || None);
+        self.oid_count = usize::from(count);
+        if self.objects.len() < self.oid_count {
+            self.objects.resize_with(self.oid_count, || None);
+        }
         Ok(())
     }
 
     fn finalize(&mut self, crc: u32) -> Result<(), Shutdown> {
         if self.is_finalized() {
-            return Err(Shutdown::by_host(Reason::AlreadyFinalized, "finalize_config came twice"));
+            return Err(Shutdown::by_host(reason::ALREADY_FINALIZED, "finalize_config came twice"));
         }
         self.moves.finalize();
         self.config_crc = crc;
-        // From here on the core does not allocate: a block full of requests to inline devices
-        // leaves at most as many answers.
-        self.completions.reserve(crate::wire::block::PAYLOAD_MAX);
+        // From here on the core does not allocate.
         self.timers.reserve(TIMERS_MAX);
         let mut kinds: Vec<(&'static str, usize)> = Vec::new();
         for object in self.objects.iter().flatten() {
@@ -430,23 +397,43 @@ impl Mcu {
         Ok(())
     }
 
+    /// Forgets the configuration, as soon as every output is at its shutdown value: afterwards
+    /// nothing would try to drive it there. No command runs before.
     fn reset(&mut self) -> Result<(), Shutdown> {
-        self.clear_shutdown().map_err(|_| {
-            Shutdown::by_host(Reason::ConfigResetRunning, "config_reset came without an emergency_stop before it")
-        })?;
+        if !self.is_shutdown() {
+            return Err(Shutdown::by_host(
+                reason::CONFIG_RESET_RUNNING,
+                "config_reset came without an emergency_stop before it",
+            ));
+        }
+        self.reset_due = true;
+        self.reset_if_due();
+        Ok(())
+    }
+
+    fn reset_if_due(&mut self) {
+        if !self.reset_due || self.owes() {
+            return;
+        }
+        self.reset_due = false;
+        self.stop = Stop::default();
         self.timers.clear();
-        self.objects.clear();
-        self.pins.clear();
-        self.oids_allocated = false;
-        self.devices.clear();
+        self.timers.remove(TimerId::HOLD);
         self.workers.reset();
-        self.completions.clear();
-        self.set_lines.clear();
-        self.channels.clear();
+        self.holds = 0;
+        self.objects.clear();
+        self.oid_count = 0;
+        self.oids_allocated = false;
+        self.pins.clear();
+        self.claims.clear();
         self.board.reset();
         self.moves = MovePool::default();
         self.config_crc = 0;
         self.outbox.note(Note::Reset);
-        Ok(())
+    }
+
+    /// How late a step may be on this board before the machine stops.
+    pub fn step_late_limit(&self) -> Ticks {
+        self.board.step_late_limit()
     }
 }

@@ -5,7 +5,7 @@
 
 use std::collections::VecDeque;
 
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, reason};
 
 /// How many moves there are (`move_count`), as in the firmware on Linux.
 pub const MOVE_COUNT: u16 = 1024;
@@ -71,7 +71,7 @@ impl<T> MoveQueue<T> {
 
 #[cold]
 fn overflow(count: u16) -> Shutdown {
-    Shutdown::by_host(Reason::MoveQueueOverflow, format_args!("more than the {count} moves of move_count are queued"))
+    Shutdown::by_host(reason::MOVE_QUEUE_OVERFLOW, format_args!("more than the {count} moves of move_count are queued"))
 }
 
 #[cfg(test)]
@@ -82,13 +82,13 @@ mod tests {
     fn two_queues_share_one_pool() {
         let mut pool = MovePool::default();
         let (mut a, mut b) = (MoveQueue::default(), MoveQueue::default());
-        assert_eq!(a.push(&mut pool, 0).unwrap_err().reason, Reason::MoveQueueOverflow);
+        assert_eq!(a.push(&mut pool, 0).unwrap_err().reason, reason::MOVE_QUEUE_OVERFLOW);
         pool.finalize();
         for i in 0..MOVE_COUNT - 1 {
             a.push(&mut pool, i).unwrap();
         }
         b.push(&mut pool, 7).unwrap();
-        assert_eq!(b.push(&mut pool, 8).unwrap_err().reason, Reason::MoveQueueOverflow);
+        assert_eq!(b.push(&mut pool, 8).unwrap_err().reason, reason::MOVE_QUEUE_OVERFLOW);
         assert_eq!(a.pop(&mut pool), Some(0));
         b.push(&mut pool, 8).unwrap();
         a.clear(&mut pool);

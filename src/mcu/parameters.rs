@@ -3,6 +3,8 @@
 
 #![forbid(unsafe_code)]
 
+use std::fmt;
+
 use crate::board::Pin;
 use crate::time::{Clock, Ticks};
 use crate::wire::Malformed;
@@ -12,28 +14,44 @@ use crate::wire::vlq::{Reader, Writer};
 #[cfg(doc)]
 use super::Mcu;
 
-/// An object's id.
+/// An object's id: that of the wire, or that of an object that belongs to a feature
+/// ([`Mcu::own`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Oid(pub u8);
+pub struct Oid(u16);
 
 impl Oid {
-    /// What `set_digital_out` and `set_pwm_out` set belongs to no object. `allocate_oids` counts
-    /// to 255 at most, so none can have this.
-    pub(super) const NOBODY: Oid = Oid(u8::MAX);
+    /// The ids of the wire are below this one; those from here on are of features' own objects.
+    pub(super) const FIRST_OWN: usize = 256;
+
+    /// The id that the host calls by this number.
+    pub const fn new(oid: u8) -> Oid {
+        Oid(oid as u16)
+    }
+
+    /// The id of the object at a place of the table.
+    pub(super) fn at(index: usize) -> Oid {
+        Oid(u16::try_from(index).unwrap_or(u16::MAX))
+    }
+
+    /// The object's place in the table.
+    #[inline]
+    pub(super) fn index(self) -> usize {
+        usize::from(self.0)
+    }
 }
 
 impl Arg<'_> for Oid {
     const CONVERSIONS: &'static [&'static str] = &["%c"];
     #[inline]
     fn decode(reader: &mut Reader<'_>) -> Result<Oid, Malformed> {
-        u8::decode(reader).map(Oid)
+        u8::decode(reader).map(Oid::new)
     }
 }
 
 impl Field for Oid {
     const CONVERSIONS: &'static [&'static str] = &["%c"];
     fn encode(&self, writer: &mut Writer) {
-        self.0.encode(writer);
+        writer.int(self.0.into());
     }
 }
 
@@ -68,5 +86,11 @@ impl Field for Clock {
     const CONVERSIONS: &'static [&'static str] = &["%u"];
     fn encode(&self, writer: &mut Writer) {
         writer.int(self.wire());
+    }
+}
+
+impl fmt::Display for Oid {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
     }
 }

@@ -10,7 +10,7 @@ use super::Oid;
 /// Which timer: an object's, or the machine's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct TimerId {
-    /// The object; the machine's own timer has none.
+    /// The object; the machine's own timers have none.
     oid: Option<Oid>,
     which: u8,
 }
@@ -18,6 +18,11 @@ pub struct TimerId {
 impl TimerId {
     /// The machine's own timer, which sends `stats`.
     pub(super) const STATS: TimerId = TimerId { oid: None, which: 0 };
+
+    /// The machine's own timer, which tries shutdown values again that could not be written.
+    pub(super) const RETRY: TimerId = TimerId { oid: None, which: 1 };
+    /// The machine's own timer, which ends the wait for a bus that hangs.
+    pub(super) const HOLD: TimerId = TimerId { oid: None, which: 2 };
 
     /// Timer number `which` of an object.
     pub const fn new(oid: Oid, which: u8) -> TimerId {
@@ -77,8 +82,9 @@ impl Timers {
         self.waiting.retain(|(_, waiting)| *waiting != timer);
     }
 
+    /// Drops the timers of objects.
     pub(super) fn clear(&mut self) {
-        self.waiting.retain(|(_, timer)| *timer == TimerId::STATS);
+        self.waiting.retain(|(_, timer)| timer.oid.is_none());
     }
 }
 
@@ -94,7 +100,7 @@ mod tests {
             let mut expected: Vec<(Clock, TimerId)> = instants
                 .iter()
                 .enumerate()
-                .map(|(i, at)| (Clock::from_ticks(*at), TimerId::new(Oid(i as u8), 0)))
+                .map(|(i, at)| (Clock::from_ticks(*at), TimerId::new(Oid::new(i as u8), 0)))
                 .collect();
             for (at, timer) in &expected {
                 timers.insert(*at, *timer);

@@ -10,9 +10,9 @@ use std::time::Duration;
 
 use rtrb::Consumer;
 
-use crate::mcu::Mcu;
-use crate::shutdown::{Reason, Shutdown};
-use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
+use crate::mcu::{Mcu, base};
+use crate::shutdown::{Shutdown, reason};
+use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource, monotonic};
 use crate::wire::block::PAYLOAD_MAX;
 use crate::wire::vlq::Reader;
 
@@ -36,7 +36,7 @@ impl Payload {
         Payload { len: len as u8, bytes }
     }
 
-    fn as_slice(&self) -> &[u8] {
+    pub(super) fn as_slice(&self) -> &[u8] {
         &self.bytes[..usize::from(self.len)]
     }
 }
@@ -59,13 +59,16 @@ pub(super) enum Request {
 const NEAR: Ticks = Ticks::from_us(5);
 /// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
 const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
-/// So long the core looks for the next command before it sleeps: hosts send in bursts, and to be
-/// woken takes as long (20 to 50 us on the machines measured). A lone processor is the host's.
-const LINGER: Ticks = Ticks::from_us(30);
-/// As long may another thread keep the processor of one that yields (3.5 ms were measured).
+/// For so long the core looks for the next command before it sleeps: hosts send in bursts, and to
+/// be woken takes as long (20 to 50 us on the machines measured). A lone processor is the host's.
+const LOOKOUT: Ticks = Ticks::from_us(30);
+/// For so long another thread may keep the processor of one that yields (3.5 ms were measured).
 const SLICE: Ticks = Ticks::from_us(5000);
-/// So often commands give way to timers that are near, then one gets its turn.
+/// So often commands give way to a timer that is near, then one gets its turn.
 const PATIENCE: u32 = 20;
+/// For how long a program that ends waits for its outputs to be at their shutdown values. The
+/// guardian acts before.
+const LAST_WRITES: Duration = Duration::from_millis(1500);
 
 pub(super) struct Core {
     mcu: Mcu,
@@ -78,9 +81,13 @@ pub(super) struct Core {
     /// The block whose commands are run, and how far they were.
     block: Option<(Payload, usize)>,
     gave_way: u32,
-    linger: Ticks,
+    /// Requests to stop that were taken in, of those that the link handed over.
+    stops_taken: u32,
+    lookout: Ticks,
     /// Until when to look for the next command.
-    linger_until: Clock,
+    lookout_until: Clock,
+    /// What the guardian was told that the machine owes.
+    debtor: Option<String>,
 }
 
 /// What the core is made of.
@@ -101,17 +108,38 @@ enum Turn {
     Quit,
 }
 
+/// How a program that was asked to end has left its outputs.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Left {
+    /// At their shutdown values.
+    Safe,
+    /// This one is not there, as far as is known.
+    Owing(String),
+}
+
 impl Core {
     pub(super) fn new(parts: Parts) -> Core {
         let Parts { mcu, clock, requests, waiter, pulse, progress, wake } = parts;
-        let linger_until = clock.now();
-        let linger = if thread::available_parallelism().is_ok_and(|count| count.get() > 1) { LINGER } else { Ticks(0) };
-        let (block, gave_way) = (None, 0);
-        Core { mcu, clock, requests, waiter, pulse, progress, wake, block, gave_way, linger, linger_until }
+        let several = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
+        Core {
+            lookout: if several { LOOKOUT } else { Ticks(0) },
+            lookout_until: clock.now(),
+            mcu,
+            clock,
+            requests,
+            waiter,
+            pulse,
+            progress,
+            wake,
+            block: None,
+            gave_way: 0,
+            stops_taken: 0,
+            debtor: None,
+        }
     }
 
     /// Runs until it is asked to quit.
-    pub(super) fn run(mut self) {
+    pub(super) fn run(mut self) -> Left {
         let mut busy_since = self.clock.now();
         let mut was_shutdown = false;
         loop {
@@ -121,24 +149,26 @@ impl Core {
                     self.mcu.report_lateness(self.waiter.margin());
                 }
             }
-            let next = self.mcu.run_timers();
+            let behind = self.mcu.run_timers();
             self.pulse.beat(self.mcu.last_read(), self.mcu.is_running());
             self.mcu.run_workers();
+            self.tell_debts();
             self.waiter.ran(self.mcu.last_read());
-            let near = next.is_some_and(|next| next < self.mcu.last_read() + NEAR);
-            if !near || self.gave_way >= PATIENCE {
-                match self.run_command() {
+            if self.mcu.is_held() && !self.mcu.is_shutdown() && self.progress.stops_handed() != self.stops_taken {
+                self.stop_ahead();
+            }
+            let near = self.mcu.next_timer().is_some_and(|next| next < self.mcu.last_read() + NEAR);
+            if behind || !near || self.gave_way >= PATIENCE {
+                match self.run_commands(behind) {
                     Turn::Done => {
-                        self.linger_until = self.mcu.last_read() + self.linger;
+                        self.lookout_until = self.mcu.last_read() + self.lookout;
                         continue;
                     }
                     Turn::Quit => {
-                        // Workers and devices may take their time to end.
-                        self.pulse.beat(self.mcu.now(), false);
                         if !was_shutdown {
                             self.mcu.report_lateness(self.waiter.margin());
                         }
-                        return;
+                        return self.end();
                     }
                     Turn::Idle => {}
                 }
@@ -149,12 +179,11 @@ impl Core {
                 self.gave_way += 1;
                 continue;
             }
-            if now < self.linger_until && may_yield(self.waiter.is_realtime(), now, deadline) {
+            if now < self.lookout_until && may_yield(self.waiter.is_realtime(), now, deadline) {
                 thread::yield_now();
                 continue;
             }
             self.mcu.account(Ticks(now.since(busy_since) as u32));
-            let (requests, mcu, pending) = (&mut self.requests, &self.mcu, self.block.is_some());
             let to_go = deadline.map_or(2 * FAR, |deadline| deadline.since(now));
             if to_go > FAR {
                 // Half the way leaves room for a late wake-up.
@@ -162,10 +191,10 @@ impl Core {
                 busy_since = self.clock.now();
                 continue;
             }
-            let woken = self.waiter.wait(deadline, || {
-                // Within reach of a timer a call has to wait its turn.
-                !near && (pending || may_begin(requests, mcu) || mcu.has_completion())
-            });
+            let calls = Calls { core: &self.progress, stops_taken: self.stops_taken, mcu: &self.mcu };
+            let (requests, begun) = (&self.requests, self.block.is_some());
+            // Within reach of a timer a call has to wait its turn.
+            let woken = self.waiter.wait(deadline, || !near && calls.any(begun, requests));
             busy_since = self.clock.now();
             if woken == Woken::Due {
                 self.gave_way += 1;
@@ -176,9 +205,41 @@ impl Core {
     /// Sleeps for a span in which no timer is due, or until it is called, so that the heartbeat
     /// goes on. Unlike the wait for a timer it ends without spinning.
     fn nap(&mut self, longest: Duration) {
-        if self.block.is_none() && !may_begin(&mut self.requests, &self.mcu) && !self.mcu.has_completion() {
+        let calls = Calls { core: &self.progress, stops_taken: self.stops_taken, mcu: &self.mcu };
+        if !calls.any(self.block.is_some(), &self.requests) {
             self.waiter.nap(longest);
         }
+    }
+
+    /// Lets the guardian know what owes its shutdown value.
+    fn tell_debts(&mut self) {
+        if !self.mcu.owes() {
+            if self.debtor.take().is_some() {
+                self.pulse.paid();
+            }
+            return;
+        }
+        let debtor = self.mcu.debtor();
+        if debtor != self.debtor.as_deref() {
+            self.pulse.owe(debtor.unwrap_or_default(), self.mcu.last_read());
+            self.debtor = debtor.map(str::to_owned);
+        }
+    }
+
+    /// Waits until the outputs are where they belong.
+    fn end(mut self) -> Left {
+        let deadline = monotonic() + LAST_WRITES;
+        while self.mcu.owes() && monotonic() < deadline {
+            self.mcu.run_timers();
+            self.mcu.run_workers();
+            self.tell_debts();
+            self.pulse.beat(self.mcu.now(), false);
+            thread::park_timeout(Duration::from_millis(1));
+        }
+        let left = self.mcu.debtor().map_or(Left::Safe, |debtor| Left::Owing(debtor.to_owned()));
+        // Workers and devices may take their time to end.
+        self.pulse.beat(self.mcu.now(), false);
+        left
     }
 
     /// How many commands have time before the next timer, if each takes as long as is near.
@@ -187,59 +248,117 @@ impl Core {
         self.mcu.next_timer().map_or(i64::MAX, to_go).max(1)
     }
 
-    /// Runs the commands of a block that have time, or takes in what the link asks.
+    /// Stops the machine ahead of a block that is held back, as a request to stop waits behind it.
+    /// The requests up to that one are refused then, as in any stopped machine.
+    #[cold]
+    fn stop_ahead(&mut self) {
+        let Core { mcu, requests, block, .. } = self;
+        let rest = block.as_ref().is_some_and(|(payload, at)| mcu.is_emergency(&payload.as_slice()[*at..]));
+        let waiting = requests.slots();
+        let stop = match requests.read_chunk(waiting) {
+            _ if rest => Some(base::emergency()),
+            Err(_) => None,
+            Ok(waiting) => {
+                let (first, second) = waiting.as_slices();
+                first.iter().chain(second).find_map(|request| match request {
+                    Request::Run(payload) => mcu.is_emergency(payload.as_slice()).then(base::emergency),
+                    Request::Shutdown(shutdown) => Some(shutdown.clone()),
+                    Request::Quit => Some(program_ends()),
+                    Request::Report | Request::Hang => None,
+                })
+            }
+        };
+        // It may be on its way into the ring still.
+        if let Some(stop) = stop {
+            self.mcu.shut_down(stop);
+        }
+    }
+
+    /// Runs the commands of a block that have time, or one, or takes in what the link asks.
     #[inline]
-    fn run_command(&mut self) -> Turn {
+    fn run_commands(&mut self, one: bool) -> Turn {
         self.gave_way = 0;
+        if self.mcu.is_held() {
+            return Turn::Idle;
+        }
         let (payload, mut at) = match self.block.take() {
             Some(block) => block,
-            None if !may_begin(&mut self.requests, &self.mcu) => return Turn::Idle,
             None => match self.requests.pop() {
                 Ok(Request::Run(payload)) => {
                     self.progress.begin();
                     (payload, 0)
                 }
-                Ok(Request::Shutdown(shutdown)) => {
-                    self.mcu.shut_down(shutdown);
-                    return Turn::Done;
-                }
-                Ok(Request::Report) => {
-                    self.mcu.report_lateness(self.waiter.margin());
-                    return Turn::Done;
-                }
-                Ok(Request::Quit) => {
-                    self.mcu.shut_down(Shutdown::because(
-                        Reason::ForceShutdown,
-                        "the program ends; the host sees the connection close",
-                    ));
-                    return Turn::Quit;
-                }
-                Ok(Request::Hang) => loop {
-                    thread::park();
-                },
+                Ok(request) => return self.serve(request),
                 Err(_) => return Turn::Idle,
             },
         };
         let bytes = payload.as_slice();
         let mut reader = Reader::new(&bytes[at..]);
-        for _ in 0..self.room() {
-            if reader.is_empty() {
+        for _ in 0..if one { 1 } else { self.room() } {
+            if reader.is_empty() || self.mcu.is_held() {
                 break;
             }
             self.mcu.execute(&mut reader);
         }
         at = bytes.len() - reader.rest().len();
-        if at < bytes.len() {
+        if at < bytes.len() || self.mcu.is_held() {
             self.block = Some((payload, at));
-        } else {
-            self.progress.finish();
-            // The end of the next block will do, if that may begin; but a machine that is being
-            // configured takes its time for a block.
-            if !may_begin(&mut self.requests, &self.mcu) || !self.mcu.is_running() {
-                self.wake.wake();
-            }
+            return Turn::Done;
+        }
+        if self.progress.stops_handed() != self.stops_taken && self.mcu.is_emergency(bytes) {
+            self.stops_taken = self.stops_taken.wrapping_add(1);
+        }
+        self.progress.finish();
+        // The end of the next block will do, if that may begin; but a machine that is being
+        // configured takes its time for a block.
+        if self.requests.is_empty() || !self.mcu.is_running() {
+            self.wake.wake();
         }
         Turn::Done
+    }
+
+    /// Does what the link asks, other than to run a block.
+    fn serve(&mut self, request: Request) -> Turn {
+        match request {
+            Request::Shutdown(shutdown) => {
+                self.stops_taken = self.stops_taken.wrapping_add(1);
+                self.mcu.shut_down(shutdown);
+            }
+            Request::Report => self.mcu.report_lateness(self.waiter.margin()),
+            Request::Quit => {
+                self.mcu.shut_down(program_ends());
+                return Turn::Quit;
+            }
+            Request::Hang => loop {
+                thread::park();
+            },
+            Request::Run(_) => {}
+        }
+        Turn::Done
+    }
+}
+
+fn program_ends() -> Shutdown {
+    Shutdown::because(reason::FORCE_SHUTDOWN, "the program ends; the host sees the connection close")
+}
+
+/// What the core is called for while it waits.
+struct Calls<'a> {
+    core: &'a Progress,
+    stops_taken: u32,
+    mcu: &'a Mcu,
+}
+
+impl Calls<'_> {
+    /// Whether there is something to do: an errand is done, or a command may run, or a request to
+    /// stop waits behind one that may not. `begun` is whether a block is being run.
+    #[inline]
+    fn any(&self, begun: bool, requests: &Consumer<Request>) -> bool {
+        self.mcu.has_completion()
+            || match self.mcu.is_held() {
+                false => begun || !requests.is_empty(),
+                true => !self.mcu.is_shutdown() && self.core.stops_handed() != self.stops_taken,
+            }
     }
 }
 
@@ -249,95 +368,25 @@ fn may_yield(realtime: bool, now: Clock, deadline: Option<Clock>) -> bool {
     realtime || deadline.is_none_or(|deadline| deadline > now + SLICE)
 }
 
-/// Whether what comes next may be taken in: a block waits, unacknowledged, while a bus has no room
-/// for what it may ask. Not so where a request to stop waits behind it, be it the host's.
-fn may_begin(requests: &mut Consumer<Request>, mcu: &Mcu) -> bool {
-    !requests.is_empty() && (mcu.has_room() || is_asked_to_stop(requests, mcu))
-}
-
-#[cold]
-fn is_asked_to_stop(requests: &mut Consumer<Request>, mcu: &Mcu) -> bool {
-    let stops = |request: &Request| match request {
-        Request::Run(payload) => mcu.is_stopped_by(payload.as_slice()),
-        Request::Shutdown(_) | Request::Quit => true,
-        Request::Report | Request::Hang => false,
-    };
-    requests.read_chunk(requests.slots()).is_ok_and(|waiting| {
-        let (first, second) = waiting.as_slices();
-        first.iter().chain(second).any(stops)
-    })
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use std::sync::Mutex;
     use std::sync::atomic::{AtomicUsize, Ordering};
-    use std::sync::mpsc::{self, Receiver, Sender};
     use std::thread::JoinHandle;
     use std::time::Instant;
 
     use nix::poll::{PollFd, PollFlags, poll};
     use rtrb::{Producer, RingBuffer};
 
-    use crate::board::{Attachment, Bias, Board, Buffer, Device, Input, Output, Pin, PwmConfig, Range, SpiConfig};
+    use crate::bench::{Bench, FakeBoard};
     use crate::feature::FEATURES;
     use crate::mcu::{Dialect, Note, Outbox};
     use crate::runtime::realtime::{Processors, Scheduling};
     use crate::runtime::wakeup::MarginLimits;
     use crate::runtime::workers::Threads;
-    use crate::time::Monotonic;
+    use crate::time::{Monotonic, VirtualClock};
     use crate::wire::vlq::Writer;
-
-    /// Blocks with one transfer each: more than wait for a bus.
-    const BLOCKS: u32 = 400;
-    const CONFIGURATION: u32 = 4;
-
-    /// A board with an SPI bus and nothing else.
-    struct SpiBoard(Option<Gate>);
-
-    /// A device that waits to be let go on.
-    struct Gate(Receiver<()>);
-
-    impl Device for Gate {
-        fn run(&mut self, _data: &mut Buffer) -> Result<(), Shutdown> {
-            let _ = self.0.recv();
-            Ok(())
-        }
-    }
-
-    fn nothing<T>() -> Result<T, Shutdown> {
-        Err(Shutdown::because(Reason::NotOutput, "the board has an SPI bus only"))
-    }
-
-    impl Board for SpiBoard {
-        fn describe(&self) -> String {
-            String::new()
-        }
-        fn pins(&self) -> Vec<Range> {
-            Vec::new()
-        }
-        fn spi_buses(&self) -> Vec<Range> {
-            Vec::new()
-        }
-        fn output(&mut self, _pin: Pin, _value: bool, _shutdown_value: bool) -> Result<Box<dyn Output>, Shutdown> {
-            nothing()
-        }
-        fn input(&mut self, _pin: Pin, _bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
-            nothing()
-        }
-        fn adc(&mut self, _pin: Pin) -> Result<Attachment, Shutdown> {
-            nothing()
-        }
-        fn spi(&mut self, _config: SpiConfig) -> Result<Attachment, Shutdown> {
-            let gate = self.0.take().unwrap();
-            Ok(Attachment::Worker { bus: "spi0".into(), device: Box::new(gate) })
-        }
-        fn pwm(&mut self, _config: PwmConfig) -> Result<Attachment, Shutdown> {
-            nothing()
-        }
-        fn reset(&mut self) {}
-    }
 
     #[derive(Clone, Default)]
     struct Heard(Arc<Mutex<Vec<Vec<u8>>>>);
@@ -359,27 +408,29 @@ mod tests {
         }
     }
 
-    /// A core at work, and what stands for its link.
-    struct Bench {
-        thread: JoinHandle<()>,
+    /// A core at work with an SPI device and a digital output, and what stands for its link.
+    struct Rig {
+        thread: JoinHandle<Left>,
         dialect: Arc<Dialect>,
         clock: Arc<Counting>,
         requests: Producer<Request>,
         progress: Arc<Progress>,
         wake: Arc<LinkWake>,
         heard: Heard,
-        gate: Sender<()>,
+        bench: Bench,
     }
 
-    impl Bench {
-        /// Lets the host ask for more transfers than the bus can queue, while it does none.
-        fn overloaded() -> Bench {
-            let (gate, closed) = mpsc::channel();
-            let board = SpiBoard(Some(Gate(closed)));
+    const RESPONSE: &str = "spi_transfer_response oid=%c response=%*s";
+    const CONFIGURATION: u32 = 5;
+
+    impl Rig {
+        fn new() -> Rig {
+            let bench = Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
+            let board = FakeBoard(bench.clone());
             let dialect = Arc::new(Dialect::new(FEATURES, &board).unwrap());
             let monotonic = Monotonic::start();
             let clock = Arc::new(Counting(monotonic, AtomicUsize::new(0)));
-            let (requests, inbox) = RingBuffer::new(2 * BLOCKS as usize);
+            let (requests, inbox) = RingBuffer::new(64);
             let progress = Arc::new(Progress::default());
             let heard = Heard::default();
             let (core_dialect, core_progress, core_heard) = (dialect.clone(), progress.clone(), heard.clone());
@@ -388,7 +439,7 @@ mod tests {
             let core_wake = wake.clone();
             let thread = thread::spawn(move || {
                 let pulse = Pulse::new(monotonic).unwrap();
-                let workers = Threads::new(thread::current(), Arc::new(|| ()), pulse);
+                let workers = Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), pulse);
                 let mcu = Mcu::new(
                     core_dialect,
                     Box::new(board),
@@ -399,31 +450,59 @@ mod tests {
                 let (limits, processors) = (MarginLimits::default(), Processors::new(None).unwrap());
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
                 let (clock, progress, wake) = (core_clock, core_progress, core_wake);
-                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run();
+                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run()
             });
-            let mut bench = Bench { thread, dialect, clock, requests, progress, wake, heard, gate };
-            bench.run("allocate_oids count=%c", &[1]);
-            bench.run("config_spi_without_cs oid=%c", &[0]);
-            bench.run("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", &[0, 0, 0, 1]);
-            bench.run("finalize_config crc=%u", &[1]);
-            for n in 0..BLOCKS {
-                // The bytes: how many, and which.
-                bench.run("spi_transfer oid=%c data=%*s", &[0, 1, n % 64]);
-            }
-            bench.wait_until("the bus is full", || bench.progress.done() > CONFIGURATION + 100);
-            bench
+            let mut rig = Rig { thread, dialect, clock, requests, progress, wake, heard, bench };
+            rig.run("allocate_oids count=%c", &[2]);
+            rig.run("config_spi_without_cs oid=%c", &[0]);
+            rig.run("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", &[0, 0, 0, 1]);
+            rig.run("config_digital_out oid=%c pin=%u value=%c default_value=%c max_duration=%u", &[1, 30, 0, 0, 0]);
+            rig.run("finalize_config crc=%u", &[1]);
+            rig.wait_until("it is configured", |rig| rig.progress.done() == CONFIGURATION);
+            rig
+        }
+
+        /// The same amid a transfer on a bus that hangs, with a command behind it.
+        fn held() -> Rig {
+            let mut rig = Rig::new();
+            rig.bench.hang(true);
+            rig.transfer(7);
+            rig.run("update_digital_out oid=%c value=%c", &[1, 1]);
+            rig.wait_until("the transfer is under way", |rig| rig.bench.hangs());
+            rig
+        }
+
+        fn transfer(&mut self, byte: u32) {
+            self.run("spi_transfer oid=%c data=%*s", &[0, 1, byte]);
         }
 
         fn run(&mut self, format: &str, parameters: &[u32]) {
+            let payload = self.encode(format, parameters);
+            self.request(Request::Run(payload));
+        }
+
+        fn encode(&self, format: &str, parameters: &[u32]) -> Payload {
             let mut writer = Writer::default();
             writer.int(self.dialect.command_id(format).unwrap());
             parameters.iter().for_each(|parameter| writer.int(*parameter));
-            self.request(Request::Run(Payload::new(writer.payload().unwrap())));
+            Payload::new(writer.payload().unwrap())
         }
 
         fn request(&mut self, request: Request) {
             self.requests.push(request).ok().unwrap();
             self.thread.thread().unpark();
+        }
+
+        /// As the link asks for a stop.
+        fn stop(&mut self, request: Request) {
+            self.progress.stop_handed();
+            self.request(request);
+        }
+
+        fn quit(mut self) -> Left {
+            self.bench.hang(false);
+            self.stop(Request::Quit);
+            self.thread.join().unwrap()
         }
 
         /// The parameters of what the core said so far in responses of this format.
@@ -437,13 +516,13 @@ mod tests {
             parameters.collect()
         }
 
-        fn shutdowns(&self) -> usize {
-            self.said("shutdown clock=%u static_string_id=%hu").len()
+        fn is_stopped(&self) -> bool {
+            !self.said("shutdown clock=%u static_string_id=%hu").is_empty()
         }
 
-        fn wait_until(&self, what: &str, mut holds: impl FnMut() -> bool) {
+        fn wait_until(&self, what: &str, holds: impl Fn(&Rig) -> bool) {
             let end = Instant::now() + Duration::from_secs(60);
-            while !holds() {
+            while !holds(self) {
                 assert!(Instant::now() < end, "{what}: {} blocks done", self.progress.done());
                 thread::sleep(Duration::from_millis(1));
             }
@@ -451,40 +530,83 @@ mod tests {
     }
 
     #[test]
-    fn a_slow_bus_holds_the_host_back_and_nothing_is_lost() {
-        let mut bench = Bench::overloaded();
-        let turns = bench.clock.1.load(Ordering::Relaxed);
+    fn a_transfer_holds_its_block_and_the_commands_behind_it_back() {
+        let mut rig = Rig::held();
+        let turns = rig.clock.1.load(Ordering::Relaxed);
         thread::sleep(2 * BEAT);
-        let (done, turns) = (bench.progress.done(), bench.clock.1.load(Ordering::Relaxed) - turns);
-        assert!(done < CONFIGURATION + BLOCKS, "{done} blocks were done");
+        let turns = rig.clock.1.load(Ordering::Relaxed) - turns;
         assert!(turns < 10_000, "the core sleeps as it waits, and read the clock {turns} times");
+        assert_eq!(rig.progress.done(), CONFIGURATION, "it is not acknowledged");
+        assert!(!rig.bench.level(30), "what is behind it has not run");
 
-        (0..BLOCKS).for_each(|_| bench.gate.send(()).unwrap());
-        bench.wait_until("every block is done", || bench.progress.done() == CONFIGURATION + BLOCKS);
-        let format = "spi_transfer_response oid=%c response=%*s";
-        bench.wait_until("every answer is there", || bench.said(format).len() == BLOCKS as usize);
-        let expected: Vec<Vec<u8>> = (0..BLOCKS).map(|n| vec![0, 1, (n % 64) as u8]).collect();
-        assert_eq!(bench.said(format), expected);
-        assert_eq!(bench.shutdowns(), 0);
-        bench.request(Request::Quit);
-        bench.thread.join().unwrap();
+        // The link sleeps, and the bus answers.
+        rig.wake.sleeping();
+        rig.bench.hang(false);
+        rig.wait_until("both blocks are done", |rig| rig.progress.done() == CONFIGURATION + 2);
+        assert_eq!(rig.said(RESPONSE), [[0, 1, !7]]);
+        assert!(rig.bench.level(30));
+        let mut fds = [PollFd::new(rig.wake.event(), PollFlags::POLLIN)];
+        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
+        for byte in 0..20 {
+            rig.transfer(byte);
+        }
+        rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 22);
+        assert_eq!(rig.said(RESPONSE).len(), 21);
+        assert_eq!(rig.quit(), Left::Safe);
     }
 
     #[test]
-    fn a_block_that_is_done_is_acknowledged_while_the_next_one_is_held_back() {
-        let mut bench = Bench::overloaded();
-        thread::sleep(2 * BEAT);
-        let done = bench.progress.done();
-        // The link sleeps, and the bus makes room for one block.
-        bench.wake.sleeping();
-        bench.gate.send(()).unwrap();
-        bench.wait_until("one block more is done", || bench.progress.done() > done);
-        let mut fds = [PollFd::new(bench.wake.event(), PollFlags::POLLIN)];
-        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
-        drop(bench.gate);
-        let _ = bench.requests.push(Request::Quit);
-        bench.thread.thread().unpark();
-        bench.thread.join().unwrap();
+    fn a_request_to_stop_does_not_wait_for_a_bus_that_hangs() {
+        let shutdown = || Shutdown::because(reason::FORCE_SHUTDOWN, "a test");
+        for which in 0..4 {
+            let mut rig = Rig::held();
+            let mut blocks = CONFIGURATION + 2;
+            match which {
+                0 => rig.stop(Request::Shutdown(shutdown())),
+                1 => rig.stop(Request::Quit),
+                _ => {
+                    blocks += 1;
+                    let mut payload = rig.encode("emergency_stop", &[]);
+                    if which == 3 {
+                        // Amid others of its block.
+                        let get = rig.encode("get_config", &[]);
+                        payload = Payload::new(&[get.as_slice(), payload.as_slice(), get.as_slice()].concat());
+                    }
+                    rig.stop(Request::Run(payload));
+                }
+            }
+            rig.wait_until("the machine stops", Rig::is_stopped);
+            rig.wait_until("the blocks are refused", |rig| rig.progress.done() == blocks);
+            assert!(!rig.bench.level(30), "a command that waited has not run");
+            rig.bench.hang(false);
+            if which != 1 {
+                rig.stop(Request::Quit);
+            }
+            rig.thread.join().unwrap();
+        }
+    }
+
+    #[test]
+    fn an_emergency_stop_in_the_block_that_waits_is_seen_too() {
+        let mut rig = Rig::new();
+        rig.bench.hang(true);
+        let transfer = rig.encode("spi_transfer oid=%c data=%*s", &[0, 1, 7]);
+        let stop = rig.encode("emergency_stop", &[]);
+        let block = Payload::new(&[transfer.as_slice(), stop.as_slice()].concat());
+        rig.stop(Request::Run(block));
+        rig.wait_until("the machine stops", Rig::is_stopped);
+        assert_eq!(rig.quit(), Left::Safe);
+    }
+
+    #[test]
+    fn a_program_that_ends_waits_for_its_last_writes_and_says_what_failed() {
+        for (broken, left) in [(false, Left::Safe), (true, Left::Owing("digital output oid 1 (gpio30)".into()))] {
+            let rig = Rig::new();
+            if broken {
+                rig.bench.state().broken.insert(30);
+            }
+            assert_eq!(rig.quit(), left);
+        }
     }
 
     #[test]
@@ -494,31 +616,5 @@ mod tests {
         assert!(!may_yield(false, now, Some(soon)));
         assert!(may_yield(false, now, Some(late)) && may_yield(false, now, None));
         assert!(may_yield(true, now, Some(soon)));
-    }
-
-    #[test]
-    fn an_emergency_stop_does_not_wait_for_a_bus_that_hangs() {
-        let mut bench = Bench::overloaded();
-        bench.run("emergency_stop", &[]);
-        bench.wait_until("the machine stops", || bench.shutdowns() > 0);
-        bench.wait_until("the blocks are refused", || bench.progress.done() == CONFIGURATION + BLOCKS + 1);
-        drop(bench.gate);
-        let _ = bench.requests.push(Request::Quit);
-        bench.thread.thread().unpark();
-        bench.thread.join().unwrap();
-    }
-
-    #[test]
-    fn a_request_to_stop_does_not_wait_for_a_bus_that_hangs() {
-        for request in [Request::Quit, Request::Shutdown(Shutdown::because(Reason::ForceShutdown, "a test"))] {
-            let mut bench = Bench::overloaded();
-            bench.request(request);
-            bench.wait_until("the machine stops", || bench.shutdowns() > 0);
-            bench.wait_until("the blocks are refused", || bench.progress.done() == CONFIGURATION + BLOCKS);
-            drop(bench.gate);
-            let _ = bench.requests.push(Request::Quit);
-            bench.thread.thread().unpark();
-            bench.thread.join().unwrap();
-        }
     }
 }

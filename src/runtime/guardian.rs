@@ -44,7 +44,7 @@ use nix::sys::uio::pwrite;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::{Pid, alarm, chdir, getpid, getppid, setsid};
 
-use crate::board::Guard;
+use crate::board::linux::Guard;
 use crate::sys;
 use crate::time::{Monotonic, monotonic};
 
@@ -181,11 +181,15 @@ fn answer(socket: &OwnedFd) -> io::Result<()> {
 }
 
 impl Guard for Lifeline {
-    fn output(&mut self, line: RawFd, shutdown_value: bool) -> io::Result<()> {
+    fn output(&mut self, _name: &str, line: RawFd, shutdown_value: bool, _sleeping: Option<&str>) -> io::Result<()> {
         self.ask(&[LINE, shutdown_value.into()], Some(line))
     }
 
-    fn files(&mut self, shutdown: &[(RawFd, &[u8])]) -> io::Result<()> {
+    fn forget(&mut self, _name: &str) -> io::Result<()> {
+        Ok(())
+    }
+
+    fn files(&mut self, _name: &str, shutdown: &[(RawFd, &[u8])]) -> io::Result<()> {
         if shutdown.iter().any(|(_, bytes)| bytes.len() > FILE_BYTES) {
             return Err(io::ErrorKind::InvalidInput.into());
         }

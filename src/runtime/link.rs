@@ -18,7 +18,7 @@ use rtrb::Producer;
 
 use crate::mcu::base::{ClockResponse, IdentifyResponse, identify_response};
 use crate::mcu::{Dialect, Response};
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, TimeSource, monotonic};
 use crate::wire::block::{Received, Receiver, Sequence, frame};
 use crate::wire::vlq::{Reader, Writer};
@@ -299,7 +299,7 @@ impl Link {
     fn lose_guardian(&mut self) {
         self.guardian = None;
         let detail = "somebody killed the guardian, and without it a crash would leave heaters on: Pinion ends, to be started anew with one";
-        self.request(Request::Shutdown(Shutdown::because(Reason::GuardianLost, detail)));
+        self.request(Request::Shutdown(Shutdown::because(reason::GUARDIAN_LOST, detail)));
         self.leave_at = Some(monotonic() + FAREWELL);
     }
 
@@ -335,7 +335,7 @@ impl Link {
             self.input.truncate(filled);
             warn!("FORCE_SHUTDOWN was written to {}", self.pty.device().display());
             self.request(Request::Shutdown(Shutdown::because(
-                Reason::ForceShutdown,
+                reason::FORCE_SHUTDOWN,
                 "somebody wrote FORCE_SHUTDOWN to the pty; FIRMWARE_RESTART starts anew",
             )));
         }

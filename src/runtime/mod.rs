@@ -38,7 +38,7 @@ mod workers;
 pub use guardian::Guardian;
 pub use pty::Access;
 
-use self::core::{Core, Request};
+use self::core::{Core, Left, Request};
 use link::{End, Link, Parts};
 use notify::Notify;
 use outlet::{LinkWake, Progress};
@@ -111,7 +111,7 @@ pub fn run(
                 realtime::enter(Role::Worker);
             }
         });
-        let workers = Box::new(Threads::new(thread::current(), prepare, pulse));
+        let workers = Box::new(Threads::new(thread::current(), prepare, core_clock.clone(), pulse));
         let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
         let waiter = Waiter::new(core_clock.clone(), margin, scheduling, processors);
         Core::new(self::core::Parts {
@@ -123,7 +123,7 @@ pub fn run(
             progress: core_progress,
             wake: core_wake,
         })
-        .run();
+        .run()
     })?;
 
     info!("serving on {} ({})", options.link.display(), pty.device().display());
@@ -154,11 +154,17 @@ pub fn run(
     });
     link.stopping();
     link.request(Request::Quit);
-    let in_order = core.join().is_ok();
+    let left = core.join();
     let vigil = link.finish();
-    if !in_order {
-        // The guardian drives the outputs.
-        return Err(io::Error::other("the core ended by a panic: please report it with the lines above"));
+    // Without a goodbye the guardian drives the outputs.
+    match left {
+        Ok(Left::Safe) => {}
+        Ok(Left::Owing(debtor)) => {
+            return Err(io::Error::other(format!(
+                "{debtor} can not be driven to its shutdown value: the guardian tries that now"
+            )));
+        }
+        Err(_) => return Err(io::Error::other("the core ended by a panic: please report it with the lines above")),
     }
     if let Some(guardian) = guardian {
         guardian.goodbye();

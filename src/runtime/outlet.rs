@@ -16,7 +16,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 
 use crate::lateness::us;
 use crate::mcu::{Note, Outbox};
-use crate::shutdown::{Reason, Shutdown};
+use crate::shutdown::{Shutdown, reason};
 
 /// Bytes between core and link: some 1,000 responses. When the host does not read, later ones
 /// are dropped.
@@ -80,6 +80,7 @@ impl LinkWake {
 pub(super) struct Progress {
     begun: AtomicU32,
     done: AtomicU32,
+    stops_handed: AtomicU32,
 }
 
 impl Progress {
@@ -96,6 +97,18 @@ impl Progress {
     /// How many blocks are done.
     pub(super) fn done(&self) -> u32 {
         self.done.load(Ordering::Acquire)
+    }
+
+    /// The link is about to hand the core a request to stop: a block with `emergency_stop`,
+    /// `Request::Shutdown` or `Request::Quit`.
+    pub(super) fn stop_handed(&self) {
+        self.stops_handed.fetch_add(1, Ordering::Release);
+    }
+
+    /// How many requests to stop were handed to the core, which counts those that it took out of
+    /// the ring: where these are fewer, one waits there, or will in a moment.
+    pub(super) fn stops_handed(&self) -> u32 {
+        self.stops_handed.load(Ordering::Acquire)
     }
 }
 
@@ -172,6 +185,9 @@ impl Outbox for Outlet {
             Note::Trouble(shutdown) => {
                 self.line(gravity(shutdown), LINES_SPARE, format_args!("while shut down: {shutdown}"));
             }
+            Note::Safe(name) => {
+                self.line(Level::Warn, LINES_SPARE, format_args!("{name} is at its shutdown value after all"));
+            }
             Note::Lateness(lateness, margin) => {
                 let margin = us(margin);
                 let line = format_args!("timers: {lateness}; the core wakes {margin:.1} us early");
@@ -190,7 +206,7 @@ impl Outbox for Outlet {
 /// What somebody asked for is no error.
 fn gravity(shutdown: &Shutdown) -> Level {
     match shutdown.reason {
-        Reason::CommandRequest | Reason::ForceShutdown => Level::Warn,
+        reason::COMMAND_REQUEST | reason::FORCE_SHUTDOWN => Level::Warn,
         _ => Level::Error,
     }
 }
@@ -261,9 +277,9 @@ mod tests {
         for _ in 0..RING_BYTES {
             outlet.send(&[7; 60]);
         }
-        outlet.note(Note::Shutdown(&Shutdown::because(Reason::AdcRange, "oid 3")));
+        outlet.note(Note::Shutdown(&Shutdown::because(reason::ADC_READ, "oid 3")));
         assert!(inlet.has_line());
-        assert_eq!(inlet.line(), Some((Level::Error, "shutdown: ADC out of range: oid 3".into())));
+        assert_eq!(inlet.line(), Some((Level::Error, "shutdown: Error on analog read: oid 3".into())));
         assert_eq!(inlet.line(), None);
         let mut whole = 0;
         while let Some((response, 1)) = inlet.response() {
@@ -277,12 +293,12 @@ mod tests {
     #[test]
     fn troubles_leave_room_for_the_reason_of_a_stop() {
         let (mut outlet, mut inlet, _) = ends();
-        let trouble = Shutdown::because(Reason::PwmWrite, "no ".repeat(LINE_BYTES));
+        let trouble = Shutdown::because(reason::PWM_WRITE, "no ".repeat(LINE_BYTES));
         for _ in 0..256 {
             outlet.note(Note::Trouble(&trouble));
         }
         let reason = format!("M112 {}", "of this host ".repeat(LINE_BYTES));
-        outlet.note(Note::Shutdown(&Shutdown::because(Reason::CommandRequest, reason)));
+        outlet.note(Note::Shutdown(&Shutdown::because(reason::COMMAND_REQUEST, reason)));
         let mut lines: Vec<_> = std::iter::from_fn(|| inlet.line()).collect();
         let (level, line) = lines.pop().unwrap();
         assert_eq!(level, Level::Warn);
@@ -294,7 +310,7 @@ mod tests {
     #[test]
     fn what_was_asked_for_is_no_error() {
         let (mut outlet, mut inlet, _) = ends();
-        let end = Shutdown::because(Reason::ForceShutdown, "the end");
+        let end = Shutdown::because(reason::FORCE_SHUTDOWN, "the end");
         outlet.note(Note::Shutdown(&end));
         outlet.note(Note::Trouble(&end));
         assert_eq!(inlet.line(), Some((Level::Warn, "shutdown: Force shutdown command: the end".into())));

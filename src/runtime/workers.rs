@@ -1,38 +1,33 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One thread per bus: it runs the conversations of the bus's devices, one at a time, so that
-//! the core never waits for them.
+//! One thread per bus: it runs the errands to the bus's devices, one at a time, so that the core
+//! never waits for them.
 
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle, Thread};
+use std::time::Duration;
 
+use log::error;
 use rtrb::{Consumer, Producer, RingBuffer};
 
-use crate::board::Device;
-use crate::mcu::{Completion, Job, Workers};
-use crate::shutdown::{Reason, Shutdown};
-use crate::wire::block::PAYLOAD_MAX;
+use crate::mcu::{Completion, Job, WorkerId, Workers};
+use crate::shutdown::{Shutdown, reason};
+use crate::time::{TimeSource, monotonic};
 
 use super::pulse::{JobClock, Pulse};
 
-/// Jobs that wait for one bus.
-const QUEUE_JOBS: usize = 256;
-/// Further ones that only a machine that stops may queue: one for each object that it can have.
-const QUEUE_SPARE: usize = 256;
-
-enum Order {
-    Attach(usize, Box<dyn Device>),
-    Run(Job),
-}
+/// Errands that wait for one bus. An object has one or two of them, and there are 256 objects.
+const QUEUE_JOBS: usize = 1024;
+/// How long a worker may take to end: as long as most drivers wait for a chip that is silent.
+const END: Duration = Duration::from_secs(2);
 
 struct Worker {
     bus: String,
-    orders: Producer<Order>,
-    answers: Consumer<Completion>,
+    jobs: Producer<Job>,
+    done: Consumer<Completion>,
     quit: Arc<AtomicBool>,
-    clock: Arc<JobClock>,
     thread: JoinHandle<()>,
 }
 
@@ -43,107 +38,89 @@ pub(super) type Prepare = Arc<dyn Fn() + Send + Sync>;
 pub(super) struct Threads {
     core: Thread,
     prepare: Prepare,
+    clock: Arc<dyn TimeSource>,
     pulse: Pulse,
     workers: Vec<Worker>,
-    /// Which worker has the device.
-    devices: Vec<usize>,
 }
 
 impl Threads {
-    /// Workers that wake `core` when they have an answer, and show in `pulse` what they are at.
-    pub(super) fn new(core: Thread, prepare: Prepare, pulse: Pulse) -> Threads {
-        Threads { core, prepare, pulse, workers: Vec::new(), devices: Vec::new() }
+    /// Workers that wake `core` when an errand is done, and show in `pulse` what they are at.
+    pub(super) fn new(core: Thread, prepare: Prepare, clock: Arc<dyn TimeSource>, pulse: Pulse) -> Threads {
+        Threads { core, prepare, clock, pulse, workers: Vec::new() }
     }
 
-    fn start(&self, bus: &str) -> Result<Worker, Shutdown> {
-        let (orders, inbox) = RingBuffer::new(QUEUE_JOBS + QUEUE_SPARE);
-        let (outbox, answers) = RingBuffer::new(QUEUE_JOBS + QUEUE_SPARE);
+    fn spawn(&self, bus: &str) -> Result<Worker, Shutdown> {
+        let (jobs, inbox) = RingBuffer::new(QUEUE_JOBS);
+        let (outbox, done) = RingBuffer::new(QUEUE_JOBS);
         let quit = Arc::new(AtomicBool::new(false));
-        let (core, prepare, stop) = (self.core.clone(), self.prepare.clone(), quit.clone());
-        let clock = self.pulse.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
-        let clock = Arc::new(clock);
-        let shown = clock.clone();
+        let shown = self.pulse.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
+        let core = self.core.clone();
+        let server = Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock: self.clock.clone(), shown };
+        let prepare = self.prepare.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
             .spawn(move || {
                 prepare();
-                serve(inbox, outbox, &stop, &core, &shown);
+                server.run();
             })
             .map_err(|error| {
                 overflow(bus, &format!("its thread can not be started ({error}): raise TasksMax or ulimit -u"))
             })?;
-        Ok(Worker { bus: bus.into(), orders, answers, quit, clock, thread })
+        Ok(Worker { bus: bus.into(), jobs, done, quit, thread })
     }
 }
 
 fn overflow(bus: &str, why: &str) -> Shutdown {
-    Shutdown::because(Reason::WorkerOverflow, format!("the worker of {bus}: {why}"))
+    Shutdown::because(reason::WORKER_OVERFLOW, format!("the worker of {bus}: {why}"))
 }
 
 impl Workers for Threads {
-    fn attach(&mut self, bus: &str, device: Box<dyn Device>) -> Result<usize, Shutdown> {
-        let worker = match self.workers.iter().position(|worker| worker.bus == bus) {
-            Some(worker) => worker,
-            None => {
-                self.workers.push(self.start(bus)?);
-                self.workers.len() - 1
-            }
-        };
-        let number = self.devices.len();
-        self.devices.push(worker);
-        self.order(worker, Order::Attach(number, device))?;
-        Ok(number)
-    }
-
-    fn submit(&mut self, job: Job) -> Result<(), Shutdown> {
-        match self.devices.get(job.device) {
-            Some(worker) => self.order(*worker, Order::Run(job)),
-            None => Ok(()),
+    fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
+        if let Some(worker) = self.workers.iter().position(|worker| worker.bus == bus) {
+            return Ok(WorkerId(worker));
         }
+        self.workers.push(self.spawn(bus)?);
+        Ok(WorkerId(self.workers.len() - 1))
     }
 
-    fn has_room(&self) -> bool {
-        self.workers.iter().all(|worker| worker.orders.slots() >= QUEUE_SPARE + PAYLOAD_MAX)
-    }
-
-    fn completion(&mut self) -> Option<Completion> {
-        self.workers.iter_mut().find_map(|worker| worker.answers.pop().ok())
-    }
-
-    fn has_completion(&self) -> bool {
-        self.workers.iter().any(|worker| !worker.answers.is_empty())
-    }
-
-    fn reset(&mut self) {
-        for worker in self.workers.drain(..) {
-            worker.quit.store(true, Ordering::SeqCst);
-            worker.thread.thread().unpark();
-            // Only a transfer under way keeps it: lines and descriptors are free afterwards.
-            let _ = worker.thread.join();
-        }
-        self.devices.clear();
-    }
-}
-
-impl Threads {
-    fn order(&mut self, worker: usize, order: Order) -> Result<(), Shutdown> {
-        let worker = &mut self.workers[worker];
-        let stopping = matches!(&order, Order::Run(job) if job.stopping);
-        let kept = if stopping { 0 } else { QUEUE_SPARE };
-        if stopping {
-            worker.clock.owe(self.pulse.now());
-        }
-        if worker.orders.slots() <= kept || worker.orders.push(order).is_err() {
-            if stopping {
-                worker.clock.pay();
-            }
-            return Err(overflow(
-                &worker.bus,
-                "the bus is slower than what the host asks of it: lower the rate of the queries, or raise the bus speed",
-            ));
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Shutdown> {
+        let Some(worker) = self.workers.get_mut(worker) else { return Ok(()) };
+        if worker.jobs.push(job).is_err() {
+            return Err(overflow(&worker.bus, "more is asked of it at once than there are devices; please report it"));
         }
         worker.thread.thread().unpark();
         Ok(())
+    }
+
+    fn completion(&mut self) -> Option<Completion> {
+        self.workers.iter_mut().find_map(|worker| worker.done.pop().ok())
+    }
+
+    fn has_completion(&self) -> bool {
+        self.workers.iter().any(|worker| !worker.done.is_empty())
+    }
+
+    /// Waits for what the workers are at, as their devices are free only then; one that hangs is
+    /// left behind.
+    fn reset(&mut self) {
+        for worker in &self.workers {
+            worker.quit.store(true, Ordering::Release);
+            worker.thread.thread().unpark();
+        }
+        let end = monotonic() + END;
+        for worker in self.workers.drain(..) {
+            while !worker.thread.is_finished() && monotonic() < end {
+                thread::sleep(Duration::from_millis(1));
+            }
+            if worker.thread.is_finished() {
+                let _ = worker.thread.join();
+            } else {
+                error!(
+                    "{} does not answer: its driver or chip hangs (dmesg), and what it holds stays in use until Pinion is restarted",
+                    worker.bus
+                );
+            }
+        }
     }
 }
 
@@ -153,92 +130,102 @@ impl Drop for Threads {
     }
 }
 
-fn serve(
-    mut orders: Consumer<Order>,
-    mut answers: Producer<Completion>,
-    quit: &AtomicBool,
-    core: &Thread,
-    clock: &JobClock,
-) {
-    let mut devices: Vec<(usize, Box<dyn Device>)> = Vec::new();
-    loop {
-        // Looked at first: what was ordered before the end is done before it, as the last of it
-        // may switch an output off.
-        let ending = quit.load(Ordering::SeqCst);
-        let job = match orders.pop() {
-            Err(_) if ending => return,
-            Err(_) => {
-                thread::park();
-                continue;
+/// A worker's thread.
+struct Server {
+    jobs: Consumer<Job>,
+    done: Producer<Completion>,
+    quit: Arc<AtomicBool>,
+    core: Thread,
+    clock: Arc<dyn TimeSource>,
+    shown: JobClock,
+}
+
+impl Server {
+    fn run(mut self) {
+        loop {
+            // Read before the queue is: what was asked for before the end is done, as the last
+            // of it may switch an output off.
+            let ending = self.quit.load(Ordering::Acquire);
+            match self.jobs.pop() {
+                Ok(job) => self.serve(job),
+                Err(_) if ending => return,
+                Err(_) => thread::park(),
             }
-            Ok(Order::Attach(number, device)) => {
-                devices.push((number, device));
-                continue;
-            }
-            Ok(Order::Run(job)) => job,
-        };
-        let Job { device, ticket, mut data, stopping } = job;
-        // Attached before its first job was ordered.
-        let Some((_, device)) = devices.iter_mut().find(|(number, _)| *number == device) else { continue };
-        clock.begin();
-        let result = device.run(&mut data).map(|()| data);
-        clock.end();
-        if stopping {
-            clock.pay();
         }
-        let mut completion = Completion { ticket, result };
-        // The core takes answers in faster than a bus gives them.
-        while let Err(rtrb::PushError::Full(back)) = answers.push(completion) {
-            completion = back;
-            if quit.load(Ordering::SeqCst) {
-                // Nobody takes them in any more.
-                break;
-            }
-            thread::yield_now();
-        }
-        core.unpark();
+    }
+
+    fn serve(&mut self, job: Job) {
+        let Job { ticket, mut errand, holds } = job;
+        self.shown.begin();
+        let began = self.clock.now();
+        errand.run();
+        let ended = self.clock.now();
+        self.shown.end();
+        // There is room: as many errands as the queue to us takes fit the queue back.
+        let _ = self.done.push(Completion { ticket, errand, holds, began, ended });
+        self.core.unpark();
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::board::Buffer;
-    use crate::mcu::{Oid, Ticket};
+    use crate::mcu::{Errand, Oid, Ticket};
     use crate::time::Monotonic;
     use std::sync::mpsc::{self, Receiver, Sender};
 
-    /// Says what it was asked, and waits to be let go on.
+    /// Waits to be let go on, then says which one it is.
     struct Slow {
-        go_on: Receiver<()>,
-        asked: Sender<u8>,
+        go_on: Arc<std::sync::Mutex<Receiver<()>>>,
+        number: u8,
+        said: Sender<u8>,
     }
 
-    impl Device for Slow {
-        fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-            let _ = self.go_on.recv();
-            let _ = self.asked.send(data.as_slice()[0]);
-            Ok(())
+    impl Errand for Slow {
+        fn run(&mut self) {
+            let _ = self.go_on.lock().unwrap().recv();
+            let _ = self.said.send(self.number);
         }
     }
 
+    fn threads() -> Threads {
+        let clock = Monotonic::start();
+        Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), Pulse::new(clock).unwrap())
+    }
+
     #[test]
-    fn a_full_queue_has_room_for_the_last_word_of_a_machine_that_stops() {
+    fn what_was_asked_for_before_the_end_is_done_in_order() {
         let (release, go_on) = mpsc::channel();
-        let (asked, heard) = mpsc::channel();
-        let mut threads = Threads::new(thread::current(), Arc::new(|| ()), Pulse::new(Monotonic::start()).unwrap());
-        let device = threads.attach("pwm", Box::new(Slow { go_on, asked })).unwrap();
-        let job = |value: u8, stopping| Job {
-            device,
-            ticket: Ticket { oid: Oid(0), tag: 0 },
-            data: Buffer::new(&[value]),
-            stopping,
-        };
-        let refusal = (0..2 * QUEUE_JOBS).find_map(|_| threads.submit(job(255, false)).err()).unwrap();
-        assert_eq!(refusal.reason, Reason::WorkerOverflow);
-        threads.submit(job(0, true)).unwrap();
+        let (said, heard) = mpsc::channel();
+        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let mut threads = threads();
+        let worker = threads.start("pwm").unwrap();
+        assert_eq!(threads.start("pwm").unwrap(), worker);
+        for number in 0..5 {
+            let errand = Box::new(Slow { go_on: go_on.clone(), number, said: said.clone() });
+            let ticket = Ticket { oid: Oid::new(0), tag: number };
+            threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+        }
         drop(release);
         threads.reset();
-        assert_eq!(heard.iter().last(), Some(0));
+        drop(said);
+        assert_eq!(heard.iter().collect::<Vec<_>>(), [0, 1, 2, 3, 4]);
+    }
+
+    #[test]
+    fn a_worker_that_hangs_is_left_behind() {
+        let (release, go_on) = mpsc::channel();
+        let (said, _heard) = mpsc::channel();
+        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let mut threads = threads();
+        let worker = threads.start("i2c1").unwrap();
+        let errand = Box::new(Slow { go_on, number: 0, said });
+        let ticket = Ticket { oid: Oid::new(0), tag: 0 };
+        threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+        threads.reset();
+        assert!(!threads.has_completion());
+        // Another one takes its place.
+        threads.start("i2c1").unwrap();
+        drop(release);
     }
 }

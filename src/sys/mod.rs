@@ -118,7 +118,17 @@ pub(crate) fn receive(socket: BorrowedFd<'_>, buffer: &mut [u8]) -> io::Result<(
 #[repr(C)]
 pub(crate) struct LineValues([u8; 64]);
 
+/// `struct gpiohandle_config` (linux/gpio.h, since Linux 5.5): flags and levels of a line handle's
+/// lines.
+#[repr(C)]
+pub(crate) struct LineConfig {
+    flags: u32,
+    default_values: [u8; 64],
+    padding: [u32; 4],
+}
+
 mod request {
+    nix::ioctl_readwrite!(gpiohandle_set_config, 0xB4, 0x0a, super::LineConfig);
     nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
     nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
 }
@@ -129,6 +139,16 @@ pub(crate) fn set_line(line: BorrowedFd<'_>, value: bool) -> io::Result<()> {
     values.0[0] = value.into();
     // SAFETY: the request takes a `struct gpiohandle_data`, which lives through the call.
     unsafe { request::gpiohandle_set_line_values(line.as_raw_fd(), &mut values) }?;
+    Ok(())
+}
+
+/// Gives the only line of a handle of the GPIO character device another direction and bias
+/// (`GPIOHANDLE_REQUEST_` flags), and as an output its level.
+pub(crate) fn set_line_config(line: &impl AsRawFd, flags: u32, level: bool) -> io::Result<()> {
+    let mut config = LineConfig { flags, default_values: [0; 64], padding: [0; 4] };
+    config.default_values[0] = level.into();
+    // SAFETY: the request takes a `struct gpiohandle_config`, which lives through the call.
+    unsafe { request::gpiohandle_set_config(line.as_raw_fd(), &mut config) }?;
     Ok(())
 }
 
@@ -149,6 +169,8 @@ mod tests {
         assert_eq!(size_of::<LineValues>(), 64);
         // GPIOHANDLE_SET_LINE_VALUES_IOCTL.
         assert_eq!(nix::request_code_readwrite!(0xB4, 0x09, size_of::<LineValues>()), 0xC040_B409);
+        // GPIOHANDLE_SET_CONFIG_IOCTL.
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x0a, size_of::<LineConfig>()), 0xC054_B40A);
         // WDIOC_GETTIMEOUT.
         assert_eq!(nix::request_code_read!(b'W', 7, size_of::<i32>()), 0x8004_5707);
     }

@@ -103,16 +103,19 @@ fn a_query_without_samples_ends_the_reports() {
 }
 
 #[test]
-fn a_query_without_rest_stops_the_machine_once() {
-    let mut rig = Rig::configured(&[SENSOR]);
-    rig.send("query_analog_in oid=0 clock=@5000 sample_ticks=0 sample_count=1 rest_ticks=0 bytes_per_report=48 min_value=0 max_value=65535 range_check_count=1");
-    rig.run_until(6000);
+fn a_query_without_rest_reads_as_fast_as_the_adc_does_until_the_machine_stops() {
+    let mut rig = Rig::with_workers(3000, &[SENSOR]);
+    rig.bench.script_adc(ANALOG, &[10]);
+    rig.send("query_analog_in oid=0 clock=@5000 sample_ticks=0 sample_count=1 rest_ticks=0 bytes_per_report=1 min_value=0 max_value=65535 range_check_count=1");
+    rig.run_until(65_100);
+    assert!((18..=20).contains(&rig.responses().len()));
     rig.stall_until(6_000_000);
     rig.run_until(6_100_000);
-    assert_eq!(rig.shutdown().as_deref(), Some("Rescheduled timer in the past"));
-    rig.stall_until(12_000_000);
-    rig.run_until(12_100_000);
-    assert_eq!(rig.shutdown(), None);
+    assert_eq!(rig.shutdown(), None, "it lags behind nothing");
+    rig.send("emergency_stop");
+    rig.run_until(6_200_000);
+    assert_eq!(rig.responses(), ["shutdown clock=@6100000 static_string_id=Command request"]);
+    assert_eq!(rig.turn(), rig.mcu.next_timer(), "nothing is under way any more");
 }
 
 #[test]

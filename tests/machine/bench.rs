@@ -2,11 +2,14 @@
 //! A board that records what the machine does to its pins, and lets a test play the rest.
 
 use std::collections::{HashMap, HashSet, VecDeque};
-use std::sync::{Arc, Mutex, MutexGuard};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 
-use pinion::board::{Attachment, Bias, Board, Buffer, Device, Input, Output, Pin, PwmConfig, Range, SpiConfig};
-use pinion::mcu::{Completion, Job, Ticket, Workers};
-use pinion::shutdown::{Reason, Shutdown};
+use pinion::board::{
+    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm, PwmConfig, Range,
+    SpiConfig,
+};
+use pinion::mcu::{Completion, Job, WorkerId, Workers};
+use pinion::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion::time::{Clock, Ticks, TimeSource, VirtualClock};
 
 /// GPIO lines: pins 0 up to this.
@@ -19,13 +22,21 @@ pub const PWM: u32 = 500;
 const PWMS: u32 = 2;
 /// SPI buses: 0 up to this.
 const SPI_BUSES: u32 = 2;
+/// To break the chips of SPI bus 0 or 1: this number, and the next.
+pub const SPI_CHIPS: u32 = 600;
+/// The chip of the lines that may sleep.
+const EXPANDER: &str = "gpiochip1";
 
 /// A pin's level from an instant on, in ticks.
 pub type Edge = (u64, u8);
 
+/// Up to 64 bytes, kept without an allocation.
+type Message = ([u8; 64], usize);
+
 /// A conversation with an SPI chip.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Transfer {
+    pub at: u64,
     pub bus: u32,
     pub mode: u8,
     pub rate_hz: u32,
@@ -34,42 +45,74 @@ pub struct Transfer {
 
 #[derive(Default)]
 pub struct State {
-    /// The pins that are claimed; what they were claimed as.
-    pub claimed: HashMap<u32, &'static str>,
+    /// What each claimed pin was made last.
+    pub directions: HashMap<u32, Direction>,
+    /// Pins of chips that may sleep.
+    pub sleeping: HashSet<u32>,
+    /// Whether an errand is being run: only then may the line of such a chip be called.
+    on_worker: bool,
+    /// ADC and PWM channels in use.
+    pub claimed: HashSet<u32>,
     pub levels: HashMap<u32, bool>,
-    /// Where outputs belong if the program dies.
-    pub shutdown_values: HashMap<u32, bool>,
     /// Every change of an output, in order.
     pub edges: Vec<(u32, Edge)>,
     /// Levels of inputs from instants on.
     inputs: HashMap<u32, Vec<Edge>>,
-    pub biases: HashMap<u32, Bias>,
     /// Readings to come; the last one stays.
     readings: HashMap<u32, VecDeque<u16>>,
     /// Pins that can not be written or read any more, ADC channels too.
     pub broken: HashSet<u32>,
-    /// Bus, mode, rate and bytes of every SPI transfer.
-    transfers: Vec<(u32, u8, u32, Buffer)>,
+    /// Every SPI transfer, and when it began.
+    transfers: Vec<(u64, u32, u8, u32, Message)>,
     /// Every value of a PWM channel: pin, instant, value.
     pub pwm_values: Vec<(u32, u64, u16)>,
     /// The period of each PWM channel.
     pub pwm_cycles: HashMap<u32, u32>,
     /// How long writing a line takes.
     pub write_ticks: u32,
-    /// How long a device on a worker takes to answer; without, devices answer at once.
-    pub answer_ticks: Option<u32>,
+    /// How long a device on a worker takes to answer; at first none does.
+    pub answer_ticks: u32,
 }
 
 /// What the board, its lines, its devices and the test share.
 #[derive(Clone)]
 pub struct Bench {
     state: Arc<Mutex<State>>,
+    gate: Arc<Gate>,
     clock: VirtualClock,
     /// Instants that a test reads and writes count from here.
     origin: Clock,
 }
 
+/// Lets the SPI chips hang, in the tests that run in real time.
+#[derive(Default)]
+struct Gate {
+    /// Whether it is closed, and whether somebody waits there.
+    state: Mutex<(bool, bool)>,
+    changed: Condvar,
+}
+
+impl Gate {
+    fn pass(&self) {
+        let mut state = self.state.lock().unwrap();
+        state.1 = true;
+        state = self.changed.wait_while(state, |(closed, _)| *closed).unwrap();
+        state.1 = false;
+    }
+}
+
 impl Bench {
+    /// Lets the SPI chips hang, or lets them go on.
+    pub fn hang(&self, hang: bool) {
+        self.gate.state.lock().unwrap().0 = hang;
+        self.gate.changed.notify_all();
+    }
+
+    /// Whether a conversation hangs.
+    pub fn hangs(&self) -> bool {
+        self.gate.state.lock().unwrap().1
+    }
+
     pub fn new(clock: VirtualClock, origin: Clock) -> Bench {
         // Room enough: the bench does not allocate later, see tests/no_allocation.rs.
         let state = State {
@@ -78,7 +121,7 @@ impl Bench {
             pwm_values: Vec::with_capacity(256),
             ..State::default()
         };
-        Bench { state: Arc::new(Mutex::new(state)), clock, origin }
+        Bench { state: Arc::new(Mutex::new(state)), gate: Arc::default(), clock, origin }
     }
 
     fn ticks(&self) -> u64 {
@@ -103,9 +146,9 @@ impl Bench {
 
     /// Every SPI transfer so far.
     pub fn transfers(&self) -> Vec<Transfer> {
-        let transfer = |&(bus, mode, rate_hz, data): &(u32, u8, u32, Buffer)| {
-            let data = data.as_slice().to_vec();
-            Transfer { bus, mode, rate_hz, data }
+        let transfer = |&(at, bus, mode, rate_hz, (bytes, len)): &(u64, u32, u8, u32, Message)| {
+            let data = bytes[..len].to_vec();
+            Transfer { at, bus, mode, rate_hz, data }
         };
         self.state().transfers.iter().map(transfer).collect()
     }
@@ -119,6 +162,14 @@ impl Bench {
         self.state().levels[&pin]
     }
 
+    /// Where an output belongs if the program dies.
+    pub fn shutdown_level(&self, pin: u32) -> bool {
+        match self.state().directions[&pin] {
+            Direction::Output { shutdown_level, .. } => shutdown_level,
+            input => panic!("pin {pin} is {input:?}"),
+        }
+    }
+
     /// Lets an input change at instants in the future.
     pub fn script_input(&self, pin: u32, levels: &[Edge]) {
         self.state().inputs.entry(pin).or_default().extend(levels);
@@ -129,39 +180,26 @@ impl Bench {
         self.state().readings.insert(pin, values.iter().copied().collect());
     }
 
-    fn claim(
-        &self,
-        pin: Pin,
-        known: std::ops::Range<u32>,
-        unknown: Reason,
-        use_: &'static str,
-    ) -> Result<u32, Shutdown> {
-        let mut state = self.state();
+    /// Claims an ADC or PWM channel.
+    fn claim(&self, pin: Pin, known: std::ops::Range<u32>, unknown: ShutdownReason) -> Result<u32, Shutdown> {
         if !known.contains(&pin.0) {
             let detail = format!("the bench has no pin {}: choose one of {} to {}", pin.0, known.start, known.end - 1);
             return Err(Shutdown::because(unknown, detail));
         }
-        if let Some(other) = state.claimed.get(&pin.0) {
-            let reason = if use_ == "input" { Reason::InputLine } else { Reason::OutputLine };
-            let detail = format!("pin {} is in use as {other}: choose another pin", pin.0);
-            return Err(Shutdown::because(reason, detail));
-        }
-        state.claimed.insert(pin.0, use_);
+        self.state().claimed.insert(pin.0);
         Ok(pin.0)
     }
 
-    fn broken(&self, pin: u32, reason: Reason) -> Result<(), Shutdown> {
+    /// The core never waits for a chip that may sleep.
+    fn may_call(&self, pin: u32) {
+        let state = self.state();
+        assert!(state.on_worker || !state.sleeping.contains(&pin), "the core itself calls pin {pin}");
+    }
+
+    fn broken(&self, pin: u32, reason: ShutdownReason) -> Result<(), Shutdown> {
         match self.state().broken.contains(&pin) {
             true => Err(Shutdown::because(reason, format!("pin {pin} is gone: plug it in again"))),
             false => Ok(()),
-        }
-    }
-
-    fn attachment(&self, bus: &str, device: impl Device + 'static) -> Attachment {
-        let device = Box::new(device);
-        match self.state().answer_ticks {
-            Some(_) => Attachment::Worker { bus: bus.into(), device },
-            None => Attachment::Inline(device),
         }
     }
 }
@@ -186,44 +224,47 @@ impl Board for FakeBoard {
         vec![Range { name: "spi0".into(), first: 0, count: SPI_BUSES }]
     }
 
-    fn output(&mut self, pin: Pin, value: bool, shutdown_value: bool) -> Result<Box<dyn Output>, Shutdown> {
-        let pin = self.0.claim(pin, 0..GPIOS, Reason::NotOutput, "output")?;
-        let mut state = self.0.state();
-        state.levels.insert(pin, value);
-        state.shutdown_values.insert(pin, shutdown_value);
-        Ok(Box::new(FakeOutput { bench: self.0.clone(), pin }))
+    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
+        let Pin(number) = pin;
+        if number >= GPIOS {
+            let detail = format!("the bench has no pin {number}: choose one of 0 to {}", GPIOS - 1);
+            let unknown = match direction {
+                Direction::Output { .. } => reason::NOT_OUTPUT,
+                Direction::Input(_) => reason::NOT_INPUT,
+            };
+            return Err(Shutdown::because(unknown, detail));
+        }
+        let line = FakeLine { bench: self.0.clone(), pin: number };
+        line.set_direction(direction)?;
+        let sleeps_on = self.0.state().sleeping.contains(&number).then(|| EXPANDER.to_owned());
+        Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
     }
 
-    fn input(&mut self, pin: Pin, bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
-        let pin = self.0.claim(pin, 0..GPIOS, Reason::NotInput, "input")?;
-        self.0.state().biases.insert(pin, bias);
-        Ok(Box::new(FakeInput { bench: self.0.clone(), pin }))
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
+        let pin = self.0.claim(pin, ANALOG..ANALOG + ANALOGS, reason::ADC_OPEN)?;
+        Ok(OnWorker { bus: "iio".into(), device: Box::new(FakeAdc { bench: self.0.clone(), pin }) })
     }
 
-    fn adc(&mut self, pin: Pin) -> Result<Attachment, Shutdown> {
-        let pin = self.0.claim(pin, ANALOG..ANALOG + ANALOGS, Reason::AdcOpen, "ADC channel")?;
-        Ok(self.0.attachment("iio", FakeAdc { bench: self.0.clone(), pin }))
-    }
-
-    fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown> {
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         if config.bus >= SPI_BUSES {
             let detail = format!("the bench has no SPI bus {}: choose spi0 or spi1", config.bus);
-            return Err(Shutdown::because(Reason::SpiOpen, detail));
+            return Err(Shutdown::because(reason::SPI_OPEN, detail));
         }
         let bus = format!("spi{}", config.bus);
-        Ok(self.0.attachment(&bus, FakeSpi { bench: self.0.clone(), config }))
+        Ok(OnWorker { bus, device: Box::new(FakeSpi { bench: self.0.clone(), config }) })
     }
 
-    fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown> {
-        let pin = self.0.claim(config.pin, PWM..PWM + PWMS, Reason::PwmConfig, "PWM channel")?;
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
+        let pin = self.0.claim(config.pin, PWM..PWM + PWMS, reason::PWM_CONFIG)?;
         let mut pwm = FakePwm { bench: self.0.clone(), pin };
-        self.0.state().pwm_cycles.insert(pin, config.cycle.0);
-        pwm.run(&mut Buffer::new(&config.value.to_le_bytes()))?;
-        Ok(self.0.attachment("pwm", pwm))
+        pwm.set_cycle(config.cycle, config.value)?;
+        Ok(OnWorker { bus: "pwm".into(), device: Box::new(pwm) })
     }
 
     fn reset(&mut self) {
-        self.0.state().claimed.clear();
+        let mut state = self.0.state();
+        state.claimed.clear();
+        state.directions.clear();
     }
 }
 
@@ -232,49 +273,59 @@ struct FakePwm {
     pin: u32,
 }
 
-impl Device for FakePwm {
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-        self.bench.broken(self.pin, Reason::PwmWrite)?;
+impl Pwm for FakePwm {
+    fn set(&mut self, value: u16) -> Result<(), Shutdown> {
+        self.bench.broken(self.pin, reason::PWM_WRITE)?;
         let at = self.bench.ticks();
-        let (value, cycle) = data.as_slice().split_at(2);
-        let mut state = self.bench.state();
-        state.pwm_values.push((self.pin, at, u16::from_le_bytes(value.try_into().unwrap())));
-        if !cycle.is_empty() {
-            state.pwm_cycles.insert(self.pin, u32::from_le_bytes(cycle.try_into().unwrap()));
-        }
+        self.bench.state().pwm_values.push((self.pin, at, value));
         Ok(())
+    }
+
+    fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
+        self.bench.state().pwm_cycles.insert(self.pin, cycle.0);
+        self.set(value)
     }
 }
 
-struct FakeOutput {
+struct FakeLine {
     bench: Bench,
     pin: u32,
 }
 
-impl Output for FakeOutput {
-    fn write(&mut self, value: bool) -> Result<(), Shutdown> {
-        self.bench.broken(self.pin, Reason::LineWrite)?;
+impl Line for FakeLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        self.bench.may_call(self.pin);
+        self.bench.broken(self.pin, reason::LINE_WRITE)?;
         let mut state = self.bench.state();
-        if state.levels.insert(self.pin, value) != Some(value) {
-            state.edges.push((self.pin, (self.bench.ticks(), value.into())));
+        if matches!(state.directions.get(&self.pin), Some(Direction::Input(_))) {
+            return Ok(());
+        }
+        if state.levels.insert(self.pin, level) != Some(level) {
+            state.edges.push((self.pin, (self.bench.ticks(), level.into())));
         }
         self.bench.clock.set(self.bench.clock.now() + Ticks(state.write_ticks));
         Ok(())
     }
-}
 
-struct FakeInput {
-    bench: Bench,
-    pin: u32,
-}
-
-impl Input for FakeInput {
-    fn read(&mut self) -> Result<bool, Shutdown> {
-        self.bench.broken(self.pin, Reason::LineRead)?;
+    fn read(&self) -> Result<bool, Shutdown> {
+        self.bench.may_call(self.pin);
+        self.bench.broken(self.pin, reason::LINE_READ)?;
         let now = self.bench.ticks();
         let state = self.bench.state();
         let levels = state.inputs.get(&self.pin).map_or(&[][..], Vec::as_slice);
         Ok(levels.iter().rev().find(|(from, _)| *from <= now).is_some_and(|(_, level)| *level != 0))
+    }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let mut state = self.bench.state();
+        let before = state.directions.insert(self.pin, direction);
+        if let Direction::Output { level, .. } = direction {
+            let was = state.levels.insert(self.pin, level);
+            if before.is_some() && was != Some(level) {
+                state.edges.push((self.pin, (self.bench.ticks(), level.into())));
+            }
+        }
+        Ok(())
     }
 }
 
@@ -283,17 +334,15 @@ struct FakeAdc {
     pin: u32,
 }
 
-impl Device for FakeAdc {
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-        self.bench.broken(self.pin, Reason::AdcRead)?;
+impl Adc for FakeAdc {
+    fn read(&mut self) -> Result<u16, Shutdown> {
+        self.bench.broken(self.pin, reason::ADC_READ)?;
         let mut state = self.bench.state();
-        let value = match state.readings.get_mut(&self.pin) {
+        Ok(match state.readings.get_mut(&self.pin) {
             Some(readings) if readings.len() > 1 => readings.pop_front().unwrap(),
             Some(readings) => readings.front().copied().unwrap_or(0),
             None => 0,
-        };
-        *data = Buffer::new(&value.to_le_bytes());
-        Ok(())
+        })
     }
 }
 
@@ -303,22 +352,28 @@ struct FakeSpi {
     config: SpiConfig,
 }
 
-impl Device for FakeSpi {
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-        if let Some(chip_select) = &mut self.config.chip_select {
-            chip_select.select(true)?;
-        }
+impl BusDevice for FakeSpi {
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+        let failed = |failure: Shutdown| BusError { status: BusStatus::Failed, detail: failure.detail };
         let SpiConfig { bus, mode, rate_hz, .. } = self.config;
-        self.bench.state().transfers.push((bus, mode, rate_hz, *data));
-        data.as_mut_slice().iter_mut().for_each(|byte| *byte = !*byte);
-        if let Some(chip_select) = &mut self.config.chip_select {
-            chip_select.select(false)?;
+        self.bench.gate.pass();
+        self.bench.broken(SPI_CHIPS + bus, reason::LINE_READ).map_err(failed)?;
+        if let Some(chip_select) = &self.config.chip_select {
+            chip_select.select(true).map_err(failed)?;
+        }
+        let mut message = ([0; 64], bytes.len());
+        message.0[..bytes.len()].copy_from_slice(bytes);
+        let at = self.bench.ticks();
+        self.bench.state().transfers.push((at, bus, mode, rate_hz, message));
+        bytes.iter_mut().for_each(|byte| *byte = !*byte);
+        if let Some(chip_select) = &self.config.chip_select {
+            chip_select.select(false).map_err(failed)?;
         }
         Ok(())
     }
 }
 
-/// Workers in virtual time: one job of a bus after the other, each takes its time.
+/// Workers in virtual time: one errand of a bus after the other, each takes its time.
 #[derive(Clone)]
 pub struct FakeWorkers {
     bench: Bench,
@@ -326,18 +381,16 @@ pub struct FakeWorkers {
 }
 
 struct Shop {
-    /// Each device and the number of its bus.
-    devices: Vec<(usize, Box<dyn Device>)>,
     /// Each bus, and when it is free again.
     buses: Vec<(String, Clock)>,
-    /// In the order of their ends.
-    ends: VecDeque<(Clock, usize, Ticket, Buffer)>,
+    /// In the order of their ends: when an errand began and ends.
+    under_way: VecDeque<(Clock, Clock, Job)>,
 }
 
 impl Shop {
-    /// Room for more jobs than a test asks for: the bench does not allocate later.
+    /// Room for more errands than a test sends: the bench does not allocate later.
     fn new() -> Shop {
-        Shop { devices: Vec::new(), buses: Vec::new(), ends: VecDeque::with_capacity(256) }
+        Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256) }
     }
 }
 
@@ -346,48 +399,45 @@ impl FakeWorkers {
         FakeWorkers { bench, shop: Arc::new(Mutex::new(Shop::new())) }
     }
 
-    /// When the next answer comes.
+    /// When the next errand is done.
     pub fn next_end(&self) -> Option<Clock> {
-        self.shop.lock().unwrap().ends.front().map(|(end, ..)| *end)
+        self.shop.lock().unwrap().under_way.front().map(|(_, end, _)| *end)
     }
 }
 
 impl Workers for FakeWorkers {
-    fn attach(&mut self, bus: &str, device: Box<dyn Device>) -> Result<usize, Shutdown> {
+    fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         let mut shop = self.shop.lock().unwrap();
-        let number = shop.buses.iter().position(|(name, _)| name == bus).unwrap_or_else(|| {
+        let known = shop.buses.iter().position(|(name, _)| name == bus);
+        Ok(WorkerId(known.unwrap_or_else(|| {
             shop.buses.push((bus.into(), Clock::EPOCH));
             shop.buses.len() - 1
-        });
-        shop.devices.push((number, device));
-        Ok(shop.devices.len() - 1)
+        })))
     }
 
-    fn submit(&mut self, job: Job) -> Result<(), Shutdown> {
-        let takes = Ticks(self.bench.state().answer_ticks.unwrap_or(0));
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Shutdown> {
+        let takes = Ticks(self.bench.state().answer_ticks);
         let mut shop = self.shop.lock().unwrap();
-        let shop = &mut *shop;
-        let begin = self.bench.clock.now();
-        let free = &mut shop.buses[shop.devices[job.device].0].1;
-        let end = begin.max(*free) + takes;
+        let free = &mut shop.buses[worker].1;
+        let begin = self.bench.clock.now().max(*free);
+        let end = begin + takes;
         *free = end;
-        let place = shop.ends.partition_point(|(other, ..)| *other <= end);
-        shop.ends.insert(place, (end, job.device, job.ticket, job.data));
+        let place = shop.under_way.partition_point(|(_, other, _)| *other <= end);
+        shop.under_way.insert(place, (begin, end, job));
         Ok(())
     }
 
-    fn has_room(&self) -> bool {
-        true
-    }
-
+    /// What an errand does to its device it does at its end.
     fn completion(&mut self) -> Option<Completion> {
         if !self.has_completion() {
             return None;
         }
-        let mut shop = self.shop.lock().unwrap();
-        let (_, device, ticket, mut data) = shop.ends.pop_front()?;
-        let result = shop.devices[device].1.run(&mut data).map(|()| data);
-        Some(Completion { ticket, result })
+        let (began, ended, mut job) = self.shop.lock().unwrap().under_way.pop_front()?;
+        self.bench.state().on_worker = true;
+        job.errand.run();
+        self.bench.state().on_worker = false;
+        let Job { ticket, errand, holds } = job;
+        Some(Completion { ticket, errand, holds, began, ended })
     }
 
     fn has_completion(&self) -> bool {

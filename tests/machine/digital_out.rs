@@ -239,7 +239,7 @@ fn a_shutdown_drives_every_output_to_its_default() {
     rig.run_until(100_000);
     assert_eq!([20, 21, 22].map(|pin| rig.bench.level(pin)), [true, false, true]);
     // The guardian knows the same values.
-    assert_eq!([20, 21, 22].map(|pin| rig.bench.state().shutdown_values[&pin]), [true, false, true]);
+    assert_eq!([20, 21, 22].map(|pin| rig.bench.shutdown_level(pin)), [true, false, true]);
 }
 
 #[test]
@@ -286,16 +286,28 @@ fn a_pin_that_is_set_once_stays_and_may_be_set_again() {
     assert!(!rig.bench.level(31));
 }
 
-/// The guardian knows the line by the value that it was set to.
 #[test]
-fn a_pin_that_is_set_once_is_not_taken_over_by_an_output_that_belongs_elsewhere() {
+fn a_pin_that_is_set_once_belongs_where_the_output_that_takes_it_does() {
     let mut rig = Rig::new();
+    rig.send("set_digital_out pin=30 value=1");
+    rig.configure(&["config_digital_out oid=0 pin=30 value=1 default_value=0 max_duration=0"]);
+    assert!(!rig.bench.shutdown_level(30));
+    rig.send("emergency_stop");
+    assert!(!rig.bench.level(30));
+}
+
+/// klippy's `[duplicate_pin_override]`: two users of one line.
+#[test]
+fn two_outputs_may_share_a_line() {
+    let mut rig = Rig::configured(&[FAN, "config_digital_out oid=1 pin=20 value=0 default_value=0 max_duration=0"]);
     rig.send_all(&[
-        "allocate_oids count=1",
-        "set_digital_out pin=30 value=1",
-        "config_digital_out oid=0 pin=30 value=0 default_value=0 max_duration=0",
+        "update_digital_out oid=0 value=1",
+        "update_digital_out oid=1 value=0",
+        "update_digital_out oid=0 value=1",
     ]);
-    expect_shutdown(&rig, "Unable to open out GPIO chip line");
+    assert_eq!(rig.edges(PIN), [(0, 1), (0, 0), (0, 1)]);
+    rig.send("emergency_stop");
+    assert!(!rig.bench.level(PIN));
 }
 
 #[test]

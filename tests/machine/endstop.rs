@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Homing: an endstop is sampled, a trsync is triggered, steppers stop.
 
-use pinion::board::Bias;
+use pinion::board::{Bias, Direction};
 
 use crate::rig::Rig;
 
@@ -205,7 +205,7 @@ fn a_search_without_rest_stops_the_machine_once_it_is_behind() {
 fn the_bias_reaches_the_board() {
     for (pull_up, bias) in [(1, Bias::PullUp), (0, Bias::None), (-1, Bias::PullDown)] {
         let rig = Rig::configured(&[&format!("config_endstop oid=2 pin=10 pull_up={pull_up}")]);
-        assert_eq!(rig.bench.state().biases[&SWITCH], bias);
+        assert_eq!(rig.bench.state().directions[&SWITCH], Direction::Input(bias));
     }
 }
 

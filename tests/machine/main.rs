@@ -7,12 +7,15 @@
 mod bench;
 #[allow(dead_code)]
 mod rig;
+mod safe_ends;
+mod sleeping_lines;
 
 mod analog_in;
 mod any_bytes;
 mod base;
 mod digital_out;
 mod endstop;
+mod one_order;
 mod pwm_out;
 mod remedies;
 mod spi;

@@ -60,33 +60,42 @@ fn a_channel_that_fails_stops_the_machine() {
     rig.run_until(2_000);
     assert_eq!(rig.shutdown().as_deref(), Some("PWM write failed"));
     let notes = rig.notes();
-    assert!(notes.iter().any(|note| note.starts_with("trouble: PWM write failed")), "it is still on: {notes:?}");
+    let told = notes.iter().any(|note| note.starts_with("trouble: PWM write failed: PWM output oid 0 (pwm0)"));
+    assert!(told, "it is still on: {notes:?}");
 }
 
 const SECOND: &str = "config_pwm_out oid=1 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0";
 const SET: &str = "set_pwm_out pin=500 cycle_ticks=50000 value=100";
 
+/// Klipper allows that with `[duplicate_pin_override]`, and its firmware opens the channel anew.
 #[test]
-fn a_channel_is_not_claimed_twice() {
-    for (commands, first, second) in [
-        ([HEATER, SECOND], "PWM output oid 0", "PWM output oid 1"),
-        ([SET, SECOND], "set_pwm_out", "PWM output oid 1"),
-        ([HEATER, SET], "PWM output oid 0", "set_pwm_out"),
-    ] {
-        let mut rig = Rig::new();
-        rig.send("allocate_oids count=2");
-        rig.send_all(&commands);
-        assert_eq!(rig.shutdown().as_deref(), Some("Unable to config pwm device"));
-        let notes = rig.notes();
-        let named = |note: &String| ["pwm0", first, second, "another pin"].iter().all(|word| note.contains(word));
-        assert!(notes.iter().any(named), "{notes:?}");
+fn two_objects_may_have_one_channel() {
+    let mut rig = Rig::configured(&[HEATER, SECOND]);
+    values(&rig);
+    rig.send_all(&["queue_pwm_out oid=0 clock=@1000 value=5", "queue_pwm_out oid=1 clock=@2000 value=7"]);
+    rig.run_until(3000);
+    assert_eq!(values(&rig), [(1000, 5), (2000, 7)]);
+    rig.send("emergency_stop");
+    rig.run_until(4000);
+    assert_eq!(values(&rig), [(3000, 0), (3000, 0)]);
+}
+
+#[test]
+fn values_that_come_faster_than_the_driver_writes_are_out_of_date_and_left_out() {
+    let mut rig = Rig::with_workers(5000, &[HEATER]);
+    values(&rig);
+    for n in 1..=9 {
+        rig.send(&format!("queue_pwm_out oid=0 clock=@{} value={n}", 1000 * n));
     }
+    rig.run_until(50_000);
+    assert_eq!(values(&rig), [(6000, 1), (11_000, 6), (16_000, 9)]);
+    assert_eq!(rig.shutdown(), None);
 }
 
 #[test]
 fn a_channel_that_is_set_once_stays_and_may_be_set_again() {
     let mut rig = Rig::new();
-    rig.bench.state().answer_ticks = Some(2000);
+    rig.bench.state().answer_ticks = 2000;
     rig.configure(&[SET, "set_pwm_out pin=500 cycle_ticks=50000 value=200"]);
     rig.run_until(10_000);
     rig.send("set_pwm_out pin=500 cycle_ticks=20000 value=300");
@@ -94,8 +103,8 @@ fn a_channel_that_is_set_once_stays_and_may_be_set_again() {
     rig.send("emergency_stop");
     rig.run_until(30_000);
     assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
-    // The first value is that of the claim, the others come from the worker.
-    assert_eq!(values(&rig), [(0, 100), (2000, 200), (12_000, 300)]);
+    // Before finalize_config the channel is set up anew, afterwards a worker sets it.
+    assert_eq!(values(&rig), [(0, 100), (0, 200), (12_000, 300)]);
     assert_eq!(rig.bench.state().pwm_cycles[&PWM], 20_000);
 }
 

@@ -37,7 +37,6 @@ fn the_log_names_the_thing_and_the_remedy() {
         ),
         (&["config_endstop oid=3 pin=400 pull_up=0"], &[], "pin 400", "choose"),
         (&["config_analog_in oid=3 pin=7"], &[], "pin 7", "choose"),
-        (&[STEPPER, "config_endstop oid=3 pin=2 pull_up=0"], &[], "pin 2 is in use as output", "another pin"),
         // Objects.
         (&["config_trsync oid=10"], &[], "oid 10", "FIRMWARE_RESTART"),
         (&["config_trsync oid=9", "config_trsync oid=9"], &[], "oid 9", "FIRMWARE_RESTART"),
@@ -111,7 +110,6 @@ fn the_log_names_the_thing_and_the_remedy() {
             "oid 6",
             "max_duration of 1 ms",
         ),
-        (&[PWM, "set_pwm_out pin=500 cycle_ticks=1 value=1"], &[], "pwm0", "another pin"),
         (&[], &["set_pwm_out pin=501 cycle_ticks=1 value=1"], "pwm1", "FIRMWARE_RESTART"),
         (&[], &["set_digital_out pin=77 value=1"], "gpio77", "FIRMWARE_RESTART"),
         // Analog inputs.

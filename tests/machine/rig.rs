@@ -38,6 +38,7 @@ impl Outbox for FakeOutbox {
             Note::Shutdown(shutdown) => format!("shutdown: {shutdown}"),
             Note::Trouble(shutdown) => format!("trouble: {shutdown}"),
             Note::Configured(kinds) => format!("configured: {kinds:?}"),
+            Note::Safe(name) => format!("safe: {name}"),
             Note::Lateness(..) => return,
             Note::Reset => "reset".into(),
         };
@@ -99,7 +100,7 @@ impl Rig {
     /// As [`Rig::configured`], with devices that take `answer_ticks` on a worker.
     pub fn with_workers(answer_ticks: u32, commands: &[&str]) -> Rig {
         let mut rig = Rig::new();
-        rig.bench.state().answer_ticks = Some(answer_ticks);
+        rig.bench.state().answer_ticks = answer_ticks;
         rig.configure(commands);
         rig
     }
@@ -203,12 +204,22 @@ impl Rig {
         commands.iter().for_each(|command| self.send(command));
     }
 
-    /// Runs the commands of a block's payload.
+    /// Runs one command, and returns before the conversation that it may have begun is over.
+    pub fn begin(&mut self, command: &str) {
+        let payload = self.encode(command);
+        self.mcu.execute(&mut Reader::new(&payload));
+    }
+
+    /// Runs the commands of a block's payload, each to the end of the conversation that it began.
     #[inline]
     pub fn execute(&mut self, payload: &[u8]) {
         let mut reader = Reader::new(payload);
         while !reader.is_empty() {
             self.mcu.execute(&mut reader);
+            while self.mcu.is_held() {
+                let next = self.turn();
+                self.clock.set(next.filter(|_| self.mcu.is_held()).unwrap_or(self.clock.now()));
+            }
         }
     }
 

@@ -23,7 +23,7 @@ fn a_transfer_has_the_devices_mode_and_rate_and_its_answer() {
     assert_eq!(rig.ask("spi_transfer oid=0 data=00ff0f"), "spi_transfer_response oid=0 response=ff00f0");
     assert_eq!(rig.ask("spi_transfer oid=0 data="), "spi_transfer_response oid=0 response=");
     assert_eq!(rig.ask("spi_send oid=0 data=aa"), "");
-    let transfer = |data: &[u8]| Transfer { bus: 1, mode: 3, rate_hz: 5_000_000, data: data.into() };
+    let transfer = |data: &[u8]| Transfer { at: 0, bus: 1, mode: 3, rate_hz: 5_000_000, data: data.into() };
     assert_eq!(rig.bench.transfers(), [transfer(&[0, 0xff, 0x0f]), transfer(&[]), transfer(&[0xaa])]);
 }
 
@@ -35,63 +35,17 @@ fn the_chip_select_idles_and_is_driven_for_the_transfer() {
             "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
         ]);
         assert_eq!(rig.bench.level(CS), active_high == 0);
-        assert_eq!(rig.bench.state().shutdown_values[&CS], active_high == 0);
+        assert_eq!(rig.bench.shutdown_level(CS), active_high == 0);
         rig.send("spi_send oid=0 data=01");
         assert_eq!(rig.edges(CS), [(0, selected), (0, 1 - selected)]);
     }
 }
 
 #[test]
-fn answers_come_in_order_when_the_bus_takes_its_time() {
-    let mut rig = Rig::with_workers(
-        2000,
-        &[
-            "config_spi_without_cs oid=0",
-            "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
-            "config_spi oid=1 pin=40 cs_active_high=0",
-            "spi_set_bus oid=1 spi_bus=0 mode=1 rate=1000000",
-        ],
-    );
-    let block: Vec<u8> = (0..4).flat_map(|n| rig.encode(&format!("spi_transfer oid={} data=0{n}", n % 2))).collect();
-    rig.execute(&block);
-    assert_eq!(rig.responses(), [""; 0]);
-    // Three answers are there when the machine comes to look.
-    rig.stall_until(7999);
-    rig.run_until(7999);
-    assert_eq!(
-        rig.responses(),
-        [
-            "spi_transfer_response oid=0 response=ff",
-            "spi_transfer_response oid=1 response=fe",
-            "spi_transfer_response oid=0 response=fd",
-        ]
-    );
-    rig.run_until(8000);
-    assert_eq!(rig.responses(), ["spi_transfer_response oid=1 response=fc"]);
-}
-
-#[test]
-fn a_slow_bus_delays_no_step() {
-    let mut rig = Rig::with_workers(
-        200_000,
-        &[
-            "config_spi_without_cs oid=0",
-            "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
-            "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0",
-        ],
-    );
-    rig.send_all(&["reset_step_clock oid=1 clock=@0", "queue_step oid=1 interval=1000 count=1000 add=0"]);
-    rig.send_all(&["spi_transfer oid=0 data=00"; 5]);
-    rig.run_until(1_000_000);
-    assert_eq!(rig.responses().len(), 5);
-    assert!(rig.edges(1).iter().zip(1..).all(|((at, _), n)| *at == 1000 * n));
-}
-
-#[test]
 fn a_device_gets_its_message_at_a_shutdown_and_says_nothing() {
-    for workers in [None, Some(500)] {
+    for answer_ticks in [0, 500] {
         let mut rig = Rig::new();
-        rig.bench.state().answer_ticks = workers;
+        rig.bench.state().answer_ticks = answer_ticks;
         rig.configure(&[
             "config_spi oid=0 pin=40 cs_active_high=0",
             "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
@@ -136,5 +90,5 @@ fn a_chip_select_that_fails_stops_the_machine() {
     ]);
     rig.bench.state().broken.insert(CS);
     rig.send("spi_transfer oid=0 data=01");
-    assert_eq!(rig.responses(), ["shutdown clock=@0 static_string_id=GPIO line write failed"]);
+    assert_eq!(rig.responses(), ["shutdown clock=@0 static_string_id=Unable to issue spi ioctl"]);
 }

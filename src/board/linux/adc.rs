@@ -12,11 +12,9 @@ use std::path::Path;
 
 use industrial_io::{Backend, Context};
 
-use crate::board::{Buffer, Device};
-use crate::shutdown::{Reason, Shutdown};
+use crate::board::{self, ADC_MAX};
+use crate::shutdown::{Shutdown, reason};
 
-/// What the host takes for full scale.
-pub const ADC_MAX: u16 = 4095;
 /// What the C program assumes of every channel.
 const ASSUMED: Format = Format { bits: 12, signed: false };
 
@@ -163,18 +161,17 @@ impl Reader {
     }
 
     /// A reading in counts of 0 to [`ADC_MAX`].
-    pub fn read(&self) -> Result<u16, Shutdown> {
+    pub fn read_counts(&self) -> Result<u16, Shutdown> {
         match self.read_raw() {
             Ok(raw) => Ok(self.format.unwrap_or(ASSUMED).scale(raw)),
-            Err(error) => Err(Shutdown::because(Reason::AdcRead, read_failure(&self.subject, &error.to_string()))),
+            Err(error) => Err(Shutdown::because(reason::ADC_READ, read_failure(&self.subject, &error.to_string()))),
         }
     }
 }
 
-impl Device for Reader {
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-        *data = Buffer::new(&self.read()?.to_le_bytes());
-        Ok(())
+impl board::Adc for Reader {
+    fn read(&mut self) -> Result<u16, Shutdown> {
+        self.read_counts()
     }
 }
 

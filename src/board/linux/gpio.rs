@@ -12,15 +12,18 @@ use std::error::Error as _;
 use std::fmt;
 use std::fs;
 use std::io;
-use std::os::fd::{AsRawFd, RawFd};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use gpio_cdev::{LineDirection, LineHandle, LineRequestFlags};
 use nix::unistd::{Gid, Group, User, geteuid};
 
-use crate::board::{Bias, Input, Output};
-use crate::shutdown::{Reason, Shutdown};
+use super::guard::SharedGuard;
+use crate::board::{Bias, Direction, Line};
+use crate::shutdown::{Shutdown, ShutdownReason, reason};
+use crate::sys;
 
 /// What the kernel shows as the holder of our lines.
 const CONSUMER: &str = "pinion";
@@ -29,6 +32,11 @@ const PULL_UP: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 5);
 const PULL_DOWN: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 6);
 /// What a driver answers for what it does not have (include/linux/errno.h).
 const ENOTSUPP: i32 = 524;
+/// Subsystems whose devices are spoken to by messages, for which a driver waits.
+const SLEEPING_BUSES: [&str; 7] = ["i2c", "spi", "usb", "hid", "serial", "virtio", "w1"];
+/// Labels of chips that are no such devices and wait all the same: that of the Raspberry Pi 3 and 4
+/// asks the firmware (drivers/gpio/gpio-raspberrypi-exp.c, `can_sleep`).
+const SLEEPING_LABELS: [&str; 1] = ["raspberrypi-exp-gpio"];
 /// Labels' beginnings of chips whose drivers lack a resistor, and which they lack.
 const WITHOUT_BIAS: [(&str, &[Bias]); 4] = [
     ("raspberrypi-exp-gpio", &[Bias::PullUp, Bias::PullDown]),
@@ -45,12 +53,12 @@ pub struct Chip {
     /// The driver's label, such as `pinctrl-bcm2835`.
     pub label: String,
     /// Its lines by offset.
-    pub lines: Vec<Line>,
+    pub lines: Vec<LineInfo>,
 }
 
 /// A line as it was found.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Line {
+pub struct LineInfo {
     /// The board's name for it.
     pub name: Option<String>,
     /// Whether it drives.
@@ -102,11 +110,11 @@ fn node(dev: &Path, number: u32) -> PathBuf {
     dev.join(format!("gpiochip{number}"))
 }
 
-fn look_at(line: &gpio_cdev::Line) -> Line {
+fn look_at(line: &gpio_cdev::Line) -> LineInfo {
     // A line that tells nothing is still a line.
     line.info().map_or_else(
-        |_| Line::default(),
-        |info| Line {
+        |_| LineInfo::default(),
+        |info| LineInfo {
             name: info.name().map(str::to_owned),
             output: info.direction() == LineDirection::Out,
             // The flag says "in use", by the kernel or by a program.
@@ -114,6 +122,12 @@ fn look_at(line: &gpio_cdev::Line) -> Line {
             consumer: info.consumer().map(str::to_owned),
         },
     )
+}
+
+/// The number of the chip that `/dev/gpiochip<number>` leads to, if it is a link to another.
+pub fn number_behind(dev: &Path, number: u32) -> Option<u32> {
+    let target = fs::read_link(node(dev, number)).ok()?;
+    target.file_name()?.to_str()?.strip_prefix("gpiochip")?.parse().ok()
 }
 
 /// A line of an open chip.
@@ -124,11 +138,11 @@ pub struct Handle {
 
 /// Opens `/dev/gpiochip<number>` and picks a line. `refused` is the reason if the chip has no
 /// such line.
-pub fn open(dev: &Path, number: u32, offset: u32, refused: Reason) -> Result<Handle, Shutdown> {
+pub fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Result<Handle, Shutdown> {
     let path = node(dev, number);
     let mut chip = gpio_cdev::Chip::new(&path).map_err(|error| match errno(&error) {
-        libc::ENOENT => Shutdown::because(Reason::ChipMissing, missing(&path, &scan(dev).0)),
-        code => Shutdown::because(Reason::ChipOpen, cannot_open(&path, code)),
+        libc::ENOENT => Shutdown::because(reason::CHIP_MISSING, missing(&path, &scan(dev).0)),
+        code => Shutdown::because(reason::CHIP_OPEN, cannot_open(&path, code)),
     })?;
     let subject = Subject { chip: chip.name().to_owned(), label: chip.label().to_owned(), offset, name: None };
     let lines = chip.num_lines();
@@ -138,86 +152,110 @@ pub fn open(dev: &Path, number: u32, offset: u32, refused: Reason) -> Result<Han
 }
 
 impl Handle {
-    /// The line's identity, by whatever number it was asked for.
-    pub fn key(&self) -> (String, u32) {
-        (self.subject.chip.clone(), self.subject.offset)
+    /// The chip's name, such as `gpiochip0`, by whatever name it was opened.
+    pub fn chip(&self) -> &str {
+        &self.subject.chip
     }
 
-    /// For errors about this line.
-    pub fn subject(&self) -> &Subject {
-        &self.subject
+    /// The chip's label, such as `pinctrl-bcm2835`.
+    pub fn label(&self) -> &str {
+        &self.subject.label
     }
 
-    /// Takes the line as an output that stands at `value` from the first.
-    pub fn output(self, value: bool) -> Result<OutputLine, Shutdown> {
+    /// Takes the line; an output is given to the guardian. `sleeping` names the line's chip if
+    /// calls to it may take their time.
+    pub(super) fn request(
+        self,
+        direction: Direction,
+        guard: SharedGuard,
+        sleeping: Option<String>,
+    ) -> Result<HeldLine, Shutdown> {
+        let Setting { flags, level, refused } = self.subject.setting(direction)?;
         let handle = self
             .line
-            .request(LineRequestFlags::OUTPUT, value.into(), CONSUMER)
-            .map_err(|error| self.refusal(Reason::OutputLine, errno(&error), Bias::None))?;
-        Ok(OutputLine { handle, subject: self.subject })
+            .request(flags, level.into(), CONSUMER)
+            .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
+        let is_output = AtomicBool::new(false);
+        let line = HeldLine { handle, line: self.line, subject: self.subject, is_output, guard, sleeping };
+        line.watch_over(direction)?;
+        Ok(line)
     }
+}
 
-    /// Takes the line as an input.
-    pub fn input(self, bias: Bias) -> Result<InputLine, Shutdown> {
-        if lacks(&self.subject.label, bias) {
-            return Err(Shutdown::because(Reason::InputLine, self.subject.no_bias(bias)));
+/// What the kernel is asked for.
+struct Setting {
+    flags: LineRequestFlags,
+    level: bool,
+    /// The reason if it refuses.
+    refused: ShutdownReason,
+}
+
+/// A line that we hold.
+pub struct HeldLine {
+    handle: LineHandle,
+    line: gpio_cdev::Line,
+    subject: Subject,
+    /// What it was made last.
+    is_output: AtomicBool,
+    guard: SharedGuard,
+    sleeping: Option<String>,
+}
+
+impl HeldLine {
+    /// Lets the guardian know what has become of the line.
+    fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
+        let name = format!("{} line {}", self.subject.chip, self.subject.offset);
+        let was_output = self.is_output.load(Ordering::Relaxed);
+        match direction {
+            Direction::Output { shutdown_level, .. } => {
+                self.guard.output(&name, self.handle.as_raw_fd(), shutdown_level, self.sleeping.as_deref())?;
+            }
+            Direction::Input(_) if was_output => self.guard.forget(&name)?,
+            Direction::Input(_) => {}
         }
-        let pull = match bias {
-            Bias::None => LineRequestFlags::empty(),
-            Bias::PullUp => PULL_UP,
-            Bias::PullDown => PULL_DOWN,
-        };
-        let handle = self
-            .line
-            .request(LineRequestFlags::INPUT | pull, 0, CONSUMER)
-            .map_err(|error| self.refusal(Reason::InputLine, errno(&error), bias))?;
-        Ok(InputLine { handle, subject: self.subject })
-    }
-
-    fn refusal(&self, reason: Reason, code: i32, bias: Bias) -> Shutdown {
-        let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
-        let found = look_at(&self.line);
-        let action = match reason {
-            Reason::OutputLine => "an output",
-            _ => "an input",
-        };
-        Shutdown::because(reason, self.subject.refusal(action, code, bias, &found, &release))
+        self.is_output.store(matches!(direction, Direction::Output { .. }), Ordering::Relaxed);
+        Ok(())
     }
 }
 
-/// An output line that we hold.
-pub struct OutputLine {
-    handle: LineHandle,
-    subject: Subject,
-}
-
-impl AsRawFd for OutputLine {
-    fn as_raw_fd(&self) -> RawFd {
-        self.handle.as_raw_fd()
-    }
-}
-
-impl Output for OutputLine {
-    fn write(&mut self, value: bool) -> Result<(), Shutdown> {
+impl Line for HeldLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        if !self.is_output.load(Ordering::Relaxed) {
+            return Ok(());
+        }
         self.handle
-            .set_value(value.into())
-            .map_err(|error| Shutdown::because(Reason::LineWrite, self.subject.lost("written", errno(&error))))
+            .set_value(level.into())
+            .map_err(|error| Shutdown::because(reason::LINE_WRITE, self.subject.lost("written", errno(&error))))
     }
-}
 
-/// An input line that we hold.
-pub struct InputLine {
-    handle: LineHandle,
-    subject: Subject,
-}
-
-impl Input for InputLine {
-    fn read(&mut self) -> Result<bool, Shutdown> {
+    fn read(&self) -> Result<bool, Shutdown> {
         match self.handle.get_value() {
             Ok(value) => Ok(value != 0),
-            Err(error) => Err(Shutdown::because(Reason::LineRead, self.subject.lost("read", errno(&error)))),
+            Err(error) => Err(Shutdown::because(reason::LINE_READ, self.subject.lost("read", errno(&error)))),
         }
     }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let Setting { flags, level, refused } = self.subject.setting(direction)?;
+        sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
+            self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
+        })?;
+        self.watch_over(direction)
+    }
+}
+
+/// Whether calls to a chip may take their time, as its driver talks to it over a bus or asks a
+/// firmware. `devices` is `/sys/bus/gpio/devices`; the devices that the chip hangs on say it.
+pub fn may_sleep(devices: &Path, chip: &str, label: &str) -> bool {
+    if SLEEPING_LABELS.contains(&label) {
+        return true;
+    }
+    let Ok(device) = devices.join(chip).canonicalize() else { return false };
+    device.ancestors().skip(1).any(|parent| {
+        let subsystem = fs::read_link(parent.join("subsystem")).ok();
+        let subsystem = subsystem.as_deref().and_then(Path::file_name).and_then(|name| name.to_str());
+        subsystem.is_some_and(|name| SLEEPING_BUSES.contains(&name))
+    })
 }
 
 /// A line in an error.
@@ -240,12 +278,33 @@ impl fmt::Display for Subject {
 }
 
 impl Subject {
-    /// The line was claimed as one thing and then as another.
-    pub fn claimed_twice(&self, first: &str, second: &str) -> String {
-        format!(
-            "{self} is claimed twice: as {first} and as {second} in this configuration: a pin \
-             may have several names, change one of the two to another pin"
-        )
+    fn setting(&self, direction: Direction) -> Result<Setting, Shutdown> {
+        match direction {
+            Direction::Output { level, .. } => {
+                Ok(Setting { flags: LineRequestFlags::OUTPUT, level, refused: reason::OUTPUT_LINE })
+            }
+            Direction::Input(bias) if lacks(&self.label, bias) => {
+                Err(Shutdown::because(reason::INPUT_LINE, self.no_bias(bias)))
+            }
+            Direction::Input(bias) => {
+                let pull = match bias {
+                    Bias::None => LineRequestFlags::empty(),
+                    Bias::PullUp => PULL_UP,
+                    Bias::PullDown => PULL_DOWN,
+                };
+                Ok(Setting { flags: LineRequestFlags::INPUT | pull, level: false, refused: reason::INPUT_LINE })
+            }
+        }
+    }
+
+    /// The kernel refused the line: says why.
+    fn refused(&self, reason: ShutdownReason, code: i32, direction: Direction, line: &gpio_cdev::Line) -> Shutdown {
+        let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+        let (action, bias) = match direction {
+            Direction::Output { .. } => ("an output", Bias::None),
+            Direction::Input(bias) => ("an input", bias),
+        };
+        Shutdown::because(reason, self.refusal(action, code, bias, &look_at(line), &release))
     }
 
     fn beyond(&self, lines: u32) -> String {
@@ -274,7 +333,7 @@ impl Subject {
         )
     }
 
-    fn refusal(&self, action: &str, code: i32, bias: Bias, found: &Line, release: &str) -> String {
+    fn refusal(&self, action: &str, code: i32, bias: Bias, found: &LineInfo, release: &str) -> String {
         let (pull, _) = pull(bias);
         match code {
             libc::EBUSY => {
@@ -415,7 +474,7 @@ mod tests {
     }
 
     fn refusal(code: i32, bias: Bias, consumer: Option<&str>, release: &str) -> String {
-        let found = Line { consumer: consumer.map(str::to_owned), ..Line::default() };
+        let found = LineInfo { consumer: consumer.map(str::to_owned), ..LineInfo::default() };
         gpio17().refusal("an input", code, bias, &found, release)
     }
 
@@ -490,11 +549,11 @@ mod tests {
     #[test]
     fn a_missing_chip_is_told_from_one_that_is_none() {
         let dev = tempfile::tempdir().unwrap();
-        let open = |chip| open(dev.path(), chip, 0, Reason::NotOutput).err().unwrap();
-        assert_eq!(open(3).reason, Reason::ChipMissing);
+        let open = |chip| open(dev.path(), chip, 0, reason::NOT_OUTPUT).err().unwrap();
+        assert_eq!(open(3).reason, reason::CHIP_MISSING);
         fs::write(dev.path().join("gpiochip3"), "").unwrap();
         let none = open(3);
-        assert_eq!(none.reason, Reason::ChipOpen);
+        assert_eq!(none.reason, reason::CHIP_OPEN);
         assert!(none.to_string().contains("is not a GPIO chip"), "{none}");
         assert_eq!(nodes(dev.path()), [3]);
         let (chips, problems) = scan(dev.path());

@@ -4,24 +4,27 @@
 #![forbid(unsafe_code)]
 
 use std::collections::{BTreeSet, HashMap};
-use std::os::fd::AsRawFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::sync::atomic::AtomicU8;
 
 use industrial_io::Context;
 
-use super::{Attachment, Bias, Board, Guard, Input, Output, Pin, PwmConfig, Range, SpiConfig};
-use crate::shutdown::{Reason, Shutdown};
+use super::{Adc, Board, BusDevice, ClaimedLine, Direction, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig};
+use crate::shutdown::{Shutdown, reason};
+pub use guard::Guard;
+use guard::SharedGuard;
 use pins::{Names, Target};
 
 pub mod adc;
 pub mod gpio;
+mod guard;
 pub mod pins;
 mod pwm;
 pub mod spi;
 
 const DEV: &str = "/dev";
+const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
 const IIO: &str = "/sys/bus/iio/devices";
 
@@ -84,14 +87,13 @@ impl Inventory {
 pub struct LinuxBoard {
     inventory: Inventory,
     names: Names,
-    guard: Option<Box<dyn Guard>>,
-    /// Lines in use by chip name and offset, and as what.
-    claims: HashMap<(String, u32), &'static str>,
+    guard: SharedGuard,
     /// The present SPI mode of each node in use.
     spi_modes: HashMap<spi::Node, Arc<AtomicU8>>,
     /// IIO devices of which the log knows that they tell no resolution.
     assumed: BTreeSet<u32>,
     dev: PathBuf,
+    gpio: PathBuf,
     pwm: PathBuf,
 }
 
@@ -105,35 +107,26 @@ impl LinuxBoard {
         LinuxBoard {
             names: Names::of(&inventory),
             inventory,
-            guard,
-            claims: HashMap::new(),
+            guard: SharedGuard::new(guard),
             spi_modes: HashMap::new(),
             assumed: BTreeSet::new(),
             dev: DEV.into(),
+            gpio: GPIO.into(),
             pwm: PWM.into(),
         }
     }
 
-    /// The line of a pin that nothing of ours has claimed yet.
-    fn unclaimed(
-        &self,
-        pin: Pin,
-        wanted: &'static str,
-        no_line: Reason,
-        refused: Reason,
-    ) -> Result<gpio::Handle, Shutdown> {
+    /// The line of a pin, by the reasons that a use has for no such line and for a refusal.
+    fn open_line(&self, pin: Pin, direction: Direction) -> Result<gpio::Handle, Shutdown> {
+        let (wanted, no_line, refused) = match direction {
+            Direction::Output { .. } => ("an output", reason::NOT_OUTPUT, reason::OUTPUT_LINE),
+            Direction::Input(_) => ("an input", reason::NOT_INPUT, reason::INPUT_LINE),
+        };
         let Target::Line { chip, offset } = Target::of(pin) else {
             let detail = format!("{} can not be {wanted}: choose a GPIO pin (pinion pins lists them)", Target::of(pin));
             return Err(Shutdown::because(no_line, detail));
         };
-        let handle = gpio::open(&self.dev, chip, offset, refused)?;
-        match self.claims.get(&handle.key()) {
-            Some(first) => {
-                let detail = handle.subject().claimed_twice(first, wanted);
-                Err(Shutdown::because(refused, detail))
-            }
-            None => Ok(handle),
-        }
+        gpio::open(&self.dev, chip, offset, refused)
     }
 
     /// The device's number and the channel's name for a pin.
@@ -145,12 +138,12 @@ impl LinuxBoard {
                 let channel = adc.and_then(|adc| adc.channels.get(position as usize));
                 channel.map(|channel| (device, channel.id.clone())).ok_or_else(|| {
                     let detail = adc::missing(device, &format!("channel {position}"), &self.inventory.adcs);
-                    Shutdown::because(Reason::AdcOpen, detail)
+                    Shutdown::because(reason::ADC_OPEN, detail)
                 })
             }
             other => {
                 let detail = format!("{other} is no ADC channel: choose an analog pin (pinion pins lists them)");
-                Err(Shutdown::because(Reason::AdcOpen, detail))
+                Err(Shutdown::because(reason::ADC_OPEN, detail))
             }
         }
     }
@@ -169,79 +162,60 @@ impl Board for LinuxBoard {
         spi::ranges(&self.inventory.spi)
     }
 
-    fn output(&mut self, pin: Pin, value: bool, shutdown_value: bool) -> Result<Box<dyn Output>, Shutdown> {
-        let wanted = "an output";
-        let handle = self.unclaimed(pin, wanted, Reason::NotOutput, Reason::OutputLine)?;
-        let key = handle.key();
-        let line = handle.output(value)?;
-        if let Some(guard) = &mut self.guard {
-            guard.output(line.as_raw_fd(), shutdown_value).map_err(|error| {
-                let detail = format!("the guardian does not take {} line {}: {error}: restart Pinion", key.0, key.1);
-                Shutdown::because(Reason::GuardianLost, detail)
-            })?;
-        }
-        self.claims.insert(key, wanted);
-        Ok(Box::new(line))
+    /// A chip may have several nodes in /dev, as that of a Raspberry Pi 5 has.
+    fn canonical(&self, pin: Pin) -> Pin {
+        let Target::Line { chip, offset } = Target::of(pin) else { return pin };
+        gpio::number_behind(&self.dev, chip).and_then(|chip| pins::line_number(chip, offset)).map_or(pin, Pin)
     }
 
-    fn input(&mut self, pin: Pin, bias: Bias) -> Result<Box<dyn Input>, Shutdown> {
-        let wanted = "an input";
-        let handle = self.unclaimed(pin, wanted, Reason::NotInput, Reason::InputLine)?;
-        let key = handle.key();
-        let line = handle.input(bias)?;
-        self.claims.insert(key, wanted);
-        Ok(Box::new(line))
+    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
+        let handle = self.open_line(pin, direction)?;
+        let sleeps = gpio::may_sleep(&self.gpio, handle.chip(), handle.label());
+        let sleeps_on = sleeps.then(|| handle.chip().to_owned());
+        let line = handle.request(direction, self.guard.clone(), sleeps_on.clone())?;
+        Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
     }
 
-    fn adc(&mut self, pin: Pin) -> Result<Attachment, Shutdown> {
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let (device, id) = self.channel(pin)?;
         if self.inventory.adc(device, &id).is_none() {
             // Its driver may have come up after us; the numbers that were published stay.
             self.inventory.context =
-                adc::context(Path::new(IIO)).map_err(|problem| Shutdown::because(Reason::AdcOpen, problem))?;
+                adc::context(Path::new(IIO)).map_err(|problem| Shutdown::because(reason::ADC_OPEN, problem))?;
         }
         let reader = self.inventory.adc(device, &id).ok_or_else(|| {
             let context = self.inventory.context.as_ref();
             let present = context.map(adc::scan).unwrap_or_default();
-            Shutdown::because(Reason::AdcOpen, adc::missing(device, &id, &present))
+            Shutdown::because(reason::ADC_OPEN, adc::missing(device, &id, &present))
         })?;
         if reader.format().is_none() && self.assumed.insert(device) {
             log::info!("iio:device{device} does not tell its resolution: 12 bits are assumed");
         }
-        Ok(Attachment::Worker { bus: format!("iio:device{device}"), device: Box::new(reader) })
+        Ok(OnWorker { bus: format!("iio:device{device}"), device: Box::new(reader) })
     }
 
-    fn spi(&mut self, config: SpiConfig) -> Result<Attachment, Shutdown> {
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         let node = spi::Node::of(config.bus);
         let mode = self.spi_modes.entry(node).or_default().clone();
         let device = spi::Spi::open(&self.dev, node, config.mode, config.rate_hz, config.chip_select, mode)?;
-        Ok(Attachment::Worker { bus: format!("spi{}", node.bus), device: Box::new(device) })
+        Ok(OnWorker { bus: format!("spi{}", node.bus), device: Box::new(device) })
     }
 
-    fn pwm(&mut self, config: PwmConfig) -> Result<Attachment, Shutdown> {
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
         let Target::Pwm { chip, channel } = Target::of(config.pin) else {
             let detail = format!("{} has no hardware PWM: choose pwmchipC/pwmN", Target::of(config.pin));
-            return Err(Shutdown::because(Reason::PwmConfig, detail));
+            return Err(Shutdown::because(reason::PWM_CONFIG, detail));
         };
         let channel = pwm::Channel { chip, channel };
-        let device = pwm::Pwm::open(&self.pwm, channel, &config)?;
-        if let Some(guard) = &mut self.guard {
-            device.guard(&mut **guard, config.shutdown_value).map_err(|error| {
-                let detail = format!("the guardian does not take {channel}: {error}: restart Pinion");
-                Shutdown::because(Reason::GuardianLost, detail)
-            })?;
-        }
+        let device = pwm::Pwm::open(&self.pwm, channel, &config, self.guard.clone())?;
         // Channels share their chip's driver, and it may keep whoever writes to one.
-        Ok(Attachment::Worker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
+        Ok(OnWorker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
     }
 
     fn reset(&mut self) {
-        if let Some(guard) = &mut self.guard {
-            if let Err(error) = guard.release() {
-                log::error!("the guardian does not give back the lines: {error}: restart Pinion");
-            }
+        if let Err(error) = self.guard.release() {
+            log::error!("the guardian does not give back the lines: {error}: restart Pinion");
         }
-        self.claims.clear();
         self.spi_modes.clear();
     }
 }
@@ -249,17 +223,20 @@ impl Board for LinuxBoard {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::board::Bias;
+
+    const ON: Direction = Direction::Output { level: true, shutdown_level: false };
 
     fn board(dev: &Path) -> LinuxBoard {
         let inventory = Inventory::default();
         LinuxBoard {
             names: Names::of(&inventory),
             inventory,
-            guard: None,
-            claims: HashMap::new(),
+            guard: SharedGuard::new(None),
             spi_modes: HashMap::new(),
             assumed: BTreeSet::new(),
             dev: dev.into(),
+            gpio: dev.join("gpio"),
             pwm: dev.join("pwm"),
         }
     }
@@ -268,16 +245,16 @@ mod tests {
     fn a_pin_of_another_kind() {
         let dev = tempfile::tempdir().unwrap();
         let mut board = board(dev.path());
-        let error = board.output(Pin(4097), true, false).err().unwrap();
+        let error = board.line(Pin(4097), ON).err().unwrap();
         assert_eq!(
             error.to_string(),
             "Not an output pin: analog1 (an ADC channel) can not be an output: choose a GPIO pin \
              (pinion pins lists them)"
         );
-        let error = board.input(Pin(3000), Bias::None).err().unwrap();
-        assert_eq!(error.reason, Reason::NotInput);
+        let error = board.line(Pin(3000), Direction::Input(Bias::None)).err().unwrap();
+        assert_eq!(error.reason, reason::NOT_INPUT);
         let error = board.adc(Pin(17)).err().unwrap();
-        assert_eq!(error.reason, Reason::AdcOpen);
+        assert_eq!(error.reason, reason::ADC_OPEN);
         assert!(error.to_string().contains("gpiochip0 line 17 is no ADC channel"), "{error}");
     }
 
@@ -285,8 +262,8 @@ mod tests {
     fn nothing_is_there() {
         let dev = tempfile::tempdir().unwrap();
         let mut board = board(dev.path());
-        let error = board.output(Pin(5 * 288), true, false).err().unwrap();
-        assert_eq!(error.reason, Reason::ChipMissing);
+        let error = board.line(Pin(5 * 288), ON).err().unwrap();
+        assert_eq!(error.reason, reason::CHIP_MISSING);
         assert!(error.to_string().contains("gpiochip5: this machine has no GPIO chip"), "{error}");
         assert_eq!(board.pins().len(), 19);
         assert_eq!(board.spi_buses().len(), 8);
@@ -307,10 +284,7 @@ mod tests {
             let range = names.iter().find(|range| range.name == format!("pwmchip{chip}/pwm0")).unwrap();
             let pin = Pin(range.first + channel);
             let config = PwmConfig { pin, cycle: crate::time::Ticks::from_us(100), value: 0, shutdown_value: 0 };
-            match board.pwm(config).unwrap() {
-                Attachment::Worker { bus, .. } => bus,
-                Attachment::Inline(_) => panic!("a file is no matter for the core"),
-            }
+            board.pwm(config).unwrap().bus
         };
         assert_eq!((bus(0, 0), bus(0, 1), bus(1, 0)), ("pwmchip0".into(), "pwmchip0".into(), "pwmchip1".into()));
     }
@@ -321,7 +295,7 @@ mod tests {
             chips: vec![gpio::Chip {
                 number: 0,
                 label: "pinctrl-bcm2835".into(),
-                lines: vec![gpio::Line::default(); 54],
+                lines: vec![gpio::LineInfo::default(); 54],
             }],
             adcs: vec![adc::Adc { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
             spi: vec![spi::Node::of(0), spi::Node::of(1)],

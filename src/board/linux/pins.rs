@@ -259,12 +259,12 @@ fn runs(names: &[(String, u32)]) -> Vec<Range> {
 #[cfg(test)]
 mod tests {
     use super::super::adc::{Adc, Channel};
-    use super::super::gpio::{Chip, Line};
+    use super::super::gpio::{Chip, LineInfo};
     use super::*;
     use proptest::prelude::*;
 
     fn chip(number: u32, label: &str, names: &[&str]) -> Chip {
-        let line = |name: &&str| Line { name: (!name.is_empty()).then(|| name.to_string()), ..Line::default() };
+        let line = |name: &&str| LineInfo { name: (!name.is_empty()).then(|| name.to_string()), ..LineInfo::default() };
         Chip { number, label: label.into(), lines: names.iter().map(line).collect() }
     }
 

@@ -12,12 +12,11 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::Duration;
 
-use crate::board::{Buffer, Device, Guard, PwmConfig};
-use crate::shutdown::{Reason, Shutdown};
+use super::guard::SharedGuard;
+use crate::board::{self, PWM_MAX, PwmConfig};
+use crate::shutdown::{Shutdown, reason};
 use crate::time::{NS_PER_TICK, Ticks};
 
-/// Full scale of a PWM value (`PWM_MAX`), as the C program has it.
-const PWM_MAX: u64 = 1 << 15;
 /// udev needs a moment to hand the files of a new channel to the group.
 const UDEV_TRIES: u32 = 50;
 const UDEV_PAUSE: Duration = Duration::from_millis(10);
@@ -42,23 +41,30 @@ pub(super) struct Pwm {
     period: File,
     duty: File,
     enable: File,
+    guard: SharedGuard,
 }
 
 impl Pwm {
-    /// Exports the channel if nobody did, sets its period and value. `class` is
-    /// `/sys/class/pwm`.
-    pub(super) fn open(class: &Path, channel: Channel, config: &PwmConfig) -> Result<Pwm, Shutdown> {
+    /// Exports the channel if nobody did, sets its period and value, and gives it to the guardian.
+    /// `class` is `/sys/class/pwm`.
+    pub(super) fn open(
+        class: &Path,
+        channel: Channel,
+        config: &PwmConfig,
+        guard: SharedGuard,
+    ) -> Result<Pwm, Shutdown> {
         let refused = |what: &str, error: io::Error| {
-            Shutdown::because(Reason::PwmConfig, format!("{channel}: {what}: {error}{}", remedy(&error)))
+            Shutdown::because(reason::PWM_CONFIG, format!("{channel}: {what}: {error}{}", remedy(&error)))
         };
         let folder = export(class, channel).map_err(|error| refused("exporting it", error))?;
         let open = |name: &str| OpenOptions::new().write(true).open(folder.join(name));
         let duty = open("duty_cycle").map_err(|error| refused("opening duty_cycle", error))?;
         let enable = open("enable").map_err(|error| refused("opening enable", error))?;
         let period = open("period").map_err(|error| refused("opening period", error))?;
-        let mut pwm = Pwm { channel, period_ns: 0, period, duty, enable };
+        let mut pwm = Pwm { channel, period_ns: 0, period, duty, enable, guard };
         pwm.set_period(config.cycle)?;
-        pwm.set(config.value).map_err(|error| refused("its first value", error))?;
+        pwm.write(config.value).map_err(|error| refused("its first value", error))?;
+        pwm.watch_over(config.shutdown_value)?;
         Ok(pwm)
     }
 
@@ -68,24 +74,25 @@ impl Pwm {
         let _ = self.duty.write_at(b"0", 0);
         self.period.write_all_at(self.period_ns.to_string().as_bytes(), 0).map_err(|error| {
             let detail = format!("{}: a period of {} ns: {error}{}", self.channel, self.period_ns, remedy(&error));
-            Shutdown::because(Reason::PwmConfig, detail)
+            Shutdown::because(reason::PWM_CONFIG, detail)
         })
     }
 
     /// Lets the guardian know where the channel belongs if the program dies.
-    pub(super) fn guard(&self, guard: &mut dyn Guard, shutdown_value: u16) -> io::Result<()> {
+    fn watch_over(&self, shutdown_value: u16) -> Result<(), Shutdown> {
+        let name = self.channel.to_string();
         if shutdown_value == 0 {
-            return guard.files(&[(self.enable.as_raw_fd(), b"0")]);
+            return self.guard.files(&name, &[(self.enable.as_raw_fd(), b"0")]);
         }
         let duty = self.duty_ns(shutdown_value).to_string();
-        guard.files(&[(self.duty.as_raw_fd(), duty.as_bytes()), (self.enable.as_raw_fd(), b"1")])
+        self.guard.files(&name, &[(self.duty.as_raw_fd(), duty.as_bytes()), (self.enable.as_raw_fd(), b"1")])
     }
 
     fn duty_ns(&self, value: u16) -> u64 {
-        self.period_ns * u64::from(value).min(PWM_MAX) / PWM_MAX
+        self.period_ns * u64::from(value.min(PWM_MAX)) / u64::from(PWM_MAX)
     }
 
-    fn set(&mut self, value: u16) -> io::Result<()> {
+    fn write(&mut self, value: u16) -> io::Result<()> {
         if value == 0 {
             return self.enable.write_all_at(b"0", 0);
         }
@@ -97,20 +104,19 @@ impl Pwm {
     }
 }
 
-impl Device for Pwm {
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-        let (low, high) = match *data.as_slice() {
-            [low, high] => (low, high),
-            [low, high, c0, c1, c2, c3] => {
-                self.set_period(Ticks(u32::from_le_bytes([c0, c1, c2, c3])))?;
-                (low, high)
-            }
-            _ => return Ok(()),
-        };
-        self.set(u16::from_le_bytes([low, high])).map_err(|error| {
+impl board::Pwm for Pwm {
+    fn set(&mut self, value: u16) -> Result<(), Shutdown> {
+        self.write(value).map_err(|error| {
             let detail = format!("{}: {error}: did its driver go away? (ls /sys/class/pwm)", self.channel);
-            Shutdown::because(Reason::PwmWrite, detail)
+            Shutdown::because(reason::PWM_WRITE, detail)
         })
+    }
+
+    /// The channel keeps this value at a shutdown, so the guardian is told of it.
+    fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
+        self.set_period(cycle)?;
+        self.set(value)?;
+        self.watch_over(value)
     }
 }
 
@@ -153,7 +159,7 @@ fn remedy(error: &io::Error) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::board::Pin;
+    use crate::board::{Pin, Pwm as _};
 
     const CHANNEL: Channel = Channel { chip: 0, channel: 1 };
 
@@ -175,6 +181,10 @@ mod tests {
         class
     }
 
+    fn open(class: &tempfile::TempDir, value: u16) -> Result<Pwm, Shutdown> {
+        Pwm::open(class.path(), CHANNEL, &config(value), SharedGuard::new(None))
+    }
+
     fn read(class: &tempfile::TempDir, name: &str) -> String {
         fs::read_to_string(class.path().join("pwmchip0/pwm1").join(name)).unwrap()
     }
@@ -182,31 +192,30 @@ mod tests {
     #[test]
     fn a_value_becomes_a_duty_cycle_and_zero_switches_off() {
         let class = class(true);
-        let mut pwm = Pwm::open(class.path(), CHANNEL, &config(8192)).unwrap();
+        let mut pwm = open(&class, 8192).unwrap();
         let state = |name| read(&class, name);
         assert_eq!(
             (state("period"), state("duty_cycle"), state("enable")),
             ("1000000".into(), "250000".into(), "1".into())
         );
-        pwm.run(&mut Buffer::new(&32768u16.to_le_bytes())).unwrap();
+        pwm.set(32768).unwrap();
         assert_eq!(state("duty_cycle"), "1000000");
-        pwm.run(&mut Buffer::new(&0u16.to_le_bytes())).unwrap();
+        pwm.set(0).unwrap();
         assert_eq!(state("enable"), "0");
     }
 
     #[test]
     fn a_value_may_come_with_a_new_period() {
         let class = class(true);
-        let mut pwm = Pwm::open(class.path(), CHANNEL, &config(8192)).unwrap();
-        let [c0, c1, c2, c3] = Ticks::from_us(2000).0.to_le_bytes();
-        pwm.run(&mut Buffer::new(&[0, 64, c0, c1, c2, c3])).unwrap();
+        let mut pwm = open(&class, 8192).unwrap();
+        pwm.set_cycle(Ticks::from_us(2000), 16384).unwrap();
         assert_eq!((read(&class, "period"), read(&class, "duty_cycle")), ("2000000".into(), "1000000".into()));
     }
 
     #[test]
     fn a_channel_that_is_not_there_is_exported_and_its_absence_is_explained() {
         let class = class(false);
-        let error = Pwm::open(class.path(), CHANNEL, &config(1)).err().unwrap();
+        let error = open(&class, 1).err().unwrap();
         assert_eq!(fs::read_to_string(class.path().join("pwmchip0/export")).unwrap(), "1");
         let text = error.to_string();
         assert!(text.contains("pwmchip0/pwm1") && text.contains("device tree"), "{text}");

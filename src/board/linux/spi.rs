@@ -14,8 +14,8 @@ use linux_embedded_hal::SpidevDevice;
 use linux_embedded_hal::spidev::{SpiModeFlags, SpidevOptions, SpidevTransfer};
 
 use super::gpio::not_permitted;
-use crate::board::{Buffer, ChipSelect, Device, Range};
-use crate::shutdown::{Reason, Shutdown};
+use crate::board::{BusDevice, BusError, BusStatus, ChipSelect, Range};
+use crate::shutdown::{Shutdown, reason};
 
 /// Buses with numbers of the C program.
 const BUSES: u32 = 8;
@@ -102,66 +102,63 @@ impl Spi {
         let path = dev.join(node.to_string());
         let device = SpidevDevice::open(&path).map_err(|error| {
             let detail = cannot_open(&path, error.inner(), &scan(dev));
-            Shutdown::because(Reason::SpiOpen, detail)
+            Shutdown::because(reason::SPI_OPEN, detail)
         })?;
         let mut spi = Spi { device, node, mode, rate_hz, chip_select, node_mode };
         spi.device.configure(SpidevOptions::new().max_speed_hz(rate_hz)).map_err(|error| {
             let detail = format!("/dev/{node} refuses {rate_hz} Hz: {error}: choose another spi_speed");
-            Shutdown::because(Reason::SpiSpeed, detail)
+            Shutdown::because(reason::SPI_SPEED, detail)
         })?;
-        spi.set_mode()?;
+        spi.set_mode().map_err(|detail| Shutdown::because(reason::SPI_MODE, detail))?;
         Ok(spi)
     }
 
     /// Sets all the node's mode bits, as the C program does; the kernel keeps the sense of a
     /// chip select line that it knows of.
-    fn set_mode(&mut self) -> Result<(), Shutdown> {
+    fn set_mode(&mut self) -> Result<(), String> {
         let flags = SpiModeFlags::from_bits_retain(self.mode.into());
         self.device.configure(SpidevOptions::new().mode(flags)).map_err(|error| {
-            let detail = format!(
-                "/dev/{} refuses SPI mode {}: {error}: its controller can not serve this \
-                     chip, choose another bus",
+            format!(
+                "/dev/{} refuses SPI mode {}: {error}: its controller can not serve this chip, choose another bus",
                 self.node, self.mode
-            );
-            Shutdown::because(Reason::SpiMode, detail)
+            )
         })?;
         self.node_mode.store(self.mode, Ordering::Relaxed);
         Ok(())
     }
 
-    fn transfer(&mut self, bytes: &mut [u8]) -> Result<(), Shutdown> {
+    fn transfer(&mut self, bytes: &mut [u8]) -> Result<(), String> {
         if bytes.is_empty() {
             return Ok(());
         }
         if self.node_mode.load(Ordering::Relaxed) != self.mode {
             self.set_mode()?;
         }
+        let count = bytes.len();
         let mut transfer = SpidevTransfer::read_write_in_place(bytes);
         transfer.speed_hz = self.rate_hz;
         transfer.bits_per_word = 8;
         self.device.transfer(&mut transfer).map_err(|error| {
-            let detail = format!(
-                "/dev/{} failed to transfer {} bytes at {} Hz: {error}: look at the kernel's log \
-                 (dmesg), try a lower spi_speed",
-                self.node,
-                bytes.len(),
-                self.rate_hz
-            );
-            Shutdown::because(Reason::SpiTransfer, detail)
+            format!(
+                "/dev/{} failed to transfer {count} bytes at {} Hz: {error}: look at the kernel's log (dmesg), try a \
+                 lower spi_speed",
+                self.node, self.rate_hz
+            )
         })
+    }
+
+    fn select(&self, selected: bool) -> Result<(), String> {
+        let chip_select = self.chip_select.as_ref();
+        chip_select.map_or(Ok(()), |line| line.select(selected)).map_err(|failure| failure.detail.into())
     }
 }
 
-impl Device for Spi {
-    fn run(&mut self, data: &mut Buffer) -> Result<(), Shutdown> {
-        if let Some(chip_select) = &mut self.chip_select {
-            chip_select.select(true)?;
-        }
-        let transferred = self.transfer(data.as_mut_slice());
-        if let Some(chip_select) = &mut self.chip_select {
-            chip_select.select(false)?;
-        }
-        transferred
+impl BusDevice for Spi {
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+        let exchanged = self.select(true).and_then(|()| self.transfer(bytes));
+        // After a failure too.
+        let deselected = self.select(false);
+        exchanged.and(deselected).map_err(|detail| BusError { status: BusStatus::Failed, detail: detail.into() })
     }
 }
 
@@ -187,7 +184,7 @@ fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::board::Output;
+    use crate::board::{Direction, Line};
     use std::sync::Mutex;
 
     #[test]
@@ -223,7 +220,7 @@ mod tests {
         let dev = tempfile::tempdir().unwrap();
         fs::write(dev.path().join("spidev1.2"), "").unwrap();
         let error = open(dev.path(), None).err().unwrap();
-        assert_eq!(error.reason, Reason::SpiOpen);
+        assert_eq!(error.reason, reason::SPI_OPEN);
         assert!(error.to_string().contains("this machine has spidev1.2: enable"), "{error}");
     }
 
@@ -232,15 +229,21 @@ mod tests {
         let dev = tempfile::tempdir().unwrap();
         fs::write(dev.path().join("spidev0.0"), "").unwrap();
         let error = open(dev.path(), None).err().unwrap();
-        assert_eq!(error.reason, Reason::SpiSpeed);
+        assert_eq!(error.reason, reason::SPI_SPEED);
         assert!(error.to_string().contains("/dev/spidev0.0 refuses 1000000 Hz"), "{error}");
     }
 
-    struct Recorder(Arc<Mutex<Vec<bool>>>);
+    struct Recorder(Mutex<Vec<bool>>);
 
-    impl Output for Recorder {
-        fn write(&mut self, value: bool) -> Result<(), Shutdown> {
-            self.0.lock().unwrap().push(value);
+    impl Line for Recorder {
+        fn write(&self, level: bool) -> Result<(), Shutdown> {
+            self.0.lock().unwrap().push(level);
+            Ok(())
+        }
+        fn read(&self) -> Result<bool, Shutdown> {
+            Ok(false)
+        }
+        fn set_direction(&self, _direction: Direction) -> Result<(), Shutdown> {
             Ok(())
         }
     }
@@ -248,18 +251,18 @@ mod tests {
     #[test]
     fn a_failed_transfer_still_deselects_the_chip() {
         let node = tempfile::NamedTempFile::new().unwrap();
-        let writes = Arc::new(Mutex::new(Vec::new()));
+        let line = Arc::new(Recorder(Mutex::default()));
         let mut spi = Spi {
             device: SpidevDevice::open(node.path()).unwrap(),
             node: Node::of(0),
             mode: 0,
             rate_hz: 1000,
-            chip_select: Some(ChipSelect { line: Box::new(Recorder(writes.clone())), active_high: false }),
+            chip_select: Some(ChipSelect { line: line.clone(), active_high: false }),
             node_mode: Arc::new(AtomicU8::new(0)),
         };
-        let error = spi.run(&mut Buffer::new(&[1, 2])).err().unwrap();
-        assert_eq!(error.reason, Reason::SpiTransfer);
-        assert!(error.to_string().contains("/dev/spidev0.0"), "{error}");
-        assert_eq!(*writes.lock().unwrap(), [false, true]);
+        let error = spi.exchange(&mut [1, 2]).err().unwrap();
+        assert_eq!(error.status, BusStatus::Failed);
+        assert!(error.detail.contains("/dev/spidev0.0 failed to transfer 2 bytes"), "{error:?}");
+        assert_eq!(*line.0.lock().unwrap(), [false, true]);
     }
 }

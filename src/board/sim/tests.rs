@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 use super::*;
+use crate::board::Bias;
 use crate::time::{CLOCK_FREQ, VirtualClock};
 
 /// A board in virtual time.
@@ -26,22 +27,19 @@ impl Bench {
         Pin(pins.iter().find(|range| range.name == name).unwrap().first)
     }
 
-    fn output(&mut self, name: &str, value: bool) -> Box<dyn Output> {
+    fn output(&mut self, name: &str, value: bool) -> Arc<dyn Line> {
         let pin = self.pin(name);
-        self.board.output(pin, value, value).unwrap()
+        self.board.line(pin, Direction::Output { level: value, shutdown_level: value }).unwrap().line
     }
 
-    fn input(&mut self, name: &str) -> Box<dyn Input> {
+    fn input(&mut self, name: &str) -> Arc<dyn Line> {
         let pin = self.pin(name);
-        self.board.input(pin, Bias::PullUp).unwrap()
+        self.board.line(pin, Direction::Input(Bias::PullUp)).unwrap().line
     }
 
-    fn adc(&mut self, name: &str) -> Adc {
+    fn adc(&mut self, name: &str) -> Box<dyn Adc> {
         let pin = self.pin(name);
-        match self.board.adc(pin).unwrap() {
-            Attachment::Inline(device) => Adc(device),
-            Attachment::Worker { .. } => panic!("{name} is not inline"),
-        }
+        self.board.adc(pin).unwrap().device
     }
 
     fn axis(&self, name: &str) -> AxisView<'_> {
@@ -49,17 +47,7 @@ impl Bench {
     }
 }
 
-struct Adc(Box<dyn Device>);
-
-impl Adc {
-    fn read(&mut self) -> u16 {
-        let mut data = Buffer::EMPTY;
-        self.0.run(&mut data).unwrap();
-        u16::from_le_bytes(data.as_slice().try_into().unwrap())
-    }
-}
-
-fn pulse(step: &mut dyn Output) {
+fn pulse(step: &dyn Line) {
     step.write(true).unwrap();
     step.write(false).unwrap();
 }
@@ -297,16 +285,16 @@ fn a_wrong_pin_says_which_and_what_to_do() {
     assert!(board.input(endstop, Bias::None).is_ok());
     assert!(board.adc(sensor).is_ok());
     let errors = [
-        (board.output(nowhere, false, false).err(), Reason::NotOutput, "no pin 4294967295"),
-        (board.output(endstop, false, false).err(), Reason::NotOutput, "x_endstop"),
-        (board.output(sensor, false, false).err(), Reason::NotOutput, "bed_sensor"),
-        (board.output(step, false, false).err(), Reason::OutputLine, "x_step"),
-        (board.input(nowhere, Bias::None).err(), Reason::NotInput, "no pin 4294967295"),
-        (board.input(step, Bias::None).err(), Reason::NotInput, "x_step"),
-        (board.input(endstop, Bias::None).err(), Reason::InputLine, "x_endstop"),
-        (board.adc(nowhere).err(), Reason::AdcOpen, "no pin 4294967295"),
-        (board.adc(endstop).err(), Reason::AdcOpen, "x_endstop"),
-        (board.adc(sensor).err(), Reason::AdcOpen, "bed_sensor"),
+        (board.output(nowhere, false, false).err(), reason::NOT_OUTPUT, "no pin 4294967295"),
+        (board.output(endstop, false, false).err(), reason::NOT_OUTPUT, "x_endstop"),
+        (board.output(sensor, false, false).err(), reason::NOT_OUTPUT, "bed_sensor"),
+        (board.output(step, false, false).err(), reason::OUTPUT_LINE, "x_step"),
+        (board.input(nowhere, Bias::None).err(), reason::NOT_INPUT, "no pin 4294967295"),
+        (board.input(step, Bias::None).err(), reason::NOT_INPUT, "x_step"),
+        (board.input(endstop, Bias::None).err(), reason::INPUT_LINE, "x_endstop"),
+        (board.adc(nowhere).err(), reason::ADC_OPEN, "no pin 4294967295"),
+        (board.adc(endstop).err(), reason::ADC_OPEN, "x_endstop"),
+        (board.adc(sensor).err(), reason::ADC_OPEN, "bed_sensor"),
     ];
     for (error, reason, subject) in errors {
         let error = error.unwrap();
@@ -378,17 +366,12 @@ fn the_spi_bus_sends_back_what_it_is_sent() {
     let open =
         |bench: &mut Bench, bus, mode| bench.board.spi(SpiConfig { bus, mode, rate_hz: 1_000_000, chip_select: None });
     let bus = bench.board.spi_buses()[0].first;
-    match open(&mut bench, bus, 3).unwrap() {
-        Attachment::Worker { bus, mut device } => {
-            assert_eq!(bus, "spi0");
-            let mut data = Buffer::new(b"pinion");
-            device.run(&mut data).unwrap();
-            assert_eq!(data.as_slice(), b"pinion");
-        }
-        Attachment::Inline(_) => panic!("not on a worker"),
-    }
-    assert!(open(&mut bench, 1, 0).is_err_and(|error| error.reason == Reason::SpiOpen));
-    assert!(open(&mut bench, 0, 4).is_err_and(|error| error.reason == Reason::InvalidSpi));
+    let OnWorker { bus, mut device } = open(&mut bench, bus, 3).unwrap();
+    assert_eq!(bus, "spi0");
+    let mut bytes = *b"pinion";
+    device.exchange(&mut bytes).unwrap();
+    assert_eq!(bytes, *b"pinion");
+    assert!(open(&mut bench, 1, 0).is_err_and(|error| error.reason == reason::SPI_OPEN));
 }
 
 #[test]

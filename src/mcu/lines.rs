@@ -1,0 +1,282 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! GPIO lines: the table of claims, and outputs and inputs as objects use them.
+//!
+//! Several objects may use one line, as in the firmware, which just sets the line up again: what
+//! `[duplicate_pin_override]` allows in printer.cfg, a line that `set_digital_out` drove before an
+//! object took it, chips that share a clock line. The last set-up decides whether it is an output
+//! or an input.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use crate::board::{Bias, Board, ClaimedLine, Direction, Line, Pin};
+use crate::shutdown::{Shutdown, reason};
+
+use super::{Done, Errand, Mcu, Remote, Safe, Settable, Ticket, WorkerId};
+
+/// A line in use.
+pub(super) struct Claim {
+    /// By the board's own number for it.
+    pin: Pin,
+    line: Arc<dyn Line>,
+    /// The worker of its chip, if calls to that may take their time.
+    worker: Option<WorkerId>,
+}
+
+/// An output that the core drives itself: a call takes a microsecond or two.
+pub struct PromptLine {
+    line: Arc<dyn Line>,
+    level: bool,
+}
+
+impl PromptLine {
+    /// Drives the line.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
+    #[inline]
+    pub fn write(&mut self, level: bool) -> Result<(), Shutdown> {
+        self.level = level;
+        self.line.write(level)
+    }
+
+    /// Inverts the line.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
+    #[inline]
+    pub fn toggle(&mut self) -> Result<(), Shutdown> {
+        self.write(!self.level)
+    }
+}
+
+/// A line of a chip that may sleep, on the worker of that chip.
+struct SlowLine(Arc<dyn Line>);
+
+impl Settable for SlowLine {
+    type Value = bool;
+
+    fn set(&mut self, level: bool) -> Result<(), Shutdown> {
+        self.0.write(level)
+    }
+}
+
+/// An output line of any chip.
+pub struct OutputLine {
+    level: bool,
+    driver: Driver,
+}
+
+enum Driver {
+    Prompt(Arc<dyn Line>),
+    Slow(Remote<SlowLine>),
+}
+
+impl OutputLine {
+    /// Drives the line, or has its chip's worker drive it; `ticket` is the object's.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
+    #[inline]
+    pub fn write(&mut self, mcu: &mut Mcu, ticket: Ticket, level: bool) -> Result<(), Shutdown> {
+        self.level = level;
+        match &mut self.driver {
+            Driver::Prompt(line) => line.write(level),
+            Driver::Slow(line) => line.set(mcu, ticket, level),
+        }
+    }
+
+    /// Inverts the line.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
+    #[inline]
+    pub fn toggle(&mut self, mcu: &mut Mcu, ticket: Ticket) -> Result<(), Shutdown> {
+        self.write(mcu, ticket, !self.level)
+    }
+
+    /// Drives the line of a stopped machine to where it belongs.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
+    pub fn make_safe(&mut self, mcu: &mut Mcu, ticket: Ticket, level: bool) -> Result<Safe, Shutdown> {
+        self.write(mcu, ticket, level)?;
+        Ok(match self.driver {
+            Driver::Prompt(_) => Safe::Now,
+            Driver::Slow(_) => Safe::Later,
+        })
+    }
+
+    /// Takes in that the worker has written. True once nothing is left to be written.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
+    pub fn returned(&mut self, mcu: &mut Mcu, ticket: Ticket, done: Done) -> Result<bool, Shutdown> {
+        match &mut self.driver {
+            Driver::Prompt(_) => Ok(true),
+            Driver::Slow(line) => line.returned(mcu, ticket, done),
+        }
+    }
+}
+
+/// A look at an input of a chip that may sleep.
+struct Sampling {
+    line: Arc<dyn Line>,
+    level: Result<bool, Shutdown>,
+}
+
+impl Errand for Sampling {
+    fn run(&mut self) {
+        self.level = self.line.read();
+    }
+}
+
+/// An input line of any chip.
+pub struct InputLine(Sensor);
+
+enum Sensor {
+    Prompt(Arc<dyn Line>),
+    Slow {
+        worker: WorkerId,
+        /// Here while no look is under way.
+        sampling: Option<Box<Sampling>>,
+    },
+}
+
+impl InputLine {
+    /// The line's level; none if it comes later, to the object's `returned`, as the chip's worker
+    /// has to look.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed".
+    #[inline]
+    pub fn read(&mut self, mcu: &mut Mcu, ticket: Ticket) -> Result<Option<bool>, Shutdown> {
+        match &mut self.0 {
+            Sensor::Prompt(line) => line.read().map(Some),
+            Sensor::Slow { worker, sampling } => {
+                if let Some(sampling) = sampling.take() {
+                    mcu.dispatch(*worker, ticket, sampling)?;
+                }
+                Ok(None)
+            }
+        }
+    }
+
+    /// The level that the worker saw.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed".
+    pub fn returned(&mut self, done: Done) -> Result<bool, Shutdown> {
+        let (Sensor::Slow { sampling, .. }, Some(mut back)) = (&mut self.0, done.errand::<Sampling>()) else {
+            return Ok(false);
+        };
+        let level = std::mem::replace(&mut back.level, Ok(false));
+        *sampling = Some(back);
+        level
+    }
+}
+
+impl Mcu {
+    /// The board, to claim something: that opens files and waits for the guardian, so the steps
+    /// of a configured machine would wait, too.
+    ///
+    /// # Errors
+    ///
+    /// "Can't assign oid" after `finalize_config`.
+    pub fn board(&mut self) -> Result<&mut dyn Board, Shutdown> {
+        if self.is_finalized() {
+            return Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, "a pin or bus is claimed after finalize_config"));
+        }
+        Ok(&mut *self.board)
+    }
+
+    /// Claims a line for one more use.
+    fn claim(&mut self, pin: Pin, direction: Direction) -> Result<(Arc<dyn Line>, Option<WorkerId>), Shutdown> {
+        let pin = self.board()?.canonical(pin);
+        if let Some(Claim { line, worker, .. }) = self.claims.iter().find(|claim| claim.pin == pin) {
+            line.set_direction(direction)?;
+            return Ok((line.clone(), *worker));
+        }
+        let ClaimedLine { line, sleeps_on } = self.board()?.line(pin, direction)?;
+        let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
+        self.claims.push(Claim { pin, line: line.clone(), worker });
+        Ok((line, worker))
+    }
+
+    /// Claims an output, driven to `level`; it belongs to `shutdown_level` when the machine stops.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, such as "Unable to open out GPIO chip line".
+    pub fn output(&mut self, pin: Pin, level: bool, shutdown_level: bool) -> Result<OutputLine, Shutdown> {
+        let (line, worker) = self.claim(pin, Direction::Output { level, shutdown_level })?;
+        let driver = match worker {
+            None => Driver::Prompt(line),
+            Some(worker) => Driver::Slow(Remote::new(worker, SlowLine(line), level)),
+        };
+        Ok(OutputLine { level, driver })
+    }
+
+    /// Claims an output whose every edge has its instant, such as `step`: a chip that may sleep is
+    /// no good for that.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, and "Unable to open out GPIO chip line" for such a chip.
+    pub fn prompt_output(
+        &mut self,
+        pin: Pin,
+        use_: &str,
+        level: bool,
+        shutdown_level: bool,
+    ) -> Result<PromptLine, Shutdown> {
+        match self.claim(pin, Direction::Output { level, shutdown_level })? {
+            (line, None) => Ok(PromptLine { line, level }),
+            (_, Some(_)) => {
+                let name = self.name(pin);
+                Err(Shutdown::because(
+                    reason::OUTPUT_LINE,
+                    format!(
+                        "{name} can not be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds: choose a pin of the processor itself"
+                    ),
+                ))
+            }
+        }
+    }
+
+    /// Claims an output that workers drive, such as a chip select; it belongs to `level`.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, such as "Unable to open out GPIO chip line".
+    pub fn shared_output(&mut self, pin: Pin, level: bool) -> Result<Arc<dyn Line>, Shutdown> {
+        self.claim(pin, Direction::Output { level, shutdown_level: level }).map(|(line, _)| line)
+    }
+
+    /// Claims an input.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, such as "Unable to open in GPIO chip line".
+    pub fn input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
+        let (line, worker) = self.claim(pin, Direction::Input(bias))?;
+        Ok(InputLine(match worker {
+            None => Sensor::Prompt(line),
+            Some(worker) => Sensor::Slow { worker, sampling: Some(Box::new(Sampling { line, level: Ok(false) })) },
+        }))
+    }
+
+    /// What the dictionary calls a pin.
+    pub fn name(&self, pin: Pin) -> String {
+        self.board.pins().iter().find_map(|range| range.name_of(pin.0)).unwrap_or(format!("pin number {}", pin.0))
+    }
+}

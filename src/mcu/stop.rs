@@ -1,0 +1,191 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! How the machine stops: timers off, outputs to their shutdown values, the host is told.
+//!
+//! An output whose shutdown value can not be written at once, as a worker has to write it or as
+//! writing failed, is *owed*. What failed is tried again every [`RETRY_TICKS`]. Whoever runs the
+//! machine watches [`Mcu::debtor`]: a debt that lasts is for the guardian.
+
+#![forbid(unsafe_code)]
+
+use crate::shutdown::{Shutdown, ShutdownReason, reason};
+use crate::time::Ticks;
+
+use super::{Mcu, Note, Oid, Safe, TimerId, base};
+
+/// Between two attempts to write a shutdown value.
+pub const RETRY_TICKS: Ticks = Ticks::from_us(50_000);
+
+/// How long commands wait for a conversation that one of them began, before the machine stops:
+/// klippy gives up an answer after five seconds (`SerialRetryCommand` in serialhdl.py). A host
+/// whose window of unacknowledged blocks is full can not even send an emergency_stop.
+pub(super) const HOLD_LIMIT: Ticks = Ticks::from_us(5_000_000);
+
+/// What a stopped machine knows of its stop.
+#[derive(Default)]
+pub(super) struct Stop {
+    /// Why the machine is stopped; none while it is not.
+    pub(super) reason: Option<ShutdownReason>,
+    /// Whether it is about to stop.
+    under_way: bool,
+    owed: Vec<Debt>,
+}
+
+/// An object that owes a shutdown value.
+struct Debt {
+    oid: Oid,
+    /// What the log calls it.
+    name: String,
+    /// Whether writing failed.
+    failed: bool,
+}
+
+impl Mcu {
+    /// Whether the machine is stopped.
+    pub fn is_shutdown(&self) -> bool {
+        self.stop.reason.is_some()
+    }
+
+    /// Stops the machine: timers off, outputs to their shutdown values, the host is told. The
+    /// first reason stays.
+    pub fn shut_down(&mut self, shutdown: Shutdown) {
+        if self.stop.under_way {
+            self.outbox.note(Note::Trouble(&shutdown));
+            return;
+        }
+        let clock = self.now();
+        let first = self.stop.reason.is_none();
+        let reason = *self.stop.reason.get_or_insert(shutdown.reason);
+        self.stop.under_way = true;
+        self.timers.clear();
+        for oid in self.oids() {
+            if let Some(mut object) = self.take(oid) {
+                object.shutdown(self, oid);
+                self.put_back(oid, object);
+            }
+        }
+        for oid in self.oids() {
+            self.make_safe(oid);
+        }
+        self.stop.under_way = false;
+        self.retry_later();
+        let static_string_id = self.dialect.static_string_id(reason);
+        self.send(base::ShutdownReport { clock, static_string_id });
+        if first {
+            self.outbox.note(Note::Shutdown(&shutdown));
+        } else if shutdown.reason != reason {
+            // A host that stops a stopped machine says nothing new.
+            self.outbox.note(Note::Trouble(&shutdown));
+        }
+    }
+
+    /// Stops the machine, if it is not stopped already (the firmware's `try_shutdown`).
+    pub fn try_shut_down(&self, shutdown: Shutdown) -> Result<(), Shutdown> {
+        match self.stop.reason {
+            Some(_) => Ok(()),
+            None => Err(shutdown),
+        }
+    }
+
+    /// An output or a device of an object failed: stops the machine, or says so in the log if
+    /// that is stopped already, and tries a shutdown value again later.
+    ///
+    /// # Errors
+    ///
+    /// The failure, unless the machine is stopped.
+    pub fn device_failed(&mut self, oid: Oid, kind: &str, shutdown: Shutdown) -> Result<(), Shutdown> {
+        if self.stop.reason.is_none() {
+            return Err(shutdown);
+        }
+        let known = self.stop.owed.iter_mut().find(|debt| debt.oid == oid);
+        let again = known.is_some_and(|debt| std::mem::replace(&mut debt.failed, true));
+        // What is tried twenty times a second is told once.
+        if !again {
+            let trouble = self.blame(shutdown, kind, oid);
+            self.outbox.note(Note::Trouble(&trouble));
+        }
+        self.retry_later();
+        Ok(())
+    }
+
+    /// The outputs of an object are where they belong in a stopped machine.
+    pub fn is_safe(&mut self, oid: Oid) {
+        let Some(place) = self.stop.owed.iter().position(|debt| debt.oid == oid) else { return };
+        let debt = self.stop.owed.swap_remove(place);
+        if debt.failed {
+            self.outbox.note(Note::Safe(&debt.name));
+        }
+    }
+
+    /// What owes its shutdown value, for the log; none if nothing does.
+    pub fn debtor(&self) -> Option<&str> {
+        self.stop.owed.first().map(|debt| debt.name.as_str())
+    }
+
+    /// Whether anything owes its shutdown value.
+    #[inline]
+    pub fn owes(&self) -> bool {
+        !self.stop.owed.is_empty()
+    }
+
+    fn oids(&self) -> impl Iterator<Item = Oid> + use<> {
+        (0..self.objects.len()).map(Oid::at)
+    }
+
+    fn make_safe(&mut self, oid: Oid) {
+        let Some(mut object) = self.take(oid) else { return };
+        let safe = object.make_safe(self, oid);
+        let kind = object.kind();
+        self.put_back(oid, object);
+        if !matches!(safe, Ok(Safe::Now)) && !self.stop.owed.iter().any(|debt| debt.oid == oid) {
+            let name = self.name_object(kind, oid);
+            self.stop.owed.push(Debt { oid, name, failed: false });
+        }
+        match safe {
+            Ok(Safe::Now) => self.is_safe(oid),
+            Ok(Safe::Later) => {}
+            Err(trouble) => {
+                // A stopped machine only notes it.
+                let _ = self.device_failed(oid, kind, trouble);
+            }
+        }
+    }
+
+    /// Looks again after those that failed, if there are any.
+    fn retry_later(&mut self) {
+        if self.stop.owed.iter().any(|debt| debt.failed) {
+            self.timers.remove(TimerId::RETRY);
+            let at = self.last_read + RETRY_TICKS;
+            self.timers.insert(at, TimerId::RETRY);
+        }
+    }
+
+    /// Tries again what failed.
+    pub(super) fn retry(&mut self) {
+        for place in (0..self.stop.owed.len()).rev() {
+            let failed = self.stop.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.oid);
+            if let Some(oid) = failed {
+                self.make_safe(oid);
+            }
+        }
+        self.retry_later();
+    }
+
+    /// A conversation that a command began takes too long.
+    pub(super) fn held_too_long(&mut self) {
+        if self.is_held() {
+            let holder = self.held_by.and_then(|oid| Some((oid, self.objects.get(oid.index())?.as_ref()?.kind())));
+            let what = holder.map_or_else(|| "a device".to_owned(), |(oid, kind)| self.name_object(kind, oid));
+            let detail = format!(
+                "{what} has not answered for {} s: does its bus or its driver hang (dmesg)?",
+                HOLD_LIMIT.0 / crate::time::CLOCK_FREQ
+            );
+            self.shut_down(Shutdown::because(reason::BUS_HANGS, detail));
+        }
+    }
+
+    pub(super) fn clear_shutdown(&mut self) -> Result<(), Shutdown> {
+        self.stop.reason.take().map(drop).ok_or_else(|| {
+            Shutdown::by_host(reason::NOT_SHUTDOWN, "clear_shutdown came while the machine was not stopped")
+        })
+    }
+}
