@@ -160,13 +160,18 @@ impl ChipSelect {
 }
 
 /// Keeps copies of the outputs, to drive them to their shutdown values if the program dies.
+///
+/// An output is known by its name, which is also what the log calls it, such as `gpiochip0 line 5`
+/// or `pwmchip0/pwm1`. One that is given again replaces what was known of it.
 pub trait Guard: Send {
     /// Copies an output line's descriptor (a GPIO line handle of the character device).
-    fn output(&mut self, line: RawFd, shutdown_value: bool) -> io::Result<()>;
+    /// `sleeping` is the line's chip if its driver may sleep, as it talks to the chip over a bus:
+    /// the lines of such a chip are driven apart from all others, which do not wait for it.
+    fn output(&mut self, name: &str, line: RawFd, shutdown_value: bool, sleeping: Option<&str>) -> io::Result<()>;
 
     /// Copies the descriptors of the files that drive one output (a PWM's duty cycle and its
     /// switch), and what is to be written at the beginning of each, in this order.
-    fn files(&mut self, shutdown: &[(RawFd, &[u8])]) -> io::Result<()>;
+    fn files(&mut self, name: &str, shutdown: &[(RawFd, &[u8])]) -> io::Result<()>;
 
     /// Gives back every copy, so that the lines can be claimed anew. When this returns, they
     /// are free.

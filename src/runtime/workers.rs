@@ -5,7 +5,7 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use std::thread::{self, JoinHandle, Thread};
 
 use rtrb::{Consumer, Producer, RingBuffer};
@@ -32,7 +32,6 @@ struct Worker {
     orders: Producer<Order>,
     answers: Consumer<Completion>,
     quit: Arc<AtomicBool>,
-    clock: Arc<JobClock>,
     thread: JoinHandle<()>,
 }
 
@@ -44,6 +43,8 @@ pub(super) struct Threads {
     core: Thread,
     prepare: Prepare,
     pulse: Pulse,
+    /// Shutdown values that are on their way.
+    owed: Arc<AtomicU32>,
     workers: Vec<Worker>,
     /// Which worker has the device.
     devices: Vec<usize>,
@@ -52,7 +53,7 @@ pub(super) struct Threads {
 impl Threads {
     /// Workers that wake `core` when they have an answer, and show in `pulse` what they are at.
     pub(super) fn new(core: Thread, prepare: Prepare, pulse: Pulse) -> Threads {
-        Threads { core, prepare, pulse, workers: Vec::new(), devices: Vec::new() }
+        Threads { core, prepare, pulse, owed: Arc::default(), workers: Vec::new(), devices: Vec::new() }
     }
 
     fn start(&self, bus: &str) -> Result<Worker, Shutdown> {
@@ -61,18 +62,17 @@ impl Threads {
         let quit = Arc::new(AtomicBool::new(false));
         let (core, prepare, stop) = (self.core.clone(), self.prepare.clone(), quit.clone());
         let clock = self.pulse.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
-        let clock = Arc::new(clock);
-        let shown = clock.clone();
+        let owed = self.owed.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
             .spawn(move || {
                 prepare();
-                serve(inbox, outbox, &stop, &core, &shown);
+                serve(inbox, outbox, &stop, &core, &clock, &owed);
             })
             .map_err(|error| {
                 overflow(bus, &format!("its thread can not be started ({error}): raise TasksMax or ulimit -u"))
             })?;
-        Ok(Worker { bus: bus.into(), orders, answers, quit, clock, thread })
+        Ok(Worker { bus: bus.into(), orders, answers, quit, thread })
     }
 }
 
@@ -107,7 +107,11 @@ impl Workers for Threads {
     }
 
     fn completion(&mut self) -> Option<Completion> {
-        self.workers.iter_mut().find_map(|worker| worker.answers.pop().ok())
+        let completion = self.workers.iter_mut().find_map(|worker| worker.answers.pop().ok());
+        if completion.is_some() && self.owed.load(Ordering::SeqCst) == 0 {
+            self.pulse.paid();
+        }
+        completion
     }
 
     fn has_completion(&self) -> bool {
@@ -122,6 +126,8 @@ impl Workers for Threads {
             let _ = worker.thread.join();
         }
         self.devices.clear();
+        self.owed.store(0, Ordering::SeqCst);
+        self.pulse.paid();
     }
 }
 
@@ -131,11 +137,12 @@ impl Threads {
         let stopping = matches!(&order, Order::Run(job) if job.stopping);
         let kept = if stopping { 0 } else { QUEUE_SPARE };
         if stopping {
-            worker.clock.owe(self.pulse.now());
+            self.owed.fetch_add(1, Ordering::SeqCst);
+            self.pulse.owe(&worker.bus, self.pulse.now());
         }
         if worker.orders.slots() <= kept || worker.orders.push(order).is_err() {
             if stopping {
-                worker.clock.pay();
+                self.owed.fetch_sub(1, Ordering::SeqCst);
             }
             return Err(overflow(
                 &worker.bus,
@@ -159,6 +166,7 @@ fn serve(
     quit: &AtomicBool,
     core: &Thread,
     clock: &JobClock,
+    owed: &AtomicU32,
 ) {
     let mut devices: Vec<(usize, Box<dyn Device>)> = Vec::new();
     loop {
@@ -184,7 +192,7 @@ fn serve(
         let result = device.run(&mut data).map(|()| data);
         clock.end();
         if stopping {
-            clock.pay();
+            owed.fetch_sub(1, Ordering::SeqCst);
         }
         let mut completion = Completion { ticket, result };
         // The core takes answers in faster than a bus gives them.

@@ -175,8 +175,9 @@ impl Board for LinuxBoard {
         let key = handle.key();
         let line = handle.output(value)?;
         if let Some(guard) = &mut self.guard {
-            guard.output(line.as_raw_fd(), shutdown_value).map_err(|error| {
-                let detail = format!("the guardian does not take {} line {}: {error}: restart Pinion", key.0, key.1);
+            let name = format!("{} line {}", key.0, key.1);
+            guard.output(&name, line.as_raw_fd(), shutdown_value, None).map_err(|error| {
+                let detail = format!("the guardian does not take {name}: {error}: restart Pinion");
                 Shutdown::because(Reason::GuardianLost, detail)
             })?;
         }

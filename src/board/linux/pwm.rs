@@ -74,11 +74,12 @@ impl Pwm {
 
     /// Lets the guardian know where the channel belongs if the program dies.
     pub(super) fn guard(&self, guard: &mut dyn Guard, shutdown_value: u16) -> io::Result<()> {
+        let name = self.channel.to_string();
         if shutdown_value == 0 {
-            return guard.files(&[(self.enable.as_raw_fd(), b"0")]);
+            return guard.files(&name, &[(self.enable.as_raw_fd(), b"0")]);
         }
         let duty = self.duty_ns(shutdown_value).to_string();
-        guard.files(&[(self.duty.as_raw_fd(), duty.as_bytes()), (self.enable.as_raw_fd(), b"1")])
+        guard.files(&name, &[(self.duty.as_raw_fd(), duty.as_bytes()), (self.enable.as_raw_fd(), b"1")])
     }
 
     fn duty_ns(&self, value: u16) -> u64 {
