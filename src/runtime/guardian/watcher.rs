@@ -46,6 +46,8 @@ pub(super) fn settle(realtime: bool) {
         Signal::SIGHUP,
         Signal::SIGQUIT,
         Signal::SIGTSTP,
+        Signal::SIGTTIN,
+        Signal::SIGTTOU,
         Signal::SIGUSR1,
         Signal::SIGUSR2,
     ] {
