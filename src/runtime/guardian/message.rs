@@ -71,7 +71,7 @@ impl<'a> Message<'a> {
             (LINE, [value @ (0 | 1), rest @ ..]) => {
                 let (chip, name) = split_text(rest)?;
                 Message::Line {
-                    name: str::from_utf8(name).ok()?,
+                    name: std::str::from_utf8(name).ok()?,
                     shutdown_value: *value != 0,
                     sleeping: Some(chip).filter(|chip| !chip.is_empty()),
                 }
@@ -98,7 +98,7 @@ fn text(text: &str) -> Option<Vec<u8>> {
 fn split_text(bytes: &[u8]) -> Option<(&str, &[u8])> {
     let (length, rest) = bytes.split_first()?;
     let (text, rest) = rest.split_at_checked((*length).into())?;
-    Some((str::from_utf8(text).ok()?, rest))
+    Some((std::str::from_utf8(text).ok()?, rest))
 }
 
 #[cfg(test)]
