@@ -102,3 +102,30 @@ fn the_guardian_ends_with_a_killed_program() {
     program.end();
     wait_until("the guardian ends", || !exists(guardian));
 }
+
+#[test]
+fn a_key_that_stops_programs_does_not_stop_this_one() {
+    let program = Program::start();
+    for signal in [Signal::SIGTSTP, Signal::SIGTTIN, Signal::SIGTTOU] {
+        kill(program.pid(), signal).unwrap();
+        kill(program.guardian(), signal).unwrap();
+    }
+    // One that is stopped would not end.
+    kill(program.pid(), Signal::SIGTERM).unwrap();
+    wait_until("the program ends", || !exists(program.pid()));
+    let (status, log) = program.end();
+    assert!(status.success(), "{log}");
+    assert!(!log.contains("guardian"), "{log}");
+}
+
+#[test]
+fn a_guardian_that_is_stopped_does_not_outlive_the_program() {
+    let program = Program::start();
+    let guardian = program.guardian();
+    kill(guardian, Signal::SIGSTOP).unwrap();
+    kill(program.pid(), Signal::SIGTERM).unwrap();
+    let (status, log) = program.end();
+    assert!(status.success(), "{log}");
+    assert!(log.contains("is stopped or hangs: it is killed"), "{log}");
+    wait_until("the guardian is gone", || !exists(guardian));
+}

@@ -7,7 +7,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::HashSet;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -106,8 +105,6 @@ pub struct SimBoard {
     world: Arc<World>,
     /// By pin number.
     pins: Vec<WiredPin>,
-    /// ADC channels in use.
-    sensors: HashSet<Pin>,
 }
 
 impl SimBoard {
@@ -149,7 +146,7 @@ impl SimBoard {
         for part in &config.inputs {
             wire(Some(&part.pin), Wire::Level(part.level));
         }
-        Ok(SimBoard { clock, seed: config.seed, world: Arc::new(world), pins, sensors: HashSet::new() })
+        Ok(SimBoard { clock, seed: config.seed, world: Arc::new(world), pins })
     }
 
     /// A view of the printer for demonstrations, drawings and tests.
@@ -207,17 +204,8 @@ impl Board for SimBoard {
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let wired = self.pin(pin, reason::ADC_OPEN)?;
         let Wire::Sensor(heater) = &wired.wire else { return Err(wired.is_no("ADC channel", reason::ADC_OPEN)) };
-        if self.sensors.contains(&pin) {
-            let detail = format!(
-                "pin {} of the simulated printer is in use already as {}: choose another pin or remove one use",
-                wired.name,
-                wired.wire.describe()
-            );
-            return Err(Shutdown::because(reason::ADC_OPEN, detail));
-        }
         let noise = Noise::new(self.seed ^ u64::from(pin.0) << 32);
         let sensor = Sensor { heater: heater.clone(), clock: self.clock.clone(), noise };
-        self.sensors.insert(pin);
         Ok(OnWorker { bus: ADC_WORKER.to_owned(), device: Box::new(sensor) })
     }
 
@@ -244,9 +232,8 @@ impl Board for SimBoard {
         Ok(OnWorker { bus: SPI_WORKER.to_owned(), device: Box::new(device) })
     }
 
-    fn reset(&mut self) {
-        self.sensors.clear();
-    }
+    /// Nothing is claimed for good: the parts are there whoever drives them.
+    fn reset(&mut self) {}
 }
 
 /// A line of the board: what a pin is wired to, driven or sensed.

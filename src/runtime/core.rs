@@ -150,6 +150,9 @@ impl Core {
                 }
             }
             let behind = self.mcu.run_timers();
+            if let Some(standstill) = self.pulse.standstill(self.mcu.last_read()) {
+                self.mcu.shut_down(standstill);
+            }
             self.pulse.beat(self.mcu.last_read(), self.mcu.is_running());
             self.mcu.run_workers();
             self.tell_debts();

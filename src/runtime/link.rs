@@ -7,7 +7,6 @@
 #![forbid(unsafe_code)]
 
 use std::io;
-use std::os::fd::{AsFd, OwnedFd};
 use std::sync::Arc;
 use std::thread::{self, Thread};
 use std::time::Duration;
@@ -24,7 +23,7 @@ use crate::wire::block::{Received, Receiver, Sequence, frame};
 use crate::wire::vlq::{Reader, Writer};
 
 use super::core::{Payload, Request};
-use super::guardian::in_ms;
+use super::guardian::{GuardianWatch, in_ms};
 use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
 use super::signals::{Signal, Signals};
@@ -115,7 +114,7 @@ pub(super) struct Link {
     /// A NAK is owed, once everything before it is done.
     refused: bool,
     signals: Signals,
-    guardian: Option<Arc<OwnedFd>>,
+    guardian: Option<GuardianWatch>,
     vigil: Vigil,
     /// When to end, as the guardian is gone.
     leave_at: Option<Duration>,
@@ -149,8 +148,7 @@ pub(super) struct Parts {
     pub(super) progress: Arc<Progress>,
     pub(super) wake: Arc<LinkWake>,
     pub(super) signals: Signals,
-    /// Hangs up once the guardian is gone.
-    pub(super) guardian: Option<Arc<OwnedFd>>,
+    pub(super) guardian: Option<GuardianWatch>,
     pub(super) vigil: Vigil,
 }
 
@@ -195,6 +193,9 @@ impl Link {
         loop {
             if self.vigil.due().is_some() {
                 self.vigil.tick(monotonic());
+            }
+            if self.guardian.as_mut().is_some_and(|guardian| guardian.due().is_some() && guardian.hangs(monotonic())) {
+                self.lose_guardian("the guardian gives no sign of life: was it stopped? (a restart ends it)");
             }
             let stalled = self.take_in();
             self.linger();
@@ -262,7 +263,7 @@ impl Link {
             events |= PollFlags::POLLOUT;
         }
         // Without a guardian any other descriptor stands in.
-        let guardian = self.guardian.as_ref().map_or(self.wake.event(), |socket| socket.as_fd());
+        let guardian = self.guardian.as_ref().map_or(self.wake.event(), GuardianWatch::socket);
         let mut fds = [
             PollFd::new(self.pty.master(), events),
             PollFd::new(self.wake.event(), PollFlags::POLLIN),
@@ -282,23 +283,25 @@ impl Link {
             self.notice_host();
         }
         if lost && self.guardian.is_some() {
-            self.lose_guardian();
+            self.lose_guardian("somebody killed the guardian");
         }
         Ok(woken)
     }
 
     fn timeout(&self, stalled: bool) -> PollTimeout {
         let stall = stalled.then_some(Duration::from_millis(STALL_MS));
-        let due = self.leave_at.into_iter().chain(self.vigil.due()).min();
+        let look = self.guardian.as_ref().and_then(GuardianWatch::due);
+        let due = self.leave_at.into_iter().chain(self.vigil.due()).chain(look).min();
         let due = due.map(|at| at.saturating_sub(monotonic()));
         stall.into_iter().chain(due).min().map_or(PollTimeout::NONE, in_ms)
     }
 
-    /// The guardian is gone: stops the machine, and has the program end once the host has had
+    /// The guardian is gone, or of no use: stops the machine, and has the program end once the host has had
     /// time to read why.
-    fn lose_guardian(&mut self) {
+    fn lose_guardian(&mut self, why: &str) {
         self.guardian = None;
-        let detail = "somebody killed the guardian, and without it a crash would leave heaters on: Pinion ends, to be started anew with one";
+        let detail =
+            format!("{why}, and without it a crash would leave heaters on: Pinion ends, to be started anew with one");
         self.request(Request::Shutdown(Shutdown::because(reason::GUARDIAN_LOST, detail)));
         self.leave_at = Some(monotonic() + FAREWELL);
     }

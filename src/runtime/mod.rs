@@ -137,7 +137,7 @@ pub fn run(
         progress,
         wake,
         signals,
-        guardian: guardian.as_ref().map(Guardian::socket),
+        guardian: guardian.as_ref().map(Guardian::watch),
         vigil: Vigil::new(notify, notify::watchdog_interval(), pulse),
     });
     if realtime {

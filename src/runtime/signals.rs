@@ -12,6 +12,8 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGUSR2};
 use signal_hook::iterator::backend::SignalDelivery;
 use signal_hook::iterator::exfiltrator::SignalOnly;
 
+use crate::sys;
+
 /// What a signal asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Signal {
@@ -29,6 +31,13 @@ pub(super) struct Signals(SignalDelivery<UnixStream, SignalOnly>);
 impl Signals {
     /// From now on the signals that we know come here.
     pub(super) fn new() -> io::Result<Signals> {
+        // A key that stops programs, or a log line to a terminal that takes none from the background,
+        // is no reason to leave heaters to themselves.
+        for stop in
+            [nix::sys::signal::Signal::SIGTSTP, nix::sys::signal::Signal::SIGTTIN, nix::sys::signal::Signal::SIGTTOU]
+        {
+            sys::ignore(stop)?;
+        }
         let (read, write) = UnixStream::pair()?;
         let mut known = vec![SIGTERM, SIGINT, SIGUSR1];
         // A terminal that hangs up ends the program, unless nohup(1) started it. (The C program

@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 use super::*;
+use std::collections::HashSet;
+
 use crate::board::Bias;
 use crate::time::{CLOCK_FREQ, VirtualClock};
 
@@ -70,23 +72,23 @@ fn celsius_of(heater: &HeaterConfig, counts: f64) -> f64 {
 #[test]
 fn homing_closes_the_endstop_at_the_exact_step() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let mut step = bench.output("x_step", false);
-    let mut dir = bench.output("x_dir", false);
-    let mut enable = bench.output("x_enable", true);
-    let mut endstop = bench.input("x_endstop");
+    let step = bench.output("x_step", false);
+    let dir = bench.output("x_dir", false);
+    let enable = bench.output("x_enable", true);
+    let endstop = bench.input("x_endstop");
     dir.write(false).unwrap();
     enable.write(false).unwrap();
     let start = 60 * 80;
     for i in 1..=start {
         assert!(!endstop.read().unwrap(), "closed after {} steps", i - 1);
-        pulse(&mut *step);
+        pulse(&*step);
     }
     assert!(endstop.read().unwrap());
     assert_eq!(bench.axis("x").position_mm, 0.0);
     assert_eq!(bench.axis("x").endstop, Some(true));
     // Back off: open at the first step.
     dir.write(true).unwrap();
-    pulse(&mut *step);
+    pulse(&*step);
     assert!(!endstop.read().unwrap());
     assert_eq!(bench.axis("x").lost_steps, 0);
 }
@@ -98,13 +100,13 @@ fn an_endstop_at_the_maximum_closes_there_and_may_be_inverted() {
     config.axes[0].travel_mm = Some(61.0);
     config.axes[0].endstop_pin = PinName::try_from("!x_endstop".to_owned()).ok();
     let mut bench = Bench::new(config);
-    let mut step = bench.output("x_step", false);
+    let step = bench.output("x_step", false);
     let _dir = bench.output("x_dir", true);
     let _enable = bench.output("x_enable", false);
-    let mut endstop = bench.input("x_endstop");
+    let endstop = bench.input("x_endstop");
     for _ in 0..80 {
         assert!(endstop.read().unwrap());
-        pulse(&mut *step);
+        pulse(&*step);
     }
     assert!(!endstop.read().unwrap());
     assert_eq!(bench.axis("x").position_mm, 61.0);
@@ -113,31 +115,31 @@ fn an_endstop_at_the_maximum_closes_there_and_may_be_inverted() {
 #[test]
 fn an_axis_stays_at_its_hard_limit_and_counts_lost_steps() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let mut step = bench.output("z_step", false);
-    let mut dir = bench.output("z_dir", false);
+    let step = bench.output("z_step", false);
+    let dir = bench.output("z_dir", false);
     let _enable = bench.output("z_enable", false);
     // From 12 mm to the end 2 mm below zero, and 7 steps more.
     for _ in 0..14 * 400 + 7 {
-        pulse(&mut *step);
+        pulse(&*step);
     }
     assert_eq!(bench.axis("z").position_mm, -2.0);
     assert_eq!(bench.axis("z").lost_steps, 7);
     dir.write(true).unwrap();
-    pulse(&mut *step);
+    pulse(&*step);
     assert_eq!(bench.axis("z").position_mm, -2.0 + 1.0 / 400.0);
 }
 
 #[test]
 fn an_axis_moves_only_while_its_motor_is_enabled() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let mut step = bench.output("x_step", false);
-    let mut enable = bench.output("x_enable", true);
+    let step = bench.output("x_step", false);
+    let enable = bench.output("x_enable", true);
     assert!(!bench.axis("x").enabled);
-    pulse(&mut *step);
+    pulse(&*step);
     assert_eq!(bench.axis("x").position_mm, 60.0);
     enable.write(false).unwrap();
     assert!(bench.axis("x").enabled);
-    pulse(&mut *step);
+    pulse(&*step);
     assert_eq!(bench.axis("x").position_mm, 60.0 - 1.0 / 80.0);
     assert_eq!(bench.axis("x").lost_steps, 0);
 }
@@ -149,8 +151,8 @@ fn both_edges_step_if_the_description_says_so() {
     config.axes[1].dir_pin.inverted = true;
     let mut bench = Bench::new(config);
     // The claim of a line is no edge, whatever its level.
-    let mut x_step = bench.output("x_step", true);
-    let mut y_step = bench.output("y_step", false);
+    let x_step = bench.output("x_step", true);
+    let y_step = bench.output("y_step", false);
     let _enable = [bench.output("x_enable", false), bench.output("y_enable", false)];
     let _dir = [bench.output("x_dir", true), bench.output("y_dir", false)];
     for value in [true, false, false, true] {
@@ -166,7 +168,7 @@ fn a_heater_follows_the_analytic_curve() {
     let config = SimConfig::default_printer();
     let bed = config.heaters[1].clone();
     let mut bench = Bench::new(config);
-    let mut power = bench.output("bed_heater", false);
+    let power = bench.output("bed_heater", false);
     bench.advance(10.0);
     power.write(true).unwrap();
     let (p, l, c) = (bed.heater_watts, bed.loss_w_per_k, bed.heat_capacity_j_per_k);
@@ -191,7 +193,7 @@ fn a_sensor_lags_as_the_differential_equation_says() {
     let config = SimConfig::default_printer();
     let hot_end = config.heaters[0].clone();
     let mut bench = Bench::new(config);
-    let mut power = bench.output("hotend_heater", true);
+    let power = bench.output("hotend_heater", true);
     let (mut mass, mut sensor) = (hot_end.ambient_celsius, hot_end.ambient_celsius);
     for i in 0..6 {
         let on = i % 2 == 0;
@@ -214,7 +216,7 @@ fn a_sensor_lags_as_the_differential_equation_says() {
 #[test]
 fn half_a_duty_cycle_is_half_the_power() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let mut power = bench.output("bed_heater", false);
+    let power = bench.output("bed_heater", false);
     for _ in 0..20_000 {
         power.write(true).unwrap();
         bench.advance(0.05);
@@ -235,10 +237,10 @@ fn a_reading_is_the_temperature_with_seeded_noise() {
     for _ in 0..2 {
         let mut bench = Bench::new(config.clone());
         let mut adc = bench.adc("hotend_sensor");
-        let mut power = bench.output("hotend_heater", true);
+        let power = bench.output("hotend_heater", true);
         bench.advance(45.0);
         power.write(false).unwrap();
-        let counts: Vec<u16> = (0..1000).map(|_| adc.read()).collect();
+        let counts: Vec<u16> = (0..1000).map(|_| adc.read().unwrap()).collect();
         let mean = counts.iter().map(|&count| f64::from(count)).sum::<f64>() / 1000.0;
         let truth = bench.probe.heater("extruder").unwrap().sensor_celsius;
         assert!((celsius_of(&heater, mean) - truth).abs() < 0.1);
@@ -251,11 +253,11 @@ fn a_reading_is_the_temperature_with_seeded_noise() {
 #[test]
 fn reset_frees_the_pins_and_the_physics_goes_on() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let mut power = bench.output("bed_heater", true);
-    let mut step = bench.output("x_step", false);
+    let power = bench.output("bed_heater", true);
+    let step = bench.output("x_step", false);
     let enable = bench.output("x_enable", false);
     bench.advance(60.0);
-    pulse(&mut *step);
+    pulse(&*step);
     power.write(false).unwrap();
     let before = bench.probe.heater("heater_bed").unwrap();
     let (celsius, position_mm) = (before.celsius, bench.axis("x").position_mm);
@@ -281,20 +283,16 @@ fn a_wrong_pin_says_which_and_what_to_do() {
     let (step, endstop) = (pin("x_step", board), pin("x_endstop", board));
     let sensor = pin("bed_sensor", board);
     let nowhere = Pin(u32::MAX);
-    assert!(board.output(step, false, false).is_ok());
-    assert!(board.input(endstop, Bias::None).is_ok());
-    assert!(board.adc(sensor).is_ok());
+    let output = Direction::Output { level: false, shutdown_level: false };
+    let input = Direction::Input(Bias::None);
     let errors = [
-        (board.output(nowhere, false, false).err(), reason::NOT_OUTPUT, "no pin 4294967295"),
-        (board.output(endstop, false, false).err(), reason::NOT_OUTPUT, "x_endstop"),
-        (board.output(sensor, false, false).err(), reason::NOT_OUTPUT, "bed_sensor"),
-        (board.output(step, false, false).err(), reason::OUTPUT_LINE, "x_step"),
-        (board.input(nowhere, Bias::None).err(), reason::NOT_INPUT, "no pin 4294967295"),
-        (board.input(step, Bias::None).err(), reason::NOT_INPUT, "x_step"),
-        (board.input(endstop, Bias::None).err(), reason::INPUT_LINE, "x_endstop"),
+        (board.line(nowhere, output).err(), reason::NOT_OUTPUT, "no pin 4294967295"),
+        (board.line(endstop, output).err(), reason::NOT_OUTPUT, "x_endstop"),
+        (board.line(sensor, output).err(), reason::NOT_OUTPUT, "bed_sensor"),
+        (board.line(nowhere, input).err(), reason::NOT_INPUT, "no pin 4294967295"),
+        (board.line(step, input).err(), reason::NOT_INPUT, "x_step"),
         (board.adc(nowhere).err(), reason::ADC_OPEN, "no pin 4294967295"),
         (board.adc(endstop).err(), reason::ADC_OPEN, "x_endstop"),
-        (board.adc(sensor).err(), reason::ADC_OPEN, "bed_sensor"),
     ];
     for (error, reason, subject) in errors {
         let error = error.unwrap();
@@ -308,8 +306,8 @@ fn a_wrong_pin_says_which_and_what_to_do() {
 #[test]
 fn a_fan_spins_up_and_its_tachometer_counts_the_turns() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let mut tachometer = bench.input("fan_tachometer");
-    let mut fan = bench.output("fan", true);
+    let tachometer = bench.input("fan_tachometer");
+    let fan = bench.output("fan", true);
     bench.advance(0.4);
     let rpm = bench.probe.fan("fan").unwrap().rpm;
     assert!((rpm - 4500.0 * (1.0 - (-1f64).exp())).abs() < 1e-6);
@@ -344,7 +342,7 @@ fn a_fan_with_an_enable_pin_needs_both() {
     let _fan = bench.output("fan", true);
     bench.advance(5.0);
     assert_eq!(bench.probe.fan("fan").unwrap().rpm, 0.0);
-    let mut enable = bench.output("fan_enable", true);
+    let enable = bench.output("fan_enable", true);
     enable.write(false).unwrap();
     bench.advance(5.0);
     assert!(bench.probe.fan("fan").unwrap().rpm > 4490.0);
@@ -353,7 +351,7 @@ fn a_fan_with_an_enable_pin_needs_both() {
 #[test]
 fn lights_and_fixed_inputs() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let mut led = bench.output("led", false);
+    let led = bench.output("led", false);
     assert!(!bench.probe.output("light").unwrap().on);
     led.write(true).unwrap();
     assert!(bench.probe.output("light").unwrap().on);
@@ -416,13 +414,13 @@ fn klippy_holds_the_targets_and_finds_no_fault_with_the_heaters() {
         let gains = printer_cfg::Gains::of(&heater);
         let [kp, ki, kd] = [gains.kp, gains.ki, gains.kd].map(|gain| gain / 255.0);
         let mut bench = Bench::new(config);
-        let mut power = bench.output(pin, false);
+        let power = bench.output(pin, false);
         let mut adc = bench.adc(sensor);
         let (mut last, mut slope, mut integral) = (25.0, 0.0, 0.0);
         let (mut duty, mut reached, mut hottest, mut coldest) = (0.0, None, 0f64, f64::MAX);
         for report in 0..1000 {
             let now = 0.3 * f64::from(report);
-            let samples: u16 = (0..8).map(|_| adc.read()).sum();
+            let samples: u16 = (0..8).map(|_| adc.read().unwrap()).sum();
             let celsius = celsius_of(&heater, f64::from(samples) / 8.0);
             slope = slope * 0.7 + (celsius - last);
             last = celsius;

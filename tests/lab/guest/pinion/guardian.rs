@@ -2,13 +2,20 @@
 //! The guardian: whatever becomes of the program, its outputs go to their shutdown values, and
 //! a restart claims them.
 
+use std::fs;
 use std::os::unix::process::ExitStatusExt;
+use std::path::Path;
+use std::thread;
+use std::time::Duration;
 
+use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use pinion::time::monotonic;
 
 use super::outputs::Outputs;
-use crate::program::{Program, exists, shutdown_of};
+use crate::gpio_sim::GpioSim;
+use crate::program::{Program, configure, exists, run, shutdown_of};
 use crate::sysfs;
 use crate::trace::Trace;
 
@@ -33,8 +40,9 @@ fn end_by(outputs: &Outputs, signal: Signal) -> String {
     let safe_us = outputs.assert_safe(&trace);
     assert!(safe_us - began_us < WITHIN_US, "{signal}: it took {} us", safe_us - began_us);
     sysfs::wait_until("the guardian is gone", || !exists(guardian));
-    // SIGUSR2 makes the core hang, for which the guardian kills the program.
-    let death = if signal == Signal::SIGUSR2 { Signal::SIGKILL } else { signal };
+    // SIGUSR2 makes the core hang and SIGSTOP the whole program, for which the guardian kills it.
+    let hangs = [Signal::SIGUSR2, Signal::SIGSTOP].contains(&signal);
+    let death = if hangs { Signal::SIGKILL } else { signal };
     assert_eq!(program.wait().signal(), Some(death as i32));
     println!("{signal}: safe after {} us", safe_us - began_us);
     program.log()
@@ -75,4 +83,157 @@ fn a_program_without_its_guardian_stops_and_says_so() {
     program.wait_for_line(&["shutdown: Guardian process lost", "somebody killed the guardian"]);
     let program = Program::start();
     outputs.switch_on(&mut program.connect(), 0);
+}
+
+#[test]
+fn a_program_that_is_stopped_is_killed_and_its_outputs_are_safe() {
+    let outputs = Outputs::new();
+    let log = end_by(&outputs, Signal::SIGSTOP);
+    assert!(log.contains("the core gave no sign of life for 550 ms"), "{log}");
+    let program = Program::start();
+    outputs.switch_on(&mut program.connect(), 0);
+}
+
+#[test]
+fn a_guardian_that_is_stopped_counts_as_lost() {
+    let outputs = Outputs::new();
+    let mut program = Program::start();
+    let mut client = program.connect();
+    outputs.switch_on(&mut client, 0);
+    let guardian = program.guardian();
+    let trace = Trace::start();
+    outputs.wait_until_on();
+    let began_us = monotonic().as_micros() as u64;
+    kill(guardian, Signal::SIGSTOP).expect("a guardian");
+    assert_eq!(shutdown_of(&mut client), "Guardian process lost");
+    let safe_us = outputs.assert_safe(&trace);
+    // It had listened 550 ms before at most.
+    let after_ms = (safe_us - began_us) / 1000;
+    assert!((1400..2100).contains(&after_ms), "{after_ms} ms");
+    assert_eq!(program.wait().code(), Some(1));
+    assert!(!exists(guardian), "it would keep the lines");
+    program.wait_for_line(&["shutdown: Guardian process lost", "no sign of life: was it stopped?"]);
+    let program = Program::start();
+    outputs.switch_on(&mut program.connect(), 0);
+}
+
+/// A line that is on, without a limit (`max_duration`) and with nothing else that would notice
+/// that time was lost.
+struct Heater {
+    sim: GpioSim,
+}
+
+impl Heater {
+    fn new() -> Heater {
+        Heater { sim: GpioSim::new("lab", 8) }
+    }
+
+    fn switch_on(&self, program: &Program) -> pinion::host::Client {
+        let mut client = program.connect();
+        configure(&mut client, 1, &["config_digital_out oid=0 pin=lab/gpio0 value=0 default_value=0 max_duration=0"]);
+        run(&mut client, "update_digital_out oid=0 value=1");
+        assert!(self.is_on());
+        client
+    }
+
+    fn is_on(&self) -> bool {
+        self.sim.level(0)
+    }
+
+    /// The machine is stopped, and the program lives: nobody took it for one that hangs.
+    fn assert_stopped_in_order(&self, mut program: Program, mut client: pinion::host::Client) {
+        assert_eq!(shutdown_of(&mut client), "Rescheduled timer in the past");
+        sysfs::wait_until("the heater is off", || !self.is_on());
+        program.wait_for_line(&["Pinion stood still for"]);
+        assert!(exists(program.guardian()));
+        // Longer than any of the two is patient with the other.
+        thread::sleep(Duration::from_secs(3));
+        assert!(program.is_running());
+        program.signal(Signal::SIGTERM);
+        assert!(program.wait().success());
+        assert!(!program.log().contains("guardian"), "{}", program.log());
+    }
+}
+
+#[test]
+fn a_machine_that_was_stopped_with_its_guardian_stops_when_both_go_on() {
+    let heater = Heater::new();
+    for guardian_first in [true, false] {
+        let program = Program::start();
+        let client = heater.switch_on(&program);
+        let mut both = [program.guardian(), program.pid()];
+        for process in both {
+            kill(process, Signal::SIGSTOP).expect("a process");
+        }
+        thread::sleep(Duration::from_secs(20));
+        assert!(heater.is_on(), "nobody is left who could switch it off");
+        if !guardian_first {
+            both.reverse();
+        }
+        for process in both {
+            kill(process, Signal::SIGCONT).expect("a process");
+        }
+        heater.assert_stopped_in_order(program, client);
+    }
+}
+
+/// A control group (version 2) of its own.
+struct ControlGroup;
+
+impl ControlGroup {
+    const ROOT: &str = "/tmp/cgroup";
+    const GROUP: &str = "/tmp/cgroup/pinion";
+
+    fn new() -> ControlGroup {
+        fs::create_dir_all(Self::ROOT).expect("a folder");
+        let none: Option<&str> = None;
+        mount(Some("cgroup2"), Self::ROOT, Some("cgroup2"), MsFlags::empty(), none).expect("control groups");
+        fs::create_dir(Self::GROUP).expect("a control group");
+        ControlGroup
+    }
+
+    fn add(&self, process: Pid) {
+        sysfs::write(Path::new(Self::GROUP).join("cgroup.procs"), process.to_string());
+    }
+
+    fn freeze(&self, frozen: bool) {
+        let frozen = u8::from(frozen);
+        sysfs::write(Path::new(Self::GROUP).join("cgroup.freeze"), frozen.to_string());
+        let state = format!("frozen {frozen}");
+        sysfs::wait_until(&state, || sysfs::read(Path::new(Self::GROUP).join("cgroup.events")).contains(&state));
+    }
+}
+
+impl Drop for ControlGroup {
+    fn drop(&mut self) {
+        // Thawed, or what is in it could not even be killed.
+        let _ = fs::write(Path::new(Self::GROUP).join("cgroup.freeze"), "0");
+        let processes = fs::read_to_string(Path::new(Self::GROUP).join("cgroup.procs")).unwrap_or_default();
+        for process in processes.lines() {
+            let _ = fs::write(Path::new(Self::ROOT).join("cgroup.procs"), process);
+        }
+        let _ = fs::remove_dir(Self::GROUP);
+        let _ = umount2(Self::ROOT, MntFlags::MNT_DETACH);
+    }
+}
+
+#[test]
+fn a_machine_whose_control_group_was_frozen_stops_when_it_is_thawed() {
+    let heater = Heater::new();
+    let program = Program::start();
+    let group = ControlGroup::new();
+    group.add(program.pid());
+    group.add(program.guardian());
+    let client = heater.switch_on(&program);
+    // A moment in which nothing is noticed, and no longer than what is noticed anyway.
+    group.freeze(true);
+    thread::sleep(Duration::from_millis(300));
+    group.freeze(false);
+    thread::sleep(Duration::from_secs(5));
+    assert!(heater.is_on(), "{}", program.log());
+    group.freeze(true);
+    thread::sleep(Duration::from_secs(20));
+    assert!(heater.is_on());
+    group.freeze(false);
+    heater.assert_stopped_in_order(program, client);
 }

@@ -1,0 +1,484 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The guardian: a second process that drives the outputs to their shutdown values if the
+//! program dies or its core hangs.
+//!
+//! It is forked before any thread starts, and is given a copy of every output's descriptor with
+//! the shutdown value: a line keeps its state as long as a descriptor of it is open. It acts
+//!
+//! - when the program's end of their socket closes without a goodbye, or its pidfd says that it
+//!   is gone: SIGKILL, a crash, the OOM killer;
+//! - when the core leaves no heartbeat in a page that both share (`pulse.rs`), while outputs are
+//!   held: within 600 ms of its last one while the machine runs.
+//!
+//! It drives the outputs, kills the program if that still lives (so that a core which comes back
+//! can not drive them again; what it drove meanwhile is driven back), says so in the log, and
+//! ends, which frees the lines for a restart. It has a session of its own and ignores the signals
+//! that ask a program to end, as a terminal and a service manager send them to both processes:
+//! it ends when the program says goodbye.
+//!
+//! A guardian that is killed, stopped or hangs stops the machine: the link notices, the machine
+//! shuts down as "Guardian process lost", and the program ends with status 1, so that the service
+//! manager starts both anew: a second guardian can not be forked from a program with threads.
+//!
+//! This file is the program's side, `watcher.rs` the second process, and `message.rs` what they say
+//! to each other.
+//!
+//! For tests: with `PINION_TEST_HANG` in the environment SIGUSR2 makes the core hang.
+
+#![forbid(unsafe_code)]
+
+mod message;
+mod watcher;
+
+use std::io::{self, IoSlice};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
+use std::sync::Arc;
+use std::thread;
+use std::time::Duration;
+
+use log::warn;
+use nix::errno::Errno;
+use nix::poll::PollTimeout;
+use nix::sys::signal::{Signal, kill};
+use nix::sys::socket::{
+    AddressFamily, ControlMessage, MsgFlags, SockFlag, SockType, recv, send, sendmsg, setsockopt, socketpair, sockopt,
+};
+use nix::sys::time::TimeVal;
+use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
+use nix::unistd::{Pid, getpid};
+
+use crate::board::linux::Guard;
+use crate::sys;
+use crate::time::{Monotonic, monotonic};
+
+use super::pulse::{GuardianEar, Pulse};
+
+use message::{Message, TAKEN};
+use watcher::{Program, Watcher};
+
+/// How long the program waits for the guardian's answer.
+const ANSWER_S: i64 = 5;
+/// How long a process that was asked to end, or killed, may take to be gone.
+const END: Duration = Duration::from_secs(2);
+
+/// The program's end of the guardian. Dropped without [`Guardian::goodbye`] it makes the guardian
+/// drive what it holds.
+pub struct Guardian {
+    socket: Arc<OwnedFd>,
+    pid: Pid,
+    pulse: Pulse,
+}
+
+impl Guardian {
+    /// Forks the guardian: before any thread is started. `clock` is the core's. With `realtime`
+    /// it runs above the core.
+    ///
+    /// # Errors
+    ///
+    /// If there are threads already, or the kernel has no room for a process, a socket or a page.
+    pub fn start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
+        Guardian::try_start(clock, realtime)
+            .map_err(|error| io::Error::new(error.kind(), format!("the guardian can not be started: {error}")))
+    }
+
+    fn try_start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
+        let pulse = Pulse::new(clock)?;
+        let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
+        setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::new(ANSWER_S, 0))?;
+        let program = Program::new(getpid());
+        let ours = socket.as_raw_fd();
+        let pid = sys::fork(move || {
+            // A copy of the program's end: while it is open here, the program's death would not
+            // close the socket.
+            let _ = nix::unistd::close(ours);
+            watcher::settle(realtime);
+            Watcher::new(theirs, program, pulse).watch();
+            0
+        })?;
+        // Once it answers, the signals that end a program do not end it.
+        answer(&socket)?;
+        Ok(Guardian { socket: Arc::new(socket), pid, pulse })
+    }
+
+    /// What a board gives its outputs to.
+    pub fn guard(&self) -> Box<dyn Guard> {
+        Box::new(Lifeline { socket: self.socket.clone(), pulse: self.pulse, lost: false })
+    }
+
+    pub(super) fn pulse(&self) -> Pulse {
+        self.pulse
+    }
+
+    /// How the program notices that the guardian is lost.
+    pub(super) fn watch(&self) -> GuardianWatch {
+        GuardianWatch { socket: self.socket.clone(), ear: GuardianEar::new(self.pulse) }
+    }
+
+    /// Ends the guardian: the outputs are where they belong.
+    pub fn goodbye(self) {
+        if self.tell_goodbye().is_err() {
+            return;
+        }
+        let until = monotonic() + END;
+        while let Ok(WaitStatus::StillAlive) = waitpid(self.pid, Some(WaitPidFlag::WNOHANG)) {
+            if monotonic() > until {
+                warn!(
+                    "the guardian (process {}) is stopped or hangs: it is killed, as it would keep the lines",
+                    self.pid
+                );
+                // It is our child, and nobody has waited for it: the number is still its own.
+                let _ = kill(self.pid, Signal::SIGKILL);
+                return;
+            }
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    fn tell_goodbye(&self) -> io::Result<()> {
+        let message = Message::Goodbye.encode().ok_or(io::ErrorKind::InvalidInput)?;
+        send(self.socket.as_raw_fd(), &message, MsgFlags::MSG_NOSIGNAL)?;
+        Ok(())
+    }
+}
+
+/// The link's end of the guardian.
+pub(super) struct GuardianWatch {
+    socket: Arc<OwnedFd>,
+    ear: GuardianEar,
+}
+
+impl GuardianWatch {
+    /// Hangs up (POLLHUP) once the guardian is gone.
+    pub(super) fn socket(&self) -> BorrowedFd<'_> {
+        self.socket.as_fd()
+    }
+
+    /// When to ask next whether the guardian hangs (CLOCK_MONOTONIC); none while it holds no
+    /// outputs.
+    pub(super) fn due(&self) -> Option<Duration> {
+        self.ear.due()
+    }
+
+    /// Whether it is stopped or hangs at `now` (CLOCK_MONOTONIC).
+    pub(super) fn hangs(&mut self, now: Duration) -> bool {
+        self.ear.is_lost(now)
+    }
+}
+
+/// The board's end of the guardian.
+struct Lifeline {
+    socket: Arc<OwnedFd>,
+    pulse: Pulse,
+    /// After an answer that did not come, later ones might be taken for it.
+    lost: bool,
+}
+
+impl Lifeline {
+    fn ask(&mut self, message: &Message<'_>, descriptor: Option<RawFd>) -> io::Result<()> {
+        if self.lost {
+            return Err(io::Error::other("it is lost"));
+        }
+        let message = message.encode().ok_or(io::ErrorKind::InvalidInput)?;
+        if self.converse(&message, descriptor)? {
+            return Ok(());
+        }
+        Err(io::Error::other("it has no room for another descriptor (raise LimitNOFILE)"))
+    }
+
+    /// Whether the guardian takes the message. Without an answer it is lost.
+    fn converse(&mut self, message: &[u8], descriptor: Option<RawFd>) -> io::Result<bool> {
+        let fds: Vec<RawFd> = descriptor.into_iter().collect();
+        let rights = [ControlMessage::ScmRights(&fds)];
+        let control = if fds.is_empty() { &[][..] } else { &rights[..] };
+        let socket = self.socket.as_raw_fd();
+        let sent = sendmsg::<()>(socket, &[IoSlice::new(message)], control, MsgFlags::MSG_NOSIGNAL, None);
+        sent.map_err(io::Error::from).and_then(|_| answer(&self.socket)).inspect_err(|_| {
+            self.lost = true;
+            self.pulse.miss_answer();
+        })
+    }
+}
+
+/// Waits for the guardian's answer: whether it has taken what it was sent.
+fn answer(socket: &OwnedFd) -> io::Result<bool> {
+    let mut answer = [0];
+    loop {
+        return match recv(socket.as_raw_fd(), &mut answer, MsgFlags::empty()) {
+            Err(Errno::EINTR) => continue,
+            Err(Errno::EAGAIN) => Err(io::Error::other(format!("it gave no answer within {ANSWER_S} s"))),
+            Err(error) => Err(error.into()),
+            Ok(1) => Ok(answer == [TAKEN]),
+            Ok(_) => Err(io::Error::other("it is gone")),
+        };
+    }
+}
+
+impl Guard for Lifeline {
+    fn output(&mut self, name: &str, line: RawFd, shutdown_value: bool, sleeping: Option<&str>) -> io::Result<()> {
+        self.ask(&Message::Line { name, shutdown_value, sleeping }, Some(line))
+    }
+
+    fn files(&mut self, name: &str, shutdown: &[(RawFd, &[u8])]) -> io::Result<()> {
+        let Some(((file, bytes), others)) = shutdown.split_last() else { return Ok(()) };
+        others.iter().try_for_each(|(file, bytes)| self.ask(&Message::File(bytes), Some(*file)))?;
+        self.ask(&Message::LastFile { name, bytes }, Some(*file))
+    }
+
+    fn forget(&mut self, name: &str) -> io::Result<()> {
+        self.ask(&Message::Forget { name }, None)
+    }
+
+    fn release(&mut self) -> io::Result<()> {
+        self.ask(&Message::Release, None)
+    }
+}
+
+/// A poll's timeout, rounded up.
+pub(super) fn in_ms(timeout: Duration) -> PollTimeout {
+    let ms = timeout.as_nanos().div_ceil(1_000_000);
+    PollTimeout::try_from(ms).unwrap_or(PollTimeout::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nix::sys::resource::{Resource, setrlimit};
+    use std::fs::{self, File};
+    use std::io::{BufRead, BufReader};
+    use std::path::{Path, PathBuf};
+    use std::process::{Child, Command, Stdio};
+
+    const MS: Duration = Duration::from_millis(1);
+
+    /// A core that gets on while a shutdown value does not get to its output.
+    fn stop_and_owe(pulse: Pulse) {
+        for beats in 0.. {
+            if beats == 10 {
+                pulse.owe("pwmchip7/pwm0", pulse.now());
+            }
+            // Never as a machine that runs, of which a busy computer could miss a beat.
+            pulse.beat(pulse.now(), false);
+            thread::sleep(10 * MS);
+        }
+    }
+
+    /// A guarded program, which is killed with a test that fails.
+    struct Guarded(Child);
+
+    impl Drop for Guarded {
+        fn drop(&mut self) {
+            let _ = self.0.kill();
+            let _ = self.0.wait();
+        }
+    }
+
+    /// This test program itself, as a program that is guarded.
+    fn start(script: &str, file: &Path) -> (Guarded, u32) {
+        fs::write(file, "on ").unwrap();
+        let mut child = Command::new(std::env::current_exe().unwrap())
+            .args(["--ignored", "--exact", "runtime::guardian::tests::guarded_program"])
+            .args(["--test-threads=1", "--nocapture"])
+            .env("GUARDED_SCRIPT", script)
+            .env("GUARDED_FILE", file)
+            .stdout(Stdio::piped())
+            .stderr(File::create(log_of(file)).unwrap())
+            .spawn()
+            .unwrap();
+        let lines = BufReader::new(child.stdout.as_mut().unwrap()).lines();
+        let guardian = lines.map_while(Result::ok).find_map(|line| line.strip_prefix("guardian ")?.parse().ok());
+        (Guarded(child), guardian.expect("the guarded program says who guards it"))
+    }
+
+    #[test]
+    #[ignore = "started by other tests"]
+    fn guarded_program() {
+        let (Ok(script), Ok(path)) = (std::env::var("GUARDED_SCRIPT"), std::env::var("GUARDED_FILE")) else { return };
+        env_logger::Builder::new().filter_level(log::LevelFilter::Info).init();
+        if script == "cramped" {
+            // Less than the stack of one more thread.
+            let pages: u64 =
+                fs::read_to_string("/proc/self/statm").unwrap().split(' ').next().unwrap().parse().unwrap();
+            let limit = pages * 4096 + (1 << 20);
+            setrlimit(Resource::RLIMIT_AS, limit, limit).unwrap();
+        }
+        let guardian = Guardian::start(Monotonic::start(), false).unwrap();
+        let pulse = guardian.pulse();
+        let mut guard = guardian.guard();
+        let file = File::options().read(true).write(script != "readonly").open(path).unwrap();
+        let shutdown: [(RawFd, &[u8]); 2] = [(file.as_raw_fd(), b"on?"), (file.as_raw_fd(), b"off")];
+        if script == "again" {
+            // A value that is then replaced.
+            guard.files("pwmchip7/pwm0", &[(file.as_raw_fd(), b"old"), (file.as_raw_fd(), b"bad")]).unwrap();
+        }
+        guard.files("pwmchip7/pwm0", &shutdown).unwrap();
+        if script == "release" {
+            guard.release().unwrap();
+        }
+        // Before a beat that may be the last.
+        println!("\nguardian {}", guardian.pid);
+        pulse.beat(pulse.now(), script == "hang");
+        match script.as_str() {
+            "abort" => std::process::abort(),
+            "goodbye" => guardian.goodbye(),
+            "owe" => stop_and_owe(pulse),
+            _ => loop {
+                thread::sleep(Duration::from_secs(1));
+            },
+        }
+    }
+
+    fn wait_until(what: &str, condition: impl Fn() -> bool) {
+        let until = monotonic() + Duration::from_secs(60);
+        while !condition() {
+            assert!(monotonic() < until, "waited in vain: {what}");
+            thread::sleep(5 * MS);
+        }
+    }
+
+    fn is_gone(pid: u32) -> bool {
+        // An orphan's zombie may wait for an init that does not care.
+        fs::read_to_string(format!("/proc/{pid}/stat")).map_or(true, |stat| stat.contains(") Z "))
+    }
+
+    fn content(file: &Path) -> String {
+        fs::read_to_string(file).unwrap()
+    }
+
+    /// A file, in a folder that goes with it.
+    fn file() -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("output");
+        (folder, file)
+    }
+
+    fn log_of(file: &Path) -> PathBuf {
+        file.with_extension("log")
+    }
+
+    #[test]
+    fn a_killed_program_s_outputs_go_to_their_shutdown_values() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("sleep", &file);
+        let comm = fs::read_to_string(format!("/proc/{guardian}/comm")).unwrap();
+        assert_eq!(comm, "pinion-guardian\n");
+        assert_eq!(content(&file), "on ");
+        program.0.kill().unwrap();
+        wait_until("driven", || content(&file) == "off");
+        wait_until("the guardian ends", || is_gone(guardian));
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn an_output_that_is_given_again_goes_to_the_later_value() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("again", &file);
+        program.0.kill().unwrap();
+        wait_until("the guardian ends", || is_gone(guardian));
+        assert_eq!(content(&file), "off");
+        assert!(content(&log_of(&file)).contains("all 1 outputs are driven"));
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn an_output_that_can_not_be_driven_is_named() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("readonly", &file);
+        program.0.kill().unwrap();
+        wait_until("the guardian ends", || is_gone(guardian));
+        let log = content(&log_of(&file));
+        assert!(
+            log.contains("pwmchip7/pwm0: Bad file descriptor (os error 9): it is not at its shutdown value"),
+            "{log}"
+        );
+        assert!(log.contains("only 0 of 1 outputs are driven") && log.contains("switch the power off"), "{log}");
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn a_guardian_without_memory_for_threads_drives_the_outputs_all_the_same() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("cramped", &file);
+        program.0.kill().unwrap();
+        wait_until("the guardian ends", || is_gone(guardian));
+        assert_eq!(content(&file), "off");
+        assert!(content(&log_of(&file)).contains("all 1 outputs are driven"));
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn an_aborted_program_s_outputs_go_to_their_shutdown_values() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("abort", &file);
+        wait_until("driven", || content(&file) == "off");
+        wait_until("the guardian ends", || is_gone(guardian));
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn a_program_that_hangs_is_killed_and_its_outputs_driven() {
+        use std::os::unix::process::ExitStatusExt;
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("hang", &file);
+        wait_until("driven", || content(&file) == "off");
+        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
+        wait_until("the guardian ends", || is_gone(guardian));
+    }
+
+    #[test]
+    fn an_output_that_does_not_get_its_shutdown_value_is_named_and_the_program_killed() {
+        use std::os::unix::process::ExitStatusExt;
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("owe", &file);
+        wait_until("driven", || content(&file) == "off");
+        assert_eq!(program.0.wait().unwrap().signal(), Some(9));
+        wait_until("the guardian ends", || is_gone(guardian));
+        let log = content(&log_of(&file));
+        assert!(log.contains("pwmchip7/pwm0 is not at its shutdown value within 1000 ms:"), "{log}");
+        // Two files are one output.
+        assert!(log.contains("all 1 outputs are driven to their shutdown values"), "{log}");
+    }
+
+    #[test]
+    fn signals_that_ask_a_program_to_end_leave_the_guardian_alone() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("sleep", &file);
+        for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
+            kill(Pid::from_raw(guardian as i32), signal).unwrap();
+        }
+        thread::sleep(50 * MS);
+        assert!(!is_gone(guardian));
+        program.0.kill().unwrap();
+        wait_until("driven", || content(&file) == "off");
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn outputs_that_were_given_back_stay_as_they_are() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("release", &file);
+        program.0.kill().unwrap();
+        wait_until("the guardian ends", || is_gone(guardian));
+        assert_eq!(content(&file), "on ");
+        program.0.wait().unwrap();
+    }
+
+    #[test]
+    fn after_a_goodbye_outputs_stay_as_they_are() {
+        let (_folder, file) = file();
+        let (mut program, guardian) = start("goodbye", &file);
+        assert!(program.0.wait().unwrap().success());
+        assert!(is_gone(guardian));
+        assert_eq!(content(&file), "on ");
+    }
+
+    #[test]
+    fn a_program_with_threads_can_not_be_guarded() {
+        // libtest runs tests in threads, unless told otherwise.
+        let (stop, stopped) = std::sync::mpsc::channel::<()>();
+        let other = thread::spawn(move || stopped.recv());
+        let error = Guardian::start(Monotonic::start(), false).err().unwrap();
+        assert_eq!(error.to_string(), "the guardian can not be started: threads have been started already");
+        drop(stop);
+        let _ = other.join();
+    }
+}

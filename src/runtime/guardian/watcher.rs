@@ -1,0 +1,595 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The second process: watches the program, and drives the outputs when it has to.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::iter;
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
+use std::sync::mpsc::{self, Receiver, Sender};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use log::error;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::prctl;
+use nix::sys::signal::{Signal, kill};
+use nix::sys::socket::{MsgFlags, send};
+use nix::sys::uio::pwrite;
+use nix::unistd::{Pid, alarm, chdir, getppid, setsid};
+
+use crate::sys;
+use crate::time::monotonic;
+
+use super::super::pulse::{Ear, Pulse};
+use super::super::realtime;
+use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
+use super::{END, in_ms};
+
+/// How long an output that can not be driven is tried, and a driver that hangs waited for.
+const TRY_FOR: Duration = Duration::from_secs(2);
+/// How often such an output is tried.
+const TRY_EVERY: Duration = Duration::from_millis(50);
+/// How long the log may take, in seconds.
+const LOG_S: u32 = 2;
+
+/// Makes the process itself: its name, session, signals and priority.
+pub(super) fn settle(realtime: bool) {
+    // None of these can fail where it matters, and there is nobody to tell.
+    let _ = prctl::set_name(c"pinion-guardian");
+    let _ = setsid();
+    let _ = chdir("/");
+    for ignored in [
+        Signal::SIGTERM,
+        Signal::SIGINT,
+        Signal::SIGHUP,
+        Signal::SIGQUIT,
+        Signal::SIGTSTP,
+        Signal::SIGTTIN,
+        Signal::SIGTTOU,
+        Signal::SIGUSR1,
+        Signal::SIGUSR2,
+    ] {
+        let _ = sys::ignore(ignored);
+    }
+    // As root: the last to be picked when memory is short.
+    let _ = std::fs::write("/proc/self/oom_score_adj", "-1000");
+    if realtime {
+        realtime::enter_guardian();
+    }
+    // The code that drives outputs is read from the disk now, and locked in memory with the rest:
+    // later the disk might hang.
+    drive(&mut []);
+}
+
+/// Drives an output to its shutdown value.
+type Drive = Box<dyn Fn() -> io::Result<()> + Send>;
+
+/// What became of an output.
+struct Outcome {
+    name: String,
+    /// What its last drive came to; none as long as the first has not come back.
+    result: Option<io::Result<()>>,
+}
+
+impl Outcome {
+    fn is_driven(&self) -> bool {
+        matches!(self.result, Some(Ok(())))
+    }
+
+    /// For the log: its name and what is wrong.
+    fn complaint(&self) -> String {
+        match &self.result {
+            Some(Err(error)) => format!("{}: {error}", self.name),
+            _ => format!("{}: its driver hangs (dmesg)", self.name),
+        }
+    }
+}
+
+/// An output.
+struct Output {
+    drive: Drive,
+    outcome: Outcome,
+}
+
+impl Output {
+    fn new(name: &str, drive: Drive) -> Output {
+        Output { drive, outcome: Outcome { name: name.into(), result: None } }
+    }
+
+    fn line(name: &str, line: OwnedFd, value: bool) -> Output {
+        Output::new(name, Box::new(move || sys::set_line(line.as_fd(), value)))
+    }
+
+    /// An output of files, such as a PWM, and what is to be written at the beginning of each.
+    fn files(name: &str, files: Vec<(OwnedFd, Box<[u8]>)>) -> Output {
+        let drive = move || {
+            files.iter().try_for_each(|(file, bytes)| match pwrite(file, bytes, 0)? {
+                written if written == bytes.len() => Ok(()),
+                _ => Err(io::ErrorKind::WriteZero.into()),
+            })
+        };
+        Output::new(name, Box::new(drive))
+    }
+}
+
+/// Drives every output, whatever becomes of the others. Does not allocate.
+fn drive(outputs: &mut [Output]) {
+    for Output { drive, outcome } in outputs {
+        outcome.result = Some(drive());
+    }
+}
+
+/// Outputs that are driven by one thread: those of a chip whose driver may sleep, or a PWM.
+struct Group {
+    chip: String,
+    outputs: Vec<Output>,
+}
+
+/// What the guardian holds.
+#[derive(Default)]
+struct Held {
+    /// Lines whose drivers never sleep.
+    native: Vec<Output>,
+    apart: Vec<Group>,
+}
+
+impl Held {
+    fn is_empty(&self) -> bool {
+        self.native.is_empty() && self.apart.is_empty()
+    }
+
+    /// Holds an output, in place of what was held by its name. One with a chip of its own is driven
+    /// apart from those of other chips.
+    fn hold(&mut self, chip: Option<&str>, output: Output) {
+        self.forget(&output.outcome.name);
+        match chip {
+            None => self.native.push(output),
+            Some(chip) => match self.apart.iter_mut().find(|group| group.chip == chip) {
+                Some(group) => group.outputs.push(output),
+                None => self.apart.push(Group { chip: chip.into(), outputs: vec![output] }),
+            },
+        }
+    }
+
+    /// Gives back what is held by a name.
+    fn forget(&mut self, name: &str) {
+        let others = self.apart.iter_mut().map(|group| &mut group.outputs);
+        for outputs in iter::once(&mut self.native).chain(others) {
+            outputs.retain(|held| *held.outcome.name != *name);
+        }
+        self.apart.retain(|group| !group.outputs.is_empty());
+    }
+}
+
+/// The guarded program.
+#[derive(Debug)]
+pub(super) struct Program {
+    pid: Pid,
+    pidfd: Option<OwnedFd>,
+}
+
+impl Program {
+    /// The process `pid`, which is our parent.
+    pub(super) fn new(pid: Pid) -> Program {
+        // Before Linux 5.3 the socket alone tells the program's end.
+        Program { pid, pidfd: sys::pidfd(pid).ok() }
+    }
+
+    fn has_ended(&self) -> bool {
+        match &self.pidfd {
+            Some(pidfd) => is_readable(pidfd.as_fd()),
+            None => getppid() != self.pid,
+        }
+    }
+
+    fn kill(&self) {
+        // Its pid is its own as long as it is our parent.
+        if getppid() == self.pid {
+            let _ = kill(self.pid, Signal::SIGKILL);
+        }
+    }
+
+    fn wait_for_end(&self) {
+        let until = monotonic() + END;
+        while !self.has_ended() && monotonic() < until {
+            thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+/// Why the outputs are driven.
+enum Cause {
+    Died,
+    Hangs,
+}
+
+/// What a message came to.
+enum Heard {
+    /// The guardian goes on.
+    Message,
+    Goodbye,
+    /// There is nobody at the other end any more.
+    End,
+}
+
+/// The second process.
+pub(super) struct Watcher {
+    socket: OwnedFd,
+    program: Program,
+    pulse: Pulse,
+    held: Held,
+    /// The files so far of an output that has more of them.
+    files: Vec<(OwnedFd, Box<[u8]>)>,
+}
+
+impl Watcher {
+    pub(super) fn new(socket: OwnedFd, program: Program, pulse: Pulse) -> Watcher {
+        Watcher { socket, program, pulse, held: Held::default(), files: Vec::new() }
+    }
+
+    /// Says that it is there, and watches until the program says goodbye or needs help.
+    pub(super) fn watch(mut self) {
+        self.answer(TAKEN);
+        // While outputs are held.
+        let mut ear: Option<Ear> = None;
+        let cause = loop {
+            let pause = match &mut ear {
+                Some(ear) => match ear.listen(self.pulse.now()) {
+                    Some(pause) => Some(pause),
+                    None => break Cause::Hangs,
+                },
+                None => None,
+            };
+            let (message, ended) = self.wait(pause);
+            if message {
+                match self.take_message() {
+                    Heard::Message if self.held.is_empty() => ear = None,
+                    Heard::Message => drop(ear.get_or_insert_with(|| Ear::new(self.pulse, self.pulse.now()))),
+                    Heard::Goodbye => return,
+                    Heard::End => break Cause::Died,
+                }
+            } else if ended {
+                break Cause::Died;
+            }
+        };
+        if !self.held.is_empty() {
+            self.rescue(&cause);
+        }
+    }
+
+    /// Sleeps; then whether there is a message, and whether the program has ended.
+    fn wait(&self, timeout: Option<Duration>) -> (bool, bool) {
+        let timeout = timeout.map_or(PollTimeout::NONE, in_ms);
+        let pidfd = self.program.pidfd.as_ref().map_or(self.socket.as_fd(), AsFd::as_fd);
+        let mut fds = [PollFd::new(self.socket.as_fd(), PollFlags::POLLIN), PollFd::new(pidfd, PollFlags::POLLIN)];
+        if poll(&mut fds, timeout).is_err() {
+            return (false, false);
+        }
+        let [message, ended] = fds.map(|fd| fd.revents().is_some_and(|events| !events.is_empty()));
+        (message, ended)
+    }
+
+    fn take_message(&mut self) -> Heard {
+        let mut bytes = [0; MESSAGE_BYTES];
+        let (len, descriptor) = match sys::receive(self.socket.as_fd(), &mut bytes) {
+            Ok((0, _)) => return Heard::End,
+            Ok(received) => received,
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => return Heard::Message,
+            // Most likely out of descriptors.
+            Err(_) => {
+                self.answer(REFUSED);
+                return Heard::Message;
+            }
+        };
+        let message = Message::decode(&bytes[..len]);
+        if message == Some(Message::Goodbye) {
+            return Heard::Goodbye;
+        }
+        let taken = message.is_some_and(|message| self.take(message, descriptor));
+        self.answer(if taken { TAKEN } else { REFUSED });
+        Heard::Message
+    }
+
+    /// Does what it is told, or not: then the message makes no sense.
+    fn take(&mut self, message: Message<'_>, descriptor: Option<OwnedFd>) -> bool {
+        match (message, descriptor) {
+            (Message::Release, _) => {
+                self.held = Held::default();
+                self.files.clear();
+            }
+            (Message::Line { name, shutdown_value, sleeping }, Some(line)) => {
+                self.held.hold(sleeping, Output::line(name, line, shutdown_value));
+            }
+            (Message::Forget { name }, _) => self.held.forget(name),
+            (Message::File(bytes), Some(file)) => self.files.push((file, bytes.into())),
+            (Message::LastFile { name, bytes }, Some(file)) => {
+                let mut files = std::mem::take(&mut self.files);
+                files.push((file, bytes.into()));
+                self.held.hold(Some(name), Output::files(name, files));
+            }
+            _ => return false,
+        }
+        true
+    }
+
+    fn answer(&self, answer: u8) {
+        // The program that does not hear it is dead, which the next look tells.
+        let _ = send(self.socket.as_raw_fd(), &[answer], MsgFlags::MSG_NOSIGNAL);
+    }
+
+    /// Drives everything, and kills the program meanwhile. Says in the log what came of it.
+    fn rescue(self, cause: &Cause) {
+        let Watcher { program, pulse, held: Held { mut native, apart }, .. } = self;
+        // Lines first: they never keep us.
+        drive(&mut native);
+        let diagnosis = pulse.diagnosis();
+        let program = Arc::new(program);
+        let survivor = (!program.has_ended()).then(|| program.clone());
+        let mut crew = Crew::default();
+        for Group { outputs, .. } in apart {
+            crew.employ(outputs, survivor.clone(), TRY_FOR);
+        }
+        if let Some(program) = &survivor {
+            program.kill();
+            program.wait_for_end();
+            // What it did until then is undone.
+            drive(&mut native);
+        }
+        let (driven, failed): (Vec<_>, Vec<_>) = native.into_iter().partition(|output| output.outcome.is_driven());
+        crew.employ(failed, None, TRY_FOR);
+        // A log that nobody reads must not keep the lines.
+        alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
+        let of_crew = crew.wait(TRY_FOR, |outcome| {
+            let seconds = TRY_FOR.as_secs();
+            error!("guardian: {}: it is not at its shutdown value yet, and tried for {seconds} s", outcome.complaint());
+        });
+        alarm::set(LOG_S);
+        let pid = program.pid;
+        let what = match cause {
+            Cause::Died => format!("Pinion (process {pid}) died: was it killed, or did it crash?"),
+            Cause::Hangs => format!("{diagnosis}: Pinion (process {pid}) is killed"),
+        };
+        let outcomes: Vec<_> = driven.iter().map(|output| &output.outcome).chain(&of_crew).collect();
+        error!("guardian: {what}; {}", summary(&outcomes));
+    }
+}
+
+/// What became of the outputs, for the log.
+fn summary(outcomes: &[&Outcome]) -> String {
+    let all = outcomes.len();
+    let complaints: Vec<_> =
+        outcomes.iter().filter(|outcome| !outcome.is_driven()).map(|outcome| outcome.complaint()).collect();
+    match complaints.len() {
+        0 => format!("all {all} outputs are driven to their shutdown values, start Pinion again"),
+        failed => format!(
+            "only {} of {all} outputs are driven to their shutdown values ({}): switch the power off",
+            all - failed,
+            complaints.join(", ")
+        ),
+    }
+}
+
+/// What a thread tells each time that it has driven an output: the output's number, and what came
+/// of it.
+type Report = (usize, io::Result<()>);
+
+/// Threads that drive groups of outputs: one whose driver never comes back keeps neither the other
+/// groups nor us.
+struct Crew {
+    tell: Sender<Report>,
+    told: Receiver<Report>,
+    /// By the outputs' numbers.
+    outcomes: Vec<Outcome>,
+    /// Work that has got no thread, as memory is short.
+    left: Vec<Work>,
+}
+
+impl Default for Crew {
+    fn default() -> Crew {
+        let (tell, told) = mpsc::channel();
+        Crew { tell, told, outcomes: Vec::new(), left: Vec::new() }
+    }
+}
+
+impl Crew {
+    /// Has a thread drive these outputs: at once, and again after the end of `survivor`, which may
+    /// drive them until then. Those that fail are tried until `try_for` is over.
+    fn employ(&mut self, outputs: Vec<Output>, survivor: Option<Arc<Program>>, try_for: Duration) {
+        let mut drives = Vec::new();
+        for Output { drive, outcome } in outputs {
+            drives.push((self.outcomes.len(), drive));
+            self.outcomes.push(Outcome { result: None, ..outcome });
+        }
+        // A thread that can not be had takes what it was given with it: it is given a share only.
+        let work = Arc::new(Mutex::new(Some(Work { drives, survivor, try_for })));
+        let (theirs, tell) = (work.clone(), self.tell.clone());
+        let run = move || {
+            if let Some(work) = take(&theirs) {
+                // Nobody listens any more once the time is over.
+                work.run(|report| drop(tell.send(report)));
+            }
+        };
+        if thread::Builder::new().spawn(run).is_err() {
+            self.left.extend(take(&work));
+        }
+    }
+
+    /// What became of the outputs once all are driven, or `limit` is over. Calls `complain` for
+    /// each that fails, once.
+    fn wait(self, limit: Duration, mut complain: impl FnMut(&Outcome)) -> Vec<Outcome> {
+        let Crew { tell, told, mut outcomes, left } = self;
+        // Now the channel closes when the last thread is done.
+        drop(tell);
+        let mut note = |(number, result): Report| {
+            let outcome: &mut Outcome = &mut outcomes[number];
+            let first = outcome.result.is_none();
+            outcome.result = Some(result);
+            if first && !outcome.is_driven() {
+                complain(outcome);
+            }
+        };
+        let until = monotonic() + limit;
+        while let Ok(report) = told.recv_timeout(until.saturating_sub(monotonic())) {
+            note(report);
+        }
+        // Last, as a driver that hangs would keep us here.
+        for work in left {
+            work.run(&mut note);
+        }
+        outcomes
+    }
+}
+
+fn take<T>(from: &Mutex<Option<T>>) -> Option<T> {
+    from.lock().unwrap_or_else(PoisonError::into_inner).take()
+}
+
+/// What one thread has to do.
+struct Work {
+    drives: Vec<(usize, Drive)>,
+    survivor: Option<Arc<Program>>,
+    try_for: Duration,
+}
+
+impl Work {
+    fn run(self, mut report: impl FnMut(Report)) {
+        let Work { mut drives, survivor, try_for } = self;
+        if let Some(program) = survivor {
+            for (_, drive) in &drives {
+                // Whether it fails counts below only.
+                let _ = drive();
+            }
+            program.wait_for_end();
+        }
+        let until = monotonic() + try_for;
+        loop {
+            drives.retain(|(number, drive)| {
+                let result = drive();
+                let failed = result.is_err();
+                report((*number, result));
+                failed
+            });
+            if drives.is_empty() || monotonic() >= until {
+                return;
+            }
+            thread::sleep(TRY_EVERY);
+        }
+    }
+}
+
+fn is_readable(fd: BorrowedFd<'_>) -> bool {
+    let mut fds = [PollFd::new(fd, PollFlags::POLLIN)];
+    poll(&mut fds, PollTimeout::ZERO).is_ok_and(|ready| ready > 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nix::errno::Errno;
+    use std::cell::Cell;
+    use std::sync::atomic::{AtomicU32, Ordering};
+
+    /// Far longer than anything takes.
+    const LONG: Duration = Duration::from_secs(60);
+
+    thread_local! {
+        /// Dropped when the thread ends, and so after it has told what its drives came to.
+        static ALIVE: Cell<Option<Sender<()>>> = const { Cell::new(None) };
+    }
+
+    fn output(name: &str, drive: impl Fn() -> io::Result<()> + Send + 'static) -> Output {
+        Output::new(name, Box::new(drive))
+    }
+
+    /// An output that notes when the thread that drove it ends.
+    fn noted(name: &str, alive: &Sender<()>, errno: Option<Errno>) -> Output {
+        let alive = alive.clone();
+        output(name, move || {
+            ALIVE.set(Some(alive.clone()));
+            errno.map_or(Ok(()), |errno| Err(errno.into()))
+        })
+    }
+
+    fn error_code(outcome: &Outcome) -> Option<i32> {
+        outcome.result.as_ref()?.as_ref().err()?.raw_os_error()
+    }
+
+    #[test]
+    fn a_driver_that_hangs_keeps_nobody_else() {
+        let (_release, hangs) = mpsc::channel::<()>();
+        let hangs = Mutex::new(hangs);
+        let (alive, ended) = mpsc::channel();
+        let stuck = output("gpiochip3 line 5", move || hangs.lock().unwrap().recv().map_err(io::Error::other));
+        let mut crew = Crew::default();
+        // A line behind the one that hangs, of the same chip, is lost with it.
+        crew.employ(vec![stuck, output("gpiochip3 line 6", || Ok(()))], None, Duration::ZERO);
+        crew.employ(vec![noted("pwmchip0/pwm0", &alive, Some(Errno::ENODEV))], None, Duration::ZERO);
+        crew.employ(vec![noted("pwmchip0/pwm1", &alive, None)], None, Duration::ZERO);
+        drop(alive);
+        assert!(ended.recv().is_err(), "both of the others are done");
+        let mut complaints = Vec::new();
+        let outcomes = crew.wait(Duration::from_millis(1), |outcome| complaints.push(outcome.complaint()));
+        assert!(outcomes[0].result.is_none() && outcomes[1].result.is_none());
+        assert_eq!(error_code(&outcomes[2]), Some(libc::ENODEV));
+        assert!(outcomes[3].is_driven());
+        assert_eq!(complaints, ["pwmchip0/pwm0: No such device (os error 19)"]);
+        let summary = summary(&outcomes.iter().collect::<Vec<_>>());
+        let begin = "only 1 of 4 outputs are driven to their shutdown values (gpiochip3 line 5: its driver hangs";
+        assert!(summary.starts_with(begin) && summary.ends_with("switch the power off"), "{summary}");
+    }
+
+    #[test]
+    fn an_output_that_fails_is_tried_again_and_those_beside_it_wait_for_nothing() {
+        let (tries, others) = (Arc::new(AtomicU32::new(0)), Arc::new(AtomicU32::new(0)));
+        let (theirs, of_others) = (tries.clone(), others.clone());
+        let failing = output("pwmchip0/pwm0", move || match theirs.fetch_add(1, Ordering::SeqCst) {
+            0..3 => Err(Errno::EIO.into()),
+            _ => Ok(()),
+        });
+        let other = output("pwmchip0/pwm1", move || {
+            of_others.fetch_add(1, Ordering::SeqCst);
+            Ok(())
+        });
+        let mut crew = Crew::default();
+        crew.employ(vec![failing, other], None, LONG);
+        let mut complaints = 0;
+        let outcomes = crew.wait(LONG, |outcome| {
+            assert_eq!(error_code(outcome), Some(libc::EIO));
+            complaints += 1;
+        });
+        assert!(outcomes.iter().all(Outcome::is_driven));
+        assert_eq!((complaints, tries.load(Ordering::SeqCst), others.load(Ordering::SeqCst)), (1, 4, 1));
+    }
+
+    #[test]
+    fn an_output_that_keeps_failing_is_given_up() {
+        let mut crew = Crew::default();
+        crew.employ(vec![output("pwmchip0/pwm0", || Err(Errno::EIO.into()))], None, Duration::from_millis(1));
+        let outcomes = crew.wait(LONG, |_| ());
+        assert_eq!(error_code(&outcomes[0]), Some(libc::EIO));
+    }
+
+    #[test]
+    fn an_output_that_is_given_again_replaces_itself() {
+        let value = Arc::new(AtomicU32::new(0));
+        let set = |to| {
+            let value = value.clone();
+            output("gpiochip0 line 5", move || {
+                value.store(to, Ordering::SeqCst);
+                Ok(())
+            })
+        };
+        let mut held = Held::default();
+        held.hold(None, set(1));
+        held.hold(None, output("gpiochip0 line 6", || Ok(())));
+        held.hold(None, set(2));
+        held.hold(Some("gpiochip3"), output("gpiochip3 line 5", || Ok(())));
+        held.hold(Some("gpiochip3"), output("gpiochip3 line 6", || Ok(())));
+        held.hold(Some("gpiochip3"), output("gpiochip3 line 5", || Ok(())));
+        assert_eq!((held.native.len(), held.apart.len(), held.apart[0].outputs.len()), (2, 1, 2));
+        drive(&mut held.native);
+        assert_eq!(value.load(Ordering::SeqCst), 2);
+    }
+}
