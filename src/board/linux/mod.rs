@@ -236,10 +236,10 @@ impl Board for LinuxBoard {
     }
 
     fn reset(&mut self) {
-        if let Some(guard) = &mut self.guard {
-            if let Err(error) = guard.release() {
-                log::error!("the guardian does not give back the lines: {error}: restart Pinion");
-            }
+        if let Some(guard) = &mut self.guard
+            && let Err(error) = guard.release()
+        {
+            log::error!("the guardian does not give back the lines: {error}: restart Pinion");
         }
         self.claims.clear();
         self.spi_modes.clear();
