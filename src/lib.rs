@@ -13,6 +13,9 @@
 //!
 //! [`host`] is the other end of the wire: a small client for demonstrations and tests.
 
+// They panic when nobody reads; tests may.
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
 pub mod board;
 pub mod cli;
 pub mod feature;

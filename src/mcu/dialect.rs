@@ -125,6 +125,26 @@ impl Dialect {
         self.dictionary.commands.get(format)?.as_u64().map(|id| id as u32)
     }
 
+    /// Whether a block has the command with this id. A block that makes no sense is looked at up to
+    /// where it does not: there the machine stops.
+    pub fn contains(&self, payload: &[u8], id: u32) -> bool {
+        // Nearly always the look for the number's last byte is enough.
+        if !payload.contains(&(id as u8 & 0x7f)) {
+            return false;
+        }
+        let mut reader = Reader::new(payload);
+        while let Ok(found) = reader.int() {
+            if found == id {
+                return true;
+            }
+            let Ok(command) = self.command(found) else { return false };
+            if command.skip(&mut reader).is_err() {
+                return false;
+            }
+        }
+        false
+    }
+
     #[inline]
     pub(super) fn command(&self, id: u32) -> Result<&Entry, Shutdown> {
         match self.commands.get(id as usize) {
@@ -147,4 +167,35 @@ fn names(ranges: Vec<Range>) -> serde_json::Map<String, Value> {
             count => (range.name, json!([range.first, count])),
         })
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::board::sim::{SimBoard, SimConfig};
+    use crate::feature::FEATURES;
+    use crate::time::{Clock, VirtualClock};
+    use crate::wire::vlq::Writer;
+    use std::sync::Arc;
+
+    #[test]
+    fn a_command_is_found_among_others_and_not_in_their_parameters() {
+        let clock = VirtualClock::at(Clock::from_ticks(0));
+        let board = SimBoard::new(SimConfig::default_printer(), Arc::new(clock)).unwrap();
+        let dialect = Dialect::new(FEATURES, &board).unwrap();
+        let stop = dialect.command_id("emergency_stop").unwrap();
+        let step = dialect.command_id("queue_step oid=%c interval=%u count=%hu add=%hi").unwrap();
+        let contains = |ints: &[u32]| {
+            let mut writer = Writer::default();
+            ints.iter().for_each(|int| writer.int(*int));
+            dialect.contains(writer.payload().unwrap(), stop)
+        };
+        assert!(contains(&[stop]));
+        assert!(contains(&[step, stop, stop, stop, stop, stop, step]));
+        assert!(!contains(&[step, stop, stop, stop, stop]));
+        assert!(!contains(&[step, 1, 2, 3, 4]));
+        assert!(!contains(&[]));
+        assert!(!contains(&[4711, stop]), "the machine stops at a command that there is not");
+        assert!(!contains(&[step, stop]), "and at one that is cut short");
+    }
 }

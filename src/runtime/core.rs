@@ -36,7 +36,7 @@ impl Payload {
         Payload { len: len as u8, bytes }
     }
 
-    fn as_slice(&self) -> &[u8] {
+    pub(super) fn as_slice(&self) -> &[u8] {
         &self.bytes[..usize::from(self.len)]
     }
 }
