@@ -32,7 +32,7 @@ help:
 	@echo 'make lab      only the latter'
 	@echo 'make lab-pi   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
 	@echo 'make bench    the benchmarks'
-	@echo 'make check    formatting, lints, documentation, man pages'
+	@echo 'make check    formatting, lints, documentation, man pages, what the package has'
 	@echo 'make build    the program: $(PINION)'
 	@echo 'make install  program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
 	@echo 'make deb      a Debian package in $(DEB_FOLDER)'
@@ -73,13 +73,15 @@ check: system-packages
 	RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links' $(CARGO) doc --locked --no-deps --document-private-items --quiet
 	$(CARGO) build --locked --quiet
 	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
+	@scripts/system-packages deb
+	scripts/check-deb
 
 system-packages: cargo
 	@scripts/system-packages build
 
 cargo:
 	@command -v $(CARGO) >/dev/null || { \
-	    echo 'There is no cargo: install Rust 1.85 or later (rustup), then try again.' >&2; exit 1; }
+	    echo 'There is no cargo: install Rust 1.88 or later (rustup), then try again.' >&2; exit 1; }
 
 # Root installs what was built before: no compiler runs as root.
 install: install-program install-system

@@ -13,6 +13,9 @@
 //!
 //! [`host`] is the other end of the wire: a small client for demonstrations and tests.
 
+// They panic when nobody reads; tests may.
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+
 // The fake board of the tests in tests/machine, which call this crate by its name.
 #[cfg(test)]
 extern crate self as pinion;

@@ -4,7 +4,6 @@
 #![forbid(unsafe_code)]
 
 use std::fs;
-use std::io::{self, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -15,8 +14,8 @@ use crate::feature::FEATURES;
 use crate::mcu::Dialect;
 use crate::time::Monotonic;
 
-use super::failed;
 use super::run::BoardName;
+use super::{failed, print};
 
 /// Options of `pinion dict`.
 #[derive(Args, Clone, Debug)]
@@ -46,6 +45,6 @@ fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
 fn put(args: &DictArgs, json: &[u8]) -> Result<(), String> {
     match &args.output {
         Some(path) => fs::write(path, json).map_err(|error| format!("{} can not be written: {error}", path.display())),
-        None => io::stdout().write_all(json).map_err(|error| format!("stdout: {error}")),
+        None => print(&String::from_utf8_lossy(json)),
     }
 }

@@ -19,7 +19,7 @@ use crate::runtime::realtime::{self, Processors, Role, Scheduling};
 use crate::runtime::wakeup::{MarginLimits, Waiter};
 use crate::time::{Clock, Monotonic, Ticks, TimeSource};
 
-use super::failed;
+use super::{failed, print};
 
 /// Options of `pinion latency`.
 #[derive(Args, Clone, Debug)]
@@ -65,20 +65,21 @@ pub fn run(args: &LatencyArgs) -> ExitCode {
     let Ok(Ok((scheduling, halves))) = measured.map(thread::JoinHandle::join) else {
         return failed("the measuring thread can not be started: raise TasksMax or ulimit -u");
     };
-    for half in &halves {
-        println!("{}:", half.name);
-        println!("  wake-ups  {}", half.wakeup);
-        println!("  edges     {}  (margin {:.1} us)", half.edge, us(half.margin));
-    }
     let verdict = judge(&halves, scheduling);
-    println!("verdict: {verdict}");
-    match &args.svg {
-        Some(path) => match fs::write(path, draw(&halves, verdict.fitness)) {
-            Ok(()) => ExitCode::SUCCESS,
-            Err(error) => failed(format!("{} can not be written: {error}", path.display())),
-        },
-        None => ExitCode::SUCCESS,
+    let drawn = args.svg.as_ref().map_or(Ok(()), |path| {
+        fs::write(path, draw(&halves, verdict.fitness))
+            .map_err(|error| format!("{} can not be written: {error}", path.display()))
+    });
+    print(&report(&halves, &verdict)).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
+}
+
+fn report(halves: &[Half; 2], verdict: &Verdict) -> String {
+    let mut text = String::new();
+    for Half { name, wakeup, edge, margin } in halves {
+        let _ = writeln!(text, "{name}:\n  wake-ups  {wakeup}\n  edges     {edge}  (margin {:.1} us)", us(*margin));
     }
+    let _ = writeln!(text, "verdict: {verdict}");
+    text
 }
 
 fn measure(

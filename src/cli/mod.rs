@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::io::Write as _;
+use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
@@ -11,6 +11,7 @@ use log::LevelFilter;
 
 pub mod dict;
 pub mod latency;
+mod logging;
 pub mod pins;
 pub mod run;
 pub mod sim;
@@ -55,47 +56,38 @@ enum Command {
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    start_log(cli.log.log_level);
-    match cli.command {
+    logging::start(cli.log.log_level);
+    let status = match cli.command {
         None => run::run(&cli.run),
         Some(Command::Run(args)) => run::run(&args),
         Some(Command::Pins(args)) => pins::run(&args),
         Some(Command::Dict(args)) => dict::run(&args),
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
-    }
-}
-
-/// One line an event on stderr: for the journal with its level's prefix (sd-daemon(3)), for
-/// people with the seconds since the kernel's start, which are the machine's own clock.
-fn start_log(level: LevelFilter) {
-    let journal = std::env::var_os("JOURNAL_STREAM").is_some();
-    env_logger::Builder::new()
-        .filter_level(level)
-        .format(move |out, record| {
-            if journal {
-                let priority = match record.level() {
-                    log::Level::Error => 3,
-                    log::Level::Warn => 4,
-                    log::Level::Info => 6,
-                    log::Level::Debug | log::Level::Trace => 7,
-                };
-                writeln!(out, "<{priority}>{}", record.args())
-            } else {
-                let now = crate::time::monotonic().as_secs_f64();
-                writeln!(out, "[{now:12.6}] {:5} {}", record.level(), record.args())
-            }
-        })
-        .init();
+    };
+    logging::finish();
+    status
 }
 
 /// From now on a panic, in whatever thread, is logged and ends the process: a machine of which
 /// only the link is left would look alive to its host, its outputs as they are.
 fn end_by_panic() {
     std::panic::set_hook(Box::new(|panic| {
+        // Now: after this line nothing runs that could bring the lines before it out.
+        logging::finish();
         log::error!("this is a bug in Pinion, which ends here: please report it with this line: {panic}");
         std::process::abort();
     }));
+}
+
+/// Prints on stdout. A reader that has seen enough (head) and closed it is no failure: what is left
+/// to do is done without it.
+fn print(text: &str) -> Result<(), String> {
+    let mut out = io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout can not be written: {error}")),
+        _ => Ok(()),
+    }
 }
 
 /// Says on stderr why a subcommand failed.
@@ -115,7 +107,8 @@ mod tests {
         if std::env::var_os("PINION_TEST_PANIC").is_none() {
             return;
         }
-        start_log(LevelFilter::Info);
+        logging::start(LevelFilter::Info);
+        logging::detach();
         end_by_panic();
         let _ = std::thread::Builder::new().name("core".into()).spawn(|| panic!("in the core"));
         std::thread::sleep(std::time::Duration::from_secs(20));

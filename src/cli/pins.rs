@@ -4,7 +4,6 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::Write as _;
-use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::Args;
@@ -14,6 +13,8 @@ use crate::board::linux::adc::Adc;
 use crate::board::linux::gpio::{Chip, LineInfo};
 use crate::board::linux::pins::{Names, channel_number, line_number};
 use crate::board::linux::spi::Node;
+
+use super::{failed, print};
 
 /// Options of `pinion pins`.
 #[derive(Args, Clone, Debug, Default)]
@@ -31,20 +32,12 @@ pub fn run(args: &PinsArgs) -> ExitCode {
     let inventory = Inventory::scan();
     let list = list(&inventory, args, &|device, id| reading(&inventory, device, id));
     for problem in &inventory.problems {
-        eprintln!("pinion: {problem}");
+        log::warn!("{problem}");
     }
     if list.is_empty() {
-        eprintln!("pinion: {}", nothing(args));
-        return ExitCode::FAILURE;
+        return failed(nothing(args));
     }
-    // A reader that has seen enough (head) is no failure.
-    match io::stdout().write_all(list.as_bytes()) {
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => {
-            eprintln!("pinion: the list can not be written: {error}");
-            ExitCode::FAILURE
-        }
-        _ => ExitCode::SUCCESS,
-    }
+    print(&list).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
 fn nothing(args: &PinsArgs) -> String {
@@ -173,10 +166,10 @@ fn adc_section(adc: &Adc, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, 
         let number = channel_number(adc.number, position, &channel.id);
         let mut named: Vec<String> =
             number.map_or_else(Vec::new, |n| names.of_pin(n)).into_iter().map(str::to_owned).collect();
-        if let (0, Some(n)) = (adc.number, channel.id.strip_prefix("voltage")) {
-            if n.parse::<u32>().is_ok_and(|n| n < 8) {
-                named.push(format!("analog{n}"));
-            }
+        if let (0, Some(n)) = (adc.number, channel.id.strip_prefix("voltage"))
+            && n.parse::<u32>().is_ok_and(|n| n < 8)
+        {
+            named.push(format!("analog{n}"));
         }
         // iioN/voltageM is for those whose name does not tell them apart.
         if named.len() > 1 {

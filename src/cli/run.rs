@@ -17,7 +17,7 @@ use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Guardian, Options};
 use crate::time::{Monotonic, TimeSource};
 
-use super::{end_by_panic, failed};
+use super::{end_by_panic, failed, logging};
 
 /// What -w feeds.
 const WATCHDOG: &str = "/dev/watchdog";
@@ -25,9 +25,9 @@ const WATCHDOG: &str = "/dev/watchdog";
 /// Options of `pinion run`, and of `pinion` alone.
 #[derive(Args, Clone, Debug)]
 pub struct RunArgs {
-    /// Where to put the link to the pty that the host opens
+    /// Where to put the symbolic link to the pty that the host opens
     #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
-    link: PathBuf,
+    symlink: PathBuf,
     /// Run in real time: SCHED_FIFO and locked memory
     #[arg(short = 'r')]
     realtime: bool,
@@ -103,7 +103,7 @@ impl RunArgs {
     /// What the runtime needs to know.
     pub fn options(&self) -> Options {
         Options {
-            link: self.link.clone(),
+            symlink: self.symlink.clone(),
             access: Access { mode: self.mode, group: self.group.clone() },
             realtime: self.realtime,
             cpu: self.cpu,
@@ -126,6 +126,7 @@ pub fn run(args: &RunArgs) -> ExitCode {
         Ok(guardian) => guardian,
         Err(error) => return failed(error),
     };
+    logging::detach();
     let board = match args.board.open(Arc::new(clock), guardian.as_ref().map(Guardian::guard)) {
         Ok(board) => board,
         Err(error) => return failed(error),

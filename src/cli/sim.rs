@@ -25,8 +25,8 @@ use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Options};
 use crate::time::Monotonic;
 
-use super::failed;
 use super::run::sim_config;
+use super::{failed, logging, print};
 
 /// Options of `pinion sim`.
 #[derive(Args, Clone, Debug)]
@@ -49,9 +49,9 @@ pub struct SimArgs {
     /// Run in real time: SCHED_FIFO and locked memory
     #[arg(short = 'r')]
     realtime: bool,
-    /// Where to put the link to the pty that the host opens
+    /// Where to put the symbolic link to the pty that the host opens
     #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
-    link: PathBuf,
+    symlink: PathBuf,
 }
 
 /// Shows the printer at work and goes on serving it, or prints its configuration.
@@ -61,13 +61,13 @@ pub fn run(args: &SimArgs) -> ExitCode {
         Err(error) => return failed(error),
     };
     if args.print_board {
-        print!("{}", SimConfig::default_toml());
-        return ExitCode::SUCCESS;
+        return print(SimConfig::default_toml()).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
     if args.print_config {
-        print!("{}", printer_cfg(&config, &args.link.to_string_lossy()));
-        return ExitCode::SUCCESS;
+        let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
+        return print(&printer_cfg).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
+    logging::detach();
     let plan = plan(&config);
     let clock = Monotonic::start();
     let board = match SimBoard::new(config, Arc::new(clock)) {
@@ -76,7 +76,7 @@ pub fn run(args: &SimArgs) -> ExitCode {
     };
     let probe = board.probe();
     let options = Options {
-        link: args.link.clone(),
+        symlink: args.symlink.clone(),
         access: Access { mode: 0o660, group: None },
         realtime: args.realtime,
         cpu: None,
@@ -123,16 +123,16 @@ fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended
         return;
     }
     let file = args.file.as_ref().map_or(String::new(), |file| format!(" {}", file.display()));
-    println!(
+    tell(&format!(
         "\nThe simulated printer goes on until Ctrl-C. To connect a Klipper host:\n  \
-         pinion sim{file} -I {link} --print-config > printer.cfg\n  \
-         klippy.py printer.cfg",
-        link = args.link.display()
-    );
+         pinion sim{file} -I {symlink} --print-config > printer.cfg\n  \
+         klippy.py printer.cfg\n",
+        symlink = args.symlink.display()
+    ));
 }
 
 fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
-    let mut client = Client::connect(&args.link, Duration::from_secs(5)).map_err(|error| error.to_string())?;
+    let mut client = Client::connect(&args.symlink, Duration::from_secs(5)).map_err(|error| error.to_string())?;
     let report = demonstrate(&mut client, plan, &mut Lines::stdout()).map_err(|error| error.to_string())?;
     if let Some(path) = &args.picture {
         draw(path, &report)?;
@@ -140,24 +140,32 @@ fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, 
     // The next host finds the machine as if it had just been started.
     client.reset().map_err(|error| error.to_string())?;
     for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
-        println!(
-            "       the printer's {} axis stands at {:.3} mm, {} steps lost",
+        tell(&format!(
+            "       the printer's {} axis stands at {:.3} mm, {} steps lost\n",
             axis.name, axis.position_mm, axis.lost_steps
-        );
+        ));
     }
     for heater in probe.heaters() {
-        println!("       the printer's {} is at {:.1} C", heater.name, heater.celsius);
+        tell(&format!("       the printer's {} is at {:.1} C\n", heater.name, heater.celsius));
     }
     let lost: u64 = probe.axes().map(|axis| axis.lost_steps).sum();
     let all_right = report.passed() && lost == 0;
-    println!("{}", if all_right { "all of it was right" } else { "NOT all of it was right" });
+    tell(if all_right { "all of it was right\n" } else { "NOT all of it was right\n" });
     Ok(all_right)
+}
+
+/// Prints how the demonstration goes. The printer is there for its host all the same when this can
+/// not be printed.
+fn tell(text: &str) {
+    if let Err(error) = print(text) {
+        log::warn!("{error}");
+    }
 }
 
 fn draw(path: &Path, report: &Report) -> Result<(), String> {
     fs::write(path, picture::homing(report))
         .map_err(|error| format!("{} can not be written: {error}", path.display()))?;
-    println!("drawn: {}", path.display());
+    tell(&format!("drawn: {}\n", path.display()));
     Ok(())
 }
 

@@ -2,7 +2,8 @@
 //! The link: reads the pty, checks blocks, hands commands to the core, frames responses.
 //!
 //! It answers `identify` and `get_clock` by itself when they come alone in a block: they need
-//! no core, and the host's clock synchronisation sees the shortest round trip.
+//! no core, and the host's clock synchronisation sees the shortest round trip, also while a bus
+//! holds the blocks before them back.
 
 #![forbid(unsafe_code)]
 
@@ -24,6 +25,7 @@ use crate::wire::vlq::{Reader, Writer};
 
 use super::core::{Payload, Request};
 use super::guardian::{GuardianWatch, in_ms};
+use super::ledger::Ledger;
 use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
 use super::signals::{Signal, Signals};
@@ -36,7 +38,7 @@ const INPUT_BYTES: usize = 4096;
 /// Bytes for a host that does not read; then responses wait in the ring, then they are lost.
 const OUTPUT_BYTES: usize = 16 * 1024;
 /// How long to wait awake for the core to be done with blocks.
-const LINGER: Duration = Duration::from_micros(100);
+const AWAIT_CORE: Duration = Duration::from_micros(100);
 /// How long to wait for a core that has no room for requests.
 const STALL_MS: u64 = 1;
 /// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
@@ -50,6 +52,7 @@ struct Known {
     dialect: Arc<Dialect>,
     get_clock: Option<u32>,
     identify: Option<u32>,
+    emergency_stop: Option<u32>,
 }
 
 impl Known {
@@ -57,6 +60,7 @@ impl Known {
         Known {
             get_clock: dialect.command_id("get_clock"),
             identify: dialect.command_id("identify offset=%u count=%c"),
+            emergency_stop: dialect.command_id("emergency_stop"),
             dialect,
         }
     }
@@ -77,6 +81,11 @@ impl Known {
         }
         let piece: IdentifyResponse<'_> = identify_response(self.dialect.compressed(), offset, count as u8);
         Some(self.encode(&piece))
+    }
+
+    /// Whether the host asks in this block for the machine to be stopped.
+    fn stops(&self, payload: &[u8]) -> bool {
+        self.emergency_stop.is_some_and(|id| self.dialect.contains(payload, id))
     }
 
     fn encode<R: Response>(&self, response: &R) -> Writer {
@@ -101,18 +110,9 @@ pub(super) struct Link {
     inlet: Inlet,
     progress: Arc<Progress>,
     wake: Arc<LinkWake>,
-    /// Blocks handed to the core.
-    handed: u32,
-    /// Blocks answered here.
-    answered: u32,
-    /// What the last empty block said: how many blocks were done.
-    acknowledged: u32,
-    /// Whether there is a processor beside the core's.
-    lingers: bool,
-    /// How many blocks the last framed response says were received.
-    said: u32,
-    /// A NAK is owed, once everything before it is done.
-    refused: bool,
+    ledger: Ledger,
+    /// Whether there is a processor beside the core's, to wait on for the core.
+    has_own_processor: bool,
     signals: Signals,
     guardian: Option<GuardianWatch>,
     vigil: Vigil,
@@ -126,6 +126,8 @@ pub(super) struct Link {
 struct Woken {
     by_signal: bool,
     by_input: bool,
+    /// The host is gone.
+    by_hangup: bool,
 }
 
 /// Why the link ends.
@@ -168,12 +170,8 @@ impl Link {
             inlet,
             progress,
             wake,
-            handed: 0,
-            answered: 0,
-            acknowledged: 0,
-            said: 0,
-            lingers: thread::available_parallelism().is_ok_and(|count| count.get() > 1),
-            refused: false,
+            ledger: Ledger::default(),
+            has_own_processor: thread::available_parallelism().is_ok_and(|count| count.get() > 1),
             signals,
             guardian,
             vigil,
@@ -198,7 +196,7 @@ impl Link {
                 self.lose_guardian("the guardian gives no sign of life: was it stopped? (a restart ends it)");
             }
             let stalled = self.take_in();
-            self.linger();
+            self.await_core();
             self.give_out();
             let woken = self.wait(stalled)?;
             if woken.by_signal {
@@ -212,6 +210,9 @@ impl Link {
             }
             if self.leave_at.is_some_and(|at| monotonic() >= at) {
                 return Ok(End::GuardianLost);
+            }
+            if woken.by_hangup {
+                self.part_from_host()?;
             }
             if woken.by_input {
                 self.read()?;
@@ -232,11 +233,14 @@ impl Link {
 
     fn tell_status(&self) {
         let host = if self.attached { "a host is attached" } else { "no host is attached" };
-        self.vigil.status(&format!("serving on {}, {host}", self.pty.link().display()));
+        self.vigil.status(&format!("serving on {}, {host}", self.pty.symlink().display()));
     }
 
     /// Asks the core something. It takes requests in faster than a person or a signal asks.
     pub(super) fn request(&mut self, request: Request) {
+        if matches!(request, Request::Shutdown(_) | Request::Quit) {
+            self.progress.stop_handed();
+        }
         let mut request = request;
         while let Err(rtrb::PushError::Full(back)) = self.requests.push(request) {
             request = back;
@@ -249,11 +253,10 @@ impl Link {
     /// Sleeps until there is something to do.
     fn wait(&mut self, stalled: bool) -> io::Result<Woken> {
         self.wake.sleeping();
-        let full = self.output.len() >= OUTPUT_BYTES;
-        let unread = !full && (self.inlet.has_response() || self.done() != self.acknowledged);
-        if unread || self.inlet.has_line() {
+        let news = self.inlet.has_response() || self.ledger.is_behind(self.progress.done());
+        if news && !self.is_full() || self.inlet.has_line() {
             self.wake.awake(false);
-            return Ok(Woken { by_signal: false, by_input: true });
+            return Ok(Woken { by_signal: false, by_input: true, by_hangup: false });
         }
         let mut events = PollFlags::empty();
         if !stalled {
@@ -267,7 +270,6 @@ impl Link {
         let mut fds = [
             PollFd::new(self.pty.master(), events),
             PollFd::new(self.wake.event(), PollFlags::POLLIN),
-            PollFd::new(self.pty.watch(), PollFlags::POLLIN),
             PollFd::new(self.signals.event(), PollFlags::POLLIN),
             PollFd::new(guardian, PollFlags::empty()),
         ];
@@ -275,13 +277,14 @@ impl Link {
             Ok(_) | Err(nix::errno::Errno::EINTR) => {}
             Err(error) => return Err(error.into()),
         }
-        let happened = |fd: &PollFd<'_>| fd.revents().is_some_and(|events| !events.is_empty());
-        let woken = Woken { by_signal: happened(&fds[3]), by_input: happened(&fds[0]) };
-        let (called, visited, lost) = (happened(&fds[1]), happened(&fds[2]), happened(&fds[4]));
+        let events = |fd: &PollFd<'_>| fd.revents().unwrap_or(PollFlags::empty());
+        let woken = Woken {
+            by_signal: !events(&fds[2]).is_empty(),
+            by_input: events(&fds[0]).contains(PollFlags::POLLIN),
+            by_hangup: events(&fds[0]).contains(PollFlags::POLLHUP),
+        };
+        let (called, lost) = (!events(&fds[1]).is_empty(), !events(&fds[3]).is_empty());
         self.wake.awake(called);
-        if visited {
-            self.notice_host();
-        }
         if lost && self.guardian.is_some() {
             self.lose_guardian("somebody killed the guardian");
         }
@@ -306,20 +309,22 @@ impl Link {
         self.leave_at = Some(monotonic() + FAREWELL);
     }
 
-    fn notice_host(&mut self) {
-        let attached = self.pty.attached();
-        if attached == self.attached {
-            return;
-        }
-        self.attached = attached;
-        self.tell_status();
-        if attached {
+    fn meet_host(&mut self) -> io::Result<()> {
+        if !self.attached && self.pty.meet_host()? {
+            self.attached = true;
+            self.tell_status();
             info!("host attached");
-        } else {
-            info!("host gone");
-            self.output.clear();
-            self.pty.discard_output();
         }
+        Ok(())
+    }
+
+    fn part_from_host(&mut self) -> io::Result<()> {
+        self.pty.part_from_host()?;
+        self.attached = false;
+        self.output.clear();
+        self.tell_status();
+        info!("host gone");
+        Ok(())
     }
 
     fn read(&mut self) -> io::Result<()> {
@@ -330,9 +335,8 @@ impl Link {
         self.input.resize(INPUT_BYTES, 0);
         let read = self.pty.read(&mut self.input[filled..]);
         self.input.truncate(filled + read.as_ref().copied().unwrap_or(0));
-        if read? > 0 && !self.attached {
-            // It came since the last sleep: an answer to nobody would be dropped.
-            self.notice_host();
+        if read? > 0 {
+            self.meet_host()?;
         }
         if self.input[filled..] == *FORCE_SHUTDOWN {
             self.input.truncate(filled);
@@ -345,16 +349,11 @@ impl Link {
         Ok(())
     }
 
-    /// How many blocks are done, by the core or here.
-    fn done(&self) -> u32 {
-        self.progress.done().wrapping_add(self.answered)
-    }
-
     /// Takes in the blocks that were read. True if the core had no room for all of them.
     fn take_in(&mut self) -> bool {
         let mut taken = 0;
         let mut stalled = false;
-        let handed = self.handed;
+        let handed = self.ledger.handed();
         loop {
             if self.requests.slots() <= REQUESTS_KEPT {
                 stalled = taken < self.input.len();
@@ -365,61 +364,71 @@ impl Link {
             match received {
                 Received::Nothing => break,
                 Received::Skip => {}
-                Received::Nak => self.refused = true,
+                Received::Nak => self.ledger.refuse(),
                 Received::Payload(payload) => {
-                    // Answers leave in the order of the blocks.
-                    let idle = self.progress.done() == self.handed;
-                    let answer = if idle { self.known.answer(payload, || self.clock.now()) } else { None };
-                    let Some(answer) = answer else {
-                        // There is room.
-                        let _ = self.requests.push(Request::Run(Payload::new(payload)));
-                        self.handed = self.handed.wrapping_add(1);
-                        continue;
-                    };
-                    frame_records(&mut self.inlet, self.answered, &mut self.said, &mut self.output);
-                    self.answered = self.answered.wrapping_add(1);
-                    if let Some(payload) = answer.payload() {
-                        frame(payload, Sequence::after(self.done()), &mut self.output);
+                    let payload = Payload::new(payload);
+                    if !self.answer(&payload) {
+                        self.hand(payload);
                     }
                 }
             }
         }
         // The core need not know of what is answered here: awake, it would keep the answer waiting.
-        if self.handed != handed {
+        if self.ledger.handed() != handed {
             self.core.unpark();
         }
         self.input.drain(..taken);
         stalled
     }
 
+    /// Answers a block here, if that can be done. A host that does not read gets its answers, like
+    /// any others, from the core, which drops what finds no room.
+    fn answer(&mut self, payload: &Payload) -> bool {
+        let Some(answer) = self.known.answer(payload.as_slice(), || self.clock.now()) else { return false };
+        let core_done = self.progress.done();
+        self.frame_responses();
+        if self.is_full() {
+            return false;
+        }
+        let Some(number) = self.ledger.answer(core_done) else { return false };
+        if let Some(payload) = answer.payload() {
+            frame(payload, Sequence::after(number), &mut self.output);
+        }
+        true
+    }
+
+    /// Hands a block to the core, where there is room for it.
+    fn hand(&mut self, payload: Payload) {
+        if self.known.stops(payload.as_slice()) {
+            self.progress.stop_handed();
+        }
+        let _ = self.requests.push(Request::Run(payload));
+        self.ledger.hand();
+    }
+
     /// Leaves the core the microseconds that it needs for the blocks: to sleep and be woken takes
     /// longer.
-    fn linger(&self) {
-        let handed = self.handed;
-        if !self.lingers || self.progress.done() == handed {
+    fn await_core(&self) {
+        let handed = self.ledger.handed();
+        if !self.has_own_processor || self.progress.done() == handed {
             return;
         }
-        let end = monotonic() + LINGER;
+        let end = monotonic() + AWAIT_CORE;
         while self.progress.done() != handed && monotonic() < end {
             thread::yield_now();
         }
     }
 
-    /// Says once how far the blocks are done. An empty block that repeats the number of the one
-    /// before is a NAK to the host, and is sent only for that.
-    fn acknowledge(&mut self, done: u32) {
-        if done != self.acknowledged {
-            self.acknowledged = done;
-            // A response of a block that is still being run has said more: to the host a number
-            // that goes back is no acknowledgement, it counts the bytes as invalid.
-            if done.wrapping_sub(self.said) as i32 >= 0 {
-                frame(&[], Sequence::after(done), &mut self.output);
-            }
-        }
-        // Its number is the one after the last block's: that must be done.
-        if self.refused && done == self.handed.wrapping_add(self.answered) {
-            self.refused = false;
-            frame(&[], Sequence::after(done), &mut self.output);
+    /// Whether the host has to read before it gets any more.
+    fn is_full(&self) -> bool {
+        self.output.len() >= OUTPUT_BYTES
+    }
+
+    /// Frames what the core said, as long as the host reads.
+    fn frame_responses(&mut self) {
+        while self.output.len() < OUTPUT_BYTES {
+            let Some((payload, core_begun)) = self.inlet.response() else { return };
+            frame(payload, Sequence::after(self.ledger.respond(core_begun)), &mut self.output);
         }
     }
 
@@ -428,11 +437,14 @@ impl Link {
         while let Some((level, line)) = self.inlet.line() {
             log!(level, "{line}");
         }
-        // What was said of these blocks is in the ring already.
-        let done = self.done();
-        frame_records(&mut self.inlet, self.answered, &mut self.said, &mut self.output);
-        if self.output.len() < OUTPUT_BYTES {
-            self.acknowledge(done);
+        // In this order: what the core said of the blocks that are done is in the ring already, and
+        // all of it is framed before they are acknowledged.
+        let core_done = self.progress.done();
+        self.frame_responses();
+        if !self.is_full() {
+            for number in self.ledger.acknowledge(core_done).into_iter().flatten() {
+                frame(&[], Sequence::after(number), &mut self.output);
+            }
         }
         if !self.attached {
             self.output.clear();
@@ -447,14 +459,5 @@ impl Link {
                 self.output.clear();
             }
         }
-    }
-}
-
-/// Frames what the core said as long as the host reads.
-fn frame_records(inlet: &mut Inlet, answered: u32, said: &mut u32, output: &mut Vec<u8>) {
-    while output.len() < OUTPUT_BYTES {
-        let Some((payload, begun)) = inlet.response() else { return };
-        *said = begun.wrapping_add(answered);
-        frame(payload, Sequence::after(*said), output);
     }
 }

@@ -24,6 +24,7 @@ use crate::time::{Monotonic, TimeSource};
 mod budget;
 mod core;
 pub mod guardian;
+mod ledger;
 mod link;
 mod notify;
 mod outlet;
@@ -56,8 +57,8 @@ const REQUESTS: usize = 256;
 /// How the program runs.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Where the link to the pty stands.
-    pub link: PathBuf,
+    /// Where the symbolic link to the pty stands.
+    pub symlink: PathBuf,
     /// Who may open the pty.
     pub access: Access,
     /// Whether to ask for real-time scheduling.
@@ -83,7 +84,7 @@ pub fn run(
     let processors = Processors::new(options.cpu)?;
     // First: who sees the link may send a signal, which must not leave the link behind.
     let signals = Signals::new()?;
-    let pty = Pty::open(&options.link, &options.access)?;
+    let pty = Pty::open(&options.symlink, &options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
     let dialect = Arc::new(Dialect::new(FEATURES, &*board)?);
@@ -126,7 +127,7 @@ pub fn run(
         .run()
     })?;
 
-    info!("serving on {} ({})", options.link.display(), pty.device().display());
+    info!("serving on {} ({})", options.symlink.display(), pty.device().display());
     let mut link = Link::new(Parts {
         pty,
         clock,

@@ -54,8 +54,13 @@ impl LinkWake {
     }
 
     /// The link is about to sleep, and looks once more at all that could wake it.
+    ///
+    /// Either that look sees what the core put there, or the core's [`LinkWake::wake`] sees that the
+    /// link sleeps. A swap guarantees that, as it reads, too: when it comes after the core's swap in
+    /// `wake` it reads that one's value, and so sees all that the core wrote before. With a plain
+    /// store it would not: the core could find the link awake, the link could look before the core's
+    /// response is to be seen, and would then sleep on it.
     pub(super) fn sleeping(&self) {
-        // Not a store: what was there when the core last called has to be seen afterwards.
         self.asleep.swap(true, Ordering::SeqCst);
     }
 
@@ -72,7 +77,9 @@ impl LinkWake {
     }
 }
 
-/// How many of the link's blocks the core has begun and done. A response carries the sequence
+/// How far link and core are with the host's blocks and with requests to stop.
+///
+/// The core counts the blocks that it has begun and done. A response carries the sequence
 /// number of the block that it answers: klippy takes a response for an answer to a query only
 /// if its number says that the query was received (`#sent_time` in serialhdl.py), and a number
 /// that runs ahead of the core would make an answer to an earlier query of the same name one.
@@ -172,7 +179,7 @@ impl Outbox for Outlet {
         let mut head = [0; HEAD_BYTES];
         head[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
         head[2..].copy_from_slice(&self.progress.begun.load(Ordering::Relaxed).to_le_bytes());
-        // When the host does not read, what it misses is lost, as in the firmware.
+        // When the host does not read, what finds no room is lost, as in the firmware.
         push(&mut self.responses, &head, payload);
         self.wake.wake();
     }
@@ -186,7 +193,7 @@ impl Outbox for Outlet {
                 self.line(gravity(shutdown), LINES_SPARE, format_args!("while shut down: {shutdown}"));
             }
             Note::Safe(name) => {
-                self.line(Level::Warn, LINES_SPARE, format_args!("{name} is at its shutdown value after all"));
+                self.line(Level::Info, LINES_SPARE, format_args!("{name} is at its shutdown value after all"));
             }
             Note::Lateness(lateness, margin) => {
                 let margin = us(margin);
@@ -203,10 +210,11 @@ impl Outbox for Outlet {
     }
 }
 
-/// What somebody asked for is no error.
+/// What somebody asked for is no fault: M112 and FIRMWARE_RESTART, SIGTERM, and FORCE_SHUTDOWN, of
+/// which the link warns.
 fn gravity(shutdown: &Shutdown) -> Level {
     match shutdown.reason {
-        reason::COMMAND_REQUEST | reason::FORCE_SHUTDOWN => Level::Warn,
+        reason::COMMAND_REQUEST | reason::FORCE_SHUTDOWN => Level::Info,
         _ => Level::Error,
     }
 }
@@ -242,7 +250,7 @@ impl Inlet {
         let mut head = [0; LINE_HEAD_BYTES];
         pop(&mut self.lines, &mut head)?;
         let [level, low, high] = head;
-        let level = [Level::Error, Level::Warn].into_iter().find(|known| *known as u8 == level).unwrap_or(Level::Info);
+        let level = if level == Level::Error as u8 { Level::Error } else { Level::Info };
         let mut text = [0; LINE_BYTES];
         let len = usize::from(u16::from_le_bytes([low, high])).min(LINE_BYTES);
         let text = pop(&mut self.lines, &mut text[..len])?;
@@ -301,19 +309,19 @@ mod tests {
         outlet.note(Note::Shutdown(&Shutdown::because(reason::COMMAND_REQUEST, reason)));
         let mut lines: Vec<_> = std::iter::from_fn(|| inlet.line()).collect();
         let (level, line) = lines.pop().unwrap();
-        assert_eq!(level, Level::Warn);
+        assert_eq!(level, Level::Info);
         assert!(line.starts_with("shutdown: Command request: M112 of this host"), "{line}");
         assert!(lines.len() > 20);
         assert!(lines.iter().all(|(level, line)| *level == Level::Error && line.len() == LINE_BYTES));
     }
 
     #[test]
-    fn what_was_asked_for_is_no_error() {
+    fn what_was_asked_for_is_no_warning() {
         let (mut outlet, mut inlet, _) = ends();
         let end = Shutdown::because(reason::FORCE_SHUTDOWN, "the end");
         outlet.note(Note::Shutdown(&end));
         outlet.note(Note::Trouble(&end));
-        assert_eq!(inlet.line(), Some((Level::Warn, "shutdown: Force shutdown command: the end".into())));
-        assert_eq!(inlet.line(), Some((Level::Warn, "while shut down: Force shutdown command: the end".into())));
+        assert_eq!(inlet.line(), Some((Level::Info, "shutdown: Force shutdown command: the end".into())));
+        assert_eq!(inlet.line(), Some((Level::Info, "while shut down: Force shutdown command: the end".into())));
     }
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The pseudo terminal that the host opens, and the link that leads to it.
+//! The pseudo terminal that the host opens, and the symbolic link that leads to it.
 
 #![forbid(unsafe_code)]
 
@@ -12,24 +12,27 @@ use std::path::{Path, PathBuf};
 use log::warn;
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, FdFlag, OFlag, fcntl};
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::pty::openpty;
-use nix::sys::inotify::{AddWatchFlags, InitFlags, Inotify};
 use nix::sys::termios::{FlushArg, SetArg, cfmakeraw, tcflush, tcgetattr, tcsetattr};
 use nix::unistd::{Gid, Group, chown, read, ttyname, write};
+
+use crate::sys;
 
 /// Whose the terminal is when nobody says.
 const USUAL_GROUP: &str = "tty";
 
-/// A terminal whose slave end stands at `link`.
+/// A terminal that a host finds by a symbolic link.
+///
+/// Whether a host is there is told by what the kernel does when the slave end is closed for the last
+/// time: the master hangs up. So our own slave end is open only while no host is there; then the
+/// host's leaving is the last one's, however many processes had opened the terminal.
 pub(super) struct Pty {
     master: OwnedFd,
-    /// Kept open, so that a host that goes away does not hang up the terminal.
-    slave: OwnedFd,
+    /// Open while no host is there, so that nothing hangs up.
+    slave: Option<OwnedFd>,
     device: PathBuf,
-    link: PathBuf,
-    watch: Inotify,
-    /// How many times the slave end is open, ourselves left out.
-    hosts: usize,
+    symlink: PathBuf,
 }
 
 /// Who may open the terminal.
@@ -50,8 +53,8 @@ fn said<T>(result: Result<T, impl Into<io::Error>>, what: &str) -> io::Result<T>
 }
 
 impl Pty {
-    /// Opens a terminal and puts the link in place.
-    pub(super) fn open(link: &Path, access: &Access) -> io::Result<Pty> {
+    /// Opens a terminal and puts the symbolic link in place.
+    pub(super) fn open(symlink: &Path, access: &Access) -> io::Result<Pty> {
         let pty = said(openpty(None, None), "no pseudo terminal can be opened (is /dev/pts mounted?)")?;
         let mut raw = said(tcgetattr(&pty.slave), "the terminal's settings")?;
         cfmakeraw(&mut raw);
@@ -62,10 +65,8 @@ impl Pty {
         said(fcntl(&pty.master, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)), "the terminal's descriptor")?;
         let device = said(ttyname(&pty.slave), "the terminal's name")?;
         grant(&device, access)?;
-        let watch = said(Inotify::init(InitFlags::IN_NONBLOCK | InitFlags::IN_CLOEXEC), "inotify")?;
-        said(watch.add_watch(&device, AddWatchFlags::IN_OPEN | AddWatchFlags::IN_CLOSE), "inotify on the terminal")?;
-        place_link(&device, link)?;
-        Ok(Pty { master: pty.master, slave: pty.slave, device, link: link.to_owned(), watch, hosts: 0 })
+        place_symlink(&device, symlink)?;
+        Ok(Pty { master: pty.master, slave: Some(pty.slave), device, symlink: symlink.to_owned() })
     }
 
     /// The slave end's device.
@@ -74,15 +75,16 @@ impl Pty {
     }
 
     /// Where the host finds it.
-    pub(super) fn link(&self) -> &Path {
-        &self.link
+    pub(super) fn symlink(&self) -> &Path {
+        &self.symlink
     }
 
     /// Reads what the host wrote; nothing is 0 bytes.
     pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match read(&self.master, buffer) {
             Ok(len) => Ok(len),
-            Err(Errno::EAGAIN | Errno::EINTR) => Ok(0),
+            // EIO: the host is gone, and all that it wrote was read.
+            Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(0),
             Err(error) => Err(error.into()),
         }
     }
@@ -96,44 +98,39 @@ impl Pty {
         }
     }
 
-    /// Takes in who opened and closed the terminal: whether a host is there now.
-    pub(super) fn attached(&mut self) -> bool {
-        while let Ok(events) = self.watch.read_events() {
-            for event in events {
-                if event.mask.contains(AddWatchFlags::IN_Q_OVERFLOW) {
-                    // Who came and went is lost. A host that is there must not be left without
-                    // answers, and one that is not takes none: it is there until it closes.
-                    self.hosts = 1;
-                } else if event.mask.contains(AddWatchFlags::IN_OPEN) {
-                    self.hosts += 1;
-                } else if event.mask.intersects(AddWatchFlags::IN_CLOSE) {
-                    self.hosts = self.hosts.saturating_sub(1);
-                }
-            }
+    /// Somebody wrote: whether a host is there, or has written and gone (as `echo` in a shell does).
+    /// From here on the master hangs up when it leaves.
+    pub(super) fn meet_host(&mut self) -> io::Result<bool> {
+        self.slave = None;
+        let mut fds = [PollFd::new(self.master.as_fd(), PollFlags::empty())];
+        said(poll(&mut fds, PollTimeout::ZERO), "the terminal")?;
+        let is_there = !fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLHUP));
+        if !is_there {
+            self.part_from_host()?;
         }
-        self.hosts > 0
+        Ok(is_there)
     }
 
-    /// Drops what the host that went away did not read.
-    pub(super) fn discard_output(&self) {
+    /// The master hung up: what the host did not read is dropped, and nothing hangs up until the
+    /// next one comes.
+    pub(super) fn part_from_host(&mut self) -> io::Result<()> {
+        let slave = said(sys::pty_slave(self.master.as_fd()), "opening the terminal anew")?;
         // Without success the next host skips some old blocks.
-        let _ = tcflush(&self.slave, FlushArg::TCIFLUSH);
+        let _ = tcflush(&slave, FlushArg::TCIFLUSH);
+        self.slave = Some(slave);
+        Ok(())
     }
 
     pub(super) fn master(&self) -> BorrowedFd<'_> {
         self.master.as_fd()
     }
-
-    pub(super) fn watch(&self) -> BorrowedFd<'_> {
-        self.watch.as_fd()
-    }
 }
 
 impl Drop for Pty {
     fn drop(&mut self) {
-        // Somebody else's link is left alone.
-        if fs::read_link(&self.link).is_ok_and(|target| target == self.device) {
-            let _ = fs::remove_file(&self.link);
+        // Somebody else's is left alone.
+        if fs::read_link(&self.symlink).is_ok_and(|target| target == self.device) {
+            let _ = fs::remove_file(&self.symlink);
         }
     }
 }
@@ -171,43 +168,89 @@ fn give(device: &Path, name: &str) -> io::Result<()> {
     said(chown(device, None, Some(gid)), &what)
 }
 
-fn place_link(device: &Path, link: &Path) -> io::Result<()> {
-    match fs::symlink_metadata(link) {
+fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
+    match fs::symlink_metadata(symlink) {
         Ok(found) if !found.file_type().is_symlink() => {
             return Err(io::Error::other(format!(
                 "{} exists and is no symbolic link: remove it, or choose another path with -I",
-                link.display()
+                symlink.display()
             )));
         }
         _ => {}
     }
     // A rename replaces a stale link in one step: a host never finds none.
-    let mut fresh = link.as_os_str().to_owned();
+    let mut fresh = symlink.as_os_str().to_owned();
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
     let what =
-        format!("the link {} can not be made (does the directory exist, and may we write there?)", link.display());
+        format!("the link {} can not be made (does the directory exist, and may we write there?)", symlink.display());
     said(std::os::unix::fs::symlink(device, &fresh), &what)?;
-    said(fs::rename(&fresh, link), &what).inspect_err(|_| drop(fs::remove_file(&fresh)))
+    said(fs::rename(&fresh, symlink), &what).inspect_err(|_| drop(fs::remove_file(&fresh)))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs::File;
+    use std::fs::{File, OpenOptions};
+    use std::io::{Read, Write};
+
+    /// A terminal, and how a host opens it.
+    fn terminal() -> (tempfile::TempDir, Pty, impl Fn() -> File) {
+        let folder = tempfile::tempdir().unwrap();
+        let pty = Pty::open(&folder.path().join("tty"), &Access { mode: 0o600, group: None }).unwrap();
+        let device = pty.device().to_owned();
+        (folder, pty, move || OpenOptions::new().read(true).write(true).open(&device).unwrap())
+    }
+
+    fn hangs_up(pty: &Pty) -> bool {
+        let mut fds = [PollFd::new(pty.master(), PollFlags::empty())];
+        poll(&mut fds, PollTimeout::ZERO).unwrap() > 0
+    }
 
     #[test]
-    fn a_host_that_came_amid_too_many_events_to_count_is_there_and_can_go() {
-        let folder = tempfile::tempdir().unwrap();
-        let mut pty = Pty::open(&folder.path().join("tty"), &Access { mode: 0o600, group: None }).unwrap();
-        let queue: usize =
-            fs::read_to_string("/proc/sys/fs/inotify/max_queued_events").unwrap().trim().parse().unwrap();
-        for _ in 0..queue / 2 + 10 {
-            drop(File::open(pty.device()).unwrap());
+    fn a_host_is_there_until_the_last_process_has_closed_the_terminal() {
+        let (_folder, mut pty, open) = terminal();
+        assert!(!hangs_up(&pty));
+        // However many came and went before, and did not say a word.
+        for _ in 0..100 {
+            drop(open());
         }
-        let host = File::open(pty.device()).unwrap();
-        assert!(pty.attached());
+        let (klippy, echo) = (open(), open());
+        assert!(pty.meet_host().unwrap());
+        drop(klippy);
+        assert!(!hangs_up(&pty));
+        drop(echo);
+        assert!(hangs_up(&pty));
+        pty.part_from_host().unwrap();
+        assert!(!hangs_up(&pty));
+    }
+
+    #[test]
+    fn who_wrote_and_left_is_heard_and_is_not_there() {
+        let (_folder, mut pty, open) = terminal();
+        open().write_all(b"FORCE_SHUTDOWN\n").unwrap();
+        assert!(!pty.meet_host().unwrap());
+        let mut heard = [0; 64];
+        let len = pty.read(&mut heard).unwrap();
+        assert_eq!(heard[..len], *b"FORCE_SHUTDOWN\n");
+        assert!(!hangs_up(&pty));
+    }
+
+    #[test]
+    fn the_next_host_does_not_read_what_was_for_the_last_one() {
+        let (_folder, mut pty, open) = terminal();
+        let mut host = open();
+        host.write_all(b"?").unwrap();
+        assert!(pty.meet_host().unwrap());
+        pty.write(b"for the last one").unwrap();
         drop(host);
-        assert!(!pty.attached());
+        let mut heard = [0; 64];
+        assert_eq!(pty.read(&mut heard).unwrap(), 1);
+        assert_eq!(pty.read(&mut heard).unwrap(), 0, "a terminal that hung up has nothing to read");
+        pty.part_from_host().unwrap();
+        host = open();
+        pty.write(b"for this one").unwrap();
+        let len = host.read(&mut heard).unwrap();
+        assert_eq!(heard[..len], *b"for this one");
     }
 }

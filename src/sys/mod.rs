@@ -160,6 +160,18 @@ pub(crate) fn watchdog_timeout_s(watchdog: BorrowedFd<'_>) -> io::Result<i32> {
     Ok(seconds)
 }
 
+/// Opens the other end of the pseudo terminal whose master this is, whatever its permissions are
+/// (Linux 4.13). It does not become the process's controlling terminal.
+pub(crate) fn pty_slave(master: BorrowedFd<'_>) -> io::Result<OwnedFd> {
+    let flags = libc::O_RDWR | libc::O_NOCTTY | libc::O_CLOEXEC;
+    // SAFETY: the request takes a number.
+    match unsafe { libc::ioctl(master.as_raw_fd(), libc::TIOCGPTPEER, flags) } {
+        -1 => Err(io::Error::last_os_error()),
+        // SAFETY: a new descriptor that nobody else knows of.
+        fd => Ok(unsafe { OwnedFd::from_raw_fd(fd) }),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

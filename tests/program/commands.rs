@@ -2,6 +2,7 @@
 //! The subcommands.
 
 use std::fs;
+use std::process::{Command, Stdio};
 
 use nix::sys::signal::Signal;
 
@@ -146,18 +147,48 @@ fn latency_judges_the_machine() {
     assert!(fs::read_to_string(svg).unwrap().ends_with("</svg>\n"));
 }
 
-#[test]
-fn a_reader_that_has_seen_enough_is_no_crash() {
-    use std::os::unix::process::ExitStatusExt;
+/// A stdout whose reader has closed it, as `head` does.
+fn closed_pipe() -> std::io::PipeWriter {
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);
-    let output = std::process::Command::new(env!("CARGO_BIN_EXE_pinion"))
-        .args(["sim", "--print-config"])
-        .stdout(writer)
-        .stderr(std::process::Stdio::piped())
-        .spawn()
-        .unwrap()
-        .wait_with_output()
-        .unwrap();
-    assert_eq!(output.status.signal(), None, "{}", String::from_utf8_lossy(&output.stderr));
+    writer
+}
+
+#[test]
+fn a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed() {
+    for args in [
+        &["sim", "--print-config"][..],
+        &["sim", "--print-board"],
+        &["dict", "--board", "sim"],
+        &["pins"],
+        &["latency", "--seconds", "2"],
+    ] {
+        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            .args(args)
+            .stdout(closed_pipe())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let closed = child.wait_with_output().unwrap();
+        let log = String::from_utf8(closed.stderr).unwrap();
+        assert!(!log.contains("panicked"), "{args:?}: {log}");
+        // A machine without pins has none to list.
+        let expected = if args == ["pins"] { output(args).status.code() } else { Some(0) };
+        assert_eq!(closed.status.code(), expected, "{args:?}: {log}");
+    }
+}
+
+#[test]
+fn a_simulated_printer_of_which_nobody_reads_goes_on_to_serve_its_host() {
+    let (folder, toml) = folder_with("quick.toml", &quick_printer());
+    let log = fs::File::create(folder.path().join("log")).unwrap();
+    let mut pinion = Pinion::start_to(folder, &["sim", "-r", toml.to_str().unwrap()], closed_pipe(), log);
+    // The demonstration's own host leaves at its end.
+    pinion.logged("host gone");
+    let mut client = pinion.client();
+    assert!(!client.status().unwrap().is_shutdown);
+    drop(client);
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0));
+    assert!(!pinion.log().contains("panicked"), "{}", pinion.log());
 }

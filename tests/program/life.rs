@@ -2,12 +2,13 @@
 //! The pty, its link, hosts that come and go, signals.
 
 use std::fs;
-use std::io::Write;
+use std::io::{BufRead, BufReader, PipeReader, PipeWriter, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
-use std::process::Command;
+use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::signal::Signal;
 use pinion::host::Error;
 use pinion::host::config::Config;
@@ -162,32 +163,123 @@ fn sigusr1_tells_how_late_timers_were() {
 
 #[test]
 fn a_host_that_never_reads_neither_blocks_the_machine_nor_makes_it_grow() {
+    // One that the core answers, and two that the link answers by itself.
+    for query in ["get_uptime", "get_clock", "identify offset=0 count=40"] {
+        let pinion = Pinion::simulated(&[]);
+        let payload = pinion.client().messages().encode_line(query).unwrap();
+        let before = pinion.private_kb();
+        let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
+        let (done, finished) = std::sync::mpsc::channel();
+        std::thread::spawn(move || {
+            // Who does not read does not know the expected number: all sixteen are tried in turn.
+            let (mut blocks, mut sequence) = (Vec::new(), Sequence::default());
+            for _ in 0..16 {
+                frame(&payload, sequence, &mut blocks);
+                sequence = sequence.next();
+            }
+            for _ in 0..5_000 {
+                tty.write_all(&blocks).unwrap();
+            }
+            done.send(()).unwrap();
+            // The terminal stays open: a host that hangs is no host that is gone.
+            std::thread::park();
+        });
+        finished.recv_timeout(PATIENCE).expect("the machine takes commands in");
+        let grown = pinion.private_kb().saturating_sub(before);
+        assert!(grown < 2048, "{query}: grew by {grown} kB");
+        // And why the machine stops is in the log all the same. (It counts only if it is read apart
+        // from the blocks.)
+        pinion.until("the reason of the stop in the log", || {
+            fs::write(pinion.link(), "FORCE_SHUTDOWN\n").unwrap();
+            pinion.log().contains("shutdown: Force shutdown command: ")
+        });
+        // Who reads is served.
+        let mut client = pinion.client();
+        client.reset().unwrap();
+        assert!(!client.status().unwrap().is_shutdown);
+    }
+}
+
+#[test]
+fn hosts_that_come_and_go_by_the_thousand_do_not_hide_the_one_that_leaves() {
     let pinion = Pinion::simulated(&[]);
-    let get_uptime = pinion.client().messages().encode("get_uptime", &[]).unwrap();
-    let before = pinion.private_kb();
-    let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
-    let (done, finished) = std::sync::mpsc::channel();
+    for _ in 0..20_000 {
+        drop(fs::File::open(pinion.link()).unwrap());
+    }
+    let mut client = pinion.client();
+    client.status().unwrap();
+    pinion.logged("host attached");
+    // Another process that opens and closes the terminal meanwhile takes nothing from it.
+    for _ in 0..20_000 {
+        drop(fs::File::open(pinion.link()).unwrap());
+    }
+    client.status().unwrap();
+    assert!(!pinion.log().contains("host gone"));
+    drop(client);
+    pinion.logged("host gone");
+}
+
+#[test]
+fn what_the_host_and_the_service_manager_ask_for_is_no_warning() {
+    let mut pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    Config::default().apply(&mut client).unwrap();
+    client.reset().unwrap();
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0));
+    let log = pinion.log();
+    assert!(log.contains("INFO  shutdown: Command request: "), "{log}");
+    assert!(log.contains("INFO  shutdown: Force shutdown command: "), "{log}");
+    assert!(!log.contains("WARN") && !log.contains("ERROR"), "{log}");
+}
+
+/// A pipe that has no room left.
+fn full_pipe() -> (PipeReader, PipeWriter) {
+    let (reader, mut writer) = std::io::pipe().unwrap();
+    fcntl(&writer, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).unwrap();
+    while writer.write(&[b'.'; 4096]).is_ok() {}
+    fcntl(&writer, FcntlArg::F_SETFL(OFlag::empty())).unwrap();
+    (reader, writer)
+}
+
+#[test]
+fn a_log_that_nobody_reads_stops_neither_the_machine_nor_its_end() {
+    let (reader, writer) = full_pipe();
+    let folder = tempfile::tempdir().unwrap();
+    let mut pinion = Pinion::start_to(folder, &["run", "--board", "sim"], Stdio::null(), writer);
+    pinion.wait_for_link();
+    let mut client = pinion.client();
+    Config::default().apply(&mut client).unwrap();
+    client.reset().unwrap();
+    assert!(!client.status().unwrap().is_shutdown);
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0));
+    assert!(!exists(&pinion.link()));
+    drop(reader);
+}
+
+#[test]
+fn a_log_that_is_read_again_tells_how_much_of_it_was_lost() {
+    let (reader, writer) = full_pipe();
+    let folder = tempfile::tempdir().unwrap();
+    let mut pinion = Pinion::start_to(folder, &["run", "--board", "sim"], Stdio::null(), writer);
+    pinion.wait_for_link();
+    let mut client = pinion.client();
+    // Each has three lines for the log: that is more than the program keeps.
+    for _ in 0..200 {
+        client.reset().unwrap();
+    }
+    let (sender, lines) = std::sync::mpsc::channel();
     std::thread::spawn(move || {
-        // Who does not read does not know the expected number: all sixteen are tried in turn.
-        let (mut blocks, mut sequence) = (Vec::new(), Sequence::default());
-        for _ in 0..16 {
-            frame(&get_uptime, sequence, &mut blocks);
-            sequence = sequence.next();
-        }
-        for _ in 0..5_000 {
-            tty.write_all(&blocks).unwrap();
-        }
-        done.send(()).unwrap();
-        // The terminal stays open: a host that hangs is no host that is gone.
-        std::thread::park();
+        let lines = BufReader::new(reader).lines().map_while(Result::ok);
+        lines.for_each(|line| drop(sender.send(line)));
     });
-    finished.recv_timeout(PATIENCE).expect("the machine takes commands in");
-    let grown = pinion.private_kb().saturating_sub(before);
-    assert!(grown < 2048, "grew by {grown} kB");
-    // And why the machine stops is in the log all the same. (It counts only if it is read apart
-    // from the blocks.)
-    pinion.until("the reason of the stop in the log", || {
-        fs::write(pinion.link(), "FORCE_SHUTDOWN\n").unwrap();
-        pinion.log().contains("shutdown: Force shutdown command: ")
-    });
+    let wait_for = |text: &str| {
+        while !lines.recv_timeout(PATIENCE).unwrap_or_else(|_| panic!("no line with {text}")).contains(text) {}
+    };
+    wait_for("INFO  serving on ");
+    wait_for(" lines of the log were lost, as nobody read it");
+    pinion.signal(Signal::SIGTERM);
+    wait_for("shutdown: Force shutdown command: ");
+    assert_eq!(pinion.end().code(), Some(0));
 }

@@ -3,7 +3,7 @@
 
 use std::fs::{self, File};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitStatus};
+use std::process::{Child, Command, ExitStatus, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -38,13 +38,19 @@ impl Pinion {
 
     /// The same, in a folder that was prepared.
     pub fn start_in(folder: TempDir, args: &[&str]) -> Pinion {
+        let out = File::create(folder.path().join("out")).unwrap();
         let log = File::create(folder.path().join("log")).unwrap();
+        Pinion::start_to(folder, args, out, log)
+    }
+
+    /// The same, with a stdout and a stderr of the test's.
+    pub fn start_to(folder: TempDir, args: &[&str], out: impl Into<Stdio>, log: impl Into<Stdio>) -> Pinion {
         let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
             .args(args)
             .arg("-I")
             .arg(folder.path().join("tty"))
             .env_remove("JOURNAL_STREAM")
-            .stdout(File::create(folder.path().join("out")).unwrap())
+            .stdout(out)
             .stderr(log)
             .spawn()
             .unwrap();
@@ -56,7 +62,8 @@ impl Pinion {
     }
 
     pub fn log(&self) -> String {
-        fs::read_to_string(self.folder.path().join("log")).unwrap()
+        // There is none where the test has stderr.
+        fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
     }
 
     pub fn out(&self) -> String {
