@@ -8,6 +8,7 @@ use std::io;
 use std::os::fd::{AsFd, BorrowedFd};
 use std::os::unix::net::UnixStream;
 
+use nix::sys::signal::Signal::{SIGTSTP, SIGTTIN, SIGTTOU};
 use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGUSR2};
 use signal_hook::iterator::backend::SignalDelivery;
 use signal_hook::iterator::exfiltrator::SignalOnly;
@@ -33,9 +34,7 @@ impl Signals {
     pub(super) fn new() -> io::Result<Signals> {
         // A key that stops programs, or a log line to a terminal that takes none from the background,
         // is no reason to leave heaters to themselves.
-        for stop in
-            [nix::sys::signal::Signal::SIGTSTP, nix::sys::signal::Signal::SIGTTIN, nix::sys::signal::Signal::SIGTTOU]
-        {
+        for stop in [SIGTSTP, SIGTTIN, SIGTTOU] {
             sys::ignore(stop)?;
         }
         let (read, write) = UnixStream::pair()?;

@@ -36,7 +36,7 @@ const LOG_S: u32 = 2;
 
 /// Makes the process itself: its name, session, signals and priority.
 pub(super) fn settle(realtime: bool) {
-    // None of these can fail where it matters, and there is nobody to tell.
+    // Each of these is an improvement only: the guardian does its work without, too.
     let _ = prctl::set_name(c"pinion-guardian");
     let _ = setsid();
     let _ = chdir("/");
@@ -315,14 +315,14 @@ impl Watcher {
     }
 
     fn answer(&self, answer: u8) {
-        // The program that does not hear it is dead, which the next look tells.
+        // If the program can not be told it is dead, which the next poll tells.
         let _ = send(self.socket.as_raw_fd(), &[answer], MsgFlags::MSG_NOSIGNAL);
     }
 
     /// Drives everything, and kills the program meanwhile. Says in the log what came of it.
     fn rescue(self, cause: &Cause) {
         let Watcher { program, pulse, held: Held { mut native, apart }, .. } = self;
-        // Lines first: they never keep us.
+        // The computer's own lines first: writing to them never has to wait.
         drive(&mut native);
         let diagnosis = pulse.diagnosis();
         let program = Arc::new(program);
@@ -339,7 +339,8 @@ impl Watcher {
         }
         let (driven, failed): (Vec<_>, Vec<_>) = native.into_iter().partition(|output| output.outcome.is_driven());
         crew.employ(failed, None, TRY_FOR);
-        // A log that nobody reads must not keep the lines.
+        // A log that nobody reads would block us, and the lines could not be claimed anew: the alarm
+        // ends this process then.
         alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
         let of_crew = crew.wait(TRY_FOR, |outcome| {
             let seconds = TRY_FOR.as_secs();
@@ -402,7 +403,8 @@ impl Crew {
             drives.push((self.outcomes.len(), drive));
             self.outcomes.push(Outcome { result: None, ..outcome });
         }
-        // A thread that can not be had takes what it was given with it: it is given a share only.
+        // A closure whose thread can not be started is lost with all that it owns: so it owns a share
+        // of the work only, and the work can be taken back.
         let work = Arc::new(Mutex::new(Some(Work { drives, survivor, try_for })));
         let (theirs, tell) = (work.clone(), self.tell.clone());
         let run = move || {
@@ -434,7 +436,7 @@ impl Crew {
         while let Ok(report) = told.recv_timeout(until.saturating_sub(monotonic())) {
             note(report);
         }
-        // Last, as a driver that hangs would keep us here.
+        // Last: a driver that hangs would block this thread.
         for work in left {
             work.run(&mut note);
         }
@@ -458,7 +460,7 @@ impl Work {
         let Work { mut drives, survivor, try_for } = self;
         if let Some(program) = survivor {
             for (_, drive) in &drives {
-                // Whether it fails counts below only.
+                // Driven again below, where a failure is reported.
                 let _ = drive();
             }
             program.wait_for_end();
