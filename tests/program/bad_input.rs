@@ -58,8 +58,6 @@ fn wrong_pins() {
     );
     stops(&pinion, &["config_endstop oid=0 pin=x_step pull_up=1"], "Not an input pin", &["x_step"]);
     stops(&pinion, &["config_analog_in oid=0 pin=led"], "Unable to open adc device", &["led"]);
-    let twice = [OUTPUT, "config_digital_out oid=2 pin=led value=0 default_value=0 max_duration=0"];
-    stops(&pinion, &twice, "Unable to open out GPIO chip line", &["led"]);
 }
 
 #[test]
