@@ -20,12 +20,18 @@ const HOST_PROGRAMS: [&str; 1] = ["/usr/bin/chrt"];
 pub struct OtherProgram {
     pub name: String,
     path: PathBuf,
+    arguments: String,
 }
 
 impl OtherProgram {
     /// Where the guest has it.
-    pub fn path_inside(&self) -> String {
+    fn path_inside(&self) -> String {
         format!("/lab/programs/{}", self.name)
+    }
+
+    /// How the guest starts it, with words between spaces.
+    pub fn command(&self) -> String {
+        format!("{} {}", self.path_inside(), self.arguments)
     }
 }
 
@@ -37,8 +43,9 @@ impl FromStr for OtherProgram {
         if name.is_empty() || name == "pinion" || !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') {
             return Err(format!("{name:?} is no name for a program: letters, digits and _, and not pinion"));
         }
+        let (path, arguments) = path.split_once(' ').unwrap_or((path, ""));
         let path = fs::canonicalize(path).map_err(|error| format!("cannot read {path}: {error}"))?;
-        Ok(OtherProgram { name: name.into(), path })
+        Ok(OtherProgram { name: name.into(), path, arguments: arguments.into() })
     }
 }
 

@@ -4,8 +4,8 @@
 # instead of tests.
 #
 # The tests of the plan run one by one, each in a process of its own: one that
-# dies takes no other with it. A line of the plan may name a program after the test,
-# which that is to measure instead of pinion. Results go to the 9p share: "NAME STATUS" lines in
+# dies takes no other with it. A line of the plan may have a command after the test,
+# whose program that is to measure instead of pinion. Results go to the 9p share: "NAME STATUS" lines in
 # results, and what each test printed in output/NAME. Each test's name goes to the
 # console as it begins.
 . /lab/start.sh

@@ -71,7 +71,7 @@ impl Run<'_> {
         let folder = cache.run_folder()?;
         let folder = folder.path();
         let plan = folder.join("plan");
-        let program = self.program.map(OtherProgram::path_inside).unwrap_or_default();
+        let program = self.program.map(OtherProgram::command).unwrap_or_default();
         let text: String = self.tests.iter().map(|test| format!("{test} {program}\n")).collect();
         fs::write(&plan, text).map_err(|error| format!("cannot write {}: {error}", plan.display()))?;
         let mut machine = machine(folder)?;

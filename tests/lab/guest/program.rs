@@ -48,9 +48,10 @@ impl Program {
     /// `--program` gave, which takes the options of Klipper's.
     pub fn measured() -> Program {
         match other() {
-            Some(path) => {
-                let mut command = Command::new(path);
-                command.arg("-r");
+            Some(words) => {
+                let mut words = words.split_whitespace();
+                let mut command = Command::new(words.next().expect("a program"));
+                command.args(words).arg("-r");
                 Program::spawn(command)
             }
             None => Program::start(),
@@ -171,9 +172,9 @@ impl Drop for Program {
     }
 }
 
-/// The path of the program to be measured instead of Pinion: see `init.sh`.
+/// The command of the program to be measured instead of Pinion: see `init.sh`.
 pub fn other() -> Option<String> {
-    env::var("LAB_PROGRAM").ok().filter(|path| !path.is_empty())
+    env::var("LAB_PROGRAM").ok().filter(|command| !command.is_empty())
 }
 
 /// Whether the process is there and has not ended.
