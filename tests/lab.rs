@@ -16,6 +16,7 @@ mod lab {
     pub mod process;
     pub mod report;
     pub mod snapshot;
+    pub mod table;
     pub mod tools;
     pub mod vm;
 }
@@ -23,6 +24,9 @@ mod lab {
 use std::process::ExitCode;
 use std::sync::Mutex;
 use std::thread;
+
+use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
+use nix::unistd::Pid;
 
 use lab::cache::Cache;
 use lab::guest_program::GuestProgram;
@@ -40,6 +44,10 @@ const FAILED: u8 = 101;
 /// the work left.
 const TESTS_AT_A_MACHINE: usize = 32;
 
+/// Tests whose figures are to be compared with those of another run, or of another program: they
+/// have a machine for themselves, so that they do not depend on what ran there before.
+const FIGURES: &str = "timing::figures::";
+
 fn main() -> ExitCode {
     match run(&Options::from_args()) {
         Ok(true) => ExitCode::SUCCESS,
@@ -53,7 +61,7 @@ fn main() -> ExitCode {
 
 /// Whether every selected test passed; an error is the lab's own failure.
 fn run(options: &Options) -> Result<bool, String> {
-    let program = GuestProgram::build()?;
+    let program = GuestProgram::build(&options.programs)?;
     if options.shell {
         return shell(options, &program);
     }
@@ -61,23 +69,11 @@ fn run(options: &Options) -> Result<bool, String> {
     if tests.is_empty() {
         return Err("the guest program holds no tests".into());
     }
-    let mut runs = Vec::new();
-    let mut filtered_out = 0;
-    for flavour in Flavour::ALL {
-        let (selected, others): (Vec<_>, Vec<_>) =
-            tests.iter().cloned().partition(|test| options.selects(flavour, test));
-        filtered_out += others.len();
-        let machines = selected.len().div_ceil(TESTS_AT_A_MACHINE);
-        // By turns: the tests of one file take alike, and may be the longest.
-        runs.extend((0..machines).map(|machine| {
-            let tests = selected.iter().skip(machine).step_by(machines).cloned().collect();
-            Run { flavour, tests }
-        }));
-    }
+    let (runs, filtered_out) = plan(options, tests);
     if options.list {
         for run in &runs {
             for test in &run.tests {
-                println!("{}: test", run.flavour.name_of(test));
+                println!("{}: test", run.name_of(test));
             }
         }
         return Ok(true);
@@ -90,7 +86,33 @@ fn run(options: &Options) -> Result<bool, String> {
     Ok(report.finish())
 }
 
-fn boot_all(runs: &[Run], program: &GuestProgram, report: &mut Report) -> Result<(), String> {
+/// The machines' runs, and how many tests were not selected.
+fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
+    let (figures, others): (Vec<_>, Vec<_>) = tests.into_iter().partition(|test| test.starts_with(FIGURES));
+    let mut runs = Vec::new();
+    let mut filtered_out = 0;
+    for flavour in Flavour::ALL {
+        let mut add = |program, tests: &[String], at_a_machine: usize| {
+            let whole = Run { flavour, program, tests: tests.to_vec() };
+            let (selected, left_out): (Vec<_>, Vec<_>) =
+                tests.iter().partition(|test| options.selects(flavour, &whole.name_of(test)));
+            filtered_out += left_out.len();
+            let machines = selected.len().div_ceil(at_a_machine);
+            // By turns: the tests of one file take alike, and may be the longest.
+            runs.extend((0..machines).map(|machine| {
+                let tests = selected.iter().skip(machine).step_by(machines).map(|test| (*test).clone()).collect();
+                Run { flavour, program, tests }
+            }));
+        };
+        add(None, &others, TESTS_AT_A_MACHINE);
+        for program in [None].into_iter().chain(options.programs.iter().map(Some)) {
+            add(program, &figures, figures.len());
+        }
+    }
+    (runs, filtered_out)
+}
+
+fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -> Result<(), String> {
     lab::tools::ensure()?;
     let cache = Cache::open()?;
     let offers = Offers::ask()?;
@@ -107,7 +129,7 @@ fn boot_all(runs: &[Run], program: &GuestProgram, report: &mut Report) -> Result
         at_once(&kernels, kernels.len(), |kernel| Snapshot::prepare(kernel, program, &cache))?
     };
     // The slower kernel's first.
-    let order: Vec<&Run> = runs.iter().rev().collect();
+    let order: Vec<&Run<'_>> = runs.iter().rev().collect();
     let report = Mutex::new(report);
     // A machine emulates one processor.
     let machines = thread::available_parallelism().map_or(1, usize::from);
@@ -119,7 +141,8 @@ fn boot_all(runs: &[Run], program: &GuestProgram, report: &mut Report) -> Result
 }
 
 /// What the function makes of each item, in their order; so many threads take the next one when
-/// they are done with the one before.
+/// they are done with the one before. Each stays on a processor, and so do the threads of the
+/// emulators that it starts: `Emulator` tells why.
 fn at_once<T: Sync, R: Send>(
     items: &[T],
     threads: usize,
@@ -129,8 +152,10 @@ fn at_once<T: Sync, R: Send>(
     let done = Mutex::new(Vec::new());
     thread::scope(|scope| {
         let threads: Vec<_> = (0..threads)
-            .map(|_| {
-                scope.spawn(|| -> Result<(), String> {
+            .map(|number| {
+                let (queue, done, function) = (&queue, &done, &function);
+                scope.spawn(move || -> Result<(), String> {
+                    stay_on_processor(number)?;
                     loop {
                         let next = queue.lock().expect("it is not held in a panic").next();
                         let Some((index, item)) = next else { return Ok(()) };
@@ -147,7 +172,20 @@ fn at_once<T: Sync, R: Send>(
     Ok(done.into_iter().map(|(_, result)| result).collect())
 }
 
-fn shell(options: &Options, program: &GuestProgram) -> Result<bool, String> {
+/// Keeps this thread on the n-th of the processors that it may use, or on one of them if there are
+/// fewer.
+fn stay_on_processor(number: usize) -> Result<(), String> {
+    let me = Pid::from_raw(0);
+    let choose = |allowed: CpuSet| {
+        let processors: Vec<usize> = (0..CpuSet::count()).filter(|cpu| allowed.is_set(*cpu) == Ok(true)).collect();
+        let mut one = CpuSet::new();
+        one.set(processors[number % processors.len()])?;
+        sched_setaffinity(me, &one)
+    };
+    sched_getaffinity(me).and_then(choose).map_err(|error| format!("cannot choose a processor: {error}"))
+}
+
+fn shell(options: &Options, program: &GuestProgram<'_>) -> Result<bool, String> {
     lab::tools::ensure()?;
     let cache = Cache::open()?;
     let flavour = options.flavour.unwrap_or(Flavour::Stock);

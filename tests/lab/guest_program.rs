@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The test program that runs in the guest: cargo's test target `guest`, with
-//! `pinion` itself and the libraries that both need.
+//! `pinion` itself, other programs to be measured, and the libraries that they need.
 
 use std::env;
 use std::ffi::OsStr;
@@ -8,6 +8,7 @@ use std::fs;
 use std::hash::{Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
+use std::str::FromStr;
 
 use super::initramfs::Archive;
 use super::process;
@@ -15,13 +16,47 @@ use super::process;
 /// Programs of the host that busybox has no equivalent of.
 const HOST_PROGRAMS: [&str; 1] = ["/usr/bin/chrt"];
 
-pub struct GuestProgram {
+/// A micro-controller program of the host that is measured beside Pinion.
+pub struct OtherProgram {
+    pub name: String,
     path: PathBuf,
+    arguments: String,
 }
 
-impl GuestProgram {
+impl OtherProgram {
+    /// Where the guest has it.
+    fn path_inside(&self) -> String {
+        format!("/lab/programs/{}", self.name)
+    }
+
+    /// How the guest starts it, with words between spaces.
+    pub fn command(&self) -> String {
+        format!("{} {}", self.path_inside(), self.arguments)
+    }
+}
+
+impl FromStr for OtherProgram {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<OtherProgram, String> {
+        let (name, path) = text.split_once('=').ok_or_else(|| format!("{text} is not NAME=PATH"))?;
+        if name.is_empty() || name == "pinion" || !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') {
+            return Err(format!("{name:?} is no name for a program: letters, digits and _, and not pinion"));
+        }
+        let (path, arguments) = path.split_once(' ').unwrap_or((path, ""));
+        let path = fs::canonicalize(path).map_err(|error| format!("cannot read {path}: {error}"))?;
+        Ok(OtherProgram { name: name.into(), path, arguments: arguments.into() })
+    }
+}
+
+pub struct GuestProgram<'a> {
+    path: PathBuf,
+    others: &'a [OtherProgram],
+}
+
+impl<'a> GuestProgram<'a> {
     /// Has cargo build it, in the profile that this harness was built in.
-    pub fn build() -> Result<GuestProgram, String> {
+    pub fn build(others: &'a [OtherProgram]) -> Result<GuestProgram<'a>, String> {
         let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
         cargo.current_dir(env!("CARGO_MANIFEST_DIR"));
         cargo.args(["test", "--no-run", "--test", "guest", "--message-format", "json"]);
@@ -36,7 +71,7 @@ impl GuestProgram {
             .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
             .find(|message| message["target"]["name"] == "guest" && message["executable"].is_string())
             .and_then(|message| message["executable"].as_str().map(PathBuf::from))
-            .map(|path| GuestProgram { path })
+            .map(|path| GuestProgram { path, others })
             .ok_or_else(|| "cargo built no test target `guest`".into())
     }
 
@@ -61,7 +96,10 @@ impl GuestProgram {
             let name = program.file_name().unwrap_or_default().to_string_lossy();
             archive.copy(&format!("/bin/{name}"), program)?;
         }
-        for library in libraries(self.programs())? {
+        for other in self.others {
+            archive.copy(&other.path_inside(), &other.path)?;
+        }
+        for library in libraries(&self.programs())? {
             let content = fs::read(&library).map_err(|error| format!("cannot read {library}: {error}"))?;
             archive.program(&library, &content);
         }
@@ -73,7 +111,7 @@ impl GuestProgram {
         for source in [include_str!("guest_program.rs"), include_str!("initramfs.rs"), include_str!("init.sh")] {
             source.hash(hasher);
         }
-        let libraries = libraries(self.programs())?;
+        let libraries = libraries(&self.programs())?;
         for path in self.programs().into_iter().chain(libraries.iter().map(Path::new)) {
             let describe = |error| format!("cannot read {}: {error}", path.display());
             let metadata = fs::metadata(path).map_err(describe)?;
@@ -83,9 +121,9 @@ impl GuestProgram {
         Ok(())
     }
 
-    fn programs(&self) -> [&Path; 3] {
-        let [chrt] = HOST_PROGRAMS.map(Path::new);
-        [&self.path, pinion(), chrt]
+    fn programs(&self) -> Vec<&Path> {
+        let others = self.others.iter().map(|other| other.path.as_path());
+        [self.path.as_path(), pinion()].into_iter().chain(HOST_PROGRAMS.map(Path::new)).chain(others).collect()
     }
 }
 
@@ -94,7 +132,7 @@ fn pinion() -> &'static Path {
 }
 
 /// The paths that the loader finds, itself among them.
-fn libraries(programs: [&Path; 3]) -> Result<Vec<String>, String> {
+fn libraries(programs: &[&Path]) -> Result<Vec<String>, String> {
     let mut libraries = Vec::new();
     for program in programs {
         // "name => /path (address)", or "/path (address)" for the loader.

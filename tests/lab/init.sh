@@ -4,7 +4,8 @@
 # instead of tests.
 #
 # The tests of the plan run one by one, each in a process of its own: one that
-# dies takes no other with it. Results go to the 9p share: "NAME STATUS" lines in
+# dies takes no other with it. A line of the plan may have a command after the test,
+# whose program that is to measure instead of pinion. Results go to the 9p share: "NAME STATUS" lines in
 # results, and what each test printed in output/NAME. Each test's name goes to the
 # console as it begins.
 . /lab/start.sh
@@ -37,7 +38,7 @@ kernel_log() {
 }
 
 run_test() {
-	timeout -s KILL 60 guest --exact "$1" --nocapture </dev/null
+	LAB_PROGRAM=$2 timeout -s KILL 60 guest --exact "$1" --nocapture </dev/null
 	status=$?
 	[ $status = 137 ] && echo "killed: it took longer than 60 s"
 	kernel_log || status=99
@@ -53,6 +54,9 @@ if [ -n "$LAB_SHELL" ]; then
 	poweroff -f
 fi
 
+# What the kernel leaves for later at its start is then behind it: the last of it is the
+# choice of the processor's counter as its clock, two seconds after boot.
+sleep 10
 # QEMU's pvpanic stops the machine here, at this very instruction. The host takes a
 # snapshot, and each run goes on from that, with a plan of its own.
 out 0x505 001
@@ -62,9 +66,9 @@ insmod /lab/plan.ko
 cat /sys/firmware/qemu_fw_cfg/by_name/opt/pinion/plan/raw >/tmp/plan
 mkdir -p /tmp/lab/output
 dmesg -c >/tmp/lab/output/boot
-while read -r test; do
+while read -r test program; do
 	echo "lab: $test"
-	run_test "$test" >"/tmp/lab/output/$test" 2>&1
+	run_test "$test" "$program" >"/tmp/lab/output/$test" 2>&1
 	echo "$test $?" >>/tmp/lab/results
 done </tmp/plan
 # Nothing of the host is to be met before the tests are over: its answers take a

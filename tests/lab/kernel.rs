@@ -34,11 +34,6 @@ impl Flavour {
         }
     }
 
-    /// The name under which a test is reported.
-    pub fn name_of(self, test: &str) -> String {
-        format!("{}::{test}", self.name())
-    }
-
     /// The package which always depends on the newest kernel.
     fn package(self) -> &'static str {
         match self {

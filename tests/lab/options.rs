@@ -4,6 +4,7 @@
 use std::env;
 use std::process;
 
+use super::guest_program::OtherProgram;
 use super::kernel::Flavour;
 
 const USAGE: &str = "\
@@ -18,6 +19,9 @@ Options:
   --list             Print the names
   --nocapture        Show the output of tests that pass, too
   --flavour NAME     Only this kernel: stock or rt
+  --program 'NAME=PATH [ARGUMENTS]'
+                     Have the tests of timing::figures measure this program of the
+                     host, too: one that takes the options of Klipper's linux MCU
   --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
 
 /// What to run, and how.
@@ -28,6 +32,7 @@ pub struct Options {
     exact: bool,
     only_ignored: bool,
     pub flavour: Option<Flavour>,
+    pub programs: Vec<OtherProgram>,
     pub list: bool,
     pub show_output: bool,
     pub shell: bool,
@@ -61,6 +66,7 @@ impl Options {
                 "--list" => options.list = true,
                 "--nocapture" | "--no-capture" | "--show-output" => options.show_output = true,
                 "--flavour" => options.flavour = Some(value()?.parse()?),
+                "--program" => options.programs.push(value()?.parse()?),
                 "--shell" => options.shell = true,
                 "--ignored" => options.only_ignored = true,
                 // `cargo test -- ...` gives every test program the same words.
@@ -75,9 +81,8 @@ impl Options {
         Ok(options)
     }
 
-    /// Whether the test is to run on this flavour.
-    pub fn selects(&self, flavour: Flavour, test: &str) -> bool {
-        let name = flavour.name_of(test);
+    /// Whether the test is to run on this flavour. The name is that under which it is reported.
+    pub fn selects(&self, flavour: Flavour, name: &str) -> bool {
         let matches = |filter: &String| match self.exact {
             true => name == *filter,
             false => name.contains(filter),

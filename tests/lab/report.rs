@@ -3,6 +3,7 @@
 
 use std::time::Instant;
 
+use super::table::Table;
 use super::vm::Run;
 
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -17,19 +18,23 @@ pub struct Report {
     passed: usize,
     /// Name and output.
     failures: Vec<(String, String)>,
+    table: Table,
     filtered_out: usize,
     show_output: bool,
 }
 
 impl Report {
-    pub fn new(runs: &[Run], filtered_out: usize, show_output: bool) -> Report {
+    pub fn new(runs: &[Run<'_>], filtered_out: usize, show_output: bool) -> Report {
         let planned = runs.iter().map(|run| run.tests.len()).sum();
         println!("\nrunning {planned} test{}", if planned == 1 { "" } else { "s" });
-        Report { started: Instant::now(), planned, passed: 0, failures: Vec::new(), filtered_out, show_output }
+        let table = Table::new(runs.iter().map(Run::column));
+        Report { started: Instant::now(), planned, passed: 0, failures: Vec::new(), table, filtered_out, show_output }
     }
 
     /// Takes a test's result.
-    pub fn test(&mut self, name: &str, outcome: Outcome, output: &str) {
+    pub fn test(&mut self, run: &Run<'_>, test: &str, outcome: Outcome, output: &str) {
+        let name = run.name_of(test);
+        self.table.take(&run.column(), output);
         if self.show_output {
             println!("---- {name} ----\n{}", output.trim_end());
         }
@@ -40,13 +45,14 @@ impl Report {
             }
             Outcome::Failed => {
                 println!("test {name} ... FAILED");
-                self.failures.push((name.to_owned(), output.to_owned()));
+                self.failures.push((name, output.to_owned()));
             }
         }
     }
 
     /// Prints the rest. Whether every test that was planned has passed.
     pub fn finish(mut self) -> bool {
+        self.table.print();
         if !self.failures.is_empty() {
             println!("\nfailures:\n");
             for (name, output) in &self.failures {

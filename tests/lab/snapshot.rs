@@ -23,7 +23,7 @@ pub struct Snapshot(File);
 impl Snapshot {
     /// Boots the kernel with the program unless that was done before. The caller
     /// has the cache's lock.
-    pub fn prepare(kernel: &Kernel, program: &GuestProgram, cache: &Cache) -> Result<Snapshot, String> {
+    pub fn prepare(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache) -> Result<Snapshot, String> {
         let folder = kernel.folder();
         let path = folder.join(format!("{PREFIX}{:016x}", key(kernel, program)?));
         if !path.exists() {
@@ -43,7 +43,7 @@ impl Snapshot {
     }
 }
 
-fn make(kernel: &Kernel, program: &GuestProgram, cache: &Cache, path: &Path) -> Result<(), String> {
+fn make(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache, path: &Path) -> Result<(), String> {
     let folder = cache.run_folder()?;
     let file = File::create(path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
     let mut emulator = Emulator::start(vm::booting(kernel, &program.payload()?, folder.path())?, folder.path())?;
@@ -61,7 +61,7 @@ fn name_of(file: &File) -> String {
 }
 
 /// Changes with everything that a booted machine is made of.
-fn key(kernel: &Kernel, program: &GuestProgram) -> Result<u64, String> {
+fn key(kernel: &Kernel, program: &GuestProgram<'_>) -> Result<u64, String> {
     let mut hasher = DefaultHasher::new();
     process::output(Command::new(vm::EMULATOR).arg("--version"))?.hash(&mut hasher);
     kernel.folder().hash(&mut hasher);

@@ -12,6 +12,7 @@ use serde_json::json;
 
 use super::cache::Cache;
 use super::emulator::{Emulator, SILENCE_MAX};
+use super::guest_program::OtherProgram;
 use super::kernel::{Flavour, Kernel};
 use super::report::{Outcome, Report};
 use super::snapshot::Snapshot;
@@ -26,10 +27,10 @@ const EXIT_PLAN_DONE: i32 = 33;
 /// What init begins a line of the console with that names the next test.
 const MARK: &str = "lab: ";
 
-/// The guest's time: an instruction takes 2 ns. It is the same on every host, to
+/// The guest's time: an instruction takes 1 ns. It is the same on every host, to
 /// the nanosecond, and passes at once when the guest has nothing to do. By the
 /// host's clock an emulated processor would be slow, and stop whenever the host does.
-const TIME: [&str; 6] = ["-icount", "shift=1,sleep=off", "-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"];
+const TIME: [&str; 6] = ["-icount", "shift=0,sleep=off", "-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"];
 
 /// A panic reboots, which ends the emulator. The rest is what an emulated processor would
 /// spend time on and no test is about: guards against the faults of real processors, the
@@ -42,19 +43,36 @@ const COMMAND_LINE: &str = "console=ttyS0 quiet panic=-1 mitigations=off cryptom
 const PROCESSOR: &str = "qemu64,+rdrand";
 
 /// The tests that one machine runs.
-pub struct Run {
+pub struct Run<'a> {
     pub flavour: Flavour,
+    /// What they measure, if not Pinion.
+    pub program: Option<&'a OtherProgram>,
     pub tests: Vec<String>,
 }
 
-impl Run {
+impl Run<'_> {
+    /// The name under which a test is reported.
+    pub fn name_of(&self, test: &str) -> String {
+        match self.program {
+            Some(program) => format!("{}::{}::{test}", self.flavour.name(), program.name),
+            None => format!("{}::{test}", self.flavour.name()),
+        }
+    }
+
+    /// Whose figures the tests print.
+    pub fn column(&self) -> String {
+        let program = self.program.map_or("pinion", |program| &program.name);
+        format!("{} {program}", self.flavour.name())
+    }
+
     /// Runs the tests and reports them. An error is a failure of the lab; one of
     /// the guest is that of the tests it left out.
     pub fn perform(&self, snapshot: &Snapshot, cache: &Cache, report: &Mutex<&mut Report>) -> Result<(), String> {
         let folder = cache.run_folder()?;
         let folder = folder.path();
         let plan = folder.join("plan");
-        let text: String = self.tests.iter().map(|test| format!("{test}\n")).collect();
+        let program = self.program.map(OtherProgram::command).unwrap_or_default();
+        let text: String = self.tests.iter().map(|test| format!("{test} {program}\n")).collect();
         fs::write(&plan, text).map_err(|error| format!("cannot write {}: {error}", plan.display()))?;
         let mut machine = machine(folder)?;
         machine
@@ -77,9 +95,9 @@ impl Run {
             for test in &self.tests[count..] {
                 let output = match test == culprit {
                     true => format!("{cause}\n{}", emulator.said()),
-                    false => format!("no result: see {}", self.flavour.name_of(culprit)),
+                    false => format!("no result: see {}", self.name_of(culprit)),
                 };
-                report.lock().expect("no machine panics").test(&self.flavour.name_of(test), Outcome::Failed, &output);
+                report.lock().expect("no machine panics").test(self, test, Outcome::Failed, &output);
             }
         }
         Ok(())
@@ -100,7 +118,7 @@ impl Run {
             // A name that the program does not know is a success to libtest.
             let passed = status == "0" && output.contains("test result: ok. 1 passed;");
             let outcome = if passed { Outcome::Passed } else { Outcome::Failed };
-            report.lock().expect("no machine panics").test(&self.flavour.name_of(test), outcome, &output);
+            report.lock().expect("no machine panics").test(self, test, outcome, &output);
             reported += 1;
         }
         Ok(reported)

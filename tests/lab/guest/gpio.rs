@@ -116,20 +116,20 @@ fn a_chip_that_goes_away_fails_its_held_lines() {
 fn every_write_is_traced_with_its_time() {
     let sim = GpioSim::new("lab", 8);
     let handle = output(&sim, 7);
-    let now_us = || {
+    let now_ns = || {
         let now = clock_gettime(ClockId::CLOCK_MONOTONIC).expect("the clock");
-        u64::try_from(now.tv_sec() * 1_000_000 + now.tv_nsec() / 1000).expect("after boot")
+        u64::try_from(now.tv_sec() * 1_000_000_000 + now.tv_nsec()).expect("after boot")
     };
     let trace = Trace::start();
-    let before_us = now_us();
+    let before_ns = now_ns();
     for step in 0..100_u8 {
         handle.set_value(step % 2).expect("a held line");
     }
-    let after_us = now_us();
+    let after_ns = now_ns();
     let writes = trace.writes();
     let levels: Vec<bool> = writes.iter().map(|write| write.level).collect();
     assert_eq!(levels, (0..100).map(|step| step % 2 == 1).collect::<Vec<_>>());
     assert!(writes.iter().all(|write| write.line == sim.kernel_number(7)));
-    assert!(writes.is_sorted_by_key(|write| write.at_us));
-    assert!(before_us <= writes[0].at_us && writes[99].at_us <= after_us);
+    assert!(writes.is_sorted_by_key(|write| write.at_ns));
+    assert!(before_ns <= writes[0].at_ns && writes[99].at_ns <= after_ns);
 }

@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion run` as a child of the test, and what a host says to it.
+//! `pinion run`, or another micro-controller program, as a child of the test, and what a host
+//! says to it.
 
-use std::fs::{self, File};
+use std::env;
+use std::fs::{self, DirEntry, File};
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus};
@@ -10,6 +12,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
+use nix::time::{clock_getcpuclockid, clock_gettime};
 use nix::unistd::Pid;
 use pinion::host::config::Config;
 use pinion::host::{Client, Error};
@@ -36,19 +39,37 @@ impl Program {
     /// With these arguments to `pinion run`, and this in its environment; returns once a host
     /// may come.
     pub fn with(args: &[&str], environment: &[(&str, &str)]) -> Program {
+        let mut command = Command::new("pinion");
+        command.args(["run", "-g", "0"]).args(args).envs(environment.iter().copied());
+        Program::spawn(command)
+    }
+
+    /// The program that the lab measures, in real time: Pinion, or the one that the host's
+    /// `--program` gave, which takes the options of Klipper's.
+    pub fn measured() -> Program {
+        match other() {
+            Some(words) => {
+                let mut words = words.split_whitespace();
+                let mut command = Command::new(words.next().expect("a program"));
+                command.args(words).arg("-r");
+                Program::spawn(command)
+            }
+            None => Program::start(),
+        }
+    }
+
+    fn spawn(mut command: Command) -> Program {
         sysfs::assert_in_guest();
         static COUNT: AtomicUsize = AtomicUsize::new(0);
         let instance = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
         let link = PathBuf::from(format!("/tmp/pinion-{instance}"));
         let log = link.with_extension("log");
-        let child = Command::new("pinion")
-            .args(["run", "-g", "0", "-I"])
+        let child = command
+            .arg("-I")
             .arg(&link)
-            .args(args)
-            .envs(environment.iter().copied())
             .stderr(File::create(&log).expect("a log"))
             .spawn()
-            .expect("pinion");
+            .unwrap_or_else(|error| panic!("{command:?}: {error}"));
         let program = Program { child, link, log };
         sysfs::wait_until("the link to the pty stands", || program.link.exists());
         program
@@ -67,13 +88,6 @@ impl Program {
         Pid::from_raw(self.child.id().try_into().expect("a process id"))
     }
 
-    /// The thread that owns the machine.
-    pub fn core(&self) -> Pid {
-        let thread = sysfs::entry_with(&format!("/proc/{}/task", self.pid()), "comm", "core");
-        let id = thread.file_name().and_then(|name| name.to_str()).expect("a thread's id");
-        Pid::from_raw(id.parse().expect("a number"))
-    }
-
     /// The process that watches over its outputs.
     pub fn guardian(&self) -> Pid {
         self.find_guardian().expect("a guardian")
@@ -84,6 +98,25 @@ impl Program {
         let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).ok()?;
         let mut pids = children.split_whitespace().filter_map(|pid| pid.parse().ok()).map(Pid::from_raw);
         pids.find(|pid| fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|name| name == "pinion-guardian\n"))
+    }
+
+    /// It and the process that it forked, if any.
+    fn processes(&self) -> impl Iterator<Item = Pid> {
+        [self.pid()].into_iter().chain(self.find_guardian())
+    }
+
+    /// All of its threads.
+    pub fn threads(&self) -> Vec<Pid> {
+        let threads = |process: Pid| fs::read_dir(format!("/proc/{process}/task")).expect("a running program");
+        let id = |thread: DirEntry| thread.file_name().to_str().and_then(|id| id.parse().ok()).expect("a thread's id");
+        let all = self.processes().flat_map(threads);
+        all.map(|thread| Pid::from_raw(id(thread.expect("a readable folder")))).collect()
+    }
+
+    /// The processor's time that all of its threads had so far.
+    pub fn cpu_time(&self) -> Duration {
+        let of = |process| clock_getcpuclockid(process).and_then(clock_gettime).expect("a running program");
+        self.processes().map(|process| Duration::from(of(process))).sum()
     }
 
     pub fn signal(&self, signal: Signal) {
@@ -134,9 +167,14 @@ impl Drop for Program {
             thread::sleep(Duration::from_millis(1));
         }
         if thread::panicking() {
-            println!("--- log of pinion\n{}---", fs::read_to_string(&self.log).unwrap_or_default());
+            println!("--- log of the program\n{}---", fs::read_to_string(&self.log).unwrap_or_default());
         }
     }
+}
+
+/// The command of the program to be measured instead of Pinion: see `init.sh`.
+pub fn other() -> Option<String> {
+    env::var("LAB_PROGRAM").ok().filter(|command| !command.is_empty())
 }
 
 /// Whether the process is there and has not ended.

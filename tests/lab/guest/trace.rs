@@ -1,6 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What really happened on the lines, and when: the kernel's own trace points.
+//! What really happened on the lines, and when; and which system calls a program made: the
+//! kernel's own trace points.
 
+use std::cell::RefCell;
+use std::collections::BTreeMap;
+use std::fs::OpenOptions;
+use std::io::{ErrorKind, Read};
+use std::os::unix::fs::OpenOptionsExt;
+
+use nix::fcntl::OFlag;
 use nix::unistd::Pid;
 
 use super::sysfs;
@@ -14,49 +22,55 @@ pub struct Write {
     pub line: u32,
     pub level: bool,
     /// CLOCK_MONOTONIC.
-    pub at_us: u64,
-}
-
-/// A system call being entered.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Call {
-    /// As in `libc::SYS_ioctl`.
-    pub number: i64,
-    /// CLOCK_MONOTONIC.
-    pub at_us: u64,
+    pub at_ns: u64,
 }
 
 /// Records every write to every GPIO line until it is dropped. There is one
 /// recorder in a guest.
-pub struct Trace(());
+///
+/// It reads the ring buffer's pages rather than the file `trace`: that text has microseconds
+/// only, and to make it takes an emulated processor long.
+pub struct Trace {
+    event: Event,
+    writes: RefCell<Vec<Write>>,
+}
+
+/// Where the pages have what is looked for, from the event's `id` and `format`.
+struct Event {
+    id: u64,
+    gpio: usize,
+    get: usize,
+    value: usize,
+}
 
 impl Trace {
     pub fn start() -> Trace {
-        Trace::prepare();
-        set("tracing_on", "1");
-        Trace(())
-    }
-
-    /// Records the system calls of a thread, too.
-    pub fn with_calls_of(thread: Pid) -> Trace {
-        Trace::prepare();
-        set("events/raw_syscalls/sys_enter/filter", &format!("common_pid == {thread}"));
-        set("events/raw_syscalls/sys_enter/enable", "1");
-        set("tracing_on", "1");
-        Trace(())
-    }
-
-    fn prepare() {
         set("tracing_on", "0");
         set("trace", "");
         set("trace_clock", "mono");
-        set("buffer_size_kb", "4096");
+        set("buffer_size_kb", "8192");
         set("events/gpio/gpio_value/enable", "1");
+        let format = get("events/gpio/gpio_value/format");
+        let offset = |field: &str| {
+            // field:unsigned gpio;	offset:8;	size:4;	signed:0;
+            let rest = format.split_once(&format!(" {field};\toffset:")).map(|(_, rest)| rest);
+            let offset = rest.and_then(|rest| rest.split_once(';')?.0.parse().ok());
+            offset.unwrap_or_else(|| panic!("no {field} in this:\n{format}"))
+        };
+        let id = get("events/gpio/gpio_value/id").parse().expect("a number");
+        let event = Event { id, gpio: offset("gpio"), get: offset("get"), value: offset("value") };
+        set("tracing_on", "1");
+        Trace { event, writes: RefCell::default() }
     }
 
     /// The writes so far, oldest first.
     pub fn writes(&self) -> Vec<Write> {
-        entries(write)
+        let mut writes = self.writes.borrow_mut();
+        for processor in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+            self.read(processor, &mut writes);
+        }
+        writes.sort_by_key(|write| write.at_ns);
+        writes.clone()
     }
 
     /// Those to one line, by the kernel's number of it.
@@ -66,17 +80,110 @@ impl Trace {
         writes
     }
 
-    /// The system calls so far, oldest first.
-    pub fn calls(&self) -> Vec<Call> {
-        entries(call)
+    /// Takes what one processor has recorded out of the ring buffer.
+    fn read(&self, processor: usize, writes: &mut Vec<Write>) {
+        let path = format!("{TRACEFS}/per_cpu/cpu{processor}/trace_pipe_raw");
+        let mut pages = OpenOptions::new()
+            .read(true)
+            .custom_flags(OFlag::O_NONBLOCK.bits())
+            .open(&path)
+            .unwrap_or_else(|error| panic!("{path}: {error}"));
+        let mut page = [0; 4096];
+        loop {
+            match pages.read(&mut page) {
+                Ok(0) => return,
+                Ok(len) => self.event.find(&page[..len], writes),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => return,
+                Err(error) => panic!("{path}: {error}"),
+            }
+        }
     }
 }
 
 impl Drop for Trace {
     fn drop(&mut self) {
-        for name in ["tracing_on", "events/gpio/gpio_value/enable", "events/raw_syscalls/sys_enter/enable"] {
+        for name in ["tracing_on", "events/gpio/gpio_value/enable"] {
             let _ = sysfs::try_write(format!("{TRACEFS}/{name}"), "0");
         }
+    }
+}
+
+impl Event {
+    /// Appends the writes of a page. Its form is told by `events/header_page` and
+    /// `events/header_event`, and in the kernel's include/linux/ring_buffer.h.
+    fn find(&self, page: &[u8], writes: &mut Vec<Write>) {
+        const MISSED_EVENTS: u64 = 1 << 31;
+        const LENGTH: u64 = 0xf_ffff;
+        const WORD: usize = 4;
+        let word = |at: usize| u32::from_ne_bytes(page[at..at + WORD].try_into().expect("four bytes"));
+        let long = |at: usize| u64::from_ne_bytes(page[at..at + 8].try_into().expect("eight bytes"));
+        let (mut at_ns, commit) = (long(0), long(8));
+        assert!(commit & MISSED_EVENTS == 0, "the trace is not complete");
+        let mut at = 16;
+        let end = at + (commit & LENGTH) as usize;
+        while at < end {
+            let head = word(at);
+            let (kind, delta) = (head & 0x1f, u64::from(head >> 5));
+            let extended = |at: usize| (u64::from(word(at + WORD)) << 27) + delta;
+            let len = match kind {
+                // Padding up to the page's end.
+                29 if delta == 0 => return,
+                30 => {
+                    at_ns += extended(at);
+                    WORD
+                }
+                31 => {
+                    at_ns = extended(at);
+                    WORD
+                }
+                _ => {
+                    at_ns += delta;
+                    // A long event's first word is its length, and so is that of a dropped one.
+                    if kind == 0 || kind == 29 { word(at + WORD) as usize } else { kind as usize * WORD }
+                }
+            };
+            let data = at + WORD;
+            at = data + len;
+            let is_small = (1..=28).contains(&kind);
+            // The event's id is the first field of each.
+            if is_small && word(data) as u64 & 0xffff == self.id && word(data + self.get) == 0 {
+                let (line, level) = (word(data + self.gpio), word(data + self.value) != 0);
+                writes.push(Write { line, level, at_ns });
+            }
+        }
+    }
+}
+
+/// Counts the system calls of threads until it is dropped. The kernel itself counts, which takes
+/// less time than to record each.
+pub struct Calls {
+    trigger: String,
+}
+
+const CALLS: &str = "events/raw_syscalls/sys_enter";
+
+impl Calls {
+    pub fn of(threads: &[Pid]) -> Calls {
+        let pids: Vec<String> = threads.iter().map(|thread| format!("common_pid == {thread}")).collect();
+        let calls = Calls { trigger: format!("hist:keys=id if {}", pids.join(" || ")) };
+        set(&format!("{CALLS}/trigger"), &calls.trigger);
+        calls
+    }
+
+    /// How many so far, by number as in `libc::SYS_ioctl`.
+    pub fn so_far(&self) -> BTreeMap<i64, u64> {
+        // { id:         16 } hitcount:       1000
+        let count = |line: &str| {
+            let (id, hits) = line.strip_prefix("{ id:")?.split_once("} hitcount:")?;
+            Some((id.trim().parse().ok()?, hits.trim().parse().ok()?))
+        };
+        get(&format!("{CALLS}/hist")).lines().filter_map(count).collect()
+    }
+}
+
+impl Drop for Calls {
+    fn drop(&mut self) {
+        let _ = sysfs::try_write(format!("{TRACEFS}/{CALLS}/trigger"), format!("!{}", self.trigger));
     }
 }
 
@@ -84,31 +191,6 @@ fn set(name: &str, value: &str) {
     sysfs::write(format!("{TRACEFS}/{name}"), value);
 }
 
-fn entries<T>(parse: impl Fn(&str) -> Option<T>) -> Vec<T> {
-    let trace = sysfs::read(format!("{TRACEFS}/trace"));
-    assert!(!trace.contains("LOST"), "the trace is not complete");
-    trace.lines().filter_map(parse).collect()
-}
-
-/// `guest-123 [000] d..1. 12.345678: gpio_value: 507 set 1`
-fn write(entry: &str) -> Option<Write> {
-    let (head, event) = entry.split_once(": gpio_value: ")?;
-    let mut words = event.split(' ');
-    let line = words.next()?.parse().ok()?;
-    if words.next()? != "set" {
-        return None;
-    }
-    Some(Write { line, level: words.next()? == "1", at_us: microseconds(head)? })
-}
-
-/// `core-123 [000] d..1. 12.345678: sys_enter: NR 16 (5, c018b409, 7f, 0, 0, 0)`
-fn call(entry: &str) -> Option<Call> {
-    let (head, event) = entry.split_once(": sys_enter: NR ")?;
-    Some(Call { number: event.split(' ').next()?.parse().ok()?, at_us: microseconds(head)? })
-}
-
-/// The time at the end of an entry's head.
-fn microseconds(head: &str) -> Option<u64> {
-    let (seconds, microseconds) = head.rsplit(' ').next()?.split_once('.')?;
-    Some(seconds.parse::<u64>().ok()? * 1_000_000 + microseconds.parse::<u64>().ok()?)
+fn get(name: &str) -> String {
+    sysfs::read(format!("{TRACEFS}/{name}"))
 }

@@ -37,14 +37,17 @@ static inline void mock_bus_record(struct mock_bus *bus, const char *what,
 				   cap - bus->sent_len, "\n");
 }
 
-/* Sleeps and fails as the test asked: 0, or a negative errno. */
+/*
+ * Sleeps and fails as the test asked: 0, or a negative errno. (msleep() would round up to the
+ * kernel's ticks.)
+ */
 static inline int mock_bus_trouble(struct mock_bus *bus)
 {
 	unsigned int delay_ms = READ_ONCE(bus->delay_ms);
 	int err = 0;
 
 	if (delay_ms)
-		msleep(delay_ms);
+		usleep_range(delay_ms * 1000UL, delay_ms * 1000UL);
 	mutex_lock(&bus->lock);
 	if (bus->fail_count) {
 		bus->fail_count--;

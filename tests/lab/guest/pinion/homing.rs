@@ -14,7 +14,7 @@ use crate::trace::Trace;
 const SWITCH: u32 = 2;
 const STEPS_PER_S: f64 = 2000.0;
 /// Closer than this, steps and the switch can not be told apart in the trace.
-const JITTER_US: u64 = 200;
+const JITTER_NS: u64 = 200_000;
 
 #[test]
 fn an_axis_homes_backs_off_and_homes_again() {
@@ -33,21 +33,21 @@ fn an_axis_homes_backs_off_and_homes_again() {
     let mut position = 0;
     for switch_at in [-700, -650] {
         let trace = Trace::start();
-        let mut closed_us = None;
+        let mut closed_ns = None;
         let homed = queue.home(client, stepper, endstop, false, &profile(3000), &mut |sight| {
-            if closed_us.is_none() && sight.position <= switch_at {
+            if closed_ns.is_none() && sight.position <= switch_at {
                 sim.pull(SWITCH, false);
-                closed_us = Some(monotonic().as_micros() as u64);
+                closed_ns = Some(monotonic().as_nanos() as u64);
             }
         });
         let homed = homed.expect("a homing");
         assert_eq!(homed.reason, Reason::Endstop);
-        let closed_us = closed_us.expect("the switch was closed");
+        let closed_ns = closed_ns.expect("the switch was closed");
         let steps = trace.writes_to(sim.kernel_number(0));
-        let rising: Vec<u64> = steps.iter().filter(|write| write.level).map(|write| write.at_us).collect();
+        let rising: Vec<u64> = steps.iter().filter(|write| write.level).map(|write| write.at_ns).collect();
         assert_eq!(homed.position, position - rising.len() as i64, "it is where the lines say");
         assert!(homed.position <= switch_at);
-        let after = rising.iter().filter(|at_us| **at_us > closed_us + JITTER_US).count();
+        let after = rising.iter().filter(|at_ns| **at_ns > closed_ns + JITTER_NS).count();
         assert!(after <= homed.slack_steps as usize, "{after} steps after the switch closed");
         assert!(endstop.triggered(client).expect("a state"));
         drop(trace);

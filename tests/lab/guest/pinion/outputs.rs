@@ -108,7 +108,7 @@ impl Outputs {
         // Longer than any cycle.
         std::thread::sleep(std::time::Duration::from_millis(100));
         assert!(is_safe(), "an output is still pulsed");
-        LINES.iter().filter_map(last).map(|write| write.at_us).max().expect("lines")
+        LINES.iter().filter_map(last).map(|write| write.at_ns).max().expect("lines") / 1000
     }
 }
 
