@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A running QEMU and the conversation with its monitor, QMP.
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::{BufRead, BufReader, Write};
 use std::path::{Path, PathBuf};
-use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus, Stdio};
+use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -27,19 +27,9 @@ pub struct Emulator {
 impl Emulator {
     /// Runs the command, with what it and the machine say in files of the folder.
     pub fn start(mut machine: Command, folder: &Path) -> Result<Emulator, String> {
-        let log = File::create(folder.join("qemu")).map_err(|error| error.to_string())?;
-        let mut qemu = machine
-            .arg("-serial")
-            .arg(format!("file:{}", folder.join("console").display()))
-            .args(["-qmp", "stdio"])
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(log)
-            .spawn()
-            .map_err(|error| format!("cannot start the emulator: {error}"))?;
-        let input = qemu.stdin.take().expect("a pipe was asked for");
-        let output = BufReader::new(qemu.stdout.take().expect("a pipe was asked for"));
-        let mut emulator = Emulator { qemu, input, output, folder: folder.to_owned() };
+        machine.arg("-serial").arg(format!("file:{}", folder.join("console").display())).args(["-qmp", "stdio"]);
+        let (qemu, input, output) = process::start_emulator(&mut machine, folder)?;
+        let mut emulator = Emulator { qemu, input, output: BufReader::new(output), folder: folder.to_owned() };
         emulator.ask(json!({"execute": "qmp_capabilities"}))?;
         emulator.settle_order();
         Ok(emulator)

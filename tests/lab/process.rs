@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Other programs, with errors that tell what was run and what it said.
 
-use std::process::{Command, Output, Stdio};
+use std::fs::File;
+use std::path::Path;
+use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
 
 /// What the command printed; its output and standard error are in the error.
 pub fn output(command: &mut Command) -> Result<String, String> {
@@ -25,6 +27,21 @@ fn finished(command: &mut Command) -> Result<Output, String> {
         String::from_utf8_lossy(&output.stdout),
         String::from_utf8_lossy(&output.stderr)
     ))
+}
+
+/// Starts an emulator, for a conversation over its standard input and output. What it says to
+/// standard error is in the file `qemu` of the folder.
+pub fn start_emulator(command: &mut Command, folder: &Path) -> Result<(Child, ChildStdin, ChildStdout), String> {
+    let log = File::create(folder.join("qemu")).map_err(|error| error.to_string())?;
+    let mut emulator = command
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(log)
+        .spawn()
+        .map_err(|error| format!("cannot start the emulator: {error}"))?;
+    let input = emulator.stdin.take().expect("a pipe was asked for");
+    let output = emulator.stdout.take().expect("a pipe was asked for");
+    Ok((emulator, input, output))
 }
 
 /// Runs a shell pipeline which fails if any part of it does. The words come in as

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A Raspberry Pi 3 under QEMU, and the conversation with it over its serial console.
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, BufRead, BufReader, Write};
 use std::path::Path;
-use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
+use std::process::{Child, ChildStdin, ChildStdout, Command};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread;
 use std::time::Duration;
@@ -14,6 +14,7 @@ use tempfile::TempDir;
 use super::cache::Cache;
 use super::debian::{EMULATOR, Sysroot};
 use super::gpio::{Gpio, LINES, Trigger};
+use super::process;
 
 /// Longer than a test may take, and longer than a boot on a busy computer.
 const SILENCE_MAX: Duration = Duration::from_secs(240);
@@ -59,18 +60,16 @@ impl Machine {
     pub fn boot(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<Machine, String> {
         let folder = cache.run_folder()?;
         let qtest = folder.path().join("qtest");
-        let log = File::create(folder.path().join("qemu")).map_err(|error| error.to_string())?;
-        let mut qemu = command(sysroot, initramfs, folder.path(), "")?
-            .arg("-qtest")
-            .arg(format!("unix:{},server=on,wait=off", qtest.display()))
-            .args(["-qtest-log", "none", "-serial", "stdio", "-monitor", "none"])
-            .stdin(Stdio::piped())
-            .stdout(Stdio::piped())
-            .stderr(log)
-            .spawn()
-            .map_err(|error| format!("cannot start the emulator: {error}"))?;
-        let input = qemu.stdin.take().expect("a pipe was asked for");
-        let output = qemu.stdout.take().expect("a pipe was asked for");
+        let mut command = command(sysroot, initramfs, folder.path(), "")?;
+        command.arg("-qtest").arg(format!("unix:{},server=on,wait=off", qtest.display())).args([
+            "-qtest-log",
+            "none",
+            "-serial",
+            "stdio",
+            "-monitor",
+            "none",
+        ]);
+        let (mut qemu, input, output) = process::start_emulator(&mut command, folder.path())?;
         match Gpio::connect(&qtest) {
             Ok(gpio) => Ok(Machine {
                 qemu,

@@ -275,13 +275,15 @@ fn edges_cost_system_calls() {
         println!("{case}, by number: {}", by_number.collect::<Vec<_>>().join(", "));
         if is_pinion() {
             let [writes, waits, looks] = [libc::SYS_ioctl, libc::SYS_futex, libc::SYS_clock_gettime].map(count);
-            assert!(writes <= 1.001 * steps && waits <= 1.1 * steps, "{case}");
+            // (Something else may have the processor between the look at the clock and the count.)
+            assert!((0.95..1.05).contains(&(writes / steps)) && waits <= 1.1 * steps, "{case}");
             // The clock is read without a call; the core asks for its running time by one, in each
             // millisecond. A few more are the link's.
             let span_ms = (*to - *from).as_secs_f64() * 1000.0;
             assert!(looks <= 1.02 * span_ms && all - writes - waits - looks <= span_ms / 2.0, "{case}");
         }
-        Ok(format!("{:.3}", all / steps))
+        // Each edge is one write, and the steps in a span are not known as exactly.
+        Ok(format!("{:.3}", all / count(libc::SYS_ioctl)))
     });
 }
 
