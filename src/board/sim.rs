@@ -10,29 +10,29 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::{
-    Adc, Board, BusDevice, BusError, BusStatus, ChipSelect, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SpiConfig,
-};
+use super::{Adc, Board, BusDevice, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
 mod config;
+mod loopback;
 mod physics;
 mod printer_cfg;
+mod spi;
 mod thermistor;
+mod tmc5160;
 
 pub use config::{
-    AxisConfig, End, FanConfig, HeaterConfig, InputConfig, Limits, OutputConfig, PinName, SimConfig, SimError,
+    AxisConfig, ChipConfig, End, FanConfig, HeaterConfig, InputConfig, Limits, OutputConfig, PinName, SimConfig,
+    SimError, SpiBusConfig,
 };
 pub use printer_cfg::printer_cfg;
 
+use loopback::Loopback;
 use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
+use spi::{SelectLine, SpiBus, SpiChip, SpiDevice};
+use tmc5160::Tmc5160;
 
-/// The SPI bus that sends back what it is sent.
-const LOOPBACK_BUS: &str = "spidev0.0";
-/// The worker of the bus.
-const SPI_WORKER: &str = "spi0";
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
 
@@ -48,6 +48,7 @@ enum Wire {
     Fan(Arc<Fan>, Switch),
     Tachometer(Arc<Fan>),
     Lamp(Arc<Lamp>),
+    Select(Arc<SelectLine>),
     Level(bool),
 }
 
@@ -65,6 +66,7 @@ impl Wire {
             Wire::Fan(fan, Switch::Enable) => format!("output (enable of fan {})", fan.name),
             Wire::Tachometer(fan) => format!("input (tachometer of fan {})", fan.name),
             Wire::Lamp(lamp) => format!("output ({})", lamp.name),
+            Wire::Select(line) => format!("output (chip select of {})", line.chip),
             Wire::Level(_) => "input".to_owned(),
         }
     }
@@ -105,6 +107,8 @@ pub struct SimBoard {
     world: Arc<World>,
     /// By pin number.
     pins: Vec<WiredPin>,
+    /// By number.
+    spi_buses: Vec<Arc<SpiBus>>,
 }
 
 impl SimBoard {
@@ -138,7 +142,7 @@ impl SimBoard {
             wire(part.tachometer_pin.as_ref(), Wire::Tachometer(fan.clone()));
             world.fans.push(fan);
         }
-        for part in config.leds.iter().chain(&config.outputs) {
+        for part in config.switched() {
             let lamp = Arc::new(Lamp::new(&part.name));
             wire(Some(&part.pin), Wire::Lamp(lamp.clone()));
             world.lamps.push(lamp);
@@ -146,7 +150,30 @@ impl SimBoard {
         for part in &config.inputs {
             wire(Some(&part.pin), Wire::Level(part.level));
         }
-        Ok(SimBoard { clock, seed: config.seed, world: Arc::new(world), pins })
+        let lamp = |name: &str| {
+            let (part, lamp) = config.switched().zip(&world.lamps).find(|(part, _)| part.pin.name == name)?;
+            Some((lamp.clone(), part.pin.inverted))
+        };
+        let buses: Result<Vec<_>, _> = config.spi_buses.iter().map(|bus| SpiBus::new(bus, lamp)).collect();
+        let mut buses = buses?;
+        for part in &config.chips {
+            let chip: Box<dyn SpiChip> = match part {
+                ChipConfig::Loopback { .. } => Box::new(Loopback),
+                ChipConfig::Tmc5160 { axis, .. } => {
+                    let Some(axis) = world.axes.iter().find(|other| other.name == *axis) else { continue };
+                    Box::new(Tmc5160::new(axis.clone(), clock.clone()))
+                }
+            };
+            let select = part.select_pin().map(|_| Arc::new(SelectLine::new(&part.name())));
+            if let Some(line) = &select {
+                wire(part.select_pin(), Wire::Select(line.clone()));
+            }
+            if let Some(bus) = buses.iter_mut().find(|bus| bus.name == part.bus()) {
+                bus.solder(part.name(), select, chip);
+            }
+        }
+        let spi_buses = buses.into_iter().map(Arc::new).collect();
+        Ok(SimBoard { clock, seed: config.seed, world: Arc::new(world), pins, spi_buses })
     }
 
     /// A view of the printer for demonstrations, drawings and tests.
@@ -184,7 +211,8 @@ impl Board for SimBoard {
     }
 
     fn spi_buses(&self) -> Vec<Range> {
-        vec![Range { name: LOOPBACK_BUS.to_owned(), first: 0, count: 1 }]
+        let range = |(first, bus): (u32, &Arc<SpiBus>)| Range { name: bus.name.clone(), first, count: 1 };
+        (0..).zip(&self.spi_buses).map(range).collect()
     }
 
     /// The parts drive their lines harder than any bias pulls.
@@ -222,14 +250,13 @@ impl Board for SimBoard {
     }
 
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        if config.bus != 0 {
-            return Err(Shutdown::because(
-                reason::SPI_OPEN,
-                format!("the simulated printer has no SPI bus {}: use {LOOPBACK_BUS}", config.bus),
-            ));
-        }
-        let device = Loopback { chip_select: config.chip_select };
-        Ok(OnWorker { bus: SPI_WORKER.to_owned(), device: Box::new(device) })
+        let bus = usize::try_from(config.bus).ok().and_then(|place| self.spi_buses.get(place)).ok_or_else(|| {
+            let names: Vec<&str> = self.spi_buses.iter().map(|bus| bus.name.as_str()).collect();
+            let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
+            Shutdown::because(reason::SPI_OPEN, format!("the simulated printer has no SPI bus {}: {has}", config.bus))
+        })?;
+        let device = SpiDevice { bus: bus.clone(), mode: config.mode, chip_select: config.chip_select };
+        Ok(OnWorker { bus: format!("spi{}", config.bus), device: Box::new(device) })
     }
 
     /// Nothing is claimed for good: the parts are there whoever drives them.
@@ -249,12 +276,13 @@ impl Line for SimLine {
         let on = level != self.pin.inverted;
         let was_on = self.on.swap(on, Ordering::Relaxed);
         match &self.pin.wire {
-            Wire::Step(axis) if on != was_on && (on || axis.both_edges) => axis.step(),
+            Wire::Step(axis) if on != was_on => axis.edge(on),
             Wire::Direction(axis) => axis.set_forward(on),
             Wire::Enable(axis) => axis.set_enabled(on),
             Wire::Heater(heater) => heater.switch(on, self.clock.now()),
             Wire::Fan(fan, switch) => fan.switch(*switch, on, self.clock.now()),
             Wire::Lamp(lamp) => lamp.switch(on),
+            Wire::Select(line) => line.drive(on),
             Wire::Step(_) | Wire::Endstop(_) | Wire::Sensor(_) | Wire::Tachometer(_) | Wire::Level(_) => {}
         }
         Ok(())
@@ -294,21 +322,6 @@ impl Adc for Sensor {
         let celsius = self.heater.at(self.clock.now()).sensor_celsius;
         let noise_counts = self.noise.draw() * self.heater.noise_counts;
         Ok(self.heater.thermistor.counts(celsius, noise_counts))
-    }
-}
-
-/// An SPI device with its output wired to its input: every byte comes back.
-struct Loopback {
-    chip_select: Option<ChipSelect>,
-}
-
-impl BusDevice for Loopback {
-    fn exchange(&mut self, _bytes: &mut [u8]) -> Result<(), BusError> {
-        let Some(chip_select) = &self.chip_select else { return Ok(()) };
-        chip_select
-            .select(true)
-            .and_then(|()| chip_select.select(false))
-            .map_err(|failure| BusError { status: BusStatus::Failed, detail: failure.detail })
     }
 }
 

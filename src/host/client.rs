@@ -15,10 +15,10 @@ use super::serial::{Link, Received};
 use crate::time::Clock;
 use crate::wire::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
 
-/// How long a query waits for its response.
-pub const QUERY_TIMEOUT: Duration = Duration::from_secs(5);
-/// After this time a query is sent again: a response that was lost is not repeated by itself.
-const RETRY: Duration = Duration::from_millis(500);
+/// How long after its acknowledgement a query without an answer is sent again; each time twice as
+/// long, and so many times (klippy's SerialRetryCommand, serialhdl.py).
+const RETRY_DELAY: Duration = Duration::from_millis(10);
+const RETRIES: u32 = 5;
 /// How long reading the dictionary may take in all.
 const IDENTIFY_TIMEOUT: Duration = Duration::from_secs(15);
 const IDENTIFY_CHUNK: u8 = 40;
@@ -70,7 +70,18 @@ impl Client {
     }
 
     fn start(link: Link, path: Option<PathBuf>) -> Result<Client, Error> {
-        let mut client = Client {
+        let mut client = Client::unidentified(link, path);
+        client.identify()?;
+        let uptime = client.query("get_uptime", &[], "uptime", None)?;
+        let ticks = u64::from(uptime.u32("high")?) << 32 | u64::from(uptime.u32("clock")?);
+        client.clock = Clock::from_ticks(ticks);
+        client.clock_at = uptime.at;
+        client.estimate_clock(8)?;
+        Ok(client)
+    }
+
+    fn unidentified(link: Link, path: Option<PathBuf>) -> Client {
+        Client {
             link,
             path,
             dictionary: Dictionary::default(),
@@ -80,14 +91,7 @@ impl Client {
             frequency_hz: 0.0,
             clock: Clock::EPOCH,
             clock_at: Instant::now(),
-        };
-        client.identify()?;
-        let uptime = client.query("get_uptime", &[], "uptime", None)?;
-        let ticks = u64::from(uptime.u32("high")?) << 32 | u64::from(uptime.u32("clock")?);
-        client.clock = Clock::from_ticks(ticks);
-        client.clock_at = uptime.at;
-        client.estimate_clock(8)?;
-        Ok(client)
+        }
     }
 
     fn identify(&mut self) -> Result<(), Error> {
@@ -190,9 +194,18 @@ impl Client {
         self.link.send(&block)
     }
 
-    /// Sends a command and waits for its response, of this `oid` if one is given; sends again
-    /// if none comes. Fails with [`Error::Shutdown`] if the micro-controller shuts down
-    /// meanwhile or refuses the command because it is shut down.
+    /// Sends a command and takes its response, of this `oid` if one is given.
+    ///
+    /// As in klippy, an answer counts if it is there when the acknowledgement is; otherwise the
+    /// command is sent again after 10 ms, even if its answer came meanwhile. A micro-controller
+    /// that acknowledges before it answers so gets its command twice, and the second answer may
+    /// pass for the one to the next query.
+    ///
+    /// # Errors
+    ///
+    /// [`Error::Shutdown`] if the micro-controller shuts down meanwhile or refuses the command
+    /// because it is shut down; [`Error::Timeout`] if the last of the repetitions has no answer,
+    /// either.
     pub fn query(
         &mut self,
         command: &str,
@@ -203,29 +216,32 @@ impl Client {
         let payload = self.messages.encode(command, args)?;
         self.inbox.retain(|params| !params.is(response, oid));
         let known = self.shutdown.take();
-        let until = Instant::now() + QUERY_TIMEOUT;
-        let result = self.ask(&payload, response, oid, until);
+        let begun = Instant::now();
+        let result = self.ask(&payload, response, oid);
         if self.shutdown.is_none() {
             self.shutdown = known;
         }
         result?.ok_or_else(|| Error::Timeout {
             waiting_for: format!("`{response}` in answer to `{command}`"),
-            after: QUERY_TIMEOUT,
+            after: begun.elapsed(),
         })
     }
 
-    fn ask(
-        &mut self,
-        payload: &[u8],
-        response: &str,
-        oid: Option<u8>,
-        until: Instant,
-    ) -> Result<Option<Params>, Error> {
-        while Instant::now() < until {
+    fn ask(&mut self, payload: &[u8], response: &str, oid: Option<u8>) -> Result<Option<Params>, Error> {
+        for repetition in 0..=RETRIES {
             self.link.send(payload)?;
-            let again = until.min(Instant::now() + RETRY);
-            if let Some(params) = self.wait(response, oid, again)? {
+            while let Some(received) = self.link.receive_unsettled()? {
+                self.file(&received);
+                if let Some(params) = self.take(response, oid) {
+                    return Ok(Some(params));
+                }
+                self.check()?;
+            }
+            if let Some(params) = self.take(response, oid) {
                 return Ok(Some(params));
+            }
+            if repetition < RETRIES {
+                self.listen(Instant::now() + RETRY_DELAY * 2u32.pow(repetition))?;
             }
         }
         Ok(None)
@@ -397,8 +413,9 @@ fn before_identify() -> Dictionary {
 
 #[cfg(test)]
 mod tests {
-    use super::super::fake::Mcu;
+    use super::super::fake::{Mcu, Peer};
     use super::*;
+    use crate::wire::vlq::Writer;
 
     #[test]
     fn a_dictionary_is_read_and_a_query_answered() {
@@ -415,6 +432,43 @@ mod tests {
         assert!(client.clock_in(0.0).unwrap().ticks() >= 1 << 32);
         drop(client);
         peer.join().unwrap();
+    }
+
+    /// A micro-controller that keeps its answers until the next block.
+    fn late() -> (std::thread::JoinHandle<Vec<Vec<u8>>>, Client) {
+        let mut held = Vec::new();
+        let (peer, link) = Peer::start(0, &[], move |payload| {
+            let Some(oid) = payload.get(1) else { return Vec::new() };
+            let answer = [69, *oid, 0, 0, 1].map(u32::from);
+            let mut writer = Writer::default();
+            answer.into_iter().for_each(|value| writer.int(value));
+            std::mem::replace(&mut held, vec![writer.payload().unwrap().to_vec()])
+        });
+        let messages = Messages::new(&super::super::fake::dictionary());
+        (peer, Client { messages, ..Client::unidentified(link, None) })
+    }
+
+    #[test]
+    fn an_answer_that_comes_after_the_acknowledgement_is_asked_for_again() {
+        let (peer, mut client) = late();
+        for asked in [7u8, 8] {
+            // The answers are always those of the block before.
+            let state = client.query("endstop_query_state", &[("oid", asked.into())], "endstop_state", Some(asked));
+            assert_eq!(state.unwrap().int("oid").unwrap(), i64::from(asked));
+        }
+        drop(client);
+        assert_eq!(peer.join().unwrap(), [[11, 7], [11, 7], [11, 8], [11, 8]]);
+    }
+
+    #[test]
+    fn a_query_that_is_never_answered_is_given_up() {
+        let (peer, link) = Peer::start(0, &[], |_| Vec::new());
+        let messages = Messages::new(&super::super::fake::dictionary());
+        let mut client = Client { messages, ..Client::unidentified(link, None) };
+        let error = client.query("get_clock", &[], "clock", None).unwrap_err().to_string();
+        assert!(error.starts_with("no `clock` in answer to `get_clock` within 0."), "{error}");
+        drop(client);
+        assert_eq!(peer.join().unwrap(), vec![[2]; 6]);
     }
 
     #[test]

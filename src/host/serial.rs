@@ -250,6 +250,11 @@ pub struct Link {
     retransmit_at: Instant,
     heard_at: Instant,
     received: VecDeque<Received>,
+    /// Payloads that came in, and that were handed out or thrown away.
+    arrived: u64,
+    taken: u64,
+    /// `arrived` when the last block that was sent was acknowledged.
+    settled: Option<u64>,
     traffic: Traffic,
 }
 
@@ -284,6 +289,9 @@ impl Link {
             retransmit_at: now,
             heard_at: now,
             received: VecDeque::new(),
+            arrived: 0,
+            taken: 0,
+            settled: Some(0),
             traffic: Traffic::default(),
         };
         link.synchronise(timeout)?;
@@ -334,7 +342,7 @@ impl Link {
     /// The next payload that came in; waits for one, `None` if none comes in time.
     pub fn receive(&mut self, until: Instant) -> Result<Option<Received>, Error> {
         loop {
-            if let Some(received) = self.received.pop_front() {
+            if let Some(received) = self.next_received() {
                 return Ok(Some(received));
             }
             self.exchange(until)?;
@@ -342,6 +350,22 @@ impl Link {
                 return Ok(None);
             }
         }
+    }
+
+    /// The next payload of those that come in before, or with, the acknowledgement of all that was
+    /// sent; waits for one, `None` once there are no more.
+    pub fn receive_unsettled(&mut self) -> Result<Option<Received>, Error> {
+        self.wait_while(|link| link.received.is_empty() && link.settled.is_none())?;
+        match self.settled {
+            Some(before) if self.taken >= before => Ok(None),
+            _ => Ok(self.next_received()),
+        }
+    }
+
+    fn next_received(&mut self) -> Option<Received> {
+        let received = self.received.pop_front();
+        self.taken += u64::from(received.is_some());
+        received
     }
 
     /// Sends one payload `count` times as fast as the window allows, and tells how long it
@@ -391,6 +415,7 @@ impl Link {
         self.sent_bytes += payload.len() + BLOCK_MIN;
         self.traffic.blocks_sent += 1;
         self.sent.push_back(Sent { payload: payload.to_vec(), at: now });
+        self.settled = None;
         Ok(())
     }
 
@@ -452,8 +477,9 @@ impl Link {
         }
         if !payload.is_empty() {
             if self.received.len() >= RECEIVED_MAX {
-                self.received.pop_front();
+                self.next_received();
             }
+            self.arrived += 1;
             self.received.push_back(Received { payload, at });
         } else if self.last_ack < self.receive {
             self.last_ack = self.receive;
@@ -466,6 +492,9 @@ impl Link {
                 self.receive
             };
             self.send_again(at);
+        }
+        if self.sent.is_empty() {
+            self.settled.get_or_insert(self.arrived);
         }
     }
 

@@ -41,10 +41,24 @@ impl Printer {
 
     /// A printer whose configuration was changed.
     pub fn start_with(checkout: &Path, change: impl FnOnce(String) -> String) -> Printer {
+        Printer::start_on(checkout, |board, _| board, change)
+    }
+
+    /// The same, of another description; its change is told the path of a file of its own.
+    pub fn start_on(
+        checkout: &Path,
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+    ) -> Printer {
         // klippy knows a pseudo terminal by the beginning of its path.
         let folder = tempfile::Builder::new().prefix("klipper_host_").tempdir_in("/tmp").unwrap();
+        let printed = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["sim", "--print-board"]).output().unwrap();
+        let board = describe(String::from_utf8(printed.stdout).unwrap(), &folder.path().join("trace"));
+        fs::write(folder.path().join("board.toml"), board).unwrap();
         let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-            .args(["run", "-r", "--board", "sim", "-I"])
+            .args(["run", "-r", "--board"])
+            .arg(format!("sim:{}", folder.path().join("board.toml").display()))
+            .arg("-I")
             .arg(folder.path().join("tty"))
             .stderr(File::create(folder.path().join("pinion.log")).unwrap())
             .spawn()
@@ -63,7 +77,9 @@ impl Printer {
     /// Writes the printer's configuration, changed.
     pub fn configure(&mut self, change: impl FnOnce(String) -> String) {
         let printed = Command::new(env!("CARGO_BIN_EXE_pinion"))
-            .args(["sim", "--print-config", "-I"])
+            .arg("sim")
+            .arg(self.path("board.toml"))
+            .args(["--print-config", "-I"])
             .arg(self.path("tty"))
             .output()
             .unwrap();
@@ -208,6 +224,19 @@ impl Printer {
     /// Pinion's log.
     pub fn log(&self) -> String {
         fs::read_to_string(self.path("pinion.log")).unwrap()
+    }
+
+    /// klippy's log, once it has this text so many times: a thread of klippy's writes it.
+    #[track_caller]
+    pub fn host_log(&mut self, text: &str, times: usize) -> String {
+        let log = |printer: &Printer| fs::read_to_string(printer.path("klippy.log")).unwrap();
+        self.until(text, |printer| log(printer).matches(text).count() >= times);
+        log(self)
+    }
+
+    /// What the description's own file holds.
+    pub fn trace(&self) -> String {
+        fs::read_to_string(self.path("trace")).unwrap()
     }
 
     #[track_caller]

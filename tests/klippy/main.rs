@@ -90,6 +90,98 @@ fn klippy_tells_a_wrong_pin_and_goes_on_after_it_was_mended() {
     printer.gcode("G28");
 }
 
+/// What DUMP_TMC reads of a TMC5160 (klippy/extras/tmc5160.py), and the values that klippy does not
+/// write, of a chip whose motor stands and never moved. DRV_STATUS is standstill at the holding
+/// current that klippy sets; IOIN is the version, step and direction mode, and a power stage that is
+/// switched off.
+const DUMPED: [(&str, u8, Option<u32>); 13] = [
+    ("GCONF", 0x00, None),
+    ("CHOPCONF", 0x6c, None),
+    ("GSTAT", 0x01, Some(1)),
+    ("DRV_STATUS", 0x6f, Some(0x801f_0000)),
+    ("FACTORY_CONF", 0x08, Some(0x0f)),
+    ("IOIN", 0x04, Some(0x3000_0050)),
+    ("LOST_STEPS", 0x73, Some(0)),
+    ("MSCNT", 0x6a, Some(0)),
+    ("MSCURACT", 0x6b, Some(0x00f7_0000)),
+    ("OTP_READ", 0x07, Some(0x0f)),
+    ("PWM_SCALE", 0x71, Some(0)),
+    ("PWM_AUTO", 0x72, Some(0x0000_001e)),
+    ("TSTEP", 0x12, Some(0x000f_ffff)),
+];
+
+/// The last value that a host wrote to a register of the chip.
+fn written(sent: &[u64], register: u8) -> Option<u32> {
+    let is_it = |datagram: &&u64| (**datagram >> 32) as u8 == register | 0x80;
+    sent.iter().rfind(is_it).map(|datagram| *datagram as u32)
+}
+
+#[test]
+fn klippy_reads_the_registers_of_a_driver_on_a_slow_bus_each_once() {
+    const DUMPS: usize = 100;
+    let Some(checkout) = checkout("klippy_reads_the_registers_of_a_driver_on_a_slow_bus_each_once") else { return };
+    let slow = |board: String, trace: &std::path::Path| {
+        let bus = format!("name = \"spidev1.0\"\ndelay_us = 4000\ntrace_file = {trace:?}\n");
+        let slow = board.replace("name = \"spidev1.0\"\n", &bus);
+        assert_ne!(slow, board, "the built-in printer's bus has another name");
+        slow
+    };
+    let mut printer = Printer::start_on(&checkout, slow, |config| config);
+    printer.until_state("ready");
+    let sent = |printer: &Printer| -> Vec<u64> {
+        let trace = printer.trace();
+        let sent = trace.lines().map(|line| line.split_once(" sent=").unwrap().1.split_once(' ').unwrap().0);
+        sent.map(|sent| u64::from_str_radix(sent, 16).unwrap()).collect()
+    };
+    // klippy sets up each register, with a datagram that fetches what was written, then asks where
+    // the motor stands.
+    let before = sent(&printer);
+    let (set_up, position) = before.split_at(before.len() - 2);
+    assert_eq!(position, [0x6a << 32; 2]);
+    assert!(set_up.len() > 20 && set_up.chunks(2).all(|pair| pair[0] >> 39 == 1 && pair[1] == 0), "{set_up:x?}");
+    let mut registers: Vec<u64> = set_up.iter().step_by(2).map(|datagram| datagram >> 32).collect();
+    registers.sort_unstable();
+    registers.dedup();
+    assert_eq!(2 * registers.len(), set_up.len(), "klippy wrote one twice: {set_up:x?}");
+
+    for _ in 0..DUMPS {
+        printer.gcode("DUMP_TMC STEPPER=stepper_z");
+    }
+    let dumped = printer.host_log("\nTSTEP:", DUMPS);
+    let read = sent(&printer).split_off(before.len());
+    let asked = DUMPED.iter().flat_map(|(_, register, _)| [u64::from(*register) << 32; 2]);
+    let asked: Vec<u64> = asked.cycle().take(DUMPS * 2 * DUMPED.len()).collect();
+    assert_eq!(read, asked);
+    for (name, register, known) in DUMPED {
+        let value = written(set_up, register).or(known).unwrap();
+        let lines = dumped.lines().filter_map(|line| line.strip_prefix(&format!("{name}:")));
+        let values: Vec<&str> = lines.map(|line| line.split_whitespace().next().unwrap()).collect();
+        assert_eq!(values, vec![format!("{value:08x}"); DUMPS], "{name}");
+    }
+}
+
+#[test]
+fn klippy_homes_and_moves_an_axis_with_and_without_its_driver() {
+    let Some(checkout) = checkout("klippy_homes_and_moves_an_axis_with_and_without_its_driver") else { return };
+    for with_driver in [true, false] {
+        let mut printer = Printer::start_with(&checkout, |config| {
+            let (before, driver) = config.split_once("[tmc5160 stepper_z]\n").unwrap();
+            let (_, after) = driver.split_once("\n\n").unwrap_or_default();
+            if with_driver { config.clone() } else { format!("{before}{after}") }
+        });
+        printer.until_state("ready");
+        printer.gcode("G28\nG1 Z7 F600\nM400\nG28 Z\nGET_POSITION");
+        let log = printer.host_log("\nmcu: stepper_x:", 1);
+        // The axis stood at 12 mm, of 400 steps each.
+        let (_, position) = log.split_once("\nmcu: stepper_x:").unwrap();
+        let steps = position.lines().next().unwrap().rsplit_once(" stepper_z:").unwrap().1.parse::<i32>().unwrap();
+        assert!((-4900..=-4790).contains(&steps), "{steps}");
+        // klippy compares the driver's microstep counter with its own at each homing.
+        assert_eq!(log.contains("TMC 'stepper_z' reports GSTAT: "), with_driver, "{log}");
+        assert!(!log.contains("phase change"), "{log}");
+    }
+}
+
 #[test]
 fn klippy_translates_g_code_with_our_dictionary() {
     let Some(checkout) = checkout("klippy_translates_g_code_with_our_dictionary") else { return };

@@ -4,4 +4,5 @@
 mod bad_input;
 mod commands;
 mod life;
+mod one_order;
 mod process;

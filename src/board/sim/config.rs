@@ -4,7 +4,7 @@
 use std::collections::HashSet;
 use std::fmt;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
@@ -90,6 +90,12 @@ pub struct SimConfig {
     /// Inputs that stay at one level: buttons, a filament sensor.
     #[serde(default, rename = "input")]
     pub inputs: Vec<InputConfig>,
+    /// SPI buses.
+    #[serde(default, rename = "spi_bus")]
+    pub spi_buses: Vec<SpiBusConfig>,
+    /// The chips on the buses.
+    #[serde(default, rename = "chip")]
+    pub chips: Vec<ChipConfig>,
 }
 
 /// What printer.cfg allows the motion; the simulated axes follow at any speed.
@@ -282,6 +288,45 @@ pub struct InputConfig {
     pub level: bool,
 }
 
+/// An SPI bus.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SpiBusConfig {
+    /// The name that the board publishes, such as `spidev0.0`.
+    pub name: String,
+    /// How long each transfer takes.
+    #[serde(default)]
+    pub delay_us: u64,
+    /// A file that gets a line for each transfer: the chips that were selected, the bytes both
+    /// ways, the levels of `trace_pins` at each byte.
+    pub trace_file: Option<PathBuf>,
+    /// Pins of lights and other outputs.
+    #[serde(default)]
+    pub trace_pins: Vec<String>,
+}
+
+/// A chip on a bus. What it is stands in its `kind`.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
+pub enum ChipConfig {
+    /// Sends back what it is sent.
+    Loopback {
+        /// Its SPI bus.
+        bus: String,
+        /// Low selects it; without it, it is the only chip on its bus.
+        select_pin: Option<PinName>,
+    },
+    /// A stepper driver.
+    Tmc5160 {
+        /// Its SPI bus.
+        bus: String,
+        /// Low selects it; without it, it is the only chip on its bus.
+        select_pin: Option<PinName>,
+        /// The axis whose motor it drives.
+        axis: String,
+    },
+}
+
 /// The default printer's description; a test holds it to be right.
 const DEFAULT: &str = include_str!("default.toml");
 
@@ -461,7 +506,87 @@ impl SimConfig {
         for input in &self.inputs {
             pin(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
         }
+        unique("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name).collect())?;
+        for bus in &self.spi_buses {
+            let whose = &format!("spi_bus `{}`", bus.name);
+            check(whose, "delay_us", bus.delay_us as f64, NotNegative)?;
+            if let Some(name) = bus.trace_pins.iter().find(|name| !self.switched().any(|part| part.pin.name == **name))
+            {
+                let cause = format!("`{name}` is no pin of an [[output]] or [[led]]");
+                return wrong(whose, "trace_pins", &cause, "name such a pin, without `!`");
+            }
+        }
+        for chip in &self.chips {
+            let whose = &format!("chip `{}`", chip.name());
+            pin(whose, "select_pin", chip.select_pin())?;
+            if !self.spi_buses.iter().any(|bus| bus.name == chip.bus()) {
+                return wrong(whose, "bus", &format!("there is no `{}`", chip.bus()), "name an [[spi_bus]]");
+            }
+            let shares = self.chips.iter().filter(|other| other.bus() == chip.bus()).count() > 1;
+            match chip.select_pin() {
+                Some(pin) if pin.inverted => {
+                    return wrong(
+                        whose,
+                        "select_pin",
+                        "klippy knows chips that are selected by a low level only",
+                        "remove the `!`",
+                    );
+                }
+                None if shares => {
+                    return wrong(whose, "select_pin", "it is not the only chip on its bus", "add it");
+                }
+                _ => {}
+            }
+            if let ChipConfig::Tmc5160 { axis, .. } = chip {
+                let drives =
+                    |other: &&ChipConfig| matches!(other, ChipConfig::Tmc5160 { axis: driven, .. } if driven == axis);
+                if !self.axes.iter().any(|other| other.name == *axis) {
+                    return wrong(whose, "axis", &format!("there is no `{axis}`"), "name an [[axis]]");
+                }
+                if self.chips.iter().filter(drives).count() > 1 {
+                    return wrong(whose, "axis", &format!("`{axis}` has two drivers"), "remove one");
+                }
+            }
+        }
         Ok(())
+    }
+
+    /// Lights and other outputs.
+    pub(super) fn switched(&self) -> impl Iterator<Item = &OutputConfig> {
+        self.leds.iter().chain(&self.outputs)
+    }
+}
+
+impl SpiBusConfig {
+    pub(super) fn no_trace_file(&self, error: &std::io::Error) -> SimError {
+        fault(
+            &format!("spi_bus `{}`", self.name),
+            "trace_file",
+            &format!("it can not be made: {error}"),
+            "name a file in a folder that may be written",
+        )
+    }
+}
+
+impl ChipConfig {
+    /// What it is, for a person.
+    pub(super) fn name(&self) -> String {
+        match self {
+            ChipConfig::Loopback { .. } => "loopback".to_owned(),
+            ChipConfig::Tmc5160 { axis, .. } => format!("tmc5160 {axis}"),
+        }
+    }
+
+    /// Its bus.
+    pub(super) fn bus(&self) -> &str {
+        let (ChipConfig::Loopback { bus, .. } | ChipConfig::Tmc5160 { bus, .. }) = self;
+        bus
+    }
+
+    /// The pin that selects it.
+    pub(super) fn select_pin(&self) -> Option<&PinName> {
+        let (ChipConfig::Loopback { select_pin, .. } | ChipConfig::Tmc5160 { select_pin, .. }) = self;
+        select_pin.as_ref()
     }
 }
 
@@ -563,6 +688,20 @@ mod tests {
             (", [150.0, 1641.9]", "", "`points_celsius_ohm`", "two"),
             ("1641.9", "-1", "`points_celsius_ohm`", "above zero"),
             ("[25.0, 100000.0]", "[25.0, true]", "`points_celsius_ohm`", "invalid type"),
+            ("bus = \"spidev1.0\"", "bus = \"spidev2.0\"", "`bus`", "no `spidev2.0`"),
+            ("bus = \"spidev1.0\"", "bus = \"spidev0.0\"", "`select_pin`", "not the only chip"),
+            ("\"z_cs\"", "\"!z_cs\"", "`select_pin`", "low level only"),
+            ("\"z_cs\"", "\"z_dir\"", "`select_pin`", "has a use already"),
+            ("axis = \"z\"", "axis = \"w\"", "`axis`", "no `w`"),
+            ("kind = \"tmc5160\"", "kind = \"tmc9\"", "", "unknown variant `tmc9`"),
+            ("axis = \"z\"", "axes = \"z\"", "", "unknown field `axes`"),
+            ("name = \"spidev1.0\"", "name = \"spidev0.0\"", "`name`", "two are called `spidev0.0`"),
+            (
+                "name = \"spidev1.0\"",
+                "name = \"spidev1.0\"\ntrace_pins = [\"x_dir\"]",
+                "`trace_pins`",
+                "`x_dir` is no pin",
+            ),
             ("seed = 1", "seed = = 1", "`seed`", ""),
             ("[[25.0, 100000.0], [150", "[[25.0, 100000.0],\n[true", "`points_celsius_ohm`", ""),
         ] {

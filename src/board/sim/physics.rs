@@ -59,16 +59,23 @@ impl<const N: usize> Together<N> {
 #[derive(Debug)]
 pub struct Axis {
     pub name: String,
-    pub both_edges: bool,
     pub travel_mm: Option<f64>,
     steps_per_mm: f64,
     /// The steps at which it hits something.
     hard_limits: Option<(i64, i64)>,
     /// The endstop's end, and the step from which on it is closed.
     endstop: Option<(End, i64)>,
+    /// Whether a falling edge is a step, too.
+    both_edges: AtomicBool,
+    /// Whether the step line is on.
+    stepped: AtomicBool,
+    /// Whether the direction line is low for forward.
+    dir_inverted: bool,
     forward: AtomicBool,
     enabled: AtomicBool,
     position: AtomicI64,
+    /// Steps that its driver was given: those with a low direction line less those with a high one.
+    turned: AtomicI64,
     lost_steps: AtomicU64,
 }
 
@@ -78,7 +85,6 @@ impl Axis {
         let steps = |mm: f64| (mm * config.steps_per_mm).round() as i64;
         Axis {
             name: config.name.clone(),
-            both_edges: config.step_both_edges,
             travel_mm: config.travel_mm,
             steps_per_mm: config.steps_per_mm,
             hard_limits: config.travel_mm.map(|travel_mm| {
@@ -89,11 +95,19 @@ impl Axis {
                 End::Min => (End::Min, 0),
                 End::Max => (End::Max, steps(config.travel_mm.unwrap_or(0.0))),
             }),
+            both_edges: AtomicBool::new(config.step_both_edges),
+            stepped: AtomicBool::new(false),
+            dir_inverted: config.dir_pin.inverted,
             forward: AtomicBool::new(false),
             enabled: AtomicBool::new(config.enable_pin.is_none()),
             position: AtomicI64::new(steps(config.start_mm)),
+            turned: AtomicI64::new(0),
             lost_steps: AtomicU64::new(0),
         }
+    }
+
+    pub fn set_both_edges(&self, both_edges: bool) {
+        self.both_edges.store(both_edges, Ordering::Relaxed);
     }
 
     pub fn set_forward(&self, forward: bool) {
@@ -108,13 +122,31 @@ impl Axis {
         self.enabled.load(Ordering::Relaxed)
     }
 
-    /// An edge that is a step.
-    pub fn step(&self) {
+    /// Whether the level of the direction line is high.
+    pub fn is_dir_high(&self) -> bool {
+        self.forward.load(Ordering::Relaxed) != self.dir_inverted
+    }
+
+    pub fn is_stepped(&self) -> bool {
+        self.stepped.load(Ordering::Relaxed)
+    }
+
+    /// An edge of the step line.
+    pub fn edge(&self, on: bool) {
+        self.stepped.store(on, Ordering::Relaxed);
+        if on || self.both_edges.load(Ordering::Relaxed) {
+            self.step();
+        }
+    }
+
+    fn step(&self) {
+        let turn = if self.is_dir_high() { -1 } else { 1 };
+        self.turned.store(self.turned_steps().wrapping_add(turn), Ordering::Relaxed);
         if !self.is_enabled() {
             return;
         }
-        let position = self.position.load(Ordering::Relaxed);
-        let next = position.wrapping_add(if self.forward.load(Ordering::Relaxed) { 1 } else { -1 });
+        let way = if self.forward.load(Ordering::Relaxed) { 1 } else { -1 };
+        let next = self.position_steps().wrapping_add(way);
         match self.hard_limits {
             Some((min, max)) if !(min..=max).contains(&next) => {
                 let lost = self.lost_steps.load(Ordering::Relaxed);
@@ -126,6 +158,10 @@ impl Axis {
 
     pub fn position_steps(&self) -> i64 {
         self.position.load(Ordering::Relaxed)
+    }
+
+    pub fn turned_steps(&self) -> i64 {
+        self.turned.load(Ordering::Relaxed)
     }
 
     pub fn position_mm(&self) -> f64 {

@@ -3,7 +3,7 @@
 
 use std::fmt::{self, Display, Write};
 
-use super::config::{AxisConfig, End, FanConfig, HeaterConfig, SimConfig};
+use super::config::{AxisConfig, ChipConfig, End, FanConfig, HeaterConfig, PinName, SimConfig};
 
 /// Full steps in a turn of the usual stepper motor.
 const FULL_STEPS: f64 = 200.0;
@@ -38,17 +38,22 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
 
     let hot_end = |name: &str| name == "extruder";
     let has_hot_end = config.heaters.iter().any(|heater| hot_end(&heater.name));
+    let stepper = |name: &str| match name {
+        "x" | "y" | "z" if cartesian => format!("stepper_{name}"),
+        "extruder" if has_hot_end => "extruder".to_owned(),
+        name => format!("manual_stepper {name}"),
+    };
     for axis in &config.axes {
         match axis.name.as_str() {
             "x" | "y" | "z" if cartesian => {
-                cfg.section(format_args!("stepper_{}", axis.name));
+                cfg.section(stepper(&axis.name));
                 cfg.stepper(axis);
                 cfg.rail(axis);
             }
             // Goes into the hot end's section.
             "extruder" if has_hot_end => {}
             name => {
-                cfg.section(format_args!("manual_stepper {name}"));
+                cfg.section(stepper(name));
                 cfg.stepper(axis);
                 cfg.key("velocity", axis.homing_mm_per_s);
                 cfg.key_if("endstop_pin", axis.endstop_pin.as_ref());
@@ -87,6 +92,20 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     for output in &config.outputs {
         cfg.section(format_args!("output_pin {}", output.name));
         cfg.key("pin", &output.pin);
+    }
+    for chip in &config.chips {
+        match chip {
+            // No section of klippy's is for it.
+            ChipConfig::Loopback { .. } => {}
+            ChipConfig::Tmc5160 { bus, select_pin, axis } => {
+                cfg.section(format_args!("tmc5160 {}", stepper(axis)));
+                cfg.comment("May be left out, as the motor turns without; then start Pinion anew: the chip keeps");
+                cfg.comment("what it was told.");
+                cfg.chip(bus, select_pin.as_ref());
+                cfg.key("run_current", 0.8);
+                cfg.key("sense_resistor", 0.075);
+            }
+        }
     }
     if !config.inputs.is_empty() {
         cfg.section_break();
@@ -178,6 +197,14 @@ impl Sections {
         self.key("pid_Kp", format_args!("{:.3}", gains.kp));
         self.key("pid_Ki", format_args!("{:.3}", gains.ki));
         self.key("pid_Kd", format_args!("{:.3}", gains.kd));
+    }
+
+    fn chip(&mut self, bus: &str, select_pin: Option<&PinName>) {
+        match select_pin {
+            Some(pin) => self.key("cs_pin", pin),
+            None => self.key("cs_pin", "None"),
+        }
+        self.key("spi_bus", bus);
     }
 
     fn fan(&mut self, fan: &FanConfig) {

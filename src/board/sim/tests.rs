@@ -2,7 +2,7 @@
 use super::*;
 use std::collections::HashSet;
 
-use crate::board::Bias;
+use crate::board::{Bias, ChipSelect};
 use crate::time::{CLOCK_FREQ, VirtualClock};
 
 /// A board in virtual time.
@@ -358,18 +358,74 @@ fn lights_and_fixed_inputs() {
     assert!(bench.input("filament_sensor").read().unwrap());
 }
 
+impl Bench {
+    fn spi(&mut self, bus: &str, select_pin: Option<&str>) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let bus = self.board.spi_buses().iter().find(|range| range.name == bus).map_or(99, |range| range.first);
+        let chip_select = select_pin.map(|pin| ChipSelect { line: self.output(pin, true), active_high: false });
+        self.board.spi(SpiConfig { bus, mode: 3, rate_hz: 1_000_000, chip_select })
+    }
+}
+
+fn exchange(device: &mut OnWorker<dyn BusDevice>, bytes: &str) -> String {
+    let byte = |at| u8::from_str_radix(&bytes[at..at + 2], 16).unwrap();
+    let mut bytes: Vec<u8> = (0..bytes.len()).step_by(2).map(byte).collect();
+    device.device.exchange(&mut bytes).unwrap();
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
 #[test]
-fn the_spi_bus_sends_back_what_it_is_sent() {
+fn each_spi_bus_has_its_worker_and_the_first_one_sends_back_what_it_is_sent() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let open =
-        |bench: &mut Bench, bus, mode| bench.board.spi(SpiConfig { bus, mode, rate_hz: 1_000_000, chip_select: None });
-    let bus = bench.board.spi_buses()[0].first;
-    let OnWorker { bus, mut device } = open(&mut bench, bus, 3).unwrap();
-    assert_eq!(bus, "spi0");
-    let mut bytes = *b"pinion";
+    let mut loopback = bench.spi("spidev0.0", None).unwrap();
+    assert_eq!(exchange(&mut loopback, "0070696e"), "0070696e");
+    let driver = bench.spi("spidev1.0", Some("z_cs")).unwrap();
+    assert_eq!((loopback.bus.as_str(), driver.bus.as_str()), ("spi0", "spi1"));
+    let error = bench.spi("spidev7.0", None).err().unwrap();
+    assert_eq!(error.reason, reason::SPI_OPEN);
+    assert!(error.detail.contains("use spidev0.0 or spidev1.0"), "{}", error.detail);
+}
+
+#[test]
+fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = SimConfig::default_printer();
+    let driver = |axis: &str| ChipConfig::Tmc5160 {
+        bus: "spidev1.0".into(),
+        select_pin: PinName::try_from(format!("{axis}_cs")).ok(),
+        axis: axis.into(),
+    };
+    config.chips = vec![driver("x"), driver("y")];
+    config.spi_buses[1].trace_file = Some(folder.path().join("trace"));
+    config.spi_buses[1].trace_pins = vec!["led".into(), "beeper".into()];
+    let mut bench = Bench::new(config);
+    let led = bench.output("led", true);
+    let [mut x, mut y] = ["x_cs", "y_cs"].map(|pin| bench.spi("spidev1.0", Some(pin)).unwrap());
+    assert_eq!(exchange(&mut x, "8000000004"), "0900000000");
+    assert_eq!(exchange(&mut y, "0000000000"), "0900000000");
+    led.write(false).unwrap();
+    assert_eq!(exchange(&mut x, "0000000000"), "0900000004");
+    assert_eq!(exchange(&mut y, "0000000000"), "0900000008", "the reset value");
+    let mut nobody = bench.spi("spidev1.0", None).unwrap();
+    assert_eq!(exchange(&mut nobody, "0000"), "ffff", "pulled up");
+    assert_eq!(
+        std::fs::read_to_string(folder.path().join("trace")).unwrap(),
+        "chips=tmc5160 x sent=8000000004 received=0900000000 led=11111 beeper=00000\n\
+         chips=tmc5160 y sent=0000000000 received=0900000000 led=11111 beeper=00000\n\
+         chips=tmc5160 x sent=0000000000 received=0900000004 led=00000 beeper=00000\n\
+         chips=tmc5160 y sent=0000000000 received=0900000008 led=00000 beeper=00000\n\
+         chips= sent=0000 received=ffff led=00 beeper=00\n"
+    );
+}
+
+#[test]
+fn a_chip_that_is_spoken_to_in_another_mode_hears_nothing() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let chip_select = Some(ChipSelect { line: bench.output("z_cs", true), active_high: false });
+    let OnWorker { mut device, .. } =
+        bench.board.spi(SpiConfig { bus: 1, mode: 0, rate_hz: 1_000_000, chip_select }).unwrap();
+    let mut bytes = [0; 5];
     device.exchange(&mut bytes).unwrap();
-    assert_eq!(bytes, *b"pinion");
-    assert!(open(&mut bench, 1, 0).is_err_and(|error| error.reason == reason::SPI_OPEN));
+    assert_eq!(bytes, [0xff; 5]);
 }
 
 #[test]

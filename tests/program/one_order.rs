@@ -1,0 +1,170 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! One order, as a host sees it over the pty and a chip at its pins: the client asks again as
+//! klippy does, the simulated bus takes its time and records what was said on it.
+
+use std::fs;
+use std::io::Write;
+use std::path::PathBuf;
+
+use nix::sys::signal::Signal;
+use pinion::host::{Arg, Client, Error};
+
+use crate::process::{PATIENCE, Pinion, output};
+
+/// A printer whose buses take so long for a transfer, and the record of its first bus, a loop.
+fn slow_printer(delay_ms: u64) -> (Pinion, PathBuf) {
+    let folder = tempfile::tempdir().unwrap();
+    let (toml, trace) = (folder.path().join("slow.toml"), folder.path().join("trace"));
+    let printer = String::from_utf8(output(&["sim", "--print-board"]).stdout).unwrap();
+    let slow = printer.replace(
+        "name = \"spidev0.0\"\n",
+        &format!(
+            "name = \"spidev0.0\"\ndelay_us = {}\ntrace_file = {trace:?}\ntrace_pins = [\"beeper\"]\n",
+            1000 * delay_ms
+        ),
+    );
+    assert_ne!(slow, printer, "the built-in printer's bus has another name");
+    fs::write(&toml, slow).unwrap();
+    let board = format!("sim:{}", toml.display());
+    let pinion = Pinion::start_in(folder, &["run", "--board", &board]);
+    pinion.wait_for_link();
+    (pinion, trace)
+}
+
+const SPI: u8 = 0;
+const DISPLAY: &[&str] = &[
+    "allocate_oids count=2",
+    "config_spi_without_cs oid=0",
+    "spi_set_bus oid=0 spi_bus=spidev0.0 mode=0 rate=1000000",
+    "config_digital_out oid=1 pin=beeper value=0 default_value=0 max_duration=0",
+    "finalize_config crc=1",
+];
+
+fn configured(pinion: &Pinion) -> Client {
+    let mut client = pinion.client();
+    for line in DISPLAY {
+        client.send_line(line).unwrap();
+    }
+    assert!(client.status().unwrap().is_config);
+    client
+}
+
+/// Asks the device to send back this number.
+fn transfer(client: &mut Client, number: u8) -> Result<Vec<u8>, Error> {
+    let args = [("oid", SPI.into()), ("data", Arg::Bytes(&[number]))];
+    let answer = client.query("spi_transfer", &args, "spi_transfer_response", Some(SPI))?;
+    Ok(answer.bytes("response")?.to_vec())
+}
+
+/// The bytes that the chip got in each transfer, in hex, and the level of D/C at each.
+fn heard(trace: &PathBuf) -> Vec<(String, String)> {
+    let trace = fs::read_to_string(trace).unwrap();
+    let field = |line: &str, key: &str| {
+        let field = line.split(' ').find_map(|field| field.strip_prefix(key));
+        field.unwrap_or_else(|| panic!("no {key} in {line}")).to_owned()
+    };
+    trace.lines().map(|line| (field(line, "sent="), field(line, "beeper="))).collect()
+}
+
+#[track_caller]
+fn each_transfer_happens_once_and_has_its_own_answer(delay_ms: u64, count: u8) {
+    let (pinion, trace) = slow_printer(delay_ms);
+    let mut client = configured(&pinion);
+    for number in 0..count {
+        assert_eq!(transfer(&mut client, number).unwrap(), [number]);
+    }
+    let sent: Vec<String> = heard(&trace).into_iter().map(|(sent, _)| sent).collect();
+    let asked: Vec<String> = (0..count).map(|number| format!("{number:02x}")).collect();
+    assert_eq!(sent, asked);
+}
+
+#[test]
+fn transfers_of_4_ms_happen_once_and_have_their_own_answers() {
+    each_transfer_happens_once_and_has_its_own_answer(4, 100);
+}
+
+#[test]
+fn transfers_of_400_ms_happen_once_and_have_their_own_answers() {
+    each_transfer_happens_once_and_has_its_own_answer(400, 5);
+}
+
+/// klippy's SPI4wire (extras/display/uc1701.py): D/C to where it belongs, the bytes.
+#[test]
+fn a_display_sees_its_line_and_its_bytes_in_order() {
+    let (pinion, trace) = slow_printer(4);
+    let mut client = configured(&pinion);
+    for n in 0..60 {
+        // Short ones share their blocks, long ones have them for themselves.
+        let bytes = format!("{n:02x}").repeat(1 + n % 40);
+        client.send_line(&format!("update_digital_out oid=1 value={}", n % 2)).unwrap();
+        let commands = [
+            client.messages().encode_line(&format!("spi_send oid=0 data={bytes}")).unwrap(),
+            client.messages().encode_line(&format!("update_digital_out oid=1 value={}", 1 - n % 2)).unwrap(),
+        ];
+        client.send_encoded(&commands).unwrap();
+    }
+    client.link().settle().unwrap();
+    let heard = heard(&trace);
+    assert_eq!(heard.len(), 60, "{heard:?}");
+    for (n, (sent, levels)) in heard.iter().enumerate() {
+        let length = 1 + n % 40;
+        assert_eq!(*sent, format!("{n:02x}").repeat(length));
+        assert_eq!(*levels, (n % 2).to_string().repeat(length), "D/C at message {n}");
+    }
+}
+
+#[test]
+fn the_clock_is_told_beside_a_slow_transfer() {
+    let (pinion, _) = slow_printer(400);
+    let mut client = configured(&pinion);
+    client.send_line("spi_transfer oid=0 data=2a").unwrap();
+    let clocks = [(); 3].map(|()| client.query("get_clock", &[], "clock", None).unwrap().u32("clock").unwrap());
+    assert!(client.take("spi_transfer_response", Some(SPI)).is_none(), "the transfer was over before the clock came");
+    assert!(clocks.is_sorted_by(|a, b| b.wrapping_sub(*a) as i32 > 0), "{clocks:?}");
+    client.link().settle().unwrap();
+    let answer = client.wait("spi_transfer_response", Some(SPI), std::time::Instant::now()).unwrap().unwrap();
+    assert_eq!(answer.bytes("response").unwrap(), [0x2a]);
+}
+
+/// A machine whose bus hangs, with a command that waits for it.
+fn hanging() -> (Pinion, Client) {
+    let (pinion, trace) = slow_printer(60_000);
+    let mut client = configured(&pinion);
+    client.send_line("spi_transfer oid=0 data=01").unwrap();
+    client.send_line("update_digital_out oid=1 value=1").unwrap();
+    // The answer shows that the machine has the transfer, too.
+    client.query("get_clock", &[], "clock", None).unwrap();
+    assert_eq!(heard(&trace), []);
+    (pinion, client)
+}
+
+#[test]
+fn an_emergency_stop_gets_past_a_bus_that_hangs() {
+    let (_pinion, mut client) = hanging();
+    client.send_line("emergency_stop").unwrap();
+    assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Command request"));
+    // A stopped machine acknowledges what waited behind the transfer.
+    client.link().settle().unwrap();
+}
+
+#[test]
+fn a_forced_shutdown_gets_past_a_bus_that_hangs() {
+    let (pinion, mut client) = hanging();
+    fs::OpenOptions::new().write(true).open(pinion.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
+    assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Force shutdown command"));
+}
+
+#[test]
+fn a_signal_gets_past_a_bus_that_hangs() {
+    let (mut pinion, _client) = hanging();
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    assert!(pinion.log().contains("shutdown: Force shutdown command: "), "{}", pinion.log());
+    assert!(pinion.log().contains("spi0 does not answer"), "{}", pinion.log());
+}
+
+#[test]
+fn a_bus_that_hangs_for_ever_stops_the_machine() {
+    let (_pinion, mut client) = hanging();
+    assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Bus does not answer"));
+}
