@@ -5,6 +5,7 @@
 mod outputs;
 
 mod analog;
+mod duplicate;
 mod expander;
 mod guardian;
 mod hard_pwm;
