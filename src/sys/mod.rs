@@ -134,7 +134,7 @@ mod request {
 }
 
 /// Drives the only line of a handle of the GPIO character device.
-pub(crate) fn set_line(line: BorrowedFd<'_>, value: bool) -> io::Result<()> {
+pub(crate) fn set_line(line: &impl AsRawFd, value: bool) -> io::Result<()> {
     let mut values = LineValues([0; 64]);
     values.0[0] = value.into();
     // SAFETY: the request takes a `struct gpiohandle_data`, which lives through the call.
@@ -150,6 +150,23 @@ pub(crate) fn set_line_config(line: &impl AsRawFd, flags: u32, level: bool) -> i
     // SAFETY: the request takes a `struct gpiohandle_config`, which lives through the call.
     unsafe { request::gpiohandle_set_config(line.as_raw_fd(), &mut config) }?;
     Ok(())
+}
+
+/// GPIOHANDLE_REQUEST_OUTPUT.
+const OUTPUT: u32 = 1 << 1;
+
+/// Drives the only line of a handle, of a chip that is spoken to over a bus, and learns whether the
+/// chip has taken it.
+///
+/// [`set_line`] does not tell: on many kernels, 6.1 among them, a driver's function that sets a level
+/// returns nothing, and a chip that does not answer goes unnoticed. The one that makes a line an
+/// output of some level does return an error. Linux before 5.5 offers that for new handles only, and
+/// says EINVAL.
+pub(crate) fn set_line_checked(line: &impl AsRawFd, value: bool) -> io::Result<()> {
+    match set_line_config(line, OUTPUT, value) {
+        Err(error) if error.raw_os_error() == Some(libc::EINVAL) => set_line(line, value),
+        set => set,
+    }
 }
 
 /// After how many seconds without food a hardware watchdog resets the machine.

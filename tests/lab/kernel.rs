@@ -55,7 +55,7 @@ impl FromStr for Flavour {
 }
 
 /// Loaded in this order, with options. What they depend on comes before them.
-const MODULES: [(&str, &str); 17] = [
+const MODULES: [(&str, &str); 18] = [
     ("virtio_pci", ""),
     ("9pnet_virtio", ""),
     ("9p", ""),
@@ -66,6 +66,7 @@ const MODULES: [(&str, &str); 17] = [
     ("mock_spi", ""),
     ("i2c-dev", ""),
     ("mock_i2c", ""),
+    ("gpio-pca953x", ""),
     ("mock_pwm", ""),
     ("w1_therm", ""),
     ("mock_w1", ""),
@@ -97,9 +98,10 @@ const IMAGE_PARTS: [&str; 14] = [
     "./boot/vmlinuz-*",
 ];
 
-/// Upstream's mocks and what they include. Folders stand for all their files.
-const UPSTREAM: [&str; 6] = [
+/// Upstream's mocks and drivers, and what they include. Folders stand for all their files.
+const UPSTREAM: [&str; 7] = [
     "kernel/irq/irq_sim.c",
+    "drivers/gpio/gpio-pca953x.c",
     "drivers/gpio/gpio-sim.c",
     "drivers/gpio/gpiolib.h",
     "drivers/iio/dummy",
@@ -108,8 +110,11 @@ const UPSTREAM: [&str; 6] = [
 ];
 
 /// A module that is made of a source of the same name needs that source renamed.
-const UPSTREAM_RENAMED: [(&str, &str); 2] =
-    [("gpio-sim.c", "gpio-sim-main.c"), ("iio_dummy_evgen.c", "iio_dummy_evgen-main.c")];
+const UPSTREAM_RENAMED: [(&str, &str); 3] = [
+    ("gpio-pca953x.c", "gpio-pca953x-main.c"),
+    ("gpio-sim.c", "gpio-sim-main.c"),
+    ("iio_dummy_evgen.c", "iio_dummy_evgen-main.c"),
+];
 
 /// A kernel, ready to boot.
 pub struct Kernel {
@@ -285,8 +290,12 @@ fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
         (&"busybox-static".to_owned(), &["./bin/busybox"]),
     ];
     // A stamp tells which parts were unpacked.
+    let stamp_of = |package: &String, parts: &[&str]| match *package == packages.source {
+        true => UPSTREAM.join(" "),
+        false => parts.join(" "),
+    };
     let is_missing = |(package, parts): &(&String, &[&str])| {
-        !fs::read_to_string(stamps.join(package)).is_ok_and(|stamp| stamp == parts.join(" "))
+        !fs::read_to_string(stamps.join(package)).is_ok_and(|stamp| stamp == stamp_of(package, parts))
     };
     let missing: Vec<_> = all.into_iter().filter(is_missing).collect();
     if missing.is_empty() {
@@ -318,7 +327,7 @@ fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
         if *package == packages.source {
             unpack_upstream(&packages.source, tree)?;
         }
-        fs::write(stamps.join(package), parts.join(" "))
+        fs::write(stamps.join(package), stamp_of(package, parts))
             .map_err(|error| describe("write", &stamps.join(package), &error))?;
         remove(&archive)?;
     }

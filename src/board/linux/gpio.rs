@@ -198,10 +198,16 @@ pub struct HeldLine {
     /// What it was made last.
     is_output: AtomicBool,
     guard: SharedGuard,
+    /// Its chip, if calls to that may take their time.
     sleeping: Option<String>,
 }
 
 impl HeldLine {
+    /// A call to the chip failed.
+    fn lost(&self, reason: ShutdownReason, what: &str, code: i32) -> Shutdown {
+        Shutdown::because(reason, self.subject.lost(what, code, self.sleeping.is_some()))
+    }
+
     /// Lets the guardian know what has become of the line.
     fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
         let name = format!("{} line {}", self.subject.chip, self.subject.offset);
@@ -223,15 +229,17 @@ impl Line for HeldLine {
         if !self.is_output.load(Ordering::Relaxed) {
             return Ok(());
         }
-        self.handle
-            .set_value(level.into())
-            .map_err(|error| Shutdown::because(reason::LINE_WRITE, self.subject.lost("written", errno(&error))))
+        let code = match &self.sleeping {
+            None => self.handle.set_value(level.into()).map_err(|error| errno(&error)),
+            Some(_) => sys::set_line_checked(&self.handle, level).map_err(|e| e.raw_os_error().unwrap_or_default()),
+        };
+        code.map_err(|code| self.lost(reason::LINE_WRITE, "written", code))
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
         match self.handle.get_value() {
             Ok(value) => Ok(value != 0),
-            Err(error) => Err(Shutdown::because(reason::LINE_READ, self.subject.lost("read", errno(&error)))),
+            Err(error) => Err(self.lost(reason::LINE_READ, "read", errno(&error))),
         }
     }
 
@@ -325,10 +333,14 @@ impl Subject {
         )
     }
 
-    fn lost(&self, what: &str, code: i32) -> String {
+    /// `sleeping`: whether the chip is spoken to over a bus.
+    fn lost(&self, what: &str, code: i32, sleeping: bool) -> String {
+        let why = match sleeping {
+            true => "its chip does not answer, or is gone: check its power and wiring",
+            false => "its chip or driver is gone",
+        };
         format!(
-            "{self} can no longer be {what}: {}: its chip or driver is gone, look at the kernel's \
-             log (dmesg), then FIRMWARE_RESTART",
+            "{self} can no longer be {what}: {}: {why}, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
             text(code)
         )
     }
@@ -468,6 +480,7 @@ pub(super) fn text(code: i32) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::os::unix::fs::symlink;
 
     fn gpio17() -> Subject {
         Subject { chip: "gpiochip0".into(), label: "pinctrl-bcm2835".into(), offset: 17, name: Some("GPIO17".into()) }
@@ -500,6 +513,76 @@ mod tests {
         assert!(driver.contains("without the ~"), "{driver}");
         let reserved = refusal(libc::EINVAL, Bias::PullUp, None, "6.6.0");
         assert!(reserved.contains("another function"), "{reserved}");
+    }
+
+    /// A made-up `/sys` of one GPIO chip, below devices of which each has its name and its subsystem.
+    fn sleeps(devices: &[(&str, &str)], label: &str) -> bool {
+        let sys = tempfile::tempdir().unwrap();
+        let mut device = sys.path().join("devices");
+        let mut add = |name: &str, subsystem: &str| {
+            device.push(name);
+            fs::create_dir_all(&device).unwrap();
+            if !subsystem.is_empty() {
+                symlink(format!("/sys/bus/{subsystem}"), device.join("subsystem")).unwrap();
+            }
+        };
+        for (name, subsystem) in devices {
+            add(name, subsystem);
+        }
+        add("gpiochip3", "gpio");
+        let chips = sys.path().join("bus/gpio/devices");
+        fs::create_dir_all(&chips).unwrap();
+        symlink(&device, chips.join("gpiochip3")).unwrap();
+        assert!(!may_sleep(&chips, "gpiochip4", "another"), "a chip that is not there");
+        may_sleep(&chips, "gpiochip3", label)
+    }
+
+    #[test]
+    fn a_chip_behind_a_bus_may_sleep() {
+        let platform = [("platform", ""), ("soc", "platform"), ("fe804000.i2c", "platform")];
+        let i2c = [&platform[..], &[("i2c-1", "i2c"), ("1-0020", "i2c")]].concat();
+        assert!(sleeps(&i2c, "1-0020"));
+        // A function of a chip that has several.
+        assert!(sleeps(&[&i2c[..], &[("da9063-gpio", "platform")]].concat(), "da9063-gpio"));
+        let usb = [("pci0000:00", ""), ("0000:00:14.0", "pci"), ("usb1", "usb"), ("1-2", "usb"), ("1-2:1.0", "usb")];
+        assert!(sleeps(&[&usb[..], &[("0003:10C4:EA90.0001", "hid")]].concat(), "CP2112 GPIO"));
+        assert!(sleeps(
+            &[("platform", ""), ("fe204000.spi", "platform"), ("spi0", "spi_master"), ("spi0.0", "spi")],
+            ""
+        ));
+        assert!(sleeps(&[("virtual", ""), ("misc", ""), ("uhid", "misc"), ("0003:04D8:00DD.0001", "hid")], "mcp2221"));
+    }
+
+    #[test]
+    fn a_chip_of_the_computer_s_own_does_not_sleep() {
+        let soc = [("platform", ""), ("soc", "platform"), ("fe200000.gpio", "platform")];
+        assert!(!sleeps(&soc, "pinctrl-bcm2711"));
+        let rp1 = [
+            ("platform", ""),
+            ("axi", "platform"),
+            ("1000120000.pcie", "platform"),
+            ("pci0002:00", ""),
+            ("0002:00:00.0", "pci"),
+            ("0002:01:00.0", "pci"),
+            ("1f000d0000.gpio", "platform"),
+        ];
+        assert!(!sleeps(&rp1, "pinctrl-rp1"));
+    }
+
+    #[test]
+    fn a_chip_that_asks_the_firmware_is_known_by_its_label() {
+        let device =
+            [("platform", ""), ("soc", "platform"), ("soc:firmware", "platform"), ("soc:firmware:gpio", "platform")];
+        assert!(sleeps(&device, "raspberrypi-exp-gpio"));
+        assert!(!sleeps(&device, "another"));
+    }
+
+    #[test]
+    fn a_chip_that_no_longer_answers_says_what_to_look_at() {
+        let own = gpio17().lost("written", libc::ENODEV, false);
+        assert!(own.contains("can no longer be written: No such device") && own.contains("its chip or driver is gone"));
+        let expander = gpio17().lost("read", libc::ENXIO, true);
+        assert!(expander.contains("does not answer") && expander.contains("power and wiring"), "{expander}");
     }
 
     #[test]

@@ -99,7 +99,12 @@ impl Output {
     }
 
     fn line(name: &str, line: OwnedFd, value: bool) -> Output {
-        Output::new(name, Box::new(move || sys::set_line(line.as_fd(), value)))
+        Output::new(name, Box::new(move || sys::set_line(&line, value)))
+    }
+
+    /// A line of a chip that may sleep, which may not answer.
+    fn sleeping_line(name: &str, line: OwnedFd, value: bool) -> Output {
+        Output::new(name, Box::new(move || sys::set_line_checked(&line, value)))
     }
 
     /// An output of files, such as a PWM, and what is to be written at the beginning of each.
@@ -300,7 +305,8 @@ impl Watcher {
                 self.files.clear();
             }
             (Message::Line { name, shutdown_value, sleeping }, Some(line)) => {
-                self.held.hold(sleeping, Output::line(name, line, shutdown_value));
+                let make = if sleeping.is_some() { Output::sleeping_line } else { Output::line };
+                self.held.hold(sleeping, make(name, line, shutdown_value));
             }
             (Message::Forget { name }, _) => self.held.forget(name),
             (Message::File(bytes), Some(file)) => self.files.push((file, bytes.into())),

@@ -11,7 +11,8 @@ use super::{sysfs, uapi};
 const MOCK: &str = "/sys/devices/platform/mock-i2c";
 const CHIP: u16 = 0x50;
 
-fn bus() -> PathBuf {
+/// The node of the mocked bus.
+pub fn bus() -> PathBuf {
     let entry = sysfs::entry_with("/sys/class/i2c-dev", "name", "mock-i2c");
     Path::new("/dev").join(entry.file_name().expect("a named entry"))
 }

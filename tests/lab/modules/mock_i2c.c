@@ -6,6 +6,8 @@
  *
  * In /sys/devices/platform/mock-i2c:
  *   sent             one line per write: "ADDRESS BYTE...", in hexadecimal
+ *   change           written: "ADDRESS REGISTER VALUE", in hexadecimal: the chip
+ *                    changes a register by itself, whatever the bus is at
  *   fail, delay_ms   see mock_bus.h
  */
 #include <linux/i2c.h>
@@ -79,7 +81,26 @@ static const struct i2c_algorithm mock_i2c_algorithm = {
 	.functionality = mock_i2c_functionality,
 };
 
-static struct attribute *mock_i2c_attrs[] = { MOCK_BUS_ATTRS, NULL };
+static ssize_t change_store(struct device *dev, struct device_attribute *attr,
+			    const char *buf, size_t len)
+{
+	struct mock_i2c *mock = dev_get_drvdata(dev);
+	unsigned int address, reg;
+	u8 value;
+
+	if (sscanf(buf, "%x %x %hhx", &address, &reg, &value) != 3 ||
+	    address < FIRST_ADDRESS || address >= FIRST_ADDRESS + CHIPS || reg > 255)
+		return -EINVAL;
+	mutex_lock(&mock->bus.lock);
+	mock->registers[address - FIRST_ADDRESS][reg] = value;
+	mutex_unlock(&mock->bus.lock);
+	return len;
+}
+static DEVICE_ATTR_WO(change);
+
+static struct attribute *mock_i2c_attrs[] = {
+	MOCK_BUS_ATTRS, &dev_attr_change.attr, NULL
+};
 ATTRIBUTE_GROUPS(mock_i2c);
 
 static int mock_i2c_probe(struct platform_device *pdev)

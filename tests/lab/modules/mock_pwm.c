@@ -3,6 +3,7 @@
  * A PWM chip of eight channels which holds what it is told.
  *
  * In /sys/devices/platform/mock-pwm:
+ *   fail      written: an errno with which each change fails, or 0
  *   outputs   one line per channel, "CHANNEL PERIOD_NS DUTY_NS ENABLED WRITES":
  *             what the pins would do, whoever has the channel exported
  */
@@ -16,6 +17,7 @@ struct mock_pwm {
 	struct pwm_chip chip;
 	struct pwm_state outputs[CHANNELS];
 	unsigned int writes[CHANNELS];
+	int fail_errno;
 };
 
 static struct platform_device *mock_pwm_device;
@@ -29,7 +31,10 @@ static int mock_pwm_apply(struct pwm_chip *chip, struct pwm_device *pwm,
 			  const struct pwm_state *state)
 {
 	struct mock_pwm *mock = to_mock_pwm(chip);
+	int fail_errno = READ_ONCE(mock->fail_errno);
 
+	if (fail_errno)
+		return -fail_errno;
 	mock->outputs[pwm->hwpwm] = *state;
 	mock->writes[pwm->hwpwm]++;
 	return 0;
@@ -64,7 +69,25 @@ static ssize_t outputs_show(struct device *dev, struct device_attribute *attr,
 }
 static DEVICE_ATTR_RO(outputs);
 
-static struct attribute *mock_pwm_attrs[] = { &dev_attr_outputs.attr, NULL };
+static ssize_t fail_store(struct device *dev, struct device_attribute *attr,
+			  const char *buf, size_t len)
+{
+	struct mock_pwm *mock = dev_get_drvdata(dev);
+	unsigned int fail_errno;
+	int err = kstrtouint(buf, 0, &fail_errno);
+
+	if (err)
+		return err;
+	if (fail_errno > MAX_ERRNO)
+		return -EINVAL;
+	WRITE_ONCE(mock->fail_errno, fail_errno);
+	return len;
+}
+static DEVICE_ATTR_WO(fail);
+
+static struct attribute *mock_pwm_attrs[] = {
+	&dev_attr_outputs.attr, &dev_attr_fail.attr, NULL
+};
 ATTRIBUTE_GROUPS(mock_pwm);
 
 static int mock_pwm_probe(struct platform_device *pdev)

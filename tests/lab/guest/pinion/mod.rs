@@ -5,6 +5,8 @@
 mod outputs;
 
 mod analog;
+mod duplicate;
+mod expander;
 mod guardian;
 mod hard_pwm;
 mod homing;

@@ -1,0 +1,367 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Lines of an I/O expander: a chip on I2C, whose driver sleeps while it talks to the chip.
+
+use std::fs;
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+use nix::sys::signal::Signal;
+use pinion::host::Client;
+use pinion::host::config::Config;
+use pinion::host::motion::{Endstop, MoveQueue, Profile, Reason, Stepper};
+use pinion::time::monotonic;
+
+use crate::gpio_sim::GpioSim;
+use crate::i2c;
+use crate::program::{Program, configure, exists, refusal, run, shutdown_of};
+use crate::sysfs;
+use crate::trace::{Trace, Write};
+use crate::uapi;
+
+const MOCK: &str = "/sys/devices/platform/mock-i2c";
+const ADDRESS: u16 = 0x50;
+const LINES: u32 = 8;
+/// The registers of a PCA9554, and what they hold after its reset.
+const INPUT: u8 = 0;
+const OUTPUT: u8 = 1;
+const RESET: [u8; 4] = [0x00, 0xff, 0x00, 0xff];
+/// What the guardian promises.
+const WITHIN_US: u64 = 600_000;
+/// A chip that hangs does so for this long, in milliseconds: far longer than anybody waits for it.
+const HANGS_MS: u64 = 12_000;
+
+/// A PCA9554 on the mocked bus. It goes when dropped.
+struct Expander {
+    adapter: PathBuf,
+    chip_name: String,
+}
+
+impl Expander {
+    fn new() -> Expander {
+        let registers: Vec<u8> = [INPUT].into_iter().chain(RESET).collect();
+        uapi::i2c_transfer(&i2c::bus(), ADDRESS, &registers, 0).expect("a register file");
+        let adapter = sysfs::entry_with("/sys/bus/i2c/devices", "name", "mock-i2c");
+        sysfs::write(adapter.join("new_device"), format!("pca9554 {ADDRESS:#x}"));
+        let bus = adapter.file_name().and_then(|name| name.to_str()).expect("a name").replace("i2c-", "");
+        let device = adapter.join(format!("{bus}-{ADDRESS:04x}"));
+        let chip = fs::read_dir(device).expect("the chip's device").flatten().map(|entry| entry.file_name());
+        let chip = chip.filter_map(|name| name.into_string().ok()).find(|name| name.starts_with("gpiochip"));
+        Expander { adapter, chip_name: chip.expect("a GPIO chip") }
+    }
+
+    fn pin(&self, offset: u32) -> String {
+        format!("{}/gpio{offset}", self.chip_name)
+    }
+
+    fn line(&self, offset: u32) -> String {
+        format!("{} line {offset}", self.chip_name)
+    }
+
+    /// The level that the chip gives the line. Waits for what is under way on the bus.
+    fn level(&self, offset: u32) -> bool {
+        let output = uapi::i2c_transfer(&i2c::bus(), ADDRESS, &[OUTPUT], 1).expect("the output register");
+        output[0] >> offset & 1 != 0
+    }
+
+    /// What is at the chip's inputs from outside.
+    fn set_inputs(&self, levels: u8) {
+        sysfs::write(format!("{MOCK}/change"), format!("{ADDRESS:x} {INPUT:x} {levels:x}"));
+    }
+
+    /// From now on each of its transfers takes so long.
+    fn slow_down(&self, delay_ms: u64) -> sysfs::Setting {
+        sysfs::set(format!("{MOCK}/delay_ms"), delay_ms.to_string(), "0")
+    }
+
+    /// From now on it does not acknowledge.
+    fn fall_silent(&self) -> sysfs::Setting {
+        sysfs::set(format!("{MOCK}/fail"), format!("{} 1000000", Errno::ENXIO as i32), "0 0")
+    }
+
+    fn is_held(&self) -> bool {
+        let chip = Path::new("/dev").join(&self.chip_name);
+        (0..LINES).any(|offset| !uapi::line_info(&chip, offset).consumer.is_empty())
+    }
+
+    /// Waits until no process is in its driver any more: one that was killed amid a transfer stays
+    /// there until that is over.
+    fn wait_until_free(&self) {
+        let until = Instant::now() + Duration::from_millis(2 * HANGS_MS);
+        while self.is_held() && Instant::now() < until {
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+impl Drop for Expander {
+    fn drop(&mut self) {
+        // The kernel would go on with a chip that is gone.
+        self.wait_until_free();
+        let _ = fs::write(self.adapter.join("delete_device"), format!("{ADDRESS:#x}"));
+    }
+}
+
+fn output(oid: usize, pin: &str) -> String {
+    format!("config_digital_out oid={oid} pin={pin} value=0 default_value=0 max_duration=0")
+}
+
+/// A heater on a line of the processor's and a fan on the expander, both on.
+struct Machine {
+    /// First, as it is dropped first.
+    expander: Expander,
+    sim: GpioSim,
+    /// The kernel's number of the heater's line. It can not be had while the chip hangs: the kernel
+    /// reads every line for it.
+    heater: u32,
+}
+
+impl Machine {
+    fn new() -> Machine {
+        let sim = GpioSim::new("lab", 8);
+        Machine { heater: sim.kernel_number(0), expander: Expander::new(), sim }
+    }
+
+    fn switch_on(&self, client: &mut Client) {
+        configure(client, 2, &[output(0, "lab/gpio0"), output(1, &self.expander.pin(3))]);
+        run(client, "update_digital_out oid=0 value=1");
+        run(client, "update_digital_out oid=1 value=1");
+        assert!(self.sim.level(0) && self.expander.level(3));
+    }
+
+    /// Waits until the heater, which was on, was switched off, and returns when (CLOCK_MONOTONIC,
+    /// microseconds).
+    fn heater_off_us(&self, trace: &Trace) -> u64 {
+        let first = || trace.writes_to(self.heater).first().copied();
+        sysfs::wait_until("the heater is switched off", || first().is_some());
+        let Write { level, at_us, .. } = first().expect("a write");
+        assert!(!level);
+        at_us
+    }
+
+    /// A program that is started anew has it all, once the chip's driver is free.
+    fn assert_starts_anew(&self) {
+        self.expander.wait_until_free();
+        let program = Program::start();
+        self.switch_on(&mut program.connect());
+    }
+}
+
+fn now_us() -> u64 {
+    monotonic().as_micros() as u64
+}
+
+/// The name under which the log knows the fan.
+fn fan(machine: &Machine) -> String {
+    format!("digital output oid 1 ({})", machine.expander.pin(3))
+}
+
+#[test]
+fn steps_beside_a_slow_output_are_in_time() {
+    let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+    let program = Program::start();
+    let client = &mut program.connect();
+    let mut config = Config::default();
+    Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
+    config.oid().expect("few objects");
+    config.add(output(1, &expander.pin(5)));
+    config.apply(client).expect("a configuration that it takes");
+    let step = sim.kernel_number(0);
+    let _slow = expander.slow_down(50);
+    sysfs::write(format!("{MOCK}/sent"), "0");
+    let trace = Trace::start();
+    let start = client.clock_in(0.2).expect("the clock").wire();
+    for line in [
+        format!("reset_step_clock oid=0 clock={start}"),
+        "queue_step oid=0 interval=50000 count=1000 add=0".to_owned(),
+        format!("queue_digital_out oid=1 clock={start} on_ticks=1"),
+        format!("queue_digital_out oid=1 clock={} on_ticks=0", start.wrapping_add(client.ticks(0.3))),
+    ] {
+        run(client, &line);
+    }
+    // A command for which the host waits.
+    thread::sleep(Duration::from_millis(800));
+    let began_us = now_us();
+    run(client, "update_digital_out oid=1 value=1");
+    assert!(now_us() - began_us >= 50_000, "it is acknowledged when it is done");
+    thread::sleep(Duration::from_millis(500));
+    let edges = trace.writes_to(step);
+    let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_us).collect();
+    assert_eq!(rising.len(), 1000);
+    let worst = rising.iter().zip(0..).map(|(at_us, n)| (at_us - rising[0]).abs_diff(1000 * n)).max();
+    println!("steps stray by {worst:?} us");
+    assert!(worst.expect("steps") < 200, "{worst:?} us");
+    let sent = sysfs::read(format!("{MOCK}/sent"));
+    let outputs: Vec<&str> = sent.lines().filter(|line| line.starts_with("50 01 ")).collect();
+    assert_eq!(outputs, ["50 01 ff", "50 01 df", "50 01 ff"]);
+}
+
+#[test]
+fn a_step_pin_on_it_is_refused_with_the_reason() {
+    let (_sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+    let program = Program::start();
+    let client = &mut program.connect();
+    for (step, dir) in [(expander.pin(0), "lab/gpio1".to_owned()), ("lab/gpio0".to_owned(), expander.pin(1))] {
+        let config = format!("config_stepper oid=0 step_pin={step} dir_pin={dir} invert_step=0 step_pulse_ticks=100");
+        assert_eq!(refusal(client, 1, &[config]), "Unable to open out GPIO chip line");
+    }
+    for (pin, what) in [(0, "a step pin"), (1, "a dir pin")] {
+        program.wait_for_line(&[&expander.pin(pin), what, "behind a bus", "choose a pin of the processor itself"]);
+    }
+    configure(client, 1, &[output(0, &expander.pin(0))]);
+}
+
+#[test]
+fn an_axis_homes_to_an_endstop_on_it() {
+    const SWITCH: u32 = 7;
+    let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+    let program = Program::start();
+    let client = &mut program.connect();
+    let mut config = Config::default();
+    let stepper = Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
+    let endstop = Endstop::configure(&mut config, &expander.pin(SWITCH), 0, false).expect("few objects");
+    let status = config.apply(client).expect("a configuration that it takes");
+    let mut queue = MoveQueue::new(status.move_count);
+    let profile = Profile::trapezoid(3000, 2000.0, 20_000.0, 50e6).expect("a profile");
+    let step = sim.kernel_number(0);
+    let _slow = expander.slow_down(5);
+    assert!(!endstop.triggered(client).expect("a state"));
+    let trace = Trace::start();
+    let mut closed = None;
+    let homed = queue.home(client, stepper, endstop, false, &profile, &mut |sight| {
+        if closed.is_none() && sight.position <= -700 {
+            expander.set_inputs(1 << SWITCH);
+            closed = Some(sight.position);
+        }
+    });
+    let homed = homed.expect("a homing");
+    assert_eq!(homed.reason, Reason::Endstop);
+    assert!(endstop.triggered(client).expect("a state"));
+    let rising = trace.writes_to(step).iter().filter(|write| write.level).count();
+    assert_eq!(homed.position, -(rising as i64), "it is where the lines say");
+    assert!((-3000..=-700).contains(&homed.position), "{}", homed.position);
+}
+
+#[test]
+fn an_emergency_stop_waits_for_no_chip_that_hangs() {
+    let machine = Machine::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    machine.switch_on(client);
+    let trace = Trace::start();
+    let guardian = program.guardian();
+    let hangs = machine.expander.slow_down(HANGS_MS);
+    let began_us = now_us();
+    client.send_line("emergency_stop").expect("a session");
+    let off_us = machine.heater_off_us(&trace);
+    assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
+    // Nothing more than the fan's shutdown value is missing, and the guardian sees to that.
+    program.wait_for_line(&["guardian: ", &fan(&machine), "is not at its shutdown value within 1000 ms"]);
+    // The second that a shutdown value may take, two for the program's end, two for the chip.
+    let acted_us = now_us() - began_us;
+    assert!((4_900_000..5_500_000).contains(&acted_us), "{acted_us} us");
+    program.wait_for_line(&["only 1 of 2 outputs", &machine.expander.line(3), "its driver hangs"]);
+    assert!(!exists(program.pid()), "it is killed while the chip still hangs");
+    sysfs::wait_until("the guardian ends", || !exists(guardian));
+    assert!(now_us() - began_us < 1000 * HANGS_MS);
+    drop(hangs);
+    assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
+    // The write that hung is done in the end.
+    machine.expander.wait_until_free();
+    assert!(!machine.expander.level(3));
+    drop(trace);
+    machine.assert_starts_anew();
+}
+
+#[test]
+fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
+    let machine = Machine::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    machine.switch_on(client);
+    let trace = Trace::start();
+    let guardian = program.guardian();
+    let hangs = machine.expander.slow_down(HANGS_MS);
+    // A worker is at it, while the machine runs on.
+    let at = client.clock_in(0.1).expect("the clock").wire();
+    run(client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
+    thread::sleep(Duration::from_secs(2));
+    assert!(machine.sim.level(0) && program.is_running());
+    let began_us = now_us();
+    program.signal(Signal::SIGKILL);
+    let off_us = machine.heater_off_us(&trace);
+    assert!(off_us - began_us < WITHIN_US, "{} us", off_us - began_us);
+    program.wait_for_line(&["guardian: ", "only 1 of 2 outputs", &machine.expander.line(3), "its driver hangs"]);
+    sysfs::wait_until("the guardian ends", || !exists(guardian));
+    assert!(!exists(program.pid()));
+    drop(hangs);
+    drop(trace);
+    machine.assert_starts_anew();
+}
+
+#[test]
+fn a_chip_that_does_not_acknowledge_stops_the_machine_and_is_tried_again() {
+    let machine = Machine::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    machine.switch_on(client);
+    let silent = machine.expander.fall_silent();
+    client.send_line("update_digital_out oid=1 value=0").expect("a session");
+    assert_eq!(shutdown_of(client), "GPIO line write failed");
+    assert!(!machine.sim.level(0), "the heater is off");
+    let line = machine.expander.line(3);
+    program.wait_for_line(&["shutdown: GPIO line write failed", &fan(&machine), &line, "its chip does not answer"]);
+    thread::sleep(Duration::from_millis(300));
+    assert!(!program.log().contains("after all"));
+    drop(silent);
+    program.wait_for_line(&[&fan(&machine), "is at its shutdown value after all"]);
+    assert!(!machine.expander.level(3));
+    // Nobody had to help.
+    thread::sleep(Duration::from_secs(2));
+    assert!(program.is_running());
+    assert!(!program.log().contains("guardian"), "{}", program.log());
+    client.reset().expect("a reset");
+    machine.switch_on(client);
+}
+
+#[test]
+fn a_chip_that_stays_silent_is_left_to_the_guardian_which_names_it() {
+    let machine = Machine::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    machine.switch_on(client);
+    let silent = machine.expander.fall_silent();
+    let began_us = now_us();
+    client.send_line("update_digital_out oid=1 value=0").expect("a session");
+    assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
+    let killed_us = now_us() - began_us;
+    assert!((1_000_000..1_500_000).contains(&killed_us), "{killed_us} us");
+    program.wait_for_line(&["guardian: ", &fan(&machine), "is not at its shutdown value within 1000 ms"]);
+    program.wait_for_line(&["only 1 of 2 outputs", &machine.expander.line(3), "No such device or address"]);
+    drop(silent);
+    machine.assert_starts_anew();
+}
+
+#[test]
+fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
+    let machine = Machine::new();
+    let mut program = Program::start();
+    machine.switch_on(&mut program.connect());
+    let guardian = program.guardian();
+    let silent = machine.expander.fall_silent();
+    let trace = Trace::start();
+    let began_us = now_us();
+    program.signal(Signal::SIGTERM);
+    let off_us = machine.heater_off_us(&trace);
+    assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
+    assert!(!program.wait().success());
+    // The chip is back while the guardian tries.
+    drop(silent);
+    sysfs::wait_until("the guardian ends", || !exists(guardian));
+    program.wait_for_line(&["guardian: ", &fan(&machine), "all 2 outputs are driven to their shutdown values"]);
+    assert!(!machine.expander.level(3));
+    drop(trace);
+    machine.assert_starts_anew();
+}
