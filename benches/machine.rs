@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use bench::{Bench, FakeBoard};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use pinion::board::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
 use pinion::feature::FEATURES;
 use pinion::mcu::{Dialect, MOVE_COUNT};
@@ -60,6 +60,12 @@ impl Board for Quiet {
     }
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         self.0.spi(config)
+    }
+    fn i2c_buses(&self) -> Vec<Range> {
+        self.0.i2c_buses()
+    }
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        self.0.i2c(config)
     }
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
         self.0.pwm(config)

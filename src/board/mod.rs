@@ -113,8 +113,15 @@ pub trait Pwm: Send {
 /// How a bus answered, in the words of the dictionary's `i2c_bus_status`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BusStatus {
-    /// The driver failed in another way than these; SPI has no other status.
-    Failed,
+    /// The chip did not acknowledge a byte, or the driver failed in another way than these; SPI has
+    /// no other status.
+    Nack,
+    /// The bus was not free, or the chip held the clock, for too long.
+    Timeout,
+    /// No chip acknowledged the address.
+    StartNack,
+    /// No chip acknowledged the address when it was addressed again to be read from.
+    StartReadNack,
 }
 
 /// A conversation that failed: what the bus said, and for the log which device, why, and what
@@ -128,9 +135,36 @@ pub struct BusError {
 }
 
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
+///
+/// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
 pub trait BusDevice: Send {
     /// Sends the bytes and replaces each by the one that came back meanwhile (SPI).
-    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError>;
+    ///
+    /// # Errors
+    ///
+    /// What the bus said.
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+        let _ = bytes;
+        Err(BusError::other_kind("an SPI transfer", "an I2C device"))
+    }
+
+    /// Writes bytes and reads bytes, with a repeated start between the two (I2C). Nothing to read is
+    /// a plain write, nothing to write a plain read.
+    ///
+    /// # Errors
+    ///
+    /// What the bus said.
+    fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        let _ = (write, read);
+        Err(BusError::other_kind("an I2C transfer", "an SPI device"))
+    }
+}
+
+impl BusError {
+    fn other_kind(wanted: &str, is: &str) -> BusError {
+        let detail = format!("{wanted} was asked of {is}: a fault of the host's configuration; correct the bus");
+        BusError { status: BusStatus::Nack, detail: detail.into() }
+    }
 }
 
 /// Something whose calls may take their time, and the worker that makes them.
@@ -165,6 +199,17 @@ pub struct SpiConfig {
     pub rate_hz: u32,
     /// A line of our own that selects the chip.
     pub chip_select: Option<ChipSelect>,
+}
+
+/// An I2C device's parameters.
+#[derive(Clone, Copy, Debug)]
+pub struct I2cConfig {
+    /// The bus's number on the wire.
+    pub bus: u32,
+    /// The chip's address, 7 bits.
+    pub address: u8,
+    /// Clock rate that the host asks for; on Linux the driver has its own.
+    pub rate_hz: u32,
 }
 
 /// A line that selects a chip.
@@ -207,6 +252,12 @@ pub trait Board: Send {
 
     /// Opens an SPI device.
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
+
+    /// The names of the dictionary's enumeration `i2c_bus`.
+    fn i2c_buses(&self) -> Vec<Range>;
+
+    /// Opens an I2C device.
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
 
     /// Opens a hardware PWM channel.
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;

@@ -10,7 +10,9 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::{Adc, Board, BusDevice, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig};
+use super::{
+    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
@@ -241,6 +243,15 @@ impl Board for SimBoard {
     /// the printer, is late by milliseconds now and then.
     fn step_late_limit(&self) -> Ticks {
         Ticks::from_us(100_000)
+    }
+
+    fn i2c_buses(&self) -> Vec<Range> {
+        Vec::new()
+    }
+
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let detail = format!("the simulated printer has no I2C bus {}: leave out what is on it", config.bus);
+        Err(Shutdown::because(reason::I2C_OPEN, detail))
     }
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {

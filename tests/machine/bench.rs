@@ -5,8 +5,8 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 
 use pinion::board::{
-    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, Line, OnWorker, Pin, Pwm, PwmConfig, Range,
-    SpiConfig,
+    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig,
+    Range, SpiConfig,
 };
 use pinion::mcu::{Completion, Job, WorkerId, Workers};
 use pinion::shutdown::{Shutdown, ShutdownReason, reason};
@@ -43,8 +43,20 @@ pub struct Transfer {
     pub data: Vec<u8>,
 }
 
+/// A chip on an SPI bus: it is told the instant in ticks, and replaces the bytes that it gets by those
+/// that it sends.
+pub type SpiChip = Box<dyn FnMut(u64, &mut [u8]) + Send>;
+
+/// A chip at an I2C address: it is told the instant in ticks and what is written, and fills in what is
+/// read.
+pub type I2cChip = Box<dyn FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus> + Send>;
+
 #[derive(Default)]
 pub struct State {
+    /// By bus.
+    spi_chips: HashMap<u32, SpiChip>,
+    /// By bus and address.
+    i2c_chips: HashMap<(u32, u8), I2cChip>,
     /// What each claimed pin was made last.
     pub directions: HashMap<u32, Direction>,
     /// Pins of chips that may sleep.
@@ -170,6 +182,26 @@ impl Bench {
         }
     }
 
+    /// Puts a chip on SPI bus 0 or 1.
+    pub fn plug_spi(&self, bus: u32, chip: impl FnMut(u64, &mut [u8]) + Send + 'static) {
+        self.state().spi_chips.insert(bus, Box::new(chip));
+    }
+
+    /// Puts a chip at an address of I2C bus 0 or 1.
+    pub fn plug_i2c(
+        &self,
+        bus: u32,
+        address: u8,
+        chip: impl FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus> + Send + 'static,
+    ) {
+        self.state().i2c_chips.insert((bus, address), Box::new(chip));
+    }
+
+    /// Takes a chip off an I2C bus.
+    pub fn unplug_i2c(&self, bus: u32, address: u8) {
+        self.state().i2c_chips.remove(&(bus, address));
+    }
+
     /// Lets an input change at instants in the future.
     pub fn script_input(&self, pin: u32, levels: &[Edge]) {
         self.state().inputs.entry(pin).or_default().extend(levels);
@@ -252,6 +284,15 @@ impl Board for FakeBoard {
         }
         let bus = format!("spi{}", config.bus);
         Ok(OnWorker { bus, device: Box::new(FakeSpi { bench: self.0.clone(), config }) })
+    }
+
+    fn i2c_buses(&self) -> Vec<Range> {
+        vec![Range { name: "i2c.0".into(), first: 0, count: 2 }]
+    }
+
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let bus = format!("i2c{}", config.bus);
+        Ok(OnWorker { bus, device: Box::new(FakeI2c { bench: self.0.clone(), config }) })
     }
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
@@ -346,7 +387,29 @@ impl Adc for FakeAdc {
     }
 }
 
-/// A chip that sends back the complement of what it gets.
+/// What stands at an I2C address: a chip that a test plugged in, or nothing.
+struct FakeI2c {
+    bench: Bench,
+    config: I2cConfig,
+}
+
+impl BusDevice for FakeI2c {
+    fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        let I2cConfig { bus, address, .. } = self.config;
+        let at = self.bench.ticks();
+        // Not locked while the chip answers: it may look at the bench.
+        let chip = self.bench.state().i2c_chips.remove(&(bus, address));
+        let Some(mut chip) = chip else {
+            let detail = format!("nothing answers at 0x{address:02x}: check the wiring");
+            return Err(BusError { status: BusStatus::StartNack, detail: detail.into() });
+        };
+        let answer = chip(at, write, read);
+        self.bench.state().i2c_chips.insert((bus, address), chip);
+        answer.map_err(|status| BusError { status, detail: "the chip on the bench says no: ask it again".into() })
+    }
+}
+
+/// A chip that sends back the complement of what it gets, or one that a test plugged in.
 struct FakeSpi {
     bench: Bench,
     config: SpiConfig,
@@ -354,7 +417,7 @@ struct FakeSpi {
 
 impl BusDevice for FakeSpi {
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
-        let failed = |failure: Shutdown| BusError { status: BusStatus::Failed, detail: failure.detail };
+        let failed = |failure: Shutdown| BusError { status: BusStatus::Nack, detail: failure.detail };
         let SpiConfig { bus, mode, rate_hz, .. } = self.config;
         self.bench.gate.pass();
         self.bench.broken(SPI_CHIPS + bus, reason::LINE_READ).map_err(failed)?;
@@ -365,7 +428,14 @@ impl BusDevice for FakeSpi {
         message.0[..bytes.len()].copy_from_slice(bytes);
         let at = self.bench.ticks();
         self.bench.state().transfers.push((at, bus, mode, rate_hz, message));
-        bytes.iter_mut().for_each(|byte| *byte = !*byte);
+        let chip = self.bench.state().spi_chips.remove(&bus);
+        match chip {
+            Some(mut chip) => {
+                chip(at, bytes);
+                self.bench.state().spi_chips.insert(bus, chip);
+            }
+            None => bytes.iter_mut().for_each(|byte| *byte = !*byte),
+        }
         if let Some(chip_select) = &self.config.chip_select {
             chip_select.select(false).map_err(failed)?;
         }

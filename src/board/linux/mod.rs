@@ -10,7 +10,9 @@ use std::sync::atomic::AtomicU8;
 
 use industrial_io::Context;
 
-use super::{Adc, Board, BusDevice, ClaimedLine, Direction, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig};
+use super::{
+    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+};
 use crate::shutdown::{Shutdown, reason};
 pub use guard::Guard;
 use guard::SharedGuard;
@@ -199,6 +201,15 @@ impl Board for LinuxBoard {
         let mode = self.spi_modes.entry(node).or_default().clone();
         let device = spi::Spi::open(&self.dev, node, config.mode, config.rate_hz, config.chip_select, mode)?;
         Ok(OnWorker { bus: format!("spi{}", node.bus), device: Box::new(device) })
+    }
+
+    fn i2c_buses(&self) -> Vec<Range> {
+        Vec::new()
+    }
+
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let detail = format!("there is no I2C bus {}: choose another", config.bus);
+        Err(Shutdown::because(reason::I2C_OPEN, detail))
     }
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {

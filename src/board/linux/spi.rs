@@ -158,7 +158,7 @@ impl BusDevice for Spi {
         let exchanged = self.select(true).and_then(|()| self.transfer(bytes));
         // After a failure too.
         let deselected = self.select(false);
-        exchanged.and(deselected).map_err(|detail| BusError { status: BusStatus::Failed, detail: detail.into() })
+        exchanged.and(deselected).map_err(|detail| BusError { status: BusStatus::Nack, detail: detail.into() })
     }
 }
 
@@ -261,7 +261,7 @@ mod tests {
             node_mode: Arc::new(AtomicU8::new(0)),
         };
         let error = spi.exchange(&mut [1, 2]).err().unwrap();
-        assert_eq!(error.status, BusStatus::Failed);
+        assert_eq!(error.status, BusStatus::Nack);
         assert!(error.detail.contains("/dev/spidev0.0 failed to transfer 2 bytes"), "{error:?}");
         assert_eq!(*line.0.lock().unwrap(), [false, true]);
     }

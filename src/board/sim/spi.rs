@@ -91,7 +91,7 @@ impl Trace {
         line.push('\n');
         // In one write, so that a reader never sees half a line.
         self.file.write_all(line.as_bytes()).map_err(|error| BusError {
-            status: BusStatus::Failed,
+            status: BusStatus::Nack,
             detail: format!("{} can not be written: {error}: choose another trace_file", self.path.display()).into(),
         })
     }
@@ -189,7 +189,7 @@ impl SpiDevice {
     fn select(&self, selected: bool) -> Result<(), BusError> {
         let chip_select = self.chip_select.as_ref();
         let driven = chip_select.map_or(Ok(()), |chip_select| chip_select.select(selected));
-        driven.map_err(|failure| BusError { status: BusStatus::Failed, detail: failure.detail })
+        driven.map_err(|failure| BusError { status: BusStatus::Nack, detail: failure.detail })
     }
 }
 
