@@ -40,7 +40,7 @@ pub struct Inventory {
     /// For the log: each thing that is there and can not be used, with its cause and remedy.
     pub problems: Vec<String>,
     /// libiio's view of this machine; none without IIO devices.
-    context: Option<Context>,
+    pub(crate) context: Option<Context>,
 }
 
 impl Inventory {

@@ -273,7 +273,7 @@ mod tests {
         IioDevice { number, name: name.into(), label: None, channels: ids.iter().map(channel).collect() }
     }
 
-    fn names(chips: Vec<Chip>, adcs: Vec<Adc>) -> Vec<(String, u32)> {
+    fn names(chips: Vec<Chip>, adcs: Vec<IioDevice>) -> Vec<(String, u32)> {
         let inventory = Inventory { chips, adcs, ..Inventory::default() };
         Names::of(&inventory).0
     }
