@@ -45,10 +45,10 @@ impl Range {
     }
 }
 
-/// An input's resistor.
+/// The resistor that the chip puts on an input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bias {
-    /// As the line is wired.
+    /// None: the level is what the wiring makes it.
     None,
     /// To the supply.
     PullUp,
@@ -56,33 +56,47 @@ pub enum Bias {
     PullDown,
 }
 
-/// What a GPIO line is claimed as.
+/// Whether a claimed GPIO line is an output or an input, and how it is set up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
-    /// It drives.
+    /// The line is driven.
     Output {
-        /// The level from the first moment on.
+        /// The level that it is driven to as it becomes an output.
         level: bool,
-        /// Where the line belongs when the machine stops or the program dies.
+        /// The level that it is driven to when the machine stops or the program dies.
         shutdown_level: bool,
     },
-    /// It is read; a resistor that can not be had is an error.
+    /// The line is read. A resistor that the chip does not have is an error.
     Input(Bias),
 }
 
-/// A claimed GPIO line. Whoever shares it, core or worker, has a handle of the same line.
+/// A claimed GPIO line. The objects and workers that share a line all hold this one value.
 ///
-/// Calls must not allocate or log. They must not block either, unless the board said that the
-/// line [sleeps](ClaimedLine::sleeps_on): then only a worker calls them.
+/// No call may allocate or log. Nor may one block, unless the board said that the line
+/// [sleeps](ClaimedLine::sleeps_on): then only a worker calls it.
 pub trait Line: Send + Sync {
-    /// Drives an output. On a line that was made an input since, it does nothing.
+    /// Drives an output to a level; `true` is high. A line that another user has made an input
+    /// since is left as it is.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
     fn write(&self, level: bool) -> Result<(), Shutdown>;
 
-    /// The line's level.
+    /// The line's level; `true` is high.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed".
     fn read(&self) -> Result<bool, Shutdown>;
 
-    /// Makes it an output or an input, for all who share it: the last use decides, as in the
-    /// firmware, where a line that is set up again loses its earlier set-up.
+    /// Makes the line an output or an input for all who share it. As in the firmware, the last
+    /// set-up of a line replaces the ones before.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open out GPIO chip line" or "Unable to open in GPIO chip line", and on the
+    /// simulated printer "Not an output pin" or "Not an input pin".
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
 }
 
@@ -90,29 +104,43 @@ pub trait Line: Send + Sync {
 pub struct ClaimedLine {
     /// The line.
     pub line: Arc<dyn Line>,
-    /// The name of its chip's worker, if calls to this chip may take their time (an expander
-    /// behind I2C, SPI or USB): the core itself must not call it.
+    /// The name of the worker of the line's chip, if calls to that chip may block, as it is an
+    /// expander on I2C, SPI or USB. The core must not call such a line.
     pub sleeps_on: Option<String>,
 }
 
 /// An ADC channel.
 pub trait Adc: Send {
-    /// One reading in counts of 0 to [`ADC_MAX`].
+    /// One reading in counts of 0 to [`ADC_MAX`]. May block.
+    ///
+    /// # Errors
+    ///
+    /// "Error on analog read".
     fn read(&mut self) -> Result<u16, Shutdown>;
 }
 
-/// A hardware PWM channel.
+/// A hardware PWM channel. Its calls may block.
 pub trait Pwm: Send {
-    /// Sets the share of the period that the output is on: 0 to [`PWM_MAX`].
+    /// Sets for how much of each period the output is on: 0 to [`PWM_MAX`].
+    ///
+    /// # Errors
+    ///
+    /// "PWM write failed".
     fn set(&mut self, value: u16) -> Result<(), Shutdown>;
 
-    /// Sets period and share anew.
+    /// Sets a new period, and for how much of it the output is on: 0 to [`PWM_MAX`]. The output
+    /// stays as it is set here when the machine stops or the program dies.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to config pwm device", "PWM write failed", "Guardian process lost".
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown>;
 }
 
 /// How a bus answered, in the words of the dictionary's `i2c_bus_status`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BusStatus {
+<<<<<<< HEAD
     /// The chip did not acknowledge a byte, or the driver failed in another way than these; SPI has
     /// no other status.
     Nack,
@@ -122,18 +150,22 @@ pub enum BusStatus {
     StartNack,
     /// No chip acknowledged the address when it was addressed again to be read from.
     StartReadNack,
+=======
+    /// The transfer failed. SPI has no other status.
+    Failed,
+>>>>>>> link
 }
 
-/// A conversation that failed: what the bus said, and for the log which device, why, and what
-/// to do.
+/// Why a conversation with a chip failed.
 #[derive(Debug, PartialEq)]
 pub struct BusError {
-    /// How the bus answered.
+    /// How the bus answered, for the wire.
     pub status: BusStatus,
-    /// Subject, cause and remedy.
+    /// Which device failed, why, and what to do about it, for the log.
     pub detail: Box<str>,
 }
 
+<<<<<<< HEAD
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
 ///
 /// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
@@ -165,27 +197,37 @@ impl BusError {
         let detail = format!("{wanted} was asked of {is}: a fault of the host's configuration; correct the bus");
         BusError { status: BusStatus::Nack, detail: detail.into() }
     }
+=======
+/// One chip on its bus. A worker uses it, for one conversation at a time; calls may block.
+pub trait BusDevice: Send {
+    /// Sends bytes over SPI, and replaces each by the byte that came in at the same time.
+    ///
+    /// # Errors
+    ///
+    /// The transfer failed, or the chip could not be selected.
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError>;
+>>>>>>> link
 }
 
-/// Something whose calls may take their time, and the worker that makes them.
+/// A device whose calls may block, and the name of the worker that is to make them.
 pub struct OnWorker<T: ?Sized> {
-    /// Whatever shares a bus has its name in common, such as `spi0` or `iio:device1`: one
-    /// worker runs the conversations of a bus, one after the other.
+    /// The name of the worker, such as `spi0` or `iio:device1`. Devices on one bus carry the same
+    /// name, so that one worker makes all their calls, one after the other.
     pub bus: String,
-    /// The thing itself.
+    /// The device.
     pub device: Box<T>,
 }
 
-/// A hardware PWM output's parameters; values are of a full scale of [`PWM_MAX`].
+/// A hardware PWM output's parameters. Both values are 0 (off) to [`PWM_MAX`] (on all the time).
 #[derive(Clone, Copy, Debug)]
 pub struct PwmConfig {
     /// The channel.
     pub pin: Pin,
     /// The period.
     pub cycle: Ticks,
-    /// The first value.
+    /// The value from the beginning.
     pub value: u16,
-    /// Where the output belongs if the program dies.
+    /// The value that the output is set to if the program dies.
     pub shutdown_value: u16,
 }
 
@@ -195,12 +237,13 @@ pub struct SpiConfig {
     pub bus: u32,
     /// 0 to 3: clock polarity in bit 1, clock phase in bit 0.
     pub mode: u8,
-    /// Clock rate.
+    /// The bus's clock rate while it speaks to this chip.
     pub rate_hz: u32,
-    /// A line of our own that selects the chip.
+    /// The GPIO line that selects the chip; none if the bus's controller selects it, or nothing.
     pub chip_select: Option<ChipSelect>,
 }
 
+<<<<<<< HEAD
 /// An I2C device's parameters.
 #[derive(Clone, Copy, Debug)]
 pub struct I2cConfig {
@@ -213,24 +256,31 @@ pub struct I2cConfig {
 }
 
 /// A line that selects a chip.
+=======
+/// A GPIO line that selects a chip.
+>>>>>>> link
 pub struct ChipSelect {
-    /// The line, at its idle level.
+    /// The line, an output.
     pub line: Arc<dyn Line>,
-    /// Whether the chip is selected by a high level.
+    /// Whether a high level selects the chip, rather than a low one.
     pub active_high: bool,
 }
 
 impl ChipSelect {
-    /// Drives the line to its selected or idle level.
+    /// Drives the line so that the chip is selected, or not.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
     pub fn select(&self, selected: bool) -> Result<(), Shutdown> {
         self.line.write(selected == self.active_high)
     }
 }
 
-/// A computer with pins. Errors carry the firmware's shutdown reason, and the cause, the thing
-/// and the remedy for the log.
+/// A computer with pins. Opening and claiming may block and allocate, so the machine does so only
+/// until `finalize_config`.
 pub trait Board: Send {
-    /// One line for the log: what it is and how many pins it has.
+    /// One line for the log: what the board is and what it has.
     fn describe(&self) -> String;
 
     /// The names of the dictionary's enumeration `pin`.
@@ -239,20 +289,35 @@ pub trait Board: Send {
     /// The names of the dictionary's enumeration `spi_bus`.
     fn spi_buses(&self) -> Vec<Range>;
 
-    /// The one number that stands for the line of a pin, where several may.
+    /// One and the same number for all the pins that lead to one line.
     fn canonical(&self, pin: Pin) -> Pin {
         pin
     }
 
-    /// Claims a line that is not claimed yet.
+    /// Claims a line that nobody has claimed yet.
+    ///
+    /// # Errors
+    ///
+    /// "Not an output pin", "Not an input pin", "GPIO chip device not found", "Unable to open GPIO
+    /// chip device", "Unable to open out GPIO chip line", "Unable to open in GPIO chip line",
+    /// "Guardian process lost".
     fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown>;
 
     /// Opens an ADC channel.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open adc device".
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown>;
 
     /// Opens an SPI device.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open spi device", "Unable to set SPI speed", "Unable to set SPI mode".
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
 
+<<<<<<< HEAD
     /// The names of the dictionary's enumeration `i2c_bus`.
     fn i2c_buses(&self) -> Vec<Range>;
 
@@ -260,14 +325,21 @@ pub trait Board: Send {
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
 
     /// Opens a hardware PWM channel.
+=======
+    /// Opens a hardware PWM channel and sets its first value.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to config pwm device", "Guardian process lost".
+>>>>>>> link
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;
 
-    /// How late a step may be before the machine stops: a motor that is stepped late loses its
-    /// place. 1 ms, as in the firmware.
+    /// How late a step may be before the machine stops, as a motor that is stepped too late loses
+    /// steps. 1 ms, as in the firmware.
     fn step_late_limit(&self) -> Ticks {
         Ticks::from_us(1000)
     }
 
-    /// Forgets every claim. The machine has dropped what it was given.
+    /// Forgets all claims. The machine has dropped the lines and devices before.
     fn reset(&mut self);
 }

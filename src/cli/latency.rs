@@ -224,9 +224,13 @@ const PANEL: f64 = 190.0;
 const LEFT: f64 = 50.0;
 const RIGHT: f64 = 50.0;
 
-/// Both halves as histograms over a logarithmic axis from 0.02 us to 100 ms.
+/// Where a lateness stands on the horizontal axis, which is logarithmic from 0.02 us to 100 ms.
+fn place(late_us: f64) -> f64 {
+    LEFT + (late_us.max(0.02) / 0.02).log10() / 6.7 * (WIDTH - LEFT - RIGHT)
+}
+
+/// Both halves as histograms, one above the other.
 fn draw(halves: &[Half; 2], fitness: Fitness) -> String {
-    let x = |late_us: f64| LEFT + (late_us.max(0.02) / 0.02).log10() / 6.7 * (WIDTH - LEFT - RIGHT);
     let height = 40.0 + 2.0 * PANEL;
     let mut svg = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{WIDTH}\" height=\"{height}\" font-family=\"sans-serif\" font-size=\"12\">\n\
@@ -251,41 +255,51 @@ fn draw(halves: &[Half; 2], fitness: Fitness) -> String {
                 LEFT + 90.0,
                 top + 12.0 + line
             );
-            let most = lateness.buckets().map(|(_, count)| count).max().unwrap_or(1) as f64;
-            let mut before = 0.0;
-            for (upper, count) in lateness.buckets() {
-                // Logarithmic in the count too: one late event in ten thousand is to be seen.
-                let tall = (count as f64 + 1.0).ln() / (most + 1.0).ln() * (PANEL - 90.0);
-                let (from, to) = (x((us(upper) * 8.0 / 9.0).max(before)), x(us(upper)));
-                before = us(upper);
-                let _ = writeln!(
-                    svg,
-                    "<rect x=\"{from:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{tall:.1}\" fill=\"{color}\" fill-opacity=\"0.7\"/>",
-                    base - tall,
-                    (to - from).max(2.0)
-                );
-            }
+            draw_bars(&mut svg, lateness, color, base);
         }
-        let _ = writeln!(svg, "<path d=\"M{LEFT} {base}H{}\" stroke=\"#444444\"/>", WIDTH - RIGHT);
-        for (late_us, label) in [
-            (0.1, "0.1 us"),
-            (1.0, "1 us"),
-            (10.0, "10 us"),
-            (100.0, "100 us"),
-            (1e3, "1 ms"),
-            (1e4, "10 ms"),
-            (1e5, "100 ms"),
-        ] {
-            let _ = writeln!(
-                svg,
-                "<path d=\"M{0:.1} {base}v4\" stroke=\"#444444\"/><text x=\"{0:.1}\" y=\"{1:.0}\" text-anchor=\"middle\">{label}</text>",
-                x(late_us),
-                base + 17.0
-            );
-        }
+        draw_scale(&mut svg, base);
     }
     svg.push_str("</svg>\n");
     svg
+}
+
+/// One distribution as bars that stand on `base`.
+fn draw_bars(svg: &mut String, lateness: &Lateness, color: &str, base: f64) {
+    let most = lateness.buckets().map(|(_, count)| count).max().unwrap_or(1) as f64;
+    let mut before = 0.0;
+    for (upper, count) in lateness.buckets() {
+        // The height is logarithmic, too, so that one late event in ten thousand can be seen.
+        let tall = (count as f64 + 1.0).ln() / (most + 1.0).ln() * (PANEL - 90.0);
+        let (from, to) = (place((us(upper) * 8.0 / 9.0).max(before)), place(us(upper)));
+        before = us(upper);
+        let _ = writeln!(
+            svg,
+            "<rect x=\"{from:.1}\" y=\"{:.1}\" width=\"{:.1}\" height=\"{tall:.1}\" fill=\"{color}\" fill-opacity=\"0.7\"/>",
+            base - tall,
+            (to - from).max(2.0)
+        );
+    }
+}
+
+/// The horizontal axis with its labels.
+fn draw_scale(svg: &mut String, base: f64) {
+    let _ = writeln!(svg, "<path d=\"M{LEFT} {base}H{}\" stroke=\"#444444\"/>", WIDTH - RIGHT);
+    for (late_us, label) in [
+        (0.1, "0.1 us"),
+        (1.0, "1 us"),
+        (10.0, "10 us"),
+        (100.0, "100 us"),
+        (1e3, "1 ms"),
+        (1e4, "10 ms"),
+        (1e5, "100 ms"),
+    ] {
+        let _ = writeln!(
+            svg,
+            "<path d=\"M{0:.1} {base}v4\" stroke=\"#444444\"/><text x=\"{0:.1}\" y=\"{1:.0}\" text-anchor=\"middle\">{label}</text>",
+            place(late_us),
+            base + 17.0
+        );
+    }
 }
 
 #[cfg(test)]

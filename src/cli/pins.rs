@@ -9,7 +9,7 @@ use std::process::ExitCode;
 use clap::Args;
 
 use crate::board::linux::Inventory;
-use crate::board::linux::adc::Adc;
+use crate::board::linux::adc::IioDevice;
 use crate::board::linux::gpio::{Chip, LineInfo};
 use crate::board::linux::pins::{Names, channel_number, line_number};
 use crate::board::linux::spi::Node;
@@ -160,7 +160,7 @@ fn cut(text: &str) -> String {
     }
 }
 
-fn adc_section(adc: &Adc, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> String) -> String {
+fn adc_section(adc: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> String) -> String {
     let mut rows = Vec::new();
     for (position, channel) in adc.channels.iter().enumerate() {
         let number = channel_number(adc.number, position, &channel.id);
@@ -222,7 +222,7 @@ mod tests {
                     line("SPI_CE1_N", Some("spi0 CS1"), true),
                 ],
             }],
-            adcs: vec![Adc {
+            adcs: vec![IioDevice {
                 number: 0,
                 name: "ads1115".into(),
                 label: None,

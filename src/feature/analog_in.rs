@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Analog inputs: oversampling, range check, reports of several readings.
 //!
-//! A reading may take its time on a worker. The samples keep their places in time as long as
-//! the ADC keeps up; a slow one loses samples, never steps.
+//! A worker takes the readings, as each may block for a while. If the ADC is slower than the host
+//! wants, samples are left out; timers and steps do not wait for it.
 
 #![forbid(unsafe_code)]
 
@@ -36,11 +36,11 @@ response! {
     pub(super) struct State<'a> { oid: Oid, next_clock: Clock, values: &'a [u8] }
 }
 
-/// Bytes of readings that a report holds.
+/// How many bytes of readings a report holds at most.
 const REPORT_BYTES: usize = 48;
 const SAMPLE_BYTES: usize = 2;
 
-/// One reading of a channel: there is one box for each input.
+/// One reading of a channel. Each input has one box of these, which is used again and again.
 struct Reading {
     adc: Box<dyn Adc>,
     counts: Result<u16, Shutdown>,
@@ -54,9 +54,9 @@ impl Errand for Reading {
 
 struct AnalogIn {
     worker: WorkerId,
-    /// Here while the ADC is not being read.
+    /// None while the ADC is being read: then the worker has the box.
     reading: Option<Box<Reading>>,
-    /// Whether a sample is due while the ADC is still busy with one of an earlier query.
+    /// Whether a sample waits until the ADC is done with one of an earlier query.
     waiting: bool,
     sample_ticks: Ticks,
     sample_count: u8,
@@ -65,17 +65,19 @@ struct AnalogIn {
     max_value: u16,
     range_check_count: u8,
     bytes_per_report: u8,
-    /// The next first sample.
+    /// When the first sample of the next sum is due.
     next_begin: Clock,
-    /// The sample under way.
+    /// When the present sample was due.
     sample_at: Clock,
+    /// How many samples the present sum has.
     taken: u8,
-    /// Wraps as the firmware's does.
+    /// The sum of the samples. It wraps around, as the firmware's does.
     sum: u16,
     invalid_count: u8,
     report: [u8; REPORT_BYTES],
     report_len: usize,
-    /// Tells answers to an earlier query.
+    /// Changes with every [`AnalogIn::restart`]: a reading with another tag was begun before it, and
+    /// does not count.
     tag: u8,
 }
 
@@ -87,7 +89,7 @@ impl AnalogIn {
         self.tag = self.tag.wrapping_add(1);
     }
 
-    /// Has the ADC read, as soon as it is free.
+    /// Has the worker read the ADC, or remembers to once the reading under way is back.
     fn sample(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
         match self.reading.take() {
             Some(reading) => mcu.dispatch(self.worker, Ticket { oid, tag: self.tag }, reading),
@@ -98,7 +100,8 @@ impl AnalogIn {
         }
     }
 
-    /// The first sample after `self.next_begin`, past the ones that the ADC was too slow for.
+    /// Moves `next_begin` on by `rest_ticks`, or by as many of them as it takes to lie in the future:
+    /// what was due before is left out, as the ADC was too slow for it.
     fn skip_missed(&mut self, now: Clock) {
         self.next_begin = self.next_begin + self.rest_ticks;
         let behind = now.since(self.next_begin);
@@ -106,7 +109,7 @@ impl AnalogIn {
             return;
         }
         self.next_begin = match u64::from(self.rest_ticks.0) {
-            // As fast as the ADC reads: nothing is missed.
+            // Without a pause the next sum just begins now.
             0 => now,
             rest => Clock::from_ticks(self.next_begin.ticks() + (behind as u64 / rest + 1) * rest),
         };
@@ -167,7 +170,7 @@ impl Object for AnalogIn {
         let counts = match counts {
             Ok(counts) => counts,
             Err(failure) => {
-                // A stopped machine goes on with the next reading.
+                // In a stopped machine this sum is given up, and the next one begins in its turn.
                 mcu.try_shut_down(failure)?;
                 self.restart();
                 self.skip_missed(mcu.now());
@@ -191,13 +194,14 @@ impl Object for AnalogIn {
     }
 
     fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
-        // What is under way counts no more.
+        // A reading that is under way does not count any more.
         self.restart();
-        // Readings without rest would keep a stopped machine busy for ever.
+        // Without a pause between sums a stopped machine would be busy with them for ever.
         if self.sample_count == 0 || self.rest_ticks == Ticks(0) {
             return;
         }
-        // The host sees temperatures of a stopped machine too.
+        // Sampling goes on, as in the firmware, so that the host sees the temperatures of a stopped
+        // machine, too.
         self.skip_missed(mcu.now());
         mcu.go_on(TimerId::new(oid, 0), self.next_begin);
     }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Digital outputs: queued changes, software PWM, and a limit to how long the host may be
-//! silent while the output is not at its shutdown value.
+//! Digital outputs: queued changes, software PWM, and `max_duration`, a limit to how long an output
+//! may stay at another than its shutdown value without news from the host.
 
 #![forbid(unsafe_code)]
 
@@ -36,9 +36,9 @@ struct Move {
     on_ticks: Ticks,
 }
 
-/// What the timer does next.
+/// What the output's timer does when it runs next.
 enum Phase {
-    /// Loads the next move.
+    /// Applies the next change of the queue.
     Load,
     /// Toggles the pin.
     Toggle,
@@ -53,14 +53,14 @@ struct DigitalOut {
     cycle: Ticks,
     queue: MoveQueue<Move>,
     phase: Phase,
-    /// Whether the pin is being pulsed.
+    /// Whether software PWM pulses the pin.
     toggling: bool,
     on: bool,
     on_ticks: Ticks,
     off_ticks: Ticks,
-    /// When the timer runs next, while it runs.
+    /// When the timer runs next, if it is running.
     wake: Clock,
-    /// When the present state must end: the next move, or the limit of `max_duration`.
+    /// When the present state ends: at the next change, or when `max_duration` runs out.
     end: Option<Clock>,
 }
 
@@ -73,7 +73,7 @@ impl DigitalOut {
         Ticket { oid, tag: 0 }
     }
 
-    /// Applies the oldest move, due at `at`.
+    /// Applies the oldest change of the queue, which was due at `at`.
     fn load(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
         let Some(Move { on_ticks, .. }) = self.queue.pop(&mut mcu.moves) else {
             return Err(not_refreshed(MISSED_DIGITAL, self.max_duration));
@@ -106,7 +106,7 @@ impl DigitalOut {
         Ok(self.wake_at(Some(off_at)))
     }
 
-    /// Pulses the pin, due at `at`.
+    /// Makes the edge of a pulse, which was due at `at`.
     fn toggle(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
         self.line.toggle(mcu, Self::ticket(oid))?;
         self.on = !self.on;
@@ -141,7 +141,7 @@ impl DigitalOut {
         }
         self.end = Some(at);
         if self.toggling && self.wake < at {
-            // The pulses end in a load by themselves.
+            // `toggle` sees the new end and loads the change then.
             return Ok(());
         }
         mcu.cancel(Self::timer(oid));
@@ -204,23 +204,28 @@ impl Object for DigitalOut {
     }
 }
 
-/// The lines that `set_digital_out` drove. No object owns them; they keep their levels, at a
-/// shutdown too.
+/// The lines that `set_digital_out` has set. They belong to no object of the host, and keep their
+/// levels even when the machine stops.
 #[derive(Default)]
 struct SetLines(Vec<(Pin, OutputLine)>);
 
 impl SetLines {
-    /// Drives a line, and holds it from then on.
+    /// Drives a line, and keeps it claimed from then on.
     ///
-    /// The firmware takes this at any time, and so does this machine for a line that it holds.
-    /// To claim one opens files and waits for the guardian: that is refused after
-    /// `finalize_config`, as steps would wait with it. klippy sets its lines before.
+    /// In the firmware this works at any time. Here it does for a line that is claimed already. A new
+    /// one is refused after `finalize_config`: to claim it, the core would have to open files and wait
+    /// for the guardian, and steps would wait with it. klippy sets its lines before that.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open out GPIO chip line" for such a line, or the 257th; those of [`Mcu::output`];
+    /// "GPIO line write failed".
     fn set(&mut self, mcu: &mut Mcu, oid: Oid, pin: Pin, value: bool) -> Result<(), Shutdown> {
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
             Some(place) if mcu.is_finalized() => self.0[place].1.write(mcu, Ticket { oid, tag: place as u8 }, value),
             _ if mcu.is_finalized() => Err(set_too_late(mcu, reason::OUTPUT_LINE, "set_digital_out", pin)),
-            // Set up anew: where it belongs has changed, too.
+            // Claimed anew, so that the guardian learns the new level.
             Some(place) => {
                 self.0[place].1 = mcu.output(pin, value, value)?;
                 Ok(())

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Endstops: sample a pin, confirm, trigger a trsync.
+//! Endstops: a pin is sampled until it has a level several times in a row, then a trsync is triggered.
 
 #![forbid(unsafe_code)]
 
@@ -20,25 +20,23 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 response! {
-    /// Where the endstop stands.
+    /// The endstop's level, and whether the machine still samples it.
     "endstop_state oid=%c homing=%c next_clock=%u pin_value=%c"
     pub(super) struct State { oid: Oid, homing: bool, next_clock: Clock, pin_value: bool }
 }
 
 struct Endstop {
     pin: InputLine,
-    /// What the host asked for last; a trigger leaves it, so that it can ask when it came.
+    /// The last `endstop_home`. It stays after the trigger, so that `endstop_query_state` can still
+    /// tell when that came.
     homing: Option<Homing>,
-    /// The search after the samples of the last match.
+    /// When sampling goes on if the samples after the last match do not confirm it.
     next_wake: Clock,
-    /// The sample that is due, while its chip's worker looks.
+    /// When the sample was due that the chip's worker is taking; none if it takes none.
     due: Option<Clock>,
-    /// Whether the host waits for that look, too, and with it the commands behind its query.
-    asked: Option<Held>,
+    /// A query waits for the worker's look at the line, too; `true` if further commands wait with it.
+    asked: Option<bool>,
 }
-
-/// Whether commands wait.
-type Held = bool;
 
 #[derive(Clone, Copy)]
 struct Homing {
@@ -48,7 +46,7 @@ struct Homing {
     pin_value: bool,
     trsync: Oid,
     trigger_reason: u8,
-    /// The matching samples still wanted; below `sample_count` while confirming.
+    /// How many matching samples are still wanted; fewer than `sample_count` while confirming.
     wanted: u8,
 }
 
@@ -57,7 +55,7 @@ impl Endstop {
         Ticket { oid, tag: 0 }
     }
 
-    /// Takes the sample that is due at `at`, now or as soon as the chip's worker has looked.
+    /// Takes the sample that is due at `at`, or has the chip's worker take it.
     fn sample(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
         match self.pin.read(mcu, Self::ticket(oid))? {
             Some(level) => self.judge(mcu, level, at),
@@ -68,7 +66,7 @@ impl Endstop {
         }
     }
 
-    /// Counts a sample of the instant `at`.
+    /// Decides by a sample, which was due at `at`, how to go on.
     fn judge(&mut self, mcu: &mut Mcu, level: bool, at: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(Next::Done) };
         let confirming = homing.wanted < homing.sample_count;
@@ -122,7 +120,7 @@ impl Object for Endstop {
             }
         }
         let Some(at) = self.due.take() else { return Ok(()) };
-        // A look that was under way before the sample was due says nothing of it.
+        // The worker may have looked for a query, before the sample was due: then it looks again.
         let next = if began < at { self.sample(mcu, oid, at)? } else { self.judge(mcu, level, at)? };
         if let Next::At(at) = next {
             let now = mcu.now();

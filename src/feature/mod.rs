@@ -17,7 +17,7 @@ mod spi;
 mod stepper;
 mod trsync;
 
-/// Every feature. What is not listed is not in the dictionary.
+/// Every feature. One that is not listed here does not get into the dictionary.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
     digital_out::FEATURE,
@@ -48,7 +48,7 @@ const fn response_index(format: &str) -> usize {
     panic!("the response is not listed by any feature")
 }
 
-/// An output with a `max_duration` got no change in time.
+/// The stop for an output whose `max_duration` ran out before the host changed it again.
 #[cold]
 fn not_refreshed(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     let ms = max_duration.0 / Ticks::from_us(1000).0;
@@ -58,14 +58,14 @@ fn not_refreshed(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     )
 }
 
-/// An output with a `max_duration` is to change after it only.
+/// The stop for an output whose next change is queued for later than its `max_duration` allows.
 #[cold]
 fn changes_too_late(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     let ms = max_duration.0 / Ticks::from_us(1000).0;
     Shutdown::by_host(reason, format_args!("its next change is scheduled later than its max_duration of {ms} ms"))
 }
 
-/// A pin is set without an object after `finalize_config`, and was not before.
+/// The stop for a `set_digital_out` or `set_pwm_out` that names a new pin after `finalize_config`.
 #[cold]
 fn set_too_late(mcu: &Mcu, reason: ShutdownReason, command: &str, pin: Pin) -> Shutdown {
     let name = mcu.name(pin);

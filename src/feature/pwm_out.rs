@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Hardware PWM outputs: queued values, and a limit to how long the host may be silent.
+//! Hardware PWM outputs: queued values, and `max_duration`, a limit to how long an output may stay at
+//! another than its shutdown value without news from the host.
 
 #![forbid(unsafe_code)]
 
@@ -30,10 +31,10 @@ shutdowns! {
 
 const KIND: &str = "PWM output";
 
-/// A channel on the worker of its chip.
+/// A PWM channel, as the worker of its chip has it.
 struct Channel(Box<dyn Pwm>);
 
-/// What a channel is set to: a value, and with `set_pwm_out` a new period as well.
+/// What a channel is set to: a value of 0 to [`PWM_MAX`], and by `set_pwm_out` a new period as well.
 #[derive(Clone, Copy)]
 struct Setting {
     value: u16,
@@ -51,8 +52,8 @@ impl Settable for Channel {
     }
 }
 
-/// Opens a channel. Several objects may have the same one, each with files of its own, as in the
-/// firmware.
+/// Opens a channel. As in the firmware, several objects may have the same one, each with files of its
+/// own.
 fn open(mcu: &mut Mcu, config: PwmConfig) -> Result<Remote<Channel>, Shutdown> {
     let OnWorker { bus, device } = mcu.board()?.pwm(config)?;
     let worker = mcu.worker(&bus)?;
@@ -69,7 +70,7 @@ struct PwmOut {
     default_value: u16,
     max_duration: Ticks,
     queue: MoveQueue<Move>,
-    /// When the host must have sent another value.
+    /// When the present value ends: the host must have queued another one by then.
     end: Option<Clock>,
 }
 
@@ -139,14 +140,14 @@ impl Object for PwmOut {
     }
 }
 
-/// The channels that `set_pwm_out` set. No object owns them; they keep their values, at a
-/// shutdown too.
+/// The channels that `set_pwm_out` has set. They belong to no object of the host, and keep their
+/// values even when the machine stops.
 #[derive(Default)]
 struct SetChannels(Vec<(Pin, Remote<Channel>)>);
 
 impl SetChannels {
-    /// Sets a channel, and holds it from then on. As with `set_digital_out` a channel that is
-    /// held may be set anew at any time; others are refused after `finalize_config`.
+    /// Sets a channel, and keeps it open from then on. As with `set_digital_out`, a channel that is
+    /// open may be set again at any time; a new one is refused after `finalize_config`.
     fn set(&mut self, mcu: &mut Mcu, oid: Oid, config: PwmConfig) -> Result<(), Shutdown> {
         let PwmConfig { pin, cycle, value, .. } = config;
         let known = self.0.iter().position(|(held, _)| *held == pin);

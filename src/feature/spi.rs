@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! SPI devices, with a chip select line of our own or without, and messages that they get at
-//! a shutdown.
+//! SPI devices, with or without a GPIO line that selects the chip, and the messages that they are
+//! sent at a shutdown.
 //!
-//! `spi_send` and `spi_transfer` are over, and answered, before the next command runs: displays
-//! set their D/C line by the commands around a `spi_send`, and klippy takes the acknowledgement of
-//! a query for the end of the wait for its answer.
+//! A `spi_send` or `spi_transfer` is over, and answered, before the next command runs. klippy relies
+//! on that: for displays it sets the D/C line by the commands before and after a `spi_send`, and when
+//! the acknowledgement of a query arrives it does not wait for the answer any longer.
 
 #![forbid(unsafe_code)]
 
@@ -40,7 +40,7 @@ response! {
     pub(super) struct TransferResponse<'a> { oid: Oid, response: &'a [u8] }
 }
 
-/// Bytes to a device, and what came back; those of a message block fit.
+/// The bytes for a device, and afterwards those that came back. A message block's bytes fit.
 struct Transfer {
     bytes: [u8; PAYLOAD_MAX],
     len: usize,
@@ -71,13 +71,13 @@ impl Talk for Transfer {
 
 struct Spi {
     bus: Option<Bus>,
-    /// Before the bus is known; then the worker drives it.
+    /// Kept here until the bus is set; from then on the device on the worker has it.
     chip_select: Option<ChipSelect>,
-    /// Here while no command's transfer is under way.
+    /// None while a transfer is under way: then the worker has the box.
     transfer: Option<Box<Conversation<Transfer>>>,
 }
 
-// What a transfer is for.
+// The tags of transfers: for `spi_send`, without an answer, and for `spi_transfer`.
 const SEND: u8 = 0;
 const TRANSFER: u8 = 1;
 
@@ -93,7 +93,8 @@ impl Spi {
         if self.bus.is_some() {
             return Err(invalid("it has a bus already"));
         }
-        // The firmware would open it even then; here steps would wait for the files.
+        // The firmware opens it even after that. Here the core would have to wait for the files, and
+        // steps with it.
         if mcu.is_finalized() {
             return Err(invalid("it gets a bus after finalize_config"));
         }
@@ -109,7 +110,7 @@ impl Spi {
             answer(mcu, oid, tag, data);
             return Ok(());
         };
-        // Commands wait for each other, so it is here.
+        // The box is here, as no command runs while another one's transfer is under way.
         let Some(mut transfer) = self.transfer.take() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
         };
@@ -156,10 +157,10 @@ impl Object for Spi {
     }
 }
 
-/// What a device is told at a shutdown.
+/// The message that a device is sent at a shutdown.
 struct SpiShutdown {
     spi: Oid,
-    /// Here while it is not on its way.
+    /// None while the message is on its way: then the worker has the box.
     message: Option<Box<Conversation<Transfer>>>,
     bytes: Box<[u8]>,
 }

@@ -21,7 +21,7 @@ shutdowns! {
 }
 
 response! {
-    /// Whether the trigger may still come, or why it came.
+    /// Whether the trigger was not pulled yet, and if it was, why.
     "trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u"
     pub(super) struct State { oid: Oid, can_trigger: bool, trigger_reason: u8, clock: Clock }
 }
@@ -35,14 +35,16 @@ pub(super) struct Trsync {
     signals: Vec<Oid>,
 }
 
-/// No object waits for two triggers, so this many signals never allocate.
+/// There are no more objects than this, and none waits for two triggers: so this much room, made at
+/// configuration, is always enough.
 const SIGNALS_MAX: usize = 256;
 
 const REPORT: u8 = 0;
 const EXPIRE: u8 = 1;
 
 impl Trsync {
-    /// Pulls the trigger: every object that waits for it is told, and the host.
+    /// Pulls the trigger, unless it was pulled before: tells every object that waits for it, and the
+    /// host.
     pub(super) fn trigger(&mut self, mcu: &mut Mcu, oid: Oid, reason: u8) -> Result<(), Shutdown> {
         if self.pull(mcu, reason)? {
             self.report(mcu, oid);
@@ -50,7 +52,7 @@ impl Trsync {
         Ok(())
     }
 
-    /// Pulls the trigger, if it was not pulled before.
+    /// Pulls the trigger without telling the host. False if it was pulled before.
     fn pull(&mut self, mcu: &mut Mcu, reason: u8) -> Result<bool, Shutdown> {
         let pulled = std::mem::take(&mut self.can_trigger);
         if pulled {
@@ -67,7 +69,11 @@ impl Trsync {
         mcu.send(State { oid, can_trigger: self.can_trigger, trigger_reason: self.trigger_reason, clock });
     }
 
-    /// Lets an object wait for the trigger.
+    /// Adds an object to those that are told of the trigger.
+    ///
+    /// # Errors
+    ///
+    /// "Can't add signal that is already active" if it waits for one already, "Invalid oid type".
     pub(super) fn add_signal(mcu: &mut Mcu, trsync: Oid, waiting: Oid) -> Result<(), Shutdown> {
         if mcu.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
             return Err(Shutdown::by_host(
@@ -157,7 +163,8 @@ const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", |mcu
         mcu.cancel(TimerId::new(oid, REPORT));
         mcu.cancel(TimerId::new(oid, EXPIRE));
         let trigger_reason = trsync.trigger_reason;
-        // The host asked, it need not be told when: clock 0, as in the firmware.
+        // The host itself pulled the trigger and does not need to know when: the clock is 0, as in the
+        // firmware.
         mcu.send(State { oid, can_trigger: false, trigger_reason, clock: Clock::EPOCH });
         Ok(())
     })

@@ -372,14 +372,31 @@ impl<'a> Axis<'a> {
         let second = self.approach(client, queue, far, speed * SECOND_SPEED, &mut trace)?;
         let sights = trace.sights;
 
+        let (passed, seen) = self.judge(from, first, released, second);
+        report.check(progress, format!("{} homed", plan.name), passed, seen);
+
+        let frequency_hz = client.frequency_hz();
+        let at = |clock: Clock| clock.since(start) as f64 / frequency_hz;
+        let triggers = [first.trigger, second.trigger];
+        report.axes.push(AxisReport {
+            name: plan.name.clone(),
+            samples: samples(&sights, second.position, plan.steps_per_mm, at),
+            triggers_s: triggers.into_iter().flatten().map(at).collect(),
+        });
+        Ok(())
+    }
+
+    /// Whether both approaches, the first begun at position `from`, ended at the endstop and at the
+    /// same place, and what was seen. `released` tells whether the endstop opened in between.
+    fn judge(&self, from: i64, first: Homed, released: bool, second: Homed) -> (bool, String) {
         let went = (first.position - from).abs();
         let slack = i64::from(first.slack_steps);
         let apart = (second.position - first.position).abs();
         let mut passed = first.reason == Reason::Endstop && second.reason == Reason::Endstop && released;
         passed &= apart <= slack;
         let mut seen = format!("endstop after {went} steps");
-        if let Some(start_mm) = plan.start_mm {
-            let expected = (start_mm * plan.steps_per_mm).round() as i64;
+        if let Some(start_mm) = self.plan.start_mm {
+            let expected = (start_mm * self.plan.steps_per_mm).round() as i64;
             passed &= (went - expected).abs() <= slack;
             seen += &format!(" ({expected} expected)");
         }
@@ -392,17 +409,7 @@ impl<'a> Axis<'a> {
         if !released {
             seen += "; the endstop stayed triggered when the axis went back";
         }
-        report.check(progress, format!("{} homed", plan.name), passed, seen);
-
-        let frequency_hz = client.frequency_hz();
-        let at = |clock: Clock| clock.since(start) as f64 / frequency_hz;
-        let triggers = [first.trigger, second.trigger];
-        report.axes.push(AxisReport {
-            name: plan.name.clone(),
-            samples: samples(&sights, second.position, plan.steps_per_mm, at),
-            triggers_s: triggers.into_iter().flatten().map(at).collect(),
-        });
-        Ok(())
+        (passed, seen)
     }
 
     fn approach(

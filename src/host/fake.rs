@@ -94,33 +94,49 @@ fn serve(
                 Some(Fault::Corrupt) => block[2] ^= 0x10,
                 _ => {}
             }
-            while !block.is_empty() {
-                let (taken, received) = receiver.next(&block);
-                match received {
-                    Received::Nothing => break,
-                    Received::Skip => {}
-                    Received::Nak => acknowledge(receiver.expected(), &mut output),
-                    Received::Payload(payload) => {
-                        if !payload.is_empty() {
-                            taken_payloads.push(payload.to_vec());
-                        }
-                        for response in answer(payload) {
-                            frame(&response, receiver.expected(), &mut output);
-                        }
-                        if fault != Some(Fault::MuteAck) {
-                            acknowledge(receiver.expected(), &mut output);
-                        }
-                        if fault == Some(Fault::DoubleAck) {
-                            acknowledge(receiver.expected(), &mut output);
-                        }
-                    }
+            let acknowledgements = match fault {
+                Some(Fault::MuteAck) => 0,
+                Some(Fault::DoubleAck) => 2,
+                _ => 1,
+            };
+            receive(&mut receiver, block, acknowledgements, &mut output, |payload| {
+                if !payload.is_empty() {
+                    taken_payloads.push(payload.to_vec());
                 }
-                block.drain(..taken);
-            }
+                answer(payload)
+            });
         }
         if stream.write_all(&output).is_err() {
             return taken_payloads;
         }
+    }
+}
+
+/// Takes a block in as a micro-controller does: `answer` gives the responses to its payload, and each
+/// payload is acknowledged so many times.
+fn receive(
+    receiver: &mut Receiver,
+    mut block: Vec<u8>,
+    acknowledgements: usize,
+    output: &mut Vec<u8>,
+    mut answer: impl FnMut(&[u8]) -> Vec<Vec<u8>>,
+) {
+    while !block.is_empty() {
+        let (taken, received) = receiver.next(&block);
+        match received {
+            Received::Nothing => break,
+            Received::Skip => {}
+            Received::Nak => acknowledge(receiver.expected(), output),
+            Received::Payload(payload) => {
+                for response in answer(payload) {
+                    frame(&response, receiver.expected(), output);
+                }
+                for _ in 0..acknowledgements {
+                    acknowledge(receiver.expected(), output);
+                }
+            }
+        }
+        block.drain(..taken);
     }
 }
 

@@ -258,6 +258,24 @@ impl Endstop {
         Ok(self.state(client)?.0)
     }
 
+    /// Has the micro-controller look at the pin from `start` on, each `rest_ticks`, and pull the
+    /// trigger once several samples in a row, `sample_ticks` apart, see it triggered.
+    fn search(&self, client: &mut Client, start: Clock, sample_ticks: u32, rest_ticks: u32) -> Result<(), Error> {
+        client.send(
+            "endstop_home",
+            &[
+                ("oid", self.oid.into()),
+                ("clock", start.into()),
+                ("sample_ticks", sample_ticks.into()),
+                ("sample_count", ENDSTOP_SAMPLES.into()),
+                ("rest_ticks", rest_ticks.into()),
+                ("pin_value", (!self.invert).into()),
+                ("trsync_oid", self.trsync.into()),
+                ("trigger_reason", Reason::Endstop.code().into()),
+            ],
+        )
+    }
+
     /// Whether it is triggered, and the clock of the sample after the one that ended homing.
     fn state(&self, client: &mut Client) -> Result<(bool, Clock), Error> {
         let args = [("oid", self.oid.into())];
@@ -376,31 +394,9 @@ impl MoveQueue {
         let report_ticks = expire_ticks * 3 / 10;
         let start = client.clock_in(LEAD_S)?;
         client.drain();
-        client.send(
-            "trsync_start",
-            &[
-                ("oid", trsync.into()),
-                ("report_clock", start.into()),
-                ("report_ticks", report_ticks.into()),
-                ("expire_reason", Reason::Silence.code().into()),
-            ],
-        )?;
-        client.send("stepper_stop_on_trigger", &[("oid", stepper.oid.into()), ("trsync_oid", trsync.into())])?;
         let mut expire = start.displaced(expire_ticks);
-        set_timeout(client, trsync, expire)?;
-        client.send(
-            "endstop_home",
-            &[
-                ("oid", endstop.oid.into()),
-                ("clock", start.into()),
-                ("sample_ticks", sample_ticks.into()),
-                ("sample_count", ENDSTOP_SAMPLES.into()),
-                ("rest_ticks", rest_ticks.into()),
-                ("pin_value", (!endstop.invert).into()),
-                ("trsync_oid", trsync.into()),
-                ("trigger_reason", Reason::Endstop.code().into()),
-            ],
-        )?;
+        arm(client, stepper, trsync, start, report_ticks, expire)?;
+        endstop.search(client, start, sample_ticks, rest_ticks)?;
         let mut moving = self.begin(client, stepper, positive, profile, start)?;
         let mut look_at = Instant::now();
         let mut watch = Some(Watch { endstop, seen });
@@ -528,6 +524,29 @@ impl MoveQueue {
 
 fn no_news() -> Error {
     Error::Timeout { waiting_for: "report `trsync_state` on homing".to_owned(), after: NEWS_TIMEOUT }
+}
+
+/// Starts a trsync that stops a stepper when it is triggered. It reports from `start` on, each
+/// `report_ticks`, and triggers by itself at `expire` unless that is set anew.
+fn arm(
+    client: &mut Client,
+    stepper: Stepper,
+    trsync: u8,
+    start: Clock,
+    report_ticks: u32,
+    expire: Clock,
+) -> Result<(), Error> {
+    client.send(
+        "trsync_start",
+        &[
+            ("oid", trsync.into()),
+            ("report_clock", start.into()),
+            ("report_ticks", report_ticks.into()),
+            ("expire_reason", Reason::Silence.code().into()),
+        ],
+    )?;
+    client.send("stepper_stop_on_trigger", &[("oid", stepper.oid.into()), ("trsync_oid", trsync.into())])?;
+    set_timeout(client, trsync, expire)
 }
 
 fn set_timeout(client: &mut Client, trsync: u8, clock: Clock) -> Result<(), Error> {

@@ -51,8 +51,8 @@ const RESPONSES: &[&str] = &[
     Pong::FORMAT,
 ];
 
-/// Bytes that the host may send ahead of an acknowledgement. Half of a pty's 4096-byte buffer:
-/// the host's bytes never wait for ours to be read.
+/// How many bytes the host may send before they are acknowledged: half of a pty's buffer of 4096
+/// bytes, so that all of them fit in it, and the host never blocks in its write.
 const RECEIVE_WINDOW: u32 = 2048;
 
 pub(super) const fn response_index(format: &str) -> usize {
@@ -77,17 +77,17 @@ response! {
     pub struct ClockResponse { clock: Clock }
 }
 response! {
-    /// The present instant, 64 bits of it.
+    /// The present instant as 64 bits.
     "uptime high=%u clock=%u"
     pub struct Uptime { high: u32, clock: Clock }
 }
 response! {
-    /// Whether the machine is configured, and as what.
+    /// Whether the machine is configured, and the check sum that the host gave its configuration.
     "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
     pub struct Config { is_config: bool, crc: u32, is_shutdown: bool, move_count: u16 }
 }
 response! {
-    /// The machine was just made.
+    /// The machine has started and waits for its configuration.
     "starting"
     pub struct Starting {}
 }
@@ -112,9 +112,10 @@ response! {
     pub struct Pong<'a> { data: &'a [u8] }
 }
 
-/// The piece of the dictionary that `identify` asks for, or as much of it as fits a block.
+/// The answer to `identify`: `count` bytes of the compressed dictionary from `offset` on, or as many
+/// of them as there are and fit a block.
 pub fn identify_response(dictionary: &[u8], offset: u32, count: u8) -> IdentifyResponse<'_> {
-    // A block's payload less the id, the offset (up to five bytes) and the length.
+    // Besides the data, the payload has the id (1 byte), the offset (up to 5) and the length (1).
     let count = usize::from(count).min(crate::wire::block::PAYLOAD_MAX - 7);
     let start = (offset as usize).min(dictionary.len());
     let end = (start + count).min(dictionary.len());
@@ -162,7 +163,7 @@ const CONFIG_RESET: Command = command!("config_reset", |mcu| mcu.reset()).allowe
 
 pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(emergency())).allowed_in_shutdown();
 
-/// What `emergency_stop` stops the machine with.
+/// The stop that `emergency_stop` asks for.
 pub fn emergency() -> Shutdown {
     Shutdown::because(
         reason::COMMAND_REQUEST,

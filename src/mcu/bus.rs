@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Conversations with chips on a bus.
 //!
-//! An object that is a bus device (an SPI device, say) lends it: an object that talks to the chip
-//! names the device's oid at configuration and asks for it when it talks. klippy configures a
-//! sensor first and sets the bus of its device afterwards.
+//! An object such as an SPI device stands for a chip, and lends it to other objects. One that talks
+//! to the chip, such as a sensor, learns the oid of the SPI device at configuration, but borrows the
+//! chip only as it talks: klippy configures the sensor before it sets the bus of the SPI device.
 
 #![forbid(unsafe_code)]
 
@@ -14,34 +14,38 @@ use crate::shutdown::Shutdown;
 
 use super::{Errand, Mcu, Oid, Ticket, WorkerId};
 
-/// A device that several conversations use in turn. They all run on the worker of its bus, so
-/// nobody ever waits for the lock, and the core never takes it.
+/// A chip that several conversations use in turn. All of them run on the worker of its bus, one
+/// after the other, so the lock is always free. The core never takes it.
 type SharedDevice = Arc<Mutex<Box<dyn BusDevice>>>;
 
-/// A bus device and the worker of its bus.
+/// A chip and the worker of its bus.
 #[derive(Clone)]
 pub struct Bus {
     worker: WorkerId,
     device: SharedDevice,
 }
 
-/// What is said to a chip: plain code that runs on the worker.
+/// What is said to a chip: plain code that runs on the worker and may block there.
 pub trait Talk: Send + 'static {
-    /// Has the conversation, and keeps what came of it.
+    /// Has the conversation, and keeps what the chip answered.
+    ///
+    /// # Errors
+    ///
+    /// Those of the calls of `chip`.
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError>;
 }
 
-/// A conversation: what is said, and how it went.
+/// A conversation with a chip: an [`Errand`] that is made once and used again and again.
 pub struct Conversation<T> {
-    /// What is said, and what came of it.
+    /// What is said, and afterwards also what the chip answered.
     pub talk: T,
-    /// How it went.
+    /// Whether the last conversation succeeded.
     pub result: Result<(), BusError>,
     device: Option<SharedDevice>,
 }
 
 impl<T: Talk> Conversation<T> {
-    /// A conversation to be had with [`Mcu::converse`].
+    /// A conversation for [`Mcu::converse`]. It allocates: objects make theirs at configuration.
     pub fn new(talk: T) -> Box<Conversation<T>> {
         Box::new(Conversation { talk, result: Ok(()), device: None })
     }
@@ -56,15 +60,19 @@ impl<T: Talk> Errand for Conversation<T> {
 }
 
 impl Bus {
-    /// A device that lives on this worker.
+    /// A chip whose bus has this worker.
     pub fn new(worker: WorkerId, device: Box<dyn BusDevice>) -> Bus {
         Bus { worker, device: Arc::new(Mutex::new(device)) }
     }
 }
 
 impl Mcu {
-    /// Has a conversation with the device of object `device`; it comes back to
-    /// [`Object::returned`](super::Object::returned).
+    /// Sends a conversation to the chip that object `device` stands for. It comes back to
+    /// [`Object::returned`](super::Object::returned) of the ticket's object.
+    ///
+    /// # Errors
+    ///
+    /// "Invalid oid type" if the object stands for no chip, "Bus worker queue overflow".
     pub fn converse<T: Talk>(
         &mut self,
         device: Oid,
@@ -75,7 +83,11 @@ impl Mcu {
         self.converse_on(&bus, ticket, conversation)
     }
 
-    /// The same, for the device's own object.
+    /// The same, for the object that stands for the chip itself.
+    ///
+    /// # Errors
+    ///
+    /// "Bus worker queue overflow".
     pub fn converse_on<T: Talk>(
         &mut self,
         bus: &Bus,

@@ -12,14 +12,14 @@ use crate::wire::vlq::{Reader, Writer};
 use super::Mcu;
 
 impl From<Malformed> for Shutdown {
-    /// [`Mcu::execute`] says which command it was.
+    /// The detail is empty: [`Mcu::execute`] adds which command it was.
     #[cold]
     fn from(_: Malformed) -> Shutdown {
         Shutdown::because(reason::COMMAND_PARSER, "")
     }
 }
 
-/// Decodes a command's parameters and runs it.
+/// Decodes a command's parameters and runs the command. An error stops the machine.
 pub type Handler = fn(&mut Mcu, &mut Reader<'_>) -> Result<(), Shutdown>;
 
 /// A command that the host may send.
@@ -44,7 +44,7 @@ impl Command {
 pub trait Response {
     /// Name, parameters and their conversions.
     const FORMAT: &'static str;
-    /// Its place in the list of all responses, in the order of the features.
+    /// Its place in the list of the responses of all features.
     const INDEX: usize;
     /// Appends the parameters.
     fn encode(&self, writer: &mut Writer);
@@ -58,16 +58,16 @@ pub enum Constant {
     Text(&'static str),
 }
 
-/// An enumeration of the dictionary: its name, and the names that stand for values, which may be
-/// the board's.
+/// An enumeration of the dictionary. Its names may depend on the board.
 pub struct Enumeration {
     /// Such as `spi_bus`.
     pub name: &'static str,
-    /// Its names.
+    /// The names on this board, and the values that they stand for.
     pub values: fn(&dyn Board) -> Vec<Range>,
 }
 
-/// What a feature adds to the dictionary. To be filled up with [`Feature::EMPTY`].
+/// What a feature adds to the dictionary. Fields that a feature does not need come from
+/// [`Feature::EMPTY`].
 pub struct Feature {
     /// Its name.
     pub name: &'static str,

@@ -15,7 +15,7 @@ use crate::wire::vlq::Reader;
 
 use super::command::{Constant, Feature, Handler};
 
-/// A command as it is found by its id.
+/// What the machine knows of a command that came by its id.
 pub(super) struct Entry {
     pub(super) format: &'static str,
     pub(super) handler: Handler,
@@ -35,14 +35,14 @@ impl Entry {
 
 /// The messages that a host may exchange with the machine, by their ids.
 pub struct Dialect {
-    /// By id; ids are counted up from `identify`'s.
+    /// By id.
     commands: Vec<Option<Entry>>,
     /// By [`super::Response::INDEX`].
     response_ids: Vec<u32>,
     /// By their number in the enumeration `static_string_id`.
     shutdowns: Vec<ShutdownReason>,
-    /// What is published.
     dictionary: Dictionary,
+    /// The dictionary as `identify` serves it.
     compressed: Vec<u8>,
 }
 
@@ -111,7 +111,7 @@ impl Dialect {
         &self.dictionary
     }
 
-    /// The dictionary as `identify` serves it.
+    /// The dictionary, zlib-compressed JSON, as `identify` serves it.
     pub fn compressed(&self) -> &[u8] {
         &self.compressed
     }
@@ -123,7 +123,7 @@ impl Dialect {
 
     /// The number of a shutdown text.
     pub(super) fn static_string_id(&self, reason: ShutdownReason) -> u16 {
-        // Each is listed: `shutdowns!` makes the list along with the texts.
+        // Every reason is in the list, as `shutdowns!` makes the list along with the constants.
         self.shutdowns.iter().position(|listed| *listed == reason).unwrap_or(0) as u16
     }
 
@@ -132,10 +132,11 @@ impl Dialect {
         self.dictionary.commands.get(format)?.as_u64().map(|id| id as u32)
     }
 
-    /// Whether a block has the command with this id. A block that makes no sense is looked at up to
-    /// where it does not: there the machine stops.
+    /// Whether a block's payload has the command with this id. What follows an unknown command, or one
+    /// that is cut short, does not count, as the machine stops there.
     pub fn contains(&self, payload: &[u8], id: u32) -> bool {
-        // Nearly always the look for the number's last byte is enough.
+        // The last byte of the id's encoding must occur somewhere. It mostly does not, and then no
+        // command need be decoded.
         if !payload.contains(&(id as u8 & 0x7f)) {
             return false;
         }

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Work that may take its time: it travels to the worker of its bus as an [`Errand`], is done
-//! there, and comes back to the object that sent it.
+//! Work that may block: it travels to the worker of its bus as an [`Errand`], is done there, and
+//! comes back to the object that sent it.
 //!
-//! An errand carries everything that the work needs and what came of it, in a box that its
-//! object makes at configuration and uses again and again. So a request costs no allocation, may
-//! be of any size, and no object has more of them under way than it has boxes: a queue of a bus
-//! can not grow.
+//! An errand carries everything that the work needs, and afterwards its result, in a box that the
+//! object makes at configuration and uses again and again. So sending it does not allocate, it may be
+//! of any size, and no object has more errands under way than it has boxes, so that the queue of a bus
+//! can not grow beyond their number.
 //!
 //! **One order.** The firmware runs a command to its end before it looks at the next, and
 //! acknowledges a block after its last command; klippy relies on both. So an errand that a
@@ -25,9 +25,9 @@ use super::{HOLD_LIMIT, Mcu, Oid, TimerId};
 #[cfg(doc)]
 use super::Object;
 
-/// Work that may take its time.
+/// Work that may block.
 pub trait Errand: Any + Send {
-    /// Does it. Runs on a worker, and may block there.
+    /// Does the work, and keeps its result. Runs on a worker.
     fn run(&mut self);
 }
 
@@ -36,7 +36,7 @@ pub trait Errand: Any + Send {
 pub struct Ticket {
     /// The object that sent it.
     pub oid: Oid,
-    /// Whatever tells its errands apart.
+    /// A number by which the object tells its errands apart.
     pub tag: u8,
 }
 
@@ -50,34 +50,34 @@ pub struct Job {
     pub holds: bool,
 }
 
-/// An errand that is done.
+/// An errand that is done, on its way back from its worker.
 pub struct Completion {
     /// Whose it is.
     pub ticket: Ticket,
-    /// The work, with what came of it.
+    /// The work and its result.
     pub errand: Box<dyn Errand>,
     /// Whether commands wait for it.
     pub holds: bool,
-    /// When the worker took it up.
+    /// When the worker began the work.
     pub began: Clock,
-    /// When it was done.
+    /// When the worker had done it.
     pub ended: Clock,
 }
 
-/// An errand back at its object.
+/// An errand that is done, as its object gets it back.
 pub struct Done {
-    /// The number that the object gave it.
+    /// The tag of the object's [`Ticket`].
     pub tag: u8,
-    /// The work, with what came of it.
+    /// The work and its result.
     pub errand: Box<dyn Errand>,
-    /// When the worker took it up.
+    /// When the worker began the work.
     pub began: Clock,
-    /// When it was done.
+    /// When the worker had done it.
     pub ended: Clock,
 }
 
 impl Done {
-    /// The errand as what it was sent; none if it is another.
+    /// The errand as the type `T` that was sent; none if it is of another type.
     pub fn errand<T: Errand>(self) -> Option<Box<T>> {
         let any: Box<dyn Any> = self.errand;
         any.downcast().ok()
@@ -90,36 +90,53 @@ pub struct WorkerId(pub usize);
 
 /// Runs errands, those of one bus one after the other.
 pub trait Workers: Send {
-    /// The worker of a bus, which is started if it is the first thing on that bus.
+    /// The worker of a bus. It is started if the bus has none yet.
+    ///
+    /// # Errors
+    ///
+    /// "Bus worker queue overflow" if it can not be started.
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown>;
 
     /// Hands a job over, without waiting.
+    ///
+    /// # Errors
+    ///
+    /// "Bus worker queue overflow".
     fn submit(&mut self, worker: WorkerId, job: Job) -> Result<(), Shutdown>;
 
-    /// The next errand that is done, in order among those of one bus.
+    /// The next errand that is done. Those of one bus come in the order in which they were sent.
     fn completion(&mut self) -> Option<Completion>;
 
-    /// Whether there is one.
+    /// Whether [`Workers::completion`] has one.
     fn has_completion(&self) -> bool;
 
-    /// Ends every worker. No completion of an earlier job comes after this.
+    /// Ends every worker. After this no completion of an earlier job comes.
     fn reset(&mut self);
 }
 
 impl Mcu {
-    /// The worker of a bus. Only before `finalize_config`: it may start a thread.
+    /// The worker of a bus. To be called before `finalize_config` only, as it may start a thread.
+    ///
+    /// # Errors
+    ///
+    /// "Bus worker queue overflow" if it can not be started.
     pub fn worker(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         self.workers.start(bus)
     }
 
-    /// Sends an errand; it comes back to [`Object::returned`]. Commands wait for it if it is a
-    /// command, or the return of an errand that holds, that sends it.
+    /// Sends an errand, which comes back to [`Object::returned`]. If a command sends it, further
+    /// commands wait until it is back; likewise if an object sends it on the return of an errand for
+    /// which commands wait.
+    ///
+    /// # Errors
+    ///
+    /// "Bus worker queue overflow".
     pub fn dispatch(&mut self, worker: WorkerId, ticket: Ticket, errand: Box<dyn Errand>) -> Result<(), Shutdown> {
         let holds = self.hold(ticket.oid);
         self.hand_over(worker, Job { ticket, errand, holds })
     }
 
-    /// Sends an errand for which commands wait already, by an earlier [`Mcu::hold`], or do not.
+    /// Sends an errand whose sender has called [`Mcu::hold`] itself; `job.holds` is what that returned.
     pub(super) fn hand_over(&mut self, worker: WorkerId, job: Job) -> Result<(), Shutdown> {
         let holds = job.holds;
         let sent = self.workers.submit(worker, job);
@@ -129,8 +146,8 @@ impl Mcu {
         sent
     }
 
-    /// Lets commands wait for this object until as many calls of [`Mcu::release`], if a command
-    /// runs now; returns whether that is so.
+    /// If a command runs now, makes further commands wait for this object, until [`Mcu::release`] was
+    /// called as often as this. Returns whether they wait.
     pub fn hold(&mut self, oid: Oid) -> bool {
         if self.commanded {
             if self.holds == 0 {
@@ -143,7 +160,7 @@ impl Mcu {
         self.commanded
     }
 
-    /// Takes one [`Mcu::hold`] back.
+    /// Takes back one [`Mcu::hold`] that returned true.
     pub fn release(&mut self) {
         self.holds = self.holds.saturating_sub(1);
         if self.holds == 0 {
@@ -151,8 +168,8 @@ impl Mcu {
         }
     }
 
-    /// Whether a conversation that a command began is still under way, or a `config_reset`, so that
-    /// no further command may run.
+    /// Whether no further command may run now, as an errand that a command sent is under way, or a
+    /// `config_reset` waits for the outputs.
     #[inline]
     pub fn is_held(&self) -> bool {
         self.holds > 0 && self.stop.reason.is_none() || self.reset_due
@@ -176,7 +193,7 @@ impl Mcu {
     fn give_back(&mut self, completion: Completion) {
         let Completion { ticket: Ticket { oid, tag }, errand, holds, began, ended } = completion;
         if let Some(mut object) = self.take(oid) {
-            // What the object sends now goes on with what the command began.
+            // If a command sent this errand, what the object sends now belongs to the command, too.
             self.commanded = holds;
             let done = object.returned(self, oid, Done { tag, errand, began, ended });
             let done = done.map_err(|stop| self.blame(stop, object.kind(), oid));

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the host configures under an oid, and the table of all.
+//! Objects: what the host configures under an oid, and the table of all of them.
 
 #![forbid(unsafe_code)]
 
@@ -11,56 +11,57 @@ use crate::time::Clock;
 
 use super::{Bus, Done, Mcu, Oid, TimerId};
 
-/// What becomes of a timer after its event.
+/// What an event answers: what becomes of its timer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
-    /// It runs again at that instant.
+    /// The timer runs again at this instant.
     At(Clock),
-    /// It is done.
+    /// The timer stops.
     Done,
 }
 
-/// Whether an object's outputs are where they belong in a stopped machine.
+/// Whether an object's outputs are at their shutdown values.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[must_use]
 pub enum Safe {
     /// They are.
     Now,
-    /// They were told to go there; the object says so when they are ([`Mcu::is_safe`]).
+    /// A worker is to write them. The object calls [`Mcu::is_safe`] once that is done.
     Later,
 }
 
 /// An object that the host configured under an oid. Its methods run in the core: once
 /// configured they must not allocate, lock, log or block.
 pub trait Object: Any + Send {
-    /// What it is, for the configuration's summary: `stepper`, `digital output`.
+    /// What people call such an object, for the log: `stepper`, `digital output`.
     fn kind(&self) -> &'static str;
 
-    /// A timer of this object is due since `at`.
+    /// A timer of this object runs, which was due at `at`. An error stops the machine.
     fn event(&mut self, _mcu: &mut Mcu, _timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
         Ok(Next::Done)
     }
 
-    /// An errand of this object is back.
+    /// An errand of this object has come back from its worker. An error stops the machine.
     fn returned(&mut self, _mcu: &mut Mcu, _oid: Oid, _done: Done) -> Result<(), Shutdown> {
         Ok(())
     }
 
-    /// The trsync that this object waits for was triggered.
+    /// The trsync that this object waits for was triggered. An error stops the machine.
     fn triggered(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<(), Shutdown> {
         Ok(())
     }
 
-    /// The machine stops: timers are gone, whatever was queued is dropped.
+    /// The machine stops and has removed all timers: the object drops whatever it had queued.
     fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {}
 
-    /// The machine has stopped: drives the outputs to their shutdown values. What fails is tried
-    /// again every [`super::RETRY_TICKS`]; the guardian takes over if that takes too long.
+    /// Drives the outputs to their shutdown values, after [`Object::shutdown`]. As long as this fails
+    /// it is called again every [`super::RETRY_TICKS`]; if it fails for too long, the guardian drives
+    /// the outputs and ends the program.
     fn make_safe(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<Safe, Shutdown> {
         Ok(Safe::Now)
     }
 
-    /// The bus device that this object is; none before its bus is set.
+    /// The chip that this object stands for, if it is a bus device whose bus is set.
     fn bus(&self) -> Option<&Bus> {
         None
     }
@@ -80,12 +81,11 @@ impl Mcu {
         }
     }
 
-    /// Lends an object of type `T` to `f`, or says that the oid is out of range or of another
-    /// kind.
+    /// Lends the object of type `T` under `oid` to `f`.
     ///
     /// # Errors
     ///
-    /// "Invalid oid type", and whatever `f` returns.
+    /// "Invalid oid type" if there is no object, or one of another type; whatever `f` returns.
     #[inline]
     pub fn with<T: Object, R>(
         &mut self,
@@ -102,8 +102,8 @@ impl Mcu {
         result
     }
 
-    /// The one object of type `T` that belongs to a feature rather than to an oid, such as the
-    /// lines that `set_digital_out` holds; made at its first use.
+    /// The id of the one object of type `T` that belongs to a feature rather than to an oid of the
+    /// host, such as the lines that `set_digital_out` holds. It is made at its first use.
     pub fn own<T: Object + Default>(&mut self) -> Oid {
         let is_it = |object: &Option<Box<dyn Object>>| {
             let any = object.as_ref().map(|object| -> &dyn Any { &**object });
@@ -118,13 +118,17 @@ impl Mcu {
         Oid::at(index)
     }
 
-    /// The bus device of an object.
+    /// The chip that an object stands for.
+    ///
+    /// # Errors
+    ///
+    /// "Invalid oid type" if it stands for none, or its bus is not set.
     pub(super) fn lend(&self, oid: Oid) -> Result<Bus, Shutdown> {
         let object = self.objects.get(oid.index()).and_then(Option::as_ref);
         object.and_then(|object| object.bus()).cloned().ok_or_else(|| not_configured(oid))
     }
 
-    /// The objects of type `T` for which `f` holds.
+    /// Whether `f` holds for any object of type `T`.
     pub fn any<T: Object>(&self, mut f: impl FnMut(&T) -> bool) -> bool {
         self.objects.iter().flatten().any(|object| {
             let any: &dyn Any = &**object;
@@ -132,7 +136,11 @@ impl Mcu {
         })
     }
 
-    /// Passes a trsync's trigger on to an object.
+    /// Passes a trsync's trigger on to an object that waits for it.
+    ///
+    /// # Errors
+    ///
+    /// Whatever [`Object::triggered`] returns.
     pub fn trigger(&mut self, oid: Oid) -> Result<(), Shutdown> {
         match self.take(oid) {
             Some(mut object) => {
@@ -144,12 +152,12 @@ impl Mcu {
         }
     }
 
-    /// Says whether a new object may be put under `oid`: to be asked before a pin is claimed, as
-    /// nothing would drive back at a shutdown an output that has no object.
+    /// Checks that a new object may be put under `oid`. To be called before its pins are claimed: an
+    /// output that was claimed for no object would not be driven to its shutdown value.
     ///
     /// # Errors
     ///
-    /// "Can't assign oid".
+    /// "Can't assign oid" if it has an object, is out of range, or the configuration is complete.
     pub fn vacant(&self, oid: Oid) -> Result<(), Shutdown> {
         let taken =
             |why: &str| Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, format_args!("oid {} is {why}", oid.index())));
@@ -172,7 +180,7 @@ impl Mcu {
         Ok(())
     }
 
-    /// Puts a new object under `oid` that the log knows by its pin: an oid tells a user nothing.
+    /// Puts a new object under `oid`. The log names it by its pin, too, as a user does not know oids.
     ///
     /// # Errors
     ///
@@ -183,7 +191,7 @@ impl Mcu {
         Ok(())
     }
 
-    /// Says which object a stop was about.
+    /// Adds to a stop's detail which object it was about.
     #[cold]
     pub(super) fn blame(&self, stop: Shutdown, kind: &str, oid: Oid) -> Shutdown {
         stop.of(&self.name_object(kind, oid))

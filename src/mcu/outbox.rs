@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Where the machine leaves what it has to say.
+//! The machine's way out: responses for the host, and notes for the log.
 
 #![forbid(unsafe_code)]
 
@@ -7,29 +7,30 @@ use crate::lateness::Lateness;
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
 
-/// Where the machine leaves what it has to say.
+/// Where the machine leaves responses for the host and notes for the log. Its calls run in the core:
+/// they must not allocate or block.
 pub trait Outbox: Send {
-    /// A response to the host: the payload of one message block. It is dropped if the host
-    /// does not read.
+    /// Takes a response to the host, the payload of one message block. If the host does not read
+    /// and there is no room left, the response is dropped.
     fn send(&mut self, payload: &[u8]);
 
-    /// Something for the log.
+    /// Takes a note for the log.
     fn note(&mut self, note: Note<'_>);
 }
 
-/// Something for the log.
+/// An event that belongs in the log.
 #[derive(Debug)]
 pub enum Note<'a> {
     /// The machine stopped.
     Shutdown(&'a Shutdown),
-    /// Something else failed while it stopped.
+    /// Something else failed while the machine stopped, or is stopped.
     Trouble(&'a Shutdown),
-    /// An output is at its shutdown value, after attempts that failed.
+    /// This output is at its shutdown value, after attempts that failed.
     Safe(&'a str),
     /// The host configured this many objects of each kind.
     Configured(&'a [(&'static str, usize)]),
-    /// How late timers were since the machine was made, and how early the core now wakes for
-    /// them.
+    /// How late timers were since the machine was made, and how long before a timer the core wakes
+    /// at present.
     Lateness(&'a Lateness, Ticks),
     /// The machine was rebuilt and waits for a configuration.
     Reset,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the parameters of commands and responses may be, beside plain numbers and bytes.
+//! The types that parameters of commands and responses may have, beside plain numbers and bytes.
 
 #![forbid(unsafe_code)]
 
@@ -14,16 +14,16 @@ use crate::wire::vlq::{Reader, Writer};
 #[cfg(doc)]
 use super::Mcu;
 
-/// An object's id: that of the wire, or that of an object that belongs to a feature
+/// An object's id: the one that the host uses, or that of an object which belongs to a feature
 /// ([`Mcu::own`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Oid(u16);
 
 impl Oid {
-    /// The ids of the wire are below this one; those from here on are of features' own objects.
+    /// Ids below this one are the host's; those from here on are of features' own objects.
     pub(super) const FIRST_OWN: usize = 256;
 
-    /// The id that the host calls by this number.
+    /// The id that has this number on the wire.
     pub const fn new(oid: u8) -> Oid {
         Oid(oid as u16)
     }
@@ -56,7 +56,7 @@ impl Field for Oid {
 }
 
 impl Arg<'_> for Pin {
-    // A pin under `%c` exceeds 255: the host writes every integer whole.
+    // `%c` suggests a byte, but the host encodes every integer whole, and a pin may exceed 255.
     const CONVERSIONS: &'static [&'static str] = &["%u", "%c"];
     fn decode(reader: &mut Reader<'_>) -> Result<Pin, Malformed> {
         reader.int().map(Pin)
@@ -71,7 +71,7 @@ impl Arg<'_> for Ticks {
     }
 }
 
-/// An instant as the host sent it, to be widened by [`Mcu::instant`].
+/// An instant as the host sends it: the low 32 bits of a clock. [`Mcu::instant`] makes it whole.
 #[derive(Clone, Copy, Debug)]
 pub struct WireClock(pub u32);
 

@@ -5,10 +5,11 @@
 
 use crate::time::Ticks;
 
-/// Divisor of the squares (`STATS_SUMSQ_BASE`).
+/// What squares of ticks are divided by (`STATS_SUMSQ_BASE`).
 pub const SUMSQ_BASE: u32 = 256;
 
-/// Busy spans since the last `stats` response.
+/// The spans in which the core was busy since the last `stats` response: how many, the sum of their
+/// ticks, and the sum of the squares of these over [`SUMSQ_BASE`].
 #[derive(Debug, Default)]
 pub(super) struct Stats {
     pub(super) count: u32,
@@ -17,7 +18,7 @@ pub(super) struct Stats {
 }
 
 impl Stats {
-    /// Adds a busy span. The squares saturate, as in the firmware.
+    /// Adds a busy span. The sum of the squares saturates, as in the firmware.
     pub(super) fn add(&mut self, busy: Ticks) {
         let square = u64::from(busy.0) * u64::from(busy.0);
         let square = square.div_ceil(u64::from(SUMSQ_BASE));

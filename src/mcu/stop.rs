@@ -12,12 +12,13 @@ use crate::time::Ticks;
 
 use super::{Mcu, Note, Oid, Safe, TimerId, base};
 
-/// Between two attempts to write a shutdown value.
+/// The pause between two attempts to write a shutdown value.
 pub const RETRY_TICKS: Ticks = Ticks::from_us(50_000);
 
-/// How long commands wait for a conversation that one of them began, before the machine stops:
-/// klippy gives up an answer after five seconds (`SerialRetryCommand` in serialhdl.py). A host
-/// whose window of unacknowledged blocks is full can not even send an emergency_stop.
+/// How long commands may wait for an errand before the machine stops. klippy, too, gives up waiting
+/// for an answer after five seconds (`SerialRetryCommand` in serialhdl.py). Without this limit a bus
+/// that hangs would keep the host from stopping the machine: once its window of unacknowledged blocks
+/// is full, it can not even send an `emergency_stop`.
 pub(super) const HOLD_LIMIT: Ticks = Ticks::from_us(5_000_000);
 
 /// What a stopped machine knows of its stop.
@@ -25,7 +26,7 @@ pub(super) const HOLD_LIMIT: Ticks = Ticks::from_us(5_000_000);
 pub(super) struct Stop {
     /// Why the machine is stopped; none while it is not.
     pub(super) reason: Option<ShutdownReason>,
-    /// Whether it is about to stop.
+    /// Whether `shut_down` is running: what fails meanwhile must not start it again.
     under_way: bool,
     owed: Vec<Debt>,
 }
@@ -45,8 +46,8 @@ impl Mcu {
         self.stop.reason.is_some()
     }
 
-    /// Stops the machine: timers off, outputs to their shutdown values, the host is told. The
-    /// first reason stays.
+    /// Stops the machine: removes all timers, drives the outputs to their shutdown values, and tells
+    /// the host. A machine that is stopped already does the same once more, and keeps its first reason.
     pub fn shut_down(&mut self, shutdown: Shutdown) {
         if self.stop.under_way {
             self.outbox.note(Note::Trouble(&shutdown));
@@ -73,12 +74,17 @@ impl Mcu {
         if first {
             self.outbox.note(Note::Shutdown(&shutdown));
         } else if shutdown.reason != reason {
-            // A host that stops a stopped machine says nothing new.
+            // The same reason again, such as a second `emergency_stop`, would tell the log nothing new.
             self.outbox.note(Note::Trouble(&shutdown));
         }
     }
 
-    /// Stops the machine, if it is not stopped already (the firmware's `try_shutdown`).
+    /// The given stop as an error, which then stops the machine; nothing if the machine is stopped
+    /// already (the firmware's `try_shutdown`).
+    ///
+    /// # Errors
+    ///
+    /// `shutdown`, unless the machine is stopped.
     pub fn try_shut_down(&self, shutdown: Shutdown) -> Result<(), Shutdown> {
         match self.stop.reason {
             Some(_) => Ok(()),
@@ -86,8 +92,9 @@ impl Mcu {
         }
     }
 
-    /// An output or a device of an object failed: stops the machine, or says so in the log if
-    /// that is stopped already, and tries a shutdown value again later.
+    /// To be called when an output or device of an object has failed. A running machine is stopped by
+    /// the error that this returns. In a stopped one the log is told, and the shutdown value is tried
+    /// again later.
     ///
     /// # Errors
     ///
@@ -107,7 +114,8 @@ impl Mcu {
         Ok(())
     }
 
-    /// The outputs of an object are where they belong in a stopped machine.
+    /// To be called by an object that answered [`Safe::Later`], once its outputs are at their shutdown
+    /// values.
     pub fn is_safe(&mut self, oid: Oid) {
         let Some(place) = self.stop.owed.iter().position(|debt| debt.oid == oid) else { return };
         let debt = self.stop.owed.swap_remove(place);
@@ -116,12 +124,12 @@ impl Mcu {
         }
     }
 
-    /// What owes its shutdown value, for the log; none if nothing does.
+    /// The name of an object that owes its shutdown value, for the log; none if nothing is owed.
     pub fn debtor(&self) -> Option<&str> {
         self.stop.owed.first().map(|debt| debt.name.as_str())
     }
 
-    /// Whether anything owes its shutdown value.
+    /// Whether any shutdown value is owed.
     #[inline]
     pub fn owes(&self) -> bool {
         !self.stop.owed.is_empty()
@@ -144,13 +152,13 @@ impl Mcu {
             Ok(Safe::Now) => self.is_safe(oid),
             Ok(Safe::Later) => {}
             Err(trouble) => {
-                // A stopped machine only notes it.
+                // The machine is stopped, so this notes the failure and returns Ok.
                 let _ = self.device_failed(oid, kind, trouble);
             }
         }
     }
 
-    /// Looks again after those that failed, if there are any.
+    /// Starts the timer of the next attempt, if any shutdown value could not be written.
     fn retry_later(&mut self) {
         if self.stop.owed.iter().any(|debt| debt.failed) {
             self.timers.remove(TimerId::RETRY);
@@ -159,7 +167,7 @@ impl Mcu {
         }
     }
 
-    /// Tries again what failed.
+    /// Tries again to write the shutdown values that could not be written.
     pub(super) fn retry(&mut self) {
         for place in (0..self.stop.owed.len()).rev() {
             let failed = self.stop.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.oid);
@@ -170,7 +178,7 @@ impl Mcu {
         self.retry_later();
     }
 
-    /// A conversation that a command began takes too long.
+    /// The timer of [`HOLD_LIMIT`]: commands have waited too long for an errand.
     pub(super) fn held_too_long(&mut self) {
         if self.is_held() {
             let holder = self.held_by.and_then(|oid| Some((oid, self.objects.get(oid.index())?.as_ref()?.kind())));

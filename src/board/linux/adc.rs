@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! ADC channels of the Industrial I/O subsystem, through libiio.
 //!
-//! A reading is a conversation with a chip and takes its time: it runs on a worker, one for
-//! each IIO device.
+//! A reading may take milliseconds, as the driver has to talk to its chip. So a worker takes it,
+//! one for each IIO device.
 
 #![forbid(unsafe_code)]
 
@@ -15,12 +15,12 @@ use industrial_io::{Backend, Context};
 use crate::board::{self, ADC_MAX};
 use crate::shutdown::{Shutdown, reason};
 
-/// What the C program assumes of every channel.
+/// The format that the C program assumes for every channel; here for those that do not tell theirs.
 const ASSUMED: Format = Format { bits: 12, signed: false };
 
 /// An IIO device with voltage inputs.
 #[derive(Clone, Debug)]
-pub struct Adc {
+pub struct IioDevice {
     /// The number of `iio:device<n>`.
     pub number: u32,
     /// The driver's name, such as `ads1115`.
@@ -40,7 +40,7 @@ pub struct Channel {
     pub format: Option<Format>,
 }
 
-/// How a channel counts.
+/// The resolution of a channel's raw readings, and whether they have a sign.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Format {
     bits: u32,
@@ -48,14 +48,14 @@ pub struct Format {
 }
 
 impl Format {
-    /// A format of 1 to 64 bits (signed: 2 to 64), or none.
-    pub fn new(bits: u32, signed: bool) -> Option<Format> {
+    /// A format of 1 to 64 bits (signed: 2 to 64); none for another number.
+    pub(crate) fn new(bits: u32, signed: bool) -> Option<Format> {
         (1 + u32::from(signed)..=64).contains(&bits).then_some(Format { bits, signed })
     }
 
-    /// A raw reading in counts of 0 to [`ADC_MAX`], rounded; what is out of range is clamped,
-    /// negative voltages to 0.
-    pub fn scale(self, raw: i64) -> u16 {
+    /// Turns a raw reading into counts of 0 to [`ADC_MAX`], rounded to the nearest. A raw reading out
+    /// of range is clamped, a negative one to 0.
+    pub(super) fn scale(self, raw: i64) -> u16 {
         let full = (1i128 << (self.bits - u32::from(self.signed))) - 1;
         let raw = i128::from(raw).clamp(0, full);
         let scaled = (raw * i128::from(ADC_MAX) + full / 2) / full;
@@ -70,8 +70,8 @@ impl fmt::Display for Format {
     }
 }
 
-/// libiio's view of this machine; none without IIO devices, as it costs memory.
-pub fn context(devices: &Path) -> Result<Option<Context>, String> {
+/// libiio's view of this machine. None without IIO devices: libiio would take memory for nothing.
+pub(super) fn context(devices: &Path) -> Result<Option<Context>, String> {
     let any = fs::read_dir(devices)
         .into_iter()
         .flatten()
@@ -86,8 +86,8 @@ pub fn context(devices: &Path) -> Result<Option<Context>, String> {
 }
 
 /// The ADCs in the order of their numbers.
-pub fn scan(context: &Context) -> Vec<Adc> {
-    let mut adcs: Vec<Adc> = context
+pub(super) fn scan(context: &Context) -> Vec<IioDevice> {
+    let mut adcs: Vec<IioDevice> = context
         .devices()
         .filter_map(|device| {
             let number = number(&device)?;
@@ -96,7 +96,7 @@ pub fn scan(context: &Context) -> Vec<Adc> {
                 .filter_map(|channel| Some(Channel { id: input_id(&channel)?, format: format(&channel) }))
                 .collect();
             channels.sort_by_cached_key(|channel| in_order(&channel.id));
-            (!channels.is_empty()).then(|| Adc {
+            (!channels.is_empty()).then(|| IioDevice {
                 number,
                 name: device.name().unwrap_or_default(),
                 label: device.label(),
@@ -108,8 +108,8 @@ pub fn scan(context: &Context) -> Vec<Adc> {
     adcs
 }
 
-/// Sorts `voltage10` after `voltage9`: libiio's own order is the directory's, which changes,
-/// and positions are numbers on the wire.
+/// A key that sorts `voltage10` after `voltage9`. A channel's place is part of its pin number, so it
+/// must always be the same, and libiio's own order is that of the directory, which is not.
 fn in_order(id: &str) -> (u32, String) {
     let digits = id.trim_start_matches(|c: char| !c.is_ascii_digit());
     let end = digits.find(|c: char| !c.is_ascii_digit()).unwrap_or(digits.len());
@@ -120,34 +120,40 @@ fn number(device: &industrial_io::Device) -> Option<u32> {
     device.id()?.strip_prefix("iio:device")?.parse().ok()
 }
 
-/// The name of a voltage input that can be read one reading at a time.
+/// The driver's name for a channel that is a voltage input and can be read one reading at a time;
+/// none for any other channel.
 fn input_id(channel: &industrial_io::Channel) -> Option<String> {
     let id = channel.id()?;
     (channel.is_input() && id.starts_with("voltage") && channel.has_attr("raw")).then_some(id)
 }
 
 fn format(channel: &industrial_io::Channel) -> Option<Format> {
-    // Only a channel that can be scanned tells its format.
+    // Only a channel that can also be read through a buffer (a "scan element") tells its format.
     let format = channel.is_scan_element().then(|| channel.data_format())?;
     Format::new(format.bits(), format.is_signed())
 }
 
-/// A channel that is read.
-pub struct Reader {
+/// An open channel.
+pub struct ChannelReader {
     device: industrial_io::Device,
     index: usize,
     format: Option<Format>,
     subject: String,
 }
 
-impl Reader {
-    /// The channel `id` of `iio:device<number>`, if it is there.
-    pub fn open(context: &Context, number: u32, id: &str) -> Option<Reader> {
+impl ChannelReader {
+    /// Opens the channel that the driver of `iio:device<number>` calls `id`, if it is there.
+    pub(super) fn open(context: &Context, number: u32, id: &str) -> Option<ChannelReader> {
         let device = context.devices().find(|d| self::number(d) == Some(number))?;
         let (index, channel) =
             device.channels().enumerate().find(|(_, channel)| input_id(channel).as_deref() == Some(id))?;
         let name = device.name().unwrap_or_default();
-        Some(Reader { index, format: format(&channel), subject: format!("iio:device{number} ({name}) {id}"), device })
+        Some(ChannelReader {
+            index,
+            format: format(&channel),
+            subject: format!("iio:device{number} ({name}) {id}"),
+            device,
+        })
     }
 
     /// Its resolution, where the driver tells it.
@@ -155,12 +161,20 @@ impl Reader {
         self.format
     }
 
-    /// A reading as the driver gives it.
+    /// A reading as the driver gives it, in the units of [`ChannelReader::format`].
+    ///
+    /// # Errors
+    ///
+    /// libiio's own.
     pub fn read_raw(&self) -> Result<i64, industrial_io::Error> {
         self.device.get_channel(self.index)?.attr_read_int("raw")
     }
 
     /// A reading in counts of 0 to [`ADC_MAX`].
+    ///
+    /// # Errors
+    ///
+    /// "Error on analog read".
     pub fn read_counts(&self) -> Result<u16, Shutdown> {
         match self.read_raw() {
             Ok(raw) => Ok(self.format.unwrap_or(ASSUMED).scale(raw)),
@@ -169,7 +183,7 @@ impl Reader {
     }
 }
 
-impl board::Adc for Reader {
+impl board::Adc for ChannelReader {
     fn read(&mut self) -> Result<u16, Shutdown> {
         self.read_counts()
     }
@@ -184,8 +198,8 @@ fn read_failure(subject: &str, error: &str) -> String {
     format!("{subject} can not be read: {error}: {remedy}")
 }
 
-/// A channel is not there: says what is.
-pub fn missing(number: u32, id: &str, adcs: &[Adc]) -> String {
+/// For the log: a channel is not there, and which are.
+pub(super) fn missing(number: u32, id: &str, adcs: &[IioDevice]) -> String {
     let known: Vec<String> = adcs
         .iter()
         .map(|adc| {
@@ -249,7 +263,7 @@ mod tests {
             "iio:device0 (ads1115) voltage3 can not be read: EIO: I/O error: check the chip's \
              wiring and supply, and the kernel's log (dmesg)"
         );
-        let adc = Adc {
+        let adc = IioDevice {
             number: 1,
             name: "mcp3008".into(),
             label: None,

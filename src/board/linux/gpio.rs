@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! GPIO lines of the character device.
+//! GPIO lines through the kernel's character device.
 //!
-//! A pull resistor can not be verified: the kernel takes `ENOTSUPP` from a driver that has none
-//! for success, and what it tells of a line is what was asked for. So a resistor is refused
-//! where the kernel refuses it and on the chips in [`WITHOUT_BIAS`], which are known to have
-//! none; on any other chip it is as good as its driver's word.
+//! Whether a chip has really switched a pull resistor on can not be seen: if its driver answers
+//! `ENOTSUPP`, the kernel takes that for success, and what the kernel tells of a line is what was
+//! asked for. So a resistor is refused where the kernel refuses it, and on the chips in
+//! [`WITHOUT_BIAS`], which are known to have none. On any other chip we have to trust the driver.
 
 #![forbid(unsafe_code)]
 
@@ -25,19 +25,19 @@ use crate::board::{Bias, Direction, Line};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::sys;
 
-/// What the kernel shows as the holder of our lines.
+/// The name that the kernel shows as the consumer of our lines.
 const CONSUMER: &str = "pinion";
 /// GPIOHANDLE_REQUEST_BIAS_PULL_UP and _DOWN (Linux 5.5), which gpio-cdev does not name.
 const PULL_UP: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 5);
 const PULL_DOWN: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 6);
-/// What a driver answers for what it does not have (include/linux/errno.h).
+/// What a driver answers if it does not support a request (include/linux/errno.h).
 const ENOTSUPP: i32 = 524;
-/// Subsystems whose devices are spoken to by messages, for which a driver waits.
+/// Subsystems whose drivers send their devices messages and sleep until these are answered.
 const SLEEPING_BUSES: [&str; 7] = ["i2c", "spi", "usb", "hid", "serial", "virtio", "w1"];
-/// Labels of chips that are no such devices and wait all the same: that of the Raspberry Pi 3 and 4
-/// asks the firmware (drivers/gpio/gpio-raspberrypi-exp.c, `can_sleep`).
+/// Labels of chips that are on none of these buses, but whose drivers sleep all the same. That of the
+/// Raspberry Pi 3 and 4 asks the firmware (drivers/gpio/gpio-raspberrypi-exp.c, `can_sleep`).
 const SLEEPING_LABELS: [&str; 1] = ["raspberrypi-exp-gpio"];
-/// Labels' beginnings of chips whose drivers lack a resistor, and which they lack.
+/// How the labels of chips without certain resistors begin, and which resistors these chips lack.
 const WITHOUT_BIAS: [(&str, &[Bias]); 4] = [
     ("raspberrypi-exp-gpio", &[Bias::PullUp, Bias::PullDown]),
     ("brcmvirt-gpio", &[Bias::PullUp, Bias::PullDown]),
@@ -59,20 +59,20 @@ pub struct Chip {
 /// A line as it was found.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LineInfo {
-    /// The board's name for it.
+    /// The name that the device tree gives the line.
     pub name: Option<String>,
-    /// Whether it drives.
+    /// Whether it is an output.
     pub output: bool,
-    /// Whether someone holds it.
+    /// Whether the kernel or a program uses it.
     pub held: bool,
-    /// Who, as far as the kernel tells.
+    /// Who uses it, as far as the kernel tells.
     pub consumer: Option<String>,
 }
 
-/// The chips of this machine by number, and what is wrong with those that can not be read.
+/// The chips of this machine by number, and a line for the log for each that can not be read.
 ///
-/// A node that is a second name of another chip (`/dev/gpiochip4` on a Raspberry Pi 5) is left
-/// out: its lines have the other's names. Its numbers work all the same.
+/// A node that is a link to another chip's (`/dev/gpiochip4` on a Raspberry Pi 5) is left out, as
+/// its lines are those of the other chip. Pins with its number work all the same.
 pub fn scan(dev: &Path) -> (Vec<Chip>, Vec<String>) {
     let mut chips = Vec::new();
     let mut problems = Vec::new();
@@ -94,7 +94,7 @@ pub fn scan(dev: &Path) -> (Vec<Chip>, Vec<String>) {
     (chips, problems)
 }
 
-/// The numbers of the chips in `dev`, counted up.
+/// The numbers of the chips in `dev`, in ascending order.
 fn nodes(dev: &Path) -> Vec<u32> {
     let mut numbers: Vec<u32> = fs::read_dir(dev)
         .into_iter()
@@ -111,13 +111,13 @@ fn node(dev: &Path, number: u32) -> PathBuf {
 }
 
 fn look_at(line: &gpio_cdev::Line) -> LineInfo {
-    // A line that tells nothing is still a line.
+    // Without information the line still keeps its place in the list, which is its offset.
     line.info().map_or_else(
         |_| LineInfo::default(),
         |info| LineInfo {
             name: info.name().map(str::to_owned),
             output: info.direction() == LineDirection::Out,
-            // The flag says "in use", by the kernel or by a program.
+            // Despite its name this flag means "in use", be it by the kernel or by a program.
             held: info.is_kernel(),
             consumer: info.consumer().map(str::to_owned),
         },
@@ -130,13 +130,17 @@ pub fn number_behind(dev: &Path, number: u32) -> Option<u32> {
     target.file_name()?.to_str()?.strip_prefix("gpiochip")?.parse().ok()
 }
 
-/// A line of an open chip.
+/// A line of an open chip, not yet requested.
 pub struct Handle {
     line: gpio_cdev::Line,
     subject: Subject,
 }
 
-/// Opens `/dev/gpiochip<number>` and picks a line. `refused` is the reason if the chip has no
+/// Opens `/dev/gpiochip<number>` and picks a line.
+///
+/// # Errors
+///
+/// "GPIO chip device not found", "Unable to open GPIO chip device"; `refused` if the chip has no
 /// such line.
 pub fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Result<Handle, Shutdown> {
     let path = node(dev, number);
@@ -152,7 +156,7 @@ pub fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Re
 }
 
 impl Handle {
-    /// The chip's name, such as `gpiochip0`, by whatever name it was opened.
+    /// The kernel's name for the chip, such as `gpiochip0`, even if a link to it was opened.
     pub fn chip(&self) -> &str {
         &self.subject.chip
     }
@@ -162,15 +166,20 @@ impl Handle {
         &self.subject.label
     }
 
-    /// Takes the line; an output is given to the guardian. `sleeping` names the line's chip if
-    /// calls to it may take their time.
+    /// Requests the line from the kernel; an output is given to the guardian. `sleeping` is the name
+    /// of the line's chip if calls to that may block.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open out GPIO chip line", "Unable to open in GPIO chip line", "Guardian process
+    /// lost".
     pub(super) fn request(
         self,
         direction: Direction,
         guard: SharedGuard,
         sleeping: Option<String>,
     ) -> Result<HeldLine, Shutdown> {
-        let Setting { flags, level, refused } = self.subject.setting(direction)?;
+        let LineSetup { flags, level, refused } = self.subject.setting(direction)?;
         let handle = self
             .line
             .request(flags, level.into(), CONSUMER)
@@ -183,32 +192,32 @@ impl Handle {
 }
 
 /// What the kernel is asked for.
-struct Setting {
+struct LineSetup {
     flags: LineRequestFlags,
     level: bool,
-    /// The reason if it refuses.
+    /// The reason to stop with if the kernel refuses.
     refused: ShutdownReason,
 }
 
-/// A line that we hold.
-pub struct HeldLine {
+/// A line that we have requested.
+pub(super) struct HeldLine {
     handle: LineHandle,
     line: gpio_cdev::Line,
     subject: Subject,
-    /// What it was made last.
+    /// Whether its last set-up made it an output.
     is_output: AtomicBool,
     guard: SharedGuard,
-    /// Its chip, if calls to that may take their time.
+    /// The name of its chip, if calls to that may block.
     sleeping: Option<String>,
 }
 
 impl HeldLine {
-    /// A call to the chip failed.
+    /// The error for a call to the chip that failed with the error number `code`.
     fn lost(&self, reason: ShutdownReason, what: &str, code: i32) -> Shutdown {
         Shutdown::because(reason, self.subject.lost(what, code, self.sleeping.is_some()))
     }
 
-    /// Lets the guardian know what has become of the line.
+    /// Has the guardian hold the line if it is an output now, and let go of it if it no longer is.
     fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
         let name = format!("{} line {}", self.subject.chip, self.subject.offset);
         let was_output = self.is_output.load(Ordering::Relaxed);
@@ -244,7 +253,7 @@ impl Line for HeldLine {
     }
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
-        let Setting { flags, level, refused } = self.subject.setting(direction)?;
+        let LineSetup { flags, level, refused } = self.subject.setting(direction)?;
         sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
             self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
         })?;
@@ -252,9 +261,9 @@ impl Line for HeldLine {
     }
 }
 
-/// Whether calls to a chip may take their time, as its driver talks to it over a bus or asks a
-/// firmware. `devices` is `/sys/bus/gpio/devices`; the devices that the chip hangs on say it.
-pub fn may_sleep(devices: &Path, chip: &str, label: &str) -> bool {
+/// Whether calls to a chip may block, as its driver talks to it over a bus or asks a firmware: told
+/// by the subsystems of the devices above the chip in `devices`, which is `/sys/bus/gpio/devices`.
+pub(super) fn may_sleep(devices: &Path, chip: &str, label: &str) -> bool {
     if SLEEPING_LABELS.contains(&label) {
         return true;
     }
@@ -266,9 +275,9 @@ pub fn may_sleep(devices: &Path, chip: &str, label: &str) -> bool {
     })
 }
 
-/// A line in an error.
+/// What errors say of a line.
 #[derive(Clone, Debug)]
-pub struct Subject {
+struct Subject {
     chip: String,
     label: String,
     offset: u32,
@@ -286,10 +295,10 @@ impl fmt::Display for Subject {
 }
 
 impl Subject {
-    fn setting(&self, direction: Direction) -> Result<Setting, Shutdown> {
+    fn setting(&self, direction: Direction) -> Result<LineSetup, Shutdown> {
         match direction {
             Direction::Output { level, .. } => {
-                Ok(Setting { flags: LineRequestFlags::OUTPUT, level, refused: reason::OUTPUT_LINE })
+                Ok(LineSetup { flags: LineRequestFlags::OUTPUT, level, refused: reason::OUTPUT_LINE })
             }
             Direction::Input(bias) if lacks(&self.label, bias) => {
                 Err(Shutdown::because(reason::INPUT_LINE, self.no_bias(bias)))
@@ -300,12 +309,12 @@ impl Subject {
                     Bias::PullUp => PULL_UP,
                     Bias::PullDown => PULL_DOWN,
                 };
-                Ok(Setting { flags: LineRequestFlags::INPUT | pull, level: false, refused: reason::INPUT_LINE })
+                Ok(LineSetup { flags: LineRequestFlags::INPUT | pull, level: false, refused: reason::INPUT_LINE })
             }
         }
     }
 
-    /// The kernel refused the line: says why.
+    /// The error for a line that the kernel has refused with the error number `code`.
     fn refused(&self, reason: ShutdownReason, code: i32, direction: Direction, line: &gpio_cdev::Line) -> Shutdown {
         let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
         let (action, bias) = match direction {
@@ -333,7 +342,7 @@ impl Subject {
         )
     }
 
-    /// `sleeping`: whether the chip is spoken to over a bus.
+    /// `what` is "read" or "written"; `sleeping` tells whether the chip is on a bus.
     fn lost(&self, what: &str, code: i32, sleeping: bool) -> String {
         let why = match sleeping {
             true => "its chip does not answer, or is gone: check its power and wiring",
@@ -383,7 +392,7 @@ impl Subject {
     }
 }
 
-/// A resistor's name, and the sign that asks for it in a configuration.
+/// A resistor's name, and the sign in front of a pin that asks for it in printer.cfg.
 fn pull(bias: Bias) -> (&'static str, char) {
     match bias {
         Bias::PullDown => ("pull-down", '~'),
@@ -391,7 +400,7 @@ fn pull(bias: Bias) -> (&'static str, char) {
     }
 }
 
-/// Whether the chip is known to ignore this resistor.
+/// Whether the chip with this label is known not to have this resistor.
 fn lacks(label: &str, bias: Bias) -> bool {
     WITHOUT_BIAS.iter().any(|(chip, lacking)| label.starts_with(chip) && lacking.contains(&bias))
 }
@@ -426,7 +435,7 @@ fn cannot_open(path: &Path, code: i32) -> String {
     }
 }
 
-/// Says to whom a device node belongs and how to be let in.
+/// For the log: to whom a device node belongs, and how to get permission to open it.
 pub(super) fn not_permitted(path: &Path) -> String {
     let who = User::from_uid(geteuid()).ok().flatten().map_or_else(|| format!("user {}", geteuid()), |user| user.name);
     let (mode, group) = match fs::metadata(path) {
@@ -457,8 +466,8 @@ fn permission_text(path: &Path, who: &str, mode: u32, group: &str) -> String {
 
 /// The error number of a call that has just failed.
 ///
-/// gpio-cdev hides the number in a type of its own version of nix; but it does nothing between
-/// the failing call and its return, so the thread still has it.
+/// gpio-cdev hides the number in an error type of another version of nix than ours. But it makes no
+/// system call between the one that fails and its own return, so the thread's errno is still that.
 fn errno(error: &gpio_cdev::Error) -> i32 {
     let last = io::Error::last_os_error().raw_os_error();
     error
@@ -469,7 +478,7 @@ fn errno(error: &gpio_cdev::Error) -> i32 {
         .unwrap_or_default()
 }
 
-/// What an error number means, in lower case to stand in a sentence.
+/// The meaning of an error number, in lower case, as it stands in a sentence.
 pub(super) fn text(code: i32) -> String {
     match code {
         ENOTSUPP => "not supported by the driver (error 524)".to_owned(),
@@ -542,7 +551,7 @@ mod tests {
         let platform = [("platform", ""), ("soc", "platform"), ("fe804000.i2c", "platform")];
         let i2c = [&platform[..], &[("i2c-1", "i2c"), ("1-0020", "i2c")]].concat();
         assert!(sleeps(&i2c, "1-0020"));
-        // A function of a chip that has several.
+        // The GPIO part of a chip with several functions: a platform device below an I2C device.
         assert!(sleeps(&[&i2c[..], &[("da9063-gpio", "platform")]].concat(), "da9063-gpio"));
         let usb = [("pci0000:00", ""), ("0000:00:14.0", "pci"), ("usb1", "usb"), ("1-2", "usb"), ("1-2:1.0", "usb")];
         assert!(sleeps(&[&usb[..], &[("0003:10C4:EA90.0001", "hid")]].concat(), "CP2112 GPIO"));

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the board gives to the guardian process.
+//! The board's way to the guardian process, which is given every output.
 
 #![forbid(unsafe_code)]
 
@@ -9,30 +9,32 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::shutdown::{Shutdown, reason};
 
-/// Keeps copies of the outputs, to drive them to their shutdown values if the program dies.
+/// Holds copies of the outputs' descriptors, to drive the outputs to their shutdown values if the
+/// program dies.
 ///
-/// An output is known by its name, which is also what the log calls it, such as `gpiochip0 line 5`
-/// or `pwmchip0/pwm1`. One that is given again replaces what was known of it.
+/// An output is known by its name, such as `gpiochip0 line 5` or `pwmchip0/pwm1`, which the log uses,
+/// too. An output that is given again under its name replaces the earlier one.
+///
+/// Each call fails if the guardian refuses or does not answer.
 pub trait Guard: Send {
     /// Copies an output line's descriptor (a GPIO line handle of the character device).
-    /// `sleeping` is the line's chip if its driver may sleep, as it talks to the chip over a bus:
-    /// the lines of such a chip are driven apart from all others, which do not wait for it.
+    /// `sleeping` is the name of the line's chip if calls to that may block. The lines of such a
+    /// chip are driven by a thread of their own, so that no other output waits for it.
     fn output(&mut self, name: &str, line: RawFd, shutdown_value: bool, sleeping: Option<&str>) -> io::Result<()>;
 
-    /// Copies the descriptors of the files that drive one output (a PWM's duty cycle and its
-    /// switch), and what is to be written at the beginning of each, in this order.
+    /// Copies the descriptors of the files that set one output, such as a PWM's `duty_cycle` and
+    /// `enable`. `shutdown` has what is to be written at the beginning of each, in this order.
     fn files(&mut self, name: &str, shutdown: &[(RawFd, &[u8])]) -> io::Result<()>;
 
-    /// Gives back the copies of one output, which is none any more.
+    /// Drops the copies of a line or channel that is no output any more.
     fn forget(&mut self, name: &str) -> io::Result<()>;
 
-    /// Gives back every copy, so that the lines can be claimed anew. When this returns, they
-    /// are free.
+    /// Drops all copies. When this returns, the lines can be requested again.
     fn release(&mut self) -> io::Result<()>;
 }
 
-/// The guard, if there is one, as board and workers share it. A call waits for the guardian: the
-/// board makes it while the machine is configured, later only workers do.
+/// The guard, if there is one, as the board and its workers share it. A call waits for the
+/// guardian's answer. So the core calls it only until the machine is configured, and workers later.
 #[derive(Clone)]
 pub(super) struct SharedGuard(Option<Arc<Mutex<Box<dyn Guard>>>>);
 

@@ -36,16 +36,17 @@ pub struct Inventory {
     /// GPIO chips.
     pub chips: Vec<gpio::Chip>,
     /// ADCs.
-    pub adcs: Vec<adc::Adc>,
+    pub adcs: Vec<adc::IioDevice>,
     /// SPI device nodes.
     pub spi: Vec<spi::Node>,
-    /// What is there and can not be used, and the remedy.
+    /// For the log: each thing that is there and can not be used, with its cause and remedy.
     pub problems: Vec<String>,
+    /// libiio's view of this machine; none without IIO devices.
     pub(crate) context: Option<Context>,
 }
 
 impl Inventory {
-    /// Looks around. Nothing has to be there.
+    /// Looks for chips, ADCs and buses. A machine that has none of them is no error.
     pub fn scan() -> Inventory {
         let dev = Path::new(DEV);
         let (chips, problems) = gpio::scan(dev);
@@ -60,12 +61,12 @@ impl Inventory {
         inventory
     }
 
-    /// A channel of `iio:device<device>` to read from, if it is there.
-    pub fn adc(&self, device: u32, id: &str) -> Option<adc::Reader> {
-        adc::Reader::open(self.context.as_ref()?, device, id)
+    /// Opens the channel that the driver of `iio:device<device>` calls `id`, if it is there.
+    pub fn adc(&self, device: u32, id: &str) -> Option<adc::ChannelReader> {
+        adc::ChannelReader::open(self.context.as_ref()?, device, id)
     }
 
-    /// One line: each thing, and how many pins it has.
+    /// One line for people: each chip and ADC with the number of its lines or channels.
     pub fn describe(&self) -> String {
         let chips = self.chips.iter().map(|chip| {
             let lines = chip.lines.len();
@@ -90,9 +91,9 @@ pub struct LinuxBoard {
     inventory: Inventory,
     names: Names,
     guard: SharedGuard,
-    /// The present SPI mode of each node in use.
+    /// The mode that each spidev node in use is set to at present, shared by the chips behind it.
     spi_modes: HashMap<spi::Node, Arc<AtomicU8>>,
-    /// IIO devices of which the log knows that they tell no resolution.
+    /// The numbers of IIO devices that tell no resolution, and of which the log has said so.
     assumed: BTreeSet<u32>,
     dev: PathBuf,
     gpio: PathBuf,
@@ -100,7 +101,7 @@ pub struct LinuxBoard {
 }
 
 impl LinuxBoard {
-    /// Looks around and publishes what is there. `guard` copies every output line.
+    /// Looks around and publishes what is there. Every output is given to `guard`.
     pub fn new(guard: Option<Box<dyn Guard>>) -> LinuxBoard {
         let inventory = Inventory::scan();
         for problem in &inventory.problems {
@@ -118,7 +119,7 @@ impl LinuxBoard {
         }
     }
 
-    /// The line of a pin, by the reasons that a use has for no such line and for a refusal.
+    /// The line of a pin, not yet requested from the kernel. Errors are those of outputs or inputs.
     fn open_line(&self, pin: Pin, direction: Direction) -> Result<gpio::Handle, Shutdown> {
         let (wanted, no_line, refused) = match direction {
             Direction::Output { .. } => ("an output", reason::NOT_OUTPUT, reason::OUTPUT_LINE),
@@ -131,7 +132,7 @@ impl LinuxBoard {
         gpio::open(&self.dev, chip, offset, refused)
     }
 
-    /// The device's number and the channel's name for a pin.
+    /// The number of a pin's IIO device, and the name that its driver has for the channel.
     fn channel(&self, pin: Pin) -> Result<(u32, String), Shutdown> {
         match Target::of(pin) {
             Target::Analog(n) => Ok((0, format!("voltage{n}"))),
@@ -164,7 +165,8 @@ impl Board for LinuxBoard {
         spi::ranges(&self.inventory.spi)
     }
 
-    /// A chip may have several nodes in /dev, as that of a Raspberry Pi 5 has.
+    /// A chip may have several nodes in /dev: on a Raspberry Pi 5, `gpiochip4` is a link to
+    /// `gpiochip0`.
     fn canonical(&self, pin: Pin) -> Pin {
         let Target::Line { chip, offset } = Target::of(pin) else { return pin };
         gpio::number_behind(&self.dev, chip).and_then(|chip| pins::line_number(chip, offset)).map_or(pin, Pin)
@@ -181,7 +183,8 @@ impl Board for LinuxBoard {
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let (device, id) = self.channel(pin)?;
         if self.inventory.adc(device, &id).is_none() {
-            // Its driver may have come up after us; the numbers that were published stay.
+            // The device's driver may have been loaded after the program started: look again. The
+            // pin numbers stay as they were published then.
             self.inventory.context =
                 adc::context(Path::new(IIO)).map_err(|problem| Shutdown::because(reason::ADC_OPEN, problem))?;
         }
@@ -219,7 +222,8 @@ impl Board for LinuxBoard {
         };
         let channel = pwm::Channel { chip, channel };
         let device = pwm::Pwm::open(&self.pwm, channel, &config, self.guard.clone())?;
-        // Channels share their chip's driver, and it may keep whoever writes to one.
+        // A write to one channel may block in the driver of the chip, which the chip's other
+        // channels share: so they share a worker, too.
         Ok(OnWorker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
     }
 
@@ -308,7 +312,7 @@ mod tests {
                 label: "pinctrl-bcm2835".into(),
                 lines: vec![gpio::LineInfo::default(); 54],
             }],
-            adcs: vec![adc::Adc { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
+            adcs: vec![adc::IioDevice { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
             spi: vec![spi::Node::of(0), spi::Node::of(1)],
             ..Inventory::default()
         };

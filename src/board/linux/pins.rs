@@ -9,10 +9,10 @@
 //! | 2^24.. | every other line: 4096 numbers for each chip | `gpiochip9/gpio0` |
 //! | 2^25.. | every other ADC channel: 256 numbers for each device | |
 //!
-//! `gpio17` is `gpiochip0/gpio17`. To these come the names that this machine has: `GPIO17` (the line's own),
-//! `pinctrl-rp1/gpio17` (by the chip's label) and `ads1115/voltage3`. A name that two things
-//! share, that looks like one of the numeric names, or that klippy cannot read from a
-//! configuration is left out.
+//! `gpio17` stands for `gpiochip0/gpio17`. The machine's own names are published as well: `GPIO17`
+//! (the name that the device tree gives a line), `pinctrl-rp1/gpio17` (by the chip's label) and
+//! `ads1115/voltage3`. A name is left out if two things share it, if it looks like one of the numeric
+//! names, or if klippy can not read it from a configuration.
 
 #![forbid(unsafe_code)]
 
@@ -22,23 +22,23 @@ use std::fmt;
 use super::Inventory;
 use crate::board::{Pin, Range};
 
-/// The chips that have numbers of the C program.
+/// How many chips have pin numbers in the C program.
 const CHIPS: u32 = 9;
-/// Numbers of each of them (`MAX_GPIO_LINES`).
+/// How many numbers each of these chips has (`MAX_GPIO_LINES`).
 const CHIP_LINES: u32 = 288;
-/// The first ADC channel (`ANALOG_START`).
+/// The number of the first ADC channel (`ANALOG_START`).
 const ANALOG: u32 = 1 << 12;
-/// How many of them.
+/// How many ADC channels the C program has.
 const ANALOG_CHANNELS: u32 = 8;
-/// The first hardware PWM channel (`HARD_PWM_START`).
+/// The number of the first hardware PWM channel (`HARD_PWM_START`).
 const PWM: u32 = 1 << 16;
 const PWM_CHIPS: u32 = 8;
 const PWM_CHIP_CHANNELS: u32 = 16;
-/// Lines that the C program has no number for.
+/// The first number of the lines for which the C program has none.
 const FURTHER_LINES: u32 = 1 << 24;
 const FURTHER_CHIPS: u32 = 1 << 12;
 const FURTHER_CHIP_LINES: u32 = 1 << 12;
-/// ADC channels that the C program has no number for.
+/// The first number of the ADC channels for which the C program has none.
 const FURTHER_CHANNELS: u32 = 1 << 25;
 const FURTHER_DEVICES: u32 = 1 << 12;
 const FURTHER_DEVICE_CHANNELS: u32 = 1 << 8;
@@ -55,11 +55,11 @@ pub enum Target {
     },
     /// Channel `voltage<n>` of iio:device0.
     Analog(u32),
-    /// A channel by its position in the scan of an IIO device.
+    /// A channel of an IIO device, by its place among the device's channels.
     Channel {
         /// The number of `iio:device<n>`.
         device: u32,
-        /// Position in [`Adc::channels`](super::adc::Adc::channels).
+        /// Position in [`IioDevice::channels`](super::adc::IioDevice::channels).
         position: u32,
     },
     /// A hardware PWM channel.
@@ -162,7 +162,7 @@ impl Names {
                 for holder in holders.into_iter().flatten() {
                     own.push((format!("{holder}/{}", channel.id), number));
                 }
-                // Two devices of one name can still be told apart.
+                // The driver's name alone does not tell two devices of one type apart.
                 own.push((format!("iio{}/{}", adc.number, channel.id), number));
             }
         }
@@ -172,10 +172,10 @@ impl Names {
         Names(names)
     }
 
-    /// The names of one pin, the most telling first.
+    /// The names of one pin: the line's own name first, then those with the chip in front.
     pub fn of_pin(&self, number: u32) -> Vec<&str> {
         let mut names: Vec<&str> = self.0.iter().filter(|(_, n)| *n == number).map(|(name, _)| name.as_str()).collect();
-        // The line's own name has no slash.
+        // A line's own name has no slash, so it sorts first.
         names.sort_by_key(|name| name.contains('/'));
         names
     }
@@ -198,26 +198,26 @@ impl Names {
     }
 }
 
-/// Leaves out the names that stand for several pins, and repetitions.
+/// Leaves out names that stand for several pins, and the repetitions of a name and pin.
 fn unshared(names: Vec<(String, u32)>) -> Vec<(String, u32)> {
     let mut owner: HashMap<String, Option<u32>> = HashMap::new();
     for (name, number) in &names {
         owner.entry(name.clone()).and_modify(|one| *one = one.filter(|one| one == number)).or_insert(Some(*number));
     }
     let mut names = names;
-    // `remove` leaves one of each that is kept.
+    // Of a name that occurs twice for one pin the first is kept: `remove` finds nothing for the second.
     names.retain(|(name, _)| owner.remove(name).flatten().is_some());
     names
 }
 
-/// Whether klippy reads this name from a configuration as it is.
+/// Whether klippy takes this name from a configuration unchanged.
 fn writable(name: &str) -> bool {
     !name.starts_with('/')
         && name.chars().any(|c| c.is_ascii_alphanumeric())
         && name.chars().all(|c| c.is_ascii_graphic() && !":!^~,#;".contains(c))
 }
 
-/// Whether this is one of the names that are made of numbers, of whatever number.
+/// Whether this looks like a name of the numeric kind (`gpio17`, `analog3`), whatever its number.
 fn numeric_name(name: &str) -> bool {
     let digits = |s: &str| !s.is_empty() && s.bytes().all(|c| c.is_ascii_digit());
     let counted = |s: &str, word: &str| s.strip_prefix(word).is_some_and(digits);
@@ -229,7 +229,7 @@ fn numeric_name(name: &str) -> bool {
     }
 }
 
-/// Joins names whose number counts up with their value.
+/// Joins names whose numbers count up along with their values into ranges.
 fn runs(names: &[(String, u32)]) -> Vec<Range> {
     let mut names: Vec<(&str, Option<u64>, u32, &str)> = names
         .iter()
@@ -258,7 +258,7 @@ fn runs(names: &[(String, u32)]) -> Vec<Range> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::adc::{Adc, Channel};
+    use super::super::adc::{Channel, IioDevice};
     use super::super::gpio::{Chip, LineInfo};
     use super::*;
     use proptest::prelude::*;
@@ -268,12 +268,12 @@ mod tests {
         Chip { number, label: label.into(), lines: names.iter().map(line).collect() }
     }
 
-    fn adc(number: u32, name: &str, ids: &[&str]) -> Adc {
+    fn adc(number: u32, name: &str, ids: &[&str]) -> IioDevice {
         let channel = |id: &&str| Channel { id: id.to_string(), format: None };
-        Adc { number, name: name.into(), label: None, channels: ids.iter().map(channel).collect() }
+        IioDevice { number, name: name.into(), label: None, channels: ids.iter().map(channel).collect() }
     }
 
-    fn names(chips: Vec<Chip>, adcs: Vec<Adc>) -> Vec<(String, u32)> {
+    fn names(chips: Vec<Chip>, adcs: Vec<IioDevice>) -> Vec<(String, u32)> {
         let inventory = Inventory { chips, adcs, ..Inventory::default() };
         Names::of(&inventory).0
     }

@@ -17,7 +17,7 @@ use crate::board::{self, PWM_MAX, PwmConfig};
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{NS_PER_TICK, Ticks};
 
-/// udev needs a moment to hand the files of a new channel to the group.
+/// The files of a newly exported channel belong to root until udev has given them to the group.
 const UDEV_TRIES: u32 = 50;
 const UDEV_PAUSE: Duration = Duration::from_millis(10);
 
@@ -45,8 +45,12 @@ pub(super) struct Pwm {
 }
 
 impl Pwm {
-    /// Exports the channel if nobody did, sets its period and value, and gives it to the guardian.
+    /// Exports the channel if it is not, sets its period and value, and gives it to the guardian.
     /// `class` is `/sys/class/pwm`.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to config pwm device", "Guardian process lost".
     pub(super) fn open(
         class: &Path,
         channel: Channel,
@@ -70,7 +74,8 @@ impl Pwm {
 
     fn set_period(&mut self, cycle: Ticks) -> Result<(), Shutdown> {
         self.period_ns = u64::from(cycle.0) * NS_PER_TICK;
-        // A period below the present duty cycle is refused: zero that first.
+        // The kernel refuses a period shorter than the present duty cycle, so that becomes 0 first.
+        // If this fails, the write below fails as well, and is reported.
         let _ = self.duty.write_at(b"0", 0);
         self.period.write_all_at(self.period_ns.to_string().as_bytes(), 0).map_err(|error| {
             let detail = format!("{}: a period of {} ns: {error}{}", self.channel, self.period_ns, remedy(&error));
@@ -78,7 +83,7 @@ impl Pwm {
         })
     }
 
-    /// Lets the guardian know where the channel belongs if the program dies.
+    /// Tells the guardian what to set the channel to if the program dies.
     fn watch_over(&self, shutdown_value: u16) -> Result<(), Shutdown> {
         let name = self.channel.to_string();
         if shutdown_value == 0 {
@@ -112,7 +117,8 @@ impl board::Pwm for Pwm {
         })
     }
 
-    /// The channel keeps this value at a shutdown, so the guardian is told of it.
+    /// An output of `set_pwm_out` stays as it is when the machine stops. So the guardian is told to
+    /// set it to this value, too.
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         self.set_period(cycle)?;
         self.set(value)?;
@@ -120,7 +126,7 @@ impl board::Pwm for Pwm {
     }
 }
 
-/// The channel's folder; BeagleBone kernels name it otherwise.
+/// The channel's folder, which is made if it is not there. BeagleBone kernels call it `pwm-C:N`.
 fn export(class: &Path, channel: Channel) -> io::Result<PathBuf> {
     let chip = class.join(format!("pwmchip{}", channel.chip));
     let folder = chip.join(format!("pwm{}", channel.channel));

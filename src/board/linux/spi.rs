@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! SPI devices of spidev.
+//! SPI devices through the kernel's spidev driver.
 
 #![forbid(unsafe_code)]
 
@@ -17,9 +17,9 @@ use super::gpio::not_permitted;
 use crate::board::{BusDevice, BusError, BusStatus, ChipSelect, Range};
 use crate::shutdown::{Shutdown, reason};
 
-/// Buses with numbers of the C program.
+/// How many buses the C program has names for.
 const BUSES: u32 = 8;
-/// Chip selects of each that have names.
+/// How many chip selects of each bus have names.
 const BUS_NODES: u32 = 16;
 
 /// A device node `/dev/spidev<bus>.<select>`.
@@ -37,7 +37,7 @@ impl Node {
         Node { bus: number >> 8, select: number & 0xff }
     }
 
-    /// The number on the wire, if it has one.
+    /// The number on the wire; none for a chip select above 255, which the number has no room for.
     pub fn number(self) -> Option<u32> {
         let fits = self.select <= 0xff && self.bus <= u32::MAX >> 8;
         fits.then_some(self.bus << 8 | self.select)
@@ -84,13 +84,18 @@ pub struct Spi {
     mode: u8,
     rate_hz: u32,
     chip_select: Option<ChipSelect>,
-    /// The node's present mode. Chips that share a node, told apart by lines of our own, may
-    /// differ in their mode, and the kernel keeps one for the node. One worker runs them all.
+    /// The mode that the node is set to at present. Several chips may share a node, each selected by
+    /// a GPIO line, and may need different modes; the kernel keeps only one for the node. As one
+    /// worker speaks to all of them, the order of their accesses is clear.
     node_mode: Arc<AtomicU8>,
 }
 
 impl Spi {
-    /// Opens a node and sets its rate and mode. `node_mode` is common to all who use the node.
+    /// Opens a node and sets its rate and mode. All devices on the node share `node_mode`.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open spi device", "Unable to set SPI speed", "Unable to set SPI mode".
     pub fn open(
         dev: &Path,
         node: Node,
@@ -113,8 +118,8 @@ impl Spi {
         Ok(spi)
     }
 
-    /// Sets all the node's mode bits, as the C program does; the kernel keeps the sense of a
-    /// chip select line that it knows of.
+    /// Sets all mode bits of the node, as the C program does. That clears SPI_CS_HIGH, too, but the
+    /// kernel itself keeps the polarity of a chip select that the device tree describes.
     fn set_mode(&mut self) -> Result<(), String> {
         let flags = SpiModeFlags::from_bits_retain(self.mode.into());
         self.device.configure(SpidevOptions::new().mode(flags)).map_err(|error| {
@@ -156,7 +161,7 @@ impl Spi {
 impl BusDevice for Spi {
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
         let exchanged = self.select(true).and_then(|()| self.transfer(bytes));
-        // After a failure too.
+        // A chip that stayed selected after a failure would disturb the next conversation.
         let deselected = self.select(false);
         exchanged.and(deselected).map_err(|detail| BusError { status: BusStatus::Nack, detail: detail.into() })
     }

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The simulated printer's description: TOML in, checked values out.
 
+#![forbid(unsafe_code)]
+
 use std::collections::HashSet;
 use std::fmt;
 use std::fs;
@@ -8,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::thermistor::Thermistor;
+use super::thermistor::{KELVIN, NoThermistor, Thermistor};
 
 /// What is wrong with a description, in one line: file, key, cause, remedy.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -375,180 +377,35 @@ impl SimConfig {
         Ok(config)
     }
 
-    /// Whether the values make a printer.
+    /// Checks that the values make a printer.
+    ///
+    /// # Errors
+    ///
+    /// The first value that is wrong, with its key and a remedy.
     pub(super) fn validate(&self) -> Result<(), SimError> {
-        use Bound::{AboveZero, Any, NotNegative};
-        let limits = &self.limits;
-        check("[limits]", "velocity_mm_per_s", limits.velocity_mm_per_s, AboveZero)?;
-        check("[limits]", "accel_mm_per_s2", limits.accel_mm_per_s2, AboveZero)?;
-        check("[limits]", "z_velocity_mm_per_s", limits.z_velocity_mm_per_s, AboveZero)?;
-        check("[limits]", "z_accel_mm_per_s2", limits.z_accel_mm_per_s2, AboveZero)?;
-        let mut pins = HashSet::new();
-        let mut pin = |whose: &str, key: &str, pin: Option<&PinName>| match pin {
-            Some(pin) if !pins.insert(pin.name.clone()) => {
-                wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name")
-            }
-            _ => Ok(()),
-        };
-        let unique = |kind: &str, names: Vec<&String>| {
-            let mut seen = HashSet::new();
-            names.into_iter().try_for_each(|name| {
-                if !is_word(name) {
-                    wrong(kind, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
-                } else if !seen.insert(name) {
-                    wrong(kind, "name", &format!("two are called `{name}`"), "rename one")
-                } else {
-                    Ok(())
-                }
-            })
-        };
-        unique("[[axis]]", self.axes.iter().map(|axis| &axis.name).collect())?;
-        unique("[[heater]]", self.heaters.iter().map(|heater| &heater.name).collect())?;
-        unique("[[fan]]", self.fans.iter().map(|fan| &fan.name).collect())?;
-        unique("[[led]]", self.leds.iter().map(|led| &led.name).collect())?;
-        unique("[[output]]", self.outputs.iter().map(|output| &output.name).collect())?;
-        unique("[[input]]", self.inputs.iter().map(|input| &input.name).collect())?;
-
-        for axis in &self.axes {
-            let whose = &format!("axis `{}`", axis.name);
-            pin(whose, "step_pin", Some(&axis.step_pin))?;
-            pin(whose, "dir_pin", Some(&axis.dir_pin))?;
-            pin(whose, "enable_pin", axis.enable_pin.as_ref())?;
-            pin(whose, "endstop_pin", axis.endstop_pin.as_ref())?;
-            check(whose, "steps_per_mm", axis.steps_per_mm, AboveZero)?;
-            check(whose, "microsteps", axis.microsteps.into(), AboveZero)?;
-            check(whose, "overtravel_mm", axis.overtravel_mm, NotNegative)?;
-            check(whose, "start_mm", axis.start_mm, Any)?;
-            check(whose, "homing_mm_per_s", axis.homing_mm_per_s, AboveZero)?;
-            match axis.travel_mm {
-                Some(travel_mm) => {
-                    check(whose, "travel_mm", travel_mm, AboveZero)?;
-                    let free = -axis.overtravel_mm..=travel_mm + axis.overtravel_mm;
-                    if !free.contains(&axis.start_mm) {
-                        return wrong(
-                            whose,
-                            "start_mm",
-                            &format!("{} is out of its reach", axis.start_mm),
-                            &format!("start between 0 and {travel_mm}"),
-                        );
-                    }
-                }
-                None if axis.endstop_pin.is_some() => {
-                    return wrong(
-                        whose,
-                        "travel_mm",
-                        "an axis with an endstop needs it",
-                        "add it, or remove `endstop_pin`",
-                    );
-                }
-                None => {}
-            }
-        }
-        for heater in &self.heaters {
-            let whose = &format!("heater `{}`", heater.name);
-            pin(whose, "pin", Some(&heater.pin))?;
-            pin(whose, "sensor_pin", Some(&heater.sensor_pin))?;
-            if heater.sensor_pin.inverted {
-                return wrong(whose, "sensor_pin", "an analog pin has no polarity", "remove the `!`");
-            }
-            check(whose, "heater_watts", heater.heater_watts, AboveZero)?;
-            check(whose, "heat_capacity_j_per_k", heater.heat_capacity_j_per_k, AboveZero)?;
-            check(whose, "loss_w_per_k", heater.loss_w_per_k, AboveZero)?;
-            check(whose, "sensor_lag_s", heater.sensor_lag_s, NotNegative)?;
-            let time_constant_s = heater.heat_capacity_j_per_k / heater.loss_w_per_k;
-            if heater.sensor_lag_s > time_constant_s / 2.0 {
-                return wrong(
-                    whose,
-                    "sensor_lag_s",
-                    &format!("{} is slower than the heater itself", heater.sensor_lag_s),
-                    &format!("stay below {:.1}", time_constant_s / 2.0),
-                );
-            }
-            let absolute_zero = -Thermistor::KELVIN;
-            for (key, celsius) in [
-                ("ambient_celsius", heater.ambient_celsius),
-                ("start_celsius", heater.start_celsius()),
-                ("min_celsius", heater.min_celsius),
-            ] {
-                check(whose, key, celsius, Any)?;
-                if celsius <= absolute_zero {
-                    return wrong(whose, key, &format!("{celsius} is below absolute zero"), "use degrees Celsius");
-                }
-            }
-            check(whose, "max_celsius", heater.max_celsius, Any)?;
-            if heater.max_celsius <= heater.min_celsius {
-                return wrong(
-                    whose,
-                    "max_celsius",
-                    &format!("{} is not above min_celsius", heater.max_celsius),
-                    "raise it",
-                );
-            }
-            check(whose, "noise_counts", heater.noise_counts, NotNegative)?;
-            check(whose, "pullup_ohm", heater.pullup_ohm, AboveZero)?;
-            heater.thermistor()?;
-        }
-        for fan in &self.fans {
-            let whose = &format!("fan `{}`", fan.name);
-            pin(whose, "pin", Some(&fan.pin))?;
-            pin(whose, "enable_pin", fan.enable_pin.as_ref())?;
-            pin(whose, "tachometer_pin", fan.tachometer_pin.as_ref())?;
-            check(whose, "pulses_per_revolution", fan.pulses_per_revolution.into(), AboveZero)?;
-            check(whose, "max_rpm", fan.max_rpm, AboveZero)?;
-            check(whose, "spin_up_s", fan.spin_up_s, AboveZero)?;
-        }
+        self.limits.validate()?;
+        unique("[[axis]]", self.axes.iter().map(|axis| &axis.name))?;
+        unique("[[heater]]", self.heaters.iter().map(|heater| &heater.name))?;
+        unique("[[fan]]", self.fans.iter().map(|fan| &fan.name))?;
+        unique("[[led]]", self.leds.iter().map(|led| &led.name))?;
+        unique("[[output]]", self.outputs.iter().map(|output| &output.name))?;
+        unique("[[input]]", self.inputs.iter().map(|input| &input.name))?;
+        unique("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name))?;
+        let mut pins = UsedPins::default();
+        self.axes.iter().try_for_each(|axis| axis.validate(&mut pins))?;
+        self.heaters.iter().try_for_each(|heater| heater.validate(&mut pins))?;
+        self.fans.iter().try_for_each(|fan| fan.validate(&mut pins))?;
         for led in &self.leds {
-            pin(&format!("led `{}`", led.name), "pin", Some(&led.pin))?;
+            pins.claim(&format!("led `{}`", led.name), "pin", Some(&led.pin))?;
         }
         for output in &self.outputs {
-            pin(&format!("output `{}`", output.name), "pin", Some(&output.pin))?;
+            pins.claim(&format!("output `{}`", output.name), "pin", Some(&output.pin))?;
         }
         for input in &self.inputs {
-            pin(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
+            pins.claim(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
         }
-        unique("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name).collect())?;
-        for bus in &self.spi_buses {
-            let whose = &format!("spi_bus `{}`", bus.name);
-            check(whose, "delay_us", bus.delay_us as f64, NotNegative)?;
-            if let Some(name) = bus.trace_pins.iter().find(|name| !self.switched().any(|part| part.pin.name == **name))
-            {
-                let cause = format!("`{name}` is no pin of an [[output]] or [[led]]");
-                return wrong(whose, "trace_pins", &cause, "name such a pin, without `!`");
-            }
-        }
-        for chip in &self.chips {
-            let whose = &format!("chip `{}`", chip.name());
-            pin(whose, "select_pin", chip.select_pin())?;
-            if !self.spi_buses.iter().any(|bus| bus.name == chip.bus()) {
-                return wrong(whose, "bus", &format!("there is no `{}`", chip.bus()), "name an [[spi_bus]]");
-            }
-            let shares = self.chips.iter().filter(|other| other.bus() == chip.bus()).count() > 1;
-            match chip.select_pin() {
-                Some(pin) if pin.inverted => {
-                    return wrong(
-                        whose,
-                        "select_pin",
-                        "klippy knows chips that are selected by a low level only",
-                        "remove the `!`",
-                    );
-                }
-                None if shares => {
-                    return wrong(whose, "select_pin", "it is not the only chip on its bus", "add it");
-                }
-                _ => {}
-            }
-            if let ChipConfig::Tmc5160 { axis, .. } = chip {
-                let drives =
-                    |other: &&ChipConfig| matches!(other, ChipConfig::Tmc5160 { axis: driven, .. } if driven == axis);
-                if !self.axes.iter().any(|other| other.name == *axis) {
-                    return wrong(whose, "axis", &format!("there is no `{axis}`"), "name an [[axis]]");
-                }
-                if self.chips.iter().filter(drives).count() > 1 {
-                    return wrong(whose, "axis", &format!("`{axis}` has two drivers"), "remove one");
-                }
-            }
-        }
-        Ok(())
+        self.spi_buses.iter().try_for_each(|bus| bus.validate(self))?;
+        self.chips.iter().try_for_each(|chip| chip.validate(self, &mut pins))
     }
 
     /// Lights and other outputs.
@@ -557,7 +414,89 @@ impl SimConfig {
     }
 }
 
+impl Limits {
+    fn validate(&self) -> Result<(), SimError> {
+        for (key, value) in [
+            ("velocity_mm_per_s", self.velocity_mm_per_s),
+            ("accel_mm_per_s2", self.accel_mm_per_s2),
+            ("z_velocity_mm_per_s", self.z_velocity_mm_per_s),
+            ("z_accel_mm_per_s2", self.z_accel_mm_per_s2),
+        ] {
+            check("[limits]", key, value, Bound::AboveZero)?;
+        }
+        Ok(())
+    }
+}
+
+impl AxisConfig {
+    /// Checks the axis by itself, and that its pins are free.
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+        use Bound::{AboveZero, Any, NotNegative};
+        let whose = &format!("axis `{}`", self.name);
+        pins.claim(whose, "step_pin", Some(&self.step_pin))?;
+        pins.claim(whose, "dir_pin", Some(&self.dir_pin))?;
+        pins.claim(whose, "enable_pin", self.enable_pin.as_ref())?;
+        pins.claim(whose, "endstop_pin", self.endstop_pin.as_ref())?;
+        check(whose, "steps_per_mm", self.steps_per_mm, AboveZero)?;
+        check(whose, "microsteps", self.microsteps.into(), AboveZero)?;
+        check(whose, "overtravel_mm", self.overtravel_mm, NotNegative)?;
+        check(whose, "start_mm", self.start_mm, Any)?;
+        check(whose, "homing_mm_per_s", self.homing_mm_per_s, AboveZero)?;
+        match self.travel_mm {
+            Some(travel_mm) => {
+                check(whose, "travel_mm", travel_mm, AboveZero)?;
+                let free = -self.overtravel_mm..=travel_mm + self.overtravel_mm;
+                if !free.contains(&self.start_mm) {
+                    return wrong(
+                        whose,
+                        "start_mm",
+                        &format!("{} is out of its reach", self.start_mm),
+                        &format!("start between 0 and {travel_mm}"),
+                    );
+                }
+            }
+            None if self.endstop_pin.is_some() => {
+                return wrong(
+                    whose,
+                    "travel_mm",
+                    "an axis with an endstop needs it",
+                    "add it, or remove `endstop_pin`",
+                );
+            }
+            None => {}
+        }
+        Ok(())
+    }
+}
+
+impl FanConfig {
+    /// Checks the fan by itself, and that its pins are free.
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+        use Bound::AboveZero;
+        let whose = &format!("fan `{}`", self.name);
+        pins.claim(whose, "pin", Some(&self.pin))?;
+        pins.claim(whose, "enable_pin", self.enable_pin.as_ref())?;
+        pins.claim(whose, "tachometer_pin", self.tachometer_pin.as_ref())?;
+        check(whose, "pulses_per_revolution", self.pulses_per_revolution.into(), AboveZero)?;
+        check(whose, "max_rpm", self.max_rpm, AboveZero)?;
+        check(whose, "spin_up_s", self.spin_up_s, AboveZero)?;
+        Ok(())
+    }
+}
+
 impl SpiBusConfig {
+    /// Checks the bus, and that the pins to trace are outputs of the printer.
+    fn validate(&self, printer: &SimConfig) -> Result<(), SimError> {
+        let whose = &format!("spi_bus `{}`", self.name);
+        check(whose, "delay_us", self.delay_us as f64, Bound::NotNegative)?;
+        let unknown = self.trace_pins.iter().find(|name| !printer.switched().any(|part| part.pin.name == **name));
+        unknown.map_or(Ok(()), |name| {
+            let cause = format!("`{name}` is no pin of an [[output]] or [[led]]");
+            wrong(whose, "trace_pins", &cause, "name such a pin, without `!`")
+        })
+    }
+
+    /// The error of a `trace_file` that can not be made.
     pub(super) fn no_trace_file(&self, error: &std::io::Error) -> SimError {
         fault(
             &format!("spi_bus `{}`", self.name),
@@ -569,6 +508,41 @@ impl SpiBusConfig {
 }
 
 impl ChipConfig {
+    /// Checks the chip against the rest of the printer, and that its pin is free.
+    fn validate(&self, printer: &SimConfig, pins: &mut UsedPins) -> Result<(), SimError> {
+        let whose = &format!("chip `{}`", self.name());
+        pins.claim(whose, "select_pin", self.select_pin())?;
+        if !printer.spi_buses.iter().any(|bus| bus.name == self.bus()) {
+            return wrong(whose, "bus", &format!("there is no `{}`", self.bus()), "name an [[spi_bus]]");
+        }
+        let shares = printer.chips.iter().filter(|other| other.bus() == self.bus()).count() > 1;
+        match self.select_pin() {
+            Some(pin) if pin.inverted => {
+                return wrong(
+                    whose,
+                    "select_pin",
+                    "klippy knows chips that are selected by a low level only",
+                    "remove the `!`",
+                );
+            }
+            None if shares => {
+                return wrong(whose, "select_pin", "it is not the only chip on its bus", "add it");
+            }
+            _ => {}
+        }
+        if let ChipConfig::Tmc5160 { axis, .. } = self {
+            let drives =
+                |other: &&ChipConfig| matches!(other, ChipConfig::Tmc5160 { axis: driven, .. } if driven == axis);
+            if !printer.axes.iter().any(|other| other.name == *axis) {
+                return wrong(whose, "axis", &format!("there is no `{axis}`"), "name an [[axis]]");
+            }
+            if printer.chips.iter().filter(drives).count() > 1 {
+                return wrong(whose, "axis", &format!("`{axis}` has two drivers"), "remove one");
+            }
+        }
+        Ok(())
+    }
+
     /// What it is, for a person.
     pub(super) fn name(&self) -> String {
         match self {
@@ -591,16 +565,114 @@ impl ChipConfig {
 }
 
 impl HeaterConfig {
-    /// The temperature at first.
+    /// Checks the heater by itself, and that its pins are free.
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+        use Bound::{AboveZero, NotNegative};
+        let whose = &format!("heater `{}`", self.name);
+        pins.claim(whose, "pin", Some(&self.pin))?;
+        pins.claim(whose, "sensor_pin", Some(&self.sensor_pin))?;
+        if self.sensor_pin.inverted {
+            return wrong(whose, "sensor_pin", "an analog pin has no polarity", "remove the `!`");
+        }
+        check(whose, "heater_watts", self.heater_watts, AboveZero)?;
+        check(whose, "heat_capacity_j_per_k", self.heat_capacity_j_per_k, AboveZero)?;
+        check(whose, "loss_w_per_k", self.loss_w_per_k, AboveZero)?;
+        check(whose, "sensor_lag_s", self.sensor_lag_s, NotNegative)?;
+        let time_constant_s = self.heat_capacity_j_per_k / self.loss_w_per_k;
+        if self.sensor_lag_s > time_constant_s / 2.0 {
+            return wrong(
+                whose,
+                "sensor_lag_s",
+                &format!("{} is slower than the heater itself", self.sensor_lag_s),
+                &format!("stay below {:.1}", time_constant_s / 2.0),
+            );
+        }
+        self.validate_temperatures(whose)?;
+        check(whose, "noise_counts", self.noise_counts, NotNegative)?;
+        check(whose, "pullup_ohm", self.pullup_ohm, AboveZero)?;
+        self.thermistor()?;
+        Ok(())
+    }
+
+    fn validate_temperatures(&self, whose: &str) -> Result<(), SimError> {
+        let absolute_zero = -KELVIN;
+        for (key, celsius) in [
+            ("ambient_celsius", self.ambient_celsius),
+            ("start_celsius", self.start_celsius()),
+            ("min_celsius", self.min_celsius),
+        ] {
+            check(whose, key, celsius, Bound::Any)?;
+            if celsius <= absolute_zero {
+                return wrong(whose, key, &format!("{celsius} is below absolute zero"), "use degrees Celsius");
+            }
+        }
+        check(whose, "max_celsius", self.max_celsius, Bound::Any)?;
+        if self.max_celsius <= self.min_celsius {
+            return wrong(whose, "max_celsius", &format!("{} is not above min_celsius", self.max_celsius), "raise it");
+        }
+        Ok(())
+    }
+
+    /// The temperature at first, in °C.
     pub(super) fn start_celsius(&self) -> f64 {
         self.start_celsius.unwrap_or(self.ambient_celsius)
     }
 
-    /// Its thermistor.
+    /// The thermistor that these points and this beta describe.
+    ///
+    /// # Errors
+    ///
+    /// The key whose values no thermistor has, and a remedy.
     pub(super) fn thermistor(&self) -> Result<Thermistor, SimError> {
-        Thermistor::new(self)
-            .map_err(|(key, cause, remedy)| fault(&format!("heater `{}`", self.name), key, cause, remedy))
+        const POINTS: &str = "points_celsius_ohm";
+        Thermistor::new(&self.points_celsius_ohm, self.beta_k, self.pullup_ohm).map_err(|why| {
+            let (key, cause, remedy) = match why {
+                NoThermistor::PointOutOfRange => {
+                    (POINTS, "kelvins and resistances are above zero", "take the points from the data sheet")
+                }
+                NoThermistor::BetaOutOfRange => ("beta_k", "a beta is above zero", "such as 3950.0"),
+                NoThermistor::BetaMissing => ("beta_k", "one point needs a beta", "add it, or three points"),
+                NoThermistor::PointsBesideBeta => (POINTS, "with `beta_k` there is one point", "keep one"),
+                NoThermistor::PointCount => {
+                    (POINTS, "none, two or more than three points", "give three, or one and `beta_k`")
+                }
+                NoThermistor::PointsOnNoCurve => {
+                    (POINTS, "no thermistor has these three", "take others from the data sheet, or one and `beta_k`")
+                }
+            };
+            fault(&format!("heater `{}`", self.name), key, cause, remedy)
+        })
     }
+}
+
+/// The pins that have a use already, by name.
+#[derive(Default)]
+struct UsedPins(HashSet<String>);
+
+impl UsedPins {
+    /// Uses a pin, if there is one; fails if it has a use already.
+    fn claim(&mut self, whose: &str, key: &str, pin: Option<&PinName>) -> Result<(), SimError> {
+        match pin {
+            Some(pin) if !self.0.insert(pin.name.clone()) => {
+                wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name")
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
+/// Checks that the parts of a kind have names, and that no two share one.
+fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>) -> Result<(), SimError> {
+    let mut seen = HashSet::new();
+    names.try_for_each(|name| {
+        if !is_word(name) {
+            wrong(kind, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
+        } else if !seen.insert(name) {
+            wrong(kind, "name", &format!("two are called `{name}`"), "rename one")
+        } else {
+            Ok(())
+        }
+    })
 }
 
 /// The error of a key.

@@ -5,6 +5,8 @@
 //! allocates: a state changes only when a pin does, and what lies between two changes is solved
 //! exactly by whoever asks.
 
+#![forbid(unsafe_code)]
+
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
 
 use super::config::{AxisConfig, End, FanConfig, HeaterConfig};

@@ -1,9 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The printer.cfg with which a klippy finds on the board what the description put there.
 
+#![forbid(unsafe_code)]
+
 use std::fmt::{self, Display, Write};
 
-use super::config::{AxisConfig, ChipConfig, End, FanConfig, HeaterConfig, PinName, SimConfig};
+use super::config::{AxisConfig, ChipConfig, End, FanConfig, HeaterConfig, InputConfig, SimConfig};
 
 /// Full steps in a turn of the usual stepper motor.
 const FULL_STEPS: f64 = 200.0;
@@ -20,69 +22,13 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     cfg.section("mcu");
     cfg.key("serial", pty);
 
-    let axis = |name: &str| config.axes.iter().find(|axis| axis.name == name);
-    let rail = |name: &str| axis(name).is_some_and(|axis| axis.endstop_pin.is_some());
-    let cartesian = rail("x") && rail("y") && rail("z");
-    let limits = &config.limits;
-    cfg.section("printer");
-    cfg.key("kinematics", if cartesian { "cartesian" } else { "none" });
-    cfg.key("max_velocity", limits.velocity_mm_per_s);
-    cfg.key("max_accel", limits.accel_mm_per_s2);
-    if cartesian {
-        // klippy refuses a z axis that outruns the head.
-        let velocity = limits.z_velocity_mm_per_s.min(limits.velocity_mm_per_s);
-        let accel = limits.z_accel_mm_per_s2.min(limits.accel_mm_per_s2);
-        cfg.key("max_z_velocity", velocity);
-        cfg.key("max_z_accel", accel);
-    }
-
-    let hot_end = |name: &str| name == "extruder";
-    let has_hot_end = config.heaters.iter().any(|heater| hot_end(&heater.name));
-    let stepper = |name: &str| match name {
-        "x" | "y" | "z" if cartesian => format!("stepper_{name}"),
-        "extruder" if has_hot_end => "extruder".to_owned(),
-        name => format!("manual_stepper {name}"),
-    };
-    for axis in &config.axes {
-        match axis.name.as_str() {
-            "x" | "y" | "z" if cartesian => {
-                cfg.section(stepper(&axis.name));
-                cfg.stepper(axis);
-                cfg.rail(axis);
-            }
-            // Goes into the hot end's section.
-            "extruder" if has_hot_end => {}
-            name => {
-                cfg.section(stepper(name));
-                cfg.stepper(axis);
-                cfg.key("velocity", axis.homing_mm_per_s);
-                cfg.key_if("endstop_pin", axis.endstop_pin.as_ref());
-            }
-        }
-    }
+    let layout = Layout::of(config);
+    cfg.motion(&layout);
     for heater in &config.heaters {
         cfg.thermistor(heater);
-        match heater.name.as_str() {
-            "extruder" => {
-                cfg.section("extruder");
-                if let Some(axis) = axis("extruder") {
-                    cfg.stepper(axis);
-                }
-                cfg.key("nozzle_diameter", 0.4);
-                cfg.key("filament_diameter", 1.75);
-                let min_extrude = 170f64.clamp(heater.min_celsius, heater.max_celsius);
-                cfg.key("min_extrude_temp", min_extrude);
-            }
-            "heater_bed" => cfg.section("heater_bed"),
-            name => cfg.section(format_args!("heater_generic {name}")),
-        }
-        cfg.heater(heater);
+        cfg.heater(heater, &layout);
     }
     for fan in &config.fans {
-        match fan.name.as_str() {
-            "fan" => cfg.section("fan"),
-            name => cfg.section(format_args!("fan_generic {name}")),
-        }
         cfg.fan(fan);
     }
     for led in &config.leds {
@@ -94,28 +40,41 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
         cfg.key("pin", &output.pin);
     }
     for chip in &config.chips {
-        match chip {
-            // No section of klippy's is for it.
-            ChipConfig::Loopback { .. } => {}
-            ChipConfig::Tmc5160 { bus, select_pin, axis } => {
-                cfg.section(format_args!("tmc5160 {}", stepper(axis)));
-                cfg.comment("May be left out, as the motor turns without; then start Pinion anew: the chip keeps");
-                cfg.comment("what it was told.");
-                cfg.chip(bus, select_pin.as_ref());
-                cfg.key("run_current", 0.8);
-                cfg.key("sense_resistor", 0.075);
-            }
-        }
+        cfg.chip(chip, &layout);
     }
-    if !config.inputs.is_empty() {
-        cfg.section_break();
-        cfg.comment("Inputs at a fixed level, for whatever watches one:");
-        for input in &config.inputs {
-            let level = if input.level { "on" } else { "off" };
-            cfg.comment(format_args!("  {}: {} ({level})", input.name, input.pin));
-        }
-    }
+    cfg.inputs(&config.inputs);
     cfg.0
+}
+
+/// The name of klippy's section that has both the hot end's heater and its stepper.
+const HOT_END: &str = "extruder";
+
+/// Which of klippy's sections the axes belong to.
+struct Layout<'a> {
+    config: &'a SimConfig,
+    /// Whether the axes `x`, `y` and `z` can be homed, as klippy's cartesian kinematics wants.
+    is_cartesian: bool,
+    has_hot_end: bool,
+}
+
+impl<'a> Layout<'a> {
+    fn of(config: &'a SimConfig) -> Layout<'a> {
+        let can_home = |name| config.axes.iter().any(|axis| axis.name == name && axis.endstop_pin.is_some());
+        Layout {
+            config,
+            is_cartesian: ["x", "y", "z"].into_iter().all(can_home),
+            has_hot_end: config.heaters.iter().any(|heater| heater.name == HOT_END),
+        }
+    }
+
+    /// The section of an axis' stepper.
+    fn stepper(&self, axis: &str) -> String {
+        match axis {
+            "x" | "y" | "z" if self.is_cartesian => format!("stepper_{axis}"),
+            HOT_END if self.has_hot_end => HOT_END.to_owned(),
+            name => format!("manual_stepper {name}"),
+        }
+    }
 }
 
 /// A printer.cfg as it grows.
@@ -152,6 +111,37 @@ impl Sections {
         }
     }
 
+    /// `[printer]`, and a section for each axis but the hot end's.
+    fn motion(&mut self, layout: &Layout<'_>) {
+        let limits = &layout.config.limits;
+        self.section("printer");
+        self.key("kinematics", if layout.is_cartesian { "cartesian" } else { "none" });
+        self.key("max_velocity", limits.velocity_mm_per_s);
+        self.key("max_accel", limits.accel_mm_per_s2);
+        if layout.is_cartesian {
+            // klippy refuses a z axis that is faster than the head.
+            self.key("max_z_velocity", limits.z_velocity_mm_per_s.min(limits.velocity_mm_per_s));
+            self.key("max_z_accel", limits.z_accel_mm_per_s2.min(limits.accel_mm_per_s2));
+        }
+        for axis in &layout.config.axes {
+            match axis.name.as_str() {
+                "x" | "y" | "z" if layout.is_cartesian => {
+                    self.section(layout.stepper(&axis.name));
+                    self.stepper(axis);
+                    self.rail(axis);
+                }
+                // Its keys stand in the section of the hot end's heater.
+                HOT_END if layout.has_hot_end => {}
+                name => {
+                    self.section(layout.stepper(name));
+                    self.stepper(axis);
+                    self.key("velocity", axis.homing_mm_per_s);
+                    self.key_if("endstop_pin", axis.endstop_pin.as_ref());
+                }
+            }
+        }
+    }
+
     fn stepper(&mut self, axis: &AxisConfig) {
         self.key("step_pin", &axis.step_pin);
         self.key("dir_pin", &axis.dir_pin);
@@ -185,7 +175,21 @@ impl Sections {
         self.key_if("beta", heater.beta_k);
     }
 
-    fn heater(&mut self, heater: &HeaterConfig) {
+    fn heater(&mut self, heater: &HeaterConfig, layout: &Layout<'_>) {
+        match heater.name.as_str() {
+            HOT_END => {
+                self.section(HOT_END);
+                if let Some(axis) = layout.config.axes.iter().find(|axis| axis.name == HOT_END) {
+                    self.stepper(axis);
+                }
+                self.key("nozzle_diameter", 0.4);
+                self.key("filament_diameter", 1.75);
+                let min_extrude = 170f64.clamp(heater.min_celsius, heater.max_celsius);
+                self.key("min_extrude_temp", min_extrude);
+            }
+            "heater_bed" => self.section("heater_bed"),
+            name => self.section(format_args!("heater_generic {name}")),
+        }
         self.key("heater_pin", &heater.pin);
         self.key("sensor_type", format_args!("sim_{}", heater.name));
         self.key("sensor_pin", &heater.sensor_pin);
@@ -199,15 +203,42 @@ impl Sections {
         self.key("pid_Kd", format_args!("{:.3}", gains.kd));
     }
 
-    fn chip(&mut self, bus: &str, select_pin: Option<&PinName>) {
-        match select_pin {
-            Some(pin) => self.key("cs_pin", pin),
-            None => self.key("cs_pin", "None"),
+    fn chip(&mut self, chip: &ChipConfig, layout: &Layout<'_>) {
+        match chip {
+            // klippy has no section for a wire; a test's own commands talk to it.
+            ChipConfig::Loopback { .. } => {}
+            ChipConfig::Tmc5160 { bus, select_pin, axis } => {
+                self.section(format_args!("tmc5160 {}", layout.stepper(axis)));
+                self.comment("May be left out, as the motor turns without; then start Pinion anew: the chip keeps");
+                self.comment("what it was told.");
+                match select_pin {
+                    Some(pin) => self.key("cs_pin", pin),
+                    None => self.key("cs_pin", "None"),
+                }
+                self.key("spi_bus", bus);
+                self.key("run_current", 0.8);
+                self.key("sense_resistor", 0.075);
+            }
         }
-        self.key("spi_bus", bus);
+    }
+
+    fn inputs(&mut self, inputs: &[InputConfig]) {
+        if inputs.is_empty() {
+            return;
+        }
+        self.section_break();
+        self.comment("Inputs at a fixed level, for whatever watches one:");
+        for input in inputs {
+            let level = if input.level { "on" } else { "off" };
+            self.comment(format_args!("  {}: {} ({level})", input.name, input.pin));
+        }
     }
 
     fn fan(&mut self, fan: &FanConfig) {
+        match fan.name.as_str() {
+            "fan" => self.section("fan"),
+            name => self.section(format_args!("fan_generic {name}")),
+        }
         self.key("pin", &fan.pin);
         self.key_if("enable_pin", fan.enable_pin.as_ref());
         if let Some(pin) = &fan.tachometer_pin {
@@ -218,23 +249,24 @@ impl Sections {
     }
 }
 
-/// klippy's PID parameters.
+/// klippy's PID parameters. 255 of each stand for full power.
 #[derive(Clone, Copy, Debug)]
-pub struct Gains {
-    /// Full power is 255 of it for each kelvin too cold.
-    pub kp: f64,
-    /// The same for each kelvin and second.
-    pub ki: f64,
-    /// The same for each kelvin a second.
-    pub kd: f64,
+pub(super) struct Gains {
+    /// Power for each kelvin that the heater is too cold.
+    pub(super) kp: f64,
+    /// Power for each kelvin too cold and each second that this has lasted.
+    pub(super) ki: f64,
+    /// Power for each kelvin a second at which the temperature falls.
+    pub(super) kd: f64,
 }
 
 impl Gains {
-    /// The gains for a heater by the SIMC rules (Skogestad, 2003): the loop is to be as quick as
-    /// its delay. The delay is klippy's (a reading is half of 0.3 s old, its answer waits for
-    /// 0.3 s, the soft PWM has 0.1 s) and the sensor's lag. The derivative cancels half of it.
-    /// Full power is never less than 2 K away: a finer loop would follow the sensor's noise.
-    pub fn of(heater: &HeaterConfig) -> Gains {
+    /// The gains for a heater by the SIMC rules (Skogestad, 2003), which make the loop as quick as
+    /// its delay allows. That delay is klippy's 0.5 s and the sensor's lag: a reading is 0.15 s old on
+    /// average (klippy takes one in 0.3 s), its answer takes effect 0.3 s later, and the soft PWM's cycle
+    /// of 0.1 s adds half of that. The derivative term cancels half of the delay. Full power is reached no closer
+    /// than 2 K below the target, as a stronger gain would make power follow the sensor's noise.
+    pub(super) fn of(heater: &HeaterConfig) -> Gains {
         const PID_PARAM_BASE: f64 = 255.0;
         const FINEST_BAND_K: f64 = 2.0;
         let delay_s = 0.5 + heater.sensor_lag_s;

@@ -1,4 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
+//! The simulated board in virtual time: what its pins do to axes, heaters and fans.
+
+#![forbid(unsafe_code)]
+
 use super::*;
 use std::collections::HashSet;
 
