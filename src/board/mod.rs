@@ -140,7 +140,6 @@ pub trait Pwm: Send {
 /// How a bus answered, in the words of the dictionary's `i2c_bus_status`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BusStatus {
-<<<<<<< HEAD
     /// The chip did not acknowledge a byte, or the driver failed in another way than these; SPI has
     /// no other status.
     Nack,
@@ -150,10 +149,6 @@ pub enum BusStatus {
     StartNack,
     /// No chip acknowledged the address when it was addressed again to be read from.
     StartReadNack,
-=======
-    /// The transfer failed. SPI has no other status.
-    Failed,
->>>>>>> link
 }
 
 /// Why a conversation with a chip failed.
@@ -165,7 +160,6 @@ pub struct BusError {
     pub detail: Box<str>,
 }
 
-<<<<<<< HEAD
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
 ///
 /// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
@@ -197,16 +191,6 @@ impl BusError {
         let detail = format!("{wanted} was asked of {is}: a fault of the host's configuration; correct the bus");
         BusError { status: BusStatus::Nack, detail: detail.into() }
     }
-=======
-/// One chip on its bus. A worker uses it, for one conversation at a time; calls may block.
-pub trait BusDevice: Send {
-    /// Sends bytes over SPI, and replaces each by the byte that came in at the same time.
-    ///
-    /// # Errors
-    ///
-    /// The transfer failed, or the chip could not be selected.
-    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError>;
->>>>>>> link
 }
 
 /// A device whose calls may block, and the name of the worker that is to make them.
@@ -243,7 +227,6 @@ pub struct SpiConfig {
     pub chip_select: Option<ChipSelect>,
 }
 
-<<<<<<< HEAD
 /// An I2C device's parameters.
 #[derive(Clone, Copy, Debug)]
 pub struct I2cConfig {
@@ -256,9 +239,6 @@ pub struct I2cConfig {
 }
 
 /// A line that selects a chip.
-=======
-/// A GPIO line that selects a chip.
->>>>>>> link
 pub struct ChipSelect {
     /// The line, an output.
     pub line: Arc<dyn Line>,
@@ -317,7 +297,6 @@ pub trait Board: Send {
     /// "Unable to open spi device", "Unable to set SPI speed", "Unable to set SPI mode".
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
 
-<<<<<<< HEAD
     /// The names of the dictionary's enumeration `i2c_bus`.
     fn i2c_buses(&self) -> Vec<Range>;
 
@@ -325,13 +304,6 @@ pub trait Board: Send {
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
 
     /// Opens a hardware PWM channel.
-=======
-    /// Opens a hardware PWM channel and sets its first value.
-    ///
-    /// # Errors
-    ///
-    /// "Unable to config pwm device", "Guardian process lost".
->>>>>>> link
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;
 
     /// How late a step may be before the machine stops, as a motor that is stepped too late loses

@@ -3,13 +3,14 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{Bias, Pin};
+use crate::board::Pin;
 use crate::mcu::{
     Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
+use super::bias;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
@@ -137,12 +138,7 @@ impl Object for Endstop {
 const CONFIG_ENDSTOP: Command =
     command!("config_endstop oid=%c pin=%c pull_up=%c", |mcu, oid: Oid, pin: Pin, pull_up: i8| {
         mcu.vacant(oid)?;
-        let bias = match pull_up {
-            1.. => Bias::PullUp,
-            0 => Bias::None,
-            _ => Bias::PullDown,
-        };
-        let input = mcu.input(pin, bias)?;
+        let input = mcu.input(pin, bias(pull_up))?;
         let endstop = Endstop { pin: input, homing: None, next_wake: Clock::EPOCH, due: None, asked: None };
         mcu.assign_on(pin, oid, endstop)
     });

@@ -3,13 +3,15 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::Pin;
+use crate::board::{Bias, Pin};
 use crate::mcu::{Feature, Mcu, base};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
 use crate::wire::format::same;
 
 mod analog_in;
+mod buttons;
+mod counter;
 mod digital_out;
 mod endstop;
 mod pwm_out;
@@ -26,6 +28,8 @@ pub const FEATURES: &[Feature] = &[
     endstop::FEATURE,
     trsync::FEATURE,
     analog_in::FEATURE,
+    buttons::FEATURE,
+    counter::FEATURE,
     spi::FEATURE,
 ];
 
@@ -46,6 +50,15 @@ const fn response_index(format: &str) -> usize {
         feature += 1;
     }
     panic!("the response is not listed by any feature")
+}
+
+/// The resistor that a command's `pull_up` asks for.
+fn bias(pull_up: i8) -> Bias {
+    match pull_up {
+        1.. => Bias::PullUp,
+        0 => Bias::None,
+        _ => Bias::PullDown,
+    }
 }
 
 /// The stop for an output whose `max_duration` ran out before the host changed it again.

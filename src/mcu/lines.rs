@@ -151,6 +151,13 @@ enum Sensor {
 }
 
 impl InputLine {
+    fn new(line: Arc<dyn Line>, worker: Option<WorkerId>) -> InputLine {
+        InputLine(match worker {
+            None => Sensor::Prompt(line),
+            Some(worker) => Sensor::Slow { worker, sampling: Some(Box::new(Sampling { line, level: Ok(false) })) },
+        })
+    }
+
     /// The line's level; none if it comes later, to the object's `returned`, as the chip's worker
     /// has to look.
     ///
@@ -199,14 +206,23 @@ impl Mcu {
         Ok(&mut *self.board)
     }
 
-    /// Claims a line for one more use.
+    /// Claims a line for one more use, while the machine is configured.
     fn claim(&mut self, pin: Pin, direction: Direction) -> Result<(Arc<dyn Line>, Option<WorkerId>), Shutdown> {
-        let pin = self.board()?.canonical(pin);
+        self.board()?;
+        self.claim_at_any_time(pin, direction)
+    }
+
+    fn claim_at_any_time(
+        &mut self,
+        pin: Pin,
+        direction: Direction,
+    ) -> Result<(Arc<dyn Line>, Option<WorkerId>), Shutdown> {
+        let pin = self.board.canonical(pin);
         if let Some(Claim { line, worker, .. }) = self.claims.iter().find(|claim| claim.pin == pin) {
             line.set_direction(direction)?;
             return Ok((line.clone(), *worker));
         }
-        let ClaimedLine { line, sleeps_on } = self.board()?.line(pin, direction)?;
+        let ClaimedLine { line, sleeps_on } = self.board.line(pin, direction)?;
         let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
         self.claims.push(Claim { pin, line: line.clone(), worker });
         Ok((line, worker))
@@ -269,10 +285,19 @@ impl Mcu {
     /// Those of the board, such as "Unable to open in GPIO chip line".
     pub fn input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
         let (line, worker) = self.claim(pin, Direction::Input(bias))?;
-        Ok(InputLine(match worker {
-            None => Sensor::Prompt(line),
-            Some(worker) => Sensor::Slow { worker, sampling: Some(Box::new(Sampling { line, level: Ok(false) })) },
-        }))
+        Ok(InputLine::new(line, worker))
+    }
+
+    /// Claims an input, after `finalize_config` too. That opens a file and may start a thread, for
+    /// which steps would wait: it is for `buttons_add` only, which klippy sends as it connects,
+    /// after `finalize_config` and before any step.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, such as "Unable to open in GPIO chip line".
+    pub fn late_input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
+        let (line, worker) = self.claim_at_any_time(pin, Direction::Input(bias))?;
+        Ok(InputLine::new(line, worker))
     }
 
     /// What the dictionary calls a pin.

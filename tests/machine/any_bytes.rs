@@ -22,6 +22,8 @@ const OBJECTS: &[&str] = &[
     "spi_set_bus oid=6 spi_bus=0 mode=0 rate=1000000",
     "config_spi_shutdown oid=7 spi_oid=6 shutdown_msg=01",
     "set_digital_out pin=0 value=1",
+    "config_buttons oid=8 button_count=3",
+    "config_counter oid=9 pin=8 pull_up=1",
 ];
 
 #[derive(Clone, Debug)]

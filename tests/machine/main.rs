@@ -13,6 +13,8 @@ mod sleeping_lines;
 mod analog_in;
 mod any_bytes;
 mod base;
+mod buttons;
+mod counter;
 mod digital_out;
 mod endstop;
 mod one_order;
