@@ -18,7 +18,7 @@ use signal_hook::consts::{SIGINT, SIGTERM};
 
 use crate::board::sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 use crate::host::Client;
-use crate::host::demo::{AxisPlan, HeaterPlan, Lines, Pin, Plan, Report, demonstrate};
+use crate::host::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
 use crate::host::heater::{Goal, Thermistor};
 use crate::host::picture;
 use crate::runtime::wakeup::MarginLimits;
@@ -133,7 +133,7 @@ fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended
 
 fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
     let mut client = Client::connect(&args.symlink, Duration::from_secs(5)).map_err(|error| error.to_string())?;
-    let report = demonstrate(&mut client, plan, &mut Lines::stdout()).map_err(|error| error.to_string())?;
+    let report = demonstrate(&mut client, plan, &mut ProgressLines::stdout()).map_err(|error| error.to_string())?;
     if let Some(path) = &args.picture {
         draw(path, &report)?;
     }
@@ -177,8 +177,8 @@ fn plan(config: &SimConfig) -> Plan {
     }
 }
 
-fn pin(name: &PinName) -> Pin {
-    Pin { name: name.name.clone(), invert: name.inverted }
+fn pin(name: &PinName) -> NamedPin {
+    NamedPin { name: name.name.clone(), invert: name.inverted }
 }
 
 /// An axis that can be homed.

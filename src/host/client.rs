@@ -11,29 +11,29 @@ use serde_json::{Map, Value as Json};
 
 use super::Error;
 use super::messages::{Arg, Messages, Params};
-use super::serial::{Link, Received};
+use super::serial::{BlockLink, Received};
 use crate::time::Clock;
 use crate::wire::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
 
-/// How long after its acknowledgement a query without an answer is sent again; each time twice as
-/// long, and so many times (klippy's SerialRetryCommand, serialhdl.py).
+/// How long after its acknowledgement a query without an answer is sent again. The pause doubles each
+/// time, and there are as many of them as klippy makes (SerialRetryCommand in serialhdl.py).
 const RETRY_DELAY: Duration = Duration::from_millis(10);
 const RETRIES: u32 = 5;
 /// How long reading the dictionary may take in all.
 const IDENTIFY_TIMEOUT: Duration = Duration::from_secs(15);
 const IDENTIFY_CHUNK: u8 = 40;
-/// A dictionary is a few kilobytes; what goes beyond this is none.
+/// The longest compressed dictionary that is read. A real one has a few kilobytes.
 const IDENTIFY_MAX: usize = 128 * 1024;
-/// Responses kept for those who may ask for them; the oldest go first.
+/// How many responses are kept until somebody asks for them. The oldest are dropped first.
 const INBOX_MAX: usize = 65_536;
-/// The age at which the clock's estimate is renewed.
+/// The age from which on the estimate of the micro-controller's clock is renewed.
 const CLOCK_AGE: Duration = Duration::from_millis(500);
 
 /// A session with a micro-controller.
 #[derive(Debug)]
 pub struct Client {
-    link: Link,
-    /// Where to open the tty again after a reset that closed it.
+    link: BlockLink,
+    /// The path by which to open the tty again after a reset that closed it; none over a descriptor.
     path: Option<PathBuf>,
     dictionary: Dictionary,
     messages: Messages,
@@ -45,13 +45,13 @@ pub struct Client {
 }
 
 impl Client {
-    /// Opens a tty, identifies the micro-controller and finds out its clock. Tries again until
-    /// `timeout`: the program may still be starting.
+    /// Opens a tty, identifies the micro-controller and estimates its clock. Tries again until
+    /// `timeout` is over, as the program at the other end may still be starting.
     pub fn connect(path: &Path, timeout: Duration) -> Result<Client, Error> {
         let until = Instant::now() + timeout;
         loop {
             let rest = until.saturating_duration_since(Instant::now());
-            let result = Link::open(path, rest.min(Duration::from_secs(1)))
+            let result = BlockLink::open(path, rest.min(Duration::from_secs(1)))
                 .and_then(|link| Client::start(link, Some(path.to_owned())));
             match result {
                 Err(Error::Io { .. } | Error::Closed { .. } | Error::Timeout { .. })
@@ -65,11 +65,11 @@ impl Client {
     }
 
     /// Identifies the micro-controller at the other end of a link and finds out its clock.
-    pub fn new(link: Link) -> Result<Client, Error> {
+    pub fn new(link: BlockLink) -> Result<Client, Error> {
         Client::start(link, None)
     }
 
-    fn start(link: Link, path: Option<PathBuf>) -> Result<Client, Error> {
+    fn start(link: BlockLink, path: Option<PathBuf>) -> Result<Client, Error> {
         let mut client = Client::unidentified(link, path);
         client.identify()?;
         let uptime = client.query("get_uptime", &[], "uptime", None)?;
@@ -80,7 +80,7 @@ impl Client {
         Ok(client)
     }
 
-    fn unidentified(link: Link, path: Option<PathBuf>) -> Client {
+    fn unidentified(link: BlockLink, path: Option<PathBuf>) -> Client {
         Client {
             link,
             path,
@@ -161,18 +161,18 @@ impl Client {
     }
 
     /// The link beneath.
-    pub fn link(&mut self) -> &mut Link {
+    pub fn link(&mut self) -> &mut BlockLink {
         &mut self.link
     }
 
-    /// Sends a command. Fails as [`Messages::encode`] and [`Link::send`] do.
+    /// Sends a command. Fails as [`Messages::encode`] and [`BlockLink::send`] do.
     pub fn send(&mut self, command: &str, args: &[(&str, Arg<'_>)]) -> Result<(), Error> {
         let payload = self.messages.encode(command, args)?;
         self.link.send(&payload)
     }
 
     /// Sends a command in klippy's notation. Fails as [`Messages::encode`] and
-    /// [`Link::send`] do.
+    /// [`BlockLink::send`] do.
     pub fn send_line(&mut self, line: &str) -> Result<(), Error> {
         let payload = self.messages.encode_line(line)?;
         self.link.send(&payload)
@@ -196,16 +196,15 @@ impl Client {
 
     /// Sends a command and takes its response, of this `oid` if one is given.
     ///
-    /// As in klippy, an answer counts if it is there when the acknowledgement is; otherwise the
-    /// command is sent again after 10 ms, even if its answer came meanwhile. A micro-controller
-    /// that acknowledges before it answers so gets its command twice, and the second answer may
-    /// pass for the one to the next query.
+    /// As in klippy, the answer must have come when the acknowledgement comes. Otherwise the command
+    /// is sent again after 10 ms, even if the answer comes in that time. So a micro-controller that
+    /// acknowledges before it answers gets the command twice, and its second answer may pass for the
+    /// answer to the next query.
     ///
     /// # Errors
     ///
-    /// [`Error::Shutdown`] if the micro-controller shuts down meanwhile or refuses the command
-    /// because it is shut down; [`Error::Timeout`] if the last of the repetitions has no answer,
-    /// either.
+    /// [`Error::Shutdown`] if the micro-controller shuts down, or refuses the command as it is shut
+    /// down; [`Error::Timeout`] if the last repetition has no answer, either.
     pub fn query(
         &mut self,
         command: &str,
@@ -257,7 +256,7 @@ impl Client {
             }
             self.check()?;
             match self.link.receive(until)? {
-                // However much else comes in, the time is limited.
+                // Checked for each response, so that a flood of others can not prolong the wait.
                 Some(received) => self.file(&received),
                 None => return Ok(None),
             }
@@ -320,8 +319,8 @@ impl Client {
         self.shutdown = None;
     }
 
-    /// Opens the tty again and starts over; over a descriptor, only the dictionary and the
-    /// clock are read again.
+    /// Opens the tty again and starts a new session. Over a descriptor, which can not be opened again,
+    /// only reads the dictionary and the clock again.
     pub(super) fn reconnect(&mut self, timeout: Duration) -> Result<(), Error> {
         match self.path.clone() {
             Some(path) => *self = Client::connect(&path, timeout)?,
@@ -349,7 +348,7 @@ impl Client {
         }
     }
 
-    /// Renews the clock's estimate: of several round trips the shortest counts.
+    /// Renews the estimate of the clock by the shortest of several round trips.
     pub fn estimate_clock(&mut self, round_trips: u32) -> Result<(), Error> {
         let mut best: Option<(Duration, Instant, u32)> = None;
         for _ in 0..round_trips.max(1) {
@@ -401,7 +400,7 @@ impl Client {
     }
 }
 
-/// What a host knows before it has read a dictionary.
+/// The two messages that a host knows before it has read a dictionary.
 fn before_identify() -> Dictionary {
     let entry = |format: &str, id: i32| Map::from_iter([(format.to_owned(), Json::from(id))]);
     Dictionary {
@@ -413,13 +412,13 @@ fn before_identify() -> Dictionary {
 
 #[cfg(test)]
 mod tests {
-    use super::super::fake::{Mcu, Peer};
+    use super::super::fake::{FakeMcu, Peer};
     use super::*;
     use crate::wire::vlq::Writer;
 
     #[test]
     fn a_dictionary_is_read_and_a_query_answered() {
-        let (peer, link) = Mcu::default().start();
+        let (peer, link) = FakeMcu::default().start();
         let mut client = Client::new(link).unwrap();
         assert_eq!(client.dictionary().version, "fake");
         assert_eq!(client.frequency_hz(), 50e6);
@@ -473,7 +472,7 @@ mod tests {
 
     #[test]
     fn a_shutdown_carries_the_firmware_s_text() {
-        let (peer, link) = Mcu::default().start();
+        let (peer, link) = FakeMcu::default().start();
         let mut client = Client::new(link).unwrap();
         client.check().unwrap();
         let reason = client.emergency_stop().unwrap();
@@ -487,7 +486,7 @@ mod tests {
 
     #[test]
     fn a_dictionary_of_nonsense_is_refused() {
-        let (peer, link) = Mcu::identifying(vec![1, 2, 3]).start();
+        let (peer, link) = FakeMcu::identifying(vec![1, 2, 3]).start();
         let error = Client::new(link).unwrap_err().to_string();
         assert!(error.starts_with("the MCU's data dictionary is unusable"), "{error}");
         peer.join().unwrap();

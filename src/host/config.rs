@@ -12,7 +12,7 @@ use super::{Client, Error};
 
 /// How long a reset may take.
 const RESET_TIMEOUT: Duration = Duration::from_secs(10);
-/// What klippy leaves the micro-controller between the steps of a reset.
+/// The pause that klippy makes between the steps of a reset.
 const RESET_PAUSE: Duration = Duration::from_millis(15);
 
 /// A configuration in the making: commands in klippy's notation, without `allocate_oids` and
@@ -94,7 +94,7 @@ impl Client {
     /// Asks for the state of the configuration.
     pub fn status(&mut self) -> Result<Status, Error> {
         let config = match self.query("get_config", &[], "config", None) {
-            // The news of a shutdown may come first; get_config is answered all the same.
+            // A shutdown is reported here only once. A stopped machine answers get_config, too.
             Err(Error::Shutdown { .. }) => self.query("get_config", &[], "config", None)?,
             other => other?,
         };
@@ -128,7 +128,7 @@ impl Client {
         std::thread::sleep(RESET_PAUSE);
         self.send(command, &[])?;
         std::thread::sleep(RESET_PAUSE);
-        // The C program starts itself anew and with it the tty; its last words are of no use.
+        // The C program restarts itself and closes the tty. What it sends until then is dropped.
         loop {
             let rest = until.saturating_duration_since(Instant::now());
             let attempt = self.reconnect(rest).and_then(|()| self.status());
@@ -152,7 +152,7 @@ impl Client {
 
 #[cfg(test)]
 mod tests {
-    use super::super::fake::Mcu;
+    use super::super::fake::FakeMcu;
     use super::*;
 
     #[test]
@@ -166,7 +166,7 @@ mod tests {
 
     #[test]
     fn a_machine_is_configured_and_one_in_use_is_reset_first() {
-        let (peer, link) = Mcu::default().start();
+        let (peer, link) = FakeMcu::default().start();
         let mut client = Client::new(link).unwrap();
         let mut config = Config::default();
         for crc in 0..2 {

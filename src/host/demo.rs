@@ -9,21 +9,21 @@ use std::time::{Duration, Instant};
 
 use super::config::Config;
 use super::heater::{Goal, Heater, Thermistor, Wiring};
-use super::motion::{Endstop, Homed, MoveQueue, Profile, Reason, Sight, Stepper, Watch};
+use super::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
 use super::{Client, Error};
 use crate::time::Clock;
 
-/// How far beyond its travel an axis looks for its endstop.
+/// An axis looks for its endstop over its travel times this.
 const OVERTRAVEL: f64 = 1.2;
-/// The second time an axis approaches its endstop at this part of the speed.
+/// The second approach to the endstop has the speed of the first times this.
 const SECOND_SPEED: f64 = 0.5;
 
-/// A pin by name, and whether it is inverted.
+/// A pin by its name, and whether it is inverted.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
-pub struct Pin {
+pub struct NamedPin {
     /// A name of the dictionary's enumeration `pin`.
     pub name: String,
-    /// Whether low means yes.
+    /// Whether a low level means on.
     pub invert: bool,
 }
 
@@ -33,14 +33,14 @@ pub struct AxisPlan {
     /// What people call it.
     pub name: String,
     /// The step pin.
-    pub step: Pin,
+    pub step: NamedPin,
     /// The direction pin.
-    pub dir: Pin,
+    pub dir: NamedPin,
     /// The pin that powers the motor, if there is one.
-    pub enable: Option<Pin>,
+    pub enable: Option<NamedPin>,
     /// The endstop's pin.
-    pub endstop: Pin,
-    /// Its bias: 1 up, -1 down, 0 none.
+    pub endstop: NamedPin,
+    /// The endstop's resistor: 1 pulls up, -1 down, 0 is none.
     pub endstop_pull: i8,
     /// Steps in a millimetre.
     pub steps_per_mm: f64,
@@ -50,7 +50,7 @@ pub struct AxisPlan {
     pub pulse_us: f64,
     /// How far the axis can go, in millimetres.
     pub travel_mm: f64,
-    /// How far it is from the endstop now, in millimetres, if that is known.
+    /// How far the axis is from the endstop at first, in millimetres, if that is known.
     pub start_mm: Option<f64>,
     /// Whether the endstop is where the position is greatest.
     pub home_positive: bool,
@@ -58,7 +58,7 @@ pub struct AxisPlan {
     pub speed_mm_s: f64,
     /// Acceleration in mm/s².
     pub acceleration_mm_s2: f64,
-    /// How far it goes back before it approaches the endstop again, in millimetres.
+    /// How far the axis goes back before its second approach, in millimetres.
     pub retract_mm: f64,
 }
 
@@ -68,7 +68,7 @@ pub struct HeaterPlan {
     /// What people call it.
     pub name: String,
     /// The output's pin.
-    pub heater: Pin,
+    pub heater: NamedPin,
     /// The sensor's pin.
     pub sensor: String,
     /// The sensor.
@@ -77,11 +77,11 @@ pub struct HeaterPlan {
     pub min_c: f64,
     /// Degrees Celsius above which the micro-controller shuts down.
     pub max_c: f64,
-    /// What it shall do.
+    /// What is to be shown.
     pub goal: Goal,
 }
 
-/// A demonstration.
+/// What a demonstration is to show.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plan {
     /// The axes, homed in this order.
@@ -95,7 +95,7 @@ pub struct Plan {
 pub struct AxisSample {
     /// Seconds since the first move of the demonstration.
     pub t_s: f64,
-    /// Millimetres from where the axis was at last homed.
+    /// Millimetres from the position at which the second approach ended.
     pub mm: f64,
     /// Steps in a second since the sample before, with the sign of the direction.
     pub steps_per_s: f64,
@@ -136,12 +136,12 @@ pub struct HeatReport {
     pub samples: Vec<HeatSample>,
 }
 
-/// Something that was shown, and whether it was right.
+/// Something that was shown, and whether it went as it should.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Check {
     /// What was to be shown.
     pub what: String,
-    /// Whether it was right.
+    /// Whether it went as it should.
     pub passed: bool,
     /// What was seen.
     pub seen: String,
@@ -163,56 +163,57 @@ pub struct Report {
 }
 
 impl Report {
-    /// Whether everything that was shown was right.
+    /// Whether everything that was shown went as it should.
     pub fn passed(&self) -> bool {
         self.checks.iter().all(|check| check.passed)
     }
 
-    fn check(&mut self, progress: &mut dyn Progress, what: String, passed: bool, seen: String) {
+    fn check(&mut self, progress: &mut dyn Observer, what: String, passed: bool, seen: String) {
         let check = Check { what, passed, seen };
         progress.checked(&check);
         self.checks.push(check);
     }
 }
 
-/// Is told how the demonstration goes.
-pub trait Progress {
-    /// Something is under way, this part of it done (0 to 1).
+/// Whoever is told how the demonstration goes.
+pub trait Observer {
+    /// `what` is under way; `part` of it, 0 to 1, is done.
     fn update(&mut self, what: &str, part: f64, detail: &str);
     /// Something was shown.
     fn checked(&mut self, check: &Check);
 }
 
-/// Progress as a line that is written over on a terminal, and as a line a second elsewhere.
+/// Writes how the demonstration goes: on a terminal as one line that is written over, elsewhere as
+/// one line a second.
 #[derive(Debug)]
-pub struct Lines<W: Write> {
+pub struct ProgressLines<W: Write> {
     out: W,
     live: bool,
     next: Option<Instant>,
 }
 
-impl Lines<io::Stdout> {
-    /// Progress on standard output.
-    pub fn stdout() -> Lines<io::Stdout> {
+impl ProgressLines<io::Stdout> {
+    /// Writes to standard output.
+    pub fn stdout() -> ProgressLines<io::Stdout> {
         let out = io::stdout();
         let live = out.is_terminal();
-        Lines::new(out, live)
+        ProgressLines::new(out, live)
     }
 }
 
-impl<W: Write> Lines<W> {
-    /// Progress on `out`; `live` if a line there can be written over.
-    pub fn new(out: W, live: bool) -> Lines<W> {
-        Lines { out, live, next: None }
+impl<W: Write> ProgressLines<W> {
+    /// Writes to `out`; `live` tells whether a line there can be written over.
+    pub fn new(out: W, live: bool) -> ProgressLines<W> {
+        ProgressLines { out, live, next: None }
     }
 
-    // The demonstration must not fail because nobody reads of it.
+    // Errors are ignored: the demonstration goes on even if nobody reads how it goes.
     fn write(&mut self, line: &str) {
         let _ = self.out.write_all(line.as_bytes()).and_then(|()| self.out.flush());
     }
 }
 
-impl<W: Write> Progress for Lines<W> {
+impl<W: Write> Observer for ProgressLines<W> {
     fn update(&mut self, what: &str, part: f64, detail: &str) {
         const WIDTH: usize = 24;
         let now = Instant::now();
@@ -238,7 +239,7 @@ impl<W: Write> Progress for Lines<W> {
     }
 }
 
-/// An axis ready to move.
+/// An axis whose stepper, endstop and motor switch are configured.
 struct Axis<'a> {
     plan: &'a AxisPlan,
     stepper: Stepper,
@@ -246,9 +247,12 @@ struct Axis<'a> {
     enable: Option<(u8, bool)>,
 }
 
-/// Carries out the plan. Fails if the micro-controller does not answer or shuts down; what was
-/// merely not right stands in the report.
-pub fn demonstrate(client: &mut Client, plan: &Plan, progress: &mut dyn Progress) -> Result<Report, Error> {
+/// Carries out the plan. What was shown and did not go as it should stands in the report.
+///
+/// # Errors
+///
+/// The micro-controller does not answer or shuts down, or the plan can not be carried out.
+pub fn demonstrate(client: &mut Client, plan: &Plan, progress: &mut dyn Observer) -> Result<Report, Error> {
     let dictionary = client.dictionary();
     let mut report = Report { app: dictionary.app.clone(), version: dictionary.version.clone(), ..Report::default() };
     let (commands, responses) = (dictionary.commands.len(), dictionary.responses.len());
@@ -339,20 +343,20 @@ impl<'a> Axis<'a> {
         client.send("update_digital_out", &[("oid", oid.into()), ("value", (on != invert).into())])
     }
 
-    /// Approaches the endstop, goes back, and approaches it again more slowly.
+    /// Approaches the endstop, goes back, approaches it again more slowly, and reports on it.
     fn home(
         &self,
         client: &mut Client,
         queue: &mut MoveQueue,
         start: Clock,
         report: &mut Report,
-        progress: &mut dyn Progress,
+        progress: &mut dyn Observer,
     ) -> Result<(), Error> {
         let plan = self.plan;
         let what = format!("home {}", plan.name);
         self.power(client, true)?;
         let from = self.stepper.position(client)?;
-        let mut trace = Trace {
+        let mut trace = AxisRecorder {
             what: &what,
             steps_per_mm: plan.steps_per_mm,
             full_mm: plan.start_mm.unwrap_or(plan.travel_mm),
@@ -392,7 +396,7 @@ impl<'a> Axis<'a> {
         let went = (first.position - from).abs();
         let slack = i64::from(first.slack_steps);
         let apart = (second.position - first.position).abs();
-        let mut passed = first.reason == Reason::Endstop && second.reason == Reason::Endstop && released;
+        let mut passed = first.reason == HomingEnd::Endstop && second.reason == HomingEnd::Endstop && released;
         passed &= apart <= slack;
         let mut seen = format!("endstop after {went} steps");
         if let Some(start_mm) = self.plan.start_mm {
@@ -402,7 +406,7 @@ impl<'a> Axis<'a> {
         }
         seen += &format!(", the second time {apart} steps off, at most {slack} allowed");
         for (homed, time) in [(first, "first"), (second, "second")] {
-            if homed.reason != Reason::Endstop {
+            if homed.reason != HomingEnd::Endstop {
                 seen += &format!("; the {time} time it ended by {:?}", homed.reason);
             }
         }
@@ -418,7 +422,7 @@ impl<'a> Axis<'a> {
         queue: &mut MoveQueue,
         far_mm: f64,
         speed_mm_s: f64,
-        trace: &mut Trace<'_>,
+        trace: &mut AxisRecorder<'_>,
     ) -> Result<Homed, Error> {
         let profile = self.profile(client, far_mm, speed_mm_s)?;
         queue.home(client, self.stepper, self.endstop, self.plan.home_positive, &profile, &mut |sight| trace.saw(sight))
@@ -435,18 +439,18 @@ impl<'a> Axis<'a> {
     }
 }
 
-/// Collects what is seen of an axis, and shows it.
-struct Trace<'a> {
+/// Keeps what is seen of an axis while it moves, and shows it to the observer.
+struct AxisRecorder<'a> {
     what: &'a str,
     steps_per_mm: f64,
     full_mm: f64,
     from: i64,
     frequency_hz: f64,
     sights: Vec<Sight>,
-    progress: &'a mut dyn Progress,
+    progress: &'a mut dyn Observer,
 }
 
-impl Trace<'_> {
+impl AxisRecorder<'_> {
     fn saw(&mut self, sight: Sight) {
         let mm = (sight.position - self.from) as f64 / self.steps_per_mm;
         let rate = self.sights.last().map_or(0.0, |last| rate(*last, sight, self.frequency_hz));
@@ -507,7 +511,7 @@ fn heat(
     plan: &HeaterPlan,
     heater: &mut Heater,
     report: &mut Report,
-    progress: &mut dyn Progress,
+    progress: &mut dyn Observer,
 ) -> Result<(), Error> {
     let what = format!("heat {}", plan.name);
     let goal = plan.goal;
@@ -550,7 +554,7 @@ mod tests {
 
     fn shown(live: bool) -> String {
         let mut out = Vec::new();
-        let mut lines = Lines::new(&mut out, live);
+        let mut lines = ProgressLines::new(&mut out, live);
         lines.update("home x", 0.5, "5 mm");
         lines.update("home x", 2.0, "not shown: too soon");
         lines.checked(&Check { what: "x homed".to_owned(), passed: false, seen: "800 steps".to_owned() });

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The other end for tests: a peer over a socket that loses and mangles blocks to order, and
-//! a micro-controller that knows a handful of commands.
+//! The other end of the wire for tests: a peer over a socket that loses and mangles the blocks that
+//! the test names, and a micro-controller that knows a handful of commands.
 
 #![forbid(unsafe_code)]
 
@@ -11,12 +11,12 @@ use std::time::Duration;
 
 use serde_json::json;
 
-use super::serial::{Link, Port};
+use super::serial::{BlockLink, Port};
 use crate::wire::block::{Found, Received, Receiver, Resync, Sequence, frame};
 use crate::wire::dictionary::Dictionary;
 use crate::wire::vlq::{Reader, Writer};
 
-/// What happens to a block on its way.
+/// What goes wrong with a block on its way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Fault {
     /// It is lost.
@@ -29,7 +29,7 @@ pub(super) enum Fault {
     DoubleAck,
 }
 
-/// A peer that acknowledges, and answers with what a function says.
+/// A peer that acknowledges blocks, and answers them by a function of the test.
 pub(super) struct Peer;
 
 impl Peer {
@@ -40,12 +40,12 @@ impl Peer {
         before: u8,
         faults: &[(u64, Fault)],
         answer: impl FnMut(&[u8]) -> Vec<Vec<u8>> + Send + 'static,
-    ) -> (JoinHandle<Vec<Vec<u8>>>, Link) {
+    ) -> (JoinHandle<Vec<Vec<u8>>>, BlockLink) {
         let (ours, theirs) = UnixStream::pair().unwrap();
         let faults = faults.to_vec();
         let peer = thread::spawn(move || serve(theirs, before, &faults, answer));
         let port = Port::from_fd(ours.into(), "fake").unwrap();
-        (peer, Link::new(port, Duration::from_secs(60)).unwrap())
+        (peer, BlockLink::new(port, Duration::from_secs(60)).unwrap())
     }
 }
 
@@ -80,7 +80,7 @@ fn serve(
             let Some((sequence, payload)) = block else {
                 continue;
             };
-            // The handshake's empty block is not counted.
+            // The empty block with which a session begins has no number.
             let number = (!payload.is_empty()).then(|| {
                 count += 1;
                 count - 1
@@ -183,25 +183,25 @@ pub(super) fn dictionary() -> Dictionary {
 }
 
 /// A micro-controller that can be identified, configured, shut down and reset.
-pub(super) struct Mcu {
+pub(super) struct FakeMcu {
     identify: Vec<u8>,
     crc: Option<u32>,
     is_shutdown: bool,
 }
 
-impl Default for Mcu {
-    fn default() -> Mcu {
-        Mcu { identify: dictionary().compress().unwrap(), crc: None, is_shutdown: false }
+impl Default for FakeMcu {
+    fn default() -> FakeMcu {
+        FakeMcu { identify: dictionary().compress().unwrap(), crc: None, is_shutdown: false }
     }
 }
 
-impl Mcu {
-    /// One whose `identify` serves these bytes.
-    pub(super) fn identifying(identify: Vec<u8>) -> Mcu {
-        Mcu { identify, ..Mcu::default() }
+impl FakeMcu {
+    /// A micro-controller whose `identify` serves these bytes as its compressed dictionary.
+    pub(super) fn identifying(identify: Vec<u8>) -> FakeMcu {
+        FakeMcu { identify, ..FakeMcu::default() }
     }
 
-    pub(super) fn start(mut self) -> (JoinHandle<Vec<Vec<u8>>>, Link) {
+    pub(super) fn start(mut self) -> (JoinHandle<Vec<Vec<u8>>>, BlockLink) {
         Peer::start(0, &[], move |payload| self.answer(payload))
     }
 

@@ -11,20 +11,21 @@ use super::{Client, Error, Params};
 use crate::time::Clock;
 
 const KELVIN: f64 = 273.15;
-/// No thermistor is read above this.
+/// Readings that would mean a higher temperature than this count as this one.
 const HOTTEST_K: f64 = 1000.0;
 /// The output's period, in seconds.
 const CYCLE_S: f64 = 0.1;
-/// After so long without a new setting the micro-controller shuts down, in seconds.
+/// The output's `max_duration`, in seconds: after this time without a new value the micro-controller
+/// shuts down.
 const MAX_DURATION_S: f64 = 3.0;
 const REPORT_S: f64 = 0.3;
 const SAMPLE_S: f64 = 0.001;
 const SAMPLES: u8 = 8;
-/// Readings out of range one after the other that make the micro-controller shut down.
+/// How many readings in a row may be out of range before the micro-controller shuts down.
 const RANGE_CHECKS: u8 = 4;
-/// How far ahead of the present the output is set, in seconds.
+/// How long after the present a new value of the output takes effect, in seconds.
 const LEAD_S: f64 = 0.25;
-/// How long a reading may fail to come.
+/// How long to wait for a reading.
 const READING_TIMEOUT: Duration = Duration::from_secs(3);
 
 /// A thermistor from a pin to ground, pulled up by a resistor to the reference voltage.
@@ -72,7 +73,7 @@ impl Thermistor {
                 a + b * x + c * x * x * x
             }
         };
-        // A short circuit is hot, not beyond absolute zero.
+        // A short circuit would come out as a negative inverse. It counts as very hot.
         1.0 / inverse.max(1.0 / HOTTEST_K) - KELVIN
     }
 }
@@ -112,14 +113,14 @@ pub struct Heater {
     last: Option<Clock>,
 }
 
-/// What a heater shall do.
+/// What a heater is to reach.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Goal {
     /// Degrees Celsius.
     pub target_c: f64,
     /// How far off it may be, in degrees.
     pub tolerance_c: f64,
-    /// For how long it must be there, in seconds.
+    /// For how long it must stay within the tolerance, in seconds.
     pub hold_s: f64,
     /// When to give up, in seconds.
     pub timeout_s: f64,
@@ -148,12 +149,12 @@ impl Heater {
         Ok(Heater { sensor, output, wiring, celsius, last: None })
     }
 
-    /// Heats until the goal is reached, and for its time; then switches off, and tells the
-    /// last reading. Fails if it is not reached in time.
+    /// Heats until the goal is reached and held, switches off, and returns the last reading. Fails if
+    /// the goal is not reached in time.
     pub fn heat(&mut self, client: &mut Client, goal: Goal, seen: &mut dyn FnMut(Reading)) -> Result<Reading, Error> {
         self.query(client, SAMPLES)?;
         let result = self.pursue(client, goal, seen);
-        // After a shutdown there is nothing to switch off, and the shutdown is what matters.
+        // After a shutdown the output is off, and the error to return is that of the shutdown.
         if client.check().is_ok() {
             self.set(client, 0.0)?;
             self.query(client, 0)?;
@@ -230,7 +231,7 @@ impl Heater {
         let cycle = client.ticks(CYCLE_S);
         let part = if self.wiring.invert { 1.0 - power } else { power };
         let on_ticks = (part.clamp(0.0, 1.0) * f64::from(cycle)).round() as u32;
-        // Settings must follow each other in time.
+        // Each value must take effect after the one before.
         let clock = client.clock_in(LEAD_S)?;
         let clock = self.last.map_or(clock, |last| clock.max(last.displaced(1)));
         self.last = Some(clock);
@@ -270,7 +271,8 @@ fn seconds(span: f64) -> Duration {
     Duration::try_from_secs_f64(span).unwrap_or(Duration::MAX / 4)
 }
 
-/// Full power far below the target; near it, in proportion to the error and its integral.
+/// A proportional-integral controller: full power far below the target, and near it a power in
+/// proportion to the error and its integral.
 #[derive(Debug, Default)]
 struct Control {
     integral: f64,
@@ -279,7 +281,7 @@ struct Control {
 impl Control {
     /// Degrees below the target at which power begins to fall.
     const BAND_C: f64 = 4.0;
-    /// How fast the integral follows, in seconds.
+    /// The time constant of the integral, in seconds.
     const INTEGRAL_S: f64 = 30.0;
 
     fn power(&mut self, error_c: f64, elapsed_s: f64) -> f64 {

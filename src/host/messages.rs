@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Commands and responses by name, as a data dictionary has them.
+//! Commands and responses by their names in a data dictionary.
 
 #![forbid(unsafe_code)]
 
@@ -95,7 +95,7 @@ impl Params {
         Ok(self.int(parameter)? as u32)
     }
 
-    /// A number that means yes or no. Fails if the response has no such number.
+    /// A number that stands for true or false. Fails if the response has no such number.
     pub fn flag(&self, parameter: &str) -> Result<bool, Error> {
         Ok(self.int(parameter)? != 0)
     }
@@ -130,7 +130,7 @@ impl Params {
 struct Parameter {
     name: String,
     conversion: Conversion,
-    /// Which enumeration names its values.
+    /// The enumeration that names the parameter's values, if there is one.
     enumeration: Option<usize>,
 }
 
@@ -196,7 +196,7 @@ impl Enumeration {
     }
 }
 
-/// What can be said to a micro-controller, and what it answers: its dictionary, ready for use.
+/// The commands and responses of a dictionary, prepared for encoding and decoding.
 #[derive(Clone, Debug, Default)]
 pub struct Messages {
     commands: HashMap<String, Message>,
@@ -205,7 +205,7 @@ pub struct Messages {
 }
 
 impl Messages {
-    /// Prepares a dictionary. Messages whose format is none are left out.
+    /// Prepares a dictionary. Messages whose format can not be parsed are left out.
     pub fn new(dictionary: &Dictionary) -> Messages {
         let enumerations: Vec<_> = dictionary
             .enumerations
@@ -354,7 +354,7 @@ impl Messages {
     }
 }
 
-/// `pin` names the values of `pin` and of `step_pin`.
+/// Whether an enumeration names the values of a parameter: `pin` does for `pin` and for `step_pin`.
 fn names_values_of(enumeration: &str, parameter: &str) -> bool {
     parameter.strip_suffix(enumeration).is_some_and(|front| front.is_empty() || front.ends_with('_'))
 }

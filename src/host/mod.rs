@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The other end of the wire: a small host client, for `pinion run`'s demonstration, for the
+//! The other end of the wire: a small host client for the demonstration of `pinion sim`, for the
 //! tests over a real pty, for the lab and for the benches.
 //!
 //! - [`serial`]: blocks over a tty, acknowledged and sent again as klippy does
@@ -11,7 +11,7 @@
 //! - [`demo`]: all of it in one go, with progress and checks
 //! - [`picture`]: an SVG of the homing just done
 //!
-//! One thread: whoever waits also reads, acknowledges and sends again.
+//! There is one thread: a call that waits also reads, acknowledges and sends blocks again.
 
 #![forbid(unsafe_code)]
 
@@ -32,9 +32,9 @@ use std::time::Duration;
 
 pub use client::Client;
 pub use messages::{Arg, Params};
-pub use serial::Link;
+pub use serial::BlockLink;
 
-/// Why the host could not do what it was asked; each prints as one line with a remedy.
+/// Why the host client could not do something. Each prints as one line with a remedy.
 #[derive(Debug)]
 pub enum Error {
     /// The tty refused an operation.

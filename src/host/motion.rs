@@ -12,39 +12,41 @@ use super::config::Config;
 use super::{Client, Error};
 use crate::time::Clock;
 
-/// How far ahead of their time steps are sent, in seconds.
+/// How long before they are due steps are sent, in seconds.
 const LOOKAHEAD_S: f64 = 1.0;
-/// How far ahead of the present a move starts, in seconds.
+/// How long after the present a move starts, in seconds: time to send its first steps.
 const LEAD_S: f64 = 0.25;
 /// How often position and endstop are looked at during a move.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
-/// How often they are looked at after homing.
+/// How many times they are looked at after homing, with the axis at rest.
 const LOOKS_AT_REST: u32 = 5;
-/// How long a wait for news lasts while steps may have to be sent.
+/// How long to wait for a response at most before looking whether more steps are to be sent.
 const FEED_EVERY: Duration = Duration::from_millis(5);
-/// The intervals of a ramp's chord differ by this part at most, which keeps the chord within
-/// half a hundredth of the curve...
+/// By how much of itself the interval may shrink within one chord of a ramp. A tenth keeps the chord
+/// within half a hundredth of the curve.
 const CHORD: f64 = 0.1;
-/// ... and by this part where they fall so slowly that whole ticks are a coarse measure of it.
+/// The same where intervals shrink by fewer than [`ADD_COARSE`] ticks a step: `add` is a whole number
+/// of ticks, so its rounding matters there.
 const CHORD_FINE: f64 = 0.02;
 const ADD_COARSE: i64 = -8;
-/// Longest interval between two steps, in ticks; beyond it a clock would seem to be in the past.
+/// The longest interval between two steps, in ticks. With a much longer one, the 32-bit clock of the
+/// next step would be taken for one in the past.
 const INTERVAL_MAX: f64 = (1u32 << 30) as f64;
 
-/// Entries of the move queue that are left for heaters and pins.
+/// How many entries of the move queue are left to heaters and other outputs.
 const RESERVED_MOVES: usize = 16;
 
-/// Without news for so long (seconds) the micro-controller ends homing by itself; klippy's
-/// time for a single micro-controller.
+/// After this many seconds without a message from the host the micro-controller ends homing by itself.
+/// It is klippy's value for a printer with one micro-controller.
 const TRSYNC_TIMEOUT_S: f64 = 5.0;
-/// How long the report on homing may fail to come.
+/// How long after the end of the move the report of the trsync may come.
 const NEWS_TIMEOUT: Duration = Duration::from_secs(6);
 const ENDSTOP_SAMPLE_S: f64 = 0.000_015;
 const ENDSTOP_SAMPLES: u8 = 4;
 
 /// Why homing ended, as klippy numbers it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Reason {
+pub enum HomingEnd {
     /// The endstop closed.
     Endstop,
     /// The host gave up.
@@ -53,26 +55,26 @@ pub enum Reason {
     PastEnd,
     /// The micro-controller did not hear from the host in time.
     Silence,
-    /// Something else.
+    /// A reason that klippy does not have.
     Other(i64),
 }
 
-impl Reason {
+impl HomingEnd {
     fn code(self) -> i64 {
         match self {
-            Reason::Endstop => 1,
-            Reason::Host => 2,
-            Reason::PastEnd => 3,
-            Reason::Silence => 4,
-            Reason::Other(code) => code,
+            HomingEnd::Endstop => 1,
+            HomingEnd::Host => 2,
+            HomingEnd::PastEnd => 3,
+            HomingEnd::Silence => 4,
+            HomingEnd::Other(code) => code,
         }
     }
 
-    fn of(code: i64) -> Reason {
-        [Reason::Endstop, Reason::Host, Reason::PastEnd, Reason::Silence]
+    fn of(code: i64) -> HomingEnd {
+        [HomingEnd::Endstop, HomingEnd::Host, HomingEnd::PastEnd, HomingEnd::Silence]
             .into_iter()
             .find(|reason| reason.code() == code)
-            .unwrap_or(Reason::Other(code))
+            .unwrap_or(HomingEnd::Other(code))
     }
 }
 
@@ -107,7 +109,7 @@ impl Run {
     }
 }
 
-/// A move of one stepper: speed up, go on, slow down.
+/// A move of one stepper: it speeds up, keeps its speed, and slows down.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Profile {
     /// The move, in order.
@@ -134,7 +136,7 @@ impl Profile {
             });
         }
         let cruise = cruise as u32;
-        // Ideal time of the i-th step from rest is sqrt(2 i / a).
+        // From rest, the ideal time of step i is sqrt(2 i / a).
         let tick_of = |step: u32| frequency_hz * (2.0 * f64::from(step) / acceleration).sqrt();
         let interval = |step: u32| {
             let ideal = (tick_of(step + 1) - tick_of(step)).min(INTERVAL_MAX);
@@ -143,7 +145,7 @@ impl Profile {
         let ramp_steps = (speed * speed / (2.0 * acceleration)).min(f64::from(steps / 2)) as u32;
         let ramp = ramp(ramp_steps, interval);
         let peak = ramp.last().map_or(cruise, |run| run.last_interval());
-        // A short move never reaches its speed; its middle goes on at the peak.
+        // A short move does not reach the wanted speed. Its middle keeps the highest one it reaches.
         let even = if ramp_steps < steps / 2 { cruise } else { peak };
         let mut runs = ramp.clone();
         let mut rest = steps - 2 * ramp_steps;
@@ -158,14 +160,15 @@ impl Profile {
     }
 }
 
-/// Chords to the intervals of the steps `0..steps`, which fall ever more slowly. `add` is
-/// rounded towards zero, so no chord reaches below the one after it.
+/// Approximates the intervals of the steps `0..steps`, which shrink ever more slowly, by runs whose
+/// intervals change evenly (chords of the curve). `add` is rounded towards zero, so that no run ends
+/// with a shorter interval than the next one begins with.
 fn ramp(steps: u32, interval: impl Fn(u32) -> u32) -> Vec<Run> {
     let mut runs = Vec::new();
     let mut at = 0;
     while at < steps {
         let first = interval(at);
-        // The longest chord whose intervals fall by no more than this part, by bisection.
+        // The end of the longest chord whose intervals shrink by no more than `part`, by bisection.
         let chord = |part: f64| {
             let least = f64::from(first) * (1.0 - part);
             let (mut count, mut beyond) = (1, (steps - at).min(u32::from(u16::MAX)) + 1);
@@ -197,7 +200,7 @@ fn ramp(steps: u32, interval: impl Fn(u32) -> u32) -> Vec<Run> {
 /// A stepper as configured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stepper {
-    /// Its object.
+    /// Its oid.
     pub oid: u8,
     /// Whether its direction pin is inverted.
     pub invert_dir: bool,
@@ -234,9 +237,9 @@ impl Stepper {
 /// An endstop and the trsync that it triggers, as configured.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Endstop {
-    /// The endstop's object.
+    /// The endstop's oid.
     pub oid: u8,
-    /// The trsync's object.
+    /// The trsync's oid.
     pub trsync: u8,
     /// Whether the pin is low when the endstop is triggered.
     pub invert: bool,
@@ -271,7 +274,7 @@ impl Endstop {
                 ("rest_ticks", rest_ticks.into()),
                 ("pin_value", (!self.invert).into()),
                 ("trsync_oid", self.trsync.into()),
-                ("trigger_reason", Reason::Endstop.code().into()),
+                ("trigger_reason", HomingEnd::Endstop.code().into()),
             ],
         )
     }
@@ -308,19 +311,19 @@ pub struct Watch<'a> {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Homed {
     /// Why it ended.
-    pub reason: Reason,
+    pub reason: HomingEnd,
     /// When the move began.
     pub start: Clock,
     /// When the endstop was first seen triggered, if it was.
     pub trigger: Option<Clock>,
     /// The position at which the stepper stopped, in steps.
     pub position: i64,
-    /// Steps that it may have gone on after the endstop closed: those of one sampling of it.
+    /// How many steps the stepper may have made after the endstop closed, until the samples of the
+    /// endstop have shown it.
     pub slack_steps: u32,
 }
 
-/// The entries of the micro-controller's move queue that are in use, and the moves that they
-/// are for.
+/// Paces moves into the micro-controller's move queue: keeps account of its entries in use.
 #[derive(Debug)]
 pub struct MoveQueue {
     room: usize,
@@ -358,7 +361,7 @@ impl MoveQueue {
         let start = client.clock_in(LEAD_S)?;
         let mut moving = self.begin(client, stepper, positive, profile, start)?;
         let mut look_at = Instant::now();
-        // Steps may be a little late.
+        // Waits 10 ms longer, as the last step may be a little late.
         let arrived = moving.end.displaced(client.ticks(0.01));
         while client.clock_in(0.0)? <= arrived {
             self.feed(client, &mut moving)?;
@@ -416,7 +419,8 @@ impl MoveQueue {
             }
             let clock = client.widen(state.u32("clock")?);
             if clock >= moving.end {
-                client.send("trsync_trigger", &[("oid", trsync.into()), ("reason", Reason::PastEnd.code().into())])?;
+                client
+                    .send("trsync_trigger", &[("oid", trsync.into()), ("reason", HomingEnd::PastEnd.code().into())])?;
                 break;
             }
             let later = clock.displaced(expire_ticks);
@@ -440,17 +444,17 @@ impl MoveQueue {
         stepper: Stepper,
         endstop: Endstop,
         rest_ticks: u32,
-    ) -> Result<(Reason, Option<Clock>, i64), Error> {
+    ) -> Result<(HomingEnd, Option<Clock>, i64), Error> {
         let nothing =
             ["clock", "sample_ticks", "sample_count", "rest_ticks", "pin_value", "trsync_oid", "trigger_reason"];
         let mut args = vec![("oid", endstop.oid.into())];
         args.extend(nothing.map(|name| (name, 0u8.into())));
         client.send("endstop_home", &args)?;
-        // The last report may still be on its way; the answer to this comes after it.
+        // The last report may still be on its way. It has come once all that was sent is acknowledged.
         client.link().settle()?;
         let mut state = client.query(
             "trsync_trigger",
-            &[("oid", endstop.trsync.into()), ("reason", Reason::Host.code().into())],
+            &[("oid", endstop.trsync.into()), ("reason", HomingEnd::Host.code().into())],
             "trsync_state",
             Some(endstop.trsync),
         )?;
@@ -459,9 +463,9 @@ impl MoveQueue {
             let next = client.wait("trsync_state", Some(endstop.trsync), until)?;
             state = next.ok_or_else(no_news)?;
         }
-        let reason = Reason::of(state.int("trigger_reason")?);
+        let reason = HomingEnd::of(state.int("trigger_reason")?);
         self.releases.clear();
-        let trigger = if reason == Reason::Endstop {
+        let trigger = if reason == HomingEnd::Endstop {
             let (_, next) = endstop.state(client)?;
             Some(next.displaced(rest_ticks.wrapping_neg()))
         } else {
@@ -514,7 +518,7 @@ impl MoveQueue {
                     ("add", run.add.into()),
                 ],
             )?);
-            // The entry is free once the run before it is over.
+            // The micro-controller takes a run out of its queue when the run before it is over.
             self.releases.push(Reverse(moving.next));
             moving.next = Clock::from_ticks(moving.next.ticks() + run.ticks());
         }
@@ -542,7 +546,7 @@ fn arm(
             ("oid", trsync.into()),
             ("report_clock", start.into()),
             ("report_ticks", report_ticks.into()),
-            ("expire_reason", Reason::Silence.code().into()),
+            ("expire_reason", HomingEnd::Silence.code().into()),
         ],
     )?;
     client.send("stepper_stop_on_trigger", &[("oid", stepper.oid.into()), ("trsync_oid", trsync.into())])?;
@@ -614,7 +618,7 @@ mod tests {
             prop_assert_eq!(intervals.iter().sum::<u64>(), profile.ticks);
             let fastest = (FREQUENCY_HZ / speed) as u64;
             prop_assert!(intervals.iter().all(|interval| *interval >= fastest));
-            // Falling, then rising, and the same forwards and backwards.
+            // The intervals shrink, then grow, and are the same from either end.
             let lowest = intervals.iter().min().unwrap();
             let bottom = intervals.iter().position(|i| i == lowest).unwrap();
             prop_assert!(intervals[..=bottom].is_sorted_by(|a, b| a >= b));

@@ -17,7 +17,7 @@ const POSITION: f64 = 190.0;
 const LANE: f64 = 22.0;
 const RATE: f64 = 130.0;
 const BOTTOM: f64 = 46.0;
-/// Colours that stand out from white and from black.
+/// Colours that can be seen on white and on black.
 const COLOURS: [&str; 6] = ["#d9580d", "#1a8fe3", "#2f9e44", "#b04fc4", "#c49a00", "#e0457b"];
 
 /// Draws the homing of the report's axes as an SVG document: readable on light and on dark
@@ -67,7 +67,7 @@ fn mm_at(axis: &AxisReport, t_s: f64) -> f64 {
     }
 }
 
-/// A range of values laid over a range of the drawing.
+/// Maps a range of values to a range of the drawing.
 struct Scale {
     least: f64,
     most: f64,
@@ -96,7 +96,7 @@ impl Scale {
             .map(|factor| factor * power)
             .find(|step| *step >= coarse * 0.999)
             .unwrap_or(coarse);
-        // A hair beyond a round number is not worth another step.
+        // A value just beyond a round number does not widen the range by a whole step.
         let least = (least / step + 0.02).floor() * step;
         let most = ((most / step - 0.02).ceil() * step).max(least + step);
         Scale { least, most, step, from, to }
@@ -115,7 +115,7 @@ impl Scale {
 
     fn label(&self, value: f64) -> String {
         let decimals = (-self.step.log10().floor()).clamp(0.0, 3.0) as usize;
-        // No minus before a zero.
+        // A value near zero would be labelled "-0".
         let value = if value.abs() < self.step / 2.0 { 0.0 } else { value };
         format!("{value:.decimals$}")
     }
@@ -156,7 +156,7 @@ impl Svg {
         let mut x = WIDTH - RIGHT;
         for (i, axis) in report.axes.iter().enumerate().rev() {
             let colour = COLOURS[i % COLOURS.len()];
-            // A letter is some eight units wide.
+            // Estimated: a letter is about eight units wide.
             x -= 8.0 * axis.name.chars().count() as f64 + 42.0;
             self.put(format_args!(
                 "<line x1=\"{x:.1}\" y1=\"20\" x2=\"{:.1}\" y2=\"20\" stroke=\"{colour}\" \

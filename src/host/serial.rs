@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Blocks over a tty: a [`Port`] carries bytes and finds blocks in them, a [`Link`] delivers
+//! Blocks over a tty: a [`Port`] carries bytes and finds blocks in them, a [`BlockLink`] delivers
 //! payloads in order, each once.
 //!
-//! The rules of sending again are klippy's (chelper/serialqueue.c): at most [`WINDOW`] blocks
-//! without acknowledgement; after the retransmission time, or at once after a NAK, all of them
-//! again behind a sync byte; an empty block that repeats the last acknowledgement is a NAK.
+//! Blocks are sent again by klippy's rules (chelper/serialqueue.c). At most [`WINDOW`] blocks are
+//! sent without being acknowledged. After the retransmission time, or at once after a NAK, all of them
+//! are sent again, behind a sync byte. An empty block that repeats the last acknowledgement is a NAK.
 
 #![forbid(unsafe_code)]
 
@@ -25,19 +25,19 @@ use nix::sys::time::TimeSpec;
 use super::Error;
 use crate::wire::block::{BLOCK_MAX, BLOCK_MIN, Found, PAYLOAD_MAX, Resync, Sequence, frame};
 
-/// Blocks that may be on their way without acknowledgement.
+/// How many blocks may be sent without being acknowledged.
 pub const WINDOW: usize = 12;
-/// How long the other end may leave all blocks unacknowledged before sending fails.
+/// How long to wait for any acknowledgement before sending fails.
 pub const SILENCE: Duration = Duration::from_secs(5);
 
-/// Payloads kept for whoever receives next; the oldest go first.
+/// How many payloads are kept until they are received. The oldest are dropped first.
 const RECEIVED_MAX: usize = 65_536;
 const SYNC: u8 = 0x7e;
 const RTO_MIN: Duration = Duration::from_millis(25);
 const RTO_MAX: Duration = Duration::from_secs(5);
 
-/// Bytes over a tty, pty, socket or anything else that can be polled; finds blocks in what
-/// comes in and leaves their order to others. Tests speak through it what no [`Link`] would.
+/// Carries bytes over a tty, pty, socket or anything else that can be polled, and finds the blocks in
+/// what comes in, in whatever order. Tests send bytes through it that a [`BlockLink`] would never send.
 #[derive(Debug)]
 pub struct Port {
     file: File,
@@ -62,7 +62,7 @@ impl Port {
         Port::new(file, name)
     }
 
-    /// Takes over an open descriptor; a tty is made raw. `name` stands in errors.
+    /// Takes over an open descriptor. A tty is made raw. Errors call it `name`.
     pub fn from_fd(fd: OwnedFd, name: &str) -> Result<Port, Error> {
         Port::new(File::from(fd), name.to_owned())
     }
@@ -94,18 +94,18 @@ impl Port {
         &self.name
     }
 
-    /// Puts bytes of any kind, as they are, behind those that wait to be written.
+    /// Appends bytes, just as they are, to those that wait to be written.
     pub fn queue(&mut self, bytes: &[u8]) {
         self.output.extend_from_slice(bytes);
     }
 
-    /// Puts an intact block of this sequence number behind the bytes that wait to be written.
+    /// Appends an intact block with this sequence number to the bytes that wait to be written.
     pub fn queue_block(&mut self, payload: &[u8], sequence: Sequence) {
         frame(payload, sequence, &mut self.output);
     }
 
-    /// Writes what waits and reads until something came in or the time is over. Whether bytes
-    /// came in.
+    /// Writes what waits to be written, and reads until something comes in or the time is over. Returns
+    /// whether bytes came in.
     pub fn exchange(&mut self, until: Instant) -> Result<bool, Error> {
         self.write_some()?;
         let wait = until.saturating_duration_since(Instant::now());
@@ -186,7 +186,7 @@ impl Port {
     }
 
     fn failed(&self, doing: &'static str, source: io::Error) -> Error {
-        // A pty whose other end is gone says EIO, a socket EPIPE or ECONNRESET.
+        // If the other end is gone, a pty fails with EIO, and a socket with EPIPE or ECONNRESET.
         if let Some(libc::EIO | libc::EPIPE | libc::ECONNRESET) = source.raw_os_error() {
             return Error::Closed { port: self.name.clone() };
         }
@@ -228,16 +228,16 @@ struct Sent {
 ///
 /// Numbers count blocks from the session's start; the wire carries them modulo 16.
 #[derive(Debug)]
-pub struct Link {
+pub struct BlockLink {
     port: Port,
     sequences: [Sequence; 16],
     synchronised: bool,
-    /// Number of the next block to send.
+    /// The number of the next new block.
     send: u64,
-    /// Number of the oldest block without acknowledgement.
+    /// The number of the oldest block that is not acknowledged.
     receive: u64,
     last_ack: u64,
-    /// NAKs up to this number answer what was sent before the last time it was sent again.
+    /// NAKs up to this number are ignored: they answer blocks that have been sent again since.
     ignore_nak: u64,
     /// Blocks below this number were sent more than once.
     retransmitted: u64,
@@ -250,28 +250,28 @@ pub struct Link {
     retransmit_at: Instant,
     heard_at: Instant,
     received: VecDeque<Received>,
-    /// Payloads that came in, and that were handed out or thrown away.
+    /// How many payloads have come in, and how many of them were received or dropped.
     arrived: u64,
     taken: u64,
-    /// `arrived` when the last block that was sent was acknowledged.
+    /// What `arrived` was when the last block that was sent was acknowledged.
     settled: Option<u64>,
     traffic: Traffic,
 }
 
-impl Link {
+impl BlockLink {
     /// Opens a tty, and finds out which block the other end expects next.
-    pub fn open(path: &Path, timeout: Duration) -> Result<Link, Error> {
-        Link::new(Port::open(path)?, timeout)
+    pub fn open(path: &Path, timeout: Duration) -> Result<BlockLink, Error> {
+        BlockLink::new(Port::open(path)?, timeout)
     }
 
     /// Makes a link of a port: finds out which block the other end expects next.
-    pub fn new(port: Port, timeout: Duration) -> Result<Link, Error> {
+    pub fn new(port: Port, timeout: Duration) -> Result<BlockLink, Error> {
         let now = Instant::now();
         let mut sequences = [Sequence::default(); 16];
         for i in 1..sequences.len() {
             sequences[i] = sequences[i - 1].next();
         }
-        let mut link = Link {
+        let mut link = BlockLink {
             port,
             sequences,
             synchronised: false,
@@ -298,8 +298,9 @@ impl Link {
         Ok(link)
     }
 
-    /// Sends an empty block: whether it was expected or not, the answer names the block
-    /// expected after it. The sync bytes before it end a block that an earlier host left half.
+    /// Finds out which block the other end expects next, by sending an empty one: the answer tells it
+    /// whether the number of the empty block was right or not. The sync bytes before it end a block
+    /// that an earlier host may have left incomplete.
     fn synchronise(&mut self, timeout: Duration) -> Result<(), Error> {
         let until = Instant::now() + timeout;
         while !self.synchronised {
@@ -319,8 +320,8 @@ impl Link {
         Ok(())
     }
 
-    /// Limits the bytes without acknowledgement to what the other end can buffer, as its
-    /// constant `RECEIVE_WINDOW` tells.
+    /// Limits the bytes that are sent without being acknowledged to what the other end can buffer: its
+    /// constant `RECEIVE_WINDOW`.
     pub fn set_window_bytes(&mut self, bytes: usize) {
         self.window_bytes = bytes.max(BLOCK_MAX);
     }
@@ -352,8 +353,8 @@ impl Link {
         }
     }
 
-    /// The next payload of those that come in before, or with, the acknowledgement of all that was
-    /// sent; waits for one, `None` once there are no more.
+    /// The next of the payloads that come in before all that was sent is acknowledged, or together with
+    /// that. Waits for one; `None` once there are no more.
     pub fn receive_unsettled(&mut self) -> Result<Option<Received>, Error> {
         self.wait_while(|link| link.received.is_empty() && link.settled.is_none())?;
         match self.settled {
@@ -368,8 +369,8 @@ impl Link {
         received
     }
 
-    /// Sends one payload `count` times as fast as the window allows, and tells how long it
-    /// took until all were acknowledged. Payloads that come in meanwhile are kept.
+    /// Sends one payload `count` times as fast as the window allows, and returns how long it took until
+    /// all were acknowledged. Payloads that come in during that time are kept.
     pub fn flood(&mut self, payload: &[u8], count: u64) -> Result<Duration, Error> {
         let start = Instant::now();
         for _ in 0..count {
@@ -379,7 +380,7 @@ impl Link {
         Ok(start.elapsed())
     }
 
-    /// Blocks on their way without acknowledgement.
+    /// How many blocks are sent and not acknowledged.
     pub fn unacknowledged(&self) -> usize {
         self.sent.len()
     }
@@ -389,7 +390,7 @@ impl Link {
         Traffic { garbage_bytes: self.port.garbage, ..self.traffic }
     }
 
-    /// The port beneath, for what a link would never send.
+    /// The port beneath, to send bytes that a link would never send.
     pub fn port(&mut self) -> &mut Port {
         &mut self.port
     }
@@ -419,7 +420,7 @@ impl Link {
         Ok(())
     }
 
-    fn wait_while(&mut self, busy: impl Fn(&Link) -> bool) -> Result<(), Error> {
+    fn wait_while(&mut self, busy: impl Fn(&BlockLink) -> bool) -> Result<(), Error> {
         while busy(self) {
             let until = self.heard_at + SILENCE;
             self.exchange(until)?;
@@ -436,7 +437,7 @@ impl Link {
     /// One round of writing, waiting, reading, acknowledging and sending again.
     fn exchange(&mut self, until: Instant) -> Result<(), Error> {
         self.port.write_some()?;
-        // What still waits to be written must not be sent again before it was.
+        // The retransmission time runs only once everything has been written.
         let timed = !self.sent.is_empty() && self.port.output.is_empty();
         let until = if timed { until.min(self.retransmit_at) } else { until };
         if self.port.exchange(until)? {
@@ -486,7 +487,7 @@ impl Link {
         } else if self.receive > self.ignore_nak && !self.sent.is_empty() {
             self.traffic.naks += 1;
             self.ignore_nak = if self.receive < self.retransmitted {
-                // The second NAK since the blocks were sent again; a third is not believed.
+                // It is the second NAK since the blocks were sent again. Further ones are ignored.
                 self.retransmitted
             } else {
                 self.receive
@@ -515,7 +516,7 @@ impl Link {
         self.retransmit_at = at + self.rto;
     }
 
-    /// The retransmission time after RFC 6298, with a generous first guess.
+    /// Adapts the retransmission time to a round trip, after RFC 6298.
     fn measure(&mut self, sample: Duration) {
         let (smooth, variation) = match self.round_trip {
             None => (sample * 10, sample / 2),
@@ -643,15 +644,15 @@ mod tests {
     fn silence_and_a_closed_end_are_told() {
         let (ours, theirs) = UnixStream::pair().unwrap();
         let port = Port::from_fd(ours.into(), "mute").unwrap();
-        let error = Link::new(port, Duration::from_millis(50)).unwrap_err();
+        let error = BlockLink::new(port, Duration::from_millis(50)).unwrap_err();
         assert!(error.to_string().starts_with("no answer on mute within 0.1 s"), "{error}");
         drop(theirs);
         let (ours, theirs) = UnixStream::pair().unwrap();
         drop(theirs);
         let port = Port::from_fd(ours.into(), "gone").unwrap();
-        let error = Link::new(port, Duration::from_secs(60)).unwrap_err();
+        let error = BlockLink::new(port, Duration::from_secs(60)).unwrap_err();
         assert!(error.to_string().starts_with("gone was closed"), "{error}");
-        let error = Link::open(Path::new("/dev/no-such-tty"), Duration::ZERO).unwrap_err();
+        let error = BlockLink::open(Path::new("/dev/no-such-tty"), Duration::ZERO).unwrap_err();
         assert!(error.to_string().starts_with("cannot open /dev/no-such-tty: No such file"), "{error}");
     }
 

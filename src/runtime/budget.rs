@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Stays clear of the kernel's real-time throttle.
+//! Keeps the core from being stopped by the kernel's real-time throttle.
 //!
-//! A SCHED_FIFO thread that runs for more than `sched_rt_runtime_us` of a
-//! `sched_rt_period_us` is stopped for the rest of the period (Documentation/scheduler/
-//! sched-rt-group.rst): 50 ms in every second, which a print does not survive. The kernel counts
-//! that for each processor. So the core looks at its own running time, as the kernel counts it,
-//! and moves to another processor before it was on one for too much of a second. Where it has no
-//! other it spends a little of a busy second as SCHED_OTHER, which is never throttled.
+//! The kernel stops a SCHED_FIFO thread that has run for `sched_rt_runtime_us` of a
+//! `sched_rt_period_us` until that period is over (Documentation/scheduler/sched-rt-group.rst). By
+//! default that is for 50 ms in every second, which ends a print. The kernel counts for each processor
+//! apart. So the core watches its own running time, as the kernel counts it, and moves to another
+//! processor before its time on the present one is used up. If it has no other, it runs as
+//! SCHED_OTHER, which is never throttled, for a small part of a busy second.
 
 #![forbid(unsafe_code)]
 
@@ -15,36 +15,36 @@ use std::time::Duration;
 
 use crate::time::{Clock, NS_PER_TICK, Ticks};
 
-/// What the core should run as.
+/// The scheduling class that the core is to run in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Class {
     Fifo,
     Other,
 }
 
-/// A bucket of running time as SCHED_FIFO on a processor: it fills at a share of real time and
-/// drains while the core runs as SCHED_FIFO. Whatever the phase of the kernel's period, a period
-/// sees at most the share and a full bucket.
+/// The running time as SCHED_FIFO that the core has left on a processor, kept as a bucket: it fills at
+/// a share of real time, and drains while the core runs as SCHED_FIFO. So in any period of the kernel,
+/// wherever it begins, the core runs for at most that share and one full bucket.
 #[derive(Debug)]
 pub(super) struct Budget {
     class: Class,
-    /// In 1/1024 ticks.
+    /// What is left, in 1/1024 ticks.
     level: i64,
     full: i64,
-    /// Filled by this much of 1024 a tick.
+    /// How much the bucket fills in a tick, in 1/1024 ticks.
     share: i64,
     looked: Clock,
-    /// The running time then.
+    /// The thread's running time at that look.
     ran: Duration,
 }
 
-/// How often to look. The kernel counts the way into a sleep and out of it as running, too,
-/// which the core's own clock readings do not tell; its count costs a system call.
+/// How many ticks lie between two looks at the thread's running time. Only the kernel knows it, as it
+/// also counts the way into a sleep and out of it; and to ask the kernel costs a system call.
 const LOOK_TICKS: i64 = 50_000;
 
 const FINE: i64 = 1024;
 
-/// The throttle as the kernel tells it.
+/// The kernel's setting of the throttle, in microseconds.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Throttle {
     pub(super) runtime_us: u32,
@@ -55,15 +55,16 @@ impl Throttle {
     /// The throttle in force; none if it is switched off or the kernel has none.
     pub(super) fn read() -> Option<Throttle> {
         let read = |name: &str| fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse().ok();
-        // -1 switches it off, and is no u32.
+        // A runtime of -1 switches the throttle off. It does not parse as a u32, so this returns none.
         let throttle = Throttle { runtime_us: read("sched_rt_runtime_us")?, period_us: read("sched_rt_period_us")? };
         (throttle.runtime_us < throttle.period_us).then_some(throttle)
     }
 }
 
 impl Budget {
-    /// A full budget for a thread that runs as SCHED_FIFO. A twentieth of the allowance is
-    /// left to the kernel's own accounting, another is the bucket.
+    /// A full budget for a thread that runs as SCHED_FIFO and has run for `ran` so far. Of what the
+    /// kernel allows, nine tenths are the share, and a twentieth the bucket; the last twentieth is
+    /// kept in reserve, for what the kernel counts and the looks do not see.
     pub(super) fn new(throttle: Throttle, now: Clock, ran: Duration) -> Budget {
         let allowance = i64::from(throttle.runtime_us) * FINE / i64::from(throttle.period_us.max(1));
         let full = i64::from(throttle.runtime_us) * i64::from(Ticks::from_us(1).0) * FINE / 20;
@@ -81,7 +82,8 @@ impl Budget {
         now.since(self.looked) >= LOOK_TICKS
     }
 
-    /// The thread ran for that long in its life so far: whether its class is to change.
+    /// Takes in that the thread has run for `ran` in its life so far. The class that it is to change
+    /// to, if it is to change.
     pub(super) fn look(&mut self, now: Clock, ran: Duration) -> Option<Class> {
         let span = now.since(self.looked).clamp(0, 1 << 40);
         let spent = ran.saturating_sub(self.ran).as_nanos() as i64 / NS_PER_TICK as i64;
@@ -98,8 +100,8 @@ impl Budget {
         Some(class)
     }
 
-    /// The thread goes on as SCHED_FIFO on another processor, whose bucket is full: it filled
-    /// while the thread was on this one, if it was ever on the other.
+    /// The thread has moved to another processor and goes on as SCHED_FIFO. The bucket of that one is
+    /// full: if the thread was there before, it has filled again meanwhile.
     pub(super) fn moved(&mut self) {
         self.class = Class::Fifo;
         self.level = self.full;

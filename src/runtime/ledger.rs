@@ -1,16 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Which number each block to the host carries: how many of its blocks were received and done.
+//! The sequence numbers of the blocks that go to the host: each says how many of the host's blocks
+//! were received and are done.
 //!
-//! A number acknowledges every block before it. So it counts only the leading blocks that are all
-//! done: a block that the link answered at once, while blocks before it are still with the core, is
-//! counted when those are done.
+//! A number acknowledges all blocks before it. So a block counts only once all blocks before it are
+//! done, too. That matters for those that the link answers at once, while the core is still busy with
+//! blocks that came before.
 
 #![forbid(unsafe_code)]
 
 use std::collections::VecDeque;
 
-/// Blocks that may be answered ahead of blocks that the core still has. klippy has 12 blocks open
-/// at most (`MAX_PENDING_BLOCKS` in chelper/serialqueue.c).
+/// How many blocks the link may have answered that do not count yet. klippy sends at most 12 blocks
+/// before it waits for an acknowledgement (`MAX_PENDING_BLOCKS` in chelper/serialqueue.c).
 const EARLY_MAX: usize = 32;
 
 /// The account of the blocks that came from the host. All numbers count blocks since the start and
@@ -19,24 +20,24 @@ const EARLY_MAX: usize = 32;
 pub(super) struct Ledger {
     /// Blocks handed to the core.
     handed: u32,
-    /// How many of them it is known to be done with.
+    /// How many of those the core was done with when the link last looked.
     core_done: u32,
-    /// For each block that was answered here and is not counted yet: how many blocks had been
-    /// handed to the core before it.
+    /// The blocks that the link has answered and that do not count yet: for each, how many blocks had
+    /// been handed to the core before it.
     early: VecDeque<u32>,
-    /// Blocks that were answered here and are counted.
+    /// How many blocks that the link has answered count.
     settled: u32,
-    /// The highest number that was sent. A number that goes back acknowledges nothing: klippy
-    /// counts its bytes as invalid.
+    /// The highest number that was sent. No lower one may follow: klippy would take it for an error
+    /// on the line and drop the block.
     said: u32,
-    /// The number of the last empty block.
+    /// The number of the last empty block that was sent.
     acknowledged: u32,
-    /// A block was refused, and the host was not told so yet.
+    /// Whether the host is still to be told that a block was refused.
     nak_owed: bool,
 }
 
 impl Ledger {
-    /// A block goes to the core.
+    /// Takes in that a block is handed to the core.
     pub(super) fn hand(&mut self) {
         self.handed = self.handed.wrapping_add(1);
     }
@@ -46,16 +47,16 @@ impl Ledger {
         self.handed
     }
 
-    /// A block was refused: it came out of order, or garbage did.
+    /// Takes in that a block was refused, as it came out of order, or that garbage came.
     pub(super) fn refuse(&mut self) {
         self.nak_owed = true;
     }
 
-    /// A block is answered here: the number that its answer carries. None if too many blocks are
-    /// ahead of the core already; then it has to go to the core, too.
+    /// Takes in that the link answers a block itself, and returns the number of its answer. None if
+    /// too many such blocks do not count yet: then this one has to go to the core, too.
     ///
-    /// All that the core said up to `core_done`, how many blocks it is done with, must have been
-    /// given to [`Ledger::respond`] before: its number would be too high afterwards.
+    /// `core_done` is how many blocks the core is done with. Its responses to these must all have gone
+    /// through [`Ledger::respond`] before, as they would get too high a number afterwards.
     pub(super) fn answer(&mut self, core_done: u32) -> Option<u32> {
         self.settle(core_done);
         if self.early.len() >= EARLY_MAX {
@@ -66,23 +67,24 @@ impl Ledger {
         Some(self.say(self.done()))
     }
 
-    /// The number of a response of the core, which had begun so many blocks when it gave it: the
-    /// one just after the block that it was running.
+    /// The number of a response of the core, which had begun `core_begun` blocks when it sent that: the
+    /// number just after the block that it was running.
     pub(super) fn respond(&mut self, core_begun: u32) -> u32 {
         self.settle(core_begun.wrapping_sub(1));
         self.say(core_begun.wrapping_add(self.settled))
     }
 
-    /// The numbers of the empty blocks that are to be sent when the core is done with so many
-    /// blocks. The first acknowledges what was done since the last one. The second is a NAK: to the
-    /// host an empty block that repeats a number is one, so it is sent only where one is owed, and
-    /// once all blocks before the refused one are done.
+    /// The numbers of the empty blocks that are to be sent now that the core is done with `core_done`
+    /// blocks (for which the same holds as in [`Ledger::answer`]).
     ///
-    /// For `core_done` the same holds as in [`Ledger::answer`].
+    /// The first acknowledges what was done since the last such block. The second is a NAK, for the
+    /// host takes an empty block that repeats the last number for one. So it is sent only if a block
+    /// was refused, and once all blocks before that one are done.
     pub(super) fn acknowledge(&mut self, core_done: u32) -> [Option<u32>; 2] {
         self.settle(core_done);
         let done = self.done();
-        // A response of a block that the core is still running has said more already.
+        // No acknowledgement is needed if a response to the block that the core is running has
+        // carried a higher number already.
         let news = done != self.acknowledged && !is_after(self.said, done);
         self.acknowledged = done;
         let all_done = self.core_done == self.handed;
@@ -95,12 +97,13 @@ impl Ledger {
         is_after(core_done, self.core_done) || self.done() != self.acknowledged
     }
 
-    /// How many leading blocks are done.
+    /// How many blocks count: all of them are done, and all before them.
     fn done(&self) -> u32 {
         self.core_done.wrapping_add(self.settled)
     }
 
-    /// The core is done with so many blocks: counts the blocks answered here that follow these.
+    /// Takes in how many blocks the core is done with, and counts the blocks that the link has answered
+    /// as far as all blocks before them are done.
     fn settle(&mut self, core_done: u32) {
         if is_after(core_done, self.core_done) {
             self.core_done = core_done;
@@ -213,8 +216,8 @@ mod tests {
             let own = model.just_after(begun);
             model.seen = model.seen.max(begun.saturating_sub(1));
             prop_assert_eq!(number, own.max(model.sent));
-            // Where it had to be raised, no block of the core's lies between: a query there has its
-            // answer from the link.
+            // If the number had to be raised above that, all blocks in between were answered by the
+            // link: so it acknowledges no block that the core still has.
             prop_assert!(model.blocks[own..number].iter().all(|early| *early));
             model.sent = number;
         }
@@ -285,7 +288,7 @@ mod tests {
         ledger.hand();
         assert_eq!(ledger.answer(0), Some(0), "the transfer before it is not done");
         assert_eq!(ledger.acknowledge(0), [None, None]);
-        // The answer to the transfer stands before the query.
+        // The number of the answer to the transfer does not acknowledge the query behind it.
         assert_eq!(ledger.respond(1), 1);
         assert_eq!(ledger.acknowledge(1), [Some(2), None]);
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Tells the service manager how we are: sd_notify(3).
+//! Tells the service manager about the program's state: sd_notify(3).
 
 #![forbid(unsafe_code)]
 
@@ -11,11 +11,11 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::time::Duration;
 
-/// The service manager's ear, if there is one.
+/// A socket to the service manager, if there is one.
 pub(super) struct Notify(Option<UnixDatagram>);
 
 impl Notify {
-    /// The one that the environment names (`NOTIFY_SOCKET`).
+    /// Connects to the socket that the environment names in `NOTIFY_SOCKET`, if it names one.
     pub(super) fn from_env() -> io::Result<Notify> {
         match env::var_os("NOTIFY_SOCKET") {
             Some(name) => Notify::to(&name),
@@ -30,7 +30,7 @@ impl Notify {
                 _ => SocketAddr::from_pathname(name)?,
             };
             let socket = UnixDatagram::unbound()?;
-            // A service manager that is busy must not keep the host waiting.
+            // The link sends these messages: it must not block on a service manager that is busy.
             socket.set_nonblocking(true)?;
             socket.connect_addr(&address)?;
             Ok(Notify(Some(socket)))
@@ -41,10 +41,10 @@ impl Notify {
         })
     }
 
-    /// Sends assignments, one a line.
+    /// Sends assignments such as `READY=1`, one on each line.
     pub(super) fn send(&self, assignments: &str) {
         if let Some(socket) = &self.0 {
-            // What it misses it does not miss for long.
+            // A message that is lost does no harm: state and watchdog messages are sent again and again.
             let _ = socket.send(assignments.as_bytes());
         }
     }
@@ -55,8 +55,8 @@ impl Notify {
     }
 }
 
-/// How often the service manager wants to hear that we are alive (`WatchdogSec=`): half of its
-/// limit.
+/// How often to tell the service manager that the program is alive: at half of the limit that it sets
+/// (`WatchdogSec=`); none if it sets none.
 pub(super) fn watchdog_interval() -> Option<Duration> {
     let variable = |name| env::var(name).ok();
     interval(variable("WATCHDOG_USEC"), variable("WATCHDOG_PID"), std::process::id())

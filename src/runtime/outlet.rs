@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! From the core to the link: responses for the host and lines for the log, through rings that
-//! neither side waits for. Lines have one of their own, as a host that does not read must not
-//! cost the line that says why the machine stopped.
+//! The core's way to the link: responses for the host and lines for the log. Neither side waits for
+//! the other: what does not fit a ring is dropped. Lines have a ring of their own, so that the line
+//! that says why the machine stopped gets through even if the host does not read its responses.
 
 #![forbid(unsafe_code)]
 
@@ -18,22 +18,21 @@ use crate::lateness::us;
 use crate::mcu::{Note, Outbox};
 use crate::shutdown::{Shutdown, reason};
 
-/// Bytes between core and link: some 1,000 responses. When the host does not read, later ones
-/// are dropped.
+/// The size of the ring of responses, of which some 1,000 fit.
 const RING_BYTES: usize = 1 << 16;
-/// A payload's length and the blocks begun.
+/// What stands before a response in the ring: its length, and how many blocks the core had begun.
 const HEAD_BYTES: usize = 6;
-/// The longest line for the log.
+/// The longest line for the log. One that is longer is cut.
 const LINE_BYTES: usize = 1024;
-/// A line's level and its length.
+/// What stands before a line in the ring: its level and its length.
 const LINE_HEAD_BYTES: usize = 3;
-/// Bytes of lines between core and link.
+/// The size of the ring of lines.
 const LINES_BYTES: usize = 1 << 15;
-/// Of these, what only a machine that stops may use: each object can have trouble with that, and
-/// the reason comes last.
+/// The part of it that is kept free for the line that says why the machine stopped. That one comes
+/// last: before it, each object may have logged that it could not be stopped.
 const LINES_SPARE: usize = 2 * (LINE_HEAD_BYTES + LINE_BYTES);
 
-/// Wakes the link, at the price of a system call only while it sleeps.
+/// Wakes the link. Costs a system call only if the link sleeps.
 pub(super) struct LinkWake {
     asleep: AtomicBool,
     event: EventFd,
@@ -45,26 +44,26 @@ impl LinkWake {
         Ok(LinkWake { asleep: AtomicBool::new(false), event })
     }
 
-    /// Something is there for the link.
+    /// To be called by the core after it has put something into a ring.
     pub(super) fn wake(&self) {
         if self.asleep.swap(false, Ordering::SeqCst) {
-            // It can only be full of wake-ups already.
+            // The write can fail only if the counter is full of wake-ups, and then the link wakes, too.
             let _ = self.event.write(1);
         }
     }
 
-    /// The link is about to sleep, and looks once more at all that could wake it.
+    /// To be called by the link before it sleeps. After this it must look at the rings once more.
     ///
-    /// Either that look sees what the core put there, or the core's [`LinkWake::wake`] sees that the
-    /// link sleeps. A swap guarantees that, as it reads, too: when it comes after the core's swap in
-    /// `wake` it reads that one's value, and so sees all that the core wrote before. With a plain
-    /// store it would not: the core could find the link awake, the link could look before the core's
-    /// response is to be seen, and would then sleep on it.
+    /// Then no wake-up is lost. Either this swap comes first: the core's swap in [`LinkWake::wake`]
+    /// finds the link asleep and wakes it. Or the core's swap comes first: this one reads the value
+    /// that it left, and so the look that follows sees all that the core wrote before it. A plain
+    /// store would read nothing, so the second case would not hold: the link could look before the
+    /// core's response becomes visible to it, and go to sleep although the core found it awake.
     pub(super) fn sleeping(&self) {
         self.asleep.swap(true, Ordering::SeqCst);
     }
 
-    /// The link is awake, and was called or not.
+    /// To be called by the link after its sleep; `called` tells whether its event was readable.
     pub(super) fn awake(&self, called: bool) {
         self.asleep.store(false, Ordering::SeqCst);
         if called {
@@ -77,12 +76,13 @@ impl LinkWake {
     }
 }
 
-/// How far link and core are with the host's blocks and with requests to stop.
+/// How many of the host's blocks the core has begun and done, and how many requests to stop the link
+/// has handed to it. The counts wrap around.
 ///
-/// The core counts the blocks that it has begun and done. A response carries the sequence
-/// number of the block that it answers: klippy takes a response for an answer to a query only
-/// if its number says that the query was received (`#sent_time` in serialhdl.py), and a number
-/// that runs ahead of the core would make an answer to an earlier query of the same name one.
+/// By them a response gets the sequence number of the block that it answers. klippy takes a response
+/// for the answer to a query only if its number says that the query had been received (`#sent_time`
+/// in serialhdl.py). If numbers ran ahead of the core, a late answer to an earlier query of the same
+/// name would pass for the answer to the present one.
 #[derive(Debug, Default)]
 pub(super) struct Progress {
     begun: AtomicU32,
@@ -91,7 +91,7 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// The core takes up the next block.
+    /// The core begins the next block.
     pub(super) fn begin(&self) {
         self.begun.fetch_add(1, Ordering::Relaxed);
     }
@@ -112,14 +112,14 @@ impl Progress {
         self.stops_handed.fetch_add(1, Ordering::Release);
     }
 
-    /// How many requests to stop were handed to the core, which counts those that it took out of
-    /// the ring: where these are fewer, one waits there, or will in a moment.
+    /// How many requests to stop the link has handed to the core, or is about to. The core counts
+    /// those that it has taken out of its ring: as long as these are fewer, one is still to come.
     pub(super) fn stops_handed(&self) -> u32 {
         self.stops_handed.load(Ordering::Acquire)
     }
 }
 
-/// The core's end.
+/// The core's end of the rings.
 pub(super) struct Outlet {
     responses: Producer<u8>,
     lines: Producer<u8>,
@@ -127,14 +127,14 @@ pub(super) struct Outlet {
     progress: Arc<Progress>,
 }
 
-/// The link's end.
+/// The link's end of the rings.
 pub(super) struct Inlet {
     responses: Consumer<u8>,
     lines: Consumer<u8>,
     payload: Vec<u8>,
 }
 
-/// Both ends.
+/// Makes the rings, and returns both ends.
 pub(super) fn outlet(wake: Arc<LinkWake>, progress: Arc<Progress>) -> (Outlet, Inlet) {
     let (to_host, responses) = RingBuffer::new(RING_BYTES);
     let (to_log, lines) = RingBuffer::new(LINES_BYTES);
@@ -142,14 +142,14 @@ pub(super) fn outlet(wake: Arc<LinkWake>, progress: Arc<Progress>) -> (Outlet, I
     (Outlet { responses: to_host, lines: to_log, wake, progress }, inlet)
 }
 
-/// Puts a record in as a whole, or not at all.
+/// Puts a record into a ring as a whole, or drops it if it does not fit.
 fn push(ring: &mut Producer<u8>, head: &[u8], bytes: &[u8]) {
     if let Ok(chunk) = ring.write_chunk_uninit(head.len() + bytes.len()) {
         chunk.fill_from_iter(head.iter().chain(bytes).copied());
     }
 }
 
-/// Takes so many bytes out of a ring, if they are there.
+/// Takes as many bytes out of a ring as `to` has room for, if there are that many.
 fn pop<'a>(ring: &mut Consumer<u8>, to: &'a mut [u8]) -> Option<&'a [u8]> {
     let chunk = ring.read_chunk(to.len()).ok()?;
     for (to, from) in to.iter_mut().zip(chunk) {
@@ -159,11 +159,11 @@ fn pop<'a>(ring: &mut Consumer<u8>, to: &'a mut [u8]) -> Option<&'a [u8]> {
 }
 
 impl Outlet {
-    /// What does not leave `spare` bytes free is lost.
+    /// Puts a line into its ring, or drops it if that would leave fewer than `spare` bytes free.
     fn line(&mut self, level: Level, spare: usize, line: std::fmt::Arguments<'_>) {
         let mut text = [0; LINE_BYTES];
         let mut rest = &mut text[..];
-        // A line that is too long is cut.
+        // The write fails where the text is full: the line is cut there.
         let _ = rest.write_fmt(line);
         let len = LINE_BYTES - rest.len();
         if self.lines.slots() >= LINE_HEAD_BYTES + len + spare {
@@ -179,7 +179,7 @@ impl Outbox for Outlet {
         let mut head = [0; HEAD_BYTES];
         head[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
         head[2..].copy_from_slice(&self.progress.begun.load(Ordering::Relaxed).to_le_bytes());
-        // When the host does not read, what finds no room is lost, as in the firmware.
+        // If the host does not read, the ring fills up, and responses are dropped, as in the firmware.
         push(&mut self.responses, &head, payload);
         self.wake.wake();
     }
@@ -210,8 +210,8 @@ impl Outbox for Outlet {
     }
 }
 
-/// What somebody asked for is no fault: M112 and FIRMWARE_RESTART, SIGTERM, and FORCE_SHUTDOWN, of
-/// which the link warns.
+/// The level at which a stop is logged: as information if somebody has asked for it (M112 and
+/// FIRMWARE_RESTART; SIGTERM; FORCE_SHUTDOWN, for which the link logs a warning itself).
 fn gravity(shutdown: &Shutdown) -> Level {
     match shutdown.reason {
         reason::COMMAND_REQUEST | reason::FORCE_SHUTDOWN => Level::Info,
@@ -236,7 +236,7 @@ impl std::fmt::Display for Kinds<'_> {
 }
 
 impl Inlet {
-    /// The next response, and how many blocks the core had begun when it gave it.
+    /// The payload of the next response, and how many blocks the core had begun when it sent that.
     pub(super) fn response(&mut self) -> Option<(&[u8], u32)> {
         let mut head = [0; HEAD_BYTES];
         pop(&mut self.responses, &mut head)?;

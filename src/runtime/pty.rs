@@ -19,17 +19,17 @@ use nix::unistd::{Gid, Group, chown, read, ttyname, write};
 
 use crate::sys;
 
-/// Whose the terminal is when nobody says.
+/// The group that gets the terminal if the command line names none.
 const USUAL_GROUP: &str = "tty";
 
 /// A terminal that a host finds by a symbolic link.
 ///
-/// Whether a host is there is told by what the kernel does when the slave end is closed for the last
-/// time: the master hangs up. So our own slave end is open only while no host is there; then the
-/// host's leaving is the last one's, however many processes had opened the terminal.
+/// The kernel tells when the host has gone: once the last process has closed the slave end, the master
+/// hangs up. For that our own slave end must be closed while a host is there. It is open while none
+/// is, as otherwise the master would be hung up all that time.
 pub(super) struct Pty {
     master: OwnedFd,
-    /// Open while no host is there, so that nothing hangs up.
+    /// Our own slave end, open while no host is there.
     slave: Option<OwnedFd>,
     device: PathBuf,
     symlink: PathBuf,
@@ -40,8 +40,8 @@ pub(super) struct Pty {
 pub struct Access {
     /// Permission bits.
     pub mode: u32,
-    /// Group name or number. `None` is `tty` where that is permitted, and the system's choice
-    /// where not.
+    /// Name or number of the group. Without one it is `tty`, or, if that is not permitted, the group
+    /// that the system has given the terminal.
     pub group: Option<String>,
 }
 
@@ -54,6 +54,10 @@ fn said<T>(result: Result<T, impl Into<io::Error>>, what: &str) -> io::Result<T>
 
 impl Pty {
     /// Opens a terminal and puts the symbolic link in place.
+    ///
+    /// # Errors
+    ///
+    /// One line with the cause and the remedy.
     pub(super) fn open(symlink: &Path, access: &Access) -> io::Result<Pty> {
         let pty = said(openpty(None, None), "no pseudo terminal can be opened (is /dev/pts mounted?)")?;
         let mut raw = said(tcgetattr(&pty.slave), "the terminal's settings")?;
@@ -69,27 +73,27 @@ impl Pty {
         Ok(Pty { master: pty.master, slave: Some(pty.slave), device, symlink: symlink.to_owned() })
     }
 
-    /// The slave end's device.
+    /// The path of the slave end, such as `/dev/pts/3`.
     pub(super) fn device(&self) -> &Path {
         &self.device
     }
 
-    /// Where the host finds it.
+    /// The path of the symbolic link, by which the host finds the terminal.
     pub(super) fn symlink(&self) -> &Path {
         &self.symlink
     }
 
-    /// Reads what the host wrote; nothing is 0 bytes.
+    /// Reads what the host wrote, and returns how many bytes; 0 if there is nothing.
     pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match read(&self.master, buffer) {
             Ok(len) => Ok(len),
-            // EIO: the host is gone, and all that it wrote was read.
+            // The kernel answers EIO once the host has gone and all that it wrote has been read.
             Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(0),
             Err(error) => Err(error.into()),
         }
     }
 
-    /// Writes what the terminal has room for.
+    /// Writes as many bytes as the terminal has room for, and returns how many.
     pub(super) fn write(&self, bytes: &[u8]) -> io::Result<usize> {
         match write(&self.master, bytes) {
             Ok(len) => Ok(len),
@@ -98,8 +102,8 @@ impl Pty {
         }
     }
 
-    /// Somebody wrote: whether a host is there, or has written and gone (as `echo` in a shell does).
-    /// From here on the master hangs up when it leaves.
+    /// To be called when bytes came while no host was there: closes our slave end, so that the master
+    /// hangs up when the host goes. Returns false if it has gone already, as `echo` in a shell does.
     pub(super) fn meet_host(&mut self) -> io::Result<bool> {
         self.slave = None;
         let mut fds = [PollFd::new(self.master.as_fd(), PollFlags::empty())];
@@ -111,11 +115,12 @@ impl Pty {
         Ok(is_there)
     }
 
-    /// The master hung up: what the host did not read is dropped, and nothing hangs up until the
-    /// next one comes.
+    /// To be called when the master has hung up, as the host has gone: opens our slave end again, and
+    /// drops what the host did not read.
     pub(super) fn part_from_host(&mut self) -> io::Result<()> {
         let slave = said(sys::pty_slave(self.master.as_fd()), "opening the terminal anew")?;
-        // Without success the next host skips some old blocks.
+        // Should this fail, the next host reads some blocks that were meant for this one, and skips
+        // them.
         let _ = tcflush(&slave, FlushArg::TCIFLUSH);
         self.slave = Some(slave);
         Ok(())
@@ -128,7 +133,7 @@ impl Pty {
 
 impl Drop for Pty {
     fn drop(&mut self) {
-        // Somebody else's is left alone.
+        // Another program may have put its own link there since: that one must stay.
         if fs::read_link(&self.symlink).is_ok_and(|target| target == self.device) {
             let _ = fs::remove_file(&self.symlink);
         }
@@ -140,7 +145,8 @@ fn grant(device: &Path, access: &Access) -> io::Result<()> {
     said(fs::set_permissions(device, fs::Permissions::from_mode(access.mode)), &about("the mode"))?;
     match &access.group {
         Some(name) => give(device, name),
-        // Nobody asked for it: the C program leaves the group alone, and so runs as any user.
+        // The user has not asked for this group, so the program runs without it: only root or a member
+        // may give a file to `tty`. (The C program leaves the group as it is.)
         None => give(device, USUAL_GROUP).or_else(|error| {
             let gid = fs::metadata(device)?.gid();
             warn!("{error}: it stays with group {gid}; a klippy of another user can not open it");
@@ -178,7 +184,7 @@ fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
         }
         _ => {}
     }
-    // A rename replaces a stale link in one step: a host never finds none.
+    // A rename replaces a stale link in one step, so that a host finds a link at any time.
     let mut fresh = symlink.as_os_str().to_owned();
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
@@ -211,7 +217,7 @@ mod tests {
     fn a_host_is_there_until_the_last_process_has_closed_the_terminal() {
         let (_folder, mut pty, open) = terminal();
         assert!(!hangs_up(&pty));
-        // However many came and went before, and did not say a word.
+        // Hosts that opened and closed the terminal without writing must make no difference.
         for _ in 0..100 {
             drop(open());
         }

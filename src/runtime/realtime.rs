@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Real time: scheduling class, locked memory, timer slack, processor. What is not permitted is
-//! told with the limit and the remedy, and the program runs on without it.
+//! Real time: scheduling class, locked memory, timer slack, processor. What the kernel does not permit
+//! is left out; the log then names the limit and the remedy.
 
 #![forbid(unsafe_code)]
 
@@ -30,7 +30,8 @@ pub enum Role {
     Worker,
 }
 
-/// Half of the highest priority, as the C program has it; the others stand below the core.
+/// The SCHED_FIFO priority of a thread. The core has half of the highest one, as the C program does,
+/// and the other threads have less.
 fn priority(role: Role) -> i32 {
     match role {
         Role::Core => 49,
@@ -39,18 +40,18 @@ fn priority(role: Role) -> i32 {
     }
 }
 
-/// The core's claim against ordinary threads, the strongest.
+/// The core's nice value while it runs as SCHED_OTHER: the most favourable that there is.
 const NICE: i32 = -20;
-/// The guardian must get its turn when the core takes every turn.
+/// The guardian stands above the core, so that it still runs if the core takes all of the processor.
 const GUARDIAN_PRIORITY: i32 = 50;
-/// MCL_ONFAULT (linux/mman.h): lock pages as they are touched, as the libraries that libiio
-/// drags in would otherwise take 40 MB.
+/// MCL_ONFAULT (linux/mman.h): pages are locked once they are touched. Without it all pages of the
+/// libraries that libiio needs would be locked, which are 40 MB.
 const MCL_ONFAULT: i32 = 4;
-/// As much of a stack as any thread of ours uses.
+/// More than any thread of ours uses of its stack.
 const STACK_BYTES: usize = 256 * 1024;
-/// The calling thread.
+/// What the scheduling calls take for the calling thread.
 const MYSELF: Pid = Pid::from_raw(0);
-/// Capabilities (linux/capability.h).
+/// Numbers of capabilities (linux/capability.h).
 const CAP_IPC_LOCK: u32 = 14;
 const CAP_SYS_NICE: u32 = 23;
 
@@ -58,10 +59,12 @@ fn lock_flags() -> MlockAllFlags {
     MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE | MlockAllFlags::from_bits_retain(MCL_ONFAULT)
 }
 
-/// Keeps every page that was touched in memory.
+/// Locks every page that is touched from now on, or was, in memory. If that is not permitted, the log
+/// says so.
 pub fn lock_memory() {
     let limit = limit(Resource::RLIMIT_MEMLOCK);
-    // Within a limit, what is mapped later would fail for want of room: threads, for one.
+    // With a limit, locking may succeed now, but later mappings would fail once the limit is reached:
+    // no thread could be started any more. So memory is locked only where there is no limit.
     let locked = match limit != RLIM_INFINITY && !has_capability(CAP_IPC_LOCK) {
         true => Err(memory_refusal(limit)),
         false => mlockall(lock_flags()).map_err(|error| error.to_string()),
@@ -84,14 +87,16 @@ fn memory_refusal(limit: u64) -> String {
 pub enum Scheduling {
     /// SCHED_FIFO.
     RealTime,
-    /// As every program.
+    /// SCHED_OTHER, as every program.
     Ordinary,
 }
 
-/// Gives the calling thread its real-time priority, if that is permitted.
+/// Gives the calling thread its real-time priority, if that is permitted. Returns how it is scheduled
+/// now.
 pub fn enter(role: Role) -> Scheduling {
     touch_stack();
-    // Before 6.13 a futex wait has the default slack even under SCHED_FIFO.
+    // Before Linux 6.13 a futex wait ends up to 50 us late (the default timer slack) even under
+    // SCHED_FIFO, unless the slack is set.
     if let Err(error) = prctl::set_timerslack(1) {
         warn!("timer slack: {error}");
     }
@@ -99,7 +104,7 @@ pub fn enter(role: Role) -> Scheduling {
         Ok(()) => {
             if role == Role::Core {
                 info!("real time: SCHED_FIFO, priority {}", priority(role));
-                // For when it has to go on as SCHED_OTHER.
+                // It counts while the budget has the core run as SCHED_OTHER.
                 if let Err(error) = sys::set_nice(NICE) {
                     debug!("nice {NICE}: {error}");
                 }
@@ -107,7 +112,7 @@ pub fn enter(role: Role) -> Scheduling {
             Scheduling::RealTime
         }
         Err(error) => {
-            // The others fare alike.
+            // The other threads are refused for the same reason: one warning is enough.
             if role == Role::Core {
                 warn!("no real-time scheduling: {}; steps may be late", refusal(&error));
             }
@@ -118,12 +123,12 @@ pub fn enter(role: Role) -> Scheduling {
 
 /// Makes the calling thread an ordinary one again.
 pub fn leave() {
-    // To give up a privilege is always permitted.
+    // These can not fail: a thread may always give up a priority.
     let _ = sys::set_other().and_then(|()| sys::set_nice(0));
 }
 
-/// Changes the core's class. What was permitted at the start is permitted still; if not, the
-/// core goes on as it is.
+/// Changes the scheduling class of the calling thread, which is the core. It was permitted at the
+/// start; should it no longer be, the core goes on in its present class.
 pub(super) fn change(class: Class) {
     let _ = match class {
         Class::Fifo => sys::set_fifo(priority(Role::Core)),
@@ -131,20 +136,21 @@ pub(super) fn change(class: Class) {
     };
 }
 
-/// Puts the guardian above the core, its memory locked. The program tells what is not permitted.
+/// Locks the memory of the calling process, which is the guardian, and puts it above the core. It does
+/// not log what is refused: the core is refused the same, and the program logs that.
 pub(super) fn enter_guardian() {
     touch_stack();
     let _ = mlockall(lock_flags());
     let _ = sys::set_fifo(GUARDIAN_PRIORITY).or_else(|_| sys::set_fifo(priority(Role::Core)));
 }
 
-/// Has the kernel provide the stack before it is needed.
+/// Writes to the stack, so that the kernel provides its pages now and not while a step is due.
 #[inline(never)]
 fn touch_stack() {
     hint::black_box(&mut [0u8; STACK_BYTES]);
 }
 
-/// What keeps this process from real-time scheduling, and the remedy.
+/// For the log: what keeps this process from real-time scheduling, and the remedy.
 fn refusal(error: &io::Error) -> String {
     scheduling_refusal(error, limit(Resource::RLIMIT_RTPRIO), has_capability(CAP_SYS_NICE), group_runtime_us())
 }
@@ -183,7 +189,8 @@ fn effective_capabilities(status: &str) -> u64 {
     line.and_then(|bits| u64::from_str_radix(bits.trim(), 16).ok()).unwrap_or(0)
 }
 
-/// The real-time budget of this process's control group, where the kernel has such a thing.
+/// The real-time budget of this process's control group in microseconds, if its kernel is built to
+/// have them (CONFIG_RT_GROUP_SCHED).
 fn group_runtime_us() -> Option<i64> {
     let groups = fs::read_to_string("/proc/self/cgroup").ok()?;
     let group = cpu_group(&groups)?;
@@ -193,7 +200,7 @@ fn group_runtime_us() -> Option<i64> {
         .find_map(|folder| fs::read_to_string(format!("{folder}{group}/cpu.rt_runtime_us")).ok()?.trim().parse().ok())
 }
 
-/// The path of the group that the `cpu` controller of the first generation has this process in.
+/// The path of this process's group of the `cpu` controller (cgroup v1), from /proc/PID/cgroup.
 fn cpu_group(groups: &str) -> Option<&str> {
     groups.lines().find_map(|line| {
         let (controllers, path) = line.split_once(':')?.1.split_once(':')?;
@@ -201,7 +208,7 @@ fn cpu_group(groups: &str) -> Option<&str> {
     })
 }
 
-/// The processors that this process may use, and the one that its core is to keep to.
+/// The processors that this process may use, and the one that the core is to stay on, if any.
 #[derive(Clone, Copy)]
 pub struct Processors {
     present: CpuSet,
@@ -209,8 +216,11 @@ pub struct Processors {
 }
 
 impl Processors {
-    /// Those of the calling thread, the core on any or on one of them only; an error if there is
-    /// no such processor. Leaves the calling thread where it is.
+    /// The processors of the calling thread. `core` is the one that the core is to stay on.
+    ///
+    /// # Errors
+    ///
+    /// The process may not use that processor, or there is none of this number.
     pub fn new(core: Option<usize>) -> io::Result<Processors> {
         let processors = Processors { present: sched_getaffinity(MYSELF)?, core };
         let Some(cpu) = core else { return Ok(processors) };
@@ -223,7 +233,7 @@ impl Processors {
         })
     }
 
-    /// Keeps the calling thread, which is the core, to its processor if it is to have one.
+    /// Binds the calling thread, which is the core, to its processor, if it is to stay on one.
     pub(super) fn confine(&self) -> io::Result<()> {
         let Some(cpu) = self.core else { return Ok(()) };
         let mut cpus = CpuSet::new();
@@ -231,17 +241,18 @@ impl Processors {
         Ok(sched_setaffinity(MYSELF, &cpus)?)
     }
 
-    /// Lets the calling thread, which the core started, run on any.
+    /// Lets the calling thread run on any processor. The core has started it, so it has inherited the
+    /// core's binding.
     pub(super) fn free(&self) {
-        // Without success it shares the core's.
+        // Should this fail, the thread just shares the core's processor.
         let _ = sched_setaffinity(MYSELF, &self.present);
     }
 
-    /// Moves the calling thread, which is the core, off its present processor. Whether there was
-    /// another.
+    /// Moves the calling thread, which is the core, to another processor. False if there is no other,
+    /// or the core is to stay on one.
     pub(super) fn change(&self) -> bool {
         let mut others = self.present;
-        // The set without a processor is empty where there is one only, which the kernel refuses.
+        // With one processor only, the set of the others is empty, and the kernel refuses it.
         self.core.is_none()
             && sched_getcpu()
                 .and_then(|cpu| others.unset(cpu))
@@ -312,7 +323,7 @@ mod tests {
         assert_eq!(sched_getaffinity(MYSELF), Ok(before));
         for _ in 0..10 {
             let cpu = sched_getcpu().unwrap();
-            // It may have been moved between the two looks, but not to where it must not be.
+            // The kernel may move the thread between sched_getcpu and the change, but only within the set.
             assert_eq!(any.change(), present.len() > 1);
             if present.len() == 2 {
                 assert_ne!(sched_getaffinity(MYSELF).unwrap(), before, "left processor {cpu}");

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Signals, as the link takes them in.
+//! Signals to the program. The link waits for them beside the host's bytes.
 
 #![forbid(unsafe_code)]
 
@@ -18,29 +18,29 @@ use crate::sys;
 /// What a signal asks for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Signal {
-    /// To end the program in order.
+    /// SIGTERM, SIGINT, SIGHUP: to end the program in order.
     End,
-    /// To tell in the log how late timers were.
+    /// SIGUSR1: to log how late timers were.
     Report,
-    /// A core that hangs, for a test.
+    /// SIGUSR2, in tests only: to have the core hang.
     Hang,
 }
 
-/// The signals that came.
+/// The signals that have come and were not asked for yet.
 pub(super) struct Signals(SignalDelivery<UnixStream, SignalOnly>);
 
 impl Signals {
-    /// From now on the signals that we know come here.
+    /// Has the signals that the program knows come here instead of ending it.
     pub(super) fn new() -> io::Result<Signals> {
-        // A key that stops programs, or a log line to a terminal that takes none from the background,
-        // is no reason to leave heaters to themselves.
+        // These would stop the program and leave heaters as they are: Ctrl-Z, or a program in the
+        // background that reads from its terminal or writes a log line to one that allows none.
         for stop in [SIGTSTP, SIGTTIN, SIGTTOU] {
             sys::ignore(stop)?;
         }
         let (read, write) = UnixStream::pair()?;
         let mut known = vec![SIGTERM, SIGINT, SIGUSR1];
-        // A terminal that hangs up ends the program, unless nohup(1) started it. (The C program
-        // dies of it, its pins as they are.)
+        // SIGHUP, as a terminal closes, ends the program in order, unless nohup(1) has started it.
+        // (It kills the C program, which leaves its pins as they are.)
         if !hang_up_is_ignored(&fs::read_to_string("/proc/self/status")?) {
             known.push(SIGHUP);
         }
@@ -66,7 +66,7 @@ impl Signals {
     }
 }
 
-/// By /proc/PID/status.
+/// Whether the program was started with SIGHUP ignored; `status` is /proc/PID/status.
 fn hang_up_is_ignored(status: &str) -> bool {
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Watchdogs: the hardware's, which resets the machine (`-w`), and the service manager's, which
-//! starts the program anew. Both are fed only while the core, the link and every worker get on.
+//! Watchdogs: the hardware's, which resets the computer (`-w`), and the service manager's, which
+//! restarts the program. Both are fed only while neither the core, nor the link, nor a worker hangs.
 //!
-//! The link feeds them, so that it gets on needs no proof. The core has its heartbeat, with the
-//! limits of the guardian. A worker gets on unless one job takes longer than [`JOB`].
+//! The link feeds them, so if it hangs, they are not fed. The core hangs if its heartbeat fails to
+//! come for as long as the guardian allows. A worker hangs if one job takes longer than [`JOB_LIMIT`].
 
 #![forbid(unsafe_code)]
 
@@ -22,11 +22,12 @@ use super::notify::Notify;
 use super::pulse::{BEAT, Pulse};
 
 /// The longest that one job of a worker may take.
-const JOB: Duration = Duration::from_secs(10);
-/// The limit of a hardware watchdog that does not tell it.
+const JOB_LIMIT: Duration = Duration::from_secs(10);
+/// The limit that is assumed for a hardware watchdog that does not tell its own.
 const USUAL_LIMIT: Duration = Duration::from_secs(10);
 
-/// A hardware watchdog. Dropped without [`Watchdog::close`] it goes on and resets the machine.
+/// A hardware watchdog. If it is dropped without [`Watchdog::close`], it goes on running and resets
+/// the computer.
 pub(super) struct Watchdog {
     file: File,
     limit: Duration,
@@ -50,7 +51,8 @@ impl Watchdog {
         }
     }
 
-    /// Stops it: the program ends in order.
+    /// Stops the watchdog, as the program ends in order. "V" is what its driver wants for that
+    /// (Documentation/watchdog/watchdog-api.rst, "magic close").
     fn close(mut self) {
         if let Err(error) = self.file.write_all(b"V") {
             warn!("the watchdog can not be stopped: {error}: this machine is about to be reset");
@@ -74,11 +76,11 @@ fn cannot_open(path: &Path, error: &io::Error) -> io::Error {
     io::Error::new(error.kind(), format!("-w: {} can not be opened: {error}: {remedy}", path.display()))
 }
 
-/// Feeds the watchdogs, as long as all get on.
+/// Feeds the watchdogs as long as nothing hangs.
 pub(super) struct Vigil {
     watchdog: Option<Watchdog>,
     notify: Notify,
-    /// How often they are fed; none without a watchdog.
+    /// How often the watchdogs are fed; none if there are none.
     interval: Option<Duration>,
     due: Duration,
     pulse: Pulse,
@@ -88,30 +90,30 @@ pub(super) struct Vigil {
 impl Vigil {
     /// `notify_interval` is how often the service manager wants to be fed, if at all.
     pub(super) fn new(notify: Notify, notify_interval: Option<Duration>, pulse: Pulse) -> Vigil {
-        // More often than the core gives a sign there is nothing new to tell.
+        // Between two heartbeats of the core nothing new is known, so feeding more often is of no use.
         let interval = notify_interval.map(|interval| interval.max(BEAT));
         Vigil { watchdog: None, notify, interval, due: monotonic(), pulse, starving: false }
     }
 
-    /// Takes a hardware watchdog in.
+    /// Has a hardware watchdog fed as well.
     pub(super) fn feed(&mut self, watchdog: Watchdog) {
         let interval = (watchdog.limit / 3).max(BEAT);
         self.interval = Some(self.interval.map_or(interval, |present| present.min(interval)));
         self.watchdog = Some(watchdog);
     }
 
-    /// When to tick next.
+    /// When to call [`Vigil::tick`] next (CLOCK_MONOTONIC).
     pub(super) fn due(&self) -> Option<Duration> {
         self.interval.map(|_| self.due)
     }
 
-    /// Feeds the watchdogs if it is time.
+    /// Feeds the watchdogs if it is time to, at `now` (CLOCK_MONOTONIC).
     pub(super) fn tick(&mut self, now: Duration) {
         let Some(interval) = self.interval.filter(|_| now >= self.due) else { return };
         self.due = now + interval;
         let clock = self.pulse.at(now);
         let silent = self.pulse.is_silent(clock);
-        let stuck = self.pulse.stuck(clock, JOB);
+        let stuck = self.pulse.stuck(clock, JOB_LIMIT);
         if !silent && stuck.is_none() {
             if std::mem::take(&mut self.starving) {
                 warn!("Pinion gets on: the watchdogs are fed again");
@@ -124,7 +126,7 @@ impl Vigil {
             match stuck {
                 Some(bus) => error!(
                     "a transfer on {bus} takes more than {} s: the watchdogs are not fed; check the chip's wiring",
-                    JOB.as_secs()
+                    JOB_LIMIT.as_secs()
                 ),
                 None => error!("the core hangs: the watchdogs are not fed"),
             }
@@ -136,17 +138,17 @@ impl Vigil {
         self.notify.status(status);
     }
 
-    /// The program serves.
+    /// Tells the service manager that the program has started.
     pub(super) fn ready(&self) {
         self.notify.send("READY=1");
     }
 
-    /// The program begins to end.
+    /// Tells the service manager that the program begins to end.
     pub(super) fn stopping(&self) {
         self.notify.send("STOPPING=1\nSTATUS=shutting down");
     }
 
-    /// The program has ended in order.
+    /// Stops the hardware watchdog, as the program has ended in order.
     pub(super) fn end(self) {
         if let Some(watchdog) = self.watchdog {
             watchdog.close();
@@ -187,7 +189,7 @@ mod tests {
             now += interval;
         }
         assert_eq!(food(file.path()), "...");
-        // No beat since the last meal.
+        // The core has not given a heartbeat since the watchdog was last fed.
         vigil.tick(now);
         assert_eq!(food(file.path()), "...");
         pulse.beat(pulse.at(now + interval), true);

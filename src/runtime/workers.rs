@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One thread per bus: it runs the errands to the bus's devices, one at a time, so that the core
-//! never waits for them.
+//! Workers: one thread for each bus runs the errands to the bus's devices, one after the other, so
+//! that the core never waits for a device.
 
 #![forbid(unsafe_code)]
 
@@ -18,10 +18,10 @@ use crate::time::{TimeSource, monotonic};
 
 use super::pulse::{JobClock, Pulse};
 
-/// Errands that wait for one bus. An object has one or two of them, and there are 256 objects.
+/// How many errands may wait for one bus. There are at most 256 objects, with one or two errands each.
 const QUEUE_JOBS: usize = 1024;
-/// How long a worker may take to end: as long as most drivers wait for a chip that is silent.
-const END: Duration = Duration::from_secs(2);
+/// How long to wait for workers to end: most drivers give up a chip that is silent within this time.
+const END_LIMIT: Duration = Duration::from_secs(2);
 
 struct Worker {
     bus: String,
@@ -31,10 +31,10 @@ struct Worker {
     thread: JoinHandle<()>,
 }
 
-/// Called by each new worker's thread before anything else.
+/// What the thread of each new worker calls first.
 pub(super) type Prepare = Arc<dyn Fn() + Send + Sync>;
 
-/// The workers of a machine; they come into being with the first device of their bus.
+/// The workers of a machine. Each is started as the first device of its bus is opened.
 pub(super) struct Threads {
     core: Thread,
     prepare: Prepare,
@@ -44,7 +44,8 @@ pub(super) struct Threads {
 }
 
 impl Threads {
-    /// Workers that wake `core` when an errand is done, and show in `pulse` what they are at.
+    /// No workers yet. Those to come unpark `core` when an errand is done, and note in `pulse` since
+    /// when they run it.
     pub(super) fn new(core: Thread, prepare: Prepare, clock: Arc<dyn TimeSource>, pulse: Pulse) -> Threads {
         Threads { core, prepare, clock, pulse, workers: Vec::new() }
     }
@@ -100,14 +101,14 @@ impl Workers for Threads {
         self.workers.iter().any(|worker| !worker.done.is_empty())
     }
 
-    /// Waits for what the workers are at, as their devices are free only then; one that hangs is
-    /// left behind.
+    /// Waits until the workers have done what was submitted, for up to two seconds: only then are their
+    /// devices free to be opened again. A worker that hangs is left behind, with its devices.
     fn reset(&mut self) {
         for worker in &self.workers {
             worker.quit.store(true, Ordering::Release);
             worker.thread.thread().unpark();
         }
-        let end = monotonic() + END;
+        let end = monotonic() + END_LIMIT;
         for worker in self.workers.drain(..) {
             while !worker.thread.is_finished() && monotonic() < end {
                 thread::sleep(Duration::from_millis(1));
@@ -143,8 +144,8 @@ struct Server {
 impl Server {
     fn run(mut self) {
         loop {
-            // Read before the queue is: what was asked for before the end is done, as the last
-            // of it may switch an output off.
+            // This must be read before the queue. A job that was submitted before `quit` was set is
+            // then seen, and is still done: it may switch an output off.
             let ending = self.quit.load(Ordering::Acquire);
             match self.jobs.pop() {
                 Ok(job) => self.serve(job),
@@ -161,7 +162,8 @@ impl Server {
         errand.run();
         let ended = self.clock.now();
         self.shown.end();
-        // There is room: as many errands as the queue to us takes fit the queue back.
+        // This does not fail: no more errands are under way than there are boxes, and the queue back
+        // is as long as the one that they came by.
         let _ = self.done.push(Completion { ticket, errand, holds, began, ended });
         self.core.unpark();
     }

@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What program and guardian say to each other, over a socket that keeps messages whole.
+//! The messages between program and guardian. Their socket (SOCK_SEQPACKET) keeps each in one piece.
 //!
-//! A message is a byte that tells its kind, and what [`Message`] says of it. Those about a line or
-//! a file come with its descriptor. To each but the last the guardian answers [`TAKEN`] or
-//! [`REFUSED`].
+//! A message begins with a byte that tells which [`Message`] it is. One about a line or a file comes
+//! with its descriptor. The guardian answers each with [`TAKEN`] or [`REFUSED`], except for
+//! [`Message::Goodbye`].
 
 #![forbid(unsafe_code)]
 
-/// No message is longer.
+/// The length of the longest message.
 pub(super) const MESSAGE_BYTES: usize = 256;
 
-/// The guardian has done what it was told.
+/// The guardian's answer if it has done what the message says.
 pub(super) const TAKEN: u8 = b'+';
-/// It has not.
+/// The guardian's answer if it has not.
 pub(super) const REFUSED: u8 = b'-';
 
 const LINE: u8 = 1;
@@ -25,38 +25,39 @@ const FORGET: u8 = 6;
 /// A message to the guardian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Message<'a> {
-    /// A line to hold.
+    /// Hold a GPIO line.
     Line {
         /// The output's name.
         name: &'a str,
-        /// Where it belongs.
+        /// The level to drive it to.
         shutdown_value: bool,
-        /// Its chip, if calls of that may sleep.
+        /// The name of its chip, if calls to that may block.
         sleeping: Option<&'a str>,
     },
-    /// A file of an output that has more of them, and what is to be written to it.
+    /// A file of an output that has several, and what is to be written to it. The last file follows in
+    /// [`Message::LastFile`].
     File(&'a [u8]),
-    /// The last or only file of an output, and what is to be written to it. Only with this one the
-    /// output is held, so that none is held by half.
+    /// Hold an output of files: this is its last or only one. As nothing is held before this message,
+    /// no output is ever held with only some of its files.
     LastFile {
         /// The output's name.
         name: &'a str,
         /// What is to be written.
         bytes: &'a [u8],
     },
-    /// Give back an output, which is none any more.
+    /// Drop a line that is no output any more.
     Forget {
         /// The output's name.
         name: &'a str,
     },
-    /// Give everything back.
+    /// Drop everything that is held.
     Release,
-    /// The program ends in order.
+    /// End, as the program ends in order.
     Goodbye,
 }
 
 impl<'a> Message<'a> {
-    /// Its bytes; none if they are too many.
+    /// The message as bytes; none if they are more than [`MESSAGE_BYTES`].
     pub(super) fn encode(&self) -> Option<Vec<u8>> {
         let message = match *self {
             Message::Line { name, shutdown_value, sleeping } => {
@@ -71,7 +72,7 @@ impl<'a> Message<'a> {
         (message.len() <= MESSAGE_BYTES).then_some(message)
     }
 
-    /// The message that these bytes are, if they are one.
+    /// The message in these bytes, if they are one.
     pub(super) fn decode(message: &'a [u8]) -> Option<Message<'a>> {
         let (kind, rest) = message.split_first()?;
         Some(match (*kind, rest) {
@@ -96,13 +97,13 @@ impl<'a> Message<'a> {
     }
 }
 
-/// A text that something follows: its length and itself.
+/// A text that is followed by something: a byte with its length, and the text.
 fn text(text: &str) -> Option<Vec<u8>> {
     let length = u8::try_from(text.len()).ok()?;
     Some([&[length], text.as_bytes()].concat())
 }
 
-/// The text at the beginning, and what follows it.
+/// Splits what [`text`] has made from what follows it.
 fn split_text(bytes: &[u8]) -> Option<(&str, &[u8])> {
     let (length, rest) = bytes.split_first()?;
     let (text, rest) = rest.split_at_checked((*length).into())?;

@@ -3,22 +3,23 @@
 //! program dies or its core hangs.
 //!
 //! It is forked before any thread starts, and is given a copy of every output's descriptor with
-//! the shutdown value: a line keeps its state as long as a descriptor of it is open. It acts
+//! the shutdown value. As long as it has the descriptor of a line open, the kernel keeps that line's
+//! level. It acts
 //!
 //! - when the program's end of their socket closes without a goodbye, or its pidfd says that it
 //!   is gone: SIGKILL, a crash, the OOM killer;
 //! - when the core leaves no heartbeat in a page that both share (`pulse.rs`), while outputs are
 //!   held: within 600 ms of its last one while the machine runs.
 //!
-//! It drives the outputs, kills the program if that still lives (so that a core which comes back
-//! can not drive them again; what it drove meanwhile is driven back), says so in the log, and
-//! ends, which frees the lines for a restart. It has a session of its own and ignores the signals
-//! that ask a program to end, as a terminal and a service manager send them to both processes:
-//! it ends when the program says goodbye.
+//! Then it drives the outputs, kills the program if that still lives, drives the outputs once more, as
+//! the core may have come back and driven them before it was killed, says so in the log, and ends,
+//! which frees the lines for a restart. It has a session of its own and ignores the signals that ask a
+//! program to end: a terminal or service manager sends them to both processes, and the guardian must
+//! not end before the program, which says goodbye to it.
 //!
-//! A guardian that is killed, stopped or hangs stops the machine: the link notices, the machine
-//! shuts down as "Guardian process lost", and the program ends with status 1, so that the service
-//! manager starts both anew: a second guardian can not be forked from a program with threads.
+//! If the guardian itself is killed, stopped or hangs, the link notices. The machine shuts down as
+//! "Guardian process lost" and the program ends with status 1, so that the service manager starts both
+//! anew. (The program can not fork another guardian, as it has threads by then.)
 //!
 //! This file is the program's side, `watcher.rs` the second process, and `message.rs` what they say
 //! to each other.
@@ -56,13 +57,13 @@ use super::pulse::{GuardianEar, Pulse};
 use message::{Message, TAKEN};
 use watcher::{Program, Watcher};
 
-/// How long the program waits for the guardian's answer.
+/// How long the program waits for the guardian's answer, in seconds.
 const ANSWER_S: i64 = 5;
-/// How long a process that was asked to end, or killed, may take to be gone.
-const END: Duration = Duration::from_secs(2);
+/// How long to wait for the end of a process that was asked to end, or was killed.
+const END_LIMIT: Duration = Duration::from_secs(2);
 
-/// The program's end of the guardian. Dropped without [`Guardian::goodbye`] it makes the guardian
-/// drive what it holds.
+/// The program's side of the guardian. If it is dropped without [`Guardian::goodbye`], the guardian
+/// drives the outputs that it holds.
 pub struct Guardian {
     socket: Arc<OwnedFd>,
     pid: Pid,
@@ -70,12 +71,12 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Forks the guardian: before any thread is started. `clock` is the core's. With `realtime`
-    /// it runs above the core.
+    /// Forks the guardian. To be called before any thread is started. `clock` is the core's. With
+    /// `realtime` the guardian's priority is above the core's.
     ///
     /// # Errors
     ///
-    /// If there are threads already, or the kernel has no room for a process, a socket or a page.
+    /// There are threads already, or the kernel has no room for a process, a socket or a page.
     pub fn start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
         Guardian::try_start(clock, realtime)
             .map_err(|error| io::Error::new(error.kind(), format!("the guardian can not be started: {error}")))
@@ -88,19 +89,19 @@ impl Guardian {
         let program = Program::new(getpid());
         let ours = socket.as_raw_fd();
         let pid = sys::fork(move || {
-            // A copy of the program's end: while it is open here, the program's death would not
-            // close the socket.
+            // The fork has copied the program's end of the socket. It must not stay open here: the
+            // socket would not be closed when the program dies.
             let _ = nix::unistd::close(ours);
             watcher::settle(realtime);
             Watcher::new(theirs, program, pulse).watch();
             0
         })?;
-        // Once it answers, the signals that end a program do not end it.
+        // The guardian answers once it ignores the signals that end a program.
         answer(&socket)?;
         Ok(Guardian { socket: Arc::new(socket), pid, pulse })
     }
 
-    /// What a board gives its outputs to.
+    /// What a board is to give its outputs to.
     pub fn guard(&self) -> Box<dyn Guard> {
         Box::new(Lifeline { socket: self.socket.clone(), pulse: self.pulse, lost: false })
     }
@@ -109,24 +110,25 @@ impl Guardian {
         self.pulse
     }
 
-    /// How the program notices that the guardian is lost.
+    /// What the link watches to notice that the guardian is lost.
     pub(super) fn watch(&self) -> GuardianWatch {
         GuardianWatch { socket: self.socket.clone(), ear: GuardianEar::new(self.pulse) }
     }
 
-    /// Ends the guardian: the outputs are where they belong.
+    /// Ends the guardian. The outputs must be at their shutdown values.
     pub fn goodbye(self) {
         if self.tell_goodbye().is_err() {
             return;
         }
-        let until = monotonic() + END;
+        let until = monotonic() + END_LIMIT;
         while let Ok(WaitStatus::StillAlive) = waitpid(self.pid, Some(WaitPidFlag::WNOHANG)) {
             if monotonic() > until {
                 warn!(
                     "the guardian (process {}) is stopped or hangs: it is killed, as it would keep the lines",
                     self.pid
                 );
-                // It is our child, and nobody has waited for it: the number is still its own.
+                // The guardian is our child and was not waited for yet, so the kernel can not have
+                // given its process number to another.
                 let _ = kill(self.pid, Signal::SIGKILL);
                 return;
             }
@@ -141,35 +143,35 @@ impl Guardian {
     }
 }
 
-/// The link's end of the guardian.
+/// The link's view of the guardian.
 pub(super) struct GuardianWatch {
     socket: Arc<OwnedFd>,
     ear: GuardianEar,
 }
 
 impl GuardianWatch {
-    /// Hangs up (POLLHUP) once the guardian is gone.
+    /// A socket that hangs up (POLLHUP) once the guardian is gone.
     pub(super) fn socket(&self) -> BorrowedFd<'_> {
         self.socket.as_fd()
     }
 
-    /// When to ask next whether the guardian hangs (CLOCK_MONOTONIC); none while it holds no
-    /// outputs.
+    /// When to call [`GuardianWatch::hangs`] next (CLOCK_MONOTONIC); none while no outputs are held.
     pub(super) fn due(&self) -> Option<Duration> {
         self.ear.due()
     }
 
-    /// Whether it is stopped or hangs at `now` (CLOCK_MONOTONIC).
+    /// Whether the guardian is stopped or hangs at `now` (CLOCK_MONOTONIC).
     pub(super) fn hangs(&mut self, now: Duration) -> bool {
         self.ear.is_lost(now)
     }
 }
 
-/// The board's end of the guardian.
+/// The board's way to the guardian.
 struct Lifeline {
     socket: Arc<OwnedFd>,
     pulse: Pulse,
-    /// After an answer that did not come, later ones might be taken for it.
+    /// Whether an answer has failed to come. Nothing is asked any more then, as a late answer would
+    /// pass for the answer to the next message.
     lost: bool,
 }
 
@@ -185,7 +187,8 @@ impl Lifeline {
         Err(io::Error::other("it has no room for another descriptor (raise LimitNOFILE)"))
     }
 
-    /// Whether the guardian takes the message. Without an answer it is lost.
+    /// Sends a message, and returns whether the guardian has done what it says. Without an answer the
+    /// guardian counts as lost.
     fn converse(&mut self, message: &[u8], descriptor: Option<RawFd>) -> io::Result<bool> {
         let fds: Vec<RawFd> = descriptor.into_iter().collect();
         let rights = [ControlMessage::ScmRights(&fds)];
@@ -199,7 +202,7 @@ impl Lifeline {
     }
 }
 
-/// Waits for the guardian's answer: whether it has taken what it was sent.
+/// Waits for the guardian's answer, and returns whether that is [`TAKEN`].
 fn answer(socket: &OwnedFd) -> io::Result<bool> {
     let mut answer = [0];
     loop {
@@ -233,7 +236,7 @@ impl Guard for Lifeline {
     }
 }
 
-/// A poll's timeout, rounded up.
+/// A timeout for poll(2), rounded up to whole milliseconds.
 pub(super) fn in_ms(timeout: Duration) -> PollTimeout {
     let ms = timeout.as_nanos().div_ceil(1_000_000);
     PollTimeout::try_from(ms).unwrap_or(PollTimeout::MAX)
@@ -250,13 +253,14 @@ mod tests {
 
     const MS: Duration = Duration::from_millis(1);
 
-    /// A core that gets on while a shutdown value does not get to its output.
+    /// A core that runs on, but owes a shutdown value for ever.
     fn stop_and_owe(pulse: Pulse) {
         for beats in 0.. {
             if beats == 10 {
                 pulse.owe("pwmchip7/pwm0", pulse.now());
             }
-            // Never as a machine that runs, of which a busy computer could miss a beat.
+            // As the core of a stopped machine, for which the limit is wider: a busy computer may delay
+            // a beat.
             pulse.beat(pulse.now(), false);
             thread::sleep(10 * MS);
         }

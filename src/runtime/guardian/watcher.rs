@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The second process: watches the program, and drives the outputs when it has to.
+//! The guardian process: watches the program, and drives the outputs when the program can not.
 
 #![forbid(unsafe_code)]
 
@@ -25,18 +25,19 @@ use crate::time::monotonic;
 use super::super::pulse::{Ear, Pulse};
 use super::super::realtime;
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
-use super::{END, in_ms};
+use super::{END_LIMIT, in_ms};
 
-/// How long an output that can not be driven is tried, and a driver that hangs waited for.
+/// For how long to try again to drive an output that can not be driven, and to wait for a driver that
+/// hangs.
 const TRY_FOR: Duration = Duration::from_secs(2);
-/// How often such an output is tried.
+/// The pause between two attempts to drive such an output.
 const TRY_EVERY: Duration = Duration::from_millis(50);
-/// How long the log may take, in seconds.
+/// How long writing to the log may take, in seconds.
 const LOG_S: u32 = 2;
 
-/// Makes the process itself: its name, session, signals and priority.
+/// Gives the new process its name, session, signals and priority.
 pub(super) fn settle(realtime: bool) {
-    // Each of these is an improvement only: the guardian does its work without, too.
+    // Failures are ignored here: without any of these the guardian can still do its work.
     let _ = prctl::set_name(c"pinion-guardian");
     let _ = setsid();
     let _ = chdir("/");
@@ -53,23 +54,23 @@ pub(super) fn settle(realtime: bool) {
     ] {
         let _ = sys::ignore(ignored);
     }
-    // As root: the last to be picked when memory is short.
+    // When memory is short, the kernel now kills other processes first. Only root may ask for this.
     let _ = std::fs::write("/proc/self/oom_score_adj", "-1000");
     if realtime {
         realtime::enter_guardian();
     }
-    // The code that drives outputs is read from the disk now, and locked in memory with the rest:
-    // later the disk might hang.
+    // A first call, without outputs, reads the code from the disk, and so it is locked in memory, too.
+    // When it is needed, the disk might hang.
     drive(&mut []);
 }
 
 /// Drives an output to its shutdown value.
 type Drive = Box<dyn Fn() -> io::Result<()> + Send>;
 
-/// What became of an output.
+/// Whether an output could be driven.
 struct Outcome {
     name: String,
-    /// What its last drive came to; none as long as the first has not come back.
+    /// The result of the last attempt; none as long as the first one has not returned.
     result: Option<io::Result<()>>,
 }
 
@@ -78,7 +79,7 @@ impl Outcome {
         matches!(self.result, Some(Ok(())))
     }
 
-    /// For the log: its name and what is wrong.
+    /// For the log: the output's name and what is wrong with it.
     fn complaint(&self) -> String {
         match &self.result {
             Some(Err(error)) => format!("{}: {error}", self.name),
@@ -87,7 +88,7 @@ impl Outcome {
     }
 }
 
-/// An output.
+/// An output that the guardian holds.
 struct Output {
     drive: Drive,
     outcome: Outcome,
@@ -102,12 +103,13 @@ impl Output {
         Output::new(name, Box::new(move || sys::set_line(&line, value)))
     }
 
-    /// A line of a chip that may sleep, which may not answer.
+    /// A line of a chip that may sleep. It is driven in a way that tells whether the chip has answered.
     fn sleeping_line(name: &str, line: OwnedFd, value: bool) -> Output {
         Output::new(name, Box::new(move || sys::set_line_checked(&line, value)))
     }
 
-    /// An output of files, such as a PWM, and what is to be written at the beginning of each.
+    /// An output that is set by files, such as a PWM, with what is to be written at the beginning of
+    /// each.
     fn files(name: &str, files: Vec<(OwnedFd, Box<[u8]>)>) -> Output {
         let drive = move || {
             files.iter().try_for_each(|(file, bytes)| match pwrite(file, bytes, 0)? {
@@ -119,7 +121,7 @@ impl Output {
     }
 }
 
-/// Drives every output, whatever becomes of the others. Does not allocate.
+/// Drives every output, even if others fail. Does not allocate.
 fn drive(outputs: &mut [Output]) {
     for Output { drive, outcome } in outputs {
         outcome.result = Some(drive());
@@ -132,21 +134,21 @@ struct Group {
     outputs: Vec<Output>,
 }
 
-/// What the guardian holds.
+/// The outputs that the guardian holds.
 #[derive(Default)]
-struct Held {
-    /// Lines whose drivers never sleep.
+struct HeldOutputs {
+    /// Lines of chips whose drivers never sleep.
     native: Vec<Output>,
     apart: Vec<Group>,
 }
 
-impl Held {
+impl HeldOutputs {
     fn is_empty(&self) -> bool {
         self.native.is_empty() && self.apart.is_empty()
     }
 
-    /// Holds an output, in place of what was held by its name. One with a chip of its own is driven
-    /// apart from those of other chips.
+    /// Holds an output, in place of the one that was held by its name. With `chip` it is driven by that
+    /// chip's thread, without one with the native lines.
     fn hold(&mut self, chip: Option<&str>, output: Output) {
         self.forget(&output.outcome.name);
         match chip {
@@ -158,7 +160,7 @@ impl Held {
         }
     }
 
-    /// Gives back what is held by a name.
+    /// Drops the output of this name.
     fn forget(&mut self, name: &str) {
         let others = self.apart.iter_mut().map(|group| &mut group.outputs);
         for outputs in iter::once(&mut self.native).chain(others) {
@@ -176,9 +178,9 @@ pub(super) struct Program {
 }
 
 impl Program {
-    /// The process `pid`, which is our parent.
+    /// The process `pid`, which must be our parent.
     pub(super) fn new(pid: Pid) -> Program {
-        // Before Linux 5.3 the socket alone tells the program's end.
+        // Linux before 5.3 has no pidfd. There the socket alone tells that the program has ended.
         Program { pid, pidfd: sys::pidfd(pid).ok() }
     }
 
@@ -190,14 +192,14 @@ impl Program {
     }
 
     fn kill(&self) {
-        // Its pid is its own as long as it is our parent.
+        // As long as it is our parent, its process number has not been given to another.
         if getppid() == self.pid {
             let _ = kill(self.pid, Signal::SIGKILL);
         }
     }
 
     fn wait_for_end(&self) {
-        let until = monotonic() + END;
+        let until = monotonic() + END_LIMIT;
         while !self.has_ended() && monotonic() < until {
             thread::sleep(Duration::from_millis(1));
         }
@@ -210,34 +212,35 @@ enum Cause {
     Hangs,
 }
 
-/// What a message came to.
-enum Heard {
-    /// The guardian goes on.
+/// What came over the socket.
+enum Incoming {
+    /// A message, which was answered.
     Message,
     Goodbye,
-    /// There is nobody at the other end any more.
-    End,
+    /// Nothing: the program has closed its end.
+    Closed,
 }
 
-/// The second process.
+/// The guardian process.
 pub(super) struct Watcher {
     socket: OwnedFd,
     program: Program,
     pulse: Pulse,
-    held: Held,
-    /// The files so far of an output that has more of them.
+    held: HeldOutputs,
+    /// The files that have come so far of an output whose last file is still to come.
     files: Vec<(OwnedFd, Box<[u8]>)>,
 }
 
 impl Watcher {
     pub(super) fn new(socket: OwnedFd, program: Program, pulse: Pulse) -> Watcher {
-        Watcher { socket, program, pulse, held: Held::default(), files: Vec::new() }
+        Watcher { socket, program, pulse, held: HeldOutputs::default(), files: Vec::new() }
     }
 
-    /// Says that it is there, and watches until the program says goodbye or needs help.
+    /// Tells the program that it is ready, and watches until the program says goodbye, dies or hangs;
+    /// in the last two cases it drives the outputs.
     pub(super) fn watch(mut self) {
         self.answer(TAKEN);
-        // While outputs are held.
+        // Listens to the core's heartbeat. There is one only while outputs are held.
         let mut ear: Option<Ear> = None;
         let cause = loop {
             let pause = match &mut ear {
@@ -250,10 +253,10 @@ impl Watcher {
             let (message, ended) = self.wait(pause);
             if message {
                 match self.take_message() {
-                    Heard::Message if self.held.is_empty() => ear = None,
-                    Heard::Message => drop(ear.get_or_insert_with(|| Ear::new(self.pulse, self.pulse.now()))),
-                    Heard::Goodbye => return,
-                    Heard::End => break Cause::Died,
+                    Incoming::Message if self.held.is_empty() => ear = None,
+                    Incoming::Message => drop(ear.get_or_insert_with(|| Ear::new(self.pulse, self.pulse.now()))),
+                    Incoming::Goodbye => return,
+                    Incoming::Closed => break Cause::Died,
                 }
             } else if ended {
                 break Cause::Died;
@@ -264,7 +267,7 @@ impl Watcher {
         }
     }
 
-    /// Sleeps; then whether there is a message, and whether the program has ended.
+    /// Waits for up to `timeout`. Returns whether a message has come, and whether the program has ended.
     fn wait(&self, timeout: Option<Duration>) -> (bool, bool) {
         let timeout = timeout.map_or(PollTimeout::NONE, in_ms);
         let pidfd = self.program.pidfd.as_ref().map_or(self.socket.as_fd(), AsFd::as_fd);
@@ -276,32 +279,32 @@ impl Watcher {
         (message, ended)
     }
 
-    fn take_message(&mut self) -> Heard {
+    fn take_message(&mut self) -> Incoming {
         let mut bytes = [0; MESSAGE_BYTES];
         let (len, descriptor) = match sys::receive(self.socket.as_fd(), &mut bytes) {
-            Ok((0, _)) => return Heard::End,
+            Ok((0, _)) => return Incoming::Closed,
             Ok(received) => received,
-            Err(error) if error.kind() == io::ErrorKind::Interrupted => return Heard::Message,
-            // Most likely out of descriptors.
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => return Incoming::Message,
+            // Most likely there was no room for one more descriptor.
             Err(_) => {
                 self.answer(REFUSED);
-                return Heard::Message;
+                return Incoming::Message;
             }
         };
         let message = Message::decode(&bytes[..len]);
         if message == Some(Message::Goodbye) {
-            return Heard::Goodbye;
+            return Incoming::Goodbye;
         }
         let taken = message.is_some_and(|message| self.take(message, descriptor));
         self.answer(if taken { TAKEN } else { REFUSED });
-        Heard::Message
+        Incoming::Message
     }
 
-    /// Does what it is told, or not: then the message makes no sense.
+    /// Does what a message says. False if it makes no sense, such as one that lacks its descriptor.
     fn take(&mut self, message: Message<'_>, descriptor: Option<OwnedFd>) -> bool {
         match (message, descriptor) {
             (Message::Release, _) => {
-                self.held = Held::default();
+                self.held = HeldOutputs::default();
                 self.files.clear();
             }
             (Message::Line { name, shutdown_value, sleeping }, Some(line)) => {
@@ -321,14 +324,14 @@ impl Watcher {
     }
 
     fn answer(&self, answer: u8) {
-        // If the program can not be told it is dead, which the next poll tells.
+        // If this fails, the program is dead, and the next poll tells so.
         let _ = send(self.socket.as_raw_fd(), &[answer], MsgFlags::MSG_NOSIGNAL);
     }
 
-    /// Drives everything, and kills the program meanwhile. Says in the log what came of it.
+    /// Drives all outputs, kills the program, and logs what could be driven and what could not.
     fn rescue(self, cause: &Cause) {
-        let Watcher { program, pulse, held: Held { mut native, apart }, .. } = self;
-        // The computer's own lines first: writing to them never has to wait.
+        let Watcher { program, pulse, held: HeldOutputs { mut native, apart }, .. } = self;
+        // Native lines come first, as writing to them never blocks.
         drive(&mut native);
         let diagnosis = pulse.diagnosis();
         let program = Arc::new(program);
@@ -340,13 +343,13 @@ impl Watcher {
         if let Some(program) = &survivor {
             program.kill();
             program.wait_for_end();
-            // What it did until then is undone.
+            // The core may have driven them again before it was killed.
             drive(&mut native);
         }
         let (driven, failed): (Vec<_>, Vec<_>) = native.into_iter().partition(|output| output.outcome.is_driven());
         crew.employ(failed, None, TRY_FOR);
-        // A log that nobody reads would block us, and the lines could not be claimed anew: the alarm
-        // ends this process then.
+        // If nobody reads the log, writing to it blocks, and this process would keep the lines in use
+        // for ever. The alarm ends it then (SIGALRM).
         alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
         let of_crew = crew.wait(TRY_FOR, |outcome| {
             let seconds = TRY_FOR.as_secs();
@@ -363,7 +366,7 @@ impl Watcher {
     }
 }
 
-/// What became of the outputs, for the log.
+/// For the log: how many outputs could be driven, and what is wrong with the others.
 fn summary(outcomes: &[&Outcome]) -> String {
     let all = outcomes.len();
     let complaints: Vec<_> =
@@ -378,18 +381,17 @@ fn summary(outcomes: &[&Outcome]) -> String {
     }
 }
 
-/// What a thread tells each time that it has driven an output: the output's number, and what came
-/// of it.
-type Report = (usize, io::Result<()>);
+/// What a thread reports after each attempt to drive an output: the output's number, and the result.
+type Attempt = (usize, io::Result<()>);
 
-/// Threads that drive groups of outputs: one whose driver never comes back keeps neither the other
-/// groups nor us.
+/// Threads that each drive a group of outputs, so that a driver that hangs delays neither the other
+/// groups nor this process.
 struct Crew {
-    tell: Sender<Report>,
-    told: Receiver<Report>,
+    tell: Sender<Attempt>,
+    told: Receiver<Attempt>,
     /// By the outputs' numbers.
     outcomes: Vec<Outcome>,
-    /// Work that has got no thread, as memory is short.
+    /// Work for which no thread could be started, as memory is short.
     left: Vec<Work>,
 }
 
@@ -401,21 +403,22 @@ impl Default for Crew {
 }
 
 impl Crew {
-    /// Has a thread drive these outputs: at once, and again after the end of `survivor`, which may
-    /// drive them until then. Those that fail are tried until `try_for` is over.
+    /// Has a thread drive these outputs, and try again those that fail until `try_for` is over. If
+    /// `survivor` is given, the program still lives and may drive them, too: they are driven at once,
+    /// and again when it has ended.
     fn employ(&mut self, outputs: Vec<Output>, survivor: Option<Arc<Program>>, try_for: Duration) {
         let mut drives = Vec::new();
         for Output { drive, outcome } in outputs {
             drives.push((self.outcomes.len(), drive));
             self.outcomes.push(Outcome { result: None, ..outcome });
         }
-        // A closure whose thread can not be started is lost with all that it owns: so it owns a share
-        // of the work only, and the work can be taken back.
+        // If the thread can not be started, its closure is dropped with all that it owns. So it owns
+        // the work together with this function, which can then take the work back.
         let work = Arc::new(Mutex::new(Some(Work { drives, survivor, try_for })));
         let (theirs, tell) = (work.clone(), self.tell.clone());
         let run = move || {
             if let Some(work) = take(&theirs) {
-                // Nobody listens any more once the time is over.
+                // Sending fails once `wait` has returned. Nobody needs the result then.
                 work.run(|report| drop(tell.send(report)));
             }
         };
@@ -424,13 +427,13 @@ impl Crew {
         }
     }
 
-    /// What became of the outputs once all are driven, or `limit` is over. Calls `complain` for
-    /// each that fails, once.
+    /// Waits until all outputs are driven, or `limit` is over, and returns how it went. Calls
+    /// `complain` once for each output whose first attempt fails.
     fn wait(self, limit: Duration, mut complain: impl FnMut(&Outcome)) -> Vec<Outcome> {
         let Crew { tell, told, mut outcomes, left } = self;
-        // Now the channel closes when the last thread is done.
+        // Without this sender the channel closes when the last thread is done, and ends the wait.
         drop(tell);
-        let mut note = |(number, result): Report| {
+        let mut note = |(number, result): Attempt| {
             let outcome: &mut Outcome = &mut outcomes[number];
             let first = outcome.result.is_none();
             outcome.result = Some(result);
@@ -442,7 +445,7 @@ impl Crew {
         while let Ok(report) = told.recv_timeout(until.saturating_sub(monotonic())) {
             note(report);
         }
-        // Last: a driver that hangs would block this thread.
+        // This comes last, as a driver that hangs would block this thread.
         for work in left {
             work.run(&mut note);
         }
@@ -454,7 +457,7 @@ fn take<T>(from: &Mutex<Option<T>>) -> Option<T> {
     from.lock().unwrap_or_else(PoisonError::into_inner).take()
 }
 
-/// What one thread has to do.
+/// What one thread is to do: see [`Crew::employ`].
 struct Work {
     drives: Vec<(usize, Drive)>,
     survivor: Option<Arc<Program>>,
@@ -462,11 +465,11 @@ struct Work {
 }
 
 impl Work {
-    fn run(self, mut report: impl FnMut(Report)) {
+    fn run(self, mut report: impl FnMut(Attempt)) {
         let Work { mut drives, survivor, try_for } = self;
         if let Some(program) = survivor {
             for (_, drive) in &drives {
-                // Driven again below, where a failure is reported.
+                // Not reported: they are driven again below.
                 let _ = drive();
             }
             program.wait_for_end();
@@ -589,7 +592,7 @@ mod tests {
                 Ok(())
             })
         };
-        let mut held = Held::default();
+        let mut held = HeldOutputs::default();
         held.hold(None, set(1));
         held.hold(None, output("gpiochip0 line 6", || Ok(())));
         held.hold(None, set(2));

@@ -3,7 +3,7 @@
 
 use pinion::host::Client;
 use pinion::host::config::Config;
-use pinion::host::motion::{Endstop, MoveQueue, Profile, Reason, Stepper};
+use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 
 use super::outside::Outside;
 use super::program::Pinion;
@@ -66,7 +66,7 @@ fn homing_ends_where_the_outside_closes_the_endstop() {
     let edges = outside.edges(STEP);
     let pulses = edges.len() as i64 / 2;
     println!("homed at {} after {pulses} pulses; the endstop closed after {CLOSES_AFTER}", homed.position);
-    assert_eq!(homed.reason, Reason::Endstop);
+    assert_eq!(homed.reason, HomingEnd::Endstop);
     assert_eq!(edges, "10".repeat(pulses as usize), "pulses are complete");
     assert_eq!(homed.position, pulses, "every step was seen");
     let late = homed.position - CLOSES_AFTER as i64;

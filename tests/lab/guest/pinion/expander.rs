@@ -11,7 +11,7 @@ use nix::errno::Errno;
 use nix::sys::signal::Signal;
 use pinion::host::Client;
 use pinion::host::config::Config;
-use pinion::host::motion::{Endstop, MoveQueue, Profile, Reason, Stepper};
+use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 use pinion::time::monotonic;
 
 use crate::gpio_sim::GpioSim;
@@ -237,7 +237,7 @@ fn an_axis_homes_to_an_endstop_on_it() {
         }
     });
     let homed = homed.expect("a homing");
-    assert_eq!(homed.reason, Reason::Endstop);
+    assert_eq!(homed.reason, HomingEnd::Endstop);
     assert!(endstop.triggered(client).expect("a state"));
     let rising = trace.writes_to(step).iter().filter(|write| write.level).count();
     assert_eq!(homed.position, -(rising as i64), "it is where the lines say");

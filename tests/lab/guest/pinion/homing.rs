@@ -4,7 +4,7 @@
 use std::time::Duration;
 
 use pinion::host::config::Config;
-use pinion::host::motion::{Endstop, MoveQueue, Profile, Reason, Stepper};
+use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 use pinion::time::monotonic;
 
 use crate::gpio_sim::GpioSim;
@@ -41,7 +41,7 @@ fn an_axis_homes_backs_off_and_homes_again() {
             }
         });
         let homed = homed.expect("a homing");
-        assert_eq!(homed.reason, Reason::Endstop);
+        assert_eq!(homed.reason, HomingEnd::Endstop);
         let closed_ns = closed_ns.expect("the switch was closed");
         let steps = trace.writes_to(sim.kernel_number(0));
         let rising: Vec<u64> = steps.iter().filter(|write| write.level).map(|write| write.at_ns).collect();
@@ -59,7 +59,7 @@ fn an_axis_homes_backs_off_and_homes_again() {
     }
 
     let homed = queue.home(client, stepper, endstop, false, &profile(300), &mut |_| ()).expect("a homing");
-    assert_eq!((homed.reason, homed.position), (Reason::PastEnd, position - 300), "nobody closed the switch");
+    assert_eq!((homed.reason, homed.position), (HomingEnd::PastEnd, position - 300), "nobody closed the switch");
 }
 
 #[test]
