@@ -54,6 +54,9 @@ pub struct Margin {
 
 /// After so many waits too short to sleep a smaller margin is tried.
 const UNSLEPT_MAX: u32 = 500;
+/// A shorter sleep is late by what the way into it and out of it takes: it saves nothing, and would
+/// have the margin grow.
+const NAP_MIN: i64 = Ticks::from_us(1).0 as i64;
 /// One wake-up in this many may come after the instant.
 const LATE_SHARE: i64 = 50;
 /// After so many wake-ups in a row before the instant the margin is far too large, as a load is over:
@@ -211,7 +214,7 @@ impl Waiter {
             }
             let early = self.margin.get();
             let asleep = deadline.since(now) - i64::from(early.0);
-            if asleep <= 0 {
+            if asleep <= NAP_MIN {
                 break;
             }
             slept = true;

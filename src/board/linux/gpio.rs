@@ -218,14 +218,21 @@ impl HeldLine {
     }
 }
 
+impl HeldLine {
+    /// Out of the way of what drives the line.
+    #[cold]
+    #[inline(never)]
+    fn unwritten(&self, error: &gpio_cdev::Error) -> Shutdown {
+        Shutdown::because(reason::LINE_WRITE, self.subject.lost("written", errno(error)))
+    }
+}
+
 impl Line for HeldLine {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
         if !self.is_output.load(Ordering::Relaxed) {
             return Ok(());
         }
-        self.handle
-            .set_value(level.into())
-            .map_err(|error| Shutdown::because(reason::LINE_WRITE, self.subject.lost("written", errno(&error))))
+        self.handle.set_value(level.into()).map_err(|error| self.unwritten(&error))
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
