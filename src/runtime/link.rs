@@ -13,8 +13,7 @@ use std::thread::{self, Thread};
 use std::time::Duration;
 
 use log::{info, log, warn};
-use nix::errno::Errno;
-use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags, EpollTimeout};
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use rtrb::Producer;
 
 use crate::mcu::base::{ClockResponse, IdentifyResponse, identify_response};
@@ -116,78 +115,19 @@ pub(super) struct Link {
     has_own_processor: bool,
     signals: Signals,
     guardian: Option<GuardianWatch>,
-    sleep: Sleep,
     vigil: Vigil,
     /// When to end, as the guardian is gone.
     leave_at: Option<Duration>,
 }
 
-/// What the link sleeps on. epoll(7), as it costs nothing for what did not happen, where poll(2) asks
-/// all of them twice in each sleep.
-struct Sleep {
-    epoll: Epoll,
-    /// What of the pty ends the sleep at present.
-    pty: EpollFlags,
-}
-
-/// What the link sleeps on, as epoll names it.
-const PTY: u64 = 0;
-const CALL: u64 = 1;
-const SIGNAL: u64 = 2;
-const GUARDIAN: u64 = 3;
-
-impl Sleep {
-    fn new(pty: &Pty, wake: &LinkWake, signals: &Signals, guardian: Option<&GuardianWatch>) -> io::Result<Sleep> {
-        let epoll = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
-        epoll.add(pty.master(), EpollEvent::new(EpollFlags::EPOLLIN, PTY))?;
-        // By edges: each call ends one sleep, and need not be read.
-        epoll.add(wake.event(), EpollEvent::new(EpollFlags::EPOLLIN | EpollFlags::EPOLLET, CALL))?;
-        epoll.add(signals.event(), EpollEvent::new(EpollFlags::EPOLLIN, SIGNAL))?;
-        if let Some(guardian) = guardian {
-            // It hangs up, which is always told.
-            epoll.add(guardian.socket(), EpollEvent::new(EpollFlags::empty(), GUARDIAN))?;
-        }
-        Ok(Sleep { epoll, pty: EpollFlags::EPOLLIN })
-    }
-
-    /// Sleeps until something happens, and of the pty one of `events` or that the host hangs up.
-    fn until(&mut self, pty: &Pty, events: EpollFlags, timeout: EpollTimeout) -> io::Result<Woken> {
-        if events != self.pty {
-            self.epoll.modify(pty.master(), &mut EpollEvent::new(events, PTY))?;
-            self.pty = events;
-        }
-        let mut happened = [EpollEvent::empty(); 4];
-        let count = match self.epoll.wait(&mut happened, timeout) {
-            Ok(count) => count,
-            Err(Errno::EINTR) => 0,
-            Err(error) => return Err(error.into()),
-        };
-        let mut woken = Woken::default();
-        for event in &happened[..count] {
-            match event.data() {
-                PTY => {
-                    woken.by_input = event.events().contains(EpollFlags::EPOLLIN);
-                    woken.by_hangup = event.events().contains(EpollFlags::EPOLLHUP);
-                }
-                SIGNAL => woken.by_signal = true,
-                GUARDIAN => woken.by_guardian = true,
-                _ => {}
-            }
-        }
-        Ok(woken)
-    }
-}
-
 /// What ended the link's sleep: it looks only where there is something, as each look is a system
 /// call.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct Woken {
     by_signal: bool,
     by_input: bool,
     /// The host is gone.
     by_hangup: bool,
-    /// The guardian is gone.
-    by_guardian: bool,
 }
 
 /// Why the link ends.
@@ -215,10 +155,9 @@ pub(super) struct Parts {
 }
 
 impl Link {
-    pub(super) fn new(parts: Parts) -> io::Result<Link> {
+    pub(super) fn new(parts: Parts) -> Link {
         let Parts { pty, clock, dialect, requests, core, inlet, progress, wake, signals, guardian, vigil } = parts;
-        Ok(Link {
-            sleep: Sleep::new(&pty, &wake, &signals, guardian.as_ref())?,
+        Link {
             pty,
             clock,
             known: Known::new(dialect),
@@ -237,7 +176,7 @@ impl Link {
             guardian,
             vigil,
             leave_at: None,
-        })
+        }
     }
 
     /// Feeds a hardware watchdog from now on.
@@ -316,40 +255,54 @@ impl Link {
         self.wake.sleeping();
         let news = self.inlet.has_response() || self.ledger.is_behind(self.progress.done());
         if news && !self.is_full() || self.inlet.has_line() {
-            self.wake.awake();
-            return Ok(Woken { by_input: true, ..Woken::default() });
+            self.wake.awake(false);
+            return Ok(Woken { by_signal: false, by_input: true, by_hangup: false });
         }
-        let mut events = EpollFlags::empty();
+        let mut events = PollFlags::empty();
         if !stalled {
-            events |= EpollFlags::EPOLLIN;
+            events |= PollFlags::POLLIN;
         }
         if !self.output.is_empty() {
-            events |= EpollFlags::EPOLLOUT;
+            events |= PollFlags::POLLOUT;
         }
-        let timeout = self.timeout(stalled);
-        let woken = self.sleep.until(&self.pty, events, timeout)?;
-        self.wake.awake();
-        if woken.by_guardian {
+        // Without a guardian any other descriptor stands in.
+        let guardian = self.guardian.as_ref().map_or(self.wake.event(), GuardianWatch::socket);
+        let mut fds = [
+            PollFd::new(self.pty.master(), events),
+            PollFd::new(self.wake.event(), PollFlags::POLLIN),
+            PollFd::new(self.signals.event(), PollFlags::POLLIN),
+            PollFd::new(guardian, PollFlags::empty()),
+        ];
+        match poll(&mut fds, self.timeout(stalled)) {
+            Ok(_) | Err(nix::errno::Errno::EINTR) => {}
+            Err(error) => return Err(error.into()),
+        }
+        let events = |fd: &PollFd<'_>| fd.revents().unwrap_or(PollFlags::empty());
+        let woken = Woken {
+            by_signal: !events(&fds[2]).is_empty(),
+            by_input: events(&fds[0]).contains(PollFlags::POLLIN),
+            by_hangup: events(&fds[0]).contains(PollFlags::POLLHUP),
+        };
+        let (called, lost) = (!events(&fds[1]).is_empty(), !events(&fds[3]).is_empty());
+        self.wake.awake(called);
+        if lost && self.guardian.is_some() {
             self.lose_guardian("somebody killed the guardian");
         }
         Ok(woken)
     }
 
-    fn timeout(&self, stalled: bool) -> EpollTimeout {
+    fn timeout(&self, stalled: bool) -> PollTimeout {
         let stall = stalled.then_some(Duration::from_millis(STALL_MS));
         let look = self.guardian.as_ref().and_then(GuardianWatch::due);
         let due = self.leave_at.into_iter().chain(self.vigil.due()).chain(look).min();
         let due = due.map(|at| at.saturating_sub(monotonic()));
-        stall.into_iter().chain(due).min().map_or(EpollTimeout::NONE, in_ms)
+        stall.into_iter().chain(due).min().map_or(PollTimeout::NONE, in_ms)
     }
 
     /// The guardian is gone, or of no use: stops the machine, and has the program end once the host has had
     /// time to read why.
     fn lose_guardian(&mut self, why: &str) {
-        if let Some(guardian) = self.guardian.take() {
-            // It would end each sleep. (It is known, so this can not fail.)
-            let _ = self.sleep.epoll.delete(guardian.socket());
-        }
+        self.guardian = None;
         let detail =
             format!("{why}, and without it a crash would leave heaters on: Pinion ends, to be started anew with one");
         self.request(Request::Shutdown(Shutdown::because(reason::GUARDIAN_LOST, detail)));

@@ -140,7 +140,7 @@ pub fn run(
         signals,
         guardian: guardian.as_ref().map(Guardian::watch),
         vigil: Vigil::new(notify, notify::watchdog_interval(), pulse),
-    })?;
+    });
     if realtime {
         realtime::enter(Role::Link);
     }

@@ -48,7 +48,7 @@ impl LinkWake {
     /// Something is there for the link.
     pub(super) fn wake(&self) {
         if self.asleep.swap(false, Ordering::SeqCst) {
-            // Its 64 bits never are full.
+            // It can only be full of wake-ups already.
             let _ = self.event.write(1);
         }
     }
@@ -64,12 +64,14 @@ impl LinkWake {
         self.asleep.swap(true, Ordering::SeqCst);
     }
 
-    /// The link is awake.
-    pub(super) fn awake(&self) {
+    /// The link is awake, and was called or not.
+    pub(super) fn awake(&self, called: bool) {
         self.asleep.store(false, Ordering::SeqCst);
+        if called {
+            let _ = self.event.read();
+        }
     }
 
-    /// Written to at each call, and never read: an epoll(7) by edges tells each.
     pub(super) fn event(&self) -> BorrowedFd<'_> {
         self.event.as_fd()
     }
