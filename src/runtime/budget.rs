@@ -34,13 +34,15 @@ pub(super) struct Budget {
     /// How much the bucket fills in a tick, in 1/1024 ticks.
     share: i64,
     looked: Clock,
-    /// The thread's running time at that look.
+    /// When to look next.
+    due: Clock,
+    /// The thread's running time at the last look.
     ran: Duration,
 }
 
-/// How many ticks lie between two looks at the thread's running time. Only the kernel knows it, as it
-/// also counts the way into a sleep and out of it; and to ask the kernel costs a system call.
-const LOOK_TICKS: i64 = 50_000;
+/// How long to wait between two looks at the thread's running time at least. Only the kernel knows it,
+/// as it also counts the way into a sleep and out of it; and to ask the kernel costs a system call.
+const LOOK: Ticks = Ticks::from_us(1000);
 
 const FINE: i64 = 1024;
 
@@ -68,7 +70,7 @@ impl Budget {
     pub(super) fn new(throttle: Throttle, now: Clock, ran: Duration) -> Budget {
         let allowance = i64::from(throttle.runtime_us) * FINE / i64::from(throttle.period_us.max(1));
         let full = i64::from(throttle.runtime_us) * i64::from(Ticks::from_us(1).0) * FINE / 20;
-        Budget { class: Class::Fifo, level: full, full, share: allowance * 9 / 10, looked: now, ran }
+        Budget { class: Class::Fifo, level: full, full, share: allowance * 9 / 10, looked: now, due: now + LOOK, ran }
     }
 
     /// Whether the thread is to run as SCHED_FIFO at present.
@@ -79,7 +81,7 @@ impl Budget {
     /// Whether it is time to [`Budget::look`].
     #[inline]
     pub(super) fn is_due(&self, now: Clock) -> bool {
-        now.since(self.looked) >= LOOK_TICKS
+        now >= self.due
     }
 
     /// Takes in that the thread has run for `ran` in its life so far. The class that it is to change
@@ -91,6 +93,9 @@ impl Budget {
         self.ran = ran;
         let drain = if self.class == Class::Fifo { spent * FINE } else { 0 };
         self.level = (self.level + span * self.share - drain).min(self.full);
+        // To run for a tick drains no more than a tick, so half of what is left now is left then.
+        let half = if self.class == Class::Fifo { self.level / FINE / 2 } else { 0 };
+        self.due = now + Ticks(half.clamp(i64::from(LOOK.0), i64::from(u32::MAX)) as u32);
         let class = match self.class {
             Class::Fifo if self.level <= 0 => Class::Other,
             Class::Other if self.level >= self.full / 2 => Class::Fifo,

@@ -48,18 +48,34 @@ pub struct Margin {
     fine: i64,
     /// Waits since the last wake-up that were too short to sleep.
     unslept: u32,
+    /// Wake-ups since the last one that came after the instant.
+    covered: u32,
 }
 
 /// After so many waits too short to sleep a smaller margin is tried.
 const UNSLEPT_MAX: u32 = 500;
+/// A shorter sleep is late by what the way into it and out of it takes: it saves nothing, and would
+/// have the margin grow.
+const NAP_MIN: i64 = Ticks::from_us(1).0 as i64;
 /// One wake-up in this many may come after the instant.
 const LATE_SHARE: i64 = 50;
+/// After so many wake-ups in a row before the instant the margin is far too large, as a load is over:
+/// a margin that is right has such a row once in 57 times (0.98 to the power of 200).
+const COVERED_MAX: u32 = 200;
+/// It then shrinks so many times as fast.
+const HASTE: i64 = 8;
+/// Sleeps that are tried at the start, and how long each is.
+const TRIALS: usize = 16;
+const TRIAL: Duration = Duration::from_micros(100);
 const FINE: i64 = 256;
 
 impl Margin {
-    /// A margin that starts in the middle of its bounds.
-    pub fn new(limits: MarginLimits) -> Margin {
-        Margin { limits, fine: (i64::from(limits.min.0) + i64::from(limits.max.0)) / 2 * FINE, unslept: 0 }
+    /// A margin that covers a wake-up that comes `late` after it was asked for, and a quarter more:
+    /// what it does not cover it learns from edges that are late.
+    pub fn new(limits: MarginLimits, late: i64) -> Margin {
+        let mut margin = Margin { limits, fine: 0, unslept: 0, covered: 0 };
+        margin.displace(late.clamp(0, i64::from(u32::MAX)) * FINE * 5 / 4);
+        margin
     }
 
     /// How long before an instant to wake.
@@ -74,7 +90,14 @@ impl Margin {
         let present = self.fine / FINE;
         // Steps in proportion: quick to follow a load, fine when there is none.
         let step = present.max(64) * FINE / 24;
-        self.displace(if late > present { step } else { -step / LATE_SHARE });
+        if late > present {
+            self.covered = 0;
+            self.displace(step);
+            return;
+        }
+        self.covered = self.covered.saturating_add(1);
+        let haste = if self.covered > COVERED_MAX { HASTE } else { 1 };
+        self.displace(-step * haste / LATE_SHARE);
     }
 
     /// A wait was too short to sleep, so that nothing was learned. A margin above the step
@@ -98,6 +121,19 @@ fn running_time() -> Duration {
     clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map_or(Duration::ZERO, Duration::from)
 }
 
+/// How late the calling thread wakes from short sleeps: the second latest of a few, as the latest
+/// may be due to something else.
+fn try_wake_ups(clock: &dyn TimeSource) -> i64 {
+    let mut late = [0; TRIALS];
+    for late in &mut late {
+        let asleep = clock.now();
+        thread::park_timeout(TRIAL);
+        *late = clock.now().since(asleep) - (TRIAL.as_nanos() as u64 / NS_PER_TICK) as i64;
+    }
+    late.sort_unstable();
+    late[TRIALS - 2]
+}
+
 /// Why a wait ended.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Woken {
@@ -118,7 +154,8 @@ pub struct Waiter {
 }
 
 impl Waiter {
-    /// A waiter for the calling thread, which runs as `scheduling` says on `processors`.
+    /// A waiter for the calling thread, which runs as `scheduling` says on `processors`. It sleeps a
+    /// few times, two milliseconds in all, to learn how late it wakes.
     pub fn new(
         clock: Arc<dyn TimeSource>,
         limits: MarginLimits,
@@ -127,7 +164,8 @@ impl Waiter {
     ) -> Waiter {
         let throttle = if scheduling == Scheduling::RealTime { Throttle::read() } else { None };
         let budget = throttle.map(|throttle| Budget::new(throttle, clock.now(), running_time()));
-        Waiter { clock, margin: Margin::new(limits), processors, scheduling, budget }
+        let margin = Margin::new(limits, try_wake_ups(&*clock));
+        Waiter { clock, margin, processors, scheduling, budget }
     }
 
     /// The margin as it was learned.
@@ -176,7 +214,7 @@ impl Waiter {
             }
             let early = self.margin.get();
             let asleep = deadline.since(now) - i64::from(early.0);
-            if asleep <= 0 {
+            if asleep <= NAP_MIN {
                 break;
             }
             slept = true;
@@ -212,7 +250,7 @@ mod tests {
 
     #[test]
     fn the_margin_settles_where_one_wake_up_in_fifty_is_later() {
-        let mut margin = Margin::new(MarginLimits::default());
+        let mut margin = Margin::new(MarginLimits::default(), 0);
         let mut later = 0;
         // Lateness spread evenly over 0..2000 ticks by a full-period generator.
         let mut random = 1u64;
@@ -228,8 +266,29 @@ mod tests {
     }
 
     #[test]
+    fn it_starts_above_the_wake_ups_that_were_tried() {
+        let start = |late| Margin::new(MarginLimits::up_to_us(200), late).get();
+        assert_eq!(start(4000), Ticks(5000));
+        assert_eq!((start(-5), start(10), start(i64::MAX)), (Ticks(250), Ticks(250), Ticks(10_000)));
+    }
+
+    #[test]
+    fn it_forgets_a_load_within_a_thousand_wake_ups() {
+        let mut margin = Margin::new(MarginLimits::default(), i64::MAX);
+        for _ in 0..1000 {
+            margin.learn(300);
+        }
+        assert!(margin.get() <= Ticks(320), "{:?}", margin.get());
+        // And does not sink below them.
+        for _ in 0..100_000 {
+            margin.learn(300);
+            assert!(margin.get() >= Ticks(297), "{:?}", margin.get());
+        }
+    }
+
+    #[test]
     fn a_margin_that_allows_no_sleep_shrinks() {
-        let mut margin = Margin::new(MarginLimits::default());
+        let mut margin = Margin::new(MarginLimits::default(), 4000);
         let start = margin.get();
         for _ in 0..UNSLEPT_MAX {
             margin.unslept();
@@ -258,7 +317,7 @@ mod tests {
     #[test]
     fn the_margin_stays_within_its_bounds() {
         let limits = MarginLimits { min: Ticks(50), max: Ticks(500) };
-        let mut margin = Margin::new(limits);
+        let mut margin = Margin::new(limits, 100);
         for _ in 0..10_000 {
             margin.learn(1_000_000);
         }

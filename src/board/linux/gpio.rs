@@ -213,6 +213,8 @@ pub(super) struct HeldLine {
 
 impl HeldLine {
     /// The error for a call to the chip that failed with the error number `code`.
+    #[cold]
+    #[inline(never)]
     fn lost(&self, reason: ShutdownReason, what: &str, code: i32) -> Shutdown {
         Shutdown::because(reason, self.subject.lost(what, code, self.sleeping.is_some()))
     }
@@ -238,11 +240,11 @@ impl Line for HeldLine {
         if !self.is_output.load(Ordering::Relaxed) {
             return Ok(());
         }
-        let code = match &self.sleeping {
-            None => self.handle.set_value(level.into()).map_err(|error| errno(&error)),
-            Some(_) => sys::set_line_checked(&self.handle, level).map_err(|e| e.raw_os_error().unwrap_or_default()),
-        };
-        code.map_err(|code| self.lost(reason::LINE_WRITE, "written", code))
+        match &self.sleeping {
+            None => self.handle.set_value(level.into()).map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error))),
+            Some(_) => sys::set_line_checked(&self.handle, level)
+                .map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default())),
+        }
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
