@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::Pin;
+use crate::board::{Pin, Range};
 use crate::mcu::{Feature, Mcu, base};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
@@ -13,8 +13,10 @@ mod analog_in;
 mod digital_out;
 mod endstop;
 mod pwm_out;
+mod sos_filter;
 mod spi;
 mod stepper;
+mod trigger_analog;
 mod trsync;
 
 /// Every feature. What is not listed is not in the dictionary.
@@ -27,6 +29,8 @@ pub const FEATURES: &[Feature] = &[
     trsync::FEATURE,
     analog_in::FEATURE,
     spi::FEATURE,
+    sos_filter::FEATURE,
+    trigger_analog::FEATURE,
 ];
 
 /// The place of a response in the list of all, found by the compiler.
@@ -46,6 +50,11 @@ const fn response_index(format: &str) -> usize {
         feature += 1;
     }
     panic!("the response is not listed by any feature")
+}
+
+/// The names of an enumeration that is the same on every board.
+fn named(values: &[(&str, u8)]) -> Vec<Range> {
+    values.iter().map(|&(name, value)| Range { name: name.into(), first: value.into(), count: 1 }).collect()
 }
 
 /// An output with a `max_duration` got no change in time.
