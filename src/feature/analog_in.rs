@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Analog inputs: oversampling, range check, reports of several readings.
+//! Analog inputs: oversampling, range check, reports of several readings, homing by their values.
 //!
 //! A worker takes the readings, as each may block for a while. If the ADC is slower than the host
 //! wants, samples are left out; timers and steps do not wait for it.
@@ -14,9 +14,11 @@ use crate::mcu::{
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
+use super::trigger_analog::Attached;
+
 pub(super) const FEATURE: Feature = Feature {
     name: "analog_in",
-    commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN],
+    commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN, ANALOG_IN_ATTACH_TRIGGER_ANALOG],
     responses: &[State::FORMAT],
     constants: &[("ADC_MAX", Constant::Number(ADC_MAX as u32))],
     shutdowns: SHUTDOWNS,
@@ -79,6 +81,7 @@ struct AnalogIn {
     /// Changes with every [`AnalogIn::restart`]: a reading with another tag was begun before it, and
     /// does not count.
     tag: u8,
+    attached: Attached,
 }
 
 impl AnalogIn {
@@ -159,7 +162,7 @@ impl Object for AnalogIn {
     }
 
     fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let tag = done.tag;
+        let (tag, read_at) = (done.tag, done.ended);
         let Some(mut reading) = done.errand::<Reading>() else { return Ok(()) };
         let counts = std::mem::replace(&mut reading.counts, Ok(0));
         self.reading = Some(reading);
@@ -187,6 +190,7 @@ impl Object for AnalogIn {
         }
         self.check_range(mcu)?;
         self.skip_missed(now);
+        self.attached.update(mcu, self.sum.into(), read_at)?;
         self.report(mcu, oid);
         self.restart();
         mcu.go_on(timer, self.next_begin);
@@ -196,6 +200,7 @@ impl Object for AnalogIn {
     fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
         // A reading that is under way does not count any more.
         self.restart();
+        self.attached = Attached::default();
         // Without a pause between sums a stopped machine would be busy with them for ever.
         if self.sample_count == 0 || self.rest_ticks == Ticks(0) {
             return;
@@ -229,6 +234,7 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
         report: [0; REPORT_BYTES],
         report_len: 0,
         tag: 0,
+        attached: Attached::default(),
     };
     mcu.assign_on(pin, oid, input)
 });
@@ -269,5 +275,12 @@ const QUERY_ANALOG_IN: Command = command!(
             }
             mcu.schedule(TimerId::new(oid, 0), at)
         })
+    }
+);
+
+const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
+    "analog_in_attach_trigger_analog oid=%c trigger_analog_oid=%c",
+    |mcu, oid: Oid, trigger_analog_oid: Oid| {
+        mcu.with::<AnalogIn, _>(oid, |input, mcu| input.attached.attach(mcu, trigger_analog_oid))
     }
 );

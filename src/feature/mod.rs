@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{Bias, Pin};
+use crate::board::{Bias, Pin, Range};
 use crate::mcu::{Feature, Mcu, base};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
@@ -15,8 +15,10 @@ mod counter;
 mod digital_out;
 mod endstop;
 mod pwm_out;
+mod sos_filter;
 mod spi;
 mod stepper;
+mod trigger_analog;
 mod trsync;
 
 /// Every feature. One that is not listed here does not get into the dictionary.
@@ -31,6 +33,8 @@ pub const FEATURES: &[Feature] = &[
     buttons::FEATURE,
     counter::FEATURE,
     spi::FEATURE,
+    sos_filter::FEATURE,
+    trigger_analog::FEATURE,
 ];
 
 /// The place of a response in the list of all, found by the compiler.
@@ -50,6 +54,11 @@ const fn response_index(format: &str) -> usize {
         feature += 1;
     }
     panic!("the response is not listed by any feature")
+}
+
+/// The names of an enumeration that is the same on every board.
+fn named(values: &[(&str, u8)]) -> Vec<Range> {
+    values.iter().map(|&(name, value)| Range { name: name.into(), first: value.into(), count: 1 }).collect()
 }
 
 /// The resistor that a command's `pull_up` asks for.

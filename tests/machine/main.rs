@@ -20,5 +20,7 @@ mod endstop;
 mod one_order;
 mod pwm_out;
 mod remedies;
+mod sos_filter;
 mod spi;
 mod stepper;
+mod trigger_analog;

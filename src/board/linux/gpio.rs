@@ -241,7 +241,10 @@ impl Line for HeldLine {
             return Ok(());
         }
         match &self.sleeping {
-            None => self.handle.set_value(level.into()).map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error))),
+            None => self
+                .handle
+                .set_value(level.into())
+                .map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error))),
             Some(_) => sys::set_line_checked(&self.handle, level)
                 .map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default())),
         }

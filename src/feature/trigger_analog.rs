@@ -1,0 +1,271 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Homing and probing by the samples of a sensor: what a sensor reads goes through a filter, and pulls
+//! a trsync when it crosses the value that the host set. Samples out of range, a filter that overflows,
+//! a sensor that reports an error or falls silent pull it as well, with a reason of their own.
+
+#![forbid(unsafe_code)]
+
+use crate::mcu::{
+    Command, Enumeration, Feature, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response,
+};
+use crate::shutdown::Shutdown;
+use crate::time::{Clock, Ticks};
+
+use super::named;
+use super::sos_filter::SosFilter;
+use super::trsync::Trsync;
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "trigger_analog",
+    commands: &[
+        CONFIG_TRIGGER_ANALOG,
+        TRIGGER_ANALOG_SET_RAW_RANGE,
+        TRIGGER_ANALOG_SET_TRIGGER,
+        TRIGGER_ANALOG_HOME,
+        TRIGGER_ANALOG_QUERY_STATE,
+    ],
+    responses: &[State::FORMAT],
+    enumerations: &[
+        Enumeration {
+            name: "trigger_analog_type",
+            values: |_| named(&[("abs_ge", ABS_GE), ("gt", GT), ("diff_peak_gt", DIFF_PEAK_GT)]),
+        },
+        Enumeration {
+            name: "trigger_analog_error:",
+            values: |_| {
+                named(&[
+                    ("RAW_RANGE", RAW_RANGE),
+                    ("OVERFLOW", OVERFLOW),
+                    ("MONITOR", MONITOR),
+                    ("SENSOR_SPECIFIC", SENSOR_SPECIFIC),
+                ])
+            },
+        },
+    ],
+    ..Feature::EMPTY
+};
+
+response! {
+    /// Whether samples are looked at, and when the trigger came.
+    "trigger_analog_state oid=%c homing=%c homing_clock=%u"
+    pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
+}
+
+// What pulls the trigger: its absolute value is at least the trigger value, it is above it, or it is
+// below the highest one so far by more than it.
+const ABS_GE: u8 = 0;
+const GT: u8 = 1;
+const DIFF_PEAK_GT: u8 = 2;
+
+// Errors, which the host finds added to its `error_reason` in the trsync's reason.
+const RAW_RANGE: u8 = 0;
+const OVERFLOW: u8 = 1;
+const MONITOR: u8 = 2;
+/// The first of the sensor's own.
+const SENSOR_SPECIFIC: u8 = 3;
+
+pub(super) struct TriggerAnalog {
+    filter: Oid,
+    raw_min: i32,
+    raw_max: i32,
+    trigger_type: u8,
+    trigger_value: i32,
+    /// The highest filtered value since `trigger_analog_home`.
+    peak: i32,
+    /// Whether samples are looked at.
+    homing: bool,
+    /// Whether every sample so far was of an instant before `homing_clock`.
+    awaits: bool,
+    /// When homing begins; when it was triggered, from then on.
+    homing_clock: Clock,
+    trsync: Option<Oid>,
+    trigger_reason: u8,
+    error_reason: u8,
+    monitor_ticks: Ticks,
+    monitor_max: u8,
+    /// Turns of the monitor since the last sample.
+    monitor_count: u8,
+}
+
+impl TriggerAnalog {
+    /// Takes in a sample of the sensor, read at the instant `at`.
+    fn update(&mut self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
+        if !self.homing || self.awaits && at < self.homing_clock {
+            return Ok(());
+        }
+        self.awaits = false;
+        self.monitor_count = 0;
+        if !(self.raw_min..=self.raw_max).contains(&sample) {
+            return self.fail(mcu, RAW_RANGE);
+        }
+        let Ok(value) = mcu.with::<SosFilter, _>(self.filter, |filter, _| Ok(filter.apply(sample)))? else {
+            return self.fail(mcu, OVERFLOW);
+        };
+        if !self.crosses(value) {
+            return Ok(());
+        }
+        self.homing = false;
+        self.homing_clock = at;
+        self.pull(mcu, self.trigger_reason)
+    }
+
+    /// Whether a filtered value pulls the trigger. The firmware compares a negative trigger value as
+    /// an unsigned one, but for [`GT`].
+    fn crosses(&mut self, value: i32) -> bool {
+        match self.trigger_type {
+            ABS_GE => value.unsigned_abs() >= self.trigger_value as u32,
+            GT => value > self.trigger_value,
+            DIFF_PEAK_GT if value > self.peak => {
+                self.peak = value;
+                false
+            }
+            DIFF_PEAK_GT => self.peak.abs_diff(value) > self.trigger_value as u32,
+            _ => false,
+        }
+    }
+
+    /// Homing ends with an error.
+    fn fail(&mut self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
+        if !std::mem::take(&mut self.homing) {
+            return Ok(());
+        }
+        self.pull(mcu, self.error_reason.wrapping_add(error))
+    }
+
+    fn pull(&self, mcu: &mut Mcu, reason: u8) -> Result<(), Shutdown> {
+        let Some(trsync) = self.trsync else { return Ok(()) };
+        mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, reason))
+    }
+}
+
+impl Object for TriggerAnalog {
+    fn kind(&self) -> &'static str {
+        "analog trigger"
+    }
+
+    /// Looks whether the sensor is silent. If it is the trigger is pulled, and samples that come later
+    /// are looked at all the same, as in the firmware: a trsync is pulled once.
+    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        if !self.homing {
+            return Ok(Next::Done);
+        }
+        if self.monitor_count > self.monitor_max {
+            self.pull(mcu, self.error_reason.wrapping_add(MONITOR))?;
+            return Ok(Next::Done);
+        }
+        self.monitor_count = self.monitor_count.wrapping_add(1);
+        Ok(Next::At(at + self.monitor_ticks))
+    }
+}
+
+/// Where a sensor's samples go for homing, if the host attached something.
+#[derive(Clone, Copy, Default)]
+pub(super) struct Attached(Option<Oid>);
+
+impl Attached {
+    /// Attaches an analog trigger.
+    pub(super) fn attach(&mut self, mcu: &mut Mcu, trigger_analog: Oid) -> Result<(), Shutdown> {
+        mcu.with::<TriggerAnalog, _>(trigger_analog, |_, _| Ok(()))?;
+        self.0 = Some(trigger_analog);
+        Ok(())
+    }
+
+    /// A sample that was read at the instant `at`.
+    pub(super) fn update(self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
+        let Some(oid) = self.0 else { return Ok(()) };
+        mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| trigger.update(mcu, sample, at))
+    }
+
+    /// An error of the sensor, by its own number.
+    pub(super) fn note_error(self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
+        let Some(oid) = self.0 else { return Ok(()) };
+        mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| trigger.fail(mcu, error.wrapping_add(SENSOR_SPECIFIC)))
+    }
+}
+
+const CONFIG_TRIGGER_ANALOG: Command =
+    command!("config_trigger_analog oid=%c sos_filter_oid=%c", |mcu, oid: Oid, sos_filter_oid: Oid| {
+        mcu.with::<SosFilter, _>(sos_filter_oid, |_, _| Ok(()))?;
+        let trigger = TriggerAnalog {
+            filter: sos_filter_oid,
+            raw_min: 0,
+            raw_max: 0,
+            trigger_type: 0,
+            trigger_value: 0,
+            peak: 0,
+            homing: false,
+            awaits: false,
+            homing_clock: Clock::EPOCH,
+            trsync: None,
+            trigger_reason: 0,
+            error_reason: 0,
+            monitor_ticks: Ticks(0),
+            monitor_max: 0,
+            monitor_count: 0,
+        };
+        mcu.assign(oid, trigger)
+    });
+
+const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
+    "trigger_analog_set_raw_range oid=%c raw_min=%i raw_max=%i",
+    |mcu, oid: Oid, raw_min: i32, raw_max: i32| {
+        mcu.with::<TriggerAnalog, _>(oid, |trigger, _| {
+            trigger.raw_min = raw_min;
+            trigger.raw_max = raw_max;
+            Ok(())
+        })
+    }
+);
+
+const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
+    "trigger_analog_set_trigger oid=%c trigger_analog_type=%c trigger_value=%i",
+    |mcu, oid: Oid, trigger_analog_type: u8, trigger_value: i32| {
+        mcu.with::<TriggerAnalog, _>(oid, |trigger, _| {
+            trigger.trigger_type = trigger_analog_type;
+            trigger.trigger_value = trigger_value;
+            Ok(())
+        })
+    }
+);
+
+const TRIGGER_ANALOG_HOME: Command = command!(
+    "trigger_analog_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u monitor_ticks=%u monitor_max=%u",
+    |mcu,
+     oid: Oid,
+     trsync_oid: Oid,
+     trigger_reason: u8,
+     error_reason: u8,
+     clock: WireClock,
+     monitor_ticks: Ticks,
+     monitor_max: u32| {
+        let at = mcu.instant(clock);
+        mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| {
+            mcu.cancel(TimerId::new(oid, 0));
+            trigger.monitor_ticks = monitor_ticks;
+            if monitor_ticks == Ticks(0) {
+                trigger.homing = false;
+                trigger.trsync = None;
+                return Ok(());
+            }
+            mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
+            trigger.trsync = Some(trsync_oid);
+            trigger.trigger_reason = trigger_reason;
+            trigger.error_reason = error_reason;
+            trigger.homing_clock = at;
+            // The firmware keeps its low byte.
+            trigger.monitor_max = monitor_max as u8;
+            trigger.monitor_count = 0;
+            trigger.homing = true;
+            trigger.awaits = true;
+            trigger.peak = i32::MIN;
+            mcu.schedule(TimerId::new(oid, 0), at)
+        })
+    }
+);
+
+const TRIGGER_ANALOG_QUERY_STATE: Command = command!("trigger_analog_query_state oid=%c", |mcu, oid: Oid| {
+    mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| {
+        mcu.send(State { oid, homing: trigger.homing, homing_clock: trigger.homing_clock });
+        Ok(())
+    })
+});
