@@ -19,7 +19,7 @@ use crate::time::{Monotonic, TimeSource};
 
 use super::{end_by_panic, failed, logging};
 
-/// What -w feeds.
+/// The device of the watchdog that -w feeds.
 const WATCHDOG: &str = "/dev/watchdog";
 
 /// Options of `pinion run`, and of `pinion` alone.
@@ -82,7 +82,7 @@ impl FromStr for BoardName {
 }
 
 impl BoardName {
-    /// The board itself; `guard` copies its outputs.
+    /// Opens the board. Its outputs are given to `guard`.
     pub fn open(&self, clock: Arc<dyn TimeSource>, guard: Option<Box<dyn Guard>>) -> Result<Box<dyn Board>, String> {
         match self {
             BoardName::Linux => Ok(Box::new(LinuxBoard::new(guard))),
@@ -117,7 +117,7 @@ impl RunArgs {
 pub fn run(args: &RunArgs) -> ExitCode {
     end_by_panic();
     let clock = Monotonic::start();
-    // Before anything that starts a thread. A simulated printer needs none.
+    // The guardian must be forked before any thread is started. A simulated printer needs none.
     let guardian = match args.board {
         BoardName::Linux => Some(Guardian::start(clock, args.realtime)),
         BoardName::Sim(_) => None,
