@@ -82,7 +82,7 @@ impl Lateness {
     }
 
     /// The buckets that hold samples: the largest value that belongs to each, and how many it holds.
-    pub fn buckets(&self) -> impl Iterator<Item = (Ticks, u64)> + '_ {
+    pub(crate) fn buckets(&self) -> impl Iterator<Item = (Ticks, u64)> + '_ {
         let filled = self.counts.iter().enumerate().filter(|(_, count)| **count > 0);
         filled.map(|(bucket, count)| (Ticks(upper(bucket)), *count))
     }

@@ -23,7 +23,7 @@ use super::{failed, print};
 
 /// Options of `pinion latency`.
 #[derive(Args, Clone, Debug)]
-pub struct LatencyArgs {
+pub(super) struct LatencyArgs {
     /// How long to measure, half of it idle and half under load
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(2..=3600))]
     seconds: u32,
@@ -47,7 +47,7 @@ struct Half {
 }
 
 /// Measures, prints and judges.
-pub fn run(args: &LatencyArgs) -> ExitCode {
+pub(super) fn run(args: &LatencyArgs) -> ExitCode {
     let span = Duration::from_secs(args.seconds.into()) / 2;
     let processors = match Processors::new(None) {
         Ok(processors) => processors,

@@ -22,7 +22,7 @@ pub mod sim;
 /// klipper_mcu (-r -w -I PATH) works unchanged.
 #[derive(Parser, Debug)]
 #[command(name = "pinion", version, max_term_width = 100, args_conflicts_with_subcommands = true)]
-pub struct Cli {
+pub(crate) struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
     #[command(flatten)]

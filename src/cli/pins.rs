@@ -18,7 +18,7 @@ use super::{failed, print};
 
 /// Options of `pinion pins`.
 #[derive(Args, Clone, Debug, Default)]
-pub struct PinsArgs {
+pub(super) struct PinsArgs {
     /// Show only GPIO lines that nobody holds
     #[arg(long)]
     pub free: bool,
@@ -28,7 +28,7 @@ pub struct PinsArgs {
 }
 
 /// Prints the list.
-pub fn run(args: &PinsArgs) -> ExitCode {
+pub(super) fn run(args: &PinsArgs) -> ExitCode {
     let inventory = Inventory::scan();
     let list = list(&inventory, args, &|device, id| reading(&inventory, device, id));
     for problem in &inventory.problems {

@@ -30,7 +30,7 @@ use super::{failed, logging, print};
 
 /// Options of `pinion sim`.
 #[derive(Args, Clone, Debug)]
-pub struct SimArgs {
+pub(super) struct SimArgs {
     /// The printer's description; the built-in printer if left out
     #[arg(value_name = "FILE.toml")]
     file: Option<PathBuf>,
@@ -55,7 +55,7 @@ pub struct SimArgs {
 }
 
 /// Shows the printer at work and goes on serving it, or prints its configuration.
-pub fn run(args: &SimArgs) -> ExitCode {
+pub(super) fn run(args: &SimArgs) -> ExitCode {
     let config = match sim_config(args.file.as_deref()) {
         Ok(config) => config,
         Err(error) => return failed(error),
