@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How late things happened: a distribution that takes a sample without allocating.
+//! Distributions of how late things happened. To record a sample does not allocate.
 
 #![forbid(unsafe_code)]
 
@@ -7,12 +7,13 @@ use std::fmt;
 
 use crate::time::{CLOCK_FREQ, Ticks};
 
-/// Parts of an octave: a bucket is at most an eighth wide.
+/// Into how many buckets each octave (from a power of two to the next) is parted. So a bucket is at
+/// most as wide as an eighth of its values.
 const PARTS: usize = 8;
-/// Up to 2^32 ticks (86 s); later counts as that late.
+/// Enough buckets for 2^32 ticks (86 s). What is later counts as that late.
 const BUCKETS: usize = 30 * PARTS + PARTS;
 
-/// Counts of samples by how late they were.
+/// Counts samples by how late they were.
 #[derive(Clone, Debug)]
 pub struct Lateness {
     counts: [u64; BUCKETS],
@@ -26,7 +27,8 @@ impl Default for Lateness {
     }
 }
 
-/// Values below two octaves' parts have a bucket each, larger ones share the parts of theirs.
+/// The bucket of a value in ticks. Values below 16 have a bucket each; larger ones share the eight
+/// buckets of their octave.
 fn bucket(late: u32) -> usize {
     if late < PARTS as u32 {
         return late as usize;
@@ -46,7 +48,7 @@ fn upper(bucket: usize) -> u32 {
 }
 
 impl Lateness {
-    /// Takes a sample; one that came early is not late.
+    /// Takes a sample in ticks. One that came early, below zero, counts as not late.
     #[inline]
     pub fn record(&mut self, late: i64) {
         let late = late.clamp(0, i64::from(u32::MAX)) as u32;
@@ -65,7 +67,8 @@ impl Lateness {
         Ticks(self.max)
     }
 
-    /// What share `q` (0 to 1) of the samples did not exceed, to an eighth.
+    /// How late at most the share `q` (0 to 1) of the samples was. It is up to an eighth too high, as
+    /// it is the upper end of a bucket.
     pub fn quantile(&self, q: f64) -> Ticks {
         let wanted = (q * self.samples as f64).ceil() as u64;
         let mut seen = 0;
@@ -78,8 +81,8 @@ impl Lateness {
         self.max()
     }
 
-    /// The buckets that hold samples: largest value and count.
-    pub fn buckets(&self) -> impl Iterator<Item = (Ticks, u64)> + '_ {
+    /// The buckets that hold samples: the largest value that belongs to each, and how many it holds.
+    pub(crate) fn buckets(&self) -> impl Iterator<Item = (Ticks, u64)> + '_ {
         let filled = self.counts.iter().enumerate().filter(|(_, count)| **count > 0);
         filled.map(|(bucket, count)| (Ticks(upper(bucket)), *count))
     }

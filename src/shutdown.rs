@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Why the machine stops: the firmware's short text for the wire, a long one for the log.
+//! Why the machine stops: the firmware's short text for the wire, and a long one for the log.
 
 #![forbid(unsafe_code)]
 
@@ -112,30 +112,30 @@ pub mod reason {
     }
 }
 
-/// A stop of the machine: the reason, and for the log what it was about and what to do.
+/// A stop of the machine: the reason for the wire, and the detail for the log.
 ///
-/// The detail is made as the machine stops, when lateness no longer counts.
+/// Making the detail allocates. That is allowed, as it is made when the machine stops anyway.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shutdown {
     /// What goes over the wire.
     pub reason: ShutdownReason,
-    /// Cause, subject and remedy, for the log.
+    /// What the stop is about, its cause and the remedy, for the log.
     pub detail: Box<str>,
 }
 
 impl Shutdown {
-    /// A stop whose log line names the thing and the remedy.
+    /// A stop with this reason and detail.
     pub fn because(reason: ShutdownReason, detail: impl Into<Box<str>>) -> Shutdown {
         Shutdown { reason, detail: detail.into() }
     }
 
-    /// A stop for a command that can not be right where it came.
+    /// A stop for a command that no correct host would send at that point.
     #[cold]
     pub fn by_host(reason: ShutdownReason, what: impl fmt::Display) -> Shutdown {
         Shutdown::because(reason, format!("{what}: a fault of the host; FIRMWARE_RESTART, and report it with its log"))
     }
 
-    /// Says which object it was about.
+    /// The same stop, with the name of the object that it is about in front of its detail.
     #[cold]
     pub fn of(self, object: &str) -> Shutdown {
         Shutdown::because(self.reason, format!("{object}: {}", self.detail))

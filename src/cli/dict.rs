@@ -19,7 +19,7 @@ use super::{failed, print};
 
 /// Options of `pinion dict`.
 #[derive(Args, Clone, Debug)]
-pub struct DictArgs {
+pub(super) struct DictArgs {
     /// Write to FILE instead of stdout
     #[arg(short = 'o', value_name = "FILE")]
     output: Option<PathBuf>,
@@ -29,7 +29,7 @@ pub struct DictArgs {
 }
 
 /// Prints the dictionary as JSON.
-pub fn run(args: &DictArgs) -> ExitCode {
+pub(super) fn run(args: &DictArgs) -> ExitCode {
     match dictionary(args).and_then(|json| put(args, &json)) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion latency`: how late this machine wakes up, and what that is good for.
+//! `pinion latency`: how late this computer wakes up, and for which outputs that is good enough.
 
 #![forbid(unsafe_code)]
 
@@ -23,7 +23,7 @@ use super::{failed, print};
 
 /// Options of `pinion latency`.
 #[derive(Args, Clone, Debug)]
-pub struct LatencyArgs {
+pub(super) struct LatencyArgs {
     /// How long to measure, half of it idle and half under load
     #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(2..=3600))]
     seconds: u32,
@@ -32,21 +32,22 @@ pub struct LatencyArgs {
     svg: Option<PathBuf>,
 }
 
-/// Between two events: 1,000 a second, so that nearly every wait is a real sleep.
+/// The time between two events: 1,000 a second, so that the program really sleeps in between.
 const PERIOD: Ticks = Ticks::from_us(1000);
 
 /// What was measured in one half.
 struct Half {
     name: &'static str,
-    /// A sleep's end after the instant it was asked for.
+    /// How late sleeps ended.
     wakeup: Lateness,
-    /// An event after its instant, with the program's own waiting.
+    /// How late events were, with the program's own way of waiting: it wakes early and spins the rest.
     edge: Lateness,
+    /// How early the program woke at last.
     margin: Ticks,
 }
 
 /// Measures, prints and judges.
-pub fn run(args: &LatencyArgs) -> ExitCode {
+pub(super) fn run(args: &LatencyArgs) -> ExitCode {
     let span = Duration::from_secs(args.seconds.into()) / 2;
     let processors = match Processors::new(None) {
         Ok(processors) => processors,
@@ -90,7 +91,7 @@ fn measure(
     let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
     let end = clock.now().ticks() + (span.as_nanos() / 20) as u64;
     let mut half = Half { name, wakeup: Lateness::default(), edge: Lateness::default(), margin: Ticks(0) };
-    // A quarter with bare sleeps, the rest with the program's own waiting.
+    // Bare sleeps for a quarter of the time, then the program's own waiting.
     let bare_end = clock.now().ticks() + (span.as_nanos() / 80) as u64;
     let bare = MarginLimits { min: Ticks(0), max: Ticks(0) };
     run_for(&clock, new_waiter(clock.clone(), bare), bare_end, &mut half.wakeup);
@@ -112,7 +113,7 @@ fn run_for(clock: &Arc<dyn TimeSource>, mut waiter: Waiter, end: u64, lateness: 
     waiter.margin()
 }
 
-/// Keeps every processor and the memory busy as long as it lives.
+/// Threads that keep every processor and the memory busy, until this is dropped.
 struct Load {
     end: Arc<AtomicBool>,
     threads: Vec<thread::JoinHandle<()>>,
@@ -124,7 +125,7 @@ impl Load {
         let count = thread::available_parallelism().map_or(1, usize::from);
         let work = |end: Arc<AtomicBool>| {
             move || {
-                // Larger than a cache, so that the memory is loaded too; and a system call.
+                // Larger than a cache, so that the memory is busy, too.
                 let mut memory = vec![0u8; 8 << 20];
                 while !end.load(Ordering::Relaxed) {
                     for byte in memory.iter_mut().step_by(64) {
@@ -134,7 +135,7 @@ impl Load {
                 }
             }
         };
-        // A thread inherits the class of the one that starts it.
+        // The threads inherit the scheduling class of this one, which must not be SCHED_FIFO for them.
         let threads = (0..count).map(|_| {
             let work = work(end.clone());
             thread::spawn(move || {
@@ -155,7 +156,7 @@ impl Drop for Load {
     }
 }
 
-/// What the machine is good for.
+/// For which outputs the computer is good enough.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fitness {
     Steppers,
@@ -184,9 +185,9 @@ impl std::fmt::Display for Verdict {
     }
 }
 
-/// A step over a millisecond late stops the machine ("Stepper too far in past"), so a tenth
-/// of that must hold for 999 of 1000 edges and the worst must stay below it. A host refreshes
-/// a heater every 300 ms within 5 s: 50 ms do no harm.
+/// A step that is late by more than 1 ms stops the machine ("Stepper too far in past"). So for
+/// steppers no edge may be that late, and 999 of 1000 must stay below a tenth of it. A heater has to be
+/// set again within 5 s, and klippy does so every 300 ms: 50 ms do no harm there.
 const STEPPERS_P999_US: f64 = 100.0;
 const STEPPERS_MAX_US: f64 = 1000.0;
 const SLOW_MAX_US: f64 = 50_000.0;

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The log: one line an event on stderr.
+//! The log: one line on stderr for each event.
 //!
-//! While the program serves a host no thread waits for whoever reads stderr, be it a journal that
-//! stalls or a terminal stopped by Ctrl-S: lines go through a bounded queue to a thread that writes
-//! them. Without that thread (it can not be there before the guardian is forked, nor in the guardian)
-//! a line is written at once, or given up if nobody reads for a while.
+//! While the program serves a host, no thread may block because nobody reads stderr, such as a journal
+//! that stalls or a terminal that Ctrl-S has stopped. So lines go through a bounded queue to a thread
+//! that writes them. Before the guardian is forked there can be no thread, and the guardian has none.
+//! There, a line is written at once, and dropped if nobody reads it for a second.
 
 #![forbid(unsafe_code)]
 
@@ -21,13 +21,13 @@ use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::unistd::write;
 
-/// Lines that wait to be written; what does not fit is lost and counted.
+/// How many lines may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
-/// How long at most the program's end waits for a reader.
+/// How long the program waits at its end until the queue is written.
 const FAREWELL: Duration = Duration::from_secs(1);
-/// How long at most a line that is written at once waits for one.
+/// How long a line that is written at once may wait for somebody to read, in milliseconds.
 const PATIENCE_MS: u16 = 1000;
-/// So many bytes a pipe that is ready to be written to takes without blocking (`PIPE_BUF`).
+/// How many bytes a pipe takes without blocking once poll(2) says that it can be written (`PIPE_BUF`).
 const PIECE_BYTES: usize = 4096;
 
 static STDERR: Stderr = Stderr { style: OnceLock::new(), queue: Mutex::new(Queue::new()), changed: Condvar::new() };
@@ -35,18 +35,18 @@ static STDERR: Stderr = Stderr { style: OnceLock::new(), queue: Mutex::new(Queue
 struct Stderr {
     style: OnceLock<Style>,
     queue: Mutex<Queue>,
-    /// A line came, or the last one was written.
+    /// Told when a line comes, and when the queue has been written.
     changed: Condvar,
 }
 
 /// Lines on their way to the thread that writes them.
 struct Queue {
     lines: VecDeque<String>,
-    /// Lines that did not fit since this was last told.
+    /// How many lines were dropped since the log last said so.
     lost: u64,
     /// Whether there is a thread that writes.
     has_writer: bool,
-    /// Whether it has a line in hand.
+    /// Whether that thread is writing a line, which is no longer in the queue.
     is_writing: bool,
 }
 
@@ -55,7 +55,7 @@ impl Queue {
         Queue { lines: VecDeque::new(), lost: 0, has_writer: false, is_writing: false }
     }
 
-    /// Takes a line in, or counts it as lost.
+    /// Appends a line, or counts it as lost if there is no room.
     fn push(&mut self, line: String) {
         if self.lines.len() < LINES_MAX {
             self.lines.push_back(line);
@@ -64,7 +64,7 @@ impl Queue {
         }
     }
 
-    /// The next line to write. Lost lines are told of once those before them are written.
+    /// The next line to write. Once the queue is empty this is one that tells how many lines were lost.
     fn pop(&mut self, style: Style) -> Option<String> {
         self.lines.pop_front().or_else(|| {
             let lost = std::mem::take(&mut self.lost);
@@ -78,12 +78,13 @@ impl Queue {
     }
 }
 
-/// How lines look.
+/// The form of a line.
 #[derive(Clone, Copy, Debug)]
 enum Style {
-    /// With their levels' prefixes (sd-daemon(3)).
+    /// For the journal: with the level as a prefix (sd-daemon(3)).
     Journal,
-    /// For people, with the seconds since the kernel's start, which are the machine's own clock.
+    /// For people: with level and time, in seconds of CLOCK_MONOTONIC, by which the machine's own
+    /// clock runs, too.
     Plain,
 }
 
@@ -113,12 +114,13 @@ impl Stderr {
         *self.style.get_or_init(|| if for_journal() { Style::Journal } else { Style::Plain })
     }
 
-    /// The lock is held for moments only, and by nobody who writes. A panic does not spoil a queue.
+    /// Locks the queue. Nobody holds the lock while writing to stderr, so this does not wait for long.
+    /// A panic of another holder leaves the queue in order.
     fn queue(&self) -> MutexGuard<'_, Queue> {
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Writes lines as they come, for ever.
+    /// Writes lines as they come. Does not return.
     fn write_on(&self) {
         let mut queue = self.queue();
         loop {
@@ -162,8 +164,8 @@ impl Log for Stderr {
     fn flush(&self) {}
 }
 
-/// Writes a line to stderr. What nobody reads within `patience` is given up, and so is what can not
-/// be written: there is nobody to tell.
+/// Writes a line to stderr. The rest of it is dropped if nobody reads for as long as `patience`, or if
+/// it can not be written: there is no other place to report that.
 fn put(line: &str, patience: PollTimeout) {
     let stderr = io::stderr();
     let mut rest = line.as_bytes();
@@ -182,15 +184,15 @@ fn put(line: &str, patience: PollTimeout) {
     }
 }
 
-/// From now on what is logged comes out, if it is at `level` or graver.
+/// Turns the log on, for lines at `level` or graver.
 pub(super) fn start(level: LevelFilter) {
-    // Whoever has set another logger, as a test may, keeps it.
+    // This fails if another logger is set already, as a test may have done. That one stays.
     let _ = log::set_logger(&STDERR);
     log::set_max_level(level);
 }
 
-/// From now on no thread waits for whoever reads stderr. To be called once everything is forked: a
-/// thread is not.
+/// Starts the thread that writes, so that no other thread waits for whoever reads stderr. To be called
+/// after the guardian is forked, as a process with threads can not be.
 pub(super) fn detach() {
     match thread::Builder::new().name("log".into()).spawn(|| STDERR.write_on()) {
         Ok(_) => STDERR.queue().has_writer = true,
@@ -198,7 +200,7 @@ pub(super) fn detach() {
     }
 }
 
-/// Waits for what was logged to be read, for a second at most. What comes later is written at once.
+/// Waits for a second at most until the queue is written. Later lines are written at once.
 pub(super) fn finish() {
     let mut queue = STDERR.queue();
     if queue.has_writer {

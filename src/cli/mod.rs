@@ -22,7 +22,7 @@ pub mod sim;
 /// klipper_mcu (-r -w -I PATH) works unchanged.
 #[derive(Parser, Debug)]
 #[command(name = "pinion", version, max_term_width = 100, args_conflicts_with_subcommands = true)]
-pub struct Cli {
+pub(crate) struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
     #[command(flatten)]
@@ -69,19 +69,19 @@ pub fn main() -> ExitCode {
     status
 }
 
-/// From now on a panic, in whatever thread, is logged and ends the process: a machine of which
-/// only the link is left would look alive to its host, its outputs as they are.
+/// Has a panic in any thread logged and end the process. Otherwise only that thread would end: without
+/// its core, for one, the machine would still answer its host, with the outputs as they are.
 fn end_by_panic() {
     std::panic::set_hook(Box::new(|panic| {
-        // Now: after this line nothing runs that could bring the lines before it out.
+        // First, as the lines that wait in the log's queue are lost once the process has ended.
         logging::finish();
         log::error!("this is a bug in Pinion, which ends here: please report it with this line: {panic}");
         std::process::abort();
     }));
 }
 
-/// Prints on stdout. A reader that has seen enough (head) and closed it is no failure: what is left
-/// to do is done without it.
+/// Prints on stdout. A reader that has closed it, such as `head`, is no failure: the program goes on
+/// with what else it has to do.
 fn print(text: &str) -> Result<(), String> {
     let mut out = io::stdout().lock();
     match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
@@ -90,7 +90,7 @@ fn print(text: &str) -> Result<(), String> {
     }
 }
 
-/// Says on stderr why a subcommand failed.
+/// Logs why a subcommand failed, and returns its exit status.
 fn failed(error: impl std::fmt::Display) -> ExitCode {
     log::error!("{error}");
     ExitCode::FAILURE

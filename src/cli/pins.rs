@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion pins`: what this machine has, and how to write it in printer.cfg.
+//! `pinion pins`: the pins and buses of this computer, and how to write them in printer.cfg.
 
 #![forbid(unsafe_code)]
 
@@ -18,7 +18,7 @@ use super::{failed, print};
 
 /// Options of `pinion pins`.
 #[derive(Args, Clone, Debug, Default)]
-pub struct PinsArgs {
+pub(super) struct PinsArgs {
     /// Show only GPIO lines that nobody holds
     #[arg(long)]
     pub free: bool,
@@ -27,8 +27,8 @@ pub struct PinsArgs {
     pub filter: Option<String>,
 }
 
-/// Prints the list. It fails only if there is nothing to print.
-pub fn run(args: &PinsArgs) -> ExitCode {
+/// Prints the list.
+pub(super) fn run(args: &PinsArgs) -> ExitCode {
     let inventory = Inventory::scan();
     let list = list(&inventory, args, &|device, id| reading(&inventory, device, id));
     for problem in &inventory.problems {
@@ -50,7 +50,7 @@ fn nothing(args: &PinsArgs) -> String {
     }
 }
 
-/// What a channel reads now, for people.
+/// What a channel reads now, as text.
 fn reading(inventory: &Inventory, device: u32, id: &str) -> String {
     let Some(reader) = inventory.adc(device, id) else {
         return "gone".to_owned();
@@ -62,7 +62,7 @@ fn reading(inventory: &Inventory, device: u32, id: &str) -> String {
     }
 }
 
-/// The whole list. `reading` tells what a channel of a device reads.
+/// The whole list. `reading` returns what a channel (its driver's name) of a device (its number) reads.
 fn list(inventory: &Inventory, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> String) -> String {
     let names = Names::of(inventory);
     let mut sections: Vec<String> = inventory.chips.iter().map(|chip| chip_section(chip, &names, args)).collect();
@@ -75,7 +75,7 @@ fn list(inventory: &Inventory, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> S
     sections.join("\n")
 }
 
-/// Whether any of the names has the filter in it.
+/// Whether the filter of the command line is part of any of the names.
 fn wanted<'a>(args: &PinsArgs, names: impl IntoIterator<Item = &'a str>) -> bool {
     let Some(filter) = &args.filter else {
         return true;
@@ -84,7 +84,7 @@ fn wanted<'a>(args: &PinsArgs, names: impl IntoIterator<Item = &'a str>) -> bool
     names.into_iter().any(|name| name.to_lowercase().contains(&filter))
 }
 
-/// A heading, and rows whose cells stand below one another; nothing without rows.
+/// A heading and a table; nothing if there are no rows.
 fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> String {
     if rows.is_empty() {
         return String::new();
@@ -114,7 +114,7 @@ fn chip_section(chip: &Chip, names: &Names, args: &PinsArgs) -> String {
     let row = |(offset, line): (u32, &LineInfo)| {
         let number = line_number(chip.number, offset);
         let numbered = match number {
-            // The first chip's lines go by their offset.
+            // The lines of gpiochip0 have the short names.
             Some(number) if number == offset => format!("gpio{offset}"),
             _ => format!("{path}/gpio{offset}"),
         };
@@ -126,7 +126,8 @@ fn chip_section(chip: &Chip, names: &Names, args: &PinsArgs) -> String {
         if args.free && line.held || !wanted(args, known) {
             return None;
         }
-        // The most telling name and the numeric one; the heading shows the others' pattern.
+        // The first name, which is the line's own if it has one, and the numeric one. What the others
+        // look like is said in the heading.
         let write = match named.first() {
             Some(name) => format!("{name}, {numbered}"),
             None => numbered,
@@ -152,7 +153,7 @@ fn holder(line: &LineInfo) -> &str {
     }
 }
 
-/// At most 20 characters, so that a row stays within 100 columns.
+/// Cuts a text to 20 characters, so that a row fits into 100 columns.
 fn cut(text: &str) -> String {
     match text.char_indices().nth(20) {
         Some(_) => text.chars().take(19).chain(['…']).collect(),
@@ -171,7 +172,7 @@ fn adc_section(adc: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn
         {
             named.push(format!("analog{n}"));
         }
-        // iioN/voltageM is for those whose name does not tell them apart.
+        // The name iioN/voltageM is shown only for devices that share their other name.
         if named.len() > 1 {
             named.retain(|name| !name.starts_with(&format!("iio{}/", adc.number)));
         }

@@ -19,12 +19,12 @@ use crate::time::{Monotonic, TimeSource};
 
 use super::{end_by_panic, failed, logging};
 
-/// What -w feeds.
+/// The device of the watchdog that -w feeds.
 const WATCHDOG: &str = "/dev/watchdog";
 
 /// Options of `pinion run`, and of `pinion` alone.
 #[derive(Args, Clone, Debug)]
-pub struct RunArgs {
+pub(super) struct RunArgs {
     /// Where to put the symbolic link to the pty that the host opens
     #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
     symlink: PathBuf,
@@ -61,7 +61,7 @@ fn mode(text: &str) -> Result<u32, String> {
 
 /// Which board, as the command line names it.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub enum BoardName {
+pub(super) enum BoardName {
     /// This machine's pins.
     Linux,
     /// The simulated printer: the default one, or that of a TOML file.
@@ -82,8 +82,12 @@ impl FromStr for BoardName {
 }
 
 impl BoardName {
-    /// The board itself; `guard` copies its outputs.
-    pub fn open(&self, clock: Arc<dyn TimeSource>, guard: Option<Box<dyn Guard>>) -> Result<Box<dyn Board>, String> {
+    /// Opens the board. Its outputs are given to `guard`.
+    pub(super) fn open(
+        &self,
+        clock: Arc<dyn TimeSource>,
+        guard: Option<Box<dyn Guard>>,
+    ) -> Result<Box<dyn Board>, String> {
         match self {
             BoardName::Linux => Ok(Box::new(LinuxBoard::new(guard))),
             BoardName::Sim(file) => {
@@ -95,13 +99,13 @@ impl BoardName {
 }
 
 /// The description of a simulated printer: that of a file, or the default one.
-pub fn sim_config(file: Option<&Path>) -> Result<SimConfig, SimError> {
+pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, SimError> {
     file.map_or_else(|| Ok(SimConfig::default_printer()), SimConfig::load)
 }
 
 impl RunArgs {
     /// What the runtime needs to know.
-    pub fn options(&self) -> Options {
+    pub(super) fn options(&self) -> Options {
         Options {
             symlink: self.symlink.clone(),
             access: Access { mode: self.mode, group: self.group.clone() },
@@ -114,10 +118,10 @@ impl RunArgs {
 }
 
 /// Serves until SIGTERM, SIGINT or SIGHUP.
-pub fn run(args: &RunArgs) -> ExitCode {
+pub(super) fn run(args: &RunArgs) -> ExitCode {
     end_by_panic();
     let clock = Monotonic::start();
-    // Before anything that starts a thread. A simulated printer needs none.
+    // The guardian must be forked before any thread is started. A simulated printer needs none.
     let guardian = match args.board {
         BoardName::Linux => Some(Guardian::start(clock, args.realtime)),
         BoardName::Sim(_) => None,

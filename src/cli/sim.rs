@@ -30,7 +30,7 @@ use super::{failed, logging, print};
 
 /// Options of `pinion sim`.
 #[derive(Args, Clone, Debug)]
-pub struct SimArgs {
+pub(super) struct SimArgs {
     /// The printer's description; the built-in printer if left out
     #[arg(value_name = "FILE.toml")]
     file: Option<PathBuf>,
@@ -55,7 +55,7 @@ pub struct SimArgs {
 }
 
 /// Shows the printer at work and goes on serving it, or prints its configuration.
-pub fn run(args: &SimArgs) -> ExitCode {
+pub(super) fn run(args: &SimArgs) -> ExitCode {
     let config = match sim_config(args.file.as_deref()) {
         Ok(config) => config,
         Err(error) => return failed(error),
@@ -84,7 +84,7 @@ pub fn run(args: &SimArgs) -> ExitCode {
         watchdog: None,
     };
     let right = Arc::new(AtomicBool::new(false));
-    // A demonstration that is interrupted has not failed.
+    // Set once the program is asked to end: a demonstration that this interrupts has not failed.
     let ended = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
         if let Err(error) = signal_hook::flag::register(signal, ended.clone()) {
@@ -108,7 +108,7 @@ pub fn run(args: &SimArgs) -> ExitCode {
     }
 }
 
-/// Shows the printer at work, then asks the program to end or says how to go on.
+/// Shows the printer at work, then ends the program or says how to use it with klippy.
 fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended: &AtomicBool) {
     match demonstration(args, plan, probe) {
         Err(_) if ended.load(Ordering::SeqCst) => return,
@@ -116,7 +116,7 @@ fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended
         Err(error) => log::error!("the demonstration: {error}"),
     }
     if args.demo {
-        // Our own orderly end, as by Ctrl-C.
+        // SIGTERM to ourselves: the program ends in order, as by Ctrl-C.
         if let Err(error) = kill(getpid(), Signal::SIGTERM) {
             log::error!("ending: {error}");
         }
@@ -137,7 +137,7 @@ fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, 
     if let Some(path) = &args.picture {
         draw(path, &report)?;
     }
-    // The next host finds the machine as if it had just been started.
+    // Reset the machine, so that the next host finds it as if just started.
     client.reset().map_err(|error| error.to_string())?;
     for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
         tell(&format!(
@@ -154,8 +154,8 @@ fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, 
     Ok(all_right)
 }
 
-/// Prints how the demonstration goes. The printer is there for its host all the same when this can
-/// not be printed.
+/// Prints how the demonstration goes. Errors are ignored: the printer serves its host even if nothing
+/// can be printed.
 fn tell(text: &str) {
     if let Err(error) = print(text) {
         log::warn!("{error}");
@@ -169,7 +169,7 @@ fn draw(path: &Path, report: &Report) -> Result<(), String> {
     Ok(())
 }
 
-/// What the host client is told of the printer.
+/// The plan of a demonstration with this printer.
 fn plan(config: &SimConfig) -> Plan {
     Plan {
         axes: config.axes.iter().filter_map(axis).collect(),
@@ -181,7 +181,7 @@ fn pin(name: &PinName) -> NamedPin {
     NamedPin { name: name.name.clone(), invert: name.inverted }
 }
 
-/// An axis that can be homed.
+/// The plan for an axis; none if it can not be homed.
 fn axis(axis: &AxisConfig) -> Option<AxisPlan> {
     let travel_mm = axis.travel_mm?;
     Some(AxisPlan {
@@ -206,7 +206,7 @@ fn axis(axis: &AxisConfig) -> Option<AxisPlan> {
     })
 }
 
-/// A heater whose sensor the host client can read.
+/// The plan for a heater; none if the host client does not know its kind of thermistor.
 fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
     let pullup_ohms = heater.pullup_ohm;
     let thermistor = match (heater.points_celsius_ohm.as_slice(), heater.beta_k) {
@@ -221,7 +221,7 @@ fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
         thermistor,
         min_c: heater.min_celsius,
         max_c: heater.max_celsius,
-        // Half a minute's heating of the built-in bed.
+        // The built-in bed takes half a minute to get there.
         goal: Goal { target_c: heater.ambient_celsius + 20.0, tolerance_c: 1.0, hold_s: 3.0, timeout_s: 180.0 },
     })
 }

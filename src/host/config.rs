@@ -94,7 +94,8 @@ impl Client {
     /// Asks for the state of the configuration.
     pub fn status(&mut self) -> Result<Status, Error> {
         let config = match self.query("get_config", &[], "config", None) {
-            // A shutdown is reported here only once. A stopped machine answers get_config, too.
+            // The query fails if the report of a shutdown comes in during it. A stopped machine answers
+            // get_config all the same, so this asks once more.
             Err(Error::Shutdown { .. }) => self.query("get_config", &[], "config", None)?,
             other => other?,
         };

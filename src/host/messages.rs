@@ -233,12 +233,12 @@ impl Messages {
     }
 
     /// Whether there is such a command.
-    pub fn has_command(&self, name: &str) -> bool {
+    pub(super) fn has_command(&self, name: &str) -> bool {
         self.commands.contains_key(name)
     }
 
     /// Whether there is such a command with such a parameter.
-    pub fn has_parameter(&self, command: &str, parameter: &str) -> bool {
+    pub(super) fn has_parameter(&self, command: &str, parameter: &str) -> bool {
         self.commands.get(command).is_some_and(|m| m.parameters.iter().any(|p| p.name == parameter))
     }
 

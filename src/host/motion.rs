@@ -99,7 +99,7 @@ impl Run {
     }
 
     /// The interval before the last step, in ticks.
-    pub fn last_interval(&self) -> u32 {
+    fn last_interval(&self) -> u32 {
         let last = i64::from(self.interval) + i64::from(self.add) * (i64::from(self.count) - 1);
         last.max(0) as u32
     }

@@ -130,7 +130,7 @@ impl Port {
     }
 
     /// The next intact block among the bytes read so far.
-    pub fn next_block(&mut self) -> Option<(Sequence, Vec<u8>)> {
+    fn next_block(&mut self) -> Option<(Sequence, Vec<u8>)> {
         loop {
             let (taken, found) = self.resync.next(&self.input);
             let block = match found {
@@ -322,7 +322,7 @@ impl BlockLink {
 
     /// Limits the bytes that are sent without being acknowledged to what the other end can buffer: its
     /// constant `RECEIVE_WINDOW`.
-    pub fn set_window_bytes(&mut self, bytes: usize) {
+    pub(super) fn set_window_bytes(&mut self, bytes: usize) {
         self.window_bytes = bytes.max(BLOCK_MAX);
     }
 
@@ -331,7 +331,27 @@ impl BlockLink {
     /// Fails if the payload does not fit a block, the other end closes, or acknowledges
     /// nothing for [`SILENCE`].
     pub fn send(&mut self, payload: &[u8]) -> Result<(), Error> {
-        self.enqueue(payload)?;
+        if payload.len() > PAYLOAD_MAX {
+            return Err(Error::Message {
+                message: format!("a payload of {} bytes", payload.len()),
+                why: format!("a block takes {PAYLOAD_MAX}"),
+            });
+        }
+        self.wait_while(|link| {
+            link.sent.len() >= WINDOW || (!link.sent.is_empty() && link.sent_bytes + BLOCK_MAX > link.window_bytes)
+        })?;
+        let now = Instant::now();
+        if self.sent.is_empty() {
+            self.retransmit_at = now + self.rto;
+            self.heard_at = now;
+        }
+        self.port.queue_block(payload, self.sequence(self.send));
+        self.rtt_sample.get_or_insert(self.send);
+        self.send += 1;
+        self.sent_bytes += payload.len() + BLOCK_MIN;
+        self.traffic.blocks_sent += 1;
+        self.sent.push_back(Sent { payload: payload.to_vec(), at: now });
+        self.settled = None;
         self.port.write_some()
     }
 
@@ -355,7 +375,7 @@ impl BlockLink {
 
     /// The next of the payloads that come in before all that was sent is acknowledged, or together with
     /// that. Waits for one; `None` once there are no more.
-    pub fn receive_unsettled(&mut self) -> Result<Option<Received>, Error> {
+    pub(super) fn receive_unsettled(&mut self) -> Result<Option<Received>, Error> {
         self.wait_while(|link| link.received.is_empty() && link.settled.is_none())?;
         match self.settled {
             Some(before) if self.taken >= before => Ok(None),
@@ -367,17 +387,6 @@ impl BlockLink {
         let received = self.received.pop_front();
         self.taken += u64::from(received.is_some());
         received
-    }
-
-    /// Sends one payload `count` times as fast as the window allows, and returns how long it took until
-    /// all were acknowledged. Payloads that come in during that time are kept.
-    pub fn flood(&mut self, payload: &[u8], count: u64) -> Result<Duration, Error> {
-        let start = Instant::now();
-        for _ in 0..count {
-            self.enqueue(payload)?;
-        }
-        self.settle()?;
-        Ok(start.elapsed())
     }
 
     /// How many blocks are sent and not acknowledged.
@@ -393,31 +402,6 @@ impl BlockLink {
     /// The port beneath, to send bytes that a link would never send.
     pub fn port(&mut self) -> &mut Port {
         &mut self.port
-    }
-
-    fn enqueue(&mut self, payload: &[u8]) -> Result<(), Error> {
-        if payload.len() > PAYLOAD_MAX {
-            return Err(Error::Message {
-                message: format!("a payload of {} bytes", payload.len()),
-                why: format!("a block takes {PAYLOAD_MAX}"),
-            });
-        }
-        self.wait_while(|link| {
-            link.sent.len() >= WINDOW || (!link.sent.is_empty() && link.sent_bytes + BLOCK_MAX > link.window_bytes)
-        })?;
-        let now = Instant::now();
-        if self.sent.is_empty() {
-            self.retransmit_at = now + self.rto;
-            self.heard_at = now;
-        }
-        self.port.queue_block(payload, self.sequence(self.send));
-        self.rtt_sample.get_or_insert(self.send);
-        self.send += 1;
-        self.sent_bytes += payload.len() + BLOCK_MIN;
-        self.traffic.blocks_sent += 1;
-        self.sent.push_back(Sent { payload: payload.to_vec(), at: now });
-        self.settled = None;
-        Ok(())
     }
 
     fn wait_while(&mut self, busy: impl Fn(&BlockLink) -> bool) -> Result<(), Error> {
@@ -620,9 +604,12 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_is_counted_to_the_last_acknowledgement() {
+    fn settling_waits_for_the_last_acknowledgement() {
         let (peer, mut link) = Peer::start(0, &[], |_| Vec::new());
-        link.flood(b"nop", 5000).unwrap();
+        for _ in 0..5000 {
+            link.send(b"nop").unwrap();
+        }
+        link.settle().unwrap();
         assert_eq!(link.unacknowledged(), 0);
         drop(link);
         assert_eq!(peer.join().unwrap().len(), 5000);

@@ -79,7 +79,7 @@ response! {
 response! {
     /// The present instant as 64 bits.
     "uptime high=%u clock=%u"
-    pub struct Uptime { high: u32, clock: Clock }
+    pub(super) struct Uptime { high: u32, clock: Clock }
 }
 response! {
     /// Whether the machine is configured, and the check sum that the host gave its configuration.
@@ -94,12 +94,12 @@ response! {
 response! {
     /// The machine stops.
     "shutdown clock=%u static_string_id=%hu"
-    pub struct ShutdownReport { clock: Clock, static_string_id: u16 }
+    pub(super) struct ShutdownReport { clock: Clock, static_string_id: u16 }
 }
 response! {
     /// A command was not run, as the machine is stopped.
     "is_shutdown static_string_id=%hu"
-    pub struct IsShutdown { static_string_id: u16 }
+    pub(super) struct IsShutdown { static_string_id: u16 }
 }
 response! {
     /// How busy the core was.
@@ -109,7 +109,7 @@ response! {
 response! {
     /// The answer to `debug_ping`.
     "pong data=%*s"
-    pub struct Pong<'a> { data: &'a [u8] }
+    pub(super) struct Pong<'a> { data: &'a [u8] }
 }
 
 /// The answer to `identify`: `count` bytes of the compressed dictionary from `offset` on, or as many
@@ -164,7 +164,7 @@ const CONFIG_RESET: Command = command!("config_reset", |mcu| mcu.reset()).allowe
 pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(emergency())).allowed_in_shutdown();
 
 /// The stop that `emergency_stop` asks for.
-pub fn emergency() -> Shutdown {
+pub(crate) fn emergency() -> Shutdown {
     Shutdown::because(
         reason::COMMAND_REQUEST,
         "the host asked for it (M112, or its log says why): FIRMWARE_RESTART once the cause is dealt with",

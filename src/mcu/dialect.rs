@@ -117,7 +117,7 @@ impl Dialect {
     }
 
     /// The id of the response of type `R`.
-    pub fn response_id<R: super::Response>(&self) -> u32 {
+    pub(crate) fn response_id<R: super::Response>(&self) -> u32 {
         self.response_ids[R::INDEX]
     }
 

@@ -6,7 +6,7 @@
 use crate::time::Ticks;
 
 /// What squares of ticks are divided by (`STATS_SUMSQ_BASE`).
-pub const SUMSQ_BASE: u32 = 256;
+pub(super) const SUMSQ_BASE: u32 = 256;
 
 /// The spans in which the core was busy since the last `stats` response: how many, the sum of their
 /// ticks, and the sum of the squares of these over [`SUMSQ_BASE`].

@@ -134,7 +134,7 @@ fn format(channel: &industrial_io::Channel) -> Option<Format> {
 }
 
 /// An open channel.
-pub struct ChannelReader {
+pub(crate) struct ChannelReader {
     device: industrial_io::Device,
     index: usize,
     format: Option<Format>,
@@ -157,7 +157,7 @@ impl ChannelReader {
     }
 
     /// Its resolution, where the driver tells it.
-    pub fn format(&self) -> Option<Format> {
+    pub(super) fn format(&self) -> Option<Format> {
         self.format
     }
 
@@ -166,7 +166,7 @@ impl ChannelReader {
     /// # Errors
     ///
     /// libiio's own.
-    pub fn read_raw(&self) -> Result<i64, industrial_io::Error> {
+    pub(crate) fn read_raw(&self) -> Result<i64, industrial_io::Error> {
         self.device.get_channel(self.index)?.attr_read_int("raw")
     }
 
@@ -175,7 +175,7 @@ impl ChannelReader {
     /// # Errors
     ///
     /// "Error on analog read".
-    pub fn read_counts(&self) -> Result<u16, Shutdown> {
+    pub(crate) fn read_counts(&self) -> Result<u16, Shutdown> {
         match self.read_raw() {
             Ok(raw) => Ok(self.format.unwrap_or(ASSUMED).scale(raw)),
             Err(error) => Err(Shutdown::because(reason::ADC_READ, read_failure(&self.subject, &error.to_string()))),

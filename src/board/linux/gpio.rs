@@ -73,7 +73,7 @@ pub struct LineInfo {
 ///
 /// A node that is a link to another chip's (`/dev/gpiochip4` on a Raspberry Pi 5) is left out, as
 /// its lines are those of the other chip. Pins with its number work all the same.
-pub fn scan(dev: &Path) -> (Vec<Chip>, Vec<String>) {
+pub(super) fn scan(dev: &Path) -> (Vec<Chip>, Vec<String>) {
     let mut chips = Vec::new();
     let mut problems = Vec::new();
     for number in nodes(dev) {
@@ -125,13 +125,13 @@ fn look_at(line: &gpio_cdev::Line) -> LineInfo {
 }
 
 /// The number of the chip that `/dev/gpiochip<number>` leads to, if it is a link to another.
-pub fn number_behind(dev: &Path, number: u32) -> Option<u32> {
+pub(super) fn number_behind(dev: &Path, number: u32) -> Option<u32> {
     let target = fs::read_link(node(dev, number)).ok()?;
     target.file_name()?.to_str()?.strip_prefix("gpiochip")?.parse().ok()
 }
 
 /// A line of an open chip, not yet requested.
-pub struct Handle {
+pub(super) struct Handle {
     line: gpio_cdev::Line,
     subject: Subject,
 }
@@ -142,7 +142,7 @@ pub struct Handle {
 ///
 /// "GPIO chip device not found", "Unable to open GPIO chip device"; `refused` if the chip has no
 /// such line.
-pub fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Result<Handle, Shutdown> {
+pub(super) fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Result<Handle, Shutdown> {
     let path = node(dev, number);
     let mut chip = gpio_cdev::Chip::new(&path).map_err(|error| match errno(&error) {
         libc::ENOENT => Shutdown::because(reason::CHIP_MISSING, missing(&path, &scan(dev).0)),
@@ -157,12 +157,12 @@ pub fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Re
 
 impl Handle {
     /// The kernel's name for the chip, such as `gpiochip0`, even if a link to it was opened.
-    pub fn chip(&self) -> &str {
+    pub(super) fn chip(&self) -> &str {
         &self.subject.chip
     }
 
     /// The chip's label, such as `pinctrl-bcm2835`.
-    pub fn label(&self) -> &str {
+    pub(super) fn label(&self) -> &str {
         &self.subject.label
     }
 

@@ -62,7 +62,7 @@ impl Inventory {
     }
 
     /// Opens the channel that the driver of `iio:device<device>` calls `id`, if it is there.
-    pub fn adc(&self, device: u32, id: &str) -> Option<adc::ChannelReader> {
+    pub(crate) fn adc(&self, device: u32, id: &str) -> Option<adc::ChannelReader> {
         adc::ChannelReader::open(self.context.as_ref()?, device, id)
     }
 

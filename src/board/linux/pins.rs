@@ -45,7 +45,7 @@ const FURTHER_DEVICE_CHANNELS: u32 = 1 << 8;
 
 /// What a pin's number stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Target {
+pub(crate) enum Target {
     /// A line of `/dev/gpiochip<chip>`.
     Line {
         /// The chip's number.
@@ -75,7 +75,7 @@ pub enum Target {
 
 impl Target {
     /// What `pin` stands for.
-    pub fn of(pin: Pin) -> Target {
+    pub(crate) fn of(pin: Pin) -> Target {
         let within = |base: u32, count: u32| pin.0.checked_sub(base).filter(|at| *at < count);
         if let Some(at) = within(0, CHIPS * CHIP_LINES) {
             Target::Line { chip: at / CHIP_LINES, offset: at % CHIP_LINES }
@@ -108,7 +108,7 @@ impl fmt::Display for Target {
 }
 
 /// The number of a line, if it has one.
-pub fn line_number(chip: u32, offset: u32) -> Option<u32> {
+pub(crate) fn line_number(chip: u32, offset: u32) -> Option<u32> {
     if chip < CHIPS && offset < CHIP_LINES {
         Some(chip * CHIP_LINES + offset)
     } else if chip < FURTHER_CHIPS && offset < FURTHER_CHIP_LINES {
@@ -119,7 +119,7 @@ pub fn line_number(chip: u32, offset: u32) -> Option<u32> {
 }
 
 /// The number of an ADC channel, if it has one; `id` is the driver's, such as `voltage3`.
-pub fn channel_number(device: u32, position: usize, id: &str) -> Option<u32> {
+pub(crate) fn channel_number(device: u32, position: usize, id: &str) -> Option<u32> {
     let plain =
         id.strip_prefix("voltage").and_then(|n| n.parse::<u32>().ok()).filter(|n| device == 0 && *n < ANALOG_CHANNELS);
     let position = u32::try_from(position).ok()?;
@@ -134,11 +134,11 @@ pub fn channel_number(device: u32, position: usize, id: &str) -> Option<u32> {
 
 /// The names that this machine has beyond those of the C program, each with its number.
 #[derive(Debug, Default)]
-pub struct Names(Vec<(String, u32)>);
+pub(crate) struct Names(Vec<(String, u32)>);
 
 impl Names {
     /// The names of what was found.
-    pub fn of(inventory: &Inventory) -> Names {
+    pub(crate) fn of(inventory: &Inventory) -> Names {
         let mut numeric = Vec::new();
         let mut own = Vec::new();
         for chip in &inventory.chips {
@@ -173,7 +173,7 @@ impl Names {
     }
 
     /// The names of one pin: the line's own name first, then those with the chip in front.
-    pub fn of_pin(&self, number: u32) -> Vec<&str> {
+    pub(crate) fn of_pin(&self, number: u32) -> Vec<&str> {
         let mut names: Vec<&str> = self.0.iter().filter(|(_, n)| *n == number).map(|(name, _)| name.as_str()).collect();
         // A line's own name has no slash, so it sorts first.
         names.sort_by_key(|name| name.contains('/'));
@@ -181,7 +181,7 @@ impl Names {
     }
 
     /// The dictionary's enumeration `pin`: the C program's ranges and these names.
-    pub fn ranges(&self) -> Vec<Range> {
+    pub(super) fn ranges(&self) -> Vec<Range> {
         let range = |name: String, first, count| Range { name, first, count };
         let mut ranges = vec![range("gpio0".into(), 0, CHIP_LINES)];
         for chip in 0..CHIPS {

@@ -56,7 +56,7 @@ impl fmt::Display for Node {
 }
 
 /// The nodes in `dev`, in order.
-pub fn scan(dev: &Path) -> Vec<Node> {
+pub(super) fn scan(dev: &Path) -> Vec<Node> {
     let mut nodes: Vec<Node> = fs::read_dir(dev)
         .into_iter()
         .flatten()
@@ -68,7 +68,7 @@ pub fn scan(dev: &Path) -> Vec<Node> {
 }
 
 /// The dictionary's enumeration `spi_bus`: the C program's, and the nodes beyond it.
-pub fn ranges(nodes: &[Node]) -> Vec<Range> {
+pub(super) fn ranges(nodes: &[Node]) -> Vec<Range> {
     let c_program = (0..BUSES).map(|bus| Range { name: format!("spidev{bus}.0"), first: bus << 8, count: BUS_NODES });
     let further = nodes
         .iter()
@@ -78,7 +78,7 @@ pub fn ranges(nodes: &[Node]) -> Vec<Range> {
 }
 
 /// An open SPI device.
-pub struct Spi {
+pub(super) struct Spi {
     device: SpidevDevice,
     node: Node,
     mode: u8,
@@ -96,7 +96,7 @@ impl Spi {
     /// # Errors
     ///
     /// "Unable to open spi device", "Unable to set SPI speed", "Unable to set SPI mode".
-    pub fn open(
+    pub(super) fn open(
         dev: &Path,
         node: Node,
         mode: u8,

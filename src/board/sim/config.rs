@@ -12,7 +12,7 @@ use serde::Deserialize;
 
 use super::thermistor::{KELVIN, NoThermistor, Thermistor};
 
-/// What is wrong with a description, in one line: file, key, cause, remedy.
+/// What is wrong with a description: one line with file, key, cause and remedy.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct SimError(String);
 
@@ -24,7 +24,7 @@ impl fmt::Display for SimError {
 
 impl std::error::Error for SimError {}
 
-/// A pin as the description names it: `x_step`, or `!x_step` with its polarity turned around.
+/// A pin as the description names it: `x_step`, or `!x_step` for an inverted one.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 pub struct PinName {
@@ -59,7 +59,7 @@ impl fmt::Display for PinName {
     }
 }
 
-/// Whether klippy takes `text` for a pin and for the name of a section.
+/// Whether klippy takes `text` as the name of a pin or of a section.
 fn is_word(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || "_-./".contains(c))
 }
@@ -68,10 +68,10 @@ fn is_word(text: &str) -> bool {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SimConfig {
-    /// Start value of the sensors' noise: the same seed gives the same readings.
+    /// Seed of the sensors' noise: the same seed gives the same readings.
     #[serde(default)]
     pub seed: u64,
-    /// What printer.cfg allows the motion.
+    /// The limits of the motion in printer.cfg.
     #[serde(default)]
     pub limits: Limits,
     /// The axes; `x`, `y`, `z` and `extruder` are those of a cartesian printer.
@@ -100,7 +100,7 @@ pub struct SimConfig {
     pub chips: Vec<ChipConfig>,
 }
 
-/// What printer.cfg allows the motion; the simulated axes follow at any speed.
+/// The limits of the motion in printer.cfg. The simulated axes themselves follow at any speed.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct Limits {
@@ -141,31 +141,31 @@ pub enum End {
 pub struct AxisConfig {
     /// Such as `x`.
     pub name: String,
-    /// Each rising edge is a step.
+    /// The step pin. Each rising edge is a step.
     pub step_pin: PinName,
-    /// High counts up.
+    /// The direction pin. While it is high, steps count up.
     pub dir_pin: PinName,
-    /// The motor is held, and moves, while this is high; without it, always.
+    /// The motor is held, and steps, only while this is high. Without this pin it always is.
     pub enable_pin: Option<PinName>,
     /// Whether the falling edge of the step pin is a step too.
     #[serde(default)]
     pub step_both_edges: bool,
     /// Steps in a millimetre.
     pub steps_per_mm: f64,
-    /// Steps in a full step of a motor with 200 of them, for printer.cfg.
+    /// Microsteps in a full step, for printer.cfg. The motor has 200 full steps in a turn.
     #[serde(default = "default_microsteps")]
     pub microsteps: u32,
-    /// The axis goes from 0 to here; without it, on for ever.
+    /// The axis goes from 0 to here. Without this it has no end.
     pub travel_mm: Option<f64>,
-    /// How far beyond its travel the axis moves before it hits something and loses steps.
+    /// How far beyond either end of its travel the axis goes before it hits something and loses steps.
     #[serde(default = "default_overtravel_mm")]
     pub overtravel_mm: f64,
-    /// Where the axis stands at first.
+    /// The position of the axis at first.
     #[serde(default)]
     pub start_mm: f64,
-    /// High at and beyond the endstop's end of the travel.
+    /// The endstop's pin. It is high while the axis is at that end of its travel or beyond.
     pub endstop_pin: Option<PinName>,
-    /// The endstop's end.
+    /// The end of the travel at which the endstop sits.
     #[serde(default = "default_end")]
     pub endstop_at: End,
     /// Speed of homing, for printer.cfg.
@@ -205,18 +205,18 @@ pub struct HeaterConfig {
     pub heat_capacity_j_per_k: f64,
     /// Heat lost to the surroundings for each kelvin above them.
     pub loss_w_per_k: f64,
-    /// Time constant with which the sensor follows the heated mass; 0 for at once.
+    /// Time constant with which the sensor follows the heated mass; 0 means at once.
     #[serde(default)]
     pub sensor_lag_s: f64,
     /// Temperature of the surroundings.
     #[serde(default = "default_ambient_celsius")]
     pub ambient_celsius: f64,
-    /// Temperature at first; the surroundings' if it is not told.
+    /// Temperature at first. Without this it is that of the surroundings.
     pub start_celsius: Option<f64>,
-    /// Below this the host stops, for printer.cfg.
+    /// `min_temp` in printer.cfg: below this the host stops.
     #[serde(default)]
     pub min_celsius: f64,
-    /// Above this the host stops, for printer.cfg.
+    /// `max_temp` in printer.cfg: above this the host stops.
     pub max_celsius: f64,
     /// Standard deviation of a reading, in counts of the ADC.
     #[serde(default)]
@@ -246,9 +246,9 @@ pub struct FanConfig {
     pub name: String,
     /// Power is on while this is high.
     pub pin: PinName,
-    /// If there is one, it must be high too.
+    /// A second pin that must be high, too, for the fan to have power.
     pub enable_pin: Option<PinName>,
-    /// High for the first half of each pulse.
+    /// An input that is high for the first half of each pulse of the tachometer.
     pub tachometer_pin: Option<PinName>,
     /// Pulses of the tachometer in a revolution.
     #[serde(default = "default_pulses_per_revolution")]
@@ -302,12 +302,12 @@ pub struct SpiBusConfig {
     /// A file that gets a line for each transfer: the chips that were selected, the bytes both
     /// ways, the levels of `trace_pins` at each byte.
     pub trace_file: Option<PathBuf>,
-    /// Pins of lights and other outputs.
+    /// The pins of `[[led]]` and `[[output]]` whose levels are to be in the trace.
     #[serde(default)]
     pub trace_pins: Vec<String>,
 }
 
-/// A chip on a bus. What it is stands in its `kind`.
+/// A chip on a bus. In the TOML its key `kind` tells which of these it is.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
 pub enum ChipConfig {
@@ -329,10 +329,10 @@ pub enum ChipConfig {
     },
 }
 
-/// The default printer's description; a test holds it to be right.
+/// The default printer's description. A test makes sure that it is valid.
 const DEFAULT: &str = include_str!("default.toml");
 
-/// What a key may be set to.
+/// The range that a number must be in.
 enum Bound {
     Any,
     NotNegative,
@@ -408,7 +408,7 @@ impl SimConfig {
         self.chips.iter().try_for_each(|chip| chip.validate(self, &mut pins))
     }
 
-    /// Lights and other outputs.
+    /// All lights and other outputs.
     pub(super) fn switched(&self) -> impl Iterator<Item = &OutputConfig> {
         self.leds.iter().chain(&self.outputs)
     }
@@ -543,7 +543,7 @@ impl ChipConfig {
         Ok(())
     }
 
-    /// What it is, for a person.
+    /// The chip's name for people.
     pub(super) fn name(&self) -> String {
         match self {
             ChipConfig::Loopback { .. } => "loopback".to_owned(),
@@ -685,10 +685,10 @@ fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), SimErr
     Err(fault(whose, key, cause, remedy))
 }
 
-/// Numbers beyond this describe no printer, and would overflow a position or a time.
+/// Larger numbers describe no printer, and could overflow a position or a time.
 const MAX_NUMBER: f64 = 1e9;
 
-/// Whether a number is within its bound.
+/// Checks that a number is in its range.
 fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimError> {
     let fault = match bound {
         _ if !(-MAX_NUMBER..=MAX_NUMBER).contains(&value) => "is out of range",
@@ -699,12 +699,13 @@ fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimErro
     wrong(whose, key, &format!("{value} {fault}"), "set a value of the printer's")
 }
 
-/// The line of a byte of the text, and the key whose value is there.
+/// The number of the line that has the byte `at` of the text, and the key whose value is there.
 fn place(text: &str, at: usize) -> (usize, Option<&str>) {
     let before = text.get(..at).unwrap_or(text);
     let line = before.matches('\n').count() + 1;
     let key = before.rsplit_once('=').and_then(|(keys, value)| {
-        // On a later line, the value has to be a list that goes on.
+        // If lines lie between the key and that byte, it belongs to the value only if that is a list
+        // which is not closed yet.
         let open = value.matches('[').count() > value.matches(']').count();
         let goes_on = value.trim_start().starts_with('[') && open;
         if value.contains('\n') && !goes_on {

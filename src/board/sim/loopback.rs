@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A wire from the bus's output to its input: every byte comes back.
+//! A wire from the bus's output (MOSI) to its input (MISO): every byte comes back.
 
 #![forbid(unsafe_code)]
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The printer.cfg with which a klippy finds on the board what the description put there.
+//! The printer.cfg that matches a simulated printer.
 
 #![forbid(unsafe_code)]
 
@@ -82,7 +82,7 @@ impl<'a> Layout<'a> {
 struct Sections(String);
 
 impl Sections {
-    /// Adds a line. A String takes everything that is written to it.
+    /// Adds a line. Writing to a String does not fail.
     fn line(&mut self, line: fmt::Arguments<'_>) {
         let written = self.0.write_fmt(format_args!("{line}\n"));
         debug_assert!(written.is_ok());
@@ -147,8 +147,8 @@ impl Sections {
         self.key("dir_pin", &axis.dir_pin);
         self.key_if("enable_pin", axis.enable_pin.as_ref());
         self.key("microsteps", axis.microsteps);
-        // klippy steps on both edges for a driver that it sets up itself only; elsewhere it makes
-        // a pulse, which is two steps of such a motor.
+        // klippy steps on both edges only for a driver that it sets up itself. For any other it makes a
+        // pulse, which has two edges and so is two steps of this motor.
         let pulses_per_mm = axis.steps_per_mm / if axis.step_both_edges { 2.0 } else { 1.0 };
         let rotation_distance = FULL_STEPS * f64::from(axis.microsteps) / pulses_per_mm;
         self.key("rotation_distance", rotation_distance);

@@ -119,19 +119,22 @@ mod tests {
         1.0 / inv_t - KELVIN
     }
 
-    /// A hot end's thermistor by three points, a bed's by one point and beta.
-    const SENSORS: [(&[(f64, f64)], Option<f64>); 2] =
-        [(&[(25.0, 100_000.0), (150.0, 1641.9), (250.0, 226.15)], None), (&[(25.0, 100_000.0)], Some(3950.0))];
+    /// A hot end's thermistor, by three points.
+    const HOT_END: &[(f64, f64)] = &[(25.0, 100_000.0), (150.0, 1641.9), (250.0, 226.15)];
+    /// A bed's thermistor, by one point and this beta.
+    const BED: &[(f64, f64)] = &[(25.0, 100_000.0)];
+    const BED_BETA_K: f64 = 3950.0;
     const PULLUP_OHM: f64 = 4700.0;
 
     fn thermistors() -> [Thermistor; 2] {
-        SENSORS.map(|(points, beta_k)| Thermistor::new(points, beta_k, PULLUP_OHM).unwrap())
+        [(HOT_END, None), (BED, Some(BED_BETA_K))]
+            .map(|(points, beta_k)| Thermistor::new(points, beta_k, PULLUP_OHM).unwrap())
     }
 
     #[test]
     fn the_points_lie_on_the_curve() {
-        for ((points, _), thermistor) in SENSORS.iter().zip(thermistors()) {
-            for (celsius, ohm) in *points {
+        for (points, thermistor) in [HOT_END, BED].into_iter().zip(thermistors()) {
+            for (celsius, ohm) in points {
                 let expected = ohm / (PULLUP_OHM + ohm);
                 assert!((thermistor.fraction(*celsius) - expected).abs() < 1e-9);
             }
