@@ -10,6 +10,8 @@ use crate::time::Ticks;
 
 pub mod linux;
 pub mod sim;
+pub mod soft_i2c;
+pub mod soft_spi;
 
 /// A pin's number on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -68,6 +70,9 @@ pub enum Direction {
     },
     /// It is read; a resistor that can not be had is an error.
     Input(Bias),
+    /// It pulls low or lets go, and is read in either case: a wire that several drive. It begins let
+    /// go, and has a pull-up where the chip is not known to have none. The guardian has no part in it.
+    OpenDrain,
 }
 
 /// A claimed GPIO line. Whoever shares it, core or worker, has a handle of the same line.
@@ -75,7 +80,8 @@ pub enum Direction {
 /// Calls must not allocate or log. They must not block either, unless the board said that the
 /// line [sleeps](ClaimedLine::sleeps_on): then only a worker calls them.
 pub trait Line: Send + Sync {
-    /// Drives an output. On a line that was made an input since, it does nothing.
+    /// Drives an output; lets an open drain go (high) or pulls it low. On a line that was made an
+    /// input since, it does nothing.
     fn write(&self, level: bool) -> Result<(), Shutdown>;
 
     /// The line's level.
@@ -134,6 +140,9 @@ pub struct BusError {
     pub detail: Box<str>,
 }
 
+/// How often a register is asked for before that counts as failed.
+const READ_TRIES: u32 = 3;
+
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
 ///
 /// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
@@ -157,6 +166,26 @@ pub trait BusDevice: Send {
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         let _ = (write, read);
         Err(BusError::other_kind("an I2C transfer", "an SPI device"))
+    }
+
+    /// Reads from a register on, or with none from wherever the chip stands (I2C). What is not
+    /// acknowledged is asked for up to [`READ_TRIES`] times: a chip may be busy, and a spike on a long
+    /// cable is no reason to stop a print.
+    ///
+    /// For registers that reading or naming does not change. A command, or a FIFO, is
+    /// [`BusDevice::write_read`]'s: asked for twice it might be carried out twice.
+    ///
+    /// # Errors
+    ///
+    /// What the bus said at last; a timeout at once, as it took long enough.
+    fn read_register(&mut self, register: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        let mut tries = 1;
+        loop {
+            match self.write_read(register, read) {
+                Err(error) if error.status != BusStatus::Timeout && tries < READ_TRIES => tries += 1,
+                done => return done,
+            }
+        }
     }
 }
 

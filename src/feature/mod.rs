@@ -12,6 +12,7 @@ use crate::wire::format::same;
 mod analog_in;
 mod digital_out;
 mod endstop;
+mod i2c;
 mod pwm_out;
 mod spi;
 mod stepper;
@@ -20,13 +21,14 @@ mod trsync;
 /// Every feature. What is not listed is not in the dictionary.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
-    digital_out::FEATURE,
-    pwm_out::FEATURE,
-    stepper::FEATURE,
-    endstop::FEATURE,
-    trsync::FEATURE,
     analog_in::FEATURE,
+    digital_out::FEATURE,
+    endstop::FEATURE,
+    i2c::FEATURE,
+    pwm_out::FEATURE,
     spi::FEATURE,
+    stepper::FEATURE,
+    trsync::FEATURE,
 ];
 
 /// The place of a response in the list of all, found by the compiler.

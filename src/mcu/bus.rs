@@ -62,7 +62,20 @@ impl Bus {
     }
 }
 
+/// The worker of every bus that is made of lines. Such buses may share lines in any way, several
+/// clocks one MISO, say, so one worker runs them all.
+const SOFTWARE: &str = "software";
+
 impl Mcu {
+    /// A device on a bus that is made of lines.
+    ///
+    /// # Errors
+    ///
+    /// That the worker can not be started.
+    pub fn software_bus(&mut self, device: Box<dyn BusDevice>) -> Result<Bus, Shutdown> {
+        Ok(Bus::new(self.worker(SOFTWARE)?, device))
+    }
+
     /// Has a conversation with the device of object `device`; it comes back to
     /// [`Object::returned`](super::Object::returned).
     pub fn converse<T: Talk>(

@@ -107,6 +107,11 @@ impl Mcu {
         Ok(())
     }
 
+    /// A device failed in a way that the host is told by an answer: only the log hears of it here.
+    pub fn note_failure(&mut self, failure: &Shutdown) {
+        self.outbox.note(Note::Failed(failure));
+    }
+
     /// The outputs of an object are where they belong in a stopped machine.
     pub fn is_safe(&mut self, oid: Oid) {
         let Some(place) = self.stop.owed.iter().position(|debt| debt.oid == oid) else { return };

@@ -22,6 +22,8 @@ const OBJECTS: &[&str] = &[
     "spi_set_bus oid=6 spi_bus=0 mode=0 rate=1000000",
     "config_spi_shutdown oid=7 spi_oid=6 shutdown_msg=01",
     "set_digital_out pin=0 value=1",
+    "config_i2c oid=8",
+    "i2c_set_bus oid=8 i2c_bus=0 rate=400000 address=64",
 ];
 
 #[derive(Clone, Debug)]
@@ -76,6 +78,7 @@ proptest! {
     fn no_bytes_break_the_machine(answer_ticks in 0u32..50_000, actions in vec(action(), 1..60)) {
         let mut rig = Rig::new();
         rig.bench.state().answer_ticks = answer_ticks;
+        rig.bench.plug_i2c(0, 64, |_, _, _| Ok(()));
         rig.bench.script_adc(ANALOG, &[1000, 2000, 60_000, 0]);
         rig.bench.script_input(5, &[(100_000, 1), (100_700, 0), (200_000, 1)]);
         rig.configure(OBJECTS);

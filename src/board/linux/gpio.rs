@@ -15,7 +15,7 @@ use std::io;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use gpio_cdev::{LineDirection, LineHandle, LineRequestFlags};
 use nix::unistd::{Gid, Group, User, geteuid};
@@ -171,13 +171,14 @@ impl Handle {
         sleeping: Option<String>,
     ) -> Result<HeldLine, Shutdown> {
         let Setting { flags, level, refused } = self.subject.setting(direction)?;
+        let bits = flags.bits();
         let handle = self
             .line
             .request(flags, level.into(), CONSUMER)
             .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
-        let is_output = AtomicBool::new(false);
-        let line = HeldLine { handle, line: self.line, subject: self.subject, is_output, guard, sleeping };
-        line.watch_over(direction)?;
+        let line =
+            HeldLine { handle, line: self.line, subject: self.subject, flags: AtomicU32::new(0), guard, sleeping };
+        line.watch_over(direction, bits)?;
         Ok(line)
     }
 }
@@ -195,8 +196,8 @@ pub struct HeldLine {
     handle: LineHandle,
     line: gpio_cdev::Line,
     subject: Subject,
-    /// What it was made last.
-    is_output: AtomicBool,
+    /// What it was made last (`GPIOHANDLE_REQUEST_` flags).
+    flags: AtomicU32,
     guard: SharedGuard,
     /// Its chip, if calls to that may take their time.
     sleeping: Option<String>,
@@ -209,29 +210,33 @@ impl HeldLine {
     }
 
     /// Lets the guardian know what has become of the line.
-    fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
+    fn watch_over(&self, direction: Direction, flags: u32) -> Result<(), Shutdown> {
         let name = format!("{} line {}", self.subject.chip, self.subject.offset);
-        let was_output = self.is_output.load(Ordering::Relaxed);
+        let before = LineRequestFlags::from_bits_retain(self.flags.load(Ordering::Relaxed));
+        let was_watched = before.contains(LineRequestFlags::OUTPUT) && !before.contains(LineRequestFlags::OPEN_DRAIN);
         match direction {
             Direction::Output { shutdown_level, .. } => {
                 self.guard.output(&name, self.handle.as_raw_fd(), shutdown_level, self.sleeping.as_deref())?;
             }
-            Direction::Input(_) if was_output => self.guard.forget(&name)?,
-            Direction::Input(_) => {}
+            Direction::Input(_) | Direction::OpenDrain if was_watched => self.guard.forget(&name)?,
+            Direction::Input(_) | Direction::OpenDrain => {}
         }
-        self.is_output.store(matches!(direction, Direction::Output { .. }), Ordering::Relaxed);
+        self.flags.store(flags, Ordering::Relaxed);
         Ok(())
     }
 }
 
 impl Line for HeldLine {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
-        if !self.is_output.load(Ordering::Relaxed) {
+        let flags = self.flags.load(Ordering::Relaxed);
+        if flags & LineRequestFlags::OUTPUT.bits() == 0 {
             return Ok(());
         }
         let code = match &self.sleeping {
             None => self.handle.set_value(level.into()).map_err(|error| errno(&error)),
-            Some(_) => sys::set_line_checked(&self.handle, level).map_err(|e| e.raw_os_error().unwrap_or_default()),
+            Some(_) => {
+                sys::set_line_checked(&self.handle, flags, level).map_err(|e| e.raw_os_error().unwrap_or_default())
+            }
         };
         code.map_err(|code| self.lost(reason::LINE_WRITE, "written", code))
     }
@@ -248,7 +253,7 @@ impl Line for HeldLine {
         sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
             self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
         })?;
-        self.watch_over(direction)
+        self.watch_over(direction, flags.bits())
     }
 }
 
@@ -291,6 +296,13 @@ impl Subject {
             Direction::Output { level, .. } => {
                 Ok(Setting { flags: LineRequestFlags::OUTPUT, level, refused: reason::OUTPUT_LINE })
             }
+            // The kernel never drives it high: where the chip has no open drain, it makes the line an
+            // input instead.
+            Direction::OpenDrain => {
+                let pull = if lacks(&self.label, Bias::PullUp) { LineRequestFlags::empty() } else { PULL_UP };
+                let flags = LineRequestFlags::OUTPUT | LineRequestFlags::OPEN_DRAIN | pull;
+                Ok(Setting { flags, level: true, refused: reason::OUTPUT_LINE })
+            }
             Direction::Input(bias) if lacks(&self.label, bias) => {
                 Err(Shutdown::because(reason::INPUT_LINE, self.no_bias(bias)))
             }
@@ -311,6 +323,7 @@ impl Subject {
         let (action, bias) = match direction {
             Direction::Output { .. } => ("an output", Bias::None),
             Direction::Input(bias) => ("an input", bias),
+            Direction::OpenDrain => ("an open drain", Bias::PullUp),
         };
         Shutdown::because(reason, self.refusal(action, code, bias, &look_at(line), &release))
     }

@@ -104,7 +104,7 @@ impl Output {
 
     /// A line of a chip that may sleep, which may not answer.
     fn sleeping_line(name: &str, line: OwnedFd, value: bool) -> Output {
-        Output::new(name, Box::new(move || sys::set_line_checked(&line, value)))
+        Output::new(name, Box::new(move || sys::set_line_checked(&line, sys::OUTPUT, value)))
     }
 
     /// An output of files, such as a PWM, and what is to be written at the beginning of each.
