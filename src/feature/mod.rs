@@ -13,6 +13,7 @@ mod analog_in;
 mod digital_out;
 mod endstop;
 mod i2c;
+mod pca9685;
 mod pwm_out;
 mod spi;
 mod stepper;
@@ -25,6 +26,7 @@ pub const FEATURES: &[Feature] = &[
     digital_out::FEATURE,
     endstop::FEATURE,
     i2c::FEATURE,
+    pca9685::FEATURE,
     pwm_out::FEATURE,
     spi::FEATURE,
     stepper::FEATURE,

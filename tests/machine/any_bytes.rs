@@ -24,6 +24,7 @@ const OBJECTS: &[&str] = &[
     "set_digital_out pin=0 value=1",
     "config_i2c oid=8",
     "i2c_set_bus oid=8 i2c_bus=0 rate=400000 address=64",
+    "config_pca9685 oid=9 bus=0 addr=64 channel=0 cycle_ticks=1000000 value=1 default_value=0 max_duration=100000",
 ];
 
 #[derive(Clone, Debug)]

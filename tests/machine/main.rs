@@ -17,6 +17,7 @@ mod digital_out;
 mod endstop;
 mod i2c;
 mod one_order;
+mod pca9685;
 mod pwm_out;
 mod remedies;
 mod software_buses;
