@@ -95,6 +95,13 @@ impl fmt::Debug for Clock {
 pub trait TimeSource: Send + Sync {
     /// The present instant; never earlier than an instant that it told before.
     fn now(&self) -> Clock;
+
+    /// Waits until `end` without sleeping: for the pulses of a bus, which are shorter than a sleep.
+    fn spin_until(&self, end: Clock) {
+        while self.now() < end {
+            std::hint::spin_loop();
+        }
+    }
 }
 
 /// CLOCK_MONOTONIC in ticks. Tick 0 is a whole second of it, so that the lateness of an edge
@@ -153,6 +160,10 @@ impl VirtualClock {
 impl TimeSource for VirtualClock {
     fn now(&self) -> Clock {
         Clock(self.0.load(Ordering::SeqCst))
+    }
+
+    fn spin_until(&self, end: Clock) {
+        self.set(end);
     }
 }
 

@@ -10,6 +10,8 @@ use crate::time::Ticks;
 
 pub mod linux;
 pub mod sim;
+pub mod soft_i2c;
+pub mod soft_spi;
 
 /// A pin's number on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -68,6 +70,9 @@ pub enum Direction {
     },
     /// The line is read. A resistor that the chip does not have is an error.
     Input(Bias),
+    /// It pulls low or lets go, and is read in either case: a wire that several drive. It begins let
+    /// go, and has a pull-up where the chip is not known to have none. The guardian has no part in it.
+    OpenDrain,
 }
 
 /// A claimed GPIO line. The objects and workers that share a line all hold this one value.
@@ -75,8 +80,8 @@ pub enum Direction {
 /// No call may allocate or log. Nor may one block, unless the board said that the line
 /// [sleeps](ClaimedLine::sleeps_on): then only a worker calls it.
 pub trait Line: Send + Sync {
-    /// Drives an output to a level; `true` is high. A line that another user has made an input
-    /// since is left as it is.
+    /// Drives an output to a level, or lets an open drain go (`true`, high) or pulls it low. A line that
+    /// another user has made an input since is left as it is.
     ///
     /// # Errors
     ///
@@ -160,6 +165,9 @@ pub struct BusError {
     pub detail: Box<str>,
 }
 
+/// How often a register is asked for before that counts as failed.
+const READ_TRIES: u32 = 3;
+
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
 ///
 /// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
@@ -183,6 +191,26 @@ pub trait BusDevice: Send {
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         let _ = (write, read);
         Err(BusError::other_kind("an I2C transfer", "an SPI device"))
+    }
+
+    /// Reads from a register on, or with none from wherever the chip stands (I2C). What is not
+    /// acknowledged is asked for up to [`READ_TRIES`] times: a chip may be busy, and a spike on a long
+    /// cable is no reason to stop a print.
+    ///
+    /// For registers that reading or naming does not change. A command, or a FIFO, is
+    /// [`BusDevice::write_read`]'s: asked for twice it might be carried out twice.
+    ///
+    /// # Errors
+    ///
+    /// What the bus said at last; a timeout at once, as it took long enough.
+    fn read_register(&mut self, register: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        let mut tries = 1;
+        loop {
+            match self.write_read(register, read) {
+                Err(error) if error.status != BusStatus::Timeout && tries < READ_TRIES => tries += 1,
+                done => return done,
+            }
+        }
     }
 }
 

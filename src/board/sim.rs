@@ -220,7 +220,7 @@ impl Board for SimBoard {
     /// The parts drive their lines harder than any bias pulls.
     fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
         let no_pin = match direction {
-            Direction::Output { .. } => reason::NOT_OUTPUT,
+            Direction::Output { .. } | Direction::OpenDrain => reason::NOT_OUTPUT,
             Direction::Input(_) => reason::NOT_INPUT,
         };
         let pin = self.pin(pin, no_pin)?.clone();
@@ -314,7 +314,8 @@ impl Line for SimLine {
         let drives = !senses && !matches!(self.pin.wire, Wire::Sensor(_));
         match direction {
             Direction::Output { level, .. } if drives => self.write(level),
-            Direction::Output { .. } => Err(self.pin.is_no("output", reason::NOT_OUTPUT)),
+            Direction::OpenDrain if drives => self.write(true),
+            Direction::Output { .. } | Direction::OpenDrain => Err(self.pin.is_no("output", reason::NOT_OUTPUT)),
             Direction::Input(_) if senses => Ok(()),
             Direction::Input(_) => Err(self.pin.is_no("input", reason::NOT_INPUT)),
         }

@@ -14,6 +14,8 @@ mod buttons;
 mod counter;
 mod digital_out;
 mod endstop;
+mod i2c;
+mod pca9685;
 mod pwm_out;
 mod sos_filter;
 mod spi;
@@ -24,17 +26,19 @@ mod trsync;
 /// Every feature. One that is not listed here does not get into the dictionary.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
-    digital_out::FEATURE,
-    pwm_out::FEATURE,
-    stepper::FEATURE,
-    endstop::FEATURE,
-    trsync::FEATURE,
     analog_in::FEATURE,
     buttons::FEATURE,
     counter::FEATURE,
-    spi::FEATURE,
+    digital_out::FEATURE,
+    endstop::FEATURE,
+    i2c::FEATURE,
+    pca9685::FEATURE,
+    pwm_out::FEATURE,
     sos_filter::FEATURE,
+    spi::FEATURE,
+    stepper::FEATURE,
     trigger_analog::FEATURE,
+    trsync::FEATURE,
 ];
 
 /// The place of a response in the list of all, found by the compiler.

@@ -10,17 +10,27 @@
 
 use std::fmt;
 
+use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusDevice, BusError, ChipSelect, OnWorker, Pin, SpiConfig};
 use crate::mcu::{
     Bus, Command, Conversation, Done, Enumeration, Feature, Mcu, Object, Oid, Response, Safe, Talk, Ticket, command,
     response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
+use crate::time::Ticks;
 use crate::wire::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
     name: "spi",
-    commands: &[CONFIG_SPI, CONFIG_SPI_WITHOUT_CS, SPI_SET_BUS, SPI_TRANSFER, SPI_SEND, CONFIG_SPI_SHUTDOWN],
+    commands: &[
+        CONFIG_SPI,
+        CONFIG_SPI_WITHOUT_CS,
+        SPI_SET_BUS,
+        SPI_SET_SW_BUS,
+        SPI_TRANSFER,
+        SPI_SEND,
+        CONFIG_SPI_SHUTDOWN,
+    ],
     responses: &[TransferResponse::FORMAT],
     enumerations: &[Enumeration { name: "spi_bus", values: |board| board.spi_buses() }],
     shutdowns: SHUTDOWNS,
@@ -86,7 +96,8 @@ impl Spi {
         Spi { bus: None, chip_select, transfer: Some(Transfer::new(&[])) }
     }
 
-    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
+    /// Whether it may get a bus, of this mode.
+    fn may_have_bus(&self, mcu: &Mcu, mode: u8) -> Result<(), Shutdown> {
         if mode > 3 {
             return Err(invalid(format_args!("mode {mode} is none of 0 to 3")));
         }
@@ -98,9 +109,31 @@ impl Spi {
         if mcu.is_finalized() {
             return Err(invalid("it gets a bus after finalize_config"));
         }
+        Ok(())
+    }
+
+    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
+        self.may_have_bus(mcu, mode)?;
         let chip_select = self.chip_select.take();
         let OnWorker { bus, device } = mcu.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
         self.bus = Some(Bus::new(mcu.worker(&bus)?, device));
+        Ok(())
+    }
+
+    fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
+        self.may_have_bus(mcu, mode)?;
+        let [miso, mosi, sclk] = pins;
+        // In the firmware's order, which counts where one line is MISO and MOSI: it drives.
+        let device = SoftSpi {
+            miso: mcu.shared_input(miso)?,
+            mosi: mcu.shared_output(mosi, false)?,
+            sclk: mcu.shared_output(sclk, false)?,
+            mode,
+            pulse,
+            chip_select: self.chip_select.take(),
+            clock: mcu.clock(),
+        };
+        self.bus = Some(mcu.software_bus(Box::new(device))?);
         Ok(())
     }
 
@@ -211,6 +244,16 @@ const SPI_SET_BUS: Command =
         let mode = u8::try_from(mode).unwrap_or(u8::MAX);
         mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_bus(mcu, spi_bus, mode, rate))
     });
+
+const SPI_SET_SW_BUS: Command = command!(
+    "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
+    |mcu, oid: Oid, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
+        // Of one byte, as in the firmware.
+        let mode = mode as u8;
+        let pins = [miso_pin, mosi_pin, sclk_pin];
+        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_lines(mcu, pins, mode, pulse_ticks))
+    }
+);
 
 const SPI_TRANSFER: Command = command!("spi_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
     mcu.with::<Spi, _>(oid, |spi, mcu| spi.transfer(mcu, oid, TRANSFER, data))

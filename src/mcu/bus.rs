@@ -66,7 +66,20 @@ impl Bus {
     }
 }
 
+/// The worker of every bus that is made of lines. Such buses may share lines in any way, several
+/// clocks one MISO, say, so one worker runs them all.
+const SOFTWARE: &str = "software";
+
 impl Mcu {
+    /// A device on a bus that is made of lines.
+    ///
+    /// # Errors
+    ///
+    /// That the worker can not be started.
+    pub fn software_bus(&mut self, device: Box<dyn BusDevice>) -> Result<Bus, Shutdown> {
+        Ok(Bus::new(self.worker(SOFTWARE)?, device))
+    }
+
     /// Sends a conversation to the chip that object `device` stands for. It comes back to
     /// [`Object::returned`](super::Object::returned) of the ticket's object.
     ///

@@ -278,6 +278,25 @@ impl Mcu {
         self.claim(pin, Direction::Output { level, shutdown_level: level }).map(|(line, _)| line)
     }
 
+    /// Claims an input that workers read, pulled up where it can be.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, such as "Unable to open in GPIO chip line".
+    pub fn shared_input(&mut self, pin: Pin) -> Result<Arc<dyn Line>, Shutdown> {
+        let pulled_up = self.claim(pin, Direction::Input(Bias::PullUp));
+        pulled_up.or_else(|_| self.claim(pin, Direction::Input(Bias::None))).map(|(line, _)| line)
+    }
+
+    /// Claims a wire that workers pull low or let go, and read.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, such as "Unable to open out GPIO chip line".
+    pub fn shared_wire(&mut self, pin: Pin) -> Result<Arc<dyn Line>, Shutdown> {
+        self.claim(pin, Direction::OpenDrain).map(|(line, _)| line)
+    }
+
     /// Claims an input.
     ///
     /// # Errors

@@ -25,6 +25,8 @@ pub enum Note<'a> {
     Shutdown(&'a Shutdown),
     /// Something else failed while the machine stopped, or is stopped.
     Trouble(&'a Shutdown),
+    /// A device failed, and the machine goes on.
+    Failed(&'a Shutdown),
     /// This output is at its shutdown value, after attempts that failed.
     Safe(&'a str),
     /// The host configured this many objects of each kind.

@@ -114,6 +114,11 @@ impl Mcu {
         Ok(())
     }
 
+    /// A device failed in a way that the host is told by an answer: only the log hears of it here.
+    pub fn note_failure(&mut self, failure: &Shutdown) {
+        self.outbox.note(Note::Failed(failure));
+    }
+
     /// To be called by an object that answered [`Safe::Later`], once its outputs are at their shutdown
     /// values.
     pub fn is_safe(&mut self, oid: Oid) {

@@ -192,6 +192,7 @@ impl Outbox for Outlet {
             Note::Trouble(shutdown) => {
                 self.line(gravity(shutdown), LINES_SPARE, format_args!("while shut down: {shutdown}"));
             }
+            Note::Failed(failure) => self.line(Level::Warn, LINES_SPARE, format_args!("{failure}")),
             Note::Safe(name) => {
                 self.line(Level::Info, LINES_SPARE, format_args!("{name} is at its shutdown value after all"));
             }

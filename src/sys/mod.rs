@@ -131,6 +131,8 @@ mod request {
     nix::ioctl_readwrite!(gpiohandle_set_config, 0xB4, 0x0a, super::LineConfig);
     nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
     nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
+    // I2C_FUNCS (linux/i2c-dev.h).
+    nix::ioctl_read_bad!(i2c_funcs, 0x0705, libc::c_ulong);
 }
 
 /// Drives the only line of a handle of the GPIO character device.
@@ -153,20 +155,29 @@ pub(crate) fn set_line_config(line: &impl AsRawFd, flags: u32, level: bool) -> i
 }
 
 /// GPIOHANDLE_REQUEST_OUTPUT.
-const OUTPUT: u32 = 1 << 1;
+pub(crate) const OUTPUT: u32 = 1 << 1;
 
 /// Drives the only line of a handle, of a chip that is spoken to over a bus, and learns whether the
-/// chip has taken it.
+/// chip has taken it. `flags` are those that the line was made an output with.
 ///
 /// [`set_line`] does not tell: on many kernels, 6.1 among them, a driver's function that sets a level
 /// returns nothing, and a chip that does not answer goes unnoticed. The one that makes a line an
 /// output of some level does return an error. Linux before 5.5 offers that for new handles only, and
 /// says EINVAL.
-pub(crate) fn set_line_checked(line: &impl AsRawFd, value: bool) -> io::Result<()> {
-    match set_line_config(line, OUTPUT, value) {
+pub(crate) fn set_line_checked(line: &impl AsRawFd, flags: u32, value: bool) -> io::Result<()> {
+    match set_line_config(line, flags, value) {
         Err(error) if error.raw_os_error() == Some(libc::EINVAL) => set_line(line, value),
         set => set,
     }
+}
+
+/// Whether the adapter of an I2C bus takes plain messages (I2C_FUNC_I2C of linux/i2c.h); those of many
+/// PC chipsets know SMBus only.
+pub(crate) fn is_plain_i2c(bus: &impl AsRawFd) -> io::Result<bool> {
+    let mut functions: libc::c_ulong = 0;
+    // SAFETY: the request writes an unsigned long, which lives through the call.
+    unsafe { request::i2c_funcs(bus.as_raw_fd(), &mut functions) }?;
+    Ok(functions & 1 != 0)
 }
 
 /// After how many seconds without food a hardware watchdog resets the machine.

@@ -24,6 +24,9 @@ const OBJECTS: &[&str] = &[
     "set_digital_out pin=0 value=1",
     "config_buttons oid=8 button_count=3",
     "config_counter oid=9 pin=8 pull_up=1",
+    "config_i2c oid=10",
+    "i2c_set_bus oid=10 i2c_bus=0 rate=400000 address=64",
+    "config_pca9685 oid=11 bus=0 addr=64 channel=0 cycle_ticks=1000000 value=1 default_value=0 max_duration=100000",
 ];
 
 #[derive(Clone, Debug)]
@@ -78,6 +81,7 @@ proptest! {
     fn no_bytes_break_the_machine(answer_ticks in 0u32..50_000, actions in vec(action(), 1..60)) {
         let mut rig = Rig::new();
         rig.bench.state().answer_ticks = answer_ticks;
+        rig.bench.plug_i2c(0, 64, |_, _, _| Ok(()));
         rig.bench.script_adc(ANALOG, &[1000, 2000, 60_000, 0]);
         rig.bench.script_input(5, &[(100_000, 1), (100_700, 0), (200_000, 1)]);
         rig.configure(OBJECTS);

@@ -22,6 +22,8 @@ pub const PWM: u32 = 500;
 const PWMS: u32 = 2;
 /// SPI buses: 0 up to this.
 const SPI_BUSES: u32 = 2;
+/// I2C buses: 0 up to this.
+const I2C_BUSES: u32 = 2;
 /// To break the chips of SPI bus 0 or 1: this number, and the next.
 pub const SPI_CHIPS: u32 = 600;
 /// The chip of the lines that may sleep.
@@ -261,7 +263,7 @@ impl Board for FakeBoard {
         if number >= GPIOS {
             let detail = format!("the bench has no pin {number}: choose one of 0 to {}", GPIOS - 1);
             let unknown = match direction {
-                Direction::Output { .. } => reason::NOT_OUTPUT,
+                Direction::Output { .. } | Direction::OpenDrain => reason::NOT_OUTPUT,
                 Direction::Input(_) => reason::NOT_INPUT,
             };
             return Err(Shutdown::because(unknown, detail));
@@ -287,10 +289,14 @@ impl Board for FakeBoard {
     }
 
     fn i2c_buses(&self) -> Vec<Range> {
-        vec![Range { name: "i2c.0".into(), first: 0, count: 2 }]
+        vec![Range { name: "i2c.0".into(), first: 0, count: I2C_BUSES }]
     }
 
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        if config.bus >= I2C_BUSES {
+            let detail = format!("the bench has no I2C bus {}: choose i2c.0 or i2c.1", config.bus);
+            return Err(Shutdown::because(reason::I2C_OPEN, detail));
+        }
         let bus = format!("i2c{}", config.bus);
         Ok(OnWorker { bus, device: Box::new(FakeI2c { bench: self.0.clone(), config }) })
     }

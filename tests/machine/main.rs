@@ -7,8 +7,6 @@
 mod bench;
 #[allow(dead_code)]
 mod rig;
-mod safe_ends;
-mod sleeping_lines;
 
 mod analog_in;
 mod any_bytes;
@@ -17,9 +15,14 @@ mod buttons;
 mod counter;
 mod digital_out;
 mod endstop;
+mod i2c;
 mod one_order;
+mod pca9685;
 mod pwm_out;
 mod remedies;
+mod safe_ends;
+mod sleeping_lines;
+mod software_buses;
 mod sos_filter;
 mod spi;
 mod stepper;

@@ -37,6 +37,7 @@ impl Outbox for FakeOutbox {
         let text = match note {
             Note::Shutdown(shutdown) => format!("shutdown: {shutdown}"),
             Note::Trouble(shutdown) => format!("trouble: {shutdown}"),
+            Note::Failed(failure) => format!("failed: {failure}"),
             Note::Configured(kinds) => format!("configured: {kinds:?}"),
             Note::Safe(name) => format!("safe: {name}"),
             Note::Lateness(..) => return,

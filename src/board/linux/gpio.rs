@@ -15,7 +15,7 @@ use std::io;
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use gpio_cdev::{LineDirection, LineHandle, LineRequestFlags};
 use nix::unistd::{Gid, Group, User, geteuid};
@@ -180,13 +180,14 @@ impl Handle {
         sleeping: Option<String>,
     ) -> Result<HeldLine, Shutdown> {
         let LineSetup { flags, level, refused } = self.subject.setting(direction)?;
+        let bits = flags.bits();
         let handle = self
             .line
             .request(flags, level.into(), CONSUMER)
             .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
-        let is_output = AtomicBool::new(false);
-        let line = HeldLine { handle, line: self.line, subject: self.subject, is_output, guard, sleeping };
-        line.watch_over(direction)?;
+        let line =
+            HeldLine { handle, line: self.line, subject: self.subject, flags: AtomicU32::new(0), guard, sleeping };
+        line.watch_over(direction, bits)?;
         Ok(line)
     }
 }
@@ -204,8 +205,8 @@ pub(super) struct HeldLine {
     handle: LineHandle,
     line: gpio_cdev::Line,
     subject: Subject,
-    /// Whether its last set-up made it an output.
-    is_output: AtomicBool,
+    /// What its last set-up made it (`GPIOHANDLE_REQUEST_` flags).
+    flags: AtomicU32,
     guard: SharedGuard,
     /// The name of its chip, if calls to that may block.
     sleeping: Option<String>,
@@ -220,24 +221,26 @@ impl HeldLine {
     }
 
     /// Has the guardian hold the line if it is an output now, and let go of it if it no longer is.
-    fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
+    fn watch_over(&self, direction: Direction, flags: u32) -> Result<(), Shutdown> {
         let name = format!("{} line {}", self.subject.chip, self.subject.offset);
-        let was_output = self.is_output.load(Ordering::Relaxed);
+        let before = LineRequestFlags::from_bits_retain(self.flags.load(Ordering::Relaxed));
+        let was_watched = before.contains(LineRequestFlags::OUTPUT) && !before.contains(LineRequestFlags::OPEN_DRAIN);
         match direction {
             Direction::Output { shutdown_level, .. } => {
                 self.guard.output(&name, self.handle.as_raw_fd(), shutdown_level, self.sleeping.as_deref())?;
             }
-            Direction::Input(_) if was_output => self.guard.forget(&name)?,
-            Direction::Input(_) => {}
+            Direction::Input(_) | Direction::OpenDrain if was_watched => self.guard.forget(&name)?,
+            Direction::Input(_) | Direction::OpenDrain => {}
         }
-        self.is_output.store(matches!(direction, Direction::Output { .. }), Ordering::Relaxed);
+        self.flags.store(flags, Ordering::Relaxed);
         Ok(())
     }
 }
 
 impl Line for HeldLine {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
-        if !self.is_output.load(Ordering::Relaxed) {
+        let flags = self.flags.load(Ordering::Relaxed);
+        if flags & LineRequestFlags::OUTPUT.bits() == 0 {
             return Ok(());
         }
         match &self.sleeping {
@@ -245,7 +248,7 @@ impl Line for HeldLine {
                 .handle
                 .set_value(level.into())
                 .map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error))),
-            Some(_) => sys::set_line_checked(&self.handle, level)
+            Some(_) => sys::set_line_checked(&self.handle, flags, level)
                 .map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default())),
         }
     }
@@ -262,7 +265,7 @@ impl Line for HeldLine {
         sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
             self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
         })?;
-        self.watch_over(direction)
+        self.watch_over(direction, flags.bits())
     }
 }
 
@@ -305,6 +308,13 @@ impl Subject {
             Direction::Output { level, .. } => {
                 Ok(LineSetup { flags: LineRequestFlags::OUTPUT, level, refused: reason::OUTPUT_LINE })
             }
+            // The kernel never drives it high: where the chip has no open drain, it makes the line an
+            // input instead.
+            Direction::OpenDrain => {
+                let pull = if lacks(&self.label, Bias::PullUp) { LineRequestFlags::empty() } else { PULL_UP };
+                let flags = LineRequestFlags::OUTPUT | LineRequestFlags::OPEN_DRAIN | pull;
+                Ok(LineSetup { flags, level: true, refused: reason::OUTPUT_LINE })
+            }
             Direction::Input(bias) if lacks(&self.label, bias) => {
                 Err(Shutdown::because(reason::INPUT_LINE, self.no_bias(bias)))
             }
@@ -325,6 +335,7 @@ impl Subject {
         let (action, bias) = match direction {
             Direction::Output { .. } => ("an output", Bias::None),
             Direction::Input(bias) => ("an input", bias),
+            Direction::OpenDrain => ("an open drain", Bias::PullUp),
         };
         Shutdown::because(reason, self.refusal(action, code, bias, &look_at(line), &release))
     }

@@ -21,6 +21,7 @@ use pins::{Names, Target};
 pub mod adc;
 pub mod gpio;
 mod guard;
+pub mod i2c;
 pub mod pins;
 mod pwm;
 pub mod spi;
@@ -39,6 +40,8 @@ pub struct Inventory {
     pub adcs: Vec<adc::IioDevice>,
     /// SPI device nodes.
     pub spi: Vec<spi::Node>,
+    /// Numbers of I2C buses.
+    pub i2c: Vec<u32>,
     /// For the log: each thing that is there and can not be used, with its cause and remedy.
     pub problems: Vec<String>,
     /// libiio's view of this machine; none without IIO devices.
@@ -50,7 +53,8 @@ impl Inventory {
     pub fn scan() -> Inventory {
         let dev = Path::new(DEV);
         let (chips, problems) = gpio::scan(dev);
-        let mut inventory = Inventory { chips, spi: spi::scan(dev), problems, ..Inventory::default() };
+        let mut inventory =
+            Inventory { chips, spi: spi::scan(dev), i2c: i2c::scan(dev), problems, ..Inventory::default() };
         match adc::context(Path::new(IIO)) {
             Ok(context) => {
                 inventory.adcs = context.as_ref().map(adc::scan).unwrap_or_default();
@@ -77,10 +81,12 @@ impl Inventory {
             format!("iio {} ({channels} channels)", adc.name)
         });
         let nodes: Vec<String> = self.spi.iter().map(spi::Node::to_string).collect();
-        let parts = [chips.collect::<Vec<_>>().join(", "), adcs.collect::<Vec<_>>().join(", "), nodes.join(" ")];
+        let buses: Vec<String> = self.i2c.iter().map(|bus| format!("i2c.{bus}")).collect();
+        let (chips, adcs) = (chips.collect::<Vec<_>>().join(", "), adcs.collect::<Vec<_>>().join(", "));
+        let parts = [chips, adcs, nodes.join(" "), buses.join(" ")];
         let parts: Vec<String> = parts.into_iter().filter(|part| !part.is_empty()).collect();
         match parts.is_empty() {
-            true => "linux: no GPIO chip, ADC or SPI device is to be seen".to_owned(),
+            true => "linux: no GPIO chip, ADC, SPI device or I2C bus is to be seen".to_owned(),
             false => format!("linux: {}", parts.join("; ")),
         }
     }
@@ -122,7 +128,7 @@ impl LinuxBoard {
     /// The line of a pin, not yet requested from the kernel. Errors are those of outputs or inputs.
     fn open_line(&self, pin: Pin, direction: Direction) -> Result<gpio::Handle, Shutdown> {
         let (wanted, no_line, refused) = match direction {
-            Direction::Output { .. } => ("an output", reason::NOT_OUTPUT, reason::OUTPUT_LINE),
+            Direction::Output { .. } | Direction::OpenDrain => ("an output", reason::NOT_OUTPUT, reason::OUTPUT_LINE),
             Direction::Input(_) => ("an input", reason::NOT_INPUT, reason::INPUT_LINE),
         };
         let Target::Line { chip, offset } = Target::of(pin) else {
@@ -207,12 +213,12 @@ impl Board for LinuxBoard {
     }
 
     fn i2c_buses(&self) -> Vec<Range> {
-        Vec::new()
+        i2c::ranges(&self.inventory.i2c)
     }
 
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        let detail = format!("there is no I2C bus {}: choose another", config.bus);
-        Err(Shutdown::because(reason::I2C_OPEN, detail))
+        let device = i2c::I2c::open(&self.dev, config)?;
+        Ok(OnWorker { bus: format!("i2c{}", config.bus), device: Box::new(device) })
     }
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
@@ -282,6 +288,7 @@ mod tests {
         assert!(error.to_string().contains("gpiochip5: this machine has no GPIO chip"), "{error}");
         assert_eq!(board.pins().len(), 19);
         assert_eq!(board.spi_buses().len(), 8);
+        assert_eq!(board.i2c_buses().len(), 1);
         assert!(board.describe().starts_with("linux: no GPIO"));
     }
 
@@ -314,12 +321,13 @@ mod tests {
             }],
             adcs: vec![adc::IioDevice { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
             spi: vec![spi::Node::of(0), spi::Node::of(1)],
+            i2c: vec![1],
             ..Inventory::default()
         };
         assert_eq!(
             inventory.describe(),
             "linux: gpiochip0 pinctrl-bcm2835 (54 lines); iio ads1115 (0 channels); spidev0.0 \
-             spidev0.1"
+             spidev0.1; i2c.1"
         );
     }
 }

@@ -105,7 +105,7 @@ impl Output {
 
     /// A line of a chip that may sleep. It is driven in a way that tells whether the chip has answered.
     fn sleeping_line(name: &str, line: OwnedFd, value: bool) -> Output {
-        Output::new(name, Box::new(move || sys::set_line_checked(&line, value)))
+        Output::new(name, Box::new(move || sys::set_line_checked(&line, sys::OUTPUT, value)))
     }
 
     /// An output that is set by files, such as a PWM, with what is to be written at the beginning of

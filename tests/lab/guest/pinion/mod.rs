@@ -10,6 +10,7 @@ mod expander;
 mod guardian;
 mod hard_pwm;
 mod homing;
+mod i2c;
 mod lines;
 mod pins;
 mod safe_state;

@@ -1,0 +1,400 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! PCA9685: 16 PWM outputs behind I2C, with queued values and a limit to how long the host may be
+//! silent.
+//!
+//! Registers and times are those of NXP's data sheet, PCA9685 rev. 4.
+
+#![forbid(unsafe_code)]
+
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
+use crate::mcu::{
+    Command, Constant, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, Remote, Safe, Settable, Ticket, TimerId,
+    WireClock, command,
+};
+use crate::shutdown::{Shutdown, shutdowns};
+use crate::time::{CLOCK_FREQ, Clock, Ticks};
+
+use super::{changes_too_late, not_refreshed};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "pca9685",
+    commands: &[CONFIG_PCA9685, QUEUE_PCA9685_OUT, SET_PCA9685_OUT],
+    constants: &[("PCA9685_MAX", Constant::Number(VALUE_MAX as u32))],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// A channel above 15 or a value above 4096.
+    INVALID_CHANNEL = "Invalid pca9685 channel or value";
+    /// A queued value above 4096.
+    INVALID_VALUE = "Invalid pca9685 value";
+    /// A second period for one chip, which has a single one.
+    OTHER_CYCLE = "All PCA9685 channels must have the same cycle_ticks";
+    /// More than 16 chips.
+    TOO_MANY = "Too many i2c devices";
+    /// The bus is not there, or the chip does not answer as it is set up.
+    NOT_SET_UP = "Unable to open and init PCA9685 device";
+    /// The chip does not take a value.
+    NOT_UPDATED = "Unable to update PCA9685 value";
+    /// The host did not refresh an output in time.
+    MISSED = "Missed scheduling of next pca9685 event";
+    /// An output would stay on for longer than its `max_duration`.
+    MAX_DURATION = "Scheduled pca9685 event will exceed max_duration";
+}
+
+/// Full scale of a value.
+const VALUE_MAX: u16 = 4096;
+const CHANNELS: usize = 16;
+const CHIPS_MAX: usize = 16;
+
+// Registers.
+const MODE1: u8 = 0x00;
+const LED0: u8 = 0x06;
+const ALL_LED: u8 = 0xfa;
+const PRE_SCALE: u8 = 0xfe;
+// Bits of MODE1.
+const AUTO_INCREMENT: u8 = 0x20;
+const SLEEP: u8 = 0x10;
+const ALL_CALL: u8 = 0x01;
+/// The bit of LEDn_ON_H and LEDn_OFF_H that means always.
+const FULL: u8 = 0x10;
+const OSCILLATOR_HZ: u64 = 25_000_000;
+/// Until the oscillator runs, at most.
+const OSCILLATOR_START: Duration = Duration::from_micros(500);
+/// The host names none, and the driver has its own.
+const RATE_HZ: u32 = 100_000;
+
+/// The value of PRE_SCALE for a period: 25 MHz / (4096 * rate) - 1, within 3 and 255.
+fn prescale(cycle: Ticks) -> u8 {
+    let divisor = u64::from(VALUE_MAX) * u64::from(CLOCK_FREQ);
+    let rounded = (OSCILLATOR_HZ * u64::from(cycle.0) + divisor / 2) / divisor;
+    // A period of next to nothing becomes the longest one, as in the firmware.
+    rounded.wrapping_sub(1).clamp(3, 0xff) as u8
+}
+
+/// What sets the output at register `first` to a value.
+fn message(first: u8, value: u16) -> [u8; 5] {
+    let (on, off) = match value {
+        0 => (0, u16::from(FULL) << 8),
+        VALUE_MAX.. => (u16::from(FULL) << 8, 0),
+        _ => (0, value),
+    };
+    let ([on_low, on_high], [off_low, off_high]) = (on.to_le_bytes(), off.to_le_bytes());
+    [first, on_low, on_high, off_low, off_high]
+}
+
+/// A chip, as its outputs share it. They all run on the worker of its bus, so nobody ever waits for
+/// the lock, and the core never takes it.
+struct Chip {
+    device: Box<dyn BusDevice>,
+    prescale: u8,
+    is_set_up: bool,
+}
+
+impl Chip {
+    fn set_up(&mut self) -> Result<(), BusError> {
+        if self.is_set_up {
+            return Ok(());
+        }
+        // The prescaler takes a value in sleep only.
+        self.device.write_read(&[MODE1, AUTO_INCREMENT | SLEEP | ALL_CALL], &mut [])?;
+        self.device.write_read(&[PRE_SCALE, self.prescale], &mut [])?;
+        self.device.write_read(&[MODE1, AUTO_INCREMENT | ALL_CALL], &mut [])?;
+        thread::sleep(OSCILLATOR_START);
+        self.device.write_read(&message(ALL_LED, 0), &mut [])?;
+        self.is_set_up = true;
+        Ok(())
+    }
+}
+
+/// One output of a chip.
+struct Channel {
+    chip: Arc<Mutex<Chip>>,
+    first_register: u8,
+}
+
+#[derive(Clone, Copy)]
+enum Setting {
+    /// The chip is to be set up; then the output is off.
+    SetUp,
+    Value(u16),
+    /// Where it belongs in a stopped machine. A chip that was never set up drives nothing.
+    ShutdownValue(u16),
+}
+
+impl Settable for Channel {
+    type Value = Setting;
+
+    fn set(&mut self, setting: Setting) -> Result<(), Shutdown> {
+        let mut chip = self.chip.lock().unwrap_or_else(PoisonError::into_inner);
+        let value = match setting {
+            Setting::ShutdownValue(_) if !chip.is_set_up => return Ok(()),
+            Setting::Value(value) | Setting::ShutdownValue(value) => Some(value),
+            Setting::SetUp => None,
+        };
+        chip.set_up().map_err(|error| Shutdown::because(NOT_SET_UP, error.detail))?;
+        let Some(value) = value else { return Ok(()) };
+        let written = chip.device.write_read(&message(self.first_register, value), &mut []);
+        written.map_err(|error| Shutdown::because(NOT_UPDATED, error.detail))
+    }
+}
+
+/// An output on the worker of its bus.
+struct Output {
+    channel: Remote<Channel>,
+    shutdown_value: u16,
+    /// Whether it was ever set.
+    is_used: bool,
+    /// Whether it is still on its way to its shutdown value.
+    is_pending: bool,
+}
+
+struct Address {
+    bus: u8,
+    address: u8,
+    cycle: Ticks,
+}
+
+/// The chips and their outputs, whose errands come back to it.
+#[derive(Default)]
+struct Chips {
+    chips: Vec<Address>,
+    /// 16 for each chip: an output's place is also the tag of its errands.
+    outputs: Vec<Output>,
+}
+
+impl Chips {
+    /// The place of an output; its chip is opened if it is the first of that.
+    fn output(&mut self, mcu: &mut Mcu, wanted: Address, channel: u8) -> Result<u8, Shutdown> {
+        let Address { bus, address, cycle } = wanted;
+        let known = self.chips.iter().position(|chip| chip.bus == bus && chip.address == address);
+        let chip = match known {
+            Some(chip) => {
+                let present = self.chips[chip].cycle;
+                if present != cycle {
+                    let detail = format!(
+                        "the chip at i2c.{bus} address {address:#04x} has a cycle of {} ticks, and one of {} is asked \
+                         for: give its channels the same cycle_time",
+                        present.0, cycle.0
+                    );
+                    return Err(Shutdown::because(OTHER_CYCLE, detail));
+                }
+                chip
+            }
+            None if self.chips.len() == CHIPS_MAX => {
+                return Err(Shutdown::because(TOO_MANY, "there are 17 PCA9685 chips: 16 are possible, remove one"));
+            }
+            None => {
+                self.open(mcu, wanted)?;
+                self.chips.len() - 1
+            }
+        };
+        Ok((chip * CHANNELS) as u8 + channel)
+    }
+
+    fn open(&mut self, mcu: &mut Mcu, address: Address) -> Result<(), Shutdown> {
+        let config = I2cConfig { bus: address.bus.into(), address: address.address & 0x7f, rate_hz: RATE_HZ };
+        let opened = mcu.board()?.i2c(config);
+        let OnWorker { bus, device } = opened.map_err(|error| Shutdown::because(NOT_SET_UP, error.detail))?;
+        let worker = mcu.worker(&bus)?;
+        let chip = Chip { device, prescale: prescale(address.cycle), is_set_up: false };
+        let chip = Arc::new(Mutex::new(chip));
+        self.chips.push(address);
+        for channel in 0..CHANNELS as u8 {
+            let channel = Channel { chip: chip.clone(), first_register: LED0 + 4 * channel };
+            let channel = Remote::new(worker, channel, Setting::SetUp);
+            self.outputs.push(Output { channel, shutdown_value: 0, is_used: false, is_pending: false });
+        }
+        Ok(())
+    }
+
+    fn set(&mut self, mcu: &mut Mcu, oid: Oid, place: u8, setting: Setting) -> Result<(), Shutdown> {
+        let output = &mut self.outputs[usize::from(place)];
+        output.is_used = true;
+        output.channel.set(mcu, Ticket { oid, tag: place }, setting)
+    }
+}
+
+impl Object for Chips {
+    fn kind(&self) -> &'static str {
+        "PCA9685"
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let ticket = Ticket { oid, tag: done.tag };
+        let Some(output) = self.outputs.get_mut(usize::from(ticket.tag)) else { return Ok(()) };
+        match output.channel.returned(mcu, ticket, done) {
+            Ok(true) => output.is_pending = false,
+            Ok(false) => {}
+            Err(failure) => return mcu.device_failed(oid, self.kind(), failure),
+        }
+        if !self.outputs.iter().any(|output| output.is_pending) {
+            mcu.is_safe(oid);
+        }
+        Ok(())
+    }
+
+    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
+        let mut safe = Safe::Now;
+        for (output, tag) in self.outputs.iter_mut().zip(0..=u8::MAX).filter(|(output, _)| output.is_used) {
+            output.is_pending = true;
+            output.channel.set(mcu, Ticket { oid, tag }, Setting::ShutdownValue(output.shutdown_value))?;
+            safe = Safe::Later;
+        }
+        Ok(safe)
+    }
+}
+
+struct Move {
+    at: Clock,
+    value: u16,
+}
+
+/// An output that the host schedules.
+struct Pca9685 {
+    chips: Oid,
+    place: u8,
+    default_value: u16,
+    max_duration: Ticks,
+    queue: MoveQueue<Move>,
+    /// When the host must have sent another value.
+    end: Option<Clock>,
+}
+
+impl Pca9685 {
+    fn timer(oid: Oid) -> TimerId {
+        TimerId::new(oid, 0)
+    }
+
+    fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
+        let first = self.queue.is_empty();
+        self.queue.push(&mut mcu.moves, Move { at, value })?;
+        if value > VALUE_MAX {
+            return Err(Shutdown::by_host(INVALID_VALUE, format_args!("value {value} is above {VALUE_MAX}")));
+        }
+        if !first {
+            return Ok(());
+        }
+        if self.end.take().is_some_and(|end| end < at) {
+            return Err(changes_too_late(MAX_DURATION, self.max_duration));
+        }
+        mcu.cancel(Self::timer(oid));
+        mcu.schedule(Self::timer(oid), at)
+    }
+}
+
+impl Object for Pca9685 {
+    fn kind(&self) -> &'static str {
+        "PCA9685 output"
+    }
+
+    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        let Some(Move { value, .. }) = self.queue.pop(&mut mcu.moves) else {
+            return Err(not_refreshed(MISSED, self.max_duration));
+        };
+        let (own, place) = (self.chips, self.place);
+        mcu.with::<Chips, _>(own, |chips, mcu| chips.set(mcu, own, place, Setting::Value(value)))?;
+        let limited = value != self.default_value && self.max_duration.0 != 0;
+        let end = limited.then(|| at + self.max_duration);
+        let Some(next) = self.queue.first().map(|next| next.at) else {
+            self.end = end;
+            return Ok(end.map_or(Next::Done, Next::At));
+        };
+        if end.is_some_and(|end| end < next) {
+            return Err(changes_too_late(MAX_DURATION, self.max_duration));
+        }
+        Ok(Next::At(next))
+    }
+
+    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
+        self.end = None;
+        self.queue.clear(&mut mcu.moves);
+    }
+}
+
+/// Says whether a chip has this channel and all of these values.
+fn check(channel: u8, values: &[u16]) -> Result<(), Shutdown> {
+    if usize::from(channel) < CHANNELS && values.iter().all(|value| *value <= VALUE_MAX) {
+        return Ok(());
+    }
+    let what = format_args!("channel {channel} with values {values:?} is not within 15 and {VALUE_MAX}");
+    Err(Shutdown::by_host(INVALID_CHANNEL, what))
+}
+
+const CONFIG_PCA9685: Command = command!(
+    "config_pca9685 oid=%c bus=%c addr=%c channel=%c cycle_ticks=%u value=%hu default_value=%hu max_duration=%u",
+    |mcu,
+     oid: Oid,
+     bus: u8,
+     addr: u8,
+     channel: u8,
+     cycle_ticks: Ticks,
+     value: u16,
+     default_value: u16,
+     max_duration: Ticks| {
+        mcu.vacant(oid)?;
+        check(channel, &[value, default_value])?;
+        let own = mcu.own::<Chips>();
+        let place = mcu.with::<Chips, _>(own, |chips, mcu| {
+            let place = chips.output(mcu, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+            chips.outputs[usize::from(place)].shutdown_value = default_value;
+            let setting = if value == 0 { Setting::SetUp } else { Setting::Value(value) };
+            chips.set(mcu, own, place, setting)?;
+            Ok(place)
+        })?;
+        mcu.assign(
+            oid,
+            Pca9685 { chips: own, place, default_value, max_duration, queue: MoveQueue::default(), end: None },
+        )
+    }
+);
+
+const QUEUE_PCA9685_OUT: Command =
+    command!("queue_pca9685_out oid=%c clock=%u value=%hu", |mcu, oid: Oid, clock: WireClock, value: u16| {
+        let at = mcu.instant(clock);
+        mcu.with::<Pca9685, _>(oid, |output, mcu| output.queue(mcu, oid, at, value))
+    });
+
+const SET_PCA9685_OUT: Command = command!(
+    "set_pca9685_out bus=%c addr=%c channel=%c cycle_ticks=%u value=%hu",
+    |mcu, bus: u8, addr: u8, channel: u8, cycle_ticks: Ticks, value: u16| {
+        check(channel, &[value])?;
+        let own = mcu.own::<Chips>();
+        mcu.with::<Chips, _>(own, |chips, mcu| {
+            let place = chips.output(mcu, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+            chips.set(mcu, own, place, Setting::Value(value))
+        })
+    }
+);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_prescaler_of_a_period() {
+        // The data sheet's example: 200 Hz is 30 (7.3.5).
+        for (hz, expected) in [(200, 30), (50, 121), (1526, 3), (24, 253), (20, 255), (10_000, 3), (25_000_000, 255)] {
+            assert_eq!(prescale(Ticks(CLOCK_FREQ / hz)), expected, "{hz} Hz");
+        }
+        assert_eq!(prescale(Ticks(u32::MAX)), 255);
+    }
+
+    #[test]
+    fn the_registers_of_a_value() {
+        for (value, expected) in [
+            (0, [6, 0, 0, 0, 0x10]),
+            (1, [6, 0, 0, 1, 0]),
+            (0x0abc, [6, 0, 0, 0xbc, 0x0a]),
+            (4095, [6, 0, 0, 0xff, 0x0f]),
+            (4096, [6, 0, 0x10, 0, 0]),
+        ] {
+            assert_eq!(message(LED0, value), expected);
+        }
+    }
+}
