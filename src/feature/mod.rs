@@ -9,11 +9,20 @@ use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
 use crate::wire::format::same;
 
+mod adxl345;
 mod analog_in;
+mod bmi160;
 mod digital_out;
 mod endstop;
+mod fifo_sensor;
+mod i2c;
+mod icm20948;
+mod lis2dw;
+mod mpu9250;
 mod pwm_out;
+mod sensor_bulk;
 mod spi;
+mod spi_angle;
 mod stepper;
 mod trsync;
 
@@ -27,6 +36,15 @@ pub const FEATURES: &[Feature] = &[
     trsync::FEATURE,
     analog_in::FEATURE,
     spi::FEATURE,
+    adxl345::FEATURE,
+    bmi160::FEATURE,
+    fifo_sensor::FEATURE,
+    i2c::FEATURE,
+    icm20948::FEATURE,
+    lis2dw::FEATURE,
+    mpu9250::FEATURE,
+    sensor_bulk::FEATURE,
+    spi_angle::FEATURE,
 ];
 
 /// The place of a response in the list of all, found by the compiler.

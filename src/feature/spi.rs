@@ -41,24 +41,25 @@ response! {
 }
 
 /// Bytes to a device, and what came back; those of a message block fit.
-struct Transfer {
+#[derive(Clone)]
+pub(super) struct Transfer {
     bytes: [u8; PAYLOAD_MAX],
     len: usize,
 }
 
 impl Transfer {
-    fn new(data: &[u8]) -> Box<Conversation<Transfer>> {
+    pub(super) fn new(data: &[u8]) -> Box<Conversation<Transfer>> {
         let mut transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0 };
         transfer.load(data);
         Conversation::new(transfer)
     }
 
-    fn load(&mut self, data: &[u8]) {
+    pub(super) fn load(&mut self, data: &[u8]) {
         self.len = data.len().min(PAYLOAD_MAX);
         self.bytes[..self.len].copy_from_slice(&data[..self.len]);
     }
 
-    fn bytes(&self) -> &[u8] {
+    pub(super) fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
 }
@@ -69,10 +70,12 @@ impl Talk for Transfer {
     }
 }
 
-struct Spi {
+/// An SPI device.
+pub(super) struct Spi {
     bus: Option<Bus>,
     /// Before the bus is known; then the worker drives it.
     chip_select: Option<ChipSelect>,
+    has_chip_select: bool,
     /// Here while no command's transfer is under way.
     transfer: Option<Box<Conversation<Transfer>>>,
 }
@@ -83,7 +86,12 @@ const TRANSFER: u8 = 1;
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
-        Spi { bus: None, chip_select, transfer: Some(Transfer::new(&[])) }
+        Spi { bus: None, has_chip_select: chip_select.is_some(), chip_select, transfer: Some(Transfer::new(&[])) }
+    }
+
+    /// Whether it has a chip select line of its own.
+    pub(super) fn has_chip_select(&self) -> bool {
+        self.has_chip_select
     }
 
     fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {

@@ -22,6 +22,9 @@ const OBJECTS: &[&str] = &[
     "spi_set_bus oid=6 spi_bus=0 mode=0 rate=1000000",
     "config_spi_shutdown oid=7 spi_oid=6 shutdown_msg=01",
     "set_digital_out pin=0 value=1",
+    "config_adxl345 oid=8 spi_oid=6",
+    "config_spi_angle oid=9 spi_oid=6 spi_angle_type=2",
+    "config_lis2dw oid=10 bus_oid=6 bus_oid_type=0 lis_chip_type=0",
 ];
 
 #[derive(Clone, Debug)]

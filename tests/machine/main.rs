@@ -10,13 +10,16 @@ mod rig;
 mod safe_ends;
 mod sleeping_lines;
 
+mod adxl345;
 mod analog_in;
 mod any_bytes;
 mod base;
 mod digital_out;
 mod endstop;
+mod fifo_sensors;
 mod one_order;
 mod pwm_out;
 mod remedies;
 mod spi;
+mod spi_angle;
 mod stepper;
