@@ -99,6 +99,7 @@ const OBJECTS: &[&str] = &[
     "config_pwm_out oid=8 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0",
     "set_pwm_out pin=501 cycle_ticks=50000 value=0",
     "set_digital_out pin=9 value=0",
+    "config_adxl345 oid=10 spi_oid=7",
 ];
 
 /// Homes, heats, prints for half a minute and homes again.
@@ -107,6 +108,8 @@ fn print(rig: Rig) -> Print {
     print.rig.bench.script_adc(ANALOG, &[500]);
     print.rig.bench.script_input(6, &[(9_000_000, 1), (30_000_000, 0), (1_470_000_000, 1)]);
     print.send("query_analog_in oid=6 clock=@100000 sample_ticks=50000 sample_count=8 rest_ticks=15000000 bytes_per_report=48 min_value=0 max_value=65535 range_check_count=4");
+    // The bench has room for a few hundred transfers.
+    print.send("query_adxl345 oid=10 rest_ticks=20000000");
     print.home(5_000_000);
     assert_eq!(print.rig.ask("endstop_query_state oid=3").split(' ').nth(2), Some("homing=1"));
     let mut at = 40_000_000;
@@ -123,6 +126,7 @@ fn print(rig: Rig) -> Print {
             print.send(&format!("queue_digital_out oid=5 clock=@{at} on_ticks={}", 100 * n));
             print.send(&format!("queue_pwm_out oid=8 clock=@{at} value={n}"));
             print.send("spi_transfer oid=7 data=0102030405");
+            print.send("query_adxl345_status oid=10");
             print.send(&format!("set_pwm_out pin=501 cycle_ticks=50000 value={n}"));
             print.send(&format!("set_digital_out pin=9 value={}", n / 50 % 2));
             for command in ["get_clock", "get_uptime", "get_config", "debug_ping data=01", "stepper_get_position oid=0"]

@@ -9,16 +9,24 @@ use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
 use crate::wire::format::same;
 
+mod adxl345;
 mod analog_in;
+mod bmi160;
 mod buttons;
 mod counter;
 mod digital_out;
 mod endstop;
+mod fifo_sensor;
 mod i2c;
+mod icm20948;
+mod lis2dw;
+mod mpu9250;
 mod pca9685;
 mod pwm_out;
+mod sensor_bulk;
 mod sos_filter;
 mod spi;
+mod spi_angle;
 mod stepper;
 mod trigger_analog;
 mod trsync;
@@ -26,16 +34,24 @@ mod trsync;
 /// Every feature. One that is not listed here does not get into the dictionary.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
+    adxl345::FEATURE,
     analog_in::FEATURE,
+    bmi160::FEATURE,
     buttons::FEATURE,
     counter::FEATURE,
     digital_out::FEATURE,
     endstop::FEATURE,
+    fifo_sensor::FEATURE,
     i2c::FEATURE,
+    icm20948::FEATURE,
+    lis2dw::FEATURE,
+    mpu9250::FEATURE,
     pca9685::FEATURE,
     pwm_out::FEATURE,
+    sensor_bulk::FEATURE,
     sos_filter::FEATURE,
     spi::FEATURE,
+    spi_angle::FEATURE,
     stepper::FEATURE,
     trigger_analog::FEATURE,
     trsync::FEATURE,

@@ -51,24 +51,25 @@ response! {
 }
 
 /// The bytes for a device, and afterwards those that came back. A message block's bytes fit.
-struct Transfer {
+#[derive(Clone)]
+pub(super) struct Transfer {
     bytes: [u8; PAYLOAD_MAX],
     len: usize,
 }
 
 impl Transfer {
-    fn new(data: &[u8]) -> Box<Conversation<Transfer>> {
+    pub(super) fn new(data: &[u8]) -> Box<Conversation<Transfer>> {
         let mut transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0 };
         transfer.load(data);
         Conversation::new(transfer)
     }
 
-    fn load(&mut self, data: &[u8]) {
+    pub(super) fn load(&mut self, data: &[u8]) {
         self.len = data.len().min(PAYLOAD_MAX);
         self.bytes[..self.len].copy_from_slice(&data[..self.len]);
     }
 
-    fn bytes(&self) -> &[u8] {
+    pub(super) fn bytes(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
 }
@@ -79,10 +80,12 @@ impl Talk for Transfer {
     }
 }
 
-struct Spi {
+/// An SPI device.
+pub(super) struct Spi {
     bus: Option<Bus>,
     /// Kept here until the bus is set; from then on the device on the worker has it.
     chip_select: Option<ChipSelect>,
+    has_chip_select: bool,
     /// None while a transfer is under way: then the worker has the box.
     transfer: Option<Box<Conversation<Transfer>>>,
 }
@@ -93,7 +96,12 @@ const TRANSFER: u8 = 1;
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
-        Spi { bus: None, chip_select, transfer: Some(Transfer::new(&[])) }
+        Spi { bus: None, has_chip_select: chip_select.is_some(), chip_select, transfer: Some(Transfer::new(&[])) }
+    }
+
+    /// Whether it has a chip select line of its own.
+    pub(super) fn has_chip_select(&self) -> bool {
+        self.has_chip_select
     }
 
     /// Whether it may get a bus, of this mode.

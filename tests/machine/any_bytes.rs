@@ -27,6 +27,9 @@ const OBJECTS: &[&str] = &[
     "config_i2c oid=10",
     "i2c_set_bus oid=10 i2c_bus=0 rate=400000 address=64",
     "config_pca9685 oid=11 bus=0 addr=64 channel=0 cycle_ticks=1000000 value=1 default_value=0 max_duration=100000",
+    "config_adxl345 oid=12 spi_oid=6",
+    "config_spi_angle oid=13 spi_oid=6 spi_angle_type=2",
+    "config_lis2dw oid=14 bus_oid=6 bus_oid_type=0 lis_chip_type=0",
 ];
 
 #[derive(Clone, Debug)]

@@ -86,6 +86,11 @@ pub struct State {
     pub write_ticks: u32,
     /// How long a device on a worker takes to answer; at first none does.
     pub answer_ticks: u32,
+    /// How long each byte takes on a bus. If it does, an errand is run as it is handed over, and its
+    /// chip is told the instants at which it will be spoken to.
+    pub byte_ticks: u32,
+    /// How far the errand that is run has come, then.
+    bus_now: Option<Clock>,
 }
 
 /// What the board, its lines, its devices and the test share.
@@ -140,6 +145,16 @@ impl Bench {
 
     fn ticks(&self) -> u64 {
         self.clock.now().since(self.origin) as u64
+    }
+
+    /// When a conversation of so many bytes begins.
+    fn bus_ticks(&self, bytes: usize) -> u64 {
+        let mut state = self.state();
+        let takes = Ticks(state.byte_ticks * bytes as u32);
+        let Some(now) = &mut state.bus_now else { return self.ticks() };
+        let at = *now;
+        *now = at + takes;
+        at.since(self.origin) as u64
     }
 
     pub fn state(&self) -> MutexGuard<'_, State> {
@@ -402,7 +417,9 @@ struct FakeI2c {
 impl BusDevice for FakeI2c {
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         let I2cConfig { bus, address, .. } = self.config;
-        let at = self.bench.ticks();
+        // The address goes before what is written, and before what is read.
+        let addresses = usize::from(!write.is_empty()) + usize::from(!read.is_empty());
+        let at = self.bench.bus_ticks(write.len() + read.len() + addresses);
         // Not locked while the chip answers: it may look at the bench.
         let chip = self.bench.state().i2c_chips.remove(&(bus, address));
         let Some(mut chip) = chip else {
@@ -432,7 +449,7 @@ impl BusDevice for FakeSpi {
         }
         let mut message = ([0; 64], bytes.len());
         message.0[..bytes.len()].copy_from_slice(bytes);
-        let at = self.bench.ticks();
+        let at = self.bench.bus_ticks(bytes.len());
         self.bench.state().transfers.push((at, bus, mode, rate_hz, message));
         let chip = self.bench.state().spi_chips.remove(&bus);
         match chip {
@@ -491,27 +508,35 @@ impl Workers for FakeWorkers {
         })))
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Shutdown> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: Job) -> Result<(), Shutdown> {
         let takes = Ticks(self.bench.state().answer_ticks);
+        let at_once = self.bench.state().byte_ticks != 0;
         let mut shop = self.shop.lock().unwrap();
         let free = &mut shop.buses[worker].1;
         let begin = self.bench.clock.now().max(*free);
-        let end = begin + takes;
+        let mut end = begin + takes;
+        if at_once {
+            self.bench.state().bus_now = Some(end);
+            job.errand.run();
+            end = self.bench.state().bus_now.take().unwrap_or(end);
+        }
         *free = end;
         let place = shop.under_way.partition_point(|(_, other, _)| *other <= end);
         shop.under_way.insert(place, (begin, end, job));
         Ok(())
     }
 
-    /// What an errand does to its device it does at its end.
+    /// What an errand does to its device it does at its end, unless bytes take their time.
     fn completion(&mut self) -> Option<Completion> {
         if !self.has_completion() {
             return None;
         }
         let (began, ended, mut job) = self.shop.lock().unwrap().under_way.pop_front()?;
-        self.bench.state().on_worker = true;
-        job.errand.run();
-        self.bench.state().on_worker = false;
+        if self.bench.state().byte_ticks == 0 {
+            self.bench.state().on_worker = true;
+            job.errand.run();
+            self.bench.state().on_worker = false;
+        }
         let Job { ticket, errand, holds } = job;
         Some(Completion { ticket, errand, holds, began, ended })
     }

@@ -8,6 +8,7 @@ mod bench;
 #[allow(dead_code)]
 mod rig;
 
+mod adxl345;
 mod analog_in;
 mod any_bytes;
 mod base;
@@ -15,6 +16,7 @@ mod buttons;
 mod counter;
 mod digital_out;
 mod endstop;
+mod fifo_sensors;
 mod i2c;
 mod one_order;
 mod pca9685;
@@ -25,5 +27,6 @@ mod sleeping_lines;
 mod software_buses;
 mod sos_filter;
 mod spi;
+mod spi_angle;
 mod stepper;
 mod trigger_analog;

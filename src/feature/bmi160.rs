@@ -1,0 +1,88 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The accelerometer BMI160, on SPI or I2C.
+//!
+//! Registers after its data sheet (Bosch, BST-BMI160-DS000: "Register (0x22-0x23) FIFO_LENGTH",
+//! "Register (0x24) FIFO_DATA"); klippy has it put bare samples of the accelerometer in the FIFO.
+
+#![forbid(unsafe_code)]
+
+use crate::board::{BusDevice, BusError};
+use crate::mcu::{Command, Feature, Oid, command};
+use crate::time::Ticks;
+
+use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
+
+pub(super) const FEATURE: Feature =
+    Feature { name: "bmi160", commands: &[CONFIG_BMI160, QUERY_BMI160, QUERY_BMI160_STATUS], ..Feature::EMPTY };
+
+const FIFO_LENGTH: u8 = 0x22;
+const FIFO_DATA: u8 = 0x24;
+/// Bytes that the FIFO holds.
+const FIFO_BYTES: u16 = 1024;
+
+/// What FIFO_LENGTH says, low byte first.
+fn fill(length: [u8; 2]) -> Fill {
+    let bytes = u16::from_le_bytes(length);
+    Fill { bytes, overflowed: bytes > FIFO_BYTES }
+}
+
+#[derive(Clone, Copy)]
+struct Bmi160 {
+    bus_type: BusType,
+}
+
+impl Bmi160 {
+    fn ask_fill(self, chip: &mut dyn BusDevice) -> Result<Fill, BusError> {
+        let mut length = [0; 2];
+        self.bus_type.read(chip, FIFO_LENGTH, &mut length)?;
+        Ok(fill(length))
+    }
+}
+
+impl FifoChip for Bmi160 {
+    const NAME: &'static str = "BMI160";
+    const SAMPLE_BYTES: usize = 6;
+
+    fn bus_type(self) -> BusType {
+        self.bus_type
+    }
+
+    fn read(self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError> {
+        let read = |chip: &mut dyn BusDevice, block: &mut [u8]| self.bus_type.read(chip, FIFO_DATA, block);
+        reading.block(chip, |chip| self.ask_fill(chip), read)
+    }
+
+    fn fill(self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError> {
+        self.ask_fill(chip).map(Some)
+    }
+}
+
+const CONFIG_BMI160: Command =
+    command!("config_bmi160 oid=%c bus_oid=%c bus_oid_type=%c", |mcu, oid: Oid, bus_oid: Oid, bus_oid_type: u8| {
+        configure(mcu, oid, bus_oid, Bmi160 { bus_type: BusType::of(bus_oid_type)? })
+    });
+
+const QUERY_BMI160: Command = command!("query_bmi160 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
+    query::<Bmi160>(mcu, oid, rest_ticks)
+});
+
+const QUERY_BMI160_STATUS: Command =
+    command!("query_bmi160_status oid=%c", |mcu, oid: Oid| query_status::<Bmi160>(mcu, oid));
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_length_of_the_fifo() {
+        for (length, bytes, overflowed) in [
+            ([0, 0], 0, false),
+            ([0x30, 0], 48, false),
+            ([0x00, 0x04], 1024, false),
+            ([0x01, 0x04], 1025, true),
+            ([0xff, 0xff], 65535, true),
+        ] {
+            assert_eq!(fill(length), Fill { bytes, overflowed });
+        }
+    }
+}

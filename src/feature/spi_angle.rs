@@ -1,0 +1,594 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Magnetic angle sensors on SPI: A1333, AS5047D, TLE5012B, MT6816, MT6826S.
+//!
+//! Every `rest_ticks` there is one entry for the host, be it an angle or an error: klippy
+//! (`extras/angle.py`) counts entries to tell when each was due, and an entry has by how much it came
+//! later (or, of the TLE5012B, the chip's own clock). A sensor is asked one thing at a time: what it
+//! latched for a measurement is read before a transfer of the host's latches anew.
+
+#![forbid(unsafe_code)]
+
+use crate::mcu::{
+    Command, Conversation, Done, Enumeration, Feature, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock,
+    command, response,
+};
+use crate::shutdown::{Shutdown, reason, shutdowns};
+use crate::time::{Clock, Ticks};
+
+use super::named;
+use super::sensor_bulk::SensorBulk;
+use super::spi::{Spi, Transfer};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "spi_angle",
+    commands: &[CONFIG_SPI_ANGLE, QUERY_SPI_ANGLE, SPI_ANGLE_TRANSFER],
+    responses: &[TransferResponse::FORMAT],
+    enumerations: &[Enumeration {
+        name: "spi_angle_type",
+        values: |_| named(&[("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)]),
+    }],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// A `spi_angle_type` that the enumeration does not have.
+    INVALID_CHIP = "Invalid spi_angle chip type";
+    /// The SPI device has no chip select line of its own.
+    NEEDS_CS = "angle sensor requires cs pin";
+}
+
+response! {
+    /// What a sensor sent back, and when it latched that; nothing if the bus was too slow to tell.
+    "spi_angle_transfer_response oid=%c clock=%u response=%*s"
+    pub(super) struct TransferResponse<'a> { oid: Oid, clock: Clock, response: &'a [u8] }
+}
+
+/// A transfer that takes longer says too little about when the sensor latched.
+const TRANSFER_MAX: Ticks = Ticks::from_us(50);
+/// What stands for the time in an entry that is an error.
+const TIME_ERROR: u8 = 0xff;
+/// How long the TLE5012B's frame counter of 6 bits is unambiguous, with some margin: 32 times 32
+/// periods of its timer of 750 kHz, in whole microseconds.
+const FRAMES_MAX: Ticks = Ticks::from_us((32 * 32 * 1_000_000u64 / 750_000) as u32);
+const ENTRY_BYTES: usize = 3;
+const MESSAGE_MAX: usize = 10;
+
+/// Why there is no angle, as klippy's log counts it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Fault {
+    /// The measurement before was not over in time.
+    Overflow = 0,
+    /// It came too late to be told by how much.
+    Schedule = 1,
+    /// The transfer took too long.
+    SpiTime = 2,
+    /// A check sum or parity is wrong.
+    Crc = 3,
+    /// The angle was told before.
+    Duplicate = 4,
+    /// The sensor says that it has none.
+    NoAngle = 5,
+}
+
+/// The sensors, in the order of `spi_angle_type`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Chip {
+    A1333,
+    As5047d,
+    Tle5012b,
+    Mt6816,
+    Mt6826s,
+}
+
+/// An angle of 16 bits, and of the TLE5012B its own clock.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Angle {
+    angle: u16,
+    frame: Option<u8>,
+}
+
+/// A cyclic redundancy check of 8 bits.
+fn crc8(polynomial: u8, start: u8, bytes: &[u8]) -> u8 {
+    bytes.iter().fold(start, |crc, byte| {
+        (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 != 0 { (crc << 1) ^ polynomial } else { crc << 1 })
+    })
+}
+
+fn is_odd(bytes: [u8; 2]) -> bool {
+    u16::from_be_bytes(bytes).count_ones() % 2 == 1
+}
+
+impl Chip {
+    /// The sensor with this number.
+    fn of(number: u8) -> Result<Chip, Shutdown> {
+        const CHIPS: [Chip; 5] = [Chip::A1333, Chip::As5047d, Chip::Tle5012b, Chip::Mt6816, Chip::Mt6826s];
+        CHIPS.get(usize::from(number)).copied().ok_or_else(|| {
+            Shutdown::by_host(INVALID_CHIP, format_args!("spi_angle_type {number} is not in the dictionary"))
+        })
+    }
+
+    /// What has to be said before the message: the end of this transfer is when the sensor latches.
+    /// The TLE5012B latches at the end of an empty one; the AS5047D at the end of the one that asks
+    /// for the angle (ANGLECOM), which the next one brings.
+    fn preface(self, purpose: Purpose) -> Option<&'static [u8]> {
+        match (self, purpose) {
+            (Chip::Tle5012b, _) => Some(&[]),
+            (Chip::As5047d, Purpose::Measurement) => Some(&[0x7f, 0xfe]),
+            _ => None,
+        }
+    }
+
+    /// The message that brings the angle.
+    fn message(self) -> &'static [u8] {
+        match self {
+            // Angle register, for the next transfer.
+            Chip::A1333 => &[0x32, 0x00],
+            // No operation.
+            Chip::As5047d => &[0xc0, 0x00],
+            // Three registers from AVAL on, of those that were latched, and the safety word.
+            Chip::Tle5012b => &[0x84, 0x23, 0, 0, 0, 0, 0, 0, 0, 0],
+            // Two registers from 3 on.
+            Chip::Mt6816 => &[0x83, 0x00, 0x00],
+            // Four registers from 3 on.
+            Chip::Mt6826s => &[0x30, 0x03, 0, 0, 0, 0],
+        }
+    }
+
+    /// Whether what is measured is that of the transfer's end, where it has no preface. (Of the
+    /// MT6816 and MT6826S that is so for measurements only.)
+    fn latches_at_end(self, purpose: Purpose) -> bool {
+        match purpose {
+            Purpose::Measurement => matches!(self, Chip::Mt6816 | Chip::Mt6826s),
+            Purpose::Transfer => self == Chip::As5047d,
+        }
+    }
+
+    /// The angle in what a message brought back.
+    fn decode(self, reply: &[u8; MESSAGE_MAX]) -> Result<Angle, Fault> {
+        let [b0, b1, b2, b3, b4, b5, b6, .., b8, b9] = *reply;
+        let word = |high: u8, low: u8| u16::from_be_bytes([high, low]);
+        let check = |wrong: bool, fault: Fault| if wrong { Err(fault) } else { Ok(()) };
+        let (angle, frame) = match self {
+            Chip::A1333 => {
+                check(b0 & 0x80 != 0, Fault::Crc)?;
+                (word(b0, b1) << 1, None)
+            }
+            Chip::As5047d => {
+                check(is_odd([b0, b1]), Fault::Crc)?;
+                check(b0 & 0x40 != 0, Fault::NoAngle)?;
+                (word(b0, b1) << 2, None)
+            }
+            Chip::Tle5012b => {
+                // SAE J1850, over the command too.
+                let crc = crc8(0x1d, crc8(0x1d, 0xff, &self.message()[..2]), &reply[2..8]);
+                check(!crc != b9, Fault::Crc)?;
+                check(b8 & 0x10 == 0, Fault::NoAngle)?;
+                check(b2 & 0x80 == 0, Fault::Duplicate)?;
+                (word(b2, b3) << 1, Some((b6 >> 1) & 0x3f))
+            }
+            Chip::Mt6816 => {
+                check(is_odd([b1, b2]), Fault::Crc)?;
+                check(b2 & 0x02 != 0, Fault::NoAngle)?;
+                (word(b1, b2) & 0xfffc, None)
+            }
+            Chip::Mt6826s => {
+                check(crc8(0x07, 0, &[b2, b3, b4]) != b5, Fault::Crc)?;
+                check(b4 & 0x02 != 0, Fault::NoAngle)?;
+                (word(b2, b3), None)
+            }
+        };
+        Ok(Angle { angle, frame })
+    }
+}
+
+/// An entry: of an angle that was latched so many ticks after it was due.
+fn entry(measured: Result<Angle, Fault>, late: u32, time_shift: u8) -> [u8; ENTRY_BYTES] {
+    let timed = measured.and_then(|Angle { angle, frame }| match frame {
+        Some(_) if late > FRAMES_MAX.0 => Err(Fault::Schedule),
+        Some(frame) => Ok((frame, angle)),
+        None => {
+            // Rounded.
+            let shift = u32::from(time_shift).min(63);
+            let half = (1u64 << shift) >> 1;
+            let time = u8::try_from((u64::from(late) + half) >> shift).ok().filter(|time| *time != TIME_ERROR);
+            time.map(|time| (time, angle)).ok_or(Fault::Schedule)
+        }
+    });
+    let (time, value) = timed.unwrap_or_else(|fault| (TIME_ERROR, fault as u16));
+    let [low, high] = value.to_le_bytes();
+    [time, low, high]
+}
+
+/// What a sensor is asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Purpose {
+    /// By the timer.
+    Measurement,
+    /// By `spi_angle_transfer`.
+    Transfer,
+}
+
+// The errands.
+const PREFACE: u8 = 0;
+const MESSAGE: u8 = 1;
+
+struct SpiAngle {
+    chip: Chip,
+    spi: Oid,
+    bulk: SensorBulk,
+    rest_ticks: Ticks,
+    time_shift: u8,
+    /// What is under way.
+    purpose: Option<Purpose>,
+    /// When the measurement under way was due, and when its preface was over.
+    slot: Clock,
+    latched: Clock,
+    /// Whether it is of an earlier query, and counts no more.
+    stale: bool,
+    /// The measurement that comes next, and how many before it there was no time for.
+    due: Option<Clock>,
+    overflows: u16,
+    /// For measurements, and prefaces of transfers; here while there is none under way.
+    measurement: Option<Box<Conversation<Transfer>>>,
+    /// The host's transfer; here while it is not under way.
+    transfer: Option<Box<Conversation<Transfer>>>,
+    /// Whether it waits for the measurement under way, and commands for it.
+    transfer_waits: bool,
+    holds: bool,
+}
+
+impl SpiAngle {
+    fn add(&mut self, mcu: &mut Mcu, oid: Oid, entry: [u8; ENTRY_BYTES]) {
+        self.bulk.add(mcu, oid, &entry);
+    }
+
+    /// Begins what is due, if nothing is under way.
+    fn go_on(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        if self.purpose.is_some() {
+            return Ok(());
+        }
+        if std::mem::take(&mut self.transfer_waits) {
+            return self.begin(mcu, oid, Purpose::Transfer);
+        }
+        let Some(slot) = self.due.take() else { return Ok(()) };
+        self.slot = slot;
+        for _ in 0..std::mem::take(&mut self.overflows) {
+            self.add(mcu, oid, entry(Err(Fault::Overflow), 0, 0));
+        }
+        self.begin(mcu, oid, Purpose::Measurement)
+    }
+
+    fn begin(&mut self, mcu: &mut Mcu, oid: Oid, purpose: Purpose) -> Result<(), Shutdown> {
+        self.purpose = Some(purpose);
+        match self.chip.preface(purpose) {
+            Some(preface) => self.say(mcu, oid, PREFACE, preface),
+            None => self.say_message(mcu, oid, purpose),
+        }
+    }
+
+    fn say_message(&mut self, mcu: &mut Mcu, oid: Oid, purpose: Purpose) -> Result<(), Shutdown> {
+        match (purpose, self.transfer.take()) {
+            (Purpose::Transfer, Some(transfer)) => mcu.converse(self.spi, Ticket { oid, tag: MESSAGE }, transfer),
+            (_, transfer) => {
+                self.transfer = transfer;
+                self.say(mcu, oid, MESSAGE, self.chip.message())
+            }
+        }
+    }
+
+    fn say(&mut self, mcu: &mut Mcu, oid: Oid, tag: u8, message: &[u8]) -> Result<(), Shutdown> {
+        // Nothing else is under way, so it is here.
+        let Some(mut measurement) = self.measurement.take() else { return Ok(()) };
+        measurement.talk.load(message);
+        mcu.converse(self.spi, Ticket { oid, tag }, measurement)
+    }
+
+    /// Takes in the end of a transfer. True if that is all that was under way.
+    fn take_in(
+        &mut self,
+        mcu: &mut Mcu,
+        oid: Oid,
+        purpose: Purpose,
+        tag: u8,
+        reply: &[u8],
+        (began, ended): (Clock, Clock),
+    ) -> Result<bool, Shutdown> {
+        let too_slow = ended.since(began) > i64::from(TRANSFER_MAX.0);
+        if tag == PREFACE {
+            self.latched = ended;
+            // The TLE5012B latches at an edge.
+            if self.chip == Chip::As5047d && too_slow {
+                self.measured(mcu, oid, Err(Fault::SpiTime), ended);
+                return Ok(true);
+            }
+            self.say_message(mcu, oid, purpose)?;
+            return Ok(false);
+        }
+        let has_preface = self.chip.preface(purpose).is_some();
+        let too_slow = too_slow && !has_preface;
+        let latched = match () {
+            () if has_preface => self.latched,
+            () if self.chip.latches_at_end(purpose) => ended,
+            () => began,
+        };
+        match purpose {
+            Purpose::Transfer => {
+                let response = if too_slow { &[] } else { reply };
+                mcu.send(TransferResponse { oid, clock: latched, response });
+            }
+            Purpose::Measurement => {
+                let mut message = [0; MESSAGE_MAX];
+                let len = reply.len().min(MESSAGE_MAX);
+                message[..len].copy_from_slice(&reply[..len]);
+                let measured = if too_slow { Err(Fault::SpiTime) } else { self.chip.decode(&message) };
+                self.measured(mcu, oid, measured, latched);
+            }
+        }
+        Ok(true)
+    }
+
+    fn measured(&mut self, mcu: &mut Mcu, oid: Oid, measured: Result<Angle, Fault>, latched: Clock) {
+        if !self.stale {
+            let late = latched.wire().wrapping_sub(self.slot.wire());
+            self.add(mcu, oid, entry(measured, late, self.time_shift));
+        }
+    }
+
+    /// Nothing is under way any more.
+    fn over(&mut self, mcu: &mut Mcu) {
+        let was_transfer = self.purpose.take() == Some(Purpose::Transfer);
+        self.stale = false;
+        if was_transfer && std::mem::take(&mut self.holds) {
+            mcu.release();
+        }
+    }
+
+    /// Ends the measurements.
+    fn end(&mut self) {
+        self.stale = self.purpose == Some(Purpose::Measurement);
+        self.due = None;
+        self.overflows = 0;
+    }
+
+    fn put_back(&mut self, purpose: Purpose, tag: u8, said: Box<Conversation<Transfer>>) {
+        match (purpose, tag) {
+            (Purpose::Transfer, MESSAGE) => self.transfer = Some(said),
+            _ => self.measurement = Some(said),
+        }
+    }
+
+    fn query(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, rest_ticks: Ticks, time_shift: u8) -> Result<(), Shutdown> {
+        let timer = TimerId::new(oid, 0);
+        mcu.cancel(timer);
+        self.end();
+        if rest_ticks == Ticks(0) {
+            return Ok(());
+        }
+        self.rest_ticks = rest_ticks;
+        self.time_shift = time_shift;
+        self.bulk.reset();
+        mcu.schedule(timer, at)
+    }
+
+    fn ask(&mut self, mcu: &mut Mcu, oid: Oid, data: &[u8]) -> Result<(), Shutdown> {
+        // Commands wait for each other, so it is here; a stopped machine's may be still under way.
+        let Some(transfer) = &mut self.transfer else {
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came amid another one"));
+        };
+        transfer.talk.load(data);
+        self.transfer_waits = true;
+        // The measurement under way was begun by a timer: what it sends on does not hold by itself.
+        if self.purpose.is_some() {
+            self.holds = mcu.hold(oid);
+        }
+        self.go_on(mcu, oid)
+    }
+}
+
+impl Object for SpiAngle {
+    fn kind(&self) -> &'static str {
+        "angle sensor"
+    }
+
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        if let Some(oid) = timer.oid() {
+            if self.due.replace(at).is_some() {
+                self.overflows = self.overflows.saturating_add(1);
+            }
+            self.go_on(mcu, oid)?;
+        }
+        Ok(Next::At(at + self.rest_ticks))
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let (tag, span) = (done.tag, (done.began, done.ended));
+        let Some(mut said) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
+        let Some(purpose) = self.purpose else { return Ok(()) };
+        let result = std::mem::replace(&mut said.result, Ok(()));
+        let taken_in = match result {
+            Ok(()) => {
+                let reply = said.talk.clone();
+                self.put_back(purpose, tag, said);
+                self.take_in(mcu, oid, purpose, tag, reply.bytes(), span)
+            }
+            Err(error) => {
+                self.put_back(purpose, tag, said);
+                mcu.device_failed(oid, self.kind(), error.into()).map(|()| true)
+            }
+        };
+        if !matches!(taken_in, Ok(false)) {
+            self.over(mcu);
+        }
+        taken_in?;
+        self.go_on(mcu, oid)
+    }
+
+    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
+        self.end();
+        self.transfer_waits = false;
+        // A stopped machine is held by nothing.
+        if std::mem::take(&mut self.holds) {
+            mcu.release();
+        }
+    }
+}
+
+const CONFIG_SPI_ANGLE: Command = command!(
+    "config_spi_angle oid=%c spi_oid=%c spi_angle_type=%c",
+    |mcu, oid: Oid, spi_oid: Oid, spi_angle_type: u8| {
+        let chip = Chip::of(spi_angle_type)?;
+        mcu.vacant(oid)?;
+        if !mcu.with::<Spi, _>(spi_oid, |spi, _| Ok(spi.has_chip_select()))? {
+            return Err(Shutdown::because(
+                NEEDS_CS,
+                "its SPI device has no chip select line of its own: set cs_pin to a GPIO line, not to None",
+            ));
+        }
+        let sensor = SpiAngle {
+            chip,
+            spi: spi_oid,
+            bulk: SensorBulk::new(),
+            rest_ticks: Ticks(0),
+            time_shift: 0,
+            purpose: None,
+            slot: Clock::EPOCH,
+            latched: Clock::EPOCH,
+            stale: false,
+            due: None,
+            overflows: 0,
+            measurement: Some(Transfer::new(&[])),
+            transfer: Some(Transfer::new(&[])),
+            transfer_waits: false,
+            holds: false,
+        };
+        mcu.assign(oid, sensor)
+    }
+);
+
+const QUERY_SPI_ANGLE: Command = command!(
+    "query_spi_angle oid=%c clock=%u rest_ticks=%u time_shift=%c",
+    |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, time_shift: u8| {
+        let at = mcu.instant(clock);
+        mcu.with::<SpiAngle, _>(oid, |sensor, mcu| sensor.query(mcu, oid, at, rest_ticks, time_shift))
+    }
+);
+
+const SPI_ANGLE_TRANSFER: Command = command!("spi_angle_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
+    mcu.with::<SpiAngle, _>(oid, |sensor, mcu| sensor.ask(mcu, oid, data))
+});
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn reply(bytes: &[u8]) -> [u8; MESSAGE_MAX] {
+        let mut reply = [0; MESSAGE_MAX];
+        reply[..bytes.len()].copy_from_slice(bytes);
+        reply
+    }
+
+    fn angle(angle: u16) -> Result<Angle, Fault> {
+        Ok(Angle { angle, frame: None })
+    }
+
+    #[test]
+    fn check_sums_are_those_of_the_data_sheets() {
+        // The catalogue's check values of CRC-8/SAE-J1850 and CRC-8/SMBUS.
+        assert_eq!(!crc8(0x1d, 0xff, b"123456789"), 0x4b);
+        assert_eq!(crc8(0x07, 0, b"123456789"), 0xf4);
+    }
+
+    #[test]
+    fn angles_and_faults_of_each_chip() {
+        for (chip, bytes, expected) in [
+            // 15 bits behind a zero.
+            (Chip::A1333, &[0x00, 0x00][..], angle(0)),
+            (Chip::A1333, &[0x7f, 0xff], angle(0xfffe)),
+            (Chip::A1333, &[0x40, 0x01], angle(0x8002)),
+            (Chip::A1333, &[0xff, 0xff], Err(Fault::Crc)),
+            // Even parity, error flag, 14 bits.
+            (Chip::As5047d, &[0x00, 0x00], angle(0)),
+            (Chip::As5047d, &[0xa0, 0x00], angle(0x8000)),
+            (Chip::As5047d, &[0x3f, 0xff], angle(0xfffc)),
+            (Chip::As5047d, &[0x20, 0x00], Err(Fault::Crc)),
+            (Chip::As5047d, &[0xc0, 0x00], Err(Fault::NoAngle)),
+            (Chip::As5047d, &[0xff, 0xff], Err(Fault::NoAngle)),
+            // 14 bits, no magnet, parity.
+            (Chip::Mt6816, &[0, 0x00, 0x00], angle(0)),
+            (Chip::Mt6816, &[0, 0x80, 0x01], angle(0x8000)),
+            (Chip::Mt6816, &[0, 0xff, 0xfc], angle(0xfffc)),
+            (Chip::Mt6816, &[0, 0x80, 0x00], Err(Fault::Crc)),
+            (Chip::Mt6816, &[0, 0x80, 0x02], Err(Fault::NoAngle)),
+            // 15 bits, status, check sum.
+            (Chip::Mt6826s, &[0, 0, 0x00, 0x00, 0x00, 0x00], angle(0)),
+            (Chip::Mt6826s, &[0, 0, 0x12, 0x34, 0x00, crc8(7, 0, &[0x12, 0x34, 0])], angle(0x1234)),
+            (Chip::Mt6826s, &[0, 0, 0x12, 0x34, 0x02, crc8(7, 0, &[0x12, 0x34, 2])], Err(Fault::NoAngle)),
+            (Chip::Mt6826s, &[0, 0, 0x12, 0x34, 0x00, 0x00], Err(Fault::Crc)),
+            (Chip::Mt6826s, &[0xff; 6], Err(Fault::Crc)),
+        ] {
+            assert_eq!(chip.decode(&reply(bytes)), expected, "{chip:?} {bytes:02x?}");
+        }
+    }
+
+    #[test]
+    fn the_tle5012b_tells_its_frame() {
+        let tle = |aval: u16, frame: u8, status: u8| {
+            let [high, low] = aval.to_be_bytes();
+            let mut reply = [0x84, 0x23, high, low, 0x12, 0x34, frame << 1, 0x56, status, 0];
+            let crc = crc8(0x1d, 0xff, &reply[..8]);
+            reply[9] = !crc;
+            reply
+        };
+        let decode = |reply: [u8; 10]| Chip::Tle5012b.decode(&reply);
+        assert_eq!(decode(tle(0x8000 | 0x1234, 63, 0xff)), Ok(Angle { angle: 0x2468, frame: Some(63) }));
+        assert_eq!(decode(tle(0xffff, 0, 0x10)), Ok(Angle { angle: 0xfffe, frame: Some(0) }));
+        assert_eq!(decode(tle(0x1234, 5, 0xff)), Err(Fault::Duplicate));
+        assert_eq!(decode(tle(0x8000, 5, 0xef)), Err(Fault::NoAngle));
+        for bit in 0..48 {
+            let mut reply = tle(0x9234, 5, 0xff);
+            reply[2 + bit / 8] ^= 1 << (bit % 8);
+            assert_eq!(decode(reply), Err(Fault::Crc), "bit {bit}");
+        }
+        assert_eq!(decode([0xff; 10]), Err(Fault::Crc));
+        assert_eq!(decode([0x00; 10]), Err(Fault::Crc));
+    }
+
+    #[test]
+    fn an_entry_has_the_time_in_steps_of_the_shift() {
+        for (late, shift, time) in [
+            (0, 0, Some(0)),
+            (254, 0, Some(254)),
+            (255, 0, None),
+            (511, 9, Some(1)),
+            (255, 9, Some(0)),
+            (256, 9, Some(1)),
+            (254 * 512 + 255, 9, Some(254)),
+            (254 * 512 + 256, 9, None),
+            (u32::MAX, 24, None),
+            (u32::MAX, 25, Some(128)),
+            (u32::MAX, 255, Some(0)),
+        ] {
+            let expected = time.map_or([0xff, 1, 0], |time| [time, 0x34, 0x12]);
+            assert_eq!(entry(angle(0x1234), late, shift), expected, "{late} {shift}");
+        }
+        let framed = Ok(Angle { angle: 0x1234, frame: Some(63) });
+        assert_eq!(entry(framed, 68_250, 9), [63, 0x34, 0x12]);
+        assert_eq!(entry(framed, 68_251, 9), [0xff, 1, 0]);
+        assert_eq!(entry(Err(Fault::NoAngle), 0, 9), [0xff, 5, 0]);
+    }
+
+    proptest! {
+        /// What klippy makes of it: never an angle where the sensor told of none.
+        #[test]
+        fn a_fault_is_never_an_angle(late: u32, shift: u8, bytes: [u8; MESSAGE_MAX], which in 0u8..5) {
+            let measured = Chip::of(which).unwrap().decode(&bytes);
+            let [time, low, high] = entry(measured, late, shift);
+            match measured {
+                Ok(Angle { angle, .. }) if time != TIME_ERROR => prop_assert_eq!([low, high], angle.to_le_bytes()),
+                _ => prop_assert_eq!((time, high), (TIME_ERROR, 0)),
+            }
+        }
+    }
+}
