@@ -13,10 +13,13 @@ mod analog_in;
 mod buttons;
 mod counter;
 mod digital_out;
+mod ds18b20;
 mod endstop;
+mod neopixel;
 mod pwm_out;
 mod spi;
 mod stepper;
+mod thermocouple;
 mod trsync;
 
 /// Every feature. What is not listed is not in the dictionary.
@@ -30,6 +33,9 @@ pub const FEATURES: &[Feature] = &[
     analog_in::FEATURE,
     buttons::FEATURE,
     counter::FEATURE,
+    ds18b20::FEATURE,
+    neopixel::FEATURE,
+    thermocouple::FEATURE,
     spi::FEATURE,
 ];
 

@@ -69,7 +69,7 @@ impl Talk for Transfer {
     }
 }
 
-struct Spi {
+pub(super) struct Spi {
     bus: Option<Bus>,
     /// Before the bus is known; then the worker drives it.
     chip_select: Option<ChipSelect>,

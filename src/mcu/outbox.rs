@@ -22,6 +22,8 @@ pub trait Outbox: Send {
 pub enum Note<'a> {
     /// The machine stopped.
     Shutdown(&'a Shutdown),
+    /// Something failed that does not stop the machine.
+    Warning(&'a Shutdown),
     /// Something else failed while it stopped.
     Trouble(&'a Shutdown),
     /// An output is at its shutdown value, after attempts that failed.

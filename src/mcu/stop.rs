@@ -107,6 +107,12 @@ impl Mcu {
         Ok(())
     }
 
+    /// Says in the log that something of an object failed which does not stop the machine.
+    pub fn warn(&mut self, oid: Oid, kind: &str, trouble: Shutdown) {
+        let trouble = self.blame(trouble, kind, oid);
+        self.outbox.note(Note::Warning(&trouble));
+    }
+
     /// The outputs of an object are where they belong in a stopped machine.
     pub fn is_safe(&mut self, oid: Oid) {
         let Some(place) = self.stop.owed.iter().position(|debt| debt.oid == oid) else { return };

@@ -189,6 +189,7 @@ impl Outbox for Outlet {
             Note::Shutdown(shutdown) => {
                 self.line(gravity(shutdown), 0, format_args!("shutdown: {shutdown}"));
             }
+            Note::Warning(shutdown) => self.line(Level::Warn, LINES_SPARE, format_args!("{shutdown}")),
             Note::Trouble(shutdown) => {
                 self.line(gravity(shutdown), LINES_SPARE, format_args!("while shut down: {shutdown}"));
             }

@@ -24,6 +24,9 @@ const OBJECTS: &[&str] = &[
     "set_digital_out pin=0 value=1",
     "config_buttons oid=8 button_count=3",
     "config_counter oid=9 pin=8 pull_up=1",
+    "config_thermocouple oid=10 spi_oid=6 thermocouple_type=1",
+    "config_ds18b20 oid=11 serial=3238 max_error_count=2",
+    "config_neopixel oid=12 pin=701 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
 ];
 
 #[derive(Clone, Debug)]
@@ -80,6 +83,7 @@ proptest! {
         rig.bench.state().answer_ticks = answer_ticks;
         rig.bench.script_adc(ANALOG, &[1000, 2000, 60_000, 0]);
         rig.bench.script_input(5, &[(100_000, 1), (100_700, 0), (200_000, 1)]);
+        rig.bench.script_ds18b20("28", &[Some(20_000), None, Some(-5000), None]);
         rig.configure(OBJECTS);
         for action in &actions {
             match action {
