@@ -136,9 +136,9 @@ impl Machine {
     fn heater_off_us(&self, trace: &Trace) -> u64 {
         let first = || trace.writes_to(self.heater).first().copied();
         sysfs::wait_until("the heater is switched off", || first().is_some());
-        let Write { level, at_us, .. } = first().expect("a write");
+        let Write { level, at_ns, .. } = first().expect("a write");
         assert!(!level);
-        at_us
+        at_ns / 1000
     }
 
     /// A program that is started anew has it all, once the chip's driver is free.
@@ -188,7 +188,7 @@ fn steps_beside_a_slow_output_are_in_time() {
     assert!(now_us() - began_us >= 50_000, "it is acknowledged when it is done");
     thread::sleep(Duration::from_millis(500));
     let edges = trace.writes_to(step);
-    let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_us).collect();
+    let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_ns / 1000).collect();
     assert_eq!(rising.len(), 1000);
     let worst = rising.iter().zip(0..).map(|(at_us, n)| (at_us - rising[0]).abs_diff(1000 * n)).max();
     println!("steps stray by {worst:?} us");
