@@ -254,7 +254,8 @@ mod tests {
     /// Words of the data sheets' tables; for chips with registers behind the byte that means nothing.
     #[test]
     fn words_and_faults() {
-        let cases: &[(Chip, &[u8], u8, (u32, u8))] = &[
+        type Case = (Chip, &'static [u8], u8, (u32, u8));
+        let cases: &[Case] = &[
             // +1600 C and a cold junction of +127 C.
             (Chip::Max31855, &[0x64, 0x00, 0x7f, 0x00], 0, (0x6400_7f00, 0)),
             // -250 C, -55 C.

@@ -5,12 +5,15 @@
 mod outputs;
 
 mod analog;
+mod buttons;
+mod ds18b20;
 mod duplicate;
 mod expander;
 mod guardian;
 mod hard_pwm;
 mod homing;
 mod lines;
+mod neopixel;
 mod pins;
 mod safe_state;
 mod spi;
