@@ -75,6 +75,8 @@ pub mod reason {
         pub SPI_MODE = "Unable to set SPI mode";
         /// An I2C bus that is not there or not permitted.
         pub I2C_OPEN = "Unable to open i2c device";
+        /// A DS18B20 that is not there or not permitted.
+        pub DS18B20_OPEN = "Invalid DS18B20 serial id, could not open for reading";
         /// A hardware PWM channel that is not there, not permitted or refuses its period.
         pub PWM_CONFIG = "Unable to config pwm device";
         /// A hardware PWM channel can no longer be written (Pinion's own text).

@@ -99,7 +99,22 @@ const OBJECTS: &[&str] = &[
     "config_pwm_out oid=8 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0",
     "set_pwm_out pin=501 cycle_ticks=50000 value=0",
     "set_digital_out pin=9 value=0",
-    "config_adxl345 oid=10 spi_oid=7",
+    "config_adxl345 oid=14 spi_oid=7",
+    "config_buttons oid=9 button_count=2",
+    "config_counter oid=10 pin=12 pull_up=1",
+    "config_thermocouple oid=11 spi_oid=7 thermocouple_type=3",
+    "config_ds18b20 oid=12 serial=3238 max_error_count=4",
+    "config_neopixel oid=13 pin=701 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
+];
+
+/// What klippy sends after the configuration, before anything moves.
+const BEGINNINGS: &[&str] = &[
+    "buttons_add oid=9 pos=0 pin=10 pull_up=1",
+    "buttons_add oid=9 pos=1 pin=11 pull_up=1",
+    "buttons_query oid=9 clock=@100000 rest_ticks=100000 retransmit_count=50 invert=0",
+    "query_counter oid=10 clock=@100000 poll_ticks=75000 sample_ticks=50000000",
+    "query_thermocouple oid=11 clock=@100000 rest_ticks=50000000 min_value=0 max_value=65535 max_invalid_count=255",
+    "query_ds18b20 oid=12 clock=@100000 rest_ticks=150000000 min_value=-55000 max_value=125000",
 ];
 
 /// Homes, heats, prints for half a minute and homes again.
@@ -107,9 +122,12 @@ fn print(rig: Rig) -> Print {
     let mut print = Print { rig, counted: 0 };
     print.rig.bench.script_adc(ANALOG, &[500]);
     print.rig.bench.script_input(6, &[(9_000_000, 1), (30_000_000, 0), (1_470_000_000, 1)]);
+    print.rig.bench.script_input(11, &[(50_000_000, 1), (900_000_000, 0)]);
+    print.rig.bench.script_input(12, &[(50_000_000, 1), (60_000_000, 0)]);
+    print.rig.send_all(BEGINNINGS);
     print.send("query_analog_in oid=6 clock=@100000 sample_ticks=50000 sample_count=8 rest_ticks=15000000 bytes_per_report=48 min_value=0 max_value=65535 range_check_count=4");
     // The bench has room for a few hundred transfers.
-    print.send("query_adxl345 oid=10 rest_ticks=20000000");
+    print.send("query_adxl345 oid=14 rest_ticks=20000000");
     print.home(5_000_000);
     assert_eq!(print.rig.ask("endstop_query_state oid=3").split(' ').nth(2), Some("homing=1"));
     let mut at = 40_000_000;
@@ -126,9 +144,12 @@ fn print(rig: Rig) -> Print {
             print.send(&format!("queue_digital_out oid=5 clock=@{at} on_ticks={}", 100 * n));
             print.send(&format!("queue_pwm_out oid=8 clock=@{at} value={n}"));
             print.send("spi_transfer oid=7 data=0102030405");
-            print.send("query_adxl345_status oid=10");
+            print.send("query_adxl345_status oid=14");
             print.send(&format!("set_pwm_out pin=501 cycle_ticks=50000 value={n}"));
             print.send(&format!("set_digital_out pin=9 value={}", n / 50 % 2));
+            print.send("neopixel_update oid=13 pos=1 data=ff00ff");
+            print.send("neopixel_send oid=13");
+            print.send("buttons_ack oid=9 count=1");
             for command in ["get_clock", "get_uptime", "get_config", "debug_ping data=01", "stepper_get_position oid=0"]
             {
                 print.send(command);
@@ -168,7 +189,11 @@ impl Print {
 
 #[test]
 fn a_print_allocates_nothing_once_configured() {
-    for rig in [Rig::configured(OBJECTS), Rig::with_workers(40_000, OBJECTS)] {
+    for answer_ticks in [0, 40_000] {
+        let mut rig = Rig::new();
+        rig.bench.state().answer_ticks = answer_ticks;
+        rig.bench.script_ds18b20("28", &[Some(20_000)]);
+        rig.configure(OBJECTS);
         let print = print(rig);
         assert_eq!(print.rig.notes().len(), 1, "configured, and nothing else");
         assert_eq!(print.counted, 0);

@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use crate::shutdown::Shutdown;
+use crate::shutdown::{Shutdown, reason};
 use crate::time::Ticks;
 
 pub mod linux;
@@ -140,6 +140,24 @@ pub trait Pwm: Send {
     ///
     /// "Unable to config pwm device", "PWM write failed", "Guardian process lost".
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown>;
+}
+
+/// A thermometer whose reading takes its time.
+pub trait Thermometer: Send {
+    /// The temperature in thousandths of a degree Celsius.
+    ///
+    /// # Errors
+    ///
+    /// Subject, cause and remedy for the log; the next reading may be good.
+    fn read(&mut self) -> Result<i32, Box<str>>;
+}
+
+/// The data output of an SPI controller, used for itself: the controller's clock times what is sent.
+pub struct Mosi {
+    /// The output; nobody answers there.
+    pub line: OnWorker<dyn BusDevice>,
+    /// Bytes that are sent without a pause.
+    pub message_max: usize,
 }
 
 /// How a bus answered, in the words of the dictionary's `i2c_bus_status`.
@@ -334,6 +352,29 @@ pub trait Board: Send {
     /// Opens a hardware PWM channel.
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;
 
+    /// Opens the SPI data output that `pin` names, in mode 0.
+    ///
+    /// # Errors
+    ///
+    /// "Not an output pin" for any other pin, and those of [`Board::spi`].
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+        let _ = rate_hz;
+        let names = self.pins();
+        let name = names.iter().find_map(|range| range.name_of(pin.0)).unwrap_or(format!("pin number {}", pin.0));
+        Err(Shutdown::because(reason::NOT_OUTPUT, not_mosi(&name)))
+    }
+
+    /// Opens the DS18B20 thermometer that the kernel calls `serial`, such as `28-0123456789ab`.
+    ///
+    /// # Errors
+    ///
+    /// "Invalid DS18B20 serial id, could not open for reading".
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        let serial = String::from_utf8_lossy(serial);
+        let detail = format!("{serial:?}: this board has no one-wire bus: take another sensor");
+        Err(Shutdown::because(reason::DS18B20_OPEN, detail))
+    }
+
     /// How late a step may be before the machine stops, as a motor that is stepped too late loses
     /// steps. 1 ms, as in the firmware.
     fn step_late_limit(&self) -> Ticks {
@@ -342,4 +383,11 @@ pub trait Board: Send {
 
     /// Forgets all claims. The machine has dropped the lines and devices before.
     fn reset(&mut self);
+}
+
+/// Why a pin is no SPI data output.
+fn not_mosi(name: &str) -> String {
+    format!(
+        "{name} can not drive LEDs: their pulses are too short for a program on Linux; connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\" (pinion pins lists them)"
+    )
 }

@@ -196,7 +196,7 @@ fn spi_section(nodes: &[Node], args: &PinsArgs) -> String {
         .iter()
         .map(Node::to_string)
         .filter(|name| wanted(args, [name.as_str(), "spi"]))
-        .map(|name| vec![format!("/dev/{name}"), format!("spi_bus: {name}")])
+        .map(|name| vec![format!("/dev/{name}"), format!("spi_bus: {name}, or for LEDs pin: {name}")])
         .collect();
     section("SPI", &["device", "in printer.cfg"], &rows)
 }
@@ -263,7 +263,7 @@ iio:device0 ads1115, 2 channels
 
 SPI
   device          in printer.cfg
-  /dev/spidev0.1  spi_bus: spidev0.1
+  /dev/spidev0.1  spi_bus: spidev0.1, or for LEDs pin: spidev0.1
 "
         );
     }

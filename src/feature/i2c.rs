@@ -147,7 +147,7 @@ impl Object for I2c {
         self.transfer = Some(transfer);
         let failed_before = std::mem::replace(&mut self.failing, result.is_err());
         match result {
-            Err(error) if !failed_before => mcu.note_failure(&i2c_shutdown(error)),
+            Err(error) if !failed_before => mcu.warn(oid, self.kind(), i2c_shutdown(error)),
             _ => {}
         }
         Ok(())

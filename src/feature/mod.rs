@@ -15,12 +15,14 @@ mod bmi160;
 mod buttons;
 mod counter;
 mod digital_out;
+mod ds18b20;
 mod endstop;
 mod fifo_sensor;
 mod i2c;
 mod icm20948;
 mod lis2dw;
 mod mpu9250;
+mod neopixel;
 mod pca9685;
 mod pwm_out;
 mod sensor_bulk;
@@ -28,6 +30,7 @@ mod sos_filter;
 mod spi;
 mod spi_angle;
 mod stepper;
+mod thermocouple;
 mod trigger_analog;
 mod trsync;
 
@@ -40,12 +43,14 @@ pub const FEATURES: &[Feature] = &[
     buttons::FEATURE,
     counter::FEATURE,
     digital_out::FEATURE,
+    ds18b20::FEATURE,
     endstop::FEATURE,
     fifo_sensor::FEATURE,
     i2c::FEATURE,
     icm20948::FEATURE,
     lis2dw::FEATURE,
     mpu9250::FEATURE,
+    neopixel::FEATURE,
     pca9685::FEATURE,
     pwm_out::FEATURE,
     sensor_bulk::FEATURE,
@@ -53,6 +58,7 @@ pub const FEATURES: &[Feature] = &[
     spi::FEATURE,
     spi_angle::FEATURE,
     stepper::FEATURE,
+    thermocouple::FEATURE,
     trigger_analog::FEATURE,
     trsync::FEATURE,
 ];

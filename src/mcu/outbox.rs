@@ -23,10 +23,10 @@ pub trait Outbox: Send {
 pub enum Note<'a> {
     /// The machine stopped.
     Shutdown(&'a Shutdown),
+    /// Something failed that does not stop the machine.
+    Warning(&'a Shutdown),
     /// Something else failed while the machine stopped, or is stopped.
     Trouble(&'a Shutdown),
-    /// A device failed, and the machine goes on.
-    Failed(&'a Shutdown),
     /// This output is at its shutdown value, after attempts that failed.
     Safe(&'a str),
     /// The host configured this many objects of each kind.

@@ -114,9 +114,10 @@ impl Mcu {
         Ok(())
     }
 
-    /// A device failed in a way that the host is told by an answer: only the log hears of it here.
-    pub fn note_failure(&mut self, failure: &Shutdown) {
-        self.outbox.note(Note::Failed(failure));
+    /// Says in the log that something of an object failed which does not stop the machine.
+    pub fn warn(&mut self, oid: Oid, kind: &str, trouble: Shutdown) {
+        let trouble = self.blame(trouble, kind, oid);
+        self.outbox.note(Note::Warning(&trouble));
     }
 
     /// To be called by an object that answered [`Safe::Later`], once its outputs are at their shutdown

@@ -30,6 +30,9 @@ const OBJECTS: &[&str] = &[
     "config_adxl345 oid=12 spi_oid=6",
     "config_spi_angle oid=13 spi_oid=6 spi_angle_type=2",
     "config_lis2dw oid=14 bus_oid=6 bus_oid_type=0 lis_chip_type=0",
+    "config_thermocouple oid=15 spi_oid=6 thermocouple_type=1",
+    "config_ds18b20 oid=16 serial=3238 max_error_count=2",
+    "config_neopixel oid=17 pin=701 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
 ];
 
 #[derive(Clone, Debug)]
@@ -87,6 +90,7 @@ proptest! {
         rig.bench.plug_i2c(0, 64, |_, _, _| Ok(()));
         rig.bench.script_adc(ANALOG, &[1000, 2000, 60_000, 0]);
         rig.bench.script_input(5, &[(100_000, 1), (100_700, 0), (200_000, 1)]);
+        rig.bench.script_ds18b20("28", &[Some(20_000), None, Some(-5000), None]);
         rig.configure(OBJECTS);
         for action in &actions {
             match action {

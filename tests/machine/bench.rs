@@ -5,8 +5,8 @@ use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
 
 use pinion::board::{
-    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig,
-    Range, SpiConfig,
+    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, I2cConfig, Line, Mosi, OnWorker, Pin, Pwm,
+    PwmConfig, Range, SpiConfig, Thermometer,
 };
 use pinion::mcu::{Completion, Job, WorkerId, Workers};
 use pinion::shutdown::{Shutdown, ShutdownReason, reason};
@@ -24,6 +24,8 @@ const PWMS: u32 = 2;
 const SPI_BUSES: u32 = 2;
 /// I2C buses: 0 up to this.
 const I2C_BUSES: u32 = 2;
+/// The data output of SPI bus 0, and of 1.
+pub const MOSI: u32 = 700;
 /// To break the chips of SPI bus 0 or 1: this number, and the next.
 pub const SPI_CHIPS: u32 = 600;
 /// The chip of the lines that may sleep.
@@ -74,6 +76,8 @@ pub struct State {
     inputs: HashMap<u32, Vec<Edge>>,
     /// Readings to come; the last one stays.
     readings: HashMap<u32, VecDeque<u16>>,
+    /// What each DS18B20 reads, in thousandths of a degree; the last one stays. None fails.
+    thermometers: HashMap<Vec<u8>, VecDeque<Option<i32>>>,
     /// Pins that can not be written or read any more, ADC channels too.
     pub broken: HashSet<u32>,
     /// Every SPI transfer, and when it began.
@@ -229,6 +233,11 @@ impl Bench {
         self.state().readings.insert(pin, values.iter().copied().collect());
     }
 
+    /// Plugs a DS18B20 in, which reads these values and then stays at the last; none fails.
+    pub fn script_ds18b20(&self, serial: &str, values: &[Option<i32>]) {
+        self.state().thermometers.insert(serial.into(), values.iter().copied().collect());
+    }
+
     /// Claims an ADC or PWM channel.
     fn claim(&self, pin: Pin, known: std::ops::Range<u32>, unknown: ShutdownReason) -> Result<u32, Shutdown> {
         if !known.contains(&pin.0) {
@@ -266,6 +275,7 @@ impl Board for FakeBoard {
             Range { name: "gpio0".into(), first: 0, count: GPIOS },
             Range { name: "analog0".into(), first: ANALOG, count: ANALOGS },
             Range { name: "pwm0".into(), first: PWM, count: PWMS },
+            Range { name: "spidev0".into(), first: MOSI, count: SPI_BUSES },
         ]
     }
 
@@ -303,6 +313,24 @@ impl Board for FakeBoard {
         Ok(OnWorker { bus, device: Box::new(FakeSpi { bench: self.0.clone(), config }) })
     }
 
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+        let Some(bus) = pin.0.checked_sub(MOSI).filter(|bus| *bus < SPI_BUSES) else {
+            let detail = format!("pin {} is no SPI data output: choose spidev0", pin.0);
+            return Err(Shutdown::because(reason::NOT_OUTPUT, detail));
+        };
+        let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
+        Ok(Mosi { line, message_max: 64 })
+    }
+
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        if !self.0.state().thermometers.contains_key(serial) {
+            let detail = format!("the bench has no {}: plug it in", String::from_utf8_lossy(serial));
+            return Err(Shutdown::because(reason::DS18B20_OPEN, detail));
+        }
+        let device = FakeThermometer { bench: self.0.clone(), serial: serial.into() };
+        Ok(OnWorker { bus: "w1".into(), device: Box::new(device) })
+    }
+
     fn i2c_buses(&self) -> Vec<Range> {
         vec![Range { name: "i2c.0".into(), first: 0, count: I2C_BUSES }]
     }
@@ -327,6 +355,20 @@ impl Board for FakeBoard {
         let mut state = self.0.state();
         state.claimed.clear();
         state.directions.clear();
+    }
+}
+
+struct FakeThermometer {
+    bench: Bench,
+    serial: Vec<u8>,
+}
+
+impl Thermometer for FakeThermometer {
+    fn read(&mut self) -> Result<i32, Box<str>> {
+        let mut state = self.bench.state();
+        let values = state.thermometers.get_mut(&self.serial).unwrap();
+        let value = if values.len() > 1 { values.pop_front().unwrap() } else { values[0] };
+        value.ok_or_else(|| "the sensor on the bench has a wrong CRC: check the wires".into())
     }
 }
 

@@ -98,7 +98,7 @@ fn a_chip_that_is_unplugged_is_told_once_and_is_there_when_it_is_back() {
         let answer = rig.ask("i2c_transfer oid=0 write=10 read_len=2");
         assert_eq!(answer, "i2c_response oid=0 i2c_bus_status=3 response=0000");
     }
-    assert_eq!(rig.notes(), ["failed: I2C START NACK: nothing answers at 0x48: check the wiring"]);
+    assert_eq!(rig.notes(), ["warning: I2C START NACK: I2C device oid 0: nothing answers at 0x48: check the wiring"]);
     plug(&rig, &[]);
     assert_eq!(rig.ask("i2c_transfer oid=0 write=10 read_len=2"), "i2c_response oid=0 i2c_bus_status=0 response=1011");
     rig.bench.unplug_i2c(1, 0x48);

@@ -36,8 +36,8 @@ impl Outbox for FakeOutbox {
     fn note(&mut self, note: Note<'_>) {
         let text = match note {
             Note::Shutdown(shutdown) => format!("shutdown: {shutdown}"),
+            Note::Warning(shutdown) => format!("warning: {shutdown}"),
             Note::Trouble(shutdown) => format!("trouble: {shutdown}"),
-            Note::Failed(failure) => format!("failed: {failure}"),
             Note::Configured(kinds) => format!("configured: {kinds:?}"),
             Note::Safe(name) => format!("safe: {name}"),
             Note::Lateness(..) => return,

@@ -11,7 +11,8 @@ use std::sync::atomic::AtomicU8;
 use industrial_io::Context;
 
 use super::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+    Thermometer, not_mosi,
 };
 use crate::shutdown::{Shutdown, reason};
 pub use guard::Guard;
@@ -25,10 +26,12 @@ pub mod i2c;
 pub mod pins;
 mod pwm;
 pub mod spi;
+mod w1;
 
 const DEV: &str = "/dev";
 const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
+const W1: &str = "/sys/bus/w1/devices";
 const IIO: &str = "/sys/bus/iio/devices";
 
 /// What this machine has.
@@ -233,6 +236,21 @@ impl Board for LinuxBoard {
         Ok(OnWorker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
     }
 
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+        let Target::Mosi(node) = Target::of(pin) else {
+            return Err(Shutdown::because(reason::NOT_OUTPUT, not_mosi(&Target::of(pin).to_string())));
+        };
+        let bus = node.number().unwrap_or(u32::MAX);
+        let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
+        Ok(Mosi { line, message_max: spi::message_max() })
+    }
+
+    /// Each sensor has a worker: the kernel lets others use the bus while one measures.
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        let device = w1::Ds18b20::open(Path::new(W1), serial)?;
+        Ok(OnWorker { bus: format!("w1 {}", String::from_utf8_lossy(serial)), device: Box::new(device) })
+    }
+
     fn reset(&mut self) {
         if let Err(error) = self.guard.release() {
             log::error!("the guardian does not give back the lines: {error}: restart Pinion");
@@ -277,6 +295,25 @@ mod tests {
         let error = board.adc(Pin(17)).err().unwrap();
         assert_eq!(error.reason, reason::ADC_OPEN);
         assert!(error.to_string().contains("gpiochip0 line 17 is no ADC channel"), "{error}");
+    }
+
+    #[test]
+    fn leds_need_the_data_output_of_an_spi_device() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let error = board.mosi(Pin(17), 3_200_000).err().unwrap();
+        assert_eq!(error.reason, reason::NOT_OUTPUT);
+        assert!(error.detail.starts_with("gpiochip0 line 17 can not drive LEDs"), "{error}");
+        assert!(error.detail.contains("\"pin: spidev0.0\""), "{error}");
+        let names = Names::of(&Inventory { spi: vec![spi::Node::of(256), spi::Node::of(257)], ..Inventory::default() });
+        let range = names.ranges().into_iter().find(|range| range.name == "spidev1.0").unwrap();
+        assert_eq!(range.count, 2);
+        // It is named as what it is, and it is no GPIO line.
+        let error = board.mosi(Pin(range.first + 1), 3_200_000).err().unwrap();
+        assert_eq!(error.reason, reason::SPI_OPEN);
+        assert!(error.detail.contains("spidev1.1"), "{error}");
+        let error = board.line(Pin(range.first), ON).err().unwrap();
+        assert!(error.detail.starts_with("spidev1.0 (an SPI device's data output) can not be an output"), "{error}");
     }
 
     #[test]

@@ -8,6 +8,7 @@
 //! | 65536..65664 | 16 channels of each of pwmchip0 to 7, as the C program | `pwmchip0/pwm1` |
 //! | 2^24.. | every other line: 4096 numbers for each chip | `gpiochip9/gpio0` |
 //! | 2^25.. | every other ADC channel: 256 numbers for each device | |
+//! | 2^26.. | the data outputs (MOSI) of SPI devices, which LEDs may be connected to | `spidev0.0` |
 //!
 //! `gpio17` stands for `gpiochip0/gpio17`. The machine's own names are published as well: `GPIO17`
 //! (the name that the device tree gives a line), `pinctrl-rp1/gpio17` (by the chip's label) and
@@ -20,6 +21,7 @@ use std::collections::HashMap;
 use std::fmt;
 
 use super::Inventory;
+use super::spi::Node;
 use crate::board::{Pin, Range};
 
 /// How many chips have pin numbers in the C program.
@@ -42,6 +44,9 @@ const FURTHER_CHIP_LINES: u32 = 1 << 12;
 const FURTHER_CHANNELS: u32 = 1 << 25;
 const FURTHER_DEVICES: u32 = 1 << 12;
 const FURTHER_DEVICE_CHANNELS: u32 = 1 << 8;
+/// Data outputs of SPI devices, by the device's number on the wire.
+const MOSI: u32 = 1 << 26;
+const MOSI_NODES: u32 = 1 << 16;
 
 /// What a pin's number stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,6 +74,8 @@ pub(crate) enum Target {
         /// The channel's number in the chip.
         channel: u32,
     },
+    /// The data output of an SPI device.
+    Mosi(Node),
     /// No pin has this number.
     Nothing(u32),
 }
@@ -87,6 +94,8 @@ impl Target {
             Target::Line { chip: at / FURTHER_CHIP_LINES, offset: at % FURTHER_CHIP_LINES }
         } else if let Some(at) = within(FURTHER_CHANNELS, FURTHER_DEVICES * FURTHER_DEVICE_CHANNELS) {
             Target::Channel { device: at / FURTHER_DEVICE_CHANNELS, position: at % FURTHER_DEVICE_CHANNELS }
+        } else if let Some(at) = within(MOSI, MOSI_NODES) {
+            Target::Mosi(Node::of(at))
         } else {
             Target::Nothing(pin.0)
         }
@@ -102,6 +111,7 @@ impl fmt::Display for Target {
                 write!(f, "ADC channel {position} of iio:device{device}")
             }
             Target::Pwm { chip, channel } => write!(f, "pwmchip{chip}/pwm{channel} (hardware PWM)"),
+            Target::Mosi(node) => write!(f, "{node} (an SPI device's data output)"),
             Target::Nothing(pin) => write!(f, "pin number {pin} (no pin has it)"),
         }
     }
@@ -164,6 +174,11 @@ impl Names {
                 }
                 // The driver's name alone does not tell two devices of one type apart.
                 own.push((format!("iio{}/{}", adc.number, channel.id), number));
+            }
+        }
+        for node in &inventory.spi {
+            if let Some(number) = node.number().filter(|number| *number < MOSI_NODES) {
+                numeric.push((node.to_string(), MOSI + number));
             }
         }
         own.retain(|(name, _)| writable(name) && !numeric_name(name));
@@ -427,7 +442,8 @@ mod tests {
                 Target::Pwm { chip, channel } => prop_assert_eq!(PWM + chip * PWM_CHIP_CHANNELS + channel, pin),
                 Target::Nothing(same) => prop_assert_eq!(same, pin),
                 Target::Analog(n) => prop_assert_eq!(n + ANALOG, pin),
-                Target::Channel { .. } => prop_assert!(pin >= FURTHER_CHANNELS),
+                Target::Channel { .. } => prop_assert!((FURTHER_CHANNELS..MOSI).contains(&pin)),
+                Target::Mosi(node) => prop_assert_eq!(node.number().map(|number| MOSI + number), Some(pin)),
             }
         }
     }

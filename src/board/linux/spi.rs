@@ -77,6 +77,12 @@ pub(super) fn ranges(nodes: &[Node]) -> Vec<Range> {
     c_program.chain(further).collect()
 }
 
+/// The longest transfer that the driver takes, which it tells as its parameter `bufsiz`.
+pub(super) fn message_max() -> usize {
+    let told = fs::read_to_string("/sys/module/spidev/parameters/bufsiz").ok();
+    told.and_then(|text| text.trim().parse().ok()).unwrap_or(4096)
+}
+
 /// An open SPI device.
 pub(super) struct Spi {
     device: SpidevDevice,

@@ -137,9 +137,8 @@ impl Machine {
         let first = || trace.writes_to(self.heater).first().copied();
         sysfs::wait_until("the heater is switched off", || first().is_some());
         let Write { level, at_ns, .. } = first().expect("a write");
-        let at_us = at_ns / 1000;
         assert!(!level);
-        at_us
+        at_ns / 1000
     }
 
     /// A program that is started anew has it all, once the chip's driver is free.

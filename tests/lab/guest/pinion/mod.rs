@@ -5,6 +5,8 @@
 mod outputs;
 
 mod analog;
+mod buttons;
+mod ds18b20;
 mod duplicate;
 mod expander;
 mod guardian;
@@ -12,6 +14,7 @@ mod hard_pwm;
 mod homing;
 mod i2c;
 mod lines;
+mod neopixel;
 mod pins;
 mod safe_state;
 mod spi;

@@ -1,0 +1,194 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! DS18B20 thermometers, read by the kernel's one-wire driver.
+//!
+//! A reading takes 750 ms, on a worker. It is told as soon as it is there; the firmware tells it when
+//! the next one is due.
+
+#![forbid(unsafe_code)]
+
+use crate::board::{OnWorker, Thermometer};
+use crate::mcu::{
+    Command, Done, Errand, Feature, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId, command,
+    response,
+};
+use crate::shutdown::{Shutdown, shutdowns};
+use crate::time::{CLOCK_FREQ, Clock, Ticks};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "ds18b20",
+    commands: &[CONFIG_DS18B20, QUERY_DS18B20],
+    responses: &[Reading::FORMAT],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// A serial number that would lead out of the folder of the sensors.
+    INVALID_SERIAL = "Invalid DS18B20 serial id, must not contain '/'";
+    /// More than `max_error_count` readings in a row failed.
+    READ_FAILED = "Error reading DS18B20 sensor";
+    /// A reading is not over after five seconds.
+    TOO_SLOW = "DS18B20 sensor didn't respond in time";
+    /// A temperature outside its range.
+    OUT_OF_RANGE = "DS18B20 out of range";
+}
+
+response! {
+    /// A temperature in thousandths of a degree, measured `rest_ticks` before `next_clock`; or the last
+    /// one, and how many readings failed since.
+    "ds18b20_result oid=%c next_clock=%u value=%i fault=%u"
+    pub(super) struct Reading { oid: Oid, next_clock: Clock, value: i32, fault: u32 }
+}
+
+/// How long a reading may take (`W1_READ_TIMEOUT_SEC` of the firmware).
+const READ_LIMIT: i64 = 5 * CLOCK_FREQ as i64;
+
+/// One reading: there is one box for each sensor.
+struct Look {
+    sensor: Box<dyn Thermometer>,
+    result: Result<i32, Box<str>>,
+}
+
+impl Errand for Look {
+    fn run(&mut self) {
+        self.result = self.sensor.read();
+    }
+}
+
+struct Ds18b20 {
+    worker: WorkerId,
+    /// Here while the sensor is not being read.
+    look: Option<Box<Look>>,
+    /// When the reading under way was asked for.
+    asked: Clock,
+    /// The turn after that.
+    next_clock: Clock,
+    rest_ticks: Ticks,
+    min_value: i32,
+    max_value: i32,
+    max_error_count: u8,
+    /// Readings that failed since the last one that did not.
+    error_count: u8,
+    value: i32,
+    /// Tells readings of an earlier query.
+    tag: u8,
+}
+
+impl Ds18b20 {
+    fn check_range(&self, mcu: &Mcu) -> Result<(), Shutdown> {
+        if (self.min_value..=self.max_value).contains(&self.value) {
+            return Ok(());
+        }
+        let celsius = |value: i32| f64::from(value) / 1000.;
+        mcu.try_shut_down(Shutdown::because(
+            OUT_OF_RANGE,
+            format!(
+                "it read {} C where {} C to {} C is allowed: what it watches is past its limits, or the sensor is broken (85 C is what it says when its supply just came back)",
+                celsius(self.value),
+                celsius(self.min_value),
+                celsius(self.max_value)
+            ),
+        ))
+    }
+}
+
+impl Object for Ds18b20 {
+    fn kind(&self) -> &'static str {
+        "DS18B20"
+    }
+
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+        let next = at + self.rest_ticks;
+        match self.look.take() {
+            Some(look) => {
+                self.asked = at;
+                self.next_clock = next;
+                mcu.dispatch(self.worker, Ticket { oid, tag: self.tag }, look)?;
+            }
+            None if at.since(self.asked) > READ_LIMIT => mcu.try_shut_down(Shutdown::because(
+                TOO_SLOW,
+                "its reading is under way for more than 5 s: does the bus or its driver hang (dmesg), or do too many sensors share it?",
+            ))?,
+            // This turn is left out.
+            None => {}
+        }
+        Ok(Next::At(next))
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let tag = done.tag;
+        let Some(look) = done.errand::<Look>() else { return Ok(()) };
+        let look = self.look.insert(look);
+        if tag != self.tag {
+            return Ok(());
+        }
+        match &look.result {
+            Ok(value) => {
+                self.value = *value;
+                self.error_count = 0;
+            }
+            Err(detail) => {
+                self.error_count = self.error_count.saturating_add(1);
+                if self.error_count > self.max_error_count {
+                    let times = self.error_count;
+                    let detail = format!("{detail} ({times} readings in a row failed)");
+                    return mcu.try_shut_down(Shutdown::because(READ_FAILED, detail));
+                }
+            }
+        }
+        let fault = self.error_count;
+        mcu.send(Reading { oid, next_clock: self.next_clock, value: self.value, fault: fault.into() });
+        if fault == 0 { self.check_range(mcu) } else { Ok(()) }
+    }
+
+    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+        self.tag = self.tag.wrapping_add(1);
+    }
+}
+
+const CONFIG_DS18B20: Command = command!(
+    "config_ds18b20 oid=%c serial=%*s max_error_count=%c",
+    |mcu, oid: Oid, serial: &[u8], max_error_count: u8| {
+        mcu.vacant(oid)?;
+        if serial.contains(&b'/') {
+            let serial = String::from_utf8_lossy(serial);
+            let detail =
+                format!("{serial:?} is no sensor: serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab");
+            return Err(Shutdown::because(INVALID_SERIAL, detail));
+        }
+        let OnWorker { bus, device } = mcu.board()?.ds18b20(serial)?;
+        let sensor = Ds18b20 {
+            worker: mcu.worker(&bus)?,
+            look: Some(Box::new(Look { sensor: device, result: Ok(0) })),
+            asked: Clock::EPOCH,
+            next_clock: Clock::EPOCH,
+            rest_ticks: Ticks(0),
+            min_value: 0,
+            max_value: 0,
+            max_error_count,
+            error_count: 0,
+            value: 0,
+            tag: 0,
+        };
+        mcu.assign(oid, sensor)
+    }
+);
+
+const QUERY_DS18B20: Command = command!(
+    "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",
+    |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
+        let at = mcu.instant(clock);
+        mcu.with::<Ds18b20, _>(oid, |sensor, mcu| {
+            mcu.cancel(TimerId::new(oid, 0));
+            sensor.tag = sensor.tag.wrapping_add(1);
+            if rest_ticks == Ticks(0) {
+                return Ok(());
+            }
+            sensor.rest_ticks = rest_ticks;
+            sensor.min_value = min_value;
+            sensor.max_value = max_value;
+            mcu.schedule(TimerId::new(oid, 0), at)
+        })
+    }
+);

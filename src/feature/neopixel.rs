@@ -1,0 +1,208 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Chains of WS2812 LEDs ("neopixels") on the data output (MOSI) of an SPI controller.
+//!
+//! A data bit of the chain is a pulse: a short one is 0, a long one is 1. Those times are too short for
+//! a program on Linux; the SPI controller's clock keeps them. Four of its bits make one bit of the
+//! chain: `1000` for 0, `1110` for 1. At 3.2 MHz these are 312.5 and 937.5 ns high of 1250 ns, within
+//! the data sheet's 400 and 800 ns, 150 more or less, of 1250 ns (Worldsemi WS2812B, "Data transfer
+//! time"). Each byte on the wire ends low, so that a pause of the controller between two bytes does
+//! not change a bit, and a controller that has only a lower rate, down to 2 MHz, will do: what is
+//! critical is the short pulse, below 500 ns (the firmware's src/neopixel.c on what chips really
+//! need).
+
+#![forbid(unsafe_code)]
+
+use crate::board::{BusDevice, BusError, Mosi, OnWorker, Pin};
+use crate::mcu::{
+    Bus, Command, Conversation, Done, Feature, Mcu, Object, Oid, Response, Talk, Ticket, command, response,
+};
+use crate::shutdown::{Shutdown, reason, shutdowns};
+use crate::time::{CLOCK_FREQ, Ticks};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "neopixel",
+    commands: &[CONFIG_NEOPIXEL, NEOPIXEL_UPDATE, NEOPIXEL_SEND],
+    responses: &[Sent::FORMAT],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// A chain of more bytes than the format or the SPI driver has room for.
+    INVALID_SIZE = "Invalid neopixel data_size";
+    /// `neopixel_update` past the end of the chain.
+    INVALID_UPDATE = "Invalid neopixel update command";
+}
+
+response! {
+    /// The colours are on their way to the LEDs, or could not be sent; klippy then sends once more.
+    "neopixel_result oid=%c success=%c"
+    pub(super) struct Sent { oid: Oid, success: bool }
+}
+
+/// Bits of the SPI bus in a second.
+const RATE_HZ: u32 = 3_200_000;
+/// Bytes of the SPI bus for one of the chain.
+const WIRE_BYTES: usize = 4;
+/// Sizes and positions from here on are refused, as in the firmware.
+const SIZE_LIMIT: u16 = 0x8000;
+
+/// The bytes of the SPI bus for one byte of the chain.
+fn encode(byte: u8) -> [u8; WIRE_BYTES] {
+    let half = |bit: u8| if byte >> bit & 1 == 1 { 0b1110 } else { 0b1000 };
+    [(7, 6), (5, 4), (3, 2), (1, 0)].map(|(first, second)| half(first) << 4 | half(second))
+}
+
+/// How many bytes keep the line low for at least so long.
+fn low_bytes(ticks: Ticks) -> usize {
+    let bits = u64::from(ticks.0) * u64::from(RATE_HZ);
+    usize::try_from(bits.div_ceil(u64::from(CLOCK_FREQ) * 8)).unwrap_or(usize::MAX)
+}
+
+/// The chain's colours on their way.
+struct Frame {
+    data: Vec<u8>,
+    /// Low for the reset time, the colours, low for the reset time. Low before: the controller may
+    /// leave its output high when it rests. Low behind: then the LEDs take the colours at once.
+    message: Vec<u8>,
+    low_bytes: usize,
+}
+
+impl Talk for Frame {
+    fn talk(&mut self, line: &mut dyn BusDevice) -> Result<(), BusError> {
+        // What came in last time is still there.
+        self.message.fill(0);
+        let colours = self.message.iter_mut().skip(self.low_bytes);
+        for (wire, byte) in colours.zip(self.data.iter().copied().flat_map(encode)) {
+            *wire = byte;
+        }
+        line.exchange(&mut self.message)
+    }
+}
+
+struct Neopixel {
+    bus: Bus,
+    data: Vec<u8>,
+    /// Here while the colours are not on their way.
+    frame: Option<Box<Conversation<Frame>>>,
+    /// Whether the log knows that sending fails.
+    failing: bool,
+}
+
+impl Neopixel {
+    fn update(&mut self, pos: u16, bytes: &[u8]) -> Result<(), Shutdown> {
+        let size = self.data.len();
+        let pos = usize::from(pos);
+        let part = self.data.get_mut(pos..pos + bytes.len());
+        let part = part.ok_or_else(|| {
+            let what = format_args!("bytes {pos} to {} of a chain of {size}", pos + bytes.len());
+            Shutdown::by_host(INVALID_UPDATE, what)
+        })?;
+        part.copy_from_slice(bytes);
+        Ok(())
+    }
+
+    fn send(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        // Commands wait for each other, so it is here.
+        let Some(mut frame) = self.frame.take() else {
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came amid another one"));
+        };
+        frame.talk.data.copy_from_slice(&self.data);
+        mcu.converse_on(&self.bus, Ticket { oid, tag: 0 }, frame)
+    }
+}
+
+impl Object for Neopixel {
+    fn kind(&self) -> &'static str {
+        "neopixel"
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let Some(mut frame) = done.errand::<Conversation<Frame>>() else { return Ok(()) };
+        let result = std::mem::replace(&mut frame.result, Ok(()));
+        self.frame = Some(frame);
+        mcu.send(Sent { oid, success: result.is_ok() });
+        // No colour is worth a print. klippy tries eight times for each change: once is enough in the log.
+        let known = std::mem::replace(&mut self.failing, result.is_err());
+        if let (Err(error), false) = (result, known) {
+            mcu.warn(oid, self.kind(), error.into());
+        }
+        Ok(())
+    }
+}
+
+const CONFIG_NEOPIXEL: Command = command!(
+    "config_neopixel oid=%c pin=%u data_size=%hu bit_max_ticks=%u reset_min_ticks=%u",
+    |mcu, oid: Oid, pin: Pin, data_size: u16, bit_max_ticks: Ticks, reset_min_ticks: Ticks| {
+        // The controller's clock does not dawdle amid a message.
+        let _ = bit_max_ticks;
+        mcu.vacant(oid)?;
+        if data_size >= SIZE_LIMIT {
+            return Err(Shutdown::by_host(INVALID_SIZE, format_args!("a chain of {data_size} bytes")));
+        }
+        let Mosi { line: OnWorker { bus, device }, message_max } = mcu.board()?.mosi(pin, RATE_HZ)?;
+        let size = usize::from(data_size);
+        let low_bytes = low_bytes(reset_min_ticks);
+        let len = low_bytes.saturating_mul(2).saturating_add(size * WIRE_BYTES);
+        if len > message_max {
+            let detail = format!(
+                "{}: a chain of {size} bytes makes a message of {len}, and its driver takes {message_max} at once: lower chain_count, or raise the kernel's parameter spidev.bufsiz",
+                mcu.name(pin)
+            );
+            return Err(Shutdown::because(INVALID_SIZE, detail));
+        }
+        let frame = Frame { data: vec![0; size], message: vec![0; len], low_bytes };
+        let chain = Neopixel {
+            bus: Bus::new(mcu.worker(&bus)?, device),
+            data: vec![0; size],
+            frame: Some(Conversation::new(frame)),
+            failing: false,
+        };
+        mcu.assign_on(pin, oid, chain)
+    }
+);
+
+const NEOPIXEL_UPDATE: Command =
+    command!("neopixel_update oid=%c pos=%hu data=%*s", |mcu, oid: Oid, pos: u16, data: &[u8]| {
+        mcu.with::<Neopixel, _>(oid, |chain, _| chain.update(pos, data))
+    });
+
+const NEOPIXEL_SEND: Command = command!("neopixel_send oid=%c", |mcu, oid: Oid| {
+    mcu.with::<Neopixel, _>(oid, |chain, mcu| chain.send(mcu, oid))
+});
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_of_the_chain() {
+        assert_eq!(encode(0x00), [0x88; 4]);
+        assert_eq!(encode(0xff), [0xee; 4]);
+        assert_eq!(encode(0x93), [0xe8, 0x8e, 0x88, 0xee]);
+    }
+
+    /// High and low times of each bit, as the data sheet has them (WS2812B: T0H, T1H, T0L, T1L).
+    #[test]
+    fn pulses_are_within_the_data_sheet() {
+        let bit_ns = 1e9 / f64::from(RATE_HZ);
+        for byte in [0x00, 0xff, 0xa5] {
+            let wire = encode(byte).into_iter().flat_map(|wire| (0..8).rev().map(move |bit| wire >> bit & 1));
+            for (n, pulse) in wire.collect::<Vec<u8>>().chunks(4).enumerate() {
+                let high = f64::from(pulse.iter().sum::<u8>()) * bit_ns;
+                let low = 4. * bit_ns - high;
+                let (want_high, want_low) = if byte >> (7 - n) & 1 == 1 { (800., 450.) } else { (400., 850.) };
+                assert!((high - want_high).abs() <= 150. && (low - want_low).abs() <= 150., "{high} {low}");
+                assert!(pulse.is_sorted_by(|a, b| a >= b), "one pulse, and it comes first");
+            }
+        }
+    }
+
+    #[test]
+    fn the_line_is_low_for_the_reset_time() {
+        // 50 us are 160 bits.
+        assert_eq!(low_bytes(Ticks::from_us(50)), 20);
+        assert_eq!(low_bytes(Ticks(1)), 1);
+        assert_eq!(low_bytes(Ticks(0)), 0);
+    }
+}

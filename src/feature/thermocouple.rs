@@ -1,0 +1,286 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Thermocouple and RTD converters on SPI: MAX31855, MAX31856, MAX31865, MAX6675.
+//!
+//! The machine passes the chip's word on, and klippy makes degrees of it.
+
+#![forbid(unsafe_code)]
+
+use crate::board::{Board, BusDevice, BusError, Range};
+use crate::mcu::{
+    Command, Conversation, Done, Enumeration, Feature, Mcu, Next, Object, Oid, Response, Talk, Ticket, TimerId,
+    WireClock, command, response,
+};
+use crate::shutdown::{Shutdown, shutdowns};
+use crate::time::{Clock, Ticks};
+
+use super::spi::Spi;
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "thermocouple",
+    commands: &[CONFIG_THERMOCOUPLE, QUERY_THERMOCOUPLE],
+    responses: &[Reading::FORMAT],
+    enumerations: &[Enumeration { name: "thermocouple_type", values: types }],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// A `thermocouple_type` that is none.
+    INVALID_TYPE = "Invalid thermocouple chip type";
+    /// Faults, or values out of range, `max_invalid_count` times in a row.
+    READER_FAULT = "Thermocouple reader fault";
+}
+
+response! {
+    /// What the chip read `rest_ticks` before `next_clock`, and its fault bits.
+    "thermocouple_result oid=%c next_clock=%u value=%u fault=%c"
+    pub(super) struct Reading { oid: Oid, next_clock: Clock, value: u32, fault: u8 }
+}
+
+/// A chip; its number on the wire is its place in [`Chip::ALL`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Chip {
+    Max31855,
+    Max31856,
+    Max31865,
+    Max6675,
+}
+
+impl Chip {
+    const ALL: [(Chip, &'static str); 4] = [
+        (Chip::Max31855, "MAX31855"),
+        (Chip::Max31856, "MAX31856"),
+        (Chip::Max31865, "MAX31865"),
+        (Chip::Max6675, "MAX6675"),
+    ];
+
+    fn name(self) -> &'static str {
+        Chip::ALL.iter().find(|(chip, _)| *chip == self).map_or("", |(_, name)| name)
+    }
+
+    /// What is sent: the word's register and room for the word.
+    fn word_message(self) -> &'static [u8] {
+        match self {
+            // They have no registers: each transfer is the one word.
+            Chip::Max31855 => &[0; 4],
+            Chip::Max6675 => &[0; 2],
+            // LTCBH, LTCBM, LTCBL: the linearized temperature (data sheet 19-7534, register map).
+            Chip::Max31856 => &[0x0c, 0, 0, 0],
+            // RTD MSBs and LSBs (data sheet 19-6478, register map).
+            Chip::Max31865 => &[0x01, 0, 0],
+        }
+    }
+
+    /// The register with the faults; none if they are in the word.
+    fn fault_register(self) -> Option<u8> {
+        match self {
+            Chip::Max31855 | Chip::Max6675 => None,
+            Chip::Max31856 => Some(0x0f),
+            Chip::Max31865 => Some(0x07),
+        }
+    }
+
+    /// The word of an answer to [`word_message`](Self::word_message), and the fault bits, with those of
+    /// the fault register.
+    fn decode(self, answer: &[u8], register: u8) -> (u32, u8) {
+        // The byte that came back while a register was named says nothing.
+        let word = answer.iter().skip(usize::from(self.fault_register().is_some()));
+        let value = word.fold(0, |value, byte| value << 8 | u32::from(*byte));
+        let low = value as u8;
+        let fault = match self {
+            // Short to VCC, short to GND, open (data sheet 19-5793, table 2: D2 to D0).
+            Chip::Max31855 => low & 0x07,
+            Chip::Max31856 => register,
+            // Bits 1 and 0 of the register are not used; D0 of the word is "any fault".
+            Chip::Max31865 => register & !0x03 | low & 0x01,
+            // Open (D2), and the device ID (D1), which reads 0 (data sheet 19-2235, table 2).
+            Chip::Max6675 => low & 0x06,
+        };
+        (value, fault)
+    }
+}
+
+fn types(_board: &dyn Board) -> Vec<Range> {
+    Chip::ALL.iter().zip(0..).map(|((_, name), first)| Range { name: (*name).into(), first, count: 1 }).collect()
+}
+
+/// One look at the chip.
+struct Look {
+    chip: Chip,
+    value: u32,
+    fault: u8,
+}
+
+impl Talk for Look {
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        let template = self.chip.word_message();
+        let mut buffer = [0; 4];
+        let word = &mut buffer[..template.len()];
+        word.copy_from_slice(template);
+        chip.exchange(word)?;
+        let mut faults = [0; 2];
+        if let Some(register) = self.chip.fault_register() {
+            faults[0] = register;
+            chip.exchange(&mut faults)?;
+        }
+        (self.value, self.fault) = self.chip.decode(word, faults[1]);
+        Ok(())
+    }
+}
+
+struct Thermocouple {
+    spi: Oid,
+    chip: Chip,
+    /// Here while the chip is not asked.
+    look: Option<Box<Conversation<Look>>>,
+    rest_ticks: Ticks,
+    min_value: u32,
+    max_value: u32,
+    max_invalid_count: u8,
+    invalid_count: u8,
+    /// The turn after the one that is being looked for.
+    next_clock: Clock,
+    /// Tells answers to an earlier query.
+    tag: u8,
+}
+
+impl Thermocouple {
+    fn check(&mut self, mcu: &Mcu, value: u32, fault: u8) -> Result<(), Shutdown> {
+        if fault == 0 && (self.min_value..=self.max_value).contains(&value) {
+            self.invalid_count = 0;
+            return Ok(());
+        }
+        self.invalid_count = self.invalid_count.saturating_add(1);
+        if self.invalid_count < self.max_invalid_count {
+            return Ok(());
+        }
+        let times = std::mem::take(&mut self.invalid_count);
+        let name = self.chip.name();
+        let detail = match fault {
+            0 => format!(
+                "the {name} read 0x{value:x} where 0x{:x} to 0x{:x} is allowed, {times} times in a row: a heater past its limits, or a sensor that is broken or unplugged",
+                self.min_value, self.max_value
+            ),
+            fault => format!(
+                "the {name} reports fault bits 0x{fault:02x}, {times} times in a row: check the sensor and its wires (klippy's log names the fault)"
+            ),
+        };
+        mcu.try_shut_down(Shutdown::because(READER_FAULT, detail))
+    }
+}
+
+impl Object for Thermocouple {
+    fn kind(&self) -> &'static str {
+        "thermocouple"
+    }
+
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        let next = at + self.rest_ticks;
+        // A chip that is still being asked misses this turn.
+        if let (Some(oid), Some(look)) = (timer.oid(), self.look.take()) {
+            self.next_clock = next;
+            mcu.converse(self.spi, Ticket { oid, tag: self.tag }, look)?;
+        }
+        Ok(Next::At(next))
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let tag = done.tag;
+        let Some(mut look) = done.errand::<Conversation<Look>>() else { return Ok(()) };
+        let result = std::mem::replace(&mut look.result, Ok(()));
+        let Look { value, fault, .. } = look.talk;
+        self.look = Some(look);
+        if tag != self.tag {
+            return Ok(());
+        }
+        result.or_else(|error| mcu.try_shut_down(error.into()))?;
+        mcu.send(Reading { oid, next_clock: self.next_clock, value, fault });
+        self.check(mcu, value, fault)
+    }
+
+    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+        self.tag = self.tag.wrapping_add(1);
+    }
+}
+
+const CONFIG_THERMOCOUPLE: Command = command!(
+    "config_thermocouple oid=%c spi_oid=%c thermocouple_type=%c",
+    |mcu, oid: Oid, spi_oid: Oid, thermocouple_type: u8| {
+        let Some((chip, _)) = Chip::ALL.get(usize::from(thermocouple_type)).copied() else {
+            let what = format_args!("thermocouple_type {thermocouple_type} is none");
+            return Err(Shutdown::by_host(INVALID_TYPE, what));
+        };
+        mcu.with::<Spi, _>(spi_oid, |_, _| Ok(()))?;
+        let object = Thermocouple {
+            spi: spi_oid,
+            chip,
+            look: Some(Conversation::new(Look { chip, value: 0, fault: 0 })),
+            rest_ticks: Ticks(0),
+            min_value: 0,
+            max_value: 0,
+            max_invalid_count: 0,
+            invalid_count: 0,
+            next_clock: Clock::EPOCH,
+            tag: 0,
+        };
+        mcu.assign(oid, object)
+    }
+);
+
+const QUERY_THERMOCOUPLE: Command = command!(
+    "query_thermocouple oid=%c clock=%u rest_ticks=%u min_value=%u max_value=%u max_invalid_count=%c",
+    |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
+        let at = mcu.instant(clock);
+        mcu.with::<Thermocouple, _>(oid, |sensor, mcu| {
+            mcu.cancel(TimerId::new(oid, 0));
+            sensor.tag = sensor.tag.wrapping_add(1);
+            if rest_ticks == Ticks(0) {
+                return Ok(());
+            }
+            sensor.rest_ticks = rest_ticks;
+            sensor.min_value = min_value;
+            sensor.max_value = max_value;
+            sensor.max_invalid_count = max_invalid_count;
+            sensor.invalid_count = 0;
+            mcu.schedule(TimerId::new(oid, 0), at)
+        })
+    }
+);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Words of the data sheets' tables; for chips with registers behind the byte that means nothing.
+    #[test]
+    fn words_and_faults() {
+        type Case = (Chip, &'static [u8], u8, (u32, u8));
+        let cases: &[Case] = &[
+            // +1600 C and a cold junction of +127 C.
+            (Chip::Max31855, &[0x64, 0x00, 0x7f, 0x00], 0, (0x6400_7f00, 0)),
+            // -250 C, -55 C.
+            (Chip::Max31855, &[0xf0, 0x60, 0xc9, 0x00], 0, (0xf060_c900, 0)),
+            (Chip::Max31855, &[0x00, 0x01, 0x00, 0x01], 0, (0x0001_0001, 1)),
+            (Chip::Max31855, &[0x00, 0x01, 0x00, 0x02], 0, (0x0001_0002, 2)),
+            (Chip::Max31855, &[0x00, 0x01, 0x00, 0x04], 0, (0x0001_0004, 4)),
+            // Bit 3 is reserved.
+            (Chip::Max31855, &[0x00, 0x00, 0x00, 0x08], 0, (0x0000_0008, 0)),
+            // +1600 C.
+            (Chip::Max31856, &[0xff, 0x64, 0x00, 0x00], 0, (0x64_0000, 0)),
+            (Chip::Max31856, &[0xff, 0xff, 0xff, 0xe0], 0x81, (0xff_ffe0, 0x81)),
+            // 100 Ohm of 400.
+            (Chip::Max31865, &[0xff, 0x40, 0x00], 0, (0x4000, 0)),
+            (Chip::Max31865, &[0xff, 0x40, 0x01], 0x80, (0x4001, 0x81)),
+            (Chip::Max31865, &[0xff, 0x40, 0x00], 0x03, (0x4000, 0)),
+            (Chip::Max31865, &[0xff, 0x40, 0x02], 0x04, (0x4002, 0x04)),
+            // 1023.75 C.
+            (Chip::Max6675, &[0x7f, 0xf8], 0, (0x7ff8, 0)),
+            (Chip::Max6675, &[0x00, 0x04], 0, (0x0004, 4)),
+            (Chip::Max6675, &[0x00, 0x02], 0, (0x0002, 2)),
+            (Chip::Max6675, &[0x00, 0x01], 0, (0x0001, 0)),
+        ];
+        for (chip, answer, register, expected) in cases {
+            assert_eq!(chip.decode(answer, *register), *expected, "{chip:?} {answer:02x?}");
+        }
+    }
+}
