@@ -95,6 +95,13 @@ impl fmt::Debug for Clock {
 pub trait TimeSource: Send + Sync {
     /// The present instant; never earlier than an instant that it told before.
     fn now(&self) -> Clock;
+
+    /// Waits until `end` without sleeping: for the pulses of a bus, which are shorter than a sleep.
+    fn spin_until(&self, end: Clock) {
+        while self.now() < end {
+            std::hint::spin_loop();
+        }
+    }
 }
 
 /// CLOCK_MONOTONIC in ticks. Tick 0 is a whole second of it, so that the lateness of an edge
@@ -148,11 +155,23 @@ impl VirtualClock {
     pub fn set(&self, now: Clock) {
         self.0.fetch_max(now.0, Ordering::SeqCst);
     }
+
+    /// Runs `work` in a time of its own that begins now, as another thread does, and tells when it
+    /// ended. The clock itself stands where it stood.
+    pub fn aside(&self, work: impl FnOnce()) -> Clock {
+        let now = self.now();
+        work();
+        Clock(self.0.swap(now.0, Ordering::SeqCst))
+    }
 }
 
 impl TimeSource for VirtualClock {
     fn now(&self) -> Clock {
         Clock(self.0.load(Ordering::SeqCst))
+    }
+
+    fn spin_until(&self, end: Clock) {
+        self.set(end);
     }
 }
 

@@ -84,6 +84,13 @@ pub trait Line: Send + Sync {
     /// Makes it an output or an input, for all who share it: the last use decides, as in the
     /// firmware, where a line that is set up again loses its earlier set-up.
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
+
+    /// The same amid a conversation on this line (single-wire UART, open-drain I2C): as cheap as a
+    /// write, since the guardian is not told. Claim the line as an input, so that the guardian never
+    /// drives it.
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.set_direction(direction)
+    }
 }
 
 /// A line as the board hands it out.

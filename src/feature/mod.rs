@@ -11,22 +11,30 @@ use crate::wire::format::same;
 
 mod analog_in;
 mod digital_out;
+mod display;
 mod endstop;
+mod hd44780;
+mod pace;
 mod pwm_out;
 mod spi;
+mod st7920;
 mod stepper;
+mod tmcuart;
 mod trsync;
 
 /// Every feature. What is not listed is not in the dictionary.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
-    digital_out::FEATURE,
-    pwm_out::FEATURE,
-    stepper::FEATURE,
-    endstop::FEATURE,
-    trsync::FEATURE,
     analog_in::FEATURE,
+    digital_out::FEATURE,
+    endstop::FEATURE,
+    hd44780::FEATURE,
+    pwm_out::FEATURE,
     spi::FEATURE,
+    st7920::FEATURE,
+    stepper::FEATURE,
+    tmcuart::FEATURE,
+    trsync::FEATURE,
 ];
 
 /// The place of a response in the list of all, found by the compiler.

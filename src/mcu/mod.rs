@@ -155,6 +155,11 @@ impl Mcu {
         self.last_read
     }
 
+    /// The clock, for what a worker paces by it.
+    pub fn clock(&self) -> Arc<dyn TimeSource> {
+        self.clock.clone()
+    }
+
     /// The instant that was read last: in the past, by little while timers run.
     #[inline]
     pub fn last_read(&self) -> Clock {

@@ -175,9 +175,9 @@ impl Handle {
             .line
             .request(flags, level.into(), CONSUMER)
             .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
-        let is_output = AtomicBool::new(false);
+        let is_output = AtomicBool::new(is_output(direction));
         let line = HeldLine { handle, line: self.line, subject: self.subject, is_output, guard, sleeping };
-        line.watch_over(direction)?;
+        line.watch_over(direction, false)?;
         Ok(line)
     }
 }
@@ -209,9 +209,8 @@ impl HeldLine {
     }
 
     /// Lets the guardian know what has become of the line.
-    fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
+    fn watch_over(&self, direction: Direction, was_output: bool) -> Result<(), Shutdown> {
         let name = format!("{} line {}", self.subject.chip, self.subject.offset);
-        let was_output = self.is_output.load(Ordering::Relaxed);
         match direction {
             Direction::Output { shutdown_level, .. } => {
                 self.guard.output(&name, self.handle.as_raw_fd(), shutdown_level, self.sleeping.as_deref())?;
@@ -219,9 +218,12 @@ impl HeldLine {
             Direction::Input(_) if was_output => self.guard.forget(&name)?,
             Direction::Input(_) => {}
         }
-        self.is_output.store(matches!(direction, Direction::Output { .. }), Ordering::Relaxed);
         Ok(())
     }
+}
+
+fn is_output(direction: Direction) -> bool {
+    matches!(direction, Direction::Output { .. })
 }
 
 impl Line for HeldLine {
@@ -244,11 +246,18 @@ impl Line for HeldLine {
     }
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let was_output = self.is_output.load(Ordering::Relaxed);
+        self.turn(direction)?;
+        self.watch_over(direction, was_output)
+    }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         let Setting { flags, level, refused } = self.subject.setting(direction)?;
         sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
             self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
         })?;
-        self.watch_over(direction)
+        self.is_output.store(is_output(direction), Ordering::Relaxed);
+        Ok(())
     }
 }
 
