@@ -83,7 +83,7 @@ proptest! {
         prop_assert_eq!(rig.responses(), [response(&[])]);
         let edges = rig.edges(TX);
         prop_assert_eq!(edges[0], (QUIET, 0));
-        prop_assert!(edges.iter().all(|(at, _)| (at - QUIET) % bit == 0), "{:?}", edges);
+        prop_assert!(edges.iter().all(|(at, _)| (at - QUIET).is_multiple_of(bit)), "{:?}", edges);
         // Bits of padding in the last byte are low, and a UART takes them for another byte.
         let heard = hear(&edges, bit);
         prop_assert_eq!(&heard[..message.len()], &message[..]);
