@@ -103,6 +103,13 @@ pub trait Line: Send + Sync {
     /// "Unable to open out GPIO chip line" or "Unable to open in GPIO chip line", and on the
     /// simulated printer "Not an output pin" or "Not an input pin".
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
+
+    /// The same amid a conversation on this line (single-wire UART, open-drain I2C): as cheap as a
+    /// write, since the guardian is not told. Claim the line as an input, so that the guardian never
+    /// drives it.
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.set_direction(direction)
+    }
 }
 
 /// A line as the board hands it out.

@@ -15,22 +15,27 @@ mod bmi160;
 mod buttons;
 mod counter;
 mod digital_out;
+mod display;
 mod ds18b20;
 mod endstop;
 mod fifo_sensor;
+mod hd44780;
 mod i2c;
 mod icm20948;
 mod lis2dw;
 mod mpu9250;
 mod neopixel;
+mod pace;
 mod pca9685;
 mod pwm_out;
 mod sensor_bulk;
 mod sos_filter;
 mod spi;
 mod spi_angle;
+mod st7920;
 mod stepper;
 mod thermocouple;
+mod tmcuart;
 mod trigger_analog;
 mod trsync;
 
@@ -46,6 +51,7 @@ pub const FEATURES: &[Feature] = &[
     ds18b20::FEATURE,
     endstop::FEATURE,
     fifo_sensor::FEATURE,
+    hd44780::FEATURE,
     i2c::FEATURE,
     icm20948::FEATURE,
     lis2dw::FEATURE,
@@ -57,8 +63,10 @@ pub const FEATURES: &[Feature] = &[
     sos_filter::FEATURE,
     spi::FEATURE,
     spi_angle::FEATURE,
+    st7920::FEATURE,
     stepper::FEATURE,
     thermocouple::FEATURE,
+    tmcuart::FEATURE,
     trigger_analog::FEATURE,
     trsync::FEATURE,
 ];

@@ -255,12 +255,27 @@ impl Mcu {
         level: bool,
         shutdown_level: bool,
     ) -> Result<PromptLine, Shutdown> {
-        match self.claim(pin, Direction::Output { level, shutdown_level })? {
-            (line, None) => Ok(PromptLine { line, level }),
+        let line = self.prompt_line(pin, use_, Direction::Output { level, shutdown_level })?;
+        Ok(PromptLine { line, level })
+    }
+
+    /// Claims a line on which every edge has its instant, for an errand that drives or reads it: a
+    /// chip that may sleep is no good for that.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, and "Unable to open out GPIO chip line" or its like for such a chip.
+    pub fn prompt_line(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<Arc<dyn Line>, Shutdown> {
+        match self.claim(pin, direction)? {
+            (line, None) => Ok(line),
             (_, Some(_)) => {
                 let name = self.name(pin);
+                let refused = match direction {
+                    Direction::Input(_) => reason::INPUT_LINE,
+                    _ => reason::OUTPUT_LINE,
+                };
                 Err(Shutdown::because(
-                    reason::OUTPUT_LINE,
+                    refused,
                     format!(
                         "{name} can not be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds: choose a pin of the processor itself"
                     ),

@@ -63,6 +63,8 @@ pub struct State {
     i2c_chips: HashMap<(u32, u8), I2cChip>,
     /// What each claimed pin was made last.
     pub directions: HashMap<u32, Direction>,
+    /// What each pin was made amid a conversation, in order.
+    pub turns: Vec<(u32, Direction)>,
     /// Pins of chips that may sleep.
     pub sleeping: HashSet<u32>,
     /// Whether an errand is being run: only then may the line of such a chip be called.
@@ -142,6 +144,7 @@ impl Bench {
             edges: Vec::with_capacity(1 << 16),
             transfers: Vec::with_capacity(256),
             pwm_values: Vec::with_capacity(256),
+            turns: Vec::with_capacity(256),
             ..State::default()
         };
         Bench { state: Arc::new(Mutex::new(state)), gate: Arc::default(), clock, origin }
@@ -431,6 +434,13 @@ impl Line for FakeLine {
         }
         Ok(())
     }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.bench.may_call(self.pin);
+        self.bench.broken(self.pin, reason::LINE_WRITE)?;
+        self.bench.state().turns.push((self.pin, direction));
+        self.set_direction(direction)
+    }
 }
 
 struct FakeAdc {
@@ -518,14 +528,43 @@ pub struct FakeWorkers {
 struct Shop {
     /// Each bus, and when it is free again.
     buses: Vec<(String, Clock)>,
-    /// In the order of their ends: when an errand began and ends.
-    under_way: VecDeque<(Clock, Clock, Job)>,
+    /// In the order of their ends.
+    under_way: VecDeque<UnderWay>,
+}
+
+/// An errand on its way.
+struct UnderWay {
+    worker: usize,
+    begin: Clock,
+    end: Clock,
+    work: Work,
+}
+
+enum Work {
+    ToDo(Job),
+    Done(Completion),
 }
 
 impl Shop {
     /// Room for more errands than a test sends: the bench does not allocate later.
     fn new() -> Shop {
         Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256) }
+    }
+
+    fn insert(&mut self, new: UnderWay) {
+        let place = self.under_way.partition_point(|other| other.end <= new.end);
+        self.under_way.insert(place, new);
+    }
+
+    /// An errand of this worker took its own time as well: those behind it wait for it.
+    fn delay(&mut self, worker: usize, ended: Clock, by: Ticks) {
+        self.buses[worker].1 = self.buses[worker].1.max(ended);
+        for other in self.under_way.iter_mut().filter(|other| other.worker == worker) {
+            other.begin = other.begin + by;
+            other.end = other.end + by;
+            self.buses[worker].1 = self.buses[worker].1.max(other.end);
+        }
+        self.under_way.make_contiguous().sort_by_key(|other| other.end);
     }
 }
 
@@ -536,7 +575,7 @@ impl FakeWorkers {
 
     /// When the next errand is done.
     pub fn next_end(&self) -> Option<Clock> {
-        self.shop.lock().unwrap().under_way.front().map(|(_, end, _)| *end)
+        self.shop.lock().unwrap().under_way.front().map(|next| next.end)
     }
 }
 
@@ -557,30 +596,42 @@ impl Workers for FakeWorkers {
         let free = &mut shop.buses[worker].1;
         let begin = self.bench.clock.now().max(*free);
         let mut end = begin + takes;
-        if at_once {
+        let work = if at_once {
             self.bench.state().bus_now = Some(end);
             job.errand.run();
             end = self.bench.state().bus_now.take().unwrap_or(end);
-        }
+            let Job { ticket, errand, holds } = job;
+            Work::Done(Completion { ticket, errand, holds, began: begin, ended: end })
+        } else {
+            Work::ToDo(job)
+        };
         *free = end;
-        let place = shop.under_way.partition_point(|(_, other, _)| *other <= end);
-        shop.under_way.insert(place, (begin, end, job));
+        shop.insert(UnderWay { worker, begin, end, work });
         Ok(())
     }
 
-    /// What an errand does to its device it does at its end, unless bytes take their time.
+    /// What an errand does to its device it does at its end, unless bytes take their time. One that
+    /// keeps time itself goes on from there in a time of its own, and is done when that has come.
     fn completion(&mut self) -> Option<Completion> {
-        if !self.has_completion() {
-            return None;
-        }
-        let (began, ended, mut job) = self.shop.lock().unwrap().under_way.pop_front()?;
-        if self.bench.state().byte_ticks == 0 {
+        while self.has_completion() {
+            let UnderWay { worker, begin: began, end, work } = self.shop.lock().unwrap().under_way.pop_front()?;
+            let Job { ticket, mut errand, holds } = match work {
+                Work::ToDo(job) => job,
+                Work::Done(completion) => return Some(completion),
+            };
             self.bench.state().on_worker = true;
-            job.errand.run();
+            let now = self.bench.clock.now();
+            let ended = self.bench.clock.aside(|| errand.run());
             self.bench.state().on_worker = false;
+            if ended == now {
+                return Some(Completion { ticket, errand, holds, began, ended: end });
+            }
+            let mut shop = self.shop.lock().unwrap();
+            shop.delay(worker, ended, Ticks(ended.since(now) as u32));
+            let work = Work::Done(Completion { ticket, errand, holds, began, ended });
+            shop.insert(UnderWay { worker, begin: began, end: ended, work });
         }
-        let Job { ticket, errand, holds } = job;
-        Some(Completion { ticket, errand, holds, began, ended })
+        None
     }
 
     fn has_completion(&self) -> bool {

@@ -185,9 +185,9 @@ impl Handle {
             .line
             .request(flags, level.into(), CONSUMER)
             .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
-        let line =
-            HeldLine { handle, line: self.line, subject: self.subject, flags: AtomicU32::new(0), guard, sleeping };
-        line.watch_over(direction, bits)?;
+        let flags = AtomicU32::new(bits);
+        let line = HeldLine { handle, line: self.line, subject: self.subject, flags, guard, sleeping };
+        line.watch_over(direction, 0)?;
         Ok(line)
     }
 }
@@ -221,9 +221,10 @@ impl HeldLine {
     }
 
     /// Has the guardian hold the line if it is an output now, and let go of it if it no longer is.
-    fn watch_over(&self, direction: Direction, flags: u32) -> Result<(), Shutdown> {
+    /// `before` are the flags of the set-up before this one.
+    fn watch_over(&self, direction: Direction, before: u32) -> Result<(), Shutdown> {
         let name = format!("{} line {}", self.subject.chip, self.subject.offset);
-        let before = LineRequestFlags::from_bits_retain(self.flags.load(Ordering::Relaxed));
+        let before = LineRequestFlags::from_bits_retain(before);
         let was_watched = before.contains(LineRequestFlags::OUTPUT) && !before.contains(LineRequestFlags::OPEN_DRAIN);
         match direction {
             Direction::Output { shutdown_level, .. } => {
@@ -232,7 +233,6 @@ impl HeldLine {
             Direction::Input(_) | Direction::OpenDrain if was_watched => self.guard.forget(&name)?,
             Direction::Input(_) | Direction::OpenDrain => {}
         }
-        self.flags.store(flags, Ordering::Relaxed);
         Ok(())
     }
 }
@@ -261,11 +261,18 @@ impl Line for HeldLine {
     }
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let before = self.flags.load(Ordering::Relaxed);
+        self.turn(direction)?;
+        self.watch_over(direction, before)
+    }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         let LineSetup { flags, level, refused } = self.subject.setting(direction)?;
         sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
             self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
         })?;
-        self.watch_over(direction, flags.bits())
+        self.flags.store(flags.bits(), Ordering::Relaxed);
+        Ok(())
     }
 }
 

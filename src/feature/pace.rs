@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The time of an errand that drives lines itself, with a few microseconds between two edges.
+//!
+//! Where the firmware waits in a loop, or has a timer for each bit, a worker waits in a loop here: no
+//! step is later for it, and between two edges nothing has to be woken up.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use crate::mcu::Mcu;
+use crate::time::{Clock, Ticks, TimeSource};
+
+/// How long a wait may go on after it is told to stop.
+const SLICE: Ticks = Ticks::from_us(1000);
+
+/// Keeps time on a worker, until the core says stop. The errand and its object have one each.
+#[derive(Clone)]
+pub(super) struct Pace {
+    clock: Arc<dyn TimeSource>,
+    stopped: Arc<AtomicBool>,
+}
+
+impl Pace {
+    /// The pace of an object's errands.
+    pub(super) fn new(mcu: &Mcu) -> Pace {
+        Pace::of(mcu.clock())
+    }
+
+    /// A pace by this clock.
+    pub(super) fn of(clock: Arc<dyn TimeSource>) -> Pace {
+        Pace { clock, stopped: Arc::default() }
+    }
+
+    pub(super) fn now(&self) -> Clock {
+        self.clock.now()
+    }
+
+    /// Waits for an instant. False if the errand is to end, as the machine stopped.
+    pub(super) fn until(&self, at: Clock) -> bool {
+        loop {
+            if self.stopped.load(Ordering::Relaxed) {
+                return false;
+            }
+            let now = self.clock.now();
+            if now >= at {
+                return true;
+            }
+            self.clock.spin_until(at.min(now + SLICE));
+        }
+    }
+
+    /// Has the errand that is under way end soon, and no wait succeed until [`Pace::resume`].
+    pub(super) fn stop(&self) {
+        self.stopped.store(true, Ordering::Relaxed);
+    }
+
+    /// Lets errands wait again.
+    pub(super) fn resume(&self) {
+        self.stopped.store(false, Ordering::Relaxed);
+    }
+}

@@ -1,0 +1,99 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Graphic displays with an ST7920, on its serial interface.
+//!
+//! A message is a synchronising byte, which says whether commands or data follow, and each byte as two
+//! with the upper and the lower four bits in front (Sitronix' data sheet, "Serial interface"). The
+//! display executes a byte as its second half ends, so what it needs of time passes before that.
+
+#![forbid(unsafe_code)]
+
+use crate::board::Pin;
+use crate::mcu::{Command, Feature, Oid, command};
+use crate::shutdown::Shutdown;
+use crate::time::Ticks;
+
+use super::display::{Busy, Display, Panel, Register, Wire, hold};
+use super::pace::Pace;
+
+pub(super) const FEATURE: Feature =
+    Feature { name: "st7920", commands: &[CONFIG_ST7920, ST7920_SEND_CMDS, ST7920_SEND_DATA], ..Feature::EMPTY };
+
+/// SCLK is high and low for 200 ns at least.
+const HALF_CLOCK: Ticks = Ticks(10);
+const SYNC_COMMANDS: u8 = 0xf8;
+const SYNC_DATA: u8 = 0xfa;
+
+struct St7920 {
+    busy: Busy,
+    /// From a message's last byte to the first byte of the next.
+    sync_delay: Ticks,
+    /// Between bytes of a message.
+    delay: Ticks,
+    sclk: Wire,
+    sid: Wire,
+}
+
+impl St7920 {
+    /// The display takes a bit in as SCLK rises.
+    fn byte(&mut self, byte: u8) -> Result<(), Shutdown> {
+        for place in (0..8).rev() {
+            self.sid.set(byte >> place & 1 != 0)?;
+            hold(&self.busy.pace, HALF_CLOCK);
+            self.sclk.set(true)?;
+            hold(&self.busy.pace, HALF_CLOCK);
+            self.sclk.set(false)?;
+        }
+        Ok(())
+    }
+}
+
+impl Panel for St7920 {
+    fn write(&mut self, register: Register, bytes: &[u8]) -> Result<(), Shutdown> {
+        self.byte(match register {
+            Register::Commands => SYNC_COMMANDS,
+            Register::Data => SYNC_DATA,
+        })?;
+        let mut delay = self.sync_delay;
+        for byte in bytes {
+            self.byte(byte & 0xf0)?;
+            if !self.busy.over(delay) {
+                break;
+            }
+            self.byte(byte << 4)?;
+            self.busy.begin();
+            delay = self.delay;
+        }
+        Ok(())
+    }
+
+    fn idle(&mut self) -> Result<(), Shutdown> {
+        [&mut self.sclk, &mut self.sid].map(Wire::idle).into_iter().fold(Ok(()), Result::and)
+    }
+}
+
+const CONFIG_ST7920: Command = command!(
+    "config_st7920 oid=%c cs_pin=%u sclk_pin=%u sid_pin=%u sync_delay_ticks=%u cmd_delay_ticks=%u",
+    |mcu, oid: Oid, cs_pin: Pin, sclk_pin: Pin, sid_pin: Pin, sync_delay_ticks: Ticks, cmd_delay_ticks: Ticks| {
+        mcu.vacant(oid)?;
+        let pace = Pace::new(mcu);
+        let panel = St7920 {
+            busy: Busy::new(pace.clone()),
+            sync_delay: sync_delay_ticks,
+            delay: cmd_delay_ticks,
+            sclk: Wire::claim(mcu, sclk_pin)?,
+            sid: Wire::claim(mcu, sid_pin)?,
+        };
+        // Selected from now on, also in a stopped machine.
+        mcu.shared_output(cs_pin, true)?;
+        let display = Display::new(mcu, "ST7920 display", pace, panel)?;
+        mcu.assign_on(sclk_pin, oid, display)
+    }
+);
+
+const ST7920_SEND_CMDS: Command = command!("st7920_send_cmds oid=%c cmds=%*s", |mcu, oid: Oid, cmds: &[u8]| {
+    mcu.with::<Display<St7920>, _>(oid, |display, mcu| display.write(mcu, oid, Register::Commands, cmds))
+});
+
+const ST7920_SEND_DATA: Command = command!("st7920_send_data oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
+    mcu.with::<Display<St7920>, _>(oid, |display, mcu| display.write(mcu, oid, Register::Data, data))
+});
