@@ -200,6 +200,53 @@ fn a_print_allocates_nothing_once_configured() {
     }
 }
 
+/// A probe by each kind of sensor, whose lines and chips are left to answer what they will.
+#[test]
+fn probing_allocates_nothing_once_configured() {
+    let objects = [
+        "config_trsync oid=0",
+        "config_sos_filter oid=1 max_sections=4",
+        "config_trigger_analog oid=2 sos_filter_oid=1",
+        "config_analog_in oid=3 pin=400",
+        "config_hx71x oid=4 gain_channel=1 dout_pin=10 sclk_pin=11",
+        "config_spi_without_cs oid=5",
+        "config_ads1220 oid=6 spi_oid=5 data_ready_pin=12",
+        "config_ads131m0x oid=7 spi_oid=5 channel=0 num_channels=4 data_ready_pin=12",
+        "spi_set_bus oid=5 spi_bus=0 mode=1 rate=512000",
+    ];
+    for rig in [Rig::configured(&objects), Rig::with_workers(4000, &objects)] {
+        let mut print = Print { rig, counted: 0 };
+        for (n, sensor) in ["analog_in oid=3", "hx71x oid=4", "ads1220 oid=6", "ads131m0x oid=7"].iter().enumerate() {
+            let (name, oid) = sensor.split_once(' ').unwrap();
+            let at = 10_000_000 * (n as u64 + 1);
+            print.send(&format!("{name}_attach_trigger_analog {oid} trigger_analog_oid=2"));
+            print.send("sos_filter_set_offset_scale oid=1 offset=0 scale=1 scale_frac_bits=0 auto_offset=1");
+            print.send("sos_filter_set_active oid=1 n_sections=4 coeff_frac_bits=29");
+            print.send("trigger_analog_set_raw_range oid=2 raw_min=-8388608 raw_max=8388607");
+            print.send("trigger_analog_set_trigger oid=2 trigger_analog_type=1 trigger_value=1000");
+            print.send("trsync_start oid=0 report_clock=@0 report_ticks=0 expire_reason=2");
+            print.send(&format!("trigger_analog_home oid=2 trsync_oid=0 trigger_reason=1 error_reason=40 clock=@{at} monitor_ticks=1000000 monitor_max=3"));
+            match name {
+                "analog_in" => print.send(&format!("query_analog_in {oid} clock=@{at} sample_ticks=0 sample_count=1 rest_ticks=10000 bytes_per_report=48 min_value=0 max_value=65535 range_check_count=0")),
+                _ => print.send(&format!("query_{name} {oid} rest_ticks=10000")),
+            }
+            print.run_until(at + 5_000_000);
+            print.send("trigger_analog_query_state oid=2");
+            print.send("trigger_analog_home oid=2 trsync_oid=0 trigger_reason=0 error_reason=0 clock=0 monitor_ticks=0 monitor_max=0");
+            let reports = print.rig.everything();
+            assert!(
+                reports.iter().any(|it| it.starts_with("sensor_bulk_data") || it.starts_with("analog_in_state")),
+                "{name}"
+            );
+            // The bench's records have their limits.
+            if name != "analog_in" {
+                print.send(&format!("query_{name} {oid} rest_ticks=0"));
+            }
+        }
+        assert_eq!(print.counted, 0);
+    }
+}
+
 #[test]
 fn the_counter_counts() {
     // Out of the optimiser's sight, which would leave the pair out.

@@ -9,6 +9,8 @@ use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
 use crate::wire::format::same;
 
+mod ads1220;
+mod ads131m0x;
 mod adxl345;
 mod analog_in;
 mod bmi160;
@@ -20,6 +22,7 @@ mod ds18b20;
 mod endstop;
 mod fifo_sensor;
 mod hd44780;
+mod hx71x;
 mod i2c;
 mod icm20948;
 mod lis2dw;
@@ -28,6 +31,7 @@ mod neopixel;
 mod pace;
 mod pca9685;
 mod pwm_out;
+mod ready_adc;
 mod sensor_bulk;
 mod sos_filter;
 mod spi;
@@ -42,6 +46,8 @@ mod trsync;
 /// Every feature. One that is not listed here does not get into the dictionary.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
+    ads1220::FEATURE,
+    ads131m0x::FEATURE,
     adxl345::FEATURE,
     analog_in::FEATURE,
     bmi160::FEATURE,
@@ -52,6 +58,7 @@ pub const FEATURES: &[Feature] = &[
     endstop::FEATURE,
     fifo_sensor::FEATURE,
     hd44780::FEATURE,
+    hx71x::FEATURE,
     i2c::FEATURE,
     icm20948::FEATURE,
     lis2dw::FEATURE,

@@ -332,8 +332,8 @@ mod tests {
                 y
             });
             // Each section's results are rounded to integers, which the next amplifies.
-            assert!((f64::from(value) - expected).abs() < 100.0, "sample {n}: {value}, and in real numbers {expected}");
-            assert!(n < 150 || (value - 1_000_000).abs() < 200, "sample {n}: {value}");
+            assert!((f64::from(value) - expected).abs() < 2000.0, "sample {n}: {value}, and in real numbers {expected}");
+            assert!(n < 150 || (value - 1_000_000).abs() < 2000, "sample {n}: {value}");
         }
     }
 }

@@ -41,7 +41,7 @@ shutdowns! {
     /// An SPI mode above 3, or a second bus for one device.
     INVALID_SPI = "Invalid spi config";
     /// An SPI transfer failed.
-    SPI_TRANSFER_FAILED = "Unable to issue spi ioctl";
+    pub(super) SPI_TRANSFER_FAILED = "Unable to issue spi ioctl";
 }
 
 response! {

@@ -55,8 +55,14 @@ pub type SpiChip = Box<dyn FnMut(u64, &mut [u8]) + Send>;
 /// read.
 pub type I2cChip = Box<dyn FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus> + Send>;
 
+/// A chip behind an input: it is told the instant in ticks, and either which output now has which
+/// level, or nothing as its input is read, and tells the input's level.
+pub type LineChip = Box<dyn FnMut(u64, Option<(u32, bool)>) -> bool + Send>;
+
 #[derive(Default)]
 pub struct State {
+    /// By the input that they drive.
+    line_chips: HashMap<u32, LineChip>,
     /// By bus.
     spi_chips: HashMap<u32, SpiChip>,
     /// By bus and address.
@@ -224,6 +230,11 @@ impl Bench {
     /// Takes a chip off an I2C bus.
     pub fn unplug_i2c(&self, bus: u32, address: u8) {
         self.state().i2c_chips.remove(&(bus, address));
+    }
+
+    /// Puts a chip behind an input.
+    pub fn plug_line(&self, pin: u32, chip: impl FnMut(u64, Option<(u32, bool)>) -> bool + Send + 'static) {
+        self.state().line_chips.insert(pin, Box::new(chip));
     }
 
     /// Lets an input change at instants in the future.
@@ -408,7 +419,11 @@ impl Line for FakeLine {
             return Ok(());
         }
         if state.levels.insert(self.pin, level) != Some(level) {
-            state.edges.push((self.pin, (self.bench.ticks(), level.into())));
+            let at = self.bench.ticks();
+            state.edges.push((self.pin, (at, level.into())));
+            for chip in state.line_chips.values_mut() {
+                chip(at, Some((self.pin, level)));
+            }
         }
         self.bench.clock.set(self.bench.clock.now() + Ticks(state.write_ticks));
         Ok(())
@@ -418,7 +433,10 @@ impl Line for FakeLine {
         self.bench.may_call(self.pin);
         self.bench.broken(self.pin, reason::LINE_READ)?;
         let now = self.bench.ticks();
-        let state = self.bench.state();
+        let mut state = self.bench.state();
+        if let Some(chip) = state.line_chips.get_mut(&self.pin) {
+            return Ok(chip(now, None));
+        }
         let levels = state.inputs.get(&self.pin).map_or(&[][..], Vec::as_slice);
         Ok(levels.iter().rev().find(|(from, _)| *from <= now).is_some_and(|(_, level)| *level != 0))
     }
@@ -428,8 +446,12 @@ impl Line for FakeLine {
         let before = state.directions.insert(self.pin, direction);
         if let Direction::Output { level, .. } = direction {
             let was = state.levels.insert(self.pin, level);
+            let at = self.bench.ticks();
             if before.is_some() && was != Some(level) {
-                state.edges.push((self.pin, (self.bench.ticks(), level.into())));
+                state.edges.push((self.pin, (at, level.into())));
+            }
+            for chip in state.line_chips.values_mut() {
+                chip(at, Some((self.pin, level)));
             }
         }
         Ok(())

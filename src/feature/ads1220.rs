@@ -1,0 +1,81 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The ADC ADS1220 on SPI, for load cells (Texas Instruments SBAS501).
+//!
+//! 24 clocks after DRDY went low shift out a sample: 24 bits in two's complement, the highest first
+//! ("Data Format"). klippy sets the chip up by itself.
+
+#![forbid(unsafe_code)]
+
+use crate::board::Pin;
+use crate::mcu::{Command, Conversation, Feature, Mcu, Oid, Ticket, command};
+use crate::shutdown::Shutdown;
+use crate::time::Ticks;
+
+use super::ready_adc::{Frame, ReadyChip, Sample, attach, configure_spi, query, query_status, signed_24, spi_result};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "ads1220",
+    commands: &[CONFIG_ADS1220, ADS1220_ATTACH_TRIGGER_ANALOG, QUERY_ADS1220, QUERY_ADS1220_STATUS],
+    ..Feature::EMPTY
+};
+
+const SAMPLE_BYTES: usize = 3;
+
+struct Ads1220 {
+    spi: Oid,
+}
+
+impl ReadyChip for Ads1220 {
+    const NAME: &'static str = "ADS1220";
+    type Reading = Conversation<Frame<SAMPLE_BYTES>>;
+
+    fn read(&mut self, mcu: &mut Mcu, ticket: Ticket, reading: Box<Self::Reading>) -> Result<(), Shutdown> {
+        mcu.converse(self.spi, ticket, reading)
+    }
+
+    fn result(reading: &mut Self::Reading) -> Result<(), Shutdown> {
+        spi_result(reading)
+    }
+
+    fn sample(&mut self, reading: &Self::Reading, _late: bool) -> Sample {
+        Sample::Value(reading.talk.received().first_chunk().map_or(0, |bytes| signed_24(*bytes)))
+    }
+}
+
+const CONFIG_ADS1220: Command = command!(
+    "config_ads1220 oid=%c spi_oid=%c data_ready_pin=%u",
+    |mcu, oid: Oid, spi_oid: Oid, data_ready_pin: Pin| {
+        configure_spi(mcu, oid, (spi_oid, data_ready_pin), Ads1220 { spi: spi_oid }, SAMPLE_BYTES)
+    }
+);
+
+const ADS1220_ATTACH_TRIGGER_ANALOG: Command =
+    command!("ads1220_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
+        attach::<Ads1220>(mcu, oid, trigger_analog_oid)
+    });
+
+const QUERY_ADS1220: Command = command!("query_ads1220 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
+    query::<Ads1220>(mcu, oid, rest_ticks)
+});
+
+const QUERY_ADS1220_STATUS: Command =
+    command!("query_ads1220_status oid=%c", |mcu, oid: Oid| query_status::<Ads1220>(mcu, oid));
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// "Ideal Output Code versus Input Signal" of the data sheet.
+    #[test]
+    fn codes_are_those_of_the_data_sheet() {
+        for (bytes, value) in [
+            ([0x7f, 0xff, 0xff], 8_388_607),
+            ([0x00, 0x00, 0x01], 1),
+            ([0x00, 0x00, 0x00], 0),
+            ([0xff, 0xff, 0xff], -1),
+            ([0x80, 0x00, 0x00], -8_388_608),
+        ] {
+            assert_eq!(signed_24(bytes), value, "{bytes:02x?}");
+        }
+    }
+}

@@ -1,0 +1,235 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The ADCs HX711 and HX717 for load cells, on two lines (Avia Semiconductor's data sheets).
+//!
+//! A sample is shifted out by 24 pulses on the chip's clock; one to four more choose gain and channel of
+//! the next. A clock that stays high for over 60 us switches the chip off, and it begins anew as the
+//! clock falls. A worker drives the clock, and two system calls make a pulse, so on a slow or busy
+//! machine that may happen: then the bits that follow are all ones, and no check of the protocol would
+//! notice. So the worker measures every pulse, and a sample with one that may have been too long is
+//! sent as the error "read too long", upon which klippy restarts the sensor.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use log::warn;
+
+use crate::board::{Bias, Direction, Line, Pin};
+use crate::mcu::{Command, Done, Errand, Feature, Mcu, Oid, Remote, Settable, Ticket, WorkerId, command};
+use crate::shutdown::{Shutdown, shutdowns};
+use crate::time::{Ticks, TimeSource};
+
+use super::ready_adc::{ReadyAdc, ReadyChip, SWITCH, Sample, attach, query, query_status};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "hx71x",
+    commands: &[CONFIG_HX71X, HX71X_ATTACH_TRIGGER_ANALOG, QUERY_HX71X, QUERY_HX71X_STATUS],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// More or less than one to four pulses for gain and channel.
+    GAIN_RANGE = "HX71x gain/channel out of range 1-4";
+}
+
+/// What klippy knows errors by: pulses and bits do not fit, and a reading that took too long.
+const ERROR_DESYNC: i32 = i32::MIN;
+const ERROR_READ_TOO_LONG: i32 = 1 << 30;
+
+const SAMPLE_BITS: u8 = 24;
+/// At least so long the clock is high, and low (T3 and T4 of the data sheet).
+const PULSE: Duration = Duration::from_nanos(200);
+/// So long the clock may be high before the chip switches itself off.
+const POWER_DOWN: Ticks = Ticks::from_us(60);
+/// The worker of these chips.
+const WORKER: &str = "hx71x";
+
+/// What came in one reading: the sample's bits and those of the further pulses, the last one lowest.
+fn decode(raw: u32, gain_channel: u8) -> Result<i32, i32> {
+    let extra = (1 << gain_channel) - 1;
+    // The data line is high after the sample.
+    if raw & extra != extra {
+        return Err(ERROR_DESYNC);
+    }
+    Ok(((raw >> gain_channel) << 8) as i32 >> 8)
+}
+
+/// Shifts a sample out.
+struct Shift {
+    sclk: Arc<dyn Line>,
+    dout: Arc<dyn Line>,
+    /// Of the sample, and for gain and channel.
+    pulses: u8,
+    time: Arc<dyn TimeSource>,
+    /// What the log calls the clock line.
+    name: String,
+    /// What came of it.
+    raw: u32,
+    /// Whether the chip may have switched itself off amid the pulses.
+    too_long: bool,
+    /// Whether the log was told of that.
+    told: bool,
+    result: Result<(), Shutdown>,
+}
+
+impl Shift {
+    fn shift(&mut self) -> Result<(), Shutdown> {
+        self.raw = 0;
+        let mut longest = 0;
+        for _ in 0..self.pulses {
+            let rises = self.time.now();
+            self.sclk.write(true)?;
+            wait();
+            self.sclk.write(false)?;
+            longest = self.time.now().since(rises).max(longest);
+            self.raw = self.raw << 1 | u32::from(self.dout.read()?);
+            wait();
+        }
+        self.too_long = longest > i64::from(POWER_DOWN.0);
+        if self.too_long && !self.told {
+            self.told = true;
+            warn!("{}", too_slow(&self.name, longest));
+        }
+        Ok(())
+    }
+}
+
+/// For the log: the clock was high for too long, by this many ticks in all.
+fn too_slow(name: &str, ticks: i64) -> String {
+    let us = ticks / i64::from(Ticks::from_us(1).0);
+    format!(
+        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this machine is too slow or too busy for it; run Pinion with -r, or use a load cell ADC on SPI (ADS1220, ADS131M0x); said once"
+    )
+}
+
+fn wait() {
+    let start = Instant::now();
+    while start.elapsed() < PULSE {
+        std::hint::spin_loop();
+    }
+}
+
+impl Errand for Shift {
+    fn run(&mut self) {
+        self.result = self.shift();
+    }
+}
+
+/// The clock line while no sample is shifted out: high switches the chip off.
+struct PowerDown(Arc<dyn Line>);
+
+impl Settable for PowerDown {
+    type Value = bool;
+
+    fn set(&mut self, down: bool) -> Result<(), Shutdown> {
+        self.0.write(down)
+    }
+}
+
+struct Hx71x {
+    worker: WorkerId,
+    gain_channel: u8,
+    power_down: Remote<PowerDown>,
+    /// Sent instead of samples until measurements begin anew.
+    last_error: Option<i32>,
+}
+
+impl ReadyChip for Hx71x {
+    const NAME: &'static str = "HX71x";
+    type Reading = Shift;
+
+    fn read(&mut self, mcu: &mut Mcu, ticket: Ticket, reading: Box<Shift>) -> Result<(), Shutdown> {
+        mcu.dispatch(self.worker, ticket, reading)
+    }
+
+    fn result(reading: &mut Shift) -> Result<(), Shutdown> {
+        std::mem::replace(&mut reading.result, Ok(()))
+    }
+
+    fn sample(&mut self, reading: &Shift, late: bool) -> Sample {
+        match decode(reading.raw, self.gain_channel) {
+            Err(error) => self.last_error = Some(error),
+            Ok(_) if late || reading.too_long => self.last_error = Some(ERROR_READ_TOO_LONG),
+            Ok(value) if self.last_error.is_none() => return Sample::Value(value),
+            Ok(_) => {}
+        }
+        Sample::Error { code: None, value: self.last_error.unwrap_or(ERROR_DESYNC) }
+    }
+
+    fn switch(&mut self, mcu: &mut Mcu, oid: Oid, on: bool) -> Result<(), Shutdown> {
+        self.last_error = None;
+        self.power_down.set(mcu, Ticket { oid, tag: SWITCH }, !on)
+    }
+
+    fn switched(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let done = self.power_down.returned(mcu, Ticket { oid, tag: SWITCH }, done);
+        done.map(drop).or_else(|failure| mcu.try_shut_down(failure))
+    }
+}
+
+fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin) -> Result<(), Shutdown> {
+    mcu.vacant(oid)?;
+    if !(1..=4).contains(&gain_channel) {
+        return Err(Shutdown::by_host(
+            GAIN_RANGE,
+            format_args!("{gain_channel} pulses are to choose gain and channel"),
+        ));
+    }
+    let dout = mcu.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
+    // Off, until measurements begin and when the program dies.
+    let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_level: true })?;
+    let worker = mcu.worker(WORKER)?;
+    let shift = Shift {
+        sclk: sclk.clone(),
+        dout: dout.clone(),
+        pulses: SAMPLE_BITS + gain_channel,
+        time: mcu.time_source(),
+        name: mcu.name(sclk_pin),
+        raw: 0,
+        too_long: false,
+        told: false,
+        result: Ok(()),
+    };
+    let power_down = Remote::new(worker, PowerDown(sclk), true);
+    let chip = Hx71x { worker, gain_channel, power_down, last_error: None };
+    mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, dout, Box::new(shift)))
+}
+
+const CONFIG_HX71X: Command = command!(
+    "config_hx71x oid=%c gain_channel=%c dout_pin=%u sclk_pin=%u",
+    |mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
+        configure(mcu, oid, gain_channel, dout_pin, sclk_pin)
+    }
+);
+
+const HX71X_ATTACH_TRIGGER_ANALOG: Command =
+    command!("hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
+        attach::<Hx71x>(mcu, oid, trigger_analog_oid)
+    });
+
+const QUERY_HX71X: Command = command!("query_hx71x oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
+    query::<Hx71x>(mcu, oid, rest_ticks)
+});
+
+const QUERY_HX71X_STATUS: Command =
+    command!("query_hx71x_status oid=%c", |mcu, oid: Oid| query_status::<Hx71x>(mcu, oid));
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn samples_are_those_of_the_data_sheet() {
+        // "Serial Interface": 800000h is the lowest value, 7FFFFFh the highest.
+        for (sample, value) in [(0x80_0000, -8_388_608), (0xff_ffff, -1), (0, 0), (1, 1), (0x7f_ffff, 8_388_607)] {
+            for gain_channel in 1..=4 {
+                let ones = (1 << gain_channel) - 1;
+                assert_eq!(decode((sample << gain_channel) | ones, gain_channel), Ok(value));
+                assert_eq!(decode((sample << gain_channel) | (ones - 1), gain_channel), Err(ERROR_DESYNC));
+                assert_eq!(decode(sample << gain_channel, gain_channel), Err(ERROR_DESYNC));
+            }
+        }
+    }
+}
