@@ -103,7 +103,8 @@ impl Talk for Transfer {
     }
 }
 
-struct I2c {
+/// An I2C device.
+pub(super) struct I2c {
     bus: Option<Bus>,
     /// Here while no command's transfer is under way.
     transfer: Option<Box<Conversation<Transfer>>>,

@@ -25,6 +25,7 @@ mod hd44780;
 mod hx71x;
 mod i2c;
 mod icm20948;
+mod ldc1612;
 mod lis2dw;
 mod mpu9250;
 mod neopixel;
@@ -61,6 +62,7 @@ pub const FEATURES: &[Feature] = &[
     hx71x::FEATURE,
     i2c::FEATURE,
     icm20948::FEATURE,
+    ldc1612::FEATURE,
     lis2dw::FEATURE,
     mpu9250::FEATURE,
     neopixel::FEATURE,

@@ -332,7 +332,10 @@ mod tests {
                 y
             });
             // Each section's results are rounded to integers, which the next amplifies.
-            assert!((f64::from(value) - expected).abs() < 2000.0, "sample {n}: {value}, and in real numbers {expected}");
+            assert!(
+                (f64::from(value) - expected).abs() < 2000.0,
+                "sample {n}: {value}, and in real numbers {expected}"
+            );
             assert!(n < 150 || (value - 1_000_000).abs() < 2000, "sample {n}: {value}");
         }
     }

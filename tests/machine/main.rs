@@ -21,6 +21,7 @@ mod endstop;
 mod fifo_sensors;
 mod hx71x;
 mod i2c;
+mod ldc1612;
 mod neopixel;
 mod one_order;
 mod pca9685;
