@@ -168,7 +168,7 @@ impl Ldc1612 {
     fn note(&mut self, mcu: &mut Mcu, result: Result<(), BusError>) {
         let failed_before = std::mem::replace(&mut self.failing, result.is_err());
         match result {
-            Err(error) if !failed_before => mcu.note_failure(&i2c_shutdown(error)),
+            Err(error) if !failed_before => mcu.warn(oid, self.kind(), i2c_shutdown(error)),
             _ => {}
         }
     }
