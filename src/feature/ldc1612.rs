@@ -165,7 +165,7 @@ impl Ldc1612 {
     }
 
     /// Says in the log that the bus fails, if it did not before.
-    fn note(&mut self, mcu: &mut Mcu, result: Result<(), BusError>) {
+    fn note(&mut self, mcu: &mut Mcu, oid: Oid, result: Result<(), BusError>) {
         let failed_before = std::mem::replace(&mut self.failing, result.is_err());
         match result {
             Err(error) if !failed_before => mcu.warn(oid, self.kind(), i2c_shutdown(error)),
@@ -179,7 +179,7 @@ impl Ldc1612 {
         let result = std::mem::replace(&mut look.result, Ok(()));
         let found = look.talk.found;
         self.look = Some(look);
-        self.note(mcu, result);
+        self.note(mcu, oid, result);
         if std::mem::take(&mut self.stale) {
             return Ok(());
         }
@@ -210,7 +210,7 @@ impl Ldc1612 {
             self.bulk.send_status(mcu, oid, asked, if ask.talk.ready { SAMPLE_BYTES } else { 0 });
         }
         self.ask = Some(ask);
-        self.note(mcu, result);
+        self.note(mcu, oid, result);
     }
 
     fn query_status(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
