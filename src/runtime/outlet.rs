@@ -251,7 +251,7 @@ impl Inlet {
         let mut head = [0; LINE_HEAD_BYTES];
         pop(&mut self.lines, &mut head)?;
         let [level, low, high] = head;
-        let level = if level == Level::Error as u8 { Level::Error } else { Level::Info };
+        let level = [Level::Error, Level::Warn].into_iter().find(|known| *known as u8 == level).unwrap_or(Level::Info);
         let mut text = [0; LINE_BYTES];
         let len = usize::from(u16::from_le_bytes([low, high])).min(LINE_BYTES);
         let text = pop(&mut self.lines, &mut text[..len])?;
