@@ -16,12 +16,13 @@ type Heard = Arc<Mutex<Vec<(Vec<u8>, usize)>>>;
 /// say, then always.
 fn plug(rig: &Rig, statuses: &[BusStatus]) -> Heard {
     let heard = Heard::default();
-    let (log, mut statuses) = (heard.clone(), statuses.to_vec().into_iter());
+    let log = heard.clone();
+    let mut left: Vec<BusStatus> = statuses.iter().rev().copied().collect();
     rig.bench.plug_i2c(1, 0x48, move |_, write, read| {
         log.lock().unwrap().push((write.to_vec(), read.len()));
         let first = write.first().copied().unwrap_or(0xa0);
         read.iter_mut().zip(0..).for_each(|(byte, n)| *byte = first.wrapping_add(n));
-        statuses.next().map_or(Ok(()), Err)
+        left.pop().map_or(Ok(()), Err)
     });
     heard
 }
