@@ -280,3 +280,15 @@ fn a_sensor_needs_an_spi_device_and_a_line_that_can_be_looked_at() {
     rig.send_all(&["allocate_oids count=2", "config_spi_without_cs oid=0", ADS131M02]);
     assert_eq!(rig.shutdown().as_deref(), Some("Unable to open in GPIO chip line"));
 }
+
+#[test]
+fn a_sample_that_is_being_read_counts_though_the_chip_has_none_any_more() {
+    let (mut rig, _adc) = rig(ADS1220, ads1220, 2000);
+    // The line goes high as the reading begins.
+    rig.bench.plug_line(READY, |at, _| at != PERIOD);
+    rig.send(&query(ADS1220));
+    for at in [PERIOD, PERIOD + 1, PERIOD + 1999, PERIOD + 2000] {
+        rig.run_until(at);
+        assert!(rig.ask("query_ads1220_status oid=1").contains("next_sequence=0 buffered=4 "), "{at}");
+    }
+}
