@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The time of an errand that drives lines itself, with a few microseconds between two edges.
 //!
-//! Where the firmware waits in a loop, or has a timer for each bit, a worker waits in a loop here: no
-//! step is later for it, and between two edges nothing has to be woken up.
+//! Where the firmware waits in a loop, or has a timer for each bit, a worker waits in a loop here: the
+//! core is free meanwhile, and between two edges nothing has to be woken up.
 
 #![forbid(unsafe_code)]
 
