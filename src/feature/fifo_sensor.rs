@@ -14,7 +14,7 @@ use crate::mcu::{Conversation, Done, Enumeration, Feature, Mcu, Next, Object, Oi
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
 
-use super::i2c::i2c_shutdown;
+use super::i2c::{I2c, i2c_shutdown};
 use super::named;
 use super::sensor_bulk::{DATA_MAX, SensorBulk};
 use super::spi::Spi;
@@ -380,8 +380,9 @@ impl<C: FifoChip> Object for FifoSensor<C> {
 
 /// Puts a sensor under `oid` that is the bus device `device`.
 pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip: C) -> Result<(), Shutdown> {
-    if chip.bus_type() == BusType::Spi {
-        mcu.with::<Spi, _>(device, |_, _| Ok(()))?;
+    match chip.bus_type() {
+        BusType::Spi => mcu.with::<Spi, _>(device, |_, _| Ok(()))?,
+        BusType::I2c => mcu.with::<I2c, _>(device, |_, _| Ok(()))?,
     }
     let sensor = FifoSensor {
         chip,

@@ -185,7 +185,7 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
         sclk: sclk.clone(),
         dout: dout.clone(),
         pulses: SAMPLE_BITS + gain_channel,
-        time: mcu.time_source(),
+        time: mcu.clock(),
         name: mcu.name(sclk_pin),
         raw: 0,
         too_long: false,

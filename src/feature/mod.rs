@@ -44,40 +44,41 @@ mod tmcuart;
 mod trigger_analog;
 mod trsync;
 
-/// Every feature. One that is not listed here does not get into the dictionary.
+/// Every feature. One that is not listed here does not get into the dictionary. Commands that come
+/// often stand first: there are more messages than ids of one byte, which are given in this order.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
+    stepper::FEATURE,
+    trsync::FEATURE,
+    digital_out::FEATURE,
+    pwm_out::FEATURE,
+    endstop::FEATURE,
+    analog_in::FEATURE,
+    spi::FEATURE,
+    i2c::FEATURE,
+    tmcuart::FEATURE,
     ads1220::FEATURE,
     ads131m0x::FEATURE,
     adxl345::FEATURE,
-    analog_in::FEATURE,
     bmi160::FEATURE,
     buttons::FEATURE,
     counter::FEATURE,
-    digital_out::FEATURE,
     ds18b20::FEATURE,
-    endstop::FEATURE,
     fifo_sensor::FEATURE,
     hd44780::FEATURE,
     hx71x::FEATURE,
-    i2c::FEATURE,
     icm20948::FEATURE,
     ldc1612::FEATURE,
     lis2dw::FEATURE,
     mpu9250::FEATURE,
     neopixel::FEATURE,
     pca9685::FEATURE,
-    pwm_out::FEATURE,
     sensor_bulk::FEATURE,
     sos_filter::FEATURE,
-    spi::FEATURE,
     spi_angle::FEATURE,
     st7920::FEATURE,
-    stepper::FEATURE,
     thermocouple::FEATURE,
-    tmcuart::FEATURE,
     trigger_analog::FEATURE,
-    trsync::FEATURE,
 ];
 
 /// The place of a response in the list of all, found by the compiler.

@@ -33,9 +33,23 @@ impl Entry {
     }
 }
 
+/// The ids that take one byte on the wire (docs/Protocol.md, "Variable length quantities").
+const SHORT_IDS: std::ops::Range<i32> = -32..96;
+
+/// The ids in the order in which they are given: those of one byte first, beginning behind the two
+/// that a host knows beforehand.
+fn ids() -> impl Iterator<Item = i32> {
+    (IDENTIFY_ID + 1..SHORT_IDS.end).chain(SHORT_IDS.start..IDENTIFY_RESPONSE_ID).chain(SHORT_IDS.end..)
+}
+
+/// An id's place in the list of all.
+fn place(id: u32) -> usize {
+    (id as i32).wrapping_sub(SHORT_IDS.start) as u32 as usize
+}
+
 /// The messages that a host may exchange with the machine, by their ids.
 pub struct Dialect {
-    /// By id.
+    /// By the [`place`] of the id.
     commands: Vec<Option<Entry>>,
     /// By [`super::Response::INDEX`].
     response_ids: Vec<u32>,
@@ -56,10 +70,20 @@ impl Dialect {
             version: concat!("pinion-", env!("CARGO_PKG_VERSION")).into(),
             ..Dictionary::default()
         };
-        let mut commands = vec![None, None];
+        let mut ids = ids();
+        let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
         let mut response_ids = Vec::new();
+        // Responses first: what they carry fills a block to the last byte, so their ids are short.
+        for response in features.iter().flat_map(|feature| feature.responses) {
+            let id = match format::name(response) {
+                "identify_response" => IDENTIFY_RESPONSE_ID,
+                _ => next_id()?,
+            };
+            response_ids.push(id as u32);
+            dictionary.responses.insert((*response).into(), json!(id));
+        }
+        let mut commands = Vec::new();
         for command in features.iter().flat_map(|feature| feature.commands) {
-            let name = format::name(command.format);
             let conversions = format::parameters(command.format)
                 .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
             let entry = Entry {
@@ -68,25 +92,16 @@ impl Dialect {
                 in_shutdown: command.in_shutdown,
                 conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
             };
-            let id = if name == "identify" {
-                IDENTIFY_ID as usize
-            } else {
-                commands.push(None);
-                commands.len() - 1
+            let id = match format::name(command.format) {
+                "identify" => IDENTIFY_ID,
+                _ => next_id()?,
             };
-            commands[id] = Some(entry);
+            let place = place(id as u32);
+            if commands.len() <= place {
+                commands.resize_with(place + 1, || None);
+            }
+            commands[place] = Some(entry);
             dictionary.commands.insert(command.format.into(), json!(id));
-        }
-        let mut next_id = commands.len() as i32;
-        for response in features.iter().flat_map(|feature| feature.responses) {
-            let id = if format::name(response) == "identify_response" {
-                IDENTIFY_RESPONSE_ID
-            } else {
-                next_id += 1;
-                next_id - 1
-            };
-            response_ids.push(id as u32);
-            dictionary.responses.insert((*response).into(), json!(id));
         }
         for (name, constant) in features.iter().flat_map(|feature| feature.constants) {
             let value = match constant {
@@ -129,7 +144,7 @@ impl Dialect {
 
     /// The id of the command with this format.
     pub fn command_id(&self, format: &str) -> Option<u32> {
-        self.dictionary.commands.get(format)?.as_u64().map(|id| id as u32)
+        self.dictionary.commands.get(format)?.as_i64().map(|id| id as u32)
     }
 
     /// Whether a block's payload has the command with this id. What follows an unknown command, or one
@@ -155,12 +170,13 @@ impl Dialect {
 
     #[inline]
     pub(super) fn command(&self, id: u32) -> Result<&Entry, Shutdown> {
-        match self.commands.get(id as usize) {
+        match self.commands.get(place(id)) {
             Some(Some(entry)) => Ok(entry),
             _ => Err(Shutdown::because(
                 reason::INVALID_COMMAND,
                 format!(
-                    "the host sent command {id}, which the dictionary does not have: restart the host so that it reads the dictionary anew"
+                    "the host sent command {}, which the dictionary does not have: restart the host so that it reads the dictionary anew",
+                    id as i32
                 ),
             )),
         }

@@ -172,11 +172,6 @@ impl Mcu {
         Clock::widen(clock.0, now)
     }
 
-    /// The clock itself, for an errand that keeps time on a worker.
-    pub fn time_source(&self) -> Arc<dyn TimeSource> {
-        self.clock.clone()
-    }
-
     // ---- timers
 
     /// Starts a timer. One that is the next of all and has passed is too close.

@@ -510,11 +510,11 @@ mod tests {
 
         /// The parameters of what the core said so far in responses of this format.
         fn said(&self, format: &str) -> Vec<Vec<u8>> {
-            let id = self.dialect.dictionary().responses[format].as_u64().unwrap();
+            let id = self.dialect.dictionary().responses[format].as_i64().unwrap();
             let heard = self.heard.0.lock().unwrap();
             let parameters = heard.iter().filter_map(|payload| {
                 let mut reader = Reader::new(payload);
-                (u64::from(reader.int().unwrap()) == id).then(|| reader.rest().to_vec())
+                (i64::from(reader.int().unwrap() as i32) == id).then(|| reader.rest().to_vec())
             });
             parameters.collect()
         }

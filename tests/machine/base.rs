@@ -268,8 +268,8 @@ fn a_host_does_not_poke_memory() {
 
 #[test]
 fn an_unknown_command_stops_the_machine() {
-    // 1 is identify, 0 a response; 0x60 is -32; 0x9f 0x7f is far above all.
-    for payload in [&[0][..], &[0x60], &[0x5f], &[0x9f, 0x7f], &[0x8f, 0xff, 0xff, 0xff, 0x7f]] {
+    // 1 is identify, 0 a response; 0x9f 0x7f is far above all, and so is the last one, below all.
+    for payload in [&[0][..], &[0x9f, 0x7f], &[0xe0, 0x00], &[0x8f, 0xff, 0xff, 0xff, 0x00]] {
         let mut rig = Rig::new();
         rig.execute(payload);
         assert_eq!(rig.shutdown().as_deref(), Some("Invalid command"), "{payload:?}");

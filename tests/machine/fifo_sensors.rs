@@ -374,6 +374,8 @@ fn what_a_sensor_can_not_be_is_refused() {
         ("config_lis2dw oid=1 bus_oid=0 bus_oid_type=0 lis_chip_type=2", "model type invalid"),
         ("config_bmi160 oid=1 bus_oid=0 bus_oid_type=255", "bus_type invalid"),
         ("config_bmi160 oid=1 bus_oid=9 bus_oid_type=0", "Invalid oid type"),
+        ("config_bmi160 oid=1 bus_oid=0 bus_oid_type=1", "Invalid oid type"),
+        ("config_icm20948 oid=1 i2c_oid=0", "Invalid oid type"),
     ] {
         let mut rig = Rig::new();
         rig.send_all(&["allocate_oids count=5", "config_spi_without_cs oid=0", command]);

@@ -157,11 +157,11 @@ fn the_log_names_the_thing_and_the_remedy() {
 #[test]
 fn bytes_that_are_no_command_are_named() {
     let mut rig = Rig::new();
-    rig.execute(&[0x5f]);
+    rig.execute(&[0x9f, 0x7f]);
     assert_eq!(
         rig.notes(),
         [
-            "shutdown: Invalid command: the host sent command 95, which the dictionary does not have: restart the host so that it reads the dictionary anew"
+            "shutdown: Invalid command: the host sent command 4095, which the dictionary does not have: restart the host so that it reads the dictionary anew"
         ]
     );
     let mut rig = Rig::new();

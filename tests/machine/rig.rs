@@ -286,7 +286,7 @@ impl Rig {
     fn decode(&self, payload: &[u8]) -> String {
         let mut reader = Reader::new(payload);
         let id = reader.int().unwrap();
-        let is_it = |(_, value): &(&String, &serde_json::Value)| value.as_u64() == Some(id.into());
+        let is_it = |(_, value): &(&String, &serde_json::Value)| value.as_i64() == Some((id as i32).into());
         let (format, _) = self.dictionary().responses.iter().find(is_it).unwrap();
         let mut text = format::name(format).to_owned();
         for (name, conversion) in format::parameters(format).unwrap() {
