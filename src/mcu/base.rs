@@ -49,6 +49,8 @@ const RESPONSES: &[&str] = &[
     IsShutdown::FORMAT,
     Stats::FORMAT,
     Pong::FORMAT,
+    // Never sent, as `debug_read` is refused; the firmware's dictionary has it.
+    "debug_result val=%u",
 ];
 
 /// How many bytes the host may send before they are acknowledged: half of a pty's buffer of 4096
