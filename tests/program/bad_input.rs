@@ -110,7 +110,8 @@ fn memory_is_not_poked() {
 #[test]
 fn commands_that_are_none_and_commands_cut_short() {
     let pinion = Pinion::simulated(&[]);
-    for (payload, reason) in [(&[0x5f, 0x01][..], "Invalid command"), (&[0x0e, 0x00][..], "Command parser error")] {
+    // A number that no command has, and identify without its count.
+    for (payload, reason) in [(&[0x9f, 0x7f][..], "Invalid command"), (&[0x01, 0x00][..], "Command parser error")] {
         let mut client = pinion.client();
         client.link().send(payload).unwrap();
         assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some(reason));
