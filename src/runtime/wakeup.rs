@@ -48,8 +48,6 @@ pub struct Margin {
     fine: i64,
     /// Waits since the last wake-up that were too short to sleep.
     unslept: u32,
-    /// Wake-ups since the last one that came after the instant.
-    covered: u32,
 }
 
 /// After so many waits too short to sleep a smaller margin is tried.
@@ -59,11 +57,6 @@ const UNSLEPT_MAX: u32 = 500;
 const NAP_MIN: i64 = Ticks::from_us(1).0 as i64;
 /// One wake-up in this many may come after the instant.
 const LATE_SHARE: i64 = 50;
-/// After so many wake-ups in a row before the instant the margin is far too large, as a load is over:
-/// a margin that is right has such a row once in 57 times (0.98 to the power of 200).
-const COVERED_MAX: u32 = 200;
-/// It then shrinks so many times as fast.
-const HASTE: i64 = 8;
 /// Sleeps that are tried at the start, and how long each is.
 const TRIALS: usize = 16;
 const TRIAL: Duration = Duration::from_micros(100);
@@ -73,7 +66,7 @@ impl Margin {
     /// A margin that covers a wake-up that comes `late` after it was asked for, and a quarter more:
     /// what it does not cover it learns from edges that are late.
     pub fn new(limits: MarginLimits, late: i64) -> Margin {
-        let mut margin = Margin { limits, fine: 0, unslept: 0, covered: 0 };
+        let mut margin = Margin { limits, fine: 0, unslept: 0 };
         margin.displace(late.clamp(0, i64::from(u32::MAX)) * FINE * 5 / 4);
         margin
     }
@@ -90,14 +83,7 @@ impl Margin {
         let present = self.fine / FINE;
         // Steps in proportion: quick to follow a load, fine when there is none.
         let step = present.max(64) * FINE / 24;
-        if late > present {
-            self.covered = 0;
-            self.displace(step);
-            return;
-        }
-        self.covered = self.covered.saturating_add(1);
-        let haste = if self.covered > COVERED_MAX { HASTE } else { 1 };
-        self.displace(-step * haste / LATE_SHARE);
+        self.displace(if late > present { step } else { -step / LATE_SHARE });
     }
 
     /// A wait was too short to sleep, so that nothing was learned. A margin above the step
@@ -270,20 +256,6 @@ mod tests {
         let start = |late| Margin::new(MarginLimits::up_to_us(200), late).get();
         assert_eq!(start(4000), Ticks(5000));
         assert_eq!((start(-5), start(10), start(i64::MAX)), (Ticks(250), Ticks(250), Ticks(10_000)));
-    }
-
-    #[test]
-    fn it_forgets_a_load_within_a_thousand_wake_ups() {
-        let mut margin = Margin::new(MarginLimits::default(), i64::MAX);
-        for _ in 0..1000 {
-            margin.learn(300);
-        }
-        assert!(margin.get() <= Ticks(320), "{:?}", margin.get());
-        // And does not sink below them.
-        for _ in 0..100_000 {
-            margin.learn(300);
-            assert!(margin.get() >= Ticks(297), "{:?}", margin.get());
-        }
     }
 
     #[test]
