@@ -17,7 +17,7 @@ use crate::time::{Clock, Ticks};
 use super::i2c::{I2c, i2c_shutdown};
 use super::named;
 use super::sensor_bulk::{DATA_MAX, SensorBulk};
-use super::spi::Spi;
+use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "fifo_sensor",
@@ -71,7 +71,7 @@ impl BusType {
     /// The stop that a conversation that failed is for a sensor.
     pub(super) fn failed(self, error: BusError) -> Shutdown {
         match self {
-            BusType::Spi => error.into(),
+            BusType::Spi => spi_shutdown(error),
             BusType::I2c => i2c_shutdown(error),
         }
     }

@@ -19,6 +19,8 @@ use crate::mcu::{
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
 
+use super::spi::spi_shutdown;
+
 pub(super) const FEATURE: Feature = Feature {
     name: "neopixel",
     commands: &[CONFIG_NEOPIXEL, NEOPIXEL_UPDATE, NEOPIXEL_SEND],
@@ -125,7 +127,7 @@ impl Object for Neopixel {
         // No colour is worth a print. klippy tries eight times for each change: once is enough in the log.
         let known = std::mem::replace(&mut self.failing, result.is_err());
         if let (Err(error), false) = (result, known) {
-            mcu.warn(oid, self.kind(), error.into());
+            mcu.warn(oid, self.kind(), spi_shutdown(error));
         }
         Ok(())
     }

@@ -16,7 +16,7 @@ use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
 use super::sensor_bulk::SensorBulk;
-use super::spi::Spi;
+use super::spi::{Spi, spi_shutdown};
 use super::trigger_analog::Attached;
 
 /// What a reading came to.
@@ -240,7 +240,7 @@ pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<
 
 /// Takes the result of a conversation over SPI.
 pub(super) fn spi_result<T: Talk>(conversation: &mut Conversation<T>) -> Result<(), Shutdown> {
-    std::mem::replace(&mut conversation.result, Ok(())).map_err(Shutdown::from)
+    std::mem::replace(&mut conversation.result, Ok(())).map_err(spi_shutdown)
 }
 
 /// The number that 24 bits in two's complement stand for, the highest byte first.

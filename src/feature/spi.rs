@@ -171,10 +171,10 @@ fn answer(mcu: &mut Mcu, oid: Oid, tag: u8, response: &[u8]) {
     }
 }
 
-impl From<BusError> for Shutdown {
-    fn from(error: BusError) -> Shutdown {
-        Shutdown::because(SPI_TRANSFER_FAILED, error.detail)
-    }
+/// The stop for an SPI conversation that failed. Not a conversion of any `BusError`: one of an I2C
+/// bus has texts of its own (`i2c_shutdown`).
+pub(super) fn spi_shutdown(error: BusError) -> Shutdown {
+    Shutdown::because(SPI_TRANSFER_FAILED, error.detail)
 }
 
 impl Object for Spi {
@@ -190,7 +190,7 @@ impl Object for Spi {
             answer(mcu, oid, tag, transfer.talk.bytes());
         }
         self.transfer = Some(transfer);
-        result.or_else(|error| mcu.device_failed(oid, self.kind(), error.into()))
+        result.or_else(|error| mcu.device_failed(oid, self.kind(), spi_shutdown(error)))
     }
 
     fn bus(&self) -> Option<&Bus> {
@@ -220,7 +220,7 @@ impl Object for SpiShutdown {
                 mcu.is_safe(oid);
                 Ok(())
             }
-            Err(error) => mcu.device_failed(oid, self.kind(), error.into()),
+            Err(error) => mcu.device_failed(oid, self.kind(), spi_shutdown(error)),
         }
     }
 

@@ -17,7 +17,7 @@ use crate::time::{Clock, Ticks};
 
 use super::named;
 use super::sensor_bulk::SensorBulk;
-use super::spi::{Spi, Transfer};
+use super::spi::{Spi, Transfer, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "spi_angle",
@@ -414,7 +414,7 @@ impl Object for SpiAngle {
             }
             Err(error) => {
                 self.put_back(purpose, tag, said);
-                mcu.device_failed(oid, self.kind(), error.into()).map(|()| true)
+                mcu.device_failed(oid, self.kind(), spi_shutdown(error)).map(|()| true)
             }
         };
         if !matches!(taken_in, Ok(false)) {

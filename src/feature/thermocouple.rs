@@ -13,7 +13,7 @@ use crate::mcu::{
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
-use super::spi::Spi;
+use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "thermocouple",
@@ -193,7 +193,7 @@ impl Object for Thermocouple {
         if tag != self.tag {
             return Ok(());
         }
-        result.or_else(|error| mcu.try_shut_down(error.into()))?;
+        result.or_else(|error| mcu.try_shut_down(spi_shutdown(error)))?;
         mcu.send(Reading { oid, next_clock: self.next_clock, value, fault });
         self.check(mcu, value, fault)
     }
