@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use crate::shutdown::{Shutdown, reason};
-use crate::time::Ticks;
+use crate::time::{Clock, Ticks};
 
 pub mod linux;
 pub mod sim;
@@ -386,6 +386,12 @@ pub trait Board: Send {
     /// steps. 1 ms, as in the firmware.
     fn step_late_limit(&self) -> Ticks {
         Ticks::from_us(1000)
+    }
+
+    /// The machine now runs what was due at this instant; with none, what just came to it. For a
+    /// simulated board, whose parts are not to feel how late the computer is.
+    fn runs(&mut self, due: Option<Clock>) {
+        let _ = due;
     }
 
     /// Forgets all claims. The machine has dropped the lines and devices before.

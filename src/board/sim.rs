@@ -8,109 +8,68 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
 mod config;
+mod i2c;
 mod loopback;
+mod part;
 mod physics;
 mod printer_cfg;
 mod spi;
 mod thermistor;
+mod time;
 mod tmc5160;
+mod wire;
 
 pub use config::{
-    AxisConfig, ChipConfig, End, FanConfig, HeaterConfig, InputConfig, Limits, OutputConfig, PinName, SimConfig,
-    SimError, SpiBusConfig,
+    AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
+    SimConfig, SimError, SpiBusConfig,
 };
+pub use loopback::LoopbackConfig;
+pub use part::PartConfig;
 pub use printer_cfg::printer_cfg;
+pub use tmc5160::Tmc5160Config;
 
-use loopback::Loopback;
+use i2c::{I2cBus, I2cDevice};
+use part::{Sight, Workshop};
 use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
-use spi::{SelectLine, SpiBus, SpiChip, SpiDevice};
-use tmc5160::Tmc5160;
+use spi::{SpiBus, SpiDevice};
+use time::PrinterTime;
+use wire::{
+    DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimLine, StepPin,
+    TachometerPin, ThermistorPin, WiredPin,
+};
 
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
 
-/// What a pin is wired to.
-#[derive(Clone)]
-enum Wire {
-    Step(Arc<Axis>),
-    Direction(Arc<Axis>),
-    Enable(Arc<Axis>),
-    Endstop(Arc<Axis>),
-    Heater(Arc<Heater>),
-    Sensor(Arc<Heater>),
-    Fan(Arc<Fan>, Switch),
-    Tachometer(Arc<Fan>),
-    Lamp(Arc<Lamp>),
-    Select(Arc<SelectLine>),
-    Level(bool),
-}
-
-impl Wire {
-    /// What it is, for a person, and whose.
-    fn describe(&self) -> String {
-        match self {
-            Wire::Step(axis) => format!("output (step of axis {})", axis.name),
-            Wire::Direction(axis) => format!("output (direction of axis {})", axis.name),
-            Wire::Enable(axis) => format!("output (enable of axis {})", axis.name),
-            Wire::Endstop(axis) => format!("input (endstop of axis {})", axis.name),
-            Wire::Heater(heater) => format!("output (heater {})", heater.name),
-            Wire::Sensor(heater) => format!("ADC channel (sensor of heater {})", heater.name),
-            Wire::Fan(fan, Switch::Power) => format!("output (fan {})", fan.name),
-            Wire::Fan(fan, Switch::Enable) => format!("output (enable of fan {})", fan.name),
-            Wire::Tachometer(fan) => format!("input (tachometer of fan {})", fan.name),
-            Wire::Lamp(lamp) => format!("output ({})", lamp.name),
-            Wire::Select(line) => format!("output (chip select of {})", line.chip),
-            Wire::Level(_) => "input".to_owned(),
-        }
-    }
-}
-
-/// A pin of the board.
-#[derive(Clone)]
-struct WiredPin {
-    name: String,
-    inverted: bool,
-    wire: Wire,
-}
-
-impl WiredPin {
-    /// Says that it is no `kind` of pin.
-    fn is_no(&self, kind: &str, reason: ShutdownReason) -> Shutdown {
-        let detail = format!(
-            "pin {} of the simulated printer is an {}, no {kind}: choose another pin",
-            self.name,
-            self.wire.describe()
-        );
-        Shutdown::because(reason, detail)
-    }
-}
-
-/// Everything that moves, heats, spins and shines.
+/// Everything that moves, heats, spins, shines, and can be seen.
+#[derive(Default)]
 struct World {
     axes: Vec<Arc<Axis>>,
     heaters: Vec<Arc<Heater>>,
     fans: Vec<Arc<Fan>>,
     lamps: Vec<Arc<Lamp>>,
+    sights: Vec<Arc<dyn Sight>>,
 }
 
 /// A simulated printer.
 pub struct SimBoard {
-    clock: Arc<dyn TimeSource>,
+    time: Arc<PrinterTime>,
     seed: u64,
     world: Arc<World>,
     /// By pin number.
     pins: Vec<WiredPin>,
     /// By number.
     spi_buses: Vec<Arc<SpiBus>>,
+    /// By number.
+    i2c_buses: Vec<Arc<I2cBus>>,
 }
 
 impl SimBoard {
@@ -118,69 +77,68 @@ impl SimBoard {
     pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, SimError> {
         config.validate()?;
         let now = clock.now();
-        let mut pins = Vec::new();
-        let mut wire = |pin: Option<&PinName>, wire: Wire| {
-            pins.extend(pin.map(|pin| WiredPin { name: pin.name.clone(), inverted: pin.inverted, wire }));
+        let mut workshop = Workshop {
+            config: &config,
+            time: Arc::new(PrinterTime::new(clock)),
+            world: World::default(),
+            pins: Vec::new(),
+            spi_buses: Vec::new(),
+            i2c_buses: config.i2c_buses.iter().map(I2cBus::new).collect(),
         };
-        let mut world = World { axes: Vec::new(), heaters: Vec::new(), fans: Vec::new(), lamps: Vec::new() };
         for part in &config.axes {
             let axis = Arc::new(Axis::new(part));
-            wire(Some(&part.step_pin), Wire::Step(axis.clone()));
-            wire(Some(&part.dir_pin), Wire::Direction(axis.clone()));
-            wire(part.enable_pin.as_ref(), Wire::Enable(axis.clone()));
-            wire(part.endstop_pin.as_ref(), Wire::Endstop(axis.clone()));
-            world.axes.push(axis);
+            workshop.wire(Some(&part.step_pin), StepPin(axis.clone()));
+            workshop.wire(Some(&part.dir_pin), DirectionPin(axis.clone()));
+            workshop.wire(part.enable_pin.as_ref(), EnablePin(axis.clone()));
+            workshop.wire(part.endstop_pin.as_ref(), EndstopPin(axis.clone()));
+            workshop.world.axes.push(axis);
         }
         for part in &config.heaters {
             let heater = Arc::new(Heater::new(part, part.thermistor()?, now));
-            wire(Some(&part.pin), Wire::Heater(heater.clone()));
-            wire(Some(&part.sensor_pin), Wire::Sensor(heater.clone()));
-            world.heaters.push(heater);
+            workshop.wire(Some(&part.pin), HeaterPin(heater.clone()));
+            workshop.wire(Some(&part.sensor_pin), ThermistorPin(heater.clone()));
+            workshop.world.heaters.push(heater);
         }
         for part in &config.fans {
             let fan = Arc::new(Fan::new(part, now));
-            wire(Some(&part.pin), Wire::Fan(fan.clone(), Switch::Power));
-            wire(part.enable_pin.as_ref(), Wire::Fan(fan.clone(), Switch::Enable));
-            wire(part.tachometer_pin.as_ref(), Wire::Tachometer(fan.clone()));
-            world.fans.push(fan);
+            workshop.wire(Some(&part.pin), FanPin(fan.clone(), Switch::Power));
+            workshop.wire(part.enable_pin.as_ref(), FanPin(fan.clone(), Switch::Enable));
+            workshop.wire(part.tachometer_pin.as_ref(), TachometerPin(fan.clone()));
+            workshop.world.fans.push(fan);
         }
         for part in config.switched() {
             let lamp = Arc::new(Lamp::new(&part.name));
-            wire(Some(&part.pin), Wire::Lamp(lamp.clone()));
-            world.lamps.push(lamp);
+            workshop.wire(Some(&part.pin), LampPin(lamp.clone()));
+            workshop.world.lamps.push(lamp);
         }
         for part in &config.inputs {
-            wire(Some(&part.pin), Wire::Level(part.level));
+            workshop.wire(Some(&part.pin), FixedInput { name: part.name.clone(), on: part.level });
         }
-        let lamp = |name: &str| {
-            let (part, lamp) = config.switched().zip(&world.lamps).find(|(part, _)| part.pin.name == name)?;
-            Some((lamp.clone(), part.pin.inverted))
-        };
-        let buses: Result<Vec<_>, _> = config.spi_buses.iter().map(|bus| SpiBus::new(bus, lamp)).collect();
-        let mut buses = buses?;
-        for part in &config.chips {
-            let chip: Box<dyn SpiChip> = match part {
-                ChipConfig::Loopback { .. } => Box::new(Loopback),
-                ChipConfig::Tmc5160 { axis, .. } => {
-                    let Some(axis) = world.axes.iter().find(|other| other.name == *axis) else { continue };
-                    Box::new(Tmc5160::new(axis.clone(), clock.clone()))
-                }
-            };
-            let select = part.select_pin().map(|_| Arc::new(SelectLine::new(&part.name())));
-            if let Some(line) = &select {
-                wire(part.select_pin(), Wire::Select(line.clone()));
-            }
-            if let Some(bus) = buses.iter_mut().find(|bus| bus.name == part.bus()) {
-                bus.solder(part.name(), select, chip);
-            }
+        for bus in &config.spi_buses {
+            let bus = SpiBus::new(bus, |name| {
+                let (part, lamp) =
+                    config.switched().zip(&workshop.world.lamps).find(|(part, _)| part.pin.name == name)?;
+                Some((lamp.clone(), part.pin.inverted))
+            })?;
+            workshop.spi_buses.push(bus);
         }
-        let spi_buses = buses.into_iter().map(Arc::new).collect();
-        Ok(SimBoard { clock, seed: config.seed, world: Arc::new(world), pins, spi_buses })
+        for part in &config.parts {
+            part.part().build(&mut workshop)?;
+        }
+        let Workshop { time, world, pins, spi_buses, i2c_buses, .. } = workshop;
+        Ok(SimBoard {
+            time,
+            seed: config.seed,
+            world: Arc::new(world),
+            pins,
+            spi_buses: spi_buses.into_iter().map(Arc::new).collect(),
+            i2c_buses: i2c_buses.into_iter().map(Arc::new).collect(),
+        })
     }
 
     /// A view of the printer for demonstrations, drawings and tests.
     pub fn probe(&self) -> SimProbe {
-        SimProbe { world: self.world.clone(), clock: self.clock.clone() }
+        SimProbe { world: self.world.clone(), time: self.time.clone() }
     }
 
     fn pin(&self, pin: Pin, no_pin: ShutdownReason) -> Result<&WiredPin, Shutdown> {
@@ -193,6 +151,21 @@ impl SimBoard {
             Shutdown::because(no_pin, detail)
         })
     }
+}
+
+/// The bus with a number, or why there is none.
+fn numbered<'a, T>(
+    buses: &'a [Arc<T>],
+    number: u32,
+    kind: &str,
+    name: impl Fn(&T) -> &str,
+    reason: ShutdownReason,
+) -> Result<&'a Arc<T>, Shutdown> {
+    usize::try_from(number).ok().and_then(|place| buses.get(place)).ok_or_else(|| {
+        let names: Vec<&str> = buses.iter().map(|bus| name(bus)).collect();
+        let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
+        Shutdown::because(reason, format!("the simulated printer has no {kind} bus {number}: {has}"))
+    })
 }
 
 impl Board for SimBoard {
@@ -217,26 +190,28 @@ impl Board for SimBoard {
         (0..).zip(&self.spi_buses).map(range).collect()
     }
 
-    /// The parts drive their lines harder than any bias pulls.
     fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
         let no_pin = match direction {
             Direction::Output { .. } | Direction::OpenDrain => reason::NOT_OUTPUT,
             Direction::Input(_) => reason::NOT_INPUT,
         };
-        let pin = self.pin(pin, no_pin)?.clone();
-        // The line stands at its first level before the motor looks at it.
-        let first = matches!(direction, Direction::Output { level, .. } if level != pin.inverted);
-        let line = SimLine { pin, on: AtomicBool::new(first), clock: self.clock.clone() };
-        line.set_direction(direction)?;
+        let line = SimLine::new(self.pin(pin, no_pin)?.clone(), self.time.clone());
+        super::Line::set_direction(&line, direction)?;
         Ok(ClaimedLine { line: Arc::new(line), sleeps_on: None })
     }
 
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let wired = self.pin(pin, reason::ADC_OPEN)?;
-        let Wire::Sensor(heater) = &wired.wire else { return Err(wired.is_no("ADC channel", reason::ADC_OPEN)) };
+        if wired.wire.kind() != Kind::Analog {
+            return Err(wired.is_no("ADC channel", reason::ADC_OPEN));
+        }
         let noise = Noise::new(self.seed ^ u64::from(pin.0) << 32);
-        let sensor = Sensor { heater: heater.clone(), clock: self.clock.clone(), noise };
-        Ok(OnWorker { bus: ADC_WORKER.to_owned(), device: Box::new(sensor) })
+        let adc = SimAdc { wire: wired.wire.clone(), time: self.time.clone(), noise };
+        Ok(OnWorker { bus: ADC_WORKER.to_owned(), device: Box::new(adc) })
+    }
+
+    fn runs(&mut self, due: Option<Clock>) {
+        self.time.set_due(due);
     }
 
     /// A simulated motor follows at any pace: a computer without real time, as most that try
@@ -246,12 +221,14 @@ impl Board for SimBoard {
     }
 
     fn i2c_buses(&self) -> Vec<Range> {
-        Vec::new()
+        let range = |(first, bus): (u32, &Arc<I2cBus>)| Range { name: bus.name.clone(), first, count: 1 };
+        (0..).zip(&self.i2c_buses).map(range).collect()
     }
 
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        let detail = format!("the simulated printer has no I2C bus {}: leave out what is on it", config.bus);
-        Err(Shutdown::because(reason::I2C_OPEN, detail))
+        let bus = numbered(&self.i2c_buses, config.bus, "I2C", |bus| &bus.name, reason::I2C_OPEN)?;
+        let device = I2cDevice { bus: bus.clone(), address: config.address };
+        Ok(OnWorker { bus: format!("i2c{}", config.bus), device: Box::new(device) })
     }
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
@@ -261,12 +238,9 @@ impl Board for SimBoard {
     }
 
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        let bus = usize::try_from(config.bus).ok().and_then(|place| self.spi_buses.get(place)).ok_or_else(|| {
-            let names: Vec<&str> = self.spi_buses.iter().map(|bus| bus.name.as_str()).collect();
-            let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
-            Shutdown::because(reason::SPI_OPEN, format!("the simulated printer has no SPI bus {}: {has}", config.bus))
-        })?;
-        let device = SpiDevice { bus: bus.clone(), mode: config.mode, chip_select: config.chip_select };
+        let bus = numbered(&self.spi_buses, config.bus, "SPI", |bus| &bus.name, reason::SPI_OPEN)?;
+        let device =
+            SpiDevice { bus: bus.clone(), mode: config.mode, rate_hz: config.rate_hz, chip_select: config.chip_select };
         Ok(OnWorker { bus: format!("spi{}", config.bus), device: Box::new(device) })
     }
 
@@ -274,74 +248,11 @@ impl Board for SimBoard {
     fn reset(&mut self) {}
 }
 
-/// A line of the board: what a pin is wired to, driven or sensed.
-struct SimLine {
-    pin: WiredPin,
-    /// Whether it was driven on last.
-    on: AtomicBool,
-    clock: Arc<dyn TimeSource>,
-}
-
-impl Line for SimLine {
-    fn write(&self, level: bool) -> Result<(), Shutdown> {
-        let on = level != self.pin.inverted;
-        let was_on = self.on.swap(on, Ordering::Relaxed);
-        match &self.pin.wire {
-            Wire::Step(axis) if on != was_on => axis.edge(on),
-            Wire::Direction(axis) => axis.set_forward(on),
-            Wire::Enable(axis) => axis.set_enabled(on),
-            Wire::Heater(heater) => heater.switch(on, self.clock.now()),
-            Wire::Fan(fan, switch) => fan.switch(*switch, on, self.clock.now()),
-            Wire::Lamp(lamp) => lamp.switch(on),
-            Wire::Select(line) => line.drive(on),
-            Wire::Step(_) | Wire::Endstop(_) | Wire::Sensor(_) | Wire::Tachometer(_) | Wire::Level(_) => {}
-        }
-        Ok(())
-    }
-
-    fn read(&self) -> Result<bool, Shutdown> {
-        let on = match &self.pin.wire {
-            Wire::Endstop(axis) => axis.endstop().unwrap_or(false),
-            Wire::Tachometer(fan) => fan.tachometer(self.clock.now()),
-            Wire::Level(level) => *level,
-            _ => self.on.load(Ordering::Relaxed),
-        };
-        Ok(on != self.pin.inverted)
-    }
-
-    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
-        let senses = matches!(self.pin.wire, Wire::Endstop(_) | Wire::Tachometer(_) | Wire::Level(_));
-        let drives = !senses && !matches!(self.pin.wire, Wire::Sensor(_));
-        match direction {
-            Direction::Output { level, .. } if drives => self.write(level),
-            Direction::OpenDrain if drives => self.write(true),
-            Direction::Output { .. } | Direction::OpenDrain => Err(self.pin.is_no("output", reason::NOT_OUTPUT)),
-            Direction::Input(_) if senses => Ok(()),
-            Direction::Input(_) => Err(self.pin.is_no("input", reason::NOT_INPUT)),
-        }
-    }
-}
-
-/// A thermistor at its ADC channel.
-struct Sensor {
-    heater: Arc<Heater>,
-    clock: Arc<dyn TimeSource>,
-    noise: Noise,
-}
-
-impl Adc for Sensor {
-    fn read(&mut self) -> Result<u16, Shutdown> {
-        let celsius = self.heater.at(self.clock.now()).sensor_celsius;
-        let noise_counts = self.noise.draw() * self.heater.noise_counts;
-        Ok(self.heater.thermistor.counts(celsius, noise_counts))
-    }
-}
-
 /// A view of a simulated printer, from any thread, while it runs.
 #[derive(Clone)]
 pub struct SimProbe {
     world: Arc<World>,
-    clock: Arc<dyn TimeSource>,
+    time: Arc<PrinterTime>,
 }
 
 /// An axis as it stands.
@@ -395,7 +306,7 @@ pub struct OutputView<'a> {
 impl SimProbe {
     /// The instant of the printer's clock.
     pub fn now(&self) -> Clock {
-        self.clock.now()
+        self.time.now()
     }
 
     /// The axes, in the description's order.
@@ -428,6 +339,13 @@ impl SimProbe {
     /// The lights, then the other outputs.
     pub fn outputs(&self) -> impl Iterator<Item = OutputView<'_>> {
         self.world.lamps.iter().map(|lamp| OutputView { name: &lamp.name, on: lamp.is_on() })
+    }
+
+    /// What a person would see of the other parts at this instant: the part's name, and a line or a
+    /// picture of several lines.
+    pub fn sights(&self) -> impl Iterator<Item = (&str, String)> {
+        let now = self.now();
+        self.world.sights.iter().map(move |sight| (sight.name(), sight.look(now)))
     }
 
     /// An axis by name.

@@ -242,6 +242,7 @@ impl Mcu {
         let Some((at, timer)) = self.timers.pop() else { return };
         self.lateness.record(self.last_read.since(at));
         self.running = Some(at);
+        self.board.runs(Some(at));
         let result = match timer.oid() {
             Some(oid) => match self.take(oid) {
                 Some(mut object) => {
@@ -254,6 +255,7 @@ impl Mcu {
             None => Ok(self.run_own_timer(timer, at)),
         };
         self.running = None;
+        self.board.runs(None);
         match result {
             Ok(Next::At(at)) => self.timers.insert(at, timer),
             Ok(Next::Done) => {}

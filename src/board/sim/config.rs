@@ -10,6 +10,7 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
+use super::part::{Part, PartConfig, Socket};
 use super::thermistor::{KELVIN, NoThermistor, Thermistor};
 
 /// What is wrong with a description: one line with file, key, cause and remedy.
@@ -92,12 +93,18 @@ pub struct SimConfig {
     /// Inputs that stay at one level: buttons, a filament sensor.
     #[serde(default, rename = "input")]
     pub inputs: Vec<InputConfig>,
+    /// The shape of the bed.
+    #[serde(default)]
+    pub bed: BedConfig,
     /// SPI buses.
     #[serde(default, rename = "spi_bus")]
     pub spi_buses: Vec<SpiBusConfig>,
-    /// The chips on the buses.
-    #[serde(default, rename = "chip")]
-    pub chips: Vec<ChipConfig>,
+    /// I2C buses.
+    #[serde(default, rename = "i2c_bus")]
+    pub i2c_buses: Vec<I2cBusConfig>,
+    /// Chips, probes and whatever else.
+    #[serde(default, rename = "part")]
+    pub parts: Vec<PartConfig>,
 }
 
 /// The limits of the motion in printer.cfg. The simulated axes themselves follow at any speed.
@@ -307,33 +314,34 @@ pub struct SpiBusConfig {
     pub trace_pins: Vec<String>,
 }
 
-/// A chip on a bus. In the TOML its key `kind` tells which of these it is.
+/// An I2C bus.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(tag = "kind", rename_all = "lowercase", deny_unknown_fields)]
-pub enum ChipConfig {
-    /// Sends back what it is sent.
-    Loopback {
-        /// Its SPI bus.
-        bus: String,
-        /// Low selects it; without it, it is the only chip on its bus.
-        select_pin: Option<PinName>,
-    },
-    /// A stepper driver.
-    Tmc5160 {
-        /// Its SPI bus.
-        bus: String,
-        /// Low selects it; without it, it is the only chip on its bus.
-        select_pin: Option<PinName>,
-        /// The axis whose motor it drives.
-        axis: String,
-    },
+#[serde(deny_unknown_fields)]
+pub struct I2cBusConfig {
+    /// The name that the board publishes, such as `i2c.1`.
+    pub name: String,
+    /// How long each transfer takes.
+    #[serde(default)]
+    pub delay_us: u64,
+}
+
+/// The shape of the bed under a cartesian printer's nozzle; its middle is at 0.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BedConfig {
+    /// How much higher it is at the end of the x axis than at its start.
+    pub x_slope_mm: f64,
+    /// How much higher it is at the end of the y axis than at its start.
+    pub y_slope_mm: f64,
+    /// How much lower it is at the corners than in the middle.
+    pub bow_mm: f64,
 }
 
 /// The default printer's description. A test makes sure that it is valid.
 const DEFAULT: &str = include_str!("default.toml");
 
 /// The range that a number must be in.
-enum Bound {
+pub(super) enum Bound {
     Any,
     NotNegative,
     AboveZero,
@@ -404,8 +412,11 @@ impl SimConfig {
         for input in &self.inputs {
             pins.claim(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
         }
+        unique("[[i2c_bus]]", self.i2c_buses.iter().map(|bus| &bus.name))?;
+        self.bed.validate()?;
         self.spi_buses.iter().try_for_each(|bus| bus.validate(self))?;
-        self.chips.iter().try_for_each(|chip| chip.validate(self, &mut pins))
+        self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)?;
+        self.parts.iter().try_for_each(|part| self.validate_part(part.part(), &mut pins))
     }
 
     /// All lights and other outputs.
@@ -507,60 +518,62 @@ impl SpiBusConfig {
     }
 }
 
-impl ChipConfig {
-    /// Checks the chip against the rest of the printer, and that its pin is free.
-    fn validate(&self, printer: &SimConfig, pins: &mut UsedPins) -> Result<(), SimError> {
-        let whose = &format!("chip `{}`", self.name());
-        pins.claim(whose, "select_pin", self.select_pin())?;
-        if !printer.spi_buses.iter().any(|bus| bus.name == self.bus()) {
-            return wrong(whose, "bus", &format!("there is no `{}`", self.bus()), "name an [[spi_bus]]");
-        }
-        let shares = printer.chips.iter().filter(|other| other.bus() == self.bus()).count() > 1;
-        match self.select_pin() {
-            Some(pin) if pin.inverted => {
-                return wrong(
-                    whose,
-                    "select_pin",
-                    "klippy knows chips that are selected by a low level only",
-                    "remove the `!`",
-                );
-            }
-            None if shares => {
-                return wrong(whose, "select_pin", "it is not the only chip on its bus", "add it");
-            }
-            _ => {}
-        }
-        if let ChipConfig::Tmc5160 { axis, .. } = self {
-            let drives =
-                |other: &&ChipConfig| matches!(other, ChipConfig::Tmc5160 { axis: driven, .. } if driven == axis);
-            if !printer.axes.iter().any(|other| other.name == *axis) {
-                return wrong(whose, "axis", &format!("there is no `{axis}`"), "name an [[axis]]");
-            }
-            if printer.chips.iter().filter(drives).count() > 1 {
-                return wrong(whose, "axis", &format!("`{axis}` has two drivers"), "remove one");
-            }
+impl I2cBusConfig {
+    fn validate(&self) -> Result<(), SimError> {
+        check(&format!("i2c_bus `{}`", self.name), "delay_us", self.delay_us as f64, Bound::NotNegative)
+    }
+}
+
+impl BedConfig {
+    fn validate(&self) -> Result<(), SimError> {
+        for (key, value) in [("x_slope_mm", self.x_slope_mm), ("y_slope_mm", self.y_slope_mm), ("bow_mm", self.bow_mm)]
+        {
+            check("[bed]", key, value, Bound::Any)?;
         }
         Ok(())
     }
+}
 
-    /// The chip's name for people.
-    pub(super) fn name(&self) -> String {
-        match self {
-            ChipConfig::Loopback { .. } => "loopback".to_owned(),
-            ChipConfig::Tmc5160 { axis, .. } => format!("tmc5160 {axis}"),
+impl SimConfig {
+    /// Checks a part against the rest of the printer, and that its pins are free.
+    fn validate_part(&self, part: &dyn Part, pins: &mut UsedPins) -> Result<(), SimError> {
+        let whose = &format!("part `{}`", part.name());
+        if self.parts.iter().filter(|other| other.part().name() == part.name()).count() > 1 {
+            return Err(SimError(format!("{whose}: there are two of it: remove one, or tell them apart")));
         }
-    }
-
-    /// Its bus.
-    pub(super) fn bus(&self) -> &str {
-        let (ChipConfig::Loopback { bus, .. } | ChipConfig::Tmc5160 { bus, .. }) = self;
-        bus
-    }
-
-    /// The pin that selects it.
-    pub(super) fn select_pin(&self) -> Option<&PinName> {
-        let (ChipConfig::Loopback { select_pin, .. } | ChipConfig::Tmc5160 { select_pin, .. }) = self;
-        select_pin.as_ref()
+        part.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))?;
+        let socket = part.socket();
+        let neighbours = self.parts.iter().map(PartConfig::part).filter(|other| other.name() != part.name());
+        let mut neighbours = neighbours.filter_map(Part::socket);
+        match socket {
+            Some(Socket::Spi { bus, select_pin }) => {
+                pins.claim(whose, "select_pin", select_pin)?;
+                if !self.spi_buses.iter().any(|other| other.name == bus) {
+                    return wrong(whose, "bus", &format!("there is no `{bus}`"), "name an [[spi_bus]]");
+                }
+                if select_pin.is_some_and(|pin| pin.inverted) {
+                    let cause = "klippy knows chips that are selected by a low level only";
+                    return wrong(whose, "select_pin", cause, "remove the `!`");
+                }
+                let shares = neighbours.any(|other| matches!(other, Socket::Spi { bus: its, .. } if its == bus));
+                if select_pin.is_none() && shares {
+                    return wrong(whose, "select_pin", "it is not the only chip on its bus", "add it");
+                }
+            }
+            Some(Socket::I2c { bus, address }) => {
+                if !self.i2c_buses.iter().any(|other| other.name == bus) {
+                    return wrong(whose, "bus", &format!("there is no `{bus}`"), "name an [[i2c_bus]]");
+                }
+                if !(0x08..0x78).contains(&address) {
+                    return wrong(whose, "address", &format!("{address} is no 7 bit address"), "give 8 to 119");
+                }
+                if neighbours.any(|other| Some(other) == socket) {
+                    return wrong(whose, "address", &format!("{address} is taken on this bus"), "give another");
+                }
+            }
+            None => {}
+        }
+        part.validate(whose, self)
     }
 }
 
@@ -681,7 +694,7 @@ fn fault(whose: &str, key: &str, cause: &str, remedy: &str) -> SimError {
 }
 
 /// The error of a key, as a result.
-fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), SimError> {
+pub(super) fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), SimError> {
     Err(fault(whose, key, cause, remedy))
 }
 
@@ -689,7 +702,7 @@ fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), SimErr
 const MAX_NUMBER: f64 = 1e9;
 
 /// Checks that a number is in its range.
-fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimError> {
+pub(super) fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimError> {
     let fault = match bound {
         _ if !(-MAX_NUMBER..=MAX_NUMBER).contains(&value) => "is out of range",
         Bound::NotNegative if value < 0.0 => "is below zero",

@@ -7,9 +7,10 @@
 
 #![forbid(unsafe_code)]
 
+use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
 
-use super::config::{AxisConfig, End, FanConfig, HeaterConfig};
+use super::config::{AxisConfig, BedConfig, End, FanConfig, HeaterConfig};
 use super::thermistor::Thermistor;
 use crate::time::{CLOCK_FREQ, Clock};
 
@@ -134,7 +135,7 @@ impl Axis {
     }
 
     /// An edge of the step line.
-    pub fn edge(&self, on: bool) {
+    pub fn edge(&self, on: bool, _at: Clock) {
         self.stepped.store(on, Ordering::Relaxed);
         if on || self.both_edges.load(Ordering::Relaxed) {
             self.step();
@@ -181,6 +182,40 @@ impl Axis {
             End::Min => position <= at,
             End::Max => position >= at,
         })
+    }
+}
+
+/// The bed under the nozzle of a cartesian printer.
+pub struct Bed {
+    shape: BedConfig,
+    x: Option<Arc<Axis>>,
+    y: Option<Arc<Axis>>,
+    z: Option<Arc<Axis>>,
+}
+
+impl Bed {
+    pub fn new(shape: BedConfig, x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Option<Arc<Axis>>) -> Bed {
+        Bed { shape, x, y, z }
+    }
+
+    /// The height of the bed under a place: two slopes and a bow, each 0 in the middle.
+    pub fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
+        // From -1 at the start of an axis to 1 at its end.
+        let place = |axis: &Option<Arc<Axis>>, mm: f64| match axis.as_ref().and_then(|axis| axis.travel_mm) {
+            Some(travel_mm) => (2.0 * mm / travel_mm - 1.0).clamp(-1.0, 1.0),
+            None => 0.0,
+        };
+        let (u, v) = (place(&self.x, x_mm), place(&self.y, y_mm));
+        let slopes = (self.shape.x_slope_mm * u + self.shape.y_slope_mm * v) / 2.0;
+        slopes - self.shape.bow_mm * (u * u + v * v) / 2.0
+    }
+
+    /// How far the point that stands off the nozzle by so much is above the bed; negative if it
+    /// presses into it.
+    pub fn clearance_mm(&self, [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3]) -> f64 {
+        let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| axis.position_mm());
+        let height_mm = self.height_mm(position(&self.x) + x_offset_mm, position(&self.y) + y_offset_mm);
+        position(&self.z) + z_offset_mm - height_mm
     }
 }
 

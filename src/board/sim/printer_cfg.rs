@@ -5,7 +5,7 @@
 
 use std::fmt::{self, Display, Write};
 
-use super::config::{AxisConfig, ChipConfig, End, FanConfig, HeaterConfig, InputConfig, SimConfig};
+use super::config::{AxisConfig, End, FanConfig, HeaterConfig, InputConfig, PinName, SimConfig};
 
 /// Full steps in a turn of the usual stepper motor.
 const FULL_STEPS: f64 = 200.0;
@@ -39,19 +39,19 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
         cfg.section(format_args!("output_pin {}", output.name));
         cfg.key("pin", &output.pin);
     }
-    for chip in &config.chips {
-        cfg.chip(chip, &layout);
+    for part in &config.parts {
+        part.part().printer_cfg(&mut cfg, &layout);
     }
     cfg.inputs(&config.inputs);
-    cfg.0
+    cfg.text
 }
 
 /// The name of klippy's section that has both the hot end's heater and its stepper.
 const HOT_END: &str = "extruder";
 
 /// Which of klippy's sections the axes belong to.
-struct Layout<'a> {
-    config: &'a SimConfig,
+pub(super) struct Layout<'a> {
+    pub(super) config: &'a SimConfig,
     /// Whether the axes `x`, `y` and `z` can be homed, as klippy's cartesian kinematics wants.
     is_cartesian: bool,
     has_hot_end: bool,
@@ -68,7 +68,7 @@ impl<'a> Layout<'a> {
     }
 
     /// The section of an axis' stepper.
-    fn stepper(&self, axis: &str) -> String {
+    pub(super) fn stepper(&self, axis: &str) -> String {
         match axis {
             "x" | "y" | "z" if self.is_cartesian => format!("stepper_{axis}"),
             HOT_END if self.has_hot_end => HOT_END.to_owned(),
@@ -79,33 +79,55 @@ impl<'a> Layout<'a> {
 
 /// A printer.cfg as it grows.
 #[derive(Default)]
-struct Sections(String);
+pub(super) struct Sections {
+    text: String,
+    /// Whether what comes is only offered: a `#` stands before each line.
+    offered: bool,
+}
 
 impl Sections {
     /// Adds a line. Writing to a String does not fail.
     fn line(&mut self, line: fmt::Arguments<'_>) {
-        let written = self.0.write_fmt(format_args!("{line}\n"));
+        let mark = if self.offered { "#" } else { "" };
+        let written = self.text.write_fmt(format_args!("{mark}{line}\n"));
         debug_assert!(written.is_ok());
     }
 
-    fn comment(&mut self, text: impl Display) {
+    /// Adds sections that take the place of others: a `#` before each of their lines keeps them out
+    /// of use.
+    pub(super) fn offer(&mut self, sections: impl FnOnce(&mut Sections)) {
+        self.offered = true;
+        sections(self);
+        self.offered = false;
+    }
+
+    /// The keys of a chip on an SPI bus.
+    pub(super) fn spi(&mut self, bus: &str, select_pin: Option<&PinName>) {
+        match select_pin {
+            Some(pin) => self.key("cs_pin", pin),
+            None => self.key("cs_pin", "None"),
+        }
+        self.key("spi_bus", bus);
+    }
+
+    pub(super) fn comment(&mut self, text: impl Display) {
         self.line(format_args!("# {text}"));
     }
 
     fn section_break(&mut self) {
-        self.line(format_args!(""));
+        self.text.push('\n');
     }
 
-    fn section(&mut self, name: impl Display) {
+    pub(super) fn section(&mut self, name: impl Display) {
         self.section_break();
         self.line(format_args!("[{name}]"));
     }
 
-    fn key(&mut self, key: impl Display, value: impl Display) {
+    pub(super) fn key(&mut self, key: impl Display, value: impl Display) {
         self.line(format_args!("{key}: {value}"));
     }
 
-    fn key_if(&mut self, key: &str, value: Option<impl Display>) {
+    pub(super) fn key_if(&mut self, key: &str, value: Option<impl Display>) {
         if let Some(value) = value {
             self.key(key, value);
         }
@@ -203,25 +225,6 @@ impl Sections {
         self.key("pid_Kd", format_args!("{:.3}", gains.kd));
     }
 
-    fn chip(&mut self, chip: &ChipConfig, layout: &Layout<'_>) {
-        match chip {
-            // klippy has no section for a wire; a test's own commands talk to it.
-            ChipConfig::Loopback { .. } => {}
-            ChipConfig::Tmc5160 { bus, select_pin, axis } => {
-                self.section(format_args!("tmc5160 {}", layout.stepper(axis)));
-                self.comment("May be left out, as the motor turns without; then start Pinion anew: the chip keeps");
-                self.comment("what it was told.");
-                match select_pin {
-                    Some(pin) => self.key("cs_pin", pin),
-                    None => self.key("cs_pin", "None"),
-                }
-                self.key("spi_bus", bus);
-                self.key("run_current", 0.8);
-                self.key("sense_resistor", 0.075);
-            }
-        }
-    }
-
     fn inputs(&mut self, inputs: &[InputConfig]) {
         if inputs.is_empty() {
             return;
@@ -242,9 +245,8 @@ impl Sections {
         self.key("pin", &fan.pin);
         self.key_if("enable_pin", fan.enable_pin.as_ref());
         if let Some(pin) = &fan.tachometer_pin {
-            self.comment("The tachometer needs an MCU that counts edges (config_counter):");
-            self.comment(format_args!("tachometer_pin: {pin}"));
-            self.comment(format_args!("tachometer_ppr: {}", fan.pulses_per_revolution));
+            self.key("tachometer_pin", pin);
+            self.key("tachometer_ppr", fan.pulses_per_revolution);
         }
     }
 }

@@ -15,7 +15,9 @@ use std::time::{Duration, Instant};
 
 use super::config::{SimError, SpiBusConfig};
 use super::physics::Lamp;
+use super::wire::{Kind, Wire};
 use crate::board::{BusDevice, BusError, BusStatus, ChipSelect};
+use crate::time::Clock;
 
 /// A chip as its data sheet describes it. Its calls come in the order of the wires: selected,
 /// bytes, deselected.
@@ -23,20 +25,22 @@ pub(super) trait SpiChip: Send {
     /// Whether the chip works in this SPI mode (0 to 3). In another one it is not heard.
     fn knows_mode(&self, mode: u8) -> bool;
 
-    /// The chip is selected.
-    fn select(&mut self);
+    /// The chip is selected; the bus's clock has this rate.
+    fn select(&mut self, rate_hz: u32) {
+        let _ = rate_hz;
+    }
 
     /// Takes a byte in, and gives the one that leaves the chip meanwhile.
     fn exchange(&mut self, byte: u8) -> u8;
 
     /// The chip is no longer selected: many act only now.
-    fn deselect(&mut self);
+    fn deselect(&mut self) {}
 }
 
 /// A line that selects a chip while it is low.
 pub(super) struct SelectLine {
     /// Whose it is.
-    pub(super) chip: String,
+    chip: String,
     low: AtomicBool,
 }
 
@@ -45,9 +49,19 @@ impl SelectLine {
     pub(super) fn new(chip: &str) -> SelectLine {
         SelectLine { chip: chip.to_owned(), low: AtomicBool::new(false) }
     }
+}
 
-    pub(super) fn drive(&self, high: bool) {
-        self.low.store(!high, Ordering::Relaxed);
+impl Wire for SelectLine {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("chip select of {}", self.chip)
+    }
+
+    fn drive(&self, on: bool, _at: Clock) {
+        self.low.store(!on, Ordering::Relaxed);
     }
 }
 
@@ -138,7 +152,7 @@ impl SpiBus {
     }
 
     /// One transfer with whatever is selected.
-    fn transfer(&self, mode: u8, bytes: &mut [u8]) -> Result<(), BusError> {
+    fn transfer(&self, mode: u8, rate_hz: u32, bytes: &mut [u8]) -> Result<(), BusError> {
         let mut wires = self.wires.lock().unwrap_or_else(PoisonError::into_inner);
         let Wires { sockets, trace } = &mut *wires;
         let is_selected = |socket: &Socket| socket.select.as_ref().is_none_or(|line| line.low.load(Ordering::Relaxed));
@@ -147,7 +161,7 @@ impl SpiBus {
         let sent = bytes.to_vec();
         let mut levels = vec![String::new(); trace.as_ref().map_or(0, |trace| trace.pins.len())];
         let pace = Pace { start: Instant::now(), delay: self.delay, bytes: bytes.len() };
-        chips.iter_mut().for_each(|socket| socket.chip.select());
+        chips.iter_mut().for_each(|socket| socket.chip.select(rate_hz));
         for (n, byte) in bytes.iter_mut().enumerate() {
             pace.wait(n + 1);
             for ((_, lamp, inverted), levels) in trace.iter().flat_map(|trace| &trace.pins).zip(&mut levels) {
@@ -182,6 +196,7 @@ impl Pace {
 pub(super) struct SpiDevice {
     pub(super) bus: Arc<SpiBus>,
     pub(super) mode: u8,
+    pub(super) rate_hz: u32,
     pub(super) chip_select: Option<ChipSelect>,
 }
 
@@ -196,7 +211,7 @@ impl SpiDevice {
 impl BusDevice for SpiDevice {
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
         self.select(true)?;
-        let exchanged = self.bus.transfer(self.mode, bytes);
+        let exchanged = self.bus.transfer(self.mode, self.rate_hz, bytes);
         self.select(false).and(exchanged)
     }
 }

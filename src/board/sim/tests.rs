@@ -6,7 +6,7 @@
 use super::*;
 use std::collections::HashSet;
 
-use crate::board::{Bias, ChipSelect};
+use crate::board::{Bias, ChipSelect, Line};
 use crate::time::{CLOCK_FREQ, VirtualClock};
 
 /// A board in virtual time.
@@ -393,12 +393,14 @@ fn each_spi_bus_has_its_worker_and_the_first_one_sends_back_what_it_is_sent() {
 fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
     let folder = tempfile::tempdir().unwrap();
     let mut config = SimConfig::default_printer();
-    let driver = |axis: &str| ChipConfig::Tmc5160 {
-        bus: "spidev1.0".into(),
-        select_pin: PinName::try_from(format!("{axis}_cs")).ok(),
-        axis: axis.into(),
+    let driver = |axis: &str| {
+        PartConfig::Tmc5160(Tmc5160Config {
+            bus: "spidev1.0".into(),
+            select_pin: PinName::try_from(format!("{axis}_cs")).ok(),
+            axis: axis.into(),
+        })
     };
-    config.chips = vec![driver("x"), driver("y")];
+    config.parts = vec![driver("x"), driver("y")];
     config.spi_buses[1].trace_file = Some(folder.path().join("trace"));
     config.spi_buses[1].trace_pins = vec!["led".into(), "beeper".into()];
     let mut bench = Bench::new(config);

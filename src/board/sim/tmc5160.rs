@@ -18,7 +18,12 @@
 
 use std::sync::Arc;
 
+use serde::Deserialize;
+
+use super::config::{PinName, SimConfig, SimError, wrong};
+use super::part::{Part, Socket, Workshop};
 use super::physics::Axis;
+use super::printer_cfg::{Layout, Sections};
 use super::spi::SpiChip;
 use crate::time::{CLOCK_FREQ, Clock, TimeSource};
 
@@ -138,8 +143,53 @@ const REGISTERS: &[Register] = &[
     Register(0x73, R, 20, 0),     // LOST_STEPS: counts in DcStep mode only
 ];
 
+/// The chip's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tmc5160Config {
+    /// Its SPI bus.
+    pub bus: String,
+    /// Low selects it; without it, it is the only chip on its bus.
+    pub select_pin: Option<PinName>,
+    /// The axis whose motor it drives.
+    pub axis: String,
+}
+
+impl Part for Tmc5160Config {
+    fn name(&self) -> String {
+        format!("tmc5160 {}", self.axis)
+    }
+
+    fn socket(&self) -> Option<Socket<'_>> {
+        Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
+    }
+
+    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+        if !printer.axes.iter().any(|axis| axis.name == self.axis) {
+            return wrong(whose, "axis", &format!("there is no `{}`", self.axis), "name an [[axis]]");
+        }
+        Ok(())
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        if let Some(axis) = workshop.axis(&self.axis) {
+            workshop.solder_spi(self, Tmc5160::new(axis, workshop.time.clone()));
+        }
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
+        cfg.section(format_args!("tmc5160 {}", layout.stepper(&self.axis)));
+        cfg.comment("May be left out, as the motor turns without; then start Pinion anew: the chip keeps");
+        cfg.comment("what it was told.");
+        cfg.spi(&self.bus, self.select_pin.as_ref());
+        cfg.key("run_current", 0.8);
+        cfg.key("sense_resistor", 0.075);
+    }
+}
+
 /// The chip.
-pub(super) struct Tmc5160 {
+struct Tmc5160 {
     axis: Arc<Axis>,
     clock: Arc<dyn TimeSource>,
     /// By address.
@@ -158,7 +208,7 @@ pub(super) struct Tmc5160 {
 
 impl Tmc5160 {
     /// The driver of an axis, at power-up.
-    pub(super) fn new(axis: Arc<Axis>, clock: Arc<dyn TimeSource>) -> Tmc5160 {
+    fn new(axis: Arc<Axis>, clock: Arc<dyn TimeSource>) -> Tmc5160 {
         let mut registers = [0; 128];
         for Register(address, _, _, value) in REGISTERS {
             registers[usize::from(*address)] = *value;
@@ -286,7 +336,7 @@ impl SpiChip for Tmc5160 {
         mode == MODE
     }
 
-    fn select(&mut self) {
+    fn select(&mut self, _rate_hz: u32) {
         self.look();
         self.shift = u64::from(self.status()) << 32 | u64::from(self.reply);
         self.bytes = 0;
@@ -337,7 +387,7 @@ mod tests {
         }
 
         fn transfer(&mut self, bytes: &[u8]) -> Vec<u8> {
-            self.chip.select();
+            self.chip.select(1_000_000);
             let reply = bytes.iter().map(|byte| self.chip.exchange(*byte)).collect();
             self.chip.deselect();
             reply
@@ -366,8 +416,8 @@ mod tests {
         fn steps(&self, count: u32) {
             self.axis.set_enabled(true);
             for _ in 0..count {
-                self.axis.edge(true);
-                self.axis.edge(false);
+                self.axis.edge(true, self.clock.now());
+                self.axis.edge(false, self.clock.now());
             }
         }
     }
