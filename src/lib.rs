@@ -28,6 +28,7 @@ pub mod board;
 pub mod cli;
 pub mod feature;
 pub mod host;
+pub mod klippy;
 pub mod lateness;
 pub mod mcu;
 pub mod runtime;

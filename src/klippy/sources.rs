@@ -1,0 +1,206 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Which messages a checkout of klippy looks up, from the strings in its sources.
+//!
+//! klippy writes each message that it exchanges with a micro-controller as a string with the
+//! message's name and its parameters, often in pieces:
+//!
+//! ```python
+//! self.query_cmd = mcu.lookup_command("query_adxl345 oid=%c"
+//!                                     " rest_ticks=%u")
+//! ```
+
+#![forbid(unsafe_code)]
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io;
+use std::path::Path;
+
+/// No checkout has more files or longer ones; a folder that has is none.
+const FILES_MAX: usize = 2000;
+const FILE_BYTES_MAX: u64 = 1 << 20;
+/// klippy's own folder, `extras`, and packages in there.
+const DEPTH_MAX: usize = 3;
+
+/// A message as a host looks it up: its name and those of its parameters, in order, such as
+/// `query_adxl345 oid rest_ticks`. The conversions are left out, as klippy writes the parameters of
+/// `config_` commands with conversions of Python's.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub struct Shape(String);
+
+impl Shape {
+    /// The shape of a format; none of a text that is no format with parameters.
+    pub fn of(format: &str) -> Option<Shape> {
+        let (name, parameters) = format.split_once(' ')?;
+        let is_word = |word: &str| {
+            word.starts_with(|c: char| c.is_ascii_lowercase())
+                && word.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == '_')
+        };
+        if !is_word(name) {
+            return None;
+        }
+        let mut shape = name.to_owned();
+        for parameter in parameters.split(' ') {
+            let (key, conversion) = parameter.split_once('=')?;
+            if !is_word(key) || !conversion.starts_with('%') {
+                return None;
+            }
+            shape.push(' ');
+            shape.push_str(key);
+        }
+        Some(Shape(shape))
+    }
+
+    /// The message's name.
+    pub fn name(&self) -> &str {
+        self.0.split(' ').next().unwrap_or_default()
+    }
+
+    /// Name and parameters, for people.
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+/// The shapes of all messages in klippy's folder, that of `klippy.py`.
+///
+/// # Errors
+///
+/// Those of reading the folder or a file in it.
+pub fn shapes(klippy: &Path) -> io::Result<BTreeSet<Shape>> {
+    let mut shapes = BTreeSet::new();
+    let mut files = 0;
+    let mut folders = vec![(klippy.to_owned(), 1)];
+    while let Some((folder, depth)) = folders.pop() {
+        for entry in fs::read_dir(&folder)? {
+            let path = entry?.path();
+            // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads.
+            let Ok(metadata) = fs::metadata(&path) else { continue };
+            if metadata.is_dir() && depth < DEPTH_MAX {
+                folders.push((path, depth + 1));
+            } else if metadata.is_file()
+                && metadata.len() <= FILE_BYTES_MAX
+                && path.extension().is_some_and(|extension| extension == "py")
+            {
+                files += 1;
+                if files > FILES_MAX {
+                    return Err(io::Error::other(format!("more than {FILES_MAX} files of Python")));
+                }
+                let text = fs::read(&path)?;
+                // Most files have no message, and need not be read as Python.
+                if text.windows(2).any(|pair| pair == b"=%") {
+                    strings(&text, |string| shapes.extend(Shape::of(string)));
+                }
+            }
+        }
+    }
+    Ok(shapes)
+}
+
+/// Tells each string of a Python source, adjacent literals as one string.
+fn strings(source: &[u8], mut tell: impl FnMut(&str)) {
+    let mut at = 0;
+    // The bytes of the literals so far, if the last token was one.
+    let mut string: Option<Vec<u8>> = None;
+    while let Some(&byte) = source.get(at) {
+        match byte {
+            b' ' | b'\t' | b'\r' | b'\n' | b'\\' => at += 1,
+            b'#' => at += source[at..].iter().take_while(|byte| **byte != b'\n').count(),
+            b'"' | b'\'' => at = literal(source, at, string.get_or_insert_default()),
+            _ if byte.is_ascii_alphanumeric() || byte == b'_' => {
+                let is_word = |byte: &&u8| byte.is_ascii_alphanumeric() || **byte == b'_';
+                let end = at + source[at..].iter().take_while(is_word).count();
+                // `r"..."` and the like: the letters belong to the literal.
+                let is_prefix = end - at <= 2 && matches!(source.get(end), Some(b'"' | b'\''));
+                if !is_prefix {
+                    flush(&mut string, &mut tell);
+                }
+                at = end;
+            }
+            _ => {
+                flush(&mut string, &mut tell);
+                at += 1;
+            }
+        }
+    }
+    flush(&mut string, &mut tell);
+}
+
+fn flush(string: &mut Option<Vec<u8>>, tell: &mut impl FnMut(&str)) {
+    if let Some(Ok(string)) = string.take().map(String::from_utf8) {
+        tell(&string);
+    }
+}
+
+/// Appends the literal whose quote stands at `at`, and returns where it ends.
+fn literal(source: &[u8], at: usize, string: &mut Vec<u8>) -> usize {
+    let quote = source[at];
+    let is_long = source[at..].starts_with(&[quote; 3]);
+    let (mut at, end): (usize, &[u8]) = if is_long { (at + 3, &[quote; 3]) } else { (at + 1, &[quote]) };
+    while let Some(&byte) = source.get(at) {
+        if source[at..].starts_with(end) {
+            return at + end.len();
+        }
+        if byte == b'\n' && !is_long {
+            return at;
+        }
+        let escaped = byte == b'\\';
+        string.extend(source[at..].iter().take(1 + usize::from(escaped)));
+        at += 1 + usize::from(escaped);
+    }
+    at
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn told(source: &str) -> Vec<String> {
+        let mut told = Vec::new();
+        strings(source.as_bytes(), |string| told.push(string.to_owned()));
+        told
+    }
+
+    #[test]
+    fn adjacent_literals_are_one_string() {
+        assert_eq!(told("f('a' \"b\"\n  # not \"this\"\n  r'c', 'd')"), ["abc", "d"]);
+        assert_eq!(told("x = \"a\" \\\n 'b'\ny = 'c' % (1,)"), ["ab", "c"]);
+        assert_eq!(told("'it\\'s' + \"so\""), ["it\\'s", "so"]);
+        assert_eq!(told("\"\"\"a \"long\" one\n'\"\"\" 'b'"), ["a \"long\" one\n'b"]);
+        assert_eq!(told("word'a'"), ["a"], "no Python, and no reason to fail");
+        assert_eq!(told("'open\n'b'"), ["openb"]);
+        assert_eq!(told("'ends with \\"), ["ends with \\"]);
+    }
+
+    #[test]
+    fn a_shape_is_name_and_parameters() {
+        let shape = |format| Shape::of(format).map(|shape| shape.0);
+        assert_eq!(shape("query_adxl345 oid=%c rest_ticks=%u").as_deref(), Some("query_adxl345 oid rest_ticks"));
+        assert_eq!(shape("config_spi oid=%d pin=%s").as_deref(), Some("config_spi oid pin"));
+        assert_eq!(shape("i2c_write oid=%c data=%*s").as_deref(), Some("i2c_write oid data"));
+        for text in ["get_clock", "speed=%d", "Speed limit=%d", "a b", "a b= c=%d", "a  b=%d", "a b=%d, c=%d is wrong"]
+        {
+            assert_eq!(shape(text), None, "{text}");
+        }
+    }
+
+    #[test]
+    fn a_folder_is_read_with_its_packages_but_not_forever() {
+        let folder = tempfile::tempdir().unwrap();
+        let put = |path: &str, text: &str| {
+            let path = folder.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        };
+        put("mcu.py", "a('trsync_start oid=%c' ' report_clock=%u')");
+        put("extras/bus.py", "b = \"i2c_write oid=%c data=%*s\"");
+        put("extras/display/hd44780.py", "c('hd44780_send_cmds oid=%c cmds=%*s')");
+        put("a/b/c/deep.py", "d('too_deep oid=%c')");
+        put("notes.txt", "'no_python oid=%c'");
+        std::os::unix::fs::symlink("/nonexistent", folder.path().join("extras/gone.py")).unwrap();
+        let shapes = shapes(folder.path()).unwrap();
+        let shapes: Vec<&str> = shapes.iter().map(Shape::as_str).collect();
+        assert_eq!(shapes, ["hd44780_send_cmds oid cmds", "i2c_write oid data", "trsync_start oid report_clock"]);
+        assert!(super::shapes(&folder.path().join("none")).is_err());
+    }
+}
