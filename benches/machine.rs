@@ -19,7 +19,7 @@ use pinion::board::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
 use pinion::feature::FEATURES;
-use pinion::mcu::{Dialect, MOVE_COUNT};
+use pinion::mcu::{Dialect, DialectName, Generation, MOVE_COUNT};
 use pinion::shutdown::Shutdown;
 use pinion::wire::block::PAYLOAD_MAX;
 use rig::Rig;
@@ -178,7 +178,9 @@ fn steps(c: &mut Criterion) {
 /// The numbering of all messages, and their publication as compressed JSON.
 fn dictionary(c: &mut Criterion) {
     let board = FakeBoard(Rig::new().bench);
-    c.bench_function("dictionary", |b| b.iter(|| Dialect::new(FEATURES, black_box(&board)).unwrap()));
+    c.bench_function("dictionary", |b| {
+        b.iter(|| Dialect::new(FEATURES, black_box(&board), DialectName::Of(Generation::Master)).unwrap())
+    });
 }
 
 criterion_group!(benches, commands, steps, dictionary);

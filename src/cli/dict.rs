@@ -11,7 +11,7 @@ use std::sync::Arc;
 use clap::Args;
 
 use crate::feature::FEATURES;
-use crate::mcu::Dialect;
+use crate::mcu::{Dialect, DialectName};
 use crate::time::Monotonic;
 
 use super::run::BoardName;
@@ -26,6 +26,10 @@ pub(super) struct DictArgs {
     /// The board whose pins the dictionary names: linux, sim or sim:FILE.toml
     #[arg(long, value_name = "BOARD", default_value = "linux")]
     board: BoardName,
+    /// The hosts that it is for: v0.11, v0.12, v0.13 or master (of Klipper), kalico, or union (of the
+    /// last three, as far as they agree)
+    #[arg(long, value_name = "NAME", default_value = "master")]
+    dialect: DialectName,
 }
 
 /// Prints the dictionary as JSON.
@@ -38,7 +42,7 @@ pub(super) fn run(args: &DictArgs) -> ExitCode {
 
 fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
     let board = args.board.open(Arc::new(Monotonic::start()), None)?;
-    let dialect = Dialect::new(FEATURES, &*board).map_err(|error| error.to_string())?;
+    let dialect = Dialect::new(FEATURES, &*board, args.dialect).map_err(|error| error.to_string())?;
     dialect.dictionary().json().map_err(|error| error.to_string())
 }
 

@@ -13,6 +13,7 @@ use clap::Args;
 use crate::board::Board;
 use crate::board::linux::{Guard, LinuxBoard};
 use crate::board::sim::{SimBoard, SimConfig, SimError};
+use crate::mcu::DialectName;
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Guardian, Options};
 use crate::time::{Monotonic, TimeSource};
@@ -50,6 +51,10 @@ pub(super) struct RunArgs {
     /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml
     #[arg(long, value_name = "BOARD", default_value = "linux")]
     board: BoardName,
+    /// The hosts to serve: v0.11, v0.12, v0.13 or master (of Klipper), kalico, or union (of the last
+    /// three, as far as they agree)
+    #[arg(long, value_name = "NAME", default_value = "master")]
+    dialect: DialectName,
 }
 
 fn mode(text: &str) -> Result<u32, String> {
@@ -108,6 +113,7 @@ impl RunArgs {
     pub(super) fn options(&self) -> Options {
         Options {
             symlink: self.symlink.clone(),
+            dialect: self.dialect,
             access: Access { mode: self.mode, group: self.group.clone() },
             realtime: self.realtime,
             cpu: self.cpu,

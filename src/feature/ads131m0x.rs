@@ -17,10 +17,9 @@ use super::ready_adc::{Frame, ReadyChip, Sample, attach, configure_spi, query, q
 pub(super) const FEATURE: Feature = Feature {
     name: "ads131m0x",
     commands: &[CONFIG_ADS131M0X, ADS131M0X_ATTACH_TRIGGER_ANALOG, QUERY_ADS131M0X, QUERY_ADS131M0X_STATUS],
-    enumerations: &[Enumeration {
-        name: "ads131m0x_error:",
-        values: |_| named(&[("SENSOR_ERROR_CRC", ERROR_CRC), ("SENSOR_ERROR_RESET", ERROR_RESET)]),
-    }],
+    enumerations: &[Enumeration::new("ads131m0x_error:", |_| {
+        named(&[("SENSOR_ERROR_CRC", ERROR_CRC), ("SENSOR_ERROR_RESET", ERROR_RESET)])
+    })],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -19,8 +19,8 @@ use super::trigger_analog::Attached;
 pub(super) const FEATURE: Feature = Feature {
     name: "analog_in",
     commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN, ANALOG_IN_ATTACH_TRIGGER_ANALOG],
-    responses: &[State::FORMAT],
-    constants: &[("ADC_MAX", Constant::Number(ADC_MAX as u32))],
+    responses: &[State::FORM],
+    constants: &[Constant::number("ADC_MAX", ADC_MAX as u32)],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

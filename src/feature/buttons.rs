@@ -16,7 +16,7 @@ use super::bias;
 pub(super) const FEATURE: Feature = Feature {
     name: "buttons",
     commands: &[CONFIG_BUTTONS, BUTTONS_ADD, BUTTONS_QUERY, BUTTONS_ACK],
-    responses: &[State::FORMAT],
+    responses: &[State::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

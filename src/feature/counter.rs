@@ -16,7 +16,7 @@ use super::bias;
 pub(super) const FEATURE: Feature = Feature {
     name: "counter",
     commands: &[CONFIG_COUNTER, QUERY_COUNTER],
-    responses: &[State::FORMAT],
+    responses: &[State::FORM],
     ..Feature::EMPTY
 };
 

@@ -17,7 +17,7 @@ use crate::time::{CLOCK_FREQ, Clock, Ticks};
 pub(super) const FEATURE: Feature = Feature {
     name: "ds18b20",
     commands: &[CONFIG_DS18B20, QUERY_DS18B20],
-    responses: &[Reading::FORMAT],
+    responses: &[Reading::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

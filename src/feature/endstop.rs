@@ -16,7 +16,7 @@ use super::trsync::Trsync;
 pub(super) const FEATURE: Feature = Feature {
     name: "endstop",
     commands: &[CONFIG_ENDSTOP, ENDSTOP_HOME, ENDSTOP_QUERY_STATE],
-    responses: &[State::FORMAT],
+    responses: &[State::FORM],
     ..Feature::EMPTY
 };
 

@@ -21,7 +21,7 @@ use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "fifo_sensor",
-    enumerations: &[Enumeration { name: "bus_oid_type", values: |_| named(&[("spi", 0), ("i2c", 1)]) }],
+    enumerations: &[Enumeration::new("bus_oid_type", |_| named(&[("spi", 0), ("i2c", 1)]))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

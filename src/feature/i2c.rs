@@ -19,10 +19,10 @@ use crate::wire::block::PAYLOAD_MAX;
 pub(super) const FEATURE: Feature = Feature {
     name: "i2c",
     commands: &[CONFIG_I2C, I2C_SET_BUS, I2C_SET_SW_BUS, I2C_TRANSFER],
-    responses: &[TransferResponse::FORMAT],
+    responses: &[TransferResponse::FORM],
     enumerations: &[
-        Enumeration { name: "i2c_bus", values: |board| board.i2c_buses() },
-        Enumeration { name: "i2c_bus_status", values: |_| statuses() },
+        Enumeration::new("i2c_bus", |board| board.i2c_buses()),
+        Enumeration::new("i2c_bus_status", |_| statuses()),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY

@@ -30,17 +30,14 @@ pub(super) const FEATURE: Feature = Feature {
         QUERY_LDC1612,
         QUERY_STATUS_LDC1612,
     ],
-    enumerations: &[Enumeration {
-        name: "ldc1612_error:",
-        values: |_| {
-            named(&[
-                ("SENSOR_REPORTS_ERROR", SENSOR_REPORTS_ERROR),
-                ("I2C_STATUS_ERROR", I2C_STATUS_ERROR),
-                ("I2C_DATA_ERROR", I2C_DATA_ERROR),
-                ("INVALID_READ_DATA", INVALID_READ_DATA),
-            ])
-        },
-    }],
+    enumerations: &[Enumeration::new("ldc1612_error:", |_| {
+        named(&[
+            ("SENSOR_REPORTS_ERROR", SENSOR_REPORTS_ERROR),
+            ("I2C_STATUS_ERROR", I2C_STATUS_ERROR),
+            ("I2C_DATA_ERROR", I2C_DATA_ERROR),
+            ("INVALID_READ_DATA", INVALID_READ_DATA),
+        ])
+    })],
     ..Feature::EMPTY
 };
 

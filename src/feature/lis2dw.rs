@@ -17,7 +17,7 @@ use super::named;
 pub(super) const FEATURE: Feature = Feature {
     name: "lis2dw",
     commands: &[CONFIG_LIS2DW, QUERY_LIS2DW, QUERY_LIS2DW_STATUS],
-    enumerations: &[Enumeration { name: "lis_chip_type", values: |_| named(&[("LIS2DW", 0), ("LIS3DH", 1)]) }],
+    enumerations: &[Enumeration::new("lis_chip_type", |_| named(&[("LIS2DW", 0), ("LIS3DH", 1)]))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -89,7 +89,7 @@ const fn response_index(format: &str) -> usize {
         let responses = FEATURES[feature].responses;
         let mut response = 0;
         while response < responses.len() {
-            if same(responses[response], format) {
+            if same(responses[response].format, format) {
                 return index;
             }
             index += 1;

@@ -24,7 +24,7 @@ use super::spi::spi_shutdown;
 pub(super) const FEATURE: Feature = Feature {
     name: "neopixel",
     commands: &[CONFIG_NEOPIXEL, NEOPIXEL_UPDATE, NEOPIXEL_SEND],
-    responses: &[Sent::FORMAT],
+    responses: &[Sent::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -23,7 +23,7 @@ use super::{changes_too_late, not_refreshed};
 pub(super) const FEATURE: Feature = Feature {
     name: "pca9685",
     commands: &[CONFIG_PCA9685, QUEUE_PCA9685_OUT, SET_PCA9685_OUT],
-    constants: &[("PCA9685_MAX", Constant::Number(VALUE_MAX as u32))],
+    constants: &[Constant::number("PCA9685_MAX", VALUE_MAX as u32)],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

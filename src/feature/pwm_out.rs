@@ -17,7 +17,7 @@ use super::{changes_too_late, not_refreshed, set_too_late};
 pub(super) const FEATURE: Feature = Feature {
     name: "pwm_out",
     commands: &[CONFIG_PWM_OUT, QUEUE_PWM_OUT, SET_PWM_OUT],
-    constants: &[("PWM_MAX", Constant::Number(PWM_MAX as u32))],
+    constants: &[Constant::number("PWM_MAX", PWM_MAX as u32)],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

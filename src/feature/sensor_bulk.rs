@@ -14,7 +14,7 @@ use crate::mcu::{Feature, Mcu, Oid, Response, response};
 use crate::time::Clock;
 
 pub(super) const FEATURE: Feature =
-    Feature { name: "sensor_bulk", responses: &[BulkData::FORMAT, BulkStatus::FORMAT], ..Feature::EMPTY };
+    Feature { name: "sensor_bulk", responses: &[BulkData::FORM, BulkStatus::FORM], ..Feature::EMPTY };
 
 response! {
     /// Samples, packed as the sensor's module of klippy expects them.

@@ -31,8 +31,8 @@ pub(super) const FEATURE: Feature = Feature {
         SPI_SEND,
         CONFIG_SPI_SHUTDOWN,
     ],
-    responses: &[TransferResponse::FORMAT],
-    enumerations: &[Enumeration { name: "spi_bus", values: |board| board.spi_buses() }],
+    responses: &[TransferResponse::FORM],
+    enumerations: &[Enumeration::new("spi_bus", |board| board.spi_buses())],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

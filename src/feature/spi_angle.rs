@@ -22,11 +22,10 @@ use super::spi::{Spi, Transfer, spi_shutdown};
 pub(super) const FEATURE: Feature = Feature {
     name: "spi_angle",
     commands: &[CONFIG_SPI_ANGLE, QUERY_SPI_ANGLE, SPI_ANGLE_TRANSFER],
-    responses: &[TransferResponse::FORMAT],
-    enumerations: &[Enumeration {
-        name: "spi_angle_type",
-        values: |_| named(&[("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)]),
-    }],
+    responses: &[TransferResponse::FORM],
+    enumerations: &[Enumeration::new("spi_angle_type", |_| {
+        named(&[("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)])
+    })],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -24,8 +24,8 @@ pub(super) const FEATURE: Feature = Feature {
         STEPPER_GET_POSITION,
         STEPPER_STOP_ON_TRIGGER,
     ],
-    responses: &[Position::FORMAT],
-    constants: &[("STEPPER_STEP_BOTH_EDGE", Constant::Number(1))],
+    responses: &[Position::FORM],
+    constants: &[Constant::number("STEPPER_STEP_BOTH_EDGE", 1)],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -18,8 +18,8 @@ use super::spi::{Spi, spi_shutdown};
 pub(super) const FEATURE: Feature = Feature {
     name: "thermocouple",
     commands: &[CONFIG_THERMOCOUPLE, QUERY_THERMOCOUPLE],
-    responses: &[Reading::FORMAT],
-    enumerations: &[Enumeration { name: "thermocouple_type", values: types }],
+    responses: &[Reading::FORM],
+    enumerations: &[Enumeration::new("thermocouple_type", types)],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -26,7 +26,7 @@ use super::pace::Pace;
 pub(super) const FEATURE: Feature = Feature {
     name: "tmcuart",
     commands: &[CONFIG_TMCUART, TMCUART_SEND],
-    responses: &[UartResponse::FORMAT],
+    responses: &[UartResponse::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

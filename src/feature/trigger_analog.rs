@@ -24,23 +24,19 @@ pub(super) const FEATURE: Feature = Feature {
         TRIGGER_ANALOG_HOME,
         TRIGGER_ANALOG_QUERY_STATE,
     ],
-    responses: &[State::FORMAT],
+    responses: &[State::FORM],
     enumerations: &[
-        Enumeration {
-            name: "trigger_analog_type",
-            values: |_| named(&[("abs_ge", ABS_GE), ("gt", GT), ("diff_peak_gt", DIFF_PEAK_GT)]),
-        },
-        Enumeration {
-            name: "trigger_analog_error:",
-            values: |_| {
-                named(&[
-                    ("RAW_RANGE", RAW_RANGE),
-                    ("OVERFLOW", OVERFLOW),
-                    ("MONITOR", MONITOR),
-                    ("SENSOR_SPECIFIC", SENSOR_SPECIFIC),
-                ])
-            },
-        },
+        Enumeration::new("trigger_analog_type", |_| {
+            named(&[("abs_ge", ABS_GE), ("gt", GT), ("diff_peak_gt", DIFF_PEAK_GT)])
+        }),
+        Enumeration::new("trigger_analog_error:", |_| {
+            named(&[
+                ("RAW_RANGE", RAW_RANGE),
+                ("OVERFLOW", OVERFLOW),
+                ("MONITOR", MONITOR),
+                ("SENSOR_SPECIFIC", SENSOR_SPECIFIC),
+            ])
+        }),
     ],
     ..Feature::EMPTY
 };

@@ -10,7 +10,7 @@ use crate::time::{Clock, Ticks};
 pub(super) const FEATURE: Feature = Feature {
     name: "trsync",
     commands: &[CONFIG_TRSYNC, TRSYNC_START, TRSYNC_SET_TIMEOUT, TRSYNC_TRIGGER],
-    responses: &[State::FORMAT],
+    responses: &[State::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

@@ -8,7 +8,7 @@ use crate::time::{CLOCK_FREQ, Clock};
 use crate::wire::format::same;
 
 use super::stats::SUMSQ_BASE;
-use super::{Command, Constant, Enumeration, Feature, Response, command, response};
+use super::{Command, Constant, Enumeration, Feature, Form, Generations, Response, command, response};
 
 /// What this file adds to the dictionary.
 pub const FEATURE: Feature = Feature {
@@ -30,27 +30,27 @@ pub const FEATURE: Feature = Feature {
     ],
     responses: RESPONSES,
     constants: &[
-        ("CLOCK_FREQ", Constant::Number(CLOCK_FREQ)),
-        ("MCU", Constant::Text("linux")),
-        ("RECEIVE_WINDOW", Constant::Number(RECEIVE_WINDOW)),
-        ("STATS_SUMSQ_BASE", Constant::Number(SUMSQ_BASE)),
+        Constant::number("CLOCK_FREQ", CLOCK_FREQ),
+        Constant::text("MCU", "linux"),
+        Constant::number("RECEIVE_WINDOW", RECEIVE_WINDOW),
+        Constant::number("STATS_SUMSQ_BASE", SUMSQ_BASE),
     ],
-    enumerations: &[Enumeration { name: "pin", values: |board| board.pins() }],
+    enumerations: &[Enumeration::new("pin", |board| board.pins())],
     shutdowns: reason::SHUTDOWNS,
 };
 
-const RESPONSES: &[&str] = &[
-    IdentifyResponse::FORMAT,
-    ClockResponse::FORMAT,
-    Uptime::FORMAT,
-    Config::FORMAT,
-    Starting::FORMAT,
-    ShutdownReport::FORMAT,
-    IsShutdown::FORMAT,
-    Stats::FORMAT,
-    Pong::FORMAT,
+const RESPONSES: &[Form] = &[
+    IdentifyResponse::FORM,
+    ClockResponse::FORM,
+    Uptime::FORM,
+    Config::FORM,
+    Starting::FORM,
+    ShutdownReport::FORM,
+    IsShutdown::FORM,
+    Stats::FORM,
+    Pong::FORM,
     // Never sent, as `debug_read` is refused; the firmware's dictionary has it.
-    "debug_result val=%u",
+    Form { format: "debug_result val=%u", generations: Generations::ALL },
 ];
 
 /// How many bytes the host may send before they are acknowledged: half of a pty's buffer of 4096
@@ -60,7 +60,7 @@ const RECEIVE_WINDOW: u32 = 2048;
 pub(super) const fn response_index(format: &str) -> usize {
     let mut index = 0;
     while index < RESPONSES.len() {
-        if same(RESPONSES[index], format) {
+        if same(RESPONSES[index].format, format) {
             return index;
         }
         index += 1;

@@ -9,7 +9,7 @@ use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::wire::Malformed;
 use crate::wire::vlq::{Reader, Writer};
 
-use super::Mcu;
+use super::{Generations, Mcu};
 
 impl From<Malformed> for Shutdown {
     /// The detail is empty: [`Mcu::execute`] adds which command it was.
@@ -26,6 +26,8 @@ pub type Handler = fn(&mut Mcu, &mut Reader<'_>) -> Result<(), Shutdown>;
 pub struct Command {
     /// Name, parameters and their conversions, exactly as klippy looks them up.
     pub format: &'static str,
+    /// The hosts that take it in this form.
+    pub generations: Generations,
     /// Whether it also runs after a shutdown.
     pub in_shutdown: bool,
     /// What it does.
@@ -38,12 +40,27 @@ impl Command {
         self.in_shutdown = true;
         self
     }
+
+    /// The hosts that take this form: [`since`](super::since), [`until`](super::until) or
+    /// [`only`](super::only). Without it, all do.
+    pub const fn of(mut self, generations: Generations) -> Command {
+        self.generations = generations;
+        self
+    }
+}
+
+/// A form of a response: what the dictionary has of it.
+pub struct Form {
+    /// Name, parameters and their conversions.
+    pub format: &'static str,
+    /// The hosts that take it in this form.
+    pub generations: Generations,
 }
 
 /// A message to the host.
 pub trait Response {
-    /// Name, parameters and their conversions.
-    const FORMAT: &'static str;
+    /// Its format, and the hosts that take it.
+    const FORM: Form;
     /// Its place in the list of the responses of all features.
     const INDEX: usize;
     /// Appends the parameters.
@@ -51,11 +68,39 @@ pub trait Response {
 }
 
 /// A constant of the dictionary.
-pub enum Constant {
+pub struct Constant {
+    /// Such as `ADC_MAX`.
+    pub name: &'static str,
+    /// What it stands for.
+    pub value: ConstantValue,
+    /// The hosts that have it.
+    pub generations: Generations,
+}
+
+/// What a constant stands for.
+pub enum ConstantValue {
     /// A number.
     Number(u32),
     /// A text.
     Text(&'static str),
+}
+
+impl Constant {
+    /// A constant that is a number.
+    pub const fn number(name: &'static str, number: u32) -> Constant {
+        Constant { name, value: ConstantValue::Number(number), generations: Generations::ALL }
+    }
+
+    /// A constant that is a text.
+    pub const fn text(name: &'static str, text: &'static str) -> Constant {
+        Constant { name, value: ConstantValue::Text(text), generations: Generations::ALL }
+    }
+
+    /// The hosts that have it; without this, all do.
+    pub const fn of(mut self, generations: Generations) -> Constant {
+        self.generations = generations;
+        self
+    }
 }
 
 /// An enumeration of the dictionary. Its names may depend on the board.
@@ -64,6 +109,21 @@ pub struct Enumeration {
     pub name: &'static str,
     /// The names on this board, and the values that they stand for.
     pub values: fn(&dyn Board) -> Vec<Range>,
+    /// The hosts that have it.
+    pub generations: Generations,
+}
+
+impl Enumeration {
+    /// An enumeration.
+    pub const fn new(name: &'static str, values: fn(&dyn Board) -> Vec<Range>) -> Enumeration {
+        Enumeration { name, values, generations: Generations::ALL }
+    }
+
+    /// The hosts that have it with these values; without this, all do.
+    pub const fn of(mut self, generations: Generations) -> Enumeration {
+        self.generations = generations;
+        self
+    }
 }
 
 /// What a feature adds to the dictionary. Fields that a feature does not need come from
@@ -73,10 +133,10 @@ pub struct Feature {
     pub name: &'static str,
     /// Its commands.
     pub commands: &'static [Command],
-    /// The formats of its responses.
-    pub responses: &'static [&'static str],
+    /// Its responses.
+    pub responses: &'static [Form],
     /// Its constants.
-    pub constants: &'static [(&'static str, Constant)],
+    pub constants: &'static [Constant],
     /// Its enumerations.
     pub enumerations: &'static [Enumeration],
     /// Its shutdown texts: the `SHUTDOWNS` that [`shutdowns!`](crate::shutdown::shutdowns) makes.
@@ -109,21 +169,27 @@ macro_rules! command {
             let _ = args;
             $body
         }
-        $crate::mcu::Command { format: $format, in_shutdown: false, handler }
+        $crate::mcu::Command {
+            format: $format,
+            generations: $crate::mcu::Generations::ALL,
+            in_shutdown: false,
+            handler,
+        }
     }};
 }
 
-/// Declares a response as a struct. The module above must have a `response_index`, which finds
+/// Declares a response as a struct. Behind the format stands which hosts take it, such as
+/// `of until(V0_12);`; without it, all do. The module above must have a `response_index`, which finds
 /// its format in the list of responses; one that is not listed is a build error.
 macro_rules! response {
-    ($(#[$doc:meta])* $format:literal $vis:vis struct $name:ident $(<$life:lifetime>)? {
+    ($(#[$doc:meta])* $format:literal $(of $generations:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
         $($field:ident: $t:ty),* $(,)?
     }) => {
         $(#[$doc])*
         $vis struct $name $(<$life>)? { $(pub(crate) $field: $t),* }
 
         impl $(<$life>)? $crate::mcu::Response for $name $(<$life>)? {
-            const FORMAT: &'static str = {
+            const FORM: $crate::mcu::Form = {
                 assert!(
                     $crate::wire::format::agrees($format, &[$($crate::wire::format::Spec {
                         name: stringify!($field),
@@ -131,7 +197,9 @@ macro_rules! response {
                     }),*]),
                     concat!("fields disagree with \"", $format, "\"")
                 );
-                $format
+                let generations = $crate::mcu::Generations::ALL;
+                $(let generations = $generations;)?
+                $crate::mcu::Form { format: $format, generations }
             };
             const INDEX: usize = super::response_index($format);
             fn encode(&self, writer: &mut $crate::wire::vlq::Writer) {

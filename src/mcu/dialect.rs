@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::HashMap;
 use std::io;
 
 use serde_json::{Value, json};
@@ -13,7 +14,8 @@ use crate::wire::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
 use crate::wire::format::{self, Conversion};
 use crate::wire::vlq::Reader;
 
-use super::command::{Constant, Feature, Handler};
+use super::command::{ConstantValue, Feature, Handler};
+use super::{DialectName, Generation, Generations};
 
 /// What the machine knows of a command that came by its id.
 pub(super) struct Entry {
@@ -47,12 +49,50 @@ fn place(id: u32) -> usize {
     (id as i32).wrapping_sub(SHORT_IDS.start) as u32 as usize
 }
 
+/// What all features have of one kind.
+fn all<'a, T>(
+    features: &'a [Feature],
+    of: fn(&'a Feature) -> &'static [T],
+) -> impl Iterator<Item = &'static T> + Clone {
+    features.iter().flat_map(of)
+}
+
+/// Which forms of one kind a dialect has.
+struct Choice<T: 'static> {
+    /// The name of a form, and who takes it.
+    facts: fn(&'static T) -> (&'static str, Generations),
+    /// For each name the generation whose form it is.
+    chosen: HashMap<&'static str, Generation>,
+}
+
+impl<T> Choice<T> {
+    fn new(
+        dialect: &DialectName,
+        forms: impl Iterator<Item = &'static T> + Clone,
+        facts: fn(&'static T) -> (&'static str, Generations),
+    ) -> Choice<T> {
+        let mut chosen = HashMap::new();
+        for generation in dialect.generations() {
+            for (name, _) in forms.clone().map(facts).filter(|(_, takers)| takers.contains(*generation)) {
+                chosen.entry(name).or_insert(*generation);
+            }
+        }
+        Choice { facts, chosen }
+    }
+
+    fn has(&self, form: &'static T) -> bool {
+        let (name, takers) = (self.facts)(form);
+        self.chosen.get(name).is_some_and(|generation| takers.contains(*generation))
+    }
+}
+
 /// The messages that a host may exchange with the machine, by their ids.
 pub struct Dialect {
+    name: DialectName,
     /// By the [`place`] of the id.
     commands: Vec<Option<Entry>>,
     /// By [`super::Response::INDEX`].
-    response_ids: Vec<u32>,
+    response_ids: Vec<Option<u32>>,
     /// By their number in the enumeration `static_string_id`.
     shutdowns: Vec<ShutdownReason>,
     dictionary: Dictionary,
@@ -61,8 +101,9 @@ pub struct Dialect {
 }
 
 impl Dialect {
-    /// Numbers the messages of `features` and publishes them with the board's names.
-    pub fn new(features: &[Feature], board: &dyn Board) -> io::Result<Dialect> {
+    /// Numbers the messages of `features` that the hosts of this dialect take, and publishes them with
+    /// the board's names.
+    pub fn new(features: &[Feature], board: &dyn Board, name: DialectName) -> io::Result<Dialect> {
         let mut dictionary = Dictionary {
             app: "Pinion".into(),
             build_versions: concat!("rustc: ", env!("CARGO_PKG_RUST_VERSION"), " or later").into(),
@@ -73,44 +114,63 @@ impl Dialect {
         let mut ids = ids();
         let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
         let mut response_ids = Vec::new();
-        // Responses first: what they carry fills a block to the last byte, so their ids are short.
-        for response in features.iter().flat_map(|feature| feature.responses) {
-            let id = match format::name(response) {
-                "identify_response" => IDENTIFY_RESPONSE_ID,
-                _ => next_id()?,
-            };
-            response_ids.push(id as u32);
-            dictionary.responses.insert((*response).into(), json!(id));
-        }
         let mut commands = Vec::new();
-        for command in features.iter().flat_map(|feature| feature.commands) {
-            let conversions = format::parameters(command.format)
-                .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
-            let entry = Entry {
-                format: command.format,
-                handler: command.handler,
-                in_shutdown: command.in_shutdown,
-                conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
-            };
-            let id = match format::name(command.format) {
-                "identify" => IDENTIFY_ID,
-                _ => next_id()?,
-            };
-            let place = place(id as u32);
-            if commands.len() <= place {
-                commands.resize_with(place + 1, || None);
+        let responses = Choice::new(&name, all(features, |feature| feature.responses), |form| {
+            (format::name(form.format), form.generations)
+        });
+        let taken = Choice::new(&name, all(features, |feature| feature.commands), |command| {
+            (format::name(command.format), command.generations)
+        });
+        // The machine's own messages have the same ids in every dialect: an `emergency_stop` means the
+        // same to a machine that was given another one since its host read the dictionary.
+        let (base, others) = features.split_at(features.len().min(1));
+        for features in [base, others] {
+            // Responses first: what they carry fills a block to the last byte, so their ids are short.
+            for form in all(features, |feature| feature.responses) {
+                if !responses.has(form) {
+                    response_ids.push(None);
+                    continue;
+                }
+                let id = match format::name(form.format) {
+                    "identify_response" => IDENTIFY_RESPONSE_ID,
+                    _ => next_id()?,
+                };
+                response_ids.push(Some(id as u32));
+                dictionary.responses.insert(form.format.into(), json!(id));
             }
-            commands[place] = Some(entry);
-            dictionary.commands.insert(command.format.into(), json!(id));
+            for command in all(features, |feature| feature.commands).filter(|command| taken.has(command)) {
+                let conversions = format::parameters(command.format)
+                    .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
+                let entry = Entry {
+                    format: command.format,
+                    handler: command.handler,
+                    in_shutdown: command.in_shutdown,
+                    conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
+                };
+                let id = match format::name(command.format) {
+                    "identify" => IDENTIFY_ID,
+                    _ => next_id()?,
+                };
+                let place = place(id as u32);
+                if commands.len() <= place {
+                    commands.resize_with(place + 1, || None);
+                }
+                commands[place] = Some(entry);
+                dictionary.commands.insert(command.format.into(), json!(id));
+            }
         }
-        for (name, constant) in features.iter().flat_map(|feature| feature.constants) {
-            let value = match constant {
-                Constant::Number(number) => json!(number),
-                Constant::Text(text) => json!(text),
+        let constants = all(features, |feature| feature.constants);
+        let had = Choice::new(&name, constants.clone(), |constant| (constant.name, constant.generations));
+        for constant in constants.filter(|constant| had.has(constant)) {
+            let value = match constant.value {
+                ConstantValue::Number(number) => json!(number),
+                ConstantValue::Text(text) => json!(text),
             };
-            dictionary.config.insert((*name).into(), value);
+            dictionary.config.insert(constant.name.into(), value);
         }
-        for enumeration in features.iter().flat_map(|feature| feature.enumerations) {
+        let enumerations = all(features, |feature| feature.enumerations);
+        let had = Choice::new(&name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.generations));
+        for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {
             let values = names((enumeration.values)(board));
             dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
         }
@@ -118,7 +178,12 @@ impl Dialect {
         let texts = shutdowns.iter().zip(0..).map(|(reason, id)| (reason.text().into(), json!(id)));
         dictionary.enumerations.insert("static_string_id".into(), Value::Object(texts.collect()));
         let compressed = dictionary.compress()?;
-        Ok(Dialect { commands, response_ids, shutdowns, dictionary, compressed })
+        Ok(Dialect { name, commands, response_ids, shutdowns, dictionary, compressed })
+    }
+
+    /// Which dialect this is.
+    pub fn name(&self) -> DialectName {
+        self.name
     }
 
     /// The dictionary.
@@ -131,8 +196,9 @@ impl Dialect {
         &self.compressed
     }
 
-    /// The id of the response of type `R`.
-    pub(crate) fn response_id<R: super::Response>(&self) -> u32 {
+    /// The id of the response of type `R`; none if the hosts of this dialect do not take it.
+    #[inline]
+    pub(crate) fn response_id<R: super::Response>(&self) -> Option<u32> {
         self.response_ids[R::INDEX]
     }
 
@@ -206,7 +272,7 @@ mod tests {
     fn a_command_is_found_among_others_and_not_in_their_parameters() {
         let clock = VirtualClock::at(Clock::from_ticks(0));
         let board = SimBoard::new(SimConfig::default_printer(), Arc::new(clock)).unwrap();
-        let dialect = Dialect::new(FEATURES, &board).unwrap();
+        let dialect = Dialect::new(FEATURES, &board, DialectName::Of(Generation::Master)).unwrap();
         let stop = dialect.command_id("emergency_stop").unwrap();
         let step = dialect.command_id("queue_step oid=%c interval=%u count=%hu add=%hi").unwrap();
         let contains = |ints: &[u32]| {

@@ -19,6 +19,7 @@ mod bus;
 mod command;
 mod dialect;
 mod errand;
+mod generation;
 mod lines;
 mod moves;
 mod object;
@@ -30,10 +31,11 @@ mod stop;
 mod timers;
 
 pub use bus::{Bus, Conversation, Talk};
-pub use command::{Command, Constant, Enumeration, Feature, Handler, Response};
+pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response};
 pub(crate) use command::{command, response};
 pub use dialect::Dialect;
 pub use errand::{Completion, Done, Errand, Job, Ticket, WorkerId, Workers};
+pub use generation::{DialectName, Generation, Generations, only, since, until};
 pub use lines::{InputLine, OutputLine, PromptLine};
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
 pub use object::{Next, Object, Safe};
@@ -326,10 +328,32 @@ impl Mcu {
         }
     }
 
-    /// Sends a response.
+    /// Has the machine speak another dialect, for another host. False if it may not: a machine that a
+    /// host has begun to configure must be reset first, as its objects may answer in words that the
+    /// other host does not know.
+    pub fn speak(&mut self, dialect: Arc<Dialect>) -> bool {
+        let free = !self.oids_allocated && !self.is_finalized();
+        if free {
+            self.dialect = dialect;
+        }
+        free
+    }
+
+    /// The dialect that the machine speaks.
+    pub fn dialect(&self) -> &Arc<Dialect> {
+        &self.dialect
+    }
+
+    /// Whether the host takes responses of type `R`.
+    pub fn speaks<R: Response>(&self) -> bool {
+        self.dialect.response_id::<R>().is_some()
+    }
+
+    /// Sends a response, if the host takes it.
     pub fn send<R: Response>(&mut self, response: R) {
+        let Some(id) = self.dialect.response_id::<R>() else { return };
         let mut writer = Writer::default();
-        writer.int(self.dialect.response_id::<R>());
+        writer.int(id);
         response.encode(&mut writer);
         if let Some(payload) = writer.payload() {
             self.outbox.send(payload);

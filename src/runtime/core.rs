@@ -384,7 +384,7 @@ mod tests {
 
     use crate::bench::{Bench, FakeBoard};
     use crate::feature::FEATURES;
-    use crate::mcu::{Dialect, Note, Outbox};
+    use crate::mcu::{Dialect, DialectName, Generation, Note, Outbox};
     use crate::runtime::realtime::{Processors, Scheduling};
     use crate::runtime::wakeup::MarginLimits;
     use crate::runtime::workers::Threads;
@@ -430,7 +430,7 @@ mod tests {
         fn new() -> Rig {
             let bench = Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
             let board = FakeBoard(bench.clone());
-            let dialect = Arc::new(Dialect::new(FEATURES, &board).unwrap());
+            let dialect = Arc::new(Dialect::new(FEATURES, &board, DialectName::Of(Generation::Master)).unwrap());
             let monotonic = Monotonic::start();
             let clock = Arc::new(Counting(monotonic, AtomicUsize::new(0)));
             let (requests, inbox) = RingBuffer::new(64);

@@ -70,7 +70,7 @@ impl Known {
         let mut reader = Reader::new(payload);
         let id = Some(reader.int().ok()?);
         if id == self.get_clock && reader.is_empty() {
-            return Some(self.encode(&ClockResponse { clock: now() }));
+            return self.encode(&ClockResponse { clock: now() });
         }
         if id != self.identify {
             return None;
@@ -80,7 +80,7 @@ impl Known {
             return None;
         }
         let piece: IdentifyResponse<'_> = identify_response(self.dialect.compressed(), offset, count as u8);
-        Some(self.encode(&piece))
+        self.encode(&piece)
     }
 
     /// Whether the host asks in this block for the machine to be stopped.
@@ -88,11 +88,11 @@ impl Known {
         self.emergency_stop.is_some_and(|id| self.dialect.contains(payload, id))
     }
 
-    fn encode<R: Response>(&self, response: &R) -> Writer {
+    fn encode<R: Response>(&self, response: &R) -> Option<Writer> {
         let mut writer = Writer::default();
-        writer.int(self.dialect.response_id::<R>());
+        writer.int(self.dialect.response_id::<R>()?);
         response.encode(&mut writer);
-        writer
+        Some(writer)
     }
 }
 

@@ -18,7 +18,7 @@ use rtrb::RingBuffer;
 
 use crate::board::Board;
 use crate::feature::FEATURES;
-use crate::mcu::{Dialect, Mcu};
+use crate::mcu::{Dialect, DialectName, Mcu};
 use crate::time::{Monotonic, TimeSource};
 
 mod budget;
@@ -59,6 +59,8 @@ const REQUESTS: usize = 256;
 pub struct Options {
     /// Where the symbolic link to the pty stands.
     pub symlink: PathBuf,
+    /// Which dialect the machine speaks.
+    pub dialect: DialectName,
     /// Who may open the pty.
     pub access: Access,
     /// Whether to ask for real-time scheduling.
@@ -87,7 +89,7 @@ pub fn run(
     let pty = Pty::open(&options.symlink, &options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
-    let dialect = Arc::new(Dialect::new(FEATURES, &*board)?);
+    let dialect = Arc::new(Dialect::new(FEATURES, &*board, options.dialect)?);
     let clock: Arc<dyn TimeSource> = Arc::new(clock);
     let wake = Arc::new(LinkWake::new()?);
     let progress = Arc::new(Progress::default());

@@ -14,6 +14,7 @@ mod any_bytes;
 mod base;
 mod buttons;
 mod counter;
+mod dialects;
 mod digital_out;
 mod displays;
 mod ds18b20;

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use pinion::board::Board;
 use pinion::feature::FEATURES;
-use pinion::mcu::{Dialect, Mcu, Note, Outbox};
+use pinion::mcu::{Dialect, DialectName, Generation, Mcu, Note, Outbox};
 use pinion::time::{Clock, Ticks, TimeSource, VirtualClock};
 use pinion::wire::dictionary::Dictionary;
 use pinion::wire::format::{self, Conversion};
@@ -54,7 +54,6 @@ pub struct Rig {
     origin: Clock,
     clock: VirtualClock,
     workers: FakeWorkers,
-    dialect: Arc<Dialect>,
     outbox: FakeOutbox,
 }
 
@@ -71,22 +70,31 @@ impl Rig {
 
     /// A machine with another board than the bench's own.
     pub fn on_board<B: Board + 'static>(start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
+        Rig::that_speaks(DialectName::Of(Generation::Master), start, board)
+    }
+
+    /// A machine for hosts of this generation.
+    pub fn of(generation: Generation) -> Rig {
+        Rig::that_speaks(DialectName::Of(generation), ORIGIN, FakeBoard)
+    }
+
+    fn that_speaks<B: Board + 'static>(name: DialectName, start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
         let origin = Clock::from_ticks(start);
         let clock = VirtualClock::at(origin);
         let bench = Bench::new(clock.clone(), origin);
         let board = board(bench.clone());
-        let dialect = Arc::new(Dialect::new(FEATURES, &board).unwrap());
+        let dialect = Arc::new(Dialect::new(FEATURES, &board, name).unwrap());
         let workers = FakeWorkers::new(bench.clone());
         let outbox =
             FakeOutbox { payloads: Arc::new(Mutex::new(Vec::with_capacity(RESPONSE_BYTES))), notes: Arc::default() };
         let mcu = Mcu::new(
-            dialect.clone(),
+            dialect,
             Box::new(board),
             Arc::new(clock.clone()),
             Box::new(workers.clone()),
             Box::new(outbox.clone()),
         );
-        let rig = Rig { mcu, bench, origin, clock, workers, dialect, outbox };
+        let rig = Rig { mcu, bench, origin, clock, workers, outbox };
         assert_eq!(rig.responses(), ["starting"]);
         rig
     }
@@ -177,7 +185,7 @@ impl Rig {
         let parameters = format::parameters(format).unwrap();
         assert_eq!(given.len(), parameters.len(), "{command} is no {format}");
         let mut writer = Writer::default();
-        writer.int(self.dialect.command_id(format).unwrap());
+        writer.int(self.dialect().command_id(format).unwrap());
         for (name, conversion) in parameters {
             let (_, value) = given.iter().find(|(given, _)| *given == name).unwrap_or_else(|| panic!("{format}"));
             match conversion {
@@ -276,11 +284,17 @@ impl Rig {
     }
 
     pub fn dictionary(&self) -> &Dictionary {
-        self.dialect.dictionary()
+        self.dialect().dictionary()
     }
 
     pub fn dialect(&self) -> &Dialect {
-        &self.dialect
+        self.mcu.dialect()
+    }
+
+    /// Offers the machine the dialect of another generation; whether it takes it.
+    pub fn speak(&mut self, generation: Generation) -> bool {
+        let dialect = Dialect::new(FEATURES, &FakeBoard(self.bench.clone()), DialectName::Of(generation));
+        self.mcu.speak(Arc::new(dialect.unwrap()))
     }
 
     fn decode(&self, payload: &[u8]) -> String {

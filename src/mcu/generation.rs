@@ -1,0 +1,225 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The generations of hosts, and which of them take a message.
+//!
+//! To add a generation, add it here: its name, and the generation that it grew out of, whose messages
+//! it then has. docs/dialects.md goes through the rest.
+
+#![forbid(unsafe_code)]
+
+use std::fmt;
+use std::str::FromStr;
+
+/// A state of klippy that a machine can serve.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Generation {
+    /// Klipper v0.11 (November 2022).
+    V0_11,
+    /// Klipper v0.12 (November 2023).
+    V0_12,
+    /// Klipper v0.13 (April 2025).
+    V0_13,
+    /// Klipper's master branch (August 2026).
+    Master,
+    /// Kalico's main branch (July 2026).
+    Kalico,
+}
+
+use Generation::{Kalico, Master, V0_11, V0_12, V0_13};
+
+impl Generation {
+    /// All of them, the oldest first.
+    pub const ALL: [Generation; 5] = [V0_11, V0_12, V0_13, Master, Kalico];
+
+    /// What the command line, the log and the documents call it.
+    pub const fn name(self) -> &'static str {
+        match self {
+            V0_11 => "v0.11",
+            V0_12 => "v0.12",
+            V0_13 => "v0.13",
+            Master => "master",
+            Kalico => "kalico",
+        }
+    }
+
+    /// The generation that this one grew out of.
+    const fn parent(self) -> Option<Generation> {
+        match self {
+            V0_11 => None,
+            V0_12 => Some(V0_11),
+            V0_13 => Some(V0_12),
+            Master => Some(V0_13),
+            // A fork: what Klipper's master has since is Kalico's only where Kalico took it over.
+            Kalico => Some(V0_13),
+        }
+    }
+
+    /// Whether this is `ancestor`, or grew out of it.
+    const fn grew_out_of(self, ancestor: Generation) -> bool {
+        let mut this = Some(self);
+        while let Some(generation) = this {
+            if generation as u8 == ancestor as u8 {
+                return true;
+            }
+            this = generation.parent();
+        }
+        false
+    }
+}
+
+impl fmt::Display for Generation {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}
+
+/// A set of generations: those that take a form of a message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Generations(u8);
+
+/// This generation and all that grew out of it.
+pub const fn since(first: Generation) -> Generations {
+    Generations::ALL.since(first)
+}
+
+/// This generation and all that it grew out of.
+pub const fn until(last: Generation) -> Generations {
+    Generations::ALL.until(last)
+}
+
+/// This generation alone.
+pub const fn only(generation: Generation) -> Generations {
+    Generations(1 << generation as u8)
+}
+
+impl Generations {
+    /// Every generation.
+    pub const ALL: Generations = Generations((1 << Generation::ALL.len()) - 1);
+
+    /// Those of this set that are `first` or grew out of it.
+    pub const fn since(mut self, first: Generation) -> Generations {
+        let mut at = 0;
+        while at < Generation::ALL.len() {
+            if !Generation::ALL[at].grew_out_of(first) {
+                self = self.except(Generation::ALL[at]);
+            }
+            at += 1;
+        }
+        self
+    }
+
+    /// Those of this set that are `last` or that it grew out of.
+    pub const fn until(mut self, last: Generation) -> Generations {
+        let mut at = 0;
+        while at < Generation::ALL.len() {
+            if !last.grew_out_of(Generation::ALL[at]) {
+                self = self.except(Generation::ALL[at]);
+            }
+            at += 1;
+        }
+        self
+    }
+
+    /// This set and `generation`.
+    pub const fn and(self, generation: Generation) -> Generations {
+        Generations(self.0 | only(generation).0)
+    }
+
+    /// This set without `generation`.
+    pub const fn except(self, generation: Generation) -> Generations {
+        Generations(self.0 & !only(generation).0)
+    }
+
+    /// Whether `generation` is one of this set.
+    pub const fn contains(self, generation: Generation) -> bool {
+        self.0 & only(generation).0 != 0
+    }
+}
+
+/// Which dialect a machine speaks.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum DialectName {
+    /// That of hosts of one generation.
+    Of(Generation),
+    /// What Klipper v0.13, its master and Kalico take, for a host of which nothing is known. A host
+    /// looks a message up by its name alone, so of each name it has one form: master's, or, where
+    /// master has none of that name, Kalico's or that of v0.13.
+    Union,
+}
+
+impl DialectName {
+    /// All of them.
+    pub fn all() -> impl Iterator<Item = DialectName> {
+        Generation::ALL.into_iter().map(DialectName::Of).chain([DialectName::Union])
+    }
+
+    /// Whose messages it has; the form of a message is that of the first one that has the message.
+    pub(super) fn generations(&self) -> &[Generation] {
+        match self {
+            DialectName::Of(generation) => std::slice::from_ref(generation),
+            DialectName::Union => &[Master, Kalico, V0_13],
+        }
+    }
+}
+
+impl fmt::Display for DialectName {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            DialectName::Of(generation) => generation.fmt(f),
+            DialectName::Union => f.write_str("union"),
+        }
+    }
+}
+
+impl FromStr for Generation {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Generation, String> {
+        let names = || Generation::ALL.map(Generation::name).join(", ");
+        let found = Generation::ALL.into_iter().find(|generation| generation.name() == text);
+        found.ok_or_else(|| format!("there are the generations {}", names()))
+    }
+}
+
+impl FromStr for DialectName {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<DialectName, String> {
+        DialectName::all().find(|name| name.to_string() == text).ok_or_else(|| {
+            let names: Vec<String> = DialectName::all().map(|name| name.to_string()).collect();
+            format!("there are the dialects {}", names.join(", "))
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn members(set: Generations) -> Vec<Generation> {
+        Generation::ALL.into_iter().filter(|generation| set.contains(*generation)).collect()
+    }
+
+    #[test]
+    fn a_fork_has_what_it_grew_out_of() {
+        assert_eq!(members(Generations::ALL), Generation::ALL);
+        assert_eq!(members(since(V0_13)), [V0_13, Master, Kalico]);
+        assert_eq!(members(since(Master)), [Master]);
+        assert_eq!(members(until(V0_12)), [V0_11, V0_12]);
+        assert_eq!(members(until(V0_13).and(Kalico)), [V0_11, V0_12, V0_13, Kalico]);
+        assert_eq!(members(since(V0_12).until(V0_13)), [V0_12, V0_13]);
+        assert_eq!(members(since(V0_12).except(Kalico)), [V0_12, V0_13, Master]);
+        assert_eq!(members(only(Kalico)), [Kalico]);
+    }
+
+    #[test]
+    fn every_dialect_is_found_by_its_name() {
+        for name in DialectName::all() {
+            assert_eq!(name.to_string().parse(), Ok(name));
+        }
+        for generation in Generation::ALL {
+            assert_eq!(generation.name().parse(), Ok(generation));
+        }
+        let refused = "v0.10".parse::<DialectName>().unwrap_err();
+        assert!(refused.contains("v0.11, v0.12, v0.13, master, kalico, union"), "{refused}");
+    }
+}
