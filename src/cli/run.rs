@@ -51,10 +51,10 @@ pub(super) struct RunArgs {
     /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml
     #[arg(long, value_name = "BOARD", default_value = "linux")]
     board: BoardName,
-    /// The hosts to serve: v0.11, v0.12, v0.13 or master (of Klipper), kalico, or union (of the last
-    /// three, as far as they agree)
-    #[arg(long, value_name = "NAME", default_value = "master")]
-    dialect: DialectName,
+    /// The hosts to serve: auto (whichever comes), v0.11, v0.12, v0.13 or master (of Klipper), kalico,
+    /// or union (of the last three, as far as they agree)
+    #[arg(long, value_name = "NAME", default_value = "auto")]
+    dialect: Spoken,
 }
 
 fn mode(text: &str) -> Result<u32, String> {
@@ -86,6 +86,21 @@ impl FromStr for BoardName {
     }
 }
 
+/// The dialect that is spoken; none: that of the host that comes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Spoken(Option<DialectName>);
+
+impl FromStr for Spoken {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Spoken, String> {
+        match text {
+            "auto" => Ok(Spoken(None)),
+            name => name.parse().map(|name| Spoken(Some(name))),
+        }
+    }
+}
+
 impl BoardName {
     /// Opens the board. Its outputs are given to `guard`.
     pub(super) fn open(
@@ -113,7 +128,7 @@ impl RunArgs {
     pub(super) fn options(&self) -> Options {
         Options {
             symlink: self.symlink.clone(),
-            dialect: self.dialect,
+            dialect: self.dialect.0,
             access: Access { mode: self.mode, group: self.group.clone() },
             realtime: self.realtime,
             cpu: self.cpu,

@@ -21,7 +21,6 @@ use crate::host::Client;
 use crate::host::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
 use crate::host::heater::{Goal, Thermistor};
 use crate::host::picture;
-use crate::mcu::{DialectName, Generation};
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Options};
 use crate::time::Monotonic;
@@ -78,7 +77,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     let probe = board.probe();
     let options = Options {
         symlink: args.symlink.clone(),
-        dialect: DialectName::Of(Generation::Master),
+        dialect: None,
         access: Access { mode: 0o660, group: None },
         realtime: args.realtime,
         cpu: None,

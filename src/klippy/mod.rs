@@ -1,8 +1,232 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What can be known of a Klipper host from outside: which process it is, and which messages its
-//! sources look up.
+//! What can be known of a Klipper host from outside: which process it is, which messages its sources
+//! look up, and so which dialect it speaks.
 
 #![forbid(unsafe_code)]
 
+use std::collections::BTreeSet;
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use crate::mcu::{Feature, Generation, Generations};
+
 pub mod process;
 pub mod sources;
+
+use sources::{Shape, Sources};
+
+/// A klippy looks up more than 80 of our messages; what looks up fewer than these is something else.
+const SHAPES_MIN: usize = 20;
+
+/// A message that a machine knows, and who takes it.
+struct KnownShape {
+    shape: Shape,
+    generations: Generations,
+}
+
+/// What a checkout says of the host that runs from it.
+#[derive(Debug)]
+pub struct Checkout {
+    /// The folder, such as `/home/pi/klipper`.
+    pub folder: PathBuf,
+    /// The commit that is checked out, if git says so.
+    pub commit: Option<String>,
+    /// When the newest of its sources was written.
+    pub newest: SystemTime,
+    /// Every message that it looks up.
+    pub shapes: BTreeSet<Shape>,
+    /// What each generation makes of it, in the order of [`Generation::ALL`].
+    pub verdicts: Vec<Verdict>,
+}
+
+/// How a generation's dialect suits a host.
+#[derive(Debug)]
+pub struct Verdict {
+    /// Which one.
+    pub generation: Generation,
+    /// Messages in the form that the dialect has.
+    pub served: BTreeSet<Shape>,
+    /// Messages in a form that the dialect does not have, and another generation's may. A host often
+    /// looks up several forms of one message, and takes the one that there is.
+    pub other: BTreeSet<Shape>,
+}
+
+impl Checkout {
+    /// Reads the sources in klippy's folder, that of `klippy.py`, and compares them with the messages of
+    /// `features`.
+    ///
+    /// # Errors
+    ///
+    /// Those of reading, and that the folder is none of klippy's.
+    pub fn read(klippy: &Path, features: &[Feature]) -> io::Result<Checkout> {
+        let Sources { shapes, newest } = Sources::read(klippy)?;
+        let known = known(features);
+        let names: BTreeSet<&str> = known.iter().map(|known| known.shape.name()).collect();
+        let ours: BTreeSet<&Shape> = shapes.iter().filter(|shape| names.contains(shape.name())).collect();
+        if ours.len() < SHAPES_MIN {
+            return Err(io::Error::other("it does not hold klippy's sources"));
+        }
+        let verdict = |generation| {
+            let known = known.iter().filter(|known| known.generations.contains(generation));
+            let known: BTreeSet<&Shape> = known.map(|known| &known.shape).collect();
+            let (served, other): (BTreeSet<&Shape>, _) = ours.iter().partition(|shape| known.contains(*shape));
+            let owned = |shapes: BTreeSet<&Shape>| shapes.into_iter().cloned().collect();
+            Verdict { generation, served: owned(served), other: owned(other) }
+        };
+        let folder = klippy.parent().unwrap_or(klippy).to_owned();
+        Ok(Checkout {
+            commit: commit(&folder),
+            folder,
+            newest,
+            verdicts: Generation::ALL.into_iter().map(verdict).collect(),
+            shapes,
+        })
+    }
+
+    /// The dialect that has most of what the host looks up; of several the newest.
+    pub fn best(&self) -> &Verdict {
+        let best = self.verdicts.iter().rev().min_by_key(|verdict| verdict.other.len());
+        match best {
+            Some(verdict) => verdict,
+            None => unreachable!("there is a verdict for each generation"),
+        }
+    }
+
+    /// Messages that no generation has in this form though it knows their names: the host is newer than
+    /// all that this program knows, and they will not be served.
+    pub fn unknown(&self) -> impl Iterator<Item = &Shape> {
+        let everywhere = |shape: &&Shape| self.verdicts.iter().all(|verdict| verdict.other.contains(*shape));
+        self.best().other.iter().filter(everywhere)
+    }
+}
+
+/// The messages that have parameters. Those without are no more than a word in a host's sources.
+fn known(features: &[Feature]) -> Vec<KnownShape> {
+    let commands = features.iter().flat_map(|feature| feature.commands);
+    let commands = commands.map(|command| (command.format, command.generations));
+    let responses = features.iter().flat_map(|feature| feature.responses);
+    let responses = responses.map(|form| (form.format, form.generations));
+    commands
+        .chain(responses)
+        .filter_map(|(format, generations)| Some(KnownShape { shape: Shape::of(format)?, generations }))
+        .collect()
+}
+
+/// The commit of a checkout, from the files that git keeps (gitrepository-layout(5)).
+fn commit(folder: &Path) -> Option<String> {
+    let git = folder.join(".git");
+    let head = fs::read_to_string(git.join("HEAD")).ok()?;
+    let commit = match head.trim().strip_prefix("ref: ") {
+        None => head,
+        Some(name) => fs::read_to_string(git.join(name)).ok().or_else(|| {
+            let packed = fs::read_to_string(git.join("packed-refs")).ok()?;
+            let line = packed.lines().find(|line| line.split(' ').nth(1) == Some(name))?;
+            line.split(' ').next().map(str::to_owned)
+        })?,
+    };
+    let is_commit = commit.trim().len() >= 40 && commit.trim().chars().all(|c| c.is_ascii_hexdigit());
+    is_commit.then(|| commit[..9].to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::feature::FEATURES;
+
+    /// A checkout that looks these messages up, each in a string of two pieces, and nothing else.
+    fn checkout(shapes: impl IntoIterator<Item = String>) -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let klippy = folder.path().join("klippy");
+        fs::create_dir_all(klippy.join("extras")).unwrap();
+        let mut source = String::from("import mcu # of a host\n");
+        for shape in shapes {
+            let (name, parameters) = shape.split_once(' ').unwrap();
+            let parameters: Vec<String> = parameters.split(' ').map(|name| format!("{name}=%u")).collect();
+            source += &format!("mcu.lookup_command(\"{name} \"\n    \"{}\")\n", parameters.join(" "));
+        }
+        fs::write(klippy.join("extras/all.py"), source).unwrap();
+        (folder, klippy)
+    }
+
+    fn forms(generation: Generation) -> Vec<String> {
+        let known = known(FEATURES).into_iter().filter(|known| known.generations.contains(generation));
+        known.map(|known| known.shape.as_str().to_owned()).collect()
+    }
+
+    #[test]
+    fn a_host_speaks_the_dialect_that_has_what_it_looks_up() {
+        for generation in Generation::ALL {
+            let (_folder, klippy) = checkout(forms(generation));
+            let checkout = Checkout::read(&klippy, FEATURES).unwrap();
+            assert_eq!(checkout.best().generation, generation);
+            assert_eq!(checkout.best().other.len(), 0, "{generation}");
+            assert_eq!(checkout.unknown().count(), 0);
+        }
+    }
+
+    #[test]
+    fn a_host_may_look_up_what_older_machines_have_too() {
+        let older = forms(Generation::V0_13);
+        let (_folder, klippy) = checkout(forms(Generation::Master).into_iter().chain(older));
+        let checkout = Checkout::read(&klippy, FEATURES).unwrap();
+        assert_eq!(checkout.best().generation, Generation::Master);
+        assert!(checkout.best().other.iter().any(|shape| shape.name() == "i2c_write"));
+        assert_eq!(checkout.unknown().count(), 0, "another generation has it");
+    }
+
+    #[test]
+    fn of_a_newer_host_what_will_not_be_served_is_named() {
+        let newer = forms(Generation::Master).into_iter().map(|shape| match shape.as_str() {
+            "query_adxl345 oid rest_ticks" => "query_adxl345 oid rest_ticks range".to_owned(),
+            _ => shape,
+        });
+        let (_folder, klippy) = checkout(newer.chain(["config_new_chip oid bus_oid".to_owned()]));
+        let checkout = Checkout::read(&klippy, FEATURES).unwrap();
+        assert_eq!(checkout.best().generation, Generation::Master);
+        let unknown: Vec<&str> = checkout.unknown().map(Shape::as_str).collect();
+        assert_eq!(unknown, ["query_adxl345 oid rest_ticks range"]);
+    }
+
+    #[test]
+    fn another_program_is_no_klippy() {
+        let (_folder, klippy) = checkout(["queue_step oid interval count add".to_owned()]);
+        let error = Checkout::read(&klippy, FEATURES).unwrap_err();
+        assert_eq!(error.to_string(), "it does not hold klippy's sources");
+    }
+
+    #[test]
+    fn git_tells_the_commit() {
+        let folder = tempfile::tempdir().unwrap();
+        let git = folder.path().join(".git");
+        let put = |path: &str, text: &str| {
+            fs::create_dir_all(git.join(path).parent().unwrap()).unwrap();
+            fs::write(git.join(path), text).unwrap();
+        };
+        assert_eq!(commit(folder.path()), None);
+        let [first, second, third] = ["a", "b", "c"].map(|digit| digit.repeat(40));
+        put("HEAD", &format!("{first}\n"));
+        assert_eq!(commit(folder.path()).as_deref(), Some("aaaaaaaaa"));
+        put("HEAD", "ref: refs/heads/master\n");
+        put("packed-refs", &format!("# pack-refs\n{second} refs/heads/master\n"));
+        assert_eq!(commit(folder.path()).as_deref(), Some("bbbbbbbbb"));
+        put("refs/heads/master", &format!("{third}\n"));
+        assert_eq!(commit(folder.path()).as_deref(), Some("ccccccccc"));
+    }
+
+    /// With checkouts of real hosts in KLIPPER_DIR_V0_11 and so on.
+    #[test]
+    fn real_hosts_are_told_apart() {
+        for generation in Generation::ALL {
+            let variable = format!("KLIPPER_DIR_{}", generation.name().to_uppercase().replace('.', "_"));
+            let Some(folder) = std::env::var_os(&variable) else {
+                eprintln!("SKIPPED {generation}: {variable} is not set");
+                continue;
+            };
+            let checkout = Checkout::read(&Path::new(&folder).join("klippy"), FEATURES).unwrap();
+            assert_eq!(checkout.best().generation, generation);
+            assert_eq!(checkout.unknown().count(), 0, "{generation}: {:?}", checkout.best().other);
+        }
+    }
+}

@@ -15,6 +15,7 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::io;
 use std::path::Path;
+use std::time::SystemTime;
 
 /// No checkout has more files or longer ones; a folder that has is none.
 const FILES_MAX: usize = 2000;
@@ -62,39 +63,51 @@ impl Shape {
     }
 }
 
-/// The shapes of all messages in klippy's folder, that of `klippy.py`.
-///
-/// # Errors
-///
-/// Those of reading the folder or a file in it.
-pub fn shapes(klippy: &Path) -> io::Result<BTreeSet<Shape>> {
-    let mut shapes = BTreeSet::new();
-    let mut files = 0;
-    let mut folders = vec![(klippy.to_owned(), 1)];
-    while let Some((folder, depth)) = folders.pop() {
-        for entry in fs::read_dir(&folder)? {
-            let path = entry?.path();
-            // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads.
-            let Ok(metadata) = fs::metadata(&path) else { continue };
-            if metadata.is_dir() && depth < DEPTH_MAX {
-                folders.push((path, depth + 1));
-            } else if metadata.is_file()
-                && metadata.len() <= FILE_BYTES_MAX
-                && path.extension().is_some_and(|extension| extension == "py")
-            {
-                files += 1;
-                if files > FILES_MAX {
-                    return Err(io::Error::other(format!("more than {FILES_MAX} files of Python")));
-                }
-                let text = fs::read(&path)?;
-                // Most files have no message, and need not be read as Python.
-                if text.windows(2).any(|pair| pair == b"=%") {
-                    strings(&text, |string| shapes.extend(Shape::of(string)));
+/// What klippy's folder holds.
+#[derive(Debug)]
+pub struct Sources {
+    /// The shapes of all messages.
+    pub shapes: BTreeSet<Shape>,
+    /// When the newest file was written.
+    pub newest: SystemTime,
+}
+
+impl Sources {
+    /// Reads klippy's folder, that of `klippy.py`.
+    ///
+    /// # Errors
+    ///
+    /// Those of reading the folder or a file in it.
+    pub fn read(klippy: &Path) -> io::Result<Sources> {
+        let mut sources = Sources { shapes: BTreeSet::new(), newest: SystemTime::UNIX_EPOCH };
+        let mut files = 0;
+        let mut folders = vec![(klippy.to_owned(), 1)];
+        while let Some((folder, depth)) = folders.pop() {
+            for entry in fs::read_dir(&folder)? {
+                let path = entry?.path();
+                // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads.
+                let Ok(metadata) = fs::metadata(&path) else { continue };
+                if metadata.is_dir() && depth < DEPTH_MAX {
+                    folders.push((path, depth + 1));
+                } else if metadata.is_file()
+                    && metadata.len() <= FILE_BYTES_MAX
+                    && path.extension().is_some_and(|extension| extension == "py")
+                {
+                    files += 1;
+                    if files > FILES_MAX {
+                        return Err(io::Error::other(format!("more than {FILES_MAX} files of Python")));
+                    }
+                    sources.newest = sources.newest.max(metadata.modified()?);
+                    let text = fs::read(&path)?;
+                    // Most files have no message, and need not be read as Python.
+                    if text.windows(2).any(|pair| pair == b"=%") {
+                        strings(&text, |string| sources.shapes.extend(Shape::of(string)));
+                    }
                 }
             }
         }
+        Ok(sources)
     }
-    Ok(shapes)
 }
 
 /// Tells each string of a Python source, adjacent literals as one string.
@@ -198,9 +211,9 @@ mod tests {
         put("a/b/c/deep.py", "d('too_deep oid=%c')");
         put("notes.txt", "'no_python oid=%c'");
         std::os::unix::fs::symlink("/nonexistent", folder.path().join("extras/gone.py")).unwrap();
-        let shapes = shapes(folder.path()).unwrap();
-        let shapes: Vec<&str> = shapes.iter().map(Shape::as_str).collect();
+        let sources = Sources::read(folder.path()).unwrap();
+        let shapes: Vec<&str> = sources.shapes.iter().map(Shape::as_str).collect();
         assert_eq!(shapes, ["hd44780_send_cmds oid cmds", "i2c_write oid data", "trsync_start oid report_clock"]);
-        assert!(super::shapes(&folder.path().join("none")).is_err());
+        assert!(Sources::read(&folder.path().join("none")).is_err());
     }
 }

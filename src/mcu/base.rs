@@ -148,7 +148,8 @@ const GET_UPTIME: Command = command!("get_uptime", |mcu| {
 const GET_CONFIG: Command = command!("get_config", |mcu| {
     let config = Config {
         is_config: mcu.is_finalized(),
-        crc: mcu.config_crc,
+        // klippy resets a machine that another configuration has, before it sends it anything.
+        crc: if mcu.next_dialect.is_some() { !mcu.config_crc } else { mcu.config_crc },
         is_shutdown: mcu.is_shutdown(),
         move_count: mcu.moves.count,
     };

@@ -22,6 +22,8 @@ pub(super) struct Entry {
     pub(super) format: &'static str,
     pub(super) handler: Handler,
     pub(super) in_shutdown: bool,
+    /// Whether it is one of the machine's own, which has the same id in every dialect.
+    pub(super) is_own: bool,
     conversions: Box<[Conversion]>,
 }
 
@@ -124,7 +126,7 @@ impl Dialect {
         // The machine's own messages have the same ids in every dialect: an `emergency_stop` means the
         // same to a machine that was given another one since its host read the dictionary.
         let (base, others) = features.split_at(features.len().min(1));
-        for features in [base, others] {
+        for (features, is_own) in [(base, true), (others, false)] {
             // Responses first: what they carry fills a block to the last byte, so their ids are short.
             for form in all(features, |feature| feature.responses) {
                 if !responses.has(form) {
@@ -145,6 +147,7 @@ impl Dialect {
                     format: command.format,
                     handler: command.handler,
                     in_shutdown: command.in_shutdown,
+                    is_own,
                     conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
                 };
                 let id = match format::name(command.format) {

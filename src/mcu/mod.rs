@@ -102,6 +102,8 @@ pub struct Mcu {
     reset_due: bool,
     config_crc: u32,
     oids_allocated: bool,
+    /// The dialect of a host that came since the machine was configured.
+    next_dialect: Option<Arc<Dialect>>,
     stop: Stop,
     stats: Stats,
     lateness: Lateness,
@@ -140,6 +142,7 @@ impl Mcu {
             reset_due: false,
             config_crc: 0,
             oids_allocated: false,
+            next_dialect: None,
             stop: Stop::default(),
             stats: Stats::default(),
             lateness: Lateness::default(),
@@ -317,6 +320,18 @@ impl Mcu {
     fn try_execute(&mut self, payload: &mut Reader<'_>) -> Result<(), Shutdown> {
         let id = payload.int()?;
         let command = self.dialect.command(id)?;
+        if let Some(next) = &self.next_dialect
+            && !command.is_own
+        {
+            return Err(Shutdown::because(
+                reason::INVALID_COMMAND,
+                format!(
+                    "the machine is configured by a host of the dialect {}, and the present one speaks {}: FIRMWARE_RESTART",
+                    self.dialect.name(),
+                    next.name()
+                ),
+            ));
+        }
         match self.stop.reason {
             Some(reason) if !command.in_shutdown => {
                 command.skip(payload)?;
@@ -328,15 +343,17 @@ impl Mcu {
         }
     }
 
-    /// Has the machine speak another dialect, for another host. False if it may not: a machine that a
-    /// host has begun to configure must be reset first, as its objects may answer in words that the
-    /// other host does not know.
-    pub fn speak(&mut self, dialect: Arc<Dialect>) -> bool {
-        let free = !self.oids_allocated && !self.is_finalized();
-        if free {
+    /// Has the machine speak another dialect, for another host: at once, or, if a host has begun to
+    /// configure it, after the reset. Until then its objects answer in words that the other host does
+    /// not know, so only the messages of the machine itself are served, which have the same ids in
+    /// every dialect, and `get_config` tells no check sum that the other host could take for its own.
+    pub fn speak(&mut self, dialect: Arc<Dialect>) {
+        self.next_dialect = None;
+        if !self.oids_allocated && !self.is_finalized() {
             self.dialect = dialect;
+        } else if dialect.name() != self.dialect.name() {
+            self.next_dialect = Some(dialect);
         }
-        free
     }
 
     /// The dialect that the machine speaks.
@@ -460,6 +477,9 @@ impl Mcu {
         self.board.reset();
         self.moves = MovePool::default();
         self.config_crc = 0;
+        if let Some(dialect) = self.next_dialect.take() {
+            self.dialect = dialect;
+        }
         self.outbox.note(Note::Reset);
     }
 

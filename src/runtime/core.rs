@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use rtrb::Consumer;
 
-use crate::mcu::{Mcu, base};
+use crate::mcu::{Dialect, Mcu, base};
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource, monotonic};
 use crate::wire::block::PAYLOAD_MAX;
@@ -47,6 +47,8 @@ pub(super) enum Request {
     Run(Payload),
     /// Stop the machine.
     Shutdown(Shutdown),
+    /// Speak this dialect, as another host came. The link keeps a copy, so that the core never frees one.
+    Speak(Arc<Dialect>),
     /// Say how late timers were.
     Report,
     /// Stop the machine and end.
@@ -267,7 +269,7 @@ impl Core {
                     Request::Run(payload) => mcu.is_emergency(payload.as_slice()).then(base::emergency),
                     Request::Shutdown(shutdown) => Some(shutdown.clone()),
                     Request::Quit => Some(program_ends()),
-                    Request::Report | Request::Hang => None,
+                    Request::Speak(_) | Request::Report | Request::Hang => None,
                 })
             }
         };
@@ -327,6 +329,7 @@ impl Core {
                 self.stops_taken = self.stops_taken.wrapping_add(1);
                 self.mcu.shut_down(shutdown);
             }
+            Request::Speak(dialect) => self.mcu.speak(dialect),
             Request::Report => self.mcu.report_lateness(self.waiter.margin()),
             Request::Quit => {
                 self.mcu.shut_down(program_ends());
@@ -384,7 +387,7 @@ mod tests {
 
     use crate::bench::{Bench, FakeBoard};
     use crate::feature::FEATURES;
-    use crate::mcu::{Dialect, DialectName, Generation, Note, Outbox};
+    use crate::mcu::{DialectName, Generation, Note, Outbox};
     use crate::runtime::realtime::{Processors, Scheduling};
     use crate::runtime::wakeup::MarginLimits;
     use crate::runtime::workers::Threads;

@@ -17,7 +17,7 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use rtrb::Producer;
 
 use crate::mcu::base::{ClockResponse, IdentifyResponse, identify_response};
-use crate::mcu::{Dialect, Response};
+use crate::mcu::{Dialect, DialectName, Response};
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, TimeSource, monotonic};
 use crate::wire::block::{Received, Receiver, Sequence, frame};
@@ -25,6 +25,7 @@ use crate::wire::vlq::{Reader, Writer};
 
 use super::core::{Payload, Request};
 use super::guardian::{GuardianWatch, in_ms};
+use super::host::HostFinder;
 use super::ledger::Ledger;
 use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
@@ -44,6 +45,8 @@ const STALL_MS: u64 = 1;
 /// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
 /// holds the blocks back.
 const REQUESTS_KEPT: usize = 8;
+/// How long a host may be looked for before it is served as one of which nothing is known.
+const FIND_LIMIT: Duration = Duration::from_secs(1);
 /// How long a host has to read why the program ends.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -101,6 +104,12 @@ pub(super) struct Link {
     pty: Pty,
     clock: Arc<dyn TimeSource>,
     known: Known,
+    /// Those that a host may speak.
+    dialects: Vec<Arc<Dialect>>,
+    /// None if the dialect does not depend on the host.
+    finder: Option<HostFinder>,
+    /// Until when the host's first bytes wait for its dialect to be found.
+    finding: Option<Duration>,
     receiver: Receiver,
     input: Vec<u8>,
     output: Vec<u8>,
@@ -143,7 +152,9 @@ pub(super) enum End {
 pub(super) struct Parts {
     pub(super) pty: Pty,
     pub(super) clock: Arc<dyn TimeSource>,
-    pub(super) dialect: Arc<Dialect>,
+    /// Those that a host may speak; the first one is spoken before a host comes.
+    pub(super) dialects: Vec<Arc<Dialect>>,
+    pub(super) finder: Option<HostFinder>,
     pub(super) requests: Producer<Request>,
     pub(super) core: Thread,
     pub(super) inlet: Inlet,
@@ -156,11 +167,15 @@ pub(super) struct Parts {
 
 impl Link {
     pub(super) fn new(parts: Parts) -> Link {
-        let Parts { pty, clock, dialect, requests, core, inlet, progress, wake, signals, guardian, vigil } = parts;
+        let Parts { pty, clock, dialects, finder, requests, core, inlet, progress, wake, signals, guardian, vigil } =
+            parts;
         Link {
             pty,
             clock,
-            known: Known::new(dialect),
+            known: Known::new(dialects[0].clone()),
+            dialects,
+            finder,
+            finding: None,
             receiver: Receiver::default(),
             input: Vec::with_capacity(INPUT_BYTES),
             output: Vec::with_capacity(2 * OUTPUT_BYTES),
@@ -314,6 +329,10 @@ impl Link {
             self.attached = true;
             self.tell_status();
             info!("host attached");
+            if let Some(finder) = &mut self.finder {
+                finder.ask();
+                self.finding = Some(monotonic() + FIND_LIMIT);
+            }
         }
         Ok(())
     }
@@ -321,6 +340,7 @@ impl Link {
     fn part_from_host(&mut self) -> io::Result<()> {
         self.pty.part_from_host()?;
         self.attached = false;
+        self.finding = None;
         self.output.clear();
         self.tell_status();
         info!("host gone");
@@ -349,8 +369,41 @@ impl Link {
         Ok(())
     }
 
-    /// Takes in the blocks that were read. True if the core had no room for all of them.
+    /// Whether the host's dialect is not known yet.
+    fn is_finding(&mut self) -> bool {
+        let (Some(until), Some(finder)) = (self.finding, &self.finder) else { return false };
+        let found = finder.answer().or_else(|| {
+            (monotonic() >= until).then(|| {
+                warn!(
+                    "the host's dialect was not found within {FIND_LIMIT:?}: served as Klipper v0.13, master and Kalico"
+                );
+                DialectName::Union
+            })
+        });
+        if let Some(name) = found {
+            self.finding = None;
+            self.speak(name);
+        }
+        found.is_none()
+    }
+
+    /// Speaks another dialect from now on.
+    fn speak(&mut self, name: DialectName) {
+        if self.known.dialect.name() == name {
+            return;
+        }
+        if let Some(dialect) = self.dialects.iter().find(|dialect| dialect.name() == name).cloned() {
+            self.known = Known::new(dialect.clone());
+            self.request(Request::Speak(dialect));
+        }
+    }
+
+    /// Takes in the blocks that were read. True if they have to wait: for the host's dialect, or
+    /// because the core has no room for all of them.
     fn take_in(&mut self) -> bool {
+        if self.is_finding() {
+            return true;
+        }
         let mut taken = 0;
         let mut stalled = false;
         let handed = self.ledger.handed();

@@ -9,6 +9,7 @@
 #![forbid(unsafe_code)]
 
 use std::io;
+use std::iter;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread;
@@ -18,12 +19,13 @@ use rtrb::RingBuffer;
 
 use crate::board::Board;
 use crate::feature::FEATURES;
-use crate::mcu::{Dialect, DialectName, Mcu};
+use crate::mcu::{Dialect, DialectName, Generation, Mcu};
 use crate::time::{Monotonic, TimeSource};
 
 mod budget;
 mod core;
 pub mod guardian;
+mod host;
 mod ledger;
 mod link;
 mod notify;
@@ -40,6 +42,7 @@ pub use guardian::Guardian;
 pub use pty::Access;
 
 use self::core::{Core, Left, Request};
+use host::HostFinder;
 use link::{End, Link, Parts};
 use notify::Notify;
 use outlet::{LinkWake, Progress};
@@ -59,14 +62,14 @@ const REQUESTS: usize = 256;
 pub struct Options {
     /// Where the symbolic link to the pty stands.
     pub symlink: PathBuf,
-    /// Which dialect the machine speaks.
-    pub dialect: DialectName,
     /// Who may open the pty.
     pub access: Access,
     /// Whether to ask for real-time scheduling.
     pub realtime: bool,
     /// How early the core may wake for a timer.
     pub margin: MarginLimits,
+    /// The dialect to speak; none: that of the host that comes.
+    pub dialect: Option<DialectName>,
     /// The hardware watchdog to feed.
     pub watchdog: Option<PathBuf>,
     /// The processor that the core runs on, and nowhere else.
@@ -89,9 +92,20 @@ pub fn run(
     let pty = Pty::open(&options.symlink, &options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
-    let dialect = Arc::new(Dialect::new(FEATURES, &*board, options.dialect)?);
+    // All of them now, as the board's names are needed for them and the board becomes the core's.
+    let names = match options.dialect {
+        Some(name) => vec![name],
+        None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
+    };
+    let dialects = names.into_iter().map(|name| Dialect::new(FEATURES, &*board, name).map(Arc::new));
+    let dialects = dialects.collect::<io::Result<Vec<Arc<Dialect>>>>()?;
     let clock: Arc<dyn TimeSource> = Arc::new(clock);
     let wake = Arc::new(LinkWake::new()?);
+    // Before the link is of real time, which its threads would inherit.
+    let finder = match options.dialect {
+        Some(_) => None,
+        None => Some(HostFinder::start(pty.device(), wake.clone())?),
+    };
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
@@ -100,7 +114,7 @@ pub fn run(
     if realtime {
         realtime::lock_memory();
     }
-    let (core_dialect, core_clock) = (dialect.clone(), clock.clone());
+    let (core_dialect, core_clock) = (dialects[0].clone(), clock.clone());
     let (core_progress, core_wake) = (progress.clone(), wake.clone());
     let core = thread::Builder::new().name("core".into()).spawn(move || {
         if let Err(error) = processors.confine() {
@@ -133,7 +147,8 @@ pub fn run(
     let mut link = Link::new(Parts {
         pty,
         clock,
-        dialect,
+        dialects,
+        finder,
         requests,
         core: core.thread().clone(),
         inlet,

@@ -292,9 +292,9 @@ impl Rig {
     }
 
     /// Offers the machine the dialect of another generation; whether it takes it.
-    pub fn speak(&mut self, generation: Generation) -> bool {
+    pub fn speak(&mut self, generation: Generation) {
         let dialect = Dialect::new(FEATURES, &FakeBoard(self.bench.clone()), DialectName::Of(generation));
-        self.mcu.speak(Arc::new(dialect.unwrap()))
+        self.mcu.speak(Arc::new(dialect.unwrap()));
     }
 
     fn decode(&self, payload: &[u8]) -> String {
