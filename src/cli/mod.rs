@@ -10,6 +10,7 @@ use clap::{Args, Parser, Subcommand};
 use log::LevelFilter;
 
 pub mod dict;
+mod doctor;
 pub mod latency;
 mod logging;
 pub mod pins;
@@ -49,6 +50,8 @@ enum Command {
     Dict(dict::DictArgs),
     /// Measure how late this machine wakes up, and say what that is good for
     Latency(latency::LatencyArgs),
+    /// Say whether this Pinion serves a host, before the host is restarted
+    Doctor(doctor::DoctorArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
 }
@@ -63,6 +66,7 @@ pub fn main() -> ExitCode {
         Some(Command::Pins(args)) => pins::run(&args),
         Some(Command::Dict(args)) => dict::run(&args),
         Some(Command::Latency(args)) => latency::run(&args),
+        Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
     };
     logging::finish();
