@@ -8,14 +8,54 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, Feature, Oid, command};
-use crate::time::Ticks;
+use crate::mcu::{
+    Command, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, response, since, until,
+};
+use crate::time::{Clock, Ticks};
 
-use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
+use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_at, query_status};
+use super::sensor_bulk::{BulkData, Status, Words};
 
-pub(super) const FEATURE: Feature =
-    Feature { name: "adxl345", commands: &[CONFIG_ADXL345, QUERY_ADXL345, QUERY_ADXL345_STATUS], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature {
+    name: "adxl345",
+    commands: &[CONFIG_ADXL345, QUERY_ADXL345_AT, QUERY_ADXL345, QUERY_ADXL345_STATUS],
+    responses: &[OwnData::FORM, OwnStatus::FORM],
+    ..Feature::EMPTY
+};
 
+response! {
+    /// Samples.
+    "adxl345_data oid=%c sequence=%hu data=%*s" => until(V0_12);
+    pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
+}
+
+response! {
+    /// How many samples there were, of them `fifo` in the chip.
+    "adxl345_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => until(V0_12);
+    pub(super) struct OwnStatus {
+        oid: Oid,
+        clock: Clock,
+        query_ticks: u32,
+        next_sequence: u16,
+        buffered: u8,
+        fifo: u8,
+        limit_count: u16
+    }
+}
+
+const OWN_WORDS: Words = Words {
+    data_max: 50,
+    data: |mcu, BulkData { oid, sequence, data }| mcu.send(OwnData { oid, sequence, data }),
+    status: |mcu, Status { oid, clock, query_ticks, next_sequence, in_message, in_sensor, possible_overflows }| {
+        let fifo = (in_sensor / SAMPLE_BYTES as u32) as u8;
+        let (buffered, limit_count) = (in_message, possible_overflows);
+        mcu.send(OwnStatus { oid, clock, query_ticks, next_sequence, buffered, fifo, limit_count });
+    },
+};
+
+const POWER_CTL: u8 = 0x2d;
+/// Measure, of POWER_CTL.
+const MEASURE: u8 = 0x08;
 /// DATAX0, the first of the six data registers; FIFO_CTL and FIFO_STATUS follow them.
 const DATAX0: u8 = 0x32;
 const FIFO_STATUS: u8 = 0x39;
@@ -56,6 +96,16 @@ struct Adxl345;
 impl FifoChip for Adxl345 {
     const NAME: &'static str = "ADXL345";
     const SAMPLE_BYTES: usize = SAMPLE_BYTES;
+    const OWN_WORDS: Option<&'static Words> = Some(&OWN_WORDS);
+    const KEEPS_SAMPLES: bool = true;
+
+    fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        chip.exchange(&mut [POWER_CTL, MEASURE])
+    }
+
+    fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        chip.exchange(&mut [POWER_CTL, 0])
+    }
 
     fn bus_type(self) -> BusType {
         BusType::Spi
@@ -87,9 +137,16 @@ const CONFIG_ADXL345: Command = command!("config_adxl345 oid=%c spi_oid=%c", |mc
     configure(mcu, oid, spi_oid, Adxl345)
 });
 
+const QUERY_ADXL345_AT: Command =
+    command!("query_adxl345 oid=%c clock=%u rest_ticks=%u", |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks| {
+        query_at::<Adxl345>(mcu, oid, clock, rest_ticks)
+    })
+    .of(until(V0_12));
+
 const QUERY_ADXL345: Command = command!("query_adxl345 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Adxl345>(mcu, oid, rest_ticks)
-});
+})
+.of(since(V0_13));
 
 const QUERY_ADXL345_STATUS: Command =
     command!("query_adxl345_status oid=%c", |mcu, oid: Oid| query_status::<Adxl345>(mcu, oid));

@@ -8,8 +8,8 @@
 
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
-    Command, Constant, Done, Errand, Feature, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId,
-    command, response,
+    Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Next,
+    Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId, command, only, response, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -18,8 +18,8 @@ use super::trigger_analog::Attached;
 
 pub(super) const FEATURE: Feature = Feature {
     name: "analog_in",
-    commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN, ANALOG_IN_ATTACH_TRIGGER_ANALOG],
-    responses: &[State::FORM],
+    commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN, QUERY_ANALOG_IN_FOR_BATCHES, ANALOG_IN_ATTACH_TRIGGER_ANALOG],
+    responses: &[State::FORM, Batch::FORM],
     constants: &[Constant::number("ADC_MAX", ADC_MAX as u32)],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -33,9 +33,15 @@ shutdowns! {
 }
 
 response! {
+    /// A sum of readings.
+    "analog_in_state oid=%c next_clock=%u value=%hu" => until(V0_13).and(Kalico);
+    pub(super) struct State { oid: Oid, next_clock: Clock, value: u16 }
+}
+
+response! {
     /// Sums of readings, two bytes each, low byte first.
-    "analog_in_state oid=%c next_clock=%u values=%*s"
-    pub(super) struct State<'a> { oid: Oid, next_clock: Clock, values: &'a [u8] }
+    "analog_in_state oid=%c next_clock=%u values=%*s" => only(Master);
+    pub(super) struct Batch<'a> { oid: Oid, next_clock: Clock, values: &'a [u8] }
 }
 
 /// How many bytes of readings a report holds at most.
@@ -54,19 +60,26 @@ impl Errand for Reading {
     }
 }
 
-struct AnalogIn {
-    worker: WorkerId,
-    /// None while the ADC is being read: then the worker has the box.
-    reading: Option<Box<Reading>>,
-    /// Whether a sample waits until the ADC is done with one of an earlier query.
-    waiting: bool,
+/// What the host asks for.
+#[derive(Clone, Copy, Default)]
+struct Query {
     sample_ticks: Ticks,
     sample_count: u8,
     rest_ticks: Ticks,
     min_value: u16,
     max_value: u16,
     range_check_count: u8,
-    bytes_per_report: u8,
+    /// Of a batch; none if each sum is a report of its own.
+    bytes_per_report: Option<u8>,
+}
+
+struct AnalogIn {
+    worker: WorkerId,
+    /// None while the ADC is being read: then the worker has the box.
+    reading: Option<Box<Reading>>,
+    /// Whether a sample waits until the ADC is done with one of an earlier query.
+    waiting: bool,
+    query: Query,
     /// When the first sample of the next sum is due.
     next_begin: Clock,
     /// When the present sample was due.
@@ -106,12 +119,12 @@ impl AnalogIn {
     /// Moves `next_begin` on by `rest_ticks`, or by as many of them as it takes to lie in the future:
     /// what was due before is left out, as the ADC was too slow for it.
     fn skip_missed(&mut self, now: Clock) {
-        self.next_begin = self.next_begin + self.rest_ticks;
+        self.next_begin = self.next_begin + self.query.rest_ticks;
         let behind = now.since(self.next_begin);
         if behind <= 0 {
             return;
         }
-        self.next_begin = match u64::from(self.rest_ticks.0) {
+        self.next_begin = match u64::from(self.query.rest_ticks.0) {
             // Without a pause the next sum just begins now.
             0 => now,
             rest => Clock::from_ticks(self.next_begin.ticks() + (behind as u64 / rest + 1) * rest),
@@ -119,12 +132,12 @@ impl AnalogIn {
     }
 
     fn check_range(&mut self, mcu: &Mcu) -> Result<(), Shutdown> {
-        if (self.min_value..=self.max_value).contains(&self.sum) {
+        if (self.query.min_value..=self.query.max_value).contains(&self.sum) {
             self.invalid_count = 0;
             return Ok(());
         }
         self.invalid_count = self.invalid_count.saturating_add(1);
-        if self.invalid_count < self.range_check_count {
+        if self.invalid_count < self.query.range_check_count {
             return Ok(());
         }
         self.invalid_count = 0;
@@ -132,17 +145,38 @@ impl AnalogIn {
             ADC_RANGE,
             format!(
                 "it read {} where {} to {} is allowed (sum of {} samples): a heater past its limits, or a sensor that is broken or unplugged",
-                self.sum, self.min_value, self.max_value, self.sample_count
+                self.sum, self.query.min_value, self.query.max_value, self.query.sample_count
             ),
         ))
     }
 
+    fn query(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, query: Query) -> Result<(), Shutdown> {
+        mcu.cancel(TimerId::new(oid, 0));
+        self.restart();
+        self.next_begin = at;
+        self.query = query;
+        self.report_len = 0;
+        if query.sample_count == 0 {
+            return Ok(());
+        }
+        if let Some(bytes_per_report) = query.bytes_per_report.filter(|bytes| usize::from(*bytes) > REPORT_BYTES) {
+            return Err(Shutdown::by_host(
+                INVALID_BYTES_PER_REPORT,
+                format_args!("{bytes_per_report} bytes are asked for where a report has {REPORT_BYTES}"),
+            ));
+        }
+        mcu.schedule(TimerId::new(oid, 0), at)
+    }
+
     fn report(&mut self, mcu: &mut Mcu, oid: Oid) {
+        let Some(bytes_per_report) = self.query.bytes_per_report else {
+            return mcu.send(State { oid, next_clock: self.next_begin, value: self.sum });
+        };
         let bytes = self.sum.to_le_bytes();
         self.report[self.report_len..self.report_len + SAMPLE_BYTES].copy_from_slice(&bytes);
         self.report_len += SAMPLE_BYTES;
-        if self.report_len + SAMPLE_BYTES > usize::from(self.bytes_per_report) {
-            mcu.send(State { oid, next_clock: self.next_begin, values: &self.report[..self.report_len] });
+        if self.report_len + SAMPLE_BYTES > usize::from(bytes_per_report) {
+            mcu.send(Batch { oid, next_clock: self.next_begin, values: &self.report[..self.report_len] });
             self.report_len = 0;
         }
     }
@@ -184,8 +218,8 @@ impl Object for AnalogIn {
         self.sum = self.sum.wrapping_add(counts);
         self.taken += 1;
         let now = mcu.now();
-        if self.taken < self.sample_count {
-            mcu.go_on(timer, (self.sample_at + self.sample_ticks).max(now));
+        if self.taken < self.query.sample_count {
+            mcu.go_on(timer, (self.sample_at + self.query.sample_ticks).max(now));
             return Ok(());
         }
         self.check_range(mcu)?;
@@ -202,7 +236,7 @@ impl Object for AnalogIn {
         self.restart();
         self.attached = Attached::default();
         // Without a pause between sums a stopped machine would be busy with them for ever.
-        if self.sample_count == 0 || self.rest_ticks == Ticks(0) {
+        if self.query.sample_count == 0 || self.query.rest_ticks == Ticks(0) {
             return;
         }
         // Sampling goes on, as in the firmware, so that the host sees the temperatures of a stopped
@@ -219,13 +253,7 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
         worker: mcu.worker(&bus)?,
         reading: Some(Box::new(Reading { adc: device, counts: Ok(0) })),
         waiting: false,
-        sample_ticks: Ticks(0),
-        sample_count: 0,
-        rest_ticks: Ticks(0),
-        min_value: 0,
-        max_value: 0,
-        range_check_count: 0,
-        bytes_per_report: 0,
+        query: Query::default(),
         next_begin: Clock::EPOCH,
         sample_at: Clock::EPOCH,
         taken: 0,
@@ -240,6 +268,26 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
 });
 
 const QUERY_ANALOG_IN: Command = command!(
+    "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u min_value=%hu max_value=%hu range_check_count=%c",
+    |mcu,
+     oid: Oid,
+     clock: WireClock,
+     sample_ticks: Ticks,
+     sample_count: u8,
+     rest_ticks: Ticks,
+     min_value: u16,
+     max_value: u16,
+     range_check_count: u8| {
+        let at = mcu.instant(clock);
+        let bytes_per_report = None;
+        let query =
+            Query { sample_ticks, sample_count, rest_ticks, min_value, max_value, range_check_count, bytes_per_report };
+        mcu.with::<AnalogIn, _>(oid, |input, mcu| input.query(mcu, oid, at, query))
+    }
+)
+.of(until(V0_13).and(Kalico));
+
+const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
     "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u bytes_per_report=%c min_value=%hu max_value=%hu range_check_count=%c",
     |mcu,
      oid: Oid,
@@ -252,35 +300,18 @@ const QUERY_ANALOG_IN: Command = command!(
      max_value: u16,
      range_check_count: u8| {
         let at = mcu.instant(clock);
-        mcu.with::<AnalogIn, _>(oid, |input, mcu| {
-            mcu.cancel(TimerId::new(oid, 0));
-            input.restart();
-            input.next_begin = at;
-            input.sample_ticks = sample_ticks;
-            input.sample_count = sample_count;
-            input.rest_ticks = rest_ticks;
-            input.bytes_per_report = bytes_per_report;
-            input.report_len = 0;
-            input.min_value = min_value;
-            input.max_value = max_value;
-            input.range_check_count = range_check_count;
-            if sample_count == 0 {
-                return Ok(());
-            }
-            if usize::from(bytes_per_report) > REPORT_BYTES {
-                return Err(Shutdown::by_host(
-                    INVALID_BYTES_PER_REPORT,
-                    format_args!("{bytes_per_report} bytes are asked for where a report has {REPORT_BYTES}"),
-                ));
-            }
-            mcu.schedule(TimerId::new(oid, 0), at)
-        })
+        let bytes_per_report = Some(bytes_per_report);
+        let query =
+            Query { sample_ticks, sample_count, rest_ticks, min_value, max_value, range_check_count, bytes_per_report };
+        mcu.with::<AnalogIn, _>(oid, |input, mcu| input.query(mcu, oid, at, query))
     }
-);
+)
+.of(only(Master));
 
 const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
     "analog_in_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     |mcu, oid: Oid, trigger_analog_oid: Oid| {
         mcu.with::<AnalogIn, _>(oid, |input, mcu| input.attached.attach(mcu, trigger_analog_oid))
     }
-);
+)
+.of(only(Master));

@@ -7,7 +7,7 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, Feature, Oid, command};
+use crate::mcu::{Command, Feature, Generation::Master, Oid, command, only};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
@@ -60,14 +60,16 @@ impl FifoChip for Bmi160 {
 const CONFIG_BMI160: Command =
     command!("config_bmi160 oid=%c bus_oid=%c bus_oid_type=%c", |mcu, oid: Oid, bus_oid: Oid, bus_oid_type: u8| {
         configure(mcu, oid, bus_oid, Bmi160 { bus_type: BusType::of(bus_oid_type)? })
-    });
+    })
+    .of(only(Master));
 
 const QUERY_BMI160: Command = command!("query_bmi160 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Bmi160>(mcu, oid, rest_ticks)
-});
+})
+.of(only(Master));
 
 const QUERY_BMI160_STATUS: Command =
-    command!("query_bmi160_status oid=%c", |mcu, oid: Oid| query_status::<Bmi160>(mcu, oid));
+    command!("query_bmi160_status oid=%c", |mcu, oid: Oid| query_status::<Bmi160>(mcu, oid)).of(only(Master));
 
 #[cfg(test)]
 mod tests {

@@ -8,15 +8,15 @@
 
 use crate::board::{OnWorker, Thermometer};
 use crate::mcu::{
-    Command, Done, Errand, Feature, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId, command,
-    response,
+    Command, Done, Errand, Feature, Generation::Kalico, Generations, Mcu, Next, Object, Oid, Response, Ticket, TimerId,
+    WireClock, WorkerId, command, only, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "ds18b20",
-    commands: &[CONFIG_DS18B20, QUERY_DS18B20],
+    commands: &[CONFIG_DS18B20, CONFIG_DS18B20_OF_KALICO, QUERY_DS18B20],
     responses: &[Reading::FORM],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -67,6 +67,8 @@ struct Ds18b20 {
     min_value: i32,
     max_value: i32,
     max_error_count: u8,
+    /// Whether any temperature is right.
+    ignores_limits: bool,
     /// Readings that failed since the last one that did not.
     error_count: u8,
     value: i32,
@@ -76,7 +78,7 @@ struct Ds18b20 {
 
 impl Ds18b20 {
     fn check_range(&self, mcu: &Mcu) -> Result<(), Shutdown> {
-        if (self.min_value..=self.max_value).contains(&self.value) {
+        if self.ignores_limits || (self.min_value..=self.max_value).contains(&self.value) {
             return Ok(());
         }
         let celsius = |value: i32| f64::from(value) / 1000.;
@@ -147,33 +149,51 @@ impl Object for Ds18b20 {
     }
 }
 
+fn configure(
+    mcu: &mut Mcu,
+    oid: Oid,
+    serial: &[u8],
+    max_error_count: u8,
+    ignores_limits: bool,
+) -> Result<(), Shutdown> {
+    mcu.vacant(oid)?;
+    if serial.contains(&b'/') {
+        let serial = String::from_utf8_lossy(serial);
+        let detail =
+            format!("{serial:?} is no sensor: serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab");
+        return Err(Shutdown::because(INVALID_SERIAL, detail));
+    }
+    let OnWorker { bus, device } = mcu.board()?.ds18b20(serial)?;
+    let sensor = Ds18b20 {
+        worker: mcu.worker(&bus)?,
+        look: Some(Box::new(Look { sensor: device, result: Ok(0) })),
+        asked: Clock::EPOCH,
+        next_clock: Clock::EPOCH,
+        rest_ticks: Ticks(0),
+        min_value: 0,
+        max_value: 0,
+        max_error_count,
+        ignores_limits,
+        error_count: 0,
+        value: 0,
+        tag: 0,
+    };
+    mcu.assign(oid, sensor)
+}
+
 const CONFIG_DS18B20: Command = command!(
     "config_ds18b20 oid=%c serial=%*s max_error_count=%c",
-    |mcu, oid: Oid, serial: &[u8], max_error_count: u8| {
-        mcu.vacant(oid)?;
-        if serial.contains(&b'/') {
-            let serial = String::from_utf8_lossy(serial);
-            let detail =
-                format!("{serial:?} is no sensor: serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab");
-            return Err(Shutdown::because(INVALID_SERIAL, detail));
-        }
-        let OnWorker { bus, device } = mcu.board()?.ds18b20(serial)?;
-        let sensor = Ds18b20 {
-            worker: mcu.worker(&bus)?,
-            look: Some(Box::new(Look { sensor: device, result: Ok(0) })),
-            asked: Clock::EPOCH,
-            next_clock: Clock::EPOCH,
-            rest_ticks: Ticks(0),
-            min_value: 0,
-            max_value: 0,
-            max_error_count,
-            error_count: 0,
-            value: 0,
-            tag: 0,
-        };
-        mcu.assign(oid, sensor)
+    |mcu, oid: Oid, serial: &[u8], max_error_count: u8| configure(mcu, oid, serial, max_error_count, false)
+)
+.of(Generations::ALL.except(Kalico));
+
+const CONFIG_DS18B20_OF_KALICO: Command = command!(
+    "config_ds18b20 oid=%c serial=%*s max_error_count=%c ignore_limits=%c",
+    |mcu, oid: Oid, serial: &[u8], max_error_count: u8, ignore_limits: bool| {
+        configure(mcu, oid, serial, max_error_count, ignore_limits)
     }
-);
+)
+.of(only(Kalico));
 
 const QUERY_DS18B20: Command = command!(
     "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",

@@ -4,24 +4,27 @@
 //!
 //! A reading takes what there is, at most one message's samples, so that others on the bus have
 //! their turn; if the chip has more, the next reading follows at once, and otherwise `rest_ticks`
-//! later. As one worker has all conversations of a bus in order, and gives them back in order, what
+//! later. Hosts up to v0.12 have the sensor itself switched on and off (`query_at`, `stop`). As one worker has all conversations of a bus in order, and gives them back in order, what
 //! the chip says of its FIFO in a status fits the samples that the machine has by then.
 
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Conversation, Done, Enumeration, Feature, Mcu, Next, Object, Oid, Talk, Ticket, TimerId};
+use crate::mcu::{
+    Conversation, Done, Enumeration, Feature, Generation::V0_13, Mcu, Next, Object, Oid, Talk, Ticket, TimerId,
+    WireClock, since,
+};
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
 
 use super::i2c::{I2c, i2c_shutdown};
 use super::named;
-use super::sensor_bulk::{DATA_MAX, SensorBulk};
+use super::sensor_bulk::{BulkData, DATA_MAX, SensorBulk, Words};
 use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "fifo_sensor",
-    enumerations: &[Enumeration::new("bus_oid_type", |_| named(&[("spi", 0), ("i2c", 1)]))],
+    enumerations: &[Enumeration::new("bus_oid_type", |_| named(&[("spi", 0), ("i2c", 1)])).of(since(V0_13))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -69,10 +72,10 @@ impl BusType {
     }
 
     /// The stop that a conversation that failed is for a sensor.
-    pub(super) fn failed(self, error: BusError) -> Shutdown {
+    pub(super) fn failed(self, mcu: &Mcu, error: BusError) -> Shutdown {
         match self {
             BusType::Spi => spi_shutdown(error),
-            BusType::I2c => i2c_shutdown(error),
+            BusType::I2c => i2c_shutdown(mcu, error),
         }
     }
 }
@@ -94,6 +97,23 @@ pub(super) trait FifoChip: Copy + Send + 'static {
     const SAMPLE_BYTES: usize;
     /// Whether there is a register of its own that tells of overflows.
     const HAS_OVERFLOW_REGISTER: bool = false;
+
+    /// Its messages with hosts up to v0.12, if those know it.
+    const OWN_WORDS: Option<&'static Words> = None;
+    /// Whether a sensor that was switched off gives away what its FIFO has.
+    const KEEPS_SAMPLES: bool = false;
+
+    /// Switches the sensor on, for a host that leaves this to the machine.
+    fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        let _ = chip;
+        Ok(())
+    }
+
+    /// Switches the sensor off; by one transfer, as the host is told when it was.
+    fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        let _ = chip;
+        Ok(())
+    }
 
     /// The bus that it is on.
     fn bus_type(self) -> BusType;
@@ -215,10 +235,40 @@ impl<C: FifoChip> Talk for LookForOverflow<C> {
     }
 }
 
+/// Switches the sensor on or off.
+struct Switch<C> {
+    chip: C,
+    on: bool,
+}
+
+impl<C: FifoChip> Talk for Switch<C> {
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        if self.on { self.chip.switch_on(chip) } else { self.chip.switch_off(chip) }
+    }
+}
+
 // The errands.
 const READ: u8 = 0;
 const FILL: u8 = 1;
 const OVERFLOW: u8 = 2;
+const SWITCH: u8 = 3;
+
+/// What a measurement of a host up to v0.12 is at.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// None.
+    Idle,
+    /// The sensor is to be switched on by the timer, or is being switched on.
+    Begins,
+    /// The sensor is being switched off, or was at these instants: the host is told so with the number of
+    /// samples, once the FIFO is read, which may be done so many times more.
+    Ends(Option<(Clock, Clock)>, u8),
+}
+
+/// How often a FIFO of 32 samples is read after the end, so that one that never gets empty ends, too.
+const LAST_READS: u8 = 33;
+/// What is told of a FIFO that makes no sense, in samples: more than any has, so the host asks again.
+const NONSENSE: u32 = 0x7f;
 
 /// A sensor.
 struct FifoSensor<C> {
@@ -226,6 +276,9 @@ struct FifoSensor<C> {
     device: Oid,
     bulk: SensorBulk,
     rest_ticks: Ticks,
+    phase: Phase,
+    /// Here while the sensor is not being switched.
+    switch: Option<Box<Conversation<Switch<C>>>>,
     /// Here while no reading is under way.
     read: Option<Box<Conversation<Read<C>>>>,
     /// Whether the reading under way is of an earlier query, and counts no more.
@@ -265,7 +318,7 @@ impl<C: FifoChip> FifoSensor<C> {
         }
         self.read = Some(read);
         if let Err(error) = result {
-            return mcu.device_failed(oid, C::NAME, self.chip.bus_type().failed(error));
+            return self.failed(mcu, oid, error);
         }
         if stale {
             return if std::mem::take(&mut self.waiting) { self.read(mcu, oid) } else { Ok(()) };
@@ -274,8 +327,12 @@ impl<C: FifoChip> FifoSensor<C> {
         for sample in samples[..len].chunks(C::SAMPLE_BYTES) {
             self.bulk.add(mcu, oid, sample);
         }
-        if more {
-            return self.read(mcu, oid);
+        match self.phase {
+            // Nothing further is read before it is off.
+            Phase::Ends(None, _) => return Ok(()),
+            Phase::Ends(Some(_), _) => return self.ask_status(mcu, oid),
+            _ if more => return self.read(mcu, oid),
+            _ => {}
         }
         mcu.go_on(TimerId::new(oid, 0), ended + self.rest_ticks);
         Ok(())
@@ -285,9 +342,71 @@ impl<C: FifoChip> FifoSensor<C> {
     fn end(&mut self) {
         self.stale = self.read.is_none();
         self.waiting = false;
+        self.phase = Phase::Idle;
         if let Some(read) = &mut self.read {
             read.talk.reading.pending = 0;
         }
+    }
+
+    fn failed(&mut self, mcu: &mut Mcu, oid: Oid, error: BusError) -> Result<(), Shutdown> {
+        let failure = self.chip.bus_type().failed(mcu, error);
+        mcu.device_failed(oid, C::NAME, failure)
+    }
+
+    fn switch(&mut self, mcu: &mut Mcu, oid: Oid, on: bool) -> Result<(), Shutdown> {
+        // While it is being switched on it can not be switched off: that follows.
+        let Some(mut switch) = self.switch.take() else { return Ok(()) };
+        switch.talk.on = on;
+        mcu.converse(self.device, Ticket { oid, tag: SWITCH }, switch)
+    }
+
+    /// The sensor is on, or off.
+    fn switched(&mut self, mcu: &mut Mcu, oid: Oid, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
+        match self.phase {
+            Phase::Idle => Ok(()),
+            Phase::Begins => {
+                self.phase = Phase::Idle;
+                mcu.go_on(TimerId::new(oid, 0), span.1 + self.rest_ticks);
+                Ok(())
+            }
+            Phase::Ends(..) if on => self.switch(mcu, oid, false),
+            Phase::Ends(..) => {
+                self.phase = Phase::Ends(Some(span), LAST_READS);
+                self.ask_status(mcu, oid)
+            }
+        }
+    }
+
+    /// Measures from `at` on, for a host that leaves it to the machine to switch the sensor on.
+    fn query_at(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, rest_ticks: Ticks) -> Result<(), Shutdown> {
+        let timer = TimerId::new(oid, 0);
+        mcu.cancel(timer);
+        self.end();
+        self.rest_ticks = rest_ticks;
+        self.bulk.reset();
+        self.phase = Phase::Begins;
+        mcu.schedule(timer, at)
+    }
+
+    /// Switches the sensor off, sends what there is, and tells the host how much that was. What is being
+    /// read counts.
+    fn stop(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        mcu.cancel(TimerId::new(oid, 0));
+        self.waiting = false;
+        self.phase = Phase::Ends(None, LAST_READS);
+        self.switch(mcu, oid, false)
+    }
+
+    /// The sensor that was switched off said how many bytes it has.
+    fn ended(&mut self, mcu: &mut Mcu, oid: Oid, off: (Clock, Clock), bytes: u32, reads: u8) -> Result<(), Shutdown> {
+        if C::KEEPS_SAMPLES && bytes > 0 && reads > 0 {
+            self.phase = Phase::Ends(Some(off), reads - 1);
+            return self.read(mcu, oid);
+        }
+        self.phase = Phase::Idle;
+        self.bulk.flush(mcu, oid);
+        self.bulk.send_status(mcu, oid, off, bytes);
+        Ok(())
     }
 
     fn query(&mut self, mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) {
@@ -329,7 +448,10 @@ impl<C: FifoChip> Object for FifoSensor<C> {
     }
 
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
-        if let Some(oid) = timer.oid() {
+        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+        if self.phase == Phase::Begins {
+            self.switch(mcu, oid, true)?;
+        } else {
             self.read(mcu, oid)?;
         }
         Ok(Next::Done)
@@ -341,6 +463,16 @@ impl<C: FifoChip> Object for FifoSensor<C> {
             READ => {
                 let Some(read) = done.errand::<Conversation<Read<C>>>() else { return Ok(()) };
                 return self.take_in(mcu, oid, read, span.1);
+            }
+            SWITCH => {
+                let Some(mut switch) = done.errand::<Conversation<Switch<C>>>() else { return Ok(()) };
+                let result = std::mem::replace(&mut switch.result, Ok(()));
+                let on = switch.talk.on;
+                self.switch = Some(switch);
+                if result.is_ok() {
+                    return self.switched(mcu, oid, on, span);
+                }
+                result
             }
             OVERFLOW => {
                 let Some(mut overflow) = done.errand::<Conversation<LookForOverflow<C>>>() else { return Ok(()) };
@@ -358,7 +490,14 @@ impl<C: FifoChip> Object for FifoSensor<C> {
                 let result = std::mem::replace(&mut fill.result, Ok(()));
                 let told = fill.talk.fill;
                 self.fill = Some(fill);
-                // Without an answer klippy asks again.
+                if let (Ok(()), Phase::Ends(Some(off), reads)) = (&result, self.phase) {
+                    let bytes = told.map_or(0, |fill| fill.bytes.into());
+                    return self.ended(mcu, oid, off, bytes, reads);
+                }
+                if told.is_none() && result.is_ok() && C::OWN_WORDS.is_some() && !mcu.speaks::<BulkData<'_>>() {
+                    self.bulk.send_status(mcu, oid, span, NONSENSE * C::SAMPLE_BYTES as u32);
+                }
+                // Without an answer klippy asks again, since v0.13.
                 if let (Ok(()), Some(Fill { bytes, overflowed })) = (&result, told) {
                     self.bulk.count_overflows(overflowed.into());
                     // A reading under way knows better.
@@ -370,7 +509,7 @@ impl<C: FifoChip> Object for FifoSensor<C> {
                 result
             }
         };
-        result.or_else(|error| mcu.device_failed(oid, C::NAME, self.chip.bus_type().failed(error)))
+        result.or_else(|error| self.failed(mcu, oid, error))
     }
 
     fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
@@ -387,8 +526,10 @@ pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip:
     let sensor = FifoSensor {
         chip,
         device,
-        bulk: SensorBulk::new(),
+        bulk: C::OWN_WORDS.map_or_else(SensorBulk::new, |own| SensorBulk::with_own(mcu, own)),
         rest_ticks: Ticks(0),
+        phase: Phase::Idle,
+        switch: Some(Conversation::new(Switch { chip, on: false })),
         read: Some(Conversation::new(Read { chip, reading: Reading::new() })),
         stale: false,
         waiting: false,
@@ -403,6 +544,16 @@ pub(super) fn query<C: FifoChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) -> 
     mcu.with::<FifoSensor<C>, _>(oid, |sensor, mcu| {
         sensor.query(mcu, oid, rest_ticks);
         Ok(())
+    })
+}
+
+/// The same as hosts up to v0.12 ask for it: from `at` on, the sensor is switched on and off by the machine,
+/// and its end is answered by the number of samples.
+pub(super) fn query_at<C: FifoChip>(mcu: &mut Mcu, oid: Oid, at: WireClock, rest_ticks: Ticks) -> Result<(), Shutdown> {
+    let at = mcu.instant(at);
+    mcu.with::<FifoSensor<C>, _>(oid, |sensor, mcu| match rest_ticks {
+        Ticks(0) => sensor.stop(mcu, oid),
+        _ => sensor.query_at(mcu, oid, at, rest_ticks),
     })
 }
 

@@ -1,16 +1,19 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! I2C devices.
 //!
-//! `i2c_transfer` answers with the status of the bus, and klippy decides what becomes of it. It is
-//! over, and answered, before the next command runs: klippy configures chips by one transfer after
-//! the other. A plain read is tried again ([`BusDevice::read_register`]); what writes is not.
+//! `i2c_transfer` answers with the status of the bus, and klippy decides what becomes of it. The older
+//! `i2c_read`, `i2c_write` and `i2c_modify_bits` have no status: what fails there stops the machine. A
+//! transfer is over, and answered, before the next command runs: klippy configures chips by one transfer
+//! after the other. A plain read is tried again ([`BusDevice::read_register`]); what writes is not.
 
 #![forbid(unsafe_code)]
 
 use crate::board::soft_i2c::SoftI2c;
 use crate::board::{BusDevice, BusError, BusStatus, I2cConfig, OnWorker, Pin, Range};
 use crate::mcu::{
-    Bus, Command, Conversation, Done, Enumeration, Feature, Mcu, Object, Oid, Response, Talk, Ticket, command, response,
+    Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_11,
+    Generation::V0_12, Generation::V0_13, Mcu, Object, Oid, Response, Talk, Ticket, command, only, response, since,
+    until,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::Ticks;
@@ -18,11 +21,21 @@ use crate::wire::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
     name: "i2c",
-    commands: &[CONFIG_I2C, I2C_SET_BUS, I2C_SET_SW_BUS, I2C_TRANSFER],
-    responses: &[TransferResponse::FORM],
+    commands: &[
+        CONFIG_I2C,
+        CONFIG_I2C_WITH_BUS,
+        I2C_SET_BUS,
+        I2C_SET_SOFTWARE_BUS,
+        I2C_SET_SW_BUS,
+        I2C_WRITE,
+        I2C_READ,
+        I2C_MODIFY_BITS,
+        I2C_TRANSFER,
+    ],
+    responses: &[ReadResponse::FORM, TransferResponse::FORM],
     enumerations: &[
         Enumeration::new("i2c_bus", |board| board.i2c_buses()),
-        Enumeration::new("i2c_bus_status", |_| statuses()),
+        Enumeration::new("i2c_bus_status", |_| statuses()).of(only(Master)),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -37,11 +50,25 @@ shutdowns! {
     I2C_START_READ_NACK = "I2C START READ NACK";
     /// A sensor's bus was not free, or the clock was held, for too long.
     I2C_TIMEOUT = "I2C Timeout";
+    /// Up to v0.12: writing to a device failed.
+    I2C_WRITE_FAILED = "Unable write i2c device";
+    /// Up to v0.12: reading from a device or a sensor failed.
+    I2C_READ_FAILED = "Unable to read i2c device";
+    /// v0.12: a device on lines did not acknowledge.
+    SOFT_I2C_NACK = "soft_i2c NACK";
+    /// `i2c_modify_bits` with bits to clear that have none to set beside them.
+    ODD_BITS = "i2c_modify_bits: Odd number of bits!";
+}
+
+response! {
+    /// What a device sent.
+    "i2c_read_response oid=%c response=%*s" => until(V0_13).and(Kalico);
+    pub(super) struct ReadResponse<'a> { oid: Oid, response: &'a [u8] }
 }
 
 response! {
     /// How the bus answered, and what a device sent.
-    "i2c_response oid=%c i2c_bus_status=%c response=%*s"
+    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => only(Master);
     pub(super) struct TransferResponse<'a> { oid: Oid, i2c_bus_status: u8, response: &'a [u8] }
 }
 
@@ -67,12 +94,16 @@ fn statuses() -> Vec<Range> {
 }
 
 /// The stop of a machine whose sensor can not be talked to (the firmware's `i2c_shutdown_on_err`).
-pub(super) fn i2c_shutdown(error: BusError) -> Shutdown {
-    Shutdown::because(on_wire(error.status).1, error.detail)
+pub(super) fn i2c_shutdown(mcu: &Mcu, error: BusError) -> Shutdown {
+    let reason = if mcu.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
+    Shutdown::because(reason, error.detail)
 }
 
 /// Bytes to a device, and bytes from it.
 struct Transfer {
+    /// Bits to be changed in what was read, which is then written to where it was read from: those to
+    /// be cleared, and behind them as many to be set.
+    modify: Option<([u8; PAYLOAD_MAX], usize)>,
     write: [u8; PAYLOAD_MAX],
     write_len: usize,
     read: [u8; u8::MAX as usize],
@@ -85,6 +116,16 @@ impl Transfer {
         self.write[..self.write_len].copy_from_slice(&write[..self.write_len]);
         self.read_len = read_len;
         self.read = [0; u8::MAX as usize];
+        self.modify = None;
+    }
+
+    /// As many bytes from the register on as there are to be changed, and back.
+    fn load_modify(&mut self, register: &[u8], clear_set: &[u8]) {
+        let mut bits = [0; PAYLOAD_MAX];
+        let len = clear_set.len().min(PAYLOAD_MAX);
+        bits[..len].copy_from_slice(&clear_set[..len]);
+        self.load(register, len / 2);
+        self.modify = Some((bits, len / 2));
     }
 
     /// What the answer has room for, as in the firmware.
@@ -99,13 +140,29 @@ impl Talk for Transfer {
         match &self.write[..self.write_len] {
             [] if !read.is_empty() => chip.read_register(&[], read),
             write => chip.write_read(write, read),
+        }?;
+        let Some((bits, len)) = &self.modify else { return Ok(()) };
+        let (clear, set) = bits.split_at(*len);
+        let changed = read.iter().zip(clear.iter().zip(set)).map(|(byte, (clear, set))| byte & !clear | set);
+        for (place, byte) in self.write[self.write_len..].iter_mut().zip(changed) {
+            *place = byte;
         }
+        let end = (self.write_len + len).min(PAYLOAD_MAX);
+        chip.write_read(&self.write[..end], &mut [])
     }
 }
+
+// The tags of transfers, by the commands that ask for them.
+const TRANSFER: u8 = 0;
+const WRITE: u8 = 1;
+const READ: u8 = 2;
+const MODIFY: u8 = 3;
 
 /// An I2C device.
 pub(super) struct I2c {
     bus: Option<Bus>,
+    /// Whether the bus is made of lines.
+    on_lines: bool,
     /// Here while no command's transfer is under way.
     transfer: Option<Box<Conversation<Transfer>>>,
     /// Whether the last transfer failed: a display that is unplugged fails many times a second.
@@ -114,24 +171,82 @@ pub(super) struct I2c {
 
 impl I2c {
     fn new() -> I2c {
-        let transfer = Transfer { write: [0; PAYLOAD_MAX], write_len: 0, read: [0; u8::MAX as usize], read_len: 0 };
-        I2c { bus: None, transfer: Some(Conversation::new(transfer)), failing: false }
+        let transfer =
+            Transfer { modify: None, write: [0; PAYLOAD_MAX], write_len: 0, read: [0; u8::MAX as usize], read_len: 0 };
+        I2c { bus: None, on_lines: false, transfer: Some(Conversation::new(transfer)), failing: false }
     }
 
-    fn transfer(&mut self, mcu: &mut Mcu, oid: Oid, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
+    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
+        let config = I2cConfig { bus, address: seven_bits(address), rate_hz };
+        let OnWorker { bus, device } = mcu.board()?.i2c(config)?;
+        self.bus = Some(Bus::new(mcu.worker(&bus)?, device));
+        Ok(())
+    }
+
+    fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 2], pulse: Ticks, address: u32) -> Result<(), Shutdown> {
+        let [scl, sda] = pins;
+        let lines = (mcu.shared_wire(scl)?, mcu.shared_wire(sda)?);
+        let name = format!("scl {} sda {} address {:#04x}", mcu.name(scl), mcu.name(sda), seven_bits(address));
+        let device = SoftI2c::new(lines.0, lines.1, seven_bits(address), pulse, mcu.clock(), name);
+        self.bus = Some(mcu.software_bus(Box::new(device))?);
+        self.on_lines = true;
+        Ok(())
+    }
+
+    /// Has a transfer; `load` says which.
+    fn transfer(&mut self, mcu: &mut Mcu, oid: Oid, tag: u8, load: impl FnOnce(&mut Transfer)) -> Result<(), Shutdown> {
         // Commands wait for each other, so it is here.
         let Some(mut transfer) = self.transfer.take() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
         };
-        transfer.talk.load(write, read_len.into());
+        load(&mut transfer.talk);
         let Some(bus) = &self.bus else {
             // As the firmware answers for a device without a bus.
-            let (i2c_bus_status, _) = on_wire(BusStatus::Nack);
-            mcu.send(TransferResponse { oid, i2c_bus_status, response: transfer.talk.response() });
-            self.transfer = Some(transfer);
-            return Ok(());
+            let status = BusStatus::Nack;
+            let error = BusError { status, detail: "it has no bus: the host did not send i2c_set_bus".into() };
+            return self.answer(mcu, oid, tag, transfer, Err(error));
         };
-        mcu.converse_on(bus, Ticket { oid, tag: 0 }, transfer)
+        mcu.converse_on(bus, Ticket { oid, tag }, transfer)
+    }
+
+    /// Tells the host what came of a transfer. Where the answer has no status a failure stops the machine.
+    fn answer(
+        &mut self,
+        mcu: &mut Mcu,
+        oid: Oid,
+        tag: u8,
+        transfer: Box<Conversation<Transfer>>,
+        result: Result<(), BusError>,
+    ) -> Result<(), Shutdown> {
+        let response = transfer.talk.response();
+        match (tag, &result) {
+            (TRANSFER, result) => {
+                let i2c_bus_status = result.as_ref().map_or_else(|error| on_wire(error.status).0, |()| SUCCESS);
+                mcu.send(TransferResponse { oid, i2c_bus_status, response });
+            }
+            (READ, Ok(())) => mcu.send(ReadResponse { oid, response }),
+            _ => {}
+        }
+        self.transfer = Some(transfer);
+        let failed_before = std::mem::replace(&mut self.failing, result.is_err());
+        match result {
+            Err(error) if tag != TRANSFER => mcu.device_failed(oid, self.kind(), self.failure(mcu, tag, error)),
+            Err(error) if !failed_before => {
+                mcu.warn(oid, self.kind(), i2c_shutdown(mcu, error));
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The stop for a transfer that failed.
+    fn failure(&self, mcu: &Mcu, tag: u8, error: BusError) -> Shutdown {
+        match tag {
+            _ if !mcu.serves(until(V0_12)) => i2c_shutdown(mcu, error),
+            _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.detail),
+            WRITE => Shutdown::because(I2C_WRITE_FAILED, error.detail),
+            _ => i2c_shutdown(mcu, error),
+        }
     }
 }
 
@@ -141,17 +256,10 @@ impl Object for I2c {
     }
 
     fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let tag = done.tag;
         let Some(mut transfer) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
         let result = std::mem::replace(&mut transfer.result, Ok(()));
-        let i2c_bus_status = result.as_ref().map_or_else(|error| on_wire(error.status).0, |()| SUCCESS);
-        mcu.send(TransferResponse { oid, i2c_bus_status, response: transfer.talk.response() });
-        self.transfer = Some(transfer);
-        let failed_before = std::mem::replace(&mut self.failing, result.is_err());
-        match result {
-            Err(error) if !failed_before => mcu.warn(oid, self.kind(), i2c_shutdown(error)),
-            _ => {}
-        }
-        Ok(())
+        self.answer(mcu, oid, tag, transfer, result)
     }
 
     fn bus(&self) -> Option<&Bus> {
@@ -159,39 +267,86 @@ impl Object for I2c {
     }
 }
 
-const CONFIG_I2C: Command = command!("config_i2c oid=%c", |mcu, oid: Oid| mcu.assign(oid, I2c::new()));
+const CONFIG_I2C: Command = command!("config_i2c oid=%c", |mcu, oid: Oid| mcu.assign(oid, I2c::new())).of(since(V0_12));
+
+const CONFIG_I2C_WITH_BUS: Command = command!(
+    "config_i2c oid=%c i2c_bus=%u rate=%u address=%u",
+    |mcu, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
+        mcu.vacant(oid)?;
+        let mut i2c = I2c::new();
+        i2c.set_bus(mcu, i2c_bus, rate, address)?;
+        mcu.assign(oid, i2c)
+    }
+)
+.of(only(V0_11));
 
 const I2C_SET_BUS: Command = command!(
     "i2c_set_bus oid=%c i2c_bus=%u rate=%u address=%u",
     |mcu, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, mcu| {
-            let config = I2cConfig { bus: i2c_bus, address: seven_bits(address), rate_hz: rate };
-            let OnWorker { bus, device } = mcu.board()?.i2c(config)?;
-            i2c.bus = Some(Bus::new(mcu.worker(&bus)?, device));
-            Ok(())
-        })
+        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_bus(mcu, i2c_bus, rate, address))
     }
-);
+)
+.of(since(V0_12));
+
+/// Half a period of the 100 kHz that the firmware had where it was told a rate, whatever the rate.
+const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
+
+const I2C_SET_SOFTWARE_BUS: Command = command!(
+    "i2c_set_software_bus oid=%c scl_pin=%u sda_pin=%u rate=%u address=%u",
+    |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, rate: u32, address: u32| {
+        let _ = rate;
+        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_lines(mcu, [scl_pin, sda_pin], SOFTWARE_PULSE, address))
+    }
+)
+.of(since(V0_12).until(V0_13));
 
 const I2C_SET_SW_BUS: Command = command!(
     "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",
     |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, pulse_ticks: Ticks, address: u32| {
+        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_lines(mcu, [scl_pin, sda_pin], pulse_ticks, address))
+    }
+)
+.of(since(Master).and(Kalico));
+
+const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
+    mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.transfer(mcu, oid, WRITE, |transfer| transfer.load(data, 0)))
+})
+.of(until(V0_13).and(Kalico));
+
+const I2C_READ: Command =
+    command!("i2c_read oid=%c reg=%*s read_len=%u", |mcu, oid: Oid, reg: &[u8], read_len: u32| {
         mcu.with::<I2c, _>(oid, |i2c, mcu| {
-            let (scl, sda) = (mcu.shared_wire(scl_pin)?, mcu.shared_wire(sda_pin)?);
-            let name =
-                format!("scl {} sda {} address {:#04x}", mcu.name(scl_pin), mcu.name(sda_pin), seven_bits(address));
-            let device = SoftI2c::new(scl, sda, seven_bits(address), pulse_ticks, mcu.clock(), name);
-            i2c.bus = Some(mcu.software_bus(Box::new(device))?);
-            Ok(())
+            i2c.transfer(mcu, oid, READ, |transfer| transfer.load(reg, one_byte(read_len)))
+        })
+    })
+    .of(until(V0_13).and(Kalico));
+
+const I2C_MODIFY_BITS: Command = command!(
+    "i2c_modify_bits oid=%c reg=%*s clear_set_bits=%*s",
+    |mcu, oid: Oid, reg: &[u8], clear_set_bits: &[u8]| {
+        if clear_set_bits.len() % 2 != 0 {
+            let what = format_args!("{} bytes of bits are to be cleared and set", clear_set_bits.len());
+            return Err(Shutdown::by_host(ODD_BITS, what));
+        }
+        mcu.with::<I2c, _>(oid, |i2c, mcu| {
+            i2c.transfer(mcu, oid, MODIFY, |transfer| transfer.load_modify(reg, clear_set_bits))
         })
     }
-);
+)
+.of(until(V0_12));
 
 const I2C_TRANSFER: Command =
     command!("i2c_transfer oid=%c write=%*s read_len=%u", |mcu, oid: Oid, write: &[u8], read_len: u32| {
-        // Of one byte, as in the firmware.
-        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.transfer(mcu, oid, write, read_len as u8))
-    });
+        mcu.with::<I2c, _>(oid, |i2c, mcu| {
+            i2c.transfer(mcu, oid, TRANSFER, |transfer| transfer.load(write, one_byte(read_len)))
+        })
+    })
+    .of(only(Master));
+
+/// A count of bytes has one byte, as in the firmware.
+fn one_byte(count: u32) -> usize {
+    usize::from(count as u8)
+}
 
 /// An address has 7 bits; the firmware drops the others.
 fn seven_bits(address: u32) -> u8 {

@@ -6,7 +6,7 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, Feature, Oid, command};
+use crate::mcu::{Command, Feature, Generation::V0_13, Oid, command, since};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
@@ -50,11 +50,13 @@ impl FifoChip for Icm20948 {
 
 const CONFIG_ICM20948: Command = command!("config_icm20948 oid=%c i2c_oid=%c", |mcu, oid: Oid, i2c_oid: Oid| {
     configure(mcu, oid, i2c_oid, Icm20948)
-});
+})
+.of(since(V0_13));
 
 const QUERY_ICM20948: Command = command!("query_icm20948 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Icm20948>(mcu, oid, rest_ticks)
-});
+})
+.of(since(V0_13));
 
 const QUERY_ICM20948_STATUS: Command =
-    command!("query_icm20948_status oid=%c", |mcu, oid: Oid| query_status::<Icm20948>(mcu, oid));
+    command!("query_icm20948_status oid=%c", |mcu, oid: Oid| query_status::<Icm20948>(mcu, oid)).of(since(V0_13));

@@ -165,7 +165,10 @@ impl Ldc1612 {
     fn note(&mut self, mcu: &mut Mcu, oid: Oid, result: Result<(), BusError>) {
         let failed_before = std::mem::replace(&mut self.failing, result.is_err());
         match result {
-            Err(error) if !failed_before => mcu.warn(oid, self.kind(), i2c_shutdown(error)),
+            Err(error) if !failed_before => {
+                let trouble = i2c_shutdown(mcu, error);
+                mcu.warn(oid, self.kind(), trouble);
+            }
             _ => {}
         }
     }

@@ -7,17 +7,22 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, Enumeration, Feature, Oid, command};
+use crate::mcu::{
+    Command, Enumeration, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, only,
+    response, since,
+};
 use crate::shutdown::{Shutdown, shutdowns};
-use crate::time::Ticks;
+use crate::time::{Clock, Ticks};
 
-use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
+use super::fifo_sensor::{BLOCK_BYTES, BusType, FifoChip, Fill, Reading, configure, query, query_at, query_status};
 use super::named;
+use super::sensor_bulk::{BulkData, Status, Words};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "lis2dw",
-    commands: &[CONFIG_LIS2DW, QUERY_LIS2DW, QUERY_LIS2DW_STATUS],
-    enumerations: &[Enumeration::new("lis_chip_type", |_| named(&[("LIS2DW", 0), ("LIS3DH", 1)]))],
+    commands: &[CONFIG_LIS2DW_ON_SPI, CONFIG_LIS2DW, QUERY_LIS2DW_AT, QUERY_LIS2DW, QUERY_LIS2DW_STATUS],
+    responses: &[OwnData::FORM, OwnStatus::FORM],
+    enumerations: &[Enumeration::new("lis_chip_type", |_| named(&[("LIS2DW", 0), ("LIS3DH", 1)])).of(since(V0_13))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -27,6 +32,39 @@ shutdowns! {
     INVALID_MODEL = "model type invalid";
 }
 
+response! {
+    /// Samples.
+    "lis2dw_data oid=%c sequence=%hu data=%*s" => only(V0_12);
+    pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
+}
+
+response! {
+    /// How many samples there were, of them `fifo` in the chip.
+    "lis2dw_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => only(V0_12);
+    pub(super) struct OwnStatus {
+        oid: Oid,
+        clock: Clock,
+        query_ticks: u32,
+        next_sequence: u16,
+        buffered: u8,
+        fifo: u8,
+        limit_count: u16
+    }
+}
+
+const OWN_WORDS: Words = Words {
+    data_max: BLOCK_BYTES,
+    data: |mcu, BulkData { oid, sequence, data }| mcu.send(OwnData { oid, sequence, data }),
+    status: |mcu, Status { oid, clock, query_ticks, next_sequence, in_message, in_sensor, possible_overflows }| {
+        let fifo = (in_sensor / SAMPLE_BYTES as u32) as u8;
+        let (buffered, limit_count) = (in_message, possible_overflows);
+        mcu.send(OwnStatus { oid, clock, query_ticks, next_sequence, buffered, fifo, limit_count });
+    },
+};
+
+const FIFO_CTRL: u8 = 0x2e;
+/// Continuous mode, of FIFO_CTRL; 0 switches the FIFO off and empties it.
+const CONTINUOUS: u8 = 0xc0;
 /// OUT_X_L, the first of the six data registers, which the FIFO is read through.
 const OUT_X_L: u8 = 0x28;
 /// FIFO_SAMPLES of the LIS2DW, FIFO_SRC_REG of the LIS3DH.
@@ -92,6 +130,15 @@ impl Lis2dw {
 impl FifoChip for Lis2dw {
     const NAME: &'static str = "LIS2DW";
     const SAMPLE_BYTES: usize = SAMPLE_BYTES;
+    const OWN_WORDS: Option<&'static Words> = Some(&OWN_WORDS);
+
+    fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        chip.exchange(&mut [FIFO_CTRL, CONTINUOUS])
+    }
+
+    fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        chip.exchange(&mut [FIFO_CTRL, 0])
+    }
 
     fn bus_type(self) -> BusType {
         self.bus_type
@@ -107,20 +154,33 @@ impl FifoChip for Lis2dw {
     }
 }
 
+const CONFIG_LIS2DW_ON_SPI: Command = command!("config_lis2dw oid=%c spi_oid=%c", |mcu, oid: Oid, spi_oid: Oid| {
+    configure(mcu, oid, spi_oid, Lis2dw { bus_type: BusType::Spi, model: Model::Lis2dw })
+})
+.of(only(V0_12));
+
 const CONFIG_LIS2DW: Command = command!(
     "config_lis2dw oid=%c bus_oid=%c bus_oid_type=%c lis_chip_type=%c",
     |mcu, oid: Oid, bus_oid: Oid, bus_oid_type: u8, lis_chip_type: u8| {
         let chip = Lis2dw { bus_type: BusType::of(bus_oid_type)?, model: Model::of(lis_chip_type)? };
         configure(mcu, oid, bus_oid, chip)
     }
-);
+)
+.of(since(V0_13));
+
+const QUERY_LIS2DW_AT: Command =
+    command!("query_lis2dw oid=%c clock=%u rest_ticks=%u", |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks| {
+        query_at::<Lis2dw>(mcu, oid, clock, rest_ticks)
+    })
+    .of(only(V0_12));
 
 const QUERY_LIS2DW: Command = command!("query_lis2dw oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Lis2dw>(mcu, oid, rest_ticks)
-});
+})
+.of(since(V0_13));
 
 const QUERY_LIS2DW_STATUS: Command =
-    command!("query_lis2dw_status oid=%c", |mcu, oid: Oid| query_status::<Lis2dw>(mcu, oid));
+    command!("query_lis2dw_status oid=%c", |mcu, oid: Oid| query_status::<Lis2dw>(mcu, oid)).of(since(V0_12));
 
 #[cfg(test)]
 mod tests {

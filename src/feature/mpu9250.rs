@@ -6,13 +6,59 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, Feature, Oid, command};
-use crate::time::Ticks;
+use crate::mcu::{
+    Command, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, response, since, until,
+};
+use crate::time::{Clock, Ticks};
 
-use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
+use super::fifo_sensor::{BLOCK_BYTES, BusType, FifoChip, Fill, Reading, configure, query, query_at, query_status};
+use super::sensor_bulk::{BulkData, Status, Words};
 
-pub(super) const FEATURE: Feature =
-    Feature { name: "mpu9250", commands: &[CONFIG_MPU9250, QUERY_MPU9250, QUERY_MPU9250_STATUS], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature {
+    name: "mpu9250",
+    commands: &[CONFIG_MPU9250, QUERY_MPU9250_AT, QUERY_MPU9250, QUERY_MPU9250_STATUS],
+    responses: &[OwnData::FORM, OwnStatus::FORM],
+    ..Feature::EMPTY
+};
+
+response! {
+    /// Samples.
+    "mpu9250_data oid=%c sequence=%hu data=%*s" => until(V0_12);
+    pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
+}
+
+response! {
+    /// How many samples there were, of them `fifo` in the chip.
+    "mpu9250_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%u limit_count=%hu" => until(V0_12);
+    pub(super) struct OwnStatus {
+        oid: Oid,
+        clock: Clock,
+        query_ticks: u32,
+        next_sequence: u16,
+        buffered: u8,
+        fifo: u32,
+        limit_count: u16
+    }
+}
+
+const OWN_WORDS: Words = Words {
+    data_max: BLOCK_BYTES,
+    data: |mcu, BulkData { oid, sequence, data }| mcu.send(OwnData { oid, sequence, data }),
+    status: |mcu, Status { oid, clock, query_ticks, next_sequence, in_message, in_sensor, possible_overflows }| {
+        let fifo = in_sensor / SAMPLE_BYTES as u32;
+        let (buffered, limit_count) = (in_message, possible_overflows);
+        mcu.send(OwnStatus { oid, clock, query_ticks, next_sequence, buffered, fifo, limit_count });
+    },
+};
+
+const SAMPLE_BYTES: usize = 6;
+const FIFO_EN: u8 = 0x23;
+/// ACCEL, of FIFO_EN.
+const ACCEL: u8 = 0x08;
+const USER_CTRL: u8 = 0x6a;
+/// FIFO_RST and FIFO_EN, of USER_CTRL.
+const FIFO_RESET: u8 = 0x04;
+const FIFO_ENABLED: u8 = 0x40;
 
 const INT_STATUS: u8 = 0x3a;
 const FIFO_OFLOW_INT: u8 = 0x10;
@@ -31,8 +77,22 @@ struct Mpu9250;
 
 impl FifoChip for Mpu9250 {
     const NAME: &'static str = "MPU9250";
-    const SAMPLE_BYTES: usize = 6;
+    const SAMPLE_BYTES: usize = SAMPLE_BYTES;
     const HAS_OVERFLOW_REGISTER: bool = true;
+    const OWN_WORDS: Option<&'static Words> = Some(&OWN_WORDS);
+
+    fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        chip.write_read(&[FIFO_EN, 0], &mut [])?;
+        chip.write_read(&[USER_CTRL, FIFO_RESET], &mut [])?;
+        chip.write_read(&[USER_CTRL, FIFO_ENABLED], &mut [])?;
+        // Reading it clears the flag of an overflow.
+        self.overflowed(chip)?;
+        chip.write_read(&[FIFO_EN, ACCEL], &mut [])
+    }
+
+    fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        chip.write_read(&[FIFO_EN, 0], &mut [])
+    }
 
     fn bus_type(self) -> BusType {
         BusType::I2c
@@ -58,9 +118,16 @@ const CONFIG_MPU9250: Command = command!("config_mpu9250 oid=%c i2c_oid=%c", |mc
     configure(mcu, oid, i2c_oid, Mpu9250)
 });
 
+const QUERY_MPU9250_AT: Command =
+    command!("query_mpu9250 oid=%c clock=%u rest_ticks=%u", |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks| {
+        query_at::<Mpu9250>(mcu, oid, clock, rest_ticks)
+    })
+    .of(until(V0_12));
+
 const QUERY_MPU9250: Command = command!("query_mpu9250 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Mpu9250>(mcu, oid, rest_ticks)
-});
+})
+.of(since(V0_13));
 
 const QUERY_MPU9250_STATUS: Command =
     command!("query_mpu9250_status oid=%c", |mcu, oid: Oid| query_status::<Mpu9250>(mcu, oid));

@@ -7,10 +7,12 @@
 //! those counts and the instants of `sensor_bulk_status`. So a sample must never be counted twice or
 //! be left out, and the instants are those at which the bus was busy with the question, not those at
 //! which the core asked it.
+//!
+//! Up to v0.12 each sensor had messages of its own for this ([`Words`]), which stand in its file.
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Feature, Mcu, Oid, Response, response};
+use crate::mcu::{Feature, Generation::V0_13, Mcu, Oid, Response, response, since};
 use crate::time::Clock;
 
 pub(super) const FEATURE: Feature =
@@ -18,14 +20,14 @@ pub(super) const FEATURE: Feature =
 
 response! {
     /// Samples, packed as the sensor's module of klippy expects them.
-    "sensor_bulk_data oid=%c sequence=%hu data=%*s"
+    "sensor_bulk_data oid=%c sequence=%hu data=%*s" => since(V0_13);
     pub(super) struct BulkData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
 }
 
 response! {
     /// How many samples there were at `clock` to `clock + query_ticks`: `next_sequence` messages, and
     /// `buffered` bytes that are not sent yet.
-    "sensor_bulk_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%u possible_overflows=%hu"
+    "sensor_bulk_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%u possible_overflows=%hu" => since(V0_13);
     pub(super) struct BulkStatus {
         oid: Oid,
         clock: Clock,
@@ -40,8 +42,44 @@ response! {
 /// many samples each message has).
 pub(super) const DATA_MAX: usize = 51;
 
+/// The messages that samples are sent in.
+pub(super) struct Words {
+    /// Bytes of samples that a message holds.
+    pub(super) data_max: usize,
+    /// Sends samples.
+    pub(super) data: fn(&mut Mcu, BulkData<'_>),
+    /// Sends how many there are.
+    pub(super) status: fn(&mut Mcu, Status),
+}
+
+/// How many samples there were at `clock` to `clock + query_ticks`.
+pub(super) struct Status {
+    pub(super) oid: Oid,
+    pub(super) clock: Clock,
+    pub(super) query_ticks: u32,
+    /// The number of the next message.
+    pub(super) next_sequence: u16,
+    /// Bytes that wait for the next message.
+    pub(super) in_message: u8,
+    /// Bytes that are in the sensor.
+    pub(super) in_sensor: u32,
+    pub(super) possible_overflows: u16,
+}
+
+/// Those that all sensors have in common, since v0.13.
+const COMMON: Words = Words {
+    data_max: DATA_MAX,
+    data: |mcu, data| mcu.send(data),
+    status: |mcu, status| {
+        let Status { oid, clock, query_ticks, next_sequence, in_message, in_sensor, possible_overflows } = status;
+        let buffered = u32::from(in_message) + in_sensor;
+        mcu.send(BulkStatus { oid, clock, query_ticks, next_sequence, buffered, possible_overflows });
+    },
+};
+
 /// The samples of one sensor on their way to the host.
 pub(super) struct SensorBulk {
+    words: &'static Words,
     sequence: u16,
     possible_overflows: u16,
     data: [u8; DATA_MAX],
@@ -51,12 +89,21 @@ pub(super) struct SensorBulk {
 impl SensorBulk {
     /// Nothing measured yet.
     pub(super) const fn new() -> SensorBulk {
-        SensorBulk { sequence: 0, possible_overflows: 0, data: [0; DATA_MAX], len: 0 }
+        SensorBulk::in_words(&COMMON)
+    }
+
+    /// Nothing measured yet, by a sensor that has messages of its own with hosts up to v0.12.
+    pub(super) fn with_own(mcu: &Mcu, own: &'static Words) -> SensorBulk {
+        SensorBulk::in_words(if mcu.speaks::<BulkData<'_>>() { &COMMON } else { own })
+    }
+
+    const fn in_words(words: &'static Words) -> SensorBulk {
+        SensorBulk { words, sequence: 0, possible_overflows: 0, data: [0; DATA_MAX], len: 0 }
     }
 
     /// Begins to count anew.
     pub(super) fn reset(&mut self) {
-        *self = SensorBulk::new();
+        *self = SensorBulk::in_words(self.words);
     }
 
     /// Appends one sample, and sends the message once another sample of its size has no room.
@@ -65,15 +112,27 @@ impl SensorBulk {
         self.data[self.len..end].copy_from_slice(sample);
         self.len = end;
         if self.room() < sample.len() {
-            mcu.send(BulkData { oid, sequence: self.sequence, data: &self.data[..self.len] });
-            self.sequence = self.sequence.wrapping_add(1);
-            self.len = 0;
+            self.send(mcu, oid);
         }
+    }
+
+    /// Sends the samples that wait for more, if there are any: the last message of a measurement, which
+    /// hosts up to v0.12 expect.
+    pub(super) fn flush(&mut self, mcu: &mut Mcu, oid: Oid) {
+        if self.len > 0 {
+            self.send(mcu, oid);
+        }
+    }
+
+    fn send(&mut self, mcu: &mut Mcu, oid: Oid) {
+        (self.words.data)(mcu, BulkData { oid, sequence: self.sequence, data: &self.data[..self.len] });
+        self.sequence = self.sequence.wrapping_add(1);
+        self.len = 0;
     }
 
     /// Bytes that the message has room for.
     pub(super) fn room(&self) -> usize {
-        DATA_MAX - self.len
+        self.words.data_max - self.len
     }
 
     /// Counts signs that the sensor may have dropped samples.
@@ -81,16 +140,18 @@ impl SensorBulk {
         self.possible_overflows = self.possible_overflows.wrapping_add(times);
     }
 
-    /// Tells the host how many samples there are: `fifo_bytes` of them are still in the sensor, as it
-    /// said between `began` and `ended`.
-    pub(super) fn send_status(&self, mcu: &mut Mcu, oid: Oid, (began, ended): (Clock, Clock), fifo_bytes: u32) {
-        mcu.send(BulkStatus {
+    /// Tells the host how many samples there are: `in_sensor` bytes of them are still in the sensor, as
+    /// it said between `began` and `ended`.
+    pub(super) fn send_status(&self, mcu: &mut Mcu, oid: Oid, (began, ended): (Clock, Clock), in_sensor: u32) {
+        let status = Status {
             oid,
             clock: began,
             query_ticks: ended.wire().wrapping_sub(began.wire()),
             next_sequence: self.sequence,
-            buffered: self.len as u32 + fifo_bytes,
+            in_message: self.len as u8,
+            in_sensor,
             possible_overflows: self.possible_overflows,
-        });
+        };
+        (self.words.status)(mcu, status);
     }
 }

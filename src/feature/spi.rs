@@ -13,11 +13,11 @@ use std::fmt;
 use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusDevice, BusError, ChipSelect, OnWorker, Pin, SpiConfig};
 use crate::mcu::{
-    Bus, Command, Conversation, Done, Enumeration, Feature, Mcu, Object, Oid, Response, Safe, Talk, Ticket, command,
-    response,
+    Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
+    Mcu, Object, Oid, Response, Safe, Talk, Ticket, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
-use crate::time::Ticks;
+use crate::time::{CLOCK_FREQ, Ticks};
 use crate::wire::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
@@ -26,6 +26,7 @@ pub(super) const FEATURE: Feature = Feature {
         CONFIG_SPI,
         CONFIG_SPI_WITHOUT_CS,
         SPI_SET_BUS,
+        SPI_SET_SOFTWARE_BUS,
         SPI_SET_SW_BUS,
         SPI_TRANSFER,
         SPI_SEND,
@@ -253,6 +254,19 @@ const SPI_SET_BUS: Command =
         mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_bus(mcu, spi_bus, mode, rate))
     });
 
+const SPI_SET_SOFTWARE_BUS: Command = command!(
+    "spi_set_software_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u rate=%u",
+    |mcu, oid: Oid, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
+        let mode = mode as u8;
+        let pins = [miso_pin, mosi_pin, sclk_pin];
+        // The firmware ignored the rate and was as fast as its system calls. Lines that are written
+        // through mapped registers would be too fast for a chip.
+        let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
+        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_lines(mcu, pins, mode, pulse))
+    }
+)
+.of(until(V0_13));
+
 const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
     |mcu, oid: Oid, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
@@ -261,7 +275,8 @@ const SPI_SET_SW_BUS: Command = command!(
         let pins = [miso_pin, mosi_pin, sclk_pin];
         mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_lines(mcu, pins, mode, pulse_ticks))
     }
-);
+)
+.of(since(Master).and(Kalico));
 
 const SPI_TRANSFER: Command = command!("spi_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
     mcu.with::<Spi, _>(oid, |spi, mcu| spi.transfer(mcu, oid, TRANSFER, data))

@@ -9,26 +9,34 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Conversation, Done, Enumeration, Feature, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock,
-    command, response,
+    Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::V0_12, Generation::V0_13,
+    Generations, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, command, response, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
 
 use super::named;
-use super::sensor_bulk::SensorBulk;
+use super::sensor_bulk::{BulkData, SensorBulk, Status, Words};
 use super::spi::{Spi, Transfer, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "spi_angle",
     commands: &[CONFIG_SPI_ANGLE, QUERY_SPI_ANGLE, SPI_ANGLE_TRANSFER],
-    responses: &[TransferResponse::FORM],
-    enumerations: &[Enumeration::new("spi_angle_type", |_| {
-        named(&[("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)])
-    })],
+    responses: &[OwnData::FORM, OwnEnd::FORM, TransferResponse::FORM],
+    enumerations: &[
+        Enumeration::new("spi_angle_type", |_| named(&TYPES[..TYPES_OF_V0_12])).of(until(V0_12)),
+        Enumeration::new("spi_angle_type", |_| named(&TYPES)).of(KNOWN.since(V0_13)),
+    ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
+
+/// The hosts that know these sensors: Kalico has them for other boards only.
+const KNOWN: Generations = Generations::ALL.except(Kalico);
+
+const TYPES: [(&str, u8); 5] = [("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)];
+/// How many of them v0.12 knows.
+const TYPES_OF_V0_12: usize = 3;
 
 shutdowns! {
     /// A `spi_angle_type` that the enumeration does not have.
@@ -38,8 +46,27 @@ shutdowns! {
 }
 
 response! {
+    /// Entries.
+    "spi_angle_data oid=%c sequence=%hu data=%*s" => until(V0_12);
+    pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
+}
+
+response! {
+    /// The measurements have ended, with the message before this number.
+    "spi_angle_end oid=%c sequence=%hu" => until(V0_12);
+    pub(super) struct OwnEnd { oid: Oid, sequence: u16 }
+}
+
+/// The messages up to v0.12.
+const OWN_WORDS: Words = Words {
+    data_max: 48,
+    data: |mcu, BulkData { oid, sequence, data }| mcu.send(OwnData { oid, sequence, data }),
+    status: |mcu, Status { oid, next_sequence, .. }| mcu.send(OwnEnd { oid, sequence: next_sequence }),
+};
+
+response! {
     /// What a sensor sent back, and when it latched that; nothing if the bus was too slow to tell.
-    "spi_angle_transfer_response oid=%c clock=%u response=%*s"
+    "spi_angle_transfer_response oid=%c clock=%u response=%*s" => KNOWN;
     pub(super) struct TransferResponse<'a> { oid: Oid, clock: Clock, response: &'a [u8] }
 }
 
@@ -362,6 +389,11 @@ impl SpiAngle {
         mcu.cancel(timer);
         self.end();
         if rest_ticks == Ticks(0) {
+            if mcu.speaks::<OwnEnd>() {
+                self.bulk.flush(mcu, oid);
+                let now = mcu.now();
+                self.bulk.send_status(mcu, oid, (now, now), 0);
+            }
             return Ok(());
         }
         self.rest_ticks = rest_ticks;
@@ -447,7 +479,7 @@ const CONFIG_SPI_ANGLE: Command = command!(
         let sensor = SpiAngle {
             chip,
             spi: spi_oid,
-            bulk: SensorBulk::new(),
+            bulk: SensorBulk::with_own(mcu, &OWN_WORDS),
             rest_ticks: Ticks(0),
             time_shift: 0,
             purpose: None,
@@ -463,7 +495,8 @@ const CONFIG_SPI_ANGLE: Command = command!(
         };
         mcu.assign(oid, sensor)
     }
-);
+)
+.of(KNOWN);
 
 const QUERY_SPI_ANGLE: Command = command!(
     "query_spi_angle oid=%c clock=%u rest_ticks=%u time_shift=%c",
@@ -471,11 +504,13 @@ const QUERY_SPI_ANGLE: Command = command!(
         let at = mcu.instant(clock);
         mcu.with::<SpiAngle, _>(oid, |sensor, mcu| sensor.query(mcu, oid, at, rest_ticks, time_shift))
     }
-);
+)
+.of(KNOWN);
 
 const SPI_ANGLE_TRANSFER: Command = command!("spi_angle_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
     mcu.with::<SpiAngle, _>(oid, |sensor, mcu| sensor.ask(mcu, oid, data))
-});
+})
+.of(KNOWN);
 
 #[cfg(test)]
 mod tests {

@@ -6,8 +6,8 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Constant, Feature, Mcu, MoveQueue, Next, Object, Oid, PromptLine, Response, Safe, TimerId, WireClock,
-    command, response,
+    Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, PromptLine, Response, Safe,
+    TimerId, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -25,7 +25,7 @@ pub(super) const FEATURE: Feature = Feature {
         STEPPER_STOP_ON_TRIGGER,
     ],
     responses: &[Position::FORM],
-    constants: &[Constant::number("STEPPER_STEP_BOTH_EDGE", 1)],
+    constants: &[Constant::number("STEPPER_STEP_BOTH_EDGE", 1).of(since(V0_13))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };

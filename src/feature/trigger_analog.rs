@@ -6,7 +6,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Enumeration, Feature, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response,
+    Command, Enumeration, Feature, Generation::Master, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command,
+    only, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -28,7 +29,8 @@ pub(super) const FEATURE: Feature = Feature {
     enumerations: &[
         Enumeration::new("trigger_analog_type", |_| {
             named(&[("abs_ge", ABS_GE), ("gt", GT), ("diff_peak_gt", DIFF_PEAK_GT)])
-        }),
+        })
+        .of(only(Master)),
         Enumeration::new("trigger_analog_error:", |_| {
             named(&[
                 ("RAW_RANGE", RAW_RANGE),
@@ -36,14 +38,15 @@ pub(super) const FEATURE: Feature = Feature {
                 ("MONITOR", MONITOR),
                 ("SENSOR_SPECIFIC", SENSOR_SPECIFIC),
             ])
-        }),
+        })
+        .of(only(Master)),
     ],
     ..Feature::EMPTY
 };
 
 response! {
     /// Whether samples are looked at, and when the trigger came.
-    "trigger_analog_state oid=%c homing=%c homing_clock=%u"
+    "trigger_analog_state oid=%c homing=%c homing_clock=%u" => only(Master);
     pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
 }
 
@@ -200,7 +203,8 @@ const CONFIG_TRIGGER_ANALOG: Command =
             monitor_count: 0,
         };
         mcu.assign(oid, trigger)
-    });
+    })
+    .of(only(Master));
 
 const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
     "trigger_analog_set_raw_range oid=%c raw_min=%i raw_max=%i",
@@ -211,7 +215,8 @@ const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
             Ok(())
         })
     }
-);
+)
+.of(only(Master));
 
 const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
     "trigger_analog_set_trigger oid=%c trigger_analog_type=%c trigger_value=%i",
@@ -222,7 +227,8 @@ const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
             Ok(())
         })
     }
-);
+)
+.of(only(Master));
 
 const TRIGGER_ANALOG_HOME: Command = command!(
     "trigger_analog_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u monitor_ticks=%u monitor_max=%u",
@@ -257,11 +263,13 @@ const TRIGGER_ANALOG_HOME: Command = command!(
             mcu.schedule(TimerId::new(oid, 0), at)
         })
     }
-);
+)
+.of(only(Master));
 
 const TRIGGER_ANALOG_QUERY_STATE: Command = command!("trigger_analog_query_state oid=%c", |mcu, oid: Oid| {
     mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| {
         mcu.send(State { oid, homing: trigger.homing, homing_clock: trigger.homing_clock });
         Ok(())
     })
-});
+})
+.of(only(Master));

@@ -179,10 +179,10 @@ macro_rules! command {
 }
 
 /// Declares a response as a struct. Behind the format stands which hosts take it, such as
-/// `of until(V0_12);`; without it, all do. The module above must have a `response_index`, which finds
+/// `=> until(V0_12);`; without it, all do. The module above must have a `response_index`, which finds
 /// its format in the list of responses; one that is not listed is a build error.
 macro_rules! response {
-    ($(#[$doc:meta])* $format:literal $(of $generations:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
+    ($(#[$doc:meta])* $format:literal $(=> $generations:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
         $($field:ident: $t:ty),* $(,)?
     }) => {
         $(#[$doc])*
@@ -197,8 +197,8 @@ macro_rules! response {
                     }),*]),
                     concat!("fields disagree with \"", $format, "\"")
                 );
-                let generations = $crate::mcu::Generations::ALL;
-                $(let generations = $generations;)?
+                // What was said, or else all.
+                let generations = [$($generations,)? $crate::mcu::Generations::ALL][0];
                 $crate::mcu::Form { format: $format, generations }
             };
             const INDEX: usize = super::response_index($format);

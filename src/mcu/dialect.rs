@@ -15,7 +15,7 @@ use crate::wire::format::{self, Conversion};
 use crate::wire::vlq::Reader;
 
 use super::command::{ConstantValue, Feature, Handler};
-use super::{DialectName, Generation, Generations};
+use super::{DialectName, Generation, Generations, since};
 
 /// What the machine knows of a command that came by its id.
 pub(super) struct Entry {
@@ -106,10 +106,12 @@ impl Dialect {
     /// Numbers the messages of `features` that the hosts of this dialect take, and publishes them with
     /// the board's names.
     pub fn new(features: &[Feature], board: &dyn Board, name: DialectName) -> io::Result<Dialect> {
+        let serves = |hosts: Generations| name.generations().iter().any(|generation| hosts.contains(*generation));
+        let told = |text: &str| if serves(since(Generation::V0_13)) { text.to_owned() } else { String::new() };
         let mut dictionary = Dictionary {
-            app: "Pinion".into(),
+            app: told("Pinion"),
             build_versions: concat!("rustc: ", env!("CARGO_PKG_RUST_VERSION"), " or later").into(),
-            license: "GNU GPLv3".into(),
+            license: told("GNU GPLv3"),
             version: concat!("pinion-", env!("CARGO_PKG_VERSION")).into(),
             ..Dictionary::default()
         };
@@ -187,6 +189,11 @@ impl Dialect {
     /// Which dialect this is.
     pub fn name(&self) -> DialectName {
         self.name
+    }
+
+    /// Whether the machine is to behave as for these hosts, where the form of a message does not say.
+    pub(super) fn serves(&self, hosts: Generations) -> bool {
+        self.name.generations().first().is_some_and(|generation| hosts.contains(*generation))
     }
 
     /// The dictionary.

@@ -141,8 +141,8 @@ pub enum DialectName {
     /// That of hosts of one generation.
     Of(Generation),
     /// What Klipper v0.13, its master and Kalico take, for a host of which nothing is known. A host
-    /// looks a message up by its name alone, so of each name it has one form: master's, or, where
-    /// master has none of that name, Kalico's or that of v0.13.
+    /// looks a message up by its name alone, so of each name it has one form: that of v0.13, which the
+    /// two others often take as well (docs/dialects.md), or else master's, or else Kalico's.
     Union,
 }
 
@@ -152,11 +152,12 @@ impl DialectName {
         Generation::ALL.into_iter().map(DialectName::Of).chain([DialectName::Union])
     }
 
-    /// Whose messages it has; the form of a message is that of the first one that has the message.
+    /// Whose messages it has; the form of a message is that of the first one that has the message. What
+    /// is not a matter of form is as for the first.
     pub(super) fn generations(&self) -> &[Generation] {
         match self {
             DialectName::Of(generation) => std::slice::from_ref(generation),
-            DialectName::Union => &[Master, Kalico, V0_13],
+            DialectName::Union => &[V0_13, Master, Kalico],
         }
     }
 }

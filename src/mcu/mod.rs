@@ -366,6 +366,12 @@ impl Mcu {
         self.dialect.response_id::<R>().is_some()
     }
 
+    /// Whether the machine is to behave as for hosts of these generations, where no form of a message
+    /// tells them apart.
+    pub fn serves(&self, hosts: Generations) -> bool {
+        self.dialect.serves(hosts)
+    }
+
     /// Sends a response, if the host takes it.
     pub fn send<R: Response>(&mut self, response: R) {
         let Some(id) = self.dialect.response_id::<R>() else { return };

@@ -20,8 +20,8 @@ pub const IDENTIFY_ID: i32 = 1;
 /// The dictionary's contents; maps keep the order in which they are written.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
 pub struct Dictionary {
-    /// The program that speaks.
-    #[serde(default)]
+    /// The program that speaks. Hosts up to v0.12 do not know this entry.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub app: String,
     /// What it was built with.
     #[serde(default)]
@@ -32,8 +32,8 @@ pub struct Dictionary {
     pub config: Map<String, Value>,
     /// Names for values: a number, or `[first, count]` for a run of names.
     pub enumerations: Map<String, Value>,
-    /// The licence.
-    #[serde(default)]
+    /// The licence; as `app`.
+    #[serde(default, skip_serializing_if = "String::is_empty")]
     pub license: String,
     /// Id of each response by format.
     pub responses: Map<String, Value>,
