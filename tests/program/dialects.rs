@@ -1,0 +1,221 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Hosts of several generations, each recognised by the sources that it runs from. A shell that is
+//! called as klippy is has the pty open; what klippy would say, our own host client says.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+
+use pinion::host::config::Config;
+use serde_json::Value;
+use tempfile::TempDir;
+
+use crate::process::{Pinion, output};
+
+/// The form of `query_analog_in` up to v0.13, and today's.
+const ONE_VALUE: &str = "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u min_value=%hu max_value=%hu range_check_count=%c";
+const MANY_VALUES: &str = "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u bytes_per_report=%c min_value=%hu max_value=%hu range_check_count=%c";
+
+/// A checkout that looks up what the dictionary of a dialect has.
+struct Checkout(TempDir);
+
+impl Checkout {
+    fn of(dialect: &str) -> Checkout {
+        let checkout = Checkout(tempfile::tempdir().unwrap());
+        checkout.change(dialect, |formats| formats);
+        checkout
+    }
+
+    /// Puts the sources of another host into the place of these.
+    fn change(&self, dialect: &str, change: impl Fn(String) -> String) {
+        let dictionary = output(&["dict", "--board", "sim", "--dialect", dialect]).stdout;
+        let dictionary: Value = serde_json::from_slice(&dictionary).unwrap();
+        let formats = ["commands", "responses"].iter().flat_map(|kind| dictionary[kind].as_object().unwrap().keys());
+        let lookups: Vec<String> = formats.map(|format| format!("lookup(\"{format}\")\n")).collect();
+        fs::create_dir_all(self.program().parent().unwrap()).unwrap();
+        fs::write(self.program(), "# A shell opens this and does nothing with it.\n").unwrap();
+        fs::write(self.program().with_file_name("mcu.py"), change(lookups.concat())).unwrap();
+    }
+
+    fn program(&self) -> PathBuf {
+        self.0.path().join("klippy/klippy.py")
+    }
+}
+
+/// A process called as klippy is. Each line that it is given has it open the pty or close it.
+struct Host(Child);
+
+impl Host {
+    fn start(pinion: &Pinion, checkout: &Checkout) -> Host {
+        let script = format!(
+            "while true; do read line; exec 3<>{tty}; echo open; read line; exec 3>&-; echo closed; done",
+            tty = pinion.link().display()
+        );
+        let child = Command::new("/bin/sh")
+            .args(["-c", &script, "python3"])
+            .arg(checkout.program())
+            .arg("printer.cfg")
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut host = Host(child);
+        host.turn("open");
+        host
+    }
+
+    /// Opens or closes the pty, and waits until that is done.
+    fn turn(&mut self, done: &str) {
+        use std::io::{BufRead, BufReader};
+        writeln!(self.0.stdin.as_mut().unwrap()).unwrap();
+        let mut answer = String::new();
+        BufReader::new(self.0.stdout.as_mut().unwrap()).read_line(&mut answer).unwrap();
+        assert_eq!(answer.trim_end(), done);
+    }
+}
+
+impl Drop for Host {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// How often the log has a text by now, and waits until it has it once more after `act`.
+fn until_once_more<T>(pinion: &Pinion, text: &str, act: impl FnOnce() -> T) -> T {
+    let count = || pinion.log().matches(text).count();
+    let before = count();
+    let result = act();
+    pinion.until(text, || count() > before);
+    result
+}
+
+#[test]
+fn each_host_gets_the_dictionary_of_its_generation() {
+    let pinion = Pinion::simulated(&[]);
+    for dialect in ["v0.11", "v0.12", "v0.13", "master", "kalico"] {
+        let checkout = Checkout::of(dialect);
+        let host = Host::start(&pinion, &checkout);
+        let client = pinion.client();
+        let commands = &client.dictionary().commands;
+        let wanted = if dialect == "master" { MANY_VALUES } else { ONE_VALUE };
+        assert!(commands.contains_key(wanted), "{dialect}: {commands:?}");
+        assert_eq!(commands.contains_key("config_lis2dw oid=%c spi_oid=%c"), dialect == "v0.12");
+        let line = pinion.logged(&format!("dialect {dialect}, which has "));
+        let folder = checkout.0.path().to_str().unwrap();
+        assert!(line.contains(&format!("the host is klippy of {folder}, process {}", host.0.id())), "{line}");
+        until_once_more(&pinion, "host gone", || drop((client, host)));
+    }
+}
+
+#[test]
+fn a_host_that_is_no_klippy_gets_what_most_hosts_take() {
+    let pinion = Pinion::simulated(&[]);
+    let client = pinion.client();
+    // It is this very process.
+    let pid = std::process::id();
+    pinion.logged(&format!("the host, process {pid}, is no klippy: it is served as Klipper v0.13, master and Kalico"));
+    // Today's hosts take the older form, too.
+    assert!(client.dictionary().commands.contains_key(ONE_VALUE));
+    until_once_more(&pinion, "host gone", || drop(client));
+    let checkout = Checkout::of("v0.12");
+    fs::remove_file(checkout.program().with_file_name("mcu.py")).unwrap();
+    let _host = Host::start(&pinion, &checkout);
+    pinion.client();
+    pinion.logged("it does not hold klippy's sources: it is served as Klipper v0.13, master and Kalico");
+}
+
+#[test]
+fn a_dialect_that_is_named_is_spoken_whoever_comes() {
+    let pinion = Pinion::simulated(&["--dialect", "v0.12"]);
+    let checkout = Checkout::of("master");
+    let _host = Host::start(&pinion, &checkout);
+    let client = pinion.client();
+    assert!(client.dictionary().commands.contains_key(ONE_VALUE));
+    assert!(client.dictionary().commands.values().all(|id| (-32..96).contains(&id.as_i64().unwrap())));
+    let refused = output(&["run", "--board", "sim", "--dialect", "v0.10"]);
+    let error = String::from_utf8_lossy(&refused.stderr).into_owned();
+    assert!(error.contains("v0.11, v0.12, v0.13, master, kalico, union"), "{error}");
+}
+
+/// The reading of a thermistor in the words of a generation.
+fn read_temperature(pinion: &Pinion, query: &str) -> String {
+    let mut client = pinion.client();
+    let mut config = Config::default();
+    let oid = config.oid().unwrap();
+    config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
+    // That the machine is configured by another host, klippy finds as this client does: by the check
+    // sum. It then resets the machine.
+    config.apply(&mut client).unwrap();
+    let clock = client.clock_in(0.05).unwrap();
+    client.send_line(&format!("query_analog_in oid={oid} clock={} {query}", clock.wire())).unwrap();
+    let state = client.wait("analog_in_state", Some(oid), std::time::Instant::now() + crate::process::PATIENCE);
+    format!("{:?}", state.unwrap().unwrap())
+}
+
+#[test]
+fn a_host_that_was_updated_is_served_at_its_next_start_though_the_machine_is_configured() {
+    let pinion = Pinion::simulated(&[]);
+    let checkout = Checkout::of("v0.13");
+    let host = Host::start(&pinion, &checkout);
+    let state = read_temperature(
+        &pinion,
+        "sample_ticks=5000 sample_count=4 rest_ticks=500000 min_value=0 max_value=20000 range_check_count=4",
+    );
+    assert!(state.contains("\"value\"") || state.contains("value:"), "{state}");
+    until_once_more(&pinion, "host gone", || drop(host));
+    checkout.change("master", |sources| sources);
+    let _host = Host::start(&pinion, &checkout);
+    let state = read_temperature(
+        &pinion,
+        "sample_ticks=5000 sample_count=4 rest_ticks=500000 bytes_per_report=2 min_value=0 max_value=20000 range_check_count=4",
+    );
+    assert!(state.contains("values"), "{state}");
+}
+
+#[test]
+fn a_process_goes_on_with_the_sources_that_it_has_loaded() {
+    let pinion = Pinion::simulated(&[]);
+    let checkout = Checkout::of("v0.13");
+    let mut host = Host::start(&pinion, &checkout);
+    assert!(pinion.client().dictionary().commands.contains_key(ONE_VALUE));
+    // klippy's RESTART closes the pty and opens it anew, after an update of the files.
+    until_once_more(&pinion, "host gone", || host.turn("closed"));
+    checkout.change("master", |sources| sources);
+    host.turn("open");
+    assert!(pinion.client().dictionary().commands.contains_key(ONE_VALUE));
+    pinion.logged(&format!("the host is the one of before, process {}: dialect v0.13", host.0.id()));
+}
+
+#[test]
+fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
+    let pinion = Pinion::simulated(&[]);
+    let checkout = Checkout::of("master");
+    checkout.change("master", |sources| {
+        sources.replace("query_adxl345 oid=%c rest_ticks=%u", "query_adxl345 oid=%c rest_ticks=%u range=%c")
+    });
+    let _host = Host::start(&pinion, &checkout);
+    assert!(pinion.client().dictionary().commands.contains_key(MANY_VALUES), "the nearest dialect");
+    let line = pinion.logged("the host is newer than Pinion");
+    assert!(line.contains("forms of messages: query_adxl345 oid rest_ticks range: "), "{line}");
+    let doctor = |folder: &Path| output(&["doctor", "--klipper", folder.to_str().unwrap()]);
+    let newer = doctor(checkout.0.path());
+    let report = String::from_utf8_lossy(&newer.stdout).into_owned();
+    assert_eq!(newer.status.code(), Some(1), "{report}");
+    assert!(
+        report.contains("No dialect has these forms") && report.contains("\n  query_adxl345 oid rest_ticks range\n")
+    );
+    checkout.change("v0.12", |sources| sources);
+    let known = doctor(&checkout.program().parent().unwrap());
+    let report = String::from_utf8_lossy(&known.stdout).into_owned();
+    assert_eq!(known.status.code(), Some(0), "{report}");
+    assert!(
+        report.contains("ok: this host is served in the dialect v0.12, which has all that it looks up"),
+        "{report}"
+    );
+    let none = doctor(Path::new("/nonexistent"));
+    assert_eq!(none.status.code(), Some(1));
+    let error = String::from_utf8_lossy(&none.stderr).into_owned();
+    assert!(error.contains("/nonexistent") && error.contains("name a checkout of Klipper or Kalico"), "{error}");
+}
