@@ -13,6 +13,7 @@ use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
 
 use bench::ANALOG;
+use pinion::mcu::Generation::{Kalico, V0_12};
 use rig::Rig;
 
 /// The system's allocator, which counts for the thread that asks it to.
@@ -245,6 +246,91 @@ fn probing_allocates_nothing_once_configured() {
         }
         assert_eq!(print.counted, 0);
     }
+}
+
+/// What hosts before master ask for in other words.
+#[test]
+fn older_hosts_cost_no_allocation_either() {
+    let sensors = [
+        "config_spi oid=0 pin=8 cs_active_high=0",
+        "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
+        "config_i2c oid=1",
+        "i2c_set_bus oid=1 i2c_bus=0 rate=400000 address=64",
+        "config_analog_in oid=2 pin=400",
+        "config_adxl345 oid=3 spi_oid=0",
+        "config_lis2dw oid=4 spi_oid=0",
+        "config_mpu9250 oid=5 i2c_oid=1",
+        "config_spi_angle oid=6 spi_oid=0 spi_angle_type=0",
+    ];
+    for answer_ticks in [0, 4000] {
+        let mut rig = Rig::of(V0_12);
+        rig.bench.state().answer_ticks = answer_ticks;
+        rig.bench.plug_i2c(0, 64, |_, _, read| {
+            read.fill(7);
+            Ok(())
+        });
+        rig.configure(&sensors);
+        let mut print = Print { rig, counted: 0 };
+        print.send("query_analog_in oid=2 clock=@100000 sample_ticks=0 sample_count=1 rest_ticks=100000 min_value=0 max_value=65535 range_check_count=0");
+        for sensor in ["adxl345 oid=3", "lis2dw oid=4", "mpu9250 oid=5"] {
+            print.send(&format!("query_{sensor} clock=@100000 rest_ticks=100000"));
+        }
+        print.send("query_spi_angle oid=6 clock=@100000 rest_ticks=100000 time_shift=0");
+        print.send("i2c_write oid=1 data=1020");
+        print.send("i2c_read oid=1 reg=10 read_len=6");
+        print.send("i2c_modify_bits oid=1 reg=10 clear_set_bits=0102");
+        // The bench has room for a few hundred transfers.
+        print.run_until(2_000_000);
+        for sensor in ["adxl345 oid=3", "lis2dw oid=4", "mpu9250 oid=5"] {
+            let (name, oid) = sensor.split_once(' ').unwrap();
+            print.send(&format!("query_{name}_status {oid}"));
+            print.send(&format!("query_{sensor} clock=0 rest_ticks=0"));
+        }
+        print.send("query_spi_angle oid=6 clock=0 rest_ticks=0 time_shift=0");
+        print.run_until(3_000_000);
+        let reports = print.rig.everything();
+        for kind in [
+            "analog_in_state",
+            "i2c_read_response",
+            "adxl345_status",
+            "lis2dw_status",
+            "mpu9250_status",
+            "spi_angle_end",
+        ] {
+            assert!(reports.iter().any(|report| report.starts_with(kind)), "{kind}");
+        }
+        assert_eq!(print.counted, 0);
+    }
+}
+
+#[test]
+fn a_probe_of_kalico_allocates_nothing_once_configured() {
+    let mut rig = Rig::of(Kalico);
+    rig.configure(&[
+        "config_trsync oid=0",
+        "config_sos_filter oid=1 max_sections=4",
+        "config_load_cell_probe oid=2 sos_filter_oid=1",
+        "config_spi_without_cs oid=3",
+        "config_ads131m0x oid=4 spi_oid=3 data_ready_pin=12 sensor_channel_count=4 channel_mask=15",
+        "config_ads1220 oid=5 spi_oid=3 data_ready_pin=12",
+        "spi_set_bus oid=3 spi_bus=0 mode=1 rate=512000",
+    ]);
+    let mut print = Print { rig, counted: 0 };
+    print.send("sos_filter_set_active oid=1 n_sections=4 coeff_int_bits=2");
+    print.send("load_cell_probe_set_range oid=2 safety_counts_min=-8388608 safety_counts_max=8388607 tare_counts=0 trigger_grams=1 grams_per_count=1");
+    print.send("trsync_start oid=0 report_clock=@0 report_ticks=0 expire_reason=2");
+    for sensor in ["ads131m0x oid=4", "ads1220 oid=5"] {
+        let (name, oid) = sensor.split_once(' ').unwrap();
+        print.send(&format!("{name}_attach_load_cell_probe {oid} load_cell_probe_oid=2"));
+        print.send(&format!("query_{sensor} rest_ticks=10000"));
+    }
+    print.send("load_cell_probe_home oid=2 trsync_oid=0 trigger_reason=1 error_reason=40 clock=@100000 rest_ticks=10000 timeout=3");
+    print.run_until(5_000_000);
+    print.send("load_cell_probe_query_state oid=2");
+    let reports = print.rig.everything();
+    assert!(reports.iter().any(|report| report.starts_with("sensor_bulk_data oid=5")));
+    assert!(reports.iter().any(|report| report.starts_with("load_cell_probe_state")));
+    assert_eq!(print.counted, 0);
 }
 
 #[test]

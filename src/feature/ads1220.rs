@@ -7,15 +7,26 @@
 #![forbid(unsafe_code)]
 
 use crate::board::Pin;
-use crate::mcu::{Command, Conversation, Feature, Mcu, Oid, Ticket, command};
+use crate::mcu::{
+    Command, Conversation, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Ticket,
+    command, only, since,
+};
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
 
-use super::ready_adc::{Frame, ReadyChip, Sample, attach, configure_spi, query, query_status, signed_24, spi_result};
+use super::ready_adc::{
+    Frame, ReadyChip, Sample, attach, attach_probe, configure_spi, query, query_status, signed_24, spi_result,
+};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "ads1220",
-    commands: &[CONFIG_ADS1220, ADS1220_ATTACH_TRIGGER_ANALOG, QUERY_ADS1220, QUERY_ADS1220_STATUS],
+    commands: &[
+        CONFIG_ADS1220,
+        ADS1220_ATTACH_TRIGGER_ANALOG,
+        ADS1220_ATTACH_LOAD_CELL_PROBE,
+        QUERY_ADS1220,
+        QUERY_ADS1220_STATUS,
+    ],
     ..Feature::EMPTY
 };
 
@@ -47,19 +58,28 @@ const CONFIG_ADS1220: Command = command!(
     |mcu, oid: Oid, spi_oid: Oid, data_ready_pin: Pin| {
         configure_spi(mcu, oid, (spi_oid, data_ready_pin), Ads1220 { spi: spi_oid }, SAMPLE_BYTES)
     }
-);
+)
+.of(since(V0_13));
 
 const ADS1220_ATTACH_TRIGGER_ANALOG: Command =
     command!("ads1220_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
         attach::<Ads1220>(mcu, oid, trigger_analog_oid)
-    });
+    })
+    .of(only(Master));
+
+const ADS1220_ATTACH_LOAD_CELL_PROBE: Command = command!(
+    "ads1220_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
+    |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Ads1220>(mcu, oid, load_cell_probe_oid)
+)
+.of(only(Kalico));
 
 const QUERY_ADS1220: Command = command!("query_ads1220 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Ads1220>(mcu, oid, rest_ticks)
-});
+})
+.of(since(V0_13));
 
 const QUERY_ADS1220_STATUS: Command =
-    command!("query_ads1220_status oid=%c", |mcu, oid: Oid| query_status::<Ads1220>(mcu, oid));
+    command!("query_ads1220_status oid=%c", |mcu, oid: Oid| query_status::<Ads1220>(mcu, oid)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

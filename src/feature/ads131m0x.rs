@@ -7,19 +7,33 @@
 #![forbid(unsafe_code)]
 
 use crate::board::Pin;
-use crate::mcu::{Command, Conversation, Enumeration, Feature, Mcu, Oid, Ticket, command};
+use crate::mcu::{
+    Command, Conversation, Enumeration, Feature, Generation::Kalico, Generation::Master, Mcu, Oid, Ticket, command,
+    only, since,
+};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
 
 use super::named;
-use super::ready_adc::{Frame, ReadyChip, Sample, attach, configure_spi, query, query_status, signed_24, spi_result};
+use super::ready_adc::{
+    CHANNELS_MAX, Frame, ReadyChip, Sample, attach, attach_probe, configure_spi, query, query_status, signed_24,
+    spi_result,
+};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "ads131m0x",
-    commands: &[CONFIG_ADS131M0X, ADS131M0X_ATTACH_TRIGGER_ANALOG, QUERY_ADS131M0X, QUERY_ADS131M0X_STATUS],
+    commands: &[
+        CONFIG_ADS131M0X,
+        CONFIG_ADS131M0X_OF_KALICO,
+        ADS131M0X_ATTACH_TRIGGER_ANALOG,
+        ADS131M0X_ATTACH_LOAD_CELL_PROBE,
+        QUERY_ADS131M0X,
+        QUERY_ADS131M0X_STATUS,
+    ],
     enumerations: &[Enumeration::new("ads131m0x_error:", |_| {
         named(&[("SENSOR_ERROR_CRC", ERROR_CRC), ("SENSOR_ERROR_RESET", ERROR_RESET)])
-    })],
+    })
+    .of(only(Master))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -27,6 +41,10 @@ pub(super) const FEATURE: Feature = Feature {
 shutdowns! {
     /// A number of channels that no chip has, or a channel beyond them.
     INVALID_CHANNELS = "Invalid ads131m0x channels configuration";
+    /// Kalico: a number of channels that no chip has.
+    INVALID_CHANNEL_COUNT = "ads131m0x invalid sensor_channel_count";
+    /// Kalico: no channel, or one that the chip does not have.
+    INVALID_CHANNEL_MASK = "ads131m0x invalid channel_mask";
 }
 
 /// The frame's CRC does not fit its words.
@@ -35,8 +53,7 @@ const ERROR_CRC: u8 = 1;
 const ERROR_RESET: u8 = 2;
 
 const WORD_BYTES: usize = 3;
-const CHANNELS_MAX: u8 = 4;
-const FRAME_MAX: usize = frame_bytes(CHANNELS_MAX);
+const FRAME_MAX: usize = frame_bytes(CHANNELS_MAX as u8);
 /// RESET of the STATUS register, in its high byte.
 const STATUS_RESET: u8 = 1 << 2;
 
@@ -56,14 +73,14 @@ fn crc16(bytes: &[u8]) -> u16 {
 #[derive(Debug, PartialEq, Eq)]
 enum Content {
     BadCrc,
-    /// Whether the chip was reset, and the channel's sample.
+    /// Whether the chip was reset, and each channel's sample.
     Good {
         reset: bool,
-        value: i32,
+        values: [i32; CHANNELS_MAX],
     },
 }
 
-fn decode(frame: &[u8], channel: u8) -> Content {
+fn decode(frame: &[u8]) -> Content {
     let Some((words, [crc_high, crc_low, _])) = frame.split_last_chunk::<WORD_BYTES>() else {
         return Content::BadCrc;
     };
@@ -72,28 +89,63 @@ fn decode(frame: &[u8], channel: u8) -> Content {
     }
     let mut words = words.chunks_exact(WORD_BYTES).map(|word| [word[0], word[1], word[2]]);
     let [status, ..] = words.next().unwrap_or_default();
-    let value = words.nth(usize::from(channel)).map_or(0, signed_24);
-    Content::Good { reset: status & STATUS_RESET != 0, value }
+    let mut values = [0; CHANNELS_MAX];
+    for (value, word) in values.iter_mut().zip(words) {
+        *value = signed_24(word);
+    }
+    Content::Good { reset: status & STATUS_RESET != 0, values }
 }
+
+/// Which channels are sampled, and how the host is told of errors.
+#[derive(Clone, Copy)]
+enum Channels {
+    /// One.
+    One(u8),
+    /// Those whose bits are set, each with its own value: Kalico's.
+    Mask(u8),
+}
+
+/// What Kalico knows errors by.
+const KALICO_ERROR_CRC: i32 = i32::MIN;
+const KALICO_ERROR_RESET: i32 = 1 << 30;
 
 struct Ads131m0x {
     spi: Oid,
-    channel: u8,
+    channels: Channels,
     /// Whether it was reset since the measurements began: that is for the host to mend.
     was_reset: bool,
 }
 
 impl Ads131m0x {
     fn judge(&mut self, content: Content) -> Sample {
-        let error = |code: u8| Sample::Error { code: Some(code), value: i32::from(code) << 24 };
-        match content {
-            Content::BadCrc => error(ERROR_CRC),
-            Content::Good { reset, value } => {
-                self.was_reset |= reset;
-                if self.was_reset { error(ERROR_RESET) } else { Sample::Value(value) }
+        if let Content::Good { reset, .. } = content {
+            self.was_reset |= reset;
+        }
+        match (self.channels, content) {
+            (Channels::One(_), Content::BadCrc) => error_sample(ERROR_CRC),
+            (Channels::One(_), Content::Good { .. }) if self.was_reset => error_sample(ERROR_RESET),
+            (Channels::One(channel), Content::Good { values, .. }) => {
+                Sample::Value(values.get(usize::from(channel)).copied().unwrap_or_default())
+            }
+            (Channels::Mask(_), _) if self.was_reset => self.each(KALICO_ERROR_RESET),
+            (Channels::Mask(_), Content::BadCrc) => self.each(KALICO_ERROR_CRC),
+            (Channels::Mask(mask), Content::Good { values, .. }) => {
+                let mut sampled = [0; CHANNELS_MAX];
+                let chosen = values.iter().enumerate().filter(|(channel, _)| mask & 1 << channel != 0);
+                sampled.iter_mut().zip(chosen).for_each(|(place, (_, value))| *place = *value);
+                Sample::Channels { values: sampled, count: self.channels(), sum: Some(sampled.iter().sum()) }
             }
         }
     }
+
+    /// The same error in the place of each channel's value.
+    fn each(&self, error: i32) -> Sample {
+        Sample::Channels { values: [error; CHANNELS_MAX], count: self.channels(), sum: None }
+    }
+}
+
+fn error_sample(code: u8) -> Sample {
+    Sample::Error { code: Some(code), value: i32::from(code) << 24 }
 }
 
 impl ReadyChip for Ads131m0x {
@@ -109,7 +161,14 @@ impl ReadyChip for Ads131m0x {
     }
 
     fn sample(&mut self, reading: &Self::Reading, _late: bool) -> Sample {
-        self.judge(decode(reading.talk.received(), self.channel))
+        self.judge(decode(reading.talk.received()))
+    }
+
+    fn channels(&self) -> usize {
+        match self.channels {
+            Channels::One(_) => 1,
+            Channels::Mask(mask) => mask.count_ones() as usize,
+        }
     }
 
     fn switch(&mut self, _mcu: &mut Mcu, _oid: Oid, on: bool) -> Result<(), Shutdown> {
@@ -123,29 +182,60 @@ impl ReadyChip for Ads131m0x {
 const CONFIG_ADS131M0X: Command = command!(
     "config_ads131m0x oid=%c spi_oid=%c channel=%c num_channels=%c data_ready_pin=%u",
     |mcu, oid: Oid, spi_oid: Oid, channel: u8, num_channels: u8, data_ready_pin: Pin| {
-        if !(2..=CHANNELS_MAX).contains(&num_channels) || channel >= num_channels {
+        if !(2..=CHANNELS_MAX as u8).contains(&num_channels) || channel >= num_channels {
             return Err(Shutdown::by_host(
                 INVALID_CHANNELS,
                 format_args!("channel {channel} of {num_channels} is wanted of a chip that has 2 to {CHANNELS_MAX}"),
             ));
         }
-        let chip = Ads131m0x { spi: spi_oid, channel, was_reset: false };
+        let chip = Ads131m0x { spi: spi_oid, channels: Channels::One(channel), was_reset: false };
         configure_spi(mcu, oid, (spi_oid, data_ready_pin), chip, frame_bytes(num_channels))
     }
-);
+)
+.of(only(Master));
+
+const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
+    "config_ads131m0x oid=%c spi_oid=%c data_ready_pin=%u sensor_channel_count=%c channel_mask=%c",
+    |mcu, oid: Oid, spi_oid: Oid, data_ready_pin: Pin, sensor_channel_count: u8, channel_mask: u8| {
+        if !(1..=CHANNELS_MAX as u8).contains(&sensor_channel_count) {
+            return Err(Shutdown::by_host(
+                INVALID_CHANNEL_COUNT,
+                format_args!("a chip with {sensor_channel_count} channels is none of 1 to {CHANNELS_MAX}"),
+            ));
+        }
+        if channel_mask == 0 || channel_mask >> sensor_channel_count != 0 {
+            return Err(Shutdown::by_host(
+                INVALID_CHANNEL_MASK,
+                format_args!("channel_mask {channel_mask:#x} is for a chip with {sensor_channel_count} channels"),
+            ));
+        }
+        let chip = Ads131m0x { spi: spi_oid, channels: Channels::Mask(channel_mask), was_reset: false };
+        configure_spi(mcu, oid, (spi_oid, data_ready_pin), chip, frame_bytes(sensor_channel_count))
+    }
+)
+.of(only(Kalico));
 
 const ADS131M0X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ads131m0x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     |mcu, oid: Oid, trigger_analog_oid: Oid| attach::<Ads131m0x>(mcu, oid, trigger_analog_oid)
-);
+)
+.of(only(Master));
+
+const ADS131M0X_ATTACH_LOAD_CELL_PROBE: Command = command!(
+    "ads131m0x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
+    |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Ads131m0x>(mcu, oid, load_cell_probe_oid)
+)
+.of(only(Kalico));
 
 const QUERY_ADS131M0X: Command =
     command!("query_ads131m0x oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
         query::<Ads131m0x>(mcu, oid, rest_ticks)
-    });
+    })
+    .of(since(Master).and(Kalico));
 
 const QUERY_ADS131M0X_STATUS: Command =
-    command!("query_ads131m0x_status oid=%c", |mcu, oid: Oid| query_status::<Ads131m0x>(mcu, oid));
+    command!("query_ads131m0x_status oid=%c", |mcu, oid: Oid| query_status::<Ads131m0x>(mcu, oid))
+        .of(since(Master).and(Kalico));
 
 #[cfg(test)]
 mod tests {
@@ -171,14 +261,13 @@ mod tests {
     #[test]
     fn each_channel_has_its_word() {
         let good = frame(0x05 & !STATUS_RESET, [[0x7f, 0xff, 0xff], [0x80, 0, 0]]);
-        assert_eq!(decode(&good, 0), Content::Good { reset: false, value: 8_388_607 });
-        assert_eq!(decode(&good, 1), Content::Good { reset: false, value: -8_388_608 });
+        assert_eq!(decode(&good), Content::Good { reset: false, values: [8_388_607, -8_388_608, 0, 0] });
         let reset = frame(STATUS_RESET, [[0, 0, 1], [0xff, 0xff, 0xff]]);
-        assert_eq!(decode(&reset, 1), Content::Good { reset: true, value: -1 });
-        assert_eq!(decode(&[], 0), Content::BadCrc);
+        assert_eq!(decode(&reset), Content::Good { reset: true, values: [1, -1, 0, 0] });
+        assert_eq!(decode(&[]), Content::BadCrc);
         // A chip that is unplugged, or has no supply.
-        assert_eq!(decode(&[0; 12], 0), Content::BadCrc);
-        assert_eq!(decode(&[0xff; 12], 0), Content::BadCrc);
+        assert_eq!(decode(&[0; 12]), Content::BadCrc);
+        assert_eq!(decode(&[0xff; 12]), Content::BadCrc);
     }
 
     proptest! {
@@ -186,18 +275,31 @@ mod tests {
         fn one_bit_that_is_wrong_is_seen(words: [[u8; 3]; 2], bit in 0usize..11 * 8) {
             let mut frame = frame(0, words);
             frame[bit / 8] ^= 1 << (bit % 8);
-            prop_assert_eq!(decode(&frame, 0), Content::BadCrc);
+            prop_assert_eq!(decode(&frame), Content::BadCrc);
         }
     }
 
     #[test]
     fn a_reset_lasts_until_measurements_begin_anew() {
-        let mut chip = Ads131m0x { spi: Oid::new(0), channel: 0, was_reset: false };
+        let mut chip = Ads131m0x { spi: Oid::new(0), channels: Channels::One(0), was_reset: false };
+        let good = |reset: bool| Content::Good { reset, values: [5, 6, 7, 8] };
         let error = |code: u8, value: i32| Sample::Error { code: Some(code), value };
-        assert_eq!(chip.judge(Content::Good { reset: false, value: 5 }), Sample::Value(5));
+        assert_eq!(chip.judge(good(false)), Sample::Value(5));
         assert_eq!(chip.judge(Content::BadCrc), error(1, 0x0100_0000));
-        assert_eq!(chip.judge(Content::Good { reset: true, value: 5 }), error(2, 0x0200_0000));
-        assert_eq!(chip.judge(Content::Good { reset: false, value: 5 }), error(2, 0x0200_0000));
+        assert_eq!(chip.judge(good(true)), error(2, 0x0200_0000));
+        assert_eq!(chip.judge(good(false)), error(2, 0x0200_0000));
         assert_eq!(chip.judge(Content::BadCrc), error(1, 0x0100_0000));
+    }
+
+    #[test]
+    fn kalico_gets_each_channel_of_its_mask() {
+        let mut chip = Ads131m0x { spi: Oid::new(0), channels: Channels::Mask(0b1010), was_reset: false };
+        let good = |reset: bool| Content::Good { reset, values: [5, 6, 7, -8] };
+        let both = |values: [i32; 4], sum| Sample::Channels { values, count: 2, sum };
+        assert_eq!(chip.judge(good(false)), both([6, -8, 0, 0], Some(-2)));
+        assert_eq!(chip.judge(Content::BadCrc), both([i32::MIN; 4], None));
+        assert_eq!(chip.judge(good(true)), both([1 << 30; 4], None));
+        // A reset counts for more than a check sum.
+        assert_eq!(chip.judge(Content::BadCrc), both([1 << 30; 4], None));
     }
 }

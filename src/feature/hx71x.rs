@@ -16,15 +16,24 @@ use std::time::{Duration, Instant};
 use log::warn;
 
 use crate::board::{Bias, Direction, Line, Pin};
-use crate::mcu::{Command, Done, Errand, Feature, Mcu, Oid, Remote, Settable, Ticket, WorkerId, command};
+use crate::mcu::{
+    Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
+    Settable, Ticket, WorkerId, command, only, since,
+};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Ticks, TimeSource};
 
-use super::ready_adc::{ReadyAdc, ReadyChip, SWITCH, Sample, attach, query, query_status};
+use super::ready_adc::{ReadyAdc, ReadyChip, SWITCH, Sample, attach, attach_probe, query, query_status};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "hx71x",
-    commands: &[CONFIG_HX71X, HX71X_ATTACH_TRIGGER_ANALOG, QUERY_HX71X, QUERY_HX71X_STATUS],
+    commands: &[
+        CONFIG_HX71X,
+        HX71X_ATTACH_TRIGGER_ANALOG,
+        HX71X_ATTACH_LOAD_CELL_PROBE,
+        QUERY_HX71X,
+        QUERY_HX71X_STATUS,
+    ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -202,19 +211,28 @@ const CONFIG_HX71X: Command = command!(
     |mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
         configure(mcu, oid, gain_channel, dout_pin, sclk_pin)
     }
-);
+)
+.of(since(V0_13));
 
 const HX71X_ATTACH_TRIGGER_ANALOG: Command =
     command!("hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
         attach::<Hx71x>(mcu, oid, trigger_analog_oid)
-    });
+    })
+    .of(only(Master));
+
+const HX71X_ATTACH_LOAD_CELL_PROBE: Command = command!(
+    "hx71x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
+    |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Hx71x>(mcu, oid, load_cell_probe_oid)
+)
+.of(only(Kalico));
 
 const QUERY_HX71X: Command = command!("query_hx71x oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Hx71x>(mcu, oid, rest_ticks)
-});
+})
+.of(since(V0_13));
 
 const QUERY_HX71X_STATUS: Command =
-    command!("query_hx71x_status oid=%c", |mcu, oid: Oid| query_status::<Hx71x>(mcu, oid));
+    command!("query_hx71x_status oid=%c", |mcu, oid: Oid| query_status::<Hx71x>(mcu, oid)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

@@ -3,7 +3,8 @@
 //!
 //! klippy sets the chip up by itself. Its INTB line goes low when a sample is ready; without that line
 //! the STATUS register is asked every `rest_ticks`. A bus that fails stops nothing: the host gets an
-//! error in the sample's place, and homing ends.
+//! error in the sample's place, and homing ends. (For hosts that do not know such errors, v0.13 and Kalico, it
+//! stops the machine, as it did in the firmware.)
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +12,8 @@ use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
 use crate::mcu::{
-    Command, Conversation, Done, Enumeration, Feature, Mcu, Next, Object, Oid, Talk, Ticket, TimerId, command,
+    Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
+    Generations, Mcu, Next, Object, Oid, Response, Talk, Ticket, TimerId, WireClock, command, only, response, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -20,6 +22,7 @@ use super::i2c::{I2c, i2c_shutdown};
 use super::named;
 use super::sensor_bulk::SensorBulk;
 use super::trigger_analog::Attached;
+use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
     name: "ldc1612",
@@ -27,6 +30,8 @@ pub(super) const FEATURE: Feature = Feature {
         CONFIG_LDC1612,
         CONFIG_LDC1612_WITH_INTB,
         LDC1612_ATTACH_TRIGGER_ANALOG,
+        LDC1612_SETUP_HOME,
+        QUERY_LDC1612_HOME_STATE,
         QUERY_LDC1612,
         QUERY_STATUS_LDC1612,
     ],
@@ -37,9 +42,20 @@ pub(super) const FEATURE: Feature = Feature {
             ("I2C_DATA_ERROR", I2C_DATA_ERROR),
             ("INVALID_READ_DATA", INVALID_READ_DATA),
         ])
-    })],
+    })
+    .of(only(Master))],
+    responses: &[HomeState::FORM],
     ..Feature::EMPTY
 };
+
+/// The hosts that home by the sensor itself, and have the machine stop where its bus fails.
+const HOMES_ITSELF: Generations = only(V0_13).and(Kalico);
+
+response! {
+    /// Whether samples are looked at for homing, and when the trigger came.
+    "ldc1612_home_state oid=%c homing=%c trigger_clock=%u" => HOMES_ITSELF;
+    pub(super) struct HomeState { oid: Oid, homing: bool, trigger_clock: Clock }
+}
 
 /// Error flags of the chip stand in the sample.
 const SENSOR_REPORTS_ERROR: u8 = 0;
@@ -62,7 +78,7 @@ const ERROR_FLAGS: u32 = 0xe000_0000;
 const DATA: u32 = 0x0fff_ffff;
 
 /// What a reading came to.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy)]
 enum Found {
     Nothing,
     /// Both words of channel 0.
@@ -70,12 +86,9 @@ enum Found {
     Error(u8),
 }
 
-impl Found {
-    /// What the words of channel 0 say.
-    fn of(words: u32) -> Found {
-        // klippy takes such a sample for an error of the MCU's.
-        if words >> 16 == 0xffff { Found::Error(INVALID_READ_DATA) } else { Found::Sample(words) }
-    }
+/// Whether klippy would take such a sample for an error of the machine's.
+fn looks_like_an_error(words: u32) -> bool {
+    words >> 16 == 0xffff
 }
 
 fn read_word(chip: &mut dyn BusDevice, register: u8) -> Result<u16, BusError> {
@@ -99,7 +112,7 @@ impl Talk for Look {
         self.found = Found::Error(I2C_DATA_ERROR);
         let high = read_word(chip, DATA0_MSB)?;
         let low = read_word(chip, DATA0_LSB)?;
-        self.found = Found::of(u32::from(high) << 16 | u32::from(low));
+        self.found = Found::Sample(u32::from(high) << 16 | u32::from(low));
         Ok(())
     }
 }
@@ -120,6 +133,44 @@ impl Talk for Ask {
 const LOOK: u8 = 0;
 const ASK: u8 = 1;
 
+/// Homing by the sensor itself.
+struct Homing {
+    /// Pulled when the trigger comes; none while samples are not looked at.
+    trsync: Option<Oid>,
+    /// A value above it is the trigger.
+    threshold: u32,
+    trigger_reason: u8,
+    error_reason: u8,
+    /// Whether every sample so far was of an instant before `clock`.
+    awaits: bool,
+    /// When homing begins; when it was triggered, from then on.
+    clock: Clock,
+}
+
+impl Homing {
+    /// Samples are not looked at.
+    const OFF: Homing =
+        Homing { trsync: None, threshold: 0, trigger_reason: 0, error_reason: 0, awaits: false, clock: Clock::EPOCH };
+
+    /// Takes in both words of channel 0, read at the instant `at`.
+    fn update(&mut self, mcu: &mut Mcu, words: u32, at: Clock) -> Result<(), Shutdown> {
+        let Some(trsync) = self.trsync else { return Ok(()) };
+        let reason = if words > DATA {
+            self.error_reason
+        } else if self.awaits && at < self.clock {
+            return Ok(());
+        } else if words > self.threshold {
+            self.clock = at;
+            self.trigger_reason
+        } else {
+            self.awaits = false;
+            return Ok(());
+        };
+        self.trsync = None;
+        mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, reason))
+    }
+}
+
 struct Ldc1612 {
     i2c: Oid,
     /// Low while a sample is ready.
@@ -133,6 +184,7 @@ struct Ldc1612 {
     rest_ticks: Ticks,
     bulk: SensorBulk,
     attached: Attached,
+    homing: Homing,
     /// Whether the last conversation failed: the log is told of the first one.
     failing: bool,
 }
@@ -151,6 +203,7 @@ impl Ldc1612 {
             rest_ticks: Ticks(0),
             bulk: SensorBulk::new(),
             attached: Attached::default(),
+            homing: Homing::OFF,
             failing: false,
         };
         mcu.assign(oid, sensor)
@@ -161,16 +214,18 @@ impl Ldc1612 {
         self.look.is_none() && !self.stale
     }
 
-    /// Says in the log that the bus fails, if it did not before.
-    fn note(&mut self, mcu: &mut Mcu, oid: Oid, result: Result<(), BusError>) {
+    /// Says in the log that the bus fails, if it did not before; or stops the machine.
+    fn note(&mut self, mcu: &mut Mcu, oid: Oid, result: Result<(), BusError>) -> Result<(), Shutdown> {
         let failed_before = std::mem::replace(&mut self.failing, result.is_err());
-        match result {
-            Err(error) if !failed_before => {
-                let trouble = i2c_shutdown(mcu, error);
-                mcu.warn(oid, self.kind(), trouble);
-            }
-            _ => {}
+        let Err(error) = result else { return Ok(()) };
+        let trouble = i2c_shutdown(mcu, error);
+        if mcu.serves(HOMES_ITSELF) {
+            return mcu.device_failed(oid, self.kind(), trouble);
         }
+        if !failed_before {
+            mcu.warn(oid, self.kind(), trouble);
+        }
+        Ok(())
     }
 
     fn looked(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
@@ -179,10 +234,16 @@ impl Ldc1612 {
         let result = std::mem::replace(&mut look.result, Ok(()));
         let found = look.talk.found;
         self.look = Some(look);
-        self.note(mcu, oid, result);
+        self.note(mcu, oid, result)?;
         if std::mem::take(&mut self.stale) {
             return Ok(());
         }
+        let found = match found {
+            Found::Sample(words) if looks_like_an_error(words) && !mcu.serves(HOMES_ITSELF) => {
+                Found::Error(INVALID_READ_DATA)
+            }
+            found => found,
+        };
         let sample = match found {
             Found::Nothing => return Ok(()),
             Found::Error(error) => {
@@ -194,6 +255,7 @@ impl Ldc1612 {
                     0 => self.attached.update(mcu, (words & DATA) as i32, read_at)?,
                     _ => self.attached.note_error(mcu, SENSOR_REPORTS_ERROR)?,
                 }
+                self.homing.update(mcu, words, read_at)?;
                 words.to_be_bytes()
             }
         };
@@ -202,15 +264,15 @@ impl Ldc1612 {
     }
 
     /// The chip says whether it has a sample. Without an answer klippy asks again.
-    fn asked(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) {
+    fn asked(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
         let asked = (done.began, done.ended);
-        let Some(mut ask) = done.errand::<Conversation<Ask>>() else { return };
+        let Some(mut ask) = done.errand::<Conversation<Ask>>() else { return Ok(()) };
         let result = std::mem::replace(&mut ask.result, Ok(()));
         if result.is_ok() {
             self.bulk.send_status(mcu, oid, asked, if ask.talk.ready { SAMPLE_BYTES } else { 0 });
         }
         self.ask = Some(ask);
-        self.note(mcu, oid, result);
+        self.note(mcu, oid, result)
     }
 
     fn query_status(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
@@ -247,10 +309,7 @@ impl Object for Ldc1612 {
     fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
         match done.tag {
             LOOK => self.looked(mcu, oid, done),
-            _ => {
-                self.asked(mcu, oid, done);
-                Ok(())
-            }
+            _ => self.asked(mcu, oid, done),
         }
     }
 
@@ -261,17 +320,47 @@ impl Object for Ldc1612 {
 
 const CONFIG_LDC1612: Command = command!("config_ldc1612 oid=%c i2c_oid=%c", |mcu, oid: Oid, i2c_oid: Oid| {
     Ldc1612::configure(mcu, oid, i2c_oid, None)
-});
+})
+.of(since(V0_13));
 
 const CONFIG_LDC1612_WITH_INTB: Command =
     command!("config_ldc1612_with_intb oid=%c i2c_oid=%c intb_pin=%c", |mcu, oid: Oid, i2c_oid: Oid, intb_pin: Pin| {
         Ldc1612::configure(mcu, oid, i2c_oid, Some(intb_pin))
-    });
+    })
+    .of(since(V0_13));
 
 const LDC1612_ATTACH_TRIGGER_ANALOG: Command =
     command!("ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
         mcu.with::<Ldc1612, _>(oid, |sensor, mcu| sensor.attached.attach(mcu, trigger_analog_oid))
-    });
+    })
+    .of(only(Master));
+
+const LDC1612_SETUP_HOME: Command = command!(
+    "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",
+    |mcu, oid: Oid, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
+        let clock = mcu.instant(clock);
+        mcu.with::<Ldc1612, _>(oid, |sensor, mcu| {
+            if threshold == 0 {
+                sensor.homing.trsync = None;
+                return Ok(());
+            }
+            mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
+            let trsync = Some(trsync_oid);
+            sensor.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
+            Ok(())
+        })
+    }
+)
+.of(HOMES_ITSELF);
+
+const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", |mcu, oid: Oid| {
+    mcu.with::<Ldc1612, _>(oid, |sensor, mcu| {
+        let homing = &sensor.homing;
+        mcu.send(HomeState { oid, homing: homing.trsync.is_some(), trigger_clock: homing.clock });
+        Ok(())
+    })
+})
+.of(HOMES_ITSELF);
 
 const QUERY_LDC1612: Command = command!("query_ldc1612 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     mcu.with::<Ldc1612, _>(oid, |sensor, mcu| {
@@ -286,11 +375,13 @@ const QUERY_LDC1612: Command = command!("query_ldc1612 oid=%c rest_ticks=%u", |m
         let at = mcu.now() + rest_ticks;
         mcu.schedule(timer, at)
     })
-});
+})
+.of(since(V0_13));
 
 const QUERY_STATUS_LDC1612: Command = command!("query_status_ldc1612 oid=%c", |mcu, oid: Oid| {
     mcu.with::<Ldc1612, _>(oid, |sensor, mcu| sensor.query_status(mcu, oid))
-});
+})
+.of(since(V0_13));
 
 #[cfg(test)]
 mod tests {
@@ -298,14 +389,10 @@ mod tests {
 
     #[test]
     fn only_the_highest_values_are_taken_for_errors() {
-        for (words, found) in [
-            (0x0000_0000, Found::Sample(0)),
-            (0x0fff_ffff, Found::Sample(0x0fff_ffff)),
-            (0xfffe_ffff, Found::Sample(0xfffe_ffff)),
-            (0xffff_0000, Found::Error(INVALID_READ_DATA)),
-            (0xffff_ffff, Found::Error(INVALID_READ_DATA)),
-        ] {
-            assert_eq!(Found::of(words), found);
+        for (words, error) in
+            [(0x0000_0000, false), (0x0fff_ffff, false), (0xfffe_ffff, false), (0xffff_0000, true), (0xffff_ffff, true)]
+        {
+            assert_eq!(looks_like_an_error(words), error, "{words:#x}");
         }
     }
 }

@@ -27,6 +27,7 @@ mod i2c;
 mod icm20948;
 mod ldc1612;
 mod lis2dw;
+mod load_cell_probe;
 mod mpu9250;
 mod neopixel;
 mod pace;
@@ -70,6 +71,7 @@ pub const FEATURES: &[Feature] = &[
     icm20948::FEATURE,
     ldc1612::FEATURE,
     lis2dw::FEATURE,
+    load_cell_probe::FEATURE,
     mpu9250::FEATURE,
     neopixel::FEATURE,
     pca9685::FEATURE,

@@ -31,7 +31,19 @@ pub(super) enum Sample {
         /// What klippy knows the error by.
         value: i32,
     },
+    /// A value of each channel that is sampled, or in its place what klippy knows an error by.
+    Channels {
+        /// As many as there are channels.
+        values: [i32; CHANNELS_MAX],
+        /// How many channels there are.
+        count: usize,
+        /// What they come to for homing; none if that is an error.
+        sum: Option<i32>,
+    },
 }
+
+/// How many channels of a chip may be sampled.
+pub(super) const CHANNELS_MAX: usize = 4;
 
 /// What one kind of chip has of its own.
 pub(super) trait ReadyChip: Send + Sized + 'static {
@@ -48,6 +60,11 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
 
     /// What a reading that counts came to. `late` says that it was not back when it should have been.
     fn sample(&mut self, reading: &Self::Reading, late: bool) -> Sample;
+
+    /// How many values make a sample.
+    fn channels(&self) -> usize {
+        1
+    }
 
     /// Measurements begin anew, or end. Errands for that have the tag [`SWITCH`].
     fn switch(&mut self, mcu: &mut Mcu, oid: Oid, on: bool) -> Result<(), Shutdown> {
@@ -66,7 +83,7 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
 const READ: u8 = 0;
 pub(super) const SWITCH: u8 = 1;
 
-const SAMPLE_BYTES: u32 = 4;
+const VALUE_BYTES: usize = 4;
 
 /// A sensor.
 pub(super) struct ReadyAdc<C: ReadyChip> {
@@ -145,19 +162,32 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
         if std::mem::take(&mut self.stale) || result.is_err() {
             return result.or_else(|failure| mcu.try_shut_down(failure));
         }
-        let value = match self.chip.sample(reading, self.late) {
+        let mut bytes = [0; CHANNELS_MAX * VALUE_BYTES];
+        let mut put = |values: &[i32]| {
+            for (place, value) in bytes.chunks_exact_mut(VALUE_BYTES).zip(values) {
+                place.copy_from_slice(&value.to_le_bytes());
+            }
+            values.len() * VALUE_BYTES
+        };
+        let len = match self.chip.sample(reading, self.late) {
             Sample::Value(value) => {
                 self.attached.update(mcu, value, read_at)?;
-                value
+                put(&[value])
             }
             Sample::Error { code, value } => {
                 if let Some(code) = code {
                     self.attached.note_error(mcu, code)?;
                 }
-                value
+                put(&[value])
+            }
+            Sample::Channels { values, count, sum } => {
+                if let Some(sum) = sum {
+                    self.attached.update(mcu, sum, read_at)?;
+                }
+                put(&values[..count.min(CHANNELS_MAX)])
             }
         };
-        self.bulk.add(mcu, oid, &value.to_le_bytes());
+        self.bulk.add(mcu, oid, &bytes[..len]);
         Ok(())
     }
 
@@ -189,7 +219,8 @@ pub(super) fn query_status<C: ReadyChip>(mcu: &mut Mcu, oid: Oid) -> Result<(), 
     mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| {
         let now = mcu.now();
         let ready = sensor.is_pending() || !sensor.ready.read()?;
-        sensor.bulk.send_status(mcu, oid, (now, now), if ready { SAMPLE_BYTES } else { 0 });
+        let bytes = (sensor.chip.channels() * VALUE_BYTES) as u32;
+        sensor.bulk.send_status(mcu, oid, (now, now), if ready { bytes } else { 0 });
         Ok(())
     })
 }
@@ -197,6 +228,11 @@ pub(super) fn query_status<C: ReadyChip>(mcu: &mut Mcu, oid: Oid) -> Result<(), 
 /// Lets the samples be homed by.
 pub(super) fn attach<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, trigger_analog: Oid) -> Result<(), Shutdown> {
     mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| sensor.attached.attach(mcu, trigger_analog))
+}
+
+/// Lets the samples be probed by.
+pub(super) fn attach_probe<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, probe: Oid) -> Result<(), Shutdown> {
+    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| sensor.attached.attach_probe(mcu, probe))
 }
 
 /// Bytes that a chip on SPI sends while it is sent zeros; up to `N`.

@@ -6,7 +6,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Command, Feature, Object, Oid, command};
+use crate::mcu::{Command, Feature, Generation::Kalico, Generation::Master, Object, Oid, command, only, since};
 use crate::shutdown::{Shutdown, shutdowns};
 
 pub(super) const FEATURE: Feature = Feature {
@@ -17,6 +17,7 @@ pub(super) const FEATURE: Feature = Feature {
         SOS_FILTER_SET_STATE,
         SOS_FILTER_SET_OFFSET_SCALE,
         SOS_FILTER_SET_ACTIVE,
+        SOS_FILTER_SET_ACTIVE_OF_KALICO,
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -25,6 +26,10 @@ pub(super) const FEATURE: Feature = Feature {
 shutdowns! {
     /// A section beyond the `max_sections` of its filter.
     SECTION_INDEX = "Filter section index larger than max_sections";
+    /// Kalico: a sample for a filter that is not set active.
+    NOT_ACTIVE = "sos_filter not property initialized";
+    /// Kalico: a product does not fit 32 bits.
+    FILTER_OVERFLOW = "fixed_mul: overflow";
 }
 
 /// A result does not fit 32 bits.
@@ -69,6 +74,8 @@ pub(super) struct SosFilter {
     sections: Box<[Section]>,
     /// How many of them, from the first on, a value goes through.
     active: usize,
+    /// Whether it was set active since a section was changed.
+    is_ready: bool,
     coeff_frac_bits: u8,
     offset: i32,
     scale: i32,
@@ -82,6 +89,7 @@ impl SosFilter {
         SosFilter {
             sections: vec![Section::default(); usize::from(max_sections)].into(),
             active: 0,
+            is_ready: false,
             coeff_frac_bits: 0,
             offset: 0,
             scale: 0,
@@ -96,15 +104,37 @@ impl SosFilter {
             self.offset = sample.wrapping_neg();
         }
         let shifted = sample.checked_add(self.offset).ok_or(Overflow)?;
-        let scaled = fixed_mul(self.scale, shifted, self.scale_frac_bits)?;
+        self.filter(fixed_mul(self.scale, shifted, self.scale_frac_bits)?)
+    }
+
+    /// Filters a value that is scaled already.
+    fn filter(&mut self, scaled: i32) -> Result<i32, Overflow> {
         self.sections[..self.active]
             .iter_mut()
             .try_fold(scaled, |value, section| section.apply(value, self.coeff_frac_bits))
     }
 
+    /// Filters a value for Kalico, whose load cell probes scale it themselves.
+    ///
+    /// # Errors
+    ///
+    /// "sos_filter not property initialized", "fixed_mul: overflow".
+    pub(super) fn apply_scaled(&mut self, scaled: i32) -> Result<i32, Shutdown> {
+        if !self.is_ready {
+            return Err(Shutdown::by_host(NOT_ACTIVE, "a sample came before sos_filter_set_active"));
+        }
+        self.filter(scaled).map_err(|Overflow| {
+            Shutdown::because(
+                FILTER_OVERFLOW,
+                "a filtered value does not fit 32 bits: check the load cell's wires, calibration and filter settings",
+            )
+        })
+    }
+
     /// A section to be changed: the filter is off until `sos_filter_set_active`.
     fn section(&mut self, index: u8) -> Result<&mut Section, Shutdown> {
         self.active = 0;
+        self.is_ready = false;
         let max_sections = self.sections.len();
         self.sections.get_mut(usize::from(index)).ok_or_else(|| {
             Shutdown::by_host(SECTION_INDEX, format_args!("section {index} is set of a filter with {max_sections}"))
@@ -120,6 +150,7 @@ impl SosFilter {
             ));
         }
         self.active = usize::from(n_sections);
+        self.is_ready = true;
         self.coeff_frac_bits = coeff_frac_bits & FRAC_BITS_MASK;
         Ok(())
     }
@@ -134,7 +165,8 @@ impl Object for SosFilter {
 const CONFIG_SOS_FILTER: Command =
     command!("config_sos_filter oid=%c max_sections=%c", |mcu, oid: Oid, max_sections: u8| {
         mcu.assign(oid, SosFilter::new(max_sections))
-    });
+    })
+    .of(since(Master).and(Kalico));
 
 const SOS_FILTER_SET_SECTION: Command = command!(
     "sos_filter_set_section oid=%c section_idx=%c sos0=%i sos1=%i sos2=%i sos3=%i sos4=%i",
@@ -144,7 +176,8 @@ const SOS_FILTER_SET_SECTION: Command = command!(
             Ok(())
         })
     }
-);
+)
+.of(since(Master).and(Kalico));
 
 const SOS_FILTER_SET_STATE: Command = command!(
     "sos_filter_set_state oid=%c section_idx=%c state0=%i state1=%i",
@@ -154,7 +187,8 @@ const SOS_FILTER_SET_STATE: Command = command!(
             Ok(())
         })
     }
-);
+)
+.of(since(Master).and(Kalico));
 
 const SOS_FILTER_SET_OFFSET_SCALE: Command = command!(
     "sos_filter_set_offset_scale oid=%c offset=%i scale=%i scale_frac_bits=%c auto_offset=%c",
@@ -167,14 +201,26 @@ const SOS_FILTER_SET_OFFSET_SCALE: Command = command!(
             Ok(())
         })
     }
-);
+)
+.of(only(Master));
 
 const SOS_FILTER_SET_ACTIVE: Command = command!(
     "sos_filter_set_active oid=%c n_sections=%c coeff_frac_bits=%c",
     |mcu, oid: Oid, n_sections: u8, coeff_frac_bits: u8| {
         mcu.with::<SosFilter, _>(oid, |filter, _| filter.activate(n_sections, coeff_frac_bits))
     }
-);
+)
+.of(only(Master));
+
+const SOS_FILTER_SET_ACTIVE_OF_KALICO: Command = command!(
+    "sos_filter_set_active oid=%c n_sections=%c coeff_int_bits=%c",
+    |mcu, oid: Oid, n_sections: u8, coeff_int_bits: u8| {
+        // One bit of the 32 is the sign.
+        let coeff_frac_bits = 31u8.wrapping_sub(coeff_int_bits);
+        mcu.with::<SosFilter, _>(oid, |filter, _| filter.activate(n_sections, coeff_frac_bits))
+    }
+)
+.of(only(Kalico));
 
 #[cfg(test)]
 mod tests {

@@ -12,6 +12,7 @@ use crate::mcu::{
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
+use super::load_cell_probe::LoadCellProbe;
 use super::named;
 use super::sos_filter::SosFilter;
 use super::trsync::Trsync;
@@ -159,25 +160,43 @@ impl Object for TriggerAnalog {
 
 /// Where a sensor's samples go for homing, if the host attached something.
 #[derive(Clone, Copy, Default)]
-pub(super) struct Attached(Option<Oid>);
+pub(super) enum Attached {
+    #[default]
+    Nothing,
+    /// An analog trigger.
+    Trigger(Oid),
+    /// A load cell probe of Kalico.
+    Probe(Oid),
+}
 
 impl Attached {
     /// Attaches an analog trigger.
     pub(super) fn attach(&mut self, mcu: &mut Mcu, trigger_analog: Oid) -> Result<(), Shutdown> {
         mcu.with::<TriggerAnalog, _>(trigger_analog, |_, _| Ok(()))?;
-        self.0 = Some(trigger_analog);
+        *self = Attached::Trigger(trigger_analog);
+        Ok(())
+    }
+
+    /// Attaches a load cell probe.
+    pub(super) fn attach_probe(&mut self, mcu: &mut Mcu, probe: Oid) -> Result<(), Shutdown> {
+        mcu.with::<LoadCellProbe, _>(probe, |_, _| Ok(()))?;
+        *self = Attached::Probe(probe);
         Ok(())
     }
 
     /// A sample that was read at the instant `at`.
     pub(super) fn update(self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
-        let Some(oid) = self.0 else { return Ok(()) };
-        mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| trigger.update(mcu, sample, at))
+        match self {
+            Attached::Nothing => Ok(()),
+            Attached::Trigger(oid) => mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| trigger.update(mcu, sample, at)),
+            Attached::Probe(oid) => mcu.with::<LoadCellProbe, _>(oid, |probe, mcu| probe.update(mcu, sample, at)),
+        }
     }
 
-    /// An error of the sensor, by its own number.
+    /// An error of the sensor, by its own number. (A load cell probe is told of none: it notices that
+    /// samples are missing.)
     pub(super) fn note_error(self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
-        let Some(oid) = self.0 else { return Ok(()) };
+        let Attached::Trigger(oid) = self else { return Ok(()) };
         mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| trigger.fail(mcu, error.wrapping_add(SENSOR_SPECIFIC)))
     }
 }

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The subcommands.
 
+use std::collections::HashMap;
 use std::fs;
 use std::process::{Command, Stdio};
 
@@ -100,10 +101,19 @@ fn dict_prints_what_identify_serves() {
     assert_eq!(output(&["dict", "--board", "sim"]).stdout, served);
 }
 
-/// The firmware's own dictionary, that of Klipper 84104bbbd (August 2026) built as `linux` process.
-const KLIPPER_MASTER: &str = include_str!("../dictionaries/klipper-master.json");
+/// The dictionaries of the firmwares' own `linux` processes, by the dialect that is theirs, with the
+/// versions that they are of.
+const FIRMWARES: [(&str, &str); 5] = [
+    // Klipper v0.11.0, v0.12.0, v0.13.0 and 84104bbbd (August 2026).
+    ("v0.11", include_str!("../dictionaries/klipper-v0.11.json")),
+    ("v0.12", include_str!("../dictionaries/klipper-v0.12.json")),
+    ("v0.13", include_str!("../dictionaries/klipper-v0.13.json")),
+    ("master", include_str!("../dictionaries/klipper-master.json")),
+    // Kalico f2532ee34 (July 2026).
+    ("kalico", include_str!("../dictionaries/kalico.json")),
+];
 
-/// Texts of the firmware's shutdowns that can not come about here: its threads, allocator, timers and
+/// Texts of the firmwares' shutdowns that can not come about here: their threads, allocator, timers and
 /// limits are not ours. No host matches on them (klippy/extras/error_mcu.py).
 const NOT_OURS: [&str; 14] = [
     "Could not start DS18B20 reader thread",
@@ -122,32 +132,159 @@ const NOT_OURS: [&str; 14] = [
     "sentinel timer called",
 ];
 
+fn dictionary(dialect: &str) -> Value {
+    serde_json::from_slice(&output(&["dict", "--dialect", dialect]).stdout).unwrap()
+}
+
+fn keys(object: &Value) -> Vec<&str> {
+    let mut keys: Vec<&str> = object.as_object().unwrap().keys().map(String::as_str).collect();
+    keys.sort_unstable();
+    keys
+}
+
+fn strings(list: &Value) -> Vec<&str> {
+    list.as_array().unwrap().iter().filter_map(Value::as_str).collect()
+}
+
+/// Each name of an enumeration with its value: a range stands for names that count up.
+fn expanded(enumeration: &Value) -> HashMap<String, u64> {
+    let mut all = HashMap::new();
+    for (name, value) in enumeration.as_object().unwrap() {
+        let Some(range) = value.as_array() else {
+            all.insert(name.clone(), value.as_u64().unwrap());
+            continue;
+        };
+        let root = name.trim_end_matches(|c: char| c.is_ascii_digit());
+        let begin: u64 = name[root.len()..].parse().unwrap_or(0);
+        let (first, count) = (range[0].as_u64().unwrap(), range[1].as_u64().unwrap());
+        all.extend((0..count).map(|n| (format!("{root}{}", begin + n), first + n)));
+    }
+    all
+}
+
 #[test]
-fn the_dictionary_has_what_the_firmware_has() {
-    let ours: Value = serde_json::from_slice(&output(&["dict"]).stdout).unwrap();
-    let theirs: Value = serde_json::from_str(KLIPPER_MASTER).unwrap();
-    for kind in ["commands", "responses"] {
-        let mut formats: Vec<&str> = ours[kind].as_object().unwrap().keys().map(String::as_str).collect();
-        formats.sort_unstable();
-        let wanted: Vec<&str> = theirs[kind].as_array().unwrap().iter().filter_map(Value::as_str).collect();
-        assert_eq!(formats, wanted, "{kind}");
-    }
-    for (name, value) in theirs["config"].as_object().unwrap() {
-        assert_eq!(&ours["config"][name], value, "{name}");
-    }
-    assert!(ours["config"]["RECEIVE_WINDOW"].as_u64().is_some_and(|window| window >= 512));
-    for (enumeration, names) in theirs["enumerations"].as_object().unwrap() {
-        for (name, value) in names.as_object().unwrap() {
-            assert_eq!(&ours["enumerations"][enumeration][name], value, "{enumeration} {name}");
+fn each_dictionary_has_what_the_firmware_of_its_hosts_has() {
+    for (dialect, theirs) in FIRMWARES {
+        let ours = dictionary(dialect);
+        let theirs: Value = serde_json::from_str(theirs).unwrap();
+        for kind in ["commands", "responses"] {
+            assert_eq!(keys(&ours[kind]), strings(&theirs[kind]), "{dialect} {kind}");
+        }
+        let mut config = ours["config"].as_object().unwrap().clone();
+        // Ours alone: more than the 192 bytes that a host takes for granted.
+        assert!(config.remove("RECEIVE_WINDOW").is_some_and(|window| window.as_u64() >= Some(512)));
+        assert_eq!(Value::Object(config), theirs["config"], "{dialect}");
+        for (name, values) in theirs["enumerations"].as_object().unwrap() {
+            let ours = &ours["enumerations"][name];
+            if !["pin", "spi_bus", "i2c_bus"].contains(&name.as_str()) {
+                assert_eq!(ours, values, "{dialect} {name}");
+                continue;
+            }
+            // The machine's own: at least the firmware's names, with the firmware's numbers. v0.11 had other
+            // numbers for the lines of GPIO chips; to a host they are just numbers.
+            let ours = expanded(ours);
+            for (entry, value) in expanded(values) {
+                let found = ours.get(&entry).copied();
+                let other_number = dialect == "v0.11" && entry.starts_with("gpiochip");
+                assert_eq!(found, if other_number { found.or(Some(value)) } else { Some(value) }, "{dialect} {entry}");
+                assert!(found.is_some(), "{dialect} {entry}");
+            }
+        }
+        let mut known = keys(&theirs["enumerations"]);
+        known.push("static_string_id");
+        known.sort_unstable();
+        assert_eq!(keys(&ours["enumerations"]), known, "{dialect}");
+        let texts = keys(&ours["enumerations"]["static_string_id"]);
+        let missing: Vec<&str> =
+            strings(&theirs["static_strings"]).into_iter().filter(|text| !texts.contains(text)).collect();
+        let expected: Vec<&str> =
+            NOT_OURS.into_iter().filter(|text| strings(&theirs["static_strings"]).contains(text)).collect();
+        assert_eq!(missing, expected, "{dialect}");
+        let named = ["v0.11", "v0.12"].contains(&dialect);
+        for (key, is_there) in [("version", true), ("build_versions", true), ("app", !named), ("license", !named)] {
+            assert_eq!(ours[key].as_str().is_some_and(|text| !text.is_empty()), is_there, "{dialect} {key}");
         }
     }
-    let texts = ours["enumerations"]["static_string_id"].as_object().unwrap();
-    let missing: Vec<&str> = theirs["static_strings"].as_array().unwrap().iter().filter_map(Value::as_str).collect();
-    let missing: Vec<&str> = missing.into_iter().filter(|text| !texts.contains_key(*text)).collect();
-    assert_eq!(missing, NOT_OURS);
-    for key in ["version", "build_versions", "app", "license"] {
-        assert!(ours[key].as_str().is_some_and(|text| !text.is_empty()), "{key}");
+}
+
+#[test]
+fn ids_are_as_the_hosts_can_take_them() {
+    for dialect in ["v0.11", "v0.12", "v0.13", "master", "kalico", "union"] {
+        let ours = dictionary(dialect);
+        let ids = |kind: &str| -> HashMap<String, i64> {
+            let messages = ours[kind].as_object().unwrap();
+            messages
+                .iter()
+                .map(|(format, id)| (format.split(' ').next().unwrap().to_owned(), id.as_i64().unwrap()))
+                .collect()
+        };
+        let (commands, responses) = (ids("commands"), ids("responses"));
+        // A host finds a message by its name, so a name has one form, and an id one message.
+        assert_eq!(commands.len(), ours["commands"].as_object().unwrap().len(), "{dialect}");
+        assert_eq!(responses.len(), ours["responses"].as_object().unwrap().len(), "{dialect}");
+        let mut all: Vec<i64> = commands.values().chain(responses.values()).copied().collect();
+        all.sort_unstable();
+        let count = all.len();
+        all.dedup();
+        assert_eq!(all.len(), count, "{dialect}");
+        assert_eq!((commands["identify"], responses["identify_response"]), (1, 0));
+        // Of one byte: all of them for hosts that know no other, and what comes often or in full blocks.
+        let short = |id: &i64| (-32..96).contains(id);
+        if ["v0.11", "v0.12"].contains(&dialect) {
+            assert!(all.iter().all(short), "{dialect}");
+        }
+        assert!(responses.values().all(short), "{dialect}");
+        for often in ["queue_step", "set_next_step_dir", "queue_digital_out", "queue_pwm_out", "trsync_set_timeout"] {
+            assert!(short(&commands[often]), "{dialect} {often}");
+        }
+        // klippy's C code takes these for numbers that are not negative.
+        for plain in ["queue_step", "set_next_step_dir", "trsync_set_timeout", "trsync_trigger"] {
+            assert!(commands[plain] >= 0, "{dialect} {plain}");
+        }
+        assert!(responses["trsync_state"] >= 0, "{dialect}");
     }
+}
+
+/// A host of v0.13, of master or of Kalico finds in the union what it looks up; but for these, which the
+/// three have in different forms.
+#[test]
+fn the_union_is_what_three_generations_take() {
+    let union = dictionary("union");
+    let mut other_forms = Vec::new();
+    for (dialect, theirs) in FIRMWARES.iter().filter(|(dialect, _)| ["v0.13", "master", "kalico"].contains(dialect)) {
+        let theirs: Value = serde_json::from_str(theirs).unwrap();
+        for kind in ["commands", "responses"] {
+            let ours = keys(&union[kind]);
+            let missing = strings(&theirs[kind]).into_iter().filter(|format| !ours.contains(format));
+            other_forms.extend(missing.map(|format| format!("{dialect} {}", format.split(' ').next().unwrap())));
+        }
+    }
+    let expected = [
+        // Where it is the one of v0.13, master's host takes that as well (klippy/mcu.py, MCU_adc).
+        "master query_analog_in",
+        "master analog_in_state",
+        "kalico config_ads131m0x",
+        "kalico config_ds18b20",
+        "kalico sos_filter_set_active",
+    ];
+    assert_eq!(other_forms, expected);
+}
+
+#[test]
+fn a_dialect_that_is_none_is_explained() {
+    for command in ["run", "dict"] {
+        let refused = output(&[command, "--dialect", "v0.10"]);
+        assert!(!refused.status.success());
+        let text = String::from_utf8_lossy(&refused.stderr).into_owned();
+        assert!(text.contains("v0.11, v0.12, v0.13, master, kalico, union"), "{text}");
+    }
+}
+
+#[test]
+fn a_machine_serves_the_dictionary_of_its_dialect() {
+    let printed = output(&["dict", "--board", "sim", "--dialect", "v0.13"]);
+    let pinion = Pinion::simulated(&["--dialect", "v0.13"]);
+    assert_eq!(pinion.client().dictionary().json().unwrap(), printed.stdout);
 }
 
 #[test]

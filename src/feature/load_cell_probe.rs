@@ -1,0 +1,250 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Kalico's probing by load cells: a sensor's sample becomes grams, goes through a filter, and pulls a
+//! trsync when the force is as large as the host set. A sample out of the safe range, grams that
+//! overflow and a sensor that falls silent pull it as well, with a reason of their own. (Klipper's
+//! `trigger_analog` came out of it.)
+
+#![forbid(unsafe_code)]
+
+use crate::mcu::{
+    Command, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, only, response,
+};
+use crate::shutdown::{Shutdown, shutdowns};
+use crate::time::{Clock, Ticks};
+
+use super::sos_filter::SosFilter;
+use super::trsync::Trsync;
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "load_cell_probe",
+    commands: &[CONFIG_LOAD_CELL_PROBE, LOAD_CELL_PROBE_SET_RANGE, LOAD_CELL_PROBE_HOME, LOAD_CELL_PROBE_QUERY_STATE],
+    responses: &[State::FORM],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// A highest safe value below the lowest one.
+    RANGE_REVERSED = "Safety range reversed";
+    /// A trigger beyond 65535 g.
+    TRIGGER_TOO_LARGE = "trigger_grams too large";
+    /// Grams of a count that are no fraction.
+    GRAMS_PER_COUNT = "grams_per_count is invalid";
+}
+
+response! {
+    /// Whether the trigger came, and when.
+    "load_cell_probe_state oid=%c is_homing_trigger=%c trigger_ticks=%u" => only(Kalico);
+    pub(super) struct State { oid: Oid, is_homing_trigger: bool, trigger_ticks: u32 }
+}
+
+/// Fractional bits of grams, and of grams for each count.
+const GRAMS_FRAC_BITS: u32 = 15;
+const GRAMS_PER_COUNT_FRAC_BITS: u32 = 29;
+const TRIGGER_GRAMS_MAX: u32 = u16::MAX as u32;
+
+// Errors, which the host finds added to its `error_reason` in the trsync's reason.
+const SAFETY_RANGE: u8 = 0;
+const OVERFLOW: u8 = 1;
+const WATCHDOG: u8 = 2;
+
+/// What the host sets of the sensor.
+#[derive(Default)]
+struct Limits {
+    /// Beyond them a sample is an error.
+    counts_min: i32,
+    counts_max: i32,
+    tare_counts: i32,
+    /// With [`GRAMS_FRAC_BITS`].
+    trigger_grams: i32,
+    /// With [`GRAMS_PER_COUNT_FRAC_BITS`].
+    grams_per_count: i32,
+}
+
+impl Limits {
+    /// What a sample weighs; none if that does not fit.
+    fn grams(&self, counts: i32) -> Option<i32> {
+        let delta = counts.wrapping_sub(self.tare_counts);
+        let product = i64::from(delta) * i64::from(self.grams_per_count);
+        i32::try_from(product >> (GRAMS_PER_COUNT_FRAC_BITS - GRAMS_FRAC_BITS)).ok()
+    }
+}
+
+/// What homing goes on with.
+struct Homing {
+    trsync: Oid,
+    trigger_reason: u8,
+    error_reason: u8,
+    /// Whether every sample so far was of an instant before `begin`.
+    awaits: bool,
+    begin: Clock,
+    rest_ticks: Ticks,
+    /// Turns of the watchdog without a sample that are one too many.
+    watchdog_max: u8,
+    watchdog_count: u8,
+}
+
+pub(super) struct LoadCellProbe {
+    filter: Oid,
+    limits: Limits,
+    /// None while samples are not looked at.
+    homing: Option<Homing>,
+    /// When the trigger came.
+    triggered: Option<Clock>,
+}
+
+impl LoadCellProbe {
+    /// Takes in a sample of the sensor, read at the instant `at`.
+    pub(super) fn update(&mut self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
+        let Some(homing) = &mut self.homing else { return Ok(()) };
+        homing.watchdog_count = 0;
+        if homing.awaits && at < homing.begin {
+            return Ok(());
+        }
+        homing.awaits = false;
+        // The safe range does not include its ends.
+        if sample <= self.limits.counts_min || sample >= self.limits.counts_max {
+            return homing.fail(mcu, SAFETY_RANGE);
+        }
+        let Some(grams) = self.limits.grams(sample) else { return homing.fail(mcu, OVERFLOW) };
+        let filtered = mcu.with::<SosFilter, _>(self.filter, |filter, _| filter.apply_scaled(grams))?;
+        // The first one counts: samples go on to be looked at until the host ends that.
+        if filtered.wrapping_abs() < self.limits.trigger_grams || self.triggered.is_some() {
+            return Ok(());
+        }
+        self.triggered = Some(at);
+        homing.pull(mcu, homing.trigger_reason)
+    }
+}
+
+impl Homing {
+    fn fail(&self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
+        self.pull(mcu, self.error_reason.wrapping_add(error))
+    }
+
+    fn pull(&self, mcu: &mut Mcu, reason: u8) -> Result<(), Shutdown> {
+        let trsync = self.trsync;
+        mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, reason))
+    }
+}
+
+impl Object for LoadCellProbe {
+    fn kind(&self) -> &'static str {
+        "load cell probe"
+    }
+
+    /// Looks whether the sensor is silent.
+    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+        let Some(homing) = self.homing.as_mut().filter(|_| self.triggered.is_none()) else { return Ok(Next::Done) };
+        if homing.watchdog_count > homing.watchdog_max {
+            homing.fail(mcu, WATCHDOG)?;
+        }
+        homing.watchdog_count = homing.watchdog_count.wrapping_add(1);
+        Ok(Next::At(at + homing.rest_ticks))
+    }
+}
+
+const CONFIG_LOAD_CELL_PROBE: Command =
+    command!("config_load_cell_probe oid=%c sos_filter_oid=%c", |mcu, oid: Oid, sos_filter_oid: Oid| {
+        mcu.with::<SosFilter, _>(sos_filter_oid, |_, _| Ok(()))?;
+        let limits = Limits::default();
+        mcu.assign(oid, LoadCellProbe { filter: sos_filter_oid, limits, homing: None, triggered: None })
+    })
+    .of(only(Kalico));
+
+const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
+    "load_cell_probe_set_range oid=%c safety_counts_min=%i safety_counts_max=%i tare_counts=%i trigger_grams=%u grams_per_count=%i",
+    |mcu,
+     oid: Oid,
+     safety_counts_min: i32,
+     safety_counts_max: i32,
+     tare_counts: i32,
+     trigger_grams: u32,
+     grams_per_count: i32| {
+        let refuse = |reason, what: String| Err(Shutdown::by_host(reason, what));
+        if safety_counts_max < safety_counts_min {
+            return refuse(RANGE_REVERSED, format!("counts of {safety_counts_min} to {safety_counts_max} are to be safe"));
+        }
+        if trigger_grams > TRIGGER_GRAMS_MAX {
+            return refuse(TRIGGER_TOO_LARGE, format!("{trigger_grams} g are above {TRIGGER_GRAMS_MAX}"));
+        }
+        if !(0..1 << GRAMS_PER_COUNT_FRAC_BITS).contains(&grams_per_count) {
+            return refuse(GRAMS_PER_COUNT, format!("{grams_per_count} is no fraction of 2^29"));
+        }
+        mcu.with::<LoadCellProbe, _>(oid, |probe, _| {
+            probe.limits = Limits {
+                counts_min: safety_counts_min,
+                counts_max: safety_counts_max,
+                tare_counts,
+                trigger_grams: (trigger_grams << GRAMS_FRAC_BITS) as i32,
+                grams_per_count,
+            };
+            Ok(())
+        })
+    }
+)
+.of(only(Kalico));
+
+const LOAD_CELL_PROBE_HOME: Command = command!(
+    "load_cell_probe_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u rest_ticks=%u timeout=%u",
+    |mcu,
+     oid: Oid,
+     trsync_oid: Oid,
+     trigger_reason: u8,
+     error_reason: u8,
+     clock: WireClock,
+     rest_ticks: Ticks,
+     timeout: u32| {
+        let begin = mcu.instant(clock);
+        mcu.with::<LoadCellProbe, _>(oid, |probe, mcu| {
+            mcu.cancel(TimerId::new(oid, 0));
+            (probe.homing, probe.triggered) = (None, None);
+            // That is how the host ends it.
+            if error_reason == 0 {
+                return Ok(());
+            }
+            mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
+            probe.homing = Some(Homing {
+                trsync: trsync_oid,
+                trigger_reason,
+                error_reason,
+                awaits: true,
+                begin,
+                rest_ticks,
+                // The firmware keeps its low byte.
+                watchdog_max: timeout as u8,
+                watchdog_count: 0,
+            });
+            mcu.schedule(TimerId::new(oid, 0), begin)
+        })
+    }
+)
+.of(only(Kalico));
+
+const LOAD_CELL_PROBE_QUERY_STATE: Command = command!("load_cell_probe_query_state oid=%c", |mcu, oid: Oid| {
+    mcu.with::<LoadCellProbe, _>(oid, |probe, mcu| {
+        let trigger_ticks = probe.triggered.map_or(0, Clock::wire);
+        mcu.send(State { oid, is_homing_trigger: probe.triggered.is_some(), trigger_ticks });
+        Ok(())
+    })
+})
+.of(only(Kalico));
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn counts_become_grams_with_15_fractional_bits() {
+        let limits = Limits { tare_counts: 1000, grams_per_count: 1 << 28, ..Limits::default() };
+        assert_eq!(limits.grams(1000), Some(0));
+        assert_eq!(limits.grams(1001), Some(1 << 14), "half a gram");
+        assert_eq!(limits.grams(-1000), Some(-1000 << 15));
+        assert_eq!(limits.grams(1000 + 131_071), Some(131_071 << 14));
+        assert_eq!(limits.grams(1000 + 131_072), None);
+        assert_eq!(limits.grams(1000 - 131_072), Some(i32::MIN));
+        // Down, as a shift does.
+        let small = Limits { grams_per_count: 1, ..Limits::default() };
+        assert_eq!((small.grams(1), small.grams(-1), small.grams(1 << 14)), (Some(0), Some(-1), Some(1)));
+    }
+}
