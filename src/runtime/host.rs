@@ -79,8 +79,8 @@ impl Looker {
         let began = Instant::now();
         let (process, is_sure) = match find(Path::new(PROC), &self.device) {
             Ok(Search::Found(process)) => (process, true),
-            // There is no other that it could be.
-            Ok(Search::Hidden(mut processes)) if processes.len() == 1 => (processes.remove(0), false),
+            // Whichever of these it is, it runs from those sources.
+            Ok(Search::Hidden(mut processes)) if same_folder(&processes) => (processes.remove(0), false),
             Ok(Search::Hidden(processes)) => {
                 let pids: Vec<String> = processes.iter().map(|process| process.pid.to_string()).collect();
                 let pids = pids.join(", ");
@@ -106,6 +106,12 @@ impl Looker {
         self.last = Some((process, dialect));
         dialect
     }
+}
+
+/// Whether there are processes, all of which run from one folder.
+fn same_folder(processes: &[Process]) -> bool {
+    let folders: Vec<_> = processes.iter().map(|process| process.klippy_folder(Path::new(PROC))).collect();
+    folders.first().is_some_and(|first| first.is_some() && folders.iter().all(|folder| folder == first))
 }
 
 /// Says that the host gets the union, and what else may be done.

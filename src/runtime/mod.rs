@@ -20,6 +20,7 @@ use rtrb::RingBuffer;
 use crate::board::Board;
 use crate::feature::FEATURES;
 use crate::mcu::{Dialect, DialectName, Generation, Mcu};
+use crate::sys;
 use crate::time::{Monotonic, TimeSource};
 
 mod budget;
@@ -106,6 +107,10 @@ pub fn run(
         Some(_) => None,
         None => Some(HostFinder::start(pty.device(), wake.clone())?),
     };
+    // The thread that looks for the host alone may look into others from here on.
+    if let Err(error) = sys::give_up(sys::LOOK_INTO_OTHERS) {
+        warn!("capabilities can not be given up: {error}");
+    }
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);

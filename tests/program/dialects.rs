@@ -4,6 +4,7 @@
 
 use std::fs;
 use std::io::Write;
+use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
@@ -43,7 +44,8 @@ impl Checkout {
     }
 }
 
-/// A process called as klippy is. Each line that it is given has it open the pty or close it.
+/// A process called as klippy is. Each line that it is given has it open the pty or close it. Killed on
+/// drop.
 struct Host(Child);
 
 impl Host {
@@ -218,4 +220,90 @@ fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
     assert_eq!(none.status.code(), Some(1));
     let error = String::from_utf8_lossy(&none.stderr).into_owned();
     assert!(error.contains("/nonexistent") && error.contains("name a checkout of Klipper or Kalico"), "{error}");
+}
+
+/// A program's threads by their names, each with its effective capabilities.
+fn capabilities(pid: u32) -> Vec<(String, u64)> {
+    let threads = fs::read_dir(format!("/proc/{pid}/task")).unwrap().map(|thread| thread.unwrap().path());
+    let of = |thread: PathBuf| {
+        let status = fs::read_to_string(thread.join("status")).unwrap();
+        let field = |name: &str| {
+            let line = status.lines().find_map(|line| line.strip_prefix(name)).unwrap();
+            line.trim().to_owned()
+        };
+        (field("Name:"), u64::from_str_radix(&field("CapEff:"), 16).unwrap())
+    };
+    threads.map(of).collect()
+}
+
+#[test]
+fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_what_it_takes() {
+    if !nix::unistd::geteuid().is_root() {
+        let _ = writeln!(std::io::stderr(), "\nSKIPPED: a host of another user: only root can start one");
+        return;
+    }
+    /// CAP_DAC_READ_SEARCH and CAP_SYS_PTRACE.
+    const LOOKS: u64 = 1 << 2 | 1 << 19;
+    for may_look in [true, false] {
+        // A user's home that nobody else may enter, with a klippy.
+        let checkout = Checkout::of("v0.12");
+        for path in [checkout.0.path(), checkout.program().parent().unwrap()] {
+            std::os::unix::fs::chown(path, Some(12_345), Some(12_345)).unwrap();
+        }
+        fs::set_permissions(checkout.0.path(), fs::Permissions::from_mode(0o700)).unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
+        let program = folder.path().join("pinion");
+        fs::copy(env!("CARGO_BIN_EXE_pinion"), &program).unwrap();
+        let tty = folder.path().join("tty");
+        let log = folder.path().join("log");
+        let capabilities_given = if may_look { "+sys_ptrace,+dac_read_search" } else { "-all" };
+        let mut pinion = Command::new("setpriv")
+            .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
+            .arg(format!("--inh-caps={capabilities_given}"))
+            .arg(format!("--ambient-caps={capabilities_given}"))
+            .arg(&program)
+            .args(["run", "--board", "sim", "-m", "0666", "-I"])
+            .arg(&tty)
+            .stdout(Stdio::null())
+            .stderr(fs::File::create(&log).unwrap())
+            .spawn();
+        let pinion = Host(pinion.unwrap());
+        let until = |what: &str| {
+            let end = std::time::Instant::now() + crate::process::PATIENCE;
+            loop {
+                let log = fs::read_to_string(&log).unwrap();
+                if let Some(line) = log.lines().find(|line| line.contains(what)) {
+                    return line.to_owned();
+                }
+                assert!(std::time::Instant::now() < end, "waited in vain for {what}:\n{log}");
+                std::thread::sleep(std::time::Duration::from_millis(10));
+            }
+        };
+        until("serving on");
+        let script = format!("exec 3<>{}; echo open; read line", tty.display());
+        let host = Command::new("setpriv")
+            .args(["--reuid=12345", "--regid=12345", "--clear-groups", "/bin/sh", "-c", &script, "python3"])
+            .arg(checkout.program())
+            .stdin(Stdio::piped())
+            .stdout(Stdio::piped())
+            .spawn();
+        let mut host = Host(host.unwrap());
+        std::io::Read::read_exact(host.0.stdout.as_mut().unwrap(), &mut [0; 4]).unwrap();
+        // The test's own client is root's, and so is hidden, too; it is no klippy.
+        let client = pinion::host::Client::connect(&tty, crate::process::PATIENCE).unwrap();
+        let has_it = client.dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c");
+        assert_eq!(has_it, may_look);
+        if may_look {
+            let line = until("the host is klippy of ");
+            assert!(line.contains(&format!("process {}: dialect v0.12", host.0.id())), "{line}");
+            for (thread, effective) in capabilities(pinion.0.id()) {
+                let looks = if thread == "host" { LOOKS } else { 0 };
+                assert_eq!(effective & LOOKS, looks, "{thread}");
+            }
+        } else {
+            // Other klippys may run here, which are hidden as well.
+            until("CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them");
+        }
+    }
 }

@@ -54,6 +54,7 @@ pub(super) fn settle(realtime: bool) {
     ] {
         let _ = sys::ignore(ignored);
     }
+    let _ = sys::give_up(sys::LOOK_INTO_OTHERS);
     // When memory is short, the kernel now kills other processes first. Only root may ask for this.
     let _ = std::fs::write("/proc/self/oom_score_adj", "-1000");
     if realtime {
