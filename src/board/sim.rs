@@ -15,6 +15,7 @@ use super::{
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
+mod adxl345;
 mod config;
 mod i2c;
 mod loopback;
@@ -25,8 +26,10 @@ mod spi;
 mod thermistor;
 mod time;
 mod tmc5160;
+mod track;
 mod wire;
 
+pub use adxl345::Adxl345Config;
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
     SimConfig, SimError, SpiBusConfig,

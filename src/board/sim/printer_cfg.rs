@@ -53,7 +53,7 @@ const HOT_END: &str = "extruder";
 pub(super) struct Layout<'a> {
     pub(super) config: &'a SimConfig,
     /// Whether the axes `x`, `y` and `z` can be homed, as klippy's cartesian kinematics wants.
-    is_cartesian: bool,
+    pub(super) is_cartesian: bool,
     has_hot_end: bool,
 }
 
