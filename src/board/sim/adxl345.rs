@@ -21,6 +21,7 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
+use super::STEP_LATE_LIMIT;
 use super::config::{Bound, PinName, SimConfig, SimError, check, wrong};
 use super::part::{Part, Socket, Workshop};
 use super::physics::{Axis, Noise};
@@ -76,9 +77,9 @@ const Z_NOISE: f64 = 1.1 / 0.75;
 const NOISE_RATE_HZ: f64 = 100.0;
 const G_MM_PER_S2: f64 = 9806.65;
 
-/// How long after a step the chip feels it: a computer without real time makes a step late by
-/// milliseconds now and then, which is felt as if it had come when it was due.
-const DELAY_TICKS: u64 = CLOCK_FREQ as u64 / 50;
+/// How long after a step the chip feels it: as late as the computer may make one. So each is felt as if
+/// it had come when it was due.
+const DELAY_TICKS: u64 = STEP_LATE_LIMIT.0 as u64;
 
 /// The chip's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]

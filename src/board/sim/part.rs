@@ -16,7 +16,7 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{adxl345, loopback, tmc5160};
+use super::{adxl345, loopback, servo, spool, tmc5160};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -27,6 +27,10 @@ pub enum PartConfig {
     Adxl345(adxl345::Adxl345Config),
     /// Sends back what it is sent.
     Loopback(loopback::LoopbackConfig),
+    /// A servo.
+    Servo(servo::ServoConfig),
+    /// Filament and its sensors.
+    Spool(spool::SpoolConfig),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
 }
@@ -37,6 +41,8 @@ impl PartConfig {
         match self {
             PartConfig::Adxl345(config) => config,
             PartConfig::Loopback(config) => config,
+            PartConfig::Servo(config) => config,
+            PartConfig::Spool(config) => config,
             PartConfig::Tmc5160(config) => config,
         }
     }

@@ -47,7 +47,7 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
 }
 
 /// The name of klippy's section that has both the hot end's heater and its stepper.
-const HOT_END: &str = "extruder";
+pub(super) const HOT_END: &str = "extruder";
 
 /// Which of klippy's sections the axes belong to.
 pub(super) struct Layout<'a> {
