@@ -15,18 +15,23 @@ use super::{
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
+mod adxl345;
 mod config;
 mod i2c;
 mod loopback;
 mod part;
 mod physics;
 mod printer_cfg;
+mod servo;
 mod spi;
+mod spool;
 mod thermistor;
 mod time;
 mod tmc5160;
+mod track;
 mod wire;
 
+pub use adxl345::Adxl345Config;
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
     SimConfig, SimError, SpiBusConfig,
@@ -34,6 +39,8 @@ pub use config::{
 pub use loopback::LoopbackConfig;
 pub use part::PartConfig;
 pub use printer_cfg::printer_cfg;
+pub use servo::ServoConfig;
+pub use spool::SpoolConfig;
 pub use tmc5160::Tmc5160Config;
 
 use i2c::{I2cBus, I2cDevice};
@@ -45,6 +52,10 @@ use wire::{
     DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimLine, StepPin,
     TachometerPin, ThermistorPin, WiredPin,
 };
+
+/// A simulated motor follows at any pace: a computer without real time, as most that try the printer, is
+/// late by milliseconds now and then.
+const STEP_LATE_LIMIT: Ticks = Ticks::from_us(100_000);
 
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
@@ -214,10 +225,8 @@ impl Board for SimBoard {
         self.time.set_due(due);
     }
 
-    /// A simulated motor follows at any pace: a computer without real time, as most that try
-    /// the printer, is late by milliseconds now and then.
     fn step_late_limit(&self) -> Ticks {
-        Ticks::from_us(100_000)
+        STEP_LATE_LIMIT
     }
 
     fn i2c_buses(&self) -> Vec<Range> {

@@ -5,7 +5,11 @@
 //! Python with klippy's requirements (scripts/klippy-requirements.txt there). Without the
 //! former every test here is skipped, and says so.
 
+mod filament;
 mod klippy;
+mod print;
+mod rings;
+mod servo;
 
 use std::io::Write;
 use std::path::PathBuf;

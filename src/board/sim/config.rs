@@ -90,7 +90,7 @@ pub struct SimConfig {
     /// Outputs that switch something that needs no simulation.
     #[serde(default, rename = "output")]
     pub outputs: Vec<OutputConfig>,
-    /// Inputs that stay at one level: buttons, a filament sensor.
+    /// Inputs that stay at one level: buttons, a door.
     #[serde(default, rename = "input")]
     pub inputs: Vec<InputConfig>,
     /// The shape of the bed.
@@ -289,7 +289,7 @@ pub struct OutputConfig {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InputConfig {
-    /// Such as `filament`.
+    /// Such as `door`.
     pub name: String,
     /// The input.
     pub pin: PinName,
@@ -353,7 +353,7 @@ impl SimConfig {
         DEFAULT
     }
 
-    /// A cartesian printer with a hot end, a heated bed, a fan, a light and a filament sensor.
+    /// A cartesian printer with a hot end, a heated bed, a fan, a light, filament sensors and chips.
     pub fn default_printer() -> SimConfig {
         match SimConfig::parse(DEFAULT, "the built-in printer") {
             Ok(config) => config,

@@ -16,15 +16,21 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{loopback, tmc5160};
+use super::{adxl345, loopback, servo, spool, tmc5160};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum PartConfig {
+    /// An accelerometer.
+    Adxl345(adxl345::Adxl345Config),
     /// Sends back what it is sent.
     Loopback(loopback::LoopbackConfig),
+    /// A servo.
+    Servo(servo::ServoConfig),
+    /// Filament and its sensors.
+    Spool(spool::SpoolConfig),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
 }
@@ -33,7 +39,10 @@ impl PartConfig {
     /// What all of them can do.
     pub(super) fn part(&self) -> &dyn Part {
         match self {
+            PartConfig::Adxl345(config) => config,
             PartConfig::Loopback(config) => config,
+            PartConfig::Servo(config) => config,
+            PartConfig::Spool(config) => config,
             PartConfig::Tmc5160(config) => config,
         }
     }

@@ -12,10 +12,11 @@ use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
 
 use super::config::{AxisConfig, BedConfig, End, FanConfig, HeaterConfig};
 use super::thermistor::Thermistor;
+use super::track::Track;
 use crate::time::{CLOCK_FREQ, Clock};
 
 /// Seconds from `earlier` to `later`; none if they are the other way round.
-fn seconds(earlier: Clock, later: Clock) -> f64 {
+pub fn seconds(earlier: Clock, later: Clock) -> f64 {
     later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
 }
 
@@ -24,17 +25,17 @@ fn seconds(earlier: Clock, later: Clock) -> f64 {
 /// A sequence lock: the version is odd while the words change, and a reader takes them again if
 /// the version was odd or has changed. The writer never waits.
 #[derive(Debug)]
-struct Together<const N: usize> {
+pub struct Together<const N: usize> {
     version: AtomicU64,
     words: [AtomicU64; N],
 }
 
 impl<const N: usize> Together<N> {
-    fn new(words: [u64; N]) -> Together<N> {
+    pub fn new(words: [u64; N]) -> Together<N> {
         Together { version: AtomicU64::new(0), words: words.map(AtomicU64::new) }
     }
 
-    fn load(&self) -> [u64; N] {
+    pub fn load(&self) -> [u64; N] {
         loop {
             let before = self.version.load(Ordering::Acquire);
             let words = std::array::from_fn(|i| self.words[i].load(Ordering::Relaxed));
@@ -47,7 +48,7 @@ impl<const N: usize> Together<N> {
     }
 
     /// Only one thread may store.
-    fn store(&self, words: [u64; N]) {
+    pub fn store(&self, words: [u64; N]) {
         let version = self.version.load(Ordering::Relaxed);
         self.version.store(version | 1, Ordering::Relaxed);
         fence(Ordering::Release);
@@ -80,6 +81,7 @@ pub struct Axis {
     /// Steps that its driver was given: those with a low direction line less those with a high one.
     turned: AtomicI64,
     lost_steps: AtomicU64,
+    track: Track,
 }
 
 impl Axis {
@@ -106,6 +108,7 @@ impl Axis {
             position: AtomicI64::new(steps(config.start_mm)),
             turned: AtomicI64::new(0),
             lost_steps: AtomicU64::new(0),
+            track: Track::new(),
         }
     }
 
@@ -135,14 +138,14 @@ impl Axis {
     }
 
     /// An edge of the step line.
-    pub fn edge(&self, on: bool, _at: Clock) {
+    pub fn edge(&self, on: bool, at: Clock) {
         self.stepped.store(on, Ordering::Relaxed);
         if on || self.both_edges.load(Ordering::Relaxed) {
-            self.step();
+            self.step(at);
         }
     }
 
-    fn step(&self) {
+    fn step(&self, at: Clock) {
         let turn = if self.is_dir_high() { -1 } else { 1 };
         self.turned.store(self.turned_steps().wrapping_add(turn), Ordering::Relaxed);
         if !self.is_enabled() {
@@ -155,8 +158,16 @@ impl Axis {
                 let lost = self.lost_steps.load(Ordering::Relaxed);
                 self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
             }
-            _ => self.position.store(next, Ordering::Relaxed),
+            _ => {
+                self.position.store(next, Ordering::Relaxed);
+                self.track.push(at, next);
+            }
         }
+    }
+
+    /// Its last steps with their instants.
+    pub fn track(&self) -> &Track {
+        &self.track
     }
 
     pub fn position_steps(&self) -> i64 {
@@ -167,8 +178,13 @@ impl Axis {
         self.turned.load(Ordering::Relaxed)
     }
 
+    /// Where so many steps are.
+    pub fn mm(&self, steps: i64) -> f64 {
+        steps as f64 / self.steps_per_mm
+    }
+
     pub fn position_mm(&self) -> f64 {
-        self.position_steps() as f64 / self.steps_per_mm
+        self.mm(self.position_steps())
     }
 
     pub fn lost_steps(&self) -> u64 {

@@ -47,13 +47,13 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
 }
 
 /// The name of klippy's section that has both the hot end's heater and its stepper.
-const HOT_END: &str = "extruder";
+pub(super) const HOT_END: &str = "extruder";
 
 /// Which of klippy's sections the axes belong to.
 pub(super) struct Layout<'a> {
     pub(super) config: &'a SimConfig,
     /// Whether the axes `x`, `y` and `z` can be homed, as klippy's cartesian kinematics wants.
-    is_cartesian: bool,
+    pub(super) is_cartesian: bool,
     has_hot_end: bool,
 }
 

@@ -354,12 +354,15 @@ fn a_fan_with_an_enable_pin_needs_both() {
 
 #[test]
 fn lights_and_fixed_inputs() {
-    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut config = SimConfig::default_printer();
+    let pin = PinName { name: "door".into(), inverted: false };
+    config.inputs.push(InputConfig { name: "door".into(), pin, level: true });
+    let mut bench = Bench::new(config);
     let led = bench.output("led", false);
     assert!(!bench.probe.output("light").unwrap().on);
     led.write(true).unwrap();
     assert!(bench.probe.output("light").unwrap().on);
-    assert!(bench.input("filament_sensor").read().unwrap());
+    assert!(bench.input("door").read().unwrap());
 }
 
 impl Bench {
