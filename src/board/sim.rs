@@ -323,6 +323,8 @@ pub struct OutputView<'a> {
     pub name: &'a str,
     /// Whether it is on.
     pub on: bool,
+    /// How bright an eye takes it for, 0 to 1: half if it is switched on and off quickly.
+    pub brightness: f64,
 }
 
 impl SimProbe {
@@ -360,7 +362,9 @@ impl SimProbe {
 
     /// The lights, then the other outputs.
     pub fn outputs(&self) -> impl Iterator<Item = OutputView<'_>> {
-        self.world.lamps.iter().map(|lamp| OutputView { name: &lamp.name, on: lamp.is_on() })
+        let now = self.now();
+        let lamps = self.world.lamps.iter();
+        lamps.map(move |lamp| OutputView { name: &lamp.name, on: lamp.is_on(), brightness: lamp.brightness(now) })
     }
 
     /// What a person would see of the other parts at this instant: the part's name, and a line or a

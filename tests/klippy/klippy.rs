@@ -50,16 +50,40 @@ impl Printer {
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
+        Printer::start_as(false, checkout, describe, change)
+    }
+
+    /// The same, by `pinion sim --show`.
+    pub fn start_shown(
+        checkout: &Path,
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+    ) -> Printer {
+        Printer::start_as(true, checkout, describe, change)
+    }
+
+    fn start_as(
+        is_shown: bool,
+        checkout: &Path,
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+    ) -> Printer {
         // klippy knows a pseudo terminal by the beginning of its path.
         let folder = tempfile::Builder::new().prefix("klipper_host_").tempdir_in("/tmp").unwrap();
         let printed = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["sim", "--print-board"]).output().unwrap();
         let board = describe(String::from_utf8(printed.stdout).unwrap(), &folder.path().join("trace"));
-        fs::write(folder.path().join("board.toml"), board).unwrap();
-        let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-            .args(["run", "-r", "--board"])
-            .arg(format!("sim:{}", folder.path().join("board.toml").display()))
+        let file = folder.path().join("board.toml");
+        fs::write(&file, board).unwrap();
+        let mut pinion = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        if is_shown {
+            pinion.args(["sim", "-r", "--show"]).arg(&file);
+        } else {
+            pinion.args(["run", "-r", "--board"]).arg(format!("sim:{}", file.display()));
+        }
+        let pinion = pinion
             .arg("-I")
             .arg(folder.path().join("tty"))
+            .stdout(File::create(folder.path().join("shown")).unwrap())
             .stderr(File::create(folder.path().join("pinion.log")).unwrap())
             .spawn()
             .unwrap();
@@ -232,6 +256,26 @@ impl Printer {
         let log = |printer: &Printer| fs::read_to_string(printer.path("klippy.log")).unwrap();
         self.until(text, |printer| log(printer).matches(text).count() >= times);
         log(self)
+    }
+
+    /// What `--show` showed of a thing last: the rest of its line, or the lines below it.
+    pub fn shown(&self, name: &str) -> String {
+        let shown = fs::read_to_string(self.path("shown")).unwrap();
+        // A block that is still being written counts for nothing.
+        let whole = shown.rsplit_once('\n').map_or("", |(whole, _)| whole);
+        let head = format!("] {name}:");
+        let Some((_, last)) = whole.rsplit_once(&head) else { return String::new() };
+        let last = last.split("\n[").next().unwrap_or_default();
+        last.trim_start_matches([' ', '\n']).to_owned()
+    }
+
+    #[track_caller]
+    pub fn until_shown(&mut self, name: &str, is_it: impl Fn(&str) -> bool) {
+        let end = Instant::now() + START;
+        while !is_it(&self.shown(name)) {
+            assert!(Instant::now() < end, "{name} shows\n{}\n{}", self.shown(name), self.log());
+            thread::sleep(Duration::from_millis(50));
+        }
     }
 
     /// What the description's own file holds.

@@ -6,3 +6,4 @@ mod commands;
 mod life;
 mod one_order;
 mod process;
+mod show;

@@ -453,6 +453,25 @@ fn every_pin_has_its_own_name_and_number_and_stands_in_printer_cfg() {
 }
 
 #[test]
+fn a_light_that_is_switched_quickly_looks_dimmed() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let led = bench.output("led", false);
+    let brightness = |bench: &Bench| bench.probe.output("light").unwrap().brightness;
+    for _ in 0..100 {
+        led.write(true).unwrap();
+        bench.advance(0.0025);
+        led.write(false).unwrap();
+        bench.advance(0.0075);
+    }
+    assert!((0.23..0.27).contains(&brightness(&bench)), "{}", brightness(&bench));
+    bench.advance(0.2);
+    assert_eq!(brightness(&bench), 0.0);
+    led.write(true).unwrap();
+    bench.advance(0.2);
+    assert_eq!(brightness(&bench), 1.0);
+}
+
+#[test]
 fn the_data_output_of_a_bus_drives_lights_and_nothing_else() {
     let mut bench = Bench::new(SimConfig::default_printer());
     let pin = bench.pin("spidev3.0");

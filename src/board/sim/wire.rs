@@ -317,8 +317,8 @@ impl Wire for LampPin {
         self.0.name.clone()
     }
 
-    fn drive(&self, on: bool, _at: Clock) {
-        self.0.switch(on);
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.switch(on, at);
     }
 }
 
