@@ -211,7 +211,8 @@ struct Screen {
     /// The terminal's rows, and how many of them are the picture's; none before the first one.
     rows: usize,
     picture_rows: usize,
-    drawn: String,
+    /// What stands in the picture's rows.
+    drawn: Vec<String>,
 }
 
 impl Screen {
@@ -237,17 +238,16 @@ impl Screen {
             (self.rows, self.picture_rows) = (rows, picture_rows);
             self.drawn.clear();
         }
-        // Without wrapping, which would reach into the next line; the cursor goes back to the log.
-        let mut drawing = String::from("\x1b7\x1b[?7l");
         let top = rows.saturating_sub(picture_rows) + 1;
-        for n in 0..picture_rows {
-            let line = lines.get(n).map_or("", String::as_str);
-            drawing += &format!("\x1b[{};1H{line}\x1b[K", top + n);
-        }
-        drawing += "\x1b[?7h\x1b8";
-        if drawing != self.drawn {
-            out += &drawing;
-            self.drawn = drawing;
+        lines.resize(picture_rows, String::new());
+        let changed = |(n, line): (usize, &String)| {
+            (self.drawn.get(n) != Some(line)).then(|| format!("\x1b[{};1H{line}\x1b[K", top + n))
+        };
+        let changed: String = lines.iter().enumerate().filter_map(changed).collect();
+        if !changed.is_empty() {
+            // Without wrapping, which would reach into the next line; the cursor goes back to the log.
+            out += &format!("\x1b7\x1b[?7l{changed}\x1b[?7h\x1b8");
+            self.drawn = lines;
         }
         out
     }
