@@ -10,12 +10,14 @@
 use std::sync::Arc;
 
 use super::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
 mod adxl345;
+mod apa102;
+mod colour;
 mod config;
 mod i2c;
 mod loopback;
@@ -25,13 +27,17 @@ mod printer_cfg;
 mod servo;
 mod spi;
 mod spool;
+mod ssd1306;
 mod thermistor;
+mod thermocouple;
 mod time;
 mod tmc5160;
 mod track;
 mod wire;
+mod ws2812;
 
 pub use adxl345::Adxl345Config;
+pub use apa102::Apa102Config;
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
     SimConfig, SimError, SpiBusConfig,
@@ -41,12 +47,15 @@ pub use part::PartConfig;
 pub use printer_cfg::printer_cfg;
 pub use servo::ServoConfig;
 pub use spool::SpoolConfig;
+pub use ssd1306::Ssd1306Config;
+pub use thermocouple::{Converter, SensorFault, ThermocoupleConfig};
 pub use tmc5160::Tmc5160Config;
+pub use ws2812::Ws2812Config;
 
 use i2c::{I2cBus, I2cDevice};
 use part::{Sight, Workshop};
 use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
-use spi::{SpiBus, SpiDevice};
+use spi::{MosiPin, SpiBus, SpiDevice};
 use time::PrinterTime;
 use wire::{
     DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimLine, StepPin,
@@ -59,6 +68,8 @@ const STEP_LATE_LIMIT: Ticks = Ticks::from_us(100_000);
 
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
+/// Bytes that an SPI bus sends without a pause: as many as by the kernel's default `spidev.bufsiz`.
+const MESSAGE_MAX: usize = 4096;
 
 /// Everything that moves, heats, spins, shines, and can be seen.
 #[derive(Default)]
@@ -135,6 +146,9 @@ impl SimBoard {
         }
         for part in &config.parts {
             part.part().build(&mut workshop)?;
+        }
+        for bus in &config.spi_buses {
+            workshop.wire(Some(&bus.mosi_pin()), MosiPin { bus: bus.name.clone() });
         }
         let Workshop { time, world, pins, spi_buses, i2c_buses, .. } = workshop;
         Ok(SimBoard {
@@ -253,6 +267,14 @@ impl Board for SimBoard {
         Ok(OnWorker { bus: format!("spi{}", config.bus), device: Box::new(device) })
     }
 
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+        let wired = self.pin(pin, reason::NOT_OUTPUT)?;
+        let bus = self.spi_buses().into_iter().find(|bus| wired.wire.kind() == Kind::Mosi && bus.name == wired.name);
+        let bus = bus.ok_or_else(|| Shutdown::because(reason::NOT_OUTPUT, super::not_mosi(&wired.name)))?.first;
+        let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
+        Ok(Mosi { line, message_max: MESSAGE_MAX })
+    }
+
     /// Nothing is claimed for good: the parts are there whoever drives them.
     fn reset(&mut self) {}
 }
@@ -310,6 +332,8 @@ pub struct OutputView<'a> {
     pub name: &'a str,
     /// Whether it is on.
     pub on: bool,
+    /// How bright an eye takes it for, 0 to 1: half if it is switched on and off quickly.
+    pub brightness: f64,
 }
 
 impl SimProbe {
@@ -347,7 +371,9 @@ impl SimProbe {
 
     /// The lights, then the other outputs.
     pub fn outputs(&self) -> impl Iterator<Item = OutputView<'_>> {
-        self.world.lamps.iter().map(|lamp| OutputView { name: &lamp.name, on: lamp.is_on() })
+        let now = self.now();
+        let lamps = self.world.lamps.iter();
+        lamps.map(move |lamp| OutputView { name: &lamp.name, on: lamp.is_on(), brightness: lamp.brightness(now) })
     }
 
     /// What a person would see of the other parts at this instant: the part's name, and a line or a

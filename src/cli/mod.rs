@@ -15,6 +15,7 @@ pub mod latency;
 mod logging;
 pub mod pins;
 pub mod run;
+mod show;
 pub mod sim;
 
 /// A Klipper micro-controller made of a Linux process.

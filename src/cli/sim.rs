@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fs;
+use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -26,6 +27,7 @@ use crate::runtime::{self, Access, Options};
 use crate::time::Monotonic;
 
 use super::run::sim_config;
+use super::show::Show;
 use super::{failed, logging, print};
 
 /// Options of `pinion sim`.
@@ -43,6 +45,10 @@ pub(super) struct SimArgs {
     /// End after the demonstration, with status 0 if all that it showed was right
     #[arg(long)]
     demo: bool,
+    /// Instead of the demonstration show the printer as it changes, while a host drives it: a live
+    /// picture on a terminal, a line for each change elsewhere
+    #[arg(long, conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    show: bool,
     /// Draw the homing: position, endstop and step rate over time
     #[arg(long, value_name = "FILE.svg")]
     picture: Option<PathBuf>,
@@ -84,6 +90,9 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         margin: MarginLimits::default(),
         watchdog: None,
     };
+    if args.show {
+        return show_as_it_changes(args, board, probe, &options, clock);
+    }
     let right = Arc::new(AtomicBool::new(false));
     // Set once the program is asked to end: a demonstration that this interrupts has not failed.
     let ended = Arc::new(AtomicBool::new(false));
@@ -109,6 +118,31 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     }
 }
 
+/// Serves a host, and shows what it does to the printer.
+fn show_as_it_changes(
+    args: &SimArgs,
+    board: SimBoard,
+    probe: SimProbe,
+    options: &Options,
+    clock: Monotonic,
+) -> ExitCode {
+    let mut show = None;
+    let ready = || {
+        if io::stdout().is_terminal() {
+            tell_how_to_connect(args);
+        }
+        match Show::start(probe) {
+            Ok(started) => show = Some(started),
+            Err(error) => log::error!("the printer can not be shown: {error}"),
+        }
+    };
+    let ended = runtime::run(options, Box::new(board), clock, None, ready);
+    if let Some(show) = show {
+        show.end();
+    }
+    ended.map_or_else(failed, |()| ExitCode::SUCCESS)
+}
+
 /// Shows the printer at work, then ends the program or says how to use it with klippy.
 fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended: &AtomicBool) {
     match demonstration(args, plan, probe) {
@@ -123,6 +157,10 @@ fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended
         }
         return;
     }
+    tell_how_to_connect(args);
+}
+
+fn tell_how_to_connect(args: &SimArgs) {
     let file = args.file.as_ref().map_or(String::new(), |file| format!(" {}", file.display()));
     tell(&format!(
         "\nThe simulated printer goes on until Ctrl-C. To connect a Klipper host:\n  \

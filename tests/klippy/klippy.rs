@@ -79,6 +79,25 @@ impl Printer {
         })
     }
 
+    /// The same, by `pinion sim --show`.
+    pub fn start_shown(
+        checkout: &Path,
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+    ) -> Printer {
+        Printer::serve(checkout, describe, change, |folder| {
+            let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+                .args(["sim", "-r", "--show"])
+                .arg(folder.join("board.toml"))
+                .arg("-I")
+                .arg(folder.join("tty"))
+                .stdout(File::create(folder.join("shown")).unwrap())
+                .stderr(File::create(folder.join("pinion.log")).unwrap())
+                .spawn();
+            Server::Program(pinion.unwrap())
+        })
+    }
+
     /// A printer that can be looked at: it is simulated by this process, and has no log.
     pub fn start_here(
         checkout: &Path,
@@ -99,6 +118,7 @@ impl Printer {
                 cpu: None,
                 margin: MarginLimits::default(),
                 watchdog: None,
+                dialect: None,
             };
             let run = move || runtime::run(&options, Box::new(board), clock, None, || {}).unwrap();
             Server::Here(Some(thread::spawn(run)), probe, alone)
@@ -330,6 +350,26 @@ impl Printer {
         let log = |printer: &Printer| fs::read_to_string(printer.path("klippy.log")).unwrap();
         self.until(text, |printer| log(printer).matches(text).count() >= times);
         log(self)
+    }
+
+    /// What `--show` showed of a thing last: the rest of its line, or the lines below it.
+    pub fn shown(&self, name: &str) -> String {
+        let shown = fs::read_to_string(self.path("shown")).unwrap();
+        // A block that is still being written counts for nothing.
+        let whole = shown.rsplit_once('\n').map_or("", |(whole, _)| whole);
+        let head = format!("] {name}:");
+        let Some((_, last)) = whole.rsplit_once(&head) else { return String::new() };
+        let last = last.split("\n[").next().unwrap_or_default();
+        last.trim_start_matches([' ', '\n']).to_owned()
+    }
+
+    #[track_caller]
+    pub fn until_shown(&mut self, name: &str, is_it: impl Fn(&str) -> bool) {
+        let end = Instant::now() + START;
+        while !is_it(&self.shown(name)) {
+            assert!(Instant::now() < end, "{name} shows\n{}\n{}", self.shown(name), self.log());
+            thread::sleep(Duration::from_millis(50));
+        }
     }
 
     /// What the description's own file holds.

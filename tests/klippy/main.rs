@@ -10,6 +10,7 @@ mod klippy;
 mod print;
 mod rings;
 mod servo;
+mod shown;
 
 use std::io::Write;
 use std::path::PathBuf;

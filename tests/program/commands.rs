@@ -8,7 +8,7 @@ use std::process::{Command, Stdio};
 use nix::sys::signal::Signal;
 use serde_json::Value;
 
-use crate::process::{Pinion, folder_with, output};
+use crate::process::{Pinion, closed_pipe, folder_with, output};
 
 /// The built-in printer with a bed that is warm within seconds.
 fn quick_printer() -> String {
@@ -308,13 +308,6 @@ fn latency_judges_the_machine() {
         assert!(text.contains(part), "no \"{part}\" in:\n{text}");
     }
     assert!(fs::read_to_string(svg).unwrap().ends_with("</svg>\n"));
-}
-
-/// A stdout whose reader has closed it, as `head` does.
-fn closed_pipe() -> std::io::PipeWriter {
-    let (reader, writer) = std::io::pipe().unwrap();
-    drop(reader);
-    writer
 }
 
 #[test]

@@ -258,7 +258,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
         let tty = folder.path().join("tty");
         let log = folder.path().join("log");
         let capabilities_given = if may_look { "+sys_ptrace,+dac_read_search" } else { "-all" };
-        let mut pinion = Command::new("setpriv")
+        let pinion = Command::new("setpriv")
             .args(["--reuid=65534", "--regid=65534", "--clear-groups"])
             .arg(format!("--inh-caps={capabilities_given}"))
             .arg(format!("--ambient-caps={capabilities_given}"))

@@ -7,3 +7,4 @@ mod dialects;
 mod life;
 mod one_order;
 mod process;
+mod show;

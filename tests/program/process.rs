@@ -146,6 +146,13 @@ pub fn folder_with(name: &str, text: &str) -> (TempDir, PathBuf) {
     (folder, path)
 }
 
+/// A stdout whose reader has closed it, as `head` does.
+pub fn closed_pipe() -> std::io::PipeWriter {
+    let (reader, writer) = std::io::pipe().unwrap();
+    drop(reader);
+    writer
+}
+
 /// Runs `pinion` to its end.
 pub fn output(args: &[&str]) -> std::process::Output {
     Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).output().unwrap()

@@ -414,7 +414,10 @@ impl SimConfig {
         }
         unique("[[i2c_bus]]", self.i2c_buses.iter().map(|bus| &bus.name))?;
         self.bed.validate()?;
-        self.spi_buses.iter().try_for_each(|bus| bus.validate(self))?;
+        for bus in &self.spi_buses {
+            bus.validate(self)?;
+            pins.claim(&format!("spi_bus `{}`", bus.name), "name", Some(&bus.mosi_pin()))?;
+        }
         self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)?;
         self.parts.iter().try_for_each(|part| self.validate_part(part.part(), &mut pins))
     }
@@ -496,6 +499,11 @@ impl FanConfig {
 }
 
 impl SpiBusConfig {
+    /// Its data output as a pin, which has the bus's own name, as on a Linux board.
+    pub(super) fn mosi_pin(&self) -> PinName {
+        PinName { name: self.name.clone(), inverted: false }
+    }
+
     /// Checks the bus, and that the pins to trace are outputs of the printer.
     fn validate(&self, printer: &SimConfig) -> Result<(), SimError> {
         let whose = &format!("spi_bus `{}`", self.name);
@@ -571,7 +579,10 @@ impl SimConfig {
                     return wrong(whose, "address", &format!("{address} is taken on this bus"), "give another");
                 }
             }
-            None => {}
+            Some(Socket::Mosi { bus }) if !self.spi_buses.iter().any(|other| other.name == bus) => {
+                return wrong(whose, "bus", &format!("there is no `{bus}`"), "name an [[spi_bus]]");
+            }
+            Some(Socket::Mosi { .. }) | None => {}
         }
         part.validate(whose, self)
     }

@@ -13,10 +13,10 @@ use super::config::{PinName, SimConfig, SimError};
 use super::i2c::{I2cBus, I2cChip};
 use super::physics::{Axis, Bed, Heater};
 use super::printer_cfg::{Layout, Sections};
-use super::spi::{SelectLine, SpiBus, SpiChip};
+use super::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{adxl345, loopback, servo, spool, tmc5160};
+use super::{adxl345, apa102, loopback, servo, spool, ssd1306, thermocouple, tmc5160, ws2812};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -33,6 +33,14 @@ pub enum PartConfig {
     Spool(spool::SpoolConfig),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
+    /// A strip of lights on an SPI bus's data output.
+    Ws2812(ws2812::Ws2812Config),
+    /// A strip of lights on two lines.
+    Apa102(apa102::Apa102Config),
+    /// A display.
+    Ssd1306(ssd1306::Ssd1306Config),
+    /// A thermocouple's or a platinum resistor's converter.
+    Thermocouple(thermocouple::ThermocoupleConfig),
 }
 
 impl PartConfig {
@@ -44,6 +52,10 @@ impl PartConfig {
             PartConfig::Servo(config) => config,
             PartConfig::Spool(config) => config,
             PartConfig::Tmc5160(config) => config,
+            PartConfig::Ws2812(config) => config,
+            PartConfig::Apa102(config) => config,
+            PartConfig::Ssd1306(config) => config,
+            PartConfig::Thermocouple(config) => config,
         }
     }
 }
@@ -55,6 +67,8 @@ pub(super) enum Socket<'a> {
     Spi { bus: &'a str, select_pin: Option<&'a PinName> },
     /// A chip on an I2C bus.
     I2c { bus: &'a str, address: u8 },
+    /// Something on the data output of an SPI bus alone.
+    Mosi { bus: &'a str },
 }
 
 /// A part's description.
@@ -92,7 +106,8 @@ pub(super) trait Sight: Send + Sync {
     /// Whose sight it is.
     fn name(&self) -> &str;
 
-    /// What is to be seen at this instant: a line, or several for a picture.
+    /// What is to be seen at this instant: a line, or several for a picture. A colour is written as
+    /// `#rrggbb`, and `pinion sim --show` paints it where it can.
     fn look(&self, now: Clock) -> String;
 }
 
@@ -137,6 +152,14 @@ impl Workshop<'_> {
         }
         if let Some(bus) = self.spi_buses.iter_mut().find(|other| other.name == bus) {
             bus.solder(part.name(), select, Box::new(chip));
+        }
+    }
+
+    /// Puts a part on the data output of its SPI bus.
+    pub(super) fn listen(&mut self, part: &dyn Part, listener: impl MosiListener + 'static) {
+        let Some(Socket::Mosi { bus }) = part.socket() else { return };
+        if let Some(bus) = self.spi_buses.iter_mut().find(|other| other.name == bus) {
+            bus.listen(Box::new(listener));
         }
     }
 

@@ -378,20 +378,39 @@ impl Fan {
 #[derive(Debug)]
 pub struct Lamp {
     pub name: String,
-    on: AtomicBool,
+    /// Since when, how bright an eye took it for then, and whether it is on.
+    state: Together<3>,
 }
 
 impl Lamp {
+    /// What is switched faster than an eye follows looks dimmed: brightness follows the light with this
+    /// time constant.
+    const EYE_S: f64 = 0.1;
+    /// What was not switched for so long is on or off, and nothing between.
+    const STEADY_S: f64 = 0.15;
+
     pub fn new(name: &str) -> Lamp {
-        Lamp { name: name.to_owned(), on: AtomicBool::new(false) }
+        Lamp { name: name.to_owned(), state: Together::new([0; 3]) }
     }
 
     pub fn is_on(&self) -> bool {
-        self.on.load(Ordering::Relaxed)
+        let [.., on] = self.state.load();
+        on != 0
     }
 
-    pub fn switch(&self, on: bool) {
-        self.on.store(on, Ordering::Relaxed);
+    /// How bright an eye takes it for: 0 to 1.
+    pub fn brightness(&self, now: Clock) -> f64 {
+        let [since, brightness, on] = self.state.load();
+        let elapsed_s = seconds(Clock::from_ticks(since), now);
+        let end = if on == 0 { 0.0 } else { 1.0 };
+        if elapsed_s > Lamp::STEADY_S {
+            return end;
+        }
+        end + (f64::from_bits(brightness) - end) * (-elapsed_s / Lamp::EYE_S).exp()
+    }
+
+    pub fn switch(&self, on: bool, now: Clock) {
+        self.state.store([now.ticks(), self.brightness(now).to_bits(), on.into()]);
     }
 }
 

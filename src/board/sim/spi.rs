@@ -37,6 +37,30 @@ pub(super) trait SpiChip: Send {
     fn deselect(&mut self) {}
 }
 
+/// What hangs on a bus's data output (MOSI) alone: without clock and select line it hears whatever is
+/// sent on the bus.
+pub(super) trait MosiListener: Send {
+    /// The output sends these bytes, the highest bit first, and so many bits in a second. Then it stays
+    /// at the level of the last one.
+    fn hear(&mut self, rate_hz: u32, bytes: &[u8]);
+}
+
+/// The data output of a bus as a pin.
+pub(super) struct MosiPin {
+    /// The bus's name.
+    pub(super) bus: String,
+}
+
+impl Wire for MosiPin {
+    fn kind(&self) -> Kind {
+        Kind::Mosi
+    }
+
+    fn describe(&self) -> String {
+        format!("of {}", self.bus)
+    }
+}
+
 /// A line that selects a chip while it is low.
 pub(super) struct SelectLine {
     /// Whose it is.
@@ -114,6 +138,7 @@ impl Trace {
 /// What hangs on a bus.
 struct Wires {
     sockets: Vec<Socket>,
+    listeners: Vec<Box<dyn MosiListener>>,
     trace: Option<Trace>,
 }
 
@@ -141,7 +166,7 @@ impl SpiBus {
                 Some(Trace { path: path.clone(), file, pins: pins.collect() })
             }
         };
-        let wires = Mutex::new(Wires { sockets: Vec::new(), trace });
+        let wires = Mutex::new(Wires { sockets: Vec::new(), listeners: Vec::new(), trace });
         Ok(SpiBus { name: config.name.clone(), delay: Duration::from_micros(config.delay_us), wires })
     }
 
@@ -151,10 +176,15 @@ impl SpiBus {
         wires.sockets.push(Socket { name, select, chip });
     }
 
+    /// Puts something on the data output alone.
+    pub(super) fn listen(&mut self, listener: Box<dyn MosiListener>) {
+        self.wires.get_mut().unwrap_or_else(PoisonError::into_inner).listeners.push(listener);
+    }
+
     /// One transfer with whatever is selected.
     fn transfer(&self, mode: u8, rate_hz: u32, bytes: &mut [u8]) -> Result<(), BusError> {
         let mut wires = self.wires.lock().unwrap_or_else(PoisonError::into_inner);
-        let Wires { sockets, trace } = &mut *wires;
+        let Wires { sockets, listeners, trace } = &mut *wires;
         let is_selected = |socket: &Socket| socket.select.as_ref().is_none_or(|line| line.low.load(Ordering::Relaxed));
         let mut chips: Vec<&mut Socket> =
             sockets.iter_mut().filter(|socket| is_selected(socket) && socket.chip.knows_mode(mode)).collect();
@@ -172,6 +202,7 @@ impl SpiBus {
         }
         pace.wait(pace.bytes);
         chips.iter_mut().for_each(|socket| socket.chip.deselect());
+        listeners.iter_mut().for_each(|listener| listener.hear(rate_hz, &sent));
         trace.as_mut().map_or(Ok(()), |trace| trace.record(&chips, &sent, bytes, &levels))
     }
 }

@@ -442,15 +442,56 @@ fn every_pin_has_its_own_name_and_number_and_stands_in_printer_cfg() {
     let config = SimConfig::default_printer();
     let cfg = printer_cfg(&config, "/tmp/klipper_host_mcu");
     assert!(cfg.contains("serial: /tmp/klipper_host_mcu\n"));
+    // The data output of a bus is a pin, too.
+    let buses: Vec<String> = config.spi_buses.iter().map(|bus| bus.name.clone()).collect();
     let bench = Bench::new(config);
     let pins = bench.board.pins();
     for (number, range) in (0..).zip(&pins) {
         assert_eq!((range.first, range.count), (number, 1));
         let named = cfg.split([' ', '!', '\n']).any(|word| word == range.name);
-        assert!(named, "{} is not in\n{cfg}", range.name);
+        assert!(named || buses.contains(&range.name), "{} is not in\n{cfg}", range.name);
     }
     let names: HashSet<&String> = pins.iter().map(|range| &range.name).collect();
     assert_eq!(names.len(), pins.len());
+}
+
+#[test]
+fn a_light_that_is_switched_quickly_looks_dimmed() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let led = bench.output("led", false);
+    let brightness = |bench: &Bench| bench.probe.output("light").unwrap().brightness;
+    for _ in 0..100 {
+        led.write(true).unwrap();
+        bench.advance(0.0025);
+        led.write(false).unwrap();
+        bench.advance(0.0075);
+    }
+    assert!((0.23..0.27).contains(&brightness(&bench)), "{}", brightness(&bench));
+    bench.advance(0.2);
+    assert_eq!(brightness(&bench), 0.0);
+    led.write(true).unwrap();
+    bench.advance(0.2);
+    assert_eq!(brightness(&bench), 1.0);
+}
+
+#[test]
+fn the_data_output_of_a_bus_drives_lights_and_nothing_else() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let pin = bench.pin("spidev3.0");
+    let mut mosi = bench.board.mosi(pin, 3_200_000).unwrap();
+    assert_eq!(mosi.line.bus, "spi2");
+    // Green, as `neopixel` encodes it, and 50 us low.
+    let mut message = [[0xee; 4], [0x88; 4], [0x88; 4]].concat();
+    message.extend([0; 20]);
+    mosi.line.device.exchange(&mut message).unwrap();
+    let strip = bench.probe.sights().find(|(name, _)| *name == "strip").unwrap();
+    assert_eq!(strip.1, "#00ff00 off off off off off off off");
+    let error = bench.board.line(pin, Direction::Output { level: false, shutdown_level: false }).err().unwrap();
+    assert!(error.detail.contains("spidev3.0 of the simulated printer is an SPI bus's data output"), "{error}");
+    let led = bench.pin("led");
+    let error = bench.board.mosi(led, 3_200_000).err().unwrap();
+    assert_eq!(error.reason, reason::NOT_OUTPUT);
+    assert!(error.detail.starts_with("led can not drive LEDs"), "{error}");
 }
 
 #[test]

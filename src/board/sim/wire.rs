@@ -24,6 +24,8 @@ pub(super) enum Kind {
     Shared,
     /// Measure it.
     Analog,
+    /// Have an SPI controller send on it.
+    Mosi,
 }
 
 /// A part's end of a pin. "On" is what the description calls so: a high level, unless the pin is
@@ -86,6 +88,7 @@ impl WiredPin {
             Kind::Input => "an input",
             Kind::Shared => "a wire that several drive",
             Kind::Analog => "an ADC channel",
+            Kind::Mosi => "an SPI bus's data output",
         };
         let detail = format!(
             "pin {} of the simulated printer is {is} ({}), no {wanted}: choose another pin",
@@ -314,8 +317,8 @@ impl Wire for LampPin {
         self.0.name.clone()
     }
 
-    fn drive(&self, on: bool, _at: Clock) {
-        self.0.switch(on);
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.switch(on, at);
     }
 }
 

@@ -1,0 +1,460 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What a person would see of the simulated printer, as it changes (`pinion sim --show`).
+//!
+//! On a terminal it is a picture in the lowest rows, drawn anew in place; the log goes on scrolling in
+//! the rows above. Anywhere else it is a line, or a block for a picture, for each change.
+
+#![forbid(unsafe_code)]
+
+use std::fmt::Write as _;
+use std::io::{self, IsTerminal, Write};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
+use std::thread;
+use std::time::Duration;
+
+use crate::board::sim::SimProbe;
+use crate::sys;
+use crate::time::monotonic;
+
+/// Between two pictures on a terminal, and between two looks for changes.
+const DRAW_PERIOD: Duration = Duration::from_millis(100);
+const LOOK_PERIOD: Duration = Duration::from_millis(200);
+/// How long the program's end waits for a terminal that takes nothing.
+const FAREWELL: Duration = Duration::from_secs(1);
+/// Rows of a terminal that are left to the log.
+const LOG_ROWS: usize = 3;
+
+/// A thing that can be seen.
+struct Item {
+    /// What it is among: those of a kind share a line on a terminal.
+    kind: &'static str,
+    name: String,
+    /// What changes by small steps.
+    number: Option<Number>,
+    /// All that there is to say of it.
+    text: String,
+}
+
+/// A number that moves: it is told anew once it went by a step, or stands.
+#[derive(Clone, Copy, PartialEq)]
+struct Number {
+    value: f64,
+    step: f64,
+}
+
+/// All that can be seen now.
+fn look(probe: &SimProbe) -> Vec<Item> {
+    let mut items = Vec::new();
+    for axis in probe.axes() {
+        let lost = if axis.lost_steps > 0 { format!(" ({} steps lost)", axis.lost_steps) } else { String::new() };
+        // What is next to zero is not to be "-0.00".
+        let mm = (axis.position_mm * 100.0).round() / 100.0 + 0.0;
+        items.push(Item {
+            kind: "axes",
+            name: axis.name.into(),
+            number: Some(Number { value: axis.position_mm, step: 1.0 }),
+            text: format!("{mm:.2} mm{lost}"),
+        });
+    }
+    for heater in probe.heaters() {
+        items.push(Item {
+            kind: "heaters",
+            name: heater.name.into(),
+            number: Some(Number { value: heater.celsius, step: 1.0 }),
+            text: format!("{:.1} C", heater.celsius),
+        });
+    }
+    for fan in probe.fans() {
+        items.push(Item {
+            kind: "fans",
+            name: fan.name.into(),
+            number: Some(Number { value: fan.rpm, step: 100.0 }),
+            text: format!("{:.0} rpm", fan.rpm),
+        });
+    }
+    for output in probe.outputs() {
+        let text = match (output.brightness * 100.0).round() {
+            percent if percent < 1.0 => "off".into(),
+            percent if percent > 99.0 => "on".into(),
+            percent => format!("{percent} %"),
+        };
+        let number = Some(Number { value: output.brightness, step: 0.05 });
+        items.push(Item { kind: "outputs", name: output.name.into(), number, text });
+    }
+    for (name, text) in probe.sights() {
+        items.push(Item { kind: "", name: name.into(), number: None, text });
+    }
+    items
+}
+
+/// What was told of an item last, and what the look before this one saw.
+struct Told {
+    number: Option<Number>,
+    text: String,
+    seen: Option<Number>,
+}
+
+/// The lines that tell of what changed.
+#[derive(Default)]
+struct Changes {
+    /// In the order of the items.
+    told: Vec<Told>,
+}
+
+impl Changes {
+    fn lines(&mut self, items: Vec<Item>, at: Duration) -> String {
+        let mut lines = String::new();
+        for (n, item) in items.into_iter().enumerate() {
+            if let Some(told) = self.told.get_mut(n) {
+                let went = match (item.number, told.number) {
+                    (Some(now), Some(then)) => {
+                        let stands = item.number == told.seen;
+                        (now.value - then.value).abs() >= now.step || stands
+                    }
+                    _ => true,
+                };
+                told.seen = item.number;
+                if !went || item.text == told.text {
+                    continue;
+                }
+            }
+            let space = if item.text.contains('\n') { '\n' } else { ' ' };
+            // A String takes everything that is written to it.
+            let _ = writeln!(lines, "[{:12.6}] {}:{space}{}", at.as_secs_f64(), item.name, name_colours(&item.text));
+            let told = Told { number: item.number, text: item.text, seen: item.number };
+            match self.told.get_mut(n) {
+                Some(place) => *place = told,
+                None => self.told.push(told),
+            }
+        }
+        lines
+    }
+}
+
+/// Has `with` write each `#rrggbb` of a text.
+fn each_colour(text: &str, with: impl Fn(&mut String, &str, [u8; 3])) -> String {
+    let mut written = String::new();
+    let mut rest = text;
+    while let Some((before, after)) = rest.split_once('#') {
+        written += before;
+        let colour = after.get(..6).and_then(|digits| Some((digits, u32::from_str_radix(digits, 16).ok()?)));
+        rest = after;
+        match colour {
+            Some((digits, colour)) => {
+                let [_, red, green, blue] = colour.to_be_bytes();
+                with(&mut written, digits, [red, green, blue]);
+                rest = &after[6..];
+            }
+            None => written.push('#'),
+        }
+    }
+    written + rest
+}
+
+/// Adds to each colour the name that it goes by.
+fn name_colours(text: &str) -> String {
+    each_colour(text, |written, digits, parts| {
+        let strongest = parts.iter().copied().max().unwrap_or(0).max(1);
+        let strong = parts.map(|part| u16::from(part) * 2 > u16::from(strongest));
+        let name = match strong {
+            [true, true, true] => "white",
+            [true, true, false] => "yellow",
+            [true, false, true] => "magenta",
+            [true, false, false] => "red",
+            [false, true, true] => "cyan",
+            [false, true, false] => "green",
+            [false, false, true] => "blue",
+            [false, false, false] => "black",
+        };
+        *written += &format!("{name}#{digits}");
+    })
+}
+
+/// Paints each colour as a block.
+fn paint_colours(text: &str) -> String {
+    each_colour(text, |written, _, [red, green, blue]| {
+        *written += &format!("\x1b[48;2;{red};{green};{blue}m   \x1b[0m");
+    })
+}
+
+/// The picture's lines.
+fn picture(items: &[Item], paint: bool) -> Vec<String> {
+    let heads = items.iter().map(|item| if item.kind.is_empty() { &item.name } else { item.kind });
+    let width = heads.map(str::len).max().unwrap_or(0) + 2;
+    let mut lines: Vec<String> = Vec::new();
+    let mut kind = "";
+    for item in items {
+        let text = if paint { paint_colours(&item.text) } else { name_colours(&item.text) };
+        match item.kind {
+            "" if text.contains('\n') => {
+                lines.push(item.name.clone());
+                lines.extend(text.lines().map(str::to_owned));
+            }
+            "" => lines.push(format!("{:width$}{text}", item.name)),
+            // One more of the kind that the last line is of.
+            other if other == kind => {
+                if let Some(line) = lines.last_mut() {
+                    *line += &format!("   {} {text}", item.name);
+                }
+            }
+            other => lines.push(format!("{other:width$}{} {text}", item.name)),
+        }
+        kind = item.kind;
+    }
+    lines
+}
+
+/// The lowest rows of a terminal, kept out of the part that scrolls (DECSTBM of the VT100, as every
+/// terminal of today has it).
+#[derive(Default)]
+struct Screen {
+    /// The terminal's rows, and how many of them are the picture's; none before the first one.
+    rows: usize,
+    picture_rows: usize,
+    /// What stands in the picture's rows.
+    drawn: Vec<String>,
+}
+
+impl Screen {
+    /// What draws these lines on a terminal of so many rows, if that is not what it shows.
+    fn draw(&mut self, mut lines: Vec<String>, rows: usize) -> String {
+        let mut out = String::new();
+        let room = rows.saturating_sub(LOG_ROWS).max(1);
+        if lines.len() > room {
+            let left_out = lines.len() - room + 1;
+            lines.truncate(room - 1);
+            lines.push(format!("... and {left_out} lines more, on a terminal with more rows"));
+        }
+        // It does not shrink: what is above does not jump.
+        let picture_rows = if rows == self.rows { lines.len().max(self.picture_rows) } else { lines.len() };
+        if (rows, picture_rows) != (self.rows, self.picture_rows) {
+            if self.rows > 0 {
+                let top = self.rows.saturating_sub(self.picture_rows) + 1;
+                out += &format!("\x1b[r\x1b[{top};1H\x1b[J");
+            }
+            out += &"\n".repeat(picture_rows);
+            let log_rows = rows.saturating_sub(picture_rows).max(1);
+            out += &format!("\x1b[1;{log_rows}r\x1b[{log_rows};1H");
+            (self.rows, self.picture_rows) = (rows, picture_rows);
+            self.drawn.clear();
+        }
+        let top = rows.saturating_sub(picture_rows) + 1;
+        lines.resize(picture_rows, String::new());
+        let changed = |(n, line): (usize, &String)| {
+            (self.drawn.get(n) != Some(line)).then(|| format!("\x1b[{};1H{line}\x1b[K", top + n))
+        };
+        let changed: String = lines.iter().enumerate().filter_map(changed).collect();
+        if !changed.is_empty() {
+            // Without wrapping, which would reach into the next line; the cursor goes back to the log.
+            out += &format!("\x1b7\x1b[?7l{changed}\x1b[?7h\x1b8");
+            self.drawn = lines;
+        }
+        out
+    }
+
+    /// What gives the terminal back, with the last picture on it.
+    fn leave(&self) -> String {
+        if self.rows == 0 { String::new() } else { format!("\x1b[r\x1b[{};1H\n", self.rows) }
+    }
+}
+
+/// The thread that shows.
+pub(super) struct Show {
+    stop: Sender<()>,
+    done: Receiver<()>,
+}
+
+impl Show {
+    /// Shows the printer on stdout from now on.
+    pub(super) fn start(probe: SimProbe) -> io::Result<Show> {
+        let (stop, stopped) = mpsc::channel();
+        let (finished, done) = mpsc::channel();
+        thread::Builder::new().name("show".into()).spawn(move || {
+            if let Err(error) = show(&probe, &stopped) {
+                // A reader that went away, such as `head`, is no failure, and the printer serves on.
+                if error.kind() != io::ErrorKind::BrokenPipe {
+                    log::warn!("the printer is shown no longer: stdout can not be written: {error}");
+                }
+            }
+            let _ = finished.send(());
+        })?;
+        Ok(Show { stop, done })
+    }
+
+    /// Shows how it ended and gives the terminal back, unless nobody reads there.
+    pub(super) fn end(self) {
+        drop(self.stop);
+        let _ = self.done.recv_timeout(FAREWELL);
+    }
+}
+
+/// Whether stdout is a terminal that can be drawn on.
+fn is_screen() -> bool {
+    io::stdout().is_terminal() && std::env::var_os("TERM").is_none_or(|term| term != "dumb")
+}
+
+fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
+    let put = |text: &str| {
+        let mut out = io::stdout().lock();
+        out.write_all(text.as_bytes()).and_then(|()| out.flush())
+    };
+    let is_over = |period| stopped.recv_timeout(period) != Err(RecvTimeoutError::Timeout);
+    if !is_screen() {
+        let mut changes = Changes::default();
+        loop {
+            let is_over = is_over(LOOK_PERIOD);
+            let lines = changes.lines(look(probe), monotonic());
+            if !lines.is_empty() {
+                put(&lines)?;
+            }
+            if is_over {
+                return Ok(());
+            }
+        }
+    }
+    let paint = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
+    let mut screen = Screen::default();
+    loop {
+        let is_over = is_over(DRAW_PERIOD);
+        // A terminal that does not tell its size has the VT100's.
+        let rows = sys::terminal_rows(&io::stdout()).unwrap_or(24);
+        let mut drawing = screen.draw(picture(&look(probe), paint), rows);
+        if is_over {
+            drawing += &screen.leave();
+        }
+        if !drawing.is_empty() {
+            put(&drawing)?;
+        }
+        if is_over {
+            return Ok(());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn item(kind: &'static str, name: &str, value: Option<f64>, text: &str) -> Item {
+        let number = value.map(|value| Number { value, step: 1.0 });
+        Item { kind, name: name.into(), number, text: text.into() }
+    }
+
+    #[test]
+    fn what_changed_is_told_once_and_a_number_by_steps_and_as_it_stands() {
+        let mut changes = Changes::default();
+        let mut told = |mm: f64, strip: &str| {
+            let items = vec![item("axes", "x", Some(mm), &format!("{mm} mm")), item("", "strip", None, strip)];
+            changes.lines(items, Duration::from_millis(1500))
+        };
+        assert_eq!(told(0.0, "off"), "[    1.500000] x: 0 mm\n[    1.500000] strip: off\n");
+        assert_eq!(told(0.0, "off"), "");
+        assert_eq!(told(0.5, "off"), "", "it moves, but not by a step yet");
+        assert_eq!(
+            told(1.25, "#ff8000 #000010"),
+            "[    1.500000] x: 1.25 mm\n[    1.500000] strip: yellow#ff8000 blue#000010\n"
+        );
+        assert_eq!(told(1.5, "#ff8000 #000010"), "");
+        assert_eq!(told(1.5, "⠁\n⠂"), "[    1.500000] x: 1.5 mm\n[    1.500000] strip:\n⠁\n⠂\n");
+    }
+
+    #[test]
+    fn colours_are_found_in_any_text() {
+        assert_eq!(name_colours("#ff0000 off #00ff00+20"), "red#ff0000 off green#00ff00+20");
+        assert_eq!(name_colours("# #12 #é12345 #zzzzzz"), "# #12 #é12345 #zzzzzz");
+        assert_eq!(paint_colours("a #0a0b0c"), "a \x1b[48;2;10;11;12m   \x1b[0m");
+    }
+
+    #[test]
+    fn the_picture_has_a_line_for_each_kind() {
+        let items = [
+            item("axes", "x", None, "1 mm"),
+            item("axes", "y", None, "2 mm"),
+            item("fans", "fan", None, "0 rpm"),
+            item("", "strip", None, "off"),
+            item("", "display", None, "⠁\n⠂"),
+        ];
+        let lines = ["axes     x 1 mm   y 2 mm", "fans     fan 0 rpm", "strip    off", "display", "⠁", "⠂"];
+        assert_eq!(picture(&items, true), lines);
+    }
+
+    /// What a terminal of 10 rows shows, as far as the sequences go that are used here.
+    #[derive(Default)]
+    struct Terminal {
+        screen: [String; 10],
+        row: usize,
+        saved: usize,
+        /// The last row that scrolls, counted from 1.
+        bottom: usize,
+    }
+
+    impl Terminal {
+        fn take(&mut self, mut text: &str) {
+            while let Some(first) = text.chars().next() {
+                if let Some(rest) = text.strip_prefix("\x1b[") {
+                    let end = rest.find(|c: char| c.is_ascii_alphabetic()).unwrap();
+                    let numbers: Vec<usize> = rest[..end].split(';').filter_map(|n| n.parse().ok()).collect();
+                    match (&rest[end..=end], &numbers[..]) {
+                        ("H", [row, 1]) => self.row = row - 1,
+                        ("r", [1, bottom]) => (self.bottom, self.row) = (*bottom, 0),
+                        ("r", []) => (self.bottom, self.row) = (10, 0),
+                        ("J", []) => self.screen[self.row..].fill(String::new()),
+                        ("K" | "l" | "h", _) => {}
+                        other => panic!("{other:?}"),
+                    }
+                    text = &rest[end + 1..];
+                    continue;
+                }
+                text = &text[first.len_utf8()..];
+                match first {
+                    '\x1b' if text.starts_with('7') => self.saved = self.row,
+                    '\x1b' if text.starts_with('8') => self.row = self.saved,
+                    '\n' if self.row + 1 == self.bottom => self.screen[..self.bottom].rotate_left(1),
+                    '\n' if self.row < 9 => self.row += 1,
+                    '\n' => {}
+                    _ => {
+                        let line = text.find(['\x1b', '\n']).unwrap_or(text.len());
+                        self.screen[self.row] = format!("{first}{}", &text[..line]);
+                        text = &text[line..];
+                        continue;
+                    }
+                }
+                if first == '\x1b' {
+                    text = &text[1..];
+                }
+                if first == '\n' && self.row + 1 == self.bottom {
+                    self.screen[self.row].clear();
+                }
+            }
+        }
+
+        fn rows(&self) -> Vec<&str> {
+            self.screen.iter().map(String::as_str).collect()
+        }
+    }
+
+    #[test]
+    fn the_picture_stays_at_the_bottom_and_the_log_scrolls_above_it() {
+        let mut terminal = Terminal { bottom: 10, ..Terminal::default() };
+        let mut screen = Screen::default();
+        let lines = |lines: &[&str]| lines.iter().map(|line| (*line).to_owned()).collect::<Vec<_>>();
+        terminal.take("shell\n");
+        terminal.take(&screen.draw(lines(&["a", "b"]), 10));
+        assert_eq!(terminal.rows()[8..], ["a", "b"]);
+        for n in 0..20 {
+            terminal.take(&format!("log {n}\n"));
+        }
+        assert_eq!(terminal.rows()[5..], ["log 18", "log 19", "", "a", "b"]);
+        assert_eq!(screen.draw(lines(&["a", "b"]), 10), "", "nothing changed");
+        terminal.take(&screen.draw(lines(&["a", "c", "d"]), 10));
+        assert_eq!(terminal.rows()[7..], ["a", "c", "d"]);
+        terminal.take("log\n");
+        assert_eq!(terminal.rows()[5..], ["log", "", "a", "c", "d"]);
+        // Too much for this terminal: three rows are the log's.
+        let many = screen.draw((0..30).map(|n| n.to_string()).collect(), 10);
+        terminal.take(&many);
+        assert_eq!(terminal.rows()[8..], ["5", "... and 24 lines more, on a terminal with more rows"]);
+        terminal.take(&screen.leave());
+        assert_eq!((terminal.bottom, terminal.row), (10, 9), "all of it scrolls again, and below the picture");
+    }
+}

@@ -1,0 +1,165 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What a person sees of the simulated printer while a real klippy drives it: lights, the display,
+//! temperatures.
+
+use std::path::Path;
+use std::process::Command;
+
+use crate::checkout;
+use crate::klippy::{Printer, python};
+
+/// The pixels of a display's picture in Braille, by row.
+fn pixels(picture: &str) -> Vec<Vec<bool>> {
+    // The dots' numbers by column and row (Unicode, "Braille Patterns").
+    const DOTS: [[u32; 4]; 2] = [[0, 1, 2, 6], [3, 4, 5, 7]];
+    let row = |y: usize| -> Option<Vec<bool>> {
+        let line = picture.lines().nth(y / 4)?.chars();
+        // A display that is dark has no picture.
+        let line: Vec<u32> = line.map(|c| (c as u32).checked_sub(0x2800)).collect::<Option<_>>()?;
+        Some((0..128).map(|x| line[x / 2] >> DOTS[x % 2][y % 4] & 1 != 0).collect())
+    };
+    (0..64).map_while(row).collect()
+}
+
+/// klippy's own font: 16 rows for each of its characters.
+fn font(checkout: &Path) -> Vec<Vec<u8>> {
+    let script = "import font8x14\nfor glyph in font8x14.VGA_FONT: print(glyph.hex())";
+    let printed = Command::new(python())
+        .args(["-c", script])
+        .env("PYTHONPATH", checkout.join("klippy/extras/display"))
+        .env("PYTHONDONTWRITEBYTECODE", "1")
+        .output()
+        .unwrap();
+    let hex = String::from_utf8(printed.stdout).unwrap();
+    let byte = |line: &str, n: usize| u8::from_str_radix(&line[2 * n..2 * n + 2], 16).unwrap();
+    hex.lines().map(|line| (0..16).map(|n| byte(line, n)).collect()).collect()
+}
+
+/// The text of a display, by rows of 16 characters; what is no printable character is `?`.
+fn text(picture: &str, font: &[Vec<u8>]) -> Vec<String> {
+    let pixels = pixels(picture);
+    let glyph = |row: usize, column: usize| -> Vec<u8> {
+        let byte = |y: usize| (0..8).fold(0, |byte, x| byte << 1 | u8::from(pixels[16 * row + y][8 * column + x]));
+        (0..16).map(byte).collect()
+    };
+    let character = |row, column| {
+        let glyph = glyph(row, column);
+        (b' '..b'\x7f').find(|c| font[usize::from(*c)] == glyph).map_or('?', char::from)
+    };
+    (0..pixels.len() / 16).map(|row| (0..16).map(|column| character(row, column)).collect()).collect()
+}
+
+fn last_row(picture: &str, font: &[Vec<u8>]) -> String {
+    text(picture, font).pop().unwrap_or_default().trim_end().to_owned()
+}
+
+#[test]
+fn lights_have_the_colours_that_klippy_gives_them() {
+    let Some(checkout) = checkout("lights_have_the_colours_that_klippy_gives_them") else { return };
+    let mut printer = Printer::start_shown(
+        &checkout,
+        |board, _| board,
+        |config| {
+            let template = "[display_template glow]\nparam_red: 0.2\ntext: {param_red}, 0.0, {printer.toolhead.max_velocity / 600}";
+            format!("{config}\n{template}, 0.0\n")
+        },
+    );
+    printer.until_state("ready");
+    printer.until_shown("strip", |strip| strip == "off off off off off off off off");
+    printer.gcode("SET_LED LED=strip RED=1 GREEN=0.5 BLUE=0 INDEX=2");
+    printer.until_shown("strip", |strip| strip == "off yellow#ff8000 off off off off off off");
+    printer.gcode("SET_LED LED=strip BLUE=1 INDEX=8 TRANSMIT=0\nSET_LED LED=strip GREEN=0.01 INDEX=1");
+    printer.until_shown("strip", |strip| strip == "green#000300 yellow#ff8000 off off off off off blue#0000ff");
+    printer.gcode("SET_LED LED=strip RED=1 GREEN=1 BLUE=1");
+    printer.until_shown("strip", |strip| strip == ["white#ffffff"; 8].join(" "));
+    printer.gcode("SET_LED_TEMPLATE LED=strip TEMPLATE=glow param_red=0.4 INDEX=3");
+    printer.until_shown("strip", |strip| strip.split(' ').nth(2) == Some("magenta#660080"));
+    // Over lines that klippy drives bit by bit, in messages of 20 bytes.
+    printer.gcode("SET_LED LED=dots RED=0.2 INDEX=1\nSET_LED LED=dots BLUE=1 INDEX=4");
+    printer.until_shown("dots", |dots| dots == "red#330000 off off blue#0000ff");
+    printer.gcode("SET_LED LED=light WHITE=0.5\nG4 P500");
+    printer.until_shown("light", |light| {
+        light.strip_suffix(" %").is_some_and(|percent| (40..60).contains(&percent.parse().unwrap_or(0)))
+    });
+    printer.gcode("SET_LED LED=light WHITE=1");
+    printer.until_shown("light", |light| light == "on");
+}
+
+#[test]
+fn the_display_shows_what_klippy_writes() {
+    let Some(checkout) = checkout("the_display_shows_what_klippy_writes") else { return };
+    let font = font(&checkout);
+    let mut printer = Printer::start_shown(
+        &checkout,
+        |board, _| board,
+        |config| {
+            let data = "[display_data mine first]\nposition: 1, 3\ntext: { \"%.1f\" % printer.toolhead.position.x }";
+            format!("{config}\n{data}\n")
+        },
+    );
+    printer.until_state("ready");
+    printer.until_shown("display", |picture| last_row(picture, &font) == "Ready");
+    // Icons, which are no text, and beside them what they stand for.
+    let status = ["?? 25?    ??  0%", "?? 25?    ??100%", "?????????? 00:00", "Ready           "];
+    printer.until_shown("display", |picture| text(picture, &font) == status);
+    printer.gcode("M117 Pinion: 42 <ok>");
+    printer.until_shown("display", |picture| last_row(picture, &font) == "Pinion: 42 <ok>");
+    printer.gcode("M117\nG28\nG1 X37.5 Y20 Z5 F6000\nM400\nSET_DISPLAY_GROUP GROUP=mine");
+    printer.until_shown("display", |picture| {
+        text(picture, &font).iter().map(|row| row.trim_end()).eq(["", "   37.5", "", ""])
+    });
+    // And the axes stand where they are shown.
+    printer.until_shown("x", |x| x == "37.50 mm");
+    printer.gcode("M117 there\nSET_DISPLAY_GROUP GROUP=_default_16x4");
+    printer.until_shown("display", |picture| last_row(picture, &font) == "there");
+    // A restart resets nothing of the display, and klippy writes all of it anew.
+    printer.restart("FIRMWARE_RESTART");
+    printer.gcode("M117 again");
+    printer.until_shown("display", |picture| last_row(picture, &font) == "again");
+}
+
+/// A converter in the bed, beside those that are there.
+fn with_converter(board: String, chip: &str, fault: &str) -> String {
+    let part = format!("[[part]]\nkind = \"thermocouple\"\nname = \"{chip}\"\nchip = \"{chip}\"\n{fault}");
+    format!("{board}\n{part}bus = \"spidev1.0\"\nselect_pin = \"{chip}_cs\"\nheater = \"heater_bed\"\n")
+}
+
+#[test]
+fn converters_read_what_the_heater_has() {
+    const CHIPS: [&str; 4] = ["max31855", "max6675", "max31856", "max31865"];
+    let Some(checkout) = checkout("converters_read_what_the_heater_has") else { return };
+    let all = |board: String, _: &Path| CHIPS.iter().fold(board, |board, chip| with_converter(board, chip, ""));
+    let mut printer = Printer::start_shown(&checkout, all, |config| config);
+    printer.until_state("ready");
+    printer.gcode("M190 S45\nG4 P3000");
+    let bed: f64 = printer.shown("heater_bed").trim_end_matches(" C").parse().unwrap();
+    assert!((44.0..46.0).contains(&bed), "{bed}");
+    for chip in CHIPS {
+        let read = printer.object(&format!("temperature_sensor {chip}"))["temperature"].as_f64().unwrap();
+        // What is shown goes by degrees, and klippy smoothes.
+        assert!((read - bed).abs() < 1.5, "{chip}: {read} of {bed}");
+    }
+    // The hot end, cold.
+    let nozzle = printer.object("temperature_sensor nozzle")["temperature"].as_f64().unwrap();
+    assert_eq!(nozzle, 25.0);
+}
+
+#[test]
+fn a_broken_sensor_stops_the_machine_at_its_third_bad_value() {
+    let Some(checkout) = checkout("a_broken_sensor_stops_the_machine_at_its_third_bad_value") else { return };
+    for (chip, fault, told) in [
+        ("max31855", "open", "MAX31855 : Open Circuit"),
+        ("max31855", "short_to_supply", "MAX31855 : Short to Vcc"),
+        ("max6675", "open", "Max6675 : Thermocouple Open Fault"),
+        ("max31856", "short_to_supply", "Max31856: Over/Under Voltage Fault"),
+        ("max31865", "open", "Max31865 RTD input is disconnected"),
+    ] {
+        let broken = |board: String, _: &Path| with_converter(board, chip, &format!("fault = \"{fault}\"\n"));
+        let mut printer = Printer::start_shown(&checkout, broken, |config| config);
+        printer.until_state("shutdown");
+        let log = printer.host_log("Thermocouple reader fault", 1);
+        let times = log.matches(told).count();
+        assert_eq!(times, 3, "{told}: {log}");
+        printer.until_logged("reports fault bits");
+    }
+}

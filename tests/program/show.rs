@@ -1,0 +1,140 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim --show`: what a person sees while a host drives the printer.
+
+use std::fs::File;
+use std::io::Read;
+use std::process::Stdio;
+use std::sync::{Arc, Mutex};
+use std::thread;
+
+use nix::pty::{Winsize, openpty};
+use nix::sys::signal::Signal;
+use pinion::host::Client;
+
+use crate::process::{Pinion, closed_pipe, exists, output};
+
+const STRIP: &[&str] = &[
+    "allocate_oids count=2",
+    "config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0",
+    "config_neopixel oid=1 pin=spidev3.0 data_size=24 bit_max_ticks=200 reset_min_ticks=2500",
+    "finalize_config crc=1",
+];
+
+/// Switches the light on, and the strip's first two lights to red and a dark blue.
+fn drive(pinion: &Pinion) -> Client {
+    let mut client = pinion.client();
+    for line in STRIP {
+        client.send_line(line).unwrap();
+    }
+    assert!(client.status().unwrap().is_config);
+    client.send_line("update_digital_out oid=0 value=1").unwrap();
+    client.send_line("neopixel_update oid=1 pos=0 data=00ff00000020").unwrap();
+    client.send_line("neopixel_send oid=1").unwrap();
+    client
+}
+
+#[test]
+fn each_change_is_a_line() {
+    let mut pinion = Pinion::start(&["sim", "--show"]);
+    pinion.until("all things once", || pinion.out().contains("] dots: "));
+    let first = pinion.out();
+    for line in ["x: 60.00 mm", "extruder: 25.0 C", "fan: 0 rpm", "light: off", "display: dark"] {
+        assert_eq!(first.lines().filter(|shown| shown.ends_with(&format!("] {line}"))).count(), 1, "{line}\n{first}");
+    }
+    let mut client = drive(&pinion);
+    pinion.until("the light", || pinion.out().contains("] light: on\n"));
+    let strip = "] strip: red#ff0000 blue#000020 off off off off off off\n";
+    pinion.until("the strip", || pinion.out().contains(strip));
+    assert!(!client.status().unwrap().is_shutdown);
+    assert_eq!(pinion.out().matches("] dots: ").count(), 1, "what does not change is shown once");
+    assert!(!pinion.out().contains('\x1b'), "nothing for a terminal");
+    drop(client);
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    assert!(!exists(&pinion.link()));
+}
+
+#[test]
+fn on_a_terminal_there_is_a_picture_and_the_terminal_is_given_back() {
+    let size = Winsize { ws_row: 40, ws_col: 100, ws_xpixel: 0, ws_ypixel: 0 };
+    let terminal = openpty(Some(&size), None).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let log = File::create(folder.path().join("log")).unwrap();
+    let mut pinion = Pinion::start_to(folder, &["sim", "--show"], Stdio::from(terminal.slave), log);
+    let seen = Arc::new(Mutex::new(Vec::new()));
+    let reader = thread::spawn({
+        let seen = seen.clone();
+        let mut master = File::from(terminal.master);
+        move || {
+            let mut piece = [0; 4096];
+            // Fails once the program, and with it the terminal's last user, is gone.
+            while let Ok(count @ 1..) = master.read(&mut piece) {
+                seen.lock().unwrap().extend(&piece[..count]);
+            }
+        }
+    });
+    let text = || String::from_utf8_lossy(&seen.lock().unwrap()).into_owned();
+    pinion.wait_for_link();
+    let client = drive(&pinion);
+    // The colours as such.
+    let (red, blue) = ("\x1b[48;2;255;0;0m   \x1b[0m", "\x1b[48;2;0;0;32m   \x1b[0m");
+    pinion.until("the strip", || text().contains(&format!("{red} {blue} off off")));
+    pinion.until("the light", || text().contains("light on"));
+    assert!(text().contains("--print-config > printer.cfg"), "how to connect a host");
+    // The picture has rows of its own below those that scroll.
+    let regions: Vec<String> = text().split("\x1b[1;").skip(1).map(|rest| rest[..2].to_owned()).collect();
+    assert_eq!(regions.len(), 1, "{regions:?}");
+    drop(client);
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    reader.join().unwrap();
+    let text = text();
+    assert!(text.ends_with("\x1b[r\x1b[40;1H\r\n"), "{:?}", &text[text.len() - 200..]);
+}
+
+#[test]
+fn a_reader_that_goes_away_leaves_the_printer_serving() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = File::create(folder.path().join("log")).unwrap();
+    let mut pinion = Pinion::start_to(folder, &["sim", "--show"], closed_pipe(), log);
+    pinion.wait_for_link();
+    let mut client = drive(&pinion);
+    assert!(!client.status().unwrap().is_shutdown);
+    drop(client);
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0));
+    assert!(!pinion.log().contains("WARN  the printer is shown") && !pinion.log().contains("panicked"));
+}
+
+#[test]
+fn a_terminal_that_takes_nothing_does_not_keep_the_program() {
+    // A pipe of which nobody reads fills up.
+    let (_reader, writer) = std::io::pipe().unwrap();
+    fill(&writer);
+    let folder = tempfile::tempdir().unwrap();
+    let log = File::create(folder.path().join("log")).unwrap();
+    let mut pinion = Pinion::start_to(folder, &["sim", "--show"], writer, log);
+    pinion.wait_for_link();
+    let client = drive(&pinion);
+    drop(client);
+    pinion.signal(Signal::SIGINT);
+    assert_eq!(pinion.end().code(), Some(0));
+}
+
+/// Fills a pipe.
+fn fill(pipe: &std::io::PipeWriter) {
+    use nix::fcntl::{FcntlArg, OFlag, fcntl};
+    use std::io::Write;
+    fcntl(pipe, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).unwrap();
+    let mut pipe_end = pipe.try_clone().unwrap();
+    while pipe_end.write(&[b' '; 4096]).is_ok() {}
+    fcntl(pipe, FcntlArg::F_SETFL(OFlag::empty())).unwrap();
+}
+
+#[test]
+fn to_show_and_to_demonstrate_exclude_each_other() {
+    let refused = output(&["sim", "--show", "--demo"]);
+    assert_eq!(refused.status.code(), Some(2));
+    let help = String::from_utf8(output(&["sim", "--help"]).stdout).unwrap();
+    assert!(help.contains("--show") && help.contains("Instead of the demonstration"), "{help}");
+}
