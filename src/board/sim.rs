@@ -24,7 +24,9 @@ mod printer_cfg;
 mod spi;
 mod thermistor;
 mod time;
+mod tmc2209;
 mod tmc5160;
+mod trinamic;
 mod wire;
 
 pub use config::{
@@ -34,13 +36,14 @@ pub use config::{
 pub use loopback::LoopbackConfig;
 pub use part::PartConfig;
 pub use printer_cfg::printer_cfg;
+pub use tmc2209::Tmc2209Config;
 pub use tmc5160::Tmc5160Config;
 
 use i2c::{I2cBus, I2cDevice};
 use part::{Sight, Workshop};
 use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
 use spi::{SpiBus, SpiDevice};
-use time::PrinterTime;
+use time::{ErrandTime, PrinterTime};
 use wire::{
     DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimLine, StepPin,
     TachometerPin, ThermistorPin, WiredPin,
@@ -212,6 +215,10 @@ impl Board for SimBoard {
 
     fn runs(&mut self, due: Option<Clock>) {
         self.time.set_due(due);
+    }
+
+    fn errand_clock(&self, machine: Arc<dyn TimeSource>) -> Arc<dyn TimeSource> {
+        Arc::new(ErrandTime(machine))
     }
 
     /// A simulated motor follows at any pace: a computer without real time, as most that try

@@ -6,9 +6,15 @@ use std::io::{Read, Write};
 use std::os::unix::net::UnixStream;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
-use std::thread;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use nix::sys::signal::{Signal, raise};
+use pinion::board::sim::{SimBoard, SimConfig, SimProbe};
+use pinion::runtime::wakeup::MarginLimits;
+use pinion::runtime::{self, Access, Options};
+use pinion::time::Monotonic;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
@@ -22,10 +28,18 @@ pub fn python() -> String {
     std::env::var("KLIPPER_PYTHON").unwrap_or_else(|_| "python3".into())
 }
 
+/// Who serves klippy.
+enum Server {
+    /// The program.
+    Program(Child),
+    /// This process, which can look at its simulated printer.
+    Here(Option<JoinHandle<()>>, SimProbe),
+}
+
 pub struct Printer {
     checkout: PathBuf,
     folder: TempDir,
-    pinion: Child,
+    server: Server,
     host: Option<Child>,
     api: Option<UnixStream>,
     next_id: u64,
@@ -50,24 +64,70 @@ impl Printer {
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
+        Printer::serve(checkout, describe, change, |folder| {
+            let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+                .args(["run", "-r", "--board"])
+                .arg(format!("sim:{}", folder.join("board.toml").display()))
+                .arg("-I")
+                .arg(folder.join("tty"))
+                .stderr(File::create(folder.join("pinion.log")).unwrap())
+                .spawn();
+            Server::Program(pinion.unwrap())
+        })
+    }
+
+    /// A printer that can be looked at: it is simulated by this process, and has no log.
+    pub fn start_here(
+        checkout: &Path,
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+    ) -> Printer {
+        let mut printer = Printer::serve(checkout, describe, change, |folder| {
+            let clock = Monotonic::start();
+            let config = SimConfig::load(&folder.join("board.toml")).unwrap();
+            let board = SimBoard::new(config, Arc::new(clock)).unwrap();
+            let probe = board.probe();
+            let options = Options {
+                symlink: folder.join("tty"),
+                access: Access { mode: 0o660, group: None },
+                realtime: true,
+                cpu: None,
+                margin: MarginLimits::default(),
+                watchdog: None,
+            };
+            let run = move || runtime::run(&options, Box::new(board), clock, None, || {}).unwrap();
+            Server::Here(Some(thread::spawn(run)), probe)
+        });
+        printer.until_state("ready");
+        printer
+    }
+
+    fn serve(
+        checkout: &Path,
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+        serve: impl FnOnce(&Path) -> Server,
+    ) -> Printer {
         // klippy knows a pseudo terminal by the beginning of its path.
         let folder = tempfile::Builder::new().prefix("klipper_host_").tempdir_in("/tmp").unwrap();
         let printed = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["sim", "--print-board"]).output().unwrap();
         let board = describe(String::from_utf8(printed.stdout).unwrap(), &folder.path().join("trace"));
         fs::write(folder.path().join("board.toml"), board).unwrap();
-        let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-            .args(["run", "-r", "--board"])
-            .arg(format!("sim:{}", folder.path().join("board.toml").display()))
-            .arg("-I")
-            .arg(folder.path().join("tty"))
-            .stderr(File::create(folder.path().join("pinion.log")).unwrap())
-            .spawn()
-            .unwrap();
-        let mut printer = Printer { checkout: checkout.into(), folder, pinion, host: None, api: None, next_id: 0 };
+        fs::write(folder.path().join("pinion.log"), "").unwrap();
+        let server = serve(folder.path());
+        let mut printer = Printer { checkout: checkout.into(), folder, server, host: None, api: None, next_id: 0 };
         printer.until("the pty", |printer| fs::read_link(printer.path("tty")).is_ok());
         printer.configure(change);
         printer.start_host();
         printer
+    }
+
+    /// The simulated printer of [`Printer::start_here`].
+    pub fn probe(&self) -> &SimProbe {
+        match &self.server {
+            Server::Here(_, probe) => probe,
+            Server::Program(_) => panic!("the printer is another process'"),
+        }
     }
 
     fn path(&self, name: &str) -> PathBuf {
@@ -146,6 +206,27 @@ impl Printer {
         if let Err(error) = self.call("gcode/script", json!({ "script": script })) {
             panic!("{script}: {error}\n{}", self.log());
         }
+    }
+
+    /// Runs G-code that klippy refuses, and gives what it says.
+    #[track_caller]
+    pub fn refused(&mut self, script: &str) -> String {
+        match self.call("gcode/script", json!({ "script": script })) {
+            Ok(_) => panic!("{script} was not refused\n{}", self.log()),
+            Err(error) => error,
+        }
+    }
+
+    /// Runs G-code to its end, and gives what it writes to klippy's log. That klippy does not know the
+    /// command behind it, it says there, too.
+    #[track_caller]
+    pub fn said(&mut self, script: &str) -> String {
+        let before = fs::read_to_string(self.path("klippy.log")).unwrap().len();
+        self.gcode(script);
+        let marker = format!("END_{}", self.next_id);
+        self.gcode(&marker);
+        let log = self.host_log(&marker, 1);
+        log[before..].to_owned()
     }
 
     /// Runs G-code that stops the printer.
@@ -256,9 +337,18 @@ impl Printer {
 
 impl Drop for Printer {
     fn drop(&mut self) {
-        for child in self.host.iter_mut().chain([&mut self.pinion]) {
+        let end = |child: &mut Child| {
             let _ = child.kill();
             let _ = child.wait();
+        };
+        self.host.iter_mut().for_each(end);
+        match &mut self.server {
+            Server::Program(pinion) => end(pinion),
+            // It has handlers of its own for the signal, which end it and nobody else.
+            Server::Here(running, _) => {
+                let _ = raise(Signal::SIGTERM);
+                let _ = running.take().map(JoinHandle::join);
+            }
         }
     }
 }

@@ -16,7 +16,7 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{loopback, tmc5160};
+use super::{loopback, tmc2209, tmc5160};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -25,6 +25,8 @@ use crate::time::Clock;
 pub enum PartConfig {
     /// Sends back what it is sent.
     Loopback(loopback::LoopbackConfig),
+    /// A stepper driver on a UART.
+    Tmc2209(tmc2209::Tmc2209Config),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
 }
@@ -34,6 +36,7 @@ impl PartConfig {
     pub(super) fn part(&self) -> &dyn Part {
         match self {
             PartConfig::Loopback(config) => config,
+            PartConfig::Tmc2209(config) => config,
             PartConfig::Tmc5160(config) => config,
         }
     }
@@ -116,7 +119,12 @@ impl Workshop<'_> {
 
     /// Wires a pin, if the part has it.
     pub(super) fn wire(&mut self, pin: Option<&PinName>, wire: impl Wire + 'static) {
-        self.pins.extend(pin.map(|pin| WiredPin::new(pin, Arc::new(wire))));
+        self.wire_shared(pin, Arc::new(wire));
+    }
+
+    /// Wires a pin, if the part has it, to what the part itself looks at, too.
+    pub(super) fn wire_shared(&mut self, pin: Option<&PinName>, wire: Arc<dyn Wire>) {
+        self.pins.extend(pin.map(|pin| WiredPin::new(pin, wire)));
     }
 
     /// Puts a chip on its SPI bus.

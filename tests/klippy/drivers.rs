@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Trinamic's drivers on their UART and on SPI: registers, currents, homing by the load.
+
+use std::collections::HashMap;
+
+use crate::checkout;
+use crate::klippy::Printer;
+
+/// The registers of a driver by name, as klippy dumps them.
+fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
+    let said = printer.said(&format!("DUMP_TMC STEPPER={stepper}"));
+    let registers = said.lines().filter_map(|line| {
+        let (name, value) = line.trim_start_matches("// ").split_once(':')?;
+        let value = u32::from_str_radix(value.split_whitespace().next()?, 16).ok()?;
+        Some((name.to_owned(), value))
+    });
+    registers.collect()
+}
+
+/// The steps that klippy has had a stepper do, by its own count.
+fn steps(printer: &mut Printer, stepper: &str) -> i64 {
+    let said = printer.said("GET_POSITION");
+    let (_, counts) = said.split_once("mcu: ").unwrap();
+    let mut words = counts.lines().next().unwrap().split([':', ' ']);
+    words.find(|word| *word == stepper).unwrap();
+    words.next().unwrap().parse().unwrap()
+}
+
+/// The registers that klippy reads of a TMC2209 after it set it up, with the values of its defaults
+/// (klippy/extras/tmc2209.py), at standstill.
+const TMC2209: [(&str, u32); 12] = [
+    // PDN_DISABLE, MSTEP_REG_SELECT, MULTISTEP_FILT, and SpreadCycle.
+    ("GCONF", 0x0000_01c4),
+    ("OTP_READ", 0x0000_000f),
+    ("FACTORY_CONF", 0x0000_000f),
+    ("TSTEP", 0x000f_ffff),
+    // 16 microsteps, both edges, interpolation.
+    ("CHOPCONF", 0x3403_0053),
+    ("DRV_STATUS", 0x8019_0000),
+    ("MSCNT", 0),
+    ("MSCURACT", 0x00f7_0000),
+    ("PWMCONF", 0xc80d_0e24),
+    ("PWM_SCALE", 0),
+    ("PWM_AUTO", 0x000e_0024),
+    ("SG_RESULT", 0),
+];
+
+#[test]
+fn klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two() {
+    let Some(checkout) = checkout("klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two") else { return };
+    for two in [false, true] {
+        let second = |board: String, _: &std::path::Path| match two {
+            true => board.replace("uart_pin = \"y_uart\"", "uart_pin = \"y_uart\"\ntx_pin = \"y_tx\"\naddress = 3"),
+            false => board,
+        };
+        let mut printer = Printer::start_on(&checkout, second, |config| config);
+        printer.until_state("ready");
+        let dumped = dump(&mut printer, "stepper_y");
+        for (name, value) in TMC2209 {
+            assert_eq!(dumped[name], value, "{name}: {:08x}", dumped[name]);
+        }
+        // The power stage is off; MS1 and MS2 are the address.
+        assert_eq!(dumped["IOIN"] & 0xff00_005d, 0x2100_0041 | if two { 3 << 2 } else { 0 });
+        assert_eq!(dumped["GSTAT"], 1, "it was switched on");
+        assert_eq!(dumped["IHOLD_IRUN"], 0x0008_1919);
+        let count = dumped["IFCNT"];
+
+        printer.gcode("SET_TMC_CURRENT STEPPER=stepper_y CURRENT=0.4 HOLDCURRENT=0.2");
+        let current = |printer: &mut Printer, key: &str| printer.object("tmc2209 stepper_y")[key].as_f64().unwrap();
+        assert!((current(&mut printer, "run_current") - 0.4).abs() < 0.02);
+        let dumped = dump(&mut printer, "stepper_y");
+        assert_eq!(dumped["IHOLD_IRUN"] & 0x1f1f, 0x0c06);
+        assert_eq!(dumped["DRV_STATUS"] >> 16 & 0x1f, 0x06, "the chip holds by it");
+        assert_eq!(dumped["IFCNT"], (count + 1) & 0xff);
+        printer.gcode("INIT_TMC STEPPER=stepper_y");
+
+        // At the first enable klippy tells of the reset, and clears it.
+        printer.gcode("G28 Y\nG1 Y50 F6000\nM400");
+        let log = printer.host_log("TMC 'stepper_y' reports GSTAT:      00000001 reset=1(Reset)", 1);
+        assert!(!log.contains("phase change") && !log.contains("Unable to"), "{log}");
+        let dumped = dump(&mut printer, "stepper_y");
+        assert_eq!(dumped["GSTAT"], 0);
+        // 16 microsteps to a full step: klippy knows by its own count where the driver's wave stands.
+        let status = printer.object("tmc2209 stepper_y");
+        let offset = status["mcu_phase_offset"].as_i64().unwrap();
+        let position = steps(&mut printer, "stepper_y");
+        let mscnt = i64::from(dumped["MSCNT"]);
+        let phase = if status["mcu_phase_offset"].is_null() { -1 } else { (position + offset).rem_euclid(64) };
+        let phases = [mscnt, 1023 - mscnt].map(|count| (count as f64 / 16.0).round() as i64 % 64);
+        assert!(phases.contains(&phase), "{phase} {phases:?}");
+    }
+}
+
+#[test]
+fn klippy_tells_of_a_driver_that_is_not_there() {
+    let Some(checkout) = checkout("klippy_tells_of_a_driver_that_is_not_there") else { return };
+    let mut printer = Printer::start_with(&checkout, |config| config.replace("uart_address: 0", "uart_address: 1"));
+    printer.until_state("ready");
+    printer.host_log("TMC stepper_y failed to init: Unable to read tmc uart 'stepper_y' register IFCNT", 1);
+    let error = printer.refused("DUMP_TMC STEPPER=stepper_y");
+    assert!(error.contains("Unable to read tmc uart 'stepper_y' register"), "{error}");
+    // The others are not disturbed.
+    printer.gcode("G28 X");
+    printer.stop("G28 Y");
+}
