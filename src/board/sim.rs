@@ -15,6 +15,7 @@ use super::{
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
+mod angle;
 mod config;
 mod i2c;
 mod loopback;
@@ -29,6 +30,7 @@ mod tmc5160;
 mod trinamic;
 mod wire;
 
+pub use angle::{AngleChip, AngleConfig};
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
     SimConfig, SimError, SpiBusConfig,

@@ -147,3 +147,100 @@ fn klippy_homes_by_the_load_at_the_end_of_an_axis() {
     let dumped = dump(&mut printer, "stepper_z");
     assert_eq!((dumped["GCONF"] & 0x100, dumped["TCOOLTHRS"]), (0, 0));
 }
+
+/// Another sensor on the built-in printer's shaft.
+fn with_sensor(chip: &'static str) -> impl Fn(String, &std::path::Path) -> String {
+    move |board, _| {
+        let changed = board.replace("chip = \"tle5012b\"", &format!("chip = \"{chip}\""));
+        assert!(changed.contains(&format!("chip = \"{chip}\"")), "the built-in printer has another angle sensor");
+        changed
+    }
+}
+
+/// Lets klippy calibrate the sensor against its stepper.
+fn with_stepper(config: String) -> String {
+    let changed = config.replace("#stepper: stepper_y", "stepper: stepper_y");
+    assert_ne!(config, changed);
+    changed
+}
+
+#[test]
+fn klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft() {
+    let Some(checkout) = checkout("klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft") else { return };
+    let mut printer = Printer::start_here(&checkout, with_sensor("tle5012b"), with_stepper);
+    let read = printer.said("ANGLE_DEBUG_READ CHIP=y REG=0x06");
+    assert!(read.contains("ANGLE REG[0x06] = 0x4001"), "{read}");
+    printer.gcode("G28 Y\nG1 Y110 F6000\nANGLE_CALIBRATE CHIP=y");
+    let pending = printer.object("configfile")["save_config_pending_items"]["angle y"]["calibrate"].clone();
+    let table = pending.as_str().unwrap().replace('\n', "");
+    let angles: Vec<f64> = table.split(',').map(|angle| angle.trim().parse().unwrap()).collect();
+    // One for each full step, with the error of the magnet: 0.6 degrees of 65536.
+    assert_eq!(angles.len(), 200);
+    let even = |n: usize| (angles[n] - angles[0] - n as f64 * 65536.0 / 200.0 + 32768.0).rem_euclid(65536.0) - 32768.0;
+    let even: Vec<f64> = (0..200).map(even).collect();
+    let spread = even.iter().copied().fold(f64::MIN, f64::max) - even.iter().copied().fold(f64::MAX, f64::min);
+    assert!((200.0..240.0).contains(&spread), "{spread}");
+
+    printer.configure(|config| with_stepper(config).replace("[angle y]", &format!("[angle y]\ncalibrate: {table}")));
+    printer.restart("RESTART");
+    printer.gcode("G28 Y\nG1 Y100 F6000\nM400");
+    // Each batch has the angle, and where klippy believes the axis to be by it.
+    let mut errors_mm = Vec::new();
+    for place_mm in [100, 103, 107, 112, 120, 131, 150] {
+        printer.gcode(&format!("G1 Y{place_mm}\nM400\nG4 P300"));
+        let batch = printer.angles("y");
+        let offset_mm = batch["position_offset"].as_f64().unwrap();
+        let (_, angle) = batch["data"].as_array().unwrap().last().map(|sample| (&sample[0], &sample[1])).unwrap();
+        // 40 mm are a turn, whichever way round.
+        let turn_mm = angle.as_f64().unwrap() * 40.0 / 65536.0;
+        errors_mm.push(turn_mm + offset_mm - f64::from(place_mm));
+    }
+    // Uncalibrated they would differ by 0.13 mm.
+    let (least, most) = errors_mm.iter().fold((f64::MAX, f64::MIN), |(l, m), error| (l.min(*error), m.max(*error)));
+    assert!(most - least < 0.005, "{errors_mm:?}");
+}
+
+#[test]
+fn klippy_reads_each_kind_of_angle_sensor() {
+    let Some(checkout) = checkout("klippy_reads_each_kind_of_angle_sensor") else { return };
+    for chip in ["a1333", "as5047d", "mt6816", "mt6826s", "tle5012b"] {
+        let mut printer = Printer::start_here(&checkout, with_sensor(chip), |config| config);
+        printer.gcode("G28 Y\nG1 Y100 F6000\nM400\nG4 P200");
+        let last = |batch: &serde_json::Value| batch["data"].as_array().unwrap().last().unwrap()[1].as_f64().unwrap();
+        let at_100 = last(&printer.angles("y"));
+        // Two turns and a half; the magnet's error of 0.6 degrees at 77 degrees, half a turn on the other way.
+        let error = 0.6 / 360.0 * 65536.0 * 77f64.to_radians().sin();
+        let expected = (77.0 / 360.0 + 0.5) * 65536.0 - error;
+        assert!((at_100.rem_euclid(65536.0) - expected).abs() < 9.0, "{chip}: {at_100} {expected}");
+        // klippy counts on from turn to turn: half a turn more.
+        printer.gcode("G1 Y120 F6000\nM400\nG4 P200");
+        let batch = printer.angles("y");
+        let on = last(&batch) - at_100;
+        assert!((on.rem_euclid(65536.0) - 32768.0 - 2.0 * error).abs() < 9.0, "{chip}: {on}");
+        match chip {
+            "mt6816" => assert!(printer.said("ANGLE_DEBUG_READ CHIP=y").contains("No Mag: 0")),
+            "mt6826s" => {
+                let read = printer.said("ANGLE_DEBUG_READ CHIP=y REG=0x003");
+                let (_, sums) = read.split_once("CRC: ").unwrap();
+                let (one, other) = sums.lines().next().unwrap().split_once(" == ").unwrap();
+                assert_eq!(one, other.trim());
+            }
+            _ => {}
+        }
+    }
+}
+
+#[test]
+fn klippy_has_an_angle_sensor_calibrate_itself() {
+    let Some(checkout) = checkout("klippy_has_an_angle_sensor_calibrate_itself") else { return };
+    // 22 turns and more have no room on an axis that ends.
+    let long = |board: String, path: &std::path::Path| {
+        let (before, y) = board.split_once("name = \"y\"\n").unwrap();
+        with_sensor("mt6826s")(format!("{before}name = \"y\"\n{}", y.replacen("220.0", "9000.0", 1)), path)
+    };
+    let mut printer = Printer::start_here(&checkout, long, with_stepper);
+    printer.gcode("G28 Y");
+    let said = printer.said("ANGLE_CHIP_CALIBRATE CHIP=y");
+    assert!(said.contains("Calibration success"), "{said}");
+    assert!(printer.said("ANGLE_DEBUG_READ CHIP=y REG=0x113").contains("Status: Calibration Successful"));
+}

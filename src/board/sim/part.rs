@@ -16,7 +16,7 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{loopback, tmc2209, tmc5160};
+use super::{angle, loopback, tmc2209, tmc5160};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -25,6 +25,9 @@ use crate::time::Clock;
 pub enum PartConfig {
     /// Sends back what it is sent.
     Loopback(loopback::LoopbackConfig),
+    /// An angle sensor on a motor's shaft.
+    #[serde(rename = "angle_sensor")]
+    Angle(angle::AngleConfig),
     /// A stepper driver on a UART.
     Tmc2209(tmc2209::Tmc2209Config),
     /// A stepper driver.
@@ -36,6 +39,7 @@ impl PartConfig {
     pub(super) fn part(&self) -> &dyn Part {
         match self {
             PartConfig::Loopback(config) => config,
+            PartConfig::Angle(config) => config,
             PartConfig::Tmc2209(config) => config,
             PartConfig::Tmc5160(config) => config,
         }
