@@ -96,6 +96,13 @@ pub trait TimeSource: Send + Sync {
     /// The present instant; never earlier than an instant that it told before.
     fn now(&self) -> Clock;
 
+    /// An errand begins on this thread, which may have a time of its own
+    /// ([`crate::board::Board::errand_clock`]).
+    fn begin_errand(&self) {}
+
+    /// The errand has ended.
+    fn end_errand(&self) {}
+
     /// Waits until `end` without sleeping: for the pulses of a bus, which are shorter than a sleep.
     fn spin_until(&self, end: Clock) {
         while self.now() < end {

@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use crate::shutdown::{Shutdown, reason};
-use crate::time::{Clock, Ticks};
+use crate::time::{Clock, Ticks, TimeSource};
 
 pub mod linux;
 pub mod sim;
@@ -392,6 +392,12 @@ pub trait Board: Send {
     /// simulated board, whose parts are not to feel how late the computer is.
     fn runs(&mut self, due: Option<Clock>) {
         let _ = due;
+    }
+
+    /// The clock by which workers pace what they do with lines: the machine's own. A simulated board may
+    /// have another, for the same reason.
+    fn errand_clock(&self, machine: Arc<dyn TimeSource>) -> Arc<dyn TimeSource> {
+        machine
     }
 
     /// Forgets all claims. The machine has dropped the lines and devices before.

@@ -16,6 +16,7 @@ use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
 mod adxl345;
+mod angle;
 mod apa102;
 mod colour;
 mod config;
@@ -31,12 +32,15 @@ mod ssd1306;
 mod thermistor;
 mod thermocouple;
 mod time;
+mod tmc2209;
 mod tmc5160;
 mod track;
+mod trinamic;
 mod wire;
 mod ws2812;
 
 pub use adxl345::Adxl345Config;
+pub use angle::{AngleChip, AngleConfig};
 pub use apa102::Apa102Config;
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
@@ -49,6 +53,7 @@ pub use servo::ServoConfig;
 pub use spool::SpoolConfig;
 pub use ssd1306::Ssd1306Config;
 pub use thermocouple::{Converter, SensorFault, ThermocoupleConfig};
+pub use tmc2209::Tmc2209Config;
 pub use tmc5160::Tmc5160Config;
 pub use ws2812::Ws2812Config;
 
@@ -56,7 +61,7 @@ use i2c::{I2cBus, I2cDevice};
 use part::{Sight, Workshop};
 use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
 use spi::{MosiPin, SpiBus, SpiDevice};
-use time::PrinterTime;
+use time::{ErrandTime, PrinterTime};
 use wire::{
     DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimLine, StepPin,
     TachometerPin, ThermistorPin, WiredPin,
@@ -237,6 +242,10 @@ impl Board for SimBoard {
 
     fn runs(&mut self, due: Option<Clock>) {
         self.time.set_due(due);
+    }
+
+    fn errand_clock(&self, machine: Arc<dyn TimeSource>) -> Arc<dyn TimeSource> {
+        Arc::new(ErrandTime(machine))
     }
 
     fn step_late_limit(&self) -> Ticks {

@@ -162,7 +162,7 @@ impl Mcu {
 
     /// The clock, for what a worker paces by it.
     pub fn clock(&self) -> Arc<dyn TimeSource> {
-        self.clock.clone()
+        self.board.errand_clock(self.clock.clone())
     }
 
     /// The instant that was read last: in the past, by little while timers run.

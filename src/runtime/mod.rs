@@ -133,7 +133,7 @@ pub fn run(
                 realtime::enter(Role::Worker);
             }
         });
-        let workers = Box::new(Threads::new(thread::current(), prepare, core_clock.clone(), pulse));
+        let workers = Box::new(Threads::new(thread::current(), prepare, board.errand_clock(core_clock.clone()), pulse));
         let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
         let waiter = Waiter::new(core_clock.clone(), margin, scheduling, processors);
         Core::new(self::core::Parts {

@@ -45,7 +45,7 @@ pub(super) struct Threads {
 
 impl Threads {
     /// No workers yet. Those to come unpark `core` when an errand is done, and note in `pulse` since
-    /// when they run it.
+    /// when they run it. They pace themselves by the clock.
     pub(super) fn new(core: Thread, prepare: Prepare, clock: Arc<dyn TimeSource>, pulse: Pulse) -> Threads {
         Threads { core, prepare, clock, pulse, workers: Vec::new() }
     }
@@ -159,7 +159,9 @@ impl Server {
         let Job { ticket, mut errand, holds } = job;
         self.shown.begin();
         let began = self.clock.now();
+        self.clock.begin_errand();
         errand.run();
+        self.clock.end_errand();
         let ended = self.clock.now();
         self.shown.end();
         // This does not fail: no more errands are under way than there are boxes, and the queue back

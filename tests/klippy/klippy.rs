@@ -213,16 +213,7 @@ impl Printer {
         api.set_read_timeout(Some(PATIENCE)).unwrap();
         api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
         loop {
-            let mut message = Vec::new();
-            loop {
-                let mut byte = [0];
-                api.read_exact(&mut byte).map_err(|error| error.to_string())?;
-                if byte[0] == 3 {
-                    break;
-                }
-                message.push(byte[0]);
-            }
-            let answer: Value = serde_json::from_slice(&message).unwrap();
+            let answer = message(api)?;
             if answer["id"] == self.next_id {
                 return match &answer["error"] {
                     Value::Null => Ok(answer["result"].clone()),
@@ -238,6 +229,46 @@ impl Printer {
         if let Err(error) = self.call("gcode/script", json!({ "script": script })) {
             panic!("{script}: {error}\n{}", self.log());
         }
+    }
+
+    /// Runs G-code that klippy refuses, and gives what it says.
+    #[track_caller]
+    pub fn refused(&mut self, script: &str) -> String {
+        match self.call("gcode/script", json!({ "script": script })) {
+            Ok(_) => panic!("{script} was not refused\n{}", self.log()),
+            Err(error) => error,
+        }
+    }
+
+    /// Runs G-code to its end, and gives what it writes to klippy's log. That klippy does not know the
+    /// command behind it, it says there, too.
+    #[track_caller]
+    pub fn answer(&mut self, script: &str) -> String {
+        let before = fs::read_to_string(self.path("klippy.log")).unwrap().len();
+        self.gcode(script);
+        let marker = format!("END_{}", self.next_id);
+        self.gcode(&marker);
+        let log = self.host_log(&marker, 1);
+        log[before..].to_owned()
+    }
+
+    /// A batch of what an angle sensor measures now.
+    #[track_caller]
+    pub fn angles(&mut self, sensor: &str) -> Value {
+        let template = json!({ "batch": sensor });
+        self.call("angle/dump_angle", json!({ "sensor": sensor, "response_template": template })).unwrap();
+        let api = self.api.as_mut().unwrap();
+        // What else klippy says on this connection is of no use any more.
+        let batch = loop {
+            let message = message(api).unwrap();
+            let has_data = message["params"]["data"].as_array().is_some_and(|data| !data.is_empty());
+            if message["batch"] == sensor && has_data {
+                break message["params"].clone();
+            }
+        };
+        // klippy ends the measurements when nobody listens.
+        self.api = Some(UnixStream::connect(self.path("api")).unwrap());
+        batch
     }
 
     /// Runs G-code that stops the printer.
@@ -389,6 +420,19 @@ impl Printer {
             assert!(Instant::now() < end, "waited in vain for {what}\n{}", self.log());
             thread::sleep(Duration::from_millis(50));
         }
+    }
+}
+
+/// The next message of klippy's.
+fn message(api: &mut UnixStream) -> Result<Value, String> {
+    let mut message = Vec::new();
+    loop {
+        let mut byte = [0];
+        api.read_exact(&mut byte).map_err(|error| error.to_string())?;
+        if byte[0] == 3 {
+            return serde_json::from_slice(&message).map_err(|error| error.to_string());
+        }
+        message.push(byte[0]);
     }
 }
 

@@ -5,6 +5,7 @@
 //! Python with klippy's requirements (scripts/klippy-requirements.txt there). Without the
 //! former every test here is skipped, and says so.
 
+mod drivers;
 mod filament;
 mod klippy;
 mod print;

@@ -16,7 +16,7 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{adxl345, apa102, loopback, servo, spool, ssd1306, thermocouple, tmc5160, ws2812};
+use super::{adxl345, angle, apa102, loopback, servo, spool, ssd1306, thermocouple, tmc2209, tmc5160, ws2812};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -31,6 +31,11 @@ pub enum PartConfig {
     Servo(servo::ServoConfig),
     /// Filament and its sensors.
     Spool(spool::SpoolConfig),
+    /// An angle sensor on a motor's shaft.
+    #[serde(rename = "angle_sensor")]
+    Angle(angle::AngleConfig),
+    /// A stepper driver on a UART.
+    Tmc2209(tmc2209::Tmc2209Config),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
     /// A strip of lights on an SPI bus's data output.
@@ -51,6 +56,8 @@ impl PartConfig {
             PartConfig::Loopback(config) => config,
             PartConfig::Servo(config) => config,
             PartConfig::Spool(config) => config,
+            PartConfig::Angle(config) => config,
+            PartConfig::Tmc2209(config) => config,
             PartConfig::Tmc5160(config) => config,
             PartConfig::Ws2812(config) => config,
             PartConfig::Apa102(config) => config,
@@ -140,7 +147,12 @@ impl Workshop<'_> {
 
     /// Wires a pin, if the part has it.
     pub(super) fn wire(&mut self, pin: Option<&PinName>, wire: impl Wire + 'static) {
-        self.pins.extend(pin.map(|pin| WiredPin::new(pin, Arc::new(wire))));
+        self.wire_shared(pin, Arc::new(wire));
+    }
+
+    /// Wires a pin, if the part has it, to what the part itself looks at, too.
+    pub(super) fn wire_shared(&mut self, pin: Option<&PinName>, wire: Arc<dyn Wire>) {
+        self.pins.extend(pin.map(|pin| WiredPin::new(pin, wire)));
     }
 
     /// Puts a chip on its SPI bus.

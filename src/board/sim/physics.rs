@@ -82,6 +82,18 @@ pub struct Axis {
     turned: AtomicI64,
     lost_steps: AtomicU64,
     track: Track,
+    /// The instant of the last step, the ticks between it and the one before, and how many steps
+    /// in a row were lost until then.
+    stride: Together<3>,
+}
+
+/// How a motor steps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stride {
+    /// Ticks between two steps.
+    pub ticks: u64,
+    /// Steps in a row that the motor could not do.
+    pub lost_in_a_row: u64,
 }
 
 impl Axis {
@@ -109,6 +121,7 @@ impl Axis {
             turned: AtomicI64::new(0),
             lost_steps: AtomicU64::new(0),
             track: Track::new(),
+            stride: Together::new([0, u64::MAX, 0]),
         }
     }
 
@@ -141,15 +154,19 @@ impl Axis {
     pub fn edge(&self, on: bool, at: Clock) {
         self.stepped.store(on, Ordering::Relaxed);
         if on || self.both_edges.load(Ordering::Relaxed) {
-            self.step(at);
+            let [last, _, lost_in_a_row] = self.stride.load();
+            let ticks = if last == 0 { u64::MAX } else { at.since(Clock::from_ticks(last)).max(0) as u64 };
+            let lost_in_a_row = if self.step(at) { 0 } else { lost_in_a_row + 1 };
+            self.stride.store([at.ticks(), ticks, lost_in_a_row]);
         }
     }
 
-    fn step(&self, at: Clock) {
+    /// One step. False if the motor could not do it, as its axis had hit something.
+    fn step(&self, at: Clock) -> bool {
         let turn = if self.is_dir_high() { -1 } else { 1 };
         self.turned.store(self.turned_steps().wrapping_add(turn), Ordering::Relaxed);
         if !self.is_enabled() {
-            return;
+            return true;
         }
         let way = if self.forward.load(Ordering::Relaxed) { 1 } else { -1 };
         let next = self.position_steps().wrapping_add(way);
@@ -157,12 +174,22 @@ impl Axis {
             Some((min, max)) if !(min..=max).contains(&next) => {
                 let lost = self.lost_steps.load(Ordering::Relaxed);
                 self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
+                return false;
             }
             _ => {
                 self.position.store(next, Ordering::Relaxed);
                 self.track.push(at, next);
             }
         }
+        true
+    }
+
+    /// How it steps at this instant. Since the last step the time to the next one is not known yet, and
+    /// is at least what went by.
+    pub fn stride(&self, now: Clock) -> Stride {
+        let [last, ticks, lost_in_a_row] = self.stride.load();
+        let since = now.since(Clock::from_ticks(last)).max(0) as u64;
+        Stride { ticks: ticks.max(since), lost_in_a_row }
     }
 
     /// Its last steps with their instants.

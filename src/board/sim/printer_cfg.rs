@@ -8,7 +8,7 @@ use std::fmt::{self, Display, Write};
 use super::config::{AxisConfig, End, FanConfig, HeaterConfig, InputConfig, PinName, SimConfig};
 
 /// Full steps in a turn of the usual stepper motor.
-const FULL_STEPS: f64 = 200.0;
+pub(super) const FULL_STEPS: f64 = 200.0;
 
 /// The printer.cfg that matches a board, for a klippy of today's Klipper with `pty` as its serial
 /// port.

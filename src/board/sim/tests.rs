@@ -398,6 +398,7 @@ fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
     let mut config = SimConfig::default_printer();
     let driver = |axis: &str| {
         PartConfig::Tmc5160(Tmc5160Config {
+            diag1_pin: None,
             bus: "spidev1.0".into(),
             select_pin: PinName::try_from(format!("{axis}_cs")).ok(),
             axis: axis.into(),

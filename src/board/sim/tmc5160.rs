@@ -7,10 +7,11 @@
 //! was told until its power is off, whatever the machine is reset.
 //!
 //! Simulated: every register with its access and its reset value, the microstep counter and the
-//! currents of the wave table, standstill and the time between steps, the inputs. The motor is
+//! currents of the wave table, standstill and the time between steps, the inputs, StallGuard and DIAG1
+//! (`trinamic.rs`). The motor is
 //! simulated by its [`Axis`], which turns whether the chip's power stage is on or not and however
 //! many microsteps the chip is told to make, so that a host may do without the chip; of the set-up
-//! only the edges that are steps (DEDGE) are the axis's, too. Not simulated: loads, temperatures
+//! only the edges that are steps (DEDGE) are the axis's, too. Not simulated: DIAG0, CoolStep, temperatures
 //! and faults, the automatic tuning of StealthChop, and the ramp generator and encoder (their
 //! registers keep what is written).
 
@@ -20,19 +21,19 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::config::{PinName, SimConfig, SimError, wrong};
+use super::config::{PinName, SimConfig, SimError};
 use super::part::{Part, Socket, Workshop};
 use super::physics::Axis;
 use super::printer_cfg::{Layout, Sections};
 use super::spi::SpiChip;
-use crate::time::{CLOCK_FREQ, Clock, TimeSource};
+use super::trinamic::{
+    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, offer_sensorless_homing,
+    validate_axis,
+};
+use crate::time::{Clock, TimeSource};
 
 /// CPOL and CPHA are 1.
 const MODE: u8 = 3;
-/// The internal clock.
-const CLOCK_HZ: u64 = 12_000_000;
-/// TSTEP at standstill; also the clocks without a step after which the motor stands still.
-const STANDSTILL: u32 = 0xf_ffff;
 const DATAGRAM_BYTES: usize = 5;
 const WRITE: u8 = 0x80;
 
@@ -41,12 +42,15 @@ const GSTAT: u8 = 0x01;
 const IOIN: u8 = 0x04;
 const IHOLD_IRUN: u8 = 0x10;
 const TSTEP: u8 = 0x12;
+const TPWMTHRS: u8 = 0x13;
+const TCOOLTHRS: u8 = 0x14;
 const MSLUT: u8 = 0x60;
 const MSLUTSEL: u8 = 0x68;
 const MSLUTSTART: u8 = 0x69;
 const MSCNT: u8 = 0x6a;
 const MSCURACT: u8 = 0x6b;
 const CHOPCONF: u8 = 0x6c;
+const COOLCONF: u8 = 0x6d;
 const DRV_STATUS: u8 = 0x6f;
 const PWMCONF: u8 = 0x70;
 const PWM_AUTO: u8 = 0x72;
@@ -58,22 +62,17 @@ const VERSION: u32 = 0x30 << 24;
 const SD_MODE: u32 = 1 << 6;
 const GCONF_EN_PWM_MODE: u32 = 1 << 2;
 const GCONF_SHAFT: u32 = 1 << 4;
+const GCONF_DIAG1_STALL: u32 = 1 << 8;
+const GCONF_DIAG1_PUSHPULL: u32 = 1 << 13;
 const GSTAT_DRV_ERR: u32 = 1 << 1;
 const CHOPCONF_DEDGE: u32 = 1 << 29;
+const DRV_STATUS_STALLGUARD: u32 = 1 << 24;
 
-/// What the host may do with a register.
-#[derive(Clone, Copy, PartialEq)]
-enum Access {
-    /// It reads as zero.
-    Write,
-    Read,
-    ReadWrite,
-    /// Ones that are written clear their bits.
-    ReadClear,
-}
-
-/// A register: its address, access, the bits that it has, and its value at power-up.
-struct Register(u8, Access, u32, u32);
+/// SG_RESULT of a free motor with SGT at 0, what it falls by up to the full load, and what it rises by with
+/// each step of SGT: values of a common motor. The data sheet gives no formula.
+const SG_FREE: i32 = 200;
+const SG_FALL: i32 = 300;
+const SG_PER_SGT: i32 = 10;
 
 use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
 
@@ -93,10 +92,10 @@ const REGISTERS: &[Register] = &[
     Register(0x0b, W, 8, 0),            // GLOBALSCALER
     Register(0x0c, R, 16, 0),           // OFFSET_READ
     Register(IHOLD_IRUN, W, 20, 0),
-    Register(0x11, W, 8, 10),           // TPOWERDOWN
-    Register(TSTEP, R, 20, 0),          // computed
-    Register(0x13, W, 20, 0),           // TPWMTHRS
-    Register(0x14, W, 20, 0),           // TCOOLTHRS
+    Register(0x11, W, 8, 10),  // TPOWERDOWN
+    Register(TSTEP, R, 20, 0), // computed
+    Register(TPWMTHRS, W, 20, 0),
+    Register(TCOOLTHRS, W, 20, 0),
     Register(0x15, W, 20, 0),           // THIGH
     Register(0x20, RW, 2, 0),           // RAMPMODE
     Register(0x21, RW, 32, 0),          // XACTUAL
@@ -134,7 +133,7 @@ const REGISTERS: &[Register] = &[
     Register(MSCNT, R, 10, 0),    // computed
     Register(MSCURACT, R, 25, 0), // computed
     Register(CHOPCONF, RW, 32, 0x1041_0150),
-    Register(0x6d, W, 25, 0),       // COOLCONF
+    Register(COOLCONF, W, 25, 0),
     Register(0x6e, W, 24, 0),       // DCCTRL
     Register(DRV_STATUS, R, 32, 0), // computed
     Register(PWMCONF, W, 32, 0xc40c_001e),
@@ -153,6 +152,8 @@ pub struct Tmc5160Config {
     pub select_pin: Option<PinName>,
     /// The axis whose motor it drives.
     pub axis: String,
+    /// DIAG1, an open drain with a pull-up resistor: low while the motor is stalled.
+    pub diag1_pin: Option<PinName>,
 }
 
 impl Part for Tmc5160Config {
@@ -164,16 +165,19 @@ impl Part for Tmc5160Config {
         Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
     }
 
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("diag1_pin", self.diag1_pin.as_ref())]
+    }
+
     fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
-        if !printer.axes.iter().any(|axis| axis.name == self.axis) {
-            return wrong(whose, "axis", &format!("there is no `{}`", self.axis), "name an [[axis]]");
-        }
-        Ok(())
+        validate_axis(whose, printer, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         if let Some(axis) = workshop.axis(&self.axis) {
-            workshop.solder_spi(self, Tmc5160::new(axis, workshop.time.clone()));
+            let chip = Tmc5160::new(self.name(), axis, workshop.time.clone());
+            workshop.wire_shared(self.diag1_pin.as_ref(), chip.diag1.clone());
+            workshop.solder_spi(self, chip);
         }
         Ok(())
     }
@@ -185,149 +189,121 @@ impl Part for Tmc5160Config {
         cfg.spi(&self.bus, self.select_pin.as_ref());
         cfg.key("run_current", 0.8);
         cfg.key("sense_resistor", 0.075);
+        if let Some(pin) = &self.diag1_pin {
+            // An open drain: a low level tells of a stall.
+            let inverted = if pin.inverted { "" } else { "!" };
+            cfg.key("diag1_pin", format_args!("^{inverted}{}", pin.name));
+            offer_sensorless_homing(cfg, layout, "tmc5160", &self.axis, ("driver_SGT", 0));
+        }
     }
 }
 
 /// The chip.
 struct Tmc5160 {
-    axis: Arc<Axis>,
-    clock: Arc<dyn TimeSource>,
-    /// By address.
-    registers: [u32; 128],
+    motor: Motor,
+    time: Arc<dyn TimeSource>,
+    diag1: Arc<StallOutput>,
+    registers: Registers,
     /// The shift register of 40 bits, and the bytes that came in since the chip was selected.
     shift: u64,
     bytes: usize,
     /// What the next datagram brings back.
     reply: u32,
-    /// Where the microstep counter stood at a step of the axis; it goes on from there.
-    origin: (i64, u32),
-    /// When which step of the axis was seen, and the clocks between two of 256 microsteps.
-    seen: (Clock, i64),
-    tstep: u32,
 }
 
 impl Tmc5160 {
     /// The driver of an axis, at power-up.
-    fn new(axis: Arc<Axis>, clock: Arc<dyn TimeSource>) -> Tmc5160 {
-        let mut registers = [0; 128];
-        for Register(address, _, _, value) in REGISTERS {
-            registers[usize::from(*address)] = *value;
-        }
-        let step = axis.turned_steps();
-        let seen = (clock.now(), step);
-        Tmc5160 { axis, clock, registers, shift: 0, bytes: 0, reply: 0, origin: (step, 0), seen, tstep: STANDSTILL }
+    fn new(name: String, axis: Arc<Axis>, time: Arc<dyn TimeSource>) -> Tmc5160 {
+        let registers = Registers::new(REGISTERS);
+        let rule = stall_rule(&registers);
+        let diag1 = Arc::new(StallOutput::new(name, axis.clone(), rule));
+        let mut chip = Tmc5160 { motor: Motor::new(axis), time, diag1, registers, shift: 0, bytes: 0, reply: 0 };
+        chip.set_up_motor();
+        chip
     }
 
-    fn get(&self, address: u8) -> u32 {
-        self.registers[usize::from(address & !WRITE)]
-    }
-
-    fn is_set(&self, address: u8, bit: u32) -> bool {
-        self.get(address) & bit != 0
+    fn set_up_motor(&mut self) {
+        let reversed = self.registers.is_set(GCONF, GCONF_SHAFT);
+        self.motor.set_up(self.registers.get(CHOPCONF) >> 24 & 0xf, reversed);
     }
 
     /// What a host reads.
     fn read(&self, address: u8) -> u32 {
+        let now = self.time.now();
         match address {
             IOIN => {
-                let inputs = [self.axis.is_stepped(), self.axis.is_dir_high()].map(u32::from);
+                let inputs = [self.motor.axis.is_stepped(), self.motor.axis.is_dir_high()].map(u32::from);
                 // DRV_ENN switches the power stage off.
-                let off = u32::from(!self.axis.is_enabled());
+                let off = u32::from(!self.motor.axis.is_enabled());
                 VERSION | SD_MODE | off << 4 | inputs[1] << 1 | inputs[0]
             }
-            TSTEP => self.tstep,
-            MSCNT => self.mscnt(),
+            TSTEP => self.motor.tstep(now),
+            MSCNT => self.motor.mscnt(),
             MSCURACT => {
-                let current = |microstep| self.wave(microstep) as u32 & 0x1ff;
-                current(self.mscnt() + 256) << 16 | current(self.mscnt())
+                let increments = std::array::from_fn(|n| self.registers.get(MSLUT + n as u8));
+                let [segments, start] = [MSLUTSEL, MSLUTSTART].map(|address| self.registers.get(address));
+                self.motor.currents(&Wave { increments, segments, start })
             }
-            DRV_STATUS => {
-                let stealth = u32::from(self.is_set(GCONF, GCONF_EN_PWM_MODE));
-                let current = self.get(IHOLD_IRUN) >> if self.stands_still() { 0 } else { 8 } & 0x1f;
-                u32::from(self.stands_still()) << 31 | current << 16 | stealth << 14
-            }
+            DRV_STATUS => self.drv_status(now),
             // PWM_GRAD and PWM_OFS, from which the tuning starts.
-            PWM_AUTO => (self.get(PWMCONF) >> 8 & 0xff) << 16 | self.get(PWMCONF) & 0xff,
-            _ => match REGISTERS.iter().find(|register| register.0 == address) {
-                Some(Register(_, R | RW | C, ..)) => self.get(address),
-                _ => 0,
-            },
+            PWM_AUTO => (self.registers.get(PWMCONF) >> 8 & 0xff) << 16 | self.registers.get(PWMCONF) & 0xff,
+            _ => self.registers.read(address),
         }
     }
 
     fn write(&mut self, address: u8, data: u32) {
-        let Some(Register(_, access, bits, _)) = REGISTERS.iter().find(|register| register.0 == address) else {
-            return;
-        };
-        // What follows may change the counter's pace.
-        self.origin = (self.axis.turned_steps(), self.mscnt());
-        let value = &mut self.registers[usize::from(address)];
-        match access {
-            R => {}
-            W | RW => *value = data & (u32::MAX >> (32 - bits)),
-            C => *value &= !data,
+        self.registers.write(address, data);
+        if matches!(address, GCONF | CHOPCONF) {
+            self.set_up_motor();
+            self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
         }
-        if address == CHOPCONF {
-            self.axis.set_both_edges(self.is_set(CHOPCONF, CHOPCONF_DEDGE));
+        self.diag1.set(stall_rule(&self.registers));
+    }
+
+    fn drv_status(&self, now: Clock) -> u32 {
+        let tstep = self.motor.tstep(now);
+        let stands = tstep == STANDSTILL;
+        let stealth = self.registers.is_set(GCONF, GCONF_EN_PWM_MODE) && tstep >= self.registers.get(TPWMTHRS);
+        let current = self.registers.get(IHOLD_IRUN) >> if stands { 0 } else { 8 } & 0x1f;
+        let mut status = u32::from(stands) << 31 | current << 16 | u32::from(stealth) << 14;
+        // The measurement is SpreadCycle's.
+        if !stealth && !stands {
+            let fall = SG_FALL * self.motor.load(now) as i32 / FULL_LOAD as i32;
+            let result = (SG_FREE + SG_PER_SGT * sgt(&self.registers) - fall).clamp(0, 0x3ff) as u32;
+            status |= result | if result == 0 { DRV_STATUS_STALLGUARD } else { 0 };
         }
-    }
-
-    /// The size of a step as a power of two of 256th full steps (MRES).
-    fn mres(&self) -> u32 {
-        (self.get(CHOPCONF) >> 24 & 0xf).min(8)
-    }
-
-    /// The place in the wave table, 1024 to four full steps: it goes up while DIR is low.
-    fn mscnt(&self) -> u32 {
-        let (step, mscnt) = self.origin;
-        let went = self.axis.turned_steps().wrapping_sub(step) << self.mres();
-        let went = if self.is_set(GCONF, GCONF_SHAFT) { went.wrapping_neg() } else { went };
-        i64::from(mscnt).wrapping_add(went) as u32 & 0x3ff
-    }
-
-    /// The wave's value, -255 to 255, at a place in the wave table. The table has the increments
-    /// from each place of the first quarter to the next, in four segments of their own widths.
-    fn wave(&self, microstep: u32) -> i32 {
-        let (quarter, place) = (microstep >> 8 & 3, microstep & 0xff);
-        let place = if quarter & 1 == 0 { place } else { 256 - place };
-        let select = self.get(MSLUTSEL);
-        let bounds = [select >> 8, select >> 16, select >> 24].map(|bound| bound & 0xff);
-        let increment = |at: u32| {
-            let segment = bounds.iter().filter(|bound| at >= **bound).count() as u32;
-            let width = select >> (2 * segment) & 3;
-            let bit = self.get(MSLUT + (at / 32) as u8) >> (at % 32) & 1;
-            (width + bit) as i32 - 1
-        };
-        let start = self.get(MSLUTSTART);
-        let value = match place {
-            256 => (start >> 16 & 0xff) as i32,
-            _ => (start & 0xff) as i32 + (0..place).map(increment).sum::<i32>(),
-        };
-        if quarter < 2 { value } else { -value }
-    }
-
-    fn stands_still(&self) -> bool {
-        self.tstep == STANDSTILL
-    }
-
-    /// Looks how far the motor went since the last look.
-    fn look(&mut self) {
-        let (now, step) = (self.clock.now(), self.axis.turned_steps());
-        let (at, from) = self.seen;
-        let ticks = now.since(at).max(0) as u64;
-        let clocks = ticks.saturating_mul(CLOCK_HZ) / u64::from(CLOCK_FREQ);
-        let microsteps = step.abs_diff(from).saturating_mul(1 << self.mres());
-        if let Some(each) = clocks.checked_div(microsteps) {
-            self.tstep = u32::try_from(each).unwrap_or(STANDSTILL).min(STANDSTILL);
-            self.seen = (now, step);
-        } else if clocks > u64::from(STANDSTILL) {
-            self.tstep = STANDSTILL;
-        }
+        status
     }
 
     fn status(&self) -> u8 {
-        let driver_error = self.is_set(GSTAT, GSTAT_DRV_ERR);
-        u8::from(self.stands_still()) << 3 | u8::from(driver_error) << 1 | u8::from(self.is_set(GSTAT, 1))
+        let now = self.time.now();
+        let stalled = self.drv_status(now) & DRV_STATUS_STALLGUARD != 0;
+        let driver_error = self.registers.is_set(GSTAT, GSTAT_DRV_ERR);
+        let stands = self.motor.tstep(now) == STANDSTILL;
+        let reset = self.registers.is_set(GSTAT, 1);
+        u8::from(stands) << 3 | u8::from(stalled) << 2 | u8::from(driver_error) << 1 | u8::from(reset)
+    }
+}
+
+/// SGT of COOLCONF, which has a sign.
+fn sgt(registers: &Registers) -> i32 {
+    let bits = (registers.get(COOLCONF) >> 16 & 0x7f) as i32;
+    if bits < 0x40 { bits } else { bits - 0x80 }
+}
+
+/// When DIAG1 tells of a stall: SG_RESULT is 0, at velocities from TCOOLTHRS on, and in SpreadCycle.
+fn stall_rule(registers: &Registers) -> StallRule {
+    let is_set = |bit| registers.is_set(GCONF, bit);
+    // The load from which on SG_RESULT is 0.
+    let load = (SG_FREE + SG_PER_SGT * sgt(registers)) * FULL_LOAD as i32;
+    let load = (load.max(0) as u32).div_ceil(SG_FALL as u32);
+    let stealth_from = if is_set(GCONF_EN_PWM_MODE) { registers.get(TPWMTHRS) } else { STANDSTILL };
+    StallRule {
+        least_load: (is_set(GCONF_DIAG1_STALL) && load <= FULL_LOAD && stealth_from > 0).then_some(load),
+        fastest: 0,
+        slowest: registers.get(TCOOLTHRS).min(stealth_from.saturating_sub(1)),
+        mres: (registers.get(CHOPCONF) >> 24 & 0xf).min(8),
+        push_pull: is_set(GCONF_DIAG1_PUSHPULL),
     }
 }
 
@@ -337,7 +313,6 @@ impl SpiChip for Tmc5160 {
     }
 
     fn select(&mut self, _rate_hz: u32) {
-        self.look();
         self.shift = u64::from(self.status()) << 32 | u64::from(self.reply);
         self.bytes = 0;
     }
@@ -370,7 +345,7 @@ impl SpiChip for Tmc5160 {
 mod tests {
     use super::super::SimConfig;
     use super::*;
-    use crate::time::VirtualClock;
+    use crate::time::{CLOCK_FREQ, VirtualClock};
 
     struct Bench {
         axis: Arc<Axis>,
@@ -382,7 +357,7 @@ mod tests {
         fn new() -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(0));
             let axis = Arc::new(Axis::new(&SimConfig::default_printer().axes[2]));
-            let chip = Tmc5160::new(axis.clone(), Arc::new(clock.clone()));
+            let chip = Tmc5160::new("z".into(), axis.clone(), Arc::new(clock.clone()));
             Bench { axis, clock, chip }
         }
 
@@ -412,10 +387,11 @@ mod tests {
             self.clock.set(Clock::from_ticks(self.clock.now().ticks() + ms * u64::from(CLOCK_FREQ) / 1000));
         }
 
-        /// Pulses of the step pin.
-        fn steps(&self, count: u32) {
+        /// Pulses of the step pin, one in so many milliseconds.
+        fn steps(&self, count: u32, ms: u64) {
             self.axis.set_enabled(true);
             for _ in 0..count {
+                self.advance_ms(ms);
                 self.axis.edge(true, self.clock.now());
                 self.axis.edge(false, self.clock.now());
             }
@@ -470,19 +446,18 @@ mod tests {
         bench.write(CHOPCONF, 0x1041_0150 | 4 << 24);
         bench.write(IHOLD_IRUN, 31 << 8 | 8);
         bench.axis.set_forward(true);
-        bench.advance_ms(16);
-        bench.steps(10);
-        // 192000 clocks and 160 microsteps of 1/256.
-        assert_eq!(bench.read(TSTEP), 1200);
-        assert_eq!(bench.read(DRV_STATUS), 0x001f_0000);
+        bench.steps(10, 2);
+        // 24000 clocks for 16 microsteps of 1/256.
+        assert_eq!(bench.read(TSTEP), 1500);
+        assert_eq!(bench.read(DRV_STATUS), 0x001f_00c8);
         assert_eq!(bench.read(IOIN), 0x3000_0042);
         assert_eq!(bench.read(MSCNT), 1024 - 160, "DIR is high");
         // The counter goes on from there in steps of another size, and backwards.
         bench.write(CHOPCONF, 0x1041_0150 | 8 << 24);
-        bench.steps(3);
+        bench.steps(3, 1);
         bench.write(GCONF, GCONF_SHAFT);
         bench.write(CHOPCONF, 0x1041_0150);
-        bench.steps(5);
+        bench.steps(5, 1);
         assert_eq!(bench.read(MSCNT), 1024 - 160 - 3 * 256 + 5);
         bench.advance_ms(90);
         assert_eq!(bench.read(TSTEP), STANDSTILL);
@@ -494,22 +469,39 @@ mod tests {
         let mut bench = Bench::new();
         let start = bench.axis.position_steps();
         bench.axis.set_forward(true);
-        bench.steps(3);
+        bench.steps(3, 1);
         assert_eq!(bench.axis.position_steps(), start + 3);
         bench.write(CHOPCONF, 0x1041_0150 | CHOPCONF_DEDGE);
-        bench.steps(3);
+        bench.steps(3, 1);
         assert_eq!(bench.axis.position_steps(), start + 9);
     }
 
+    /// Half a full step against the end of the axis is half of the full load.
     #[test]
-    fn the_wave_table_of_power_up_is_a_sine() {
-        let bench = Bench::new();
-        for microstep in 0..1024 {
-            let angle = f64::from(microstep) * std::f64::consts::TAU / 1024.0;
-            let value = f64::from(bench.chip.wave(microstep));
-            assert!((value - 247.5 * angle.sin()).abs() < 1.5, "{microstep}: {value}");
-        }
-        let peak = bench.chip.get(MSLUTSTART) >> 16;
-        assert_eq!(bench.chip.read(MSCURACT), peak << 16, "START_SIN90, and a sine of 0");
+    fn a_load_makes_sg_result_fall_and_sgt_makes_it_rise() {
+        let mut bench = Bench::new();
+        bench.write(CHOPCONF, 0x1041_0150 | 4 << 24);
+        bench.axis.set_forward(false);
+        // It stands at 12 mm and goes 2 mm beyond its end.
+        bench.steps(14 * 400 + 8, 1);
+        assert_eq!(bench.read(DRV_STATUS) & 0x3ff, 50);
+        assert_eq!(bench.datagram(DRV_STATUS, 0).0 & 4, 0);
+        bench.write(COOLCONF, 0x7c << 16);
+        assert_eq!(bench.read(DRV_STATUS) & 0x3ff, 10, "SGT of -4");
+        bench.write(COOLCONF, 0);
+        bench.write(GCONF, GCONF_DIAG1_STALL | GCONF_DIAG1_PUSHPULL);
+        bench.write(TCOOLTHRS, STANDSTILL);
+        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()));
+        bench.steps(3, 1);
+        assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, DRV_STATUS_STALLGUARD);
+        assert_eq!(bench.datagram(DRV_STATUS, 0).0 & 4, 4);
+        assert!(bench.chip.diag1.is_stalled(bench.clock.now()));
+        // In StealthChop there is no StallGuard.
+        bench.write(GCONF, GCONF_DIAG1_STALL | GCONF_EN_PWM_MODE);
+        assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, 0);
+        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()));
+        bench.advance_ms(90);
+        bench.write(GCONF, GCONF_DIAG1_STALL);
+        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()), "it stands still");
     }
 }

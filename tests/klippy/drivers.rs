@@ -1,0 +1,246 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Trinamic's drivers on their UART and on SPI: registers, currents, homing by the load.
+
+use std::collections::HashMap;
+
+use crate::checkout;
+use crate::klippy::Printer;
+
+/// The registers of a driver by name, as klippy dumps them.
+fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
+    let said = printer.answer(&format!("DUMP_TMC STEPPER={stepper}"));
+    let registers = said.lines().filter_map(|line| {
+        let (name, value) = line.trim_start_matches("// ").split_once(':')?;
+        let value = u32::from_str_radix(value.split_whitespace().next()?, 16).ok()?;
+        Some((name.to_owned(), value))
+    });
+    registers.collect()
+}
+
+/// The steps that klippy has had a stepper do, by its own count.
+fn steps(printer: &mut Printer, stepper: &str) -> i64 {
+    let said = printer.answer("GET_POSITION");
+    let (_, counts) = said.split_once("mcu: ").unwrap();
+    let mut words = counts.lines().next().unwrap().split([':', ' ']);
+    words.find(|word| *word == stepper).unwrap();
+    words.next().unwrap().parse().unwrap()
+}
+
+/// The registers that klippy reads of a TMC2209 after it set it up, with the values of its defaults
+/// (klippy/extras/tmc2209.py), at standstill.
+const TMC2209: [(&str, u32); 12] = [
+    // PDN_DISABLE, MSTEP_REG_SELECT, MULTISTEP_FILT, and SpreadCycle.
+    ("GCONF", 0x0000_01c4),
+    ("OTP_READ", 0x0000_000f),
+    ("FACTORY_CONF", 0x0000_000f),
+    ("TSTEP", 0x000f_ffff),
+    // 16 microsteps, both edges, interpolation.
+    ("CHOPCONF", 0x3403_0053),
+    ("DRV_STATUS", 0x8019_0000),
+    ("MSCNT", 0),
+    ("MSCURACT", 0x00f7_0000),
+    ("PWMCONF", 0xc80d_0e24),
+    ("PWM_SCALE", 0),
+    ("PWM_AUTO", 0x000e_0024),
+    ("SG_RESULT", 0),
+];
+
+#[test]
+fn klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two() {
+    let Some(checkout) = checkout("klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two") else { return };
+    for two in [false, true] {
+        let second = |board: String, _: &std::path::Path| match two {
+            true => board.replace("uart_pin = \"y_uart\"", "uart_pin = \"y_uart\"\ntx_pin = \"y_tx\"\naddress = 3"),
+            false => board,
+        };
+        let mut printer = Printer::start_on(&checkout, second, |config| config);
+        printer.until_state("ready");
+        let dumped = dump(&mut printer, "stepper_y");
+        for (name, value) in TMC2209 {
+            assert_eq!(dumped[name], value, "{name}: {:08x}", dumped[name]);
+        }
+        // The power stage is off; MS1 and MS2 are the address.
+        assert_eq!(dumped["IOIN"] & 0xff00_005d, 0x2100_0041 | if two { 3 << 2 } else { 0 });
+        assert_eq!(dumped["GSTAT"], 1, "it was switched on");
+        assert_eq!(dumped["IHOLD_IRUN"], 0x0008_1919);
+        let count = dumped["IFCNT"];
+
+        printer.gcode("SET_TMC_CURRENT STEPPER=stepper_y CURRENT=0.4 HOLDCURRENT=0.2");
+        let current = |printer: &mut Printer, key: &str| printer.object("tmc2209 stepper_y")[key].as_f64().unwrap();
+        assert!((current(&mut printer, "run_current") - 0.4).abs() < 0.02);
+        let dumped = dump(&mut printer, "stepper_y");
+        assert_eq!(dumped["IHOLD_IRUN"] & 0x1f1f, 0x0c06);
+        assert_eq!(dumped["DRV_STATUS"] >> 16 & 0x1f, 0x06, "the chip holds by it");
+        assert_eq!(dumped["IFCNT"], (count + 1) & 0xff);
+        printer.gcode("INIT_TMC STEPPER=stepper_y");
+
+        // At the first enable klippy tells of the reset, and clears it.
+        printer.gcode("G28 Y\nG1 Y50 F6000\nM400");
+        let log = printer.host_log("TMC 'stepper_y' reports GSTAT:      00000001 reset=1(Reset)", 1);
+        assert!(!log.contains("phase change") && !log.contains("Unable to"), "{log}");
+        let dumped = dump(&mut printer, "stepper_y");
+        assert_eq!(dumped["GSTAT"], 0);
+        // 16 microsteps to a full step: klippy knows by its own count where the driver's wave stands.
+        let status = printer.object("tmc2209 stepper_y");
+        let offset = status["mcu_phase_offset"].as_i64().unwrap();
+        let position = steps(&mut printer, "stepper_y");
+        let mscnt = i64::from(dumped["MSCNT"]);
+        let phase = if status["mcu_phase_offset"].is_null() { -1 } else { (position + offset).rem_euclid(64) };
+        let phases = [mscnt, 1023 - mscnt].map(|count| (count as f64 / 16.0).round() as i64 % 64);
+        assert!(phases.contains(&phase), "{phase} {phases:?}");
+    }
+}
+
+#[test]
+fn klippy_tells_of_a_driver_that_is_not_there() {
+    let Some(checkout) = checkout("klippy_tells_of_a_driver_that_is_not_there") else { return };
+    let mut printer = Printer::start_with(&checkout, |config| config.replace("uart_address: 0", "uart_address: 1"));
+    printer.until_state("ready");
+    printer.host_log("TMC stepper_y failed to init: Unable to read tmc uart 'stepper_y' register IFCNT", 1);
+    let error = printer.refused("DUMP_TMC STEPPER=stepper_y");
+    assert!(error.contains("Unable to read tmc uart 'stepper_y' register"), "{error}");
+    // The others are not disturbed.
+    printer.gcode("G28 X");
+    printer.stop("G28 Y");
+}
+
+/// Puts into use what printer.cfg offers for homing by the load.
+fn without_endstops(config: String) -> String {
+    let mut offered = false;
+    let mut changed = String::new();
+    for line in config.lines() {
+        let use_it = offered && line.starts_with('#') && !line.starts_with("# ");
+        offered = line == "# To home without the endstop, by the load:" || offered && (use_it || line.is_empty());
+        changed += if use_it { &line[1..] } else { line };
+        changed += "\n";
+    }
+    assert_eq!(changed.matches("\nendstop_pin: tmc").count(), 2, "{changed}");
+    changed
+}
+
+#[test]
+fn klippy_homes_by_the_load_at_the_end_of_an_axis() {
+    let Some(checkout) = checkout("klippy_homes_by_the_load_at_the_end_of_an_axis") else { return };
+    let mut printer = Printer::start_here(&checkout, |board, _| board, without_endstops);
+    for _ in 0..2 {
+        printer.gcode("G28");
+        let position =
+            |printer: &mut Printer, axis: usize| printer.object("toolhead")["position"][axis].as_f64().unwrap();
+        // (axis, its number, mm of a step)
+        for (axis, number, step_mm) in [("y", 1, 1.0 / 80.0), ("z", 2, 1.0 / 400.0)] {
+            let stands_mm = printer.probe().axis(axis).unwrap().position_mm;
+            assert_eq!(stands_mm, -2.0, "{axis} stands at its hard end");
+            let thinks_mm = position(&mut printer, number);
+            // It stalls a step or two after it lost what makes the load: 4 steps (y) or 11 (z).
+            let off = (thinks_mm - stands_mm) / step_mm;
+            assert!((-1.0..=2.0).contains(&off), "{axis}: klippy is off by {off} steps");
+        }
+        printer.gcode("G1 Y100 Z20 F3000\nM400");
+        for (axis, step_mm, wanted_mm) in [("y", 1.0 / 80.0, 100.0), ("z", 1.0 / 400.0, 20.0)] {
+            let off = (printer.probe().axis(axis).unwrap().position_mm - wanted_mm) / step_mm;
+            assert!((-20.0..=20.0).contains(&off), "{axis} is off by {off} steps");
+        }
+    }
+    // What homing set up is as before.
+    let dumped = dump(&mut printer, "stepper_y");
+    assert_eq!((dumped["GCONF"], dumped["TCOOLTHRS"], dumped["SGTHRS"]), (0x1c4, 0, 100));
+    let dumped = dump(&mut printer, "stepper_z");
+    assert_eq!((dumped["GCONF"] & 0x100, dumped["TCOOLTHRS"]), (0, 0));
+}
+
+/// Another sensor on the built-in printer's shaft.
+fn with_sensor(chip: &'static str) -> impl Fn(String, &std::path::Path) -> String {
+    move |board, _| {
+        let changed = board.replace("chip = \"tle5012b\"", &format!("chip = \"{chip}\""));
+        assert!(changed.contains(&format!("chip = \"{chip}\"")), "the built-in printer has another angle sensor");
+        changed
+    }
+}
+
+/// Lets klippy calibrate the sensor against its stepper.
+fn with_stepper(config: String) -> String {
+    let changed = config.replace("#stepper: stepper_y", "stepper: stepper_y");
+    assert_ne!(config, changed);
+    changed
+}
+
+#[test]
+fn klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft() {
+    let Some(checkout) = checkout("klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft") else { return };
+    let mut printer = Printer::start_here(&checkout, with_sensor("tle5012b"), with_stepper);
+    let read = printer.answer("ANGLE_DEBUG_READ CHIP=y REG=0x06");
+    assert!(read.contains("ANGLE REG[0x06] = 0x4001"), "{read}");
+    printer.gcode("G28 Y\nG1 Y110 F6000\nANGLE_CALIBRATE CHIP=y");
+    let pending = printer.object("configfile")["save_config_pending_items"]["angle y"]["calibrate"].clone();
+    let table = pending.as_str().unwrap().replace('\n', "");
+    let angles: Vec<f64> = table.split(',').map(|angle| angle.trim().parse().unwrap()).collect();
+    // One for each full step, with the error of the magnet: 0.6 degrees of 65536.
+    assert_eq!(angles.len(), 200);
+    let even = |n: usize| (angles[n] - angles[0] - n as f64 * 65536.0 / 200.0 + 32768.0).rem_euclid(65536.0) - 32768.0;
+    let even: Vec<f64> = (0..200).map(even).collect();
+    let spread = even.iter().copied().fold(f64::MIN, f64::max) - even.iter().copied().fold(f64::MAX, f64::min);
+    assert!((200.0..240.0).contains(&spread), "{spread}");
+
+    printer.configure(|config| with_stepper(config).replace("[angle y]", &format!("[angle y]\ncalibrate: {table}")));
+    printer.restart("RESTART");
+    printer.gcode("G28 Y\nG1 Y100 F6000\nM400");
+    // Each batch has the angle, and where klippy believes the axis to be by it.
+    let mut errors_mm = Vec::new();
+    for place_mm in [100, 103, 107, 112, 120, 131, 150] {
+        printer.gcode(&format!("G1 Y{place_mm}\nM400\nG4 P300"));
+        let batch = printer.angles("y");
+        let offset_mm = batch["position_offset"].as_f64().unwrap();
+        let (_, angle) = batch["data"].as_array().unwrap().last().map(|sample| (&sample[0], &sample[1])).unwrap();
+        // 40 mm are a turn, whichever way round.
+        let turn_mm = angle.as_f64().unwrap() * 40.0 / 65536.0;
+        errors_mm.push(turn_mm + offset_mm - f64::from(place_mm));
+    }
+    // Uncalibrated they would differ by 0.13 mm.
+    let (least, most) = errors_mm.iter().fold((f64::MAX, f64::MIN), |(l, m), error| (l.min(*error), m.max(*error)));
+    assert!(most - least < 0.005, "{errors_mm:?}");
+}
+
+#[test]
+fn klippy_reads_each_kind_of_angle_sensor() {
+    let Some(checkout) = checkout("klippy_reads_each_kind_of_angle_sensor") else { return };
+    for chip in ["a1333", "as5047d", "mt6816", "mt6826s", "tle5012b"] {
+        let mut printer = Printer::start_here(&checkout, with_sensor(chip), |config| config);
+        printer.gcode("G28 Y\nG1 Y100 F6000\nM400\nG4 P200");
+        let last = |batch: &serde_json::Value| batch["data"].as_array().unwrap().last().unwrap()[1].as_f64().unwrap();
+        let at_100 = last(&printer.angles("y"));
+        // Two turns and a half; the magnet's error of 0.6 degrees at 77 degrees, half a turn on the other way.
+        let error = 0.6 / 360.0 * 65536.0 * 77f64.to_radians().sin();
+        let expected = (77.0 / 360.0 + 0.5) * 65536.0 - error;
+        assert!((at_100.rem_euclid(65536.0) - expected).abs() < 9.0, "{chip}: {at_100} {expected}");
+        // klippy counts on from turn to turn: half a turn more.
+        printer.gcode("G1 Y120 F6000\nM400\nG4 P200");
+        let batch = printer.angles("y");
+        let on = last(&batch) - at_100;
+        assert!((on.rem_euclid(65536.0) - 32768.0 - 2.0 * error).abs() < 9.0, "{chip}: {on}");
+        match chip {
+            "mt6816" => assert!(printer.answer("ANGLE_DEBUG_READ CHIP=y").contains("No Mag: 0")),
+            "mt6826s" => {
+                let read = printer.answer("ANGLE_DEBUG_READ CHIP=y REG=0x003");
+                let (_, sums) = read.split_once("CRC: ").unwrap();
+                let (one, other) = sums.lines().next().unwrap().split_once(" == ").unwrap();
+                assert_eq!(one, other.trim());
+            }
+            _ => {}
+        }
+    }
+}
+
+#[test]
+fn klippy_has_an_angle_sensor_calibrate_itself() {
+    let Some(checkout) = checkout("klippy_has_an_angle_sensor_calibrate_itself") else { return };
+    // 22 turns and more have no room on an axis that ends.
+    let long = |board: String, path: &std::path::Path| {
+        let (before, y) = board.split_once("name = \"y\"\n").unwrap();
+        with_sensor("mt6826s")(format!("{before}name = \"y\"\n{}", y.replacen("220.0", "9000.0", 1)), path)
+    };
+    let mut printer = Printer::start_here(&checkout, long, with_stepper);
+    printer.gcode("G28 Y");
+    let said = printer.answer("ANGLE_CHIP_CALIBRATE CHIP=y");
+    assert!(said.contains("Calibration success"), "{said}");
+    assert!(printer.answer("ANGLE_DEBUG_READ CHIP=y REG=0x113").contains("Status: Calibration Successful"));
+}
