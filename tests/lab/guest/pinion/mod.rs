@@ -6,6 +6,7 @@ mod outputs;
 
 mod analog;
 mod buttons;
+mod counter;
 mod ds18b20;
 mod duplicate;
 mod expander;
