@@ -6,6 +6,7 @@
 //! former every test here is skipped, and says so.
 
 mod klippy;
+mod regression;
 
 use std::io::Write;
 use std::path::PathBuf;
