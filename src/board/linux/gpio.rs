@@ -22,6 +22,7 @@ use std::time::Duration;
 use gpio_cdev::{LineDirection, LineHandle, LineRequestFlags};
 use nix::unistd::{Gid, Group, User, geteuid};
 
+use super::GPIO;
 use super::guard::SharedGuard;
 use crate::board::{Bias, Direction, EdgeCount, Edges, Line};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
@@ -54,6 +55,8 @@ pub struct Chip {
     pub number: u32,
     /// The driver's label, such as `pinctrl-bcm2835`.
     pub label: String,
+    /// Whether calls to it may block: an expander.
+    pub sleeps: bool,
     /// Its lines by offset.
     pub lines: Vec<LineInfo>,
 }
@@ -75,7 +78,7 @@ pub struct LineInfo {
 ///
 /// A node that is a link to another chip's (`/dev/gpiochip4` on a Raspberry Pi 5) is left out, as
 /// its lines are those of the other chip. Pins with its number work all the same.
-pub(super) fn scan(dev: &Path) -> (Vec<Chip>, Vec<String>) {
+pub(super) fn scan(dev: &Path, devices: &Path) -> (Vec<Chip>, Vec<String>) {
     let mut chips = Vec::new();
     let mut problems = Vec::new();
     for number in nodes(dev) {
@@ -91,7 +94,8 @@ pub(super) fn scan(dev: &Path) -> (Vec<Chip>, Vec<String>) {
             continue;
         }
         let lines = chip.lines().map(|line| look_at(&line)).collect();
-        chips.push(Chip { number, label: chip.label().to_owned(), lines });
+        let sleeps = may_sleep(devices, chip.name(), chip.label());
+        chips.push(Chip { number, label: chip.label().to_owned(), sleeps, lines });
     }
     (chips, problems)
 }
@@ -147,7 +151,7 @@ pub(super) struct Handle {
 pub(super) fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Result<Handle, Shutdown> {
     let path = node(dev, number);
     let mut chip = gpio_cdev::Chip::new(&path).map_err(|error| match errno(&error) {
-        libc::ENOENT => Shutdown::because(reason::CHIP_MISSING, missing(&path, &scan(dev).0)),
+        libc::ENOENT => Shutdown::because(reason::CHIP_MISSING, missing(&path, &scan(dev, Path::new(GPIO)).0)),
         code => Shutdown::because(reason::CHIP_OPEN, cannot_open(&path, code)),
     })?;
     let subject = Subject { chip: chip.name().to_owned(), label: chip.label().to_owned(), offset, name: None };
@@ -777,7 +781,7 @@ mod tests {
 
     #[test]
     fn a_missing_chip_lists_those_that_are_there() {
-        let chip = |number, label: &str| Chip { number, label: label.into(), lines: vec![] };
+        let chip = |number, label: &str| Chip { number, label: label.into(), sleeps: false, lines: vec![] };
         let path = Path::new("/dev/gpiochip5");
         assert_eq!(
             missing(path, &[chip(0, "pinctrl-rp1"), chip(10, "gpio-brcmstb@107d508500")]),
@@ -813,7 +817,7 @@ mod tests {
         assert_eq!(none.reason, reason::CHIP_OPEN);
         assert!(none.to_string().contains("is not a GPIO chip"), "{none}");
         assert_eq!(nodes(dev.path()), [3]);
-        let (chips, problems) = scan(dev.path());
+        let (chips, problems) = scan(dev.path(), dev.path());
         assert!(chips.is_empty());
         assert_eq!(problems.len(), 1);
     }

@@ -57,7 +57,7 @@ impl Inventory {
     /// Looks for chips, ADCs and buses. A machine that has none of them is no error.
     pub fn scan() -> Inventory {
         let dev = Path::new(DEV);
-        let (chips, problems) = gpio::scan(dev);
+        let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
         let mut inventory =
             Inventory { chips, spi: spi::scan(dev), i2c: i2c::scan(dev), problems, ..Inventory::default() };
         match adc::context(Path::new(IIO)) {
@@ -372,6 +372,7 @@ mod tests {
             chips: vec![gpio::Chip {
                 number: 0,
                 label: "pinctrl-bcm2835".into(),
+                sleeps: false,
                 lines: vec![gpio::LineInfo::default(); 54],
             }],
             adcs: vec![adc::IioDevice { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
