@@ -84,17 +84,17 @@ fn a_fan_of_20_000_rpm_is_measured() {
     configure(client, 1, &[COUNTER]);
     query(client);
     settled(client);
-    // Two pulses a turn are 1333 edges a second.
-    let fan = thread::spawn(move || {
-        let began = Instant::now();
-        for edge in 1..1000 {
-            sim.pull(TACHO, edge % 2 == 1);
-            thread::sleep((Duration::from_micros(750) * edge).saturating_sub(began.elapsed()));
-        }
-        sim
+    let told: Vec<(u32, u32)> = thread::scope(|scope| {
+        // Two pulses a turn are 1333 edges a second.
+        scope.spawn(|| {
+            let began = Instant::now();
+            for edge in 1..1000 {
+                sim.pull(TACHO, edge % 2 == 1);
+                thread::sleep((Duration::from_micros(750) * edge).saturating_sub(began.elapsed()));
+            }
+        });
+        (0..6).map(|_| next(client)).collect()
     });
-    let told: Vec<(u32, u32)> = (0..6).map(|_| next(client)).collect();
-    fan.join().expect("a fan");
     for pair in told[1..].windows(2) {
         let (count, ticks) = (pair[1].0 - pair[0].0, pair[1].1 - pair[0].1);
         let rpm = f64::from(count) / 4.0 * 60.0 * 50e6 / f64::from(ticks);
@@ -117,11 +117,12 @@ fn a_pin_that_floats_is_polled_and_can_be_an_output_after_a_restart() {
         (0..2000).for_each(|edge| set(&mut pull, edge % 2 == 0));
     }
     let (before, _) = settled(client);
-    // Shorter than the polling, and longer.
+    // Shorter than the polling, of which one look may meet the pin high; and longer.
     edges(&sim, 100);
-    assert_eq!(settled(client).0, before, "interrupts still count");
+    let (low, _) = settled(client);
+    assert!(low - before <= 2, "interrupts still count");
     sim.pull(TACHO, true);
-    assert_eq!(settled(client).0, before + 1);
+    assert_eq!(settled(client).0, low + 1);
     sim.pull(TACHO, false);
     configure(client, 1, &["config_digital_out oid=0 pin=lab/gpio3 value=1 default_value=1 max_duration=0"]);
     assert!(sim.level(TACHO));
@@ -147,7 +148,7 @@ fn a_counter_shares_its_pin_with_inputs_and_is_polled_if_it_comes_second() {
         let (low, _) = settled(client);
         edges(&sim, 100);
         let (after, _) = settled(client);
-        assert_eq!(after - low, if polled { 0 } else { 100 });
+        assert!(if polled { after - low <= 2 } else { after - low == 100 }, "{}", after - low);
         sim.pull(TACHO, true);
         assert!(sees(client));
         assert!(settled(client).0 > before);
