@@ -376,7 +376,7 @@ fn no_edges(code: i32) -> Box<str> {
     let why = match code {
         libc::ENXIO => "its chip has no interrupts".to_owned(),
         libc::EBUSY => "its interrupt is in use".to_owned(),
-        libc::EINVAL | libc::ENOTTY => "the kernel, which is older than 5.10, or its driver does not".to_owned(),
+        libc::EINVAL | libc::ENOTTY => "Linux before 5.10 does so for no line, and some drivers for none".to_owned(),
         _ => text(code),
     };
     format!("the kernel does not tell of its edges ({why})").into()
@@ -677,6 +677,27 @@ mod tests {
              (pinion pins lists them)"
         );
         assert!(refusal(libc::EBUSY, Bias::PullUp, None, "6.6.0").contains("by the kernel:"));
+    }
+
+    #[test]
+    fn an_edge_event_is_laid_out_as_the_kernel_has_it() {
+        // timestamp_ns, id, offset, seqno, line_seqno and padding.
+        let mut event = [0xee; EVENT_BYTES];
+        event[..8].copy_from_slice(&5_000_000_007_u64.to_ne_bytes());
+        event[20..24].copy_from_slice(&70_000_u32.to_ne_bytes());
+        let last = Some(Duration::new(5, 7));
+        assert_eq!(edge_count(&event), EdgeCount { count: 70_000, last });
+    }
+
+    #[test]
+    fn a_line_without_edges_says_why() {
+        for (code, why) in [
+            (libc::ENXIO, "its chip has no interrupts"),
+            (libc::EBUSY, "its interrupt is in use"),
+            (libc::EINVAL, "before 5.10"),
+        ] {
+            assert!(no_edges(code).contains(why), "{}", no_edges(code));
+        }
     }
 
     #[test]
