@@ -103,6 +103,9 @@ pub trait TimeSource: Send + Sync {
     /// The errand has ended.
     fn end_errand(&self) {}
 
+    /// The instant that CLOCK_MONOTONIC tells as `monotonic`: the kernel dates by that clock.
+    fn instant_of(&self, monotonic: Duration) -> Clock;
+
     /// Waits until `end` without sleeping: for the pulses of a bus, which are shorter than a sleep.
     fn spin_until(&self, end: Clock) {
         while self.now() < end {
@@ -135,9 +138,12 @@ impl Monotonic {
 
 impl TimeSource for Monotonic {
     fn now(&self) -> Clock {
-        let now = monotonic();
-        let s = now.as_secs() - self.origin_s;
-        Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(now.subsec_nanos()) / NS_PER_TICK)
+        self.instant_of(monotonic())
+    }
+
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        let s = monotonic.as_secs().saturating_sub(self.origin_s);
+        Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
     }
 }
 
@@ -177,6 +183,12 @@ impl TimeSource for VirtualClock {
         Clock(self.0.load(Ordering::SeqCst))
     }
 
+    /// Its tick 0 is that clock's zero.
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        let s = monotonic.as_secs();
+        Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
+    }
+
     fn spin_until(&self, end: Clock) {
         self.set(end);
     }
@@ -208,5 +220,14 @@ mod tests {
         let clock = Monotonic::start();
         assert_eq!(clock.duration_of(Clock::EPOCH).subsec_nanos(), 0);
         assert!(clock.now().ticks() < 2 * u64::from(CLOCK_FREQ));
+    }
+
+    #[test]
+    fn an_instant_of_the_kernel_s_clock_is_one_of_ours() {
+        let clock = Monotonic::start();
+        for ticks in [0, 1, 49_999_999, 50_000_000, 1 << 40] {
+            let instant = Clock::from_ticks(ticks);
+            assert_eq!(clock.instant_of(clock.duration_of(instant)), instant);
+        }
     }
 }

@@ -103,6 +103,7 @@ const OBJECTS: &[&str] = &[
     "config_adxl345 oid=14 spi_oid=7",
     "config_buttons oid=9 button_count=2",
     "config_counter oid=10 pin=12 pull_up=1",
+    "config_counter oid=15 pin=13 pull_up=1",
     "config_thermocouple oid=11 spi_oid=7 thermocouple_type=3",
     "config_ds18b20 oid=12 serial=3238 max_error_count=4",
     "config_neopixel oid=13 pin=701 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
@@ -114,6 +115,7 @@ const BEGINNINGS: &[&str] = &[
     "buttons_add oid=9 pos=1 pin=11 pull_up=1",
     "buttons_query oid=9 clock=@100000 rest_ticks=100000 retransmit_count=50 invert=0",
     "query_counter oid=10 clock=@100000 poll_ticks=75000 sample_ticks=50000000",
+    "query_counter oid=15 clock=@100000 poll_ticks=75000 sample_ticks=50000000",
     "query_thermocouple oid=11 clock=@100000 rest_ticks=50000000 min_value=0 max_value=65535 max_invalid_count=255",
     "query_ds18b20 oid=12 clock=@100000 rest_ticks=150000000 min_value=-55000 max_value=125000",
 ];
@@ -125,6 +127,7 @@ fn print(rig: Rig) -> Print {
     print.rig.bench.script_input(6, &[(9_000_000, 1), (30_000_000, 0), (1_470_000_000, 1)]);
     print.rig.bench.script_input(11, &[(50_000_000, 1), (900_000_000, 0)]);
     print.rig.bench.script_input(12, &[(50_000_000, 1), (60_000_000, 0)]);
+    print.rig.bench.script_input(13, &[(50_000_000, 1), (60_000_000, 0)]);
     print.rig.send_all(BEGINNINGS);
     print.send("query_analog_in oid=6 clock=@100000 sample_ticks=50000 sample_count=8 rest_ticks=15000000 bytes_per_report=48 min_value=0 max_value=65535 range_check_count=4");
     // The bench has room for a few hundred transfers.
@@ -194,6 +197,7 @@ fn a_print_allocates_nothing_once_configured() {
         let mut rig = Rig::new();
         rig.bench.state().answer_ticks = answer_ticks;
         rig.bench.script_ds18b20("28", &[Some(20_000)]);
+        rig.bench.state().counted.insert(13);
         rig.configure(OBJECTS);
         let print = print(rig);
         assert_eq!(print.rig.notes().len(), 1, "configured, and nothing else");

@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Clock, Ticks, TimeSource};
@@ -119,6 +120,40 @@ pub struct ClaimedLine {
     /// The name of the worker of the line's chip, if calls to that chip may block, as it is an
     /// expander on I2C, SPI or USB. The core must not call such a line.
     pub sleeps_on: Option<String>,
+}
+
+/// What an interrupt has counted of a line's edges.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct EdgeCount {
+    /// Edges of both directions since the line was claimed, modulo 2^32.
+    pub count: u32,
+    /// When the last one came, in CLOCK_MONOTONIC; none before the first.
+    pub last: Option<Duration>,
+}
+
+/// The edges of a line, which an interrupt counts and dates. A worker makes these calls.
+pub trait Edges: Send {
+    /// The edges up to now.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed".
+    fn count(&mut self) -> Result<EdgeCount, Shutdown>;
+
+    /// Ends the interrupts. The line can still be read.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open in GPIO chip line".
+    fn end(&mut self) -> Result<(), Shutdown>;
+}
+
+/// An input whose edges are to be counted, as the board hands it out.
+pub struct CountedLine {
+    /// The line, to be read and to be shared.
+    pub line: ClaimedLine,
+    /// Its edges; or for the log why no interrupt counts them.
+    pub edges: Result<OnWorker<dyn Edges>, Box<str>>,
 }
 
 /// An ADC channel.
@@ -335,6 +370,16 @@ pub trait Board: Send {
     /// chip device", "Unable to open out GPIO chip line", "Unable to open in GPIO chip line",
     /// "Guardian process lost".
     fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown>;
+
+    /// Claims an input that nobody has claimed yet, and has its edges counted where that can be.
+    ///
+    /// # Errors
+    ///
+    /// Those of [`Board::line`].
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
+        let line = self.line(pin, Direction::Input(bias))?;
+        Ok(CountedLine { line, edges: Err("this board has no edge events".into()) })
+    }
 
     /// Opens an ADC channel.
     ///

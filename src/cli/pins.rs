@@ -141,7 +141,8 @@ fn chip_section(chip: &Chip, names: &Names, args: &PinsArgs) -> String {
         ])
     };
     let rows: Vec<Vec<String>> = (0..).zip(&chip.lines).filter_map(row).collect();
-    let heading = format!("{path} {}, {} lines", chip.label, chip.lines.len());
+    let behind = if chip.sleeps { ", behind a bus: not for steps or other timed edges" } else { "" };
+    let heading = format!("{path} {}, {} lines{behind}", chip.label, chip.lines.len());
     section(&heading, &["line", "name", "dir", "held by", "in printer.cfg"], &rows)
 }
 
@@ -217,6 +218,7 @@ mod tests {
             chips: vec![Chip {
                 number: 0,
                 label: "pinctrl-bcm2835".into(),
+                sleeps: false,
                 lines: vec![
                     line("ID_SDA", None, false),
                     line("-", None, false),
@@ -266,6 +268,14 @@ SPI
   /dev/spidev0.1  spi_bus: spidev0.1, or for LEDs pin: spidev0.1
 "
         );
+    }
+
+    #[test]
+    fn a_chip_behind_a_bus_says_what_it_is_no_good_for() {
+        let mut inventory = pi();
+        inventory.chips[0].sleeps = true;
+        let list = list(&inventory, &PinsArgs::default(), &|_, _| String::new());
+        assert!(list.starts_with("gpiochip0 pinctrl-bcm2835, 3 lines, behind a bus: not for steps"), "{list}");
     }
 
     #[test]

@@ -239,6 +239,11 @@ impl Object for Chips {
         Ok(())
     }
 
+    /// It can not: it holds descriptors of lines and of PWM channels, and no chips on a bus.
+    fn is_guarded(&self) -> bool {
+        false
+    }
+
     fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
         let mut safe = Safe::Now;
         for (output, tag) in self.outputs.iter_mut().zip(0..=u8::MAX).filter(|(output, _)| output.is_used) {

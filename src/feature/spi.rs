@@ -225,6 +225,11 @@ impl Object for SpiShutdown {
         }
     }
 
+    /// It can not: it holds no chips on a bus.
+    fn is_guarded(&self) -> bool {
+        false
+    }
+
     fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
         let has_bus = mcu.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
         if !has_bus {

@@ -10,7 +10,7 @@
 
 use std::sync::Arc;
 
-use crate::board::{Bias, Board, ClaimedLine, Direction, Line, Pin};
+use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line, OnWorker, Pin};
 use crate::shutdown::{Shutdown, reason};
 
 use super::{Done, Errand, Mcu, Remote, Safe, Settable, Ticket, WorkerId};
@@ -192,6 +192,9 @@ impl InputLine {
     }
 }
 
+/// What counts a line's edges, and the worker that asks it; or why nothing does.
+pub type CountedEdges = Result<(WorkerId, Box<dyn Edges>), Box<str>>;
+
 impl Mcu {
     /// The board, to claim something: that opens files and waits for the guardian, so the steps
     /// of a configured machine would wait, too.
@@ -320,6 +323,26 @@ impl Mcu {
     pub fn input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
         let (line, worker) = self.claim(pin, Direction::Input(bias))?;
         Ok(InputLine::new(line, worker))
+    }
+
+    /// Claims an input whose edges an interrupt counts, if there is one.
+    ///
+    /// # Errors
+    ///
+    /// Those of the board, such as "Unable to open in GPIO chip line".
+    pub fn counted_input(&mut self, pin: Pin, bias: Bias) -> Result<(InputLine, CountedEdges), Shutdown> {
+        let own = self.board()?.canonical(pin);
+        if self.claims.iter().any(|claim| claim.pin == own) {
+            return Ok((self.input(pin, bias)?, Err("the pin has another use, too, from before".into())));
+        }
+        let CountedLine { line: ClaimedLine { line, sleeps_on }, edges } = self.board.counted_line(own, bias)?;
+        let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
+        self.claims.push(Claim { pin: own, line: line.clone(), worker });
+        let edges = match edges {
+            Ok(OnWorker { bus, device }) => Ok((self.workers.start(&bus)?, device)),
+            Err(why) => Err(why),
+        };
+        Ok((InputLine::new(line, worker), edges))
     }
 
     /// Claims an input, after `finalize_config` too. That opens a file and may start a thread, for

@@ -61,6 +61,11 @@ pub trait Object: Any + Send {
         Ok(Safe::Now)
     }
 
+    /// Whether the guardian process, too, can drive the outputs to their shutdown values.
+    fn is_guarded(&self) -> bool {
+        true
+    }
+
     /// The chip that this object stands for, if it is a bus device whose bus is set.
     fn bus(&self) -> Option<&Bus> {
         None

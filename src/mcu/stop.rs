@@ -3,14 +3,19 @@
 //!
 //! An output whose shutdown value can not be written at once, as a worker has to write it or as
 //! writing failed, is *owed*. What failed is tried again every [`RETRY_TICKS`]. Whoever runs the
-//! machine watches [`Mcu::debtor`]: a debt that lasts is for the guardian.
+//! machine watches [`Mcu::debtor`]: a debt that lasts is for the guardian. What the guardian can not
+//! write either ([`Object::is_guarded`]) is owed for [`UNGUARDED_LIMIT`] only: to end the program for it
+//! would help nobody. It is still tried until the next configuration.
 
 #![forbid(unsafe_code)]
 
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
-use crate::time::Ticks;
+use crate::time::{Clock, Ticks};
 
 use super::{Mcu, Note, Oid, Safe, TimerId, base};
+
+#[cfg(doc)]
+use super::Object;
 
 /// The pause between two attempts to write a shutdown value.
 pub const RETRY_TICKS: Ticks = Ticks::from_us(50_000);
@@ -20,6 +25,10 @@ pub const RETRY_TICKS: Ticks = Ticks::from_us(50_000);
 /// that hangs would keep the host from stopping the machine: once its window of unacknowledged blocks
 /// is full, it can not even send an `emergency_stop`.
 pub(super) const HOLD_LIMIT: Ticks = Ticks::from_us(5_000_000);
+
+/// How long the machine waits for shutdown values that only it can write: less than the second after which
+/// the guardian takes over.
+const UNGUARDED_LIMIT: Ticks = Ticks::from_us(500_000);
 
 /// What a stopped machine knows of its stop.
 #[derive(Default)]
@@ -38,6 +47,11 @@ struct Debt {
     name: String,
     /// Whether writing failed.
     failed: bool,
+    /// Whether the guardian holds the output, too.
+    guarded: bool,
+    since: Clock,
+    /// Whether nobody waits for it any more.
+    given_up: bool,
 }
 
 impl Mcu {
@@ -57,6 +71,9 @@ impl Mcu {
         let first = self.stop.reason.is_none();
         let reason = *self.stop.reason.get_or_insert(shutdown.reason);
         self.stop.under_way = true;
+        if first {
+            self.stop.owed.iter_mut().for_each(|debt| (debt.since, debt.given_up) = (clock, false));
+        }
         self.timers.clear();
         for oid in self.oids() {
             if let Some(mut object) = self.take(oid) {
@@ -132,13 +149,13 @@ impl Mcu {
 
     /// The name of an object that owes its shutdown value, for the log; none if nothing is owed.
     pub fn debtor(&self) -> Option<&str> {
-        self.stop.owed.first().map(|debt| debt.name.as_str())
+        self.stop.owed.iter().find(|debt| !debt.given_up).map(|debt| debt.name.as_str())
     }
 
     /// Whether any shutdown value is owed.
     #[inline]
     pub fn owes(&self) -> bool {
-        !self.stop.owed.is_empty()
+        self.stop.owed.iter().any(|debt| !debt.given_up)
     }
 
     fn oids(&self) -> impl Iterator<Item = Oid> + use<> {
@@ -148,11 +165,12 @@ impl Mcu {
     fn make_safe(&mut self, oid: Oid) {
         let Some(mut object) = self.take(oid) else { return };
         let safe = object.make_safe(self, oid);
-        let kind = object.kind();
+        let (kind, guarded) = (object.kind(), object.is_guarded());
         self.put_back(oid, object);
         if !matches!(safe, Ok(Safe::Now)) && !self.stop.owed.iter().any(|debt| debt.oid == oid) {
             let name = self.name_object(kind, oid);
-            self.stop.owed.push(Debt { oid, name, failed: false });
+            let since = self.last_read;
+            self.stop.owed.push(Debt { oid, name, failed: false, guarded, since, given_up: false });
         }
         match safe {
             Ok(Safe::Now) => self.is_safe(oid),
@@ -164,17 +182,31 @@ impl Mcu {
         }
     }
 
-    /// Starts the timer of the next attempt, if any shutdown value could not be written.
+    /// Starts the timer of the next attempt, if any shutdown value could not be written, or will be given
+    /// up.
     fn retry_later(&mut self) {
-        if self.stop.owed.iter().any(|debt| debt.failed) {
+        if self.stop.owed.iter().any(|debt| debt.failed || !debt.guarded && !debt.given_up) {
             self.timers.remove(TimerId::RETRY);
             let at = self.last_read + RETRY_TICKS;
             self.timers.insert(at, TimerId::RETRY);
         }
     }
 
-    /// Tries again to write the shutdown values that could not be written.
+    /// Tries again to write the shutdown values that could not be written, and no longer waits for those
+    /// that only this machine could write and could not.
     pub(super) fn retry(&mut self) {
+        let now = self.now();
+        for debt in self.stop.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {
+            if now.since(debt.since) >= i64::from(UNGUARDED_LIMIT.0) {
+                debt.given_up = true;
+                let detail = format!(
+                    "{} has not taken its shutdown values for {} ms, and nothing else can write them: its outputs may be on; check its power and wiring, then FIRMWARE_RESTART",
+                    debt.name,
+                    UNGUARDED_LIMIT.0 / Ticks::from_us(1000).0
+                );
+                self.outbox.note(Note::Trouble(&Shutdown::because(reason::BUS_HANGS, detail)));
+            }
+        }
         for place in (0..self.stop.owed.len()).rev() {
             let failed = self.stop.owed.get(place).filter(|debt| debt.failed).map(|debt| debt.oid);
             if let Some(oid) = failed {

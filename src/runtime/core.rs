@@ -412,6 +412,10 @@ mod tests {
             self.1.fetch_add(1, Ordering::Relaxed);
             self.0.now()
         }
+
+        fn instant_of(&self, monotonic: Duration) -> Clock {
+            self.0.instant_of(monotonic)
+        }
     }
 
     /// A core at work with an SPI device and a digital output, and what stands for its link.

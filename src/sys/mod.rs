@@ -9,6 +9,7 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::AtomicU32;
 
 use nix::cmsg_space;
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::sys::mman::{MapFlags, ProtFlags, mmap_anonymous};
 use nix::sys::signal::{SigHandler, Signal, signal};
 use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg};
@@ -160,7 +161,39 @@ pub(crate) struct LineConfig {
     padding: [u32; 4],
 }
 
+/// `struct gpio_v2_line_config` (linux/gpio.h, since Linux 5.10): flags and attributes of a line
+/// request's lines. An attribute is of 24 bytes.
+#[repr(C)]
+pub(crate) struct LineRequestConfig {
+    flags: u64,
+    num_attrs: u32,
+    padding: [u32; 5],
+    attrs: [[u64; 3]; 10],
+}
+
+/// `struct gpio_v2_line_request` (linux/gpio.h, since Linux 5.10).
+#[repr(C)]
+pub(crate) struct LineRequest {
+    offsets: [u32; 64],
+    consumer: [u8; 32],
+    config: LineRequestConfig,
+    num_lines: u32,
+    event_buffer_size: u32,
+    padding: [u32; 5],
+    fd: i32,
+}
+
+/// `struct gpio_v2_line_values` (linux/gpio.h, since Linux 5.10).
+#[repr(C)]
+pub(crate) struct LineRequestValues {
+    bits: u64,
+    mask: u64,
+}
+
 mod request {
+    nix::ioctl_readwrite!(gpio_v2_get_line, 0xB4, 0x07, super::LineRequest);
+    nix::ioctl_readwrite!(gpio_v2_line_set_config, 0xB4, 0x0d, super::LineRequestConfig);
+    nix::ioctl_readwrite!(gpio_v2_line_get_values, 0xB4, 0x0e, super::LineRequestValues);
     nix::ioctl_readwrite!(gpiohandle_set_config, 0xB4, 0x0a, super::LineConfig);
     nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
     nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
@@ -204,6 +237,50 @@ pub(crate) fn set_line_checked(line: &impl AsRawFd, flags: u32, value: bool) -> 
     }
 }
 
+/// What `flags` (`GPIO_V2_LINE_FLAG_`) make a line, without attributes.
+fn line_request_config(flags: u64) -> LineRequestConfig {
+    LineRequestConfig { flags, num_attrs: 0, padding: [0; 5], attrs: [[0; 3]; 10] }
+}
+
+/// Requests one line of an open GPIO chip with `GPIO_V2_LINE_FLAG_` flags. What is read from the file is its
+/// edges, if the flags ask for them; a read without any does not wait.
+pub(crate) fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, consumer: &str) -> io::Result<fs::File> {
+    let mut request = LineRequest {
+        offsets: [0; 64],
+        consumer: [0; 32],
+        config: line_request_config(flags),
+        num_lines: 1,
+        event_buffer_size: 0,
+        padding: [0; 5],
+        fd: -1,
+    };
+    request.offsets[0] = offset;
+    // The last byte stays 0.
+    request.consumer.iter_mut().zip(consumer.bytes().take(31)).for_each(|(to, from)| *to = from);
+    // SAFETY: the request takes a `struct gpio_v2_line_request`, which lives through the call.
+    unsafe { request::gpio_v2_get_line(chip.as_raw_fd(), &mut request) }?;
+    // SAFETY: the kernel has just made this descriptor for us.
+    let line = unsafe { OwnedFd::from_raw_fd(request.fd) };
+    fcntl(&line, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
+    Ok(line.into())
+}
+
+/// Gives a line of [`request_line`] other flags.
+pub(crate) fn set_line_flags(line: &impl AsRawFd, flags: u64) -> io::Result<()> {
+    let mut config = line_request_config(flags);
+    // SAFETY: the request takes a `struct gpio_v2_line_config`, which lives through the call.
+    unsafe { request::gpio_v2_line_set_config(line.as_raw_fd(), &mut config) }?;
+    Ok(())
+}
+
+/// The level of a line of [`request_line`].
+pub(crate) fn line_level(line: &impl AsRawFd) -> io::Result<bool> {
+    let mut values = LineRequestValues { bits: 0, mask: 1 };
+    // SAFETY: the request takes a `struct gpio_v2_line_values`, which lives through the call.
+    unsafe { request::gpio_v2_line_get_values(line.as_raw_fd(), &mut values) }?;
+    Ok(values.bits & 1 != 0)
+}
+
 /// Whether the adapter of an I2C bus takes plain messages (I2C_FUNC_I2C of linux/i2c.h); those of many
 /// PC chipsets know SMBus only.
 pub(crate) fn is_plain_i2c(bus: &impl AsRawFd) -> io::Result<bool> {
@@ -244,6 +321,10 @@ mod tests {
         assert_eq!(nix::request_code_readwrite!(0xB4, 0x09, size_of::<LineValues>()), 0xC040_B409);
         // GPIOHANDLE_SET_CONFIG_IOCTL.
         assert_eq!(nix::request_code_readwrite!(0xB4, 0x0a, size_of::<LineConfig>()), 0xC054_B40A);
+        // GPIO_V2_GET_LINE_IOCTL, GPIO_V2_LINE_SET_CONFIG_IOCTL, GPIO_V2_LINE_GET_VALUES_IOCTL.
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x07, size_of::<LineRequest>()), 0xC250_B407);
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x0d, size_of::<LineRequestConfig>()), 0xC110_B40D);
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x0e, size_of::<LineRequestValues>()), 0xC010_B40E);
         // WDIOC_GETTIMEOUT.
         assert_eq!(nix::request_code_read!(b'W', 7, size_of::<i32>()), 0x8004_5707);
     }

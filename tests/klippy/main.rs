@@ -9,6 +9,7 @@ mod drivers;
 mod filament;
 mod klippy;
 mod print;
+mod regression;
 mod rings;
 mod servo;
 mod shown;

@@ -3,14 +3,15 @@
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::time::Duration;
 
 use pinion::board::{
-    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, I2cConfig, Line, Mosi, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SpiConfig, Thermometer,
+    Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, EdgeCount, Edges, I2cConfig,
+    Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig, Thermometer,
 };
 use pinion::mcu::{Completion, Job, WorkerId, Workers};
 use pinion::shutdown::{Shutdown, ShutdownReason, reason};
-use pinion::time::{Clock, Ticks, TimeSource, VirtualClock};
+use pinion::time::{Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 
 /// GPIO lines: pins 0 up to this.
 pub const GPIOS: u32 = 300;
@@ -71,6 +72,8 @@ pub struct State {
     pub directions: HashMap<u32, Direction>,
     /// What each pin was made amid a conversation, in order.
     pub turns: Vec<(u32, Direction)>,
+    /// Inputs whose edges an interrupt counts.
+    pub counted: HashSet<u32>,
     /// Pins of chips that may sleep.
     pub sleeping: HashSet<u32>,
     /// Whether an errand is being run: only then may the line of such a chip be called.
@@ -313,6 +316,18 @@ impl Board for FakeBoard {
         Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
     }
 
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
+        let line = self.line(pin, Direction::Input(bias))?;
+        let edges = match self.0.state().counted.contains(&pin.0) {
+            true => {
+                let edges = FakeEdges { bench: self.0.clone(), pin: pin.0 };
+                Ok(OnWorker { bus: "edges".into(), device: Box::new(edges) as Box<dyn Edges> })
+            }
+            false => Err("this pin has no interrupt".into()),
+        };
+        Ok(CountedLine { line, edges })
+    }
+
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let pin = self.0.claim(pin, ANALOG..ANALOG + ANALOGS, reason::ADC_OPEN)?;
         Ok(OnWorker { bus: "iio".into(), device: Box::new(FakeAdc { bench: self.0.clone(), pin }) })
@@ -462,6 +477,31 @@ impl Line for FakeLine {
         self.bench.broken(self.pin, reason::LINE_WRITE)?;
         self.bench.state().turns.push((self.pin, direction));
         self.set_direction(direction)
+    }
+}
+
+/// The changes of a scripted input.
+struct FakeEdges {
+    bench: Bench,
+    pin: u32,
+}
+
+impl Edges for FakeEdges {
+    fn count(&mut self) -> Result<EdgeCount, Shutdown> {
+        self.bench.broken(self.pin, reason::LINE_READ)?;
+        let now = self.bench.ticks();
+        let state = self.bench.state();
+        assert!(state.counted.contains(&self.pin), "the interrupts were ended");
+        let levels = state.inputs.get(&self.pin).map_or(&[][..], Vec::as_slice);
+        let count = levels.partition_point(|(at, _)| *at <= now);
+        let monotonic = |at: u64| Duration::from_nanos((self.bench.origin.ticks() + at) * NS_PER_TICK);
+        let last = levels[..count].last().map(|(at, _)| monotonic(*at));
+        Ok(EdgeCount { count: count as u32, last })
+    }
+
+    fn end(&mut self) -> Result<(), Shutdown> {
+        self.bench.state().counted.remove(&self.pin);
+        Ok(())
     }
 }
 

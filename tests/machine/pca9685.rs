@@ -182,3 +182,57 @@ fn a_chip_that_goes_silent_stops_the_machine_and_is_tried_until_it_answers() {
     rig.forget_responses();
     rig.configure(&[OUTPUT]);
 }
+
+#[test]
+fn a_chip_that_stays_silent_does_not_keep_the_machine_from_the_next_configuration() {
+    let says_nothing = |_: u64, _: &[u8], _: &mut [u8]| Err(BusStatus::Nack);
+    let (mut rig, _) = rig(1000, &[OUTPUT, FREE]);
+    rig.bench.plug_i2c(1, ADDRESS, says_nothing);
+    let now = rig.now();
+    rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=1", now + 1000));
+    rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=2", now + 9000));
+    // The guardian takes over after a second without a heartbeat, which there is none while this is owed.
+    rig.run_until(now + 24_000_000);
+    assert_eq!(rig.mcu.debtor(), Some("PCA9685"));
+    rig.run_until(now + 30_000_000);
+    assert_eq!(rig.mcu.debtor(), None);
+    let notes = rig.notes();
+    let given_up = notes.iter().filter(|note| note.contains("PCA9685 has not taken its shutdown values for 500 ms"));
+    assert_eq!(given_up.count(), 1, "{notes:?}");
+
+    // It is still tried, and told of when it works.
+    let chip = plug(&rig);
+    rig.run_until(now + 40_000_000);
+    assert_eq!(bytes(&chip), [[14, 0, 0, 0, 0x10], [66, 0, 0x10, 0, 0]]);
+    assert_eq!(rig.notes(), ["safe: PCA9685"]);
+
+    // Silent again: the machine can be configured, without that chip.
+    rig.bench.plug_i2c(1, ADDRESS, says_nothing);
+    rig.send("config_reset");
+    rig.forget_responses();
+    rig.send("allocate_oids count=2");
+    rig.send(OUTPUT);
+    assert_eq!(rig.shutdown().as_deref(), Some("Unable to open and init PCA9685 device"));
+    let now = rig.now();
+    rig.run_until(now + 30_000_000);
+    rig.send("config_reset");
+    rig.forget_responses();
+    rig.configure(&[]);
+}
+
+#[test]
+fn a_config_reset_waits_for_a_silent_chip_and_no_longer_than_that() {
+    // A second for each: a bus whose driver waits until it gives up.
+    let (mut rig, _) = rig(1000, &[OUTPUT, FREE]);
+    rig.bench.state().answer_ticks = 50_000_000;
+    let now = rig.now();
+    rig.send("emergency_stop");
+    rig.begin("config_reset");
+    rig.run_until(now + 24_000_000);
+    assert!(rig.mcu.is_held());
+    rig.run_until(now + 30_000_000);
+    assert!(!rig.mcu.is_held());
+    rig.forget_responses();
+    rig.bench.state().answer_ticks = 0;
+    rig.configure(&[FREE]);
+}

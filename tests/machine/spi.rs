@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! SPI devices, on a bus that answers at once and on one that takes its time.
 
-use crate::bench::Transfer;
+use crate::bench::{SPI_CHIPS, Transfer};
 use crate::rig::Rig;
 
 const CS: u32 = 40;
@@ -61,6 +61,25 @@ fn a_device_gets_its_message_at_a_shutdown_and_says_nothing() {
         assert_eq!(rig.responses(), ["shutdown clock=@0 static_string_id=Command request"]);
         assert!(rig.bench.level(CS));
     }
+}
+
+#[test]
+fn a_message_that_can_not_be_sent_keeps_no_one_from_the_next_configuration() {
+    let mut rig = Rig::configured(&[
+        "config_spi_without_cs oid=0",
+        "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
+        "config_spi_shutdown oid=1 spi_oid=0 shutdown_msg=01",
+    ]);
+    rig.bench.state().broken.insert(SPI_CHIPS);
+    rig.send("emergency_stop");
+    rig.begin("config_reset");
+    rig.run_until(24_000_000);
+    assert!(rig.mcu.is_held() && rig.mcu.owes());
+    rig.run_until(30_000_000);
+    assert!(!rig.mcu.is_held());
+    assert!(rig.notes().iter().any(|note| note.contains("SPI shutdown message oid 1 has not taken")));
+    rig.forget_responses();
+    rig.configure(&[]);
 }
 
 #[test]

@@ -11,8 +11,8 @@ use std::sync::atomic::AtomicU8;
 use industrial_io::Context;
 
 use super::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
-    Thermometer, not_mosi,
+    Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
+    PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
 };
 use crate::shutdown::{Shutdown, reason};
 pub use guard::Guard;
@@ -32,6 +32,8 @@ const DEV: &str = "/dev";
 const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
 const W1: &str = "/sys/bus/w1/devices";
+/// The worker that reads the edges of all lines.
+const EDGE_WORKER: &str = "edges";
 const IIO: &str = "/sys/bus/iio/devices";
 
 /// What this machine has.
@@ -55,7 +57,7 @@ impl Inventory {
     /// Looks for chips, ADCs and buses. A machine that has none of them is no error.
     pub fn scan() -> Inventory {
         let dev = Path::new(DEV);
-        let (chips, problems) = gpio::scan(dev);
+        let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
         let mut inventory =
             Inventory { chips, spi: spi::scan(dev), i2c: i2c::scan(dev), problems, ..Inventory::default() };
         match adc::context(Path::new(IIO)) {
@@ -189,6 +191,23 @@ impl Board for LinuxBoard {
         Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
     }
 
+    /// A line of a chip on a bus is polled: its driver has to ask the chip at each interrupt which line
+    /// it was, and dates and counts what it then finds.
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
+        let handle = self.open_line(pin, Direction::Input(bias))?;
+        let edges = match gpio::may_sleep(&self.gpio, handle.chip(), handle.label()) {
+            true => Err("its chip is behind a bus".into()),
+            false => handle.request_edges(&self.dev, bias),
+        };
+        match edges {
+            Ok((line, edges)) => {
+                let edges = OnWorker { bus: EDGE_WORKER.to_owned(), device: Box::new(edges) as Box<dyn Edges> };
+                Ok(CountedLine { line: ClaimedLine { line: Arc::new(line), sleeps_on: None }, edges: Ok(edges) })
+            }
+            Err(why) => Ok(CountedLine { line: self.line(pin, Direction::Input(bias))?, edges: Err(why) }),
+        }
+    }
+
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let (device, id) = self.channel(pin)?;
         if self.inventory.adc(device, &id).is_none() {
@@ -262,7 +281,6 @@ impl Board for LinuxBoard {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::board::Bias;
 
     const ON: Direction = Direction::Output { level: true, shutdown_level: false };
 
@@ -354,6 +372,7 @@ mod tests {
             chips: vec![gpio::Chip {
                 number: 0,
                 label: "pinctrl-bcm2835".into(),
+                sleeps: false,
                 lines: vec![gpio::LineInfo::default(); 54],
             }],
             adcs: vec![adc::IioDevice { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],

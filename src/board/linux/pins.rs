@@ -280,7 +280,7 @@ mod tests {
 
     fn chip(number: u32, label: &str, names: &[&str]) -> Chip {
         let line = |name: &&str| LineInfo { name: (!name.is_empty()).then(|| name.to_string()), ..LineInfo::default() };
-        Chip { number, label: label.into(), lines: names.iter().map(line).collect() }
+        Chip { number, label: label.into(), sleeps: false, lines: names.iter().map(line).collect() }
     }
 
     fn adc(number: u32, name: &str, ids: &[&str]) -> IioDevice {

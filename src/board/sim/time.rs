@@ -5,6 +5,7 @@
 
 use std::cell::Cell;
 use std::sync::Arc;
+use std::time::Duration;
 
 use crate::time::{Clock, TimeSource};
 
@@ -43,6 +44,10 @@ impl TimeSource for PrinterTime {
     fn now(&self) -> Clock {
         self.clock.now()
     }
+
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        self.clock.instant_of(monotonic)
+    }
 }
 
 /// The time of the errands on a worker. While one runs it stands still but for the errand's waits, so
@@ -52,6 +57,10 @@ pub(super) struct ErrandTime(pub(super) Arc<dyn TimeSource>);
 impl TimeSource for ErrandTime {
     fn now(&self) -> Clock {
         DUE.get().unwrap_or_else(|| self.0.now())
+    }
+
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        self.0.instant_of(monotonic)
     }
 
     fn spin_until(&self, end: Clock) {
@@ -79,6 +88,10 @@ mod tests {
     impl TimeSource for Late {
         fn now(&self) -> Clock {
             self.0.now()
+        }
+
+        fn instant_of(&self, monotonic: Duration) -> Clock {
+            self.0.instant_of(monotonic)
         }
 
         fn spin_until(&self, end: Clock) {

@@ -108,6 +108,12 @@ impl GpioSim {
         sysfs::write(self.line(offset).join("pull"), if up { "pull-up" } else { "pull-down" });
     }
 
+    /// The file that [`GpioSim::pull`] writes, for whoever has to be faster.
+    pub fn pull_file(&self, offset: u32) -> fs::File {
+        let file = fs::OpenOptions::new().write(true).open(self.line(offset).join("pull"));
+        file.unwrap_or_else(|error| panic!("{}'s pull: {error}", self.label))
+    }
+
     /// Which way the line is pulled: by [`GpioSim::pull`], or by its own bias.
     pub fn is_pulled_up(&self, offset: u32) -> bool {
         sysfs::read(self.line(offset).join("pull")) == "pull-up"

@@ -11,6 +11,7 @@ use std::path::Path;
 
 use super::sysfs;
 
+pub const IS_OUT: u32 = 1 << 1;
 pub const BIAS_PULL_UP: u32 = 1 << 5;
 pub const BIAS_PULL_DOWN: u32 = 1 << 6;
 pub const BIAS_DISABLE: u32 = 1 << 7;

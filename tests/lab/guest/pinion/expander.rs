@@ -365,3 +365,29 @@ fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
     drop(trace);
     machine.assert_starts_anew();
 }
+
+#[test]
+fn pulses_at_an_expander_are_polled() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &[format!("config_counter oid=0 pin={} pull_up=0", expander.pin(2))]);
+    program.wait_for_line(&["WARN", "its chip is behind a bus, so it is polled"]);
+    let at = client.clock_in(0.02).expect("the clock").wire();
+    // Every 20 ms, told every 0.1 s.
+    run(client, &format!("query_counter oid=0 clock={at} poll_ticks=1000000 sample_ticks=5000000"));
+    let mut count = |expected: i64| {
+        client.drain();
+        let mut told = None;
+        for _ in 0..2 {
+            let until = Instant::now() + Duration::from_secs(10);
+            told = client.wait("counter_state", Some(0), until).expect("a session");
+        }
+        assert_eq!(told.expect("a state").int("count").expect("a count"), expected);
+    };
+    count(0);
+    expander.set_inputs(1 << 2);
+    count(1);
+    expander.set_inputs(0);
+    count(2);
+}

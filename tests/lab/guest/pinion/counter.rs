@@ -1,0 +1,166 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Counters, whose edges the kernel counts.
+
+use std::fs::File;
+use std::io::{Seek, SeekFrom, Write};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use pinion::host::Client;
+use pinion::time::monotonic;
+
+use crate::gpio_sim::GpioSim;
+use crate::program::{Program, configure, refusal, run};
+use crate::sysfs;
+
+const TACHO: u32 = 3;
+const COUNTER: &str = "config_counter oid=0 pin=lab/gpio3 pull_up=0";
+
+/// Has the count told every 0.1 s. A level is looked at every 50 ms, where the pin is polled.
+fn query(client: &mut Client) {
+    let at = client.clock_in(0.02).expect("the clock").wire();
+    run(client, &format!("query_counter oid=0 clock={at} poll_ticks=2500000 sample_ticks=5000000"));
+}
+
+/// The next count that is told, and the clock of its last edge.
+fn next(client: &mut Client) -> (u32, u32) {
+    let until = Instant::now() + Duration::from_secs(10);
+    let state = client.wait("counter_state", Some(0), until).expect("a session").expect("a state");
+    (state.u32("count").expect("a count"), state.u32("count_clock").expect("a clock"))
+}
+
+/// Waits for a count that was told after now, and all edges so far are in.
+fn settled(client: &mut Client) -> (u32, u32) {
+    client.drain();
+    next(client);
+    next(client)
+}
+
+/// Makes so many edges, as fast as it goes, and tells how long the last one took in CLOCK_MONOTONIC.
+fn edges(sim: &GpioSim, count: u32) -> (Duration, Duration) {
+    let mut pull = sim.pull_file(TACHO);
+    let mut last = (Duration::ZERO, Duration::ZERO);
+    for edge in 0..count {
+        let before = monotonic();
+        set(&mut pull, edge % 2 == 0);
+        last = (before, monotonic());
+    }
+    last
+}
+
+fn set(pull: &mut File, up: bool) {
+    pull.seek(SeekFrom::Start(0)).expect("a file of sysfs");
+    pull.write_all(if up { b"pull-up" } else { b"pull-down" }).expect("a pull");
+}
+
+#[test]
+fn more_edges_than_the_kernel_keeps_are_all_counted_and_the_last_one_dated() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &[COUNTER]);
+    query(client);
+    assert_eq!(settled(client).0, 0);
+    let mut expected = 0;
+    // The kernel keeps 16. An even number: each time the line ends low.
+    for count in [2, 16, 18, 400] {
+        let (before, after) = edges(&sim, count);
+        expected += count;
+        let (told, clock) = settled(client);
+        assert_eq!(told, expected);
+        // Tick 0 is a whole second of CLOCK_MONOTONIC.
+        let ns = u64::from(clock) * 20 % 1_000_000_000;
+        let since = (ns + 1_000_000_000 - u64::from(before.subsec_nanos())) % 1_000_000_000;
+        let took = (after - before).as_nanos() as u64;
+        assert!(since <= took, "dated {since} ns after the beginning of an edge of {took} ns");
+    }
+    assert!(!program.log().contains("polled"), "{}", program.log());
+}
+
+#[test]
+fn a_fan_of_20_000_rpm_is_measured() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &[COUNTER]);
+    query(client);
+    settled(client);
+    let told: Vec<(u32, u32)> = thread::scope(|scope| {
+        // Two pulses a turn are 1333 edges a second.
+        scope.spawn(|| {
+            let began = Instant::now();
+            for edge in 1..1000 {
+                sim.pull(TACHO, edge % 2 == 1);
+                thread::sleep((Duration::from_micros(750) * edge).saturating_sub(began.elapsed()));
+            }
+        });
+        (0..6).map(|_| next(client)).collect()
+    });
+    for pair in told[1..].windows(2) {
+        let (count, ticks) = (pair[1].0 - pair[0].0, pair[1].1 - pair[0].1);
+        let rpm = f64::from(count) / 4.0 * 60.0 * 50e6 / f64::from(ticks);
+        // As exact as the test's own sleep is.
+        assert!((rpm - 20_000.0).abs() < 400.0, "{rpm}: {told:?}");
+    }
+}
+
+#[test]
+fn a_pin_that_floats_is_polled_and_can_be_an_output_after_a_restart() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &[COUNTER]);
+    query(client);
+    // The kernel lists who asked for interrupts.
+    let has_interrupt = || sysfs::read("/proc/interrupts").lines().any(|line| line.ends_with("pinion"));
+    assert!(has_interrupt());
+    let mut pull = sim.pull_file(TACHO);
+    let until = Instant::now() + Duration::from_secs(5);
+    while !program.log().contains("polled from now on") {
+        assert!(Instant::now() < until, "{}", program.log());
+        (0..2000).for_each(|edge| set(&mut pull, edge % 2 == 0));
+    }
+    assert!(!has_interrupt());
+    let (before, _) = settled(client);
+    // Shorter than the polling, of which one look may meet the pin high; and longer.
+    edges(&sim, 100);
+    let (low, _) = settled(client);
+    assert!(low - before <= 2, "{}", low - before);
+    sim.pull(TACHO, true);
+    assert_eq!(settled(client).0, low + 1);
+    sim.pull(TACHO, false);
+    configure(client, 1, &["config_digital_out oid=0 pin=lab/gpio3 value=1 default_value=1 max_duration=0"]);
+    assert!(sim.level(TACHO));
+}
+
+#[test]
+fn a_counter_shares_its_pin_with_inputs_and_is_polled_if_it_comes_second() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    let endstop = "config_endstop oid=1 pin=lab/gpio3 pull_up=1";
+    let sees = |client: &mut Client| {
+        let state = client.query("endstop_query_state", &[("oid", 1.into())], "endstop_state", Some(1));
+        state.expect("a state").flag("pin_value").expect("a level")
+    };
+    for (first, second, polled) in [(COUNTER, endstop, false), (endstop, COUNTER, true)] {
+        configure(client, 2, &[first, second]);
+        query(client);
+        let (before, _) = settled(client);
+        // (The pull of the endstop moved the line, in either order.)
+        sim.pull(TACHO, false);
+        assert!(!sees(client));
+        let (low, _) = settled(client);
+        edges(&sim, 100);
+        let (after, _) = settled(client);
+        assert!(if polled { after - low <= 2 } else { after - low == 100 }, "{}", after - low);
+        sim.pull(TACHO, true);
+        assert!(sees(client));
+        assert!(settled(client).0 > before);
+        assert_eq!(program.log().contains("so it is polled"), polled, "{}", program.log());
+        sim.pull(TACHO, false);
+    }
+    let output = "config_digital_out oid=1 pin=lab/gpio3 value=0 default_value=0 max_duration=0";
+    assert_eq!(refusal(client, 2, &[COUNTER, output]), "Unable to open out GPIO chip line");
+    program.wait_for_line(&["line 3 counts pulses and can not be an output as well"]);
+}

@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The UART of stepper drivers on one wire, which is an output by turns.
+
+use std::time::{Duration, Instant};
+
+use crate::gpio_sim::GpioSim;
+use crate::program::{Program, configure};
+use crate::trace::{Trace, Write};
+use crate::uapi;
+
+const WIRE: u32 = 3;
+/// 10 kbaud: this is about the line's direction and levels, not about how exact an emulated computer is.
+const BIT_NS: u64 = 100_000;
+const CONFIG: &str = "config_tmcuart oid=0 rx_pin=lab/gpio3 pull_up=1 tx_pin=lab/gpio3 bit_time=5000";
+/// A read of register 2 of driver 0 (f5 00 02 c8), with start and stop bits.
+const SENT: [u8; 5] = [0xea, 0x03, 0x48, 0x20, 0xe4];
+const HEARD: [u8; 4] = [0xf5, 0x00, 0x02, 0xc8];
+
+/// What a UART hears: from a falling edge on it looks at each bit's middle.
+fn hear(writes: &[Write]) -> Vec<u8> {
+    let level = |at: u64| writes.iter().rev().find(|write| write.at_ns <= at).is_none_or(|write| write.level);
+    let (mut heard, mut from) = (Vec::new(), 0);
+    while let Some(start) = writes.iter().find(|write| write.at_ns >= from && !write.level) {
+        let middle = |bit: u64| start.at_ns + bit * BIT_NS + BIT_NS / 2;
+        assert!(level(middle(9)), "no stop bit after {heard:02x?}");
+        heard.push((1..9).rev().fold(0, |byte, bit| byte << 1 | u8::from(level(middle(bit)))));
+        from = middle(9);
+    }
+    heard
+}
+
+#[test]
+fn a_single_wire_is_driven_for_the_message_and_let_go_for_the_reply() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &[CONFIG]);
+    let is_output = || uapi::line_info(&sim.path(), WIRE).flags & uapi::IS_OUT != 0;
+    assert!(is_output() && sim.level(WIRE));
+    // Twice: the second message finds the wire driven again.
+    for _ in 0..2 {
+        // An output does not heed this. As an input it has the pull-up switched on, which gpio-sim shows.
+        sim.pull(WIRE, false);
+        let trace = Trace::start();
+        let args = [("oid", 0_u8.into()), ("write", SENT[..].into()), ("read", 10_u8.into())];
+        client.send("tmcuart_send", &args).expect("a session");
+        let until = Instant::now() + Duration::from_secs(10);
+        let reply = client.wait("tmcuart_response", Some(0), until).expect("a session").expect("a response");
+        assert_eq!(reply.bytes("read").expect("bytes"), [0_u8; 0], "nobody answers");
+        let writes = trace.writes_to(sim.kernel_number(WIRE));
+        assert_eq!(hear(&writes), HEARD);
+        assert!(sim.is_pulled_up(WIRE), "it never was an input: {writes:?}");
+        // The last one makes it an output once more, after the time that a driver has to answer.
+        let [.., before, last] = &writes[..] else { panic!("{writes:?}") };
+        assert!(last.level && last.at_ns - before.at_ns > 10 * BIT_NS, "{writes:?}");
+        assert!(is_output() && sim.level(WIRE));
+    }
+}
