@@ -94,7 +94,7 @@ fn wrong_times() {
 fn a_reading_out_of_range() {
     let pinion = Pinion::simulated(&[]);
     let query = "query_analog_in oid=2 clock=@3 sample_ticks=50000 sample_count=4 rest_ticks=5000000 \
-                 bytes_per_report=2 min_value=0 max_value=1 range_check_count=2";
+                 min_value=0 max_value=1 range_check_count=2";
     let lines = ["config_analog_in oid=2 pin=bed_sensor", "finalize_config crc=1", query];
     stops(&pinion, &lines, "ADC out of range", &["oid 2", "sensor"]);
 }

@@ -95,10 +95,11 @@ fn dict_prints_what_identify_serves() {
     let (_folder, file) = folder_with("dict", "");
     let printed = output(&["dict", "--board", "sim", "-o", file.to_str().unwrap()]);
     assert!(printed.status.success());
-    let pinion = Pinion::simulated(&[]);
+    let pinion = Pinion::simulated(&["--dialect", "master"]);
     let served = pinion.client().dictionary().json().unwrap();
-    assert_eq!(fs::read(&file).unwrap(), served);
-    assert_eq!(output(&["dict", "--board", "sim"]).stdout, served);
+    // Not assert_eq, which would print some ten thousand numbers.
+    assert!(fs::read(&file).unwrap() == served);
+    assert!(output(&["dict", "--board", "sim"]).stdout == served);
 }
 
 /// The dictionaries of the firmwares' own `linux` processes, by the dialect that is theirs, with the
