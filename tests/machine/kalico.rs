@@ -141,7 +141,7 @@ const STATE: &str = "load_cell_probe_query_state oid=3";
 fn a_probe_triggers_at_its_force_either_way_once_homing_has_begun() {
     // 200 counts from the tare are 100 g, more than the 50; before the fifth sample that does not count.
     let cases: [(Values, Option<u64>); 4] = [
-        (|n| vec![if n < 5 || n >= 8 { 200 } else { 199 }], Some(8)),
+        (|n| vec![if !(5..8).contains(&n) { 200 } else { 199 }], Some(8)),
         (|n| vec![if n >= 8 { 0 } else { 1 }], Some(8)),
         (|n| vec![if n == 4 { 5000 } else { 199 }], None),
         (|_| vec![200], Some(5)),
