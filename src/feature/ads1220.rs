@@ -9,7 +9,7 @@
 use crate::board::Pin;
 use crate::mcu::{
     Command, Conversation, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Ticket,
-    command, only, since,
+    command, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
@@ -65,13 +65,13 @@ const ADS1220_ATTACH_TRIGGER_ANALOG: Command =
     command!("ads1220_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
         attach::<Ads1220>(mcu, oid, trigger_analog_oid)
     })
-    .of(only(Master));
+    .of(since(Master));
 
 const ADS1220_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads1220_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Ads1220>(mcu, oid, load_cell_probe_oid)
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 const QUERY_ADS1220: Command = command!("query_ads1220 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Ads1220>(mcu, oid, rest_ticks)

@@ -9,7 +9,7 @@
 use crate::board::Pin;
 use crate::mcu::{
     Command, Conversation, Enumeration, Feature, Generation::Kalico, Generation::Master, Mcu, Oid, Ticket, command,
-    only, since,
+    since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
@@ -33,7 +33,7 @@ pub(super) const FEATURE: Feature = Feature {
     enumerations: &[Enumeration::new("ads131m0x_error:", |_| {
         named(&[("SENSOR_ERROR_CRC", ERROR_CRC), ("SENSOR_ERROR_RESET", ERROR_RESET)])
     })
-    .of(only(Master))],
+    .of(since(Master))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
@@ -192,7 +192,7 @@ const CONFIG_ADS131M0X: Command = command!(
         configure_spi(mcu, oid, (spi_oid, data_ready_pin), chip, frame_bytes(num_channels))
     }
 )
-.of(only(Master));
+.of(since(Master));
 
 const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
     "config_ads131m0x oid=%c spi_oid=%c data_ready_pin=%u sensor_channel_count=%c channel_mask=%c",
@@ -213,19 +213,19 @@ const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
         configure_spi(mcu, oid, (spi_oid, data_ready_pin), chip, frame_bytes(sensor_channel_count))
     }
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 const ADS131M0X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ads131m0x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     |mcu, oid: Oid, trigger_analog_oid: Oid| attach::<Ads131m0x>(mcu, oid, trigger_analog_oid)
 )
-.of(only(Master));
+.of(since(Master));
 
 const ADS131M0X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads131m0x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Ads131m0x>(mcu, oid, load_cell_probe_oid)
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 const QUERY_ADS131M0X: Command =
     command!("query_ads131m0x oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {

@@ -9,7 +9,7 @@
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
     Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Next,
-    Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId, command, only, response, until,
+    Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -40,7 +40,7 @@ response! {
 
 response! {
     /// Sums of readings, two bytes each, low byte first.
-    "analog_in_state oid=%c next_clock=%u values=%*s" => only(Master);
+    "analog_in_state oid=%c next_clock=%u values=%*s" => since(Master);
     pub(super) struct Batch<'a> { oid: Oid, next_clock: Clock, values: &'a [u8] }
 }
 
@@ -306,7 +306,7 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
         mcu.with::<AnalogIn, _>(oid, |input, mcu| input.query(mcu, oid, at, query))
     }
 )
-.of(only(Master));
+.of(since(Master));
 
 const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
     "analog_in_attach_trigger_analog oid=%c trigger_analog_oid=%c",
@@ -314,4 +314,4 @@ const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
         mcu.with::<AnalogIn, _>(oid, |input, mcu| input.attached.attach(mcu, trigger_analog_oid))
     }
 )
-.of(only(Master));
+.of(since(Master));

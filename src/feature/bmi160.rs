@@ -7,7 +7,7 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{BusDevice, BusError};
-use crate::mcu::{Command, Feature, Generation::Master, Oid, command, only};
+use crate::mcu::{Command, Feature, Generation::Master, Oid, command, since};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
@@ -61,15 +61,15 @@ const CONFIG_BMI160: Command =
     command!("config_bmi160 oid=%c bus_oid=%c bus_oid_type=%c", |mcu, oid: Oid, bus_oid: Oid, bus_oid_type: u8| {
         configure(mcu, oid, bus_oid, Bmi160 { bus_type: BusType::of(bus_oid_type)? })
     })
-    .of(only(Master));
+    .of(since(Master));
 
 const QUERY_BMI160: Command = command!("query_bmi160 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Bmi160>(mcu, oid, rest_ticks)
 })
-.of(only(Master));
+.of(since(Master));
 
 const QUERY_BMI160_STATUS: Command =
-    command!("query_bmi160_status oid=%c", |mcu, oid: Oid| query_status::<Bmi160>(mcu, oid)).of(only(Master));
+    command!("query_bmi160_status oid=%c", |mcu, oid: Oid| query_status::<Bmi160>(mcu, oid)).of(since(Master));
 
 #[cfg(test)]
 mod tests {

@@ -9,7 +9,7 @@
 use crate::board::{OnWorker, Thermometer};
 use crate::mcu::{
     Command, Done, Errand, Feature, Generation::Kalico, Generations, Mcu, Next, Object, Oid, Response, Ticket, TimerId,
-    WireClock, WorkerId, command, only, response,
+    WireClock, WorkerId, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -193,7 +193,7 @@ const CONFIG_DS18B20_OF_KALICO: Command = command!(
         configure(mcu, oid, serial, max_error_count, ignore_limits)
     }
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 const QUERY_DS18B20: Command = command!(
     "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",

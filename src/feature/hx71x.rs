@@ -18,7 +18,7 @@ use log::warn;
 use crate::board::{Bias, Direction, Line, Pin};
 use crate::mcu::{
     Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
-    Settable, Ticket, WorkerId, command, only, since,
+    Settable, Ticket, WorkerId, command, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Ticks, TimeSource};
@@ -218,13 +218,13 @@ const HX71X_ATTACH_TRIGGER_ANALOG: Command =
     command!("hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
         attach::<Hx71x>(mcu, oid, trigger_analog_oid)
     })
-    .of(only(Master));
+    .of(since(Master));
 
 const HX71X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "hx71x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
     |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Hx71x>(mcu, oid, load_cell_probe_oid)
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 const QUERY_HX71X: Command = command!("query_hx71x oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     query::<Hx71x>(mcu, oid, rest_ticks)

@@ -35,7 +35,7 @@ pub(super) const FEATURE: Feature = Feature {
     responses: &[ReadResponse::FORM, TransferResponse::FORM],
     enumerations: &[
         Enumeration::new("i2c_bus", |board| board.i2c_buses()),
-        Enumeration::new("i2c_bus_status", |_| statuses()).of(only(Master)),
+        Enumeration::new("i2c_bus_status", |_| statuses()).of(since(Master)),
     ],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
@@ -68,7 +68,7 @@ response! {
 
 response! {
     /// How the bus answered, and what a device sent.
-    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => only(Master);
+    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => since(Master);
     pub(super) struct TransferResponse<'a> { oid: Oid, i2c_bus_status: u8, response: &'a [u8] }
 }
 
@@ -341,7 +341,7 @@ const I2C_TRANSFER: Command =
             i2c.transfer(mcu, oid, TRANSFER, |transfer| transfer.load(write, one_byte(read_len)))
         })
     })
-    .of(only(Master));
+    .of(since(Master));
 
 /// A count of bytes has one byte, as in the firmware.
 fn one_byte(count: u32) -> usize {

@@ -43,7 +43,7 @@ pub(super) const FEATURE: Feature = Feature {
             ("INVALID_READ_DATA", INVALID_READ_DATA),
         ])
     })
-    .of(only(Master))],
+    .of(since(Master))],
     responses: &[HomeState::FORM],
     ..Feature::EMPTY
 };
@@ -333,7 +333,7 @@ const LDC1612_ATTACH_TRIGGER_ANALOG: Command =
     command!("ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
         mcu.with::<Ldc1612, _>(oid, |sensor, mcu| sensor.attached.attach(mcu, trigger_analog_oid))
     })
-    .of(only(Master));
+    .of(since(Master));
 
 const LDC1612_SETUP_HOME: Command = command!(
     "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",

@@ -7,7 +7,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, only, response,
+    Command, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response,
+    since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -34,7 +35,7 @@ shutdowns! {
 
 response! {
     /// Whether the trigger came, and when.
-    "load_cell_probe_state oid=%c is_homing_trigger=%c trigger_ticks=%u" => only(Kalico);
+    "load_cell_probe_state oid=%c is_homing_trigger=%c trigger_ticks=%u" => since(Kalico);
     pub(super) struct State { oid: Oid, is_homing_trigger: bool, trigger_ticks: u32 }
 }
 
@@ -150,7 +151,7 @@ const CONFIG_LOAD_CELL_PROBE: Command =
         let limits = Limits::default();
         mcu.assign(oid, LoadCellProbe { filter: sos_filter_oid, limits, homing: None, triggered: None })
     })
-    .of(only(Kalico));
+    .of(since(Kalico));
 
 const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
     "load_cell_probe_set_range oid=%c safety_counts_min=%i safety_counts_max=%i tare_counts=%i trigger_grams=%u grams_per_count=%i",
@@ -183,7 +184,7 @@ const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
         })
     }
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 const LOAD_CELL_PROBE_HOME: Command = command!(
     "load_cell_probe_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u rest_ticks=%u timeout=%u",
@@ -219,7 +220,7 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
         })
     }
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 const LOAD_CELL_PROBE_QUERY_STATE: Command = command!("load_cell_probe_query_state oid=%c", |mcu, oid: Oid| {
     mcu.with::<LoadCellProbe, _>(oid, |probe, mcu| {
@@ -228,7 +229,7 @@ const LOAD_CELL_PROBE_QUERY_STATE: Command = command!("load_cell_probe_query_sta
         Ok(())
     })
 })
-.of(only(Kalico));
+.of(since(Kalico));
 
 #[cfg(test)]
 mod tests {

@@ -6,7 +6,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Command, Feature, Generation::Kalico, Generation::Master, Object, Oid, command, only, since};
+use crate::mcu::{Command, Feature, Generation::Kalico, Generation::Master, Object, Oid, command, since};
 use crate::shutdown::{Shutdown, shutdowns};
 
 pub(super) const FEATURE: Feature = Feature {
@@ -202,7 +202,7 @@ const SOS_FILTER_SET_OFFSET_SCALE: Command = command!(
         })
     }
 )
-.of(only(Master));
+.of(since(Master));
 
 const SOS_FILTER_SET_ACTIVE: Command = command!(
     "sos_filter_set_active oid=%c n_sections=%c coeff_frac_bits=%c",
@@ -210,7 +210,7 @@ const SOS_FILTER_SET_ACTIVE: Command = command!(
         mcu.with::<SosFilter, _>(oid, |filter, _| filter.activate(n_sections, coeff_frac_bits))
     }
 )
-.of(only(Master));
+.of(since(Master));
 
 const SOS_FILTER_SET_ACTIVE_OF_KALICO: Command = command!(
     "sos_filter_set_active oid=%c n_sections=%c coeff_int_bits=%c",
@@ -220,7 +220,7 @@ const SOS_FILTER_SET_ACTIVE_OF_KALICO: Command = command!(
         mcu.with::<SosFilter, _>(oid, |filter, _| filter.activate(n_sections, coeff_frac_bits))
     }
 )
-.of(only(Kalico));
+.of(since(Kalico));
 
 #[cfg(test)]
 mod tests {

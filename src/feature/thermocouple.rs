@@ -8,7 +8,7 @@
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
     Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, Talk,
-    Ticket, TimerId, WireClock, command, only, response,
+    Ticket, TimerId, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -147,7 +147,7 @@ struct Thermocouple {
 impl Thermocouple {
     fn check(&mut self, mcu: &Mcu, value: u32, fault: u8) -> Result<(), Shutdown> {
         // Kalico's way to say that the host alone looks at the values.
-        if self.max_invalid_count == 0 && mcu.serves(only(Kalico)) {
+        if self.max_invalid_count == 0 && mcu.serves(since(Kalico)) {
             return Ok(());
         }
         if fault == 0 && (self.min_value..=self.max_value).contains(&value) {

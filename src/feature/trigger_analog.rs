@@ -7,7 +7,7 @@
 
 use crate::mcu::{
     Command, Enumeration, Feature, Generation::Master, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command,
-    only, response,
+    response, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -31,7 +31,7 @@ pub(super) const FEATURE: Feature = Feature {
         Enumeration::new("trigger_analog_type", |_| {
             named(&[("abs_ge", ABS_GE), ("gt", GT), ("diff_peak_gt", DIFF_PEAK_GT)])
         })
-        .of(only(Master)),
+        .of(since(Master)),
         Enumeration::new("trigger_analog_error:", |_| {
             named(&[
                 ("RAW_RANGE", RAW_RANGE),
@@ -40,14 +40,14 @@ pub(super) const FEATURE: Feature = Feature {
                 ("SENSOR_SPECIFIC", SENSOR_SPECIFIC),
             ])
         })
-        .of(only(Master)),
+        .of(since(Master)),
     ],
     ..Feature::EMPTY
 };
 
 response! {
     /// Whether samples are looked at, and when the trigger came.
-    "trigger_analog_state oid=%c homing=%c homing_clock=%u" => only(Master);
+    "trigger_analog_state oid=%c homing=%c homing_clock=%u" => since(Master);
     pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
 }
 
@@ -223,7 +223,7 @@ const CONFIG_TRIGGER_ANALOG: Command =
         };
         mcu.assign(oid, trigger)
     })
-    .of(only(Master));
+    .of(since(Master));
 
 const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
     "trigger_analog_set_raw_range oid=%c raw_min=%i raw_max=%i",
@@ -235,7 +235,7 @@ const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
         })
     }
 )
-.of(only(Master));
+.of(since(Master));
 
 const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
     "trigger_analog_set_trigger oid=%c trigger_analog_type=%c trigger_value=%i",
@@ -247,7 +247,7 @@ const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
         })
     }
 )
-.of(only(Master));
+.of(since(Master));
 
 const TRIGGER_ANALOG_HOME: Command = command!(
     "trigger_analog_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u monitor_ticks=%u monitor_max=%u",
@@ -283,7 +283,7 @@ const TRIGGER_ANALOG_HOME: Command = command!(
         })
     }
 )
-.of(only(Master));
+.of(since(Master));
 
 const TRIGGER_ANALOG_QUERY_STATE: Command = command!("trigger_analog_query_state oid=%c", |mcu, oid: Oid| {
     mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| {
@@ -291,4 +291,4 @@ const TRIGGER_ANALOG_QUERY_STATE: Command = command!("trigger_analog_query_state
         Ok(())
     })
 })
-.of(only(Master));
+.of(since(Master));

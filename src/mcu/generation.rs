@@ -53,6 +53,11 @@ impl Generation {
         }
     }
 
+    /// Its bit in a set.
+    const fn bit(self) -> u8 {
+        1 << self as u8
+    }
+
     /// Whether this is `ancestor`, or grew out of it.
     const fn grew_out_of(self, ancestor: Generation) -> bool {
         let mut this = Some(self);
@@ -73,22 +78,40 @@ impl fmt::Display for Generation {
 }
 
 /// A set of generations: those that take a form of a message.
+///
+/// A generation that is added is in all the sets that the one is in which it grew out of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Generations(u8);
 
 /// This generation and all that grew out of it.
 pub const fn since(first: Generation) -> Generations {
-    Generations::ALL.since(first)
+    let mut bits = 0;
+    let mut at = 0;
+    while at < Generation::ALL.len() {
+        if Generation::ALL[at].grew_out_of(first) {
+            bits |= Generation::ALL[at].bit();
+        }
+        at += 1;
+    }
+    Generations(bits)
 }
 
 /// This generation and all that it grew out of.
 pub const fn until(last: Generation) -> Generations {
-    Generations::ALL.until(last)
+    let mut bits = 0;
+    let mut at = 0;
+    while at < Generation::ALL.len() {
+        if last.grew_out_of(Generation::ALL[at]) {
+            bits |= Generation::ALL[at].bit();
+        }
+        at += 1;
+    }
+    Generations(bits)
 }
 
 /// This generation alone.
 pub const fn only(generation: Generation) -> Generations {
-    Generations(1 << generation as u8)
+    Generations(generation.bit())
 }
 
 impl Generations {
@@ -96,42 +119,28 @@ impl Generations {
     pub const ALL: Generations = Generations((1 << Generation::ALL.len()) - 1);
 
     /// Those of this set that are `first` or grew out of it.
-    pub const fn since(mut self, first: Generation) -> Generations {
-        let mut at = 0;
-        while at < Generation::ALL.len() {
-            if !Generation::ALL[at].grew_out_of(first) {
-                self = self.except(Generation::ALL[at]);
-            }
-            at += 1;
-        }
-        self
+    pub const fn since(self, first: Generation) -> Generations {
+        Generations(self.0 & since(first).0)
     }
 
     /// Those of this set that are `last` or that it grew out of.
-    pub const fn until(mut self, last: Generation) -> Generations {
-        let mut at = 0;
-        while at < Generation::ALL.len() {
-            if !last.grew_out_of(Generation::ALL[at]) {
-                self = self.except(Generation::ALL[at]);
-            }
-            at += 1;
-        }
-        self
+    pub const fn until(self, last: Generation) -> Generations {
+        Generations(self.0 & until(last).0)
     }
 
-    /// This set and `generation`.
-    pub const fn and(self, generation: Generation) -> Generations {
-        Generations(self.0 | only(generation).0)
+    /// This set, `first`, and all that grew out of it.
+    pub const fn and(self, first: Generation) -> Generations {
+        Generations(self.0 | since(first).0)
     }
 
-    /// This set without `generation`.
-    pub const fn except(self, generation: Generation) -> Generations {
-        Generations(self.0 & !only(generation).0)
+    /// This set without `first` and all that grew out of it.
+    pub const fn except(self, first: Generation) -> Generations {
+        Generations(self.0 & !since(first).0)
     }
 
     /// Whether `generation` is one of this set.
     pub const fn contains(self, generation: Generation) -> bool {
-        self.0 & only(generation).0 != 0
+        self.0 & generation.bit() != 0
     }
 }
 
@@ -209,7 +218,8 @@ mod tests {
         assert_eq!(members(until(V0_13).and(Kalico)), [V0_11, V0_12, V0_13, Kalico]);
         assert_eq!(members(since(V0_12).until(V0_13)), [V0_12, V0_13]);
         assert_eq!(members(since(V0_12).except(Kalico)), [V0_12, V0_13, Master]);
-        assert_eq!(members(only(Kalico)), [Kalico]);
+        assert_eq!(members(Generations::ALL.except(V0_13)), [V0_11, V0_12]);
+        assert_eq!(members(only(V0_13).and(Kalico)), [V0_13, Kalico]);
     }
 
     #[test]

@@ -141,7 +141,7 @@ const STATE: &str = "load_cell_probe_query_state oid=3";
 fn a_probe_triggers_at_its_force_either_way_once_homing_has_begun() {
     // 200 counts from the tare are 100 g, more than the 50; before the fifth sample that does not count.
     let cases: [(Values, Option<u64>); 4] = [
-        (|n| vec![if n < 5 || n >= 8 { 200 } else { 199 }], Some(8)),
+        (|n| vec![if !(5..8).contains(&n) { 200 } else { 199 }], Some(8)),
         (|n| vec![if n >= 8 { 0 } else { 1 }], Some(8)),
         (|n| vec![if n == 4 { 5000 } else { 199 }], None),
         (|_| vec![200], Some(5)),
@@ -234,14 +234,15 @@ fn ranges_that_make_no_sense_are_refused() {
 
 #[test]
 fn an_ads131m04_sends_the_channels_of_its_mask_and_is_probed_by_their_sum() {
-    let (mut rig, status) = rig(ADS131M04, |n| vec![7_000_000, 40 * n as i32, 7_000_000, 60 * n as i32]);
+    let (mut rig, status) = rig(ADS131M04, |n| vec![7_000_000, 15 * n as i32, 7_000_000, 20 * n as i32]);
     home(&mut rig);
-    // The sum of the channels is 100 n: the trigger's 200 counts from the fifth sample on.
+    // The sum of the two is 35 n: 200, which are 50 g, are passed with the sixth sample.
     rig.run_until(6 * PERIOD + PERIOD / 2);
     let responses = rig.responses();
-    assert!(responses.iter().any(|response| response.contains(" trigger_reason=1 ")), "{responses:?}");
+    let triggered = |it: &String| it.starts_with("trsync_state oid=4 can_trigger=0 trigger_reason=1 clock=@6");
+    assert!(responses.iter().any(triggered), "{responses:?}");
     let data: Vec<&String> = responses.iter().filter(|it| it.starts_with("sensor_bulk_data")).collect();
-    let expected: String = (1..=6).flat_map(|n: i32| [40 * n, 60 * n]).map(|value| hex(&value.to_le_bytes())).collect();
+    let expected: String = (1..=6).flat_map(|n: i32| [15 * n, 20 * n]).map(|value| hex(&value.to_le_bytes())).collect();
     assert_eq!(data, [&format!("sensor_bulk_data oid=1 sequence=0 data={expected}")]);
     let pending = rig.ask("query_ads131m0x_status oid=1");
     assert!(pending.contains(" next_sequence=1 buffered=0 "), "{pending}");
