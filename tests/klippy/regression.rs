@@ -271,6 +271,8 @@ fn klippy_ends_its_regression_cases_as_with_the_firmware_s_dictionary() {
                 wrong.lock().unwrap().push(format!("{} fails with {which} only:\n{log}", case.name()));
             } else if ours.configuration != theirs.configuration {
                 wrong.lock().unwrap().push(format!("{}: {}", case.name(), difference(&ours, &theirs)));
+            } else if !ours.failed && ours.configuration.last().is_none_or(|last| !last.starts_with(LAST)) {
+                wrong.lock().unwrap().push(format!("{} does not configure the machine", case.name()));
             } else if theirs.failed != case.should_fail {
                 neither.lock().unwrap().push(format!("{}:\n{}", case.name(), theirs.log));
             }
