@@ -203,8 +203,16 @@ impl I2c {
         let Some(bus) = &self.bus else {
             // As the firmware answers for a device without a bus.
             let status = BusStatus::Nack;
-            let error = BusError { status, detail: "it has no bus: the host did not send i2c_set_bus".into() };
-            return self.answer(mcu, oid, tag, transfer, Err(error));
+            if tag == TRANSFER {
+                let i2c_bus_status = on_wire(status).0;
+                mcu.send(TransferResponse { oid, i2c_bus_status, response: transfer.talk.response() });
+            }
+            self.transfer = Some(transfer);
+            if tag == TRANSFER {
+                return Ok(());
+            }
+            let detail = "it has no bus: a fault of the host, which did not send i2c_set_bus".into();
+            return Err(self.failure(mcu, tag, BusError { status, detail }));
         };
         mcu.converse_on(bus, Ticket { oid, tag }, transfer)
     }
