@@ -11,6 +11,7 @@ use std::sync::Arc;
 
 use super::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
+    Thermometer,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
@@ -20,11 +21,13 @@ mod angle;
 mod apa102;
 mod colour;
 mod config;
+mod ds18b20;
 mod i2c;
 mod loopback;
 mod part;
 mod physics;
 mod printer_cfg;
+mod pwm_channel;
 mod servo;
 mod spi;
 mod spool;
@@ -46,9 +49,11 @@ pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
     SimConfig, SimError, SpiBusConfig,
 };
+pub use ds18b20::Ds18b20Config;
 pub use loopback::LoopbackConfig;
 pub use part::PartConfig;
 pub use printer_cfg::printer_cfg;
+pub use pwm_channel::PwmChannelConfig;
 pub use servo::ServoConfig;
 pub use spool::SpoolConfig;
 pub use ssd1306::Ssd1306Config;
@@ -57,9 +62,11 @@ pub use tmc2209::Tmc2209Config;
 pub use tmc5160::Tmc5160Config;
 pub use ws2812::Ws2812Config;
 
+use ds18b20::Ds18b20;
 use i2c::{I2cBus, I2cDevice};
 use part::{Sight, Workshop};
 use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
+use pwm_channel::SimPwm;
 use spi::{MosiPin, SpiBus, SpiDevice};
 use time::{ErrandTime, PrinterTime};
 use wire::{
@@ -73,6 +80,8 @@ const STEP_LATE_LIMIT: Ticks = Ticks::from_us(100_000);
 
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
+/// The worker of the PWM channels.
+const PWM_WORKER: &str = "pwm";
 /// Bytes that an SPI bus sends without a pause: as many as by the kernel's default `spidev.bufsiz`.
 const MESSAGE_MAX: usize = 4096;
 
@@ -84,6 +93,8 @@ struct World {
     fans: Vec<Arc<Fan>>,
     lamps: Vec<Arc<Lamp>>,
     sights: Vec<Arc<dyn Sight>>,
+    /// By their serial numbers.
+    thermometers: Vec<(String, Ds18b20)>,
 }
 
 /// A simulated printer.
@@ -264,9 +275,24 @@ impl Board for SimBoard {
     }
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
-        let detail =
-            format!("the simulated printer has no hardware PWM (pin number {}): leave out hardware_pwm", config.pin.0);
-        Err(Shutdown::because(reason::PWM_CONFIG, detail))
+        let wired = self.pin(config.pin, reason::PWM_CONFIG)?;
+        if wired.wire.kind() != Kind::Pwm {
+            return Err(wired.is_no("hardware PWM channel", reason::PWM_CONFIG));
+        }
+        let mut pwm = SimPwm(wired.wire.clone());
+        pwm.set(config.value)?;
+        Ok(OnWorker { bus: PWM_WORKER.to_owned(), device: Box::new(pwm) })
+    }
+
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        let found = self.world.thermometers.iter().find(|(name, _)| name.as_bytes() == serial);
+        let (name, thermometer) = found.ok_or_else(|| {
+            let names: Vec<&str> = self.world.thermometers.iter().map(|(name, _)| name.as_str()).collect();
+            let serial = String::from_utf8_lossy(serial);
+            let detail = format!("the simulated printer has no DS18B20 {serial}: it has {}", names.join(", "));
+            Shutdown::because(reason::DS18B20_OPEN, detail)
+        })?;
+        Ok(OnWorker { bus: name.clone(), device: Box::new(thermometer.clone()) })
     }
 
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {

@@ -16,7 +16,10 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{adxl345, angle, apa102, loopback, servo, spool, ssd1306, thermocouple, tmc2209, tmc5160, ws2812};
+use super::{
+    adxl345, angle, apa102, ds18b20, loopback, pwm_channel, servo, spool, ssd1306, thermocouple, tmc2209, tmc5160,
+    ws2812,
+};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -25,6 +28,11 @@ use crate::time::Clock;
 pub enum PartConfig {
     /// An accelerometer.
     Adxl345(adxl345::Adxl345Config),
+    /// A thermometer on the one-wire bus.
+    Ds18b20(ds18b20::Ds18b20Config),
+    /// A hardware PWM channel.
+    #[serde(rename = "pwm_channel")]
+    PwmChannel(pwm_channel::PwmChannelConfig),
     /// Sends back what it is sent.
     Loopback(loopback::LoopbackConfig),
     /// A servo.
@@ -53,6 +61,8 @@ impl PartConfig {
     pub(super) fn part(&self) -> &dyn Part {
         match self {
             PartConfig::Adxl345(config) => config,
+            PartConfig::Ds18b20(config) => config,
+            PartConfig::PwmChannel(config) => config,
             PartConfig::Loopback(config) => config,
             PartConfig::Servo(config) => config,
             PartConfig::Spool(config) => config,

@@ -24,6 +24,8 @@ pub(super) enum Kind {
     Shared,
     /// Measure it.
     Analog,
+    /// Dim it, by a hardware PWM channel.
+    Pwm,
     /// Have an SPI controller send on it.
     Mosi,
 }
@@ -60,6 +62,11 @@ pub(super) trait Wire: Send + Sync {
         driven
     }
 
+    /// A PWM channel gets another value, 0 to [`PWM_MAX`](crate::board::PWM_MAX).
+    fn dim(&self, value: u16) {
+        let _ = value;
+    }
+
     /// What an ADC reads of an analog pin, in counts. `noise` is a draw of a standard normal
     /// distribution.
     fn counts(&self, at: Clock, noise: f64) -> u16 {
@@ -88,6 +95,7 @@ impl WiredPin {
             Kind::Input => "an input",
             Kind::Shared => "a wire that several drive",
             Kind::Analog => "an ADC channel",
+            Kind::Pwm => "a hardware PWM channel",
             Kind::Mosi => "an SPI bus's data output",
         };
         let detail = format!(

@@ -1,0 +1,104 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A hardware PWM channel, with something on it that is dimmed.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use serde::Deserialize;
+
+use super::config::{PinName, SimConfig, SimError, wrong};
+use super::part::{Part, Sight, Workshop};
+use super::printer_cfg::{Layout, Sections};
+use super::wire::{Kind, Wire};
+use crate::board::{PWM_MAX, Pwm};
+use crate::shutdown::Shutdown;
+use crate::time::{Clock, Ticks};
+
+/// The channel's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PwmChannelConfig {
+    /// Such as `laser`.
+    pub name: String,
+    /// The channel.
+    pub pin: PinName,
+}
+
+impl Part for PwmChannelConfig {
+    fn name(&self) -> String {
+        self.name.clone()
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("pin", Some(&self.pin))]
+    }
+
+    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+        if self.pin.inverted {
+            return wrong(whose, "pin", "a PWM channel has no polarity here", "remove the `!`");
+        }
+        Ok(())
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        let channel = Arc::new(PwmChannel { name: self.name.clone(), value: AtomicU32::new(0) });
+        workshop.wire_shared(Some(&self.pin), channel.clone());
+        workshop.show(channel);
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, _layout: &Layout<'_>) {
+        cfg.section(format_args!("output_pin {}", self.name));
+        cfg.key("pin", &self.pin);
+        cfg.key("pwm", "True");
+        cfg.key("hardware_pwm", "True");
+        cfg.key("cycle_time", 0.001);
+    }
+}
+
+/// The channel.
+struct PwmChannel {
+    name: String,
+    /// 0 to [`PWM_MAX`].
+    value: AtomicU32,
+}
+
+impl Wire for PwmChannel {
+    fn kind(&self) -> Kind {
+        Kind::Pwm
+    }
+
+    fn describe(&self) -> String {
+        format!("hardware PWM of {}", self.name)
+    }
+
+    fn dim(&self, value: u16) {
+        self.value.store(value.into(), Ordering::Relaxed);
+    }
+}
+
+impl Sight for PwmChannel {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn look(&self, _now: Clock) -> String {
+        format!("{} %", self.value.load(Ordering::Relaxed) * 100 / u32::from(PWM_MAX))
+    }
+}
+
+/// The machine's end.
+pub(super) struct SimPwm(pub(super) Arc<dyn Wire>);
+
+impl Pwm for SimPwm {
+    fn set(&mut self, value: u16) -> Result<(), Shutdown> {
+        self.0.dim(value);
+        Ok(())
+    }
+
+    fn set_cycle(&mut self, _cycle: Ticks, value: u16) -> Result<(), Shutdown> {
+        self.set(value)
+    }
+}
