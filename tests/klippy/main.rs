@@ -7,6 +7,7 @@
 
 mod drivers;
 mod filament;
+mod hosts;
 mod klippy;
 mod print;
 mod regression;

@@ -22,6 +22,10 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     cfg.section("mcu");
     cfg.key("serial", pty);
 
+    cfg.section("virtual_sdcard");
+    cfg.comment("Kalico's filament sensors want it.");
+    cfg.key("path", "~/printer_data/gcodes");
+
     let layout = Layout::of(config);
     cfg.motion(&layout);
     for heater in &config.heaters {

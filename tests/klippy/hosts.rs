@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Every generation of hosts on the whole simulated printer, each from its own checkout:
+//! `KLIPPER_DIR_V0_11`, `_V0_12`, `_V0_13`, `_MASTER` and `_KALICO`.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use pinion::mcu::Generation;
+
+use super::klippy::Printer;
+
+/// The checkout of a generation, if there is one.
+fn checkout(generation: Generation) -> Option<PathBuf> {
+    let variable = format!("KLIPPER_DIR_{}", generation.name().to_uppercase().replace('.', "_"));
+    let folder = std::env::var_os(&variable).map(PathBuf::from);
+    if folder.is_none() {
+        let skipped =
+            format!("\nSKIPPED the host {generation}: {variable} is not set; set it to a checkout of that version\n");
+        let _ = std::io::stderr().write_all(skipped.as_bytes());
+    }
+    folder
+}
+
+/// A button that is pressed, beside what the built-in printer has.
+fn with_button(board: String, _trace: &Path) -> String {
+    board + "\n[[input]]\nname = \"knob\"\npin = \"knob\"\nlevel = true\n"
+}
+
+fn with_sections(config: String) -> String {
+    // At the 3200 samples a second of klippy's default a busy computer is late now and then.
+    config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n") + "\n[gcode_button knob]\npin: knob\npress_gcode:\n"
+}
+
+#[test]
+fn hosts_of_all_generations_use_the_whole_printer() {
+    for generation in Generation::ALL {
+        let Some(checkout) = checkout(generation) else { continue };
+        let mut printer = Printer::start_on(&checkout, with_button, with_sections);
+        printer.until_state("ready");
+        printer.until_logged(&format!(": dialect {generation}, which has "));
+        use_everything(&mut printer, generation);
+        printer.restart("FIRMWARE_RESTART");
+        use_everything(&mut printer, generation);
+        printer.restart("RESTART");
+        printer.gcode("G28 X");
+        assert!(!printer.log().contains(" ERROR "), "{generation}: {}", printer.log());
+    }
+}
+
+/// Steppers, heaters and fan, hardware PWM, ADCs, thermocouple (SPI), DS18B20, accelerometer (SPI), drivers
+/// (SPI and UART), display (I2C), lights (MOSI and software SPI), buttons.
+#[track_caller]
+fn use_everything(printer: &mut Printer, generation: Generation) {
+    printer.gcode("G28\nG1 X50 Y40 Z10 F6000\nM400");
+    let toolhead = printer.object("toolhead");
+    assert_eq!(toolhead["homed_axes"], "xyz", "{generation}");
+    assert_eq!(toolhead["position"][1], 40.0);
+    printer.gcode("M140 S40\nM106 S128\nSET_PIN PIN=laser VALUE=0.4\nSET_SERVO SERVO=arm ANGLE=60");
+    printer.gcode("SET_LED LED=strip RED=1\nSET_LED LED=dots BLUE=1\nM117 Hello");
+    printer.gcode("DUMP_TMC STEPPER=stepper_z\nDUMP_TMC STEPPER=stepper_y\nACCELEROMETER_QUERY");
+    printer.gcode("M190 S40\nTURN_OFF_HEATERS");
+    for (sensor, from, to) in [
+        ("heater_bed", 38.0, 45.0),
+        ("temperature_sensor bed_underside", 30.0, 60.0),
+        ("temperature_sensor nozzle", 20.0, 30.0),
+    ] {
+        let celsius = printer.object(sensor)["temperature"].as_f64().unwrap();
+        assert!((from..to).contains(&celsius), "{generation}: {sensor} is at {celsius} C");
+    }
+    assert_eq!(printer.object("gcode_button knob")["state"], "PRESSED", "{generation}");
+    // Gravity, in the words that each generation has for it.
+    let felt = printer.said("accelerometer values (x, y, z): ");
+    let z: f64 = felt.rsplit(", ").next().unwrap().parse().unwrap();
+    assert!((z - 9806.65).abs() < 500.0, "{generation}: {felt}");
+    assert_eq!(printer.state(), "ready", "{generation}");
+}
