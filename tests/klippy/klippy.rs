@@ -79,12 +79,14 @@ impl Printer {
         })
     }
 
-    /// A printer that can be looked at: it is simulated by this process, and has no log.
+    /// A printer that can be looked at: it is simulated by this process. Its log goes to stderr with RUST_LOG=info.
     pub fn start_here(
         checkout: &Path,
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
+        // Another test may have started it.
+        let _ = env_logger::try_init();
         // Poisoned by a test that failed.
         let alone = HERE.lock().unwrap_or_else(PoisonError::into_inner);
         let mut printer = Printer::serve(checkout, describe, change, |folder| {
@@ -216,7 +218,7 @@ impl Printer {
     #[track_caller]
     pub fn gcode(&mut self, script: &str) {
         if let Err(error) = self.call("gcode/script", json!({ "script": script })) {
-            panic!("{script}: {error}\n{}", self.log());
+            panic!("{script}: {error}\n{}\n{}", self.why(), self.log());
         }
     }
 
@@ -319,7 +321,8 @@ impl Printer {
             if object[key] == wanted {
                 return;
             }
-            assert!(Instant::now() < end, "{name} stays {object}\n{}", self.log());
+            let stopped = self.state() == "shutdown";
+            assert!(!stopped && Instant::now() < end, "{name} stays {object}: {}\n{}", self.why(), self.log());
             thread::sleep(Duration::from_millis(100));
         }
     }
