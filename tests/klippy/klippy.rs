@@ -28,6 +28,12 @@ pub fn python() -> String {
     std::env::var("KLIPPER_PYTHON").unwrap_or_else(|_| "python3".into())
 }
 
+/// What lets klippy move without homing. For a test that is not about homing: there klippy is never more
+/// than 0.1 s ahead of the motion, and a busy computer stops it.
+pub const UNHOMED: &str = "\n[force_move]\nenable_force_move: True\n";
+/// Where the built-in printer stands at first.
+pub const WHERE_IT_STANDS: &str = "SET_KINEMATIC_POSITION X=60 Y=45 Z=12";
+
 /// Who serves klippy.
 enum Server {
     /// The program.
