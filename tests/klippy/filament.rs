@@ -21,7 +21,7 @@ fn start_print(checkout: &Path, moves: usize, spool: &str) -> Printer {
         format!("{cold}\n[pause_resume]\n\n[virtual_sdcard]\npath: {}\n{UNHOMED}", folder(&tty))
     };
     let mut printer = Printer::start_here(checkout, describe, change);
-    let part: String = (0..moves).map(|n| format!("G1 X{} E5 F600\n", 30 + 25 * (n % 2))).collect();
+    let part: String = (0..moves).map(|n| format!("G1 X{} E5 F1500\n", 30 + 25 * (n % 2))).collect();
     printer.write("part.gcode", &format!("{WHERE_IT_STANDS}\nM83\nG1 X30 Y30 Z5 F6000\n{part}"));
     printer.until_object(SWITCH, "filament_detected", true);
     printer.gcode("QUERY_FILAMENT_SENSOR SENSOR=filament");
