@@ -39,7 +39,7 @@ enum Server {
     /// The program.
     Program(Child),
     /// This process, which can look at its simulated printer.
-    Here(Option<JoinHandle<()>>, SimProbe, MutexGuard<'static, ()>),
+    Here { running: Option<JoinHandle<()>>, probe: SimProbe, _alone: MutexGuard<'static, ()> },
 }
 
 /// This process serves one printer at a time: the signal that ends it would end all.
@@ -109,7 +109,7 @@ impl Printer {
                 watchdog: None,
             };
             let run = move || runtime::run(&options, Box::new(board), clock, None, || {}).unwrap();
-            Server::Here(Some(thread::spawn(run)), probe, alone)
+            Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
         });
         printer.until_state("ready");
         printer
@@ -138,7 +138,7 @@ impl Printer {
     /// The simulated printer of [`Printer::start_here`].
     pub fn probe(&self) -> &SimProbe {
         match &self.server {
-            Server::Here(_, probe, _) => probe,
+            Server::Here { probe, .. } => probe,
             Server::Program(_) => panic!("the printer is another process'"),
         }
     }
@@ -371,7 +371,7 @@ impl Drop for Printer {
         match &mut self.server {
             Server::Program(pinion) => end(pinion),
             // It handles the signal, which ends it and not this process.
-            Server::Here(running, ..) => {
+            Server::Here { running, .. } => {
                 let _ = raise(Signal::SIGTERM);
                 let _ = running.take().map(JoinHandle::join);
             }
