@@ -4,7 +4,7 @@
 use std::path::Path;
 
 use super::checkout;
-use super::klippy::Printer;
+use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS};
 
 /// A print of so many moves of 5 mm of filament each, by a cold hot end.
 fn start_print(checkout: &Path, moves: usize, spool: &str) -> Printer {
@@ -18,11 +18,11 @@ fn start_print(checkout: &Path, moves: usize, spool: &str) -> Printer {
         let tty = config.lines().find_map(|line| line.strip_prefix("serial: ")).unwrap().to_owned();
         let cold = config.replace("min_extrude_temp: 170", "min_extrude_temp: 0");
         assert_ne!(cold, config);
-        format!("{cold}\n[pause_resume]\n\n[virtual_sdcard]\npath: {}\n", folder(&tty))
+        format!("{cold}\n[pause_resume]\n\n[virtual_sdcard]\npath: {}\n{UNHOMED}", folder(&tty))
     };
     let mut printer = Printer::start_here(checkout, describe, change);
-    let part: String = (0..moves).map(|n| format!("G1 X{} E5 F600\n", 30 + 25 * (n % 2))).collect();
-    printer.write("part.gcode", &format!("G28\nM83\nG1 X30 Y30 Z5 F6000\n{part}"));
+    let part: String = (0..moves).map(|n| format!("G1 X{} E5 F1500\n", 30 + 25 * (n % 2))).collect();
+    printer.write("part.gcode", &format!("{WHERE_IT_STANDS}\nM83\nG1 X30 Y30 Z5 F6000\n{part}"));
     printer.until_object(SWITCH, "filament_detected", true);
     printer.gcode("QUERY_FILAMENT_SENSOR SENSOR=filament");
     assert_eq!(printer.said("Filament Sensor filament: "), "filament detected");

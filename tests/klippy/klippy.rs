@@ -28,12 +28,18 @@ pub fn python() -> String {
     std::env::var("KLIPPER_PYTHON").unwrap_or_else(|_| "python3".into())
 }
 
+/// What lets klippy move without homing. For a test that is not about homing: there klippy is never more
+/// than 0.1 s ahead of the motion, and a busy computer stops it.
+pub const UNHOMED: &str = "\n[force_move]\nenable_force_move: True\n";
+/// Where the built-in printer stands at first.
+pub const WHERE_IT_STANDS: &str = "SET_KINEMATIC_POSITION X=60 Y=45 Z=12";
+
 /// Who serves klippy.
 enum Server {
     /// The program.
     Program(Child),
     /// This process, which can look at its simulated printer.
-    Here(Option<JoinHandle<()>>, SimProbe, MutexGuard<'static, ()>),
+    Here { running: Option<JoinHandle<()>>, probe: SimProbe, _alone: MutexGuard<'static, ()> },
 }
 
 /// This process serves one printer at a time: the signal that ends it would end all.
@@ -98,12 +104,14 @@ impl Printer {
         })
     }
 
-    /// A printer that can be looked at: it is simulated by this process, and has no log.
+    /// A printer that can be looked at: it is simulated by this process. Its log goes to stderr with RUST_LOG=info.
     pub fn start_here(
         checkout: &Path,
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
+        // Another test may have started it.
+        let _ = env_logger::try_init();
         // Poisoned by a test that failed.
         let alone = HERE.lock().unwrap_or_else(PoisonError::into_inner);
         let mut printer = Printer::serve(checkout, describe, change, |folder| {
@@ -121,7 +129,7 @@ impl Printer {
                 dialect: None,
             };
             let run = move || runtime::run(&options, Box::new(board), clock, None, || {}).unwrap();
-            Server::Here(Some(thread::spawn(run)), probe, alone)
+            Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
         });
         printer.until_state("ready");
         printer
@@ -150,7 +158,7 @@ impl Printer {
     /// The simulated printer of [`Printer::start_here`].
     pub fn probe(&self) -> &SimProbe {
         match &self.server {
-            Server::Here(_, probe, _) => probe,
+            Server::Here { probe, .. } => probe,
             Server::Program(_) => panic!("the printer is another process'"),
         }
     }
@@ -227,7 +235,7 @@ impl Printer {
     #[track_caller]
     pub fn gcode(&mut self, script: &str) {
         if let Err(error) = self.call("gcode/script", json!({ "script": script })) {
-            panic!("{script}: {error}\n{}", self.log());
+            panic!("{script}: {error}\n{}\n{}", self.why(), self.log());
         }
     }
 
@@ -370,7 +378,8 @@ impl Printer {
             if object[key] == wanted {
                 return;
             }
-            assert!(Instant::now() < end, "{name} stays {object}\n{}", self.log());
+            let stopped = self.state() == "shutdown";
+            assert!(!stopped && Instant::now() < end, "{name} stays {object}: {}\n{}", self.why(), self.log());
             thread::sleep(Duration::from_millis(100));
         }
     }
@@ -446,7 +455,7 @@ impl Drop for Printer {
         match &mut self.server {
             Server::Program(pinion) => end(pinion),
             // It handles the signal, which ends it and not this process.
-            Server::Here(running, ..) => {
+            Server::Here { running, .. } => {
                 let _ = raise(Signal::SIGTERM);
                 let _ = running.take().map(JoinHandle::join);
             }

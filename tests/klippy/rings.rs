@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use std::{fs, thread};
 
 use super::checkout;
-use super::klippy::Printer;
+use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS};
 
 /// The resonances of the built-in printer.
 const RESONANCES_HZ: [(&str, f64); 2] = [("x", 57.0), ("y", 43.5)];
@@ -18,7 +18,8 @@ const G: f64 = 9806.65;
 /// A printer whose chip takes 400 samples a second, far more than the resonances need: at klippy's 3200
 /// its FIFO lasts for 10 ms, and a computer that tests much at once is late by more now and then.
 fn start(checkout: &Path) -> Printer {
-    let mut printer = Printer::start_with(checkout, |config| config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n"));
+    let change = |config: String| config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n") + UNHOMED;
+    let mut printer = Printer::start_with(checkout, change);
     printer.until_state("ready");
     printer
 }
@@ -97,7 +98,7 @@ fn an_accelerometer_is_asked_and_measures_without_a_gap() {
 fn klippy_sees_each_axis_ring_at_its_resonance() {
     let Some(checkout) = checkout("klippy_sees_each_axis_ring_at_its_resonance") else { return };
     let mut printer = start(&checkout);
-    printer.gcode("G28");
+    printer.gcode(WHERE_IT_STANDS);
     for (axis, hz) in RESONANCES_HZ {
         let name = name("test");
         printer.gcode(&format!("TEST_RESONANCES AXIS={axis} NAME={name} {}", sweep(hz)));
@@ -110,7 +111,7 @@ fn klippy_sees_each_axis_ring_at_its_resonance() {
 fn klippy_calibrates_its_input_shaper_for_the_resonances() {
     let Some(checkout) = checkout("klippy_calibrates_its_input_shaper_for_the_resonances") else { return };
     let mut printer = start(&checkout);
-    printer.gcode("G28");
+    printer.gcode(WHERE_IT_STANDS);
     for (axis, hz) in RESONANCES_HZ {
         let name = name("calibrate");
         printer.gcode(&format!("SHAPER_CALIBRATE AXIS={axis} NAME={name} {}", sweep(hz)));
@@ -121,7 +122,6 @@ fn klippy_calibrates_its_input_shaper_for_the_resonances() {
         let fitted_hz: f64 = fitted.split(' ').next().unwrap().parse().unwrap();
         let found_hz = peak(format!("/tmp/calibration_data_{axis}_{name}.csv"), &format!("psd_{axis}"));
         let recommended = printer.said(&format!("Recommended shaper_type_{axis} = "));
-        println!("{axis}: mzv {fitted}, peak {found_hz}, recommended {recommended}");
         assert!((found_hz - hz).abs() < 1.0, "{axis}: {found_hz} Hz, not {hz}");
         assert!((fitted_hz - hz).abs() < 1.0, "{axis}: {fitted_hz} Hz, not {hz}");
         // klippy uses what it recommends.

@@ -792,6 +792,12 @@ mod tests {
             ("axis = \"z\"", "axis = \"w\"", "`axis`", "no `w`"),
             ("kind = \"tmc5160\"", "kind = \"tmc9\"", "", "unknown variant `tmc9`"),
             ("axis = \"z\"", "axes = \"z\"", "", "unknown field `axes`"),
+            ("axis = \"x\", hz", "axis = \"w\", hz", "`x`", "no axis `w`"),
+            ("hz = 43.5", "hz = 0.0", "`y`", "not above zero"),
+            ("damping_ratio = 0.1", "damping_ratio = 1.0", "`x`", "does not ring"),
+            ("rate_off_percent = 0.4", "rate_off_percent = 40.0", "`rate_off_percent`", "so far off"),
+            ("encoder_mm = 1.44", "encoder_mm = 0.0", "`encoder_mm`", "not above zero"),
+            ("max_pulse_us = 2000.0", "max_pulse_us = 900.0", "`max_pulse_us`", "not above min_pulse_us"),
             ("name = \"spidev1.0\"", "name = \"spidev0.0\"", "`name`", "two are called `spidev0.0`"),
             (
                 "name = \"spidev1.0\"",
