@@ -260,17 +260,20 @@ impl Screen {
 
 /// The thread that shows.
 pub(super) struct Show {
-    stop: Sender<()>,
+    /// Has it begin; dropped, has it end.
+    go: Sender<()>,
     done: Receiver<()>,
 }
 
 impl Show {
-    /// Shows the printer on stdout from now on.
-    pub(super) fn start(probe: SimProbe) -> io::Result<Show> {
-        let (stop, stopped) = mpsc::channel();
+    /// A thread that is to show the printer on stdout. Make it before the machine runs: a thread that a
+    /// real-time one starts has its scheduling, and would keep a host from the processor.
+    pub(super) fn prepare(probe: SimProbe) -> io::Result<Show> {
+        let (go, went) = mpsc::channel();
         let (finished, done) = mpsc::channel();
         thread::Builder::new().name("show".into()).spawn(move || {
-            if let Err(error) = show(&probe, &stopped) {
+            let shown = went.recv().map_or(Ok(()), |()| show(&probe, &went));
+            if let Err(error) = shown {
                 // A reader that went away, such as `head`, is no failure, and the printer serves on.
                 if error.kind() != io::ErrorKind::BrokenPipe {
                     log::warn!("the printer is shown no longer: stdout can not be written: {error}");
@@ -278,12 +281,18 @@ impl Show {
             }
             let _ = finished.send(());
         })?;
-        Ok(Show { stop, done })
+        Ok(Show { go, done })
+    }
+
+    /// Shows the printer from now on.
+    pub(super) fn begin(&self) {
+        // It fails only if the thread is gone, and with it what it could show.
+        let _ = self.go.send(());
     }
 
     /// Shows how it ended and gives the terminal back, unless nobody reads there.
     pub(super) fn end(self) {
-        drop(self.stop);
+        drop(self.go);
         let _ = self.done.recv_timeout(FAREWELL);
     }
 }

@@ -126,20 +126,18 @@ fn show_as_it_changes(
     options: &Options,
     clock: Monotonic,
 ) -> ExitCode {
-    let mut show = None;
+    let show = match Show::prepare(probe) {
+        Ok(show) => show,
+        Err(error) => return failed(format!("the printer can not be shown: {error}")),
+    };
     let ready = || {
         if io::stdout().is_terminal() {
             tell_how_to_connect(args);
         }
-        match Show::start(probe) {
-            Ok(started) => show = Some(started),
-            Err(error) => log::error!("the printer can not be shown: {error}"),
-        }
+        show.begin();
     };
     let ended = runtime::run(options, Box::new(board), clock, None, ready);
-    if let Some(show) = show {
-        show.end();
-    }
+    show.end();
     ended.map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim --show`: what a person sees while a host drives the printer.
 
-use std::fs::File;
+use std::fs::{self, File};
 use std::io::Read;
+use std::path::Path;
 use std::process::Stdio;
 use std::sync::{Arc, Mutex};
 use std::thread;
@@ -33,14 +34,26 @@ fn drive(pinion: &Pinion) -> Client {
     client
 }
 
+/// The scheduling policy of one of the program's threads (proc_pid_stat(5), field 41).
+fn policy(pinion: &Pinion, thread: &str) -> u32 {
+    let folders = fs::read_dir(format!("/proc/{}/task", pinion.pid())).unwrap();
+    let read = |folder: &Path, name: &str| fs::read_to_string(folder.join(name)).unwrap();
+    let mut folders = folders.map(|entry| entry.unwrap().path());
+    let folder = folders.find(|folder| read(folder, "comm").trim() == thread).unwrap();
+    // The third field comes behind the name, which is in brackets.
+    let stat = read(&folder, "stat");
+    stat.rsplit_once(") ").unwrap().1.split(' ').nth(41 - 3).unwrap().parse().unwrap()
+}
+
 #[test]
 fn each_change_is_a_line() {
-    let mut pinion = Pinion::start(&["sim", "--show"]);
+    let mut pinion = Pinion::start(&["sim", "-r", "--show"]);
     pinion.until("all things once", || pinion.out().contains("] dots: "));
     let first = pinion.out();
     for line in ["x: 60.00 mm", "extruder: 25.0 C", "fan: 0 rpm", "light: off", "display: dark"] {
         assert_eq!(first.lines().filter(|shown| shown.ends_with(&format!("] {line}"))).count(), 1, "{line}\n{first}");
     }
+    assert_eq!(policy(&pinion, "show"), 0, "to show something is no hurry (SCHED_OTHER)");
     let mut client = drive(&pinion);
     pinion.until("the light", || pinion.out().contains("] light: on\n"));
     let strip = "] strip: red#ff0000 blue#000020 off off off off off off\n";

@@ -130,6 +130,7 @@ enum Addressing {
     Page,
 }
 
+#[derive(Clone)]
 struct Chip {
     /// By page and segment; bit 0 is the page's topmost row.
     memory: [[u8; COLUMNS as usize]; PAGES as usize],
@@ -139,6 +140,7 @@ struct Chip {
 }
 
 /// What a reset sets.
+#[derive(Clone)]
 struct Settings {
     addressing: Addressing,
     column: u8,
@@ -322,7 +324,8 @@ impl Sight for Panel {
 
     /// The picture, of 2 x 4 pixels in a character.
     fn look(&self, _now: Clock) -> String {
-        let chip = self.chip();
+        // A copy: who draws may lose the processor at any time, and the bus must not wait for that.
+        let chip = self.chip().clone();
         if !chip.is_lit() {
             return "dark".into();
         }

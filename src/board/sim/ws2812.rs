@@ -206,9 +206,13 @@ impl Sight for Strip {
     }
 
     fn look(&self, now: Clock) -> String {
-        let state = self.at(now);
-        let lights = colour::list(state.lights.iter().copied());
-        match state.odd_pulses {
+        // The bus must not wait for what is done with it.
+        let (lights, odd_pulses) = {
+            let state = self.at(now);
+            (state.lights.clone(), state.odd_pulses)
+        };
+        let lights = colour::list(lights.into_iter());
+        match odd_pulses {
             0 => lights,
             count => format!("{lights} ({count} pulses are not the data sheet's)"),
         }
