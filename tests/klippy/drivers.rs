@@ -204,7 +204,7 @@ fn klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft() {
 fn klippy_reads_each_kind_of_angle_sensor() {
     let Some(checkout) = checkout("klippy_reads_each_kind_of_angle_sensor") else { return };
     for chip in ["a1333", "as5047d", "mt6816", "mt6826s", "tle5012b"] {
-        let mut printer = Printer::start_here(&checkout, with_sensor(chip), |config| config);
+        let mut printer = Printer::start_here(&checkout, with_sensor(chip), with_stepper);
         printer.gcode("G28 Y\nG1 Y100 F6000\nM400\nG4 P200");
         let last = |batch: &serde_json::Value| batch["data"].as_array().unwrap().last().unwrap()[1].as_f64().unwrap();
         let at_100 = last(&printer.angles("y"));
