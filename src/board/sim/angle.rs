@@ -447,7 +447,7 @@ impl SpiChip for Tle5012b {
         if place >= data {
             return self.safety()[(place - data) & 1];
         }
-        if place % 2 == 0 {
+        if place.is_multiple_of(2) {
             let word = self.word(command, place / 2 - 1);
             self.said.extend(word.to_be_bytes());
         }
