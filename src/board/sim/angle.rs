@@ -113,7 +113,7 @@ impl Part for AngleConfig {
         cfg.section(format_args!("angle {}", self.axis));
         cfg.key("sensor_type", self.chip.name());
         cfg.spi(&self.bus, Some(&self.select_pin));
-        cfg.comment("For ANGLE_CALIBRATE, which needs a driver on this stepper and Python's numpy:");
+        cfg.comment("To measure with it, and for ANGLE_CALIBRATE; needs a driver on this stepper, and numpy:");
         cfg.offer(|cfg| cfg.key("stepper", layout.stepper(&self.axis)));
     }
 }
@@ -447,7 +447,7 @@ impl SpiChip for Tle5012b {
         if place >= data {
             return self.safety()[(place - data) & 1];
         }
-        if place % 2 == 0 {
+        if place.is_multiple_of(2) {
             let word = self.word(command, place / 2 - 1);
             self.said.extend(word.to_be_bytes());
         }

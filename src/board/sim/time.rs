@@ -5,9 +5,10 @@
 
 use std::cell::Cell;
 use std::sync::Arc;
+use std::thread;
 use std::time::Duration;
 
-use crate::time::{Clock, TimeSource};
+use crate::time::{Clock, Ticks, TimeSource};
 
 thread_local! {
     /// The instant for which what this thread does now was due, if it was due at one.
@@ -63,58 +64,74 @@ impl TimeSource for ErrandTime {
         self.0.instant_of(monotonic)
     }
 
+    /// As the lines have the errand's time, whatever it is meanwhile, nothing has to spin: between two
+    /// bits is no time to sleep, between a thousand there is.
     fn spin_until(&self, end: Clock) {
-        self.0.spin_until(end);
-        DUE.set(DUE.get().map(|due| due.max(end)));
+        let Some(due) = DUE.get() else { return self.0.spin_until(end) };
+        DUE.set(Some(due.max(end)));
+        if end.since(self.0.now()) > i64::from(AHEAD.0) {
+            self.sleep_until(end);
+        }
     }
 
     fn begin_errand(&self) {
         DUE.set(Some(self.0.now()));
     }
 
+    /// Not before it ends in its own time.
     fn end_errand(&self) {
-        DUE.set(None);
+        if let Some(due) = DUE.take() {
+            self.sleep_until(due);
+        }
+    }
+}
+
+/// How far an errand may be ahead of the machine's clock.
+const AHEAD: Ticks = Ticks::from_us(1000);
+
+impl ErrandTime {
+    fn sleep_until(&self, end: Clock) {
+        let ticks = end.since(self.0.now()).max(0) as u64;
+        thread::sleep(Duration::from_micros(ticks / u64::from(Ticks::from_us(1).0)));
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::{Ticks, VirtualClock};
-
-    /// A clock that is late by this much at each wait.
-    struct Late(VirtualClock, Ticks);
-
-    impl TimeSource for Late {
-        fn now(&self) -> Clock {
-            self.0.now()
-        }
-
-        fn instant_of(&self, monotonic: Duration) -> Clock {
-            self.0.instant_of(monotonic)
-        }
-
-        fn spin_until(&self, end: Clock) {
-            self.0.set(end + self.1);
-        }
-    }
+    use crate::time::VirtualClock;
 
     #[test]
     fn an_errand_does_not_feel_how_late_the_computer_is() {
         let clock = VirtualClock::at(Clock::EPOCH);
-        let late = Arc::new(Late(clock.clone(), Ticks(1000)));
-        let (errand, printer) = (ErrandTime(late.clone()), PrinterTime::new(late));
+        let machine = Arc::new(clock.clone());
+        let (errand, printer) = (ErrandTime(machine.clone()), PrinterTime::new(machine));
         errand.begin_errand();
-        clock.set(Clock::EPOCH + Ticks(7));
-        assert_eq!(errand.now(), Clock::EPOCH);
         for bit in 1..4 {
+            // Each wait ends much too late.
+            clock.set(Clock::EPOCH + Ticks(1000 * bit));
             errand.spin_until(Clock::EPOCH + Ticks(10 * bit));
             assert_eq!(errand.now(), Clock::EPOCH + Ticks(10 * bit));
             assert_eq!(printer.of_the_caller(), errand.now(), "and so have the lines");
         }
         assert_eq!(printer.now(), clock.now());
         errand.end_errand();
-        assert_eq!(errand.now(), Clock::EPOCH + Ticks(1030));
+        assert_eq!(errand.now(), Clock::EPOCH + Ticks(3000));
         assert_eq!(printer.of_the_caller(), errand.now());
+    }
+
+    #[test]
+    fn an_errand_takes_its_time() {
+        let machine = Arc::new(crate::time::Monotonic::start());
+        let errand = ErrandTime(machine.clone());
+        errand.begin_errand();
+        let end = errand.now() + Ticks::from_us(5500);
+        while errand.now() < end {
+            errand.spin_until(errand.now() + Ticks::from_us(25));
+            assert!(errand.now().since(machine.now()) <= i64::from(AHEAD.0));
+        }
+        errand.end_errand();
+        // Of a microsecond, as sleep is told.
+        assert!(machine.now() + Ticks::from_us(1) >= end);
     }
 }
