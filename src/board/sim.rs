@@ -15,25 +15,35 @@ use super::{
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
+mod bltouch;
 mod config;
+mod hx71x;
 mod i2c;
+mod ldc1612;
+mod load_cell;
 mod loopback;
 mod part;
 mod physics;
 mod printer_cfg;
+mod probe;
 mod spi;
 mod thermistor;
 mod time;
 mod tmc5160;
 mod wire;
 
+pub use bltouch::{BltouchConfig, Jam};
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
     SimConfig, SimError, SpiBusConfig,
 };
+pub use hx71x::{Hx71xChip, Hx71xConfig};
+pub use ldc1612::Ldc1612Config;
+pub use load_cell::CellConfig;
 pub use loopback::LoopbackConfig;
 pub use part::PartConfig;
 pub use printer_cfg::printer_cfg;
+pub use probe::ProbeConfig;
 pub use tmc5160::Tmc5160Config;
 
 use i2c::{I2cBus, I2cDevice};

@@ -121,16 +121,7 @@ impl Printer {
         api.set_read_timeout(Some(PATIENCE)).unwrap();
         api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
         loop {
-            let mut message = Vec::new();
-            loop {
-                let mut byte = [0];
-                api.read_exact(&mut byte).map_err(|error| error.to_string())?;
-                if byte[0] == 3 {
-                    break;
-                }
-                message.push(byte[0]);
-            }
-            let answer: Value = serde_json::from_slice(&message).unwrap();
+            let answer = message(api)?;
             if answer["id"] == self.next_id {
                 return match &answer["error"] {
                     Value::Null => Ok(answer["result"].clone()),
@@ -145,6 +136,46 @@ impl Printer {
     pub fn gcode(&mut self, script: &str) {
         if let Err(error) = self.call("gcode/script", json!({ "script": script })) {
             panic!("{script}: {error}\n{}", self.log());
+        }
+    }
+
+    /// Runs G-code to its end, and gives what it answers, or why klippy refuses it.
+    pub fn try_gcode(&mut self, script: &str) -> Result<String, String> {
+        // Answers come to a connection of their own, before the result.
+        let mut api = UnixStream::connect(self.path("api")).map_err(|error| error.to_string())?;
+        api.set_read_timeout(Some(PATIENCE)).unwrap();
+        let mut ask = |id: u32, method: &str, params: Value| {
+            let request = json!({ "id": id, "method": method, "params": params });
+            api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
+            let mut answers = String::new();
+            loop {
+                let message = message(&mut api)?;
+                if let Some(line) = message["params"]["response"].as_str() {
+                    answers += line;
+                    answers.push('\n');
+                }
+                if message["id"] == id {
+                    let error = &message["error"];
+                    return if error.is_null() { Ok(answers) } else { Err(error.to_string()) };
+                }
+            }
+        };
+        ask(1, "gcode/subscribe_output", json!({ "response_template": {} }))?;
+        ask(2, "gcode/script", json!({ "script": script }))
+    }
+
+    /// Runs G-code to its end, and gives what it answers.
+    #[track_caller]
+    pub fn answer(&mut self, script: &str) -> String {
+        self.try_gcode(script).unwrap_or_else(|error| panic!("{script}: {error}\n{}", self.log()))
+    }
+
+    /// Runs G-code that klippy refuses, and gives what it says.
+    #[track_caller]
+    pub fn refused(&mut self, script: &str) -> String {
+        match self.try_gcode(script) {
+            Ok(_) => panic!("{script} was not refused\n{}", self.log()),
+            Err(error) => error,
         }
     }
 
@@ -251,6 +282,19 @@ impl Printer {
             assert!(Instant::now() < end, "waited in vain for {what}\n{}", self.log());
             thread::sleep(Duration::from_millis(50));
         }
+    }
+}
+
+/// The next message of klippy's API.
+fn message(api: &mut UnixStream) -> Result<Value, String> {
+    let mut message = Vec::new();
+    loop {
+        let mut byte = [0];
+        api.read_exact(&mut byte).map_err(|error| error.to_string())?;
+        if byte[0] == 3 {
+            return serde_json::from_slice(&message).map_err(|error| error.to_string());
+        }
+        message.push(byte[0]);
     }
 }
 

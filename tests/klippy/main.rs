@@ -6,6 +6,7 @@
 //! former every test here is skipped, and says so.
 
 mod klippy;
+mod probes;
 
 use std::io::Write;
 use std::path::PathBuf;

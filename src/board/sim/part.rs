@@ -16,7 +16,7 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{loopback, tmc5160};
+use super::{bltouch, hx71x, ldc1612, loopback, probe, tmc5160};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -27,6 +27,14 @@ pub enum PartConfig {
     Loopback(loopback::LoopbackConfig),
     /// A stepper driver.
     Tmc5160(tmc5160::Tmc5160Config),
+    /// A switch beside the nozzle.
+    Probe(probe::ProbeConfig),
+    /// A probe with a push-pin.
+    Bltouch(bltouch::BltouchConfig),
+    /// The ADC of a load cell.
+    Hx71x(hx71x::Hx71xConfig),
+    /// A coil over the bed.
+    Ldc1612(ldc1612::Ldc1612Config),
 }
 
 impl PartConfig {
@@ -35,6 +43,10 @@ impl PartConfig {
         match self {
             PartConfig::Loopback(config) => config,
             PartConfig::Tmc5160(config) => config,
+            PartConfig::Probe(config) => config,
+            PartConfig::Bltouch(config) => config,
+            PartConfig::Hx71x(config) => config,
+            PartConfig::Ldc1612(config) => config,
         }
     }
 }

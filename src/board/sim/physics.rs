@@ -15,7 +15,7 @@ use super::thermistor::Thermistor;
 use crate::time::{CLOCK_FREQ, Clock};
 
 /// Seconds from `earlier` to `later`; none if they are the other way round.
-fn seconds(earlier: Clock, later: Clock) -> f64 {
+pub fn seconds(earlier: Clock, later: Clock) -> f64 {
     later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
 }
 
@@ -24,17 +24,17 @@ fn seconds(earlier: Clock, later: Clock) -> f64 {
 /// A sequence lock: the version is odd while the words change, and a reader takes them again if
 /// the version was odd or has changed. The writer never waits.
 #[derive(Debug)]
-struct Together<const N: usize> {
+pub struct Together<const N: usize> {
     version: AtomicU64,
     words: [AtomicU64; N],
 }
 
 impl<const N: usize> Together<N> {
-    fn new(words: [u64; N]) -> Together<N> {
+    pub fn new(words: [u64; N]) -> Together<N> {
         Together { version: AtomicU64::new(0), words: words.map(AtomicU64::new) }
     }
 
-    fn load(&self) -> [u64; N] {
+    pub fn load(&self) -> [u64; N] {
         loop {
             let before = self.version.load(Ordering::Acquire);
             let words = std::array::from_fn(|i| self.words[i].load(Ordering::Relaxed));
@@ -47,7 +47,7 @@ impl<const N: usize> Together<N> {
     }
 
     /// Only one thread may store.
-    fn store(&self, words: [u64; N]) {
+    pub fn store(&self, words: [u64; N]) {
         let version = self.version.load(Ordering::Relaxed);
         self.version.store(version | 1, Ordering::Relaxed);
         fence(Ordering::Release);

@@ -3,13 +3,16 @@
 
 #![forbid(unsafe_code)]
 
+use std::cell::Cell;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
 
 use crate::time::{Clock, TimeSource};
 
-/// Stands for no instant.
-const NONE: u64 = u64::MAX;
+thread_local! {
+    /// The instant for which the timer was set that this thread runs. Only the core runs timers: a worker
+    /// that drives lines itself (an HX711's clock) does so now, whatever the core does meanwhile.
+    static DUE: Cell<Option<Clock>> = const { Cell::new(None) };
+}
 
 /// The printer's time: the machine's clock, but while the core runs a timer the instant for which
 /// that timer was set.
@@ -19,30 +22,47 @@ const NONE: u64 = u64::MAX;
 /// microseconds (the bits of a UART, the pulses of a servo, the steps that make an axis ring).
 pub(super) struct PrinterTime {
     clock: Arc<dyn TimeSource>,
-    due: AtomicU64,
 }
 
 impl PrinterTime {
     pub(super) fn new(clock: Arc<dyn TimeSource>) -> PrinterTime {
-        PrinterTime { clock, due: AtomicU64::new(NONE) }
+        PrinterTime { clock }
     }
 
-    /// What the core runs from now on was due at this instant; none: it is no timer.
+    /// What this thread, the core, runs from now on was due at this instant; none: it is no timer.
     pub(super) fn set_due(&self, due: Option<Clock>) {
-        self.due.store(due.map_or(NONE, Clock::ticks), Ordering::Relaxed);
+        DUE.set(due);
     }
 
-    /// The instant of what the core does.
-    pub(super) fn of_the_core(&self) -> Clock {
-        match self.due.load(Ordering::Relaxed) {
-            NONE => self.clock.now(),
-            due => Clock::from_ticks(due),
-        }
+    /// The instant of what the caller does to a line.
+    pub(super) fn of_the_caller(&self) -> Clock {
+        DUE.get().unwrap_or_else(|| self.clock.now())
     }
 }
 
 impl TimeSource for PrinterTime {
     fn now(&self) -> Clock {
         self.clock.now()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::time::VirtualClock;
+
+    #[test]
+    fn a_timer_of_the_core_does_not_hold_back_the_time_of_a_worker() {
+        let clock = VirtualClock::at(Clock::from_ticks(5_000));
+        let time = Arc::new(PrinterTime::new(Arc::new(clock)));
+        time.set_due(Some(Clock::from_ticks(1_000)));
+        let worker = std::thread::spawn({
+            let time = time.clone();
+            move || time.of_the_caller()
+        });
+        assert_eq!(worker.join().ok(), Some(Clock::from_ticks(5_000)));
+        assert_eq!(time.of_the_caller(), Clock::from_ticks(1_000));
+        time.set_due(None);
+        assert_eq!(time.of_the_caller(), Clock::from_ticks(5_000));
     }
 }

@@ -112,7 +112,7 @@ impl SimLine {
     fn begin(&self, level: bool) {
         let on = level != self.pin.inverted;
         self.on.store(on, Ordering::Relaxed);
-        self.pin.wire.settle(on, self.time.of_the_core());
+        self.pin.wire.settle(on, self.time.of_the_caller());
     }
 }
 
@@ -120,14 +120,14 @@ impl Line for SimLine {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
         let on = level != self.pin.inverted;
         if self.on.swap(on, Ordering::Relaxed) != on {
-            self.pin.wire.drive(on, self.time.of_the_core());
+            self.pin.wire.drive(on, self.time.of_the_caller());
         }
         Ok(())
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
         let driven = self.on.load(Ordering::Relaxed);
-        Ok(self.pin.wire.sense(driven, self.time.of_the_core()) != self.pin.inverted)
+        Ok(self.pin.wire.sense(driven, self.time.of_the_caller()) != self.pin.inverted)
     }
 
     /// The parts drive their lines harder than any bias pulls.
@@ -139,7 +139,7 @@ impl Line for SimLine {
             Direction::Output { .. } | Direction::OpenDrain => {
                 return Err(self.pin.is_no("output", reason::NOT_OUTPUT));
             }
-            Direction::Input(_) if kind == Kind::Shared => self.pin.wire.release(self.time.of_the_core()),
+            Direction::Input(_) if kind == Kind::Shared => self.pin.wire.release(self.time.of_the_caller()),
             Direction::Input(_) if kind == Kind::Input => {}
             Direction::Input(_) => return Err(self.pin.is_no("input", reason::NOT_INPUT)),
         }
