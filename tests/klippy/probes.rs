@@ -324,4 +324,12 @@ fn klippy_calibrates_an_eddy_current_probe_and_probes_with_it() {
         let expected = bed_mm(at_x, at_y) - datum;
         assert!((z - expected).abs() < 0.02, "{x} {y}: {z} {expected}");
     }
+    // By a tap: the bed gives way to the nozzle, and the frequency rises no further.
+    for (x, y) in [(110.0, 110.0), (40.0, 150.0)] {
+        printer.gcode(&format!("G1 X{x} Y{y} Z4 F6000\nM400"));
+        read_in_time(&mut printer, "PROBE METHOD=tap TAP_THRESHOLD=20000");
+        let z = printer.object("probe")["last_probe_position"][2].as_f64().unwrap();
+        let expected = bed_mm(x, y) - datum;
+        assert!((z - expected).abs() < 0.03, "{x} {y}: {z} {expected}");
+    }
 }
