@@ -15,6 +15,7 @@ use super::{
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
+mod ads1220;
 mod bltouch;
 mod config;
 mod hx71x;
@@ -26,12 +27,14 @@ mod part;
 mod physics;
 mod printer_cfg;
 mod probe;
+mod ready;
 mod spi;
 mod thermistor;
 mod time;
 mod tmc5160;
 mod wire;
 
+pub use ads1220::Ads1220Config;
 pub use bltouch::{BltouchConfig, Jam};
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,

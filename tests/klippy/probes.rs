@@ -218,6 +218,12 @@ fn klippy_calibrates_a_load_cell() {
     assert!((least..81.0).contains(&rate), "{restarts} restarts: {said}");
     assert!(said.contains("Saturated samples: 0"), "{said}");
     assert!(number(&said, "Unique values: ") > 100.0, "{said}");
+    // The other one, on SPI: no line of its is timed by the computer.
+    let said = printer.answer("LOAD_CELL_DIAGNOSTIC LOAD_CELL=ads1220");
+    let rate = number(&said, "Measured samples per second: ");
+    assert!((40.0..46.0).contains(&rate) && said.contains("reported no errors"), "{said}");
+    let said = printer.answer("LOAD_CELL_READ LOAD_CELL=ads1220");
+    assert!(said.contains("(0.14%)"), "12000 of 2^23 counts: {said}");
     home(&mut printer, "G1 X110 Y110 Z5 F6000\nM400\nLOAD_CELL_CALIBRATE");
     let tare = number(&read_in_time(&mut printer, "TARE"), "% (");
     assert!((tare - TARE_COUNTS).abs() < 60.0, "{tare}");

@@ -22,9 +22,9 @@ use serde::Deserialize;
 use super::config::{Bound, PinName, SimConfig, SimError, check};
 use super::i2c::I2cChip;
 use super::part::{Part, Socket, Workshop};
-use super::physics::{Bed, Noise, Together};
+use super::physics::{Bed, Noise};
 use super::printer_cfg::{Layout, Sections};
-use super::wire::{Kind, Wire};
+use super::ready::{Conversions, ReadyLine, ReadyPin};
 use crate::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// What is connected to CLKIN, as klippy takes for granted.
@@ -162,10 +162,8 @@ impl Part for Ldc1612Config {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
-        let intb = Arc::new(Intb(Together::new(Conversions::NONE.words())));
-        if let Some(pin) = &self.intb_pin {
-            workshop.wire(Some(pin), IntbPin(intb.clone()));
-        }
+        let intb = ReadyLine::new("interrupt of ldc1612");
+        workshop.wire(self.intb_pin.as_ref(), ReadyPin(intb.clone()));
         let noise = Noise::new(workshop.config.seed ^ SEED << 32);
         let coil = Coil { config: self.clone(), bed: workshop.bed(), noise };
         workshop.solder_i2c(self, Ldc1612::new(coil, intb, workshop.time.clone()));
@@ -208,62 +206,11 @@ impl Coil {
     }
 }
 
-/// The conversions of the chip, as its clock makes them.
-#[derive(Clone, Copy, Debug, PartialEq)]
-struct Conversions {
-    /// The first one ends here.
-    first: Clock,
-    /// Ticks of 20 ns from one end to the next; 0 while the chip sleeps.
-    period: f64,
-    /// Those that STATUS was read of.
-    seen: u64,
-    /// Whether INTB tells of them.
-    told: bool,
-}
-
-impl Conversions {
-    const NONE: Conversions = Conversions { first: Clock::from_ticks(0), period: 0.0, seen: 0, told: false };
-
-    fn words(self) -> [u64; 4] {
-        [self.first.ticks(), self.period.to_bits(), self.seen, self.told.into()]
-    }
-
-    fn of([first, period, seen, told]: [u64; 4]) -> Conversions {
-        Conversions { first: Clock::from_ticks(first), period: f64::from_bits(period), seen, told: told != 0 }
-    }
-
-    /// How many are over.
-    fn over(&self, now: Clock) -> u64 {
-        let since = now.since(self.first);
-        if self.period == 0.0 || since < 0 { 0 } else { (since as f64 / self.period) as u64 + 1 }
-    }
-}
-
-/// What the chip and its interrupt line share. The chip writes it.
-struct Intb(Together<4>);
-
-struct IntbPin(Arc<Intb>);
-
-impl Wire for IntbPin {
-    fn kind(&self) -> Kind {
-        Kind::Input
-    }
-
-    fn describe(&self) -> String {
-        "interrupt of ldc1612".into()
-    }
-
-    fn sense(&self, _driven: bool, at: Clock) -> bool {
-        let conversions = Conversions::of(self.0.0.load());
-        !conversions.told || conversions.over(at) <= conversions.seen
-    }
-}
-
 /// The chip.
 struct Ldc1612 {
     coil: Coil,
     clock: Arc<dyn TimeSource>,
-    intb: Arc<Intb>,
+    intb: Arc<ReadyLine>,
     conversions: Conversions,
     /// Conversions whose data was read.
     read: u64,
@@ -279,7 +226,7 @@ struct Ldc1612 {
 }
 
 impl Ldc1612 {
-    fn new(coil: Coil, intb: Arc<Intb>, clock: Arc<dyn TimeSource>) -> Ldc1612 {
+    fn new(coil: Coil, intb: Arc<ReadyLine>, clock: Arc<dyn TimeSource>) -> Ldc1612 {
         let mut chip = Ldc1612 {
             coil,
             clock,
@@ -328,7 +275,7 @@ impl Ldc1612 {
             told: self.get(ERROR_CONFIG) & DRDY_2INT != 0 && self.get(CONFIG) & INTB_DIS == 0,
         };
         self.read = 0;
-        self.intb.0.store(self.conversions.words());
+        self.intb.tell(self.conversions);
         if !asleep && self.get(CONFIG) & AUTO_AMP_DIS == 0 {
             // INIT_IDRIVE: what the chip found.
             let found = self.coil.config.drive_current.min(31) << 6;
@@ -382,7 +329,7 @@ impl Ldc1612 {
                 let ready = if over > self.conversions.seen { STATUS_DRDY } else { 0 };
                 let unread = if over > self.read { STATUS_UNREADCONV0 } else { 0 };
                 self.conversions.seen = over;
-                self.intb.0.store(self.conversions.words());
+                self.intb.tell(self.conversions);
                 ready | unread
             }
             _ => self.get(address),
@@ -443,7 +390,7 @@ mod tests {
     struct Bench {
         z: Arc<Axis>,
         clock: VirtualClock,
-        intb: IntbPin,
+        intb: Arc<ReadyLine>,
         chip: Ldc1612,
     }
 
@@ -467,10 +414,10 @@ mod tests {
             };
             let bed = Bed::new(Default::default(), None, None, Some(z.clone()));
             let clock = VirtualClock::at(Clock::from_ticks(0));
-            let intb = Arc::new(Intb(Together::new(Conversions::NONE.words())));
+            let intb = ReadyLine::new("intb");
             let coil = Coil { config, bed, noise: Noise::new(1) };
             let chip = Ldc1612::new(coil, intb.clone(), Arc::new(clock.clone()));
-            Bench { z, clock, intb: IntbPin(intb), chip }
+            Bench { z, clock, intb, chip }
         }
 
         /// The set-up for 400 conversions a second, at half the coil's frequency.
@@ -518,7 +465,7 @@ mod tests {
         }
 
         fn intb(&self) -> bool {
-            self.intb.sense(false, self.clock.now())
+            self.intb.level(self.clock.now())
         }
 
         fn move_z(&mut self, mm: f64) {

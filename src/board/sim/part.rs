@@ -16,7 +16,7 @@ use super::printer_cfg::{Layout, Sections};
 use super::spi::{SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
-use super::{bltouch, hx71x, ldc1612, loopback, probe, tmc5160};
+use super::{ads1220, bltouch, hx71x, ldc1612, loopback, probe, tmc5160};
 use crate::time::Clock;
 
 /// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
@@ -33,6 +33,8 @@ pub enum PartConfig {
     Bltouch(bltouch::BltouchConfig),
     /// The ADC of a load cell.
     Hx71x(hx71x::Hx71xConfig),
+    /// Another ADC of a load cell.
+    Ads1220(ads1220::Ads1220Config),
     /// A coil over the bed.
     Ldc1612(ldc1612::Ldc1612Config),
 }
@@ -46,6 +48,7 @@ impl PartConfig {
             PartConfig::Probe(config) => config,
             PartConfig::Bltouch(config) => config,
             PartConfig::Hx71x(config) => config,
+            PartConfig::Ads1220(config) => config,
             PartConfig::Ldc1612(config) => config,
         }
     }
