@@ -16,18 +16,25 @@ use super::{
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks, TimeSource};
 
+mod ads1220;
 mod adxl345;
 mod angle;
 mod apa102;
+mod bltouch;
 mod colour;
 mod config;
 mod ds18b20;
+mod hx71x;
 mod i2c;
+mod ldc1612;
+mod load_cell;
 mod loopback;
 mod part;
 mod physics;
 mod printer_cfg;
+mod probe;
 mod pwm_channel;
+mod ready;
 mod servo;
 mod spi;
 mod spool;
@@ -42,17 +49,23 @@ mod trinamic;
 mod wire;
 mod ws2812;
 
+pub use ads1220::Ads1220Config;
 pub use adxl345::Adxl345Config;
 pub use angle::{AngleChip, AngleConfig};
 pub use apa102::Apa102Config;
+pub use bltouch::{BltouchConfig, Jam};
 pub use config::{
     AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
     SimConfig, SimError, SpiBusConfig,
 };
 pub use ds18b20::Ds18b20Config;
+pub use hx71x::{Hx71xChip, Hx71xConfig};
+pub use ldc1612::Ldc1612Config;
+pub use load_cell::CellConfig;
 pub use loopback::LoopbackConfig;
 pub use part::PartConfig;
 pub use printer_cfg::printer_cfg;
+pub use probe::ProbeConfig;
 pub use pwm_channel::PwmChannelConfig;
 pub use servo::ServoConfig;
 pub use spool::SpoolConfig;

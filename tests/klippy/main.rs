@@ -10,6 +10,7 @@ mod filament;
 mod hosts;
 mod klippy;
 mod print;
+mod probes;
 mod regression;
 mod rings;
 mod servo;

@@ -17,8 +17,8 @@ use super::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
 use super::wire::{Wire, WiredPin};
 use super::{
-    adxl345, angle, apa102, ds18b20, loopback, pwm_channel, servo, spool, ssd1306, thermocouple, tmc2209, tmc5160,
-    ws2812,
+    ads1220, adxl345, angle, apa102, bltouch, ds18b20, hx71x, ldc1612, loopback, probe, pwm_channel, servo, spool,
+    ssd1306, thermocouple, tmc2209, tmc5160, ws2812,
 };
 use crate::time::Clock;
 
@@ -54,6 +54,16 @@ pub enum PartConfig {
     Ssd1306(ssd1306::Ssd1306Config),
     /// A thermocouple's or a platinum resistor's converter.
     Thermocouple(thermocouple::ThermocoupleConfig),
+    /// A switch beside the nozzle.
+    Probe(probe::ProbeConfig),
+    /// A probe with a push-pin.
+    Bltouch(bltouch::BltouchConfig),
+    /// The ADC of a load cell.
+    Hx71x(hx71x::Hx71xConfig),
+    /// Another ADC of a load cell.
+    Ads1220(ads1220::Ads1220Config),
+    /// A coil over the bed.
+    Ldc1612(ldc1612::Ldc1612Config),
 }
 
 impl PartConfig {
@@ -73,6 +83,11 @@ impl PartConfig {
             PartConfig::Apa102(config) => config,
             PartConfig::Ssd1306(config) => config,
             PartConfig::Thermocouple(config) => config,
+            PartConfig::Probe(config) => config,
+            PartConfig::Bltouch(config) => config,
+            PartConfig::Hx71x(config) => config,
+            PartConfig::Ads1220(config) => config,
+            PartConfig::Ldc1612(config) => config,
         }
     }
 }

@@ -87,6 +87,8 @@ pub(super) struct Sections {
     text: String,
     /// Whether what comes is only offered: a `#` stands before each line.
     offered: bool,
+    /// Whether there is a section of a probe, of which klippy takes one.
+    has_probe: bool,
 }
 
 impl Sections {
@@ -103,6 +105,33 @@ impl Sections {
         self.offered = true;
         sections(self);
         self.offered = false;
+    }
+
+    /// Adds the section of a probe: klippy takes one, so the first is in use, and the others are offered.
+    pub(super) fn probe(&mut self, layout: &Layout<'_>, section: impl FnOnce(&mut Sections)) {
+        if !layout.is_cartesian {
+            return;
+        }
+        if std::mem::replace(&mut self.has_probe, true) {
+            return self.offer(section);
+        }
+        section(self);
+        // Within reach of whatever stands beside the nozzle.
+        let travel_mm = |name| layout.config.axes.iter().find(|axis| axis.name == name)?.travel_mm;
+        let [x_mm, y_mm] = ["x", "y"].map(|name| travel_mm(name).unwrap_or(0.0));
+        self.section("bed_mesh");
+        self.key("mesh_min", format_args!("{}, {}", x_mm * 0.2, y_mm * 0.2));
+        self.key("mesh_max", format_args!("{}, {}", x_mm * 0.8, y_mm * 0.8));
+        self.key("probe_count", "5, 5");
+        self.key("horizontal_move_z", 5);
+        self.key("speed", layout.config.limits.velocity_mm_per_s);
+    }
+
+    /// The keys of a probe that stands off the nozzle by so much.
+    pub(super) fn offsets(&mut self, [x_mm, y_mm, z_mm]: [f64; 3]) {
+        self.key("x_offset", x_mm);
+        self.key("y_offset", y_mm);
+        self.key("z_offset", z_mm);
     }
 
     /// The keys of a chip on an SPI bus.
@@ -155,6 +184,10 @@ impl Sections {
                     self.section(layout.stepper(&axis.name));
                     self.stepper(axis);
                     self.rail(axis);
+                    if axis.name == "z" {
+                        // A nozzle that is a probe goes below the endstop.
+                        self.key("position_min", -axis.overtravel_mm);
+                    }
                 }
                 // Its keys stand in the section of the hot end's heater.
                 HOT_END if layout.has_hot_end => {}

@@ -134,4 +134,19 @@ mod tests {
         // Of a microsecond, as sleep is told.
         assert!(machine.now() + Ticks::from_us(1) >= end);
     }
+
+    #[test]
+    fn a_timer_of_the_core_does_not_hold_back_the_time_of_a_worker() {
+        let clock = VirtualClock::at(Clock::from_ticks(5_000));
+        let time = Arc::new(PrinterTime::new(Arc::new(clock)));
+        time.set_due(Some(Clock::from_ticks(1_000)));
+        let worker = std::thread::spawn({
+            let time = time.clone();
+            move || time.of_the_caller()
+        });
+        assert_eq!(worker.join().ok(), Some(Clock::from_ticks(5_000)));
+        assert_eq!(time.of_the_caller(), Clock::from_ticks(1_000));
+        time.set_due(None);
+        assert_eq!(time.of_the_caller(), Clock::from_ticks(5_000));
+    }
 }

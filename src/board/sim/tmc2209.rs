@@ -172,6 +172,7 @@ impl Part for Tmc2209Config {
         cfg.key_if("tx_pin", self.tx_pin.as_ref());
         cfg.key("uart_address", self.address);
         cfg.key("run_current", 0.8);
+        cfg.key("sense_resistor", 0.11);
         if let Some(pin) = &self.diag_pin {
             cfg.key("diag_pin", pin);
             offer_sensorless_homing(cfg, layout, "tmc2209", &self.axis, ("driver_SGTHRS", SGTHRS_FOR_HOMING));

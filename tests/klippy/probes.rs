@@ -1,0 +1,341 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The probes of the simulated printer as a user has them: homing, probing, the mesh of the bed.
+
+use serde_json::Value;
+
+use super::checkout;
+use super::klippy::Printer;
+
+/// A step of the z axis.
+const STEP_MM: f64 = 1.0 / 400.0;
+/// The travel of the x and y axis.
+const TRAVEL_MM: f64 = 220.0;
+
+/// The height of the default printer's bed: by `[bed]` 0.12 mm along x, -0.08 mm along y, and 0.1 mm lower
+/// at the corners than in the middle, which is at 0.
+fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
+    let (u, v) = (x_mm / TRAVEL_MM - 0.5, y_mm / TRAVEL_MM - 0.5);
+    0.12 * u - 0.08 * v - 0.2 * (u * u + v * v)
+}
+
+/// The configuration without a section.
+pub fn without(config: &str, section: &str) -> String {
+    let head = format!("[{section}]\n");
+    let (before, after) = config.split_once(&head).unwrap_or_else(|| panic!("no [{section}] in\n{config}"));
+    format!("{before}{}", after.split_once("\n\n").map_or("", |(_, after)| after))
+}
+
+/// The configuration with a section in use that is only offered, with more keys.
+pub fn with(config: &str, section: &str, keys: &str) -> String {
+    let head = format!("#[{section}]\n");
+    let at = config.find(&head).unwrap_or_else(|| panic!("no #[{section}] in\n{config}"));
+    let (before, rest) = config.split_at(at);
+    let (lines, after) = rest.split_once("\n\n").unwrap_or((rest, ""));
+    let lines: Vec<&str> = lines.lines().map(|line| line.strip_prefix('#').unwrap_or(line)).collect();
+    format!("{before}{}\n{keys}\n\n{after}", lines.join("\n"))
+}
+
+/// The configuration with the z axis homed by the probe, in the middle of the bed.
+fn homed_by_probe(config: &str) -> String {
+    let config = config.replace("endstop_pin: z_endstop", "endstop_pin: probe:z_virtual_endstop");
+    let (before, z) = config.split_once("[stepper_z]\n").unwrap();
+    let z = z.replacen("position_endstop: 0\n", "", 1);
+    format!("{before}[stepper_z]\n{z}\n[safe_z_home]\nhome_xy_position: 110, 110\nz_hop: 10\n")
+}
+
+/// Homes, and does what else there is to do. Again where klippy came too late with its moves, as on a busy
+/// computer it does.
+#[track_caller]
+fn home(printer: &mut Printer, then: &str) {
+    for _ in 0..5 {
+        let Err(error) = printer.try_gcode(&format!("G28\n{then}")) else { return };
+        let late = printer.log().contains("the host asked for an event") || error.contains("Communication timeout");
+        assert!(late, "{error}\n{}", printer.log());
+        printer.restart("FIRMWARE_RESTART");
+    }
+    panic!("klippy comes too late, five times\n{}", printer.log());
+}
+
+/// The number behind a text.
+fn number(said: &str, before: &str) -> f64 {
+    let (_, after) = said.split_once(before).unwrap_or_else(|| panic!("no `{before}` in\n{said}"));
+    let end = after.find(|c: char| !(c.is_ascii_digit() || ".-".contains(c))).unwrap_or(after.len());
+    after[..end].parse().unwrap_or_else(|_| panic!("no number behind `{before}` in\n{said}"))
+}
+
+/// Where a PROBE of the bed ended: place and height.
+fn probed(printer: &mut Printer, probe: &str) -> [f64; 3] {
+    printer.gcode(probe);
+    let position = printer.object("probe")["last_probe_position"].clone();
+    // klippy computes them from steps.
+    [0, 1, 2].map(|axis| (position[axis].as_f64().unwrap() * 1e6).round() / 1e6)
+}
+
+/// The greatest distance of the points of the probed mesh from the bed.
+fn mesh_fault_mm(printer: &mut Printer) -> f64 {
+    let mesh = printer.object("bed_mesh");
+    let corner = |key: &str| [0, 1].map(|axis| mesh[key][axis].as_f64().unwrap());
+    let (min, max) = (corner("mesh_min"), corner("mesh_max"));
+    let rows: Vec<Vec<f64>> = mesh["probed_matrix"].as_array().unwrap().iter().map(numbers).collect();
+    assert_eq!((rows.len(), rows[0].len()), (5, 5));
+    let place = |axis: usize, point: usize| min[axis] + (max[axis] - min[axis]) * point as f64 / 4.0;
+    let points = (0..5).flat_map(|y| (0..5).map(move |x| (x, y)));
+    points.fold(0.0, |worst: f64, (x, y)| worst.max((rows[y][x] - bed_mm(place(0, x), place(1, y))).abs()))
+}
+
+fn numbers(list: &Value) -> Vec<f64> {
+    list.as_array().unwrap().iter().map(|value| value.as_f64().unwrap()).collect()
+}
+
+#[test]
+fn klippy_probes_the_bed_and_its_mesh_is_the_shape_of_the_bed() {
+    let Some(checkout) = checkout("klippy_probes_the_bed_and_its_mesh_is_the_shape_of_the_bed") else { return };
+    let mut printer = Printer::start(&checkout);
+    home(&mut printer, "G1 Z8 F600\nQUERY_PROBE");
+    assert_eq!(printer.object("probe")["last_query"], 0);
+    for (x, y) in [(40.0, 60.0), (150.0, 30.0)] {
+        printer.gcode(&format!("G1 X{x} Y{y} Z8 F9000"));
+        let [at_x, at_y, z] = probed(&mut printer, "PROBE");
+        assert_eq!([at_x, at_y], [x + 24.0, y - 8.0]);
+        assert!((z - bed_mm(at_x, at_y)).abs() < 2.0 * STEP_MM, "{z} {}", bed_mm(at_x, at_y));
+        printer.gcode("QUERY_PROBE");
+        assert_eq!(printer.object("probe")["last_query"], 1, "it stands on the bed");
+        printer.gcode("G1 Z8 F600");
+    }
+    let said = printer.answer("PROBE_ACCURACY SAMPLES=5");
+    let range = number(&said, "range ");
+    assert!(range < 2.0 * STEP_MM, "{said}");
+    printer.gcode("BED_MESH_CALIBRATE");
+    let fault = mesh_fault_mm(&mut printer);
+    assert!(fault < 2.0 * STEP_MM, "{fault}");
+}
+
+#[test]
+fn klippy_homes_the_z_axis_by_the_probe() {
+    let Some(checkout) = checkout("klippy_homes_the_z_axis_by_the_probe") else { return };
+    let mut printer = Printer::start_with(&checkout, |config| homed_by_probe(&config));
+    printer.until_state("ready");
+    home(&mut printer, "G1 Z8 F600");
+    // The height is 0 where it homed, so each other height is by so much off.
+    let datum = bed_mm(110.0 + 24.0, 110.0 - 8.0);
+    printer.gcode("G1 X20 Y180 F9000");
+    let [x, y, z] = probed(&mut printer, "PROBE");
+    assert!((z - (bed_mm(x, y) - datum)).abs() < 3.0 * STEP_MM, "{z} {}", bed_mm(x, y) - datum);
+}
+
+#[test]
+fn klippy_homes_and_probes_with_a_bltouch() {
+    let Some(checkout) = checkout("klippy_homes_and_probes_with_a_bltouch") else { return };
+    let mut printer =
+        Printer::start_with(&checkout, |config| homed_by_probe(&with(&without(&config, "probe"), "bltouch", "")));
+    printer.until_state("ready");
+    printer.gcode("BLTOUCH_DEBUG COMMAND=pin_up\nBLTOUCH_DEBUG COMMAND=touch_mode\nQUERY_PROBE");
+    assert_eq!(printer.object("probe")["last_query"], 1, "in touch mode the line tells that the pin is up");
+    printer.gcode("BLTOUCH_DEBUG COMMAND=pin_down\nBLTOUCH_DEBUG COMMAND=touch_mode\nQUERY_PROBE");
+    assert_eq!(printer.object("probe")["last_query"], 0, "and down");
+    printer.gcode("BLTOUCH_DEBUG COMMAND=reset");
+    home(&mut printer, "G1 Z8 F600");
+    let datum = bed_mm(110.0 - 28.0, 110.0 + 12.0);
+    for (x, y) in [(200.0, 20.0), (60.0, 190.0)] {
+        printer.gcode(&format!("G1 X{x} Y{y} Z8 F9000"));
+        let [at_x, at_y, z] = probed(&mut printer, "PROBE");
+        assert_eq!([at_x, at_y], [x - 28.0, y + 12.0]);
+        assert!((z - (bed_mm(at_x, at_y) - datum)).abs() < 3.0 * STEP_MM, "{z} {}", bed_mm(at_x, at_y) - datum);
+    }
+    let said = printer.answer("G1 Z8 F600\nPROBE_ACCURACY SAMPLES=3");
+    assert!(number(&said, "range ") < 2.0 * STEP_MM, "{said}");
+    assert!(!printer.host_log("probe accuracy results", 1).contains("BLTouch failed"));
+}
+
+#[test]
+fn klippy_tells_a_bltouch_whose_pin_is_stuck() {
+    let Some(checkout) = checkout("klippy_tells_a_bltouch_whose_pin_is_stuck") else { return };
+    for (jam, error) in [("up", "Probe triggered prior to movement"), ("down", "BLTouch failed to verify sensor state")]
+    {
+        let stuck = |board: String, _: &std::path::Path| {
+            board.replace("kind = \"bltouch\"\n", &format!("kind = \"bltouch\"\njams = \"{jam}\"\n"))
+        };
+        let mut printer = Printer::start_on(&checkout, stuck, |config| with(&without(&config, "probe"), "bltouch", ""));
+        printer.until_state("ready");
+        home(&mut printer, "G1 Z8 F600");
+        let said = printer.refused("PROBE");
+        assert!(said.contains(error), "{jam}: {said}");
+        assert_eq!(printer.state(), "ready");
+    }
+}
+
+/// What the default printer's load cell counts for a gram.
+const COUNTS_PER_GRAM: f64 = 420.0;
+/// What it counts without the nozzle on the bed: -21000, and 85 g of the hot end.
+const TARE_COUNTS: f64 = -21_000.0 + 85.0 * COUNTS_PER_GRAM;
+/// The force of the nozzle in the bed.
+const GRAMS_PER_MM: f64 = 4000.0;
+
+/// Runs what reads a sensor, again where this computer was too slow to read it in time.
+#[track_caller]
+fn read_in_time(printer: &mut Printer, script: &str) -> String {
+    const SLOW: [&str; 4] = ["Sensor reported", "sensor reported errors", "timed out", "Trigger analog error"];
+    for _ in 0..10 {
+        match printer.try_gcode(script) {
+            Ok(said) => return said,
+            Err(error) => assert!(SLOW.iter().any(|slow| error.contains(slow)), "{script}: {error}"),
+        }
+    }
+    panic!("{script}: this computer is too slow, ten times\n{}", printer.log())
+}
+
+/// LOAD_CELL_DIAGNOSTIC, which takes ten seconds: how often klippy began the measurements anew, and what
+/// it says. Again where it had to.
+fn diagnostic(printer: &mut Printer) -> (usize, String) {
+    let restarts = |printer: &mut Printer| printer.host_log("", 0).matches("Forced sensor restart").count();
+    let mut last = (0, String::new());
+    for _ in 0..3 {
+        let before = restarts(printer);
+        let said = printer.answer("LOAD_CELL_DIAGNOSTIC");
+        last = (restarts(printer) - before, said);
+        if last.0 == 0 {
+            break;
+        }
+    }
+    last
+}
+
+#[test]
+fn klippy_calibrates_a_load_cell() {
+    let Some(checkout) = checkout("klippy_calibrates_a_load_cell") else { return };
+    // Nothing of the calibration is known to klippy.
+    let mut printer = Printer::start_with(&checkout, |config| {
+        let lines = config
+            .lines()
+            .filter(|line| !line.starts_with("counts_per_gram") && !line.starts_with("reference_tare_counts"));
+        lines.collect::<Vec<&str>>().join("\n")
+    });
+    printer.until_state("ready");
+    let (restarts, said) = diagnostic(&mut printer);
+    let rate = number(&said, "Measured samples per second: ");
+    // klippy begins anew, and loses a part of a second, where this computer was late amid a sample.
+    let least = if restarts == 0 { 79.0 } else { 20.0 };
+    assert!((least..81.0).contains(&rate), "{restarts} restarts: {said}");
+    assert!(said.contains("Saturated samples: 0"), "{said}");
+    assert!(number(&said, "Unique values: ") > 100.0, "{said}");
+    // The other one, on SPI: no line of its is timed by the computer.
+    let said = printer.answer("LOAD_CELL_DIAGNOSTIC LOAD_CELL=ads1220");
+    let rate = number(&said, "Measured samples per second: ");
+    assert!((40.0..46.0).contains(&rate) && said.contains("reported no errors"), "{said}");
+    let said = printer.answer("LOAD_CELL_READ LOAD_CELL=ads1220");
+    assert!(said.contains("(0.14%)"), "12000 of 2^23 counts: {said}");
+    home(&mut printer, "G1 X110 Y110 Z5 F6000\nM400\nLOAD_CELL_CALIBRATE");
+    let tare = number(&read_in_time(&mut printer, "TARE"), "% (");
+    assert!((tare - TARE_COUNTS).abs() < 60.0, "{tare}");
+    // The weight of a kilogram: the nozzle, a quarter of a millimetre deep in the bed.
+    let depth_mm = 0.25;
+    let z = bed_mm(110.0, 110.0) - depth_mm;
+    printer.gcode(&format!("G1 Z{z} F60\nM400"));
+    read_in_time(&mut printer, &format!("CALIBRATE GRAMS={}", GRAMS_PER_MM * depth_mm));
+    printer.gcode("ACCEPT");
+    let cell = printer.object("load_cell");
+    let counts_per_gram = cell["counts_per_gram"].as_f64().unwrap();
+    // The depth is right to two steps of the z axis: one by which homing may be off, and one of the move.
+    assert!((counts_per_gram / COUNTS_PER_GRAM - 1.0).abs() < 2.0 * STEP_MM / depth_mm, "{counts_per_gram}");
+    let read = |printer: &mut Printer| {
+        let said = read_in_time(printer, "LOAD_CELL_READ");
+        said.trim_start_matches("// ").split('g').next().unwrap().parse::<f64>().unwrap()
+    };
+    let grams = read(&mut printer);
+    assert!((grams - 1000.0).abs() < 1.0, "{grams}");
+    printer.gcode("G1 Z5 F600\nM400");
+    let grams = read(&mut printer);
+    assert!(grams.abs() < 1.0, "{grams}");
+}
+
+#[test]
+fn klippy_probes_by_a_tap_of_the_nozzle_on_the_load_cell() {
+    let Some(checkout) = checkout("klippy_probes_by_a_tap_of_the_nozzle_on_the_load_cell") else { return };
+    let mut printer = Printer::start_with(&checkout, |config| {
+        let config = without(&without(&config, "probe"), "load_cell");
+        with(&config, "load_cell_probe", "")
+    });
+    printer.until_state("ready");
+    home(&mut printer, "");
+    for (x, y) in [(110.0, 110.0), (30.0, 170.0)] {
+        printer.gcode(&format!("G1 X{x} Y{y} Z2 F6000\nM400"));
+        read_in_time(&mut printer, "PROBE PROBE_SPEED=1");
+        let position = printer.object("probe")["last_probe_position"].clone();
+        let z = position[2].as_f64().unwrap();
+        // The trigger is at 75 g, 0.019 mm deep; at 1 mm/s there is a sample for each 0.0125 mm, and it is
+        // noticed late where this computer is busy.
+        let depth_mm = bed_mm(x, y) - z;
+        assert!((0.010..0.060).contains(&depth_mm), "{depth_mm}");
+    }
+}
+
+#[test]
+fn klippy_calibrates_an_eddy_current_probe_and_probes_with_it() {
+    let Some(checkout) = checkout("klippy_calibrates_an_eddy_current_probe_and_probes_with_it") else { return };
+    let on = |config: String| with(&without(&config, "probe"), "probe_eddy_current coil", "");
+    let mut printer = Printer::start_with(&checkout, on);
+    printer.until_state("ready");
+    home(&mut printer, "G1 X110 Y110 Z10 F6000\nM400");
+    let said = printer.answer("LDC_CALIBRATE_DRIVE_CURRENT CHIP=coil");
+    assert_eq!(number(&said, "reg_drive_current: "), 16.0);
+    // A person lowers the nozzle until it grips a sheet of paper; here by what is known of the bed.
+    let down = bed_mm(110.0, 110.0) - 1.0;
+    let calibrate = |printer: &mut Printer| {
+        printer.gcode("G1 X110 Y110 Z1 F600\nPROBE_EDDY_CURRENT_CALIBRATE CHIP=coil");
+        printer.gcode(&format!("TESTZ Z={down}"));
+        printer.try_gcode("ACCEPT").unwrap_or_else(|error| error)
+    };
+    // klippy tells the time of a conversion by their count: where this computer lost some, it takes those
+    // of another height.
+    let faults = ["Frequency stops", "too noisy", "Failed calibration"];
+    let is_right = |said: &str| !faults.iter().any(|fault| said.contains(fault));
+    let mut said = calibrate(&mut printer);
+    for _ in 0..3 {
+        if !is_right(&said) {
+            said = calibrate(&mut printer);
+        }
+    }
+    assert!(is_right(&said), "{said}");
+    let pending = printer.object("configfile")["save_config_pending_items"]["probe_eddy_current coil"].clone();
+    let table = pending["calibrate"].as_str().unwrap().to_owned();
+    let pairs: Vec<[f64; 2]> = table
+        .split(',')
+        .map(|pair| pair.trim().split_once(':').unwrap())
+        .map(|(mm, hz)| [mm.parse().unwrap(), hz.parse().unwrap()])
+        .collect();
+    assert!(pairs.len() > 90, "{table}");
+    assert!(pairs.windows(2).all(|pair| pair[0][0] < pair[1][0] && pair[0][1] > pair[1][1]), "{table}");
+    // The coil stands 2.5 mm above the nozzle, and beside it, where the bed has another height.
+    for [mm, hz] in &pairs {
+        let distance = mm + 2.5;
+        let expected = 2_900_000.0 + 400_000.0 * (-distance / 2.5).exp();
+        assert!((hz - expected).abs() < 2_500.0, "{mm} mm: {hz} {expected}");
+    }
+
+    // With the table, and homed by the coil.
+    let table = table.replace('\n', "");
+    drop(printer);
+    let mut printer = Printer::start_with(&checkout, |config| {
+        let keys = format!("calibrate: {table}");
+        homed_by_probe(&with(&without(&config, "probe"), "probe_eddy_current coil", &keys))
+    });
+    printer.until_state("ready");
+    let datum = bed_mm(110.0 + 20.0, 110.0 + 18.0);
+    home(&mut printer, "G1 Z5 F600\nM400");
+    for (x, y) in [(110.0, 110.0), (30.0, 170.0), (180.0, 60.0)] {
+        printer.gcode(&format!("G1 X{x} Y{y} Z5 F6000\nM400"));
+        read_in_time(&mut printer, "PROBE");
+        let position = printer.object("probe")["last_probe_position"].clone();
+        let [at_x, at_y, z] = [0, 1, 2].map(|axis| position[axis].as_f64().unwrap());
+        let expected = bed_mm(at_x, at_y) - datum;
+        assert!((z - expected).abs() < 0.02, "{x} {y}: {z} {expected}");
+    }
+    // By a tap: the bed gives way to the nozzle, and the frequency rises no further.
+    for (x, y) in [(110.0, 110.0), (40.0, 150.0)] {
+        printer.gcode(&format!("G1 X{x} Y{y} Z4 F6000\nM400"));
+        read_in_time(&mut printer, "PROBE METHOD=tap TAP_THRESHOLD=20000");
+        let z = printer.object("probe")["last_probe_position"][2].as_f64().unwrap();
+        let expected = bed_mm(x, y) - datum;
+        assert!((z - expected).abs() < 0.03, "{x} {y}: {z} {expected}");
+    }
+}
