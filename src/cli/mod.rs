@@ -9,8 +9,11 @@ use std::process::ExitCode;
 use clap::{Args, Parser, Subcommand};
 use log::LevelFilter;
 
+mod check;
+mod config;
 pub mod dict;
 mod doctor;
+mod finding;
 pub mod latency;
 mod logging;
 pub mod pins;
@@ -36,9 +39,9 @@ pub(crate) struct Cli {
 /// What goes to the log (stderr).
 #[derive(Args, Debug, Clone)]
 struct LogArgs {
-    /// How much to log: error, warn, info, debug, trace or off
-    #[arg(long, value_name = "LEVEL", default_value = "info", global = true)]
-    log_level: LevelFilter,
+    /// How much to log: error, warn, info, debug, trace or off [default: info]
+    #[arg(long, value_name = "LEVEL", global = true)]
+    log_level: Option<LevelFilter>,
 }
 
 #[derive(Subcommand, Debug)]
@@ -60,10 +63,10 @@ enum Command {
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    logging::start(cli.log.log_level);
+    logging::start(cli.log.log_level.unwrap_or(LevelFilter::Info));
     let status = match cli.command {
-        None => run::run(&cli.run),
-        Some(Command::Run(args)) => run::run(&args),
+        None => run::run(&cli.run, cli.log.log_level),
+        Some(Command::Run(args)) => run::run(&args, cli.log.log_level),
         Some(Command::Pins(args)) => pins::run(&args),
         Some(Command::Dict(args)) => dict::run(&args),
         Some(Command::Latency(args)) => latency::run(&args),
