@@ -20,6 +20,7 @@ use crate::runtime::realtime::{self, Processors};
 use crate::time::Monotonic;
 
 use super::finding::{self, Finding, Group};
+use super::quietly;
 use super::run::{BoardName, Settings, WATCHDOG};
 
 /// Checks and tells; `file` is the configuration file, which has been read.
@@ -51,10 +52,7 @@ fn board(settings: &Settings) -> Vec<Finding> {
         }));
     }
     // Its problems are among the findings already.
-    let level = log::max_level();
-    log::set_max_level(log::LevelFilter::Error);
-    let board = settings.board.open(Arc::new(Monotonic::start()), None);
-    log::set_max_level(level);
+    let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None));
     let board = match board {
         Ok(board) => board,
         Err(error) => {

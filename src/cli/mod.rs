@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::ffi::OsString;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
@@ -48,13 +49,13 @@ struct LogArgs {
 enum Command {
     /// Serve a Klipper host on a pty (the default)
     Run(run::RunArgs),
-    /// List this machine's GPIO lines, ADC channels and SPI buses, as printer.cfg names them
+    /// List this machine's GPIO lines, ADCs, PWM channels and buses, as printer.cfg names them
     Pins(pins::PinsArgs),
     /// Print the data dictionary, as klippy's batch mode takes it with -d
     Dict(dict::DictArgs),
     /// Measure how late this machine wakes up, and say what that is good for
     Latency(latency::LatencyArgs),
-    /// Say whether this Pinion serves a host, before the host is restarted
+    /// Say what works on this machine and what does not, and what mends it
     Doctor(doctor::DoctorArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
@@ -77,6 +78,17 @@ pub fn main() -> ExitCode {
     status
 }
 
+/// What a command line says to `pinion run`, such as that of a process that runs; none if it is not that of
+/// a machine.
+fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<run::RunArgs>, clap::Error> {
+    let cli = Cli::try_parse_from(arguments)?;
+    Ok(match cli.command {
+        None => Some(cli.run),
+        Some(Command::Run(args)) => Some(args),
+        Some(_) => None,
+    })
+}
+
 /// Has a panic in any thread logged and end the process. Otherwise only that thread would end: without
 /// its core, for one, the machine would still answer its host, with the outputs as they are.
 fn end_by_panic() {
@@ -96,6 +108,15 @@ fn print(text: &str) -> Result<(), String> {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout can not be written: {error}")),
         _ => Ok(()),
     }
+}
+
+/// Does `work` with nothing but errors logged, as what it finds is printed.
+fn quietly<T>(work: impl FnOnce() -> T) -> T {
+    let level = log::max_level();
+    log::set_max_level(level.min(LevelFilter::Error));
+    let done = work();
+    log::set_max_level(level);
+    done
 }
 
 /// Logs why a subcommand failed, and returns its exit status.

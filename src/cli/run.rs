@@ -208,6 +208,11 @@ impl Settings {
 }
 
 impl RunArgs {
+    /// What the command line says by itself, and the configuration file that it names.
+    pub(super) fn into_parts(self) -> (Given, Option<PathBuf>) {
+        (self.given, self.config)
+    }
+
     /// What the command line says, then the configuration file; `log_level` is the command line's.
     ///
     /// # Errors

@@ -5,6 +5,7 @@ mod bad_input;
 mod commands;
 mod configuration;
 mod dialects;
+mod doctor;
 mod life;
 mod one_order;
 mod process;
