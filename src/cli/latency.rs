@@ -5,7 +5,7 @@
 
 use std::fmt::Write as _;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -19,6 +19,7 @@ use crate::runtime::realtime::{self, Processors, Role, Scheduling};
 use crate::runtime::wakeup::{MarginLimits, Waiter};
 use crate::time::{Clock, Monotonic, Ticks, TimeSource};
 
+use super::doctor::is_preempt_rt;
 use super::{failed, print};
 
 /// Options of `pinion latency`.
@@ -49,11 +50,22 @@ struct Half {
 /// Measures, prints and judges.
 pub(super) fn run(args: &LatencyArgs) -> ExitCode {
     let span = Duration::from_secs(args.seconds.into()) / 2;
-    let processors = match Processors::new(None) {
-        Ok(processors) => processors,
-        Err(error) => return failed(format!("the processors can not be told: {error}")),
+    let (scheduling, halves) = match measure_both(span) {
+        Ok(measured) => measured,
+        Err(error) => return failed(error),
     };
-    let measured = thread::Builder::new().name("core".into()).spawn(move || {
+    let verdict = judge(&halves, scheduling);
+    let drawn = args.svg.as_ref().map_or(Ok(()), |path| {
+        fs::write(path, draw(&halves, verdict.fitness))
+            .map_err(|error| format!("{} can not be written: {error}", path.display()))
+    });
+    print(&report(&halves, &verdict)).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
+}
+
+/// Measures for `span` idle and for as long under load.
+fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), String> {
+    let processors = Processors::new(None).map_err(|error| format!("the processors can not be told: {error}"))?;
+    in_thread(move || {
         realtime::lock_memory();
         let scheduling = realtime::enter(Role::Core);
         let new_waiter = |clock, limits| Waiter::new(clock, limits, scheduling, processors);
@@ -62,16 +74,42 @@ pub(super) fn run(args: &LatencyArgs) -> ExitCode {
         let loaded = measure("under load", span, new_waiter);
         drop(load);
         (scheduling, [idle, loaded])
-    });
-    let Ok(Ok((scheduling, halves))) = measured.map(thread::JoinHandle::join) else {
-        return failed("the measuring thread can not be started: raise TasksMax or ulimit -u");
-    };
-    let verdict = judge(&halves, scheduling);
-    let drawn = args.svg.as_ref().map_or(Ok(()), |path| {
-        fs::write(path, draw(&halves, verdict.fitness))
-            .map_err(|error| format!("{} can not be written: {error}", path.display()))
-    });
-    print(&report(&halves, &verdict)).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
+    })
+}
+
+/// Measures for `span` while Pinion serves a host: below it, and without load or spinning, so that it
+/// does not make it late.
+fn measure_beside(span: Duration) -> Result<(Scheduling, Half), String> {
+    let processors = Processors::new(None).map_err(|error| format!("the processors can not be told: {error}"))?;
+    in_thread(move || {
+        let scheduling = realtime::enter(Role::Worker);
+        let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
+        let end = clock.now().ticks() + (span.as_nanos() / 20) as u64;
+        let bare = MarginLimits { min: Ticks(0), max: Ticks(0) };
+        let mut wakeup = Lateness::default();
+        let margin = run_for(&clock, Waiter::new(clock.clone(), bare, scheduling, processors), end, &mut wakeup);
+        (scheduling, Half { name: "beside Pinion", edge: wakeup.clone(), wakeup, margin })
+    })
+}
+
+/// Runs this in a thread of its own, which may change its scheduling.
+fn in_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, String> {
+    let thread = thread::Builder::new().name("core".into()).spawn(work);
+    match thread.map(thread::JoinHandle::join) {
+        Ok(Ok(done)) => Ok(done),
+        _ => Err("the measuring thread can not be started: raise TasksMax or ulimit -u".into()),
+    }
+}
+
+/// A look at the latency that takes two seconds; a gentle one where Pinion serves a host.
+pub(super) fn sample(is_serving: bool) -> Result<Verdict, String> {
+    const SPAN: Duration = Duration::from_secs(2);
+    if is_serving {
+        let (scheduling, half) = measure_beside(SPAN)?;
+        return Ok(judge(&[half], scheduling));
+    }
+    let (scheduling, halves) = measure_both(SPAN / 2)?;
+    Ok(judge(&halves, scheduling))
 }
 
 fn report(halves: &[Half; 2], verdict: &Verdict) -> String {
@@ -158,26 +196,31 @@ impl Drop for Load {
 
 /// For which outputs the computer is good enough.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Fitness {
+pub(super) enum Fitness {
     Steppers,
     SlowOutputs,
     Nothing,
 }
 
-struct Verdict {
-    fitness: Fitness,
-    why: String,
-    remedy: Option<String>,
+pub(super) struct Verdict {
+    pub(super) fitness: Fitness,
+    pub(super) why: String,
+    pub(super) remedy: Option<String>,
+}
+
+impl std::fmt::Display for Fitness {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Fitness::Steppers => "fit for steppers",
+            Fitness::SlowOutputs => "fit for heaters and fans, not for steppers",
+            Fitness::Nothing => "not fit",
+        })
+    }
 }
 
 impl std::fmt::Display for Verdict {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str(match self.fitness {
-            Fitness::Steppers => "fit for steppers",
-            Fitness::SlowOutputs => "fit for heaters and fans, not for steppers",
-            Fitness::Nothing => "not fit",
-        })?;
-        write!(f, ": {}", self.why)?;
+        write!(f, "{}: {}", self.fitness, self.why)?;
         match &self.remedy {
             Some(remedy) => write!(f, "; {remedy}"),
             None => Ok(()),
@@ -192,7 +235,7 @@ const STEPPERS_P999_US: f64 = 100.0;
 const STEPPERS_MAX_US: f64 = 1000.0;
 const SLOW_MAX_US: f64 = 50_000.0;
 
-fn judge(halves: &[Half; 2], scheduling: Scheduling) -> Verdict {
+fn judge(halves: &[Half], scheduling: Scheduling) -> Verdict {
     let worst = |q: fn(&Lateness) -> Ticks| halves.iter().map(|half| us(q(&half.edge))).fold(0.0, f64::max);
     let p999 = worst(|lateness| lateness.quantile(0.999));
     let max = worst(Lateness::max);
@@ -212,8 +255,7 @@ fn remedy(fitness: Fitness, scheduling: Scheduling) -> Option<String> {
     if fitness == Fitness::Steppers {
         return None;
     }
-    let realtime_kernel = fs::read_to_string("/sys/kernel/realtime").is_ok_and(|text| text.trim() == "1");
-    Some(if realtime_kernel {
+    Some(if is_preempt_rt(Path::new("/")) == Some(true) {
         "this kernel is PREEMPT_RT already: keep a processor free with isolcpus= and --cpu, set the cpufreq governor to performance, or look for a driver that keeps interrupts off".into()
     } else {
         "install a PREEMPT_RT kernel (package linux-image-rt-amd64, linux-image-rt-arm64 or linux-image-rpi-v8-rt), or keep a processor free with isolcpus= and --cpu".into()

@@ -3,14 +3,18 @@
 
 #![forbid(unsafe_code)]
 
+use std::ffi::OsString;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::{Args, Parser, Subcommand};
 use log::LevelFilter;
 
+mod check;
+mod config;
 pub mod dict;
 mod doctor;
+mod finding;
 pub mod latency;
 mod logging;
 pub mod pins;
@@ -36,22 +40,22 @@ pub(crate) struct Cli {
 /// What goes to the log (stderr).
 #[derive(Args, Debug, Clone)]
 struct LogArgs {
-    /// How much to log: error, warn, info, debug, trace or off
-    #[arg(long, value_name = "LEVEL", default_value = "info", global = true)]
-    log_level: LevelFilter,
+    /// How much to log: error, warn, info, debug, trace or off [default: info]
+    #[arg(long, value_name = "LEVEL", global = true)]
+    log_level: Option<LevelFilter>,
 }
 
 #[derive(Subcommand, Debug)]
 enum Command {
     /// Serve a Klipper host on a pty (the default)
     Run(run::RunArgs),
-    /// List this machine's GPIO lines, ADC channels and SPI buses, as printer.cfg names them
+    /// List this machine's GPIO lines, ADCs, PWM channels and buses, as printer.cfg names them
     Pins(pins::PinsArgs),
     /// Print the data dictionary, as klippy's batch mode takes it with -d
     Dict(dict::DictArgs),
     /// Measure how late this machine wakes up, and say what that is good for
     Latency(latency::LatencyArgs),
-    /// Say whether this Pinion serves a host, before the host is restarted
+    /// Say what works on this machine and what does not, and what mends it
     Doctor(doctor::DoctorArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
@@ -60,10 +64,10 @@ enum Command {
 /// Runs the program with the process's arguments.
 pub fn main() -> ExitCode {
     let cli = Cli::parse();
-    logging::start(cli.log.log_level);
+    logging::start(cli.log.log_level.unwrap_or(LevelFilter::Info));
     let status = match cli.command {
-        None => run::run(&cli.run),
-        Some(Command::Run(args)) => run::run(&args),
+        None => run::run(&cli.run, cli.log.log_level),
+        Some(Command::Run(args)) => run::run(&args, cli.log.log_level),
         Some(Command::Pins(args)) => pins::run(&args),
         Some(Command::Dict(args)) => dict::run(&args),
         Some(Command::Latency(args)) => latency::run(&args),
@@ -72,6 +76,17 @@ pub fn main() -> ExitCode {
     };
     logging::finish();
     status
+}
+
+/// What a command line says to `pinion run`, such as that of a process that runs; none if it is not that of
+/// a machine.
+fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<run::RunArgs>, clap::Error> {
+    let cli = Cli::try_parse_from(arguments)?;
+    Ok(match cli.command {
+        None => Some(cli.run),
+        Some(Command::Run(args)) => Some(args),
+        Some(_) => None,
+    })
 }
 
 /// Has a panic in any thread logged and end the process. Otherwise only that thread would end: without
@@ -93,6 +108,15 @@ fn print(text: &str) -> Result<(), String> {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout can not be written: {error}")),
         _ => Ok(()),
     }
+}
+
+/// Does `work` with nothing but errors logged, as what it finds is printed.
+fn quietly<T>(work: impl FnOnce() -> T) -> T {
+    let level = log::max_level();
+    log::set_max_level(level.min(LevelFilter::Error));
+    let done = work();
+    log::set_max_level(level);
+    done
 }
 
 /// Logs why a subcommand failed, and returns its exit status.

@@ -1,18 +1,23 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion pins`: the pins and buses of this computer, and how to write them in printer.cfg.
+//!
+//! What is listed is gathered first, and then written as a table or as JSON.
 
 #![forbid(unsafe_code)]
 
 use std::fmt::Write as _;
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::Args;
+use serde::Serialize;
 
 use crate::board::linux::Inventory;
 use crate::board::linux::adc::IioDevice;
-use crate::board::linux::gpio::{Chip, LineInfo};
-use crate::board::linux::pins::{Names, channel_number, line_number};
+use crate::board::linux::gpio::Chip;
+use crate::board::linux::pins::{Names, channel_number, line_number, pwm_number};
 use crate::board::linux::spi::Node;
+use crate::board::linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
 
 use super::{failed, print};
 
@@ -22,6 +27,9 @@ pub(super) struct PinsArgs {
     /// Show only GPIO lines that nobody holds
     #[arg(long)]
     pub free: bool,
+    /// Print JSON
+    #[arg(long)]
+    pub json: bool,
     /// Show only what has this in a name, in any case (such as gpio17, pinctrl, voltage)
     #[arg(value_name = "NAME")]
     pub filter: Option<String>,
@@ -30,49 +38,227 @@ pub(super) struct PinsArgs {
 /// Prints the list.
 pub(super) fn run(args: &PinsArgs) -> ExitCode {
     let inventory = Inventory::scan();
-    let list = list(&inventory, args, &|device, id| reading(&inventory, device, id));
+    let sysfs = Sysfs::scan(Path::new("/"));
+    let list = List::new(&inventory, &sysfs, args, &|device, id| reading(&inventory, device, id));
     for problem in &inventory.problems {
         log::warn!("{problem}");
     }
-    if list.is_empty() {
+    // Programs want JSON of nothing, too.
+    if args.json {
+        return print(&list.json()).map_or_else(failed, |()| ExitCode::SUCCESS);
+    }
+    let text = list.text();
+    if text.is_empty() {
         return failed(nothing(args));
     }
-    print(&list).map_or_else(failed, |()| ExitCode::SUCCESS)
+    print(&text).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
 fn nothing(args: &PinsArgs) -> String {
     match &args.filter {
         Some(filter) => format!("nothing here has \"{filter}\" in a name: pinion pins lists all"),
         None if args.free => "no GPIO line is free: pinion pins lists who holds them".to_owned(),
-        None => "no GPIO chip, ADC or SPI device is to be seen: enable them in the device tree, \
-                 or try \"pinion run --board sim\""
+        None => "no GPIO chip, ADC, PWM, SPI, I2C or 1-Wire device is to be seen: enable them in the device tree \
+                 (pinion doctor says how), or try \"pinion run --board sim\""
             .to_owned(),
     }
 }
 
-/// What a channel reads now, as text.
-fn reading(inventory: &Inventory, device: u32, id: &str) -> String {
-    let Some(reader) = inventory.adc(device, id) else {
-        return "gone".to_owned();
-    };
-    match (reader.read_raw(), reader.read_counts()) {
-        (Ok(raw), Ok(scaled)) => format!("{raw} ({scaled} of 4095)"),
-        (Err(error), _) => error.to_string(),
-        (_, Err(shutdown)) => shutdown.to_string(),
+/// What a channel reads now.
+#[derive(Clone, Debug, Serialize)]
+#[serde(untagged)]
+enum Reading {
+    /// As its driver has it, and in counts of 0 to 4095, as a host gets it.
+    Good {
+        raw: i64,
+        counts: u16,
+    },
+    Failed {
+        error: String,
+    },
+}
+
+impl std::fmt::Display for Reading {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self {
+            Reading::Good { raw, counts } => write!(f, "{raw} ({counts} of 4095)"),
+            Reading::Failed { error } => f.write_str(error),
+        }
     }
 }
 
-/// The whole list. `reading` returns what a channel (its driver's name) of a device (its number) reads.
-fn list(inventory: &Inventory, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> String) -> String {
-    let names = Names::of(inventory);
-    let mut sections: Vec<String> = inventory.chips.iter().map(|chip| chip_section(chip, &names, args)).collect();
-    if !args.free {
-        let adcs = inventory.adcs.iter();
-        sections.extend(adcs.map(|adc| adc_section(adc, &names, args, reading)));
-        sections.push(spi_section(&inventory.spi, args));
+fn reading(inventory: &Inventory, device: u32, id: &str) -> Reading {
+    let Some(reader) = inventory.adc(device, id) else {
+        return Reading::Failed { error: "gone".to_owned() };
+    };
+    match (reader.read_raw(), reader.read_counts()) {
+        (Ok(raw), Ok(counts)) => Reading::Good { raw, counts },
+        (Err(error), _) => Reading::Failed { error: error.to_string() },
+        (_, Err(shutdown)) => Reading::Failed { error: shutdown.to_string() },
     }
-    sections.retain(|section| !section.is_empty());
-    sections.join("\n")
+}
+
+/// All that is listed. The field names are those of the JSON, which others rely on.
+#[derive(Debug, Serialize)]
+struct List {
+    gpio: Vec<GpioChip>,
+    adc: Vec<AdcDevice>,
+    pwm: Vec<PwmEntry>,
+    spi: Vec<SpiDevice>,
+    i2c: Vec<I2cEntry>,
+    w1: Vec<W1Sensor>,
+    /// What is there and can not be used.
+    problems: Vec<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct GpioChip {
+    chip: String,
+    label: String,
+    line_count: usize,
+    /// An expander: no lines for steps or other timed edges.
+    behind_bus: bool,
+    lines: Vec<GpioLine>,
+}
+
+#[derive(Debug, Serialize)]
+struct GpioLine {
+    line: u32,
+    /// The device tree's name.
+    name: Option<String>,
+    direction: &'static str,
+    /// Whether a driver or a program has it.
+    held: bool,
+    /// Who has it, as far as the kernel tells.
+    consumer: Option<String>,
+    /// The device that the pin is switched to.
+    device: Option<String>,
+    /// How printer.cfg may write it: the line's own name first.
+    pins: Vec<String>,
+}
+
+impl GpioLine {
+    fn is_free(&self) -> bool {
+        !self.held && self.device.is_none()
+    }
+
+    fn used_by(&self) -> &str {
+        match (&self.consumer, &self.device) {
+            (Some(consumer), _) if self.held => consumer,
+            (_, Some(device)) => device,
+            _ if self.held => "the kernel",
+            _ => "free",
+        }
+    }
+}
+
+#[derive(Debug, Serialize)]
+struct AdcDevice {
+    device: String,
+    name: String,
+    channel_count: usize,
+    channels: Vec<AdcChannel>,
+}
+
+#[derive(Debug, Serialize)]
+struct AdcChannel {
+    channel: String,
+    /// None if its driver does not tell it.
+    resolution: Option<String>,
+    reading: Reading,
+    pins: Vec<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct PwmEntry {
+    chip: String,
+    device: Option<String>,
+    channels: Vec<PwmLine>,
+}
+
+#[derive(Debug, Serialize)]
+struct PwmLine {
+    channel: u32,
+    exported: bool,
+    consumer: Option<String>,
+    /// None if it is beyond the channels that have names.
+    pin: Option<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct SpiDevice {
+    device: String,
+    spi_bus: String,
+}
+
+#[derive(Debug, Serialize)]
+struct I2cEntry {
+    device: String,
+    adapter: Option<String>,
+    i2c_bus: String,
+    /// Chips that the kernel knows of; one with a driver is not for printer.cfg.
+    chips: Vec<I2cDevice>,
+}
+
+#[derive(Debug, Serialize)]
+struct I2cDevice {
+    address: u16,
+    name: String,
+    driver: Option<String>,
+}
+
+#[derive(Debug, Serialize)]
+struct W1Sensor {
+    serial_no: String,
+}
+
+impl List {
+    /// What is wanted of all that was found. `reading` returns what a channel (its driver's name) of a
+    /// device (its number) reads.
+    fn new(inventory: &Inventory, sysfs: &Sysfs, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> Reading) -> List {
+        let names = Names::of(inventory);
+        let mut list = List {
+            gpio: inventory.chips.iter().map(|chip| gpio(chip, sysfs, &names, args)).collect(),
+            adc: vec![],
+            pwm: vec![],
+            spi: vec![],
+            i2c: vec![],
+            w1: vec![],
+            problems: inventory.problems.clone(),
+        };
+        if !args.free {
+            list.adc = inventory.adcs.iter().map(|device| adc(device, &names, args, reading)).collect();
+            list.pwm = sysfs.pwm.iter().map(|chip| pwm(chip, args)).collect();
+            list.spi = inventory.spi.iter().filter_map(|node| spi(*node, args)).collect();
+            list.i2c = sysfs.i2c.iter().filter_map(|bus| i2c(bus, args)).collect();
+            let sensors = sysfs.thermometers.iter().filter(|serial| wanted(args, [serial.as_str(), "w1", "ds18b20"]));
+            list.w1 = sensors.map(|serial| W1Sensor { serial_no: serial.clone() }).collect();
+        }
+        list.gpio.retain(|chip| !chip.lines.is_empty());
+        list.adc.retain(|device| !device.channels.is_empty());
+        list.pwm.retain(|chip| !chip.channels.is_empty());
+        list
+    }
+
+    fn json(&self) -> String {
+        match serde_json::to_string_pretty(self) {
+            Ok(json) => json + "\n",
+            Err(error) => unreachable!("maps of texts are JSON: {error}"),
+        }
+    }
+
+    fn text(&self) -> String {
+        let gpio = self.gpio.iter().map(gpio_section);
+        let adc = self.adc.iter().map(adc_section);
+        let pwm = self.pwm.iter().map(pwm_section);
+        let sections: Vec<String> = gpio
+            .chain(adc)
+            .chain(pwm)
+            .chain([spi_section(&self.spi), i2c_section(&self.i2c), w1_section(&self.w1)])
+            .filter(|section| !section.is_empty())
+            .collect();
+        sections.join("\n")
+    }
 }
 
 /// Whether the filter of the command line is part of any of the names.
@@ -82,6 +268,111 @@ fn wanted<'a>(args: &PinsArgs, names: impl IntoIterator<Item = &'a str>) -> bool
     };
     let filter = filter.to_lowercase();
     names.into_iter().any(|name| name.to_lowercase().contains(&filter))
+}
+
+fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip {
+    let path = format!("gpiochip{}", chip.number);
+    let mut lines = Vec::new();
+    for (offset, line) in (0..).zip(&chip.lines) {
+        let number = line_number(chip.number, offset);
+        let full = format!("{path}/gpio{offset}");
+        let numbered = match number {
+            // The lines of gpiochip0 have the short names.
+            Some(number) if number == offset => format!("gpio{offset}"),
+            _ => full.clone(),
+        };
+        let mut pins = number.map_or_else(Vec::new, |n| names.of_pin(n));
+        pins.retain(|name| *name != numbered);
+        let mut pins: Vec<String> = pins.into_iter().map(str::to_owned).collect();
+        // The first name, which is the line's own if it has one, then the numeric one.
+        pins.insert(pins.len().min(1), numbered);
+        let line = GpioLine {
+            line: offset,
+            name: line.name.clone(),
+            direction: if line.output { "out" } else { "in" },
+            held: line.held,
+            consumer: line.consumer.clone(),
+            device: sysfs.devices.get(&(chip.label.clone(), offset)).cloned(),
+            pins,
+        };
+        let known = [full.as_str(), &chip.label].into_iter().chain(line.name.as_deref());
+        let known = known.chain(line.pins.iter().map(String::as_str));
+        if wanted(args, known) && !(args.free && !line.is_free()) {
+            lines.push(line);
+        }
+    }
+    GpioChip { chip: path, label: chip.label.clone(), line_count: chip.lines.len(), behind_bus: chip.sleeps, lines }
+}
+
+fn adc(device: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> Reading) -> AdcDevice {
+    let mut channels = Vec::new();
+    for (position, channel) in device.channels.iter().enumerate() {
+        let number = channel_number(device.number, position, &channel.id);
+        let mut pins: Vec<String> =
+            number.map_or_else(Vec::new, |n| names.of_pin(n)).into_iter().map(str::to_owned).collect();
+        if let (0, Some(n)) = (device.number, channel.id.strip_prefix("voltage"))
+            && n.parse::<u32>().is_ok_and(|n| n < 8)
+        {
+            pins.push(format!("analog{n}"));
+        }
+        // The name iioN/voltageM is shown only for devices that share their other name.
+        if pins.len() > 1 {
+            pins.retain(|name| !name.starts_with(&format!("iio{}/", device.number)));
+        }
+        let known = [device.name.as_str(), &channel.id];
+        if wanted(args, known.into_iter().chain(pins.iter().map(String::as_str))) {
+            channels.push(AdcChannel {
+                channel: channel.id.clone(),
+                resolution: channel.format.map(|format| format.to_string()),
+                reading: reading(device.number, &channel.id),
+                pins,
+            });
+        }
+    }
+    AdcDevice {
+        device: format!("iio:device{}", device.number),
+        name: device.name.clone(),
+        channel_count: device.channels.len(),
+        channels,
+    }
+}
+
+fn pwm(chip: &PwmChip, args: &PinsArgs) -> PwmEntry {
+    let name = format!("pwmchip{}", chip.number);
+    let mut channels = Vec::new();
+    for (channel, found) in (0..).zip(&chip.channels) {
+        let full = format!("{name}/pwm{channel}");
+        if wanted(args, [full.as_str()].into_iter().chain(chip.device.as_deref())) {
+            channels.push(PwmLine {
+                channel,
+                exported: found.exported,
+                consumer: found.consumer.clone(),
+                pin: pwm_number(chip.number, channel).map(|_| full),
+            });
+        }
+    }
+    PwmEntry { chip: name, device: chip.device.clone(), channels }
+}
+
+fn spi(node: Node, args: &PinsArgs) -> Option<SpiDevice> {
+    let name = node.to_string();
+    wanted(args, [name.as_str(), "spi"]).then(|| SpiDevice { device: format!("/dev/{name}"), spi_bus: name })
+}
+
+fn i2c(bus: &I2cBus, args: &PinsArgs) -> Option<I2cEntry> {
+    let (device, i2c_bus) = (format!("/dev/i2c-{}", bus.number), format!("i2c.{}", bus.number));
+    let names = [device.as_str(), &i2c_bus].into_iter().chain(bus.adapter.as_deref());
+    let chip = |I2cChip { address, name, driver }: &I2cChip| I2cDevice {
+        address: *address,
+        name: name.clone(),
+        driver: driver.clone(),
+    };
+    wanted(args, names.chain(bus.chips.iter().map(|chip| chip.name.as_str()))).then(|| I2cEntry {
+        adapter: bus.adapter.clone(),
+        chips: bus.chips.iter().map(chip).collect(),
+        i2c_bus,
+        device,
+    })
 }
 
 /// A heading and a table; nothing if there are no rows.
@@ -109,51 +400,6 @@ fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> String {
     text
 }
 
-fn chip_section(chip: &Chip, names: &Names, args: &PinsArgs) -> String {
-    let path = format!("gpiochip{}", chip.number);
-    let row = |(offset, line): (u32, &LineInfo)| {
-        let number = line_number(chip.number, offset);
-        let numbered = match number {
-            // The lines of gpiochip0 have the short names.
-            Some(number) if number == offset => format!("gpio{offset}"),
-            _ => format!("{path}/gpio{offset}"),
-        };
-        let mut named = number.map_or_else(Vec::new, |n| names.of_pin(n));
-        named.retain(|name| *name != numbered);
-        let full = format!("{path}/gpio{offset}");
-        let known = [numbered.as_str(), &full, &chip.label];
-        let known = known.into_iter().chain(line.name.as_deref()).chain(named.iter().copied());
-        if args.free && line.held || !wanted(args, known) {
-            return None;
-        }
-        // The first name, which is the line's own if it has one, and the numeric one. What the others
-        // look like is said in the heading.
-        let write = match named.first() {
-            Some(name) => format!("{name}, {numbered}"),
-            None => numbered,
-        };
-        Some(vec![
-            offset.to_string(),
-            cut(line.name.as_deref().unwrap_or("-")),
-            if line.output { "out" } else { "in" }.into(),
-            cut(holder(line)),
-            write,
-        ])
-    };
-    let rows: Vec<Vec<String>> = (0..).zip(&chip.lines).filter_map(row).collect();
-    let behind = if chip.sleeps { ", behind a bus: not for steps or other timed edges" } else { "" };
-    let heading = format!("{path} {}, {} lines{behind}", chip.label, chip.lines.len());
-    section(&heading, &["line", "name", "dir", "held by", "in printer.cfg"], &rows)
-}
-
-fn holder(line: &LineInfo) -> &str {
-    match &line.consumer {
-        _ if !line.held => "free",
-        Some(consumer) => consumer,
-        None => "the kernel",
-    }
-}
-
 /// Cuts a text to 20 characters, so that a row fits into 100 columns.
 fn cut(text: &str) -> String {
     match text.char_indices().nth(20) {
@@ -162,50 +408,89 @@ fn cut(text: &str) -> String {
     }
 }
 
-fn adc_section(adc: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> String) -> String {
-    let mut rows = Vec::new();
-    for (position, channel) in adc.channels.iter().enumerate() {
-        let number = channel_number(adc.number, position, &channel.id);
-        let mut named: Vec<String> =
-            number.map_or_else(Vec::new, |n| names.of_pin(n)).into_iter().map(str::to_owned).collect();
-        if let (0, Some(n)) = (adc.number, channel.id.strip_prefix("voltage"))
-            && n.parse::<u32>().is_ok_and(|n| n < 8)
-        {
-            named.push(format!("analog{n}"));
-        }
-        // The name iioN/voltageM is shown only for devices that share their other name.
-        if named.len() > 1 {
-            named.retain(|name| !name.starts_with(&format!("iio{}/", adc.number)));
-        }
-        let known = [adc.name.as_str(), &channel.id];
-        if !wanted(args, known.into_iter().chain(named.iter().map(String::as_str))) {
-            continue;
-        }
-        rows.push(vec![
-            channel.id.clone(),
-            channel.format.map_or_else(|| "12 bits assumed".into(), |format| format.to_string()),
-            reading(adc.number, &channel.id),
-            named.join(", "),
-        ]);
-    }
-    let heading = format!("iio:device{} {}, {} channels", adc.number, adc.name, adc.channels.len());
+fn gpio_section(chip: &GpioChip) -> String {
+    let row = |line: &GpioLine| {
+        vec![
+            line.line.to_string(),
+            cut(line.name.as_deref().unwrap_or("-")),
+            line.direction.to_owned(),
+            cut(line.used_by()),
+            // What the others look like is said in the heading.
+            line.pins[..line.pins.len().min(2)].join(", "),
+        ]
+    };
+    let rows: Vec<Vec<String>> = chip.lines.iter().map(row).collect();
+    let behind = if chip.behind_bus { ", behind a bus: not for steps or other timed edges" } else { "" };
+    let heading = format!("{} {}, {} lines{behind}", chip.chip, chip.label, chip.line_count);
+    section(&heading, &["line", "name", "dir", "used by", "in printer.cfg"], &rows)
+}
+
+fn adc_section(device: &AdcDevice) -> String {
+    let row = |channel: &AdcChannel| {
+        vec![
+            channel.channel.clone(),
+            channel.resolution.clone().unwrap_or_else(|| "12 bits assumed".into()),
+            channel.reading.to_string(),
+            channel.pins.join(", "),
+        ]
+    };
+    let rows: Vec<Vec<String>> = device.channels.iter().map(row).collect();
+    let heading = format!("{} {}, {} channels", device.device, device.name, device.channel_count);
     section(&heading, &["channel", "resolution", "reads", "in printer.cfg"], &rows)
 }
 
-fn spi_section(nodes: &[Node], args: &PinsArgs) -> String {
-    let rows: Vec<Vec<String>> = nodes
-        .iter()
-        .map(Node::to_string)
-        .filter(|name| wanted(args, [name.as_str(), "spi"]))
-        .map(|name| vec![format!("/dev/{name}"), format!("spi_bus: {name}, or for LEDs pin: {name}")])
-        .collect();
-    section("SPI", &["device", "in printer.cfg"], &rows)
+fn pwm_section(chip: &PwmEntry) -> String {
+    let row = |line: &PwmLine| {
+        let used_by = match (&line.consumer, line.exported) {
+            (Some(consumer), _) if consumer == "sysfs" => "a program",
+            (Some(consumer), _) => consumer,
+            (None, true) => "exported",
+            (None, false) => "free",
+        };
+        let pin = line.pin.as_ref().map(|pin| format!("pin: {pin}, with hardware_pwm: True"));
+        vec![line.channel.to_string(), cut(used_by), pin.unwrap_or_else(|| "-".into())]
+    };
+    let rows: Vec<Vec<String>> = chip.channels.iter().map(row).collect();
+    let heading = format!("{}{}", chip.chip, chip.device.as_ref().map_or(String::new(), |device| format!(" {device}")));
+    section(&heading, &["channel", "used by", "in printer.cfg"], &rows)
+}
+
+fn spi_section(devices: &[SpiDevice]) -> String {
+    let row = |SpiDevice { device, spi_bus }: &SpiDevice| {
+        vec![device.clone(), format!("spi_bus: {spi_bus}, or for LEDs pin: {spi_bus}")]
+    };
+    section("SPI", &["device", "in printer.cfg"], &devices.iter().map(row).collect::<Vec<_>>())
+}
+
+fn i2c_section(buses: &[I2cEntry]) -> String {
+    let row = |bus: &I2cEntry| {
+        let taken = bus.chips.iter().filter_map(|chip| {
+            let driver = chip.driver.as_ref()?;
+            Some(format!("{:#04x} {} by {driver}", chip.address, chip.name))
+        });
+        let taken: Vec<String> = taken.collect();
+        let taken = if taken.is_empty() { "-".to_owned() } else { taken.join(", ") };
+        let adapter = cut(bus.adapter.as_deref().unwrap_or("-"));
+        vec![bus.device.clone(), adapter, taken, format!("i2c_bus: {}", bus.i2c_bus)]
+    };
+    let rows: Vec<Vec<String>> = buses.iter().map(row).collect();
+    section("I2C", &["device", "adapter", "used by the kernel", "in printer.cfg"], &rows)
+}
+
+fn w1_section(sensors: &[W1Sensor]) -> String {
+    let row = |W1Sensor { serial_no }: &W1Sensor| {
+        vec![serial_no.clone(), format!("sensor_type: DS18B20, with serial_no: {serial_no}")]
+    };
+    section("1-Wire", &["sensor", "in printer.cfg"], &sensors.iter().map(row).collect::<Vec<_>>())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::board::linux::adc::{Channel, Format};
+    use crate::board::linux::gpio::LineInfo;
+    use crate::board::linux::sysfs::PwmChannel;
+    use serde_json::{Value, json};
 
     fn pi() -> Inventory {
         let line = |name: &str, consumer: Option<&str>, held| LineInfo {
@@ -239,12 +524,34 @@ mod tests {
         }
     }
 
+    fn sysfs() -> Sysfs {
+        let fan = PwmChannel { exported: false, consumer: Some("pwm-fan".into()) };
+        Sysfs {
+            pwm: vec![PwmChip {
+                number: 0,
+                device: Some("fe20c000.pwm".into()),
+                channels: vec![PwmChannel::default(), fan],
+            }],
+            i2c: vec![I2cBus {
+                number: 1,
+                adapter: Some("bcm2835 (i2c@7e804000)".into()),
+                chips: vec![I2cChip { address: 0x48, name: "ads1115".into(), driver: Some("ads1015".into()) }],
+            }],
+            thermometers: vec!["28-0316a4f1ff27".into()],
+            devices: [(("pinctrl-bcm2835".into(), 1), "fe804000.i2c (i2c1)".into())].into(),
+        }
+    }
+
+    fn of(inventory: &Inventory, args: &PinsArgs) -> List {
+        List::new(inventory, &sysfs(), args, &|_, _| Reading::Good { raw: 1200, counts: 150 })
+    }
+
     fn printed(args: &PinsArgs) -> String {
-        list(&pi(), args, &|_, _| "1200 (150 of 4095)".into())
+        of(&pi(), args).text()
     }
 
     fn filtered(filter: &str) -> String {
-        printed(&PinsArgs { free: false, filter: Some(filter.into()) })
+        printed(&PinsArgs { filter: Some(filter.into()), ..PinsArgs::default() })
     }
 
     #[test]
@@ -253,19 +560,32 @@ mod tests {
             printed(&PinsArgs::default()),
             "\
 gpiochip0 pinctrl-bcm2835, 3 lines
-  line  name       dir  held by   in printer.cfg
-  0     ID_SDA     in   free      ID_SDA, gpio0
-  1     -          in   free      pinctrl-bcm2835/gpio1, gpio1
-  2     SPI_CE1_N  out  spi0 CS1  SPI_CE1_N, gpio2
+  line  name       dir  used by              in printer.cfg
+  0     ID_SDA     in   free                 ID_SDA, gpio0
+  1     -          in   fe804000.i2c (i2c1)  pinctrl-bcm2835/gpio1, gpio1
+  2     SPI_CE1_N  out  spi0 CS1             SPI_CE1_N, gpio2
 
 iio:device0 ads1115, 2 channels
   channel            resolution       reads               in printer.cfg
   voltage0           signed 16 bits   1200 (150 of 4095)  ads1115/voltage0, analog0
   voltage0-voltage1  12 bits assumed  1200 (150 of 4095)  ads1115/voltage0-voltage1
 
+pwmchip0 fe20c000.pwm
+  channel  used by  in printer.cfg
+  0        free     pin: pwmchip0/pwm0, with hardware_pwm: True
+  1        pwm-fan  pin: pwmchip0/pwm1, with hardware_pwm: True
+
 SPI
   device          in printer.cfg
   /dev/spidev0.1  spi_bus: spidev0.1, or for LEDs pin: spidev0.1
+
+I2C
+  device      adapter               used by the kernel       in printer.cfg
+  /dev/i2c-1  bcm2835 (i2c@7e8040…  0x48 ads1115 by ads1015  i2c_bus: i2c.1
+
+1-Wire
+  sensor           in printer.cfg
+  28-0316a4f1ff27  sensor_type: DS18B20, with serial_no: 28-0316a4f1ff27
 "
         );
     }
@@ -274,14 +594,15 @@ SPI
     fn a_chip_behind_a_bus_says_what_it_is_no_good_for() {
         let mut inventory = pi();
         inventory.chips[0].sleeps = true;
-        let list = list(&inventory, &PinsArgs::default(), &|_, _| String::new());
+        let list = of(&inventory, &PinsArgs::default()).text();
         assert!(list.starts_with("gpiochip0 pinctrl-bcm2835, 3 lines, behind a bus: not for steps"), "{list}");
     }
 
     #[test]
     fn free_lines_only() {
-        let free = printed(&PinsArgs { free: true, filter: None });
+        let free = printed(&PinsArgs { free: true, ..PinsArgs::default() });
         assert!(free.contains("ID_SDA") && !free.contains("SPI"), "{free}");
+        assert!(!free.contains("i2c"), "a pin that a device has is not free: {free}");
     }
 
     #[test]
@@ -292,6 +613,48 @@ SPI
         }
         assert!(filtered("analog0").contains("voltage0"));
         assert!(filtered("spidev0.1").starts_with("SPI"));
+        assert!(filtered("PWM0").contains("pwmchip0/pwm0") && !filtered("pwm0").contains("pwm1"));
+        assert!(filtered("i2c.1").starts_with("I2C") && filtered("28-03").starts_with("1-Wire"));
         assert_eq!(filtered("nonesuch"), "");
+    }
+
+    /// These keys are what programs rely on, and the manual page names.
+    #[test]
+    fn the_json_has_all_of_it_under_keys_that_stay() {
+        let value: Value = serde_json::from_str(&of(&pi(), &PinsArgs::default()).json()).unwrap();
+        assert_eq!(
+            value["gpio"][0]["lines"][2],
+            json!({
+                "line": 2, "name": "SPI_CE1_N", "direction": "out", "held": true, "consumer": "spi0 CS1",
+                "device": null, "pins": ["SPI_CE1_N", "gpio2", "pinctrl-bcm2835/gpio2"]
+            })
+        );
+        assert_eq!(value["gpio"][0]["lines"][1]["device"], "fe804000.i2c (i2c1)");
+        let chip = &value["gpio"][0];
+        assert_eq!((&chip["chip"], &chip["label"]), (&json!("gpiochip0"), &json!("pinctrl-bcm2835")));
+        assert_eq!((&chip["line_count"], &chip["behind_bus"]), (&json!(3), &json!(false)));
+        assert_eq!(
+            value["adc"][0]["channels"][0],
+            json!({
+                "channel": "voltage0", "resolution": "signed 16 bits", "reading": { "raw": 1200, "counts": 150 },
+                "pins": ["ads1115/voltage0", "analog0"]
+            })
+        );
+        assert_eq!(
+            value["pwm"][0]["channels"][1],
+            json!({ "channel": 1, "exported": false, "consumer": "pwm-fan", "pin": "pwmchip0/pwm1" })
+        );
+        assert_eq!(value["spi"], json!([{ "device": "/dev/spidev0.1", "spi_bus": "spidev0.1" }]));
+        assert_eq!(
+            value["i2c"][0],
+            json!({
+                "device": "/dev/i2c-1", "adapter": "bcm2835 (i2c@7e804000)", "i2c_bus": "i2c.1",
+                "chips": [{ "address": 72, "name": "ads1115", "driver": "ads1015" }]
+            })
+        );
+        assert_eq!(value["w1"], json!([{ "serial_no": "28-0316a4f1ff27" }]));
+        assert_eq!(value["problems"], json!([]));
+        let failed = serde_json::to_value(Reading::Failed { error: "EIO".into() }).unwrap();
+        assert_eq!(failed, json!({ "error": "EIO" }));
     }
 }

@@ -9,6 +9,7 @@ use std::str::FromStr;
 use std::sync::Arc;
 
 use clap::Args;
+use log::LevelFilter;
 
 use crate::board::Board;
 use crate::board::linux::{Guard, LinuxBoard};
@@ -18,46 +19,114 @@ use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Guardian, Options};
 use crate::time::{Monotonic, TimeSource};
 
-use super::{end_by_panic, failed, logging};
+use super::{check, config, end_by_panic, failed, logging};
 
 /// The device of the watchdog that -w feeds.
-const WATCHDOG: &str = "/dev/watchdog";
+pub(super) const WATCHDOG: &str = "/dev/watchdog";
+/// The longest margin that may be asked for.
+pub(super) const MARGIN_MAX_US: u32 = 10_000;
 
 /// Options of `pinion run`, and of `pinion` alone.
 #[derive(Args, Clone, Debug)]
+// What the unit and PINION_OPTIONS both say is no mistake: the last one counts.
+#[command(args_override_self = true)]
 pub(super) struct RunArgs {
-    /// Where to put the symbolic link to the pty that the host opens
-    #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
-    symlink: PathBuf,
-    /// Run in real time: SCHED_FIFO and locked memory
-    #[arg(short = 'r')]
-    realtime: bool,
-    /// Run the core on this processor only
-    #[arg(long, value_name = "N")]
-    cpu: Option<usize>,
-    /// How early, at most, the core may wake for a timer and spin the rest: it learns how early
-    /// it has to. 0 saves power and makes steps late
-    #[arg(long, value_name = "US", default_value_t = 200, value_parser = clap::value_parser!(u32).range(0..=10_000))]
-    margin: u32,
-    /// Feed the hardware watchdog /dev/watchdog
-    #[arg(short = 'w')]
-    watchdog: bool,
-    /// Permission bits of the pty, octal
-    #[arg(short = 'm', value_name = "MODE", default_value = "0660", value_parser = mode)]
-    mode: u32,
-    /// Group of the pty, by name or number [default: tty, where that is permitted]
-    #[arg(short = 'g', value_name = "GROUP")]
-    group: Option<String>,
-    /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml
-    #[arg(long, value_name = "BOARD", default_value = "linux")]
-    board: BoardName,
-    /// The hosts to serve: auto (whichever comes), v0.11, v0.12, v0.13 or master (of Klipper), kalico,
-    /// or union (of the last three, as far as they agree)
-    #[arg(long, value_name = "NAME", default_value = "auto")]
-    dialect: Spoken,
+    #[command(flatten)]
+    given: Given,
+    /// Read options from FILE, such as /etc/pinion/pinion.toml; the command line goes before it
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// Check the configuration against this machine, and end: status 0 if it can be served
+    #[arg(long)]
+    check: bool,
 }
 
-fn mode(text: &str) -> Result<u32, String> {
+/// What the command line or the configuration file says, as far as it says anything.
+#[derive(Args, Clone, Debug, Default, PartialEq)]
+pub(super) struct Given {
+    /// Where to put the symbolic link to the pty that the host opens [default: /tmp/klipper_host_mcu]
+    #[arg(short = 'I', value_name = "PATH")]
+    pub(super) symlink: Option<PathBuf>,
+    /// Run in real time: SCHED_FIFO and locked memory
+    #[arg(short = 'r', num_args = 0, default_missing_value = "true")]
+    pub(super) realtime: Option<bool>,
+    /// Run the core on this processor only
+    #[arg(long, value_name = "N")]
+    pub(super) cpu: Option<usize>,
+    /// How early, at most, the core may wake for a timer and spin the rest: it learns how early
+    /// it has to. 0 saves power and makes steps late [default: 200]
+    #[arg(long, value_name = "US", value_parser = clap::value_parser!(u32).range(0..=i64::from(MARGIN_MAX_US)))]
+    pub(super) margin: Option<u32>,
+    /// Feed the hardware watchdog /dev/watchdog
+    #[arg(short = 'w', num_args = 0, default_missing_value = "true")]
+    pub(super) watchdog: Option<bool>,
+    /// Permission bits of the pty, octal [default: 0660]
+    #[arg(short = 'm', value_name = "MODE", value_parser = mode)]
+    pub(super) mode: Option<u32>,
+    /// Group of the pty, by name or number [default: tty, where that is permitted]
+    #[arg(short = 'g', value_name = "GROUP")]
+    pub(super) group: Option<String>,
+    /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml [default: linux]
+    #[arg(long, value_name = "BOARD")]
+    pub(super) board: Option<BoardName>,
+    /// The hosts to serve: auto (whichever comes), v0.11, v0.12, v0.13 or master (of Klipper), kalico,
+    /// or union (of the last three, as far as they agree) [default: auto]
+    #[arg(long, value_name = "NAME")]
+    pub(super) dialect: Option<Spoken>,
+    /// The command line's is an option of all subcommands.
+    #[arg(skip)]
+    pub(super) log_level: Option<LevelFilter>,
+}
+
+/// What the program runs by.
+#[derive(Clone, Debug)]
+pub(super) struct Settings {
+    pub(super) symlink: PathBuf,
+    pub(super) realtime: bool,
+    pub(super) cpu: Option<usize>,
+    pub(super) margin_us: u32,
+    pub(super) watchdog: bool,
+    pub(super) access: Access,
+    pub(super) board: BoardName,
+    pub(super) dialect: Option<DialectName>,
+    pub(super) log_level: LevelFilter,
+}
+
+impl Given {
+    /// What is said here, and where nothing is, what `other` says.
+    pub(super) fn or(self, other: Given) -> Given {
+        Given {
+            symlink: self.symlink.or(other.symlink),
+            realtime: self.realtime.or(other.realtime),
+            cpu: self.cpu.or(other.cpu),
+            margin: self.margin.or(other.margin),
+            watchdog: self.watchdog.or(other.watchdog),
+            mode: self.mode.or(other.mode),
+            group: self.group.or(other.group),
+            board: self.board.or(other.board),
+            dialect: self.dialect.or(other.dialect),
+            log_level: self.log_level.or(other.log_level),
+        }
+    }
+
+    /// The same with the defaults.
+    pub(super) fn settings(self) -> Settings {
+        Settings {
+            symlink: self.symlink.unwrap_or_else(|| "/tmp/klipper_host_mcu".into()),
+            realtime: self.realtime.unwrap_or(false),
+            cpu: self.cpu,
+            margin_us: self.margin.unwrap_or(200),
+            watchdog: self.watchdog.unwrap_or(false),
+            access: Access { mode: self.mode.unwrap_or(0o660), group: self.group },
+            board: self.board.unwrap_or(BoardName::Linux),
+            dialect: self.dialect.and_then(|Spoken(name)| name),
+            log_level: self.log_level.unwrap_or(LevelFilter::Info),
+        }
+    }
+}
+
+/// Permission bits, as the command line writes them.
+pub(super) fn mode(text: &str) -> Result<u32, String> {
     match u32::from_str_radix(text, 8) {
         Ok(mode) if mode <= 0o777 => Ok(mode),
         _ => Err("an octal number up to 0777 is wanted, such as 0660".into()),
@@ -123,28 +192,54 @@ pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, SimError> {
     file.map_or_else(|| Ok(SimConfig::default_printer()), SimConfig::load)
 }
 
-impl RunArgs {
+impl Settings {
     /// What the runtime needs to know.
-    pub(super) fn options(&self) -> Options {
+    fn options(&self) -> Options {
         Options {
             symlink: self.symlink.clone(),
-            dialect: self.dialect.0,
-            access: Access { mode: self.mode, group: self.group.clone() },
+            dialect: self.dialect,
+            access: self.access.clone(),
             realtime: self.realtime,
             cpu: self.cpu,
-            margin: MarginLimits::up_to_us(self.margin),
+            margin: MarginLimits::up_to_us(self.margin_us),
             watchdog: self.watchdog.then(|| WATCHDOG.into()),
         }
     }
 }
 
-/// Serves until SIGTERM, SIGINT or SIGHUP.
-pub(super) fn run(args: &RunArgs) -> ExitCode {
+impl RunArgs {
+    /// What the command line says by itself, and the configuration file that it names.
+    pub(super) fn into_parts(self) -> (Given, Option<PathBuf>) {
+        (self.given, self.config)
+    }
+
+    /// What the command line says, then the configuration file; `log_level` is the command line's.
+    ///
+    /// # Errors
+    ///
+    /// One line about the file.
+    fn settings(&self, log_level: Option<LevelFilter>) -> Result<Settings, String> {
+        let file = self.config.as_deref().map(config::load).transpose()?.unwrap_or_default();
+        let given = Given { log_level, ..self.given.clone() };
+        Ok(given.or(file).settings())
+    }
+}
+
+/// Serves until SIGTERM, SIGINT or SIGHUP; with `--check` only tells whether that could be done.
+pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
+    let settings = match args.settings(log_level) {
+        Ok(settings) => settings,
+        Err(error) => return failed(error),
+    };
+    log::set_max_level(settings.log_level);
+    if args.check {
+        return check::run(&settings, args.config.as_deref());
+    }
     end_by_panic();
     let clock = Monotonic::start();
     // The guardian must be forked before any thread is started. A simulated printer needs none.
-    let guardian = match args.board {
-        BoardName::Linux => Some(Guardian::start(clock, args.realtime)),
+    let guardian = match settings.board {
+        BoardName::Linux => Some(Guardian::start(clock, settings.realtime)),
         BoardName::Sim(_) => None,
     };
     let guardian = match guardian.transpose() {
@@ -152,11 +247,14 @@ pub(super) fn run(args: &RunArgs) -> ExitCode {
         Err(error) => return failed(error),
     };
     logging::detach();
-    let board = match args.board.open(Arc::new(clock), guardian.as_ref().map(Guardian::guard)) {
+    if let Some(file) = &args.config {
+        log::info!("configuration {}", file.display());
+    }
+    let board = match settings.board.open(Arc::new(clock), guardian.as_ref().map(Guardian::guard)) {
         Ok(board) => board,
         Err(error) => return failed(error),
     };
-    match runtime::run(&args.options(), board, clock, guardian, || ()) {
+    match runtime::run(&settings.options(), board, clock, guardian, || ()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }

@@ -131,7 +131,7 @@ fn commit(folder: &Path) -> Option<String> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::feature::FEATURES;
 
@@ -150,7 +150,8 @@ mod tests {
         (folder, klippy)
     }
 
-    fn forms(generation: Generation) -> Vec<String> {
+    /// What a generation's machines know.
+    pub(crate) fn forms(generation: Generation) -> Vec<String> {
         let known = known(FEATURES).into_iter().filter(|known| known.generations.contains(generation));
         known.map(|known| known.shape.as_str().to_owned()).collect()
     }

@@ -40,11 +40,7 @@ pub enum Search {
 /// Those of looking at the terminal or at `proc` itself.
 pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
     let terminal = fs::metadata(device)?;
-    let mut processes: Vec<Process> = fs::read_dir(proc)?
-        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
-        .filter(|pid| *pid != std::process::id())
-        .filter_map(|pid| Process::read(proc, pid))
-        .collect();
+    let mut processes = all(proc)?;
     // A look into a process costs a call for each of its files, so the likely ones come first; of a
     // process and its children the parent.
     processes.sort_by_key(|process| (process.klippy().is_none(), process.started));
@@ -62,6 +58,19 @@ pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
     Ok(if hidden.is_empty() { Search::Nobody } else { Search::Hidden(hidden) })
 }
 
+/// All processes but this one.
+///
+/// # Errors
+///
+/// Those of looking at `proc` itself.
+pub fn all(proc: &Path) -> io::Result<Vec<Process>> {
+    Ok(fs::read_dir(proc)?
+        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
+        .filter(|pid| *pid != std::process::id())
+        .filter_map(|pid| Process::read(proc, pid))
+        .collect())
+}
+
 impl Process {
     fn read(proc: &Path, pid: u32) -> Option<Process> {
         let folder = proc.join(pid.to_string());
@@ -75,8 +84,8 @@ impl Process {
         Some(Process { pid, started, arguments })
     }
 
-    /// The argument that names klippy's program.
-    fn klippy(&self) -> Option<&Path> {
+    /// The argument that names klippy's program, should the process be klippy.
+    pub fn klippy(&self) -> Option<&Path> {
         let is_it = |argument: &&PathBuf| argument.file_name().is_some_and(|name| name == "klippy.py");
         self.arguments.iter().find(is_it).map(PathBuf::as_path)
     }

@@ -7,6 +7,7 @@
 use std::fs;
 use std::hint;
 use std::io;
+use std::thread;
 
 use log::{debug, info, warn};
 use nix::sched::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
@@ -119,6 +120,17 @@ pub fn enter(role: Role) -> Scheduling {
             Scheduling::Ordinary
         }
     }
+}
+
+/// Whether this process may have SCHED_FIFO.
+///
+/// # Errors
+///
+/// What keeps it from that, and the remedy.
+pub fn is_permitted() -> Result<(), String> {
+    // A scheduling class is a thread's own, and this one is gone at once.
+    let tried = thread::spawn(|| sys::set_fifo(priority(Role::Core)).map_err(|error| refusal(&error)));
+    tried.join().unwrap_or_else(|_| Err("it could not be tried: look at the kernel's log (dmesg)".into()))
 }
 
 /// Makes the calling thread an ordinary one again.

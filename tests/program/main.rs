@@ -3,7 +3,9 @@
 
 mod bad_input;
 mod commands;
+mod configuration;
 mod dialects;
+mod doctor;
 mod life;
 mod one_order;
 mod process;

@@ -26,6 +26,7 @@ pub mod i2c;
 pub mod pins;
 mod pwm;
 pub mod spi;
+pub mod sysfs;
 mod w1;
 
 const DEV: &str = "/dev";

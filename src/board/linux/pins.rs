@@ -142,6 +142,11 @@ pub(crate) fn channel_number(device: u32, position: usize, id: &str) -> Option<u
     }
 }
 
+/// The number of a hardware PWM channel, if it has one.
+pub(crate) fn pwm_number(chip: u32, channel: u32) -> Option<u32> {
+    (chip < PWM_CHIPS && channel < PWM_CHIP_CHANNELS).then_some(PWM + chip * PWM_CHIP_CHANNELS + channel)
+}
+
 /// The names that this machine has beyond those of the C program, each with its number.
 #[derive(Debug, Default)]
 pub(crate) struct Names(Vec<(String, u32)>);

@@ -15,6 +15,15 @@ use crate::shutdown::{Shutdown, reason};
 /// The sensors of the family of the DS18B20.
 const FAMILY: &str = "28-";
 
+/// The sensors in `devices`, in order.
+pub(super) fn scan(devices: &Path) -> Vec<String> {
+    let entries = fs::read_dir(devices).into_iter().flatten().flatten();
+    let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
+    let mut sensors: Vec<String> = names.filter(|name| name.starts_with(FAMILY)).collect();
+    sensors.sort();
+    sensors
+}
+
 /// A DS18B20.
 #[derive(Debug)]
 pub(super) struct Ds18b20 {
@@ -68,10 +77,7 @@ fn cannot_open(devices: &Path, file: &Path, error: &io::Error) -> String {
     let path = file.display();
     match error.kind() {
         io::ErrorKind::NotFound => {
-            let entries = fs::read_dir(devices).into_iter().flatten().flatten();
-            let names = entries.filter_map(|entry| entry.file_name().into_string().ok());
-            let mut sensors: Vec<String> = names.filter(|name| name.starts_with(FAMILY)).collect();
-            sensors.sort();
+            let sensors = scan(devices);
             let there = match sensors.is_empty() {
                 true => "the kernel knows no DS18B20: enable the bus (on a Raspberry Pi \"dtoverlay=w1-gpio\" in config.txt) and check the wires".to_owned(),
                 false => format!("the kernel knows {}: correct serial_no", sensors.join(", ")),

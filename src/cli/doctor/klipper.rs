@@ -1,43 +1,19 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion doctor`: what works and what does not, and what mends it.
+//! `pinion doctor --klipper DIR`: whether this Pinion serves the host of a checkout.
 
 #![forbid(unsafe_code)]
 
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
-use std::process::ExitCode;
+use std::path::Path;
 
-use clap::Args;
-
+use crate::cli::finding::Finding;
 use crate::feature::FEATURES;
 use crate::klippy::Checkout;
 use crate::klippy::sources::Shape;
 
-use super::{failed, print};
-
-/// Options of `pinion doctor`.
-#[derive(Args, Clone, Debug)]
-pub(super) struct DoctorArgs {
-    /// A checkout of Klipper or Kalico: whether this Pinion serves that host, before you restart it
-    #[arg(long, value_name = "DIR")]
-    klipper: PathBuf,
-}
-
-/// Prints what was found; fails if something needs to be mended.
-pub(super) fn run(args: &DoctorArgs) -> ExitCode {
-    let checkout = match read(&args.klipper) {
-        Ok(checkout) => checkout,
-        Err(error) => return failed(error),
-    };
-    if let Err(error) = print(&report(&checkout)) {
-        return failed(error);
-    }
-    if checkout.unknown().count() == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
-}
-
 /// Reads a checkout, named by itself or by klippy's folder in it.
-fn read(folder: &Path) -> Result<Checkout, String> {
+pub(super) fn read(folder: &Path) -> Result<Checkout, String> {
     let inside = folder.join("klippy");
     let klippy = if inside.join("klippy.py").exists() { inside } else { folder.to_owned() };
     Checkout::read(&klippy, FEATURES).map_err(|error| {
@@ -48,8 +24,22 @@ fn read(folder: &Path) -> Result<Checkout, String> {
     })
 }
 
+/// The verdict in a line.
+pub(super) fn finding(checkout: &Checkout) -> Finding {
+    const CHECK: &str = "checkout";
+    let host = format!("{} is served in the dialect {}", checkout.folder.display(), checkout.best().generation);
+    match checkout.unknown().count() {
+        0 => Finding::ok(CHECK, host),
+        forms => Finding::error(
+            CHECK,
+            format!("{host}, and looks up {forms} forms of messages that no dialect has"),
+            "sudo apt install --only-upgrade pinion-mcu, before the host is restarted",
+        ),
+    }
+}
+
 /// The report: each dialect, the forms in which they differ, the verdict.
-fn report(checkout: &Checkout) -> String {
+pub(super) fn report(checkout: &Checkout) -> String {
     let best = checkout.best();
     let all: BTreeSet<&Shape> = best.served.union(&best.other).collect();
     let commit = checkout.commit.as_ref().map_or(String::new(), |commit| format!(", commit {commit}"));

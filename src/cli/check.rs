@@ -1,0 +1,210 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion run --check`: whether a configuration can be served on this machine. Nothing is changed: no
+//! link is made, no output is touched, and the hardware watchdog, which to open would start, is not
+//! opened.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::process::ExitCode;
+use std::sync::Arc;
+
+use nix::unistd::{AccessFlags, Gid, Group as UserGroup, access, getegid, geteuid, getgroups};
+
+use crate::board::linux::Inventory;
+use crate::feature::FEATURES;
+use crate::mcu::{Dialect, DialectName};
+use crate::runtime::realtime::{self, Processors};
+use crate::time::Monotonic;
+
+use super::finding::{self, Finding, Group};
+use super::quietly;
+use super::run::{BoardName, Settings, WATCHDOG};
+
+/// Checks and tells; `file` is the configuration file, which has been read.
+pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
+    let mut findings = Vec::new();
+    if let Some(file) = file {
+        findings.push(Finding::ok("config", format!("{} can be read", file.display())));
+    }
+    findings.extend(board(settings));
+    findings.push(link(&settings.symlink));
+    findings.push(group(settings.access.group.as_deref()));
+    findings.extend(real_time(settings));
+    if settings.watchdog {
+        findings.push(watchdog(Path::new(WATCHDOG)));
+    }
+    let groups = [Group::new("configuration", findings)];
+    finding::finish(&finding::text(&groups), &groups)
+}
+
+/// Whether the board opens, its devices may be opened, and the dialect can be made of its pins.
+fn board(settings: &Settings) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    if settings.board == BoardName::Linux {
+        // The board would log these, and serve what is left.
+        let problems = Inventory::scan().problems;
+        findings.extend(problems.into_iter().map(|problem| {
+            let (what, remedy) = problem.split_once(": ").unwrap_or((&problem, "look at the kernel's log (dmesg)"));
+            Finding::error("devices", what, remedy)
+        }));
+    }
+    // Its problems are among the findings already.
+    let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None));
+    let board = match board {
+        Ok(board) => board,
+        Err(error) => {
+            findings.push(Finding::error("board", error, "correct the file, or choose another board"));
+            return findings;
+        }
+    };
+    findings.push(Finding::ok("board", format!("board {}", board.describe())));
+    let name = settings.dialect.unwrap_or(DialectName::Union);
+    findings.push(match Dialect::new(FEATURES, &*board, name) {
+        Ok(_) => match settings.dialect {
+            Some(name) => Finding::ok("dialect", format!("dialect {name}")),
+            None => Finding::ok("dialect", "dialect of whichever host comes"),
+        },
+        Err(error) => Finding::error("dialect", format!("dialect {name}: {error}"), "choose another"),
+    });
+    findings
+}
+
+/// Whether the link can be put in place.
+fn link(symlink: &Path) -> Finding {
+    let path = symlink.display();
+    let folder = match symlink.parent() {
+        Some(parent) if !parent.as_os_str().is_empty() => parent,
+        _ => Path::new("."),
+    };
+    let Ok(about_folder) = fs::metadata(folder) else {
+        let remedy = format!("sudo mkdir {}, or choose another path (symlink)", folder.display());
+        return Finding::error("symlink", format!("{path}: there is no folder {}", folder.display()), remedy);
+    };
+    if access(folder, AccessFlags::W_OK | AccessFlags::X_OK).is_err() {
+        let remedy = "run Pinion as another user, or choose another path (symlink)";
+        return Finding::error("symlink", format!("{path}: nothing may be written in {}", folder.display()), remedy);
+    }
+    match fs::symlink_metadata(symlink) {
+        Ok(there) if !there.file_type().is_symlink() => {
+            Finding::error("symlink", format!("{path} exists and is no symbolic link"), format!("sudo rm {path}"))
+        }
+        // Only its owner and the folder's may replace a file in a folder such as /tmp.
+        Ok(there) if about_folder.mode() & 0o1000 != 0 && !is_one_of(&[there.uid(), about_folder.uid()]) => {
+            Finding::error("symlink", format!("{path} is another user's link"), format!("sudo rm {path}"))
+        }
+        Ok(_) => Finding::ok("symlink", format!("{path} is a link, and will be replaced")),
+        Err(_) => Finding::ok("symlink", format!("{path} can be made")),
+    }
+}
+
+fn is_one_of(owners: &[u32]) -> bool {
+    geteuid().is_root() || owners.contains(&geteuid().as_raw())
+}
+
+/// Whether the terminal may be given to the group.
+fn group(name: Option<&str>) -> Finding {
+    let wanted = name.unwrap_or("tty");
+    let found = match wanted.parse() {
+        Ok(gid) => Some(Gid::from_raw(gid)),
+        Err(_) => UserGroup::from_name(wanted).ok().flatten().map(|group| group.gid),
+    };
+    let Some(gid) = found else {
+        return Finding::error(
+            "group",
+            format!("there is no group {wanted}"),
+            format!("sudo groupadd --system {wanted}"),
+        );
+    };
+    let is_ours = geteuid().is_root() || gid == getegid() || getgroups().is_ok_and(|groups| groups.contains(&gid));
+    if is_ours {
+        return Finding::ok("group", format!("the terminal goes to the group {wanted}"));
+    }
+    let remedy = format!("sudo usermod -aG {wanted} {}, and log in anew", user_name());
+    let what = format!("the terminal can not be given to the group {wanted}, of which this user is no member");
+    match name {
+        Some(_) => Finding::error("group", what, remedy),
+        // The program then goes on with the user's own group.
+        None => Finding::warning("group", format!("{what}: a klippy of another user can not open it"), remedy),
+    }
+}
+
+fn user_name() -> String {
+    let user = nix::unistd::User::from_uid(geteuid()).ok().flatten();
+    user.map_or_else(|| geteuid().to_string(), |user| user.name)
+}
+
+/// Whether the processor is there, and whether real time is permitted, if it is asked for.
+fn real_time(settings: &Settings) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    match (settings.cpu, Processors::new(settings.cpu)) {
+        (Some(cpu), Ok(_)) => findings.push(Finding::ok("cpu", format!("the core stays on processor {cpu}"))),
+        (None, Ok(_)) => {}
+        (_, Err(error)) => {
+            let error = error.to_string();
+            let (what, remedy) = error.rsplit_once(": ").unwrap_or((&error, "choose another"));
+            findings.push(Finding::error("cpu", what, remedy));
+        }
+    }
+    if settings.realtime {
+        findings.push(match realtime::is_permitted() {
+            Ok(()) => Finding::ok("realtime", "real time is permitted"),
+            Err(why) => {
+                let (what, remedy) = why.split_once(": ").unwrap_or((&why, "run as root"));
+                Finding::warning("realtime", format!("no real-time scheduling: {what}"), remedy)
+            }
+        });
+    }
+    findings
+}
+
+/// Whether the watchdog is there and may be opened.
+fn watchdog(device: &Path) -> Finding {
+    let path = device.display();
+    if !device.exists() {
+        let remedy = "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
+        return Finding::error("watchdog", format!("there is no {path}"), remedy);
+    }
+    match access(device, AccessFlags::W_OK) {
+        Ok(()) => Finding::ok("watchdog", format!("{path} is there")),
+        Err(_) => Finding::error(
+            "watchdog",
+            format!("{path} may not be opened by this user"),
+            "sudo udevadm trigger --subsystem-match=misc --action=add, or run Pinion as its service does",
+        ),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::finding::Level;
+
+    #[test]
+    fn a_link_can_be_made_where_nothing_else_stands() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tty");
+        assert_eq!(link(&path).status, Level::Ok);
+        std::os::unix::fs::symlink("/dev/pts/99", &path).unwrap();
+        assert!(link(&path).found.ends_with("is a link, and will be replaced"));
+        fs::remove_file(&path).unwrap();
+        fs::write(&path, "").unwrap();
+        let refused = link(&path);
+        assert_eq!((refused.status, refused.remedy), (Level::Error, Some(format!("sudo rm {}", path.display()))));
+        let refused = link(&folder.path().join("none/tty"));
+        assert!(refused.status == Level::Error && refused.found.contains("there is no folder"), "{refused:?}");
+    }
+
+    #[test]
+    fn groups_and_watchdogs_that_are_not_there() {
+        assert_eq!(group(Some("no_such_group")).status, Level::Error);
+        assert_eq!(group(Some(&getegid().to_string())).status, Level::Ok);
+        let folder = tempfile::tempdir().unwrap();
+        let device = folder.path().join("watchdog");
+        assert_eq!(watchdog(&device).status, Level::Error);
+        fs::write(&device, "").unwrap();
+        assert_eq!(watchdog(&device).status, Level::Ok);
+    }
+}

@@ -1,0 +1,474 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Pins and buses: whether they are there, whether Pinion may open them, who holds the lines, and what
+//! the computer's firmware says of its power.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use crate::board::linux::gpio::Chip;
+use crate::cli::finding::Finding;
+use crate::cli::run::Settings;
+
+use super::machine::{Access, Machine, Who};
+
+/// A kind of devices.
+struct Class {
+    check: &'static str,
+    name: &'static str,
+    access: Access,
+    /// udev's subsystem.
+    subsystem: &'static str,
+    /// The line of a Raspberry Pi's config.txt, and what begins one that enables it, too.
+    enabled_by: Option<(&'static str, &'static [&'static str])>,
+    nodes: fn(&Machine) -> Vec<PathBuf>,
+}
+
+const CLASSES: [Class; 6] = [
+    Class {
+        check: "gpio",
+        name: "GPIO",
+        access: Access::READ_WRITE,
+        subsystem: "gpio",
+        enabled_by: None,
+        nodes: |machine| machine.beginning("/dev", "gpiochip"),
+    },
+    Class {
+        check: "adc",
+        name: "ADC",
+        access: Access::READ,
+        subsystem: "iio",
+        enabled_by: None,
+        nodes: |machine| {
+            let devices = machine.beginning("/sys/bus/iio/devices", "iio:device");
+            let channels = devices.iter().flat_map(|device| inside(device, "in_voltage"));
+            channels.filter(|channel| channel.to_string_lossy().ends_with("_raw")).collect()
+        },
+    },
+    Class {
+        check: "pwm",
+        name: "PWM",
+        access: Access::WRITE,
+        subsystem: "pwm",
+        enabled_by: Some(("dtoverlay=pwm-2chan", &["dtoverlay=pwm"])),
+        nodes: |machine| {
+            let chips = machine.beginning("/sys/class/pwm", "pwmchip");
+            chips.into_iter().map(|chip| chip.join("export")).filter(|file| file.exists()).collect()
+        },
+    },
+    Class {
+        check: "spi",
+        name: "SPI",
+        access: Access::READ_WRITE,
+        subsystem: "spidev",
+        enabled_by: Some(("dtparam=spi=on", &["dtparam=spi", "dtoverlay=spi"])),
+        nodes: |machine| machine.beginning("/dev", "spidev"),
+    },
+    Class {
+        check: "i2c",
+        name: "I2C",
+        access: Access::READ_WRITE,
+        subsystem: "i2c-dev",
+        enabled_by: Some(("dtparam=i2c_arm=on", &["dtparam=i2c", "dtoverlay=i2c"])),
+        nodes: |machine| machine.beginning("/dev", "i2c-"),
+    },
+    Class {
+        check: "w1",
+        name: "1-Wire",
+        access: Access::READ,
+        subsystem: "w1",
+        enabled_by: Some(("dtoverlay=w1-gpio", &["dtoverlay=w1-gpio"])),
+        nodes: |machine| {
+            let sensors = machine.beginning("/sys/bus/w1/devices", "28-");
+            sensors.into_iter().map(|sensor| sensor.join("w1_slave")).filter(|file| file.exists()).collect()
+        },
+    },
+];
+
+fn inside(folder: &Path, beginning: &str) -> Vec<PathBuf> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    let found = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(beginning));
+    found.map(|entry| entry.path()).collect()
+}
+
+/// Whether `user` may open what is there.
+pub(super) fn permissions(machine: &Machine, settings: &Settings, user: &Who) -> Vec<Finding> {
+    let mut findings: Vec<Finding> =
+        CLASSES.iter().filter_map(|class| permission(machine, user, class, &(class.nodes)(machine))).collect();
+    if settings.watchdog {
+        const WATCHDOG: Class = Class {
+            check: "watchdog",
+            name: "watchdog",
+            access: Access::WRITE,
+            subsystem: "misc",
+            enabled_by: None,
+            nodes: |machine| vec![machine.path("/dev/watchdog")],
+        };
+        findings.extend(permission(machine, user, &WATCHDOG, &(WATCHDOG.nodes)(machine)));
+    }
+    findings
+}
+
+/// None where there is nothing to open.
+fn permission(machine: &Machine, user: &Who, class: &Class, nodes: &[PathBuf]) -> Option<Finding> {
+    // One that vanishes meanwhile is none.
+    let nodes: Vec<_> = nodes.iter().filter_map(|node| Some((node, fs::metadata(node).ok()?))).collect();
+    let refused: Vec<_> = nodes.iter().filter(|(_, about)| !user.may(class.access, about)).collect();
+    let (name, who) = (class.name, &user.name);
+    let Some((node, about)) = refused.first() else {
+        let first = machine.name(nodes.first()?.0);
+        let more = if nodes.len() > 1 { format!(" and {} more", nodes.len() - 1) } else { String::new() };
+        return Some(Finding::ok(class.check, format!("{name}: {who} may open {}{more}", first.display())));
+    };
+    let found = format!(
+        "{name}: {who} may not open {}, which is {} ({} of {} refused)",
+        machine.name(node).display(),
+        machine.ownership(about),
+        refused.len(),
+        nodes.len()
+    );
+    let group = machine.group_name(std::os::unix::fs::MetadataExt::gid(about));
+    let anew = if who == "pinion" { "sudo systemctl restart pinion-mcu" } else { "log in anew" };
+    let remedy = if class.access.is_given_to_group(about) && group != "root" && group != "0" {
+        format!("sudo usermod -aG {group} {who}, then {anew}")
+    } else if rules_are_there(machine) {
+        format!(
+            "sudo udevadm control --reload && sudo udevadm trigger --action=add --subsystem-match={}",
+            class.subsystem
+        )
+    } else {
+        "install the udev rules: sudo apt install --reinstall pinion-mcu, or sudo make install".into()
+    };
+    Some(Finding::error(class.check, found, remedy))
+}
+
+fn rules_are_there(machine: &Machine) -> bool {
+    let folders = ["/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d"];
+    folders.iter().any(|folder| machine.names(folder).iter().any(|name| name.ends_with("pinion-mcu.rules")))
+}
+
+/// Which pins and buses there are, and how to enable those that there are not.
+pub(super) fn presence(machine: &Machine) -> Vec<Finding> {
+    CLASSES.iter().map(|class| present(machine, class)).collect()
+}
+
+fn present(machine: &Machine, class: &Class) -> Finding {
+    let Class { check, name, .. } = *class;
+    let nodes: Vec<String> =
+        (class.nodes)(machine).iter().map(|node| machine.name(node).display().to_string()).collect();
+    if let Some(first) = nodes.first() {
+        let more = if nodes.len() > 1 { format!(" and {} more", nodes.len() - 1) } else { String::new() };
+        return Finding::ok(check, format!("{name}: {first}{more}"));
+    }
+    if check == "gpio" {
+        let remedy = "connect an I/O board that the kernel knows, or try pinion run --board sim";
+        return Finding::warning(check, "GPIO: this computer has no GPIO chip", remedy);
+    }
+    if check == "i2c" && !machine.beginning("/sys/bus/i2c/devices", "i2c-").is_empty() {
+        let remedy = "echo i2c-dev | sudo tee /etc/modules-load.d/i2c-dev.conf && sudo modprobe i2c-dev";
+        return Finding::warning(check, "I2C: there are buses, and no /dev/i2c-*: i2c-dev is not loaded", remedy);
+    }
+    let off = format!("{name}: none");
+    let Some((line, beginnings)) = class.enabled_by else {
+        return Finding::ok(check, off).or("if there is one, load its driver (a device tree overlay, as a rule)");
+    };
+    let config = is_pi(machine).then(|| machine.first(&["/boot/firmware/config.txt", "/boot/config.txt"])).flatten();
+    let Some(config) = config else {
+        return Finding::ok(check, off).or("if it is wanted, enable it in the device tree, and reboot");
+    };
+    let text = machine.text(config).unwrap_or_default();
+    let is_on = |line: &str| {
+        let line = line.trim();
+        let off = ["=off", "=0", "=false"].iter().any(|end| line.ends_with(end));
+        !off && beginnings.iter().any(|beginning| line.starts_with(beginning))
+    };
+    match text.lines().any(is_on) {
+        true if check == "w1" => Finding::warning(
+            check,
+            "1-Wire: on, and no DS18B20 answers",
+            "check its wires and the pull-up resistor (4.7 kOhm)",
+        ),
+        true => Finding::warning(check, format!("{name}: on in {config}, and not there"), "sudo reboot"),
+        false => Finding::ok(check, format!("{name}: off"))
+            .or(format!("if it is wanted: printf '[all]\\n{line}\\n' | sudo tee -a {config}, and reboot")),
+    }
+}
+
+fn is_pi(machine: &Machine) -> bool {
+    machine.text("/proc/device-tree/model").is_some_and(|model| model.contains("Raspberry Pi"))
+}
+
+/// Who holds GPIO lines.
+pub(super) fn holders(machine: &Machine, chips: &[Chip]) -> Vec<Finding> {
+    const CHECK: &str = "gpio_lines";
+    /// More are listed by `pinion pins`.
+    const SHOWN: usize = 8;
+    let chip = |chip: &Chip| {
+        let held = (0u32..).zip(&chip.lines).filter(|(_, line)| line.held);
+        let mut held: Vec<String> = held
+            .map(|(offset, line)| format!("{offset} by \"{}\"", line.consumer.as_deref().unwrap_or("the kernel")))
+            .collect();
+        let count = held.len();
+        held.truncate(SHOWN);
+        let more = if count > SHOWN { ", ... (pinion pins lists all)" } else { "" };
+        let colon = if count > 0 { ": " } else { "" };
+        let (number, label, lines) = (chip.number, &chip.label, chip.lines.len());
+        let list = held.join(", ");
+        Finding::ok(CHECK, format!("gpiochip{number} {label}: {count} of {lines} lines are held{colon}{list}{more}"))
+    };
+    let mut findings: Vec<Finding> = chips.iter().map(chip).collect();
+    let programs: Vec<String> = machine
+        .processes()
+        .iter()
+        .filter(|process| {
+            let folder = machine.path(format!("/proc/{}/fd", process.pid));
+            let files = fs::read_dir(folder).into_iter().flatten().flatten();
+            let mut targets = files.filter_map(|file| fs::read_link(file.path()).ok());
+            // Of a line, of several, or of one with edges (drivers/gpio/gpiolib-cdev.c).
+            targets.any(|target| target.to_string_lossy().starts_with("anon_inode:gpio"))
+        })
+        .map(|process| {
+            let program = process.arguments.first().and_then(|program| program.file_name());
+            format!("{} (process {})", program.unwrap_or_default().to_string_lossy(), process.pid)
+        })
+        .collect();
+    if !programs.is_empty() {
+        findings.push(Finding::ok(CHECK, format!("programs that hold lines: {}", programs.join(", "))));
+    }
+    findings
+}
+
+/// What the firmware of a Raspberry Pi says of its power and temperature. `vcgencmd` is the program that asks
+/// it, where that may be started.
+pub(super) fn power(machine: &Machine, vcgencmd: Option<&Path>) -> Vec<Finding> {
+    const CHECK: &str = "power";
+    let Some(bits) = throttled(machine, vcgencmd) else {
+        return match is_pi(machine) {
+            true => {
+                vec![Finding::warning(CHECK, "whether the power is good is unknown", "sudo vcgencmd get_throttled")]
+            }
+            false => vec![Finding::ok(CHECK, "whether the power is good is unknown: this is no Raspberry Pi")],
+        };
+    };
+    // https://www.raspberrypi.com/documentation/computers/os.html#get_throttled
+    let states = [
+        (0, "the voltage is too low", "use a better power supply and a short, thick cable"),
+        (1, "the processors' frequency is capped", "use a better power supply, or cool the computer"),
+        (2, "the processors are throttled", "use a better power supply, or cool the computer"),
+        (3, "the processors are at their temperature limit", "cool the computer"),
+    ];
+    let mut findings = Vec::new();
+    for (bit, what, remedy) in states {
+        let is = |bit: u32| bits >> bit & 1 == 1;
+        if is(bit) {
+            findings.push(Finding::error(CHECK, format!("{what}: steps are late and outputs fail"), remedy));
+        } else if is(16 + bit) {
+            findings.push(Finding::warning(CHECK, format!("since it was started, at times {what}"), remedy));
+        }
+    }
+    if findings.is_empty() {
+        findings.push(Finding::ok(CHECK, "voltage and temperature were good since the computer was started"));
+    }
+    findings
+}
+
+/// The firmware's bits, from sysfs or by vcgencmd.
+fn throttled(machine: &Machine, vcgencmd: Option<&Path>) -> Option<u32> {
+    let hex = |text: &str| u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok();
+    let file = machine.names("/sys/devices/platform").into_iter().find_map(|folder| {
+        let folder = format!("/sys/devices/platform/{folder}");
+        let firmware = machine.names(&folder).into_iter().find(|name| name.ends_with("firmware"))?;
+        machine.text(format!("{folder}/{firmware}/get_throttled"))
+    });
+    if let Some(bits) = file {
+        return hex(&bits);
+    }
+    let told = output(Command::new(vcgencmd?).arg("get_throttled"))?;
+    hex(told.trim().strip_prefix("throttled=")?)
+}
+
+/// What a program prints; none if it does not end within two seconds.
+fn output(command: &mut Command) -> Option<String> {
+    const PATIENCE: Duration = Duration::from_secs(2);
+    let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+    let mut child = command.spawn().ok()?;
+    let end = Instant::now() + PATIENCE;
+    loop {
+        match child.try_wait() {
+            Ok(None) if Instant::now() < end => thread::sleep(Duration::from_millis(10)),
+            Ok(Some(_)) => break,
+            // It hangs: it is told to end, and left alone should it not.
+            _ => {
+                let _ = child.kill();
+                return None;
+            }
+        }
+    }
+    let mut text = String::new();
+    child.stdout.take()?.take(4096).read_to_string(&mut text).ok()?;
+    Some(text)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{Tree, told};
+    use super::*;
+    use crate::board::linux::gpio::LineInfo;
+    use crate::cli::finding::Level::{Error, Ok, Warning};
+    use crate::cli::run::Given;
+    use std::os::unix::fs::MetadataExt;
+
+    fn watched() -> Settings {
+        Given { watchdog: Some(true), ..Given::default() }.settings()
+    }
+
+    /// Somebody who is neither root nor the one who runs the tests.
+    fn stranger(gids: Vec<u32>) -> Who {
+        Who { name: "pinion".into(), uid: 54_321, gids }
+    }
+
+    const NODES: [(&str, &str); 7] = [
+        ("gpio", "dev/gpiochip0"),
+        ("adc", "sys/bus/iio/devices/iio:device0/in_voltage3_raw"),
+        ("pwm", "sys/class/pwm/pwmchip0/export"),
+        ("spi", "dev/spidev0.0"),
+        ("i2c", "dev/i2c-1"),
+        ("w1", "sys/bus/w1/devices/28-01/w1_slave"),
+        ("watchdog", "dev/watchdog"),
+    ];
+
+    #[test]
+    fn devices_that_the_group_has_may_be_opened_by_its_members() {
+        let tree = Tree::new();
+        NODES.iter().for_each(|(_, path)| tree.put_mode(path, "", 0o660));
+        let gid = fs::metadata(tree.machine().path("/dev/gpiochip0")).unwrap().gid();
+        tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
+        let findings = permissions(&tree.machine(), &watched(), &stranger(vec![gid]));
+        assert_eq!(findings.len(), NODES.len());
+        NODES.iter().for_each(|(check, _)| drop(told(&findings, check, Ok, "pinion may open /")));
+        let findings = permissions(&tree.machine(), &watched(), &stranger(vec![gid + 1]));
+        for (check, path) in NODES {
+            let remedy = told(&findings, check, Error, &format!("pinion may not open /{path}, which is "));
+            assert_eq!(remedy, "sudo usermod -aG gpio pinion, then sudo systemctl restart pinion-mcu");
+        }
+    }
+
+    #[test]
+    fn devices_that_are_root_s_alone_want_the_rules() {
+        let tree = Tree::new();
+        tree.put_mode("dev/spidev0.0", "", 0o600);
+        let find = || permissions(&tree.machine(), &Given::default().settings(), &stranger(vec![]));
+        assert!(told(&find(), "spi", Error, "0600 (1 of 1 refused)").contains("apt install --reinstall"));
+        tree.put("usr/lib/udev/rules.d/60-pinion-mcu.rules", "");
+        assert!(told(&find(), "spi", Error, "may not open").ends_with("--subsystem-match=spidev"));
+        assert_eq!(find().len(), 1, "nothing is said of what is not there");
+    }
+
+    #[test]
+    fn what_is_there_and_how_to_enable_the_rest() {
+        let tree = Tree::new();
+        let findings = presence(&tree.machine());
+        told(&findings, "gpio", Warning, "no GPIO chip");
+        assert!(told(&findings, "spi", Ok, "SPI: none").contains("device tree"));
+        tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0");
+        tree.put("boot/firmware/config.txt", "#dtparam=spi=on\ndtparam=i2c_arm=on\ndtoverlay=w1-gpio\n");
+        let findings = presence(&tree.machine());
+        let remedy = told(&findings, "spi", Ok, "SPI: off");
+        assert!(remedy.contains("dtparam=spi=on") && remedy.contains("/boot/firmware/config.txt"), "{remedy}");
+        assert_eq!(told(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, and not there"), "sudo reboot");
+        told(&findings, "w1", Warning, "no DS18B20 answers");
+        assert!(told(&findings, "pwm", Ok, "PWM: off").contains("dtoverlay=pwm-2chan"));
+        tree.put("sys/bus/i2c/devices/i2c-1/name", "");
+        assert!(told(&presence(&tree.machine()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
+        NODES.iter().for_each(|(_, path)| tree.put(path, ""));
+        let findings = presence(&tree.machine());
+        assert!(findings.iter().all(|finding| finding.status == Ok && finding.remedy.is_none()), "{findings:?}");
+        told(&findings, "i2c", Ok, "I2C: /dev/i2c-1");
+    }
+
+    #[test]
+    fn who_holds_which_line() {
+        let tree = Tree::new();
+        let line = |consumer: Option<&str>, held| LineInfo {
+            held,
+            consumer: consumer.map(str::to_owned),
+            ..LineInfo::default()
+        };
+        let chip = Chip {
+            number: 0,
+            label: "pinctrl".into(),
+            sleeps: false,
+            lines: vec![line(Some("spi0 CS0"), true), line(None, false), line(None, true)],
+        };
+        let findings = holders(&tree.machine(), std::slice::from_ref(&chip));
+        told(
+            &findings,
+            "gpio_lines",
+            Ok,
+            "gpiochip0 pinctrl: 2 of 3 lines are held: 0 by \"spi0 CS0\", 2 by \"the kernel\"",
+        );
+        assert_eq!(findings.len(), 1);
+        tree.process(77, &["/usr/bin/gpiomon", "17"], 1000, &[]);
+        tree.link("proc/77/fd/3", "anon_inode:gpio-line");
+        tree.process(78, &["/usr/bin/other"], 1000, &[]);
+        tree.link("proc/78/fd/3", "/dev/null");
+        told(&holders(&tree.machine(), &[]), "gpio_lines", Ok, "programs that hold lines: gpiomon (process 77)");
+        let many = Chip { lines: vec![line(Some("a"), true); 20], ..chip };
+        told(&holders(&tree.machine(), &[many]), "gpio_lines", Ok, "20 of 20 lines are held: 0 by \"a\"");
+    }
+
+    #[test]
+    fn a_pi_tells_of_its_power() {
+        let tree = Tree::new();
+        told(&power(&tree.machine(), None), "power", Ok, "unknown: this is no Raspberry Pi");
+        tree.put("proc/device-tree/model", "Raspberry Pi 3");
+        told(&power(&tree.machine(), None), "power", Warning, "unknown");
+        let file = "sys/devices/platform/soc/soc:firmware/get_throttled";
+        tree.put(file, "0\n");
+        told(&power(&tree.machine(), None), "power", Ok, "were good");
+        tree.put(file, "50001\n");
+        let findings = power(&tree.machine(), None);
+        told(&findings, "power", Error, "the voltage is too low");
+        told(&findings, "power", Warning, "at times the processors are throttled");
+        assert_eq!(findings.len(), 2);
+    }
+
+    /// A program that is this script.
+    fn program(tree: &Tree, script: &str) -> PathBuf {
+        tree.put_mode("vcgencmd", script, 0o755);
+        let path = tree.machine().path("/vcgencmd");
+        // A process that another test forked in the meantime may have it open for writing until it becomes
+        // another program.
+        loop {
+            match Command::new(&path).stdout(Stdio::null()).spawn() {
+                Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy => {
+                    thread::sleep(Duration::from_millis(1))
+                }
+                Ok(mut child) => {
+                    let _ = child.kill();
+                    let _ = child.wait();
+                    return path;
+                }
+                Err(_) => return path,
+            }
+        }
+    }
+
+    #[test]
+    fn a_pi_s_program_is_asked_where_the_kernel_does_not_tell_and_not_waited_for() {
+        let tree = Tree::new();
+        let told_by = |script: &str| power(&tree.machine(), Some(&program(&tree, script)));
+        let good = told_by("#!/bin/sh\necho throttled=0x80000\n");
+        told(&good, "power", Warning, "at times the processors are at their temperature limit");
+        tree.put("proc/device-tree/model", "Raspberry Pi 3");
+        for script in ["#!/bin/sh\nexec sleep 1000\n", "#!/bin/sh\necho nonsense\n", "not a program"] {
+            told(&told_by(script), "power", Warning, "unknown");
+        }
+        told(&power(&tree.machine(), Some(Path::new("/nonexistent"))), "power", Warning, "unknown");
+    }
+}

@@ -1,0 +1,192 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The kernel: whether it is made and set up for real time.
+
+#![forbid(unsafe_code)]
+
+use std::path::Path;
+
+use crate::cli::finding::Finding;
+use crate::cli::run::Settings;
+
+use super::machine::Machine;
+
+pub(super) fn findings(machine: &Machine, settings: &Settings) -> Vec<Finding> {
+    [Some(preempt_rt(machine)), Some(throttle(machine)), Some(isolation(machine, settings)), governor(machine)]
+        .into_iter()
+        .flatten()
+        .collect()
+}
+
+/// Whether a kernel is PREEMPT_RT; none if nothing tells. `root` is that of its /proc and /sys.
+pub(in crate::cli) fn is_preempt_rt(root: &Path) -> Option<bool> {
+    let machine = Machine::at(root);
+    // The patches for older kernels tell it in /sys, the kernel itself (since 6.12) in its version only.
+    if machine.text("/sys/kernel/realtime").is_some_and(|text| text == "1") {
+        return Some(true);
+    }
+    let version = machine.text("/proc/version")?;
+    Some(version.contains("PREEMPT_RT") || version.contains("PREEMPT RT"))
+}
+
+fn preempt_rt(machine: &Machine) -> Finding {
+    const CHECK: &str = "preempt_rt";
+    let release = machine.text("/proc/sys/kernel/osrelease").unwrap_or_else(|| "of unknown version".into());
+    let package = match () {
+        () if release.contains("rpi") => "linux-image-rpi-v8-rt",
+        () if cfg!(target_arch = "x86_64") => "linux-image-rt-amd64",
+        () if cfg!(target_arch = "aarch64") => "linux-image-rt-arm64",
+        () => "linux-image-rt-armmp",
+    };
+    match is_preempt_rt(&machine.path("/")) {
+        Some(true) => Finding::ok(CHECK, format!("kernel {release} is PREEMPT_RT")),
+        Some(false) => Finding::warning(
+            CHECK,
+            format!("kernel {release} is not PREEMPT_RT: steps may be late while other programs work"),
+            format!(
+                "sudo apt install {package}, and reboot; not needed where pinion latency says \"fit for steppers\""
+            ),
+        ),
+        None => Finding::ok(CHECK, "whether the kernel is PREEMPT_RT is unknown: there is no /proc/version"),
+    }
+}
+
+fn throttle(machine: &Machine) -> Finding {
+    const CHECK: &str = "rt_throttling";
+    const REMEDY: &str = "sudo sysctl kernel.sched_rt_runtime_us=950000";
+    let number =
+        |name: &str| -> Option<i64> { machine.text(format!("/proc/sys/kernel/sched_rt_{name}_us"))?.parse().ok() };
+    let (Some(runtime), Some(period)) = (number("runtime"), number("period")) else {
+        return Finding::ok(CHECK, "whether the kernel throttles real time is unknown: it does not tell");
+    };
+    let told = format!("real time may take {runtime} of {period} us");
+    match runtime {
+        -1 => Finding::ok(CHECK, "the kernel does not throttle real time"),
+        0 => Finding::error(CHECK, "the kernel permits no real time: kernel.sched_rt_runtime_us is 0", REMEDY),
+        runtime if runtime < period / 2 => Finding::warning(CHECK, told, REMEDY),
+        _ => Finding::ok(CHECK, format!("{told}: Pinion stays clear of it")),
+    }
+}
+
+fn isolation(machine: &Machine, settings: &Settings) -> Finding {
+    const CHECK: &str = "isolated_cpus";
+    let Some(isolated) = machine.text("/sys/devices/system/cpu/isolated") else {
+        return Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell");
+    };
+    let among = |cpu: usize| {
+        isolated.split(',').any(|range| {
+            let (first, last) = range.split_once('-').unwrap_or((range, range));
+            matches!((first.parse(), last.parse()), (Ok(first), Ok(last)) if (first..=last).contains(&cpu))
+        })
+    };
+    match (isolated.as_str(), settings.cpu) {
+        ("", None) => Finding::ok(CHECK, "no processor is isolated, and Pinion takes any"),
+        ("", Some(cpu)) => Finding::warning(
+            CHECK,
+            format!("Pinion stays on processor {cpu}, which is not isolated: other programs use it, too"),
+            format!("append isolcpus={cpu} to the kernel's command line, and reboot"),
+        ),
+        (isolated, Some(cpu)) if among(cpu) => {
+            Finding::ok(CHECK, format!("Pinion stays on processor {cpu}; isolated: {isolated}"))
+        }
+        (isolated, Some(cpu)) => Finding::warning(
+            CHECK,
+            format!("Pinion stays on processor {cpu}, and others are isolated: {isolated}"),
+            format!("cpu = {} in /etc/pinion/pinion.toml", first(isolated)),
+        ),
+        (isolated, None) => Finding::warning(
+            CHECK,
+            format!("isolated: {isolated}, which nobody uses: Pinion is not told to"),
+            format!("cpu = {} in /etc/pinion/pinion.toml", first(isolated)),
+        ),
+    }
+}
+
+fn first(range: &str) -> &str {
+    range.split([',', '-']).next().unwrap_or(range)
+}
+
+/// None where processors have one frequency only, as in a virtual machine.
+fn governor(machine: &Machine) -> Option<Finding> {
+    const CHECK: &str = "governor";
+    let folders = machine.beginning("/sys/devices/system/cpu", "cpu");
+    let governors =
+        folders.iter().filter_map(|folder| machine.text(machine.name(&folder.join("cpufreq/scaling_governor"))));
+    let mut governors: Vec<String> = governors.collect();
+    governors.sort();
+    governors.dedup();
+    let slow: Vec<&str> = governors.iter().map(String::as_str).filter(|name| *name != "performance").collect();
+    match (governors.is_empty(), slow.is_empty()) {
+        (true, _) => None,
+        (_, true) => Some(Finding::ok(CHECK, "the processors' frequency governor is performance")),
+        _ => Some(Finding::warning(
+            CHECK,
+            format!("the processors' frequency governor is {}: changes of the frequency take time", slow.join(", ")),
+            "echo performance | sudo tee /sys/devices/system/cpu/cpu*/cpufreq/scaling_governor",
+        )),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{Tree, told};
+    use super::*;
+    use crate::cli::finding::Level::{Error, Ok, Warning};
+    use crate::cli::run::Given;
+
+    fn found(tree: &Tree, cpu: Option<usize>) -> Vec<Finding> {
+        findings(&tree.machine(), &Given { cpu, ..Given::default() }.settings())
+    }
+
+    #[test]
+    fn a_kernel_that_is_set_up_for_real_time() {
+        let tree = Tree::new();
+        tree.put("proc/version", "Linux version 6.12.0-rt-amd64 #1 SMP PREEMPT_RT Debian\n");
+        tree.put("proc/sys/kernel/osrelease", "6.12.0-rt-amd64\n");
+        tree.put("proc/sys/kernel/sched_rt_runtime_us", "950000\n");
+        tree.put("proc/sys/kernel/sched_rt_period_us", "1000000\n");
+        tree.put("sys/devices/system/cpu/isolated", "1,3-5\n");
+        tree.put("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance\n");
+        let findings = found(&tree, Some(4));
+        assert!(findings.len() == 4 && findings.iter().all(|finding| finding.status == Ok), "{findings:?}");
+        tree.put("proc/version", "Linux version 5.15.0 #1 SMP PREEMPT RT\n");
+        told(&found(&tree, Some(4)), "preempt_rt", Ok, "is PREEMPT_RT");
+        tree.put("proc/version", "Linux\n");
+        tree.put("sys/kernel/realtime", "1\n");
+        told(&found(&tree, Some(4)), "preempt_rt", Ok, "is PREEMPT_RT");
+        tree.put("proc/sys/kernel/sched_rt_runtime_us", "-1\n");
+        told(&found(&tree, Some(4)), "rt_throttling", Ok, "does not throttle");
+    }
+
+    #[test]
+    fn a_kernel_that_is_not() {
+        let tree = Tree::new();
+        tree.put("proc/version", "Linux version 6.1.0 #1 SMP PREEMPT_DYNAMIC\n");
+        tree.put("proc/sys/kernel/osrelease", "6.1.0-rpi4-rpi-v8\n");
+        tree.put("proc/sys/kernel/sched_rt_runtime_us", "0\n");
+        tree.put("proc/sys/kernel/sched_rt_period_us", "1000000\n");
+        tree.put("sys/devices/system/cpu/isolated", "3\n");
+        tree.put("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "ondemand\n");
+        tree.put("sys/devices/system/cpu/cpu1/cpufreq/scaling_governor", "performance\n");
+        let findings = found(&tree, None);
+        let rt = told(&findings, "preempt_rt", Warning, "6.1.0-rpi4-rpi-v8 is not PREEMPT_RT");
+        assert!(rt.starts_with("sudo apt install linux-image-rpi-v8-rt"), "{rt}");
+        told(&findings, "rt_throttling", Error, "no real time");
+        assert_eq!(told(&findings, "isolated_cpus", Warning, "nobody uses"), "cpu = 3 in /etc/pinion/pinion.toml");
+        told(&findings, "governor", Warning, "is ondemand:");
+        tree.put("proc/sys/kernel/sched_rt_runtime_us", "100000\n");
+        told(&found(&tree, Some(2)), "rt_throttling", Warning, "100000 of 1000000");
+        told(&found(&tree, Some(2)), "isolated_cpus", Warning, "and others are isolated: 3");
+        tree.put("sys/devices/system/cpu/isolated", "\n");
+        assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
+    }
+
+    #[test]
+    fn what_the_kernel_does_not_tell_is_unknown() {
+        let findings = found(&Tree::new(), None);
+        assert_eq!(findings.len(), 3);
+        assert!(
+            findings.iter().all(|finding| finding.status == Ok && finding.found.contains("unknown")),
+            "{findings:?}"
+        );
+    }
+}

@@ -1,0 +1,230 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The machine that is looked at: its files below a root, its users, its processes.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io::{self, Read};
+use std::os::unix::fs::MetadataExt;
+use std::path::{Path, PathBuf};
+
+use nix::unistd::{User, getegid, geteuid, getgroups};
+
+use crate::cli::run::Settings;
+use crate::cli::{config, run_args};
+use crate::klippy::process::{self, Process};
+
+/// Nothing that is read here is as long.
+const TEXT_MAX: u64 = 4 << 20;
+/// As many links as the kernel follows (path_resolution(7)).
+const LINKS_MAX: usize = 40;
+
+/// What the program looks at.
+pub(super) struct Machine {
+    root: PathBuf,
+}
+
+/// A user, with all groups.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) struct Who {
+    pub(super) name: String,
+    pub(super) uid: u32,
+    pub(super) gids: Vec<u32>,
+}
+
+/// Access to a file, as bits of its mode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Access(u32);
+
+impl Access {
+    pub(super) const READ: Access = Access(4);
+    pub(super) const WRITE: Access = Access(2);
+    pub(super) const READ_WRITE: Access = Access(6);
+    pub(super) const SEARCH: Access = Access(1);
+
+    /// Whether a file gives this to its group.
+    pub(super) fn is_given_to_group(self, file: &fs::Metadata) -> bool {
+        file.mode() >> 3 & self.0 == self.0
+    }
+}
+
+impl Who {
+    /// Whether the file's owner and mode let this user in (path_resolution(7)).
+    pub(super) fn may(&self, access: Access, file: &fs::Metadata) -> bool {
+        let bits = match () {
+            () if self.uid == 0 => return true,
+            () if file.uid() == self.uid => file.mode() >> 6,
+            () if self.gids.contains(&file.gid()) => file.mode() >> 3,
+            () => file.mode(),
+        };
+        bits & access.0 == access.0
+    }
+}
+
+/// A process of Pinion's that serves hosts.
+pub(super) struct Running {
+    pub(super) pid: u32,
+    /// What it runs by, as far as its command line and its configuration file can be read.
+    pub(super) settings: Option<Settings>,
+}
+
+impl Machine {
+    pub(super) fn at(root: &Path) -> Machine {
+        Machine { root: root.to_owned() }
+    }
+
+    /// Whether it is this one, of which the kernel can be asked more than files tell.
+    pub(super) fn is_this(&self) -> bool {
+        self.root == Path::new("/")
+    }
+
+    /// Where a file of the machine is.
+    pub(super) fn path(&self, path: impl AsRef<Path>) -> PathBuf {
+        let path = path.as_ref();
+        self.root.join(path.strip_prefix("/").unwrap_or(path))
+    }
+
+    /// How the machine itself calls a file.
+    pub(super) fn name(&self, path: &Path) -> PathBuf {
+        Path::new("/").join(path.strip_prefix(&self.root).unwrap_or(path))
+    }
+
+    /// A file's text without the white space around it. None if there is none or it can not be read, or if
+    /// it is no file, as reading a pipe would wait.
+    pub(super) fn text(&self, path: impl AsRef<Path>) -> Option<String> {
+        let path = self.path(path);
+        let file = fs::metadata(&path).is_ok_and(|about| about.is_file()).then(|| fs::File::open(&path))?.ok()?;
+        let mut bytes = Vec::new();
+        file.take(TEXT_MAX).read_to_end(&mut bytes).ok()?;
+        Some(String::from_utf8_lossy(&bytes).trim().to_owned())
+    }
+
+    /// The names in a folder, in order; none if there is no such folder.
+    pub(super) fn names(&self, folder: impl AsRef<Path>) -> Vec<String> {
+        let entries = fs::read_dir(self.path(folder)).into_iter().flatten().flatten();
+        let mut names: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+        names.sort();
+        names
+    }
+
+    /// The paths in a folder whose names begin so.
+    pub(super) fn beginning(&self, folder: &str, beginning: &str) -> Vec<PathBuf> {
+        let names = self.names(folder).into_iter().filter(|name| name.starts_with(beginning));
+        names.map(|name| self.path(folder).join(name)).collect()
+    }
+
+    /// The first of these files that is there.
+    pub(super) fn first<'a>(&self, paths: &[&'a str]) -> Option<&'a str> {
+        paths.iter().find(|path| self.path(path).exists()).copied()
+    }
+
+    /// Follows symbolic links as the machine itself would: all paths on the way, the last of which is no
+    /// link.
+    pub(super) fn follow(&self, path: &Path) -> io::Result<Vec<PathBuf>> {
+        let mut way = vec![self.path(path)];
+        for _ in 0..LINKS_MAX {
+            let last = &way[way.len() - 1];
+            if !fs::symlink_metadata(last)?.file_type().is_symlink() {
+                return Ok(way);
+            }
+            let target = fs::read_link(last)?;
+            let next = match target.is_absolute() {
+                true => self.path(target),
+                false => last.parent().unwrap_or(&self.root).join(target),
+            };
+            way.push(next);
+        }
+        Err(io::Error::from_raw_os_error(libc::ELOOP))
+    }
+
+    /// A user by name, from the machine's files.
+    pub(super) fn user(&self, name: &str) -> Option<Who> {
+        let passwd = self.text("/etc/passwd")?;
+        let fields: Vec<&str> =
+            passwd.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|fields| fields[0] == name)?;
+        let (uid, gid) = (fields.get(2)?.parse().ok()?, fields.get(3)?.parse().ok()?);
+        let groups = self.text("/etc/group").unwrap_or_default();
+        let member = |line: &str| {
+            let mut fields = line.split(':').skip(2);
+            let gid = fields.next()?.parse().ok()?;
+            fields.next()?.split(',').any(|member| member == name).then_some(gid)
+        };
+        let gids = std::iter::once(gid).chain(groups.lines().filter_map(member)).collect();
+        Some(Who { name: name.to_owned(), uid, gids })
+    }
+
+    /// The user of a process, with the groups that it has, which are those of the time when it was
+    /// started.
+    pub(super) fn user_of(&self, pid: u32) -> Option<Who> {
+        let status = self.text(format!("/proc/{pid}/status"))?;
+        let numbers = |field: &str| -> Vec<u32> {
+            let line = status.lines().find_map(|line| line.strip_prefix(field)).unwrap_or_default();
+            line.split_whitespace().filter_map(|number| number.parse().ok()).collect()
+        };
+        let uid = *numbers("Uid:").get(1)?;
+        let gids = numbers("Gid:").get(1).copied().into_iter().chain(numbers("Groups:")).collect();
+        Some(Who { name: self.user_name(uid), uid, gids })
+    }
+
+    fn user_name(&self, uid: u32) -> String {
+        self.name_of("/etc/passwd", uid)
+    }
+
+    pub(super) fn group_name(&self, gid: u32) -> String {
+        self.name_of("/etc/group", gid)
+    }
+
+    /// The name that a number has in /etc/passwd or /etc/group; the number if it has none.
+    fn name_of(&self, file: &str, number: u32) -> String {
+        let text = self.text(file).unwrap_or_default();
+        let has = |line: &&str| line.split(':').nth(2) == Some(&number.to_string());
+        let name = text.lines().find(has).and_then(|line| line.split(':').next());
+        name.map_or_else(|| number.to_string(), str::to_owned)
+    }
+
+    /// How a file's owner, group and mode are written: `root:gpio 0660`.
+    pub(super) fn ownership(&self, file: &fs::Metadata) -> String {
+        let (user, group) = (self.user_name(file.uid()), self.group_name(file.gid()));
+        format!("{user}:{group} {:04o}", file.mode() & 0o7777)
+    }
+
+    /// The processes, in the order in which they were started.
+    pub(super) fn processes(&self) -> Vec<Process> {
+        let mut processes = process::all(&self.path("/proc")).unwrap_or_default();
+        processes.sort_by_key(|process| (process.started, process.pid));
+        processes
+    }
+
+    /// The Pinion that runs; of it and its guardian the former, which was there first.
+    pub(super) fn running(&self) -> Option<Running> {
+        self.processes().into_iter().find_map(|process| {
+            let program = process.arguments.first()?;
+            if program.file_name()? != "pinion" {
+                return None;
+            }
+            let arguments = process.arguments.iter().map(|argument| argument.clone().into_os_string());
+            let args = match run_args(arguments) {
+                Ok(args) => args?,
+                // Another version of Pinion.
+                Err(_) => return Some(Running { pid: process.pid, settings: None }),
+            };
+            let (given, file) = args.into_parts();
+            let file = file.map_or_else(|| Ok(Default::default()), |file| config::load(&self.path(file)));
+            let settings = file.ok().map(|file| given.or(file).settings());
+            Some(Running { pid: process.pid, settings })
+        })
+    }
+
+    /// Whose permissions are looked at: the service's user for root, else the caller. None if root looks
+    /// and there is no such user.
+    pub(super) fn service_user(&self) -> Option<Who> {
+        if geteuid().is_root() || !self.is_this() {
+            return self.user("pinion");
+        }
+        let uid = geteuid();
+        let name = User::from_uid(uid).ok().flatten().map_or_else(|| uid.to_string(), |user| user.name);
+        let groups = getgroups().unwrap_or_default();
+        let gids = std::iter::once(getegid()).chain(groups).map(nix::unistd::Gid::as_raw).collect();
+        Some(Who { name, uid: uid.as_raw(), gids })
+    }
+}

@@ -1,0 +1,223 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion doctor`: what works and what does not, and what mends it.
+//!
+//! Each check reads files below a root, so that a test can make them, and says what it found; what can
+//! not be known it calls unknown. Nothing is changed.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use clap::Args;
+
+use crate::board::linux::Inventory;
+
+use super::finding::{self, Finding, Group};
+use super::latency::{self, Fitness, Verdict};
+use super::{failed, quietly};
+
+mod devices;
+mod host;
+mod kernel;
+mod klipper;
+mod machine;
+mod service;
+
+pub(super) use kernel::is_preempt_rt;
+use machine::Machine;
+
+/// Options of `pinion doctor`.
+#[derive(Args, Clone, Debug)]
+pub(super) struct DoctorArgs {
+    /// Look at a checkout of Klipper or Kalico as well: whether this Pinion serves that host, before you
+    /// restart it
+    #[arg(long, value_name = "DIR")]
+    klipper: Option<PathBuf>,
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Look at the system whose files are below DIR, such as a card's that is mounted there
+    #[arg(long, value_name = "DIR", default_value = "/")]
+    root: PathBuf,
+}
+
+/// Prints what was found; fails if something does not work.
+pub(super) fn run(args: &DoctorArgs) -> ExitCode {
+    let checkout = match args.klipper.as_deref().map(klipper::read).transpose() {
+        Ok(checkout) => checkout,
+        Err(error) => return failed(error),
+    };
+    let mut groups = quietly(|| examine(&Machine::at(&args.root)));
+    if let Some(checkout) = &checkout {
+        groups.push(Group::new("checkout", vec![klipper::finding(checkout)]));
+    }
+    if args.json {
+        return finding::finish(&finding::json(&groups), &groups);
+    }
+    let report = checkout.as_ref().map_or(String::new(), |checkout| klipper::report(checkout) + "\n");
+    finding::finish(&(report + &finding::text(&groups)), &groups)
+}
+
+fn examine(machine: &Machine) -> Vec<Group> {
+    let running = machine.running();
+    let running = running.as_ref();
+    let (settings, configuration) = service::settings(machine, running);
+    let klippy = host::klippy(machine);
+    let klippy = klippy.as_ref();
+    let mut groups = vec![
+        Group::new("kernel", kernel::findings(machine, &settings)),
+        Group::new("service", [configuration, service::findings(machine, running)].concat()),
+        Group::new("watchdog", service::watchdog(machine, &settings)),
+        Group::new("terminal", host::terminal(machine, &settings, running, klippy)),
+        Group::new("host", host::dialect(machine, &settings, klippy)),
+        Group::new("pins and buses", devices::presence(machine)),
+        Group::new(
+            "permissions",
+            match machine.service_user() {
+                Some(user) => devices::permissions(machine, &settings, &user),
+                None => vec![Finding::warning(
+                    "user",
+                    "there is no user pinion: the service is not installed, and what it may open is unknown",
+                    "sudo apt install pinion-mcu, or sudo make install",
+                )],
+            },
+        ),
+        Group::new("power", devices::power(machine, machine.is_this().then_some(Path::new("/usr/bin/vcgencmd")))),
+    ];
+    if machine.is_this() {
+        groups.insert(6, Group::new("lines", devices::holders(machine, &Inventory::scan().chips)));
+        groups.push(Group::new("latency", vec![latency(latency::sample(running.is_some()))]));
+    }
+    groups
+}
+
+/// A sample of two seconds proves nothing: what it shows is no error.
+fn latency(sample: Result<Verdict, String>) -> Finding {
+    const CHECK: &str = "latency";
+    match sample {
+        Err(error) => Finding::warning(CHECK, format!("the latency is unknown: {error}"), "pinion latency"),
+        Ok(Verdict { fitness, why, remedy }) => {
+            let found = format!("{fitness}: {why} (in two seconds; pinion latency measures for longer)");
+            match (fitness, remedy) {
+                (Fitness::Steppers, None) => Finding::ok(CHECK, found),
+                (_, remedy) => Finding::warning(CHECK, found, remedy.unwrap_or_else(|| "pinion latency".into())),
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::finding::Level;
+    use super::*;
+    use std::fs;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+    use tempfile::TempDir;
+
+    /// A machine that a test has made of files.
+    pub(super) struct Tree(TempDir);
+
+    impl Tree {
+        pub(super) fn new() -> Tree {
+            Tree(tempfile::tempdir().unwrap())
+        }
+
+        pub(super) fn machine(&self) -> Machine {
+            Machine::at(self.0.path())
+        }
+
+        pub(super) fn put(&self, path: &str, text: &str) {
+            let path = self.0.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+
+        pub(super) fn mode(&self, path: &str, mode: u32) {
+            fs::set_permissions(self.0.path().join(path), fs::Permissions::from_mode(mode)).unwrap();
+        }
+
+        pub(super) fn put_mode(&self, path: &str, text: &str, mode: u32) {
+            self.put(path, text);
+            self.mode(path, mode);
+        }
+
+        pub(super) fn link(&self, path: &str, target: &str) {
+            let path = self.0.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            symlink(target, path).unwrap();
+        }
+
+        /// A process of a user with these further groups.
+        pub(super) fn process(&self, pid: u32, arguments: &[&str], uid: u32, gids: &[u32]) {
+            let gids: Vec<String> = gids.iter().map(u32::to_string).collect();
+            self.put(&format!("proc/{pid}/cmdline"), &(arguments.join("\0") + "\0"));
+            self.put(&format!("proc/{pid}/stat"), &format!("{pid} (x) S {} 0", vec!["1"; 20].join(" ")));
+            let ids = [uid; 4].map(|uid| uid.to_string()).join("\t");
+            let status = format!("Name:\tx\nUid:\t{ids}\nGid:\t{ids}\nGroups:\t{}\n", gids.join(" "));
+            self.put(&format!("proc/{pid}/status"), &status);
+        }
+    }
+
+    /// Asserts that a check has found something with these words, and returns what mends it.
+    #[track_caller]
+    pub(super) fn told(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
+        let is_it =
+            |finding: &&Finding| finding.check == check && finding.status == status && finding.found.contains(words);
+        let found = findings.iter().find(is_it);
+        assert!(found.is_some(), "no {status:?} of {check} with \"{words}\" in {findings:#?}");
+        found.and_then(|finding| finding.remedy.clone()).unwrap_or_default()
+    }
+
+    #[test]
+    fn of_a_machine_of_which_nothing_is_known_nothing_is_wrong() {
+        let tree = Tree::new();
+        let groups = examine(&tree.machine());
+        let errors: Vec<&Finding> =
+            groups.iter().flat_map(|group| &group.findings).filter(|finding| finding.status == Level::Error).collect();
+        assert!(errors.is_empty(), "{errors:?}");
+        assert!(groups.iter().all(|group| !group.findings.is_empty()), "{groups:?}");
+    }
+
+    #[test]
+    fn files_that_are_something_else_are_no_reason_to_hang_or_panic() {
+        let tree = Tree::new();
+        let text = "\0\u{fffd} 99999999999999999999 : = [ ) (";
+        for path in [
+            "proc/version",
+            "proc/1/cmdline",
+            "proc/1/stat",
+            "proc/1/status",
+            "proc/sys/kernel/sched_rt_runtime_us",
+            "proc/sys/kernel/sched_rt_period_us",
+            "sys/devices/system/cpu/isolated",
+            "sys/devices/system/cpu/cpu0/cpufreq/scaling_governor",
+            "etc/passwd",
+            "etc/group",
+            "etc/default/pinion-mcu",
+            "etc/systemd/system/klipper.service",
+            "boot/config.txt",
+            "proc/device-tree/model",
+        ] {
+            tree.put(path, text);
+        }
+        examine(&tree.machine());
+        // A pipe that nobody writes to, and a folder in a file's place.
+        let pipe = tree.machine().path("/sys/kernel/realtime");
+        fs::create_dir_all(pipe.parent().unwrap()).unwrap();
+        nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        fs::create_dir_all(tree.machine().path("/etc/pinion/pinion.toml")).unwrap();
+        examine(&tree.machine());
+    }
+
+    #[test]
+    fn a_sample_is_no_error() {
+        let verdict = |fitness, remedy: Option<&str>| {
+            latency(Ok(Verdict { fitness, why: "x".into(), remedy: remedy.map(str::to_owned) }))
+        };
+        assert_eq!(verdict(Fitness::Steppers, None).status, Level::Ok);
+        assert_eq!(verdict(Fitness::Steppers, Some("run it as root")).status, Level::Warning);
+        assert_eq!(verdict(Fitness::Nothing, Some("isolate")).remedy.as_deref(), Some("isolate"));
+        assert_eq!(latency(Err("no thread".into())).status, Level::Warning);
+    }
+}

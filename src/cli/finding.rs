@@ -1,0 +1,170 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What `pinion doctor` and `pinion run --check` say: one finding after the other, each fine or not,
+//! with what mends it.
+
+#![forbid(unsafe_code)]
+
+use std::fmt::Write as _;
+use std::process::ExitCode;
+
+use serde::Serialize;
+use serde_json::json;
+
+use super::{failed, print};
+
+/// How grave a finding is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub(super) enum Level {
+    /// Nothing needs to be mended.
+    Ok,
+    /// Something works worse than it could, or may not work, or is not known.
+    Warning,
+    /// Something does not work.
+    Error,
+}
+
+impl Level {
+    fn name(self) -> &'static str {
+        match self {
+            Level::Ok => "ok",
+            Level::Warning => "warning",
+            Level::Error => "error",
+        }
+    }
+}
+
+/// What was found.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub(super) struct Finding {
+    /// What was looked at, in one word that stays the same from version to version.
+    pub(super) check: &'static str,
+    pub(super) status: Level,
+    /// In a sentence.
+    pub(super) found: String,
+    /// The command that mends it, or what else to do.
+    pub(super) remedy: Option<String>,
+}
+
+impl Finding {
+    /// It is as it should be.
+    pub(super) fn ok(check: &'static str, found: impl Into<String>) -> Finding {
+        Finding { check, status: Level::Ok, found: found.into(), remedy: None }
+    }
+
+    /// It may be a reason why something does not work well.
+    pub(super) fn warning(check: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Finding {
+        Finding { check, status: Level::Warning, found: found.into(), remedy: Some(remedy.into()) }
+    }
+
+    /// It is why something does not work.
+    pub(super) fn error(check: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Finding {
+        Finding { status: Level::Error, ..Finding::warning(check, found, remedy) }
+    }
+
+    /// The same with a remedy, for something that is fine but may be wanted otherwise.
+    pub(super) fn or(self, remedy: impl Into<String>) -> Finding {
+        Finding { remedy: Some(remedy.into()), ..self }
+    }
+}
+
+/// Findings under a heading.
+#[derive(Clone, Debug, Serialize)]
+pub(super) struct Group {
+    pub(super) name: &'static str,
+    pub(super) findings: Vec<Finding>,
+}
+
+impl Group {
+    pub(super) fn new(name: &'static str, findings: Vec<Finding>) -> Group {
+        Group { name, findings }
+    }
+}
+
+/// For people: a line for each finding, and below it what mends it.
+pub(super) fn text(groups: &[Group]) -> String {
+    let mut text = String::new();
+    for Group { name, findings } in groups.iter().filter(|group| !group.findings.is_empty()) {
+        // Writing to a String does not fail.
+        let _ = writeln!(text, "{name}");
+        for Finding { status, found, remedy, .. } in findings {
+            let _ = writeln!(text, "  {:<8} {found}", status.name());
+            if let Some(remedy) = remedy {
+                let _ = writeln!(text, "           -> {remedy}");
+            }
+        }
+    }
+    let [warnings, errors] = [Level::Warning, Level::Error].map(|level| count(groups, level));
+    let _ = writeln!(text, "{errors} error{}, {warnings} warning{}", plural(errors), plural(warnings));
+    text
+}
+
+/// For programs.
+pub(super) fn json(groups: &[Group]) -> String {
+    let [warnings, errors] = [Level::Warning, Level::Error].map(|level| count(groups, level));
+    format!("{:#}\n", json!({ "groups": groups, "errors": errors, "warnings": warnings }))
+}
+
+/// The program's exit status: 1 if anything does not work.
+pub(super) fn status(groups: &[Group]) -> ExitCode {
+    if count(groups, Level::Error) == 0 { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+}
+
+/// Prints a report, and returns the program's exit status.
+pub(super) fn finish(text: &str, groups: &[Group]) -> ExitCode {
+    print(text).map_or_else(failed, |()| status(groups))
+}
+
+fn count(groups: &[Group], level: Level) -> usize {
+    groups.iter().flat_map(|group| &group.findings).filter(|finding| finding.status == level).count()
+}
+
+fn plural(count: usize) -> &'static str {
+    if count == 1 { "" } else { "s" }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn groups() -> Vec<Group> {
+        vec![
+            Group::new(
+                "kernel",
+                vec![
+                    Finding::ok("preempt_rt", "it is PREEMPT_RT"),
+                    Finding::warning("governor", "it is ondemand", "cpupower frequency-set -g performance"),
+                ],
+            ),
+            Group::new("nothing", vec![]),
+            Group::new("pty", vec![Finding::error("link", "there is none", "start it")]),
+        ]
+    }
+
+    #[test]
+    fn people_get_lines_and_remedies() {
+        assert_eq!(
+            text(&groups()),
+            "\
+kernel
+  ok       it is PREEMPT_RT
+  warning  it is ondemand
+           -> cpupower frequency-set -g performance
+pty
+  error    there is none
+           -> start it
+1 error, 1 warning
+"
+        );
+    }
+
+    #[test]
+    fn programs_get_the_same() {
+        let value: serde_json::Value = serde_json::from_str(&json(&groups())).unwrap();
+        assert_eq!(value["errors"], 1);
+        assert_eq!(value["groups"][0]["name"], "kernel");
+        let finding = &value["groups"][0]["findings"][1];
+        assert_eq!((&finding["check"], &finding["status"]), (&json!("governor"), &json!("warning")));
+        assert!(value["groups"][0]["findings"][0]["remedy"].is_null());
+    }
+}
