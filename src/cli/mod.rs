@@ -17,6 +17,7 @@ pub mod pins;
 pub mod run;
 mod show;
 pub mod sim;
+mod status;
 
 /// A Klipper micro-controller made of a Linux process.
 ///
@@ -53,6 +54,8 @@ enum Command {
     Latency(latency::LatencyArgs),
     /// Say whether this Pinion serves a host, before the host is restarted
     Doctor(doctor::DoctorArgs),
+    /// Ask a running Pinion for its state, host, pins, queues and lateness
+    Status(status::StatusArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
 }
@@ -68,6 +71,7 @@ pub fn main() -> ExitCode {
         Some(Command::Dict(args)) => dict::run(&args),
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Doctor(args)) => doctor::run(&args),
+        Some(Command::Status(args)) => status::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
     };
     logging::finish();

@@ -55,6 +55,9 @@ pub(super) struct RunArgs {
     /// or union (of the last three, as far as they agree)
     #[arg(long, value_name = "NAME", default_value = "auto")]
     dialect: Spoken,
+    /// Where to put the socket for `pinion status` [default: named for the link, in /run/pinion or beside it]
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
 }
 
 fn mode(text: &str) -> Result<u32, String> {
@@ -134,6 +137,7 @@ impl RunArgs {
             cpu: self.cpu,
             margin: MarginLimits::up_to_us(self.margin),
             watchdog: self.watchdog.then(|| WATCHDOG.into()),
+            sockets: self.socket.clone().map_or_else(|| runtime::socket_paths(&self.symlink), |path| vec![path]),
         }
     }
 }
