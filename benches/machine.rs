@@ -19,7 +19,7 @@ use pinion::board::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
 use pinion::feature::FEATURES;
-use pinion::mcu::{Dialect, DialectName, Generation, MOVE_COUNT};
+use pinion::mcu::{Dialect, DialectName, Generation, MOVE_COUNT, Snapshot};
 use pinion::shutdown::Shutdown;
 use pinion::wire::block::PAYLOAD_MAX;
 use rig::Rig;
@@ -175,6 +175,54 @@ fn steps(c: &mut Criterion) {
     group.finish();
 }
 
+/// What it costs the core to tell its status: a whole snapshot, and what steps lose by one that is asked for a
+/// hundred times a second of their time. The two are measured in turns, so that their ratio holds on a busy computer,
+/// too.
+fn status(c: &mut Criterion) {
+    let mut rig = machine(8, -1);
+    let mut snapshot = Snapshot::default();
+    c.bench_function("status, eight steppers", |b| {
+        b.iter(|| {
+            snapshot.clear();
+            while !rig.mcu.tell(black_box(&mut snapshot)) {}
+        })
+    });
+    const ROUNDS: u32 = 200;
+    let mut spent = [Vec::new(), Vec::new()];
+    for round in 0..2 * ROUNDS {
+        let asked = round % 2 == 1;
+        let now = rig.now();
+        for oid in 0..8 {
+            rig.send(&format!("reset_step_clock oid={oid} clock=@{now}"));
+            // 50,000 steps a second, for 20 ms.
+            rig.send(&format!("queue_step oid={oid} interval={} count=1000 add=0", 1000 + oid));
+        }
+        let begin = Instant::now();
+        for edge in 0..8000 {
+            if asked && edge % 4000 == 0 {
+                snapshot.clear();
+                while !rig.mcu.tell(black_box(&mut snapshot)) {}
+            }
+            rig.mcu.run_timers();
+            if let Some(next) = rig.mcu.next_timer() {
+                rig.jump(next);
+            }
+        }
+        spent[usize::from(asked)].push(begin.elapsed());
+        rig.run_until(now + 100_000_000);
+        rig.forget_responses();
+    }
+    let [without, with] = spent.map(|mut rounds| {
+        rounds.sort();
+        rounds[rounds.len() / 2].as_nanos() as f64 / 8000.0
+    });
+    println!(
+        "a step edge: {without:.1} ns; with a status 100 times a second: {with:.1} ns, {:.3} times as long",
+        with / without
+    );
+    assert!(!rig.mcu.is_shutdown());
+}
+
 /// The numbering of all messages, and their publication as compressed JSON.
 fn dictionary(c: &mut Criterion) {
     let board = FakeBoard(Rig::new().bench);
@@ -183,5 +231,5 @@ fn dictionary(c: &mut Criterion) {
     });
 }
 
-criterion_group!(benches, commands, steps, dictionary);
+criterion_group!(benches, commands, steps, status, dictionary);
 criterion_main!(benches);

@@ -14,6 +14,7 @@ use std::cell::Cell;
 
 use bench::ANALOG;
 use pinion::mcu::Generation::{Kalico, V0_12};
+use pinion::mcu::Snapshot;
 use rig::Rig;
 
 /// The system's allocator, which counts for the thread that asks it to.
@@ -203,6 +204,41 @@ fn a_print_allocates_nothing_once_configured() {
         assert_eq!(print.rig.notes().len(), 1, "configured, and nothing else");
         assert_eq!(print.counted, 0);
     }
+}
+
+/// Whoever asks for the status brings the room for the answer.
+#[test]
+fn a_status_that_is_told_amid_steps_allocates_nothing() {
+    let mut rig = Rig::new();
+    rig.bench.script_ds18b20("28", &[Some(20_000)]);
+    rig.bench.state().counted.insert(13);
+    rig.configure(OBJECTS);
+    let mut print = Print { rig, counted: 0 };
+    let mut snapshot = Snapshot::default();
+    for at in (0..20u64).map(|n| 40_000_000 + 200_000 * n) {
+        print.send(&format!("reset_step_clock oid=0 clock=@{at}"));
+        print.send("queue_step oid=0 interval=10000 count=9 add=0");
+        print.send("queue_step oid=0 interval=10000 count=1 add=0");
+        print.run_until(at + 50_000);
+        snapshot.clear();
+        let mut parts = 1;
+        print.counted += allocations(|| {
+            while !print.rig.mcu.tell(&mut snapshot) {
+                parts += 1;
+            }
+        });
+        // The head, and 16 lines or objects at a time.
+        assert!(parts > 2 && snapshot.lines.len() > 10 && snapshot.objects.len() > 15);
+        let stepper = snapshot.objects[0].report;
+        assert_eq!((snapshot.moves.0, stepper.queued), (1, 1), "it steps");
+        print.run_until(at + 150_000);
+    }
+    // One that says why the machine is stopped.
+    print.rig.send("emergency_stop");
+    snapshot.clear();
+    print.counted += allocations(|| while !print.rig.mcu.tell(&mut snapshot) {});
+    assert!(snapshot.detail.starts_with("the host asked for it") && snapshot.stopped.is_some());
+    assert_eq!(print.counted, 0);
 }
 
 /// A probe by each kind of sensor, whose lines and chips are left to answer what they will.

@@ -267,11 +267,17 @@ pub trait BusDevice: Send {
         let mut tries = 1;
         loop {
             match self.write_read(register, read) {
-                Err(error) if error.status != BusStatus::Timeout && tries < READ_TRIES => tries += 1,
+                Err(error) if error.status != BusStatus::Timeout && tries < READ_TRIES => {
+                    tries += 1;
+                    self.tries_again();
+                }
                 done => return done,
             }
         }
     }
+
+    /// A transfer that failed is about to be tried again: for whoever counts that.
+    fn tries_again(&mut self) {}
 }
 
 impl BusError {

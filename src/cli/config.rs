@@ -26,7 +26,7 @@ struct Key {
 }
 
 /// Every option of `pinion run`, in the order of its `--help`.
-const KEYS: [Key; 10] = [
+const KEYS: [Key; 11] = [
     Key {
         name: "symlink",
         example: "\"/tmp/klipper_host_mcu\"",
@@ -51,6 +51,11 @@ const KEYS: [Key; 10] = [
     Key { name: "group", example: "\"tty\"", set: |given, value| put(&mut given.group, text(value)?.to_owned()) },
     Key { name: "board", example: "\"linux\"", set: |given, value| put(&mut given.board, word(value)?) },
     Key { name: "dialect", example: "\"auto\"", set: |given, value| put(&mut given.dialect, word(value)?) },
+    Key {
+        name: "socket",
+        example: "\"/run/pinion/mcu.sock\"",
+        set: |given, value| put(&mut given.socket, text(value)?.into()),
+    },
     Key {
         name: "log_level",
         example: "\"info\"",
@@ -197,6 +202,7 @@ mod tests {
         // The service's own.
         assert_eq!(given.realtime.take(), Some(true));
         assert_eq!(given.symlink.take().unwrap(), Path::new("/run/pinion/klipper_host_mcu"));
+        assert_eq!(given.socket.take().unwrap(), Path::new("/run/pinion/mcu.sock"));
         assert_eq!(given.log_level.take(), Some(log::LevelFilter::Info));
         assert_eq!(format!("{:?}", given.settings()), format!("{:?}", Given::default().settings()));
     }

@@ -21,6 +21,7 @@ pub mod pins;
 pub mod run;
 mod show;
 pub mod sim;
+mod status;
 
 /// A Klipper micro-controller made of a Linux process.
 ///
@@ -57,6 +58,8 @@ enum Command {
     Latency(latency::LatencyArgs),
     /// Say what works on this machine and what does not, and what mends it
     Doctor(doctor::DoctorArgs),
+    /// Ask a running Pinion for its state, host, pins, queues and lateness
+    Status(status::StatusArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
 }
@@ -72,6 +75,7 @@ pub fn main() -> ExitCode {
         Some(Command::Dict(args)) => dict::run(&args),
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Doctor(args)) => doctor::run(&args),
+        Some(Command::Status(args)) => status::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
     };
     logging::finish();

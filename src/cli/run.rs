@@ -73,6 +73,9 @@ pub(super) struct Given {
     /// or union (of the last three, as far as they agree) [default: auto]
     #[arg(long, value_name = "NAME")]
     pub(super) dialect: Option<Spoken>,
+    /// Where to put the socket for `pinion status` [default: named for the link, in /run/pinion or beside it]
+    #[arg(long, value_name = "PATH")]
+    pub(super) socket: Option<PathBuf>,
     /// The command line's is an option of all subcommands.
     #[arg(skip)]
     pub(super) log_level: Option<LevelFilter>,
@@ -89,6 +92,7 @@ pub(super) struct Settings {
     pub(super) access: Access,
     pub(super) board: BoardName,
     pub(super) dialect: Option<DialectName>,
+    pub(super) socket: Option<PathBuf>,
     pub(super) log_level: LevelFilter,
 }
 
@@ -105,6 +109,7 @@ impl Given {
             group: self.group.or(other.group),
             board: self.board.or(other.board),
             dialect: self.dialect.or(other.dialect),
+            socket: self.socket.or(other.socket),
             log_level: self.log_level.or(other.log_level),
         }
     }
@@ -120,6 +125,7 @@ impl Given {
             access: Access { mode: self.mode.unwrap_or(0o660), group: self.group },
             board: self.board.unwrap_or(BoardName::Linux),
             dialect: self.dialect.and_then(|Spoken(name)| name),
+            socket: self.socket,
             log_level: self.log_level.unwrap_or(LevelFilter::Info),
         }
     }
@@ -203,6 +209,7 @@ impl Settings {
             cpu: self.cpu,
             margin: MarginLimits::up_to_us(self.margin_us),
             watchdog: self.watchdog.then(|| WATCHDOG.into()),
+            sockets: self.socket.clone().map_or_else(|| runtime::socket_paths(&self.symlink), |path| vec![path]),
         }
     }
 }

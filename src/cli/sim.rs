@@ -89,6 +89,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         cpu: None,
         margin: MarginLimits::default(),
         watchdog: None,
+        sockets: runtime::socket_paths(&args.symlink),
     };
     if args.show {
         return show_as_it_changes(args, board, probe, &options, clock);

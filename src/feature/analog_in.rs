@@ -9,7 +9,7 @@
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
     Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Next,
-    Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId, command, response, since, until,
+    Object, Oid, Present, Report, Response, Ticket, TimerId, WireClock, WorkerId, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -88,6 +88,8 @@ struct AnalogIn {
     taken: u8,
     /// The sum of the samples. It wraps around, as the firmware's does.
     sum: u16,
+    /// The sample that was taken last.
+    last: Option<u16>,
     invalid_count: u8,
     report: [u8; REPORT_BYTES],
     report_len: usize,
@@ -215,6 +217,7 @@ impl Object for AnalogIn {
                 return Ok(());
             }
         };
+        self.last = Some(counts);
         self.sum = self.sum.wrapping_add(counts);
         self.taken += 1;
         let now = mcu.now();
@@ -229,6 +232,10 @@ impl Object for AnalogIn {
         self.restart();
         mcu.go_on(timer, self.next_begin);
         Ok(())
+    }
+
+    fn report(&self) -> Report {
+        Report { queued: 0, value: self.last.map(Present::Adc) }
     }
 
     fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
@@ -258,6 +265,7 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
         sample_at: Clock::EPOCH,
         taken: 0,
         sum: 0,
+        last: None,
         invalid_count: 0,
         report: [0; REPORT_BYTES],
         report_len: 0,

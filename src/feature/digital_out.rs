@@ -6,7 +6,8 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, OutputLine, Safe, Ticket, TimerId, WireClock, command,
+    Command, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, OutputLine, Report, Safe, Ticket, TimerId, WireClock,
+    command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -190,6 +191,10 @@ impl Object for DigitalOut {
             Err(failure) => return mcu.device_failed(oid, KIND, failure),
         }
         Ok(())
+    }
+
+    fn report(&self) -> Report {
+        Report { queued: self.queue.len(), value: None }
     }
 
     fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {

@@ -6,8 +6,8 @@
 
 use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
-    Command, Constant, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, Remote, Safe, Settable, Ticket, TimerId,
-    WireClock, command,
+    Command, Constant, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, Present, Remote, Report, Safe, Settable,
+    Ticket, TimerId, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -67,6 +67,8 @@ struct Move {
 
 struct PwmOut {
     channel: Remote<Channel>,
+    /// The value that it was set to last.
+    value: u16,
     default_value: u16,
     max_duration: Ticks,
     queue: MoveQueue<Move>,
@@ -80,6 +82,7 @@ impl PwmOut {
     }
 
     fn write(&mut self, mcu: &mut Mcu, oid: Oid, value: u16) -> Result<(), Shutdown> {
+        self.value = value;
         self.channel.set(mcu, Ticket { oid, tag: 0 }, Setting { value, cycle: None })
     }
 
@@ -127,6 +130,10 @@ impl Object for PwmOut {
             Err(failure) => return mcu.device_failed(oid, KIND, failure),
         }
         Ok(())
+    }
+
+    fn report(&self) -> Report {
+        Report { queued: self.queue.len(), value: Some(Present::Pwm(self.value)) }
     }
 
     fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
@@ -192,7 +199,11 @@ const CONFIG_PWM_OUT: Command = command!(
         mcu.vacant(oid)?;
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
         let channel = open(mcu, config)?;
-        mcu.assign_on(pin, oid, PwmOut { channel, default_value, max_duration, queue: MoveQueue::default(), end: None })
+        mcu.assign_on(
+            pin,
+            oid,
+            PwmOut { channel, value, default_value, max_duration, queue: MoveQueue::default(), end: None },
+        )
     }
 );
 

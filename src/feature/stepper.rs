@@ -6,8 +6,8 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, PromptLine, Response, Safe,
-    TimerId, WireClock, command, response, since,
+    Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, Present, PromptLine, Report,
+    Response, Safe, TimerId, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -229,6 +229,11 @@ impl Object for Stepper {
 
     fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
         self.stop(mcu);
+    }
+
+    fn report(&self) -> Report {
+        let position = self.position().wrapping_sub(POSITION_BIAS) as i32;
+        Report { queued: self.queue.len(), value: Some(Present::Steps(position)) }
     }
 
     fn make_safe(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<Safe, Shutdown> {

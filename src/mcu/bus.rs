@@ -12,7 +12,8 @@ use std::sync::{Arc, Mutex, PoisonError};
 use crate::board::{BusDevice, BusError};
 use crate::shutdown::Shutdown;
 
-use super::{Errand, Mcu, Oid, Ticket, WorkerId};
+use super::snapshot::Counters;
+use super::{BusCounts, Errand, Mcu, Oid, Ticket, WorkerId};
 
 /// A chip that several conversations use in turn. All of them run on the worker of its bus, one
 /// after the other, so the lock is always free. The core never takes it.
@@ -23,6 +24,31 @@ type SharedDevice = Arc<Mutex<Box<dyn BusDevice>>>;
 pub struct Bus {
     worker: WorkerId,
     device: SharedDevice,
+    counters: Arc<Counters>,
+}
+
+/// A chip whose transfers are counted.
+struct Counted {
+    device: Box<dyn BusDevice>,
+    counters: Arc<Counters>,
+}
+
+impl BusDevice for Counted {
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+        let done = self.device.exchange(bytes);
+        self.counters.count(done.is_err());
+        done
+    }
+
+    fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        let done = self.device.write_read(write, read);
+        self.counters.count(done.is_err());
+        done
+    }
+
+    fn tries_again(&mut self) {
+        self.counters.retry();
+    }
 }
 
 /// What is said to a chip: plain code that runs on the worker and may block there.
@@ -62,7 +88,14 @@ impl<T: Talk> Errand for Conversation<T> {
 impl Bus {
     /// A chip whose bus has this worker.
     pub fn new(worker: WorkerId, device: Box<dyn BusDevice>) -> Bus {
-        Bus { worker, device: Arc::new(Mutex::new(device)) }
+        let counters = Arc::new(Counters::default());
+        let counted = Counted { device, counters: counters.clone() };
+        Bus { worker, device: Arc::new(Mutex::new(Box::new(counted))), counters }
+    }
+
+    /// What went over the bus to this chip.
+    pub(super) fn counts(&self) -> BusCounts {
+        self.counters.get()
     }
 }
 

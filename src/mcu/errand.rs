@@ -110,6 +110,11 @@ pub trait Workers: Send {
     /// Whether [`Workers::completion`] has one.
     fn has_completion(&self) -> bool;
 
+    /// Tells of each worker the name of its bus, and how many jobs it has.
+    fn tell(&self, each: &mut dyn FnMut(&str, usize)) {
+        let _ = each;
+    }
+
     /// Ends every worker. After this no completion of an earlier job comes.
     fn reset(&mut self);
 }

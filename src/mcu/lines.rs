@@ -13,7 +13,8 @@ use std::sync::Arc;
 use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line, OnWorker, Pin};
 use crate::shutdown::{Shutdown, reason};
 
-use super::{Done, Errand, Mcu, Remote, Safe, Settable, Ticket, WorkerId};
+use super::snapshot::Level;
+use super::{Done, Errand, LineState, Mcu, Remote, Safe, Settable, Ticket, WorkerId};
 
 /// A line in use.
 pub(super) struct Claim {
@@ -22,12 +23,55 @@ pub(super) struct Claim {
     line: Arc<dyn Line>,
     /// The worker of its chip, if calls to that may take their time.
     worker: Option<WorkerId>,
+    /// What it was set up as last.
+    direction: Direction,
+    /// Its level for whoever asks for the machine's status.
+    shown: Arc<Level>,
+}
+
+impl Claim {
+    pub(super) fn state(&self) -> LineState {
+        LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get() }
+    }
+
+    /// The line for a user that calls it itself, as errands do.
+    fn shared(&self) -> Arc<dyn Line> {
+        Arc::new(Watched { line: self.line.clone(), shown: self.shown.clone() })
+    }
+}
+
+/// A line whose level is shown as an errand drives or sees it.
+struct Watched {
+    line: Arc<dyn Line>,
+    shown: Arc<Level>,
+}
+
+impl Line for Watched {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        self.shown.set(level);
+        self.line.write(level)
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        self.line.read().inspect(|level| self.shown.set(*level))
+    }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.shown.begin(direction);
+        self.line.set_direction(direction)
+    }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.shown.begin(direction);
+        self.line.turn(direction)
+    }
 }
 
 /// An output that the core drives itself: a call takes a microsecond or two.
 pub struct PromptLine {
     line: Arc<dyn Line>,
     level: bool,
+    shown: Arc<Level>,
 }
 
 impl PromptLine {
@@ -39,6 +83,7 @@ impl PromptLine {
     #[inline]
     pub fn write(&mut self, level: bool) -> Result<(), Shutdown> {
         self.level = level;
+        self.shown.set(level);
         self.line.write(level)
     }
 
@@ -68,6 +113,7 @@ impl Settable for SlowLine {
 pub struct OutputLine {
     level: bool,
     driver: Driver,
+    shown: Arc<Level>,
 }
 
 enum Driver {
@@ -84,6 +130,7 @@ impl OutputLine {
     #[inline]
     pub fn write(&mut self, mcu: &mut Mcu, ticket: Ticket, level: bool) -> Result<(), Shutdown> {
         self.level = level;
+        self.shown.set(level);
         match &mut self.driver {
             Driver::Prompt(line) => line.write(level),
             Driver::Slow(line) => line.set(mcu, ticket, level),
@@ -139,7 +186,10 @@ impl Errand for Sampling {
 }
 
 /// An input line of any chip.
-pub struct InputLine(Sensor);
+pub struct InputLine {
+    sensor: Sensor,
+    shown: Arc<Level>,
+}
 
 enum Sensor {
     Prompt(Arc<dyn Line>),
@@ -151,11 +201,13 @@ enum Sensor {
 }
 
 impl InputLine {
-    fn new(line: Arc<dyn Line>, worker: Option<WorkerId>) -> InputLine {
-        InputLine(match worker {
+    fn new(claim: &Claim) -> InputLine {
+        let (line, shown) = (claim.line.clone(), claim.shown.clone());
+        let sensor = match claim.worker {
             None => Sensor::Prompt(line),
             Some(worker) => Sensor::Slow { worker, sampling: Some(Box::new(Sampling { line, level: Ok(false) })) },
-        })
+        };
+        InputLine { sensor, shown }
     }
 
     /// The line's level; none if it comes later, to the object's `returned`, as the chip's worker
@@ -166,8 +218,8 @@ impl InputLine {
     /// "GPIO line read failed".
     #[inline]
     pub fn read(&mut self, mcu: &mut Mcu, ticket: Ticket) -> Result<Option<bool>, Shutdown> {
-        match &mut self.0 {
-            Sensor::Prompt(line) => line.read().map(Some),
+        match &mut self.sensor {
+            Sensor::Prompt(line) => line.read().inspect(|level| self.shown.set(*level)).map(Some),
             Sensor::Slow { worker, sampling } => {
                 if let Some(sampling) = sampling.take() {
                     mcu.dispatch(*worker, ticket, sampling)?;
@@ -183,12 +235,12 @@ impl InputLine {
     ///
     /// "GPIO line read failed".
     pub fn returned(&mut self, done: Done) -> Result<bool, Shutdown> {
-        let (Sensor::Slow { sampling, .. }, Some(mut back)) = (&mut self.0, done.errand::<Sampling>()) else {
+        let (Sensor::Slow { sampling, .. }, Some(mut back)) = (&mut self.sensor, done.errand::<Sampling>()) else {
             return Ok(false);
         };
         let level = std::mem::replace(&mut back.level, Ok(false));
         *sampling = Some(back);
-        level
+        level.inspect(|level| self.shown.set(*level))
     }
 }
 
@@ -210,25 +262,32 @@ impl Mcu {
     }
 
     /// Claims a line for one more use, while the machine is configured.
-    fn claim(&mut self, pin: Pin, direction: Direction) -> Result<(Arc<dyn Line>, Option<WorkerId>), Shutdown> {
+    fn claim(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
         self.board()?;
         self.claim_at_any_time(pin, direction)
     }
 
-    fn claim_at_any_time(
-        &mut self,
-        pin: Pin,
-        direction: Direction,
-    ) -> Result<(Arc<dyn Line>, Option<WorkerId>), Shutdown> {
+    fn claim_at_any_time(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
         let pin = self.board.canonical(pin);
-        if let Some(Claim { line, worker, .. }) = self.claims.iter().find(|claim| claim.pin == pin) {
-            line.set_direction(direction)?;
-            return Ok((line.clone(), *worker));
+        if let Some(place) = self.claims.iter().position(|claim| claim.pin == pin) {
+            let claim = &mut self.claims[place];
+            claim.line.set_direction(direction)?;
+            claim.direction = direction;
+            claim.shown.begin(direction);
+            return Ok(claim);
         }
-        let ClaimedLine { line, sleeps_on } = self.board.line(pin, direction)?;
+        let claimed = self.board.line(pin, direction)?;
+        self.enter(pin, claimed, direction)
+    }
+
+    /// Puts a line that the board has handed out into the table.
+    fn enter(&mut self, pin: Pin, claimed: ClaimedLine, direction: Direction) -> Result<&Claim, Shutdown> {
+        let ClaimedLine { line, sleeps_on } = claimed;
         let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
-        self.claims.push(Claim { pin, line: line.clone(), worker });
-        Ok((line, worker))
+        let shown = Arc::new(Level::of(direction));
+        let place = self.claims.len();
+        self.claims.push(Claim { pin, line, worker, direction, shown });
+        Ok(&self.claims[place])
     }
 
     /// Claims an output, driven to `level`; it belongs to `shutdown_level` when the machine stops.
@@ -237,12 +296,13 @@ impl Mcu {
     ///
     /// Those of the board, such as "Unable to open out GPIO chip line".
     pub fn output(&mut self, pin: Pin, level: bool, shutdown_level: bool) -> Result<OutputLine, Shutdown> {
-        let (line, worker) = self.claim(pin, Direction::Output { level, shutdown_level })?;
-        let driver = match worker {
+        let claim = self.claim(pin, Direction::Output { level, shutdown_level })?;
+        let (line, shown) = (claim.line.clone(), claim.shown.clone());
+        let driver = match claim.worker {
             None => Driver::Prompt(line),
             Some(worker) => Driver::Slow(Remote::new(worker, SlowLine(line), level)),
         };
-        Ok(OutputLine { level, driver })
+        Ok(OutputLine { level, driver, shown })
     }
 
     /// Claims an output whose every edge has its instant, such as `step`: a chip that may sleep is
@@ -258,8 +318,8 @@ impl Mcu {
         level: bool,
         shutdown_level: bool,
     ) -> Result<PromptLine, Shutdown> {
-        let line = self.prompt_line(pin, use_, Direction::Output { level, shutdown_level })?;
-        Ok(PromptLine { line, level })
+        let claim = self.prompt_claim(pin, use_, Direction::Output { level, shutdown_level })?;
+        Ok(PromptLine { line: claim.line.clone(), level, shown: claim.shown.clone() })
     }
 
     /// Claims a line on which every edge has its instant, for an errand that drives or reads it: a
@@ -269,22 +329,26 @@ impl Mcu {
     ///
     /// Those of the board, and "Unable to open out GPIO chip line" or its like for such a chip.
     pub fn prompt_line(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<Arc<dyn Line>, Shutdown> {
-        match self.claim(pin, direction)? {
-            (line, None) => Ok(line),
-            (_, Some(_)) => {
-                let name = self.name(pin);
-                let refused = match direction {
-                    Direction::Input(_) => reason::INPUT_LINE,
-                    _ => reason::OUTPUT_LINE,
-                };
-                Err(Shutdown::because(
-                    refused,
-                    format!(
-                        "{name} can not be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds: choose a pin of the processor itself"
-                    ),
-                ))
-            }
+        self.prompt_claim(pin, use_, direction).map(Claim::shared)
+    }
+
+    fn prompt_claim(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<&Claim, Shutdown> {
+        if self.claim(pin, direction)?.worker.is_some() {
+            let name = self.name(pin);
+            let refused = match direction {
+                Direction::Input(_) => reason::INPUT_LINE,
+                _ => reason::OUTPUT_LINE,
+            };
+            return Err(Shutdown::because(
+                refused,
+                format!(
+                    "{name} can not be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds: choose a pin of the processor itself"
+                ),
+            ));
         }
+        let own = self.board.canonical(pin);
+        let claimed = self.claims.iter().find(|claim| claim.pin == own);
+        claimed.ok_or_else(|| Shutdown::because(reason::OUTPUT_LINE, "a line that was claimed is in no table"))
     }
 
     /// Claims an output that workers drive, such as a chip select; it belongs to `level`.
@@ -293,7 +357,7 @@ impl Mcu {
     ///
     /// Those of the board, such as "Unable to open out GPIO chip line".
     pub fn shared_output(&mut self, pin: Pin, level: bool) -> Result<Arc<dyn Line>, Shutdown> {
-        self.claim(pin, Direction::Output { level, shutdown_level: level }).map(|(line, _)| line)
+        self.claim(pin, Direction::Output { level, shutdown_level: level }).map(Claim::shared)
     }
 
     /// Claims an input that workers read, pulled up where it can be.
@@ -302,8 +366,8 @@ impl Mcu {
     ///
     /// Those of the board, such as "Unable to open in GPIO chip line".
     pub fn shared_input(&mut self, pin: Pin) -> Result<Arc<dyn Line>, Shutdown> {
-        let pulled_up = self.claim(pin, Direction::Input(Bias::PullUp));
-        pulled_up.or_else(|_| self.claim(pin, Direction::Input(Bias::None))).map(|(line, _)| line)
+        let pulled_up = self.claim(pin, Direction::Input(Bias::PullUp)).map(Claim::shared);
+        pulled_up.or_else(|_| self.claim(pin, Direction::Input(Bias::None)).map(Claim::shared))
     }
 
     /// Claims a wire that workers pull low or let go, and read.
@@ -312,7 +376,7 @@ impl Mcu {
     ///
     /// Those of the board, such as "Unable to open out GPIO chip line".
     pub fn shared_wire(&mut self, pin: Pin) -> Result<Arc<dyn Line>, Shutdown> {
-        self.claim(pin, Direction::OpenDrain).map(|(line, _)| line)
+        self.claim(pin, Direction::OpenDrain).map(Claim::shared)
     }
 
     /// Claims an input.
@@ -321,8 +385,7 @@ impl Mcu {
     ///
     /// Those of the board, such as "Unable to open in GPIO chip line".
     pub fn input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
-        let (line, worker) = self.claim(pin, Direction::Input(bias))?;
-        Ok(InputLine::new(line, worker))
+        self.claim(pin, Direction::Input(bias)).map(InputLine::new)
     }
 
     /// Claims an input whose edges an interrupt counts, if there is one.
@@ -335,14 +398,13 @@ impl Mcu {
         if self.claims.iter().any(|claim| claim.pin == own) {
             return Ok((self.input(pin, bias)?, Err("the pin has another use, too, from before".into())));
         }
-        let CountedLine { line: ClaimedLine { line, sleeps_on }, edges } = self.board.counted_line(own, bias)?;
-        let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
-        self.claims.push(Claim { pin: own, line: line.clone(), worker });
+        let CountedLine { line, edges } = self.board.counted_line(own, bias)?;
+        let input = InputLine::new(self.enter(own, line, Direction::Input(bias))?);
         let edges = match edges {
             Ok(OnWorker { bus, device }) => Ok((self.workers.start(&bus)?, device)),
             Err(why) => Err(why),
         };
-        Ok((InputLine::new(line, worker), edges))
+        Ok((input, edges))
     }
 
     /// Claims an input, after `finalize_config` too. That opens a file and may start a thread, for
@@ -353,8 +415,7 @@ impl Mcu {
     ///
     /// Those of the board, such as "Unable to open in GPIO chip line".
     pub fn late_input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
-        let (line, worker) = self.claim_at_any_time(pin, Direction::Input(bias))?;
-        Ok(InputLine::new(line, worker))
+        self.claim_at_any_time(pin, Direction::Input(bias)).map(InputLine::new)
     }
 
     /// What the dictionary calls a pin.

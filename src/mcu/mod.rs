@@ -26,6 +26,7 @@ mod object;
 mod outbox;
 mod parameters;
 mod remote;
+mod snapshot;
 mod stats;
 mod stop;
 mod timers;
@@ -42,6 +43,7 @@ pub use object::{Next, Object, Safe};
 pub use outbox::{Note, Outbox};
 pub use parameters::{Oid, WireClock};
 pub use remote::{Remote, Settable};
+pub use snapshot::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Report, Snapshot};
 pub use stop::RETRY_TICKS;
 pub use timers::TimerId;
 

@@ -22,6 +22,11 @@ impl MovePool {
         self.count = MOVE_COUNT;
         self.free = MOVE_COUNT;
     }
+
+    /// How many moves are queued, and how many there is room for.
+    pub(super) fn used(&self) -> (u16, u16) {
+        (self.count - self.free, self.count)
+    }
 }
 
 /// One object's queued moves. It never holds more than the pool has, so it never allocates
@@ -55,6 +60,11 @@ impl<T> MoveQueue<T> {
     /// The oldest move.
     pub fn first(&self) -> Option<&T> {
         self.0.front()
+    }
+
+    /// How many are queued.
+    pub fn len(&self) -> usize {
+        self.0.len()
     }
 
     /// Whether nothing is queued.

@@ -35,6 +35,8 @@ const UNGUARDED_LIMIT: Ticks = Ticks::from_us(500_000);
 pub(super) struct Stop {
     /// Why the machine is stopped; none while it is not.
     pub(super) reason: Option<ShutdownReason>,
+    /// The cause and the remedy of the last stop, and when it was.
+    pub(super) last: Option<(Box<str>, Clock)>,
     /// Whether `shut_down` is running: what fails meanwhile must not start it again.
     under_way: bool,
     owed: Vec<Debt>,
@@ -90,6 +92,7 @@ impl Mcu {
         self.send(base::ShutdownReport { clock, static_string_id });
         if first {
             self.outbox.note(Note::Shutdown(&shutdown));
+            self.stop.last = Some((shutdown.detail, clock));
         } else if shutdown.reason != reason {
             // The same reason again, such as a second `emergency_stop`, would tell the log nothing new.
             self.outbox.note(Note::Trouble(&shutdown));

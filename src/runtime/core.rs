@@ -18,6 +18,7 @@ use crate::wire::vlq::Reader;
 
 use super::outlet::{LinkWake, Progress};
 use super::pulse::{BEAT, Pulse};
+use super::status::Teller;
 use super::wakeup::{Waiter, Woken};
 
 /// The payload of a message block on its way to the core.
@@ -61,6 +62,9 @@ pub(super) enum Request {
 const NEAR: Ticks = Ticks::from_us(5);
 /// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
 const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
+/// To tell a part of its status takes a microsecond, or several where nothing of it is in the cache: that is done
+/// only if no timer is within this span.
+const TELL: Ticks = Ticks::from_us(30);
 /// For so long the core looks for the next command before it sleeps: hosts send in bursts, and to
 /// be woken takes as long (20 to 50 us on the machines measured). A lone processor is the host's.
 const LOOKOUT: Ticks = Ticks::from_us(30);
@@ -90,6 +94,7 @@ pub(super) struct Core {
     lookout_until: Clock,
     /// What the guardian was told that the machine owes.
     debtor: Option<String>,
+    teller: Teller,
 }
 
 /// What the core is made of.
@@ -101,6 +106,7 @@ pub(super) struct Parts {
     pub(super) pulse: Pulse,
     pub(super) progress: Arc<Progress>,
     pub(super) wake: Arc<LinkWake>,
+    pub(super) teller: Teller,
 }
 
 /// What a turn for commands came to.
@@ -121,7 +127,7 @@ pub(super) enum Left {
 
 impl Core {
     pub(super) fn new(parts: Parts) -> Core {
-        let Parts { mcu, clock, requests, waiter, pulse, progress, wake } = parts;
+        let Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller } = parts;
         let several = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
         Core {
             lookout: if several { LOOKOUT } else { Ticks(0) },
@@ -137,6 +143,7 @@ impl Core {
             gave_way: 0,
             stops_taken: 0,
             debtor: None,
+            teller,
         }
     }
 
@@ -182,6 +189,10 @@ impl Core {
             let now = self.mcu.now();
             if deadline.is_some_and(|deadline| deadline <= now) {
                 self.gave_way += 1;
+                continue;
+            }
+            if self.teller.is_asked() && deadline.is_none_or(|deadline| deadline > now + TELL) {
+                self.teller.tell(&self.mcu, self.requests.slots(), self.waiter.margin());
                 continue;
             }
             if now < self.lookout_until && may_yield(self.waiter.is_realtime(), now, deadline) {
@@ -389,6 +400,7 @@ mod tests {
     use crate::feature::FEATURES;
     use crate::mcu::{DialectName, Generation, Note, Outbox};
     use crate::runtime::realtime::{Processors, Scheduling};
+    use crate::runtime::status;
     use crate::runtime::wakeup::MarginLimits;
     use crate::runtime::workers::Threads;
     use crate::time::{Monotonic, VirtualClock};
@@ -460,7 +472,8 @@ mod tests {
                 let (limits, processors) = (MarginLimits::default(), Processors::new(None).unwrap());
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
                 let (clock, progress, wake) = (core_clock, core_progress, core_wake);
-                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake }).run()
+                let teller = status::ends().0;
+                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake, teller }).run()
             });
             let mut rig = Rig { thread, dialect, clock, requests, progress, wake, heard, bench };
             rig.run("allocate_oids count=%c", &[2]);

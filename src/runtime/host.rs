@@ -20,6 +20,7 @@ use crate::klippy::process::{Process, Search, find};
 use crate::mcu::DialectName;
 
 use super::outlet::LinkWake;
+use super::status::{FoundHost, HostBoard};
 
 const PROC: &str = "/proc";
 
@@ -36,11 +37,12 @@ pub(super) struct HostFinder {
 }
 
 impl HostFinder {
-    /// Starts the thread, for the host on the terminal `device`. It wakes the link with each answer.
-    pub(super) fn start(device: &Path, wake: Arc<LinkWake>) -> io::Result<HostFinder> {
+    /// Starts the thread, for the host on the terminal `device`. It wakes the link with each answer, and shows on
+    /// `board` whom it found.
+    pub(super) fn start(device: &Path, wake: Arc<LinkWake>, board: Arc<HostBoard>) -> io::Result<HostFinder> {
         let (asks, questions) = channel();
         let (replies, answers) = channel();
-        let mut looker = Looker { device: device.to_owned(), last: None };
+        let mut looker = Looker { device: device.to_owned(), last: None, host: None, board };
         thread::Builder::new().name("host".into()).spawn(move || {
             for number in questions {
                 let told = replies.send((number, looker.look()));
@@ -72,11 +74,15 @@ struct Looker {
     /// The host that was seen last. A process goes on with the sources that it has loaded, whatever becomes
     /// of the files: klippy's RESTART keeps the process.
     last: Option<(Process, DialectName)>,
+    /// The same for whoever asks.
+    host: Option<FoundHost>,
+    board: Arc<HostBoard>,
 }
 
 impl Looker {
     fn look(&mut self) -> DialectName {
         let began = Instant::now();
+        self.board.found(None);
         let (process, is_sure) = match find(Path::new(PROC), &self.device) {
             Ok(Search::Found(process)) => (process, true),
             // Whichever of these it is, it runs from those sources.
@@ -100,9 +106,13 @@ impl Looker {
             && (last.pid, last.started) == (process.pid, process.started)
         {
             info!("the host is the one of before, process {}: dialect {dialect}", process.pid);
+            self.board.found(self.host.clone());
             return *dialect;
         }
-        let dialect = tell(&process, is_sure, began);
+        let mut host = FoundHost { pid: process.pid, is_sure, checkout: None, commit: None };
+        let dialect = tell(&process, &mut host, began);
+        self.host = Some(host);
+        self.board.found(self.host.clone());
         self.last = Some((process, dialect));
         dialect
     }
@@ -120,8 +130,8 @@ fn union(remedy: &str) -> String {
     format!("it is served as Klipper v0.13, master and Kalico{stop}{remedy}")
 }
 
-/// The dialect of a process, and a line in the log that says why.
-fn tell(process: &Process, is_sure: bool, began: Instant) -> DialectName {
+/// The dialect of a process, and a line in the log that says why. Adds to `host` where it runs from.
+fn tell(process: &Process, host: &mut FoundHost, began: Instant) -> DialectName {
     let pid = process.pid;
     let Some(folder) = process.klippy_folder(Path::new(PROC)) else {
         info!("the host, process {pid}, is no klippy: {}", union(""));
@@ -140,10 +150,12 @@ fn tell(process: &Process, is_sure: bool, began: Instant) -> DialectName {
     };
     let best = checkout.best();
     let inside = checkout.folder.strip_prefix(format!("{PROC}/{pid}/root")).unwrap_or(&checkout.folder);
+    let inside = Path::new("/").join(inside);
+    (host.checkout, host.commit) = (Some(inside.clone()), checkout.commit.clone());
     info!(
-        "the host is {}klippy of /{}{}, process {pid}: dialect {}, which has {} of the {} messages that it looks up (found in {} ms)",
-        if is_sure { "" } else { "probably the " },
-        inside.strip_prefix("/").unwrap_or(inside).display(),
+        "the host is {}klippy of {}{}, process {pid}: dialect {}, which has {} of the {} messages that it looks up (found in {} ms)",
+        if host.is_sure { "" } else { "probably the " },
+        inside.display(),
         checkout.commit.as_ref().map_or(String::new(), |commit| format!(" ({commit})")),
         best.generation,
         best.served.len(),

@@ -30,6 +30,7 @@ use super::ledger::Ledger;
 use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
 use super::signals::{Signal, Signals};
+use super::status::HostBoard;
 use super::watchdog::{Vigil, Watchdog};
 
 /// What a shell writes to the pty to stop the machine, as in Klipper's service file.
@@ -108,6 +109,7 @@ pub(super) struct Link {
     dialects: Vec<Arc<Dialect>>,
     /// None if the dialect does not depend on the host.
     finder: Option<HostFinder>,
+    host: Arc<HostBoard>,
     /// Until when the host's first bytes wait for its dialect to be found.
     finding: Option<Duration>,
     receiver: Receiver,
@@ -155,6 +157,8 @@ pub(super) struct Parts {
     /// Those that a host may speak; the first one is spoken before a host comes.
     pub(super) dialects: Vec<Arc<Dialect>>,
     pub(super) finder: Option<HostFinder>,
+    /// Where it says whether a host is there.
+    pub(super) host: Arc<HostBoard>,
     pub(super) requests: Producer<Request>,
     pub(super) core: Thread,
     pub(super) inlet: Inlet,
@@ -167,14 +171,28 @@ pub(super) struct Parts {
 
 impl Link {
     pub(super) fn new(parts: Parts) -> Link {
-        let Parts { pty, clock, dialects, finder, requests, core, inlet, progress, wake, signals, guardian, vigil } =
-            parts;
+        let Parts {
+            pty,
+            clock,
+            dialects,
+            finder,
+            host,
+            requests,
+            core,
+            inlet,
+            progress,
+            wake,
+            signals,
+            guardian,
+            vigil,
+        } = parts;
         Link {
             pty,
             clock,
             known: Known::new(dialects[0].clone()),
             dialects,
             finder,
+            host,
             finding: None,
             receiver: Receiver::default(),
             input: Vec::with_capacity(INPUT_BYTES),
@@ -247,6 +265,7 @@ impl Link {
     }
 
     fn tell_status(&self) {
+        self.host.attach(self.attached);
         let host = if self.attached { "a host is attached" } else { "no host is attached" };
         self.vigil.status(&format!("serving on {}, {host}", self.pty.symlink().display()));
     }

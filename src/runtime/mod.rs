@@ -35,12 +35,14 @@ mod pty;
 mod pulse;
 pub mod realtime;
 mod signals;
+pub(crate) mod status;
 pub mod wakeup;
 mod watchdog;
 mod workers;
 
 pub use guardian::Guardian;
 pub use pty::Access;
+pub use status::socket_paths;
 
 use self::core::{Core, Left, Request};
 use host::HostFinder;
@@ -51,6 +53,7 @@ use pty::Pty;
 use pulse::Pulse;
 use realtime::{Processors, Role, Scheduling};
 use signals::Signals;
+use status::{Fixed, HostBoard, StatusSocket};
 use wakeup::{MarginLimits, Waiter};
 use watchdog::{Vigil, Watchdog};
 use workers::Threads;
@@ -75,6 +78,8 @@ pub struct Options {
     pub watchdog: Option<PathBuf>,
     /// The processor that the core runs on, and nowhere else.
     pub cpu: Option<usize>,
+    /// Where the socket for the status stands: the first of these paths where that can be; without any there is none.
+    pub sockets: Vec<PathBuf>,
 }
 
 /// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP; calls `ready` once a host may come.
@@ -102,15 +107,26 @@ pub fn run(
     let dialects = dialects.collect::<io::Result<Vec<Arc<Dialect>>>>()?;
     let clock: Arc<dyn TimeSource> = Arc::new(clock);
     let wake = Arc::new(LinkWake::new()?);
+    let host = Arc::new(HostBoard::default());
     // Before the link is of real time, which its threads would inherit.
     let finder = match options.dialect {
         Some(_) => None,
-        None => Some(HostFinder::start(pty.device(), wake.clone())?),
+        None => Some(HostFinder::start(pty.device(), wake.clone(), host.clone())?),
     };
     // The thread that looks for the host alone may look into others from here on.
     if let Err(error) = sys::give_up(sys::LOOK_INTO_OTHERS) {
         warn!("capabilities can not be given up: {error}");
     }
+    let (teller, asker) = status::ends();
+    let fixed = Fixed {
+        link: options.symlink.clone(),
+        device: pty.device().to_owned(),
+        board: board.describe(),
+        pins: board.pins(),
+        guardian: guardian.as_ref().map(Guardian::pid),
+        requests: REQUESTS,
+    };
+    let _status = StatusSocket::start(&options.sockets, fixed, host.clone(), asker);
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
@@ -144,6 +160,7 @@ pub fn run(
             pulse,
             progress: core_progress,
             wake: core_wake,
+            teller,
         })
         .run()
     })?;
@@ -154,6 +171,7 @@ pub fn run(
         clock,
         dialects,
         finder,
+        host,
         requests,
         core: core.thread().clone(),
         inlet,

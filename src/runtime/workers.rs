@@ -101,6 +101,10 @@ impl Workers for Threads {
         self.workers.iter().any(|worker| !worker.done.is_empty())
     }
 
+    fn tell(&self, each: &mut dyn FnMut(&str, usize)) {
+        self.workers.iter().for_each(|worker| each(&worker.bus, QUEUE_JOBS - worker.jobs.slots()));
+    }
+
     /// Waits until the workers have done what was submitted, for up to two seconds: only then are their
     /// devices free to be opened again. A worker that hangs is left behind, with its devices.
     fn reset(&mut self) {

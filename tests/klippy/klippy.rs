@@ -127,6 +127,7 @@ impl Printer {
                 cpu: None,
                 margin: MarginLimits::default(),
                 watchdog: None,
+                sockets: Vec::new(),
                 dialect: None,
             };
             let run = move || runtime::run(&options, Box::new(board), clock, None, || {}).unwrap();

@@ -33,6 +33,7 @@ mod ready_adc;
 mod remedies;
 mod safe_ends;
 mod sleeping_lines;
+mod snapshot;
 mod software_buses;
 mod sos_filter;
 mod spi;

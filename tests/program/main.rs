@@ -10,3 +10,4 @@ mod life;
 mod one_order;
 mod process;
 mod show;
+mod status;

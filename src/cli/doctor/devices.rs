@@ -449,7 +449,7 @@ mod tests {
                 Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy => {
                     thread::sleep(Duration::from_millis(1))
                 }
-                Ok(mut child) => {
+                Result::Ok(mut child) => {
                     let _ = child.kill();
                     let _ = child.wait();
                     return path;

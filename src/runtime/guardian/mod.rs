@@ -110,6 +110,11 @@ impl Guardian {
         self.pulse
     }
 
+    /// Its process.
+    pub(super) fn pid(&self) -> u32 {
+        self.pid.as_raw().unsigned_abs()
+    }
+
     /// What the link watches to notice that the guardian is lost.
     pub(super) fn watch(&self) -> GuardianWatch {
         GuardianWatch { socket: self.socket.clone(), ear: GuardianEar::new(self.pulse) }

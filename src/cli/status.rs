@@ -1,0 +1,552 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion status`: asks a running Pinion how it is.
+
+#![forbid(unsafe_code)]
+
+use std::fmt::Write as _;
+use std::io::{self, IsTerminal, Read, Write as _};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use clap::Args;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
+use serde_json::Value;
+use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+
+use crate::runtime::socket_paths;
+use crate::runtime::status::connect;
+use crate::sys;
+
+use super::{failed, print};
+
+/// How long the answer may take. The program gives its core a second.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// Between two looks of `--watch`.
+const PERIOD: Duration = Duration::from_secs(1);
+/// No answer is longer.
+const ANSWER_MAX: usize = 4 << 20;
+
+/// Options of `pinion status`.
+#[derive(Args, Clone, Debug)]
+pub(super) struct StatusArgs {
+    /// Print JSON
+    #[arg(long)]
+    json: bool,
+    /// Print metrics for a Prometheus scraper
+    #[arg(long, conflicts_with = "json")]
+    prometheus: bool,
+    /// Print it anew each second: in place on a terminal, until q or Ctrl-C; elsewhere one after the other
+    #[arg(long)]
+    watch: bool,
+    /// The link of the instance to ask
+    #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
+    symlink: PathBuf,
+    /// Its socket, if that is not where the link's name says
+    #[arg(long, value_name = "PATH")]
+    socket: Option<PathBuf>,
+}
+
+/// Prints what the instance tells.
+pub(super) fn run(args: &StatusArgs) -> ExitCode {
+    let done = match args.watch {
+        true => watch(args),
+        false => ask(args).and_then(|status| print(&show(args, &status))),
+    };
+    done.map_or_else(failed, |()| ExitCode::SUCCESS)
+}
+
+fn show(args: &StatusArgs, status: &Value) -> String {
+    if args.json {
+        return format!("{status:#}\n");
+    }
+    if args.prometheus { metrics(status) } else { text(status) }
+}
+
+/// Asks the first of the sockets that answers.
+fn ask(args: &StatusArgs) -> Result<Value, String> {
+    let paths = args.socket.clone().map_or_else(|| socket_paths(&args.symlink), |path| vec![path]);
+    let mut missing = Vec::new();
+    for path in &paths {
+        match ask_at(path) {
+            Ok(status) => return Ok(status),
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
+                missing.push(path.display().to_string());
+            }
+            Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
+                return Err(format!(
+                    "{} may not be opened: it belongs to those who may open the terminal; become a member of its group (ls -lL {}), or ask with sudo",
+                    path.display(),
+                    args.symlink.display()
+                ));
+            }
+            Err(error) => {
+                return Err(format!("{} gives no answer: {error}; does Pinion hang? (its log)", path.display()));
+            }
+        }
+    }
+    Err(format!(
+        "no Pinion answers on {}: is it running (systemctl status pinion-mcu), and with the link {}?",
+        missing.join(" or "),
+        args.symlink.display()
+    ))
+}
+
+fn ask_at(path: &Path) -> io::Result<Value> {
+    let mut socket = connect(path)?;
+    let (until, mut answer, mut piece) = (Instant::now() + PATIENCE, Vec::new(), [0; 16384]);
+    loop {
+        match socket.read(&mut piece) {
+            Ok(0) => break,
+            Ok(read) if answer.len() + read <= ANSWER_MAX => answer.extend_from_slice(&piece[..read]),
+            Ok(_) => return Err(io::Error::other("what it says has no end")),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                let left = until.saturating_duration_since(Instant::now());
+                if left.is_zero() {
+                    return Err(io::ErrorKind::TimedOut.into());
+                }
+                let mut fds = [PollFd::new(socket.as_fd(), PollFlags::POLLIN)];
+                let _ = poll(&mut fds, PollTimeout::try_from(left).unwrap_or(PollTimeout::MAX));
+            }
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+    serde_json::from_slice(&answer).map_err(|error| io::Error::other(format!("that is no status ({error})")))
+}
+
+// ---- for people
+
+/// A text of the status as a terminal may have it.
+fn word(value: &Value) -> String {
+    let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
+    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
+}
+
+fn rows<'a>(status: &'a Value, key: &str) -> &'a [Value] {
+    status[key].as_array().map_or(&[], Vec::as_slice)
+}
+
+/// Seconds as people say them.
+fn span(seconds: &Value) -> String {
+    let seconds = seconds.as_f64().unwrap_or_default() as u64;
+    match seconds {
+        0..60 => format!("{seconds} s"),
+        60..3600 => format!("{} min {} s", seconds / 60, seconds % 60),
+        3600..86400 => format!("{} h {} min", seconds / 3600, seconds / 60 % 60),
+        _ => format!("{} d {} h", seconds / 86400, seconds / 3600 % 24),
+    }
+}
+
+/// The status as a page.
+fn text(status: &Value) -> String {
+    let mut page = String::new();
+    // A String takes everything that is written to it.
+    let mut row = |head: &str, text: String| {
+        let _ = writeln!(page, "{head:<10}{text}");
+    };
+    row(
+        "pinion",
+        format!("{}, process {}, up for {}", word(&status["version"]), status["pid"], span(&status["uptime_s"])),
+    );
+    row("link", format!("{} ({})", word(&status["link"]), word(&status["terminal"])));
+    row("board", word(&status["board"]));
+    let state = match status["state"].as_str().unwrap_or_default() {
+        "waiting" => "waiting for a host's configuration".to_owned(),
+        "configuring" => "a host has begun to configure it".to_owned(),
+        "configured" => "configured".to_owned(),
+        "shutdown" => {
+            let stop = &status["shutdown"];
+            format!("SHUT DOWN {} ago: {}: {}", span(&stop["ago_s"]), word(&stop["reason"]), word(&stop["detail"]))
+        }
+        _ => "unknown: the core has not answered within a second: it is busy with steps, or hangs".to_owned(),
+    };
+    row("state", state);
+    if !status["owes"].is_null() {
+        row("", format!("{} is not at its shutdown value yet", word(&status["owes"])));
+    }
+    row("host", host(status));
+    row(
+        "guardian",
+        match &status["guardian"]["pid"] {
+            Value::Null => "none, as this board needs none".to_owned(),
+            pid => format!("process {pid}"),
+        },
+    );
+    let late = &status["lateness"];
+    if late["timers"].as_u64().is_some_and(|timers| timers > 0) {
+        row(
+            "timers",
+            format!(
+                "{} run, late by p50 {} us, p99 {} us, p99.9 {} us, at most {} us; the core wakes {} us early",
+                late["timers"], late["p50_us"], late["p99_us"], late["p999_us"], late["max_us"], late["margin_us"]
+            ),
+        );
+    }
+    let queues = &status["queues"];
+    if !queues.is_null() {
+        let held = if queues["commands"]["held"] == true { " (they wait for a bus)" } else { "" };
+        let workers: String = queues["workers"]
+            .as_array()
+            .into_iter()
+            .flatten()
+            .map(|worker| format!(", {} {}", word(&worker["name"]), worker["waiting"]))
+            .collect();
+        row(
+            "queues",
+            format!(
+                "moves {} of {}, commands {}{held}{workers}",
+                queues["moves"]["waiting"], queues["moves"]["size"], queues["commands"]["waiting"]
+            ),
+        );
+    }
+    let lines = rows(status, "lines").iter().map(|line| {
+        let level = match line["level"].as_u64() {
+            Some(1) => "high",
+            Some(_) => "low",
+            None => "not looked at yet",
+        };
+        vec![word(&line["pin"]), word(&line["use"]), level.to_owned()]
+    });
+    table(&mut page, "lines", lines.collect());
+    let objects = rows(status, "objects").iter().map(|object| {
+        let oid = if object["oid"].is_null() { String::new() } else { format!("oid {}", object["oid"]) };
+        let pin = if object["pin"].is_null() { String::new() } else { word(&object["pin"]) };
+        let mut facts = Vec::new();
+        for (key, value) in object["value"].as_object().into_iter().flatten() {
+            let share = |what: &str| format!("{what} {:.1} %", value.as_f64().unwrap_or_default() * 100.0);
+            facts.push(match key.as_str() {
+                "adc" => share("reads"),
+                "duty" => share("on"),
+                _ => format!("at {value} steps"),
+            });
+        }
+        if object["queued"].as_u64().is_some_and(|queued| queued > 0) {
+            facts.push(format!("{} queued", object["queued"]));
+        }
+        let bus = &object["bus"];
+        if !bus.is_null() {
+            facts.push(format!(
+                "{} transfers, {} failed, {} of them tried again",
+                bus["transfers"], bus["errors"], bus["retries"]
+            ));
+        }
+        vec![oid, word(&object["kind"]), pin, facts.join(", ")]
+    });
+    table(&mut page, "objects", objects.collect());
+    page
+}
+
+fn host(status: &Value) -> String {
+    let host = &status["host"];
+    let dialect =
+        if status["dialect"].is_null() { String::new() } else { format!("; dialect {}", word(&status["dialect"])) };
+    if host["attached"] != true {
+        return format!("none is attached{dialect}");
+    }
+    let who = match &host["pid"] {
+        Value::Null => "attached".to_owned(),
+        pid => format!("{}process {pid}", if host["sure"] == true { "" } else { "probably " }),
+    };
+    let commit = if host["commit"].is_null() { String::new() } else { format!(" ({})", word(&host["commit"])) };
+    match &host["checkout"] {
+        Value::Null => format!("{who}{dialect}"),
+        folder => format!("{who}, klippy of {}{commit}{dialect}", word(folder)),
+    }
+}
+
+fn table(page: &mut String, head: &str, rows: Vec<Vec<String>>) {
+    let columns = rows.first().map_or(0, Vec::len);
+    let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
+    let widths: Vec<usize> = (0..columns).map(width).collect();
+    for (n, row) in rows.iter().enumerate() {
+        let cells: String = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}  ")).collect();
+        let _ = writeln!(page, "{:<10}{}", if n == 0 { head } else { "" }, cells.trim_end());
+    }
+}
+
+// ---- for a scraper
+
+/// The status in Prometheus's text exposition format, version 0.0.4.
+fn metrics(status: &Value) -> String {
+    let mut out = Metrics(String::new());
+    let number = |value: &Value| value.as_f64().unwrap_or_default();
+    out.head("pinion_info", "gauge", "The program and the host that it serves");
+    out.sample(
+        "pinion_info",
+        &[("version", &status["version"]), ("link", &status["link"]), ("dialect", &status["dialect"])],
+        1.0,
+    );
+    out.one("pinion_uptime_seconds", "gauge", "Time since the start", number(&status["uptime_s"]));
+    out.head("pinion_state", "gauge", "1 for the state that the machine is in");
+    for state in ["unknown", "waiting", "configuring", "configured", "shutdown"] {
+        out.sample("pinion_state", &[("state", &state.into())], f64::from(u8::from(status["state"] == state)));
+    }
+    if !status["shutdown"].is_null() {
+        out.head("pinion_shutdown_info", "gauge", "Why the machine is shut down");
+        out.sample("pinion_shutdown_info", &[("reason", &status["shutdown"]["reason"])], 1.0);
+    }
+    out.one(
+        "pinion_host_attached",
+        "gauge",
+        "Whether a host is there",
+        f64::from(u8::from(status["host"]["attached"] == true)),
+    );
+    out.one(
+        "pinion_guardian_present",
+        "gauge",
+        "Whether a guardian holds the outputs",
+        f64::from(u8::from(status["guardian"]["present"] == true)),
+    );
+    let late = &status["lateness"];
+    if !late.is_null() {
+        let name = "pinion_timer_lateness_seconds";
+        out.head(name, "summary", "How late timers ran, since the start");
+        for (quantile, key) in [("0.5", "p50_us"), ("0.99", "p99_us"), ("0.999", "p999_us"), ("1", "max_us")] {
+            out.sample(name, &[("quantile", &quantile.into())], number(&late[key]) / 1e6);
+        }
+        out.sample("pinion_timer_lateness_seconds_count", &[], number(&late["timers"]));
+    }
+    let queues = &status["queues"];
+    if !queues.is_null() {
+        out.one("pinion_moves_queued", "gauge", "Moves in the move queue", number(&queues["moves"]["waiting"]));
+        out.one("pinion_moves_size", "gauge", "Moves that the queue has room for", number(&queues["moves"]["size"]));
+        out.one(
+            "pinion_commands_waiting",
+            "gauge",
+            "Blocks of commands that wait for the core",
+            number(&queues["commands"]["waiting"]),
+        );
+        out.head("pinion_worker_jobs", "gauge", "Jobs that wait for a bus");
+        for worker in queues["workers"].as_array().into_iter().flatten() {
+            out.sample("pinion_worker_jobs", &[("bus", &worker["name"])], number(&worker["waiting"]));
+        }
+    }
+    out.head("pinion_line_level", "gauge", "Level of a GPIO line, as last driven or sampled");
+    for line in rows(status, "lines").iter().filter(|line| !line["level"].is_null()) {
+        out.sample("pinion_line_level", &[("pin", &line["pin"]), ("use", &line["use"])], number(&line["level"]));
+    }
+    for (key, help) in [
+        ("transfers", "Transfers to a chip"),
+        ("errors", "Transfers to a chip that failed"),
+        ("retries", "Failed transfers that were tried again"),
+    ] {
+        let name = format!("pinion_bus_{key}_total");
+        out.head(&name, "counter", help);
+        for object in rows(status, "objects").iter().filter(|object| !object["bus"].is_null()) {
+            out.sample(&name, &[("oid", &object["oid"]), ("kind", &object["kind"])], number(&object["bus"][key]));
+        }
+    }
+    for (name, kind, help) in [
+        ("pinion_pwm_duty_ratio", "duty", "For how much of each period an output is on"),
+        ("pinion_adc_ratio", "adc", "An ADC's last sample, of full scale"),
+        ("pinion_stepper_position_steps", "steps", "A stepper's position"),
+    ] {
+        out.head(name, "gauge", help);
+        for object in rows(status, "objects").iter().filter(|object| !object["value"][kind].is_null()) {
+            out.sample(name, &[("oid", &object["oid"]), ("pin", &object["pin"])], number(&object["value"][kind]));
+        }
+    }
+    out.0
+}
+
+struct Metrics(String);
+
+impl Metrics {
+    fn head(&mut self, name: &str, kind: &str, help: &str) {
+        let _ = writeln!(self.0, "# HELP {name} {help}\n# TYPE {name} {kind}");
+    }
+
+    fn sample(&mut self, name: &str, labels: &[(&str, &Value)], value: f64) {
+        let labels = labels.iter().filter(|(_, value)| !value.is_null()).map(|(label, value)| {
+            let value = word(value).replace('\\', "\\\\").replace('"', "\\\"");
+            format!("{label}=\"{value}\"")
+        });
+        let labels = labels.collect::<Vec<_>>().join(",");
+        let labels = if labels.is_empty() { labels } else { format!("{{{labels}}}") };
+        let _ = writeln!(self.0, "{name}{labels} {value}");
+    }
+
+    fn one(&mut self, name: &str, kind: &str, help: &str, value: f64) {
+        self.head(name, kind, help);
+        self.sample(name, &[], value);
+    }
+}
+
+// ---- again and again
+
+/// Prints the status each second, until it is asked to end.
+fn watch(args: &StatusArgs) -> Result<(), String> {
+    let ended = Arc::new(AtomicBool::new(false));
+    for signal in [SIGINT, SIGTERM, SIGHUP] {
+        signal_hook::flag::register(signal, ended.clone())
+            .map_err(|error| format!("signals can not be taken in: {error}"))?;
+    }
+    let (stdin, stdout) = (io::stdin(), io::stdout());
+    let mut screen = stdout.is_terminal().then(|| Screen::enter(stdin.as_fd()));
+    // An instance that can not be asked at the first time is a mistake, later one that is being restarted.
+    let mut status = Some(ask(args)?);
+    loop {
+        let page = match status.take().map_or_else(|| ask(args), Ok) {
+            Ok(status) => show(args, &status),
+            Err(error) => format!("{error}\n"),
+        };
+        match &mut screen {
+            Some(screen) => screen.draw(&page)?,
+            None => {
+                let mut out = stdout.lock();
+                // A reader that is gone wants no more.
+                if writeln!(out, "{page}").and_then(|()| out.flush()).is_err() {
+                    return Ok(());
+                }
+            }
+        }
+        let next = Instant::now() + PERIOD;
+        while Instant::now() < next {
+            if ended.load(Ordering::Relaxed)
+                || screen.as_ref().is_some_and(|screen| screen.is_told_to_end(stdin.as_fd()))
+            {
+                return Ok(());
+            }
+            if screen.is_none() {
+                thread::sleep(Duration::from_millis(20));
+            }
+        }
+    }
+}
+
+/// A terminal that is drawn on in place: its alternate screen, without a cursor, long
+/// lines cut off. Dropped, it is as before.
+struct Screen {
+    /// The settings to give back, if keys can be read.
+    before: Option<Termios>,
+}
+
+impl Screen {
+    fn enter(keys: BorrowedFd<'_>) -> Screen {
+        let before = tcgetattr(keys).ok();
+        if let Some(before) = &before {
+            let mut keyed = before.clone();
+            keyed.local_flags.remove(LocalFlags::ICANON | LocalFlags::ECHO);
+            let _ = tcsetattr(keys, SetArg::TCSANOW, &keyed);
+        }
+        let _ = print("\x1b[?1049h\x1b[?25l\x1b[?7l");
+        Screen { before }
+    }
+
+    /// Draws the page, or as much of it as the terminal has rows for.
+    fn draw(&mut self, page: &str) -> Result<(), String> {
+        let mut drawn = "\x1b[H".to_owned();
+        let all = page.lines().count();
+        let room = sys::terminal_rows(&io::stdout()).unwrap_or(24).saturating_sub(1);
+        for line in page.lines().take(if all > room { room.saturating_sub(1) } else { room }) {
+            drawn += &format!("{line}\x1b[K\r\n");
+        }
+        if all > room {
+            let _ = write!(drawn, "... and {} lines more\x1b[K\r\n", all - room.saturating_sub(1));
+        }
+        drawn += "\x1b[J";
+        print(&(drawn + if self.before.is_some() { "q ends" } else { "Ctrl-C ends" }))
+    }
+
+    /// Whether somebody has pressed q; waits a little for that.
+    fn is_told_to_end(&self, keys: BorrowedFd<'_>) -> bool {
+        if self.before.is_none() {
+            thread::sleep(Duration::from_millis(20));
+            return false;
+        }
+        let mut fds = [PollFd::new(keys, PollFlags::POLLIN)];
+        if !matches!(poll(&mut fds, 50u16), Ok(1)) {
+            return false;
+        }
+        let mut key = [0; 64];
+        match nix::unistd::read(keys, &mut key) {
+            Ok(0) => true,
+            Ok(read) => key[..read].iter().any(|key| matches!(key, b'q' | b'Q')),
+            // Without a terminal any more there is nobody to show anything.
+            Err(error) => error != nix::errno::Errno::EINTR,
+        }
+    }
+}
+
+impl Drop for Screen {
+    fn drop(&mut self) {
+        let _ = print("\x1b[?7h\x1b[?25h\x1b[?1049l");
+        if let Some(before) = &self.before {
+            let _ = tcsetattr(io::stdin().as_fd(), SetArg::TCSANOW, before);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use serde_json::json;
+
+    fn status() -> Value {
+        json!({
+            "version": "1", "pid": 5, "uptime_s": 3700.0, "link": "/tmp/l", "terminal": "/dev/pts/1", "board": "b",
+            "state": "shutdown", "shutdown": { "reason": "ADC out of range", "detail": "oid 3\u{1b}[2J", "ago_s": 61.0 },
+            "dialect": "master", "owes": null,
+            "host": { "attached": true, "pid": 7, "sure": true, "checkout": "/home/pi/klipper", "commit": "abc" },
+            "guardian": { "present": true, "pid": 6 },
+            "lines": [{ "pin": "gpio\"1", "use": "output", "level": 1 }, { "pin": "gpio2", "use": "input", "level": null }],
+            "objects": [
+                { "oid": 0, "kind": "SPI device", "pin": "gpio8", "queued": 0, "value": null,
+                  "bus": { "transfers": 9, "errors": 2, "retries": 1 } },
+                { "oid": 1, "kind": "stepper", "pin": "gpio9", "queued": 3, "value": { "steps": -5 }, "bus": null },
+            ],
+            "lateness": { "timers": 10, "p50_us": 1.0, "p99_us": 2.0, "p999_us": 3.0, "max_us": 4.0, "margin_us": 50.0, "buckets_us": [] },
+            "queues": { "moves": { "waiting": 3, "size": 1024 }, "commands": { "waiting": 0, "size": 256, "held": false },
+                        "workers": [{ "name": "spi0", "waiting": 1 }] },
+        })
+    }
+
+    #[test]
+    fn a_page_tells_all_and_obeys_nothing() {
+        let page = text(&status());
+        for line in [
+            "pinion    1, process 5, up for 1 h 1 min",
+            "state     SHUT DOWN 1 min 1 s ago: ADC out of range: oid 3?[2J",
+            "host      process 7, klippy of /home/pi/klipper (abc); dialect master",
+            "guardian  process 6",
+            "queues    moves 3 of 1024, commands 0, spi0 1",
+            "lines     gpio\"1  output  high",
+            "          gpio2   input   not looked at yet",
+            "objects   oid 0  SPI device  gpio8  9 transfers, 2 failed, 1 of them tried again",
+            "          oid 1  stepper     gpio9  at -5 steps, 3 queued",
+        ] {
+            assert!(page.lines().any(|shown| shown == line), "{line}\n{page}");
+        }
+        assert!(!page.contains('\x1b'));
+        // What an instance does not tell is left out.
+        assert!(text(&json!({ "state": "unknown" })).contains("the core has not answered"));
+    }
+
+    #[test]
+    fn metrics_have_a_type_each_and_labels_that_end() {
+        let metrics = metrics(&status());
+        for line in [
+            "pinion_state{state=\"shutdown\"} 1",
+            "pinion_state{state=\"configured\"} 0",
+            "pinion_line_level{pin=\"gpio\\\"1\",use=\"output\"} 1",
+            "pinion_timer_lateness_seconds{quantile=\"0.99\"} 0.000002",
+            "pinion_timer_lateness_seconds_count 10",
+            "pinion_bus_errors_total{oid=\"0\",kind=\"SPI device\"} 2",
+            "pinion_worker_jobs{bus=\"spi0\"} 1",
+        ] {
+            assert!(metrics.lines().any(|shown| shown == line), "{line}\n{metrics}");
+        }
+        assert!(!metrics.contains("gpio2"), "what was not looked at has no level");
+        for sample in metrics.lines().filter(|line| !line.starts_with('#')) {
+            let name = sample.split(['{', ' ']).next().unwrap().trim_end_matches("_count");
+            assert_eq!(metrics.matches(&format!("# TYPE {name} ")).count(), 1, "{name}");
+            sample.rsplit_once(' ').unwrap().1.parse::<f64>().unwrap();
+        }
+    }
+}

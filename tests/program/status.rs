@@ -1,0 +1,229 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion status`: what a running machine tells of itself, and that asking does it no harm.
+
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::Instant;
+
+use nix::pty::{Winsize, openpty};
+use nix::sys::signal::Signal;
+use nix::sys::termios::{LocalFlags, tcgetattr};
+use serde_json::{Value, json};
+
+use crate::process::{PATIENCE, Pinion, exists};
+
+fn socket(pinion: &Pinion) -> PathBuf {
+    pinion.link().with_file_name("tty.sock")
+}
+
+fn ask(pinion: &Pinion, args: &[&str]) -> std::process::Output {
+    let link = pinion.link();
+    Command::new(env!("CARGO_BIN_EXE_pinion")).arg("status").args(args).arg("-I").arg(link).output().unwrap()
+}
+
+fn status(pinion: &Pinion) -> Value {
+    let output = ask(pinion, &["--json"]);
+    assert!(output.status.success(), "{output:?}\n{}", pinion.log());
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+fn line<'a>(status: &'a Value, pin: &str) -> &'a Value {
+    let lines = status["lines"].as_array().unwrap();
+    lines.iter().find(|line| line["pin"] == pin).unwrap_or_else(|| panic!("no {pin} in {lines:?}"))
+}
+
+const CONFIGURATION: &[&str] = &[
+    "allocate_oids count=4",
+    "config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0",
+    "config_endstop oid=1 pin=x_endstop pull_up=1",
+    "config_analog_in oid=2 pin=bed_sensor",
+    "config_stepper oid=3 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
+    "finalize_config crc=1",
+];
+
+#[test]
+fn a_machine_tells_how_it_is_in_each_state() {
+    let mut pinion = Pinion::simulated(&["--dialect", "master"]);
+    let socket = socket(&pinion);
+    pinion.until("the socket", || exists(&socket));
+    let waiting = status(&pinion);
+    assert_eq!(waiting["state"], "waiting");
+    assert_eq!(waiting["pid"], pinion.pid());
+    assert_eq!(waiting["version"], env!("CARGO_PKG_VERSION"));
+    assert_eq!(waiting["link"], pinion.link().to_str().unwrap());
+    assert_eq!((&waiting["host"]["attached"], &waiting["shutdown"]), (&json!(false), &Value::Null));
+    assert_eq!(waiting["guardian"]["present"], false, "the simulated printer needs none");
+    assert_eq!(waiting["dialect"], "master");
+
+    let mut client = pinion.client();
+    for command in CONFIGURATION {
+        client.send_line(command).unwrap();
+    }
+    client.send_line("update_digital_out oid=0 value=1").unwrap();
+    let clock = client.clock_in(0.1).unwrap().wire();
+    client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
+    assert!(client.status().unwrap().is_config);
+    assert!(client.wait("analog_in_state", Some(2), Instant::now() + PATIENCE).unwrap().is_some());
+    client.send_line("endstop_query_state oid=1").unwrap();
+    client.link().settle().unwrap();
+    let configured = status(&pinion);
+    assert_eq!(configured["state"], "configured");
+    assert_eq!(configured["host"]["attached"], true);
+    assert_eq!(*line(&configured, "led"), json!({ "pin": "led", "use": "output", "level": 1 }));
+    assert_eq!(*line(&configured, "x_step"), json!({ "pin": "x_step", "use": "output", "level": 0 }));
+    let stop = line(&configured, "x_endstop");
+    assert_eq!(stop["use"], "input");
+    assert!(stop["level"].is_u64(), "it was sampled: {stop}");
+    let objects = configured["objects"].as_array().unwrap();
+    assert_eq!(objects.len(), 4);
+    assert_eq!(objects[0]["kind"], "digital output");
+    assert_eq!((&objects[2]["oid"], &objects[2]["pin"]), (&json!(2), &json!("bed_sensor")));
+    let share = objects[2]["value"]["adc"].as_f64().unwrap();
+    assert!(share > 0.0 && share < 1.0, "{share}");
+    assert_eq!(objects[3]["value"]["steps"], 0);
+    assert_eq!(configured["queues"]["moves"], json!({ "waiting": 0, "size": 1024 }));
+    let timers = configured["lateness"]["timers"].as_u64().unwrap();
+    let buckets = configured["lateness"]["buckets_us"].as_array().unwrap();
+    assert_eq!(buckets.iter().map(|bucket| bucket[1].as_u64().unwrap()).sum::<u64>(), timers);
+    assert!(timers > 0);
+
+    client.emergency_stop().unwrap();
+    let stopped = status(&pinion);
+    assert_eq!(stopped["state"], "shutdown");
+    assert_eq!(stopped["shutdown"]["reason"], "Command request");
+    // The same that the log says.
+    let logged = pinion.logged("shutdown: Command request: ");
+    assert!(logged.ends_with(stopped["shutdown"]["detail"].as_str().unwrap()), "{logged}\n{stopped}");
+    assert_eq!(line(&stopped, "led")["level"], 0);
+    let page = String::from_utf8(ask(&pinion, &[]).stdout).unwrap();
+    assert!(page.contains("SHUT DOWN 0 s ago: Command request: ") || page.contains("SHUT DOWN 1 s ago"), "{page}");
+    let metrics = String::from_utf8(ask(&pinion, &["--prometheus"]).stdout).unwrap();
+    assert!(metrics.contains("\npinion_state{state=\"shutdown\"} 1\n"), "{metrics}");
+
+    assert_eq!(fs::metadata(&socket).unwrap().permissions().mode() & 0o777, 0o660);
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    assert!(!exists(&socket));
+    let gone = ask(&pinion, &[]);
+    assert_eq!(gone.status.code(), Some(1));
+    assert!(String::from_utf8_lossy(&gone.stderr).contains("no Pinion answers on"), "{gone:?}");
+}
+
+#[test]
+fn each_of_two_instances_has_a_socket_and_none_takes_the_others() {
+    let first = Pinion::simulated(&[]);
+    first.until("the socket", || exists(&socket(&first)));
+    let path = socket(&first);
+    let second = Pinion::simulated(&["--socket", path.to_str().unwrap()]);
+    let refused = second.logged("pinion status will not be answered");
+    assert!(refused.contains("another Pinion answers there"), "{refused}");
+    second.client().status().unwrap();
+    assert_eq!(status(&first)["pid"], first.pid());
+    let third = Pinion::simulated(&[]);
+    third.until("the socket", || exists(&socket(&third)));
+    assert_eq!(status(&third)["pid"], third.pid());
+    assert_eq!(status(&first)["pid"], first.pid());
+}
+
+#[test]
+fn what_a_killed_instance_left_is_replaced() {
+    let mut first = Pinion::simulated(&[]);
+    let kept = tempfile::tempdir().unwrap();
+    let path = kept.path().join("s.sock");
+    drop(std::os::unix::net::UnixListener::bind(&path).unwrap());
+    let second = Pinion::simulated(&["--socket", path.to_str().unwrap()]);
+    second.logged("status on");
+    assert!(fs::metadata(&path).unwrap().file_type().is_socket());
+    UnixStream::connect(&path).unwrap();
+    first.signal(Signal::SIGTERM);
+    first.end();
+}
+
+#[test]
+fn clients_that_do_not_read_or_talk_rubbish_or_are_many_disturb_nobody() {
+    let pinion = Pinion::simulated(&[]);
+    let path = socket(&pinion);
+    pinion.until("the socket", || exists(&path));
+    let mut client = pinion.client();
+    for command in CONFIGURATION {
+        client.send_line(command).unwrap();
+    }
+    assert!(client.status().unwrap().is_config);
+    // None of these reads, some say something, some go at once.
+    let mut silent = Vec::new();
+    for n in 0..200 {
+        let Ok(mut socket) = UnixStream::connect(&path) else { continue };
+        if n % 3 == 0 {
+            let _ = socket.write_all(&[0xff; 5000]);
+        }
+        if n % 2 == 0 {
+            silent.push(socket);
+        }
+    }
+    let files = fs::read_dir(format!("/proc/{}/fd", pinion.pid())).unwrap().count();
+    assert!(files < 100, "{files} files are open");
+    assert_eq!(status(&pinion)["state"], "configured");
+    let status = client.status().unwrap();
+    assert!(status.is_config && !status.is_shutdown);
+    // What they did not read is there for them still, and whole.
+    let mut last = String::new();
+    silent.pop().unwrap().read_to_string(&mut last).ok();
+    assert!(last.is_empty() || serde_json::from_str::<Value>(&last).is_ok(), "{last}");
+}
+
+fn watch(pinion: &Pinion, stdin: Stdio, stdout: Stdio) -> Child {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    command.args(["status", "--watch", "-I"]).arg(pinion.link()).stdin(stdin).stdout(stdout).spawn().unwrap()
+}
+
+#[test]
+fn watching_goes_on_until_q_and_gives_the_terminal_back() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.until("the socket", || exists(&socket(&pinion)));
+    let size = Winsize { ws_row: 40, ws_col: 100, ws_xpixel: 0, ws_ypixel: 0 };
+    let terminal = openpty(Some(&size), None).unwrap();
+    let before = tcgetattr(&terminal.slave).unwrap();
+    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
+    let mut watch = watch(&pinion, dup(), dup());
+    let mut master = File::from(terminal.master);
+    let mut shown = String::new();
+    let mut piece = [0; 4096];
+    while !shown.contains("waiting for a host's configuration") || !shown.contains("q ends") {
+        let read = master.read(&mut piece).unwrap();
+        shown += &String::from_utf8_lossy(&piece[..read]);
+    }
+    assert!(!tcgetattr(&terminal.slave).unwrap().local_flags.contains(LocalFlags::ICANON));
+    master.write_all(b"q").unwrap();
+    assert!(watch.wait().unwrap().success());
+    assert_eq!(tcgetattr(&terminal.slave).unwrap().local_flags, before.local_flags);
+    let read = master.read(&mut piece).unwrap();
+    shown += &String::from_utf8_lossy(&piece[..read]);
+    assert!(shown.ends_with("\x1b[?7h\x1b[?25h\x1b[?1049l"), "{shown:?}");
+}
+
+#[test]
+fn watching_into_a_pipe_is_a_page_each_second() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.until("the socket", || exists(&socket(&pinion)));
+    let mut watch = watch(&pinion, Stdio::null(), Stdio::piped());
+    let mut out = watch.stdout.take().unwrap();
+    let (mut shown, mut piece) = (String::new(), [0; 4096]);
+    while shown.matches("\nstate ").count() < 2 {
+        let read = out.read(&mut piece).unwrap();
+        assert!(read > 0, "{shown}");
+        shown += &String::from_utf8_lossy(&piece[..read]);
+    }
+    assert!(!shown.contains('\x1b'));
+    // A reader that has gone ends it.
+    drop(out);
+    let end = Instant::now() + PATIENCE;
+    while watch.try_wait().unwrap().is_none() {
+        assert!(Instant::now() < end);
+        thread::sleep(std::time::Duration::from_millis(20));
+    }
+}
