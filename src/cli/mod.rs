@@ -6,7 +6,7 @@
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use log::LevelFilter;
 
 pub mod dict;
@@ -23,7 +23,7 @@ pub mod sim;
 /// Without a subcommand it runs as `pinion run` does: the command line of Klipper's own
 /// klipper_mcu (-r -w -I PATH) works unchanged.
 #[derive(Parser, Debug)]
-#[command(name = "pinion", version, max_term_width = 100, args_conflicts_with_subcommands = true)]
+#[command(name = "pinion", version = env!("PINION_VERSION"), max_term_width = 100, args_conflicts_with_subcommands = true)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -55,6 +55,11 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
+    /// Print a script that has a shell complete the command lines of pinion
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
 }
 
 /// Runs the program with the process's arguments.
@@ -69,9 +74,20 @@ pub fn main() -> ExitCode {
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
+        Some(Command::Completions { shell }) => completions(shell),
     };
     logging::finish();
     status
+}
+
+/// Prints the script for a shell.
+fn completions(shell: clap_complete::Shell) -> ExitCode {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Cli::command(), "pinion", &mut script);
+    match print(&String::from_utf8_lossy(&script)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(error),
+    }
 }
 
 /// Has a panic in any thread logged and end the process. Otherwise only that thread would end: without

@@ -18,8 +18,7 @@ use log::{error, info, warn};
 use rtrb::RingBuffer;
 
 use crate::board::Board;
-use crate::feature::FEATURES;
-use crate::mcu::{Dialect, DialectName, Generation, Mcu};
+use crate::mcu::{DialectName, Generation, Mcu};
 use crate::sys;
 use crate::time::{Monotonic, TimeSource};
 
@@ -35,6 +34,7 @@ mod pty;
 mod pulse;
 pub mod realtime;
 mod signals;
+mod survey;
 pub mod wakeup;
 mod watchdog;
 mod workers;
@@ -51,6 +51,7 @@ use pty::Pty;
 use pulse::Pulse;
 use realtime::{Processors, Role, Scheduling};
 use signals::Signals;
+use survey::Surveyor;
 use wakeup::{MarginLimits, Waiter};
 use watchdog::{Vigil, Watchdog};
 use workers::Threads;
@@ -98,8 +99,7 @@ pub fn run(
         Some(name) => vec![name],
         None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
     };
-    let dialects = names.into_iter().map(|name| Dialect::new(FEATURES, &*board, name).map(Arc::new));
-    let dialects = dialects.collect::<io::Result<Vec<Arc<Dialect>>>>()?;
+    let dialects = survey::dialects(&*board, &names)?;
     let clock: Arc<dyn TimeSource> = Arc::new(clock);
     let wake = Arc::new(LinkWake::new()?);
     // Before the link is of real time, which its threads would inherit.
@@ -111,6 +111,7 @@ pub fn run(
     if let Err(error) = sys::give_up(sys::LOOK_INTO_OTHERS) {
         warn!("capabilities can not be given up: {error}");
     }
+    let surveyor = board.view().map(|view| Surveyor::start(view, names, wake.clone())).transpose()?;
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
@@ -154,6 +155,7 @@ pub fn run(
         clock,
         dialects,
         finder,
+        surveyor,
         requests,
         core: core.thread().clone(),
         inlet,

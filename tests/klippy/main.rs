@@ -9,6 +9,7 @@ mod drivers;
 mod filament;
 mod klippy;
 mod print;
+mod readme;
 mod regression;
 mod rings;
 mod servo;
