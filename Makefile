@@ -17,12 +17,18 @@ TMPFILESDIR ?= $(PREFIX)/lib/tmpfiles.d
 # udev does not look below /usr/local.
 UDEVDIR ?= $(if $(filter /usr,$(PREFIX)),/usr/lib/udev,/etc/udev)/rules.d
 MANDIR ?= $(PREFIX)/share/man
+LIBDIR = $(PREFIX)/lib/pinion-mcu
+BASHDIR ?= $(PREFIX)/share/bash-completion/completions
+ZSHDIR ?= $(PREFIX)/share/zsh/site-functions
+FISHDIR ?= $(PREFIX)/share/fish/vendor_completions.d
+# A program that runs here, to ask for the shells' completions: not PINION where that is of another architecture.
+COMPLETER ?= $(PINION)
 DEB_FOLDER ?= $(CARGO_TARGET_DIR)/deb
 
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test lab lab-pi bench check build install install-program install-system uninstall deb clean
+.PHONY: help run demo test lab lab-pi lab-system bench check build install install-program install-system uninstall deb clean
 .PHONY: system-packages cargo
 
 help:
@@ -31,11 +37,12 @@ help:
 	@echo 'make test     all tests, with those against real kernel drivers in a virtual machine'
 	@echo 'make lab      only the latter'
 	@echo 'make lab-pi   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
+	@echo 'make lab-system  the package installed in a booted Debian 12 with systemd (as root)'
 	@echo 'make bench    the benchmarks'
 	@echo 'make check    formatting, lints, documentation, man pages, what the package has'
 	@echo 'make build    the program: $(PINION)'
 	@echo 'make install  program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
-	@echo 'make deb      a Debian package in $(DEB_FOLDER)'
+	@echo 'make deb      a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf'
 	@echo 'make clean    remove what was built'
 
 run: build
@@ -64,6 +71,11 @@ lab-pi: cargo
 	@scripts/system-packages build
 	$(CARGO) test --locked --test lab_pi
 
+lab-system: cargo
+	@scripts/system-packages lab
+	@scripts/system-packages deb
+	$(CARGO) test --locked --test lab_system
+
 bench: system-packages
 	$(CARGO) bench --locked
 
@@ -74,7 +86,7 @@ check: system-packages
 	$(CARGO) build --locked --quiet
 	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
 	@scripts/system-packages deb
-	scripts/check-deb
+	scripts/check-deb $(CARGO_TARGET_DIR)/debug/pinion
 
 system-packages: cargo
 	@scripts/system-packages build
@@ -91,11 +103,19 @@ install-program:
 	install -D -m 755 $(PINION) $(DESTDIR)$(PREFIX)/bin/pinion
 	install -D -m 644 man/pinion.1 $(DESTDIR)$(MANDIR)/man1/pinion.1
 	install -D -m 644 man/pinion-mcu.service.8 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
+	install -D -m 755 systemd/link $(DESTDIR)$(LIBDIR)/link
+	install -d $(DESTDIR)$(BASHDIR) $(DESTDIR)$(ZSHDIR) $(DESTDIR)$(FISHDIR)
+	$(COMPLETER) completions bash >$(DESTDIR)$(BASHDIR)/pinion
+	$(COMPLETER) completions zsh >$(DESTDIR)$(ZSHDIR)/_pinion
+	$(COMPLETER) completions fish >$(DESTDIR)$(FISHDIR)/pinion.fish
+	chmod 644 $(DESTDIR)$(BASHDIR)/pinion $(DESTDIR)$(ZSHDIR)/_pinion $(DESTDIR)$(FISHDIR)/pinion.fish
 
 install-system:
 	install -d $(DESTDIR)$(UNITDIR)
-	sed 's|/usr/bin/pinion|$(PREFIX)/bin/pinion|' systemd/pinion-mcu.service >$(DESTDIR)$(UNITDIR)/pinion-mcu.service
-	chmod 644 $(DESTDIR)$(UNITDIR)/pinion-mcu.service
+	for unit in pinion-mcu.service pinion-mcu@.service; do \
+	    sed 's|/usr/bin/pinion|$(PREFIX)/bin/pinion|; s|/usr/lib/pinion-mcu|$(LIBDIR)|' systemd/$$unit \
+	        >$(DESTDIR)$(UNITDIR)/$$unit && chmod 644 $(DESTDIR)$(UNITDIR)/$$unit || exit 1; \
+	done
 	install -D -m 644 systemd/pinion-mcu.sysusers $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf
 	install -D -m 644 systemd/pinion-mcu.tmpfiles $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf
 	install -D -m 644 udev/60-pinion-mcu.rules $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules
@@ -104,8 +124,9 @@ install-system:
 ifeq ($(DESTDIR),)
 	systemd-sysusers $(SYSUSERSDIR)/pinion-mcu.conf
 	-systemctl daemon-reload
-	-udevadm control --reload && udevadm trigger --subsystem-match=gpio --subsystem-match=spidev \
-	    --subsystem-match=i2c-dev --subsystem-match=pwm --subsystem-match=watchdog
+	-udevadm control --reload && udevadm trigger --action=change --subsystem-match=gpio \
+	    --subsystem-match=spidev --subsystem-match=i2c-dev --subsystem-match=iio --subsystem-match=pwm \
+	    --subsystem-match=w1 && udevadm trigger --action=change --sysname-match='watchdog*'
 	@echo 'Installed. Start it, now and at every boot: systemctl enable --now pinion-mcu'
 endif
 
@@ -114,13 +135,22 @@ ifeq ($(DESTDIR),)
 	-systemctl disable --now pinion-mcu
 endif
 	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
+	    $(DESTDIR)$(UNITDIR)/pinion-mcu@.service $(DESTDIR)$(LIBDIR)/link $(DESTDIR)$(BASHDIR)/pinion \
+	    $(DESTDIR)$(ZSHDIR)/_pinion $(DESTDIR)$(FISHDIR)/pinion.fish \
 	    $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf \
 	    $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules $(DESTDIR)/etc/default/pinion-mcu \
 	    $(DESTDIR)$(MANDIR)/man1/pinion.1 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
+	-rmdir $(DESTDIR)$(LIBDIR)
+ifeq ($(DESTDIR),)
+	-systemctl daemon-reload
+	-udevadm control --reload
+endif
 
+ARCH ?=
 # Rust is rustup's, of which dpkg knows nothing: -d leaves the build dependencies to us.
 deb: system-packages
-	@scripts/build-deb $(DEB_FOLDER)
+	@scripts/system-packages deb
+	@scripts/build-deb $(DEB_FOLDER) $(ARCH)
 
 clean:
 	$(CARGO) clean

@@ -363,6 +363,17 @@ pub trait Board: Send {
     /// The names of the dictionary's enumeration `spi_bus`.
     fn spi_buses(&self) -> Vec<Range>;
 
+    /// Another view of the same hardware, for a thread that [looks again](Board::look_again): what it
+    /// then finds, this board has, too. None if nothing comes and goes.
+    fn view(&self) -> Option<Box<dyn Board>> {
+        None
+    }
+
+    /// Looks for what has come and gone, which may block. True if something has.
+    fn look_again(&mut self) -> bool {
+        false
+    }
+
     /// One and the same number for all the pins that lead to one line.
     fn canonical(&self, pin: Pin) -> Pin {
         pin

@@ -7,7 +7,7 @@ use std::ffi::OsString;
 use std::io::{self, Write as _};
 use std::process::ExitCode;
 
-use clap::{Args, Parser, Subcommand};
+use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use log::LevelFilter;
 
 mod check;
@@ -28,7 +28,7 @@ mod status;
 /// Without a subcommand it runs as `pinion run` does: the command line of Klipper's own
 /// klipper_mcu (-r -w -I PATH) works unchanged.
 #[derive(Parser, Debug)]
-#[command(name = "pinion", version, max_term_width = 100, args_conflicts_with_subcommands = true)]
+#[command(name = "pinion", version = env!("PINION_VERSION"), max_term_width = 100, args_conflicts_with_subcommands = true)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     command: Option<Command>,
@@ -62,6 +62,11 @@ enum Command {
     Status(status::StatusArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
+    /// Print a script that has a shell complete the command lines of pinion
+    Completions {
+        /// The shell
+        shell: clap_complete::Shell,
+    },
 }
 
 /// Runs the program with the process's arguments.
@@ -77,6 +82,7 @@ pub fn main() -> ExitCode {
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Status(args)) => status::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
+        Some(Command::Completions { shell }) => completions(shell),
     };
     logging::finish();
     status
@@ -91,6 +97,16 @@ fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<run:
         Some(Command::Run(args)) => Some(args),
         Some(_) => None,
     })
+}
+
+/// Prints the script for a shell.
+fn completions(shell: clap_complete::Shell) -> ExitCode {
+    let mut script = Vec::new();
+    clap_complete::generate(shell, &mut Cli::command(), "pinion", &mut script);
+    match print(&String::from_utf8_lossy(&script)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(error),
+    }
 }
 
 /// Has a panic in any thread logged and end the process. Otherwise only that thread would end: without

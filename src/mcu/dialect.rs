@@ -112,7 +112,7 @@ impl Dialect {
             app: told("Pinion"),
             build_versions: concat!("rustc: ", env!("CARGO_PKG_RUST_VERSION"), " or later").into(),
             license: told("GNU GPLv3"),
-            version: concat!("pinion-", env!("CARGO_PKG_VERSION")).into(),
+            version: concat!("pinion-", env!("PINION_VERSION")).into(),
             ..Dictionary::default()
         };
         let mut ids = ids();

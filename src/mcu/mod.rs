@@ -349,11 +349,12 @@ impl Mcu {
     /// configure it, after the reset. Until then its objects answer in words that the other host does
     /// not know, so only the messages of the machine itself are served, which have the same ids in
     /// every dialect, and `get_config` tells no check sum that the other host could take for its own.
+    /// The same dialect over a board that has changed differs in its names of pins alone.
     pub fn speak(&mut self, dialect: Arc<Dialect>) {
         self.next_dialect = None;
-        if !self.oids_allocated && !self.is_finalized() {
+        if dialect.name() == self.dialect.name() || !self.oids_allocated && !self.is_finalized() {
             self.dialect = dialect;
-        } else if dialect.name() != self.dialect.name() {
+        } else {
             self.next_dialect = Some(dialect);
         }
     }

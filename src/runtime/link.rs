@@ -31,6 +31,7 @@ use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
 use super::signals::{Signal, Signals};
 use super::status::HostBoard;
+use super::survey::Surveyor;
 use super::watchdog::{Vigil, Watchdog};
 
 /// What a shell writes to the pty to stop the machine, as in Klipper's service file.
@@ -107,10 +108,14 @@ pub(super) struct Link {
     known: Known,
     /// Those that a host may speak.
     dialects: Vec<Arc<Dialect>>,
+    /// Those before the board changed last, kept until it changes again, so that the core never frees one.
+    outdated: Vec<Arc<Dialect>>,
     /// None if the dialect does not depend on the host.
     finder: Option<HostFinder>,
     host: Arc<HostBoard>,
-    /// Until when the host's first bytes wait for its dialect to be found.
+    /// None if the board never changes.
+    surveyor: Option<Surveyor>,
+    /// Until when the host's first bytes wait for its dialect, and for what the board has now.
     finding: Option<Duration>,
     receiver: Receiver,
     input: Vec<u8>,
@@ -159,6 +164,7 @@ pub(super) struct Parts {
     pub(super) finder: Option<HostFinder>,
     /// Where it says whether a host is there.
     pub(super) host: Arc<HostBoard>,
+    pub(super) surveyor: Option<Surveyor>,
     pub(super) requests: Producer<Request>,
     pub(super) core: Thread,
     pub(super) inlet: Inlet,
@@ -177,6 +183,7 @@ impl Link {
             dialects,
             finder,
             host,
+            surveyor,
             requests,
             core,
             inlet,
@@ -191,8 +198,10 @@ impl Link {
             clock,
             known: Known::new(dialects[0].clone()),
             dialects,
+            outdated: Vec::new(),
             finder,
             host,
+            surveyor,
             finding: None,
             receiver: Receiver::default(),
             input: Vec::with_capacity(INPUT_BYTES),
@@ -348,8 +357,13 @@ impl Link {
             self.attached = true;
             self.tell_status();
             info!("host attached");
+            if let Some(surveyor) = &mut self.surveyor {
+                surveyor.ask();
+            }
             if let Some(finder) = &mut self.finder {
                 finder.ask();
+            }
+            if self.surveyor.is_some() || self.finder.is_some() {
                 self.finding = Some(monotonic() + FIND_LIMIT);
             }
         }
@@ -388,30 +402,39 @@ impl Link {
         Ok(())
     }
 
-    /// Whether the host's dialect is not known yet.
+    /// Whether it is not known yet what the host is to be told: what the board has, in which dialect.
     fn is_finding(&mut self) -> bool {
-        let (Some(until), Some(finder)) = (self.finding, &self.finder) else { return false };
-        let found = finder.answer().or_else(|| {
-            (monotonic() >= until).then(|| {
-                warn!(
-                    "the host's dialect was not found within {FIND_LIMIT:?}: served as Klipper v0.13, master and Kalico"
-                );
-                DialectName::Union
-            })
-        });
-        if let Some(name) = found {
-            self.finding = None;
+        let Some(until) = self.finding else { return false };
+        let is_late = monotonic() >= until;
+        if let Some(surveyor) = &mut self.surveyor {
+            if !surveyor.is_done() && !is_late {
+                return true;
+            }
+            if let Some(dialects) = surveyor.take() {
+                self.outdated = std::mem::replace(&mut self.dialects, dialects);
+                self.speak(self.known.dialect.name());
+            }
+        }
+        if let Some(finder) = &self.finder {
+            let found = finder.answer().or_else(|| {
+                is_late.then(|| {
+                    warn!(
+                        "the host's dialect was not found within {FIND_LIMIT:?}: served as Klipper v0.13, master and Kalico"
+                    );
+                    DialectName::Union
+                })
+            });
+            let Some(name) = found else { return true };
             self.speak(name);
         }
-        found.is_none()
+        self.finding = None;
+        false
     }
 
-    /// Speaks another dialect from now on.
+    /// Speaks the dialect of this name from now on.
     fn speak(&mut self, name: DialectName) {
-        if self.known.dialect.name() == name {
-            return;
-        }
-        if let Some(dialect) = self.dialects.iter().find(|dialect| dialect.name() == name).cloned() {
+        let of_name = self.dialects.iter().find(|dialect| dialect.name() == name);
+        if let Some(dialect) = of_name.filter(|dialect| !Arc::ptr_eq(dialect, &self.known.dialect)).cloned() {
             self.known = Known::new(dialect.clone());
             self.request(Request::Speak(dialect));
         }

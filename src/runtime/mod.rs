@@ -18,8 +18,7 @@ use log::{error, info, warn};
 use rtrb::RingBuffer;
 
 use crate::board::Board;
-use crate::feature::FEATURES;
-use crate::mcu::{Dialect, DialectName, Generation, Mcu};
+use crate::mcu::{DialectName, Generation, Mcu};
 use crate::sys;
 use crate::time::{Monotonic, TimeSource};
 
@@ -36,6 +35,7 @@ mod pulse;
 pub mod realtime;
 mod signals;
 pub(crate) mod status;
+mod survey;
 pub mod wakeup;
 mod watchdog;
 mod workers;
@@ -54,6 +54,7 @@ use pulse::Pulse;
 use realtime::{Processors, Role, Scheduling};
 use signals::Signals;
 use status::{Fixed, HostBoard, StatusSocket};
+use survey::Surveyor;
 use wakeup::{MarginLimits, Waiter};
 use watchdog::{Vigil, Watchdog};
 use workers::Threads;
@@ -103,8 +104,7 @@ pub fn run(
         Some(name) => vec![name],
         None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
     };
-    let dialects = names.into_iter().map(|name| Dialect::new(FEATURES, &*board, name).map(Arc::new));
-    let dialects = dialects.collect::<io::Result<Vec<Arc<Dialect>>>>()?;
+    let dialects = survey::dialects(&*board, &names)?;
     let clock: Arc<dyn TimeSource> = Arc::new(clock);
     let wake = Arc::new(LinkWake::new()?);
     let host = Arc::new(HostBoard::default());
@@ -127,6 +127,7 @@ pub fn run(
         requests: REQUESTS,
     };
     let _status = StatusSocket::start(&options.sockets, fixed, host.clone(), asker);
+    let surveyor = board.view().map(|view| Surveyor::start(view, names, wake.clone())).transpose()?;
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
@@ -172,6 +173,7 @@ pub fn run(
         dialects,
         finder,
         host,
+        surveyor,
         requests,
         core: core.thread().clone(),
         inlet,

@@ -3,24 +3,29 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs;
-use std::io;
+use std::fs::{self, OpenOptions};
+use std::io::{self, Read as _};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::os::unix::fs::{MetadataExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
 use std::path::{Path, PathBuf};
 
-use log::warn;
+use log::{info, warn};
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, FdFlag, OFlag, fcntl};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::pty::openpty;
 use nix::sys::termios::{FlushArg, SetArg, cfmakeraw, tcflush, tcgetattr, tcsetattr};
-use nix::unistd::{Gid, Group, chown, read, ttyname, write};
+use nix::unistd::{Gid, Group, chown, geteuid, read, ttyname, write};
 
 use crate::sys;
 
 /// The group that gets the terminal if the command line names none.
 const USUAL_GROUP: &str = "tty";
+/// Where others leave files in the link's place.
+const TMP: &str = "/tmp";
+/// What the stop command of Klipper's own service writes to the link's path, whether a program serves
+/// there or not.
+const FORCE_SHUTDOWN: &str = "FORCE_SHUTDOWN";
 
 /// A terminal that a host finds by a symbolic link.
 ///
@@ -176,6 +181,10 @@ fn give(device: &Path, name: &str) -> io::Result<()> {
 
 fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
     match fs::symlink_metadata(symlink) {
+        Ok(found) if !found.file_type().is_symlink() && is_left_over(symlink) => {
+            info!("{} was a file that holds nothing but {FORCE_SHUTDOWN}: removed", symlink.display());
+            said(fs::remove_file(symlink), &format!("removing {}", symlink.display()))?;
+        }
         Ok(found) if !found.file_type().is_symlink() => {
             return Err(io::Error::other(format!(
                 "{} exists and is no symbolic link: remove it, or choose another path with -I",
@@ -194,11 +203,31 @@ fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
     said(fs::rename(&fresh, symlink), &what).inspect_err(|_| drop(fs::remove_file(&fresh)))
 }
 
+/// Whether this is a file that a service's stop command has left in /tmp, when it wrote where no link
+/// was: root's or our own, with nothing else in it. (The C program removes whatever is there.)
+fn is_left_over(path: &Path) -> bool {
+    let read = || -> io::Result<(fs::Metadata, String)> {
+        // Neither another's link nor a pipe that nobody writes to, should one come in its place now.
+        let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK;
+        let file = OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)?;
+        let mut content = String::new();
+        let found = file.metadata()?;
+        file.take(FORCE_SHUTDOWN.len() as u64 + 2).read_to_string(&mut content)?;
+        Ok((found, content))
+    };
+    path.parent() == Some(Path::new(TMP))
+        && read().is_ok_and(|(found, content)| {
+            found.is_file()
+                && [0, geteuid().as_raw()].contains(&found.uid())
+                && ["", FORCE_SHUTDOWN].contains(&content.trim_end())
+        })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
-    use std::fs::{File, OpenOptions};
-    use std::io::{Read, Write};
+    use std::fs::File;
+    use std::io::Write;
 
     /// A terminal, and how a host opens it.
     fn terminal() -> (tempfile::TempDir, Pty, impl Fn() -> File) {
@@ -229,6 +258,32 @@ mod tests {
         assert!(hangs_up(&pty));
         pty.part_from_host().unwrap();
         assert!(!hangs_up(&pty));
+    }
+
+    #[test]
+    fn a_file_that_a_stop_command_left_gives_way_to_the_link_and_no_other_does() {
+        let access = Access { mode: 0o600, group: None };
+        let file = |folder: &Path, content: &str| {
+            let mut file = tempfile::Builder::new().prefix("klipper_host_").tempfile_in(folder).unwrap();
+            file.write_all(content.as_bytes()).unwrap();
+            file.into_temp_path()
+        };
+        for content in ["", "\n", "FORCE_SHUTDOWN\n"] {
+            let path = file(Path::new(TMP), content);
+            let pty = Pty::open(&path, &access).unwrap();
+            assert_eq!(fs::read_link(&path).unwrap(), pty.device());
+        }
+        let elsewhere = tempfile::tempdir().unwrap();
+        for (folder, content) in [
+            (Path::new(TMP), "a letter\n"),
+            (Path::new(TMP), "FORCE_SHUTDOWN of somebody's printer\n"),
+            (elsewhere.path(), "FORCE_SHUTDOWN\n"),
+        ] {
+            let path = file(folder, content);
+            let error = Pty::open(&path, &access).err().unwrap().to_string();
+            assert!(error.contains("exists and is no symbolic link: remove it"), "{error}");
+            assert_eq!(fs::read_to_string(&path).unwrap(), content);
+        }
     }
 
     #[test]

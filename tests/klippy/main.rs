@@ -11,6 +11,7 @@ mod hosts;
 mod klippy;
 mod print;
 mod probes;
+mod readme;
 mod regression;
 mod rings;
 mod servo;

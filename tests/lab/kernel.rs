@@ -81,8 +81,9 @@ const MODULES: [(&str, &str); 18] = [
 const PLAN_READER: &str = "qemu_fw_cfg";
 
 /// The parts of an image package that hold these modules.
-const IMAGE_PARTS: [&str; 14] = [
-    "*/modules.builtin",
+const IMAGE_PARTS: [&str; 22] = [
+    "*/modules.builtin*",
+    // The last ones are for the system that `tests/lab_system` boots from a disk.
     "*/drivers/firmware/qemu_fw_cfg.ko",
     "*/drivers/i2c/*",
     "*/drivers/iio/*",
@@ -96,6 +97,14 @@ const IMAGE_PARTS: [&str; 14] = [
     "*/fs/netfs/*",
     "*/net/9p/*",
     "./boot/vmlinuz-*",
+    "*/crypto/crc32c_generic.ko",
+    "*/drivers/block/virtio_blk.ko",
+    "*/drivers/char/virtio_console.ko",
+    "*/fs/autofs/*",
+    "*/fs/ext4/*",
+    "*/fs/jbd2/*",
+    "*/fs/mbcache.ko",
+    "*/lib/crc*.ko",
 ];
 
 /// Upstream's mocks and drivers, and what they include. Folders stand for all their files.

@@ -5,8 +5,8 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
 use std::sync::atomic::AtomicU8;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use industrial_io::Context;
 
@@ -98,10 +98,34 @@ impl Inventory {
     }
 }
 
-/// The board that is this computer.
-pub struct LinuxBoard {
+/// What was found when somebody looked around last.
+#[derive(Default)]
+struct Seen {
     inventory: Inventory,
     names: Names,
+}
+
+impl Seen {
+    fn look() -> Seen {
+        Seen::of(Inventory::scan())
+    }
+
+    fn of(inventory: Inventory) -> Seen {
+        Seen { names: Names::of(&inventory), inventory }
+    }
+
+    /// All that a host is told of it.
+    fn told(&self) -> (String, [Vec<Range>; 3]) {
+        let Seen { inventory, names } = self;
+        (inventory.describe(), [names.ranges(), spi::ranges(&inventory.spi), i2c::ranges(&inventory.i2c)])
+    }
+}
+
+/// The board that is this computer.
+pub struct LinuxBoard {
+    /// Shared with the thread that looks again. The core asks for it while it is being configured only,
+    /// and who has it keeps it for a moment: nobody looks around meanwhile.
+    seen: Arc<Mutex<Seen>>,
     guard: SharedGuard,
     /// The mode that each spidev node in use is set to at present, shared by the chips behind it.
     spi_modes: HashMap<spi::Node, Arc<AtomicU8>>,
@@ -115,20 +139,27 @@ pub struct LinuxBoard {
 impl LinuxBoard {
     /// Looks around and publishes what is there. Every output is given to `guard`.
     pub fn new(guard: Option<Box<dyn Guard>>) -> LinuxBoard {
-        let inventory = Inventory::scan();
-        for problem in &inventory.problems {
+        let seen = Seen::look();
+        for problem in &seen.inventory.problems {
             log::warn!("{problem}");
         }
+        LinuxBoard::over(Arc::new(Mutex::new(seen)), SharedGuard::new(guard))
+    }
+
+    fn over(seen: Arc<Mutex<Seen>>, guard: SharedGuard) -> LinuxBoard {
         LinuxBoard {
-            names: Names::of(&inventory),
-            inventory,
-            guard: SharedGuard::new(guard),
+            seen,
+            guard,
             spi_modes: HashMap::new(),
             assumed: BTreeSet::new(),
             dev: DEV.into(),
             gpio: GPIO.into(),
             pwm: PWM.into(),
         }
+    }
+
+    fn seen(&self) -> MutexGuard<'_, Seen> {
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
     /// The line of a pin, not yet requested from the kernel. Errors are those of outputs or inputs.
@@ -149,10 +180,11 @@ impl LinuxBoard {
         match Target::of(pin) {
             Target::Analog(n) => Ok((0, format!("voltage{n}"))),
             Target::Channel { device, position } => {
-                let adc = self.inventory.adcs.iter().find(|adc| adc.number == device);
+                let seen = self.seen();
+                let adc = seen.inventory.adcs.iter().find(|adc| adc.number == device);
                 let channel = adc.and_then(|adc| adc.channels.get(position as usize));
                 channel.map(|channel| (device, channel.id.clone())).ok_or_else(|| {
-                    let detail = adc::missing(device, &format!("channel {position}"), &self.inventory.adcs);
+                    let detail = adc::missing(device, &format!("channel {position}"), &seen.inventory.adcs);
                     Shutdown::because(reason::ADC_OPEN, detail)
                 })
             }
@@ -166,15 +198,32 @@ impl LinuxBoard {
 
 impl Board for LinuxBoard {
     fn describe(&self) -> String {
-        self.inventory.describe()
+        self.seen().inventory.describe()
     }
 
     fn pins(&self) -> Vec<Range> {
-        self.names.ranges()
+        self.seen().names.ranges()
     }
 
     fn spi_buses(&self) -> Vec<Range> {
-        spi::ranges(&self.inventory.spi)
+        spi::ranges(&self.seen().inventory.spi)
+    }
+
+    fn view(&self) -> Option<Box<dyn Board>> {
+        Some(Box::new(LinuxBoard::over(self.seen.clone(), SharedGuard::new(None))))
+    }
+
+    fn look_again(&mut self) -> bool {
+        let now = Seen::look();
+        let mut seen = self.seen();
+        if now.told() == seen.told() {
+            return false;
+        }
+        let before = std::mem::replace(&mut *seen, now);
+        for problem in seen.inventory.problems.iter().filter(|problem| !before.inventory.problems.contains(problem)) {
+            log::warn!("{problem}");
+        }
+        true
     }
 
     /// A chip may have several nodes in /dev: on a Raspberry Pi 5, `gpiochip4` is a link to
@@ -211,17 +260,19 @@ impl Board for LinuxBoard {
 
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         let (device, id) = self.channel(pin)?;
-        if self.inventory.adc(device, &id).is_none() {
-            // The device's driver may have been loaded after the program started: look again. The
+        let mut seen = self.seen();
+        if seen.inventory.adc(device, &id).is_none() {
+            // The device's driver may have been loaded after the host came: look again. The
             // pin numbers stay as they were published then.
-            self.inventory.context =
+            seen.inventory.context =
                 adc::context(Path::new(IIO)).map_err(|problem| Shutdown::because(reason::ADC_OPEN, problem))?;
         }
-        let reader = self.inventory.adc(device, &id).ok_or_else(|| {
-            let context = self.inventory.context.as_ref();
+        let reader = seen.inventory.adc(device, &id).ok_or_else(|| {
+            let context = seen.inventory.context.as_ref();
             let present = context.map(adc::scan).unwrap_or_default();
             Shutdown::because(reason::ADC_OPEN, adc::missing(device, &id, &present))
         })?;
+        drop(seen);
         if reader.format().is_none() && self.assumed.insert(device) {
             log::info!("iio:device{device} does not tell its resolution: 12 bits are assumed");
         }
@@ -236,7 +287,7 @@ impl Board for LinuxBoard {
     }
 
     fn i2c_buses(&self) -> Vec<Range> {
-        i2c::ranges(&self.inventory.i2c)
+        i2c::ranges(&self.seen().inventory.i2c)
     }
 
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
@@ -286,16 +337,11 @@ mod tests {
     const ON: Direction = Direction::Output { level: true, shutdown_level: false };
 
     fn board(dev: &Path) -> LinuxBoard {
-        let inventory = Inventory::default();
         LinuxBoard {
-            names: Names::of(&inventory),
-            inventory,
-            guard: SharedGuard::new(None),
-            spi_modes: HashMap::new(),
-            assumed: BTreeSet::new(),
             dev: dev.into(),
             gpio: dev.join("gpio"),
             pwm: dev.join("pwm"),
+            ..LinuxBoard::over(Arc::default(), SharedGuard::new(None))
         }
     }
 

@@ -1,0 +1,82 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Looks around again whenever a host comes: a chip may have appeared since the program started, as its
+//! driver was loaded late at boot or somebody has plugged it in. The host then reads the names that are true.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, Sender, channel};
+use std::thread;
+
+use log::{error, info};
+
+use crate::board::Board;
+use crate::feature::FEATURES;
+use crate::mcu::{Dialect, DialectName};
+
+use super::outlet::LinkWake;
+
+/// The dialects of these names, over what the board has.
+pub(super) fn dialects(board: &dyn Board, names: &[DialectName]) -> io::Result<Vec<Arc<Dialect>>> {
+    names.iter().map(|name| Dialect::new(FEATURES, board, *name).map(Arc::new)).collect()
+}
+
+/// The thread that looks around: it opens devices, which the link must not wait for without an end.
+pub(super) struct Surveyor {
+    asks: Sender<()>,
+    answers: Receiver<Option<Vec<Arc<Dialect>>>>,
+    /// Questions that are not answered yet.
+    pending: usize,
+    found: Option<Vec<Arc<Dialect>>>,
+}
+
+impl Surveyor {
+    /// Starts the thread, on a view of the board. It wakes the link with each answer.
+    pub(super) fn start(
+        mut view: Box<dyn Board>,
+        names: Vec<DialectName>,
+        wake: Arc<LinkWake>,
+    ) -> io::Result<Surveyor> {
+        let (asks, questions) = channel();
+        let (replies, answers) = channel();
+        thread::Builder::new().name("survey".into()).spawn(move || {
+            for () in questions {
+                let found = view.look_again().then(|| {
+                    info!("the board has changed: {}", view.describe());
+                    dialects(&*view, &names)
+                });
+                let found = found.transpose().unwrap_or_else(|error| {
+                    error!("what the board has now can not be told to a host: {error}");
+                    None
+                });
+                let told = replies.send(found);
+                wake.wake();
+                if told.is_err() {
+                    return;
+                }
+            }
+        })?;
+        Ok(Surveyor { asks, answers, pending: 0, found: None })
+    }
+
+    /// Asks what the board has now.
+    pub(super) fn ask(&mut self) {
+        // The thread ends only with its questions.
+        self.pending += usize::from(self.asks.send(()).is_ok());
+    }
+
+    /// Whether every question is answered.
+    pub(super) fn is_done(&mut self) -> bool {
+        for answer in self.answers.try_iter() {
+            self.pending -= 1;
+            self.found = answer.or(self.found.take());
+        }
+        self.pending == 0
+    }
+
+    /// The dialects over what the board has now, if that has changed.
+    pub(super) fn take(&mut self) -> Option<Vec<Arc<Dialect>>> {
+        self.found.take()
+    }
+}

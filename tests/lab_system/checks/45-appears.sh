@@ -1,0 +1,10 @@
+# A chip that appears after Pinion has started is there for the next host, without a restart.
+fresh
+systemctl start pinion-mcu
+before=$(pid)
+! identifies $LINK extra-LINE
+chips extra
+identifies $LINK extra-LINE
+is "$(pid)" "$before" "the process"
+echo 0 >/sys/kernel/config/gpio-sim/extra/live
+! identifies $LINK extra-LINE

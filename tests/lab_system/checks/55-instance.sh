@@ -1,0 +1,13 @@
+# A further instance beside the first one, with a configuration of its own.
+pinion run --help | grep -q -e --config || { echo 'NOT RUN: this pinion takes no --config'; exit 0; }
+fresh
+systemctl start pinion-mcu
+mkdir -p /etc/pinion
+echo 'board = "sim"' >/etc/pinion/second.toml
+systemctl start pinion-mcu@second
+identifies /tmp/klipper_host_second
+identifies $LINK HEATER
+systemctl stop pinion-mcu@second
+[ ! -L /tmp/klipper_host_second ]
+identifies
+systemctl enable --now pinion-mcu@second

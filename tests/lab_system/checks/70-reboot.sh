@@ -1,0 +1,4 @@
+# It is enabled, and the computer boots.
+systemctl enable --now pinion-mcu
+systemctl reboot
+exit 77

@@ -1,0 +1,15 @@
+# Removed, it is stopped and disabled; purged, it leaves its user and groups, as the README says.
+fresh
+systemctl enable --now pinion-mcu
+apt-get remove -y pinion-mcu
+! is_active pinion-mcu
+[ ! -e /usr/bin/pinion ] && [ ! -L $LINK ]
+[ -e /etc/default/pinion-mcu ]
+! systemctl list-units --all --plain --no-legend 'pinion-mcu*' | grep .
+[ ! -L /etc/systemd/system/multi-user.target.wants/pinion-mcu.service ]
+apt-get purge -y pinion-mcu
+[ ! -e /etc/default/pinion-mcu ]
+id pinion
+left=$(find / -xdev \( -path /proc -o -path /sys -o -path /share -o -path /var/log -o -path /run \) -prune -o \
+    -iname '*pinion*' -print)
+is "$left" "" "what is left"

@@ -1,0 +1,95 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A host in the booted system, started by the checks as klippy's user:
+//!
+//! ```text
+//! host identify LINK [PIN]   tells the version, and fails if there is no such pin
+//! host light LINK PIN        switches a heater on, says "lit" and refreshes it until it is killed
+//! host home LINK             homes an axis until the endstop, which the check closes, triggers
+//! ```
+
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use pinion::host::config::Config;
+use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
+use pinion::host::{Client, Error};
+use serde_json::Value;
+
+const PATIENCE: Duration = Duration::from_secs(10);
+/// A heater that is not refreshed for so long shuts the machine down.
+const MAX_DURATION_S: f64 = 3.0;
+const REFRESH: Duration = Duration::from_millis(300);
+
+fn main() -> ExitCode {
+    let args: Vec<String> = std::env::args().skip(1).collect();
+    let args: Vec<&str> = args.iter().map(String::as_str).collect();
+    let done = match args[..] {
+        ["identify", link] => identify(link, None),
+        ["identify", link, pin] => identify(link, Some(pin)),
+        ["light", link, pin] => light(link, pin),
+        ["home", link] => home(link),
+        // As cargo and the like may start it.
+        _ => return ExitCode::SUCCESS,
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("host: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn connect(link: &str) -> Result<Client, Error> {
+    Client::connect(Path::new(link), PATIENCE)
+}
+
+fn identify(link: &str, pin: Option<&str>) -> Result<(), Error> {
+    let client = connect(link)?;
+    println!("version {}", client.dictionary().version);
+    let pins = client.dictionary().enumerations.get("pin").and_then(Value::as_object);
+    match pin {
+        Some(pin) if !pins.is_some_and(|pins| pins.contains_key(pin)) => {
+            Err(Error::Plan { subject: pin.to_owned(), why: "the dictionary has no such pin".to_owned() })
+        }
+        _ => Ok(()),
+    }
+}
+
+fn light(link: &str, pin: &str) -> Result<(), Error> {
+    let mut client = connect(link)?;
+    let mut config = Config::default();
+    let oid = config.oid()?;
+    let longest = client.ticks(MAX_DURATION_S);
+    config.add(format!("config_digital_out oid={oid} pin={pin} value=0 default_value=0 max_duration={longest}"));
+    config.apply(&mut client)?;
+    for round in 0.. {
+        client.send_line(&format!("update_digital_out oid={oid} value=1"))?;
+        client.status()?;
+        client.check()?;
+        if round == 0 {
+            println!("lit");
+        }
+        client.listen(Instant::now() + REFRESH)?;
+    }
+    Ok(())
+}
+
+fn home(link: &str) -> Result<(), Error> {
+    let mut client = connect(link)?;
+    let mut config = Config::default();
+    let pulse = client.ticks(0.000_002);
+    let stepper = Stepper::configure(&mut config, "STEP", 0, "DIR", false, pulse)?;
+    let endstop = Endstop::configure(&mut config, "ENDSTOP", 0, false)?;
+    let status = config.apply(&mut client)?;
+    // Ten seconds of it: the check closes the endstop after a second.
+    let profile = Profile::trapezoid(1000, 100.0, 400.0, client.frequency_hz())?;
+    println!("homing");
+    let homed = MoveQueue::new(status.move_count).home(&mut client, stepper, endstop, true, &profile, &mut |_| ())?;
+    println!("homed at {} by {:?}", homed.position, homed.reason);
+    match homed.reason {
+        HomingEnd::Endstop if homed.position > 0 => Ok(()),
+        _ => Err(Error::Plan { subject: "homing".to_owned(), why: "not ended by the endstop".to_owned() }),
+    }
+}

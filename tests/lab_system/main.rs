@@ -1,0 +1,161 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The package, installed in a Debian 12 that was booted with systemd in the emulator: the scripts
+//! of `tests/lab_system/checks`, in their order. docs/lab-system.md tells how to use it.
+//!
+//! This is the computer's side, a test harness of its own.
+
+mod machine;
+mod packages;
+
+// The lab's, which uses all of it.
+#[allow(dead_code)]
+#[path = "../lab/cache.rs"]
+mod cache;
+#[allow(dead_code)]
+#[path = "../lab/initramfs.rs"]
+mod initramfs;
+#[allow(dead_code)]
+#[path = "../lab/kernel.rs"]
+mod kernel;
+#[path = "../lab/process.rs"]
+mod process;
+#[allow(dead_code)]
+#[path = "../lab/tools.rs"]
+mod tools;
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Instant;
+
+use cache::Cache;
+use machine::{Machine, Root};
+
+const USAGE: &str = "\
+Usage: cargo test --test lab_system -- [OPTIONS] [FILTERS...]
+
+Installs the package in a booted Debian 12 and runs the checks whose name contains any of the filters,
+as in kill; the first one, which installs it, always. It takes root, installs the emulator if it is
+missing, and downloads 250 MB the first time.
+
+Options:
+  --nocapture        Show the output of checks that pass, too
+  --run FILE         Run this script in the machine after the checks, and print its output
+  --list             Name the checks";
+
+/// A failed run exits as libtest's do.
+const FAILED: u8 = 101;
+
+#[derive(Default)]
+struct Options {
+    filters: Vec<String>,
+    show_output: bool,
+    list: bool,
+    run: Option<PathBuf>,
+}
+
+impl Options {
+    /// Exits on a mistake, and for `--help`.
+    fn from_args() -> Options {
+        let mut options = Options::default();
+        let mut args = env::args().skip(1);
+        while let Some(arg) = args.next() {
+            match arg.as_str() {
+                "-h" | "--help" => {
+                    println!("{USAGE}");
+                    std::process::exit(0)
+                }
+                "--nocapture" | "--no-capture" | "--show-output" => options.show_output = true,
+                "--list" => options.list = true,
+                "--run" => options.run = args.next().map(PathBuf::from),
+                unknown if unknown.starts_with('-') => {
+                    eprintln!("unknown option {unknown}\n\n{USAGE}");
+                    std::process::exit(2)
+                }
+                _ => options.filters.push(arg),
+            }
+        }
+        options
+    }
+}
+
+/// A script, and what those before it leave to it.
+struct Check {
+    name: String,
+    script: String,
+}
+
+/// The scripts in the order of their numbers, each with the words that all of them share before it.
+fn checks() -> Result<Vec<Check>, String> {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/lab_system");
+    let read = |path: &Path| fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()));
+    let shared = read(&here.join("guest/words.sh"))?;
+    let folder = here.join("checks");
+    let entries = fs::read_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let mut paths: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    paths.sort();
+    let check = |path: &PathBuf| {
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Check { name, script: format!("{shared}\n{}", read(path)?) })
+    };
+    paths.iter().map(check).collect()
+}
+
+fn run(options: &Options) -> Result<bool, String> {
+    let checks = checks()?;
+    if options.list {
+        checks.iter().for_each(|check| println!("{}: test", check.name));
+        return Ok(true);
+    }
+    if !nix::unistd::geteuid().is_root() {
+        return Err("to make a root folder takes root: sudo -E env PATH=$PATH make lab-system".into());
+    }
+    let began = Instant::now();
+    let cache = Cache::open()?;
+    let root = Root::prepare(&cache)?;
+    let folder = cache.run_folder()?;
+    packages::share(&folder.path().join("share"))?;
+    println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
+
+    let mut machine = Machine::boot(&root, folder.path())?;
+    println!("booted in {:.1} s", machine.boot_took.as_secs_f64());
+    let (mut failed, mut passed) = (Vec::new(), 0);
+    for (number, check) in checks.iter().enumerate() {
+        if number > 0 && !options.filters.is_empty() && !options.filters.iter().any(|part| check.name.contains(part)) {
+            continue;
+        }
+        let began = Instant::now();
+        let (status, output) = machine.run(&check.script)?;
+        let verdict = if status == 0 { "ok" } else { "FAILED" };
+        println!("check {} ... {verdict} ({:.1} s)", check.name, began.elapsed().as_secs_f64());
+        if status != 0 || options.show_output {
+            println!("{output}");
+        }
+        match status {
+            0 => passed += 1,
+            _ => failed.push(check.name.as_str()),
+        }
+        if number == 0 && status != 0 {
+            break;
+        }
+    }
+    if let Some(file) = &options.run {
+        let script = fs::read_to_string(file).map_err(|error| format!("{}: {error}", file.display()))?;
+        let (status, output) = machine.run(&script)?;
+        println!("{output}\nstatus {status}");
+    }
+    println!("\n{passed} passed, {} failed {failed:?} in {:.1} s", failed.len(), began.elapsed().as_secs_f64());
+    Ok(failed.is_empty())
+}
+
+fn main() -> ExitCode {
+    match run(&Options::from_args()) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(FAILED),
+        Err(error) => {
+            eprintln!("lab-system: {error}");
+            ExitCode::from(FAILED)
+        }
+    }
+}

@@ -1,0 +1,61 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the machine is given: the package of the tree as it stands, a later one, the host, and the tree.
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use super::process;
+
+/// Fills the folder that the machine sees as /share.
+pub fn share(folder: &Path) -> Result<(), String> {
+    fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let tree = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let strip = |program: &Path, name: &str| {
+        process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(folder.join(name)).arg(program))
+    };
+    strip(&built(tree, &["--bin", "pinion"], "pinion")?, "pinion")?;
+    strip(&built(tree, &["--test", "host_system"], "host_system")?, "host")?;
+    process::run(
+        Command::new(tree.join("scripts/build-deb"))
+            .arg("--with")
+            .arg(folder.join("pinion"))
+            .arg(folder)
+            // dpkg-buildpackage is to run as in a shell of its own, not as in make's.
+            .env_remove("MAKEFLAGS")
+            .env_remove("MAKELEVEL"),
+    )?;
+    // The later package has another unit and another file of defaults.
+    process::pipeline(
+        r#"cd "$1"
+           mv pinion-mcu_*.deb pinion-mcu.deb
+           dpkg-deb -R pinion-mcu.deb later
+           sed -i 's/^Version: .*/&+later/' later/DEBIAN/control
+           unit=$(find later -name pinion-mcu.service)
+           sed -i 's/^Description=.*/Description=The later unit/' "$unit"
+           echo '# of the later package' >>later/etc/default/pinion-mcu
+           dpkg-deb --root-owner-group -b later later.deb
+           rm -r later"#,
+        &[&folder.display().to_string()],
+    )?;
+    // What `make install` takes: the program was built before.
+    process::pipeline(
+        r#"cd "$1"; tar -c Makefile systemd udev man | tar -x -C "$2" --one-top-level=tree
+           install -D "$2/pinion" "$2/tree/target/release/pinion""#,
+        &[&tree.display().to_string(), &folder.display().to_string()],
+    )
+}
+
+/// Has cargo build a target, and returns its program.
+fn built(tree: &Path, target: &[&str], name: &str) -> Result<PathBuf, String> {
+    let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
+    cargo.current_dir(tree).args(["build", "--locked", "--message-format", "json"]).args(target);
+    let messages = process::output(&mut cargo)?;
+    messages
+        .lines()
+        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+        .filter(|message| message["target"]["name"] == name)
+        .find_map(|message| message["executable"].as_str().map(PathBuf::from))
+        .ok_or_else(|| format!("cargo built no {name}"))
+}
