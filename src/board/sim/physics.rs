@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! What the pins move, heat and spin.
 //!
-//! One thread, the core, drives the pins; any thread may look. Nothing here locks, blocks or
+//! One thread drives a pin, mostly the core; any thread may look. Nothing here locks, blocks or
 //! allocates: a state changes only when a pin does, and what lies between two changes is solved
 //! exactly by whoever asks.
 
@@ -20,42 +20,49 @@ pub fn seconds(earlier: Clock, later: Clock) -> f64 {
     later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
 }
 
-/// A few words that belong together: the core writes them, any thread reads them whole.
+/// A few words that belong together: one thread writes them, any thread reads them whole.
 ///
-/// A sequence lock: the version is odd while the words change, and a reader takes them again if
-/// the version was odd or has changed. The writer never waits.
+/// They stand in two places by turns, so that a writer that was stopped amid its work keeps nobody
+/// waiting: the words before are still whole. It may be a worker whose processor the core took, and
+/// then it goes on only after the core is done. A reader reads again only if a whole `store` was done
+/// meanwhile, as the next one writes where it reads.
 #[derive(Debug)]
 pub struct Together<const N: usize> {
-    version: AtomicU64,
-    words: [AtomicU64; N],
+    /// How many times the words were stored. The place of the last ones is its lowest bit.
+    stores: AtomicU64,
+    places: [[AtomicU64; N]; 2],
 }
 
 impl<const N: usize> Together<N> {
     pub fn new(words: [u64; N]) -> Together<N> {
-        Together { version: AtomicU64::new(0), words: words.map(AtomicU64::new) }
+        let place = || words.map(AtomicU64::new);
+        Together { stores: AtomicU64::new(0), places: [place(), place()] }
+    }
+
+    fn place(&self, stores: u64) -> &[AtomicU64; N] {
+        &self.places[(stores & 1) as usize]
     }
 
     pub fn load(&self) -> [u64; N] {
         loop {
-            let before = self.version.load(Ordering::Acquire);
-            let words = std::array::from_fn(|i| self.words[i].load(Ordering::Relaxed));
+            let stores = self.stores.load(Ordering::Acquire);
+            let words = self.place(stores).each_ref().map(|word| word.load(Ordering::Relaxed));
             fence(Ordering::Acquire);
-            if before & 1 == 0 && before == self.version.load(Ordering::Relaxed) {
+            if stores == self.stores.load(Ordering::Relaxed) {
                 return words;
             }
-            std::thread::yield_now();
         }
     }
 
     /// Only one thread may store.
     pub fn store(&self, words: [u64; N]) {
-        let version = self.version.load(Ordering::Relaxed);
-        self.version.store(version | 1, Ordering::Relaxed);
+        let stores = self.stores.load(Ordering::Relaxed).wrapping_add(1);
+        // Who sees a word of these sees that the ones of two stores ago are no longer the last.
         fence(Ordering::Release);
-        for (word, value) in self.words.iter().zip(words) {
+        for (word, value) in self.place(stores).iter().zip(words) {
             word.store(value, Ordering::Relaxed);
         }
-        self.version.store((version | 1).wrapping_add(1), Ordering::Release);
+        self.stores.store(stores, Ordering::Release);
     }
 }
 
@@ -490,6 +497,15 @@ mod tests {
         }
         done.store(true, Ordering::Release);
         assert!(reader.join().is_ok());
+    }
+
+    #[test]
+    fn who_reads_while_the_writer_is_stopped_amid_its_work_does_not_wait() {
+        let words = Together::new([1; 3]);
+        words.store([2; 3]);
+        // The first word of the next ones.
+        words.place(2)[0].store(3, Ordering::Relaxed);
+        assert_eq!(words.load(), [2; 3]);
     }
 
     #[test]
