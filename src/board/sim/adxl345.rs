@@ -138,9 +138,7 @@ impl Part for Adxl345Config {
         check(whose, "noise_lsb", self.noise_lsb, Bound::NotNegative)?;
         for (key, ring) in self.rings() {
             let Some(ring) = ring else { continue };
-            if !printer.axes.iter().any(|axis| axis.name == ring.axis) {
-                return wrong(whose, key, &format!("there is no axis `{}`", ring.axis), "name an [[axis]]");
-            }
+            printer.check_axis(whose, &ring.axis)?;
             check(whose, key, ring.hz, Bound::AboveZero)?;
             if !(1e-6..0.99).contains(&ring.damping_ratio) {
                 let cause = format!("a damping_ratio of {} does not ring", ring.damping_ratio);
@@ -156,7 +154,7 @@ impl Part for Adxl345Config {
             let ring = ring?;
             Some(Ring::new(workshop.axis(&ring.axis)?, ring, now))
         });
-        let noise = Noise::new(workshop.config.seed ^ u64::from(DEVICE_ID));
+        let noise = workshop.noise(self);
         workshop.solder_spi(self, Adxl345::new(self, rings, noise, workshop.time.clone()));
         Ok(())
     }
@@ -375,7 +373,10 @@ impl Adxl345 {
             if self.samples.len() == room {
                 self.overrun = true;
                 if !replaces {
-                    continue;
+                    // Nor is there room for the others, however many those are.
+                    sampling.taken = due;
+                    self.feel(sampling.instant(due));
+                    break;
                 }
                 self.samples.pop_front();
             }
@@ -525,7 +526,7 @@ mod tests {
                 y: None,
                 z: None,
             };
-            let chip = Adxl345::new(&config, rings, Noise::new(1), Arc::new(clock.clone()));
+            let chip = Adxl345::new(&config, rings, Noise::of("adxl345", 1), Arc::new(clock.clone()));
             Bench { axis, clock, chip }
         }
 

@@ -23,7 +23,6 @@ use super::part::{Part, Socket, Workshop};
 use super::physics::Axis;
 use super::printer_cfg::{FULL_STEPS, Layout, Sections};
 use super::spi::SpiChip;
-use super::trinamic::validate_axis;
 use crate::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// Which of the sensors it is.
@@ -86,7 +85,7 @@ impl Part for AngleConfig {
     fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
         check(whose, "offset_degrees", self.offset_degrees, Bound::Any)?;
         check(whose, "eccentricity_degrees", self.eccentricity_degrees, Bound::NotNegative)?;
-        validate_axis(whose, printer, &self.axis)
+        printer.check_axis(whose, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {

@@ -28,7 +28,7 @@ pub struct PwmChannelConfig {
 
 impl Part for PwmChannelConfig {
     fn name(&self) -> String {
-        self.name.clone()
+        format!("pwm_channel {}", self.name)
     }
 
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
