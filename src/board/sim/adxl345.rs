@@ -171,6 +171,7 @@ impl Part for Adxl345Config {
             axis.and_then(|axis| axis.travel_mm).unwrap_or(0.0) / 2.0
         };
         cfg.section("resonance_tester");
+        cfg.needs("adxl345");
         cfg.key("accel_chip", "adxl345");
         cfg.key("probe_points", format_args!("{}, {}, {}", middle("x"), middle("y"), middle("z").min(20.0)));
         cfg.section("input_shaper");

@@ -120,7 +120,7 @@ impl Part for Hx71xConfig {
         keys(cfg);
         cfg.probe(layout, |cfg| {
             cfg.section("load_cell_probe");
-            cfg.comment("Takes the place of [load_cell], too: the nozzle is the probe.");
+            cfg.comment("Takes the place of [load_cell], too. The nozzle is the probe.");
             keys(cfg);
             cfg.key("z_offset", 0);
         });

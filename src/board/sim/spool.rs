@@ -76,6 +76,7 @@ impl Part for SpoolConfig {
         // klippy compares the encoder with an extruder's motion.
         if let Some(pin) = self.encoder_pin.as_ref().filter(|_| layout.stepper(&self.axis) == HOT_END) {
             cfg.section(format_args!("filament_motion_sensor {}_motion", self.name));
+            cfg.needs(HOT_END);
             cfg.key("switch_pin", pin);
             cfg.key("extruder", HOT_END);
             cfg.key("detection_length", (3.0 * self.encoder_mm).max(7.0));
