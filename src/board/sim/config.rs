@@ -873,6 +873,56 @@ mod tests {
         }
     }
 
+    /// The words that an error offers for one that nobody knows.
+    fn offered(toml: &str) -> Vec<String> {
+        let Err(error) = SimConfig::parse(toml, "my.toml") else { panic!("accepted {toml}") };
+        let error = error.to_string();
+        let Some((_, offered)) = error.split_once(", expected ") else { panic!("{error}") };
+        offered.split('`').skip(1).step_by(2).map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn the_documentation_has_every_kind_and_every_key() {
+        const DOCUMENTATION: &str = include_str!("../../../docs/simulator.md");
+        // A section ends at the next heading.
+        let has = |heading: &str, key: &str| {
+            let Some((_, section)) = DOCUMENTATION.split_once(&format!("\n{heading}\n")) else {
+                panic!("there is no `{heading}`");
+            };
+            let section = section.split("\n##").next().unwrap_or_default();
+            let mut words = section.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+            assert!(words.any(|word| word == key), "{key} is not in `{heading}`");
+        };
+        for key in offered("nobody = 1") {
+            has("## Its description", &key);
+        }
+        for (table, heading) in [
+            ("[limits]", "### `[limits]`"),
+            ("[[axis]]", "### `[[axis]]`"),
+            ("[[heater]]", "### `[[heater]]`"),
+            ("[[fan]]", "### `[[fan]]`"),
+            ("[[led]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
+            ("[[input]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
+            ("[bed]", "### `[bed]`"),
+            ("[[spi_bus]]", "### `[[spi_bus]]`, `[[i2c_bus]]`"),
+            ("[[i2c_bus]]", "### `[[spi_bus]]`, `[[i2c_bus]]`"),
+            ("[[part]]\nkind = \"adxl345\"\n[part.x]", "### adxl345"),
+            ("[[part]]\nkind = \"hx71x\"\n[part.cell]", "### hx71x"),
+        ] {
+            offered(&format!("{table}\nnobody = 1")).iter().for_each(|key| has(heading, key));
+        }
+        let kinds = offered("[[part]]\nkind = \"nobody\"");
+        assert!(kinds.len() > 10, "{kinds:?}");
+        for kind in kinds {
+            let keys = offered(&format!("[[part]]\nkind = \"{kind}\"\nnobody = 1"));
+            // Of a chip's place on its bus the chapter's head tells.
+            let own = keys.iter().filter(|key| !["bus", "select_pin"].contains(&key.as_str()));
+            own.for_each(|key| has(&format!("### {kind}"), key));
+        }
+        has("## Parts", "bus");
+        has("## Parts", "select_pin");
+    }
+
     #[test]
     fn a_missing_file_is_named() {
         let error = SimConfig::load(Path::new("/nonexistent/printer.toml"));

@@ -21,7 +21,9 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     cfg.comment("Printed by Pinion for its simulated printer: every number is the simulation's.");
     cfg.comment("");
     cfg.comment("Any section but [mcu], [printer] and the steppers may be taken out, with those that say that");
-    cfg.comment("they need it. Sections with a # before each line take the place of others, which they name.");
+    cfg.comment(
+        "they need it. Sections with a # before each line are offered: the words before tell what they replace.",
+    );
     cfg.section("mcu");
     cfg.key("serial", pty);
 

@@ -105,7 +105,7 @@ pub(super) fn offer_sensorless_homing(
     let config = layout.config.axes.iter().find(|other| other.name == axis && other.endstop_pin.is_some());
     let Some((config, travel_mm)) = config.and_then(|config| Some((config, config.travel_mm?))) else { return };
     let stepper = layout.stepper(axis);
-    cfg.comment("To home without the endstop, by the load:");
+    cfg.comment("To home without the endstop, by the load (these keys replace those above, which may stay):");
     cfg.offer(|cfg| {
         cfg.section(&stepper);
         cfg.key("endstop_pin", format_args!("{driver}_{stepper}:virtual_endstop"));
