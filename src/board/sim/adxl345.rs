@@ -727,6 +727,10 @@ mod tests {
         bench.write(POWER_CTL, 0);
         bench.wait(10.0);
         assert_eq!(bench.read(FIFO_STATUS), 0);
+        // Nor does a read take long after weeks.
+        bench.measure(0x40);
+        bench.wait(1e6);
+        assert_eq!(bench.read(FIFO_STATUS), 32);
     }
 
     #[test]
