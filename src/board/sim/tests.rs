@@ -597,8 +597,8 @@ fn use_all(config: SimConfig) {
         }
         for address in [42, 60] {
             let OnWorker { mut device, .. } = bench.board.i2c(I2cConfig { bus: 0, address, rate_hz: 400_000 }).unwrap();
-            // The coil's chip awake, with a current of its own; then anything.
-            for message in [&[0x1a, 0x16, 0x01][..], &[0x1e, 0x80, 0x00], &[0x00], &[0x7f, 0xff, 0xff, 0xff], &[]] {
+            // What the coil's chip measured since it was woken, with a drive current that was told; then anything.
+            for message in [&[0x00][..], &[0x1e, 0x80, 0x00], &[0x1a, 0x16, 0x01], &[0x7f, 0xff, 0xff, 0xff], &[]] {
                 // Where the address is the number that was changed, nobody answers.
                 let _ = device.write_read(message, &mut [0; 3]);
                 let _ = device.write_read(message, &mut []);
