@@ -215,11 +215,17 @@ fn numbered<'a, T>(
     name: impl Fn(&T) -> &str,
     reason: ShutdownReason,
 ) -> Result<&'a Arc<T>, Shutdown> {
-    usize::try_from(number).ok().and_then(|place| buses.get(place)).ok_or_else(|| {
-        let names: Vec<&str> = buses.iter().map(|bus| name(bus)).collect();
-        let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
-        Shutdown::because(reason, format!("the simulated printer has no {kind} bus {number}: {has}"))
-    })
+    usize::try_from(number)
+        .ok()
+        .and_then(|place| buses.get(place))
+        .ok_or_else(|| is_missing(&format!("{kind} bus {number}"), buses.iter().map(|bus| name(bus)), reason))
+}
+
+/// Says that there is no such thing, but these.
+fn is_missing<'a>(what: &str, names: impl Iterator<Item = &'a str>, reason: ShutdownReason) -> Shutdown {
+    let names: Vec<&str> = names.collect();
+    let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
+    Shutdown::because(reason, format!("the simulated printer has no {what}: {has}"))
 }
 
 impl Board for SimBoard {
@@ -259,7 +265,7 @@ impl Board for SimBoard {
         if wired.wire.kind() != Kind::Analog {
             return Err(wired.is_no("ADC channel", reason::ADC_OPEN));
         }
-        let noise = Noise::new(self.seed ^ u64::from(pin.0) << 32);
+        let noise = Noise::of(&wired.name, self.seed);
         let adc = SimAdc { wire: wired.wire.clone(), time: self.time.clone(), noise };
         Ok(OnWorker { bus: ADC_WORKER.to_owned(), device: Box::new(adc) })
     }
@@ -300,10 +306,9 @@ impl Board for SimBoard {
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
         let found = self.world.thermometers.iter().find(|(name, _)| name.as_bytes() == serial);
         let (name, thermometer) = found.ok_or_else(|| {
-            let names: Vec<&str> = self.world.thermometers.iter().map(|(name, _)| name.as_str()).collect();
-            let serial = String::from_utf8_lossy(serial);
-            let detail = format!("the simulated printer has no DS18B20 {serial}: it has {}", names.join(", "));
-            Shutdown::because(reason::DS18B20_OPEN, detail)
+            let names = self.world.thermometers.iter().map(|(name, _)| name.as_str());
+            let what = format!("DS18B20 {}", String::from_utf8_lossy(serial));
+            is_missing(&what, names, reason::DS18B20_OPEN)
         })?;
         Ok(OnWorker { bus: name.clone(), device: Box::new(thermometer.clone()) })
     }

@@ -111,7 +111,7 @@ fn without_endstops(config: String) -> String {
     let mut changed = String::new();
     for line in config.lines() {
         let use_it = offered && line.starts_with('#') && !line.starts_with("# ");
-        offered = line == "# To home without the endstop, by the load:" || offered && (use_it || line.is_empty());
+        offered = line.starts_with("# To home without the endstop") || offered && (use_it || line.is_empty());
         changed += if use_it { &line[1..] } else { line };
         changed += "\n";
     }

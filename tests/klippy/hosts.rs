@@ -10,7 +10,7 @@ use pinion::mcu::Generation;
 use super::klippy::Printer;
 
 /// The checkout of a generation, if there is one.
-fn checkout(generation: Generation) -> Option<PathBuf> {
+pub fn checkout(generation: Generation) -> Option<PathBuf> {
     let variable = format!("KLIPPER_DIR_{}", generation.name().to_uppercase().replace('.', "_"));
     let folder = std::env::var_os(&variable).map(PathBuf::from);
     if folder.is_none() {

@@ -470,6 +470,53 @@ impl Printer {
     }
 }
 
+/// The configuration without a section.
+pub fn without(config: &str, section: &str) -> String {
+    let head = format!("[{section}]\n");
+    let (before, after) = config.split_once(&head).unwrap_or_else(|| panic!("no [{section}] in\n{config}"));
+    format!("{before}{}", after.split_once("\n\n").map_or("", |(_, after)| after))
+}
+
+/// The configuration with a section in use that is only offered, with more keys.
+pub fn with(config: &str, section: &str, keys: &str) -> String {
+    let head = format!("#[{section}]\n");
+    let at = config.find(&head).unwrap_or_else(|| panic!("no #[{section}] in\n{config}"));
+    let (before, rest) = config.split_at(at);
+    let (lines, after) = rest.split_once("\n\n").unwrap_or((rest, ""));
+    let lines: Vec<&str> = lines.lines().map(|line| line.strip_prefix('#').unwrap_or(line)).collect();
+    format!("{before}{}\n{keys}\n\n{after}", lines.join("\n"))
+}
+
+/// Has klippy translate G-code with a dictionary, without any machine: what it wrote, or why it did not.
+pub fn batch(checkout: &Path, dictionary: &Path, config: &str, gcode: &str) -> Result<Vec<u8>, String> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    fs::write(path("printer.cfg"), config).unwrap();
+    fs::write(path("gcode"), gcode).unwrap();
+    let ended = Command::new(python())
+        .arg(checkout.join("klippy/klippy.py"))
+        .arg(path("printer.cfg"))
+        .arg("-i")
+        .arg(path("gcode"))
+        .arg("-o")
+        .arg(path("out"))
+        .arg("-d")
+        .arg(dictionary)
+        .arg("-l")
+        .arg(path("log"))
+        .output()
+        .unwrap();
+    if ended.status.success() {
+        return Ok(fs::read(path("out")).unwrap());
+    }
+    let log = fs::read_to_string(path("log")).unwrap_or_default();
+    Err(format!(
+        "{}{}",
+        String::from_utf8_lossy(&ended.stderr),
+        log.lines().rev().take(8).collect::<Vec<_>>().join("\n")
+    ))
+}
+
 /// The next message of klippy's API.
 fn message(api: &mut UnixStream) -> Result<Value, String> {
     let mut message = Vec::new();

@@ -14,14 +14,14 @@ mod probes;
 mod readme;
 mod regression;
 mod rings;
+mod sections;
 mod servo;
 mod shown;
 
 use std::io::Write;
 use std::path::PathBuf;
-use std::process::Command;
 
-use klippy::{Printer, python};
+use klippy::{Printer, without};
 
 /// The checkout, or a loud skip: written past the test harness, which keeps what a test prints.
 fn checkout(test: &str) -> Option<PathBuf> {
@@ -176,11 +176,13 @@ fn klippy_reads_the_registers_of_a_driver_on_a_slow_bus_each_once() {
 fn klippy_homes_and_moves_an_axis_with_and_without_its_driver() {
     let Some(checkout) = checkout("klippy_homes_and_moves_an_axis_with_and_without_its_driver") else { return };
     for with_driver in [true, false] {
-        let mut printer = Printer::start_with(&checkout, |config| {
-            let (before, driver) = config.split_once("[tmc5160 stepper_z]\n").unwrap();
-            let (_, after) = driver.split_once("\n\n").unwrap_or_default();
-            if with_driver { config.clone() } else { format!("{before}{after}") }
-        });
+        let mut printer =
+            Printer::start_with(
+                &checkout,
+                |config| {
+                    if with_driver { config } else { without(&config, "tmc5160 stepper_z") }
+                },
+            );
         printer.until_state("ready");
         printer.gcode("G28\nG1 Z7 F600\nM400\nG28 Z\nGET_POSITION");
         let log = printer.host_log("\nmcu: stepper_x:", 1);
@@ -192,30 +194,4 @@ fn klippy_homes_and_moves_an_axis_with_and_without_its_driver() {
         assert_eq!(log.contains("TMC 'stepper_z' reports GSTAT: "), with_driver, "{log}");
         assert!(!log.contains("phase change"), "{log}");
     }
-}
-
-#[test]
-fn klippy_translates_g_code_with_our_dictionary() {
-    let Some(checkout) = checkout("klippy_translates_g_code_with_our_dictionary") else { return };
-    let folder = tempfile::tempdir().unwrap();
-    let path = |name: &str| folder.path().join(name);
-    let pinion = |args: &[&str]| Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).output().unwrap().stdout;
-    std::fs::write(path("printer.cfg"), pinion(&["sim", "--print-config"])).unwrap();
-    std::fs::write(path("dict"), pinion(&["dict", "--board", "sim"])).unwrap();
-    std::fs::write(path("g.gcode"), "G28\nG1 X10 Y20 Z5 F3000\nG1 X100 Y100\nM106 S100\n").unwrap();
-    let batch = Command::new(python())
-        .arg(checkout.join("klippy/klippy.py"))
-        .arg(path("printer.cfg"))
-        .arg("-i")
-        .arg(path("g.gcode"))
-        .arg("-o")
-        .arg(path("out"))
-        .arg("-d")
-        .arg(path("dict"))
-        .output()
-        .unwrap();
-    let said = String::from_utf8_lossy(&batch.stderr);
-    assert!(batch.status.success(), "{said}\n{}", String::from_utf8_lossy(&batch.stdout));
-    let out = std::fs::metadata(path("out")).unwrap();
-    assert!(out.len() > 1000, "only {} bytes", out.len());
 }

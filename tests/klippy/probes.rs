@@ -4,7 +4,7 @@
 use serde_json::Value;
 
 use super::checkout;
-use super::klippy::Printer;
+use super::klippy::{Printer, with, without};
 
 /// A step of the z axis.
 const STEP_MM: f64 = 1.0 / 400.0;
@@ -16,23 +16,6 @@ const TRAVEL_MM: f64 = 220.0;
 fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
     let (u, v) = (x_mm / TRAVEL_MM - 0.5, y_mm / TRAVEL_MM - 0.5);
     0.12 * u - 0.08 * v - 0.2 * (u * u + v * v)
-}
-
-/// The configuration without a section.
-pub fn without(config: &str, section: &str) -> String {
-    let head = format!("[{section}]\n");
-    let (before, after) = config.split_once(&head).unwrap_or_else(|| panic!("no [{section}] in\n{config}"));
-    format!("{before}{}", after.split_once("\n\n").map_or("", |(_, after)| after))
-}
-
-/// The configuration with a section in use that is only offered, with more keys.
-pub fn with(config: &str, section: &str, keys: &str) -> String {
-    let head = format!("#[{section}]\n");
-    let at = config.find(&head).unwrap_or_else(|| panic!("no #[{section}] in\n{config}"));
-    let (before, rest) = config.split_at(at);
-    let (lines, after) = rest.split_once("\n\n").unwrap_or((rest, ""));
-    let lines: Vec<&str> = lines.lines().map(|line| line.strip_prefix('#').unwrap_or(line)).collect();
-    format!("{before}{}\n{keys}\n\n{after}", lines.join("\n"))
 }
 
 /// The configuration with the z axis homed by the probe, in the middle of the bed.

@@ -24,8 +24,6 @@ use crate::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// CPOL is 0 and CPHA is 1.
 const MODE: u8 = 1;
-/// The chip's place in the seeds of the noise.
-const SEED: u64 = 0x1220;
 /// What klippy sets up: enough for a weight, and little to do for a busy computer.
 const RATE: u32 = 45;
 
@@ -74,7 +72,7 @@ impl Part for Ads1220Config {
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         let drdy = ReadyLine::new("data ready of ads1220");
         workshop.wire(Some(&self.drdy_pin), ReadyPin(drdy.clone()));
-        let cell = Cell::new(&self.cell, workshop, SEED);
+        let cell = Cell::new(&self.cell, workshop, self);
         workshop.solder_spi(self, Ads1220::new(cell, drdy, workshop.time.clone()));
         Ok(())
     }
@@ -183,9 +181,9 @@ impl Ads1220 {
                 self.set(Conversions::NONE);
             }
             0 if byte >> 1 == 4 => self.begin(),
-            // RDATA: the data comes in any case.
             2 => self.talk = Talk::Read(first, count),
             4 => self.talk = Talk::Write(first, count),
+            // RDATA asks for the data, which comes in any case.
             _ => {}
         }
     }

@@ -23,7 +23,6 @@ use super::part::{Part, Socket, Workshop};
 use super::physics::Axis;
 use super::printer_cfg::{FULL_STEPS, Layout, Sections};
 use super::spi::SpiChip;
-use super::trinamic::validate_axis;
 use crate::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// Which of the sensors it is.
@@ -86,7 +85,7 @@ impl Part for AngleConfig {
     fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
         check(whose, "offset_degrees", self.offset_degrees, Bound::Any)?;
         check(whose, "eccentricity_degrees", self.eccentricity_degrees, Bound::NotNegative)?;
-        validate_axis(whose, printer, &self.axis)
+        printer.check_axis(whose, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
@@ -112,6 +111,7 @@ impl Part for AngleConfig {
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.section(format_args!("angle {}", self.axis));
         cfg.key("sensor_type", self.chip.name());
+        cfg.comment("Take it out for Kalico, whose Linux firmware has no angle sensors.");
         cfg.spi(&self.bus, Some(&self.select_pin));
         cfg.comment("To measure with it, and for ANGLE_CALIBRATE; needs a driver on this stepper, and numpy:");
         cfg.offer(|cfg| cfg.key("stepper", layout.stepper(&self.axis)));

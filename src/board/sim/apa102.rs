@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use serde::Deserialize;
 
 use super::colour::{self, Colour};
-use super::config::{Bound, PinName, SimConfig, SimError, check, wrong};
+use super::config::{PinName, SimConfig, SimError, check_lights, wrong};
 use super::part::{Part, Sight, Workshop};
 use super::printer_cfg::{Layout, Sections};
 use super::wire::{Kind, Wire};
@@ -52,10 +52,7 @@ impl Part for Apa102Config {
     }
 
     fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
-        check(whose, "count", self.count.into(), Bound::AboveZero)?;
-        if self.count > 1000 {
-            return wrong(whose, "count", &format!("{} is too many", self.count), "1000 at most");
-        }
+        check_lights(whose, self.count)?;
         if self.data_pin.inverted || self.clock_pin.inverted {
             return wrong(whose, "data_pin", "klippy's lines to such a strip have no polarity", "remove the `!`");
         }

@@ -28,7 +28,7 @@ use crate::time::Clock;
 
 /// How long the sensor line is high after a touch.
 const TOUCH_PULSE_S: f64 = 0.010;
-/// How far a pulse may be from a command's width: half of what lies between the closest two.
+/// How far a pulse may be from a command's width: less than half of what lies between the closest two.
 const WIDTH_TOLERANCE_US: f64 = 45.0;
 /// The pulses of a servo come every 20 ms. After a longer pause the same pulse is a new command.
 const TRAIN_S: f64 = 0.050;

@@ -422,6 +422,24 @@ impl SimConfig {
         self.parts.iter().try_for_each(|part| self.validate_part(part.part(), &mut pins))
     }
 
+    /// Checks that there is the axis that a part's key `axis` names.
+    pub(super) fn check_axis(&self, whose: &str, axis: &str) -> Result<(), SimError> {
+        there_is(whose, "axis", axis, self.axes.iter().map(|axis| &axis.name), "[[axis]]")
+    }
+
+    /// Checks that there is the heater that a part's key `heater` names.
+    pub(super) fn check_heater(&self, whose: &str, heater: &str) -> Result<(), SimError> {
+        there_is(whose, "heater", heater, self.heaters.iter().map(|heater| &heater.name), "[[heater]]")
+    }
+
+    fn check_spi_bus(&self, whose: &str, bus: &str) -> Result<(), SimError> {
+        there_is(whose, "bus", bus, self.spi_buses.iter().map(|bus| &bus.name), "[[spi_bus]]")
+    }
+
+    fn check_i2c_bus(&self, whose: &str, bus: &str) -> Result<(), SimError> {
+        there_is(whose, "bus", bus, self.i2c_buses.iter().map(|bus| &bus.name), "[[i2c_bus]]")
+    }
+
     /// All lights and other outputs.
     pub(super) fn switched(&self) -> impl Iterator<Item = &OutputConfig> {
         self.leds.iter().chain(&self.outputs)
@@ -556,9 +574,7 @@ impl SimConfig {
         match socket {
             Some(Socket::Spi { bus, select_pin }) => {
                 pins.claim(whose, "select_pin", select_pin)?;
-                if !self.spi_buses.iter().any(|other| other.name == bus) {
-                    return wrong(whose, "bus", &format!("there is no `{bus}`"), "name an [[spi_bus]]");
-                }
+                self.check_spi_bus(whose, bus)?;
                 if select_pin.is_some_and(|pin| pin.inverted) {
                     let cause = "klippy knows chips that are selected by a low level only";
                     return wrong(whose, "select_pin", cause, "remove the `!`");
@@ -569,9 +585,7 @@ impl SimConfig {
                 }
             }
             Some(Socket::I2c { bus, address }) => {
-                if !self.i2c_buses.iter().any(|other| other.name == bus) {
-                    return wrong(whose, "bus", &format!("there is no `{bus}`"), "name an [[i2c_bus]]");
-                }
+                self.check_i2c_bus(whose, bus)?;
                 if !(0x08..0x78).contains(&address) {
                     return wrong(whose, "address", &format!("{address} is no 7 bit address"), "give 8 to 119");
                 }
@@ -579,12 +593,16 @@ impl SimConfig {
                     return wrong(whose, "address", &format!("{address} is taken on this bus"), "give another");
                 }
             }
-            Some(Socket::Mosi { bus }) if !self.spi_buses.iter().any(|other| other.name == bus) => {
-                return wrong(whose, "bus", &format!("there is no `{bus}`"), "name an [[spi_bus]]");
-            }
-            Some(Socket::Mosi { .. }) | None => {}
+            Some(Socket::Mosi { bus }) => self.check_spi_bus(whose, bus)?,
+            None => {}
         }
-        part.validate(whose, self)
+        part.validate(whose, self)?;
+        // What stands behind the kind was named by the description, and names a section of printer.cfg.
+        let name = part.name();
+        match name.split_once(' ') {
+            Some((_, own)) if !is_word(own) => no_name(whose, own),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -690,13 +708,32 @@ fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>) -> Result
     let mut seen = HashSet::new();
     names.try_for_each(|name| {
         if !is_word(name) {
-            wrong(kind, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
+            no_name(kind, name)
         } else if !seen.insert(name) {
             wrong(kind, "name", &format!("two are called `{name}`"), "rename one")
         } else {
             Ok(())
         }
     })
+}
+
+/// The error of a name that klippy would not take.
+fn no_name(whose: &str, name: &str) -> Result<(), SimError> {
+    wrong(whose, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
+}
+
+/// Checks that something of this name is in the description; `kind` is its table.
+fn there_is<'a>(
+    whose: &str,
+    key: &str,
+    name: &str,
+    mut names: impl Iterator<Item = &'a String>,
+    kind: &str,
+) -> Result<(), SimError> {
+    if names.any(|other| other == name) {
+        return Ok(());
+    }
+    wrong(whose, key, &format!("there is no `{name}`"), &format!("name an {kind}"))
 }
 
 /// The error of a key.
@@ -711,6 +748,18 @@ pub(super) fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result
 
 /// Larger numbers describe no printer, and could overflow a position or a time.
 const MAX_NUMBER: f64 = 1e9;
+
+/// The lights of the longest strip.
+const MAX_LIGHTS: u32 = 1000;
+
+/// Checks how many lights a strip has.
+pub(super) fn check_lights(whose: &str, count: u32) -> Result<(), SimError> {
+    check(whose, "count", count.into(), Bound::AboveZero)?;
+    if count > MAX_LIGHTS {
+        return wrong(whose, "count", &format!("{count} is too many"), &format!("{MAX_LIGHTS} at most"));
+    }
+    Ok(())
+}
 
 /// Checks that a number is in its range.
 pub(super) fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimError> {
@@ -792,8 +841,16 @@ mod tests {
             ("axis = \"z\"", "axis = \"w\"", "`axis`", "no `w`"),
             ("kind = \"tmc5160\"", "kind = \"tmc9\"", "", "unknown variant `tmc9`"),
             ("axis = \"z\"", "axes = \"z\"", "", "unknown field `axes`"),
-            ("axis = \"x\", hz", "axis = \"w\", hz", "`x`", "no axis `w`"),
+            ("axis = \"x\", hz", "axis = \"w\", hz", "`axis`", "no `w`"),
             ("hz = 43.5", "hz = 0.0", "`y`", "not above zero"),
+            ("heater = \"extruder\"", "heater = \"oven\"", "`heater`", "no `oven`"),
+            ("name = \"arm\"", "name = \"an arm\"", "`name`", "`an arm` is no name"),
+            ("name = \"dots\"", "name = \"\"", "`name`", "`` is no name"),
+            ("count = 8", "count = 1001", "`count`", "too many"),
+            ("count = 4", "count = 1001", "`count`", "too many"),
+            ("drive_current = 16", "drive_current = 32", "`drive_current`", "no current"),
+            ("yielding = 0.9", "yielding = 1.1", "`yielding`", "more than all"),
+            ("conversion_ms = 750", "conversion_ms = 1000000001", "`conversion_ms`", "out of range"),
             ("damping_ratio = 0.1", "damping_ratio = 1.0", "`x`", "does not ring"),
             ("rate_off_percent = 0.4", "rate_off_percent = 40.0", "`rate_off_percent`", "so far off"),
             ("encoder_mm = 1.44", "encoder_mm = 0.0", "`encoder_mm`", "not above zero"),
@@ -814,6 +871,56 @@ mod tests {
             assert!(error.contains(cause), "{error}");
             assert!(!error.contains('\n'), "{error}");
         }
+    }
+
+    /// The words that an error offers for one that nobody knows.
+    fn offered(toml: &str) -> Vec<String> {
+        let Err(error) = SimConfig::parse(toml, "my.toml") else { panic!("accepted {toml}") };
+        let error = error.to_string();
+        let Some((_, offered)) = error.split_once(", expected ") else { panic!("{error}") };
+        offered.split('`').skip(1).step_by(2).map(str::to_owned).collect()
+    }
+
+    #[test]
+    fn the_documentation_has_every_kind_and_every_key() {
+        const DOCUMENTATION: &str = include_str!("../../../docs/simulator.md");
+        // A section ends at the next heading.
+        let has = |heading: &str, key: &str| {
+            let Some((_, section)) = DOCUMENTATION.split_once(&format!("\n{heading}\n")) else {
+                panic!("there is no `{heading}`");
+            };
+            let section = section.split("\n##").next().unwrap_or_default();
+            let mut words = section.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
+            assert!(words.any(|word| word == key), "{key} is not in `{heading}`");
+        };
+        for key in offered("nobody = 1") {
+            has("## Its description", &key);
+        }
+        for (table, heading) in [
+            ("[limits]", "### `[limits]`"),
+            ("[[axis]]", "### `[[axis]]`"),
+            ("[[heater]]", "### `[[heater]]`"),
+            ("[[fan]]", "### `[[fan]]`"),
+            ("[[led]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
+            ("[[input]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
+            ("[bed]", "### `[bed]`"),
+            ("[[spi_bus]]", "### `[[spi_bus]]`, `[[i2c_bus]]`"),
+            ("[[i2c_bus]]", "### `[[spi_bus]]`, `[[i2c_bus]]`"),
+            ("[[part]]\nkind = \"adxl345\"\n[part.x]", "### adxl345"),
+            ("[[part]]\nkind = \"hx71x\"\n[part.cell]", "### hx71x"),
+        ] {
+            offered(&format!("{table}\nnobody = 1")).iter().for_each(|key| has(heading, key));
+        }
+        let kinds = offered("[[part]]\nkind = \"nobody\"");
+        assert!(kinds.len() > 10, "{kinds:?}");
+        for kind in kinds {
+            let keys = offered(&format!("[[part]]\nkind = \"{kind}\"\nnobody = 1"));
+            // Of a chip's place on its bus the chapter's head tells.
+            let own = keys.iter().filter(|key| !["bus", "select_pin"].contains(&key.as_str()));
+            own.for_each(|key| has(&format!("### {kind}"), key));
+        }
+        has("## Parts", "bus");
+        has("## Parts", "select_pin");
     }
 
     #[test]

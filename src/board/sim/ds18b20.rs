@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use serde::Deserialize;
 
-use super::config::{SimConfig, SimError, wrong};
+use super::config::{Bound, SimConfig, SimError, check, wrong};
 use super::part::{Part, Workshop};
 use super::physics::Heater;
 use super::printer_cfg::{Layout, Sections};
@@ -48,10 +48,8 @@ impl Part for Ds18b20Config {
             let cause = format!("`{}` is no serial number", self.serial);
             return wrong(whose, "serial", &cause, "give `28-` and twelve hexadecimal digits");
         }
-        if !printer.heaters.iter().any(|heater| heater.name == self.heater) {
-            return wrong(whose, "heater", &format!("there is no `{}`", self.heater), "name a [[heater]]");
-        }
-        Ok(())
+        check(whose, "conversion_ms", self.conversion_ms as f64, Bound::NotNegative)?;
+        printer.check_heater(whose, &self.heater)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {

@@ -30,8 +30,6 @@ const POWER_DOWN_S: f64 = 60e-6;
 const SAMPLE_BITS: u64 = 24;
 /// The conversions that it takes to settle after a start.
 const SETTLING: u64 = 4;
-/// The chip's place in the seeds of the noise.
-const SEED: u64 = 0x4711;
 
 /// The chip's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -103,7 +101,7 @@ impl Part for Hx71xConfig {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
-        let cell = Cell::new(&self.cell, workshop, SEED);
+        let cell = Cell::new(&self.cell, workshop, self);
         let chip = Arc::new(Hx71x::new(self.chip, self.samples_per_s, cell));
         workshop.wire(Some(&self.dout_pin), DoutPin(chip.clone()));
         workshop.wire(Some(&self.sclk_pin), SclkPin(chip));
@@ -122,7 +120,7 @@ impl Part for Hx71xConfig {
         keys(cfg);
         cfg.probe(layout, |cfg| {
             cfg.section("load_cell_probe");
-            cfg.comment("Takes the place of [load_cell], too: the nozzle is the probe.");
+            cfg.comment("Takes the place of [load_cell], too. The nozzle is the probe.");
             keys(cfg);
             cfg.key("z_offset", 0);
         });

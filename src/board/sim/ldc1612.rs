@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::config::{Bound, PinName, SimConfig, SimError, check};
+use super::config::{Bound, PinName, SimConfig, SimError, check, wrong};
 use super::i2c::I2cChip;
 use super::part::{Part, Socket, Workshop};
 use super::physics::{Bed, Noise};
@@ -30,8 +30,9 @@ use crate::time::{CLOCK_FREQ, Clock, TimeSource};
 /// What is connected to CLKIN, as klippy takes for granted.
 const EXTERNAL_CLOCK_HZ: f64 = 12e6;
 const INTERNAL_CLOCK_HZ: f64 = 43.3e6;
-/// The chip's place in the seeds of the noise.
-const SEED: u64 = 0x1612;
+
+/// The highest of IDRIVE0, which has five bits.
+const MAX_CURRENT: u16 = 31;
 
 const DATA0_MSB: u8 = 0x00;
 const DATA0_LSB: u8 = 0x01;
@@ -153,10 +154,16 @@ impl Part for Ldc1612Config {
             ("near_hz", self.near_hz, NotNegative),
             ("fade_mm", self.fade_mm, AboveZero),
             ("noise_hz", self.noise_hz, NotNegative),
-            ("drive_current", self.drive_current.into(), NotNegative),
             ("yielding", self.yielding, NotNegative),
         ] {
             check(whose, key, value, bound)?;
+        }
+        if self.drive_current > MAX_CURRENT {
+            let cause = format!("{} is no current of the chip", self.drive_current);
+            return wrong(whose, "drive_current", &cause, &format!("give 0 to {MAX_CURRENT}"));
+        }
+        if self.yielding > 1.0 {
+            return wrong(whose, "yielding", "the bed gives way by more than all", "give a share of 1");
         }
         Ok(())
     }
@@ -164,8 +171,7 @@ impl Part for Ldc1612Config {
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         let intb = ReadyLine::new("interrupt of ldc1612");
         workshop.wire(self.intb_pin.as_ref(), ReadyPin(intb.clone()));
-        let noise = Noise::new(workshop.config.seed ^ SEED << 32);
-        let coil = Coil { config: self.clone(), bed: workshop.bed(), noise };
+        let coil = Coil { config: self.clone(), bed: workshop.bed(), noise: workshop.noise(self) };
         workshop.solder_i2c(self, Ldc1612::new(coil, intb, workshop.time.clone()));
         Ok(())
     }
@@ -176,9 +182,7 @@ impl Part for Ldc1612Config {
             cfg.key("sensor_type", "ldc1612");
             cfg.key("i2c_address", self.address);
             cfg.key("i2c_bus", &self.bus);
-            if let Some(pin) = &self.intb_pin {
-                cfg.key("intb_pin", pin);
-            }
+            cfg.key_if("intb_pin", self.intb_pin.as_ref());
             cfg.key("x_offset", self.x_offset_mm);
             cfg.key("y_offset", self.y_offset_mm);
             cfg.key("descend_z", 0.5);
@@ -278,7 +282,7 @@ impl Ldc1612 {
         self.intb.tell(self.conversions);
         if !asleep && self.get(CONFIG) & AUTO_AMP_DIS == 0 {
             // INIT_IDRIVE: what the chip found.
-            let found = self.coil.config.drive_current.min(31) << 6;
+            let found = self.coil.config.drive_current << 6;
             let current = &mut self.registers[usize::from(DRIVE_CURRENT0)];
             *current = *current & 0xf800 | found;
         }
@@ -415,7 +419,7 @@ mod tests {
             let bed = Bed::new(Default::default(), None, None, Some(z.clone()));
             let clock = VirtualClock::at(Clock::from_ticks(0));
             let intb = ReadyLine::new("intb");
-            let coil = Coil { config, bed, noise: Noise::new(1) };
+            let coil = Coil { config, bed, noise: Noise::of("coil", 1) };
             let chip = Ldc1612::new(coil, intb.clone(), Arc::new(clock.clone()));
             Bench { z, clock, intb, chip }
         }

@@ -7,7 +7,7 @@
 use serde::Deserialize;
 
 use super::config::{Bound, SimError, check};
-use super::part::Workshop;
+use super::part::{Part, Workshop};
 use super::physics::{Bed, Noise};
 use super::printer_cfg::Sections;
 
@@ -57,18 +57,18 @@ impl CellConfig {
 pub(super) struct Cell {
     config: CellConfig,
     bed: Bed,
-    seed: u64,
+    noise: Noise,
 }
 
 impl Cell {
-    /// The cell of a chip whose readings have a noise of their own.
-    pub(super) fn new(config: &CellConfig, workshop: &Workshop<'_>, chip: u64) -> Cell {
-        Cell { config: config.clone(), bed: workshop.bed(), seed: workshop.config.seed ^ chip << 32 }
+    /// The cell of a chip.
+    pub(super) fn new(config: &CellConfig, workshop: &Workshop<'_>, chip: &dyn Part) -> Cell {
+        Cell { config: config.clone(), bed: workshop.bed(), noise: workshop.noise(chip) }
     }
 
     #[cfg(test)]
     pub(super) fn over(config: CellConfig, bed: Bed) -> Cell {
-        Cell { config, bed, seed: 0 }
+        Cell { config, bed, noise: Noise::of("cell", 0) }
     }
 
     /// What it bears at this moment.
@@ -80,7 +80,7 @@ impl Cell {
     /// The reading of this number, of a chip of 24 bits whose gain is this share of the description's.
     pub(super) fn counts(&self, gain: f64, reading: u64) -> i32 {
         const MAX: f64 = 0x7f_ffff as f64;
-        let noise = Noise::new(self.seed.wrapping_add(reading << 8)).draw() * self.config.noise_counts;
+        let noise = self.noise.nth(reading) * self.config.noise_counts;
         let signal = self.config.zero_counts + self.config.counts_per_gram * self.grams();
         // A chip that is driven beyond its range stays at its end.
         (signal * gain + noise).round().clamp(-MAX - 1.0, MAX) as i32

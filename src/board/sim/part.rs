@@ -11,7 +11,7 @@ use serde::Deserialize;
 use super::World;
 use super::config::{PinName, SimConfig, SimError};
 use super::i2c::{I2cBus, I2cChip};
-use super::physics::{Axis, Bed, Heater};
+use super::physics::{Axis, Bed, Heater, Noise};
 use super::printer_cfg::{Layout, Sections};
 use super::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
@@ -162,6 +162,11 @@ impl Workshop<'_> {
     /// A heater by its name, if there is one.
     pub(super) fn heater(&self, name: &str) -> Option<Arc<Heater>> {
         self.world.heaters.iter().find(|heater| heater.name == name).cloned()
+    }
+
+    /// A part's noise.
+    pub(super) fn noise(&self, part: &dyn Part) -> Noise {
+        Noise::of(&part.name(), self.config.seed)
     }
 
     /// The bed under the nozzle.

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! What the pins move, heat and spin.
 //!
-//! One thread, the core, drives the pins; any thread may look. Nothing here locks, blocks or
+//! One thread drives a pin, mostly the core; any thread may look. Nothing here locks, blocks or
 //! allocates: a state changes only when a pin does, and what lies between two changes is solved
 //! exactly by whoever asks.
 
@@ -20,42 +20,49 @@ pub fn seconds(earlier: Clock, later: Clock) -> f64 {
     later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
 }
 
-/// A few words that belong together: the core writes them, any thread reads them whole.
+/// A few words that belong together: one thread writes them, any thread reads them whole.
 ///
-/// A sequence lock: the version is odd while the words change, and a reader takes them again if
-/// the version was odd or has changed. The writer never waits.
+/// They stand in two places by turns, so that a writer that was stopped amid its work keeps nobody
+/// waiting: the words before are still whole. It may be a worker whose processor the core took, and
+/// then it goes on only after the core is done. A reader reads again only if a whole `store` was done
+/// meanwhile, as the next one writes where it reads.
 #[derive(Debug)]
 pub struct Together<const N: usize> {
-    version: AtomicU64,
-    words: [AtomicU64; N],
+    /// How many times the words were stored. The place of the last ones is its lowest bit.
+    stores: AtomicU64,
+    places: [[AtomicU64; N]; 2],
 }
 
 impl<const N: usize> Together<N> {
     pub fn new(words: [u64; N]) -> Together<N> {
-        Together { version: AtomicU64::new(0), words: words.map(AtomicU64::new) }
+        let place = || words.map(AtomicU64::new);
+        Together { stores: AtomicU64::new(0), places: [place(), place()] }
+    }
+
+    fn place(&self, stores: u64) -> &[AtomicU64; N] {
+        &self.places[(stores & 1) as usize]
     }
 
     pub fn load(&self) -> [u64; N] {
         loop {
-            let before = self.version.load(Ordering::Acquire);
-            let words = std::array::from_fn(|i| self.words[i].load(Ordering::Relaxed));
+            let stores = self.stores.load(Ordering::Acquire);
+            let words = self.place(stores).each_ref().map(|word| word.load(Ordering::Relaxed));
             fence(Ordering::Acquire);
-            if before & 1 == 0 && before == self.version.load(Ordering::Relaxed) {
+            if stores == self.stores.load(Ordering::Relaxed) {
                 return words;
             }
-            std::thread::yield_now();
         }
     }
 
     /// Only one thread may store.
     pub fn store(&self, words: [u64; N]) {
-        let version = self.version.load(Ordering::Relaxed);
-        self.version.store(version | 1, Ordering::Relaxed);
+        let stores = self.stores.load(Ordering::Relaxed).wrapping_add(1);
+        // Who sees a word of these sees that the ones of two stores ago are no longer the last.
         fence(Ordering::Release);
-        for (word, value) in self.words.iter().zip(words) {
+        for (word, value) in self.place(stores).iter().zip(words) {
             word.store(value, Ordering::Relaxed);
         }
-        self.version.store((version | 1).wrapping_add(1), Ordering::Release);
+        self.stores.store(stores, Ordering::Release);
     }
 }
 
@@ -446,14 +453,23 @@ impl Lamp {
 pub struct Noise(u64);
 
 impl Noise {
-    pub fn new(seed: u64) -> Noise {
-        Noise(seed)
+    /// What SplitMix64 adds for each draw.
+    const STEP: u64 = 0x9e37_79b9_7f4a_7c15;
+
+    /// The noise of one part or pin: with the same seed each has another one.
+    pub fn of(whose: &str, seed: u64) -> Noise {
+        whose.bytes().fold(Noise(seed), |noise, byte| Noise((noise.0 ^ u64::from(byte)).wrapping_mul(Noise::STEP)))
+    }
+
+    /// The draw of this number, for who keeps no noise between two draws.
+    pub fn nth(&self, draw: u64) -> f64 {
+        Noise(self.0.wrapping_add(draw.wrapping_mul(Noise::STEP))).draw()
     }
 
     /// A draw with mean 0 and standard deviation 1: the sum of four uniform ones, which is within
     /// 3.5 and close to normal. The bits are SplitMix64's (Steele, Lea, Flood, 2014).
     pub fn draw(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(0x9e37_79b9_7f4a_7c15);
+        self.0 = self.0.wrapping_add(Noise::STEP);
         let mut bits = self.0;
         bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
         bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
@@ -493,14 +509,24 @@ mod tests {
     }
 
     #[test]
+    fn who_reads_while_the_writer_is_stopped_amid_its_work_does_not_wait() {
+        let words = Together::new([1; 3]);
+        words.store([2; 3]);
+        // The first word of the next ones.
+        words.place(2)[0].store(3, Ordering::Relaxed);
+        assert_eq!(words.load(), [2; 3]);
+    }
+
+    #[test]
     fn noise_is_normal_and_the_same_each_time() {
-        let draws = |seed| {
-            let mut noise = Noise::new(seed);
+        let draws = |whose, seed| {
+            let mut noise = Noise::of(whose, seed);
             (0..100_000).map(|_| noise.draw()).collect::<Vec<f64>>()
         };
-        let first = draws(7);
-        assert_eq!(first, draws(7));
-        assert_ne!(first, draws(8));
+        let first = draws("cell", 7);
+        assert_eq!(first, draws("cell", 7));
+        assert!([draws("cell", 8), draws("coil", 7)].iter().all(|other| other[0] != first[0] && other[1] != first[1]));
+        assert_eq!(Noise::of("cell", 7).nth(41), first[41]);
         let mean = first.iter().sum::<f64>() / first.len() as f64;
         let variance = first.iter().map(|x| x * x).sum::<f64>() / first.len() as f64;
         assert!(mean.abs() < 0.02, "{mean}");

@@ -19,11 +19,16 @@ pub(super) const FULL_STEPS: f64 = 200.0;
 pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     let mut cfg = Sections::default();
     cfg.comment("Printed by Pinion for its simulated printer: every number is the simulation's.");
+    cfg.comment("");
+    cfg.comment("Any section but [mcu], [printer] and the steppers may be taken out, with those that say that");
+    cfg.comment(
+        "they need it. Sections with a # before each line are offered: the words before tell what they replace.",
+    );
     cfg.section("mcu");
     cfg.key("serial", pty);
 
     cfg.section("virtual_sdcard");
-    cfg.comment("Kalico's filament sensors want it.");
+    cfg.comment("Kalico's filament sensors need it.");
     cfg.key("path", "~/printer_data/gcodes");
 
     let layout = Layout::of(config);
@@ -113,6 +118,8 @@ impl Sections {
             return;
         }
         if std::mem::replace(&mut self.has_probe, true) {
+            self.section_break();
+            self.comment("Another probe, in place of the one that is in use:");
             return self.offer(section);
         }
         section(self);
@@ -143,8 +150,15 @@ impl Sections {
         self.key("spi_bus", bus);
     }
 
+    /// Adds a line for people.
     pub(super) fn comment(&mut self, text: impl Display) {
-        self.line(format_args!("# {text}"));
+        let text = text.to_string();
+        self.line(format_args!("#{}{text}", if text.is_empty() { "" } else { " " }));
+    }
+
+    /// Tells that klippy takes this section only beside another one.
+    pub(super) fn needs(&mut self, section: impl Display) {
+        self.comment(format_args!("Needs [{section}]."));
     }
 
     fn section_break(&mut self) {
@@ -249,6 +263,7 @@ impl Sections {
             "heater_bed" => self.section("heater_bed"),
             name => self.section(format_args!("heater_generic {name}")),
         }
+        self.needs(format_args!("thermistor sim_{}", heater.name));
         self.key("heater_pin", &heater.pin);
         self.key("sensor_type", format_args!("sim_{}", heater.name));
         self.key("sensor_pin", &heater.sensor_pin);

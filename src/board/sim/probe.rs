@@ -52,8 +52,8 @@ impl Part for ProbeConfig {
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.probe(layout, |cfg| {
             cfg.section("probe");
-            cfg.comment("To home the z axis by it: endstop_pin: probe:z_virtual_endstop there, and no");
-            cfg.comment("position_endstop. The same holds for the other probes.");
+            cfg.comment("To home the z axis by this probe or another one, let [stepper_z] have");
+            cfg.comment("endstop_pin: probe:z_virtual_endstop, and take position_endstop out there.");
             cfg.key("pin", &self.pin);
             cfg.offsets([self.x_offset_mm, self.y_offset_mm, self.z_offset_mm]);
         });

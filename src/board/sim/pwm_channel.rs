@@ -28,7 +28,7 @@ pub struct PwmChannelConfig {
 
 impl Part for PwmChannelConfig {
     fn name(&self) -> String {
-        self.name.clone()
+        format!("pwm_channel {}", self.name)
     }
 
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
@@ -85,7 +85,8 @@ impl Sight for PwmChannel {
     }
 
     fn look(&self, _now: Clock) -> String {
-        format!("{} %", self.value.load(Ordering::Relaxed) * 100 / u32::from(PWM_MAX))
+        let share = f64::from(self.value.load(Ordering::Relaxed)) / f64::from(PWM_MAX);
+        format!("{:.0} %", share * 100.0)
     }
 }
 
@@ -100,5 +101,20 @@ impl Pwm for SimPwm {
 
     fn set_cycle(&mut self, _cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         self.set(value)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_channel_shows_the_percent_that_klippy_was_told() {
+        let channel = PwmChannel { name: "laser".into(), value: AtomicU32::new(0) };
+        for percent in 0..=100 {
+            // As klippy computes it (klippy/mcu.py).
+            channel.dim((f64::from(percent) / 100.0 * f64::from(PWM_MAX) + 0.5) as u16);
+            assert_eq!(channel.look(Clock::EPOCH), format!("{percent} %"));
+        }
     }
 }

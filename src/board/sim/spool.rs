@@ -11,7 +11,7 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::config::{Bound, PinName, SimConfig, SimError, check, wrong};
+use super::config::{Bound, PinName, SimConfig, SimError, check};
 use super::part::{Part, Workshop};
 use super::physics::Axis;
 use super::printer_cfg::{HOT_END, Layout, Sections};
@@ -53,9 +53,7 @@ impl Part for SpoolConfig {
     }
 
     fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
-        if !printer.axes.iter().any(|axis| axis.name == self.axis) {
-            return wrong(whose, "axis", &format!("there is no `{}`", self.axis), "name an [[axis]]");
-        }
+        printer.check_axis(whose, &self.axis)?;
         check(whose, "length_mm", self.length_mm, Bound::NotNegative)?;
         check(whose, "stuck_after_mm", self.stuck_after_mm.unwrap_or(0.0), Bound::NotNegative)?;
         check(whose, "encoder_mm", self.encoder_mm, Bound::AboveZero)
@@ -78,6 +76,7 @@ impl Part for SpoolConfig {
         // klippy compares the encoder with an extruder's motion.
         if let Some(pin) = self.encoder_pin.as_ref().filter(|_| layout.stepper(&self.axis) == HOT_END) {
             cfg.section(format_args!("filament_motion_sensor {}_motion", self.name));
+            cfg.needs(HOT_END);
             cfg.key("switch_pin", pin);
             cfg.key("extruder", HOT_END);
             cfg.key("detection_length", (3.0 * self.encoder_mm).max(7.0));

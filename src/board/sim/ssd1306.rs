@@ -79,7 +79,7 @@ impl Part for Ssd1306Config {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
-        let panel = Arc::new(Panel::new(&self.name, workshop.config.seed));
+        let panel = Arc::new(Panel::new(&self.name, workshop.noise(self)));
         workshop.wire(self.dc_pin.as_ref(), ModePin(panel.clone()));
         workshop.wire(self.reset_pin.as_ref(), ResetPin(panel.clone()));
         match self.dc_pin {
@@ -281,8 +281,7 @@ impl Chip {
 }
 
 impl Panel {
-    fn new(name: &str, seed: u64) -> Panel {
-        let mut noise = Noise::new(seed);
+    fn new(name: &str, mut noise: Noise) -> Panel {
         let memory = std::array::from_fn(|_| std::array::from_fn(|_| (noise.draw() * 1000.0) as i64 as u8));
         Panel {
             name: name.to_owned(),
@@ -439,7 +438,7 @@ mod tests {
 
     impl Bench {
         fn new() -> Bench {
-            let panel = Arc::new(Panel::new("display", 1));
+            let panel = Arc::new(Panel::new("display", Noise::of("display", 1)));
             Bench { i2c: OnI2c { panel: panel.clone(), control: None }, panel }
         }
 

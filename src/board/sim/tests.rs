@@ -560,3 +560,70 @@ fn klippy_holds_the_targets_and_finds_no_fault_with_the_heaters() {
         assert!(coldest > target - 2.0, "{name}: {coldest}");
     }
 }
+
+/// Uses all that a printer has, with bytes that no host would send, too.
+fn use_all(config: SimConfig) {
+    let _ = printer_cfg(&config, "/tmp/pty");
+    let mut bench = Bench::new(config);
+    let mut lines: Vec<Arc<dyn Line>> = Vec::new();
+    for number in 0..bench.board.pins.len() {
+        let pin = Pin(number as u32);
+        let output = Direction::Output { level: true, shutdown_level: true };
+        lines.extend(bench.board.line(pin, output).map(|claimed| claimed.line));
+        lines.extend(bench.board.line(pin, Direction::Input(Bias::None)).map(|claimed| claimed.line));
+        if let Ok(OnWorker { mut device, .. }) = bench.board.adc(pin) {
+            device.read().unwrap();
+        }
+        let cycle = Ticks::from_us(1000);
+        let _ = bench.board.pwm(PwmConfig { pin, cycle, value: 12_345, shutdown_value: 0 });
+    }
+    let mut noise = Noise::of("bytes", 1);
+    for seconds in [0.0, 1e-6, 0.002, 0.3, 1e5] {
+        bench.advance(seconds);
+        for line in &lines {
+            for level in [true, false] {
+                line.write(level).unwrap();
+                line.read().unwrap();
+            }
+        }
+        // Whatever a low line selects is selected.
+        for (bus, mode) in (0..bench.board.spi_buses.len()).flat_map(|bus| [(bus, 0), (bus, 1), (bus, 3)]) {
+            let config = SpiConfig { bus: bus as u32, mode, rate_hz: 1_000_000, chip_select: None };
+            let OnWorker { mut device, .. } = bench.board.spi(config).unwrap();
+            for length in [0, 1, 2, 3, 5, 9, 40] {
+                let mut bytes: Vec<u8> = (0..length).map(|_| (noise.draw() * 100.0) as i32 as u8).collect();
+                device.exchange(&mut bytes).unwrap();
+            }
+        }
+        for address in [42, 60] {
+            let OnWorker { mut device, .. } = bench.board.i2c(I2cConfig { bus: 0, address, rate_hz: 400_000 }).unwrap();
+            // What the coil's chip measured since it was woken, with a drive current that was told; then anything.
+            for message in [&[0x00][..], &[0x1e, 0x80, 0x00], &[0x1a, 0x16, 0x01], &[0x7f, 0xff, 0xff, 0xff], &[]] {
+                // Where the address is the number that was changed, nobody answers.
+                let _ = device.write_read(message, &mut [0; 3]);
+                let _ = device.write_read(message, &mut []);
+            }
+        }
+        bench.probe.sights().for_each(drop);
+        bench.probe.heaters().for_each(drop);
+        bench.probe.fans().for_each(drop);
+    }
+}
+
+#[test]
+fn no_number_of_a_description_makes_it_panic() {
+    let lines: Vec<&str> = SimConfig::default_toml().lines().collect();
+    let mut used = 0;
+    for (place, line) in lines.iter().enumerate() {
+        let Some((key, _)) = line.split_once(" = ").filter(|(_, value)| value.parse::<f64>().is_ok()) else { continue };
+        for value in ["0", "1", "-1", "31", "255", "65535", "1000000000", "-1e9", "1e-9", "1e9", "nan"] {
+            let changed = format!("{key} = {value}");
+            let text = [&lines[..place], &[&changed], &lines[place + 1..]].concat().join("\n");
+            if let Ok(config) = SimConfig::parse(&text, "test") {
+                used += 1;
+                use_all(config);
+            }
+        }
+    }
+    assert!(used > 300, "{used}");
+}

@@ -131,9 +131,7 @@ impl Part for ThermocoupleConfig {
     }
 
     fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
-        if !printer.heaters.iter().any(|heater| heater.name == self.heater) {
-            return wrong(whose, "heater", &format!("there is no `{}`", self.heater), "name a [[heater]]");
-        }
+        printer.check_heater(whose, &self.heater)?;
         if self.fault.is_some_and(|fault| !self.chip.knows(fault)) {
             let cause = format!("what a {} makes of that is not known", self.chip.name());
             return wrong(whose, "fault", &cause, "choose `open` or `shorted`");

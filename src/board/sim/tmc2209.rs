@@ -24,8 +24,8 @@ use super::part::{Part, Workshop};
 use super::physics::Axis;
 use super::printer_cfg::{Layout, Sections};
 use super::trinamic::{
-    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, offer_sensorless_homing,
-    validate_axis,
+    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
+    offer_sensorless_homing,
 };
 use super::wire::{Kind, Wire};
 use crate::time::Clock;
@@ -145,7 +145,7 @@ impl Part for Tmc2209Config {
                 return wrong(whose, key, "klippy inverts no UART", "remove the `!`");
             }
         }
-        validate_axis(whose, printer, &self.axis)
+        printer.check_axis(whose, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
@@ -166,8 +166,7 @@ impl Part for Tmc2209Config {
 
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.section(format_args!("tmc2209 {}", layout.stepper(&self.axis)));
-        cfg.comment("May be left out, as the motor turns without; then start Pinion anew: the chip keeps");
-        cfg.comment("what it was told.");
+        may_be_left_out(cfg);
         cfg.key("uart_pin", &self.uart_pin);
         cfg.key_if("tx_pin", self.tx_pin.as_ref());
         cfg.key("uart_address", self.address);

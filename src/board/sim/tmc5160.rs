@@ -27,8 +27,8 @@ use super::physics::Axis;
 use super::printer_cfg::{Layout, Sections};
 use super::spi::SpiChip;
 use super::trinamic::{
-    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, offer_sensorless_homing,
-    validate_axis,
+    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
+    offer_sensorless_homing,
 };
 use crate::time::{Clock, TimeSource};
 
@@ -170,7 +170,7 @@ impl Part for Tmc5160Config {
     }
 
     fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
-        validate_axis(whose, printer, &self.axis)
+        printer.check_axis(whose, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
@@ -184,8 +184,7 @@ impl Part for Tmc5160Config {
 
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.section(format_args!("tmc5160 {}", layout.stepper(&self.axis)));
-        cfg.comment("May be left out, as the motor turns without; then start Pinion anew: the chip keeps");
-        cfg.comment("what it was told.");
+        may_be_left_out(cfg);
         cfg.spi(&self.bus, self.select_pin.as_ref());
         cfg.key("run_current", 0.8);
         cfg.key("sense_resistor", 0.075);

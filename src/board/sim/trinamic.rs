@@ -12,7 +12,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use super::config::{End, SimConfig, SimError, wrong};
+use super::config::End;
 use super::physics::Axis;
 use super::printer_cfg::{Layout, Sections};
 use super::wire::{Kind, Wire};
@@ -87,12 +87,10 @@ impl Registers {
     }
 }
 
-/// Checks that a driver's axis is there.
-pub(super) fn validate_axis(whose: &str, printer: &SimConfig, axis: &str) -> Result<(), SimError> {
-    if !printer.axes.iter().any(|other| other.name == axis) {
-        return wrong(whose, "axis", &format!("there is no `{axis}`"), "name an [[axis]]");
-    }
-    Ok(())
+/// Tells of a driver's section that klippy does without it.
+pub(super) fn may_be_left_out(cfg: &mut Sections) {
+    cfg.comment("The motor turns without this section, too. When you take it out, start Pinion anew: the chip");
+    cfg.comment("keeps what it was told, and then takes each pulse for two steps.");
 }
 
 /// Offers the sections with which an axis that has an endstop homes by its driver instead, to where it hits
@@ -107,7 +105,7 @@ pub(super) fn offer_sensorless_homing(
     let config = layout.config.axes.iter().find(|other| other.name == axis && other.endstop_pin.is_some());
     let Some((config, travel_mm)) = config.and_then(|config| Some((config, config.travel_mm?))) else { return };
     let stepper = layout.stepper(axis);
-    cfg.comment("To home without the endstop, by the load:");
+    cfg.comment("To home without the endstop, by the load (these keys replace those above, which may stay):");
     cfg.offer(|cfg| {
         cfg.section(&stepper);
         cfg.key("endstop_pin", format_args!("{driver}_{stepper}:virtual_endstop"));

@@ -16,7 +16,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use serde::Deserialize;
 
 use super::colour::{self, Colour};
-use super::config::{Bound, SimConfig, SimError, check, wrong};
+use super::config::{SimConfig, SimError, check_lights, wrong};
 use super::part::{Part, Sight, Socket, Workshop};
 use super::printer_cfg::{Layout, Sections};
 use super::spi::MosiListener;
@@ -61,10 +61,7 @@ impl Part for Ws2812Config {
     }
 
     fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
-        check(whose, "count", self.count.into(), Bound::AboveZero)?;
-        if self.count > 1000 {
-            return wrong(whose, "count", &format!("{} is too many", self.count), "1000 at most");
-        }
+        check_lights(whose, self.count)?;
         let mut letters: Vec<char> = self.color_order.chars().collect();
         letters.sort_unstable();
         if letters != ['B', 'G', 'R'] && letters != ['B', 'G', 'R', 'W'] {
