@@ -121,6 +121,8 @@ install-system:
 	install -D -m 644 udev/60-pinion-mcu.rules $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules
 	test -e $(DESTDIR)/etc/default/pinion-mcu || \
 	    install -D -m 644 systemd/pinion-mcu.default $(DESTDIR)/etc/default/pinion-mcu
+	test -e $(DESTDIR)/etc/pinion/pinion.toml || \
+	    install -D -m 644 systemd/pinion.toml $(DESTDIR)/etc/pinion/pinion.toml
 ifeq ($(DESTDIR),)
 	systemd-sysusers $(SYSUSERSDIR)/pinion-mcu.conf
 	-systemctl daemon-reload
@@ -139,7 +141,9 @@ endif
 	    $(DESTDIR)$(ZSHDIR)/_pinion $(DESTDIR)$(FISHDIR)/pinion.fish \
 	    $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf \
 	    $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules $(DESTDIR)/etc/default/pinion-mcu \
-	    $(DESTDIR)$(MANDIR)/man1/pinion.1 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
+	    $(DESTDIR)$(MANDIR)/man1/pinion.1 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8 \
+	    $(DESTDIR)/etc/pinion/pinion.toml
+	test ! -d $(DESTDIR)/etc/pinion || rmdir --ignore-fail-on-non-empty $(DESTDIR)/etc/pinion
 	-rmdir $(DESTDIR)$(LIBDIR)
 ifeq ($(DESTDIR),)
 	-systemctl daemon-reload

@@ -297,7 +297,7 @@ fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip 
         };
         let known = [full.as_str(), &chip.label].into_iter().chain(line.name.as_deref());
         let known = known.chain(line.pins.iter().map(String::as_str));
-        if wanted(args, known) && !(args.free && !line.is_free()) {
+        if wanted(args, known) && (line.is_free() || !args.free) {
             lines.push(line);
         }
     }

@@ -135,12 +135,18 @@ mod tests {
     fn host(device: &Path, script: &Path) -> Child {
         let terminal = fs::File::open(device).unwrap();
         // A shell ignores what follows its script.
-        Command::new("/bin/sh")
+        let host = Command::new("/bin/sh")
             .args(["-c", "read line", "sh"])
             .arg(script)
             .stdin(Stdio::from(terminal))
             .spawn()
-            .unwrap()
+            .unwrap();
+        // For a moment a process that has become another program has no command line yet.
+        let line = format!("/proc/{}/cmdline", host.id());
+        while fs::read(&line).is_ok_and(|line| line.is_empty()) {
+            std::thread::sleep(std::time::Duration::from_millis(1));
+        }
+        host
     }
 
     #[test]

@@ -319,7 +319,7 @@ mod tests {
     use super::super::tests::{Tree, told};
     use super::*;
     use crate::board::linux::gpio::LineInfo;
-    use crate::cli::finding::Level::{Error, Ok, Warning};
+    use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
     use crate::cli::run::Given;
     use std::os::unix::fs::MetadataExt;
 
@@ -350,7 +350,7 @@ mod tests {
         tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
         let findings = permissions(&tree.machine(), &watched(), &stranger(vec![gid]));
         assert_eq!(findings.len(), NODES.len());
-        NODES.iter().for_each(|(check, _)| drop(told(&findings, check, Ok, "pinion may open /")));
+        NODES.iter().for_each(|(check, _)| drop(told(&findings, check, Fine, "pinion may open /")));
         let findings = permissions(&tree.machine(), &watched(), &stranger(vec![gid + 1]));
         for (check, path) in NODES {
             let remedy = told(&findings, check, Error, &format!("pinion may not open /{path}, which is "));
@@ -374,21 +374,21 @@ mod tests {
         let tree = Tree::new();
         let findings = presence(&tree.machine());
         told(&findings, "gpio", Warning, "no GPIO chip");
-        assert!(told(&findings, "spi", Ok, "SPI: none").contains("device tree"));
+        assert!(told(&findings, "spi", Fine, "SPI: none").contains("device tree"));
         tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0");
         tree.put("boot/firmware/config.txt", "#dtparam=spi=on\ndtparam=i2c_arm=on\ndtoverlay=w1-gpio\n");
         let findings = presence(&tree.machine());
-        let remedy = told(&findings, "spi", Ok, "SPI: off");
+        let remedy = told(&findings, "spi", Fine, "SPI: off");
         assert!(remedy.contains("dtparam=spi=on") && remedy.contains("/boot/firmware/config.txt"), "{remedy}");
         assert_eq!(told(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, and not there"), "sudo reboot");
         told(&findings, "w1", Warning, "no DS18B20 answers");
-        assert!(told(&findings, "pwm", Ok, "PWM: off").contains("dtoverlay=pwm-2chan"));
+        assert!(told(&findings, "pwm", Fine, "PWM: off").contains("dtoverlay=pwm-2chan"));
         tree.put("sys/bus/i2c/devices/i2c-1/name", "");
         assert!(told(&presence(&tree.machine()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
         NODES.iter().for_each(|(_, path)| tree.put(path, ""));
         let findings = presence(&tree.machine());
-        assert!(findings.iter().all(|finding| finding.status == Ok && finding.remedy.is_none()), "{findings:?}");
-        told(&findings, "i2c", Ok, "I2C: /dev/i2c-1");
+        assert!(findings.iter().all(|finding| finding.status == Fine && finding.remedy.is_none()), "{findings:?}");
+        told(&findings, "i2c", Fine, "I2C: /dev/i2c-1");
     }
 
     #[test]
@@ -409,7 +409,7 @@ mod tests {
         told(
             &findings,
             "gpio_lines",
-            Ok,
+            Fine,
             "gpiochip0 pinctrl: 2 of 3 lines are held: 0 by \"spi0 CS0\", 2 by \"the kernel\"",
         );
         assert_eq!(findings.len(), 1);
@@ -417,20 +417,20 @@ mod tests {
         tree.link("proc/77/fd/3", "anon_inode:gpio-line");
         tree.process(78, &["/usr/bin/other"], 1000, &[]);
         tree.link("proc/78/fd/3", "/dev/null");
-        told(&holders(&tree.machine(), &[]), "gpio_lines", Ok, "programs that hold lines: gpiomon (process 77)");
+        told(&holders(&tree.machine(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
         let many = Chip { lines: vec![line(Some("a"), true); 20], ..chip };
-        told(&holders(&tree.machine(), &[many]), "gpio_lines", Ok, "20 of 20 lines are held: 0 by \"a\"");
+        told(&holders(&tree.machine(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
     }
 
     #[test]
     fn a_pi_tells_of_its_power() {
         let tree = Tree::new();
-        told(&power(&tree.machine(), None), "power", Ok, "unknown: this is no Raspberry Pi");
+        told(&power(&tree.machine(), None), "power", Fine, "unknown: this is no Raspberry Pi");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
         told(&power(&tree.machine(), None), "power", Warning, "unknown");
         let file = "sys/devices/platform/soc/soc:firmware/get_throttled";
         tree.put(file, "0\n");
-        told(&power(&tree.machine(), None), "power", Ok, "were good");
+        told(&power(&tree.machine(), None), "power", Fine, "were good");
         tree.put(file, "50001\n");
         let findings = power(&tree.machine(), None);
         told(&findings, "power", Error, "the voltage is too low");

@@ -200,8 +200,8 @@ pub(super) fn watchdog(machine: &Machine, settings: &Settings) -> Vec<Finding> {
     let files = drop_ins.map(|name| format!("/etc/systemd/system.conf.d/{name}"));
     let other = std::iter::once("/etc/systemd/system.conf".to_owned()).chain(files).find(|file| {
         let text = machine.text(file).unwrap_or_default();
-        let values = text.lines().filter_map(|line| line.trim().strip_prefix("RuntimeWatchdogSec="));
-        values.last().is_some_and(|value| !["", "0", "off"].contains(&value.trim()))
+        let mut values = text.lines().filter_map(|line| line.trim().strip_prefix("RuntimeWatchdogSec="));
+        values.next_back().is_some_and(|value| !["", "0", "off"].contains(&value.trim()))
     });
     vec![match other {
         Some(file) => Finding::error(
