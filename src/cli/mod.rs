@@ -9,6 +9,7 @@ use std::process::ExitCode;
 use clap::{Args, Parser, Subcommand};
 use log::LevelFilter;
 
+mod console;
 pub mod dict;
 mod doctor;
 pub mod latency;
@@ -56,6 +57,8 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// Ask a running Pinion for its state, host, pins, queues and lateness
     Status(status::StatusArgs),
+    /// Speak to a running or a simulated machine by hand, without klippy
+    Console(console::ConsoleArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
 }
@@ -72,6 +75,7 @@ pub fn main() -> ExitCode {
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Status(args)) => status::run(&args),
+        Some(Command::Console(args)) => console::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
     };
     logging::finish();
