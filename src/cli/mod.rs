@@ -12,6 +12,7 @@ use log::LevelFilter;
 
 mod check;
 mod config;
+mod console;
 pub mod dict;
 mod doctor;
 mod finding;
@@ -60,6 +61,8 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// Ask a running Pinion for its state, host, pins, queues and lateness
     Status(status::StatusArgs),
+    /// Speak to a running or a simulated machine by hand, without klippy
+    Console(console::ConsoleArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
     /// Print a script that has a shell complete the command lines of pinion
@@ -81,6 +84,7 @@ pub fn main() -> ExitCode {
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Status(args)) => status::run(&args),
+        Some(Command::Console(args)) => console::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
         Some(Command::Completions { shell }) => completions(shell),
     };

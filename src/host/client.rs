@@ -285,6 +285,18 @@ impl Client {
         self.check()
     }
 
+    /// Waits until then, or for nothing if that is past, and takes all responses that came in. A shutdown is one of
+    /// them.
+    pub(super) fn hear(&mut self, until: Instant) -> Result<Vec<Params>, Error> {
+        for _ in 0..INBOX_MAX {
+            match self.link.receive(until)? {
+                Some(received) => self.file(&received),
+                None => break,
+            }
+        }
+        Ok(self.drain())
+    }
+
     /// All responses that came in and that nobody took.
     pub fn drain(&mut self) -> Vec<Params> {
         self.inbox.drain(..).collect()

@@ -15,6 +15,9 @@ use crate::wire::dictionary::Dictionary;
 use crate::wire::format::{self, Conversion};
 use crate::wire::vlq::{Reader, Writer};
 
+/// How many names of a run are listed.
+const NAMES_MAX: u32 = 4096;
+
 /// A value given for a command's parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Arg<'a> {
@@ -80,6 +83,11 @@ impl Params {
     /// The parameter's value, if there is such a parameter.
     pub fn get(&self, parameter: &str) -> Option<&Value> {
         self.fields.iter().find_map(|(name, value)| (name == parameter).then_some(value))
+    }
+
+    /// The parameters in their order.
+    pub(super) fn fields(&self) -> impl Iterator<Item = (&str, &Value)> {
+        self.fields.iter().map(|(name, value)| (name.as_str(), value))
     }
 
     /// A number. Fails if the response has no such number.
@@ -185,6 +193,16 @@ impl Enumeration {
         })
     }
 
+    /// Every name, sorted. Of a run that is absurdly long the beginning.
+    fn all(&self) -> Vec<String> {
+        let runs = self.runs.iter().flat_map(|(root, start, _, count)| {
+            (0..(*count).min(NAMES_MAX)).map(move |at| format!("{root}{}", u64::from(*start) + u64::from(at)))
+        });
+        let mut names: Vec<String> = self.values.keys().cloned().chain(runs).collect();
+        names.sort();
+        names
+    }
+
     fn name_of(&self, value: u32) -> Option<String> {
         if let Some(name) = self.names.get(&value) {
             return Some(name.clone());
@@ -240,6 +258,12 @@ impl Messages {
     /// Whether there is such a command with such a parameter.
     pub(super) fn has_parameter(&self, command: &str, parameter: &str) -> bool {
         self.commands.get(command).is_some_and(|m| m.parameters.iter().any(|p| p.name == parameter))
+    }
+
+    /// The names that a parameter takes, sorted; none if it takes no names.
+    pub(super) fn names(&self, parameter: &str) -> Vec<String> {
+        let enumeration = self.enumerations.iter().find(|enumeration| names_values_of(&enumeration.name, parameter));
+        enumeration.map_or_else(Vec::new, Enumeration::all)
     }
 
     /// The bytes of a command. Fails if the dictionary has no such command, if the parameters

@@ -9,6 +9,7 @@
 //! - [`motion`]: step sequences, pacing them into the move queue, homing
 //! - [`heater`]: a sensor, an output and the loop between them
 //! - [`demo`]: all of it in one go, with progress and checks
+//! - [`console`]: a session in words
 //! - [`picture`]: an SVG of the homing just done
 //!
 //! There is one thread: a call that waits also reads, acknowledges and sends blocks again.
@@ -17,6 +18,7 @@
 
 pub mod client;
 pub mod config;
+pub mod console;
 pub mod demo;
 #[cfg(test)]
 mod fake;

@@ -33,7 +33,8 @@ pub enum Search {
     Nobody,
 }
 
-/// Finds the process that has the terminal `device` open, another than this one. `proc` is /proc.
+/// Finds the process that has the terminal `device` open, another than this one, and than one that serves it, having
+/// its other end open. `proc` is /proc.
 ///
 /// # Errors
 ///
@@ -47,12 +48,12 @@ pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
     let mut hidden = Vec::new();
     for process in processes {
         match process.has_open(proc, &terminal) {
-            Ok(true) => return Ok(Search::Found(process)),
+            Ok(true) if !process.serves(proc, &terminal) => return Ok(Search::Found(process)),
             Err(error) if error.kind() == io::ErrorKind::PermissionDenied && process.klippy().is_some() => {
                 hidden.push(process);
             }
             // One that ended meanwhile, or that is none of klippy's.
-            Ok(false) | Err(_) => {}
+            Ok(_) | Err(_) => {}
         }
     }
     Ok(if hidden.is_empty() { Search::Nobody } else { Search::Hidden(hidden) })
@@ -104,6 +105,15 @@ impl Process {
         let through_root = folder.join("root").join(inside);
         let program = if through_root.exists() { through_root } else { program };
         Some(program.parent()?.to_owned())
+    }
+
+    /// Whether it has the master end of the terminal open. Which terminal a master belongs to is the `tty-index` of its
+    /// fdinfo (proc_pid_fdinfo(5)).
+    fn serves(&self, proc: &Path, terminal: &fs::Metadata) -> bool {
+        let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.rdev()));
+        let Ok(files) = fs::read_dir(proc.join(self.pid.to_string()).join("fdinfo")) else { return false };
+        let mut told = files.flatten().filter_map(|file| fs::read_to_string(file.path()).ok());
+        told.any(|info| info.lines().any(|line| line == index))
     }
 
     fn has_open(&self, proc: &Path, terminal: &fs::Metadata) -> io::Result<bool> {
@@ -167,6 +177,28 @@ mod tests {
         host.kill().unwrap();
         host.wait().unwrap();
         assert_eq!(find(Path::new("/proc"), &device).unwrap(), Search::Nobody);
+    }
+
+    #[test]
+    fn who_serves_the_terminal_is_no_host() {
+        let pty = openpty(None, None).unwrap();
+        let device = ttyname(&pty.slave).unwrap();
+        // A program that has both ends open, as Pinion has while no host is there.
+        let mut server = Command::new("/bin/sh")
+            .args(["-c", "read line"])
+            .stdin(Stdio::from(pty.slave.try_clone().unwrap()))
+            .stderr(Stdio::from(pty.master.try_clone().unwrap()))
+            .spawn()
+            .unwrap();
+        assert_eq!(find(Path::new("/proc"), &device).unwrap(), Search::Nobody);
+        let mut host = host(&device, Path::new("klippy.py"));
+        let found = find(Path::new("/proc"), &device).unwrap();
+        let Search::Found(process) = found else { panic!("{found:?}") };
+        assert_eq!(process.pid, host.id());
+        for child in [&mut server, &mut host] {
+            child.kill().unwrap();
+            child.wait().unwrap();
+        }
     }
 
     #[test]

@@ -1,0 +1,298 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion console`: a host for people, in place of klippy.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io::{self, BufRead, BufReader, IsTerminal};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use clap::Args;
+use log::LevelFilter;
+use nix::sys::signal::{Signal, kill};
+use nix::sys::termios::{SetArg, tcgetattr, tcsetattr};
+use nix::unistd::getpid;
+use rustyline::completion::Completer;
+use rustyline::config::CompletionType;
+use rustyline::error::ReadlineError;
+use rustyline::highlight::Highlighter;
+use rustyline::hint::Hinter;
+use rustyline::history::FileHistory;
+use rustyline::validate::Validator;
+use rustyline::{Config, Context, Editor, ExternalPrinter, Helper};
+
+use crate::board::sim::SimBoard;
+use crate::host::Client;
+use crate::host::console::{Console, Next, Vocabulary};
+use crate::klippy::process::{Search, find};
+use crate::runtime::wakeup::MarginLimits;
+use crate::runtime::{self, Access, Options};
+use crate::time::Monotonic;
+
+use super::run::{BoardName, sim_config};
+use super::{failed, logging, print};
+
+/// How long a machine has to answer.
+const PATIENCE: Duration = Duration::from_secs(2);
+/// How often a console that waits for a line looks for what the machine says.
+const LOOK: Duration = Duration::from_millis(20);
+/// How many lines are remembered.
+const HISTORY_LINES: usize = 1000;
+const PROMPT: &str = "> ";
+
+/// Options of `pinion console`.
+#[derive(Args, Clone, Debug)]
+pub(super) struct ConsoleArgs {
+    /// The machine's terminal
+    #[arg(value_name = "PTY", default_value = "/tmp/klipper_host_mcu")]
+    pty: PathBuf,
+    /// Run the lines of FILE, up to the first that fails, and end
+    #[arg(short = 'f', value_name = "FILE")]
+    file: Option<PathBuf>,
+    /// Speak to a simulated machine of its own: sim, or sim:FILE.toml
+    #[arg(long, value_name = "BOARD", conflicts_with = "pty")]
+    board: Option<BoardName>,
+}
+
+/// Speaks to a machine until there are no more lines.
+pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
+    let done = match &args.board {
+        None => free(&args.pty).and_then(|()| speak(args, &args.pty)),
+        Some(BoardName::Sim(file)) => simulate(args, file.as_deref()),
+        Some(BoardName::Linux) => Err("--board is sim or sim:FILE.toml here; for this machine's pins start pinion run, and name its link to pinion console".into()),
+    };
+    done.map_or_else(failed, |()| ExitCode::SUCCESS)
+}
+
+/// Fails if a host has the terminal open: two at once would take each other's answers.
+fn free(pty: &Path) -> Result<(), String> {
+    let device = fs::canonicalize(pty)
+        .map_err(|error| format!("{}: {error}: is Pinion running, and with this link?", pty.display()))?;
+    let name = |processes: &[crate::klippy::process::Process]| {
+        let names = processes.iter().map(|process| {
+            let command: Vec<String> = process.arguments.iter().map(|word| word.display().to_string()).collect();
+            format!("process {} ({})", process.pid, command.join(" "))
+        });
+        names.collect::<Vec<_>>().join(", ")
+    };
+    match find(Path::new("/proc"), &device) {
+        Ok(Search::Found(host)) => {
+            Err(format!("{} has {} open: stop it first (sudo systemctl stop klipper)", name(&[host]), pty.display()))
+        }
+        Ok(Search::Hidden(hosts)) => Err(format!(
+            "{} may have {} open, and may not be looked into: stop it first, or use sudo",
+            name(&hosts),
+            pty.display()
+        )),
+        Ok(Search::Nobody) => Ok(()),
+        Err(error) => Err(format!("who has {} open can not be found out: {error}", pty.display())),
+    }
+}
+
+/// Runs a simulated machine, and speaks to it.
+fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
+    let terminal = tcgetattr(io::stdin()).ok();
+    // The lines that tell of each event are those of a service.
+    log::set_max_level(log::max_level().min(LevelFilter::Warn));
+    logging::detach();
+    let clock = Monotonic::start();
+    let board = sim_config(file).and_then(|config| SimBoard::new(config, Arc::new(clock)));
+    let board = board.map_err(|error| error.to_string())?;
+    let symlink = std::env::temp_dir().join(format!("pinion_console_{}", std::process::id()));
+    let options = Options {
+        symlink: symlink.clone(),
+        dialect: None,
+        access: Access { mode: 0o600, group: Some(nix::unistd::getegid().to_string()) },
+        realtime: false,
+        cpu: None,
+        margin: MarginLimits::default(),
+        watchdog: None,
+        sockets: Vec::new(),
+    };
+    let said = Arc::new(Mutex::new(Ok(())));
+    let ready = {
+        let (args, said) = (args.clone(), said.clone());
+        move || {
+            let speaking = thread::Builder::new().name("console".into()).spawn(move || {
+                *said.lock().unwrap_or_else(PoisonError::into_inner) = speak(&args, &symlink);
+                // SIGTERM to ourselves: the machine ends in order.
+                if let Err(error) = kill(getpid(), Signal::SIGTERM) {
+                    log::error!("ending: {error}");
+                }
+            });
+            if let Err(error) = speaking {
+                log::error!("the console can not be started: {error}");
+            }
+        }
+    };
+    let ended = runtime::run(&options, Box::new(board), clock, None, ready);
+    if let Some(terminal) = terminal {
+        // A signal may have ended the machine amid a line.
+        let _ = tcsetattr(io::stdin(), SetArg::TCSANOW, &terminal);
+    }
+    ended.map_err(|error| error.to_string())?;
+    std::mem::replace(&mut *said.lock().unwrap_or_else(PoisonError::into_inner), Ok(()))
+}
+
+/// Speaks to the machine of a terminal: the lines of a file, of a pipe, or of a person.
+fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
+    let client = Client::connect(pty, PATIENCE).map_err(|error| error.to_string())?;
+    let console = Console::new(client);
+    match &args.file {
+        Some(path) => {
+            let about = |error| format!("{}: {error}", path.display());
+            let file = fs::File::open(path).map_err(|error| about(error.to_string()))?;
+            script(console, BufReader::new(file)).map_err(about)
+        }
+        None if !io::stdin().is_terminal() => script(console, io::stdin().lock()),
+        None => converse(console),
+    }
+}
+
+/// Carries the lines out, up to the first that fails.
+fn script(mut console: Console, lines: impl BufRead) -> Result<(), String> {
+    for (number, line) in (1..).zip(lines.lines()) {
+        let line = line.map_err(|error| format!("line {number} can not be read: {error}"))?;
+        let told = &mut |text: &str| drop(print(&format!("{text}\n")));
+        if !line.trim().is_empty() {
+            told(&format!("{PROMPT}{}", line.trim()));
+        }
+        match console.line(&line, told) {
+            Ok(Next::Line) => {}
+            Ok(Next::End) => break,
+            Err(error) => return Err(format!("line {number}: {error}")),
+        }
+    }
+    Ok(())
+}
+
+// ---- a person
+
+/// Takes lines from a person. The machine is spoken to by a thread of its own, so that what it says meanwhile is
+/// printed above the line that is being written.
+fn converse(console: Console) -> Result<(), String> {
+    let about = |error: ReadlineError| format!("the terminal: {error}");
+    let config = Config::builder().completion_type(CompletionType::List).max_history_size(HISTORY_LINES);
+    let config = config.map_err(about)?.auto_add_history(true).build();
+    let mut editor: Editor<Words, FileHistory> = Editor::with_config(config).map_err(about)?;
+    editor.set_helper(Some(Words(console.vocabulary().clone())));
+    let history = history_file();
+    if let Some(path) = &history {
+        // There is none at the first time.
+        let _ = editor.load_history(path);
+    }
+    let greeting = console.greeting();
+    print(&format!("{greeting}\n"))?;
+    let printer = editor.create_external_printer().map_err(about)?;
+    let (lines, inbox) = mpsc::channel();
+    let (outbox, answers) = mpsc::channel();
+    let gone = Arc::new(AtomicBool::new(false));
+    let session = {
+        let gone = gone.clone();
+        thread::Builder::new().name("session".into()).spawn(move || attend(console, printer, &inbox, &outbox, &gone))
+    };
+    session.map_err(|error| format!("no thread can be started: {error}"))?;
+    let ended = read_lines(&mut editor, &lines, &answers, &gone);
+    if let Some(path) = history {
+        let kept = path.parent().map_or(Ok(()), fs::create_dir_all).map_err(|error| error.to_string());
+        let kept = kept.and_then(|()| editor.save_history(&path).map_err(|error| error.to_string()));
+        if let Err(error) = kept {
+            log::warn!("the history is not kept in {}: {error}", path.display());
+        }
+    }
+    ended
+}
+
+fn read_lines(
+    editor: &mut Editor<Words, FileHistory>,
+    lines: &Sender<String>,
+    answers: &Receiver<Option<Vocabulary>>,
+    gone: &AtomicBool,
+) -> Result<(), String> {
+    loop {
+        match editor.readline(PROMPT) {
+            // What is pasted may have several lines.
+            Ok(text) => {
+                for line in text.lines() {
+                    let is_gone = lines.send(line.to_owned()).is_err();
+                    // Its answer comes before the next prompt. None: the session has ended.
+                    match answers.recv() {
+                        Ok(Some(vocabulary)) if !is_gone => editor.set_helper(Some(Words(vocabulary))),
+                        _ if gone.load(Ordering::Relaxed) => return Err("the machine is gone".into()),
+                        _ => return Ok(()),
+                    }
+                }
+            }
+            Err(ReadlineError::Interrupted) => {}
+            Err(ReadlineError::Eof) => return Ok(()),
+            Err(error) => return Err(format!("the terminal: {error}")),
+        }
+    }
+}
+
+/// Speaks to the machine: carries lines out as they come, and prints what it says.
+fn attend(
+    mut console: Console,
+    mut printer: impl ExternalPrinter,
+    lines: &Receiver<String>,
+    answers: &Sender<Option<Vocabulary>>,
+    gone: &AtomicBool,
+) {
+    let mut told = |text: &str| drop(printer.print(format!("{text}\n")));
+    loop {
+        match lines.recv_timeout(Duration::ZERO) {
+            Ok(line) => {
+                let next = console.line(&line, &mut told).unwrap_or_else(|error| {
+                    told(&format!("!! {error}"));
+                    Next::Line
+                });
+                let answer = (next == Next::Line).then(|| console.vocabulary().clone());
+                if answers.send(answer).is_err() || next == Next::End {
+                    return;
+                }
+            }
+            Err(RecvTimeoutError::Timeout) => {
+                if let Err(error) = console.listen(LOOK, &mut told) {
+                    told(&format!("!! {error}"));
+                    if console.is_gone() {
+                        gone.store(true, Ordering::Relaxed);
+                        return;
+                    }
+                }
+            }
+            Err(RecvTimeoutError::Disconnected) => return,
+        }
+    }
+}
+
+/// Where lines are remembered (XDG Base Directory Specification).
+fn history_file() -> Option<PathBuf> {
+    let folder = |name| std::env::var_os(name).map(PathBuf::from).filter(|folder| folder.is_absolute());
+    let state = folder("XDG_STATE_HOME").or_else(|| Some(folder("HOME")?.join(".local/state")))?;
+    Some(state.join("pinion/console_history"))
+}
+
+/// Completes the words of the dictionary.
+struct Words(Vocabulary);
+
+impl Completer for Words {
+    type Candidate = String;
+
+    fn complete(&self, line: &str, at: usize, _: &Context<'_>) -> rustyline::Result<(usize, Vec<String>)> {
+        Ok(self.0.complete(&line[..at]))
+    }
+}
+
+impl Hinter for Words {
+    type Hint = String;
+}
+
+impl Highlighter for Words {}
+impl Validator for Words {}
+impl Helper for Words {}

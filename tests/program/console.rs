@@ -1,0 +1,230 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion console`: scripts, a person at a terminal, and who is not let in.
+
+use std::fs::{self, File};
+use std::io::{Read, Write};
+use std::path::Path;
+use std::process::{Command, Output, Stdio};
+use std::sync::{Arc, Mutex};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::pty::{Winsize, openpty};
+use nix::sys::termios::{LocalFlags, tcgetattr};
+use pinion::host::config::Config;
+
+use crate::process::{PATIENCE, Pinion, folder_with};
+
+fn console(args: &[&str], script: &str) -> Output {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .arg("console")
+        .args(args)
+        .env_remove("JOURNAL_STREAM")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    // It may have been refused before it reads.
+    let _ = child.stdin.take().unwrap().write_all(script.as_bytes());
+    child.wait_with_output().unwrap()
+}
+
+fn text(bytes: &[u8]) -> String {
+    String::from_utf8_lossy(bytes).into_owned()
+}
+
+const OUTPUT: &str = "\
+# A light.
+allocate_oids count=1
+config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=2s
+finalize_config crc=1
+";
+
+#[test]
+fn a_script_configures_a_simulated_machine_and_sets_an_output() {
+    let script =
+        format!("{OUTPUT}update_digital_out oid=0 value=1\nget_clock\nget_config\ndelay 0.1\nquit\nnonsense\n");
+    let output = console(&["--board", "sim"], &script);
+    let (out, log) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{out}\n{log}");
+    assert!(out.contains("> update_digital_out oid=0 value=1\n"), "{out}");
+    let clock = out.lines().find(|line| line.contains("] clock clock=")).unwrap();
+    let (stamp, ticks) = clock.strip_prefix('[').unwrap().split_once("] clock clock=").unwrap();
+    // The stamp is the machine's own time, in seconds: 50 million ticks each.
+    let apart = stamp.trim().parse::<f64>().unwrap() - ticks.parse::<f64>().unwrap() / 50e6;
+    assert!((-0.01..5.0).contains(&apart), "{clock}");
+    assert!(out.contains("] config is_config=1 crc=1 is_shutdown=0 move_count=1024\n"), "{out}");
+    assert!(!out.contains("nonsense") && !out.contains("] stats "), "{out}");
+}
+
+#[test]
+fn a_script_ends_at_its_first_error_and_tells_the_line() {
+    let output = console(&["--board", "sim"], "get_uptime\n\nget_clok\nget_uptime\n");
+    assert_eq!(output.status.code(), Some(1));
+    let log = text(&output.stderr);
+    assert!(log.contains("line 3: there is no command get_clok; did you mean get_clock?"), "{log}");
+    assert_eq!(text(&output.stdout).matches("] uptime ").count(), 1);
+
+    let (_folder, file) = folder_with("script", "get_uptime\nconfig_endstop oid=0 pin=x_endstp pull_up=1\n");
+    let output = console(&["--board", "sim", "-f", file.to_str().unwrap()], "");
+    let log = text(&output.stderr);
+    assert!(log.contains(&format!("{}: line 2: `x_endstp` is none", file.display())), "{log}");
+    assert!(log.contains("did you mean x_endstop?"), "{log}");
+    assert_eq!(output.status.code(), Some(1));
+}
+
+#[test]
+fn a_shutdown_is_told_with_its_text_and_reset_ends_it() {
+    let script = "allocate_oids count=1\nallocate_oids count=1\nget_clock\n";
+    let output = console(&["--board", "sim"], script);
+    let (out, log) = (text(&output.stdout), text(&output.stderr));
+    assert_eq!(output.status.code(), Some(1), "{out}\n{log}");
+    assert!(log.contains("line 2: the machine shut down: oids already allocated"), "{log}");
+    assert!(!out.contains("] clock "), "{out}");
+    // What was asked for is no error.
+    let script = format!("{OUTPUT}emergency_stop\nreset\n{OUTPUT}get_config\n");
+    let output = console(&["--board", "sim"], &script);
+    let (out, log) = (text(&output.stdout), text(&output.stderr));
+    assert!(output.status.success(), "{out}\n{log}");
+    assert!(out.contains("static_string_id=Command request\n"), "{out}");
+    assert!(out.ends_with("] config is_config=1 crc=1 is_shutdown=0 move_count=1024\n"), "{out}");
+}
+
+#[test]
+fn an_output_follows_an_instant_that_is_given_from_now() {
+    // Refreshed within two seconds it stays; then nobody does.
+    let script =
+        format!("{OUTPUT}queue_digital_out oid=0 clock=@clock+0.2s on_ticks=1\ndelay 0.5\nget_config\ndelay 20\n");
+    let output = console(&["--board", "sim"], &script);
+    let (out, log) = (text(&output.stdout), text(&output.stderr));
+    assert!(out.contains("] config is_config=1 crc=1 is_shutdown=0"), "{out}\n{log}");
+    assert!(log.contains("line 8: the machine shut down: Missed scheduling of next digital out event"), "{log}");
+}
+
+#[test]
+fn a_running_machine_is_spoken_to_and_one_with_a_host_is_not() {
+    let pinion = Pinion::simulated(&[]);
+    let link = pinion.link();
+    let link = link.to_str().unwrap();
+    let output = console(&[link], "get_config\n");
+    assert!(output.status.success(), "{output:?}");
+    assert!(text(&output.stdout).contains("] config is_config=0 "), "{output:?}");
+    // Another process with the terminal open; this one's own client, too, is another for the console.
+    let mut client = pinion.client();
+    Config::default().apply(&mut client).unwrap();
+    let refused = console(&[link], "emergency_stop\n");
+    assert_eq!(refused.status.code(), Some(1));
+    let log = text(&refused.stderr);
+    assert!(log.contains(&format!("process {} (", std::process::id())) && log.contains("stop it first"), "{log}");
+    assert!(!client.status().unwrap().is_shutdown);
+    let missing = console(&["/tmp/no-such-link"], "");
+    assert!(text(&missing.stderr).contains("is Pinion running"), "{missing:?}");
+}
+
+/// A console at a terminal.
+struct Person {
+    master: File,
+    slave: std::os::fd::OwnedFd,
+    seen: Arc<Mutex<Vec<u8>>>,
+    child: std::process::Child,
+}
+
+impl Person {
+    fn new(args: &[&str], state: &Path) -> Person {
+        let size = Winsize { ws_row: 40, ws_col: 120, ws_xpixel: 0, ws_ypixel: 0 };
+        let terminal = openpty(Some(&size), None).unwrap();
+        let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
+        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+            .arg("console")
+            .args(args)
+            .env("XDG_STATE_HOME", state)
+            .env("TERM", "xterm")
+            .stdin(dup())
+            .stdout(dup())
+            .stderr(dup())
+            .spawn()
+            .unwrap();
+        let seen = Arc::new(Mutex::new(Vec::new()));
+        let mut master = File::from(terminal.master);
+        thread::spawn({
+            let (seen, mut master) = (seen.clone(), master.try_clone().unwrap());
+            move || {
+                let mut piece = [0; 4096];
+                while let Ok(read @ 1..) = master.read(&mut piece) {
+                    seen.lock().unwrap().extend(&piece[..read]);
+                }
+            }
+        });
+        master.flush().unwrap();
+        Person { master, slave: terminal.slave, seen, child }
+    }
+
+    fn text(&self) -> String {
+        text(&self.seen.lock().unwrap())
+    }
+
+    fn until(&mut self, what: &str) {
+        let end = Instant::now() + PATIENCE;
+        while !self.text().contains(what) {
+            assert!(Instant::now() < end, "waited in vain for {what:?}:\n{}", self.text());
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+
+    fn types(&mut self, keys: &str) {
+        self.master.write_all(keys.as_bytes()).unwrap();
+    }
+}
+
+impl Drop for Person {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+#[test]
+fn at_a_terminal_tab_completes_and_lines_are_remembered() {
+    let pinion = Pinion::simulated(&[]);
+    let state = tempfile::tempdir().unwrap();
+    let link = pinion.link();
+    for times in [1, 2] {
+        let mut person = Person::new(&[link.to_str().unwrap()], state.path());
+        let before = tcgetattr(&person.slave).unwrap().local_flags;
+        person.until("help tells of them");
+        person.until("> ");
+        if times == 1 {
+            person.types("get_up\t\r");
+        } else {
+            // The line of before, by the key that goes up.
+            person.types("\x1b[A\x1b[A\r");
+        }
+        person.until("] uptime high=");
+        person.types("helo\r");
+        person.until("!! there is no command helo; did you mean help?");
+        person.types("quit\r");
+        assert!(person.child.wait().unwrap().success(), "{}", person.text());
+        let after = tcgetattr(&person.slave).unwrap().local_flags;
+        assert!(after.contains(LocalFlags::ICANON | LocalFlags::ECHO) || after == before);
+        let kept = fs::read_to_string(state.path().join("pinion/console_history")).unwrap();
+        assert!(kept.lines().any(|line| line == "get_uptime"), "{kept}");
+        // The second time goes up beyond "quit" and "helo".
+        fs::write(state.path().join("pinion/console_history"), "#V2\nget_uptime\nhelo\n").unwrap();
+    }
+}
+
+#[test]
+fn what_the_machine_says_meanwhile_is_printed_at_once() {
+    let state = tempfile::tempdir().unwrap();
+    let mut person = Person::new(&["--board", "sim"], state.path());
+    person.until("help tells of them");
+    for line in OUTPUT.lines() {
+        person.types(&format!("{line}\r"));
+    }
+    person.types("update_digital_out oid=0 value=1\r");
+    // Nobody refreshes the output, and nobody types.
+    person.until("!! the machine shut down: Missed scheduling of next digital out event");
+    person.types("\x04");
+    assert!(person.child.wait().unwrap().success(), "{}", person.text());
+}
