@@ -86,8 +86,7 @@ fn home(link: &str) -> Result<(), Error> {
     // Ten seconds of it: the check closes the endstop after a second.
     let profile = Profile::trapezoid(1000, 100.0, 400.0, client.frequency_hz())?;
     println!("homing");
-    let homed =
-        MoveQueue::new(status.move_count).home(&mut client, stepper, endstop, true, &profile, &mut |_| ())?;
+    let homed = MoveQueue::new(status.move_count).home(&mut client, stepper, endstop, true, &profile, &mut |_| ())?;
     println!("homed at {} by {:?}", homed.position, homed.reason);
     match homed.reason {
         HomingEnd::Endstop if homed.position > 0 => Ok(()),
