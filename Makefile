@@ -85,7 +85,7 @@ check: system-packages
 	RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links' $(CARGO) doc --locked --no-deps --document-private-items --quiet
 	$(CARGO) build --locked --quiet
 	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
-	@scripts/system-packages deb
+	@scripts/system-packages check
 	scripts/check-deb $(CARGO_TARGET_DIR)/debug/pinion
 
 system-packages: cargo

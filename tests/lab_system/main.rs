@@ -36,8 +36,8 @@ const USAGE: &str = "\
 Usage: cargo test --test lab_system -- [OPTIONS] [FILTERS...]
 
 Installs the package in a booted Debian 12 and runs the checks whose name contains any of the filters,
-as in kill; the first one, which installs it, always. It takes root, installs the emulator if it is
-missing, and downloads 250 MB the first time.
+as in reboot; the first one, which installs it, always. It takes root, installs the emulator if it is
+missing, and downloads a Debian the first time.
 
 Options:
   --nocapture        Show the output of checks that pass, too

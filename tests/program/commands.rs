@@ -349,3 +349,31 @@ fn a_simulated_printer_of_which_nobody_reads_goes_on_to_serve_its_host() {
     assert_eq!(pinion.end().code(), Some(0));
     assert!(!pinion.log().contains("panicked"), "{}", pinion.log());
 }
+
+#[test]
+fn the_version_tells_the_state_of_the_sources_and_the_dictionary_tells_the_same() {
+    let version = String::from_utf8(output(&["--version"]).stdout).unwrap();
+    let version = version.trim().strip_prefix("pinion ").unwrap();
+    let (number, state) = version.split_once('-').unwrap_or((version, ""));
+    assert_eq!(number, env!("CARGO_PKG_VERSION"));
+    let head = Command::new("git").args(["rev-parse", "--verify", "HEAD"]).output();
+    // Where there is no git, as in a tree that was unpacked, it tells no state.
+    if head.is_ok_and(|head| head.status.success()) {
+        let commit = state.strip_suffix("-dirty").unwrap_or(state).strip_prefix('g').unwrap();
+        assert!(commit.len() >= 12 && commit.chars().all(|digit| digit.is_ascii_hexdigit()), "{version}");
+    }
+    let dictionary: Value = serde_json::from_slice(&output(&["dict", "--board", "sim"]).stdout).unwrap();
+    assert_eq!(dictionary["version"], format!("pinion-{version}"));
+}
+
+#[test]
+fn shells_get_completions_with_every_subcommand_and_option() {
+    for shell in ["bash", "zsh", "fish"] {
+        let script = output(&["completions", shell]);
+        assert!(script.status.success());
+        let script = String::from_utf8(script.stdout).unwrap();
+        for word in ["doctor", "latency", "print-config", "dialect"] {
+            assert!(script.contains(word), "{shell} knows no {word}");
+        }
+    }
+}

@@ -2,8 +2,9 @@
 systemctl is-system-running --wait || true
 until_true 30 test -c /dev/gpiochip0
 until_true 30 is_active lab-chips
-! id pinion 2>/dev/null
+not id pinion 2>/dev/null
 stat -c '%U:%G %n' /dev/gpiochip0 /dev/watchdog
+apt-get -qq update
 apt-get install -y /share/pinion-mcu.deb
 is "$(systemctl is-enabled pinion-mcu || true)" disabled
 is "$(systemctl is-active pinion-mcu || true)" inactive

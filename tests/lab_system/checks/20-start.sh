@@ -4,15 +4,16 @@ systemctl start pinion-mcu
 is "$(systemctl show -P NotifyAccess pinion-mcu)" main NotifyAccess
 is "$(stat -c %U "/proc/$(pid)")" pinion "the process's user"
 core=$(ps -L -o tid=,comm= -p "$(pid)" | awk '$2 == "core" { print $1 }')
-chrt -p "$core" | grep -q 'SCHED_FIFO'
+chrt -p "$core" | grep SCHED_FIFO
 [ "$(awk '/^VmLck/ { print $2 }' "/proc/$(pid)/status")" -gt 1000 ]
 guardian >/dev/null
 is "$(readlink $LINK)" /run/pinion/klipper_host_mcu "the link"
 # klippy's user may, somebody who is not in the group may not.
 identifies $LINK HEATER
-! runuser -u stranger -- /share/host identify $LINK 2>/run/stranger
+not runuser -u stranger -- /share/host identify $LINK 2>/run/stranger
 grep -i 'permission denied' /run/stranger
 # Nothing of all that, nor to stop a machine that is not configured, is worth a warning.
 systemctl stop pinion-mcu
 is "$(said pinion-mcu -p warning)" "" "a warning in the log"
-[ ! -e $LINK ] && [ ! -L $LINK ]
+[ ! -e $LINK ]
+[ ! -L $LINK ]

@@ -2,9 +2,9 @@
 fresh
 systemctl start pinion-mcu
 before=$(pid)
-! identifies $LINK extra-LINE
+not identifies $LINK extra-LINE
 chips extra
 identifies $LINK extra-LINE
 is "$(pid)" "$before" "the process"
 echo 0 >/sys/kernel/config/gpio-sim/extra/live
-! identifies $LINK extra-LINE
+not identifies $LINK extra-LINE

@@ -1,5 +1,5 @@
 # A further instance beside the first one, with a configuration of its own.
-pinion run --help | grep -q -e --config || { echo 'NOT RUN: this pinion takes no --config'; exit 0; }
+pinion run --help | grep -e --config >/dev/null || { echo 'NOT RUN: this pinion takes no --config'; exit 0; }
 fresh
 systemctl start pinion-mcu
 mkdir -p /etc/pinion

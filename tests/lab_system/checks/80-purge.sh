@@ -2,10 +2,11 @@
 fresh
 systemctl enable --now pinion-mcu
 apt-get remove -y pinion-mcu
-! is_active pinion-mcu
-[ ! -e /usr/bin/pinion ] && [ ! -L $LINK ]
+not is_active pinion-mcu
+[ ! -e /usr/bin/pinion ]
+[ ! -L $LINK ]
 [ -e /etc/default/pinion-mcu ]
-! systemctl list-units --all --plain --no-legend 'pinion-mcu*' | grep .
+is "$(systemctl list-units --all --plain --no-legend 'pinion-mcu*')" "" "the units that are there"
 [ ! -L /etc/systemd/system/multi-user.target.wants/pinion-mcu.service ]
 apt-get purge -y pinion-mcu
 [ ! -e /etc/default/pinion-mcu ]

@@ -7,6 +7,8 @@ export PATH=$PATH:/share
 LINK=/tmp/klipper_host_mcu
 CHIP=/sys/devices/platform/gpio-sim.0/gpiochip0
 
+# bash goes on after a "!" command that fails its check, and after an "a && b" whose a fails: neither is used.
+not() { if "$@"; then fail "it succeeded: $*"; fi; }
 fail() { echo "$*"; false; }
 # is VALUE WANTED [OF WHAT]
 is() { [ "$1" = "$2" ] || fail "${3:-} is \"$1\", not \"$2\""; }
