@@ -265,11 +265,16 @@ impl Core {
             Err(_) => None,
             Ok(waiting) => {
                 let (first, second) = waiting.as_slices();
+                let mut heard = mcu.heard();
                 first.iter().chain(second).find_map(|request| match request {
-                    Request::Run(payload) => mcu.is_emergency(payload.as_slice()).then(base::emergency),
+                    Request::Run(payload) => heard.is_emergency(payload.as_slice()).then(base::emergency),
                     Request::Shutdown(shutdown) => Some(shutdown.clone()),
                     Request::Quit => Some(program_ends()),
-                    Request::Speak(_) | Request::Report | Request::Hang => None,
+                    Request::Speak(dialect) => {
+                        heard = dialect;
+                        None
+                    }
+                    Request::Report | Request::Hang => None,
                 })
             }
         };
@@ -594,6 +599,25 @@ mod tests {
             }
             rig.thread.join().unwrap();
         }
+    }
+
+    #[test]
+    fn the_stop_of_a_host_that_came_meanwhile_is_read_in_its_dialect() {
+        let mut rig = Rig::held();
+        let board = FakeBoard(rig.bench.clone());
+        let dialect = Arc::new(Dialect::new(FEATURES, &board, DialectName::Of(Generation::V0_11)).unwrap());
+        rig.request(Request::Speak(dialect.clone()));
+        let format = "config_adxl345 oid=%c spi_oid=%c";
+        let mut writer = Writer::default();
+        [dialect.command_id(format).unwrap(), 0, 1].iter().for_each(|int| writer.int(*int));
+        let stop = rig.encode("emergency_stop", &[]);
+        let block = Payload::new(&[writer.payload().unwrap(), stop.as_slice()].concat());
+        assert!(!rig.dialect.is_emergency(block.as_slice()), "in the dialect of before this means something else");
+        rig.stop(Request::Run(block));
+        rig.wait_until("the machine stops", Rig::is_stopped);
+        rig.bench.hang(false);
+        rig.stop(Request::Quit);
+        rig.thread.join().unwrap();
     }
 
     #[test]

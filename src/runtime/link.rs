@@ -26,7 +26,7 @@ use crate::wire::vlq::{Reader, Writer};
 use super::core::{Payload, Request};
 use super::guardian::{GuardianWatch, in_ms};
 use super::host::HostFinder;
-use super::ledger::Ledger;
+use super::ledger::{Ledger, is_after};
 use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
 use super::signals::{Signal, Signals};
@@ -45,8 +45,10 @@ const STALL_MS: u64 = 1;
 /// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
 /// holds the blocks back.
 const REQUESTS_KEPT: usize = 8;
-/// How long a host may be looked for before it is served as one of which nothing is known.
-const FIND_LIMIT: Duration = Duration::from_secs(1);
+/// How long a host may be looked for before it is served as one of which nothing is known. A card that has just
+/// begun to be read after the computer's start may take longer than a second for the few hundred files; klippy
+/// gives up after five (`_start_session` in serialhdl.py).
+const FIND_LIMIT: Duration = Duration::from_secs(3);
 /// How long a host has to read why the program ends.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -55,7 +57,6 @@ struct Known {
     dialect: Arc<Dialect>,
     get_clock: Option<u32>,
     identify: Option<u32>,
-    emergency_stop: Option<u32>,
 }
 
 impl Known {
@@ -63,7 +64,6 @@ impl Known {
         Known {
             get_clock: dialect.command_id("get_clock"),
             identify: dialect.command_id("identify offset=%u count=%c"),
-            emergency_stop: dialect.command_id("emergency_stop"),
             dialect,
         }
     }
@@ -86,11 +86,6 @@ impl Known {
         self.encode(&piece)
     }
 
-    /// Whether the host asks in this block for the machine to be stopped.
-    fn stops(&self, payload: &[u8]) -> bool {
-        self.emergency_stop.is_some_and(|id| self.dialect.contains(payload, id))
-    }
-
     fn encode<R: Response>(&self, response: &R) -> Option<Writer> {
         let mut writer = Writer::default();
         writer.int(self.dialect.response_id::<R>()?);
@@ -104,12 +99,17 @@ pub(super) struct Link {
     pty: Pty,
     clock: Arc<dyn TimeSource>,
     known: Known,
+    /// How many blocks the core had been given when the host's dialect changed, until it begins the next one. What
+    /// it says before that may be in the words of the host that was there before.
+    changed_at: Option<u32>,
     /// Those that a host may speak.
     dialects: Vec<Arc<Dialect>>,
     /// None if the dialect does not depend on the host.
     finder: Option<HostFinder>,
     /// Until when the host's first bytes wait for its dialect to be found.
     finding: Option<Duration>,
+    /// Whether they waited for too long, and the answer is still to come.
+    is_overdue: bool,
     receiver: Receiver,
     input: Vec<u8>,
     output: Vec<u8>,
@@ -173,9 +173,11 @@ impl Link {
             pty,
             clock,
             known: Known::new(dialects[0].clone()),
+            changed_at: None,
             dialects,
             finder,
             finding: None,
+            is_overdue: false,
             receiver: Receiver::default(),
             input: Vec::with_capacity(INPUT_BYTES),
             output: Vec::with_capacity(2 * OUTPUT_BYTES),
@@ -331,6 +333,7 @@ impl Link {
             info!("host attached");
             if let Some(finder) = &mut self.finder {
                 finder.ask();
+                self.is_overdue = false;
                 self.finding = Some(monotonic() + FIND_LIMIT);
             }
         }
@@ -371,12 +374,25 @@ impl Link {
 
     /// Whether the host's dialect is not known yet.
     fn is_finding(&mut self) -> bool {
-        let (Some(until), Some(finder)) = (self.finding, &self.finder) else { return false };
+        let Some(finder) = &self.finder else { return false };
+        let Some(until) = self.finding else {
+            // The host has read the other dictionary already.
+            if self.is_overdue
+                && let Some(name) = finder.answer()
+            {
+                self.is_overdue = false;
+                if name != DialectName::Union {
+                    warn!("the host's dialect, {name}, was found too late: it is spoken from the host's RESTART on");
+                }
+            }
+            return false;
+        };
         let found = finder.answer().or_else(|| {
             (monotonic() >= until).then(|| {
                 warn!(
                     "the host's dialect was not found within {FIND_LIMIT:?}: served as Klipper v0.13, master and Kalico"
                 );
+                self.is_overdue = true;
                 DialectName::Union
             })
         });
@@ -394,6 +410,7 @@ impl Link {
         }
         if let Some(dialect) = self.dialects.iter().find(|dialect| dialect.name() == name).cloned() {
             self.known = Known::new(dialect.clone());
+            self.changed_at = Some(self.ledger.handed());
             self.request(Request::Speak(dialect));
         }
     }
@@ -452,7 +469,7 @@ impl Link {
 
     /// Hands a block to the core, where there is room for it.
     fn hand(&mut self, payload: Payload) {
-        if self.known.stops(payload.as_slice()) {
+        if self.known.dialect.is_emergency(payload.as_slice()) {
             self.progress.stop_handed();
         }
         let _ = self.requests.push(Request::Run(payload));
@@ -481,6 +498,10 @@ impl Link {
     fn frame_responses(&mut self) {
         while self.output.len() < OUTPUT_BYTES {
             let Some((payload, core_begun)) = self.inlet.response() else { return };
+            self.changed_at = self.changed_at.filter(|changed_at| !is_after(core_begun, *changed_at));
+            if self.changed_at.is_some() && !self.known.dialect.is_own_response(payload) {
+                continue;
+            }
             frame(payload, Sequence::after(self.ledger.respond(core_begun)), &mut self.output);
         }
     }
