@@ -70,7 +70,7 @@ impl HostFinder {
 struct Looker {
     device: PathBuf,
     /// The host that was seen last. A process goes on with the sources that it has loaded, whatever becomes
-    /// of the files: klippy's RESTART keeps the process.
+    /// of the files: klippy's RESTART keeps the process. One whose sources could not be read is looked at anew.
     last: Option<(Process, DialectName)>,
 }
 
@@ -102,9 +102,9 @@ impl Looker {
             info!("the host is the one of before, process {}: dialect {dialect}", process.pid);
             return *dialect;
         }
-        let dialect = tell(&process, is_sure, began);
-        self.last = Some((process, dialect));
-        dialect
+        let found = tell(&process, is_sure, began);
+        self.last = found.map(|dialect| (process, dialect));
+        found.unwrap_or(DialectName::Union)
     }
 }
 
@@ -120,12 +120,12 @@ fn union(remedy: &str) -> String {
     format!("it is served as Klipper v0.13, master and Kalico{stop}{remedy}")
 }
 
-/// The dialect of a process, and a line in the log that says why.
-fn tell(process: &Process, is_sure: bool, began: Instant) -> DialectName {
+/// The dialect of a process, none if it can not be told, and a line in the log that says why.
+fn tell(process: &Process, is_sure: bool, began: Instant) -> Option<DialectName> {
     let pid = process.pid;
     let Some(folder) = process.klippy_folder(Path::new(PROC)) else {
         info!("the host, process {pid}, is no klippy: {}", union(""));
-        return DialectName::Union;
+        return None;
     };
     let checkout = match Checkout::read(&folder, FEATURES) {
         Ok(checkout) => checkout,
@@ -135,9 +135,12 @@ fn tell(process: &Process, is_sure: bool, began: Instant) -> DialectName {
                 folder.display(),
                 union(REMEDY)
             );
-            return DialectName::Union;
+            return None;
         }
     };
+    if let Some(unread) = &checkout.unread {
+        warn!("not all of the host's sources can be read, and what those need may not work: {unread}");
+    }
     let best = checkout.best();
     let inside = checkout.folder.strip_prefix(format!("{PROC}/{pid}/root")).unwrap_or(&checkout.folder);
     info!(
@@ -160,7 +163,7 @@ fn tell(process: &Process, is_sure: bool, began: Instant) -> DialectName {
     if started(process).is_some_and(|started| started < checkout.newest) {
         warn!("the host's sources are newer than its process {pid}: restart klipper, so that both are one");
     }
-    DialectName::Of(best.generation)
+    Some(DialectName::Of(best.generation))
 }
 
 /// When a process was started, by the clock on the wall.
