@@ -607,12 +607,16 @@ mod tests {
         let board = FakeBoard(rig.bench.clone());
         let dialect = Arc::new(Dialect::new(FEATURES, &board, DialectName::Of(Generation::V0_11)).unwrap());
         rig.request(Request::Speak(dialect.clone()));
-        let format = "config_adxl345 oid=%c spi_oid=%c";
-        let mut writer = Writer::default();
-        [dialect.command_id(format).unwrap(), 0, 1].iter().for_each(|int| writer.int(*int));
         let stop = rig.encode("emergency_stop", &[]);
-        let block = Payload::new(&[writer.payload().unwrap(), stop.as_slice()].concat());
-        assert!(!rig.dialect.is_emergency(block.as_slice()), "in the dialect of before this means something else");
+        let formats = dialect.dictionary().commands.keys().filter(|format| !format.contains('*'));
+        let mut blocks = formats.map(|format| {
+            let mut writer = Writer::default();
+            writer.int(dialect.command_id(format).unwrap());
+            format.matches('%').for_each(|_| writer.int(1));
+            Payload::new(&[writer.payload().unwrap(), stop.as_slice()].concat())
+        });
+        // One that means something else in the dialect of before.
+        let block = blocks.find(|block| !rig.dialect.is_emergency(block.as_slice())).unwrap();
         rig.stop(Request::Run(block));
         rig.wait_until("the machine stops", Rig::is_stopped);
         rig.bench.hang(false);
