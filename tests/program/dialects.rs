@@ -214,7 +214,7 @@ fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
         report.contains("No dialect has these forms") && report.contains("\n  query_adxl345 oid rest_ticks range\n")
     );
     checkout.change("v0.12", |sources| sources);
-    let known = doctor(&checkout.program().parent().unwrap());
+    let known = doctor(checkout.program().parent().unwrap());
     let report = String::from_utf8_lossy(&known.stdout).into_owned();
     assert_eq!(known.status.code(), Some(0), "{report}");
     assert!(
