@@ -295,15 +295,22 @@ fn an_adxl345_that_makes_no_sense_is_told_as_that_and_ends() {
 }
 
 #[test]
-fn an_adxl345_that_makes_no_sense_for_once_at_its_end_loses_no_sample() {
-    let mut rig = configured(V0_12, ADXL345);
-    let chip = plug_adxl345(&rig);
-    rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=40000");
-    rig.run_until(8000);
-    chip.lock().unwrap().rubbish = 1;
-    rig.send("query_adxl345 oid=1 clock=0 rest_ticks=0");
-    let status = "adxl345_status oid=1 clock=@8000 query_ticks=0 next_sequence=1 buffered=0 fifo=0 limit_count=0";
-    assert_eq!(rig.responses(), [adxl345_data(0, 0..3), status.to_owned()]);
+fn an_adxl345_that_makes_no_sense_for_once_at_its_end_tells_all_its_samples() {
+    for samples in [3, 0] {
+        let mut rig = configured(V0_12, ADXL345);
+        let chip = plug_adxl345(&rig);
+        rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=40000");
+        let end = 5000 + u64::from(samples) * 1000;
+        rig.run_until(end);
+        chip.lock().unwrap().rubbish = 1;
+        rig.send("query_adxl345 oid=1 clock=0 rest_ticks=0");
+        let mut responses = rig.responses();
+        let sequence = u8::from(samples > 0);
+        let status = format!("adxl345_status oid=1 clock=@{end} query_ticks=0 next_sequence={sequence} ");
+        assert_eq!(responses.pop().unwrap(), status + "buffered=0 fifo=0 limit_count=0");
+        let data = (samples > 0).then(|| adxl345_data(0, 0..samples));
+        assert_eq!(responses, Vec::from_iter(data), "no sample is lost, and none made up");
+    }
 }
 
 #[test]
