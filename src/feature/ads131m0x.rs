@@ -72,7 +72,9 @@ fn crc16(bytes: &[u8]) -> u16 {
 /// What a frame says.
 #[derive(Debug, PartialEq, Eq)]
 enum Content {
-    BadCrc,
+    BadCrc {
+        reset: bool,
+    },
     /// Whether the chip was reset, and each channel's sample.
     Good {
         reset: bool,
@@ -82,18 +84,18 @@ enum Content {
 
 fn decode(frame: &[u8]) -> Content {
     let Some((words, [crc_high, crc_low, _])) = frame.split_last_chunk::<WORD_BYTES>() else {
-        return Content::BadCrc;
+        return Content::BadCrc { reset: false };
     };
+    let reset = words.first().is_some_and(|status| status & STATUS_RESET != 0);
     if crc16(words) != u16::from_be_bytes([*crc_high, *crc_low]) {
-        return Content::BadCrc;
+        return Content::BadCrc { reset };
     }
-    let mut words = words.chunks_exact(WORD_BYTES).map(|word| [word[0], word[1], word[2]]);
-    let [status, ..] = words.next().unwrap_or_default();
+    let words = words.chunks_exact(WORD_BYTES).map(|word| [word[0], word[1], word[2]]);
     let mut values = [0; CHANNELS_MAX];
-    for (value, word) in values.iter_mut().zip(words) {
+    for (value, word) in values.iter_mut().zip(words.skip(1)) {
         *value = signed_24(word);
     }
-    Content::Good { reset: status & STATUS_RESET != 0, values }
+    Content::Good { reset, values }
 }
 
 /// Which channels are sampled, and how the host is told of errors.
@@ -118,17 +120,19 @@ struct Ads131m0x {
 
 impl Ads131m0x {
     fn judge(&mut self, content: Content) -> Sample {
-        if let Content::Good { reset, .. } = content {
-            self.was_reset |= reset;
-        }
+        self.was_reset |= match (self.channels, &content) {
+            // Kalico takes the bit also of a frame that is damaged: a bus that floats is a reset to it.
+            (Channels::Mask(_), Content::BadCrc { reset }) | (_, Content::Good { reset, .. }) => *reset,
+            (Channels::One(_), Content::BadCrc { .. }) => false,
+        };
         match (self.channels, content) {
-            (Channels::One(_), Content::BadCrc) => error_sample(ERROR_CRC),
+            (Channels::One(_), Content::BadCrc { .. }) => error_sample(ERROR_CRC),
             (Channels::One(_), Content::Good { .. }) if self.was_reset => error_sample(ERROR_RESET),
             (Channels::One(channel), Content::Good { values, .. }) => {
                 Sample::Value(values.get(usize::from(channel)).copied().unwrap_or_default())
             }
             (Channels::Mask(_), _) if self.was_reset => self.each(KALICO_ERROR_RESET),
-            (Channels::Mask(_), Content::BadCrc) => self.each(KALICO_ERROR_CRC),
+            (Channels::Mask(_), Content::BadCrc { .. }) => self.each(KALICO_ERROR_CRC),
             (Channels::Mask(mask), Content::Good { values, .. }) => {
                 let mut sampled = [0; CHANNELS_MAX];
                 let chosen = values.iter().enumerate().filter(|(channel, _)| mask & 1 << channel != 0);
@@ -242,6 +246,8 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
+    const BAD: Content = Content::BadCrc { reset: false };
+
     /// The check value of CRC-16/CCITT-FALSE (also CRC-16/IBM-3740) in the catalogue of CRCs.
     #[test]
     fn the_crc_is_the_one_of_the_data_sheet() {
@@ -264,10 +270,10 @@ mod tests {
         assert_eq!(decode(&good), Content::Good { reset: false, values: [8_388_607, -8_388_608, 0, 0] });
         let reset = frame(STATUS_RESET, [[0, 0, 1], [0xff, 0xff, 0xff]]);
         assert_eq!(decode(&reset), Content::Good { reset: true, values: [1, -1, 0, 0] });
-        assert_eq!(decode(&[]), Content::BadCrc);
+        assert_eq!(decode(&[]), BAD);
         // A chip that is unplugged, or has no supply.
-        assert_eq!(decode(&[0; 12]), Content::BadCrc);
-        assert_eq!(decode(&[0xff; 12]), Content::BadCrc);
+        assert_eq!(decode(&[0; 12]), BAD);
+        assert_eq!(decode(&[0xff; 12]), Content::BadCrc { reset: true });
     }
 
     proptest! {
@@ -275,7 +281,8 @@ mod tests {
         fn one_bit_that_is_wrong_is_seen(words: [[u8; 3]; 2], bit in 0usize..11 * 8) {
             let mut frame = frame(0, words);
             frame[bit / 8] ^= 1 << (bit % 8);
-            prop_assert_eq!(decode(&frame), Content::BadCrc);
+            let is_seen = matches!(decode(&frame), Content::BadCrc { .. });
+            prop_assert!(is_seen);
         }
     }
 
@@ -285,10 +292,11 @@ mod tests {
         let good = |reset: bool| Content::Good { reset, values: [5, 6, 7, 8] };
         let error = |code: u8, value: i32| Sample::Error { code: Some(code), value };
         assert_eq!(chip.judge(good(false)), Sample::Value(5));
-        assert_eq!(chip.judge(Content::BadCrc), error(1, 0x0100_0000));
+        assert_eq!(chip.judge(Content::BadCrc { reset: true }), error(1, 0x0100_0000), "it may be the damage");
+        assert_eq!(chip.judge(good(false)), Sample::Value(5));
         assert_eq!(chip.judge(good(true)), error(2, 0x0200_0000));
         assert_eq!(chip.judge(good(false)), error(2, 0x0200_0000));
-        assert_eq!(chip.judge(Content::BadCrc), error(1, 0x0100_0000));
+        assert_eq!(chip.judge(BAD), error(1, 0x0100_0000));
     }
 
     #[test]
@@ -297,9 +305,9 @@ mod tests {
         let good = |reset: bool| Content::Good { reset, values: [5, 6, 7, -8] };
         let both = |values: [i32; 4], sum| Sample::Channels { values, count: 2, sum };
         assert_eq!(chip.judge(good(false)), both([6, -8, 0, 0], Some(-2)));
-        assert_eq!(chip.judge(Content::BadCrc), both([i32::MIN; 4], None));
-        assert_eq!(chip.judge(good(true)), both([1 << 30; 4], None));
+        assert_eq!(chip.judge(BAD), both([i32::MIN; 4], None));
+        assert_eq!(chip.judge(Content::BadCrc { reset: true }), both([1 << 30; 4], None));
         // A reset counts for more than a check sum.
-        assert_eq!(chip.judge(Content::BadCrc), both([1 << 30; 4], None));
+        assert_eq!(chip.judge(BAD), both([1 << 30; 4], None));
     }
 }

@@ -134,6 +134,10 @@ impl AnalogIn {
     }
 
     fn check_range(&mut self, mcu: &Mcu) -> Result<(), Shutdown> {
+        // So Kalico has limits ignored (`temp_ignore_limits`).
+        if self.query.range_check_count == 0 && mcu.serves(since(Kalico)) {
+            return Ok(());
+        }
         if (self.query.min_value..=self.query.max_value).contains(&self.sum) {
             self.invalid_count = 0;
             return Ok(());

@@ -4,8 +4,9 @@
 //!
 //! A reading takes what there is, at most one message's samples, so that others on the bus have
 //! their turn; if the chip has more, the next reading follows at once, and otherwise `rest_ticks`
-//! later. Hosts up to v0.12 have the sensor itself switched on and off (`query_at`, `stop`). As one worker has all conversations of a bus in order, and gives them back in order, what
-//! the chip says of its FIFO in a status fits the samples that the machine has by then.
+//! later. Hosts up to v0.12 have the sensor itself switched on and off (`query_at`, `stop`). As one worker has
+//! all conversations of a bus in order, and gives them back in order, what the chip says of its FIFO in a status
+//! fits the samples that the machine has by then.
 
 #![forbid(unsafe_code)]
 
@@ -491,7 +492,12 @@ impl<C: FifoChip> Object for FifoSensor<C> {
                 let told = fill.talk.fill;
                 self.fill = Some(fill);
                 if let (Ok(()), Phase::Ends(Some(off), reads)) = (&result, self.phase) {
-                    let bytes = told.map_or(0, |fill| fill.bytes.into());
+                    // What makes no sense is asked again, as samples may be left.
+                    if told.is_none() && C::KEEPS_SAMPLES && reads > 0 {
+                        self.phase = Phase::Ends(Some(off), reads - 1);
+                        return self.ask_status(mcu, oid);
+                    }
+                    let bytes = told.map_or(NONSENSE * C::SAMPLE_BYTES as u32, |fill| fill.bytes.into());
                     return self.ended(mcu, oid, off, bytes, reads);
                 }
                 if told.is_none() && result.is_ok() && C::OWN_WORDS.is_some() && !mcu.speaks::<BulkData<'_>>() {

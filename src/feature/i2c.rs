@@ -104,6 +104,8 @@ struct Transfer {
     /// Bits to be changed in what was read, which is then written to where it was read from: those to
     /// be cleared, and behind them as many to be set.
     modify: Option<([u8; PAYLOAD_MAX], usize)>,
+    /// Whether what was changed is being written.
+    writes_back: bool,
     write: [u8; PAYLOAD_MAX],
     write_len: usize,
     read: [u8; u8::MAX as usize],
@@ -117,6 +119,7 @@ impl Transfer {
         self.read_len = read_len;
         self.read = [0; u8::MAX as usize];
         self.modify = None;
+        self.writes_back = false;
     }
 
     /// As many bytes from the register on as there are to be changed, and back.
@@ -148,6 +151,7 @@ impl Talk for Transfer {
             *place = byte;
         }
         let end = (self.write_len + len).min(PAYLOAD_MAX);
+        self.writes_back = true;
         chip.write_read(&self.write[..end], &mut [])
     }
 }
@@ -171,8 +175,14 @@ pub(super) struct I2c {
 
 impl I2c {
     fn new() -> I2c {
-        let transfer =
-            Transfer { modify: None, write: [0; PAYLOAD_MAX], write_len: 0, read: [0; u8::MAX as usize], read_len: 0 };
+        let transfer = Transfer {
+            modify: None,
+            writes_back: false,
+            write: [0; PAYLOAD_MAX],
+            write_len: 0,
+            read: [0; u8::MAX as usize],
+            read_len: 0,
+        };
         I2c { bus: None, on_lines: false, transfer: Some(Conversation::new(transfer)), failing: false }
     }
 
@@ -212,7 +222,7 @@ impl I2c {
                 return Ok(());
             }
             let detail = "it has no bus: a fault of the host, which did not send i2c_set_bus".into();
-            return Err(self.failure(mcu, tag, BusError { status, detail }));
+            return Err(self.failure(mcu, tag == WRITE, BusError { status, detail }));
         };
         mcu.converse_on(bus, Ticket { oid, tag }, transfer)
     }
@@ -235,10 +245,16 @@ impl I2c {
             (READ, Ok(())) => mcu.send(ReadResponse { oid, response }),
             _ => {}
         }
+        let (writes_back, has_register) = (transfer.talk.writes_back, transfer.talk.write_len > 0);
         self.transfer = Some(transfer);
         let failed_before = std::mem::replace(&mut self.failing, result.is_err());
         match result {
-            Err(error) if tag != TRANSFER => mcu.device_failed(oid, self.kind(), self.failure(mcu, tag, error)),
+            Err(error) if tag != TRANSFER => {
+                // v0.11 wrote the register by itself before it read.
+                let of_register = mcu.serves(only(V0_11)) && has_register && error.status != BusStatus::StartReadNack;
+                let writing = tag == WRITE || writes_back || of_register;
+                mcu.device_failed(oid, self.kind(), self.failure(mcu, writing, error))
+            }
             Err(error) if !failed_before => {
                 mcu.warn(oid, self.kind(), i2c_shutdown(mcu, error));
                 Ok(())
@@ -247,13 +263,13 @@ impl I2c {
         }
     }
 
-    /// The stop for a transfer that failed.
-    fn failure(&self, mcu: &Mcu, tag: u8, error: BusError) -> Shutdown {
-        match tag {
+    /// The stop for a transfer that failed, as it wrote or as it read.
+    fn failure(&self, mcu: &Mcu, writing: bool, error: BusError) -> Shutdown {
+        match writing {
             _ if !mcu.serves(until(V0_12)) => i2c_shutdown(mcu, error),
             _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.detail),
-            WRITE => Shutdown::because(I2C_WRITE_FAILED, error.detail),
-            _ => i2c_shutdown(mcu, error),
+            true => Shutdown::because(I2C_WRITE_FAILED, error.detail),
+            false => i2c_shutdown(mcu, error),
         }
     }
 }

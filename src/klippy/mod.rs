@@ -35,6 +35,8 @@ pub struct Checkout {
     pub commit: Option<String>,
     /// When the newest of its sources was written.
     pub newest: SystemTime,
+    /// What could not be read of it, if anything.
+    pub unread: Option<String>,
     /// Every message that it looks up.
     pub shapes: BTreeSet<Shape>,
     /// What each generation makes of it, in the order of [`Generation::ALL`].
@@ -61,12 +63,12 @@ impl Checkout {
     ///
     /// Those of reading, and that the folder is none of klippy's.
     pub fn read(klippy: &Path, features: &[Feature]) -> io::Result<Checkout> {
-        let Sources { shapes, newest } = Sources::read(klippy)?;
+        let Sources { shapes, newest, unread } = Sources::read(klippy)?;
         let known = known(features);
         let names: BTreeSet<&str> = known.iter().map(|known| known.shape.name()).collect();
         let ours: BTreeSet<&Shape> = shapes.iter().filter(|shape| names.contains(shape.name())).collect();
         if ours.len() < SHAPES_MIN {
-            return Err(io::Error::other("it does not hold klippy's sources"));
+            return Err(io::Error::other(unread.unwrap_or_else(|| "it does not hold klippy's sources".into())));
         }
         let verdict = |generation| {
             let known = known.iter().filter(|known| known.generations.contains(generation));
@@ -80,6 +82,7 @@ impl Checkout {
             commit: commit(&folder),
             folder,
             newest,
+            unread,
             verdicts: Generation::ALL.into_iter().map(verdict).collect(),
             shapes,
         })
@@ -126,7 +129,8 @@ fn commit(folder: &Path) -> Option<String> {
             line.split(' ').next().map(str::to_owned)
         })?,
     };
-    let is_commit = commit.trim().len() >= 40 && commit.trim().chars().all(|c| c.is_ascii_hexdigit());
+    let commit = commit.trim();
+    let is_commit = commit.len() >= 40 && commit.chars().all(|c| c.is_ascii_hexdigit());
     is_commit.then(|| commit[..9].to_owned())
 }
 

@@ -3,12 +3,12 @@
 
 #![forbid(unsafe_code)]
 
-use std::ffi::OsStr;
+use std::ffi::{OsStr, OsString};
 use std::fs;
 use std::io;
 use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// A process that may be a host.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -33,27 +33,44 @@ pub enum Search {
     Nobody,
 }
 
-/// Finds the process that has the terminal `device` open, another than this one, and than one that serves it, having
-/// its other end open. `proc` is /proc.
+/// Finds the process that has the terminal `device` open, another than this one. `proc` is /proc.
 ///
 /// # Errors
 ///
 /// Those of looking at the terminal or at `proc` itself.
 pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
     let terminal = fs::metadata(device)?;
-    let mut processes = all(proc)?;
+    let pids = fs::read_dir(proc)?
+        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
+        .filter(|pid| *pid != std::process::id());
+    let mut klippys = Vec::new();
+    let mut others = Vec::new();
+    for pid in pids {
+        let arguments = arguments(proc, pid);
+        if klippy(&arguments).is_some() {
+            klippys.extend(Process::read(proc, pid, arguments));
+        } else if !arguments.is_empty() {
+            others.push((pid, arguments));
+        }
+    }
     // A look into a process costs a call for each of its files, so the likely ones come first; of a
     // process and its children the parent.
-    processes.sort_by_key(|process| (process.klippy().is_none(), process.started));
+    klippys.sort_by_key(|process| process.started);
     let mut hidden = Vec::new();
-    for process in processes {
-        match process.has_open(proc, &terminal) {
-            Ok(true) if !process.serves(proc, &terminal) => return Ok(Search::Found(process)),
-            Err(error) if error.kind() == io::ErrorKind::PermissionDenied && process.klippy().is_some() => {
-                hidden.push(process);
-            }
-            // One that ended meanwhile, or that is none of klippy's.
+    for process in klippys {
+        match has_open(proc, process.pid, &terminal) {
+            Ok(true) if !serves(proc, process.pid, &terminal) => return Ok(Search::Found(process)),
+            Err(error) if error.kind() == io::ErrorKind::PermissionDenied => hidden.push(process),
+            // One that ended meanwhile.
             Ok(_) | Err(_) => {}
+        }
+    }
+    for (pid, arguments) in others {
+        if let Ok(true) = has_open(proc, pid, &terminal)
+            && !serves(proc, pid, &terminal)
+            && let Some(process) = Process::read(proc, pid, arguments)
+        {
+            return Ok(Search::Found(process));
         }
     }
     Ok(if hidden.is_empty() { Search::Nobody } else { Search::Hidden(hidden) })
@@ -68,78 +85,135 @@ pub fn all(proc: &Path) -> io::Result<Vec<Process>> {
     Ok(fs::read_dir(proc)?
         .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
         .filter(|pid| *pid != std::process::id())
-        .filter_map(|pid| Process::read(proc, pid))
+        .filter_map(|pid| Process::read(proc, pid, arguments(proc, pid)))
         .collect())
 }
 
 impl Process {
-    fn read(proc: &Path, pid: u32) -> Option<Process> {
-        let folder = proc.join(pid.to_string());
-        let line = fs::read(folder.join("cmdline")).ok()?;
-        let arguments = line.split(|byte| *byte == 0).filter(|argument| !argument.is_empty());
-        let arguments = arguments.map(|argument| PathBuf::from(OsStr::from_bytes(argument))).collect();
-        let stat = fs::read_to_string(folder.join("stat")).ok()?;
+    fn read(proc: &Path, pid: u32, arguments: Vec<PathBuf>) -> Option<Process> {
+        let stat = fs::read(proc.join(pid.to_string()).join("stat")).ok()?;
         // The second field, the name in parentheses, may hold anything; starttime is the 22nd.
-        let (_, fields) = stat.rsplit_once(')')?;
+        let name_ends = stat.iter().rposition(|byte| *byte == b')')?;
+        let fields = std::str::from_utf8(&stat[name_ends + 1..]).ok()?;
         let started = fields.split_whitespace().nth(19)?.parse().ok()?;
         Some(Process { pid, started, arguments })
     }
 
-    /// The argument that names klippy's program, should the process be klippy.
-    pub fn klippy(&self) -> Option<&Path> {
-        let is_it = |argument: &&PathBuf| argument.file_name().is_some_and(|name| name == "klippy.py");
-        self.arguments.iter().find(is_it).map(PathBuf::as_path)
+    /// Whether it was started as klippy is.
+    pub fn is_klippy(&self) -> bool {
+        klippy(&self.arguments).is_some()
     }
 
     /// klippy's folder as this program can reach it, should the process be klippy: through the
     /// process's own root (a container's), or, where that is not permitted, as if both had the same.
     pub fn klippy_folder(&self, proc: &Path) -> Option<PathBuf> {
         let folder = proc.join(self.pid.to_string());
-        let program = self.klippy()?;
-        let program = if program.is_absolute() {
-            program.to_owned()
-        } else {
-            fs::read_link(folder.join("cwd")).ok()?.join(program)
-        };
-        let inside = program.strip_prefix("/").unwrap_or(&program);
-        let through_root = folder.join("root").join(inside);
-        let program = if through_root.exists() { through_root } else { program };
-        Some(program.parent()?.to_owned())
-    }
-
-    /// Whether it has the master end of the terminal open. Which terminal a master belongs to is the `tty-index` of its
-    /// fdinfo (proc_pid_fdinfo(5)).
-    fn serves(&self, proc: &Path, terminal: &fs::Metadata) -> bool {
-        let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.rdev()));
-        let Ok(files) = fs::read_dir(proc.join(self.pid.to_string()).join("fdinfo")) else { return false };
-        let mut told = files.flatten().filter_map(|file| fs::read_to_string(file.path()).ok());
-        told.any(|info| info.lines().any(|line| line == index))
-    }
-
-    fn has_open(&self, proc: &Path, terminal: &fs::Metadata) -> io::Result<bool> {
-        let folder = proc.join(self.pid.to_string()).join("fd");
-        for entry in fs::read_dir(folder)? {
-            let file = match fs::metadata(entry?.path()) {
-                // It was closed meanwhile.
-                Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
-                file => file?,
-            };
-            // Containers have terminals of the same numbers, on devices of their own.
-            let is_it = file.file_type().is_char_device() && file.rdev() == terminal.rdev();
-            if is_it && file.dev() == terminal.dev() {
-                return Ok(true);
-            }
+        let mut klippy = klippy(&self.arguments)?.to_owned();
+        if klippy.is_relative() {
+            klippy = fs::read_link(folder.join("cwd")).ok()?.join(klippy);
         }
-        Ok(false)
+        let through_root = inside(&folder.join("root"), &klippy);
+        Some(if through_root.exists() { through_root } else { klippy })
     }
+}
+
+/// The command line of a process; it is empty for the kernel's threads.
+fn arguments(proc: &Path, pid: u32) -> Vec<PathBuf> {
+    let line = fs::read(proc.join(pid.to_string()).join("cmdline")).unwrap_or_default();
+    let arguments = line.split(|byte| *byte == 0).filter(|argument| !argument.is_empty());
+    arguments.map(|argument| PathBuf::from(OsStr::from_bytes(argument))).collect()
+}
+
+/// klippy's folder, if a command line is klippy's: that of `klippy.py`, or what `-m klippy` names.
+fn klippy(arguments: &[PathBuf]) -> Option<&Path> {
+    let script = arguments.iter().find(|argument| argument.file_name().is_some_and(|name| name == "klippy.py"));
+    let is_module = |pair: &[PathBuf]| {
+        pair[0].as_os_str() == "-m" && (pair[1].as_os_str() == "klippy" || pair[1].as_os_str() == "klippy.klippy")
+    };
+    match script {
+        Some(script) => script.parent(),
+        None => arguments.windows(2).any(is_module).then_some(Path::new("klippy")),
+    }
+}
+
+/// As many links as the kernel follows in a path.
+const LINKS_MAX: usize = 40;
+
+/// The file that has the absolute `path` for a process whose root is `root`. A link that begins at the root
+/// would lead to this program's own files, if the kernel followed it: to another container's, or to a home
+/// that the service can not see.
+fn inside(root: &Path, path: &Path) -> PathBuf {
+    let mut links = 0;
+    let mut reached = PathBuf::new();
+    let push = |left: &mut Vec<OsString>, path: &Path| {
+        let names = path.components().rev().filter(|part| matches!(part, Component::Normal(_) | Component::ParentDir));
+        left.extend(names.map(|part| part.as_os_str().to_owned()));
+    };
+    let mut left = Vec::new();
+    push(&mut left, path);
+    while let Some(name) = left.pop() {
+        if name == ".." {
+            reached.pop();
+            continue;
+        }
+        let next = reached.join(name);
+        match fs::read_link(root.join(&next)) {
+            Ok(target) if links < LINKS_MAX => {
+                links += 1;
+                if target.is_absolute() {
+                    reached = PathBuf::new();
+                }
+                push(&mut left, &target);
+            }
+            _ => reached = next,
+        }
+    }
+    root.join(reached)
+}
+
+/// Whether a process has the master end of the terminal open, as Pinion itself. Which terminal a master belongs to
+/// is the `tty-index` of its fdinfo (proc_pid_fdinfo(5)).
+fn serves(proc: &Path, pid: u32, terminal: &fs::Metadata) -> bool {
+    let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.rdev()));
+    let Ok(files) = fs::read_dir(proc.join(pid.to_string()).join("fdinfo")) else { return false };
+    let mut told = files.flatten().filter_map(|file| fs::read_to_string(file.path()).ok());
+    told.any(|info| info.lines().any(|line| line == index))
+}
+
+/// Whether a process has the terminal open.
+fn has_open(proc: &Path, pid: u32, terminal: &fs::Metadata) -> io::Result<bool> {
+    for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))? {
+        let file = match fs::metadata(entry?.path()) {
+            // It was closed meanwhile.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
+            file => file?,
+        };
+        // Containers have terminals of the same numbers, on devices of their own.
+        let is_it = file.file_type().is_char_device() && file.rdev() == terminal.rdev();
+        if is_it && file.dev() == terminal.dev() {
+            return Ok(true);
+        }
+    }
+    Ok(false)
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nix::pty::openpty;
+    use nix::fcntl::{FcntlArg, FdFlag, fcntl};
+    use nix::pty::{OpenptyResult, openpty};
     use nix::unistd::ttyname;
     use std::process::{Child, Command, Stdio};
+
+    /// A terminal whose ends no process of another test inherits.
+    fn terminal() -> (OpenptyResult, PathBuf) {
+        let pty = openpty(None, None).unwrap();
+        for end in [&pty.master, &pty.slave] {
+            fcntl(end, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC)).unwrap();
+        }
+        let device = ttyname(&pty.slave).unwrap();
+        (pty, device)
+    }
 
     /// A process that has the terminal open as its input, called as klippy is.
     fn host(device: &Path, script: &Path) -> Child {
@@ -161,8 +235,7 @@ mod tests {
 
     #[test]
     fn the_process_that_has_the_terminal_open_is_found_among_all() {
-        let pty = openpty(None, None).unwrap();
-        let device = ttyname(&pty.slave).unwrap();
+        let (_pty, device) = terminal();
         assert_eq!(find(Path::new("/proc"), &device).unwrap(), Search::Nobody, "this process does not count");
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("klippy.py");
@@ -181,8 +254,7 @@ mod tests {
 
     #[test]
     fn who_serves_the_terminal_is_no_host() {
-        let pty = openpty(None, None).unwrap();
-        let device = ttyname(&pty.slave).unwrap();
+        let (pty, device) = terminal();
         // A program that has both ends open, as Pinion has while no host is there.
         let mut server = Command::new("/bin/sh")
             .args(["-c", "read line"])
@@ -203,8 +275,7 @@ mod tests {
 
     #[test]
     fn a_terminal_of_the_same_number_elsewhere_is_another() {
-        let pty = openpty(None, None).unwrap();
-        let device = ttyname(&pty.slave).unwrap();
+        let (_pty, device) = terminal();
         let mut host = host(&device, Path::new("klippy.py"));
         // A file is on another device than the terminal, whatever it is.
         let file = tempfile::NamedTempFile::new().unwrap();
@@ -220,10 +291,39 @@ mod tests {
         fs::create_dir(&folder).unwrap();
         fs::write(folder.join("cmdline"), b"python3\0/home/pi/klipper/klippy/klippy.py\0printer.cfg\0").unwrap();
         let fields: Vec<String> = (4..=52).map(|field| field.to_string()).collect();
-        fs::write(folder.join("stat"), format!("42 (a) S 1) S {}\n", fields.join(" "))).unwrap();
-        let process = Process::read(proc.path(), 42).unwrap();
+        let stat = [b"42 (a\xff) S 1) S ", fields.join(" ").as_bytes()].concat();
+        fs::write(folder.join("stat"), stat).unwrap();
+        let process = Process::read(proc.path(), 42, arguments(proc.path(), 42)).unwrap();
         assert_eq!(process.started, 22);
-        assert_eq!(process.klippy().unwrap(), Path::new("/home/pi/klipper/klippy/klippy.py"));
         assert_eq!(process.klippy_folder(proc.path()).unwrap(), Path::new("/home/pi/klipper/klippy"));
+    }
+
+    #[test]
+    fn klippy_is_found_by_its_script_or_its_module() {
+        let folder = |line: &str| {
+            let arguments: Vec<PathBuf> = line.split(' ').map(PathBuf::from).collect();
+            klippy(&arguments).map(Path::to_owned)
+        };
+        assert_eq!(folder("nice -n 5 python3 -u /a/klippy/klippy.py p.cfg"), Some("/a/klippy".into()));
+        assert_eq!(folder("python3 klippy.py p.cfg"), Some("".into()));
+        assert_eq!(folder("python3 -m klippy p.cfg"), Some("klippy".into()));
+        assert_eq!(folder("python3 -m klippy.klippy p.cfg"), Some("klippy".into()));
+        assert_eq!(folder("python3 -m http.server klippy"), None);
+    }
+
+    #[test]
+    fn links_lead_where_the_process_sees_them_lead() {
+        use std::os::unix::fs::symlink;
+        let root = tempfile::tempdir().unwrap();
+        let root = root.path();
+        fs::create_dir_all(root.join("home/pi/kalico/klippy")).unwrap();
+        symlink("/home/pi/kalico", root.join("home/pi/klipper")).unwrap();
+        symlink("../pi/klipper", root.join("home/pi/relative")).unwrap();
+        symlink("round", root.join("home/round")).unwrap();
+        let klippy = root.join("home/pi/kalico/klippy");
+        for path in ["/home/pi/klipper/klippy", "/home/pi/relative/klippy", "/../home/./pi/relative/klippy"] {
+            assert_eq!(inside(root, Path::new(path)), klippy, "{path}");
+        }
+        assert!(!inside(root, Path::new("/home/round/klippy")).exists());
     }
 }

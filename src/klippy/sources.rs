@@ -11,13 +11,17 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::BTreeSet;
-use std::fs;
-use std::io;
+use std::collections::{BTreeSet, VecDeque};
+use std::fs::{self, File};
+use std::io::{self, Read};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::time::SystemTime;
 
-/// No checkout has more files or longer ones; a folder that has is none.
+use nix::libc;
+
+/// No checkout has more files or longer ones. klippy's own come first: further ones, of a plugin that
+/// brings much along, are left out.
 const FILES_MAX: usize = 2000;
 const FILE_BYTES_MAX: u64 = 1 << 20;
 /// klippy's own folder, `extras`, and packages in there.
@@ -70,6 +74,8 @@ pub struct Sources {
     pub shapes: BTreeSet<Shape>,
     /// When the newest file was written.
     pub newest: SystemTime,
+    /// What could not be read, if anything: the first of it.
+    pub unread: Option<String>,
 }
 
 impl Sources {
@@ -77,36 +83,61 @@ impl Sources {
     ///
     /// # Errors
     ///
-    /// Those of reading the folder or a file in it.
+    /// Those of reading the folder itself. What can not be read in it is left out: it may be a plugin's.
     pub fn read(klippy: &Path) -> io::Result<Sources> {
-        let mut sources = Sources { shapes: BTreeSet::new(), newest: SystemTime::UNIX_EPOCH };
+        let mut sources = Sources { shapes: BTreeSet::new(), newest: SystemTime::UNIX_EPOCH, unread: None };
         let mut files = 0;
-        let mut folders = vec![(klippy.to_owned(), 1)];
-        while let Some((folder, depth)) = folders.pop() {
-            for entry in fs::read_dir(&folder)? {
-                let path = entry?.path();
-                // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads.
-                let Ok(metadata) = fs::metadata(&path) else { continue };
-                if metadata.is_dir() && depth < DEPTH_MAX {
-                    folders.push((path, depth + 1));
-                } else if metadata.is_file()
-                    && metadata.len() <= FILE_BYTES_MAX
-                    && path.extension().is_some_and(|extension| extension == "py")
-                {
+        let mut folders = VecDeque::from([(klippy.to_owned(), 1)]);
+        while let Some((folder, depth)) = folders.pop_front() {
+            let entries = match fs::read_dir(&folder) {
+                Err(error) if depth > 1 => {
+                    sources.leave_out(&folder, &error);
+                    continue;
+                }
+                entries => entries?,
+            };
+            for entry in entries {
+                let entry = entry?;
+                let path = entry.path();
+                if path.extension().is_some_and(|extension| extension == "py") {
+                    if files == FILES_MAX {
+                        return Ok(sources);
+                    }
                     files += 1;
-                    if files > FILES_MAX {
-                        return Err(io::Error::other(format!("more than {FILES_MAX} files of Python")));
+                    if let Err(error) = sources.add(&path) {
+                        sources.leave_out(&path, &error);
                     }
-                    sources.newest = sources.newest.max(metadata.modified()?);
-                    let text = fs::read(&path)?;
-                    // Most files have no message, and need not be read as Python.
-                    if text.windows(2).any(|pair| pair == b"=%") {
-                        strings(&text, |string| sources.shapes.extend(Shape::of(string)));
-                    }
+                } else if depth < DEPTH_MAX && !entry.file_type()?.is_file() && path.is_dir() {
+                    folders.push_back((path, depth + 1));
                 }
             }
         }
         Ok(sources)
+    }
+
+    fn add(&mut self, path: &Path) -> io::Result<()> {
+        // Not to wait for what is no file, such as a FIFO.
+        let mut file = match File::options().read(true).custom_flags(libc::O_NONBLOCK).open(path) {
+            // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads.
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
+            file => file?,
+        };
+        let metadata = file.metadata()?;
+        if !metadata.is_file() || metadata.len() > FILE_BYTES_MAX {
+            return Ok(());
+        }
+        let mut text = Vec::with_capacity(metadata.len() as usize + 1);
+        (&mut file).take(FILE_BYTES_MAX).read_to_end(&mut text)?;
+        self.newest = self.newest.max(metadata.modified()?);
+        // Most files have no message, and need not be read as Python.
+        if text.windows(2).any(|pair| pair == b"=%") {
+            strings(&text, |string| self.shapes.extend(Shape::of(string)));
+        }
+        Ok(())
+    }
+
+    fn leave_out(&mut self, path: &Path, error: &io::Error) {
+        self.unread.get_or_insert_with(|| format!("{}: {error}", path.display()));
     }
 }
 
@@ -150,18 +181,18 @@ fn literal(source: &[u8], at: usize, string: &mut Vec<u8>) -> usize {
     let quote = source[at];
     let is_long = source[at..].starts_with(&[quote; 3]);
     let (mut at, end): (usize, &[u8]) = if is_long { (at + 3, &[quote; 3]) } else { (at + 1, &[quote]) };
-    while let Some(&byte) = source.get(at) {
-        if source[at..].starts_with(end) {
-            return at + end.len();
+    let begin = at;
+    let (text_end, end) = loop {
+        match source.get(at) {
+            None => break (source.len(), source.len()),
+            Some(byte) if *byte == quote && source[at..].starts_with(end) => break (at, at + end.len()),
+            Some(b'\n') if !is_long => break (at, at),
+            Some(b'\\') => at += 2,
+            Some(_) => at += 1,
         }
-        if byte == b'\n' && !is_long {
-            return at;
-        }
-        let escaped = byte == b'\\';
-        string.extend(source[at..].iter().take(1 + usize::from(escaped)));
-        at += 1 + usize::from(escaped);
-    }
-    at
+    };
+    string.extend_from_slice(&source[begin..text_end]);
+    end
 }
 
 #[cfg(test)]
@@ -210,10 +241,17 @@ mod tests {
         put("extras/display/hd44780.py", "c('hd44780_send_cmds oid=%c cmds=%*s')");
         put("a/b/c/deep.py", "d('too_deep oid=%c')");
         put("notes.txt", "'no_python oid=%c'");
-        std::os::unix::fs::symlink("/nonexistent", folder.path().join("extras/gone.py")).unwrap();
+        let link = |target: &str, path: &str| std::os::unix::fs::symlink(target, folder.path().join(path)).unwrap();
+        link("/nonexistent", "extras/gone.py");
+        link("..", "extras/round");
+        link("self.py", "extras/self.py");
+        nix::unistd::mkfifo(&folder.path().join("extras/fifo.py"), nix::sys::stat::Mode::S_IRWXU).unwrap();
         let sources = Sources::read(folder.path()).unwrap();
         let shapes: Vec<&str> = sources.shapes.iter().map(Shape::as_str).collect();
         assert_eq!(shapes, ["hd44780_send_cmds oid cmds", "i2c_write oid data", "trsync_start oid report_clock"]);
+        // What can not be read (here a link that leads to itself; root may read any file) loses nothing else.
+        let unread = sources.unread.unwrap();
+        assert!(unread.contains("extras/self.py: "), "{unread}");
         assert!(Sources::read(&folder.path().join("none")).is_err());
     }
 }

@@ -68,6 +68,11 @@ pub(super) const fn response_index(format: &str) -> usize {
     panic!("the response is not listed")
 }
 
+/// Whether the response with this place in the list of all is one of the machine's own.
+pub(super) const fn is_own_response(index: usize) -> bool {
+    index < RESPONSES.len()
+}
+
 response! {
     /// A piece of the compressed dictionary.
     "identify_response offset=%u data=%.*s"
@@ -125,7 +130,7 @@ pub fn identify_response(dictionary: &[u8], offset: u32, count: u8) -> IdentifyR
 }
 
 const IDENTIFY: Command = command!("identify offset=%u count=%c", |mcu, offset: u32, count: u8| {
-    let dialect = mcu.dialect.clone();
+    let dialect = mcu.heard().clone();
     mcu.send(identify_response(dialect.compressed(), offset, count));
     Ok(())
 })

@@ -15,7 +15,7 @@ use crate::wire::format::{self, Conversion};
 use crate::wire::vlq::Reader;
 
 use super::command::{ConstantValue, Feature, Handler};
-use super::{DialectName, Generation, Generations, since};
+use super::{DialectName, Generation, Generations, base, since};
 
 /// What the machine knows of a command that came by its id.
 pub(super) struct Entry {
@@ -95,6 +95,8 @@ pub struct Dialect {
     commands: Vec<Option<Entry>>,
     /// By [`super::Response::INDEX`].
     response_ids: Vec<Option<u32>>,
+    /// The id of `emergency_stop`, for which each block is searched.
+    emergency_stop: Option<u32>,
     /// By their number in the enumeration `static_string_id`.
     shutdowns: Vec<ShutdownReason>,
     dictionary: Dictionary,
@@ -183,7 +185,10 @@ impl Dialect {
         let texts = shutdowns.iter().zip(0..).map(|(reason, id)| (reason.text().into(), json!(id)));
         dictionary.enumerations.insert("static_string_id".into(), Value::Object(texts.collect()));
         let compressed = dictionary.compress()?;
-        Ok(Dialect { name, commands, response_ids, shutdowns, dictionary, compressed })
+        let mut dialect =
+            Dialect { name, commands, response_ids, emergency_stop: None, shutdowns, dictionary, compressed };
+        dialect.emergency_stop = dialect.command_id(base::EMERGENCY_STOP.format);
+        Ok(dialect)
     }
 
     /// Which dialect this is.
@@ -223,9 +228,21 @@ impl Dialect {
         self.dictionary.commands.get(format)?.as_i64().map(|id| id as u32)
     }
 
+    /// Whether a block asks for an emergency stop.
+    pub fn is_emergency(&self, payload: &[u8]) -> bool {
+        self.emergency_stop.is_some_and(|id| self.contains(payload, id))
+    }
+
+    /// Whether a payload is one of the machine's own responses, which mean the same in every dialect.
+    pub fn is_own_response(&self, payload: &[u8]) -> bool {
+        let id = Reader::new(payload).int().ok();
+        let mut ids = self.response_ids.iter().enumerate();
+        id.is_some() && ids.any(|(index, own)| base::is_own_response(index) && *own == id)
+    }
+
     /// Whether a block's payload has the command with this id. What follows an unknown command, or one
     /// that is cut short, does not count, as the machine stops there.
-    pub fn contains(&self, payload: &[u8], id: u32) -> bool {
+    fn contains(&self, payload: &[u8], id: u32) -> bool {
         // The last byte of the id's encoding must occur somewhere. It mostly does not, and then no
         // command need be decoded.
         if !payload.contains(&(id as u8 & 0x7f)) {

@@ -302,14 +302,19 @@ impl Mcu {
 
     /// Whether a block asks for an emergency stop.
     pub fn is_emergency(&self, payload: &[u8]) -> bool {
-        self.dialect.command_id(base::EMERGENCY_STOP.format).is_some_and(|id| self.dialect.contains(payload, id))
+        self.heard().is_emergency(payload)
+    }
+
+    /// The dialect in which the host speaks that is there, which the machine may not be able to serve yet.
+    pub fn heard(&self) -> &Arc<Dialect> {
+        self.next_dialect.as_ref().unwrap_or(&self.dialect)
     }
 
     /// Says which command ends before its parameters do.
     #[cold]
     fn cut_short(&self, mut command: Reader<'_>) -> Shutdown {
         let id = command.int().ok();
-        let format = id.and_then(|id| self.dialect.command(id).ok()).map_or("a command's id", |entry| entry.format);
+        let format = id.and_then(|id| self.heard().command(id).ok()).map_or("a command's id", |entry| entry.format);
         Shutdown::because(
             reason::COMMAND_PARSER,
             format!(
@@ -321,34 +326,33 @@ impl Mcu {
     #[inline]
     fn try_execute(&mut self, payload: &mut Reader<'_>) -> Result<(), Shutdown> {
         let id = payload.int()?;
-        let command = self.dialect.command(id)?;
-        if let Some(next) = &self.next_dialect
-            && !command.is_own
-        {
-            return Err(Shutdown::because(
-                reason::INVALID_COMMAND,
-                format!(
-                    "the machine is configured by a host of the dialect {}, and the present one speaks {}: FIRMWARE_RESTART",
-                    self.dialect.name(),
-                    next.name()
-                ),
-            ));
-        }
+        let command = self.heard().command(id)?;
+        let is_foreign = self.next_dialect.is_some() && !command.is_own;
         match self.stop.reason {
-            Some(reason) if !command.in_shutdown => {
+            // Some of another dialect's commands would run here, on objects that are not their host's.
+            Some(reason) if is_foreign || !command.in_shutdown => {
                 command.skip(payload)?;
                 let static_string_id = self.dialect.static_string_id(reason);
                 self.send(base::IsShutdown { static_string_id });
                 Ok(())
             }
+            None if is_foreign => Err(Shutdown::because(
+                reason::INVALID_COMMAND,
+                format!(
+                    "the machine is configured by a host of the dialect {}, and the present one speaks {}: FIRMWARE_RESTART",
+                    self.dialect.name(),
+                    self.heard().name()
+                ),
+            )),
             _ => (command.handler)(self, payload),
         }
     }
 
     /// Has the machine speak another dialect, for another host: at once, or, if a host has begun to
-    /// configure it, after the reset. Until then its objects answer in words that the other host does
-    /// not know, so only the messages of the machine itself are served, which have the same ids in
-    /// every dialect, and `get_config` tells no check sum that the other host could take for its own.
+    /// configure it, after the reset. Until then only the messages of the machine itself are exchanged, which
+    /// have the same ids in every dialect: what the objects say would mean something else to the other host, or
+    /// nothing, and klippy's reader ends with the first message that it can not decode. `get_config` tells no
+    /// check sum that the other host could take for its own.
     /// The same dialect over a board that has changed differs in its names of pins alone.
     pub fn speak(&mut self, dialect: Arc<Dialect>) {
         self.next_dialect = None;
@@ -377,6 +381,9 @@ impl Mcu {
 
     /// Sends a response, if the host takes it.
     pub fn send<R: Response>(&mut self, response: R) {
+        if self.next_dialect.is_some() && !base::is_own_response(R::INDEX) {
+            return;
+        }
         let Some(id) = self.dialect.response_id::<R>() else { return };
         let mut writer = Writer::default();
         writer.int(id);

@@ -276,11 +276,16 @@ impl Core {
             Err(_) => None,
             Ok(waiting) => {
                 let (first, second) = waiting.as_slices();
+                let mut heard = mcu.heard();
                 first.iter().chain(second).find_map(|request| match request {
-                    Request::Run(payload) => mcu.is_emergency(payload.as_slice()).then(base::emergency),
+                    Request::Run(payload) => heard.is_emergency(payload.as_slice()).then(base::emergency),
                     Request::Shutdown(shutdown) => Some(shutdown.clone()),
                     Request::Quit => Some(program_ends()),
-                    Request::Speak(_) | Request::Report | Request::Hang => None,
+                    Request::Speak(dialect) => {
+                        heard = dialect;
+                        None
+                    }
+                    Request::Report | Request::Hang => None,
                 })
             }
         };
@@ -607,6 +612,29 @@ mod tests {
             }
             rig.thread.join().unwrap();
         }
+    }
+
+    #[test]
+    fn the_stop_of_a_host_that_came_meanwhile_is_read_in_its_dialect() {
+        let mut rig = Rig::held();
+        let board = FakeBoard(rig.bench.clone());
+        let dialect = Arc::new(Dialect::new(FEATURES, &board, DialectName::Of(Generation::V0_11)).unwrap());
+        rig.request(Request::Speak(dialect.clone()));
+        let stop = rig.encode("emergency_stop", &[]);
+        let formats = dialect.dictionary().commands.keys().filter(|format| !format.contains('*'));
+        let mut blocks = formats.map(|format| {
+            let mut writer = Writer::default();
+            writer.int(dialect.command_id(format).unwrap());
+            format.matches('%').for_each(|_| writer.int(1));
+            Payload::new(&[writer.payload().unwrap(), stop.as_slice()].concat())
+        });
+        // One that means something else in the dialect of before.
+        let block = blocks.find(|block| !rig.dialect.is_emergency(block.as_slice())).unwrap();
+        rig.stop(Request::Run(block));
+        rig.wait_until("the machine stops", Rig::is_stopped);
+        rig.bench.hang(false);
+        rig.stop(Request::Quit);
+        rig.thread.join().unwrap();
     }
 
     #[test]

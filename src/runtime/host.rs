@@ -72,7 +72,7 @@ impl HostFinder {
 struct Looker {
     device: PathBuf,
     /// The host that was seen last. A process goes on with the sources that it has loaded, whatever becomes
-    /// of the files: klippy's RESTART keeps the process.
+    /// of the files: klippy's RESTART keeps the process. One whose sources could not be read is looked at anew.
     last: Option<(Process, DialectName)>,
     /// The same for whoever asks.
     host: Option<FoundHost>,
@@ -110,11 +110,11 @@ impl Looker {
             return *dialect;
         }
         let mut host = FoundHost { pid: process.pid, is_sure, checkout: None, commit: None };
-        let dialect = tell(&process, &mut host, began);
+        let found = tell(&process, &mut host, began);
         self.host = Some(host);
         self.board.found(self.host.clone());
-        self.last = Some((process, dialect));
-        dialect
+        self.last = found.map(|dialect| (process, dialect));
+        found.unwrap_or(DialectName::Union)
     }
 }
 
@@ -130,12 +130,13 @@ fn union(remedy: &str) -> String {
     format!("it is served as Klipper v0.13, master and Kalico{stop}{remedy}")
 }
 
-/// The dialect of a process, and a line in the log that says why. Adds to `host` where it runs from.
-fn tell(process: &Process, host: &mut FoundHost, began: Instant) -> DialectName {
+/// The dialect of a process, none if it can not be told, and a line in the log that says why. Adds to
+/// `host` where it runs from.
+fn tell(process: &Process, host: &mut FoundHost, began: Instant) -> Option<DialectName> {
     let pid = process.pid;
     let Some(folder) = process.klippy_folder(Path::new(PROC)) else {
         info!("the host, process {pid}, is no klippy: {}", union(""));
-        return DialectName::Union;
+        return None;
     };
     let checkout = match Checkout::read(&folder, FEATURES) {
         Ok(checkout) => checkout,
@@ -145,9 +146,12 @@ fn tell(process: &Process, host: &mut FoundHost, began: Instant) -> DialectName 
                 folder.display(),
                 union(REMEDY)
             );
-            return DialectName::Union;
+            return None;
         }
     };
+    if let Some(unread) = &checkout.unread {
+        warn!("not all of the host's sources can be read, and what those need may not work: {unread}");
+    }
     let best = checkout.best();
     let inside = checkout.folder.strip_prefix(format!("{PROC}/{pid}/root")).unwrap_or(&checkout.folder);
     let inside = Path::new("/").join(inside);
@@ -172,7 +176,7 @@ fn tell(process: &Process, host: &mut FoundHost, began: Instant) -> DialectName 
     if started(process).is_some_and(|started| started < checkout.newest) {
         warn!("the host's sources are newer than its process {pid}: restart klipper, so that both are one");
     }
-    DialectName::Of(best.generation)
+    Some(DialectName::Of(best.generation))
 }
 
 /// When a process was started, by the clock on the wall.

@@ -123,7 +123,7 @@ impl Ledger {
 }
 
 /// Whether `number` is beyond `other`, for numbers less than 2^31 apart.
-fn is_after(number: u32, other: u32) -> bool {
+pub(super) fn is_after(number: u32, other: u32) -> bool {
     number.wrapping_sub(other) as i32 > 0
 }
 

@@ -26,7 +26,7 @@ use crate::wire::vlq::{Reader, Writer};
 use super::core::{Payload, Request};
 use super::guardian::{GuardianWatch, in_ms};
 use super::host::HostFinder;
-use super::ledger::Ledger;
+use super::ledger::{Ledger, is_after};
 use super::outlet::{Inlet, LinkWake, Progress};
 use super::pty::Pty;
 use super::signals::{Signal, Signals};
@@ -47,8 +47,10 @@ const STALL_MS: u64 = 1;
 /// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
 /// holds the blocks back.
 const REQUESTS_KEPT: usize = 8;
-/// How long a host may be looked for before it is served as one of which nothing is known.
-const FIND_LIMIT: Duration = Duration::from_secs(1);
+/// How long a host may be looked for before it is served as one of which nothing is known. A card that has just
+/// begun to be read after the computer's start may take longer than a second for the few hundred files; klippy
+/// gives up after five (`_start_session` in serialhdl.py).
+const FIND_LIMIT: Duration = Duration::from_secs(3);
 /// How long a host has to read why the program ends.
 const FAREWELL: Duration = Duration::from_secs(1);
 
@@ -57,7 +59,6 @@ struct Known {
     dialect: Arc<Dialect>,
     get_clock: Option<u32>,
     identify: Option<u32>,
-    emergency_stop: Option<u32>,
 }
 
 impl Known {
@@ -65,7 +66,6 @@ impl Known {
         Known {
             get_clock: dialect.command_id("get_clock"),
             identify: dialect.command_id("identify offset=%u count=%c"),
-            emergency_stop: dialect.command_id("emergency_stop"),
             dialect,
         }
     }
@@ -88,11 +88,6 @@ impl Known {
         self.encode(&piece)
     }
 
-    /// Whether the host asks in this block for the machine to be stopped.
-    fn stops(&self, payload: &[u8]) -> bool {
-        self.emergency_stop.is_some_and(|id| self.dialect.contains(payload, id))
-    }
-
     fn encode<R: Response>(&self, response: &R) -> Option<Writer> {
         let mut writer = Writer::default();
         writer.int(self.dialect.response_id::<R>()?);
@@ -106,6 +101,9 @@ pub(super) struct Link {
     pty: Pty,
     clock: Arc<dyn TimeSource>,
     known: Known,
+    /// How many blocks the core had been given when the host's dialect changed, until it begins the next one. What
+    /// it says before that may be in the words of the host that was there before.
+    changed_at: Option<u32>,
     /// Those that a host may speak.
     dialects: Vec<Arc<Dialect>>,
     /// Those before the board changed last, kept until it changes again, so that the core never frees one.
@@ -117,6 +115,8 @@ pub(super) struct Link {
     surveyor: Option<Surveyor>,
     /// Until when the host's first bytes wait for its dialect, and for what the board has now.
     finding: Option<Duration>,
+    /// Whether they waited for too long, and the answer is still to come.
+    is_overdue: bool,
     receiver: Receiver,
     input: Vec<u8>,
     output: Vec<u8>,
@@ -197,12 +197,14 @@ impl Link {
             pty,
             clock,
             known: Known::new(dialects[0].clone()),
+            changed_at: None,
             dialects,
             outdated: Vec::new(),
             finder,
             host,
             surveyor,
             finding: None,
+            is_overdue: false,
             receiver: Receiver::default(),
             input: Vec::with_capacity(INPUT_BYTES),
             output: Vec::with_capacity(2 * OUTPUT_BYTES),
@@ -362,6 +364,7 @@ impl Link {
             }
             if let Some(finder) = &mut self.finder {
                 finder.ask();
+                self.is_overdue = false;
             }
             if self.surveyor.is_some() || self.finder.is_some() {
                 self.finding = Some(monotonic() + FIND_LIMIT);
@@ -404,7 +407,10 @@ impl Link {
 
     /// Whether it is not known yet what the host is to be told: what the board has, in which dialect.
     fn is_finding(&mut self) -> bool {
-        let Some(until) = self.finding else { return false };
+        let Some(until) = self.finding else {
+            self.hear_late_answer();
+            return false;
+        };
         let is_late = monotonic() >= until;
         if let Some(surveyor) = &mut self.surveyor {
             if !surveyor.is_done() && !is_late {
@@ -421,6 +427,7 @@ impl Link {
                     warn!(
                         "the host's dialect was not found within {FIND_LIMIT:?}: served as Klipper v0.13, master and Kalico"
                     );
+                    self.is_overdue = true;
                     DialectName::Union
                 })
             });
@@ -431,10 +438,23 @@ impl Link {
         false
     }
 
+    /// An answer that came after the host had read another dictionary.
+    fn hear_late_answer(&mut self) {
+        let answer = self.finder.as_ref().filter(|_| self.is_overdue).and_then(HostFinder::answer);
+        let Some(name) = answer else { return };
+        self.is_overdue = false;
+        if name != DialectName::Union {
+            warn!("the host's dialect, {name}, was found too late: it is spoken from the host's RESTART on");
+        }
+    }
+
     /// Speaks the dialect of this name from now on.
     fn speak(&mut self, name: DialectName) {
         let of_name = self.dialects.iter().find(|dialect| dialect.name() == name);
         if let Some(dialect) = of_name.filter(|dialect| !Arc::ptr_eq(dialect, &self.known.dialect)).cloned() {
+            if name != self.known.dialect.name() {
+                self.changed_at = Some(self.ledger.handed());
+            }
             self.known = Known::new(dialect.clone());
             self.request(Request::Speak(dialect));
         }
@@ -494,7 +514,7 @@ impl Link {
 
     /// Hands a block to the core, where there is room for it.
     fn hand(&mut self, payload: Payload) {
-        if self.known.stops(payload.as_slice()) {
+        if self.known.dialect.is_emergency(payload.as_slice()) {
             self.progress.stop_handed();
         }
         let _ = self.requests.push(Request::Run(payload));
@@ -523,6 +543,10 @@ impl Link {
     fn frame_responses(&mut self) {
         while self.output.len() < OUTPUT_BYTES {
             let Some((payload, core_begun)) = self.inlet.response() else { return };
+            self.changed_at = self.changed_at.filter(|changed_at| !is_after(core_begun, *changed_at));
+            if self.changed_at.is_some() && !self.known.dialect.is_own_response(payload) {
+                continue;
+            }
             frame(payload, Sequence::after(self.ledger.respond(core_begun)), &mut self.output);
         }
     }

@@ -3,8 +3,9 @@
 
 use std::sync::{Arc, Mutex};
 
-use pinion::mcu::Generation::{Kalico, Master};
+use pinion::mcu::Generation::{Kalico, Master, V0_13};
 
+use crate::bench::ANALOG;
 use crate::rig::{Rig, hex};
 
 const MS: u64 = 50_000;
@@ -41,6 +42,24 @@ fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_machine() {
         rig.run_until(50_000);
         assert_eq!(rig.mcu.is_shutdown(), ends, "{generation} {count}");
         assert!(rig.responses()[0].starts_with("thermocouple_result "));
+    }
+}
+
+#[test]
+fn an_analog_input_without_a_count_of_invalid_readings_never_stops_the_machine() {
+    for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 2, true), (V0_13, 0, true)] {
+        let mut rig = Rig::of(generation);
+        rig.configure(&["config_analog_in oid=0 pin=400"]);
+        rig.bench.script_adc(ANALOG, &[4095; 20]);
+        rig.send(&format!(
+            "query_analog_in oid=0 clock=@5000 sample_ticks=1000 sample_count=2 rest_ticks=10000 min_value=1 \
+             max_value=2 range_check_count={count}"
+        ));
+        rig.run_until(30_000);
+        assert_eq!(rig.mcu.is_shutdown(), ends, "{generation} {count}");
+        if !ends {
+            assert_eq!(rig.responses()[0], "analog_in_state oid=0 next_clock=@15000 value=8190");
+        }
     }
 }
 

@@ -104,6 +104,8 @@ fn a_chip_that_does_not_answer_stops_the_machine_in_the_words_of_its_time() {
         (V0_11, WRITE, StartNack, "Unable write i2c device"),
         (V0_12, WRITE, Nack, "Unable write i2c device"),
         (V0_11, READ, StartReadNack, "Unable to read i2c device"),
+        (V0_11, READ, StartNack, "Unable write i2c device"),
+        (V0_11, "i2c_read oid=0 reg= read_len=1", StartNack, "Unable to read i2c device"),
         (V0_12, READ, Timeout, "Unable to read i2c device"),
         (V0_12, MODIFY, Nack, "Unable to read i2c device"),
         (V0_13, WRITE, Nack, "I2C NACK"),
@@ -117,9 +119,16 @@ fn a_chip_that_does_not_answer_stops_the_machine_in_the_words_of_its_time() {
         let responses = rig.responses();
         assert_eq!(responses.len(), 1, "no answer: {responses:?}");
         assert!(responses[0].ends_with(&format!("static_string_id={text}")), "{generation} {command}: {responses:?}");
-        assert_eq!(heard.lock().unwrap().len(), 1);
+        // Only what writes nothing is tried again.
+        let tries = if command.contains("reg= ") { 3 } else { 1 };
+        assert_eq!(heard.lock().unwrap().len(), tries);
         assert!(rig.notes().iter().any(|note| note.contains("I2C device oid 0")), "the log names the device");
     }
+    // What was read is written back.
+    let mut rig = configured(V0_12, device(V0_12));
+    plug_i2c(&rig, 1, Err(Nack));
+    rig.send(MODIFY);
+    assert_eq!(rig.shutdown().as_deref(), Some("Unable write i2c device"));
     // Without a bus.
     let mut rig = configured(V0_12, &["config_i2c oid=0"]);
     rig.send("i2c_read oid=0 reg=10 read_len=1");
@@ -177,7 +186,8 @@ struct Adxl345 {
     /// Samples made before it was switched off, and those that were read.
     made: u64,
     read: u64,
-    rubbish: bool,
+    /// How many times more it tells rubbish of its FIFO.
+    rubbish: usize,
     /// What was written to it, and when.
     written: Vec<(u64, [u8; 2])>,
 }
@@ -185,7 +195,7 @@ struct Adxl345 {
 impl Adxl345 {
     fn exchange(&mut self, at: u64, bytes: &mut [u8]) {
         let made = self.made + self.on_since.map_or(0, |since| (at - since) / 1000);
-        let entries = if self.rubbish { 0x7f } else { (made - self.read) as u8 };
+        let entries = if self.rubbish > 0 { 0x7f } else { (made - self.read) as u8 };
         match *bytes {
             [0x2d, value] => {
                 self.written.push((at, [0x2d, value]));
@@ -196,7 +206,10 @@ impl Adxl345 {
                 bytes[1..].copy_from_slice(&[self.read as u8, 0, 0, 0, 0, 0, 0x90, entries]);
                 self.read += u64::from(entries > 0);
             }
-            [0xb9, _] => bytes[1] = entries,
+            [0xb9, _] => {
+                bytes[1] = entries;
+                self.rubbish = self.rubbish.saturating_sub(1);
+            }
             _ => panic!("{bytes:02x?}"),
         }
     }
@@ -271,14 +284,33 @@ fn an_adxl345_that_makes_no_sense_is_told_as_that_and_ends() {
     let chip = plug_adxl345(&rig);
     rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
     rig.run_until(6000);
-    chip.lock().unwrap().rubbish = true;
+    chip.lock().unwrap().rubbish = usize::MAX;
     // klippy asks again where there are more than 32.
     let status = rig.ask("query_adxl345_status oid=1");
     assert!(status.contains(" fifo=127 "), "{status}");
     let status = rig.ask("query_adxl345 oid=1 clock=0 rest_ticks=0");
-    assert!(status.starts_with("adxl345_status "), "{status}");
+    assert!(status.starts_with("adxl345_status ") && status.contains(" fifo=127 "), "{status}");
     rig.run_until(100_000);
     assert_eq!(rig.responses(), [""; 0]);
+}
+
+#[test]
+fn an_adxl345_that_makes_no_sense_for_once_at_its_end_tells_all_its_samples() {
+    for samples in [3, 0] {
+        let mut rig = configured(V0_12, ADXL345);
+        let chip = plug_adxl345(&rig);
+        rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=40000");
+        let end = 5000 + u64::from(samples) * 1000;
+        rig.run_until(end);
+        chip.lock().unwrap().rubbish = 1;
+        rig.send("query_adxl345 oid=1 clock=0 rest_ticks=0");
+        let mut responses = rig.responses();
+        let sequence = u8::from(samples > 0);
+        let status = format!("adxl345_status oid=1 clock=@{end} query_ticks=0 next_sequence={sequence} ");
+        assert_eq!(responses.pop().unwrap(), status + "buffered=0 fifo=0 limit_count=0");
+        let data = (samples > 0).then(|| adxl345_data(0, 0..samples));
+        assert_eq!(responses, Vec::from_iter(data), "no sample is lost, and none made up");
+    }
 }
 
 #[test]

@@ -180,12 +180,13 @@ impl Rig {
         let mut words = command.split(' ');
         let name = words.next().unwrap();
         let given: Vec<(&str, &str)> = words.map(|word| word.split_once('=').unwrap()).collect();
-        let format = self.dictionary().commands.keys().find(|format| format::name(format) == name);
+        let dialect = self.mcu.heard();
+        let format = dialect.dictionary().commands.keys().find(|format| format::name(format) == name);
         let format = format.unwrap_or_else(|| panic!("no command {name}"));
         let parameters = format::parameters(format).unwrap();
         assert_eq!(given.len(), parameters.len(), "{command} is no {format}");
         let mut writer = Writer::default();
-        writer.int(self.dialect().command_id(format).unwrap());
+        writer.int(dialect.command_id(format).unwrap());
         for (name, conversion) in parameters {
             let (_, value) = given.iter().find(|(given, _)| *given == name).unwrap_or_else(|| panic!("{format}"));
             match conversion {

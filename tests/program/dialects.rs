@@ -123,9 +123,14 @@ fn a_host_that_is_no_klippy_gets_what_most_hosts_take() {
     until_once_more(&pinion, "host gone", || drop(client));
     let checkout = Checkout::of("v0.12");
     fs::remove_file(checkout.program().with_file_name("mcu.py")).unwrap();
-    let _host = Host::start(&pinion, &checkout);
+    let mut host = Host::start(&pinion, &checkout);
     pinion.client();
     pinion.logged("it does not hold klippy's sources: it is served as Klipper v0.13, master and Kalico");
+    // What could not be told of a process once is not held against it.
+    until_once_more(&pinion, "host gone", || host.turn("closed"));
+    checkout.change("v0.12", |sources| sources);
+    host.turn("open");
+    assert!(pinion.client().dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c"));
 }
 
 #[test]

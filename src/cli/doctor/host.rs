@@ -35,7 +35,7 @@ pub(super) struct Klippy {
 
 /// Finds klippy by its process, or by its unit.
 pub(super) fn klippy(machine: &Machine) -> Option<Klippy> {
-    let process = machine.processes().into_iter().find(|process| process.klippy().is_some());
+    let process = machine.processes().into_iter().find(|process| process.is_klippy());
     if let Some(process) = process
         && let Some(who) = machine.user_of(process.pid)
     {

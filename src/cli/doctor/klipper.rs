@@ -53,6 +53,9 @@ pub(super) fn report(checkout: &Checkout) -> String {
         let mark = if verdict.generation == best.generation { "  <- the one that it is served" } else { "" };
         let _ = writeln!(text, "  {:<8}{:>4}{mark}", verdict.generation.name(), verdict.served.len());
     }
+    if let Some(unread) = &checkout.unread {
+        let _ = writeln!(text, "\nNot all of it can be read, and what is left out here does not count: {unread}");
+    }
     let differing: Vec<&Shape> =
         all.into_iter().filter(|shape| checkout.verdicts.iter().any(|verdict| verdict.other.contains(shape))).collect();
     if !differing.is_empty() {
