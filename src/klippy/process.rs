@@ -128,9 +128,20 @@ impl Process {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nix::pty::openpty;
+    use nix::fcntl::{FcntlArg, FdFlag, fcntl};
+    use nix::pty::{OpenptyResult, openpty};
     use nix::unistd::ttyname;
     use std::process::{Child, Command, Stdio};
+
+    /// A terminal of which a child inherits what it is given only, as of the program's.
+    fn terminal() -> (OpenptyResult, PathBuf) {
+        let pty = openpty(None, None).unwrap();
+        for end in [&pty.master, &pty.slave] {
+            fcntl(end, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC)).unwrap();
+        }
+        let device = ttyname(&pty.slave).unwrap();
+        (pty, device)
+    }
 
     /// A process that has the terminal open as its input, called as klippy is.
     fn host(device: &Path, script: &Path) -> Child {
@@ -146,8 +157,7 @@ mod tests {
 
     #[test]
     fn the_process_that_has_the_terminal_open_is_found_among_all() {
-        let pty = openpty(None, None).unwrap();
-        let device = ttyname(&pty.slave).unwrap();
+        let (_pty, device) = terminal();
         assert_eq!(find(Path::new("/proc"), &device).unwrap(), Search::Nobody, "this process does not count");
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("klippy.py");
@@ -166,8 +176,7 @@ mod tests {
 
     #[test]
     fn who_serves_the_terminal_is_no_host() {
-        let pty = openpty(None, None).unwrap();
-        let device = ttyname(&pty.slave).unwrap();
+        let (pty, device) = terminal();
         // A program that has both ends open, as Pinion has while no host is there.
         let mut server = Command::new("/bin/sh")
             .args(["-c", "read line"])
@@ -188,8 +197,7 @@ mod tests {
 
     #[test]
     fn a_terminal_of_the_same_number_elsewhere_is_another() {
-        let pty = openpty(None, None).unwrap();
-        let device = ttyname(&pty.slave).unwrap();
+        let (_pty, device) = terminal();
         let mut host = host(&device, Path::new("klippy.py"));
         // A file is on another device than the terminal, whatever it is.
         let file = tempfile::NamedTempFile::new().unwrap();
