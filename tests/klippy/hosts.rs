@@ -29,11 +29,14 @@ fn with_button(board: String, _trace: &Path) -> String {
 fn with_sections(config: String, generation: Generation) -> String {
     // At the 3200 samples a second of klippy's default a busy computer is late now and then.
     let config = config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n");
-    // Load cells came with v0.13, the ADS1220 in this form with master.
-    let sections = config.split_inclusive("\n\n").filter(|section| {
-        let is_load_cell = section.starts_with("[load_cell");
-        !is_load_cell || generation == Generation::Master
-    });
+    // Load cells came with v0.13, the ADS1220 in this form with master; Kalico's firmware for Linux has no angle
+    // sensors.
+    let unknown = |section: &str| match generation {
+        Generation::Master => false,
+        Generation::Kalico => section.starts_with("[angle") || section.starts_with("[load_cell"),
+        _ => section.starts_with("[load_cell"),
+    };
+    let sections = config.split_inclusive("\n\n").filter(|section| !unknown(section));
     sections.collect::<String>() + "\n[gcode_button knob]\npin: knob\npress_gcode:\n"
 }
 
