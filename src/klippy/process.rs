@@ -205,11 +205,7 @@ mod tests {
     use nix::unistd::ttyname;
     use std::process::{Child, Command, Stdio};
 
-<<<<<<< HEAD
     /// A terminal whose ends no process of another test inherits.
-=======
-    /// A terminal of which a child inherits what it is given only, as of the program's.
->>>>>>> console
     fn terminal() -> (OpenptyResult, PathBuf) {
         let pty = openpty(None, None).unwrap();
         for end in [&pty.master, &pty.slave] {
