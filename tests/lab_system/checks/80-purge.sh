@@ -8,6 +8,8 @@ not is_active pinion-mcu
 [ -e /etc/default/pinion-mcu ]
 is "$(systemctl list-units --all --plain --no-legend 'pinion-mcu*')" "" "the units that are there"
 [ ! -L /etc/systemd/system/multi-user.target.wants/pinion-mcu.service ]
+# An instance's configuration is who made it to remove.
+rm -f /etc/pinion/second.toml
 apt-get purge -y pinion-mcu
 [ ! -e /etc/default/pinion-mcu ]
 id pinion
