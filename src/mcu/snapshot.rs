@@ -195,7 +195,8 @@ fn append<T>(list: &mut Vec<T>, item: T) {
 /// Puts as much of a text as has room.
 fn put(text: &mut String, from: &str) {
     text.clear();
-    text.push_str(&from[..from.floor_char_boundary(text.capacity())]);
+    let room = (0..=text.capacity().min(from.len())).rev().find(|end| from.is_char_boundary(*end));
+    text.push_str(&from[..room.unwrap_or(0)]);
 }
 
 impl Mcu {

@@ -469,7 +469,8 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mcu.sock");
         let (teller, asker) = ends();
-        let socket = StatusSocket::start(&[path.clone()], facts(folder.path()), Arc::default(), asker).unwrap();
+        let socket =
+            StatusSocket::start(std::slice::from_ref(&path), facts(folder.path()), Arc::default(), asker).unwrap();
         for _ in 0..2 {
             let mut text = String::new();
             UnixStream::connect(&path).unwrap().read_to_string(&mut text).unwrap();
@@ -485,7 +486,7 @@ mod tests {
     fn neither_a_live_socket_nor_another_file_is_taken_over() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mcu.sock");
-        let start = || StatusSocket::start(&[path.clone()], facts(folder.path()), Arc::default(), ends().1);
+        let start = || StatusSocket::start(std::slice::from_ref(&path), facts(folder.path()), Arc::default(), ends().1);
         fs::write(&path, "mine").unwrap();
         assert!(start().is_none());
         assert_eq!(fs::read(&path).unwrap(), b"mine");

@@ -37,7 +37,7 @@ fn levels_are_those_of_the_last_write_or_look() {
         rig.send("update_digital_out oid=2 value=1");
         assert_eq!((level(&rig, 7).1, level(&rig, 200).1), (Some(false), Some(true)));
         for is_high in [true, false] {
-            rig.bench.script_input(6, &[(0, u8::from(is_high).into())]);
+            rig.bench.script_input(6, &[(0, u8::from(is_high))]);
             rig.ask("endstop_query_state oid=1");
             assert_eq!(level(&rig, 6).1, Some(is_high));
         }
