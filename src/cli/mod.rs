@@ -51,7 +51,7 @@ struct LogArgs {
 enum Command {
     /// Serve a Klipper host on a pty (the default)
     Run(run::RunArgs),
-    /// List this machine's GPIO lines, ADCs, PWM channels and buses, as printer.cfg names them
+    /// List this machine's GPIO lines, ADCs, PWM channels and buses by their names
     Pins(pins::PinsArgs),
     /// Print the data dictionary, as klippy's batch mode takes it with -d
     Dict(dict::DictArgs),
