@@ -23,7 +23,7 @@ fn query(client: &mut Client, oid: usize) {
     run(
         client,
         &format!(
-            "query_analog_in oid={oid} clock={at} sample_ticks=5000 sample_count=1 rest_ticks=250000 bytes_per_report=2 min_value=0 max_value=4095 range_check_count=0"
+            "query_analog_in oid={oid} clock={at} sample_ticks=5000 sample_count=1 rest_ticks=250000 min_value=0 max_value=4095 range_check_count=0"
         ),
     );
 }
@@ -31,8 +31,7 @@ fn query(client: &mut Client, oid: usize) {
 fn reading(client: &mut Client, oid: u8) -> u16 {
     let until = Instant::now() + Duration::from_secs(5);
     let state = client.wait("analog_in_state", Some(oid), until).expect("a session").expect("a reading");
-    let [low, high] = state.bytes("values").expect("a reading")[..] else { panic!("{state:?}") };
-    u16::from_le_bytes([low, high])
+    state.int("value").expect("a reading") as u16
 }
 
 #[test]
@@ -66,7 +65,7 @@ fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
             run(
                 client,
                 &format!(
-                    "query_analog_in oid={oid} clock=0 sample_ticks=0 sample_count=0 rest_ticks=0 bytes_per_report=2 min_value=0 max_value=0 range_check_count=0"
+                    "query_analog_in oid={oid} clock=0 sample_ticks=0 sample_count=0 rest_ticks=0 min_value=0 max_value=0 range_check_count=0"
                 ),
             );
             client.drain();
@@ -75,7 +74,7 @@ fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
         assert_eq!(usize::from(reading(client, 7)), round * 1000);
         run(
             client,
-            "query_analog_in oid=7 clock=0 sample_ticks=0 sample_count=0 rest_ticks=0 bytes_per_report=2 min_value=0 max_value=0 range_check_count=0",
+            "query_analog_in oid=7 clock=0 sample_ticks=0 sample_count=0 rest_ticks=0 min_value=0 max_value=0 range_check_count=0",
         );
         client.drain();
     }
