@@ -44,6 +44,7 @@ mod thermocouple;
 mod tmcuart;
 mod trigger_analog;
 mod trsync;
+mod value_queue;
 
 /// Every feature. One that is not listed here does not get into the dictionary. Commands that come
 /// often stand first: there are more messages than ids of one byte, which are given in this order.

@@ -12,13 +12,13 @@ use std::time::Duration;
 
 use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
 use crate::mcu::{
-    Command, Constant, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, Remote, Safe, Settable, Ticket, TimerId,
-    WireClock, command,
+    Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Remote, Safe, Settable, Ticket, TimerId, WireClock,
+    command,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
 
-use super::{changes_too_late, not_refreshed};
+use super::value_queue::{Texts, ValueQueue};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "pca9685",
@@ -255,41 +255,22 @@ impl Object for Chips {
     }
 }
 
-struct Move {
-    at: Clock,
-    value: u16,
-}
+const TEXTS: Texts = Texts { max_duration: MAX_DURATION, missed: MISSED };
 
 /// An output that the host schedules.
 struct Pca9685 {
     chips: Oid,
     place: u8,
-    default_value: u16,
-    max_duration: Ticks,
-    queue: MoveQueue<Move>,
-    /// When the host must have sent another value.
-    end: Option<Clock>,
+    queue: ValueQueue,
 }
 
 impl Pca9685 {
-    fn timer(oid: Oid) -> TimerId {
-        TimerId::new(oid, 0)
-    }
-
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
-        let first = self.queue.is_empty();
-        self.queue.push(&mut mcu.moves, Move { at, value })?;
+        let first = self.queue.push(mcu, at, value)?;
         if value > VALUE_MAX {
             return Err(Shutdown::by_host(INVALID_VALUE, format_args!("value {value} is above {VALUE_MAX}")));
         }
-        if !first {
-            return Ok(());
-        }
-        if self.end.take().is_some_and(|end| end < at) {
-            return Err(changes_too_late(MAX_DURATION, self.max_duration));
-        }
-        mcu.cancel(Self::timer(oid));
-        mcu.schedule(Self::timer(oid), at)
+        if first { self.queue.start(mcu, oid, at) } else { Ok(()) }
     }
 }
 
@@ -299,26 +280,14 @@ impl Object for Pca9685 {
     }
 
     fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(Move { value, .. }) = self.queue.pop(&mut mcu.moves) else {
-            return Err(not_refreshed(MISSED, self.max_duration));
-        };
+        let value = self.queue.pop(mcu)?;
         let (own, place) = (self.chips, self.place);
         mcu.with::<Chips, _>(own, |chips, mcu| chips.set(mcu, own, place, Setting::Value(value)))?;
-        let limited = value != self.default_value && self.max_duration.0 != 0;
-        let end = limited.then(|| at + self.max_duration);
-        let Some(next) = self.queue.first().map(|next| next.at) else {
-            self.end = end;
-            return Ok(end.map_or(Next::Done, Next::At));
-        };
-        if end.is_some_and(|end| end < next) {
-            return Err(changes_too_late(MAX_DURATION, self.max_duration));
-        }
-        Ok(Next::At(next))
+        self.queue.next(value, at)
     }
 
     fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
-        self.end = None;
-        self.queue.clear(&mut mcu.moves);
+        self.queue.clear(mcu);
     }
 }
 
@@ -352,10 +321,7 @@ const CONFIG_PCA9685: Command = command!(
             chips.set(mcu, own, place, setting)?;
             Ok(place)
         })?;
-        mcu.assign(
-            oid,
-            Pca9685 { chips: own, place, default_value, max_duration, queue: MoveQueue::default(), end: None },
-        )
+        mcu.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(default_value, max_duration, &TEXTS) })
     }
 );
 

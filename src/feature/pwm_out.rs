@@ -6,13 +6,14 @@
 
 use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
-    Command, Constant, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, Present, Remote, Report, Safe, Settable,
-    Ticket, TimerId, WireClock, command,
+    Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Present, Remote, Report, Safe, Settable, Ticket, TimerId,
+    WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
 
-use super::{changes_too_late, not_refreshed, set_too_late};
+use super::set_too_late;
+use super::value_queue::{Texts, ValueQueue};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "pwm_out",
@@ -60,43 +61,23 @@ fn open(mcu: &mut Mcu, config: PwmConfig) -> Result<Remote<Channel>, Shutdown> {
     Ok(Remote::new(worker, Channel(device), Setting { value: config.value, cycle: None }))
 }
 
-struct Move {
-    at: Clock,
-    value: u16,
-}
+const TEXTS: Texts = Texts { max_duration: PWM_MAX_DURATION, missed: MISSED_PWM };
 
 struct PwmOut {
     channel: Remote<Channel>,
     /// The value that it was set to last.
     value: u16,
-    default_value: u16,
-    max_duration: Ticks,
-    queue: MoveQueue<Move>,
-    /// When the present value ends: the host must have queued another one by then.
-    end: Option<Clock>,
+    queue: ValueQueue,
 }
 
 impl PwmOut {
-    fn timer(oid: Oid) -> TimerId {
-        TimerId::new(oid, 0)
-    }
-
     fn write(&mut self, mcu: &mut Mcu, oid: Oid, value: u16) -> Result<(), Shutdown> {
         self.value = value;
         self.channel.set(mcu, Ticket { oid, tag: 0 }, Setting { value, cycle: None })
     }
 
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
-        let first = self.queue.is_empty();
-        self.queue.push(&mut mcu.moves, Move { at, value })?;
-        if !first {
-            return Ok(());
-        }
-        if self.end.take().is_some_and(|end| end < at) {
-            return Err(changes_too_late(PWM_MAX_DURATION, self.max_duration));
-        }
-        mcu.cancel(Self::timer(oid));
-        mcu.schedule(Self::timer(oid), at)
+        if self.queue.push(mcu, at, value)? { self.queue.start(mcu, oid, at) } else { Ok(()) }
     }
 }
 
@@ -107,20 +88,9 @@ impl Object for PwmOut {
 
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
         let Some(oid) = timer.oid() else { return Ok(Next::Done) };
-        let Some(Move { value, .. }) = self.queue.pop(&mut mcu.moves) else {
-            return Err(not_refreshed(MISSED_PWM, self.max_duration));
-        };
+        let value = self.queue.pop(mcu)?;
         self.write(mcu, oid, value)?;
-        let limited = value != self.default_value && self.max_duration.0 != 0;
-        let end = limited.then(|| at + self.max_duration);
-        let Some(next) = self.queue.first().map(|next| next.at) else {
-            self.end = end;
-            return Ok(end.map_or(Next::Done, Next::At));
-        };
-        if end.is_some_and(|end| end < next) {
-            return Err(changes_too_late(PWM_MAX_DURATION, self.max_duration));
-        }
-        Ok(Next::At(next))
+        self.queue.next(value, at)
     }
 
     fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
@@ -137,12 +107,11 @@ impl Object for PwmOut {
     }
 
     fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
-        self.end = None;
-        self.queue.clear(&mut mcu.moves);
+        self.queue.clear(mcu);
     }
 
     fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
-        self.write(mcu, oid, self.default_value)?;
+        self.write(mcu, oid, self.queue.default_value())?;
         Ok(Safe::Later)
     }
 }
@@ -199,11 +168,8 @@ const CONFIG_PWM_OUT: Command = command!(
         mcu.vacant(oid)?;
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
         let channel = open(mcu, config)?;
-        mcu.assign_on(
-            pin,
-            oid,
-            PwmOut { channel, value, default_value, max_duration, queue: MoveQueue::default(), end: None },
-        )
+        let queue = ValueQueue::new(default_value, max_duration, &TEXTS);
+        mcu.assign_on(pin, oid, PwmOut { channel, value, queue })
     }
 );
 

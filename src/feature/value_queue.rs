@@ -1,0 +1,93 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Queued values of an output, and `max_duration`, a limit to how long it may stay at another than its
+//! shutdown value without news from the host: what hardware PWM channels and PCA9685 have in common.
+
+#![forbid(unsafe_code)]
+
+use crate::mcu::{Mcu, MoveQueue, Next, Oid, TimerId};
+use crate::shutdown::{Shutdown, ShutdownReason};
+use crate::time::{Clock, Ticks};
+
+use super::{changes_too_late, not_refreshed};
+
+struct Move {
+    at: Clock,
+    value: u16,
+}
+
+/// The shutdown texts of a kind of output.
+pub(super) struct Texts {
+    /// An output would stay on for longer than its `max_duration`.
+    pub(super) max_duration: ShutdownReason,
+    /// The host did not refresh an output in time.
+    pub(super) missed: ShutdownReason,
+}
+
+/// The values that an output is to have. Its timer is the object's timer 0.
+pub(super) struct ValueQueue {
+    default_value: u16,
+    max_duration: Ticks,
+    texts: &'static Texts,
+    queue: MoveQueue<Move>,
+    /// When the present value ends: the host must have queued another one by then.
+    end: Option<Clock>,
+}
+
+impl ValueQueue {
+    pub(super) fn new(default_value: u16, max_duration: Ticks, texts: &'static Texts) -> ValueQueue {
+        ValueQueue { default_value, max_duration, texts, queue: MoveQueue::default(), end: None }
+    }
+
+    /// The value of a stopped machine.
+    pub(super) fn default_value(&self) -> u16 {
+        self.default_value
+    }
+
+    /// How many values are queued.
+    pub(super) fn len(&self) -> usize {
+        self.queue.len()
+    }
+
+    /// Appends a value. True if it is the only one: then [`ValueQueue::start`] follows.
+    pub(super) fn push(&mut self, mcu: &mut Mcu, at: Clock, value: u16) -> Result<bool, Shutdown> {
+        let first = self.queue.is_empty();
+        self.queue.push(&mut mcu.moves, Move { at, value })?;
+        Ok(first)
+    }
+
+    /// Has the timer of the object take the only value, which is for `at`.
+    pub(super) fn start(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<(), Shutdown> {
+        if self.end.take().is_some_and(|end| end < at) {
+            return Err(changes_too_late(self.texts.max_duration, self.max_duration));
+        }
+        let timer = TimerId::new(oid, 0);
+        mcu.cancel(timer);
+        mcu.schedule(timer, at)
+    }
+
+    /// Takes the value that is due.
+    pub(super) fn pop(&mut self, mcu: &mut Mcu) -> Result<u16, Shutdown> {
+        let due = self.queue.pop(&mut mcu.moves);
+        due.map(|due| due.value).ok_or_else(|| not_refreshed(self.texts.missed, self.max_duration))
+    }
+
+    /// When the timer runs next, now that the output has a value that was due at `at`.
+    pub(super) fn next(&mut self, value: u16, at: Clock) -> Result<Next, Shutdown> {
+        let limited = value != self.default_value && self.max_duration.0 != 0;
+        let end = limited.then(|| at + self.max_duration);
+        let Some(next) = self.queue.first().map(|next| next.at) else {
+            self.end = end;
+            return Ok(end.map_or(Next::Done, Next::At));
+        };
+        if end.is_some_and(|end| end < next) {
+            return Err(changes_too_late(self.texts.max_duration, self.max_duration));
+        }
+        Ok(Next::At(next))
+    }
+
+    /// Forgets all values, as the machine stops.
+    pub(super) fn clear(&mut self, mcu: &mut Mcu) {
+        self.end = None;
+        self.queue.clear(&mut mcu.moves);
+    }
+}
