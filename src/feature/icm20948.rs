@@ -10,15 +10,13 @@ use crate::mcu::{Command, Feature, Generation::V0_13, Oid, command, since};
 use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
-use super::mpu9250::fifo_count;
+use super::mpu9250::FifoRegisters;
 
 pub(super) const FEATURE: Feature =
     Feature { name: "icm20948", commands: &[CONFIG_ICM20948, QUERY_ICM20948, QUERY_ICM20948_STATUS], ..Feature::EMPTY };
 
-const INT_STATUS_2: u8 = 0x1b;
-const FIFO_OVERFLOW_INT: u8 = 0x0f;
-const FIFO_COUNTH: u8 = 0x70;
-const FIFO_R_W: u8 = 0x72;
+/// INT_STATUS_2 with FIFO_OVERFLOW_INT, FIFO_COUNTH, FIFO_R_W.
+const FIFO: FifoRegisters = FifoRegisters { int_status: 0x1b, overflow: 0x0f, count: 0x70, data: 0x72 };
 
 #[derive(Clone, Copy)]
 struct Icm20948;
@@ -33,18 +31,15 @@ impl FifoChip for Icm20948 {
     }
 
     fn read(self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError> {
-        let read = |chip: &mut dyn BusDevice, block: &mut [u8]| BusType::I2c.read(chip, FIFO_R_W, block);
-        reading.block(chip, |chip| fifo_count(chip, FIFO_COUNTH), read)
+        FIFO.read(chip, reading)
     }
 
     fn fill(self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError> {
-        fifo_count(chip, FIFO_COUNTH).map(Some)
+        FIFO.fill(chip).map(Some)
     }
 
     fn overflowed(self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
-        let mut status = [0];
-        BusType::I2c.read(chip, INT_STATUS_2, &mut status)?;
-        Ok(status[0] & FIFO_OVERFLOW_INT != 0)
+        FIFO.overflowed(chip)
     }
 }
 

@@ -60,17 +60,37 @@ const USER_CTRL: u8 = 0x6a;
 const FIFO_RESET: u8 = 0x04;
 const FIFO_ENABLED: u8 = 0x40;
 
-const INT_STATUS: u8 = 0x3a;
-const FIFO_OFLOW_INT: u8 = 0x10;
-const FIFO_COUNTH: u8 = 0x72;
-const FIFO_R_W: u8 = 0x74;
-
-/// Asks InvenSense's chips for the bytes in their FIFO: 13 bits, the high ones first.
-pub(super) fn fifo_count(chip: &mut dyn BusDevice, register: u8) -> Result<Fill, BusError> {
-    let mut count = [0; 2];
-    BusType::I2c.read(chip, register, &mut count)?;
-    Ok(Fill { bytes: u16::from_be_bytes(count) & 0x1fff, overflowed: false })
+/// Where one of InvenSense's chips has its FIFO, and what tells that it overflowed.
+pub(super) struct FifoRegisters {
+    pub(super) int_status: u8,
+    /// The bits of it that tell of an overflow.
+    pub(super) overflow: u8,
+    pub(super) count: u8,
+    pub(super) data: u8,
 }
+
+impl FifoRegisters {
+    pub(super) fn read(&self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError> {
+        let read = |chip: &mut dyn BusDevice, block: &mut [u8]| BusType::I2c.read(chip, self.data, block);
+        reading.block(chip, |chip| self.fill(chip), read)
+    }
+
+    /// Asks for the bytes in the FIFO: 13 bits, the high ones first.
+    pub(super) fn fill(&self, chip: &mut dyn BusDevice) -> Result<Fill, BusError> {
+        let mut count = [0; 2];
+        BusType::I2c.read(chip, self.count, &mut count)?;
+        Ok(Fill { bytes: u16::from_be_bytes(count) & 0x1fff, overflowed: false })
+    }
+
+    pub(super) fn overflowed(&self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+        let mut status = [0];
+        BusType::I2c.read(chip, self.int_status, &mut status)?;
+        Ok(status[0] & self.overflow != 0)
+    }
+}
+
+/// INT_STATUS with FIFO_OFLOW_INT, FIFO_COUNTH, FIFO_R_W.
+const FIFO: FifoRegisters = FifoRegisters { int_status: 0x3a, overflow: 0x10, count: 0x72, data: 0x74 };
 
 #[derive(Clone, Copy)]
 struct Mpu9250;
@@ -99,18 +119,15 @@ impl FifoChip for Mpu9250 {
     }
 
     fn read(self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError> {
-        let read = |chip: &mut dyn BusDevice, block: &mut [u8]| BusType::I2c.read(chip, FIFO_R_W, block);
-        reading.block(chip, |chip| fifo_count(chip, FIFO_COUNTH), read)
+        FIFO.read(chip, reading)
     }
 
     fn fill(self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError> {
-        fifo_count(chip, FIFO_COUNTH).map(Some)
+        FIFO.fill(chip).map(Some)
     }
 
     fn overflowed(self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
-        let mut status = [0];
-        BusType::I2c.read(chip, INT_STATUS, &mut status)?;
-        Ok(status[0] & FIFO_OFLOW_INT != 0)
+        FIFO.overflowed(chip)
     }
 }
 
