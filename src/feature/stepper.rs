@@ -70,6 +70,8 @@ struct Stepper {
     add: i16,
     /// When the present or last step is due.
     next_step: Clock,
+    /// The next edge comes no earlier: the pulse before it ends then, or the direction is set up.
+    earliest: Clock,
     /// A reversal waits for this event, the end of the last step's pulse.
     reverse_pending: bool,
     /// Where the stepper stands after the present move. While the direction is reversed it
@@ -80,6 +82,9 @@ struct Stepper {
     /// After a stop, steps are dropped until the host sets a new clock.
     need_reset: bool,
 }
+
+/// From so many ticks on, an edge is far behind.
+const FAR_BEHIND: i64 = Ticks::from_us(50).0 as i64;
 
 /// Keeps the position's top bit free to tell the direction.
 const POSITION_BIAS: u32 = 0x4000_0000;
@@ -126,11 +131,22 @@ impl Stepper {
             if self.both_edges {
                 // The last step's pulse must end before the direction changes.
                 self.reverse_pending = true;
-                return Ok(Next::At(earliest));
+                return Ok(self.edge_at(self.next_step.min(earliest), earliest));
             }
             return self.reverse(mcu);
         }
-        Ok(Next::At(self.next_step.max(earliest)))
+        Ok(self.edge_at(self.next_step, earliest))
+    }
+
+    /// Has the next edge come when it is due, or at `earliest` if that is later.
+    ///
+    /// Edges that are far behind keep their place among the other timers, in the order in which all were due, and
+    /// wait for `earliest` when it is their turn. Otherwise a machine that could not run for a while would take
+    /// every sample of an endstop before the first of the steps between them, and home at a wrong place.
+    #[inline]
+    fn edge_at(&mut self, due: Clock, earliest: Clock) -> Next {
+        self.earliest = earliest;
+        Next::At(if earliest.since(due) > FAR_BEHIND { due } else { due.max(earliest) })
     }
 
     /// Moves on to the step after the present one, `interval` later by a clock of 32 bits: what
@@ -144,7 +160,7 @@ impl Stepper {
     fn reverse(&mut self, mcu: &mut Mcu) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
         let earliest = mcu.now() + self.pulse_ticks;
-        Ok(Next::At(self.next_step.max(earliest)))
+        Ok(self.edge_at(self.next_step, earliest))
     }
 
     /// The position that the host knows: after the steps that were made.
@@ -200,6 +216,7 @@ impl Object for Stepper {
 
     #[inline]
     fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
+        mcu.spin_until(self.earliest);
         if self.reverse_pending {
             self.reverse_pending = false;
             return self.reverse(mcu);
@@ -210,13 +227,13 @@ impl Object for Stepper {
         let edges = self.edges.saturating_sub(1);
         if edges & 1 != 0 && !self.both_edges {
             self.edges = edges;
-            return Ok(Next::At(earliest));
+            return Ok(self.edge_at((self.next_step + self.pulse_ticks).min(earliest), earliest));
         }
         if edges > 0 {
             self.edges = edges;
             self.advance(self.interval, earliest);
             self.interval = self.interval.wrapping_add_signed(i32::from(self.add));
-            return Ok(Next::At(self.next_step.max(earliest)));
+            return Ok(self.edge_at(self.next_step, earliest));
         }
         self.load(mcu, Some(earliest))
     }
@@ -260,6 +277,7 @@ const CONFIG_STEPPER: Command = command!(
             interval: 0,
             add: 0,
             next_step: Clock::EPOCH,
+            earliest: Clock::EPOCH,
             reverse_pending: false,
             position: POSITION_BIAS.wrapping_neg(),
             last_dir: false,

@@ -162,6 +162,15 @@ impl Mcu {
         self.last_read
     }
 
+    /// Waits, without a turn for anything else: a step's pulse is no longer than that.
+    #[inline]
+    pub fn spin_until(&mut self, end: Clock) {
+        if self.last_read < end && self.now() < end {
+            self.clock.spin_until(end);
+            self.now();
+        }
+    }
+
     /// The clock, for what a worker paces by it.
     pub fn clock(&self) -> Arc<dyn TimeSource> {
         self.board.errand_clock(self.clock.clone())

@@ -56,6 +56,39 @@ fn every_stepper_stops_on_the_tick_of_the_last_sample() {
     assert_eq!(steps(&mut rig), ("stepper_position oid=0 pos=-6".into(), "stepper_position oid=1 pos=-6".into()));
 }
 
+/// The computer keeps the machine from running while 30 steps are due, amid which the axis meets its switch.
+#[test]
+fn a_machine_that_stood_still_takes_steps_and_samples_in_their_order() {
+    const STEP_TICKS: u64 = 25_000;
+    const REST_TICKS: u64 = 25_000;
+    const SWITCH_AT: u64 = 40;
+    // A step is a pulse, or an edge.
+    for (oid, step, both_edges) in [(0, 1, false), (1, 3, true)] {
+        let mut rig = Rig::configured(OBJECTS);
+        let mut steps = 0;
+        rig.bench.plug_line(SWITCH, move |_, edge| {
+            steps += u64::from(edge.is_some_and(|(pin, level)| pin == step && (level || both_edges)));
+            steps >= SWITCH_AT
+        });
+        rig.send_all(&[
+            "trsync_start oid=3 report_clock=@0 report_ticks=0 expire_reason=4",
+            &format!("stepper_stop_on_trigger oid={oid} trsync_oid=3"),
+            &format!("endstop_home oid=2 clock=@10000 sample_ticks=750 sample_count=4 rest_ticks={REST_TICKS} pin_value=1 trsync_oid=3 trigger_reason=1"),
+            &format!("reset_step_clock oid={oid} clock=@0"),
+            &format!("queue_step oid={oid} interval={STEP_TICKS} count=100 add=0"),
+        ]);
+        rig.run_until(30 * STEP_TICKS);
+        rig.stall_until(60 * STEP_TICKS);
+        rig.run_until(120 * STEP_TICKS);
+        // klippy computes from the sample's clock how many steps had been made by then.
+        let state = rig.ask("endstop_query_state oid=2");
+        let next_clock: u64 = state.split(['@', ' ']).find_map(|word| word.parse().ok()).unwrap();
+        assert_eq!((next_clock - REST_TICKS) / STEP_TICKS, SWITCH_AT, "{state}");
+        let stands = rig.ask(&format!("stepper_get_position oid={oid}"));
+        assert_eq!(stands, format!("stepper_position oid={oid} pos=-{SWITCH_AT}"));
+    }
+}
+
 #[test]
 fn reports_go_on_after_a_trigger_until_the_host_ends_them() {
     let mut rig = homing();

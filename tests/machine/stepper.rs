@@ -401,3 +401,33 @@ fn intervals_past_half_the_clocks_range_do_not_stall_a_move() {
     rig.run_until(5000);
     assert_eq!(rig.shutdown().as_deref(), Some("Stepper too far in past"));
 }
+
+#[test]
+fn steps_that_are_far_behind_are_caught_up_with_a_pulse_apart_and_then_come_on_time() {
+    let mut rig =
+        Rig::configured(&[PULSED, "config_stepper oid=1 step_pin=3 dir_pin=4 invert_step=-1 step_pulse_ticks=100"]);
+    for oid in [0, 1] {
+        rig.send(&format!("reset_step_clock oid={oid} clock=@0"));
+        rig.send(&format!("queue_step oid={oid} interval=5000 count=8 add=0"));
+        rig.send(&format!("set_next_step_dir oid={oid} dir=1"));
+        rig.send(&format!("queue_step oid={oid} interval=5000 count=4 add=0"));
+    }
+    rig.run_until(10_000);
+    rig.stall_until(47_000);
+    rig.run_until(100_000);
+    assert_eq!(rig.shutdown(), None);
+    // Of each pair of steps that were due at once the one on both edges has nothing to wait for.
+    let (pulsed, both) = (rig.edges(STEP), instants(&rig.edges(3)));
+    let gap = |edges: &[u64]| edges.windows(2).map(|pair| pair[1] - pair[0]).min();
+    assert_eq!((rising(&pulsed).len(), both.len()), (12, 12));
+    assert_eq!((gap(&instants(&pulsed)), gap(&both)), (Some(100), Some(200)), "{pulsed:?} {both:?}");
+    let late: Vec<u64> = rising(&pulsed).into_iter().filter(|at| at % 5000 != 0).collect();
+    assert_eq!(late.len(), 7, "{late:?}");
+    // The reversal comes after the eighth step and before the ninth, of either.
+    for (dir, steps) in [(DIR, rising(&pulsed)), (4, both.clone())] {
+        let [(reversed, 1)] = rig.edges(dir)[..] else { panic!("{:?}", rig.edges(dir)) };
+        assert!(steps[7] < reversed && reversed + 100 <= steps[8], "{steps:?} {reversed}");
+    }
+    assert_eq!(rising(&pulsed)[9..], [50_000, 55_000, 60_000]);
+    assert_eq!(both[9..], [50_000, 55_000, 60_000]);
+}
