@@ -9,7 +9,7 @@ use crate::klippy::Printer;
 
 /// The registers of a driver by name, as klippy dumps them.
 fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
-    let said = printer.log_of(&format!("DUMP_TMC STEPPER={stepper}"));
+    let said = printer.answer(&format!("DUMP_TMC STEPPER={stepper}"));
     let registers = said.lines().filter_map(|line| {
         let (name, value) = line.trim_start_matches("// ").split_once(':')?;
         let value = u32::from_str_radix(value.split_whitespace().next()?, 16).ok()?;
@@ -20,7 +20,7 @@ fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
 
 /// The steps that klippy has had a stepper do, by its own count.
 fn steps(printer: &mut Printer, stepper: &str) -> i64 {
-    let said = printer.log_of("GET_POSITION");
+    let said = printer.answer("GET_POSITION");
     let (_, counts) = said.split_once("mcu: ").unwrap();
     let mut words = counts.lines().next().unwrap().split([':', ' ']);
     words.find(|word| *word == stepper).unwrap();
@@ -169,7 +169,7 @@ fn with_stepper(config: String) -> String {
 fn klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft() {
     let Some(checkout) = checkout("klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft") else { return };
     let mut printer = Printer::start_here(&checkout, with_sensor("tle5012b"), with_stepper);
-    let read = printer.log_of("ANGLE_DEBUG_READ CHIP=y REG=0x06");
+    let read = printer.answer("ANGLE_DEBUG_READ CHIP=y REG=0x06");
     assert!(read.contains("ANGLE REG[0x06] = 0x4001"), "{read}");
     printer.gcode("G28 Y\nG1 Y110 F6000\nANGLE_CALIBRATE CHIP=y");
     let pending = printer.object("configfile")["save_config_pending_items"]["angle y"]["calibrate"].clone();
@@ -214,9 +214,9 @@ fn klippy_reads_each_kind_of_angle_sensor() {
         assert!((measured - expected + 32768.0).rem_euclid(65536.0) - 32768.0 < 1.0, "{chip}: {measured} {expected}");
         assert!((expected - measured + 32768.0).rem_euclid(65536.0) - 32768.0 < 5.0, "{chip}: {measured} {expected}");
         match chip {
-            "mt6816" => assert!(printer.log_of("ANGLE_DEBUG_READ CHIP=y").contains("No Mag: 0")),
+            "mt6816" => assert!(printer.answer("ANGLE_DEBUG_READ CHIP=y").contains("No Mag: 0")),
             "mt6826s" => {
-                let read = printer.log_of("ANGLE_DEBUG_READ CHIP=y REG=0x003");
+                let read = printer.answer("ANGLE_DEBUG_READ CHIP=y REG=0x003");
                 let (_, sums) = read.split_once("CRC: ").unwrap();
                 let (one, other) = sums.lines().next().unwrap().split_once(" == ").unwrap();
                 assert_eq!(one, other.trim());
@@ -236,7 +236,7 @@ fn klippy_has_an_angle_sensor_calibrate_itself() {
     };
     let mut printer = Printer::start_here(&checkout, long, with_stepper);
     printer.gcode("G28 Y");
-    let said = printer.log_of("ANGLE_CHIP_CALIBRATE CHIP=y");
+    let said = printer.answer("ANGLE_CHIP_CALIBRATE CHIP=y");
     assert!(said.contains("Calibration success"), "{said}");
-    assert!(printer.log_of("ANGLE_DEBUG_READ CHIP=y REG=0x113").contains("Status: Calibration Successful"));
+    assert!(printer.answer("ANGLE_DEBUG_READ CHIP=y REG=0x113").contains("Status: Calibration Successful"));
 }

@@ -286,18 +286,6 @@ impl Printer {
         }
     }
 
-    /// Runs G-code to its end, and gives what it writes to klippy's log. That klippy does not know the
-    /// command behind it, it says there, too.
-    #[track_caller]
-    pub fn log_of(&mut self, script: &str) -> String {
-        let before = fs::read_to_string(self.path("klippy.log")).unwrap().len();
-        self.gcode(script);
-        let marker = format!("END_{}", self.next_id);
-        self.gcode(&marker);
-        let log = self.host_log(&marker, 1);
-        log[before..].to_owned()
-    }
-
     /// A batch of what an angle sensor measures now.
     #[track_caller]
     pub fn angles(&mut self, sensor: &str) -> Value {
@@ -395,17 +383,6 @@ impl Printer {
         fs::read_to_string(self.path("pinion.log")).unwrap()
     }
 
-    /// What klippy answered last that begins like this, from its log.
-    #[track_caller]
-    pub fn said(&mut self, start: &str) -> String {
-        let said = |printer: &Printer| {
-            let log = fs::read_to_string(printer.path("klippy.log")).unwrap();
-            log.lines().rev().find_map(|line| line.strip_prefix(start).map(str::to_owned))
-        };
-        self.until(start, |printer| said(printer).is_some());
-        said(self).unwrap()
-    }
-
     /// Waits until one of klippy's objects has this value for a key.
     #[track_caller]
     pub fn until_object(&mut self, name: &str, key: &str, wanted: impl Into<Value>) {
@@ -422,7 +399,8 @@ impl Printer {
         }
     }
 
-    /// klippy's log, once it has this text so many times: a thread of klippy's writes it.
+    /// klippy's log, once it has this text so many times: what no command was answered. A thread of klippy's
+    /// writes it.
     #[track_caller]
     pub fn host_log(&mut self, text: &str, times: usize) -> String {
         let log = |printer: &Printer| fs::read_to_string(printer.path("klippy.log")).unwrap();
@@ -546,4 +524,11 @@ impl Drop for Printer {
             }
         }
     }
+}
+
+/// The rest of the line of klippy's answer that begins like this.
+#[track_caller]
+pub fn rest<'a>(answer: &'a str, start: &str) -> &'a str {
+    let found = answer.lines().find_map(|line| line.trim_start_matches("// ").strip_prefix(start));
+    found.unwrap_or_else(|| panic!("no `{start}` in\n{answer}"))
 }

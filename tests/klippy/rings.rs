@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use std::{fs, thread};
 
 use super::checkout;
-use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS};
+use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, rest};
 
 /// The resonances of the built-in printer.
 const RESONANCES_HZ: [(&str, f64); 2] = [("x", 57.0), ("y", 43.5)];
@@ -69,8 +69,8 @@ fn an_accelerometer_is_asked_and_measures_without_a_gap() {
     const SECONDS: f64 = 10.0;
     let Some(checkout) = checkout("an_accelerometer_is_asked_and_measures_without_a_gap") else { return };
     let mut printer = start(&checkout);
-    printer.gcode("ACCELEROMETER_QUERY");
-    let said = printer.said("accelerometer values (x, y, z): ");
+    let answer = printer.answer("ACCELEROMETER_QUERY");
+    let said = rest(&answer, "accelerometer values (x, y, z): ");
     let values: Vec<f64> = said.split(", ").map(|value| value.parse().unwrap()).collect();
     // The noise of a sample is 60 to 90 mm/s^2, and never more than three and a half times that.
     let expected = [0.0, 0.0, G];
@@ -114,21 +114,21 @@ fn klippy_calibrates_its_input_shaper_for_the_resonances() {
     printer.gcode(WHERE_IT_STANDS);
     for (axis, hz) in RESONANCES_HZ {
         let name = name("calibrate");
-        printer.gcode(&format!("SHAPER_CALIBRATE AXIS={axis} NAME={name} {}", sweep(hz)));
+        let said = printer.answer(&format!("SHAPER_CALIBRATE AXIS={axis} NAME={name} {}", sweep(hz)));
         // The frequency of a shaper is that of the resonance for which it is made (extras/shaper_defs.py); of those
         // that klippy fits, "mzv" has one notch and stands on the resonance, while those with several notches
         // have theirs to its sides.
-        let fitted = printer.said("Fitted shaper 'mzv' frequency = ");
+        let fitted = rest(&said, "Fitted shaper 'mzv' frequency = ");
         let fitted_hz: f64 = fitted.split(' ').next().unwrap().parse().unwrap();
         let found_hz = peak(format!("/tmp/calibration_data_{axis}_{name}.csv"), &format!("psd_{axis}"));
-        let recommended = printer.said(&format!("Recommended shaper_type_{axis} = "));
+        let recommended = rest(&said, &format!("Recommended shaper_type_{axis} = "));
         assert!((found_hz - hz).abs() < 1.0, "{axis}: {found_hz} Hz, not {hz}");
         assert!((fitted_hz - hz).abs() < 1.0, "{axis}: {fitted_hz} Hz, not {hz}");
         // klippy uses what it recommends.
         let (shaper, shaper_hz) = recommended.split_once(&format!(", shaper_freq_{axis} = ")).unwrap();
         let shaper_hz: f64 = shaper_hz.trim_end_matches(" Hz").parse().unwrap();
-        printer.gcode("SET_INPUT_SHAPER");
-        let in_use = printer.said(&format!("shaper_type_{axis}:{shaper} shaper_freq_{axis}:"));
+        let in_use = printer.answer("SET_INPUT_SHAPER");
+        let in_use = rest(&in_use, &format!("shaper_type_{axis}:{shaper} shaper_freq_{axis}:"));
         let in_use_hz: f64 = in_use.split(' ').next().unwrap().parse().unwrap();
         assert!((in_use_hz - shaper_hz).abs() < 0.06, "{in_use}, not {recommended}");
     }
