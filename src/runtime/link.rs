@@ -574,7 +574,10 @@ impl Link {
         match self.pty.write(&self.output) {
             Ok(written) => drop(self.output.drain(..written)),
             Err(error) => {
-                warn!("writing to {}: {error}", self.pty.device().display());
+                warn!(
+                    "{} can not be written: {error}: what the host should have read is lost, and the host asks again or gives up",
+                    self.pty.device().display()
+                );
                 self.output.clear();
             }
         }

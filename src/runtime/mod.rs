@@ -111,11 +111,13 @@ pub fn run(
     // Before the link is of real time, which its threads would inherit.
     let finder = match options.dialect {
         Some(_) => None,
-        None => Some(HostFinder::start(pty.device(), wake.clone(), host.clone())?),
+        None => Some(started(HostFinder::start(pty.device(), wake.clone(), host.clone()))?),
     };
     // The thread that looks for the host alone may look into others from here on.
     if let Err(error) = sys::give_up(sys::LOOK_INTO_OTHERS) {
-        warn!("capabilities can not be given up: {error}");
+        warn!(
+            "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH can not be given up: {error}: Pinion works, with more rights than it needs"
+        );
     }
     let (teller, asker) = status::ends();
     let fixed = Fixed {
@@ -127,7 +129,7 @@ pub fn run(
         requests: REQUESTS,
     };
     let _status = StatusSocket::start(&options.sockets, fixed, host.clone(), asker);
-    let surveyor = board.view().map(|view| Surveyor::start(view, names, wake.clone())).transpose()?;
+    let surveyor = board.view().map(|view| started(Surveyor::start(view, names, wake.clone()))).transpose()?;
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
@@ -138,9 +140,9 @@ pub fn run(
     }
     let (core_dialect, core_clock) = (dialects[0].clone(), clock.clone());
     let (core_progress, core_wake) = (progress.clone(), wake.clone());
-    let core = thread::Builder::new().name("core".into()).spawn(move || {
+    let core = started(thread::Builder::new().name("core".into()).spawn(move || {
         if let Err(error) = processors.confine() {
-            warn!("--cpu: the core is not pinned: {error}");
+            warn!("--cpu: the core is not bound to its processor: {error}: it runs on any; choose another processor");
         }
         let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };
         let prepare = Arc::new(move || {
@@ -164,7 +166,7 @@ pub fn run(
             teller,
         })
         .run()
-    })?;
+    }))?;
 
     info!("serving on {} ({})", options.symlink.display(), pty.device().display());
     let mut link = Link::new(Parts {
@@ -193,7 +195,8 @@ pub fn run(
     };
     let served = watched.and_then(|()| {
         ready();
-        link.run().inspect_err(|error| error!("the pty failed: {error}"))
+        link.run()
+            .inspect_err(|error| error!("the terminal failed: {error}: Pinion ends; look at the kernel's log (dmesg)"))
     });
     link.stopping();
     link.request(Request::Quit);
@@ -215,6 +218,15 @@ pub fn run(
     vigil.end();
     match served? {
         End::Asked => Ok(()),
-        End::GuardianLost => Err(io::Error::other("the guardian is gone")),
+        End::GuardianLost => {
+            Err(io::Error::other("the guardian is gone: Pinion ends; start it anew, as the service does by itself"))
+        }
     }
+}
+
+/// Says of a thread that can not be started what would permit one more.
+fn started<T>(thread: io::Result<T>) -> io::Result<T> {
+    thread.map_err(|error| {
+        io::Error::new(error.kind(), format!("no thread can be started: {error}: raise TasksMax or ulimit -u"))
+    })
 }

@@ -99,7 +99,7 @@ pub fn enter(role: Role) -> Scheduling {
     // Before Linux 6.13 a futex wait ends up to 50 us late (the default timer slack) even under
     // SCHED_FIFO, unless the slack is set.
     if let Err(error) = prctl::set_timerslack(1) {
-        warn!("timer slack: {error}");
+        warn!("the timer slack can not be set: {error}; steps may be late by 50 us, before Linux 6.13");
     }
     match sys::set_fifo(priority(role)) {
         Ok(()) => {

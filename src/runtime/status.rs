@@ -193,7 +193,7 @@ impl StatusSocket {
                     info!("status on {}", path.display());
                     let served = serve_on(listener, Server { asker, facts, host, begun: Instant::now() });
                     let started =
-                        served.inspect_err(|error| warn!("the status is not told: no thread can be started: {error}"));
+                        served.inspect_err(|error| warn!("pinion status will not be answered: no thread can be started: {error}: raise TasksMax or ulimit -u"));
                     return Some(StatusSocket { path: path.clone(), id, _thread: started.ok()? });
                 }
                 Err(error) => errors.push(format!("{}: {error}", path.display())),

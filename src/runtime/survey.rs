@@ -47,7 +47,9 @@ impl Surveyor {
                     dialects(&*view, &names)
                 });
                 let found = found.transpose().unwrap_or_else(|error| {
-                    error!("what the board has now can not be told to a host: {error}");
+                    error!(
+                        "what the board has now can not be told to a host: {error}: it gets the names of before; restart Pinion"
+                    );
                     None
                 });
                 let told = replies.send(found);

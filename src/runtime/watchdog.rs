@@ -128,7 +128,9 @@ impl Vigil {
                     "a transfer on {bus} takes more than {} s: the watchdogs are not fed; check the chip's wiring",
                     JOB_LIMIT.as_secs()
                 ),
-                None => error!("the core hangs: the watchdogs are not fed"),
+                None => error!(
+                    "the core hangs: the watchdogs are not fed; the guardian or the service manager ends Pinion, unless it gets on"
+                ),
             }
         }
     }

@@ -627,8 +627,8 @@ fn permission_text(path: &Path, who: &str, mode: u32, group: &str) -> String {
         )
     } else {
         format!(
-            "{who} may not open {path}, which is root's alone: give it to a group with a udev \
-             rule, or run Pinion as root"
+            "{who} may not open {path}, which is root's alone: \"sudo udevadm trigger\" or a reboot puts \
+             Pinion's udev rules in force, where they are installed; or run Pinion as root"
         )
     }
 }
