@@ -91,6 +91,9 @@ fn link(symlink: &Path) -> Finding {
         Ok(there) if !there.file_type().is_symlink() => {
             Finding::error("symlink", format!("{path} exists and is no symbolic link"), format!("sudo rm {path}"))
         }
+        Ok(_) if leads_to_ours(symlink) => {
+            Finding::ok("symlink", format!("{path} is the service's link, which root puts in place for it"))
+        }
         // Only its owner and the folder's may replace a file in a folder such as /tmp.
         Ok(there) if about_folder.mode() & 0o1000 != 0 && !is_one_of(&[there.uid(), about_folder.uid()]) => {
             Finding::error("symlink", format!("{path} is another user's link"), format!("sudo rm {path}"))
@@ -98,6 +101,14 @@ fn link(symlink: &Path) -> Finding {
         Ok(_) => Finding::ok("symlink", format!("{path} is a link, and will be replaced")),
         Err(_) => Finding::ok("symlink", format!("{path} can be made")),
     }
+}
+
+/// Whether a link leads into a folder of this user's, as the service has it: klippy could not follow this
+/// user's own link in /tmp (systemd/link).
+fn leads_to_ours(symlink: &Path) -> bool {
+    let target = fs::read_link(symlink).ok();
+    let folder = target.as_deref().and_then(Path::parent).and_then(|folder| fs::metadata(folder).ok());
+    folder.is_some_and(|folder| folder.uid() == geteuid().as_raw() && !geteuid().is_root())
 }
 
 fn is_one_of(owners: &[u32]) -> bool {

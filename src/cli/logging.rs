@@ -10,8 +10,10 @@
 
 use std::collections::VecDeque;
 use std::fmt;
+use std::fs::File;
 use std::io;
-use std::os::fd::AsFd;
+use std::os::fd::{AsFd, BorrowedFd};
+use std::os::unix::fs::MetadataExt;
 use std::sync::{Condvar, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::thread;
 use std::time::Duration;
@@ -112,7 +114,8 @@ impl Style {
 
 impl Stderr {
     fn style(&self) -> Style {
-        let for_journal = || std::env::var_os("JOURNAL_STREAM").is_some();
+        let for_journal =
+            || std::env::var("JOURNAL_STREAM").is_ok_and(|journal| is_same(&journal, io::stderr().as_fd()));
         *self.style.get_or_init(|| if for_journal() { Style::Journal } else { Style::Plain })
     }
 
@@ -141,6 +144,13 @@ impl Stderr {
             }
         }
     }
+}
+
+/// Whether a descriptor is of the file that is named by its device and inode, as `JOURNAL_STREAM` does it
+/// (systemd.exec(5)): whatever a service starts inherits the variable, though its stderr may be another.
+fn is_same(named: &str, descriptor: BorrowedFd<'_>) -> bool {
+    let file = descriptor.try_clone_to_owned().and_then(|descriptor| File::from(descriptor).metadata());
+    file.is_ok_and(|file| named == format!("{}:{}", file.dev(), file.ino()))
 }
 
 impl Log for Stderr {
@@ -230,6 +240,14 @@ mod tests {
         assert_eq!(kept, (0..LINES_MAX).map(|n| n.to_string()).collect::<Vec<_>>());
         assert!(told.ends_with("WARN  3 lines of the log were lost, as nobody read it\n"), "{told}");
         assert!(queue.is_done());
+    }
+
+    #[test]
+    fn only_a_stderr_that_is_the_journal_counts_as_it() {
+        let (stderr, other) = (tempfile::tempfile().unwrap(), tempfile::tempfile().unwrap());
+        let journal = stderr.metadata().unwrap();
+        let journal = format!("{}:{}", journal.dev(), journal.ino());
+        assert!(is_same(&journal, stderr.as_fd()) && !is_same(&journal, other.as_fd()) && !is_same("", stderr.as_fd()));
     }
 
     #[test]
