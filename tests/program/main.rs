@@ -9,6 +9,7 @@ mod dialects;
 mod doctor;
 mod life;
 mod one_order;
+mod pages;
 mod process;
 mod show;
 mod status;
