@@ -138,10 +138,14 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     // What the console ended with; none as long as it has not.
     let said = Arc::new(Mutex::new(None));
     let ready = {
-        let (args, said) = (args.clone(), said.clone());
+        let (args, said, signal) = (args.clone(), said.clone(), signal.clone());
         move || {
             let speaking = thread::Builder::new().name("console".into()).spawn(move || {
                 let done = speak(&args, &symlink);
+                // A machine that a signal ends is gone for the console, too: that is no error of the console's.
+                if signal.load(Ordering::Relaxed) != 0 {
+                    return;
+                }
                 *said.lock().unwrap_or_else(PoisonError::into_inner) = Some(done);
                 // SIGTERM to ourselves: the machine ends in order.
                 if let Err(error) = kill(getpid(), Signal::SIGTERM) {
@@ -247,9 +251,10 @@ fn converse(console: Console) -> Result<(), String> {
         // There is none at the first time.
         let _ = editor.load_history(path);
     }
+    // Where nothing can be drawn, as the output goes elsewhere or the terminal is too simple, lines come as they are.
+    let Ok(printer) = editor.create_external_printer() else { return script(console, io::stdin().lock()) };
     let greeting = console.greeting();
     print(&format!("{greeting}\n"))?;
-    let printer = editor.create_external_printer().map_err(about)?;
     let (lines, inbox) = mpsc::channel();
     let (outbox, answers) = mpsc::channel();
     let gone = Arc::new(AtomicBool::new(false));

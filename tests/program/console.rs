@@ -274,6 +274,22 @@ fn console_ended_by(signal: Signal) -> ExitStatus {
 }
 
 #[test]
+fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
+    let terminal = openpty(None, None).unwrap();
+    let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["console", "--board", "sim"])
+        .stdin(Stdio::from(terminal.slave))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    File::from(terminal.master.try_clone().unwrap()).write_all(b"get_uptime\nquit\n").unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    assert!(text(&output.stdout).contains("] uptime high="), "{output:?}");
+}
+
+#[test]
 fn what_the_machine_says_meanwhile_is_printed_at_once() {
     let state = tempfile::tempdir().unwrap();
     let mut person = Person::new(&["--board", "sim"], state.path());
