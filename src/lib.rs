@@ -13,8 +13,9 @@
 //!
 //! [`host`] is the other end of the wire: a small client for demonstrations and tests.
 
-// They panic when nobody reads; tests may.
+// Printing panics when nobody reads, these when something is not as was thought: tests may.
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+#![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
 
 // The fake board of the tests in tests/machine, which call this crate by its name.
 #[cfg(test)]

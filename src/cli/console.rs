@@ -5,9 +5,10 @@
 
 use std::fs;
 use std::io::{self, BufRead, BufReader, IsTerminal};
+use std::os::unix::fs::OpenOptionsExt;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
@@ -15,9 +16,10 @@ use std::time::Duration;
 
 use clap::Args;
 use log::LevelFilter;
+use nix::fcntl::OFlag;
 use nix::sys::signal::{Signal, kill};
-use nix::sys::termios::{SetArg, tcgetattr, tcsetattr};
-use nix::unistd::getpid;
+use nix::sys::termios::{SetArg, Termios, tcgetattr, tcsetattr};
+use nix::unistd::{getpid, write};
 use rustyline::completion::Completer;
 use rustyline::config::CompletionType;
 use rustyline::error::ReadlineError;
@@ -26,10 +28,13 @@ use rustyline::hint::Hinter;
 use rustyline::history::FileHistory;
 use rustyline::validate::Validator;
 use rustyline::{Config, Context, Editor, ExternalPrinter, Helper};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
+use signal_hook::iterator::Signals;
+use signal_hook::low_level::emulate_default_handler;
 
 use crate::board::sim::SimBoard;
-use crate::host::Client;
 use crate::host::console::{Console, Next, Vocabulary};
+use crate::host::{self, Client};
 use crate::klippy::process::{Search, find};
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Options};
@@ -63,7 +68,10 @@ pub(super) struct ConsoleArgs {
 /// Speaks to a machine until there are no more lines.
 pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
     let done = match &args.board {
-        None => free(&args.pty).and_then(|()| speak(args, &args.pty)),
+        None => {
+            let ready = free(&args.pty).and_then(|()| Terminal::remember().give_back_at(&[SIGHUP, SIGQUIT, SIGTERM]));
+            ready.and_then(|()| speak(args, &args.pty))
+        }
         Some(BoardName::Sim(file)) => simulate(args, file.as_deref()),
         Some(BoardName::Linux) => Err("--board is sim or sim:FILE.toml here; for this machine's pins start pinion run, and name its link to pinion console".into()),
     };
@@ -74,6 +82,11 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
 fn free(pty: &Path) -> Result<(), String> {
     let device = fs::canonicalize(pty)
         .map_err(|error| format!("{}: {error}: is Pinion running, and with this link?", pty.display()))?;
+    // Anything else many a process may have open. One that may not be opened is told of later.
+    let flags = (OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits();
+    if fs::OpenOptions::new().read(true).custom_flags(flags).open(&device).is_ok_and(|file| !file.is_terminal()) {
+        return Err(host::Error::NoTerminal { port: pty.display().to_string() }.to_string());
+    }
     let name = |processes: &[crate::klippy::process::Process]| {
         let names = processes.iter().map(|process| {
             let command: Vec<String> = process.arguments.iter().map(|word| word.display().to_string()).collect();
@@ -97,7 +110,14 @@ fn free(pty: &Path) -> Result<(), String> {
 
 /// Runs a simulated machine, and speaks to it.
 fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
-    let terminal = tcgetattr(io::stdin()).ok();
+    let terminal = Terminal::remember();
+    // The others end the machine in order, which then tells which it was.
+    terminal.clone().give_back_at(&[SIGQUIT])?;
+    let signal = Arc::new(AtomicUsize::new(0));
+    for ending in [SIGHUP, SIGINT, SIGTERM] {
+        signal_hook::flag::register_usize(ending, signal.clone(), ending.unsigned_abs() as usize)
+            .map_err(|error| format!("signals can not be taken in: {error}"))?;
+    }
     // The lines that tell of each event are those of a service.
     log::set_max_level(log::max_level().min(LevelFilter::Warn));
     logging::detach();
@@ -115,12 +135,18 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
         watchdog: None,
         sockets: Vec::new(),
     };
-    let said = Arc::new(Mutex::new(Ok(())));
+    // What the console ended with; none as long as it has not.
+    let said = Arc::new(Mutex::new(None));
     let ready = {
-        let (args, said) = (args.clone(), said.clone());
+        let (args, said, signal) = (args.clone(), said.clone(), signal.clone());
         move || {
             let speaking = thread::Builder::new().name("console".into()).spawn(move || {
-                *said.lock().unwrap_or_else(PoisonError::into_inner) = speak(&args, &symlink);
+                let done = speak(&args, &symlink);
+                // A machine that a signal ends is gone for the console, too: that is no error of the console's.
+                if signal.load(Ordering::Relaxed) != 0 {
+                    return;
+                }
+                *said.lock().unwrap_or_else(PoisonError::into_inner) = Some(done);
                 // SIGTERM to ourselves: the machine ends in order.
                 if let Err(error) = kill(getpid(), Signal::SIGTERM) {
                     log::error!("ending: {error}");
@@ -132,12 +158,49 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
         }
     };
     let ended = runtime::run(&options, Box::new(board), clock, None, ready);
-    if let Some(terminal) = terminal {
-        // A signal may have ended the machine amid a line.
-        let _ = tcsetattr(io::stdin(), SetArg::TCSANOW, &terminal);
-    }
+    terminal.give_back();
     ended.map_err(|error| error.to_string())?;
-    std::mem::replace(&mut *said.lock().unwrap_or_else(PoisonError::into_inner), Ok(()))
+    let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();
+    said.unwrap_or_else(|| {
+        logging::finish();
+        let signal = signal.load(Ordering::Relaxed).try_into().unwrap_or_default();
+        Err(format!("a signal ended it, which can not be passed on: {:?}", emulate_default_handler(signal)))
+    })
+}
+
+/// The terminal as it was before a line editor came, which has it otherwise while somebody writes a line.
+#[derive(Clone)]
+struct Terminal(Option<Termios>);
+
+impl Terminal {
+    fn remember() -> Terminal {
+        Terminal(tcgetattr(io::stdin()).ok())
+    }
+
+    fn give_back(&self) {
+        let (Some(before), Ok(now)) = (&self.0, tcgetattr(io::stdin())) else { return };
+        if now.local_flags != before.local_flags {
+            let _ = tcsetattr(io::stdin(), SetArg::TCSANOW, before);
+            // The editor has asked the terminal to mark what is pasted.
+            let _ = write(io::stdout(), b"\x1b[?2004l\r\n");
+        }
+    }
+
+    /// Has these signals end the program as they do by themselves, with the terminal given back first.
+    fn give_back_at(self, signals: &[i32]) -> Result<(), String> {
+        if self.0.is_none() {
+            return Ok(());
+        }
+        let mut signals = Signals::new(signals).map_err(|error| format!("signals can not be taken in: {error}"))?;
+        let wait = move || {
+            for signal in signals.forever() {
+                self.give_back();
+                let _ = emulate_default_handler(signal);
+            }
+        };
+        let waiting = thread::Builder::new().name("signals".into()).spawn(wait);
+        waiting.map(drop).map_err(|error| format!("no thread can be started: {error}"))
+    }
 }
 
 /// Speaks to the machine of a terminal: the lines of a file, of a pipe, or of a person.
@@ -147,7 +210,8 @@ fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
     match &args.file {
         Some(path) => {
             let about = |error| format!("{}: {error}", path.display());
-            let file = fs::File::open(path).map_err(|error| about(error.to_string()))?;
+            let file = fs::File::open(path)
+                .map_err(|error| about(format!("{error}: name a file with commands, or leave out -f")))?;
             script(console, BufReader::new(file)).map_err(about)
         }
         None if !io::stdin().is_terminal() => script(console, io::stdin().lock()),
@@ -187,9 +251,10 @@ fn converse(console: Console) -> Result<(), String> {
         // There is none at the first time.
         let _ = editor.load_history(path);
     }
+    // Where nothing can be drawn, as the output goes elsewhere or the terminal is too simple, lines come as they are.
+    let Ok(printer) = editor.create_external_printer() else { return script(console, io::stdin().lock()) };
     let greeting = console.greeting();
     print(&format!("{greeting}\n"))?;
-    let printer = editor.create_external_printer().map_err(about)?;
     let (lines, inbox) = mpsc::channel();
     let (outbox, answers) = mpsc::channel();
     let gone = Arc::new(AtomicBool::new(false));

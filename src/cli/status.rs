@@ -15,9 +15,10 @@ use std::time::{Duration, Instant};
 
 use clap::Args;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use nix::sys::termios::{LocalFlags, SetArg, Termios, tcgetattr, tcsetattr};
+use nix::sys::signal::{Signal, raise};
+use nix::sys::termios::{LocalFlags, SetArg, SpecialCharacterIndices, Termios, tcgetattr, tcsetattr};
 use serde_json::Value;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM};
+use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
 
 use crate::runtime::socket_paths;
 use crate::runtime::status::connect;
@@ -383,7 +384,7 @@ impl Metrics {
 /// Prints the status each second, until it is asked to end.
 fn watch(args: &StatusArgs) -> Result<(), String> {
     let ended = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGTERM, SIGHUP] {
+    for signal in [SIGINT, SIGQUIT, SIGTERM, SIGHUP] {
         signal_hook::flag::register(signal, ended.clone())
             .map_err(|error| format!("signals can not be taken in: {error}"))?;
     }
@@ -408,16 +409,34 @@ fn watch(args: &StatusArgs) -> Result<(), String> {
         }
         let next = Instant::now() + PERIOD;
         while Instant::now() < next {
-            if ended.load(Ordering::Relaxed)
-                || screen.as_ref().is_some_and(|screen| screen.is_told_to_end(stdin.as_fd()))
-            {
+            let wish = match &screen {
+                Some(screen) => screen.wish(stdin.as_fd()),
+                None => {
+                    thread::sleep(Duration::from_millis(20));
+                    None
+                }
+            };
+            if ended.load(Ordering::Relaxed) || wish == Some(Wish::End) {
                 return Ok(());
             }
-            if screen.is_none() {
-                thread::sleep(Duration::from_millis(20));
+            if wish == Some(Wish::Stop) {
+                drop(screen.take());
+                // Where nobody could have it go on again, the kernel does not stop it.
+                let _ = raise(Signal::SIGTSTP);
+                screen = Some(Screen::enter(stdin.as_fd()));
+                break;
             }
         }
     }
+}
+
+/// What a key asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Wish {
+    /// To end.
+    End,
+    /// To stop until the shell has it go on.
+    Stop,
 }
 
 /// A terminal that is drawn on in place: its alternate screen, without a cursor, long
@@ -432,7 +451,8 @@ impl Screen {
         let before = tcgetattr(keys).ok();
         if let Some(before) = &before {
             let mut keyed = before.clone();
-            keyed.local_flags.remove(LocalFlags::ICANON | LocalFlags::ECHO);
+            // Those that make signals are keys, too: the kernel's would leave the terminal as it is here.
+            keyed.local_flags.remove(LocalFlags::ICANON | LocalFlags::ECHO | LocalFlags::ISIG);
             let _ = tcsetattr(keys, SetArg::TCSANOW, &keyed);
         }
         let _ = print("\x1b[?1049h\x1b[?25l\x1b[?7l");
@@ -454,22 +474,29 @@ impl Screen {
         print(&(drawn + if self.before.is_some() { "q ends" } else { "Ctrl-C ends" }))
     }
 
-    /// Whether somebody has pressed q; waits a little for that.
-    fn is_told_to_end(&self, keys: BorrowedFd<'_>) -> bool {
-        if self.before.is_none() {
+    /// What somebody has pressed a key for; waits a little for that.
+    fn wish(&self, keys: BorrowedFd<'_>) -> Option<Wish> {
+        let Some(before) = &self.before else {
             thread::sleep(Duration::from_millis(20));
-            return false;
-        }
+            return None;
+        };
         let mut fds = [PollFd::new(keys, PollFlags::POLLIN)];
         if !matches!(poll(&mut fds, 50u16), Ok(1)) {
-            return false;
+            return None;
         }
-        let mut key = [0; 64];
-        match nix::unistd::read(keys, &mut key) {
-            Ok(0) => true,
-            Ok(read) => key[..read].iter().any(|key| matches!(key, b'q' | b'Q')),
+        let mut pressed = [0; 64];
+        match nix::unistd::read(keys, &mut pressed) {
+            Ok(read @ 1..) => pressed[..read].iter().find_map(|key| {
+                let is = |special: SpecialCharacterIndices| before.control_chars[special as usize] == *key;
+                match key {
+                    b'q' | b'Q' => Some(Wish::End),
+                    _ if is(SpecialCharacterIndices::VINTR) || is(SpecialCharacterIndices::VQUIT) => Some(Wish::End),
+                    _ => is(SpecialCharacterIndices::VSUSP).then_some(Wish::Stop),
+                }
+            }),
+            Err(nix::errno::Errno::EINTR) => None,
             // Without a terminal any more there is nobody to show anything.
-            Err(error) => error != nix::errno::Errno::EINTR,
+            Ok(_) | Err(_) => Some(Wish::End),
         }
     }
 }

@@ -48,6 +48,11 @@ pub enum Error {
         /// The kernel's answer.
         source: io::Error,
     },
+    /// The path leads to something else, to which nothing was written.
+    NoTerminal {
+        /// The path.
+        port: String,
+    },
     /// The other end closed the connection.
     Closed {
         /// The tty's name.
@@ -91,6 +96,9 @@ impl fmt::Display for Error {
         match self {
             Error::Io { doing, port, source } => {
                 write!(f, "cannot {doing} {port}: {source}; is the MCU program running, and may you open it?")
+            }
+            Error::NoTerminal { port } => {
+                write!(f, "{port} is no terminal: name the link of a Pinion that runs, such as /tmp/klipper_host_mcu")
             }
             Error::Closed { port } => {
                 write!(f, "{port} was closed by the other end; look at its log")

@@ -10,7 +10,7 @@
 
 use std::collections::VecDeque;
 use std::fs::{File, OpenOptions};
-use std::io::{self, Read, Write};
+use std::io::{self, IsTerminal, Read, Write};
 use std::os::fd::{AsFd, OwnedFd};
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
@@ -59,6 +59,10 @@ impl Port {
             .custom_flags((OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits())
             .open(path)
             .map_err(|source| Error::Io { doing: "open", port: name.clone(), source })?;
+        // What is written to a file would stay in it.
+        if !file.is_terminal() {
+            return Err(Error::NoTerminal { port: name });
+        }
         Port::new(file, name)
     }
 

@@ -104,16 +104,26 @@ impl Process {
         klippy(&self.arguments).is_some()
     }
 
-    /// klippy's folder as this program can reach it, should the process be klippy: through the
-    /// process's own root (a container's), or, where that is not permitted, as if both had the same.
+    /// klippy's folder as this program can reach it, should the process be klippy.
     pub fn klippy_folder(&self, proc: &Path) -> Option<PathBuf> {
+        self.reach(proc, klippy(&self.arguments)?)
+    }
+
+    /// The configuration that klippy has, as this program can reach it, should the process be klippy.
+    pub fn klippy_config(&self, proc: &Path) -> Option<PathBuf> {
+        self.reach(proc, klippy_config(&self.arguments)?)
+    }
+
+    /// A path of the process as this program can reach it: through the process's own root (a container's), or,
+    /// where that is not permitted, as if both had the same.
+    fn reach(&self, proc: &Path, path: &Path) -> Option<PathBuf> {
         let folder = proc.join(self.pid.to_string());
-        let mut klippy = klippy(&self.arguments)?.to_owned();
-        if klippy.is_relative() {
-            klippy = fs::read_link(folder.join("cwd")).ok()?.join(klippy);
+        let mut path = path.to_owned();
+        if path.is_relative() {
+            path = fs::read_link(folder.join("cwd")).ok()?.join(path);
         }
-        let through_root = inside(&folder.join("root"), &klippy);
-        Some(if through_root.exists() { through_root } else { klippy })
+        let through_root = inside(&folder.join("root"), &path);
+        Some(if through_root.exists() { through_root } else { path })
     }
 }
 
@@ -124,16 +134,54 @@ fn arguments(proc: &Path, pid: u32) -> Vec<PathBuf> {
     arguments.map(|argument| PathBuf::from(OsStr::from_bytes(argument))).collect()
 }
 
-/// klippy's folder, if a command line is klippy's: that of `klippy.py`, or what `-m klippy` names.
-fn klippy(arguments: &[PathBuf]) -> Option<&Path> {
-    let script = arguments.iter().find(|argument| argument.file_name().is_some_and(|name| name == "klippy.py"));
+/// Where in a command line klippy stands, if it is klippy's, and klippy's folder: that of `klippy.py`, or what
+/// `-m klippy` names.
+fn program(arguments: &[PathBuf]) -> Option<(usize, &Path)> {
+    let is_script = |argument: &PathBuf| argument.file_name().is_some_and(|name| name == "klippy.py");
     let is_module = |pair: &[PathBuf]| {
         pair[0].as_os_str() == "-m" && (pair[1].as_os_str() == "klippy" || pair[1].as_os_str() == "klippy.klippy")
     };
-    match script {
-        Some(script) => script.parent(),
-        None => arguments.windows(2).any(is_module).then_some(Path::new("klippy")),
+    match arguments.iter().position(is_script) {
+        Some(at) => Some((at, arguments[at].parent()?)),
+        None => Some((arguments.windows(2).position(is_module)? + 1, Path::new("klippy"))),
     }
+}
+
+/// klippy's folder, if a command line is klippy's.
+pub fn klippy(arguments: &[PathBuf]) -> Option<&Path> {
+    program(arguments).map(|(_, folder)| folder)
+}
+
+/// The configuration that a command line of klippy's names.
+pub fn klippy_config(arguments: &[PathBuf]) -> Option<&Path> {
+    // Those of klippy/klippy.py, and of Kalico's klippy/printer.py, which take a value.
+    const WITH_VALUE: [&str; 15] = [
+        "-i",
+        "--debuginput",
+        "-I",
+        "--input-tty",
+        "-a",
+        "--api-server",
+        "--api-server-user",
+        "--api-server-group",
+        "--api-server-file-mode",
+        "-l",
+        "--logfile",
+        "-o",
+        "--debugoutput",
+        "-d",
+        "--dictionary",
+    ];
+    let (at, _) = program(arguments)?;
+    let mut words = arguments[at + 1..].iter();
+    while let Some(word) = words.next() {
+        if WITH_VALUE.iter().any(|option| word.as_os_str() == *option) {
+            words.next();
+        } else if !word.as_os_str().as_bytes().starts_with(b"-") {
+            return Some(word);
+        }
+    }
+    None
 }
 
 /// As many links as the kernel follows in a path.
@@ -309,6 +357,23 @@ mod tests {
         assert_eq!(folder("python3 -m klippy p.cfg"), Some("klippy".into()));
         assert_eq!(folder("python3 -m klippy.klippy p.cfg"), Some("klippy".into()));
         assert_eq!(folder("python3 -m http.server klippy"), None);
+    }
+
+    #[test]
+    fn the_configuration_is_what_is_no_option_of_klippy_s() {
+        let config = |line: &str| {
+            let arguments: Vec<PathBuf> = line.split(' ').map(PathBuf::from).collect();
+            klippy_config(&arguments).map(Path::to_owned)
+        };
+        for line in [
+            "python3 /a/klippy/klippy.py /b/p.cfg -I /c/klippy.serial -l /c/klippy.log -a /c/klippy.sock",
+            "python3 /a/klippy/klippy.py -v -l /c/klippy.log --api-server=/c/klippy.sock /b/p.cfg",
+            "python3 -m klippy --api-server-group klipper /b/p.cfg",
+        ] {
+            assert_eq!(config(line), Some("/b/p.cfg".into()), "{line}");
+        }
+        assert_eq!(config("python3 /a/klippy/klippy.py -l /c/klippy.log"), None);
+        assert_eq!(config("python3 /b/p.cfg"), None);
     }
 
     #[test]

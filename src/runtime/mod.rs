@@ -53,7 +53,7 @@ use pty::Pty;
 use pulse::Pulse;
 use realtime::{Processors, Role, Scheduling};
 use signals::Signals;
-use status::{Fixed, HostBoard, StatusSocket};
+use status::{Facts, HostBoard, StatusSocket};
 use survey::Surveyor;
 use wakeup::{MarginLimits, Waiter};
 use watchdog::{Vigil, Watchdog};
@@ -120,15 +120,16 @@ pub fn run(
         );
     }
     let (teller, asker) = status::ends();
-    let fixed = Fixed {
+    let facts = Facts {
         link: options.symlink.clone(),
         device: pty.device().to_owned(),
         board: board.describe(),
         pins: board.pins(),
+        view: board.view(),
         guardian: guardian.as_ref().map(Guardian::pid),
         requests: REQUESTS,
     };
-    let _status = StatusSocket::start(&options.sockets, fixed, host.clone(), asker);
+    let _status = StatusSocket::start(&options.sockets, facts, host.clone(), asker);
     let surveyor = board.view().map(|view| started(Surveyor::start(view, names, wake.clone()))).transpose()?;
     let progress = Arc::new(Progress::default());
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());

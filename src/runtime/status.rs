@@ -26,7 +26,7 @@ use nix::sys::socket::{AddressFamily, SockFlag, SockType, UnixAddr, socket};
 use rtrb::{Consumer, Producer, RingBuffer};
 use serde_json::{Value, json};
 
-use crate::board::{ADC_MAX, PWM_MAX, Pin, Range};
+use crate::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
 use crate::lateness::{Lateness, us};
 use crate::mcu::{BusCounts, LineUse, Mcu, Present, Snapshot};
 use crate::time::{NS_PER_TICK, Ticks};
@@ -162,12 +162,16 @@ impl HostBoard {
     }
 }
 
-/// What does not change as long as the program runs.
-pub(super) struct Fixed {
+/// What is told besides what the core and the host say.
+pub(super) struct Facts {
     pub(super) link: PathBuf,
     pub(super) device: PathBuf,
+    /// What the board is.
     pub(super) board: String,
+    /// What its pins are called.
     pub(super) pins: Vec<Range>,
+    /// Where both are to be asked for anew, as chips come and go; none if nothing does.
+    pub(super) view: Option<Box<dyn Board>>,
     /// The guardian's process.
     pub(super) guardian: Option<u32>,
     /// How many requests to the core there is room for.
@@ -185,7 +189,7 @@ pub(super) struct StatusSocket {
 impl StatusSocket {
     /// Opens the socket of the first of these paths where that can be done, and serves it. Who may open the
     /// terminal may ask: the socket gets its group. A path where another instance answers is not taken over.
-    pub(super) fn start(paths: &[PathBuf], facts: Fixed, host: Arc<HostBoard>, asker: Asker) -> Option<StatusSocket> {
+    pub(super) fn start(paths: &[PathBuf], facts: Facts, host: Arc<HostBoard>, asker: Asker) -> Option<StatusSocket> {
         let mut errors = Vec::new();
         for path in paths {
             match open(path, &facts.device) {
@@ -285,7 +289,7 @@ fn serve_on(listener: UnixListener, mut server: Server) -> io::Result<PipeWriter
 
 struct Server {
     asker: Asker,
-    facts: Fixed,
+    facts: Facts,
     host: Arc<HostBoard>,
     begun: Instant,
 }
@@ -314,7 +318,10 @@ impl Server {
     /// All that there is to tell.
     fn document(&mut self) -> Value {
         let answer = self.asker.ask();
-        let facts = &self.facts;
+        let facts = &mut self.facts;
+        if let Some(view) = &facts.view {
+            (facts.board, facts.pins) = (view.describe(), view.pins());
+        }
         let mut document = json!({
             "form": FORM,
             "version": env!("CARGO_PKG_VERSION"),
@@ -355,7 +362,7 @@ fn pin_name(pins: &[Range], pin: Pin) -> String {
 }
 
 /// Adds what the core said.
-fn machine(answer: &Answer, facts: &Fixed, document: &mut serde_json::Map<String, Value>) {
+fn machine(answer: &Answer, facts: &Facts, document: &mut serde_json::Map<String, Value>) {
     let machine = &answer.machine;
     let seconds = |ticks: i64| rounded(ticks as f64 * NS_PER_TICK as f64 / 1e9);
     let state = match (machine.stopped, machine.is_configured, machine.oids_allocated) {
@@ -442,12 +449,13 @@ mod tests {
     use super::*;
     use std::io::Read;
 
-    fn facts(device: &Path) -> Fixed {
-        Fixed {
+    fn facts(device: &Path) -> Facts {
+        Facts {
             link: "/tmp/klipper_host_mcu".into(),
             device: device.to_owned(),
             board: "a board".into(),
             pins: Vec::new(),
+            view: None,
             guardian: None,
             requests: 256,
         }

@@ -3,14 +3,17 @@
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
+use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
-use std::process::{Command, Output, Stdio};
+use std::process::{Command, ExitStatus, Output, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::pty::{Winsize, openpty};
+use nix::sys::signal::{Signal, kill};
 use nix::sys::termios::{LocalFlags, tcgetattr};
+use nix::unistd::Pid;
 use pinion::host::config::Config;
 
 use crate::process::{PATIENCE, Pinion, folder_with};
@@ -122,6 +125,18 @@ fn a_running_machine_is_spoken_to_and_one_with_a_host_is_not() {
     assert!(text(&missing.stderr).contains("is Pinion running"), "{missing:?}");
 }
 
+#[test]
+fn what_is_no_terminal_is_left_as_it_is() {
+    let (_folder, file) = folder_with("passwd", "root:x:0:0:root:/root:/bin/bash\n");
+    for path in [file.to_str().unwrap(), "/dev/null"] {
+        let refused = console(&[path], "get_config\n");
+        let log = text(&refused.stderr);
+        assert!(log.contains(&format!("{path} is no terminal")), "{log}");
+        assert_eq!(refused.status.code(), Some(1));
+    }
+    assert_eq!(fs::read_to_string(&file).unwrap(), "root:x:0:0:root:/root:/bin/bash\n");
+}
+
 /// A console at a terminal.
 struct Person {
     master: File,
@@ -212,6 +227,66 @@ fn at_a_terminal_tab_completes_and_lines_are_remembered() {
         // The second time goes up beyond "quit" and "helo".
         fs::write(state.path().join("pinion/console_history"), "#V2\nget_uptime\nhelo\n").unwrap();
     }
+}
+
+#[test]
+fn a_signal_ends_it_and_the_terminal_is_as_it_was() {
+    let pinion = Pinion::simulated(&[]);
+    let link = pinion.link();
+    let state = tempfile::tempdir().unwrap();
+    for args in [&[link.to_str().unwrap()] as &[&str], &["--board", "sim"]] {
+        for signal in [Signal::SIGTERM, Signal::SIGHUP, Signal::SIGQUIT] {
+            let mut person = Person::new(args, state.path());
+            let before = tcgetattr(&person.slave).unwrap();
+            person.until("help tells of them");
+            // The line editor has the terminal, and somebody has begun a line.
+            person.until("> ");
+            person.types("get_upt");
+            person.until("get_upt");
+            assert_ne!(tcgetattr(&person.slave).unwrap(), before);
+            kill(Pid::from_raw(person.child.id() as i32), signal).unwrap();
+            let status = person.child.wait().unwrap();
+            assert_eq!(status.signal(), Some(signal as i32), "{args:?} {signal}: {status}");
+            assert_eq!(tcgetattr(&person.slave).unwrap(), before, "{args:?} {signal}");
+            // Pastes are no longer marked.
+            person.until("\x1b[?2004l");
+        }
+    }
+    // A script ends by it, too.
+    let script = console_ended_by(Signal::SIGTERM);
+    assert_eq!(script.signal(), Some(Signal::SIGTERM as i32), "{script}");
+}
+
+/// How a console ends that is sent a signal amid a script.
+fn console_ended_by(signal: Signal) -> ExitStatus {
+    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["console", "--board", "sim"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    child.stdin.as_mut().unwrap().write_all(b"get_uptime\n").unwrap();
+    let mut said = [0; 4];
+    child.stdout.as_mut().unwrap().read_exact(&mut said).unwrap();
+    kill(Pid::from_raw(child.id() as i32), signal).unwrap();
+    child.wait().unwrap()
+}
+
+#[test]
+fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
+    let terminal = openpty(None, None).unwrap();
+    let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["console", "--board", "sim"])
+        .stdin(Stdio::from(terminal.slave))
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    File::from(terminal.master.try_clone().unwrap()).write_all(b"get_uptime\nquit\n").unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    assert!(text(&output.stdout).contains("] uptime high="), "{output:?}");
 }
 
 #[test]

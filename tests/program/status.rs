@@ -207,6 +207,28 @@ fn watching_goes_on_until_q_and_gives_the_terminal_back() {
 }
 
 #[test]
+fn keys_that_the_kernel_makes_signals_of_leave_no_terminal_behind() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.until("the socket", || exists(&socket(&pinion)));
+    // Ctrl-C, and Ctrl-\\, of which a program dies by itself.
+    for key in [b"\x03", b"\x1c"] {
+        let terminal = openpty(None, None).unwrap();
+        let before = tcgetattr(&terminal.slave).unwrap();
+        let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
+        let mut watch = watch(&pinion, dup(), dup());
+        let mut master = File::from(terminal.master);
+        let (mut shown, mut piece) = (String::new(), [0; 4096]);
+        while !shown.contains("q ends") {
+            let read = master.read(&mut piece).unwrap();
+            shown += &String::from_utf8_lossy(&piece[..read]);
+        }
+        master.write_all(key).unwrap();
+        assert!(watch.wait().unwrap().success());
+        assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
+    }
+}
+
+#[test]
 fn watching_into_a_pipe_is_a_page_each_second() {
     let pinion = Pinion::simulated(&[]);
     pinion.until("the socket", || exists(&socket(&pinion)));

@@ -13,8 +13,8 @@ use std::time::{Duration, Instant};
 
 use crate::board::linux::gpio::Chip;
 use crate::cli::finding::Finding;
-use crate::cli::run::Settings;
 
+use super::instance::Instance;
 use super::machine::{Access, Machine, Who};
 
 /// A kind of devices.
@@ -97,10 +97,16 @@ fn inside(folder: &Path, beginning: &str) -> Vec<PathBuf> {
 }
 
 /// Whether `user` may open what is there.
-pub(super) fn permissions(machine: &Machine, settings: &Settings, user: &Who) -> Vec<Finding> {
-    let mut findings: Vec<Finding> =
-        CLASSES.iter().filter_map(|class| permission(machine, user, class, &(class.nodes)(machine))).collect();
-    if settings.watchdog {
+pub(super) fn permissions(machine: &Machine, instances: &[Instance], user: &Who) -> Vec<Finding> {
+    let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
+    let anew = match (user.name.as_str(), &units[..]) {
+        ("pinion", []) => "start Pinion anew".to_owned(),
+        ("pinion", units) => format!("sudo systemctl restart {}", units.join(" ")),
+        _ => "log in anew".to_owned(),
+    };
+    let permission = |class: &Class| permission(machine, user, &anew, class, &(class.nodes)(machine));
+    let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
+    if instances.iter().any(|instance| instance.settings.watchdog) {
         const WATCHDOG: Class = Class {
             check: "watchdog",
             name: "watchdog",
@@ -109,13 +115,13 @@ pub(super) fn permissions(machine: &Machine, settings: &Settings, user: &Who) ->
             enabled_by: None,
             nodes: |machine| vec![machine.path("/dev/watchdog")],
         };
-        findings.extend(permission(machine, user, &WATCHDOG, &(WATCHDOG.nodes)(machine)));
+        findings.extend(permission(&WATCHDOG));
     }
     findings
 }
 
-/// None where there is nothing to open.
-fn permission(machine: &Machine, user: &Who, class: &Class, nodes: &[PathBuf]) -> Option<Finding> {
+/// None where there is nothing to open. `anew` is what has the user's groups read again.
+fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &[PathBuf]) -> Option<Finding> {
     // One that vanishes meanwhile is none.
     let nodes: Vec<_> = nodes.iter().filter_map(|node| Some((node, fs::metadata(node).ok()?))).collect();
     let refused: Vec<_> = nodes.iter().filter(|(_, about)| !user.may(class.access, about)).collect();
@@ -133,7 +139,6 @@ fn permission(machine: &Machine, user: &Who, class: &Class, nodes: &[PathBuf]) -
         nodes.len()
     );
     let group = machine.group_name(std::os::unix::fs::MetadataExt::gid(about));
-    let anew = if who == "pinion" { "sudo systemctl restart pinion-mcu" } else { "log in anew" };
     let remedy = if class.access.is_given_to_group(about) && group != "root" && group != "0" {
         format!("sudo usermod -aG {group} {who}, then {anew}")
     } else if rules_are_there(machine) {
@@ -316,15 +321,15 @@ fn output(command: &mut Command) -> Option<String> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::instance::instances;
     use super::super::tests::{Tree, told};
     use super::*;
     use crate::board::linux::gpio::LineInfo;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
-    use crate::cli::run::Given;
     use std::os::unix::fs::MetadataExt;
 
-    fn watched() -> Settings {
-        Given { watchdog: Some(true), ..Given::default() }.settings()
+    fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
+        permissions(&tree.machine(), &instances(&tree.machine()).0, user)
     }
 
     /// Somebody who is neither root nor the one who runs the tests.
@@ -348,10 +353,11 @@ mod tests {
         NODES.iter().for_each(|(_, path)| tree.put_mode(path, "", 0o660));
         let gid = fs::metadata(tree.machine().path("/dev/gpiochip0")).unwrap().gid();
         tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
-        let findings = permissions(&tree.machine(), &watched(), &stranger(vec![gid]));
+        tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
+        let findings = permitted(&tree, &stranger(vec![gid]));
         assert_eq!(findings.len(), NODES.len());
         NODES.iter().for_each(|(check, _)| drop(told(&findings, check, Fine, "pinion may open /")));
-        let findings = permissions(&tree.machine(), &watched(), &stranger(vec![gid + 1]));
+        let findings = permitted(&tree, &stranger(vec![gid + 1]));
         for (check, path) in NODES {
             let remedy = told(&findings, check, Error, &format!("pinion may not open /{path}, which is "));
             assert_eq!(remedy, "sudo usermod -aG gpio pinion, then sudo systemctl restart pinion-mcu");
@@ -362,7 +368,7 @@ mod tests {
     fn devices_that_are_root_s_alone_want_the_rules() {
         let tree = Tree::new();
         tree.put_mode("dev/spidev0.0", "", 0o600);
-        let find = || permissions(&tree.machine(), &Given::default().settings(), &stranger(vec![]));
+        let find = || permitted(&tree, &stranger(vec![]));
         assert!(told(&find(), "spi", Error, "0600 (1 of 1 refused)").contains("apt install --reinstall"));
         tree.put("usr/lib/udev/rules.d/60-pinion-mcu.rules", "");
         assert!(told(&find(), "spi", Error, "may not open").ends_with("--subsystem-match=spidev"));

@@ -4,64 +4,92 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use crate::cli::finding::Finding;
-use crate::cli::run::Settings;
 use crate::feature::FEATURES;
 use crate::klippy::Checkout;
+use crate::klippy::process::{self, Process};
 use crate::mcu::DialectName;
 
-use super::machine::{Access, Machine, Running, Who};
-use super::service::UNIT_FOLDERS;
-
-/// klippy takes a path for a pseudo terminal's only if it begins so (klippy/serialhdl.py).
-const HOST_PATHS: &str = "/tmp/klipper_host_";
-/// Where the service has its link for klippy, whatever it tells the program.
-const HOST_PATH: &str = "/tmp/klipper_host_mcu";
+use super::instance::{HOST_PATHS, Instance};
+use super::machine::{Access, Machine, Who};
+use super::printer;
+use super::units::{self, setting};
 
 /// A klippy, running or set up.
 pub(super) struct Klippy {
     who: Who,
     /// klippy's folder, that of klippy.py.
     folder: Option<PathBuf>,
+    /// The terminals that its configuration names; none if that can not be read.
+    opens: Option<BTreeSet<PathBuf>>,
     /// How it was found.
     found_by: String,
+    /// The unit that starts it, without `.service`.
+    unit: Option<String>,
     /// It has the groups of the time when it was started.
     is_running: bool,
 }
 
-/// Finds klippy by its process, or by its unit.
-pub(super) fn klippy(machine: &Machine) -> Option<Klippy> {
-    let process = machine.processes().into_iter().find(|process| process.is_klippy());
-    if let Some(process) = process
-        && let Some(who) = machine.user_of(process.pid)
-    {
-        return Some(Klippy {
-            who,
-            folder: process.klippy_folder(&machine.path("/proc")).map(|folder| reachable(machine, folder)),
-            found_by: format!("process {}", process.pid),
-            is_running: true,
-        });
+impl Klippy {
+    /// Whether it opens this link, as far as is known.
+    fn opens(&self, link: &Path) -> bool {
+        self.opens.as_ref().is_none_or(|opens| opens.contains(link))
     }
-    UNIT_FOLDERS.iter().find_map(|folder| {
-        machine
-            .names(folder)
-            .into_iter()
-            .filter(|name| name.starts_with("klipper") && name.ends_with(".service"))
-            .find_map(|name| {
-                let unit = machine.text(format!("{folder}/{name}"))?;
-                let folder = program_folder(machine, &unit)?;
-                let user = value(&unit, "User").unwrap_or("root");
-                let who = machine.user(user).unwrap_or_else(|| match user {
-                    "root" => Who { name: "root".into(), uid: 0, gids: vec![0] },
-                    // Somebody of whom nothing is known.
-                    _ => Who { name: user.to_owned(), uid: u32::MAX, gids: vec![] },
-                });
-                Some(Klippy { who, folder: Some(machine.path(folder)), found_by: name, is_running: false })
-            })
+
+    fn restart(&self) -> String {
+        format!("sudo systemctl restart {}", self.unit.as_deref().unwrap_or("klipper"))
+    }
+}
+
+/// Each klippy: those that run, and those whose units are enabled; if there is none, those that are installed.
+pub(super) fn klippys(machine: &Machine) -> Vec<Klippy> {
+    let processes = machine.processes().into_iter().filter(Process::is_klippy);
+    let mut klippys: Vec<Klippy> = processes.filter_map(|process| running(machine, &process)).collect();
+    let runs: BTreeSet<String> = klippys.iter().filter_map(|klippy| klippy.unit.clone()).collect();
+    let units = units::enabled(machine, |unit| !runs.contains(unit));
+    klippys.extend(units.iter().filter_map(|unit| set_up(machine, unit)));
+    if klippys.is_empty() {
+        klippys.extend(units::all(machine).iter().filter_map(|unit| set_up(machine, unit)));
+    }
+    klippys
+}
+
+fn running(machine: &Machine, process: &Process) -> Option<Klippy> {
+    let proc = machine.path("/proc");
+    let config = process.klippy_config(&proc).map(|config| machine.name(&config));
+    Some(Klippy {
+        who: machine.user_of(process.pid)?,
+        folder: process.klippy_folder(&proc).map(|folder| reachable(machine, folder)),
+        opens: config.and_then(|config| printer::serials(machine, &config)),
+        found_by: format!("process {}", process.pid),
+        unit: machine.unit_of(process.pid),
+        is_running: true,
+    })
+}
+
+/// The klippy that a unit starts, if that is what it starts.
+fn set_up(machine: &Machine, unit: &str) -> Option<Klippy> {
+    let text = units::text(machine, unit)?;
+    let arguments = arguments(machine, &text)?;
+    let folder = process::klippy(&arguments).filter(|folder| folder.is_absolute())?;
+    let user = setting(&text, "User").unwrap_or("root");
+    let who = machine.user(user).unwrap_or_else(|| match user {
+        "root" => Who { name: "root".into(), uid: 0, gids: vec![0] },
+        // Somebody of whom nothing is known.
+        _ => Who { name: user.to_owned(), uid: u32::MAX, gids: vec![] },
+    });
+    Some(Klippy {
+        who,
+        folder: Some(machine.path(folder)),
+        opens: process::klippy_config(&arguments).and_then(|config| printer::serials(machine, config)),
+        found_by: format!("{unit}.service"),
+        unit: Some(unit.to_owned()),
+        is_running: false,
     })
 }
 
@@ -70,73 +98,154 @@ fn reachable(machine: &Machine, folder: PathBuf) -> PathBuf {
     if folder.starts_with(machine.path("/proc")) { folder } else { machine.path(folder) }
 }
 
-/// A setting of a unit.
-fn value<'a>(unit: &'a str, key: &str) -> Option<&'a str> {
-    let values = unit.lines().filter_map(|line| line.trim().strip_prefix(key)?.trim_start().strip_prefix('='));
-    values.map(str::trim).rfind(|value| !value.is_empty())
-}
-
-/// The folder of klippy.py, from a unit's command or the file that has its arguments.
-fn program_folder(machine: &Machine, unit: &str) -> Option<PathBuf> {
-    let file = value(unit, "EnvironmentFile").map(|file| file.trim_start_matches('-'));
-    let texts = [value(unit, "ExecStart").map(str::to_owned), file.and_then(|file| machine.text(file))];
+/// klippy's command line, from a unit's command or the file that has its arguments.
+fn arguments(machine: &Machine, unit: &str) -> Option<Vec<PathBuf>> {
+    let file = setting(unit, "EnvironmentFile").map(|file| file.trim_start_matches('-'));
+    let texts = [setting(unit, "ExecStart").map(str::to_owned), file.and_then(|file| machine.text(file))];
     texts.into_iter().flatten().find_map(|text| {
-        let words = text.split([' ', '\t', '\n', '"', '\'', '=']);
-        let program = words.map(Path::new).find(|word| word.is_absolute() && word.ends_with("klippy.py"))?;
-        Some(program.parent()?.to_owned())
+        let words = text.split([' ', '\t', '\n', '"', '\'', '=']).filter(|word| !word.is_empty());
+        let words: Vec<PathBuf> = words.map(PathBuf::from).collect();
+        process::klippy(&words).is_some().then_some(words)
     })
 }
 
-/// Whether klippy finds the terminal, and may open it.
-pub(super) fn terminal(
-    machine: &Machine,
-    settings: &Settings,
-    running: Option<&Running>,
-    klippy: Option<&Klippy>,
-) -> Vec<Finding> {
-    const CHECK: &str = "terminal";
-    const RESTART: &str = "sudo systemctl restart pinion-mcu";
-    let path = match settings.symlink.to_string_lossy().starts_with(HOST_PATHS) {
-        true => &settings.symlink,
-        false => Path::new(HOST_PATH),
-    };
+const CHECK: &str = "terminal";
+
+/// For each terminal whether the klippy that is to open it finds it, and may.
+pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
+    let mut findings = Vec::new();
+    let mut links: Vec<&Path> = Vec::new();
+    for instance in instances {
+        let Some(link) = &instance.link else {
+            let found =
+                format!("{} is no path that klippy takes for a pseudo terminal's", instance.settings.symlink.display());
+            findings
+                .push(Finding::ok(CHECK, found).or(format!("if klippy is to open it: pinion run -I {HOST_PATHS}NAME")));
+            continue;
+        };
+        if links.contains(&link.as_path()) {
+            let found = format!("{} wants the link {}, too, which another Pinion has", instance.name(), link.display());
+            findings.push(Finding::error(CHECK, found, "stop one of the two, or give it a link of its own with -I"));
+            continue;
+        }
+        links.push(link);
+        findings.extend(terminal(machine, link, Some(instance), klippys));
+    }
+    let named = klippys.iter().filter_map(|klippy| klippy.opens.as_ref()).flatten().map(PathBuf::as_path);
+    let others: BTreeSet<&Path> = named.filter(|path| !links.contains(path)).collect();
+    for path in others {
+        if is_host_path(path) {
+            findings.extend(terminal(machine, path, None, klippys));
+        } else if let Some(instance) = instances.iter().find(|instance| instance.settings.symlink == path) {
+            let found = format!("klippy's configuration names {}, which it takes for a serial port", path.display());
+            let link = instance.link.as_ref().map_or(Path::new("/tmp/klipper_host_NAME"), PathBuf::as_path);
+            findings.push(Finding::error(CHECK, found, format!("serial: {}", link.display())));
+        }
+    }
+    findings
+}
+
+fn is_host_path(path: &Path) -> bool {
+    path.to_string_lossy().starts_with(HOST_PATHS)
+}
+
+/// The unit that makes a link.
+fn unit_for(link: &Path) -> String {
+    match link.to_string_lossy().strip_prefix(HOST_PATHS) {
+        None | Some("mcu") => "pinion-mcu".to_owned(),
+        Some(name) => format!("pinion-mcu@{name}"),
+    }
+}
+
+/// Whether those who are to open a link find a terminal there, and may open it. It is that of `instance`, or one that
+/// a klippy's configuration names and no instance has.
+fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys: &[Klippy]) -> Vec<Finding> {
     let shown = path.display();
+    let opening: Vec<&Klippy> = klippys.iter().filter(|klippy| klippy.opens(path)).collect();
+    let restart = instance.map_or_else(|| format!("sudo systemctl restart {}", unit_for(path)), Instance::restart);
+    let pid = instance.and_then(|instance| instance.pid);
     let Ok(link) = fs::symlink_metadata(machine.path(path)) else {
-        return vec![match running {
-            None => Finding::ok(CHECK, format!("{shown} is not there, as Pinion does not run")),
-            Some(running) => Finding::error(
+        return vec![match (instance, pid) {
+            (Some(_), None) => Finding::ok(CHECK, format!("{shown} is not there, as Pinion does not run")),
+            (_, Some(pid)) => Finding::error(
                 CHECK,
-                format!("there is no {shown}, which klippy opens, though Pinion runs (process {})", running.pid),
-                format!("{RESTART}, or pinion run -I {shown}"),
+                format!("there is no {shown}, which klippy opens, though Pinion runs (process {pid})"),
+                format!("{restart}, or pinion run -I {shown}"),
+            ),
+            (None, _) => Finding::error(
+                CHECK,
+                format!("there is no {shown}, which klippy's configuration names{}: no Pinion has it", by(&opening)),
+                format!("sudo systemctl enable --now {}, or another serial", unit_for(path)),
             ),
         }];
     };
     if !link.file_type().is_symlink() {
         let found = format!("{shown} is a file that something else has written, and no link");
-        return vec![Finding::error(CHECK, found, format!("sudo rm {shown} && {RESTART}"))];
+        return vec![Finding::error(CHECK, found, format!("sudo rm {shown} && {restart}"))];
     }
     let Ok(way) = machine.follow(path) else {
         let target = fs::read_link(machine.path(path)).unwrap_or_default();
         let found = format!("{shown} leads to {}, which is not there", target.display());
-        return vec![match running {
-            None => Finding::warning(CHECK, found, "sudo systemctl start pinion-mcu"),
-            Some(_) => Finding::error(CHECK, found, RESTART),
+        return vec![match pid {
+            None => Finding::warning(CHECK, found, format!("sudo systemctl start {}", unit_for(path))),
+            Some(_) => Finding::error(CHECK, found, restart),
         }];
     };
     let (device, about) = match way.last().map(|device| (machine.name(device), fs::metadata(device))) {
         Some((device, Ok(about))) => (device, about),
-        _ => return vec![Finding::error(CHECK, format!("{shown} leads nowhere"), RESTART)],
+        _ => return vec![Finding::error(CHECK, format!("{shown} leads nowhere"), restart)],
     };
     let told = format!("{shown} leads to {}, which is {}", device.display(), machine.ownership(&about));
-    let Some(Klippy { who, found_by, is_running, .. }) = klippy else {
-        let unknown = "who klippy is, is unknown: none runs, and no unit starts one";
-        return vec![Finding::ok(CHECK, told), Finding::ok(CHECK, unknown)];
-    };
+    if opening.is_empty() {
+        let unknown = match klippys {
+            [] => Finding::ok(CHECK, "who klippy is, is unknown: none runs, and no unit starts one"),
+            _ => Finding::ok(CHECK, format!("no klippy's configuration names {shown}"))
+                .or(format!("in printer.cfg: [mcu host] and below it serial: {shown}")),
+        };
+        return vec![Finding::ok(CHECK, told), unknown];
+    }
+    let mut findings: Vec<Finding> = opening
+        .iter()
+        .map(|klippy| {
+            let terminal = Terminal { path, link: &link, way: &way, about: &about, told: &told };
+            access(machine, &terminal, instance, klippy)
+        })
+        .collect();
+    let sure: Vec<&Klippy> = opening.into_iter().filter(|klippy| klippy.opens.is_some()).collect();
+    if sure.len() > 1 {
+        let found = format!("more than one klippy's configuration names {shown}{}, and one can have it", by(&sure));
+        let remedy = "another serial for one of them: an instance of its own (man pinion-mcu.service)";
+        findings.push(Finding::error(CHECK, found, remedy));
+    }
+    findings
+}
+
+fn by(klippys: &[&Klippy]) -> String {
+    let names: Vec<&str> = klippys.iter().map(|klippy| klippy.found_by.as_str()).collect();
+    format!(" ({})", names.join(", "))
+}
+
+/// A terminal that is there.
+struct Terminal<'a> {
+    path: &'a Path,
+    link: &'a fs::Metadata,
+    /// All paths from the link to the device.
+    way: &'a [PathBuf],
+    about: &'a fs::Metadata,
+    /// Where the link leads, in words.
+    told: &'a str,
+}
+
+/// Whether a klippy's user may open a terminal.
+fn access(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
+    let Klippy { who, found_by, is_running, .. } = klippy;
+    let Terminal { path, link, way, about, told } = *terminal;
     let (name, told) = (&who.name, format!("{told}, for klippy's user {} ({found_by})", who.name));
-    if let Some(owner) = link_is_refused(machine, path, &link, who) {
+    if let Some(owner) = link_is_refused(machine, path, link, who) {
+        let shown = path.display();
         let found = format!("the kernel lets {name} not follow {shown}, a link of {owner}'s (fs.protected_symlinks)");
         let remedy = format!("use the service, or run Pinion as {name}");
-        return vec![Finding::error(CHECK, found, remedy)];
+        return Finding::error(CHECK, found, remedy);
     }
     let closed = way.iter().filter_map(|path| path.parent()).find_map(|folder| {
         let about = fs::metadata(folder).ok()?;
@@ -144,24 +253,23 @@ pub(super) fn terminal(
     });
     if let Some((folder, ownership)) = closed {
         let found = format!("{name} may not enter {}, which is {ownership}", folder.display());
-        return vec![Finding::error(CHECK, found, format!("sudo chmod o+x {}", folder.display()))];
+        return Finding::error(CHECK, found, format!("sudo chmod o+x {}", folder.display()));
     }
-    if who.may(Access::READ_WRITE, &about) {
-        return vec![Finding::ok(CHECK, told)];
+    if who.may(Access::READ_WRITE, about) {
+        return Finding::ok(CHECK, told);
     }
     let group = machine.group_name(about.gid());
     let is_member = machine.user(name).is_some_and(|user| user.gids.contains(&about.gid()));
-    let remedy = match () {
-        () if !Access::READ_WRITE.is_given_to_group(&about) => {
-            "mode = \"0660\" and group = \"tty\" in /etc/pinion/pinion.toml, then sudo systemctl restart pinion-mcu"
-                .to_owned()
+    let remedy = match instance {
+        Some(instance) if !Access::READ_WRITE.is_given_to_group(about) => {
+            format!("mode = \"0660\" and group = \"tty\" in {}, then {}", instance.config(), instance.restart())
         }
-        () if is_member && *is_running => {
-            "sudo systemctl restart klipper, as the user was made a member after it was started".into()
+        _ if is_member && *is_running => {
+            format!("{}, as the user was made a member after it was started", klippy.restart())
         }
-        () => format!("sudo usermod -aG {group} {name} && sudo systemctl restart klipper"),
+        _ => format!("sudo usermod -aG {group} {name} && {}", klippy.restart()),
     };
-    vec![Finding::error(CHECK, format!("{name}, klippy's user ({found_by}), may not open it: {told}"), remedy)]
+    Finding::error(CHECK, format!("{name}, klippy's user ({found_by}), may not open it: {told}"), remedy)
 }
 
 /// Whose link it is, should the kernel refuse to follow it.
@@ -179,16 +287,22 @@ fn is_protected(folder_mode: u32, folder_uid: u32, link_uid: u32, uid: u32) -> b
     folder_mode & 0o1002 == 0o1002 && link_uid != uid && link_uid != folder_uid
 }
 
-/// Whether the host's messages are those that Pinion speaks.
-pub(super) fn dialect(machine: &Machine, settings: &Settings, klippy: Option<&Klippy>) -> Vec<Finding> {
-    const CHECK: &str = "dialect";
-    let Some(Klippy { folder, found_by, .. }) = klippy else {
+/// Whether the messages of each host are those that Pinion speaks.
+pub(super) fn dialects(machine: &Machine, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
+    if klippys.is_empty() {
         let found = "which host comes is unknown: no klippy runs, and no unit starts one";
-        return vec![Finding::ok(CHECK, found).or("pinion doctor --klipper DIR looks at a checkout")];
-    };
+        return vec![Finding::ok(DIALECT, found).or("pinion doctor --klipper DIR looks at a checkout")];
+    }
+    klippys.iter().flat_map(|klippy| dialect(machine, instances, klippy)).collect()
+}
+
+const DIALECT: &str = "dialect";
+
+fn dialect(machine: &Machine, instances: &[Instance], klippy: &Klippy) -> Vec<Finding> {
+    let Klippy { folder, found_by, .. } = klippy;
     let Some(folder) = folder else {
         let found = format!("klippy's sources ({found_by}) are not known: its folder may not be looked into");
-        return vec![Finding::warning(CHECK, found, "sudo pinion doctor")];
+        return vec![Finding::warning(DIALECT, found, "sudo pinion doctor")];
     };
     let shown = machine.name(folder);
     // /proc/PID/root is the process's own root.
@@ -198,27 +312,29 @@ pub(super) fn dialect(machine: &Machine, settings: &Settings, klippy: Option<&Kl
         Ok(checkout) => checkout,
         Err(error) => {
             let found = format!("klippy's sources in {} ({found_by}) can not be read: {error}", shown.display());
-            return vec![Finding::warning(CHECK, found, "sudo pinion doctor, or pinion doctor --klipper DIR")];
+            return vec![Finding::warning(DIALECT, found, "sudo pinion doctor, or pinion doctor --klipper DIR")];
         }
     };
     let best = checkout.best();
     let commit = checkout.commit.as_ref().map_or(String::new(), |commit| format!(", commit {commit}"));
     let host = format!("the host is klippy of {}{commit} ({found_by})", shown.display());
-    let mut findings = vec![match settings.dialect {
-        None => Finding::ok(CHECK, format!("{host}: it is served in the dialect {}", best.generation)),
-        Some(DialectName::Of(generation)) if generation == best.generation => {
-            Finding::ok(CHECK, format!("{host}: dialect {generation}, as Pinion is told"))
-        }
-        Some(name) => Finding::warning(
-            CHECK,
+    let serves = |instance: &&Instance| instance.link.as_ref().is_some_and(|link| klippy.opens(link));
+    let told = instances.iter().filter(serves).filter_map(|instance| Some((instance, instance.settings.dialect?)));
+    let told: Vec<(&Instance, DialectName)> = told.collect();
+    let wrong = told.iter().find(|(_, name)| *name != DialectName::Of(best.generation));
+    let mut findings = vec![match (wrong, told.is_empty()) {
+        (None, true) => Finding::ok(DIALECT, format!("{host}: it is served in the dialect {}", best.generation)),
+        (None, false) => Finding::ok(DIALECT, format!("{host}: dialect {}, as Pinion is told", best.generation)),
+        (Some((instance, name)), _) => Finding::warning(
+            DIALECT,
             format!("{host}: its dialect is {}, and Pinion is told to speak {name}", best.generation),
-            "dialect = \"auto\" in /etc/pinion/pinion.toml, then sudo systemctl restart pinion-mcu",
+            format!("dialect = \"auto\" in {}, then {}", instance.config(), instance.restart()),
         ),
     }];
     let unknown: Vec<&str> = checkout.unknown().map(|shape| shape.as_str()).collect();
     if !unknown.is_empty() {
         findings.push(Finding::error(
-            CHECK,
+            DIALECT,
             format!("the host is newer than Pinion, which does not know: {}", unknown.join("; ")),
             "sudo apt install --only-upgrade pinion-mcu",
         ));
@@ -228,17 +344,13 @@ pub(super) fn dialect(machine: &Machine, settings: &Settings, klippy: Option<&Kl
 
 #[cfg(test)]
 mod tests {
+    use super::super::instance::instances;
     use super::super::tests::{Tree, told};
     use super::*;
     use crate::cli::finding::Level::{Error, Ok, Warning};
-    use crate::cli::run::Given;
     use crate::mcu::Generation;
 
     const PI: u32 = 54_321;
-
-    fn settings() -> Settings {
-        Given { symlink: Some("/run/pinion/klipper_host_mcu".into()), ..Given::default() }.settings()
-    }
 
     /// A machine with a terminal that the service has made, of this mode, and a user of klippy's.
     fn with_terminal(mode: u32) -> (Tree, u32) {
@@ -255,7 +367,7 @@ mod tests {
 
     fn looked(tree: &Tree) -> Vec<Finding> {
         let machine = tree.machine();
-        terminal(&machine, &settings(), machine.running().as_ref(), klippy(&machine).as_ref())
+        terminals(&machine, &instances(&machine).0, &klippys(&machine))
     }
 
     const KLIPPY: [&str; 2] = ["/home/pi/klippy-env/bin/python", "/home/pi/klipper/klippy/klippy.py"];
@@ -315,26 +427,120 @@ mod tests {
     #[test]
     fn klippy_is_found_by_its_unit() {
         let tree = Tree::new();
-        assert!(klippy(&tree.machine()).is_none());
+        assert!(klippys(&tree.machine()).is_empty());
         tree.put("etc/passwd", &format!("pi:x:{PI}:{PI}::/home/pi:/bin/sh\n"));
         tree.put("etc/systemd/system/klipper-mcu.service", "ExecStart=/usr/local/bin/klipper_mcu -r\n");
         let unit = "[Service]\nUser=pi\nEnvironmentFile=-/home/pi/klipper.env\nExecStart=/home/pi/env/bin/python $KLIPPER_ARGS\n";
         tree.put("etc/systemd/system/klipper.service", unit);
-        assert!(klippy(&tree.machine()).is_none(), "no program is named");
-        tree.put("home/pi/klipper.env", "KLIPPER_ARGS=\"/home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\"\n");
-        let found = klippy(&tree.machine()).unwrap();
-        assert_eq!((found.who.uid, found.found_by.as_str()), (PI, "klipper.service"));
+        assert!(klippys(&tree.machine()).is_empty(), "no program is named");
+        tree.put(
+            "home/pi/klipper.env",
+            "KLIPPER_ARGS=\"/home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg -l /home/pi/k.log\"\n",
+        );
+        let found = klippys(&tree.machine()).remove(0);
+        assert_eq!((found.who.uid, found.found_by.as_str(), found.opens), (PI, "klipper.service", None));
         assert_eq!(found.folder.unwrap(), tree.machine().path("/home/pi/klipper/klippy"));
+        tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
+        assert_eq!(klippys(&tree.machine())[0].opens, Some([PathBuf::from("/tmp/klipper_host_mcu")].into()));
+        // What is enabled counts, and one that runs is not counted twice.
+        tree.put(
+            "etc/systemd/system/klipper-2.service",
+            "ExecStart=/usr/bin/python3 /home/b/klipper/klippy/klippy.py b.cfg\n",
+        );
+        assert_eq!(klippys(&tree.machine()).len(), 2);
+        tree.link("etc/systemd/system/multi-user.target.wants/klipper.service", "../klipper.service");
+        assert_eq!(klippys(&tree.machine()).len(), 1);
+        tree.process(8, &KLIPPY, PI, &[]);
+        tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
+        let found: Vec<String> = klippys(&tree.machine()).into_iter().map(|klippy| klippy.found_by).collect();
+        assert_eq!(found, ["process 8"]);
+    }
+
+    /// Two printers: the users pi and other, each with a klippy that runs and a configuration, and an instance for
+    /// each.
+    fn two_printers() -> (Tree, u32) {
+        let (tree, gid) = with_terminal(0o660);
+        tree.put_mode("dev/pts/4", "", 0o660);
+        tree.link("run/pinion/klipper_host_b", "/dev/pts/4");
+        tree.link("tmp/klipper_host_b", "/run/pinion/klipper_host_b");
+        let users = format!("pi:x:{PI}:{PI}::/home/pi:/bin/sh\nother:x:{0}:{0}::/home/other:/bin/sh\n", PI + 1);
+        tree.put("etc/passwd", &users);
+        for (pid, name, unit) in [(11, "mcu", "pinion-mcu"), (12, "b", "pinion-mcu@b")] {
+            let link = format!("/run/pinion/klipper_host_{name}");
+            tree.process(pid, &["/usr/bin/pinion", "run", "-r", "-I", &link], 990, &[]);
+            tree.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
+        }
+        for (pid, user, unit, serial) in [(21, "pi", "klipper", "mcu"), (22, "other", "klipper-2", "b")] {
+            let (script, config) =
+                (format!("/home/{user}/klipper/klippy/klippy.py"), format!("/home/{user}/printer.cfg"));
+            tree.put(&config[1..], &format!("[mcu host]\nserial: /tmp/klipper_host_{serial}\n"));
+            tree.process(pid, &["/usr/bin/python3", &script, &config], PI + pid - 21, &[gid]);
+            tree.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
+        }
+        (tree, gid)
+    }
+
+    #[test]
+    fn each_of_two_printers_klippys_is_judged_by_the_link_that_it_opens() {
+        let (tree, gid) = two_printers();
+        let findings = looked(&tree);
+        assert_eq!(findings.len(), 2, "{findings:#?}");
+        told(&findings, "terminal", Ok, "/tmp/klipper_host_mcu leads to /dev/pts/3");
+        told(&findings, "terminal", Ok, "/dev/pts/4, which is");
+        told(&findings, "terminal", Ok, "for klippy's user other (process 22)");
+        // The second one is not in the group.
+        tree.process(
+            22,
+            &["/usr/bin/python3", "/home/other/klipper/klippy/klippy.py", "/home/other/printer.cfg"],
+            PI + 1,
+            &[],
+        );
+        let findings = looked(&tree);
+        told(&findings, "terminal", Ok, "for klippy's user pi (process 21)");
+        let remedy = told(&findings, "terminal", Error, "other, klippy's user (process 22), may not open it");
+        assert_eq!(remedy, "sudo usermod -aG tty other && sudo systemctl restart klipper-2");
+        // It is the second instance's terminal that is shut.
+        tree.mode("dev/pts/4", 0o600);
+        tree.process(
+            22,
+            &["/usr/bin/python3", "/home/other/klipper/klippy/klippy.py", "/home/other/printer.cfg"],
+            PI + 1,
+            &[gid],
+        );
+        let remedy = told(&looked(&tree), "terminal", Error, "other, klippy's user");
+        assert!(remedy.ends_with("in /etc/pinion/b.toml, then sudo systemctl restart pinion-mcu@b"), "{remedy}");
+    }
+
+    #[test]
+    fn links_that_two_want_or_that_nobody_has() {
+        let (tree, _) = two_printers();
+        tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
+        let findings = looked(&tree);
+        told(&findings, "terminal", Error, "names /tmp/klipper_host_mcu (process 21, process 22), and one can have it");
+        assert!(
+            told(&findings, "terminal", Ok, "no klippy's configuration names /tmp/klipper_host_b").contains("serial: ")
+        );
+        tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_c\n");
+        let remedy = told(&looked(&tree), "terminal", Error, "there is no /tmp/klipper_host_c, which klippy's");
+        assert!(remedy.starts_with("sudo systemctl enable --now pinion-mcu@c"), "{remedy}");
+        tree.put("home/other/printer.cfg", "[mcu]\nserial: /run/pinion/klipper_host_b\n");
+        let remedy = told(&looked(&tree), "terminal", Error, "names /run/pinion/klipper_host_b, which it takes");
+        assert_eq!(remedy, "serial: /tmp/klipper_host_b");
+        tree.process(13, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 1000, &[]);
+        told(&looked(&tree), "terminal", Error, "process 13 wants the link /tmp/klipper_host_b, too");
     }
 
     #[test]
     fn the_host_s_dialect() {
         let tree = Tree::new();
-        let look = |settings: &Settings| dialect(&tree.machine(), settings, klippy(&tree.machine()).as_ref());
-        told(&look(&settings()), "dialect", Ok, "which host comes is unknown");
+        let look = || {
+            let machine = tree.machine();
+            dialects(&machine, &instances(&machine).0, &klippys(&machine))
+        };
+        told(&look(), "dialect", Ok, "which host comes is unknown");
         let command = "ExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\n";
         tree.put("lib/systemd/system/klipper.service", command);
-        told(&look(&settings()), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) can not be read");
+        told(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) can not be read");
         let forms: Vec<String> = crate::klippy::tests::forms(Generation::V0_12)
             .iter()
             .map(|form| {
@@ -344,11 +550,16 @@ mod tests {
             })
             .collect();
         tree.put("home/pi/klipper/klippy/mcu.py", &forms.concat());
-        told(&look(&settings()), "dialect", Ok, "it is served in the dialect v0.12");
-        let named = |name: &str| Given { dialect: Some(name.parse().unwrap()), ..Given::default() }.settings();
-        told(&look(&named("v0.12")), "dialect", Ok, "as Pinion is told");
-        told(&look(&named("kalico")), "dialect", Warning, "its dialect is v0.12, and Pinion is told to speak kalico");
+        told(&look(), "dialect", Ok, "it is served in the dialect v0.12");
+        let speak = |name: &str| tree.put("etc/pinion/pinion.toml", &format!("dialect = \"{name}\"\n"));
+        speak("v0.12");
+        told(&look(), "dialect", Ok, "as Pinion is told");
+        speak("kalico");
+        told(&look(), "dialect", Warning, "its dialect is v0.12, and Pinion is told to speak kalico");
+        // It is another instance's host.
+        tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_b\n");
+        told(&look(), "dialect", Ok, "it is served in the dialect v0.12");
         tree.put("home/pi/klipper/klippy/new.py", "mcu.lookup_command(\"query_adxl345 oid=%c wings=%u\")\n");
-        told(&look(&settings()), "dialect", Error, "query_adxl345 oid wings");
+        told(&look(), "dialect", Error, "query_adxl345 oid wings");
     }
 }

@@ -6,15 +6,13 @@
 use std::path::Path;
 
 use crate::cli::finding::Finding;
-use crate::cli::run::Settings;
 
+use super::instance::Instance;
 use super::machine::Machine;
 
-pub(super) fn findings(machine: &Machine, settings: &Settings) -> Vec<Finding> {
-    [Some(preempt_rt(machine)), Some(throttle(machine)), Some(isolation(machine, settings)), governor(machine)]
-        .into_iter()
-        .flatten()
-        .collect()
+pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+    let kernel = [preempt_rt(machine), throttle(machine)].into_iter();
+    kernel.chain(isolation(machine, instances)).chain(governor(machine)).collect()
 }
 
 /// Whether a kernel is PREEMPT_RT; none if nothing tells. `root` is that of its /proc and /sys.
@@ -67,10 +65,10 @@ fn throttle(machine: &Machine) -> Finding {
     }
 }
 
-fn isolation(machine: &Machine, settings: &Settings) -> Finding {
+fn isolation(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "isolated_cpus";
     let Some(isolated) = machine.text("/sys/devices/system/cpu/isolated") else {
-        return Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell");
+        return vec![Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell")];
     };
     let among = |cpu: usize| {
         isolated.split(',').any(|range| {
@@ -78,27 +76,44 @@ fn isolation(machine: &Machine, settings: &Settings) -> Finding {
             matches!((first.parse(), last.parse()), (Ok(first), Ok(last)) if (first..=last).contains(&cpu))
         })
     };
-    match (isolated.as_str(), settings.cpu) {
-        ("", None) => Finding::ok(CHECK, "no processor is isolated, and Pinion takes any"),
-        ("", Some(cpu)) => Finding::warning(
-            CHECK,
-            format!("Pinion stays on processor {cpu}, which is not isolated: other programs use it, too"),
-            format!("append isolcpus={cpu} to the kernel's command line, and reboot"),
-        ),
-        (isolated, Some(cpu)) if among(cpu) => {
-            Finding::ok(CHECK, format!("Pinion stays on processor {cpu}; isolated: {isolated}"))
-        }
-        (isolated, Some(cpu)) => Finding::warning(
-            CHECK,
-            format!("Pinion stays on processor {cpu}, and others are isolated: {isolated}"),
-            format!("cpu = {} in /etc/pinion/pinion.toml", first(isolated)),
-        ),
-        (isolated, None) => Finding::warning(
-            CHECK,
-            format!("isolated: {isolated}, which nobody uses: Pinion is not told to"),
-            format!("cpu = {} in /etc/pinion/pinion.toml", first(isolated)),
-        ),
+    let mut findings = Vec::new();
+    let mut taken: Vec<usize> = Vec::new();
+    for instance in instances {
+        let Some(cpu) = instance.settings.cpu else { continue };
+        let (name, config) = (instance.name(), instance.config());
+        findings.push(match isolated.as_str() {
+            _ if taken.contains(&cpu) => Finding::warning(
+                CHECK,
+                format!("{name} stays on processor {cpu}, as another Pinion does: each keeps the other waiting"),
+                format!("another cpu in {config}"),
+            ),
+            "" => Finding::warning(
+                CHECK,
+                format!("{name} stays on processor {cpu}, which is not isolated: other programs use it, too"),
+                format!("append isolcpus={cpu} to the kernel's command line, and reboot"),
+            ),
+            isolated if among(cpu) => {
+                Finding::ok(CHECK, format!("{name} stays on processor {cpu}; isolated: {isolated}"))
+            }
+            isolated => Finding::warning(
+                CHECK,
+                format!("{name} stays on processor {cpu}, and others are isolated: {isolated}"),
+                format!("cpu = {} in {config}", first(isolated)),
+            ),
+        });
+        taken.push(cpu);
     }
+    if findings.is_empty() {
+        findings.push(match isolated.as_str() {
+            "" => Finding::ok(CHECK, "no processor is isolated, and Pinion takes any"),
+            isolated => Finding::warning(
+                CHECK,
+                format!("isolated: {isolated}, which nobody uses: Pinion is not told to"),
+                format!("cpu = {} in /etc/pinion/pinion.toml", first(isolated)),
+            ),
+        });
+    }
+    findings
 }
 
 fn first(range: &str) -> &str {
@@ -128,13 +143,14 @@ fn governor(machine: &Machine) -> Option<Finding> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::instance::instances;
     use super::super::tests::{Tree, told};
     use super::*;
     use crate::cli::finding::Level::{Error, Ok, Warning};
-    use crate::cli::run::Given;
 
     fn found(tree: &Tree, cpu: Option<usize>) -> Vec<Finding> {
-        findings(&tree.machine(), &Given { cpu, ..Given::default() }.settings())
+        tree.put("etc/pinion/pinion.toml", &cpu.map_or(String::new(), |cpu| format!("cpu = {cpu}\n")));
+        findings(&tree.machine(), &instances(&tree.machine()).0)
     }
 
     #[test]
@@ -178,6 +194,25 @@ mod tests {
         told(&found(&tree, Some(2)), "isolated_cpus", Warning, "and others are isolated: 3");
         tree.put("sys/devices/system/cpu/isolated", "\n");
         assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
+    }
+
+    #[test]
+    fn instances_on_processors_of_their_own_or_on_one() {
+        let tree = Tree::new();
+        tree.put("sys/devices/system/cpu/isolated", "2-3\n");
+        for (pid, cpu) in [(10, "2"), (11, "3")] {
+            tree.process(
+                pid,
+                &["/usr/bin/pinion", "run", "--cpu", cpu, "-I", &format!("/tmp/klipper_host_{pid}")],
+                0,
+                &[],
+            );
+        }
+        let findings = found(&tree, None);
+        told(&findings, "isolated_cpus", Ok, "process 10 stays on processor 2");
+        told(&findings, "isolated_cpus", Ok, "process 11 stays on processor 3");
+        tree.process(11, &["/usr/bin/pinion", "run", "--cpu", "2", "-I", "/tmp/klipper_host_11"], 0, &[]);
+        told(&found(&tree, None), "isolated_cpus", Warning, "process 11 stays on processor 2, as another Pinion does");
     }
 
     #[test]

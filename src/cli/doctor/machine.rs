@@ -13,6 +13,7 @@ use nix::unistd::{User, getegid, geteuid, getgroups};
 use crate::cli::run::Settings;
 use crate::cli::{config, run_args};
 use crate::klippy::process::{self, Process};
+use crate::runtime::guardian;
 
 /// Nothing that is read here is as long.
 const TEXT_MAX: u64 = 4 << 20;
@@ -64,6 +65,8 @@ impl Who {
 /// A process of Pinion's that serves hosts.
 pub(super) struct Running {
     pub(super) pid: u32,
+    /// The unit that has started it, without `.service`.
+    pub(super) unit: Option<String>,
     /// What it runs by, as far as its command line and its configuration file can be read.
     pub(super) settings: Option<Settings>,
 }
@@ -195,24 +198,34 @@ impl Machine {
         processes
     }
 
-    /// The Pinion that runs; of it and its guardian the former, which was there first.
-    pub(super) fn running(&self) -> Option<Running> {
-        self.processes().into_iter().find_map(|process| {
+    /// The Pinions that run, without their guardians.
+    pub(super) fn running(&self) -> Vec<Running> {
+        let running = |process: Process| {
             let program = process.arguments.first()?;
-            if program.file_name()? != "pinion" {
+            let pid = process.pid;
+            let is_guardian = |name: String| name.as_bytes() == guardian::NAME.to_bytes();
+            if program.file_name()? != "pinion" || self.text(format!("/proc/{pid}/comm")).is_some_and(is_guardian) {
                 return None;
             }
             let arguments = process.arguments.iter().map(|argument| argument.clone().into_os_string());
-            let args = match run_args(arguments) {
-                Ok(args) => args?,
+            let settings = match run_args(arguments) {
+                Ok(args) => {
+                    let (given, file) = args?.into_parts();
+                    let file = file.map_or_else(|| Ok(Default::default()), |file| config::load(&self.path(file)));
+                    file.ok().map(|file| given.or(file).settings())
+                }
                 // Another version of Pinion.
-                Err(_) => return Some(Running { pid: process.pid, settings: None }),
+                Err(_) => None,
             };
-            let (given, file) = args.into_parts();
-            let file = file.map_or_else(|| Ok(Default::default()), |file| config::load(&self.path(file)));
-            let settings = file.ok().map(|file| given.or(file).settings());
-            Some(Running { pid: process.pid, settings })
-        })
+            Some(Running { pid, unit: self.unit_of(pid), settings })
+        };
+        self.processes().into_iter().filter_map(running).collect()
+    }
+
+    /// The unit that has started a process, without `.service`: that of its control group (systemd.resource-control(5)).
+    pub(super) fn unit_of(&self, pid: u32) -> Option<String> {
+        let groups = self.text(format!("/proc/{pid}/cgroup"))?;
+        groups.lines().find_map(|line| Some(line.rsplit('/').next()?.strip_suffix(".service")?.to_owned()))
     }
 
     /// Whose permissions are looked at: the service's user for root, else the caller. None if root looks

@@ -19,10 +19,13 @@ use super::{failed, quietly};
 
 mod devices;
 mod host;
+mod instance;
 mod kernel;
 mod klipper;
 mod machine;
+mod printer;
 mod service;
+mod units;
 
 pub(super) use kernel::is_preempt_rt;
 use machine::Machine;
@@ -48,6 +51,12 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
         Ok(checkout) => checkout,
         Err(error) => return failed(error),
     };
+    if !args.root.is_dir() {
+        return failed(format!(
+            "{}: there is no such folder: name the one where the system's files are, such as /mnt",
+            args.root.display()
+        ));
+    }
     let mut groups = quietly(|| examine(&Machine::at(&args.root)));
     if let Some(checkout) = &checkout {
         groups.push(Group::new("checkout", vec![klipper::finding(checkout)]));
@@ -60,22 +69,19 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
 }
 
 fn examine(machine: &Machine) -> Vec<Group> {
-    let running = machine.running();
-    let running = running.as_ref();
-    let (settings, configuration) = service::settings(machine, running);
-    let klippy = host::klippy(machine);
-    let klippy = klippy.as_ref();
+    let (instances, configurations) = instance::instances(machine);
+    let klippys = host::klippys(machine);
     let mut groups = vec![
-        Group::new("kernel", kernel::findings(machine, &settings)),
-        Group::new("service", [configuration, service::findings(machine, running)].concat()),
-        Group::new("watchdog", service::watchdog(machine, &settings)),
-        Group::new("terminal", host::terminal(machine, &settings, running, klippy)),
-        Group::new("host", host::dialect(machine, &settings, klippy)),
+        Group::new("kernel", kernel::findings(machine, &instances)),
+        Group::new("service", [configurations, service::findings(machine, &instances)].concat()),
+        Group::new("watchdog", service::watchdog(machine, &instances)),
+        Group::new("terminal", host::terminals(machine, &instances, &klippys)),
+        Group::new("host", host::dialects(machine, &instances, &klippys)),
         Group::new("pins and buses", devices::presence(machine)),
         Group::new(
             "permissions",
             match machine.service_user() {
-                Some(user) => devices::permissions(machine, &settings, &user),
+                Some(user) => devices::permissions(machine, &instances, &user),
                 None => vec![Finding::warning(
                     "user",
                     "there is no user pinion: the service is not installed, and what it may open is unknown",
@@ -86,8 +92,9 @@ fn examine(machine: &Machine) -> Vec<Group> {
         Group::new("power", devices::power(machine, machine.is_this().then_some(Path::new("/usr/bin/vcgencmd")))),
     ];
     if machine.is_this() {
+        let is_serving = instances.iter().any(|instance| instance.pid.is_some());
         groups.insert(6, Group::new("lines", devices::holders(machine, &Inventory::scan().chips)));
-        groups.push(Group::new("latency", vec![latency(latency::sample(running.is_some()))]));
+        groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
     }
     groups
 }

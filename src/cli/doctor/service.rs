@@ -3,117 +3,46 @@
 
 #![forbid(unsafe_code)]
 
-use std::path::Path;
-
-use crate::cli::config::{self, SYSTEM_FILE};
 use crate::cli::finding::Finding;
-use crate::cli::run::{Given, Settings, WATCHDOG};
-use crate::cli::run_args;
+use crate::cli::run::WATCHDOG;
 
-use super::machine::{Machine, Running};
+use super::instance::{Instance, is_klipper_s};
+use super::machine::Machine;
+use super::units;
 
-/// Where units stand, those of the administrator first (systemd.unit(5)).
-pub(super) const UNIT_FOLDERS: [&str; 4] =
-    ["/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"];
-const OPTIONS_FILE: &str = "/etc/default/pinion-mcu";
 /// SCHED_FIFO (linux/sched.h).
 const SCHED_FIFO: &str = "1";
 
-/// What the service runs by, and what is wrong with the files that say so.
-pub(super) fn settings(machine: &Machine, running: Option<&Running>) -> (Settings, Vec<Finding>) {
-    let mut findings = Vec::new();
-    let mut given = Given::default();
-    match options(machine) {
-        Ok(options) => given = given.or(options),
-        Err(error) => findings.push(Finding::error(
-            "options",
-            format!("{OPTIONS_FILE}: {error}"),
-            format!("sudo nano {OPTIONS_FILE}, then sudo systemctl restart pinion-mcu"),
-        )),
-    }
-    let file = machine.path(SYSTEM_FILE);
-    if file.exists() {
-        match config::load(&file) {
-            Ok(file) => {
-                findings.push(Finding::ok("config", format!("{SYSTEM_FILE} has no mistake")));
-                given = given.or(file);
-            }
-            Err(error) => {
-                let error = error.replacen(&*file.to_string_lossy(), SYSTEM_FILE, 1);
-                let remedy = format!("sudo nano {SYSTEM_FILE}, then sudo systemctl restart pinion-mcu");
-                findings.push(Finding::error("config", error, remedy));
-            }
-        }
-    }
-    // The one that runs knows best.
-    let settings = running.and_then(|running| running.settings.clone()).unwrap_or_else(|| given.settings());
-    (settings, findings)
+pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+    let of_each = instances
+        .iter()
+        .flat_map(|instance| [Some(state(machine, instance)), real_time(machine, instance)].into_iter().flatten());
+    of_each.chain(c_program(machine)).collect()
 }
 
-/// The options that the unit takes from the environment.
-fn options(machine: &Machine) -> Result<Given, String> {
-    let text = machine.text(OPTIONS_FILE).unwrap_or_default();
-    // The last one counts (systemd.exec(5)).
-    let Some(value) = text.lines().rev().find_map(|line| line.trim().strip_prefix("PINION_OPTIONS=")) else {
-        return Ok(Given::default());
-    };
-    let words = value.trim().trim_matches(['"', '\'']).split_whitespace();
-    match run_args(["pinion", "run"].into_iter().chain(words).map(Into::into)) {
-        Ok(args) => Ok(args.map_or_else(Given::default, |args| args.into_parts().0)),
-        Err(error) => {
-            let text = error.to_string();
-            Err(text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned())
-        }
-    }
-}
-
-pub(super) fn findings(machine: &Machine, running: Option<&Running>) -> Vec<Finding> {
-    let mut findings = vec![state(machine, running)];
-    findings.extend(running.and_then(|running| real_time(machine, running)));
-    findings.extend(c_program(machine));
-    findings
-}
-
-/// The folder of a unit, if it is installed and not masked.
-fn unit(machine: &Machine, name: &str) -> Option<&'static str> {
-    let is_there = |folder: &&&str| {
-        let path = machine.path(folder).join(name);
-        path.exists() && std::fs::read_link(&path).map_or(true, |target| target != Path::new("/dev/null"))
-    };
-    UNIT_FOLDERS.iter().find(is_there).copied()
-}
-
-/// Whether a unit is started at boot: some target wants it.
-fn is_enabled(machine: &Machine, name: &str) -> bool {
-    let folders = machine
-        .names("/etc/systemd/system")
-        .into_iter()
-        .filter(|folder| [".wants", ".requires"].iter().any(|kind| folder.ends_with(kind)));
-    folders
-        .into_iter()
-        .any(|folder| machine.names(format!("/etc/systemd/system/{folder}")).iter().any(|unit| unit == name))
-}
-
-fn state(machine: &Machine, running: Option<&Running>) -> Finding {
+/// Whether an instance runs, and is started at boot.
+fn state(machine: &Machine, instance: &Instance) -> Finding {
     const CHECK: &str = "service";
-    const START: &str = "sudo systemctl enable --now pinion-mcu";
-    let (is_installed, is_enabled) =
-        (unit(machine, "pinion-mcu.service").is_some(), is_enabled(machine, "pinion-mcu.service"));
-    match (running, is_installed, is_enabled) {
-        (Some(Running { pid, .. }), _, true) => Finding::ok(CHECK, format!("Pinion runs as process {pid}")),
-        (Some(Running { pid, .. }), true, false) => {
-            Finding::ok(CHECK, format!("Pinion runs as process {pid}, and is not started at boot")).or(START)
+    let runs = |pid: u32| format!("Pinion runs as process {pid}");
+    let Some(unit) = &instance.unit else {
+        let by_hand = "no service has started it, and none starts it at boot";
+        return Finding::ok(CHECK, format!("{}: {by_hand}", runs(instance.pid.unwrap_or_default())));
+    };
+    let is_enabled = !units::enabled(machine, |name| name == unit).is_empty();
+    let is_installed = units::is_installed(machine, unit);
+    let enable = format!("sudo systemctl enable --now {unit}");
+    match (instance.pid, is_enabled) {
+        (Some(pid), true) => Finding::ok(CHECK, format!("{} ({unit})", runs(pid))),
+        (Some(pid), false) => {
+            Finding::ok(CHECK, format!("{} ({unit}), and is not started at boot", runs(pid))).or(enable)
         }
-        (Some(Running { pid, .. }), false, false) => {
-            Finding::ok(CHECK, format!("Pinion runs as process {pid}; its service is not installed"))
-        }
-        (None, _, true) => Finding::error(
+        (None, true) => Finding::error(
             CHECK,
-            "Pinion does not run, though its service is enabled",
-            "sudo systemctl restart pinion-mcu; journalctl -u pinion-mcu says why it ended",
+            format!("Pinion does not run, though its service is enabled ({unit})"),
+            format!("sudo systemctl restart {unit}; journalctl -u {unit} says why it ended"),
         ),
-        (None, true, false) => Finding::warning(CHECK, "Pinion does not run", START),
-        (None, false, false) => Finding::warning(
+        (None, false) if is_installed => Finding::warning(CHECK, "Pinion does not run", enable),
+        (None, false) => Finding::warning(
             CHECK,
             "Pinion does not run, and its service is not installed",
             "sudo apt install pinion-mcu, or sudo make install",
@@ -121,11 +50,11 @@ fn state(machine: &Machine, running: Option<&Running>) -> Finding {
     }
 }
 
-/// Whether the Pinion that runs got the real time that it asked for; none if it did not ask.
-fn real_time(machine: &Machine, running: &Running) -> Option<Finding> {
+/// Whether an instance that runs got the real time that it asked for; none if it does not run.
+fn real_time(machine: &Machine, instance: &Instance) -> Option<Finding> {
     const CHECK: &str = "realtime";
-    let pid = running.pid;
-    if running.settings.as_ref().is_some_and(|settings| !settings.realtime) {
+    let pid = instance.pid?;
+    if !instance.settings.realtime {
         let found = format!("Pinion (process {pid}) was not asked to run in real time");
         return Some(Finding::warning(CHECK, found, "use the service, or pinion run -r"));
     }
@@ -136,13 +65,14 @@ fn real_time(machine: &Machine, running: &Running) -> Option<Finding> {
         Some(stat.rsplit_once(')')?.1.split_whitespace().nth(38)? == SCHED_FIFO)
     });
     let policies: Vec<bool> = policies.collect();
+    let log = instance.unit.as_ref().map_or(String::new(), |unit| format!(": journalctl -u {unit}"));
     Some(match (policies.is_empty(), policies.contains(&true)) {
         (true, _) => Finding::ok(CHECK, format!("whether Pinion (process {pid}) runs in real time is unknown")),
         (_, true) => Finding::ok(CHECK, format!("Pinion (process {pid}) runs in real time")),
         _ => Finding::warning(
             CHECK,
             format!("Pinion (process {pid}) does not run in real time: it is not permitted"),
-            "use the service; its log says what keeps it from that: journalctl -u pinion-mcu",
+            format!("use the service; its log says what keeps it from that{log}"),
         ),
     })
 }
@@ -161,10 +91,9 @@ fn c_program(machine: &Machine) -> Vec<Finding> {
         let found = format!("Klipper's own klipper_mcu runs (process {}): it has the link and the pins", process.pid);
         findings.push(Finding::error(CHECK, found, STOP));
     }
-    let services = ["klipper-mcu.service", "klipper_mcu.service"];
-    if let Some(service) = services.into_iter().find(|service| is_enabled(machine, service)) {
-        let found = format!("{service} is enabled: at boot it is started beside Pinion, and stops it");
-        findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {service}")));
+    if let Some(unit) = units::enabled(machine, |unit| is_klipper_s(machine, unit)).first() {
+        let found = format!("{unit}.service is enabled: at boot it is started beside Pinion, and stops it");
+        findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {unit}.service")));
     }
     // A script of System V's, as Klipper's documentation had it once.
     let script = machine.names("/etc").into_iter().filter(|name| name.starts_with("rc")).find_map(|folder| {
@@ -182,10 +111,11 @@ fn c_program(machine: &Machine) -> Vec<Finding> {
 }
 
 /// The hardware watchdog, as far as it is not a matter of permissions.
-pub(super) fn watchdog(machine: &Machine, settings: &Settings) -> Vec<Finding> {
+pub(super) fn watchdog(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "watchdog_device";
     let is_there = machine.path(WATCHDOG).exists();
-    if !settings.watchdog {
+    let feeding: Vec<&Instance> = instances.iter().filter(|instance| instance.settings.watchdog).collect();
+    if feeding.is_empty() {
         let found = "Pinion does not feed the hardware watchdog";
         let finding =
             Finding::ok(CHECK, if is_there { found } else { "Pinion feeds no hardware watchdog, and there is none" });
@@ -195,6 +125,15 @@ pub(super) fn watchdog(machine: &Machine, settings: &Settings) -> Vec<Finding> {
     if !is_there {
         let remedy = "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
         return vec![Finding::error(CHECK, format!("there is no {WATCHDOG}, which Pinion is to feed"), remedy)];
+    }
+    if let [first, second, ..] = feeding[..] {
+        let found = format!(
+            "{} and {} are both told to feed {WATCHDOG}, which only one program can do",
+            first.name(),
+            second.name()
+        );
+        let remedy = format!("watchdog = false in {}, then {}", second.config(), second.restart());
+        return vec![Finding::error(CHECK, found, remedy)];
     }
     let drop_ins = machine.names("/etc/systemd/system.conf.d").into_iter();
     let files = drop_ins.map(|name| format!("/etc/systemd/system.conf.d/{name}"));
@@ -215,35 +154,15 @@ pub(super) fn watchdog(machine: &Machine, settings: &Settings) -> Vec<Finding> {
 
 #[cfg(test)]
 mod tests {
+    use super::super::instance::instances;
     use super::super::tests::{Tree, told};
     use super::*;
     use crate::cli::finding::Level::{Error, Ok, Warning};
+    use std::fs;
 
     fn found(tree: &Tree) -> Vec<Finding> {
         let machine = tree.machine();
-        findings(&machine, machine.running().as_ref())
-    }
-
-    #[test]
-    fn what_the_service_runs_by() {
-        let tree = Tree::new();
-        let read = || settings(&tree.machine(), tree.machine().running().as_ref());
-        assert!(read().1.is_empty());
-        tree.put("etc/pinion/pinion.toml", "cpu = 2\nwatchdog = true\n");
-        tree.put(
-            "etc/default/pinion-mcu",
-            "PINION_OPTIONS=\"-m 0600\"\n#PINION_OPTIONS=\"-x\"\nPINION_OPTIONS=\"--cpu 3\"\n",
-        );
-        let (settings, findings) = read();
-        assert_eq!((settings.cpu, settings.watchdog, settings.access.mode), (Some(3), true, 0o660));
-        told(&findings, "config", Ok, "has no mistake");
-        tree.put("etc/pinion/pinion.toml", "\ncpus = 2\n");
-        tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=\"--cpux 3\"\n");
-        let (_, findings) = read();
-        told(&findings, "config", Error, "/etc/pinion/pinion.toml:2:1: cpus: there is no such key: did you mean cpu?");
-        told(&findings, "options", Error, "/etc/default/pinion-mcu: unexpected argument '--cpux' found");
-        tree.process(9, &["/usr/bin/pinion", "run", "--cpu", "1"], 0, &[]);
-        assert_eq!(read().0.cpu, Some(1), "what runs counts");
+        findings(&machine, &instances(&machine).0)
     }
 
     #[test]
@@ -252,12 +171,23 @@ mod tests {
         told(&found(&tree), "service", Warning, "not installed");
         tree.put("usr/lib/systemd/system/pinion-mcu.service", "");
         assert_eq!(told(&found(&tree), "service", Warning, "does not run"), "sudo systemctl enable --now pinion-mcu");
-        tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "/usr/lib/systemd/system/x");
-        told(&found(&tree), "service", Error, "though its service is enabled");
-        tree.process(9, &["pinion", "doctor"], 0, &[]);
-        told(&found(&tree), "service", Error, "does not run");
         tree.process(10, &["/usr/bin/pinion", "run", "-r"], 990, &[]);
-        told(&found(&tree), "service", Ok, "Pinion runs as process 10");
+        tree.put("proc/10/cgroup", "0::/system.slice/pinion-mcu.service\n");
+        assert_eq!(
+            told(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu), and is not started at boot"),
+            "sudo systemctl enable --now pinion-mcu"
+        );
+        tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "/usr/lib/systemd/system/x");
+        told(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu)");
+        // One that somebody else has started is not the service's.
+        tree.put("proc/10/cgroup", "0::/user.slice/user-1000.slice/session-1.scope\n");
+        told(&found(&tree), "service", Ok, "Pinion runs as process 10: no service has started it");
+        told(&found(&tree), "service", Error, "though its service is enabled");
+        fs::remove_dir_all(tree.machine().path("/proc/10")).unwrap();
+        tree.process(9, &["pinion", "doctor"], 0, &[]);
+        let findings = found(&tree);
+        told(&findings, "service", Error, "does not run, though its service is enabled (pinion-mcu)");
+        assert_eq!(findings.iter().filter(|finding| finding.check == "service").count(), 1);
     }
 
     #[test]
@@ -270,8 +200,11 @@ mod tests {
         told(&found(&tree), "realtime", Warning, "not permitted");
         tree.put("proc/10/task/12/stat", &stat("1"));
         told(&found(&tree), "realtime", Ok, "runs in real time");
-        tree.process(10, &["/usr/bin/pinion", "run"], 990, &[]);
-        told(&found(&tree), "realtime", Warning, "was not asked");
+        // Each is judged.
+        tree.process(12, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 990, &[]);
+        let findings = found(&tree);
+        told(&findings, "realtime", Ok, "Pinion (process 10) runs in real time");
+        told(&findings, "realtime", Warning, "Pinion (process 12) was not asked");
     }
 
     #[test]
@@ -285,6 +218,12 @@ mod tests {
         );
         tree.process(20, &["/usr/local/bin/klipper_mcu", "-r"], 0, &[]);
         told(&found(&tree), "klipper_mcu", Error, "runs (process 20)");
+        tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
+        assert_eq!(
+            found(&tree).iter().filter(|finding| finding.check == "klipper_mcu").count(),
+            1,
+            "the unit starts Pinion, as the README says that it may"
+        );
         let tree = Tree::new();
         tree.link("etc/rc2.d/S01klipper_mcu", "../init.d/klipper_mcu");
         told(&found(&tree), "klipper_mcu", Error, "/etc/init.d/klipper_mcu");
@@ -293,16 +232,24 @@ mod tests {
     #[test]
     fn a_watchdog_that_is_fed() {
         let tree = Tree::new();
-        let (fed, not) = (Given { watchdog: Some(true), ..Given::default() }.settings(), Given::default().settings());
-        told(&watchdog(&tree.machine(), &not), "watchdog_device", Ok, "there is none");
-        told(&watchdog(&tree.machine(), &fed), "watchdog_device", Error, "there is no /dev/watchdog");
+        let look = || watchdog(&tree.machine(), &instances(&tree.machine()).0);
+        told(&look(), "watchdog_device", Ok, "there is none");
+        tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
+        told(&look(), "watchdog_device", Error, "there is no /dev/watchdog");
         tree.put("dev/watchdog", "");
-        assert!(
-            told(&watchdog(&tree.machine(), &not), "watchdog_device", Ok, "does not feed").contains("watchdog = true")
-        );
+        told(&look(), "watchdog_device", Ok, "is there");
+        tree.put("etc/pinion/pinion.toml", "watchdog = false\n");
+        assert!(told(&look(), "watchdog_device", Ok, "does not feed").contains("watchdog = true"));
+        tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
         tree.put("etc/systemd/system.conf", "#RuntimeWatchdogSec=20\n");
-        told(&watchdog(&tree.machine(), &fed), "watchdog_device", Ok, "is there");
+        told(&look(), "watchdog_device", Ok, "is there");
         tree.put("etc/systemd/system.conf.d/a.conf", "[Manager]\nRuntimeWatchdogSec=20\n");
-        told(&watchdog(&tree.machine(), &fed), "watchdog_device", Error, "/etc/systemd/system.conf.d/a.conf");
+        told(&look(), "watchdog_device", Error, "/etc/systemd/system.conf.d/a.conf");
+        for unit in ["pinion-mcu", "pinion-mcu@b"] {
+            tree.link(&format!("etc/systemd/system/multi-user.target.wants/{unit}.service"), "x");
+        }
+        tree.put("etc/default/pinion-mcu-b", "PINION_OPTIONS=-w\n");
+        let remedy = told(&look(), "watchdog_device", Error, "pinion-mcu and pinion-mcu@b are both told");
+        assert!(remedy.contains("/etc/pinion/b.toml"), "{remedy}");
     }
 }

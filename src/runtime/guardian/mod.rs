@@ -31,6 +31,7 @@
 mod message;
 mod watcher;
 
+use std::ffi::CStr;
 use std::io::{self, IoSlice};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::sync::Arc;
@@ -57,6 +58,8 @@ use super::pulse::{GuardianEar, Pulse};
 use message::{Message, TAKEN};
 use watcher::{Program, Watcher};
 
+/// What the kernel calls the guardian's process (proc_pid_comm(5)): its command line is the program's.
+pub(crate) const NAME: &CStr = c"pinion-guardian";
 /// How long the program waits for the guardian's answer, in seconds.
 const ANSWER_S: i64 = 5;
 /// How long to wait for the end of a process that was asked to end, or was killed.

@@ -38,7 +38,7 @@ const LOG_S: u32 = 2;
 /// Gives the new process its name, session, signals and priority.
 pub(super) fn settle(realtime: bool) {
     // Failures are ignored here: without any of these the guardian can still do its work.
-    let _ = prctl::set_name(c"pinion-guardian");
+    let _ = prctl::set_name(super::NAME);
     let _ = setsid();
     let _ = chdir("/");
     for ignored in [

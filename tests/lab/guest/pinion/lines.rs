@@ -2,6 +2,7 @@
 //! Pinion's outputs and inputs on GPIO chips, and why it refuses some.
 
 use std::os::unix::process::ExitStatusExt;
+use std::process::Command;
 
 use nix::sys::signal::Signal;
 use pinion::host::Client;
@@ -186,4 +187,21 @@ fn after_a_kill_a_restart_claims_the_lines() {
     program.signal(Signal::SIGTERM);
     assert!(program.wait().success());
     assert_eq!(uapi::line_info(&sim.path(), 0).consumer, "");
+}
+
+#[test]
+fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
+    // Only a tenth chip's lines have no names that every machine has.
+    let before: Vec<GpioSim> = (0..9).map(|n| GpioSim::new(&format!("before{n}"), 1)).collect();
+    let program = Program::start();
+    let late = GpioSim::builder("late", 8).name(3, "LAMP").build();
+    configure(&mut program.connect(), 1, &[output(0, "LAMP")]);
+    let link = program.link().to_str().expect("a path");
+    let told = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
+    let status: serde_json::Value = serde_json::from_slice(&told.stdout).expect("a status");
+    let names = ["LAMP".to_owned(), "late/gpio3".to_owned(), format!("{}/gpio3", late.chip_name())];
+    let pin = status["lines"][0]["pin"].as_str().expect("a line");
+    assert!(names.iter().any(|name| name == pin), "{status}");
+    assert!(status["board"].as_str().is_some_and(|board| board.contains("late (8 lines)")), "{status}");
+    drop(before);
 }

@@ -1,0 +1,303 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The instances of Pinion: those that run, and those whose units are enabled.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+
+use crate::cli::config::{self, SYSTEM_FILE};
+use crate::cli::finding::Finding;
+use crate::cli::run::{Given, Settings};
+use crate::cli::run_args;
+
+use super::machine::{Machine, Running};
+use super::units::{self, setting};
+
+/// The unit of the instance that there is as a rule.
+const UNIT: &str = "pinion-mcu";
+/// How klippy knows a pseudo terminal by its path (klippy/mcu.py).
+pub(super) const HOST_PATHS: &str = "/tmp/klipper_host_";
+
+/// A Pinion that runs, or is to run.
+pub(super) struct Instance {
+    /// The unit that starts it, without `.service`; none if it was started by hand.
+    pub(super) unit: Option<String>,
+    /// Its process, if it runs.
+    pub(super) pid: Option<u32>,
+    pub(super) settings: Settings,
+    /// Where klippy finds it; none if klippy does not.
+    pub(super) link: Option<PathBuf>,
+}
+
+/// What the files that belong to a unit are called.
+struct Files {
+    config: String,
+    options: String,
+    /// What the unit has the program put in place, and what leads klippy there.
+    symlink: PathBuf,
+    link: PathBuf,
+}
+
+impl Files {
+    /// Those that systemd/pinion-mcu.service and pinion-mcu@.service have; none of another unit.
+    fn of(unit: &str) -> Option<Files> {
+        let name = match unit.strip_prefix(UNIT)? {
+            "" => None,
+            name => Some(name.strip_prefix('@')?),
+        };
+        let named = name.unwrap_or("mcu");
+        Some(Files {
+            config: name.map_or_else(|| SYSTEM_FILE.to_owned(), |name| format!("/etc/pinion/{name}.toml")),
+            options: format!("/etc/default/{UNIT}{}", name.map_or_else(String::new, |name| format!("-{name}"))),
+            symlink: format!("/run/pinion/klipper_host_{named}").into(),
+            link: format!("{HOST_PATHS}{named}").into(),
+        })
+    }
+}
+
+impl Instance {
+    /// What people call it.
+    pub(super) fn name(&self) -> String {
+        match (&self.unit, self.pid) {
+            (Some(unit), _) => unit.clone(),
+            (None, Some(pid)) => format!("process {pid}"),
+            (None, None) => UNIT.to_owned(),
+        }
+    }
+
+    /// What starts it anew.
+    pub(super) fn restart(&self) -> String {
+        match &self.unit {
+            Some(unit) => format!("sudo systemctl restart {unit}"),
+            None => "start it anew".to_owned(),
+        }
+    }
+
+    /// The file with its settings.
+    pub(super) fn config(&self) -> String {
+        self.unit.as_deref().and_then(Files::of).map_or_else(|| SYSTEM_FILE.to_owned(), |files| files.config)
+    }
+}
+
+/// All instances, or, where there is none, the one that the service would be; and what is wrong with the files that
+/// say by what they run.
+pub(super) fn instances(machine: &Machine) -> (Vec<Instance>, Vec<Finding>) {
+    let running = machine.running();
+    let mut units = units::enabled(machine, |unit| is_ours(machine, unit));
+    units.retain(|unit| !running.iter().any(|running| running.unit.as_ref() == Some(unit)));
+    if running.is_empty() && units.is_empty() {
+        units.push(UNIT.to_owned());
+    }
+    let mut findings = Vec::new();
+    let mut instances = Vec::new();
+    for Running { pid, unit, settings } in running {
+        instances.push(instance(machine, unit, Some(pid), settings, &mut findings));
+    }
+    for unit in units {
+        instances.push(instance(machine, Some(unit), None, None, &mut findings));
+    }
+    (instances, findings)
+}
+
+/// Whether a unit starts Pinion: one of ours, or the one of Klipper's own program with ours in its place.
+fn is_ours(machine: &Machine, unit: &str) -> bool {
+    let is_pinion = || {
+        let text = units::text(machine, unit).unwrap_or_default();
+        let program = setting(&text, "ExecStart").and_then(|command| command.split_whitespace().next());
+        program.is_some_and(|program| Path::new(program).file_name().is_some_and(|name| name == "pinion"))
+    };
+    Files::of(unit).is_some() || units::of_klipper_mcu(unit) && is_pinion()
+}
+
+/// Whether a unit starts Klipper's own program.
+pub(super) fn is_klipper_s(machine: &Machine, unit: &str) -> bool {
+    units::of_klipper_mcu(unit) && !is_ours(machine, unit)
+}
+
+fn instance(
+    machine: &Machine,
+    unit: Option<String>,
+    pid: Option<u32>,
+    settings: Option<Settings>,
+    findings: &mut Vec<Finding>,
+) -> Instance {
+    let files = unit.as_deref().and_then(Files::of);
+    let given = match (&unit, &files) {
+        (Some(unit), Some(files)) => given(machine, unit, files, findings),
+        _ => Given::default(),
+    };
+    // The one that runs knows best. Of another version, whose command line is not understood, real time is expected.
+    let settings = settings.unwrap_or_else(|| Given { realtime: Some(true), ..given }.settings());
+    let link = if settings.symlink.to_string_lossy().starts_with(HOST_PATHS) {
+        Some(settings.symlink.clone())
+    } else {
+        // The unit's own, or one that somebody has made.
+        files.map(|files| files.link).or_else(|| link_to(machine, &settings.symlink))
+    };
+    Instance { unit, pid, settings, link }
+}
+
+/// A link that klippy takes, and that leads to this path.
+fn link_to(machine: &Machine, path: &Path) -> Option<PathBuf> {
+    let (folder, beginning) = HOST_PATHS.rsplit_once('/')?;
+    let links = machine.beginning(folder, beginning).into_iter().map(|link| machine.name(&link));
+    links.into_iter().find(|link| machine.follow(link).is_ok_and(|way| way.contains(&machine.path(path))))
+}
+
+/// What the files of a unit say.
+fn given(machine: &Machine, unit: &str, files: &Files, findings: &mut Vec<Finding>) -> Given {
+    let Files { config: config_name, options: options_name, symlink, .. } = files;
+    let restart = format!("sudo systemctl restart {unit}");
+    let mut given = Given::default();
+    match options(machine, options_name) {
+        Ok(options) => given = given.or(options),
+        Err(error) => findings.push(Finding::error(
+            "options",
+            format!("{options_name}: {error}"),
+            format!("sudo nano {options_name}, then {restart}"),
+        )),
+    }
+    // On the unit's command line, after which come the options.
+    given.symlink.get_or_insert_with(|| symlink.clone());
+    let file = machine.path(config_name);
+    if file.exists() {
+        match config::load(&file) {
+            Ok(file) => {
+                findings.push(Finding::ok("config", format!("{config_name} has no mistake")));
+                given = given.or(file);
+            }
+            Err(error) => {
+                let error = error.replacen(&*file.to_string_lossy(), config_name, 1);
+                findings.push(Finding::error("config", error, format!("sudo nano {config_name}, then {restart}")));
+            }
+        }
+    } else if units::is_installed(machine, unit) {
+        let remedy = match config_name.as_str() {
+            SYSTEM_FILE => {
+                "sudo apt install --reinstall -o Dpkg::Options::=--force-confmiss pinion-mcu, or sudo make install"
+                    .into()
+            }
+            name => format!("sudo cp {SYSTEM_FILE} {name}, then {restart}"),
+        };
+        findings.push(Finding::error(
+            "config",
+            format!("there is no {config_name}, without which {unit} does not start"),
+            remedy,
+        ));
+    }
+    given
+}
+
+/// The options that the unit takes from the environment.
+fn options(machine: &Machine, file: &str) -> Result<Given, String> {
+    let text = machine.text(file).unwrap_or_default();
+    // The last one counts (systemd.exec(5)).
+    let Some(value) = text.lines().rev().find_map(|line| line.trim().strip_prefix("PINION_OPTIONS=")) else {
+        return Ok(Given::default());
+    };
+    let words = value.trim().trim_matches(['"', '\'']).split_whitespace();
+    match run_args(["pinion", "run"].into_iter().chain(words).map(Into::into)) {
+        Ok(args) => Ok(args.map_or_else(Given::default, |args| args.into_parts().0)),
+        Err(error) => {
+            let text = error.to_string();
+            Err(text.lines().next().unwrap_or_default().trim_start_matches("error: ").to_owned())
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::{Tree, told};
+    use super::*;
+    use crate::cli::finding::Level::{Error, Ok};
+    use std::fs;
+
+    #[test]
+    fn what_the_service_runs_by() {
+        let tree = Tree::new();
+        let read = || {
+            let (mut instances, findings) = instances(&tree.machine());
+            assert_eq!(instances.len(), 1);
+            (instances.remove(0), findings)
+        };
+        assert!(read().1.is_empty());
+        tree.put("etc/pinion/pinion.toml", "cpu = 2\nwatchdog = true\n");
+        tree.put(
+            "etc/default/pinion-mcu",
+            "PINION_OPTIONS=\"-m 0600\"\n#PINION_OPTIONS=\"-x\"\nPINION_OPTIONS=\"--cpu 3\"\n",
+        );
+        let (Instance { settings, .. }, findings) = read();
+        assert_eq!((settings.cpu, settings.watchdog, settings.access.mode), (Some(3), true, 0o660));
+        told(&findings, "config", Ok, "has no mistake");
+        tree.put("etc/pinion/pinion.toml", "\ncpus = 2\n");
+        tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=\"--cpux 3\"\n");
+        let (_, findings) = read();
+        told(&findings, "config", Error, "/etc/pinion/pinion.toml:2:1: cpus: there is no such key: did you mean cpu?");
+        told(&findings, "options", Error, "/etc/default/pinion-mcu: unexpected argument '--cpux' found");
+        tree.process(9, &["/usr/bin/pinion", "run", "--cpu", "1"], 0, &[]);
+        assert_eq!(read().0.settings.cpu, Some(1), "what runs counts");
+    }
+
+    #[test]
+    fn each_instance_has_files_and_a_link_of_its_own() {
+        let tree = Tree::new();
+        for unit in ["pinion-mcu.service", "pinion-mcu@second.service", "other.service"] {
+            tree.link(&format!("etc/systemd/system/multi-user.target.wants/{unit}"), "/usr/lib/systemd/system/x");
+        }
+        tree.put("etc/pinion/second.toml", "cpu = 3\nmargn_us = 1\n");
+        tree.put("usr/lib/systemd/system/pinion-mcu@.service", "");
+        let (found, findings) = instances(&tree.machine());
+        let names: Vec<String> = found.iter().map(Instance::name).collect();
+        assert_eq!(names, ["pinion-mcu", "pinion-mcu@second"]);
+        assert_eq!(found[0].link.as_deref(), Some(Path::new("/tmp/klipper_host_mcu")));
+        assert_eq!(found[1].link.as_deref(), Some(Path::new("/tmp/klipper_host_second")));
+        let remedy = told(&findings, "config", Error, "/etc/pinion/second.toml:2:1: margn_us");
+        assert_eq!(remedy, "sudo nano /etc/pinion/second.toml, then sudo systemctl restart pinion-mcu@second");
+        fs::remove_file(tree.machine().path("/etc/pinion/second.toml")).unwrap();
+        let (_, findings) = instances(&tree.machine());
+        let remedy = told(&findings, "config", Error, "there is no /etc/pinion/second.toml");
+        assert!(remedy.starts_with("sudo cp /etc/pinion/pinion.toml /etc/pinion/second.toml"), "{remedy}");
+        // Of one that runs the process counts, and its guardian is none.
+        tree.put("etc/pinion/second.toml", "cpu = 3\n");
+        let command =
+            ["/usr/bin/pinion", "run", "-I", "/run/pinion/klipper_host_second", "--config", "/etc/pinion/second.toml"];
+        for pid in [20, 21] {
+            tree.process(pid, &command, 990, &[]);
+            tree.put(&format!("proc/{pid}/cgroup"), "0::/system.slice/system-pinion.slice/pinion-mcu@second.service\n");
+        }
+        tree.put("proc/21/comm", "pinion-guardian\n");
+        let (found, _) = instances(&tree.machine());
+        let facts: Vec<_> = found.iter().map(|it| (it.name(), it.pid, it.settings.cpu)).collect();
+        assert_eq!(facts, [("pinion-mcu@second".to_owned(), Some(20), Some(3)), ("pinion-mcu".to_owned(), None, None)]);
+        assert_eq!(found[0].link.as_deref(), Some(Path::new("/tmp/klipper_host_second")));
+    }
+
+    #[test]
+    fn an_instance_that_was_started_by_hand_may_have_a_link_that_klippy_does_not_take() {
+        let tree = Tree::new();
+        tree.process(30, &["pinion", "run", "--board", "sim", "-I", "/home/pi/sim"], 1000, &[]);
+        let link = || instances(&tree.machine()).0[0].link.clone();
+        assert_eq!(link(), None);
+        tree.put("dev/pts/4", "");
+        tree.link("home/pi/sim", "/dev/pts/4");
+        tree.link("tmp/klipper_host_sim", "/home/pi/sim");
+        assert_eq!(link().as_deref(), Some(Path::new("/tmp/klipper_host_sim")));
+    }
+
+    #[test]
+    fn the_c_program_s_unit_with_pinion_in_it_is_an_instance() {
+        let tree = Tree::new();
+        tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
+        tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/local/bin/klipper_mcu -r\n");
+        assert!(is_klipper_s(&tree.machine(), "klipper-mcu"));
+        assert_eq!(instances(&tree.machine()).0[0].name(), "pinion-mcu");
+        tree.put(
+            "etc/systemd/system/klipper-mcu.service.d/override.conf",
+            "[Service]\nExecStart=\nExecStart=/usr/bin/pinion -r\n",
+        );
+        assert!(!is_klipper_s(&tree.machine(), "klipper-mcu"));
+        let (found, _) = instances(&tree.machine());
+        assert_eq!((found.len(), found[0].name().as_str()), (1, "klipper-mcu"));
+        assert_eq!(found[0].link.as_deref(), Some(Path::new("/tmp/klipper_host_mcu")));
+    }
+}

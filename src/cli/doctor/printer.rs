@@ -1,0 +1,148 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What klippy's configuration says of micro-controllers, as far as pseudo terminals go.
+
+#![forbid(unsafe_code)]
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Component, Path, PathBuf};
+
+use super::machine::Machine;
+
+/// No configuration has as many files.
+const FILES_MAX: usize = 500;
+
+/// The `serial` of each `[mcu]` section of a configuration, with the files that it includes. None if one of them
+/// can not be read. As in klippy/configfile.py the last word on a section counts.
+pub(super) fn serials(machine: &Machine, config: &Path) -> Option<BTreeSet<PathBuf>> {
+    let mut reader = Reader { machine, serials: BTreeMap::new(), files: 0 };
+    reader.file(config, &mut Vec::new())?;
+    Some(reader.serials.into_values().collect())
+}
+
+struct Reader<'a> {
+    machine: &'a Machine,
+    /// By the section's name.
+    serials: BTreeMap<String, PathBuf>,
+    files: usize,
+}
+
+impl Reader<'_> {
+    /// Reads a file; `within` are those that include it.
+    fn file(&mut self, path: &Path, within: &mut Vec<PathBuf>) -> Option<()> {
+        self.files += 1;
+        if self.files > FILES_MAX || within.iter().any(|outer| outer == path) {
+            return None;
+        }
+        // A link leads where it does on the machine that is looked at.
+        let target = self.machine.follow(path).ok()?.pop()?;
+        let text = self.machine.text(self.machine.name(&target))?;
+        within.push(path.to_owned());
+        let mut section = String::new();
+        for line in text.lines() {
+            let line = line.split('#').next().unwrap_or_default().trim_end();
+            if let Some(header) = line.strip_prefix('[').and_then(|line| line.split(']').next()) {
+                section = header.trim().to_owned();
+                if let Some(pattern) = section.strip_prefix("include ") {
+                    let folder = path.parent().unwrap_or(Path::new("/"));
+                    for file in matching(self.machine, &folder.join(pattern.trim())) {
+                        self.file(&file, within)?;
+                    }
+                }
+                continue;
+            }
+            let Some((key, value)) = line.split_once([':', '=']) else { continue };
+            if key.trim_end() == "serial" && (section == "mcu" || section.starts_with("mcu ")) {
+                self.serials.insert(section.clone(), value.trim().into());
+            }
+        }
+        within.pop();
+        Some(())
+    }
+}
+
+/// The files that an absolute pattern of `*` and `?` names, in order; a path without any names itself.
+fn matching(machine: &Machine, pattern: &Path) -> Vec<PathBuf> {
+    let mut paths = vec![PathBuf::from("/")];
+    for part in pattern.components() {
+        let Component::Normal(part) = part else {
+            if part == Component::ParentDir {
+                paths.iter_mut().for_each(|path| path.push(".."));
+            }
+            continue;
+        };
+        let part = part.to_string_lossy();
+        if !part.contains(['*', '?']) {
+            paths.iter_mut().for_each(|path| path.push(&*part));
+            continue;
+        }
+        let found = paths.iter().flat_map(|folder| {
+            let names = machine.names(folder).into_iter();
+            // What is hidden has to be asked for by its dot.
+            let names = names.filter(|name| !name.starts_with('.') || part.starts_with('.'));
+            names.filter(|name| is_match(part.as_bytes(), name.as_bytes())).map(|name| folder.join(name))
+        });
+        paths = found.collect();
+    }
+    paths
+}
+
+fn is_match(pattern: &[u8], name: &[u8]) -> bool {
+    match (pattern.split_first(), name.split_first()) {
+        (None, None) => true,
+        (Some((b'*', rest)), _) => (0..=name.len()).any(|skipped| is_match(rest, &name[skipped..])),
+        (Some((b'?', rest)), Some((_, left))) => is_match(rest, left),
+        (Some((wanted, rest)), Some((first, left))) => wanted == first && is_match(rest, left),
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::Tree;
+    use super::*;
+
+    fn read(tree: &Tree) -> Option<Vec<String>> {
+        let serials = serials(&tree.machine(), Path::new("/home/pi/config/printer.cfg"))?;
+        Some(serials.iter().map(|path| path.display().to_string()).collect())
+    }
+
+    #[test]
+    fn each_micro_controller_s_serial_counts_as_it_was_said_last() {
+        let tree = Tree::new();
+        assert_eq!(read(&tree), None);
+        tree.put("home/pi/config/printer.cfg", "[printer]\nserial: /no\n[mcu]\nserial: /dev/serial/by-id/x # a board\n#[mcu no]\n#serial: /no\n[mcu host]\nserial=/tmp/klipper_host_mcu\n[include parts/*.cfg]\n[mcu last]\nrestart_method: command\n");
+        assert_eq!(read(&tree).unwrap(), ["/dev/serial/by-id/x", "/tmp/klipper_host_mcu"]);
+        tree.put("home/pi/config/parts/b.cfg", "[mcu host]\nserial: /tmp/klipper_host_b\n");
+        tree.put("home/pi/config/parts/a.cfg", "[mcu host]\nserial: /tmp/klipper_host_a\n[include ../up.cfg]\n");
+        tree.put("home/pi/config/parts/.hidden.cfg", "[mcu hidden]\nserial: /no\n");
+        tree.put("home/pi/config/up.cfg", "[mcu]\nserial: /tmp/klipper_host_up\n");
+        assert_eq!(read(&tree).unwrap(), ["/tmp/klipper_host_b", "/tmp/klipper_host_up"]);
+        // A link by the path that the machine itself has for it.
+        tree.link("home/pi/config/parts/c.cfg", "/usr/share/c.cfg");
+        assert_eq!(read(&tree), None, "it leads nowhere");
+        tree.put("usr/share/c.cfg", "[mcu c]\nserial: /tmp/klipper_host_c\n");
+        assert_eq!(read(&tree).unwrap().len(), 3);
+    }
+
+    #[test]
+    fn files_that_include_each_other_are_not_read_for_ever() {
+        let tree = Tree::new();
+        tree.put("home/pi/config/printer.cfg", "[include a.cfg]\n");
+        tree.put("home/pi/config/a.cfg", "[include *.cfg]\n");
+        assert_eq!(read(&tree), None);
+    }
+
+    #[test]
+    fn patterns() {
+        for (pattern, name, is) in [
+            ("*.cfg", "a.cfg", true),
+            ("*.cfg", "a.cfg.bak", false),
+            ("a?c*", "abc", true),
+            ("a?c", "ac", false),
+            ("*a*b", "xaxab", true),
+            ("", "", true),
+        ] {
+            assert_eq!(is_match(pattern.as_bytes(), name.as_bytes()), is, "{pattern} {name}");
+        }
+    }
+}

@@ -1,0 +1,96 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Units of systemd, as their files tell of them. They are called without `.service` here.
+
+#![forbid(unsafe_code)]
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::path::Path;
+
+use super::machine::Machine;
+
+/// Where units stand, those of the administrator first (systemd.unit(5)).
+const FOLDERS: [&str; 4] =
+    ["/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"];
+const ENDING: &str = ".service";
+
+/// Whether a unit is installed and not masked; an instance of a template if that is.
+pub(super) fn is_installed(machine: &Machine, unit: &str) -> bool {
+    let template = unit.split_once('@').map(|(name, _)| format!("{name}@"));
+    let is_there = |unit: &str| {
+        let mut paths = FOLDERS.iter().map(|folder| machine.path(folder).join(unit.to_owned() + ENDING));
+        let first = paths.find(|path| fs::symlink_metadata(path).is_ok());
+        first.is_some_and(|path| fs::read_link(path).map_or(true, |target| target != Path::new("/dev/null")))
+    };
+    is_there(unit) || template.is_some_and(|template| is_there(&template))
+}
+
+/// The units that are started at boot, as some target wants them, in order; of these the ones that are `wanted`.
+pub(super) fn enabled(machine: &Machine, wanted: impl Fn(&str) -> bool) -> Vec<String> {
+    const FOLDER: &str = FOLDERS[0];
+    let folders = machine.names(FOLDER).into_iter();
+    let folders = folders.filter(|folder| [".wants", ".requires"].iter().any(|kind| folder.ends_with(kind)));
+    let names = folders.flat_map(|folder| machine.names(format!("{FOLDER}/{folder}")));
+    let units: BTreeSet<String> = names.filter_map(|name| Some(name.strip_suffix(ENDING)?.to_owned())).collect();
+    units.into_iter().filter(|unit| wanted(unit)).collect()
+}
+
+/// All units that are installed, in order.
+pub(super) fn all(machine: &Machine) -> BTreeSet<String> {
+    let names = FOLDERS.iter().flat_map(|folder| machine.names(folder));
+    names.filter_map(|name| Some(name.strip_suffix(ENDING)?.to_owned())).collect()
+}
+
+/// The text of a unit, with that of the files which add to it.
+pub(super) fn text(machine: &Machine, unit: &str) -> Option<String> {
+    let file = FOLDERS.iter().find_map(|folder| machine.text(format!("{folder}/{unit}{ENDING}")))?;
+    // The administrator's come last.
+    let added = FOLDERS.iter().rev().flat_map(|folder| {
+        let folder = format!("{folder}/{unit}{ENDING}.d");
+        let names = machine.names(&folder).into_iter().filter(|name| name.ends_with(".conf"));
+        names.filter_map(|name| machine.text(format!("{folder}/{name}"))).collect::<Vec<_>>()
+    });
+    Some(std::iter::once(file).chain(added).collect::<Vec<_>>().join("\n"))
+}
+
+/// A setting in a unit's text: the last one counts.
+pub(super) fn setting<'a>(text: &'a str, key: &str) -> Option<&'a str> {
+    let values = text.lines().filter_map(|line| line.trim().strip_prefix(key)?.trim_start().strip_prefix('='));
+    values.map(str::trim).rfind(|value| !value.is_empty())
+}
+
+/// Whether this is what a unit of Klipper's own micro-controller program is called.
+pub(super) fn of_klipper_mcu(unit: &str) -> bool {
+    ["klipper-mcu", "klipper_mcu"].contains(&unit)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::Tree;
+    use super::*;
+
+    #[test]
+    fn what_is_installed_masked_or_an_instance() {
+        let tree = Tree::new();
+        let is = |unit: &str| is_installed(&tree.machine(), unit);
+        ["pinion-mcu@", "pinion-mcu"]
+            .iter()
+            .for_each(|unit| tree.put(&format!("usr/lib/systemd/system/{unit}.service"), ""));
+        assert!(is("pinion-mcu@second") && is("pinion-mcu") && !is("pinion"));
+        tree.link("etc/systemd/system/pinion-mcu.service", "/dev/null");
+        assert!(!is("pinion-mcu"), "it is masked");
+    }
+
+    #[test]
+    fn what_is_added_to_a_unit_counts() {
+        let tree = Tree::new();
+        assert_eq!(text(&tree.machine(), "a"), None);
+        tree.put("lib/systemd/system/a.service", "User=lib\nGroup=lib\n");
+        tree.put("lib/systemd/system/a.service.d/z.conf", "User=lib.d\n");
+        tree.put("etc/systemd/system/a.service.d/a.conf", "User = etc.d\n");
+        tree.put("etc/systemd/system/a.service.d/b.conf~", "User=backup\n");
+        let text = text(&tree.machine(), "a").unwrap();
+        assert_eq!((setting(&text, "User"), setting(&text, "Group")), (Some("etc.d"), Some("lib")));
+        assert_eq!(setting(&text, "ExecStart"), None);
+    }
+}
