@@ -265,8 +265,22 @@ impl Link {
     }
 
     /// Passes on what the core said last.
-    pub(super) fn finish(mut self) -> Vigil {
+    pub(super) fn finish(&mut self) {
         self.give_out();
+    }
+
+    /// Leaves a host the time to read why the program ends: what is unread when the terminal closes is lost,
+    /// and klippy then tells of a lost communication, seconds later.
+    pub(super) fn farewell(&self) {
+        if self.attached {
+            // A host that hangs up has read it; a further signal cuts it short.
+            let mut fds = [PollFd::new(self.pty.master(), PollFlags::empty())];
+            let _ = poll(&mut fds, in_ms(FAREWELL));
+        }
+    }
+
+    /// Closes the terminal.
+    pub(super) fn close(self) -> Vigil {
         self.vigil
     }
 

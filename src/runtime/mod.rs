@@ -202,7 +202,7 @@ pub fn run(
     link.stopping();
     link.request(Request::Quit);
     let left = core.join();
-    let vigil = link.finish();
+    link.finish();
     // Without a goodbye the guardian drives the outputs.
     match left {
         Ok(Left::Safe) => {}
@@ -216,7 +216,11 @@ pub fn run(
     if let Some(guardian) = guardian {
         guardian.goodbye();
     }
-    vigil.end();
+    // With its guardian lost it has taken leave already.
+    if matches!(served, Ok(End::Asked)) {
+        link.farewell();
+    }
+    link.close().end();
     match served? {
         End::Asked => Ok(()),
         End::GuardianLost => {
