@@ -5,8 +5,13 @@
 //! host identify LINK [PIN]   tells the version, and fails if there is no such pin
 //! host light LINK PIN        switches a heater on, says "lit" and refreshes it until it is killed
 //! host home LINK             homes an axis until the endstop, which the check closes, triggers
+//! host ask SOCKET METHOD PARAMS POINTER
+//!                            asks klippy over its API socket (docs/API_Server.md of Klipper), and prints
+//!                            what the JSON pointer leads to in the result
 //! ```
 
+use std::io::{self, Read, Write};
+use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
@@ -14,12 +19,14 @@ use std::time::{Duration, Instant};
 use pinion::host::config::Config;
 use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 use pinion::host::{Client, Error};
-use serde_json::Value;
+use serde_json::{Value, json};
 
 const PATIENCE: Duration = Duration::from_secs(10);
 /// A heater that is not refreshed for so long shuts the machine down.
 const MAX_DURATION_S: f64 = 3.0;
 const REFRESH: Duration = Duration::from_millis(300);
+/// klippy answers G-code when it has ended; an emulated computer homes slowly.
+const KLIPPYS_PATIENCE: Duration = Duration::from_secs(120);
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -29,6 +36,7 @@ fn main() -> ExitCode {
         ["identify", link, pin] => identify(link, Some(pin)),
         ["light", link, pin] => light(link, pin),
         ["home", link] => home(link),
+        ["ask", socket, method, params, pointer] => return asked(ask(socket, method, params, pointer)),
         // As cargo and the like may start it.
         _ => return ExitCode::SUCCESS,
     };
@@ -92,4 +100,46 @@ fn home(link: &str) -> Result<(), Error> {
         HomingEnd::Endstop if homed.position > 0 => Ok(()),
         _ => Err(Error::Plan { subject: "homing".to_owned(), why: "not ended by the endstop".to_owned() }),
     }
+}
+
+fn asked(answer: Result<String, String>) -> ExitCode {
+    match answer {
+        Ok(answer) => {
+            println!("{answer}");
+            ExitCode::SUCCESS
+        }
+        Err(error) => {
+            eprintln!("{error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// The error is klippy's own text, where there is one.
+fn ask(socket: &str, method: &str, params: &str, pointer: &str) -> Result<String, String> {
+    let params: Value = serde_json::from_str(params).map_err(|error| format!("{params}: {error}"))?;
+    let answer = request(socket, &json!({ "id": 1, "method": method, "params": params }))
+        .map_err(|error| format!("{socket}: {error}"))?;
+    if let Some(error) = answer.get("error") {
+        return Err(error["message"].as_str().map_or_else(|| error.to_string(), str::to_owned));
+    }
+    match answer["result"].pointer(pointer) {
+        Some(Value::String(text)) => Ok(text.clone()),
+        Some(value) => Ok(value.to_string()),
+        None => Err(format!("{answer} has no {pointer}")),
+    }
+}
+
+fn request(socket: &str, request: &Value) -> io::Result<Value> {
+    let mut api = UnixStream::connect(socket)?;
+    api.set_read_timeout(Some(KLIPPYS_PATIENCE))?;
+    api.write_all(format!("{request}\x03").as_bytes())?;
+    let mut answer = Vec::new();
+    for byte in api.bytes() {
+        match byte? {
+            b'\x03' => return Ok(serde_json::from_slice(&answer)?),
+            byte => answer.push(byte),
+        }
+    }
+    Err(io::Error::other("klippy has hung up"))
 }

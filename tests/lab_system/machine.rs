@@ -14,8 +14,12 @@ use super::cache::Cache;
 use super::kernel::{Flavour, Kernel, Offers, remove_others};
 use super::{process, tools};
 
-/// Longer than the agent lets a script run, and longer than a boot takes on a busy computer.
-const SILENCE_MAX: Duration = Duration::from_secs(240);
+/// By the guest's clock the agent lets a script run for less than three minutes; by the computer's, should
+/// it be busy, that is more.
+const SILENCE_MAX: Duration = Duration::from_secs(900);
+/// The guest's time: while it works, an instruction takes 1 ns; while it sleeps, time is the computer's. On a
+/// busy computer the machine is then slow, and nothing in it is late, which klippy and a watchdog would mind.
+const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];
 /// A script that ends with this status has begun to reboot the machine: the next one waits for it.
 const REBOOTS: i32 = 77;
 
@@ -155,7 +159,8 @@ impl Drop for Machine {
 fn start(kernel: &Path, initrd: &Path, folder: &Path) -> Result<(Child, ChildStdin, Receiver<String>), String> {
     let file = |name: &str| folder.join(name).display().to_string();
     let mut qemu = Command::new("qemu-system-x86_64");
-    qemu.args(["-accel", "tcg,thread=multi", "-cpu", "qemu64,+rdrand", "-smp", "2", "-m", "768"])
+    qemu.args(["-accel", "tcg", "-cpu", "qemu64,+rdrand", "-m", "768"])
+        .args(TIME)
         .args(["-nodefaults", "-display", "none", "-no-reboot", "-kernel"])
         .arg(kernel)
         .arg("-initrd")

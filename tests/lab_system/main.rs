@@ -44,6 +44,8 @@ Options:
   --run FILE         Run this script in the machine after the checks, and print its output
   --list             Name the checks";
 
+/// A check that can not be run ends so, and prints why.
+const NOT_RUN: i32 = 78;
 /// A failed run exits as libtest's do.
 const FAILED: u8 = 101;
 
@@ -116,17 +118,23 @@ fn run(options: &Options) -> Result<bool, String> {
     let root = Root::prepare(&cache)?;
     let folder = cache.run_folder()?;
     packages::share(&folder.path().join("share"))?;
+    packages::share_klippy(&folder.path().join("share"))?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
 
     let mut machine = Machine::boot(&root, folder.path())?;
     println!("booted in {:.1} s", machine.boot_took.as_secs_f64());
-    let (mut failed, mut passed) = (Vec::new(), 0);
+    let (mut failed, mut not_run, mut passed) = (Vec::new(), Vec::new(), 0);
     for (number, check) in checks.iter().enumerate() {
         if number > 0 && !options.filters.is_empty() && !options.filters.iter().any(|part| check.name.contains(part)) {
             continue;
         }
         let began = Instant::now();
         let (status, output) = machine.run(&check.script)?;
+        if status == NOT_RUN {
+            println!("check {} ... NOT RUN: {}", check.name, output.trim());
+            not_run.push(check.name.as_str());
+            continue;
+        }
         let verdict = if status == 0 { "ok" } else { "FAILED" };
         println!("check {} ... {verdict} ({:.1} s)", check.name, began.elapsed().as_secs_f64());
         if status != 0 || options.show_output {
@@ -145,7 +153,12 @@ fn run(options: &Options) -> Result<bool, String> {
         let (status, output) = machine.run(&script)?;
         println!("{output}\nstatus {status}");
     }
-    println!("\n{passed} passed, {} failed {failed:?} in {:.1} s", failed.len(), began.elapsed().as_secs_f64());
+    println!(
+        "\n{passed} passed, {} failed {failed:?}, {} not run {not_run:?} in {:.1} s",
+        failed.len(),
+        not_run.len(),
+        began.elapsed().as_secs_f64()
+    );
     Ok(failed.is_empty())
 }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the machine is given: the package of the tree as it stands, a later one, the host, and the tree.
+//! What the machine is given: the package of the tree as it stands, a later one, the host, the tree, and klippy.
 
 use std::env;
 use std::fs;
@@ -45,6 +45,19 @@ pub fn share(folder: &Path) -> Result<(), String> {
            install -D "$2/pinion" "$2/tree/target/release/pinion""#,
         &[&tree.display().to_string(), &folder.display().to_string()],
     )
+}
+
+/// klippy of the checkout that KLIPPER_DIR names, if it names one: for its own checks, see
+/// `guest/klippy.sh`. Its C library is compiled here, by klippy itself: this is a Debian 12 for x86-64, too.
+pub fn share_klippy(folder: &Path) -> Result<(), String> {
+    let words = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/lab_system/guest/klippy.sh");
+    process::run(Command::new("cp").arg(words).arg(folder))?;
+    let Some(checkout) = env::var_os("KLIPPER_DIR") else { return Ok(()) };
+    let copy = folder.join("klipper");
+    fs::create_dir(&copy).map_err(|error| format!("{}: {error}", copy.display()))?;
+    process::run(Command::new("cp").arg("-a").arg(Path::new(&checkout).join("klippy")).arg(&copy))?;
+    let python = env::var_os("KLIPPER_PYTHON").unwrap_or("python3".into());
+    process::run(Command::new(python).arg(copy.join("klippy/chelper/__init__.py")))
 }
 
 /// Has cargo build a target, and returns its program.

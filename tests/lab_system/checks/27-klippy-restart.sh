@@ -1,0 +1,30 @@
+# Pinion is restarted, and killed, while klippy runs and has the heater and a light on: they go off, klippy
+# says what happened, and FIRMWARE_RESTART is all that it takes.
+. /share/klippy.sh
+lit() {
+    gcode 'SET_PIN PIN=light VALUE=1'
+    gcode 'M140 S60'
+    until_true 10 is_high 14
+    until_true 10 is_high 3
+}
+# off SECONDS
+off() {
+    until_true "$1" is_low 3
+    is_low 14
+    until_state shutdown
+    why
+    until_true 30 is_active pinion-mcu
+}
+klippy_is_ready
+lit
+systemctl restart pinion-mcu
+off 1
+firmware_restart
+lit
+mark
+kill -9 "$(pid)"
+off 8
+firmware_restart
+lit
+gcode 'M140 S0'
+systemctl stop klipper

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+# The words of the checks with a real klippy, which a check takes by `. /share/klippy.sh`. klippy lives in
+# klippy's home and is run by a unit of the shape that KIAUH writes.
+[ -d /share/klipper ] || { echo 'KLIPPER_DIR names no checkout of Klipper'; exit 78; }
+trap 'echo "failed: line $LINENO: $BASH_COMMAND"
+    journalctl -n 25 --no-pager -u "pinion-mcu*" -u klipper 2>/dev/null
+    grep -v "^Stats" $LOG | tail -n 40' ERR
+
+DATA=/home/klippy/printer_data
+API=$DATA/comms/klippy.sock
+LOG=$DATA/logs/klippy.log
+CONFIG=$DATA/config/printer.cfg
+MOCKS=/sys/devices/platform
+# Python in the emulator takes many times as long to start as on a Raspberry Pi.
+START=90
+
+pull() { echo "pull-$2" >"$CHIP/sim_gpio$1/pull"; }
+# ask METHOD PARAMS POINTER
+ask() { host ask "$API" "$@"; }
+gcode() { ask gcode/script "{ \"script\": \"$1\" }" "" >/dev/null; }
+# of OBJECT FIELD
+of() { ask objects/query "{ \"objects\": { \"$1\": null } }" "/status/$1/$2"; }
+state() { ask info '{}' /state; }
+# What klippy says of its state, as Mainsail and Fluidd show it.
+why() { ask info '{}' /state_message; }
+says() { why | grep "$1" >/dev/null; }
+# between VALUE LEAST MOST
+between() { awk -v value="$1" -v least="$2" -v most="$3" 'BEGIN { exit !(value >= least && value <= most) }'; }
+measures() { between "$(of "$1" temperature)" "$2" "$3"; }
+# until_state STATE: asked seldom, as klippy has one slow processor to start on.
+until_state() {
+    local end=$((SECONDS + START))
+    until [ "$(state 2>/dev/null)" = "$1" ]; do
+        [ $SECONDS -lt $end ] || fail "klippy is in $(state), not in $1: $(why)"
+        sleep 1
+    done
+}
+# Its user's cure for everything. (klippy hangs up on who says it.)
+firmware_restart() {
+    gcode FIRMWARE_RESTART || true
+    until_state ready
+}
+
+# A printer whose only micro-controller is Pinion, and the surroundings of the computer's pins.
+configure() {
+    # 25 and 82 degrees, by a resistor of 4.7 kOhm.
+    echo 3911 >"$MOCKS/mock-adc.0/iio:device0/in_voltage0_raw"
+    echo 2786 >"$MOCKS/mock-adc.0/iio:device0/in_voltage1_raw"
+    # 27.5 degrees in an LM75's register.
+    echo '50 0 1b' >$MOCKS/mock-i2c/change
+    echo '50 1 80' >$MOCKS/mock-i2c/change
+    echo '0 21500' >$MOCKS/mock-w1/temperature
+    pull 6 down
+    pull 8 down
+    local bus
+    bus=$(basename $MOCKS/mock-i2c/i2c-*)
+    cat >$CONFIG <<END
+[mcu]
+serial: $LINK
+
+[printer]
+kinematics: cartesian
+max_velocity: 10
+max_accel: 50
+
+[stepper_x]
+step_pin: STEP
+dir_pin: DIR
+endstop_pin: ENDSTOP
+microsteps: 1
+rotation_distance: 40
+position_max: 50
+position_endstop: 0
+homing_speed: 5
+homing_retract_dist: 0
+
+[stepper_y]
+step_pin: lab/gpio0
+dir_pin: lab/gpio1
+endstop_pin: lab/gpio2
+microsteps: 1
+rotation_distance: 40
+position_max: 50
+position_endstop: 0
+
+[stepper_z]
+step_pin: lab/gpio10
+dir_pin: lab/gpio11
+endstop_pin: lab/gpio12
+microsteps: 1
+rotation_distance: 40
+position_max: 50
+position_endstop: 0
+
+[heater_bed]
+heater_pin: HEATER
+sensor_type: Generic 3950
+sensor_pin: analog0
+control: watermark
+min_temp: 0
+max_temp: 130
+
+[temperature_sensor chamber]
+sensor_type: Generic 3950
+sensor_pin: mock-adc12/voltage1
+min_temp: 0
+max_temp: 130
+
+[temperature_sensor thermocouple]
+sensor_type: MAX31855
+spi_bus: spidev0.0
+sensor_pin: lab/gpio15
+min_temp: -10
+max_temp: 100
+
+[temperature_sensor i2c]
+sensor_type: LM75
+i2c_bus: i2c.${bus#i2c-}
+i2c_address: 80
+min_temp: 0
+max_temp: 100
+
+[temperature_sensor wire]
+sensor_type: DS18B20
+serial_no: 28-000000001001
+sensor_mcu: mcu
+min_temp: 0
+max_temp: 100
+
+[output_pin light]
+pin: lab/gpio14
+
+[output_pin dimmer]
+pin: pwmchip0/pwm1
+pwm: True
+hardware_pwm: True
+cycle_time: 0.001
+shutdown_value: 0
+
+[fan]
+pin: lab/gpio9
+
+[gcode_button knob]
+pin: lab/gpio8
+press_gcode:
+    SET_PIN PIN=light VALUE=1
+END
+}
+
+# Once in a machine.
+install_klippy() {
+    [ ! -e /etc/systemd/system/klipper.service ] || return 0
+    mkdir -p $DATA/config $DATA/logs $DATA/comms $DATA/systemd
+    cp -a /share/klipper /home/klippy/klipper
+    cat >$DATA/systemd/klipper.env <<END
+KLIPPER_ARGS="/home/klippy/klipper/klippy/klippy.py $CONFIG -I $DATA/comms/klippy.serial -l $LOG -a $API"
+END
+    chown -R klippy: /home/klippy
+    cat >/etc/systemd/system/klipper.service <<END
+[Unit]
+Description=Klipper
+After=network-online.target
+Wants=udev.target
+
+[Service]
+Type=simple
+User=klippy
+RemainAfterExit=yes
+WorkingDirectory=/home/klippy/klipper
+EnvironmentFile=$DATA/systemd/klipper.env
+ExecStart=/usr/bin/python3 \$KLIPPER_ARGS
+Restart=always
+RestartSec=10
+
+[Install]
+WantedBy=multi-user.target
+END
+    systemctl daemon-reload
+}
+
+# klippy is installed, and ready on the configuration above.
+klippy_is_ready() {
+    fresh
+    install_klippy
+    configure
+    systemctl start pinion-mcu
+    systemctl restart klipper
+    until_state ready
+}
