@@ -14,9 +14,9 @@ use super::cache::Cache;
 use super::kernel::{Flavour, Kernel, Offers, remove_others};
 use super::{process, tools};
 
-/// By the guest's clock the agent lets a script run for less than three minutes; by the computer's, should
-/// it be busy, that is more.
-const SILENCE_MAX: Duration = Duration::from_secs(900);
+/// Longer than the agent lets a script run, which it measures by the guest's clock: on a busy computer that
+/// takes several seconds for one.
+const SILENCE_MAX: Duration = Duration::from_secs(1800);
 /// The guest's time: while it works, an instruction takes 1 ns; while it sleeps, time is the computer's. On a
 /// busy computer the machine is then slow, and nothing in it is late, which klippy and a watchdog would mind.
 const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];

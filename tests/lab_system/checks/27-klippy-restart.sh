@@ -7,24 +7,23 @@ lit() {
     until_true 10 is_high 14
     until_true 10 is_high 3
 }
-# off SECONDS
+# off SECONDS WHAT-KLIPPY-SAYS
 off() {
     until_true "$1" is_low 3
     is_low 14
     until_state shutdown
     why
+    says "$2"
     until_true 30 is_active pinion-mcu
 }
 klippy_is_ready
 lit
 systemctl restart pinion-mcu
-off 1
+off 1 'Force shutdown command'
 firmware_restart
 lit
-mark
 kill -9 "$(pid)"
-off 8
+off 8 "Lost communication with MCU 'mcu'"
 firmware_restart
 lit
-gcode 'M140 S0'
 systemctl stop klipper

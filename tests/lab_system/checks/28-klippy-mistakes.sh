@@ -2,12 +2,12 @@
 . /share/klippy.sh
 # klippy's user is not in the group: doctor names the command, which is tried here by its letter.
 sudo() { "$@"; }
+install_klippy
+configure
 systemctl stop klipper
 gpasswd -d klippy tty
 fresh
-install_klippy
-configure
-systemctl start pinion-mcu
+systemctl restart pinion-mcu
 : >$LOG
 systemctl start klipper
 until_true $START grep 'Unable to open .*port: .*Permission denied' $LOG

@@ -4,7 +4,7 @@
 [ -d /share/klipper ] || { echo 'KLIPPER_DIR names no checkout of Klipper'; exit 78; }
 trap 'echo "failed: line $LINENO: $BASH_COMMAND"
     journalctl -n 25 --no-pager -u "pinion-mcu*" -u klipper 2>/dev/null
-    grep -v "^Stats" $LOG | tail -n 40' ERR
+    grep -v "^Stats\|^Receive\|^Sent\|: got {\|^webhooks" $LOG | tail -n 40' ERR
 
 DATA=/home/klippy/printer_data
 API=$DATA/comms/klippy.sock
@@ -178,12 +178,14 @@ END
     systemctl daemon-reload
 }
 
-# klippy is installed, and ready on the configuration above.
+# klippy is installed, and ready on the configuration above. A machine that a check before has left shut
+# down, as by a heater that nobody refreshed any more, klippy does not take without a FIRMWARE_RESTART.
 klippy_is_ready() {
     fresh
     install_klippy
     configure
-    systemctl start pinion-mcu
-    systemctl restart klipper
+    systemctl stop klipper
+    systemctl restart pinion-mcu
+    systemctl start klipper
     until_state ready
 }
