@@ -8,7 +8,7 @@ systemctl stop klipper
 gpasswd -d klippy tty
 fresh
 systemctl restart pinion-mcu
-: >$LOG
+rm -f $LOG
 systemctl start klipper
 until_true $START grep 'Unable to open .*port: .*Permission denied' $LOG
 not pinion doctor >/run/doctor

@@ -4,7 +4,7 @@ install_klippy
 configure
 fresh
 systemctl stop klipper pinion-mcu
-: >$LOG
+rm -f $LOG
 systemctl start klipper
 until_true $START grep 'Unable to open .*port: ' $LOG
 systemctl start pinion-mcu
