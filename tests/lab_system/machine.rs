@@ -15,7 +15,7 @@ use super::kernel::{Flavour, Kernel, Offers, remove_others};
 use super::{process, tools};
 
 /// Longer than the agent lets a script run, and longer than a boot takes on a busy computer.
-const SILENCE_MAX: Duration = Duration::from_secs(660);
+const SILENCE_MAX: Duration = Duration::from_secs(960);
 /// A script that ends with this status has begun to reboot the machine: the next one waits for it.
 const REBOOTS: i32 = 77;
 

@@ -53,7 +53,8 @@ bare() {
     apt-get -qq autoremove -y --purge libiio0
     if id pi >/dev/null 2>&1; then userdel -rf pi; fi
     useradd -m -s /bin/bash pi
-    # sudo looks its own computer up.
+    # What any system has, and this one does not: sudo looks its own computer up.
+    mkdir -p /etc/apt/sources.list.d
     grep -q guest /etc/hosts || echo 127.0.1.1 guest >>/etc/hosts
     echo 'pi ALL=(ALL) NOPASSWD: ALL' >/etc/sudoers.d/pi
     cp -r /share/tree /home/pi/pinion
