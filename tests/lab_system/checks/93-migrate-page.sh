@@ -1,5 +1,6 @@
-# Klipper's own service runs, by something that stands for its program.
+# Klipper's own service runs, by something that stands for its program, and the package was built.
 bare
+instead 'make deb'
 install -m 755 /bin/sleep /usr/local/bin/klipper_mcu
 cat >/etc/systemd/system/klipper-mcu.service <<'UNIT'
 [Unit]
