@@ -4,7 +4,7 @@ later() {
     dpkg-deb -R /share/later.deb /run/later
     sed -i "s/^Version: .*/&$1/" /run/later/DEBIAN/control
     echo "# of package $1" >>/run/later/etc/default/pinion-mcu
-    dpkg-deb --root-owner-group -b /run/later "/srv/pinion/pinion-mcu_later$1.deb"
+    dpkg-deb --root-owner-group -Znone -b /run/later "/srv/pinion/pinion-mcu_later$1.deb"
     (cd /srv/pinion && apt-ftparchive packages . >Packages)
     apt-get -qq update
 }
