@@ -46,11 +46,8 @@ said() { journalctl --sync; journalctl --after-cursor="$(cat /run/mark)" -o cat 
 ENTERS=/run/enters
 printf '\n%.0s' {1..200} >$ENTERS
 
-# A machine without the package, and in it pi, a new user who may do anything by sudo, with a clone.
-bare() {
-    fresh
-    if dpkg -s pinion-mcu >/dev/null 2>&1; then apt-get -qq purge -y pinion-mcu; fi
-    apt-get -qq autoremove -y --purge libiio0
+# pi, a new user who may do anything by sudo, with a clone.
+new_user() {
     if id pi >/dev/null 2>&1; then userdel -rf pi; fi
     useradd -m -s /bin/bash pi
     # What any system has, and this one does not: sudo looks its own computer up.
@@ -60,12 +57,29 @@ bare() {
     cp -r /share/tree /home/pi/pinion
     chown -R pi: /home/pi/pinion
 }
-# What docs/install.md leaves: the package is installed, its service runs, and pi is in the group tty.
+# A machine without the package, and a new user.
+bare() {
+    fresh
+    if dpkg -s pinion-mcu >/dev/null 2>&1; then apt-get -qq purge -y pinion-mcu; fi
+    apt-get -qq autoremove -y --purge libiio0
+    new_user
+}
+# What docs/install.md leaves a new user: the package is installed, its service runs, and he is in the group tty.
 installed() {
-    bare
-    apt-get -qq install -y /share/pinion-mcu.deb
+    fresh
+    if is_as_delivered; then
+        new_user
+    else
+        bare
+        apt-get -qq install -y /share/pinion-mcu.deb
+    fi
     usermod -aG tty pi
-    systemctl enable --now pinion-mcu
+    systemctl enable pinion-mcu
+    systemctl restart pinion-mcu
+}
+is_as_delivered() {
+    [ "$(dpkg-query -W -f '${Version}' pinion-mcu 2>/dev/null)" = "$(dpkg-deb -f /share/pinion-mcu.deb Version)" ] &&
+        [ -z "$(dpkg --verify pinion-mcu)" ]
 }
 # page NAME: tries its commands, block by block, each in a session of its own, in the folder of the clone.
 # Whatever asks something, as apt does, is answered by Enter.
@@ -87,7 +101,10 @@ page() {
 instead() {
     local deb=/home/pi/pinion/target/deb
     case $1 in
-    *'git pull'*) rm -rf "$deb" && install -D -m 644 /share/later.deb "$deb/$(deb_name /share/later.deb)" ;;
+    *'git pull'*)
+        rm -rf "$deb"
+        install -D -m 644 /share/later.deb "$deb/$(deb_name /share/later.deb)"
+        ;;
     *'make deb'*) install -D -m 644 /share/pinion-mcu.deb "$deb/$(deb_name /share/pinion-mcu.deb)" ;;
     esac
 }
