@@ -1,5 +1,7 @@
-# Klipper's own service runs, by something that stands for its program, and the package was built.
+# Klipper's own service runs, by something that stands for its program; its user is in the group that it takes, too.
+# And the package was built.
 bare
+usermod -aG tty pi
 instead 'make deb'
 install -m 755 /bin/sleep /usr/local/bin/klipper_mcu
 cat >/etc/systemd/system/klipper-mcu.service <<'UNIT'
