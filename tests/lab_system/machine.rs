@@ -20,7 +20,7 @@ const SILENCE_MAX: Duration = Duration::from_secs(1800);
 /// The guest's time: while it works, an instruction takes 1 ns; while it sleeps, time is the computer's. On a
 /// busy computer the machine is then slow, and nothing in it is late, which klippy and a watchdog would mind.
 const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];
-/// A script that ends with this status has begun to reboot the machine: the next one waits for it.
+/// After a script that ends with this status the agent reboots the machine: the next one waits for it.
 const REBOOTS: i32 = 77;
 
 /// Program and the Debian package that has it.

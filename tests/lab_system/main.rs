@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The package, installed in a Debian 12 that was booted with systemd in the emulator: the scripts
-//! of `tests/lab_system/checks`, in their order. docs/lab-system.md tells how to use it.
+//! of `tests/lab_system/checks`, in their order, and in some of them the commands of the pages.
+//! docs/lab-system.md tells how to use it.
 //!
 //! This is the computer's side, a test harness of its own.
 
 mod machine;
 mod packages;
+mod pages;
 
 // The lab's, which uses all of it.
 #[allow(dead_code)]
@@ -17,6 +19,9 @@ mod initramfs;
 #[allow(dead_code)]
 #[path = "../lab/kernel.rs"]
 mod kernel;
+#[allow(dead_code)]
+#[path = "../pages/page.rs"]
+mod page;
 #[path = "../lab/process.rs"]
 mod process;
 #[allow(dead_code)]
@@ -101,7 +106,7 @@ fn checks() -> Result<Vec<Check>, String> {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
         Ok(Check { name, script: format!("{shared}\n{}", read(path)?) })
     };
-    paths.iter().map(check).collect()
+    pages::each_page(paths.iter().map(check).collect::<Result<_, String>>()?)
 }
 
 fn run(options: &Options) -> Result<bool, String> {
@@ -119,6 +124,7 @@ fn run(options: &Options) -> Result<bool, String> {
     let folder = cache.run_folder()?;
     packages::share(&folder.path().join("share"))?;
     packages::share_klippy(&folder.path().join("share"))?;
+    pages::share(&folder.path().join("share"))?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
 
     let mut machine = Machine::boot(&root, folder.path())?;
@@ -137,6 +143,7 @@ fn run(options: &Options) -> Result<bool, String> {
         }
         let verdict = if status == 0 { "ok" } else { "FAILED" };
         println!("check {} ... {verdict} ({:.1} s)", check.name, began.elapsed().as_secs_f64());
+        pages::not_tried(check).iter().for_each(|line| println!("{line}"));
         if status != 0 || options.show_output {
             println!("{output}");
         }

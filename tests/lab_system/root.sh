@@ -16,6 +16,7 @@ busybox=$tree/bin/busybox
 find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/sources.list*.sources' \
     -o -path '*/sources.list' \) -exec \
     mmdebstrap --quiet --mode=root --variant=minbase \
+    --include=sudo,apt-utils \
     --include=systemd,systemd-sysv,udev,dbus,kmod,procps,make,libiio0- \
     --include=python3-cffi,python3-greenlet,python3-jinja2,python3-serial \
     --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt='path-exclude=/usr/share/doc/*' \

@@ -28,5 +28,4 @@ press_gcode:
     SET_PIN PIN=light VALUE=1
 END
 systemctl enable klipper pinion-mcu
-systemctl reboot
 exit 77

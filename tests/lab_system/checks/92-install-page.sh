@@ -1,0 +1,2 @@
+bare
+page docs/install.md

@@ -1,0 +1,29 @@
+# Klipper's own service runs, by something that stands for its program; its user is in the group that it takes, too.
+# And the package was built.
+bare
+usermod -aG tty pi
+instead 'make deb'
+install -m 755 /bin/sleep /usr/local/bin/klipper_mcu
+cat >/etc/systemd/system/klipper-mcu.service <<'UNIT'
+[Unit]
+Description=stands for Klipper's own
+Before=klipper.service
+ConditionFileIsExecutable=/usr/local/bin/klipper_mcu
+[Install]
+WantedBy=multi-user.target
+[Service]
+Type=simple
+Environment=KLIPPER_HOST_MCU_SERIAL=/tmp/klipper_host_mcu
+RemainAfterExit=yes
+ExecStart=/usr/local/bin/klipper_mcu infinity
+ExecStop=sh -c 'echo "FORCE_SHUTDOWN" > ${KLIPPER_HOST_MCU_SERIAL}'
+ExecStop=sleep 1
+TimeoutStopSec=2
+Restart=always
+RestartSec=5
+UNIT
+systemctl daemon-reload
+systemctl enable --now klipper-mcu
+page docs/migrate.md
+rm -rf /etc/systemd/system/klipper-mcu.service* /usr/local/bin/klipper_mcu $LINK
+systemctl daemon-reload

@@ -1,0 +1,3 @@
+# Any page that no other check tries.
+installed
+page "$PAGE"

@@ -1,0 +1,124 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What holds of all pages: the form that their blocks are tried in, and that their links lead somewhere.
+//! Whether what they say is true, the tests beside them ask: the commands `tests/lab_system`, what is for
+//! `printer.cfg` `tests/klippy/readme.rs`.
+
+mod page;
+
+use std::path::Path;
+
+use page::{COMMANDS, Page, pages, reason};
+
+/// What a block may be.
+const KINDS: [&str; 6] = [COMMANDS, "ini", "toml", "text", "diff", "rust"];
+/// Pages for who changes Pinion. Their commands stand in indented blocks, which nobody tries.
+const FOR_DEVELOPERS: [&str; 7] = [
+    "docs/add-a-feature.md",
+    "docs/architecture.md",
+    "docs/dialects.md",
+    "docs/lab-pi.md",
+    "docs/lab-system.md",
+    "docs/lab.md",
+    "docs/performance.md",
+];
+
+/// The lines outside of fenced blocks, each with its number counted from 1.
+fn prose(page: &Page) -> Vec<(usize, &str)> {
+    let mut fenced = false;
+    let mut prose = Vec::new();
+    for (number, line) in (1..).zip(page.text.lines()) {
+        let is_fence = line.trim_start().starts_with("```");
+        if !is_fence && !fenced {
+            prose.push((number, line));
+        }
+        fenced ^= is_fence;
+    }
+    prose
+}
+
+/// As GitHub and its like make it of a heading.
+fn anchor(heading: &str) -> String {
+    let heading = heading.trim_start_matches('#').trim().to_lowercase().replace(' ', "-");
+    heading.chars().filter(|c| c.is_alphanumeric() || "-_".contains(*c)).collect()
+}
+
+#[test]
+fn every_block_says_what_it_is() {
+    for page in pages() {
+        for block in page.blocks() {
+            let Page { name, .. } = &page;
+            let line = block.line;
+            assert!(KINDS.contains(&block.kind.as_str()), "{name}:{line}: a block of {:?}", block.kind);
+            assert!(!block.text.trim().is_empty(), "{name}:{line}: an empty block");
+            let names_a_file = block.before.contains(".cfg`") || block.before.contains(".conf`");
+            assert!(block.kind != "ini" || names_a_file, "{name}:{line}: it does not say of which file it is");
+            let reason = block.not_tried.as_deref();
+            assert!(reason.is_none() || block.kind == COMMANDS, "{name}:{line}: nobody would try this anyway");
+            assert_ne!(reason, Some(""), "{name}:{line}: it does not say why it is not tried");
+        }
+        let fences = page.text.lines().filter(|line| line.trim_start().starts_with("```")).count();
+        assert_eq!(fences, 2 * page.blocks().len(), "{}: a fence is open", page.name);
+    }
+}
+
+/// A word that is not right, or a line between it and the block, would have commands tried that can not be.
+#[test]
+fn what_is_not_tried_is_said_in_the_right_place() {
+    for page in pages() {
+        let said = page.text.lines().filter(|line| line.starts_with("<!--")).count();
+        let understood = page.blocks().iter().filter(|block| block.not_tried.is_some()).count();
+        assert_eq!(said, understood, "{}: a comment is not the reason of a block", page.name);
+    }
+    assert_eq!(reason("<!-- not tried: it takes a Pi -->").as_deref(), Some("it takes a Pi"));
+    assert_eq!(reason("<!-- tried -->"), None);
+}
+
+#[test]
+fn users_find_no_commands_that_nobody_tries() {
+    for page in pages().iter().filter(|page| !FOR_DEVELOPERS.contains(&page.name.as_str())) {
+        let mut after_empty = false;
+        for (number, line) in prose(page) {
+            assert!(!(after_empty && line.starts_with("    ")), "{}:{number}: an indented block: {line}", page.name);
+            after_empty = line.trim().is_empty();
+        }
+    }
+}
+
+#[test]
+fn links_lead_somewhere() {
+    let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let pages = pages();
+    let mut count = 0;
+    for page in &pages {
+        for (number, line) in prose(page) {
+            let targets = line.split("](").skip(1).filter_map(|rest| rest.split(')').next());
+            for target in targets.filter(|target| !target.contains("://")) {
+                let (file, heading) = target.split_once('#').unwrap_or((target, ""));
+                let folder = Path::new(&page.name).parent().unwrap();
+                let path = if file.is_empty() { Path::new(&page.name).to_owned() } else { folder.join(file) };
+                // docs/../README.md is README.md.
+                let path = path.to_string_lossy().replace("docs/../", "");
+                assert!(project.join(&path).exists(), "{}:{number}: there is no {path}", page.name);
+                if !heading.is_empty() {
+                    let there = pages.iter().find(|other| other.name == path).map(prose).unwrap_or_default();
+                    let found = there.iter().any(|(_, line)| line.starts_with('#') && anchor(line) == heading);
+                    assert!(found, "{}:{number}: {path} has no heading #{heading}", page.name);
+                }
+                count += 1;
+            }
+        }
+    }
+    assert!(count > 20, "only {count} links were seen");
+}
+
+#[test]
+fn the_readme_leads_to_every_page() {
+    let pages = pages();
+    let (readme, docs) = pages.split_first().unwrap();
+    for page in docs {
+        let by_others = docs.iter().any(|other| other.text.contains(&format!("]({}", &page.name["docs/".len()..])));
+        let by_it = readme.text.contains(&format!("]({}", page.name));
+        let is_for_users = !FOR_DEVELOPERS.contains(&page.name.as_str());
+        assert!(by_it || by_others && !is_for_users, "{}: nothing leads there", page.name);
+    }
+}
