@@ -4,6 +4,8 @@
 
 #![forbid(unsafe_code)]
 
+use std::ops::Range;
+
 use crate::board::Pin;
 use crate::mcu::{
     Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, Present, PromptLine, Report,
@@ -83,8 +85,11 @@ struct Stepper {
     need_reset: bool,
 }
 
-/// From so many ticks on, an edge is far behind.
-const FAR_BEHIND: i64 = Ticks::from_us(50).0 as i64;
+/// So many ticks behind, steps are caught up with in order. A machine that runs is not 50 us late. One that is 50 ms
+/// behind is asked for more steps than it can make, and other timers are not to wait for these.
+const IN_ORDER: Range<i64> = Ticks::from_us(50).0 as i64..Ticks::from_us(50_000).0 as i64;
+/// To wait in order for the end of a longer pulse than this would keep the core from all else for too long.
+const SHORT_PULSE: Ticks = Ticks::from_us(50);
 
 /// Keeps the position's top bit free to tell the direction.
 const POSITION_BIAS: u32 = 0x4000_0000;
@@ -138,15 +143,18 @@ impl Stepper {
         Ok(self.edge_at(self.next_step, earliest))
     }
 
-    /// Has the next edge come when it is due, or at `earliest` if that is later.
+    /// Has the next edge come when it is due, or at `earliest`, the end of a pulse that begins now, if that is later.
+    /// An edge that has no instant of its own (the end of a pulse, a reversal) is due by the step that it belongs to.
     ///
-    /// Edges that are far behind keep their place among the other timers, in the order in which all were due, and
+    /// Edges that are behind keep their place among the other timers, in the order in which all were due, and
     /// wait for `earliest` when it is their turn. Otherwise a machine that could not run for a while would take
     /// every sample of an endstop before the first of the steps between them, and home at a wrong place.
     #[inline]
     fn edge_at(&mut self, due: Clock, earliest: Clock) -> Next {
         self.earliest = earliest;
-        Next::At(if earliest.since(due) > FAR_BEHIND { due } else { due.max(earliest) })
+        let behind = earliest.since(due) - i64::from(self.pulse_ticks.0);
+        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SHORT_PULSE;
+        Next::At(if in_order { due } else { due.max(earliest) })
     }
 
     /// Moves on to the step after the present one, `interval` later by a clock of 32 bits: what

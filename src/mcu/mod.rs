@@ -162,7 +162,7 @@ impl Mcu {
         self.last_read
     }
 
-    /// Waits, without a turn for anything else: a step's pulse is no longer than that.
+    /// Spins until `end`. No other timer or command runs meanwhile, so this is for spans as short as a step's pulse.
     #[inline]
     pub fn spin_until(&mut self, end: Clock) {
         if self.last_read < end && self.now() < end {

@@ -431,3 +431,29 @@ fn steps_that_are_far_behind_are_caught_up_with_a_pulse_apart_and_then_come_on_t
     assert_eq!(rising(&pulsed)[9..], [50_000, 55_000, 60_000]);
     assert_eq!(both[9..], [50_000, 55_000, 60_000]);
 }
+
+#[test]
+fn a_long_pulse_keeps_nothing_else_waiting() {
+    // Edges are 1 ms apart at least, and a step is asked for every 1.5 ms.
+    let mut rig = Rig::configured(&[
+        "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=50000",
+        "config_digital_out oid=1 pin=5 value=0 default_value=0 max_duration=0",
+    ]);
+    rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=75000 count=20 add=0"]);
+    for n in 1..20 {
+        rig.send(&format!("queue_digital_out oid=1 clock=@{} on_ticks={}", 75_000 * n + 60_000, n % 2));
+    }
+    rig.run_until(4_000_000);
+    assert_eq!(rising(&rig.edges(STEP)).len(), 20);
+    assert_eq!(instants(&rig.edges(5)), (1..20).map(|n| 75_000 * n + 60_000).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_move_goes_on_after_a_stall_of_150_ms() {
+    let mut rig = Rig::configured(&[PULSED]);
+    rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=50000 count=400 add=0"]);
+    rig.run_until(1_000_000);
+    rig.stall_until(8_500_000);
+    rig.run_until(30_000_000);
+    assert_eq!((rig.shutdown(), rising(&rig.edges(STEP)).len()), (None, 400));
+}
