@@ -135,6 +135,9 @@ endif
 uninstall:
 ifeq ($(DESTDIR),)
 	-systemctl disable --now pinion-mcu
+	-for unit in $$(systemctl list-units --all --plain --no-legend 'pinion-mcu@*.service' | cut -d ' ' -f 1); do \
+	    systemctl disable --now $$unit; \
+	done
 endif
 	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
 	    $(DESTDIR)$(UNITDIR)/pinion-mcu@.service $(DESTDIR)$(LIBDIR)/link $(DESTDIR)$(BASHDIR)/pinion \

@@ -27,7 +27,7 @@ const PINS: [(&str, u32); 15] = [
     ("GPIO25", 25),
     ("GPIO26", 26),
     ("pinctrl-bcm2711/gpio27", 27),
-    ("ads1115/voltage0", 4096),
+    ("ads1015/voltage0", 4096),
     ("mcp3208/voltage0", 4097),
     ("spidev1.0", 1 << 26),
 ];

@@ -83,6 +83,7 @@ pub struct Machine {
     kernel: PathBuf,
     initrd: PathBuf,
     folder: PathBuf,
+    share: PathBuf,
     qemu: Child,
     input: ChildStdin,
     lines: Receiver<String>,
@@ -90,14 +91,14 @@ pub struct Machine {
 }
 
 impl Machine {
-    /// Boots a copy of the root; `share` in the folder is what the machine sees as /share.
-    pub fn boot(root: &Root, folder: &Path) -> Result<Machine, String> {
+    /// Boots a copy of the root, which is put into `folder`. The machine sees `share` as /share.
+    pub fn boot(root: &Root, folder: &Path, share: &Path) -> Result<Machine, String> {
         // The holes stay holes.
         process::run(Command::new("cp").arg("--sparse=always").arg(root.folder.join("root.img")).arg(folder))?;
         let (kernel, initrd) = (root.kernel.clone(), root.folder.join("initrd"));
-        let (qemu, input, lines) = start(&kernel, &initrd, folder)?;
-        let folder = folder.to_owned();
-        let mut machine = Machine { kernel, initrd, folder, qemu, input, lines, boot_took: Duration::ZERO };
+        let (qemu, input, lines) = start(&kernel, &initrd, folder, share)?;
+        let (folder, share) = (folder.to_owned(), share.to_owned());
+        let mut machine = Machine { kernel, initrd, folder, share, qemu, input, lines, boot_took: Duration::ZERO };
         machine.wait_until_up()?;
         Ok(machine)
     }
@@ -130,7 +131,7 @@ impl Machine {
             }
             thread::sleep(Duration::from_millis(100));
         }
-        (self.qemu, self.input, self.lines) = start(&self.kernel, &self.initrd, &self.folder)?;
+        (self.qemu, self.input, self.lines) = start(&self.kernel, &self.initrd, &self.folder, &self.share)?;
         self.wait_until_up()?;
         Ok((0, output))
     }
@@ -156,7 +157,12 @@ impl Drop for Machine {
     }
 }
 
-fn start(kernel: &Path, initrd: &Path, folder: &Path) -> Result<(Child, ChildStdin, Receiver<String>), String> {
+fn start(
+    kernel: &Path,
+    initrd: &Path,
+    folder: &Path,
+    share: &Path,
+) -> Result<(Child, ChildStdin, Receiver<String>), String> {
     let file = |name: &str| folder.join(name).display().to_string();
     let mut qemu = Command::new("qemu-system-x86_64");
     qemu.args(["-accel", "tcg", "-cpu", "qemu64,+rdrand", "-m", "768"])
@@ -167,7 +173,7 @@ fn start(kernel: &Path, initrd: &Path, folder: &Path) -> Result<(Child, ChildStd
         .arg(initrd)
         .args(["-append", "console=ttyS0 quiet mitigations=off cryptomgr.notests lsm= audit=0 panic=-1"])
         .args(["-drive", &format!("file={},if=virtio,format=raw,cache=unsafe", file("root.img"))])
-        .args(["-virtfs", &format!("local,path={},mount_tag=share,security_model=none,readonly=on", file("share"))])
+        .args(["-virtfs", &format!("local,path={},mount_tag=share,security_model=none,readonly=on", share.display())])
         .args(["-device", "virtio-serial-pci", "-chardev", "stdio,id=agent,signal=off"])
         .args(["-device", "virtserialport,chardev=agent,name=agent"])
         .args(["-serial", &format!("file:{}", file("console"))]);

@@ -32,6 +32,7 @@ use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::thread;
 use std::time::Instant;
 
 use cache::Cache;
@@ -41,8 +42,8 @@ const USAGE: &str = "\
 Usage: cargo test --test lab_system -- [OPTIONS] [FILTERS...]
 
 Installs the package in a booted Debian 12 and runs the checks whose name contains any of the filters,
-as in reboot; the first one, which installs it, always. It takes root, installs the emulator if it is
-missing, and downloads a Debian the first time.
+as in reboot; before any but those of the pages the first one, which installs it. It takes root, installs the
+emulator if it is missing, and downloads a Debian the first time.
 
 Options:
   --nocapture        Show the output of checks that pass, too
@@ -51,6 +52,8 @@ Options:
 
 /// A check that can not be run ends so, and prints why.
 const NOT_RUN: i32 = 78;
+/// The first check installs the package for all that follow.
+const INSTALLS: &str = "10-install";
 /// A failed run exits as libtest's do.
 const FAILED: u8 = 101;
 
@@ -84,6 +87,10 @@ impl Options {
             }
         }
         options
+    }
+
+    fn chosen(&self, check: &Check) -> bool {
+        self.filters.is_empty() || self.filters.iter().any(|part| check.name.contains(part))
     }
 }
 
@@ -122,44 +129,41 @@ fn run(options: &Options) -> Result<bool, String> {
     let cache = Cache::open()?;
     let root = Root::prepare(&cache)?;
     let folder = cache.run_folder()?;
-    packages::share(&folder.path().join("share"))?;
-    packages::share_klippy(&folder.path().join("share"))?;
-    pages::share(&folder.path().join("share"))?;
+    let share = folder.path().join("share");
+    packages::share(&share)?;
+    packages::share_klippy(&share)?;
+    pages::share(&share)?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
 
-    let mut machine = Machine::boot(&root, folder.path())?;
-    println!("booted in {:.1} s", machine.boot_took.as_secs_f64());
-    let (mut failed, mut not_run, mut passed) = (Vec::new(), Vec::new(), 0);
-    for (number, check) in checks.iter().enumerate() {
-        if number > 0 && !options.filters.is_empty() && !options.filters.iter().any(|part| check.name.contains(part)) {
-            continue;
-        }
-        let began = Instant::now();
-        let (status, output) = machine.run(&check.script)?;
-        if status == NOT_RUN {
-            println!("check {} ... NOT RUN: {}", check.name, output.trim());
-            not_run.push(check.name.as_str());
-            continue;
-        }
-        let verdict = if status == 0 { "ok" } else { "FAILED" };
-        println!("check {} ... {verdict} ({:.1} s)", check.name, began.elapsed().as_secs_f64());
-        pages::not_tried(check).iter().for_each(|line| println!("{line}"));
-        if status != 0 || options.show_output {
-            println!("{output}");
-        }
-        match status {
-            0 => passed += 1,
-            _ => failed.push(check.name.as_str()),
-        }
-        if number == 0 && status != 0 {
-            break;
-        }
+    // The pages have a machine of their own, beside that of the others: each makes what its page finds.
+    let (mut of_pages, mut others): (Vec<_>, Vec<_>) = checks.into_iter().partition(pages::tries_any);
+    of_pages.retain(|check| options.chosen(check));
+    if options.run.is_some() || others.iter().any(|check| options.chosen(check)) {
+        others.retain(|check| check.name == INSTALLS || options.chosen(check));
+    } else {
+        others.clear();
     }
-    if let Some(file) = &options.run {
-        let script = fs::read_to_string(file).map_err(|error| format!("{}: {error}", file.display()))?;
-        let (status, output) = machine.run(&script)?;
-        println!("{output}\nstatus {status}");
+    let machines = [("checks", others, options.run.as_deref()), ("pages", of_pages, None)];
+    let run = |(name, checks, then): (&str, Vec<Check>, _)| {
+        let folder = folder.path().join(name);
+        fs::create_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+        in_a_machine(|| Machine::boot(&root, &folder, &share), &checks, options, then)
+    };
+    let tallies: Vec<Result<Tally, String>> = thread::scope(|scope| {
+        let started = machines.map(|machine| scope.spawn(|| run(machine)));
+        started
+            .into_iter()
+            .map(|thread| thread.join().unwrap_or_else(|_| Err("a machine's thread died".into())))
+            .collect()
+    });
+    let mut all = Tally::default();
+    for tally in tallies {
+        let tally = tally?;
+        all.passed += tally.passed;
+        all.failed.extend(tally.failed);
+        all.not_run.extend(tally.not_run);
     }
+    let Tally { passed, failed, not_run } = all;
     println!(
         "\n{passed} passed, {} failed {failed:?}, {} not run {not_run:?} in {:.1} s",
         failed.len(),
@@ -167,6 +171,58 @@ fn run(options: &Options) -> Result<bool, String> {
         began.elapsed().as_secs_f64()
     );
     Ok(failed.is_empty())
+}
+
+#[derive(Default)]
+struct Tally {
+    passed: usize,
+    failed: Vec<String>,
+    not_run: Vec<String>,
+}
+
+/// Runs the checks in a machine, if there are any, `then` the script that this path names.
+fn in_a_machine(
+    boot: impl FnOnce() -> Result<Machine, String>,
+    checks: &[Check],
+    options: &Options,
+    then: Option<&Path>,
+) -> Result<Tally, String> {
+    let mut tally = Tally::default();
+    if checks.is_empty() && then.is_none() {
+        return Ok(tally);
+    }
+    let mut machine = boot()?;
+    println!("booted in {:.1} s", machine.boot_took.as_secs_f64());
+    for check in checks {
+        let began = Instant::now();
+        let (status, output) = machine.run(&check.script)?;
+        if status == NOT_RUN {
+            println!("check {} ... NOT RUN: {}", check.name, output.trim());
+            tally.not_run.push(check.name.clone());
+            continue;
+        }
+        let verdict = if status == 0 { "ok" } else { "FAILED" };
+        let mut said = format!("check {} ... {verdict} ({:.1} s)\n", check.name, began.elapsed().as_secs_f64());
+        said.extend(pages::not_tried(check).iter().map(|line| format!("{line}\n")));
+        if status != 0 || options.show_output {
+            said.push_str(&output);
+        }
+        // At once, as another machine's lines may come between.
+        print!("{said}");
+        match status {
+            0 => tally.passed += 1,
+            _ => tally.failed.push(check.name.clone()),
+        }
+        if status != 0 && check.name == INSTALLS {
+            break;
+        }
+    }
+    if let Some(file) = then {
+        let script = fs::read_to_string(file).map_err(|error| format!("{}: {error}", file.display()))?;
+        let (status, output) = machine.run(&script)?;
+        println!("{output}\nstatus {status}");
+    }
+    Ok(tally)
 }
 
 fn main() -> ExitCode {

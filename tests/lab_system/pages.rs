@@ -38,6 +38,11 @@ fn tried(check: &Check) -> impl Iterator<Item = &str> {
     check.script.lines().filter_map(|line| line.strip_prefix(WORD))
 }
 
+/// Whether the check tries pages.
+pub fn tries_any(check: &Check) -> bool {
+    tried(check).next().is_some()
+}
+
 /// The checks, with the one for any page repeated for each page that no other one tries.
 ///
 /// # Errors

@@ -23,7 +23,7 @@ const ASSUMED: Format = Format { bits: 12, signed: false };
 pub struct IioDevice {
     /// The number of `iio:device<n>`.
     pub number: u32,
-    /// The driver's name, such as `ads1115`.
+    /// The driver's name, such as `mcp3208`.
     pub name: String,
     /// The device tree's label.
     pub label: Option<String>,

@@ -12,7 +12,7 @@
 //!
 //! `gpio17` stands for `gpiochip0/gpio17`. The machine's own names are published as well: `GPIO17`
 //! (the name that the device tree gives a line), `pinctrl-rp1/gpio17` (by the chip's label) and
-//! `ads1115/voltage3`. A name is left out if two things share it, if it looks like one of the numeric
+//! `mcp3208/voltage3`. A name is left out if two things share it, if it looks like one of the numeric
 //! names, or if klippy can not read it from a configuration.
 
 #![forbid(unsafe_code)]

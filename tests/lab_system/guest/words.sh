@@ -59,6 +59,8 @@ new_user() {
 }
 # A machine without the package, and a new user.
 bare() {
+    until_true 60 is_active lab-chips
+    apt-get -qq update
     fresh
     if dpkg -s pinion-mcu >/dev/null 2>&1; then apt-get -qq purge -y pinion-mcu; fi
     apt-get -qq autoremove -y --purge libiio0
