@@ -28,10 +28,12 @@ mod process;
 #[path = "../lab/tools.rs"]
 mod tools;
 
+use std::collections::VecDeque;
 use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Instant;
 
@@ -135,7 +137,8 @@ fn run(options: &Options) -> Result<bool, String> {
     pages::share(&share)?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
 
-    // The pages have a machine of their own, beside that of the others: each makes what its page finds.
+    // The checks of pages each make what their page finds. So they are run beside the others by a second machine,
+    // and by that of the others once those are done.
     let (mut of_pages, mut others): (Vec<_>, Vec<_>) = checks.into_iter().partition(pages::tries_any);
     of_pages.retain(|check| options.chosen(check));
     if options.run.is_some() || others.iter().any(|check| options.chosen(check)) {
@@ -143,11 +146,12 @@ fn run(options: &Options) -> Result<bool, String> {
     } else {
         others.clear();
     }
-    let machines = [("checks", others, options.run.as_deref()), ("pages", of_pages, None)];
+    let of_pages = Mutex::new(VecDeque::from(of_pages));
+    let machines = [("first", others, options.run.as_deref()), ("second", Vec::new(), None)];
     let run = |(name, checks, then): (&str, Vec<Check>, _)| {
         let folder = folder.path().join(name);
         fs::create_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        in_a_machine(|| Machine::boot(&root, &folder, &share), &checks, options, then)
+        in_a_machine(|| Machine::boot(&root, &folder, &share), checks, &of_pages, options, then)
     };
     let tallies: Vec<Result<Tally, String>> = thread::scope(|scope| {
         let started = machines.map(|machine| scope.spawn(|| run(machine)));
@@ -180,20 +184,27 @@ struct Tally {
     not_run: Vec<String>,
 }
 
-/// Runs the checks in a machine, if there are any, `then` the script that this path names.
+/// Runs the checks in a machine, if there are any, `then` the script that this path names, and of the shared ones
+/// as many as other machines leave.
 fn in_a_machine(
     boot: impl FnOnce() -> Result<Machine, String>,
-    checks: &[Check],
+    checks: Vec<Check>,
+    shared: &Mutex<VecDeque<Check>>,
     options: &Options,
     then: Option<&Path>,
 ) -> Result<Tally, String> {
     let mut tally = Tally::default();
-    if checks.is_empty() && then.is_none() {
+    let next_shared = || shared.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
+    let mut own = VecDeque::from(checks);
+    if own.is_empty() && then.is_none() {
+        own.extend(next_shared());
+    }
+    if own.is_empty() && then.is_none() {
         return Ok(tally);
     }
     let mut machine = boot()?;
     println!("booted in {:.1} s", machine.boot_took.as_secs_f64());
-    for check in checks {
+    while let Some(check) = own.pop_front().or_else(next_shared) {
         let began = Instant::now();
         let (status, output) = machine.run(&check.script)?;
         if status == NOT_RUN {
@@ -203,7 +214,7 @@ fn in_a_machine(
         }
         let verdict = if status == 0 { "ok" } else { "FAILED" };
         let mut said = format!("check {} ... {verdict} ({:.1} s)\n", check.name, began.elapsed().as_secs_f64());
-        said.extend(pages::not_tried(check).iter().map(|line| format!("{line}\n")));
+        said.extend(pages::not_tried(&check).iter().map(|line| format!("{line}\n")));
         if status != 0 || options.show_output {
             said.push_str(&output);
         }
