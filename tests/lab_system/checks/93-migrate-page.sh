@@ -25,5 +25,6 @@ UNIT
 systemctl daemon-reload
 systemctl enable --now klipper-mcu
 page docs/migrate.md
+systemctl disable --now klipper-mcu
 rm -rf /etc/systemd/system/klipper-mcu.service* /usr/local/bin/klipper_mcu $LINK
 systemctl daemon-reload

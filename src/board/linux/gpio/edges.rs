@@ -58,7 +58,7 @@ impl EdgeRequest {
     }
 }
 
-/// An input line whose edges the kernel counts. The kernel has no way from the requests of [`HeldLine`]
+/// An input line whose edges the kernel counts. The kernel has no way from the requests of [`HeldLine`](super::HeldLine)
 /// to one with edges, so this is another kind of line, and can not become an output.
 pub(in crate::board::linux) struct EdgeLine(Arc<EdgeRequest>);
 
