@@ -39,7 +39,7 @@ impl Reader<'_> {
         within.push(path.to_owned());
         let mut section = String::new();
         for line in text.lines() {
-            let line = line.split('#').next().unwrap_or_default().trim_end();
+            let line = without_comment(line).trim_end();
             if let Some(header) = line.strip_prefix('[').and_then(|line| line.split(']').next()) {
                 section = header.trim().to_owned();
                 if let Some(pattern) = section.strip_prefix("include ") {
@@ -58,6 +58,15 @@ impl Reader<'_> {
         within.pop();
         Some(())
     }
+}
+
+/// A line up to its comment. klippy cuts at any `#` itself; a `;` counts for Python's configparser, to which it gives
+/// the rest, at the line's start or after white space.
+fn without_comment(line: &str) -> &str {
+    let line = line.split('#').next().unwrap_or_default();
+    let begins = |at: &usize| line[..*at].chars().next_back().is_none_or(char::is_whitespace);
+    let comment = line.match_indices(';').map(|(at, _)| at).find(begins);
+    &line[..comment.unwrap_or(line.len())]
 }
 
 /// The files that an absolute pattern of `*` and `?` names, in order; a path without any names itself.
@@ -110,18 +119,18 @@ mod tests {
     fn each_micro_controller_s_serial_counts_as_it_was_said_last() {
         let tree = Tree::new();
         assert_eq!(read(&tree), None);
-        tree.put("home/pi/config/printer.cfg", "[printer]\nserial: /no\n[mcu]\nserial: /dev/serial/by-id/x # a board\n#[mcu no]\n#serial: /no\n[mcu host]\nserial=/tmp/klipper_host_mcu\n[include parts/*.cfg]\n[mcu last]\nrestart_method: command\n");
-        assert_eq!(read(&tree).unwrap(), ["/dev/serial/by-id/x", "/tmp/klipper_host_mcu"]);
+        tree.put("home/pi/config/printer.cfg", "[printer]\nserial: /no\n[mcu]\nserial: /dev/serial/by-id/x # a board\n#[mcu no]\n#serial: /no\n; [mcu no]\n;serial: /no\n[mcu host]\nserial=/tmp/klipper_host_mcu ; the Pi\n[mcu odd]\nserial: /tmp/a;b\n[include parts/*.cfg]\n[mcu last]\nrestart_method: command\n");
+        assert_eq!(read(&tree).unwrap(), ["/dev/serial/by-id/x", "/tmp/a;b", "/tmp/klipper_host_mcu"]);
         tree.put("home/pi/config/parts/b.cfg", "[mcu host]\nserial: /tmp/klipper_host_b\n");
         tree.put("home/pi/config/parts/a.cfg", "[mcu host]\nserial: /tmp/klipper_host_a\n[include ../up.cfg]\n");
         tree.put("home/pi/config/parts/.hidden.cfg", "[mcu hidden]\nserial: /no\n");
         tree.put("home/pi/config/up.cfg", "[mcu]\nserial: /tmp/klipper_host_up\n");
-        assert_eq!(read(&tree).unwrap(), ["/tmp/klipper_host_b", "/tmp/klipper_host_up"]);
+        assert_eq!(read(&tree).unwrap(), ["/tmp/a;b", "/tmp/klipper_host_b", "/tmp/klipper_host_up"]);
         // A link by the path that the machine itself has for it.
         tree.link("home/pi/config/parts/c.cfg", "/usr/share/c.cfg");
         assert_eq!(read(&tree), None, "it leads nowhere");
         tree.put("usr/share/c.cfg", "[mcu c]\nserial: /tmp/klipper_host_c\n");
-        assert_eq!(read(&tree).unwrap().len(), 3);
+        assert_eq!(read(&tree).unwrap().len(), 4);
     }
 
     #[test]
