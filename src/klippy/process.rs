@@ -148,12 +148,12 @@ fn program(arguments: &[PathBuf]) -> Option<(usize, &Path)> {
 }
 
 /// klippy's folder, if a command line is klippy's.
-pub fn klippy(arguments: &[PathBuf]) -> Option<&Path> {
+pub(crate) fn klippy(arguments: &[PathBuf]) -> Option<&Path> {
     program(arguments).map(|(_, folder)| folder)
 }
 
 /// The configuration that a command line of klippy's names.
-pub fn klippy_config(arguments: &[PathBuf]) -> Option<&Path> {
+pub(crate) fn klippy_config(arguments: &[PathBuf]) -> Option<&Path> {
     // Those of klippy/klippy.py, and of Kalico's klippy/printer.py, which take a value.
     const WITH_VALUE: [&str; 15] = [
         "-i",
