@@ -69,7 +69,10 @@ pub(super) struct ConsoleArgs {
 pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
     let done = match &args.board {
         None => {
-            let ready = free(&args.pty).and_then(|()| Terminal::remember().give_back_at(&[SIGHUP, SIGQUIT, SIGTERM]));
+            let ready = free(&args.pty).and_then(|()| {
+                let signals: Vec<i32> = [SIGQUIT, SIGTERM].into_iter().chain(hang_up()?).collect();
+                Terminal::remember().give_back_at(&signals)
+            });
             ready.and_then(|()| speak(args, &args.pty))
         }
         Some(BoardName::Sim(file)) => simulate(args, file.as_deref()),
@@ -108,13 +111,19 @@ fn free(pty: &Path) -> Result<(), String> {
     }
 }
 
+/// SIGHUP, unless the program was started with it ignored, as by nohup(1): who registers it would be ended by it.
+fn hang_up() -> Result<Option<i32>, String> {
+    let is_ignored = runtime::hang_up_is_ignored().map_err(|error| format!("/proc/self/status: {error}"))?;
+    Ok((!is_ignored).then_some(SIGHUP))
+}
+
 /// Runs a simulated machine, and speaks to it.
 fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     let terminal = Terminal::remember();
     // The others end the machine in order, which then tells which it was.
     terminal.clone().give_back_at(&[SIGQUIT])?;
     let signal = Arc::new(AtomicUsize::new(0));
-    for ending in [SIGHUP, SIGINT, SIGTERM] {
+    for ending in [SIGINT, SIGTERM].into_iter().chain(hang_up()?) {
         signal_hook::flag::register_usize(ending, signal.clone(), ending.unsigned_abs() as usize)
             .map_err(|error| format!("signals can not be taken in: {error}"))?;
     }

@@ -41,7 +41,7 @@ impl Signals {
         let mut known = vec![SIGTERM, SIGINT, SIGUSR1];
         // SIGHUP, as a terminal closes, ends the program in order, unless nohup(1) has started it.
         // (It kills the C program, which leaves its pins as they are.)
-        if !hang_up_is_ignored(&fs::read_to_string("/proc/self/status")?) {
+        if !hang_up_is_ignored()? {
             known.push(SIGHUP);
         }
         if std::env::var_os("PINION_TEST_HANG").is_some() {
@@ -66,8 +66,17 @@ impl Signals {
     }
 }
 
-/// Whether the program was started with SIGHUP ignored; `status` is /proc/PID/status.
-fn hang_up_is_ignored(status: &str) -> bool {
+/// Whether the program was started with SIGHUP ignored, as long as nobody has registered it since.
+///
+/// # Errors
+///
+/// Those of reading /proc/self/status.
+pub(crate) fn hang_up_is_ignored() -> io::Result<bool> {
+    Ok(is_hang_up_ignored_in(&fs::read_to_string("/proc/self/status")?))
+}
+
+/// `status` is /proc/PID/status.
+fn is_hang_up_ignored_in(status: &str) -> bool {
     let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
     let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
     ignored.is_some_and(|mask| mask & 1 << (SIGHUP - 1) != 0)
@@ -80,8 +89,8 @@ mod tests {
     #[test]
     fn who_starts_the_program_may_have_hang_up_ignored() {
         let status = |mask: &str| format!("Name:\tpinion\nSigBlk:\t0000000000000001\nSigIgn:\t{mask}\n");
-        assert!(hang_up_is_ignored(&status("0000000000001001")));
-        assert!(!hang_up_is_ignored(&status("0000000000001002")));
-        assert!(!hang_up_is_ignored("Name:\tpinion\n"));
+        assert!(is_hang_up_ignored_in(&status("0000000000001001")));
+        assert!(!is_hang_up_ignored_in(&status("0000000000001002")));
+        assert!(!is_hang_up_ignored_in("Name:\tpinion\n"));
     }
 }

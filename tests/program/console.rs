@@ -274,6 +274,26 @@ fn console_ended_by(signal: Signal) -> ExitStatus {
 }
 
 #[test]
+fn started_by_nohup_it_outlives_its_terminal() {
+    let mut child = Command::new("nohup")
+        .args([env!("CARGO_BIN_EXE_pinion"), "console", "--board", "sim"])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut stdin = child.stdin.take().unwrap();
+    stdin.write_all(b"get_uptime\n").unwrap();
+    let mut said = [0; 4];
+    child.stdout.as_mut().unwrap().read_exact(&mut said).unwrap();
+    kill(Pid::from_raw(child.id() as i32), Signal::SIGHUP).unwrap();
+    stdin.write_all(b"get_uptime\nget_config\nquit\n").unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    assert!(text(&output.stdout).contains("] config is_config="), "{output:?}");
+}
+
+#[test]
 fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
     let terminal = openpty(None, None).unwrap();
     let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
