@@ -271,11 +271,20 @@ impl Link {
 
     /// Leaves a host the time to read why the program ends: what is unread when the terminal closes is lost,
     /// and klippy then tells of a lost communication, seconds later.
-    pub(super) fn farewell(&self) {
-        if self.attached {
+    pub(super) fn farewell(&mut self) {
+        let end = monotonic() + FAREWELL;
+        while self.attached && monotonic() < end {
+            // What the terminal had no room for goes out as the host reads.
+            let is_out = self.output.is_empty() && !self.inlet.has_response();
+            let events = if is_out { PollFlags::empty() } else { PollFlags::POLLOUT };
+            let mut fds = [PollFd::new(self.pty.master(), events)];
             // A host that hangs up has read it; a further signal cuts it short.
-            let mut fds = [PollFd::new(self.pty.master(), PollFlags::empty())];
-            let _ = poll(&mut fds, in_ms(FAREWELL));
+            if poll(&mut fds, in_ms(end.saturating_sub(monotonic()))) != Ok(1)
+                || fds[0].revents() != Some(PollFlags::POLLOUT)
+            {
+                return;
+            }
+            self.give_out();
         }
     }
 

@@ -9,9 +9,12 @@ use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::pty::openpty;
 use nix::sys::signal::Signal;
+use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
 use pinion::host::config::Config;
-use pinion::wire::block::{Sequence, frame};
+use pinion::host::serial::Received;
+use pinion::wire::block::{PAYLOAD_MAX, Sequence, frame};
 
 use crate::process::{PATIENCE, Pinion, exists};
 
@@ -147,6 +150,55 @@ fn sigterm_tells_the_host_and_drives_outputs_to_their_shutdown_values() {
     assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Force shutdown command"));
     drop(client);
     assert_eq!(pinion.end().code(), Some(0));
+}
+
+#[test]
+fn a_host_that_was_slow_to_read_still_reads_why_the_program_ended() {
+    let mut pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    let query = client.messages().encode_line("identify offset=0 count=40").unwrap();
+    let stop = client.messages().encode_line("emergency_stop").unwrap();
+    // More answers than the terminal has room for, and fewer than the program drops.
+    let queries = query.repeat(PAYLOAD_MAX / query.len());
+    let answers_bytes = PAYLOAD_MAX / query.len() * 40;
+    let blocks = (terminal_bytes() + 40 * 1024) / answers_bytes;
+    let mut sequence = Sequence::default();
+    let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
+    // The number that is expected is not known: the first fifteen find it. What follows goes on from there.
+    for _ in 0..15 + blocks {
+        let mut block = Vec::new();
+        frame(&queries, sequence, &mut block);
+        tty.write_all(&block).unwrap();
+        sequence = sequence.next();
+    }
+    let mut block = Vec::new();
+    frame(&stop, sequence, &mut block);
+    tty.write_all(&block).unwrap();
+    pinion.logged("shutdown: Command request");
+    pinion.signal(Signal::SIGTERM);
+    let until = Instant::now() + PATIENCE;
+    let mut last = Vec::new();
+    while let Ok(Some((_, payload))) = client.link().port().wait_block(until) {
+        last = client.messages().decode(&Received { payload, at: Instant::now() });
+        if last.iter().any(|params| params.name == "shutdown") {
+            break;
+        }
+    }
+    let reasons: Vec<String> = last.iter().filter_map(|params| params.text("static_string_id").ok()).collect();
+    assert_eq!(reasons, ["Command request"], "{last:?}");
+    drop((client, tty));
+    assert_eq!(pinion.end().code(), Some(0));
+}
+
+/// How much a terminal holds for a host that does not read.
+fn terminal_bytes() -> usize {
+    let terminal = openpty(None, None).unwrap();
+    let mut attributes = tcgetattr(&terminal.slave).unwrap();
+    cfmakeraw(&mut attributes);
+    tcsetattr(&terminal.slave, SetArg::TCSANOW, &attributes).unwrap();
+    fcntl(&terminal.master, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).unwrap();
+    let mut master = fs::File::from(terminal.master);
+    std::iter::from_fn(|| master.write(&[b'.'; 256]).ok()).sum()
 }
 
 #[test]
