@@ -467,7 +467,9 @@ mod tests {
         tree.put("etc/passwd", &users);
         for (pid, name, unit) in [(11, "mcu", "pinion-mcu"), (12, "b", "pinion-mcu@b")] {
             let link = format!("/run/pinion/klipper_host_{name}");
-            tree.process(pid, &["/usr/bin/pinion", "run", "-r", "-I", &link], 990, &[]);
+            let config = format!("/etc/pinion/{name}.toml");
+            tree.process(pid, &["/usr/bin/pinion", "run", "-r", "-I", &link, "--config", &config], 990, &[]);
+            tree.put(&config[1..], "");
             tree.put(&format!("proc/{pid}/cgroup"), &format!("0::/system.slice/{unit}.service\n"));
         }
         for (pid, user, unit, serial) in [(21, "pi", "klipper", "mcu"), (22, "other", "klipper-2", "b")] {

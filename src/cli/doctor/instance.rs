@@ -24,6 +24,8 @@ pub(super) struct Instance {
     pub(super) unit: Option<String>,
     /// Its process, if it runs.
     pub(super) pid: Option<u32>,
+    /// The configuration file that it reads; none if it reads none.
+    config: Option<String>,
     pub(super) settings: Settings,
     /// Where klippy finds it; none if klippy does not.
     pub(super) link: Option<PathBuf>,
@@ -73,9 +75,9 @@ impl Instance {
         }
     }
 
-    /// The file with its settings.
-    pub(super) fn config(&self) -> String {
-        self.unit.as_deref().and_then(Files::of).map_or_else(|| SYSTEM_FILE.to_owned(), |files| files.config)
+    /// What to change its settings in.
+    pub(super) fn config(&self) -> &str {
+        self.config.as_deref().unwrap_or("its command line")
     }
 }
 
@@ -90,11 +92,12 @@ pub(super) fn instances(machine: &Machine) -> (Vec<Instance>, Vec<Finding>) {
     }
     let mut findings = Vec::new();
     let mut instances = Vec::new();
-    for Running { pid, unit, settings } in running {
-        instances.push(instance(machine, unit, Some(pid), settings, &mut findings));
+    for mut running in running {
+        let unit = running.unit.take();
+        instances.push(instance(machine, unit, Some(running), &mut findings));
     }
     for unit in units {
-        instances.push(instance(machine, Some(unit), None, None, &mut findings));
+        instances.push(instance(machine, Some(unit), None, &mut findings));
     }
     (instances, findings)
 }
@@ -117,13 +120,16 @@ pub(super) fn is_klipper_s(machine: &Machine, unit: &str) -> bool {
 fn instance(
     machine: &Machine,
     unit: Option<String>,
-    pid: Option<u32>,
-    settings: Option<Settings>,
+    running: Option<Running>,
     findings: &mut Vec<Finding>,
 ) -> Instance {
     let files = unit.as_deref().and_then(Files::of);
+    let (pid, config, settings) = match running {
+        Some(Running { pid, config, settings, .. }) => (Some(pid), config, settings),
+        None => (None, unit.as_deref().and_then(|unit| config_of(machine, unit)), None),
+    };
     let given = match (&unit, &files) {
-        (Some(unit), Some(files)) => given(machine, unit, files, findings),
+        (Some(unit), Some(files)) => given(machine, unit, files, config.as_deref(), findings),
         _ => Given::default(),
     };
     // The one that runs knows best. Of another version, whose command line is not understood, real time is expected.
@@ -134,7 +140,28 @@ fn instance(
         // The unit's own, or one that somebody has made.
         files.map(|files| files.link).or_else(|| link_to(machine, &settings.symlink))
     };
-    Instance { unit, pid, settings, link }
+    Instance { unit, pid, config, settings, link }
+}
+
+/// The configuration file that the program of a unit is to read.
+fn config_of(machine: &Machine, unit: &str) -> Option<String> {
+    match setting(&units::text(machine, unit).unwrap_or_default(), "ExecStart") {
+        Some(command) => named_config(command.split_whitespace()),
+        // One that is not installed, or an instance of a template.
+        None => Files::of(unit).map(|files| files.config),
+    }
+}
+
+/// The configuration file that a command line of Pinion's names, of whatever version.
+pub(super) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<String> {
+    while let Some(word) = words.next() {
+        match word.strip_prefix("--config") {
+            Some("") => return words.next().map(str::to_owned),
+            Some(value) => return value.strip_prefix('=').map(str::to_owned),
+            None => {}
+        }
+    }
+    None
 }
 
 /// A link that klippy takes, and that leads to this path.
@@ -145,8 +172,8 @@ fn link_to(machine: &Machine, path: &Path) -> Option<PathBuf> {
 }
 
 /// What the files of a unit say.
-fn given(machine: &Machine, unit: &str, files: &Files, findings: &mut Vec<Finding>) -> Given {
-    let Files { config: config_name, options: options_name, symlink, .. } = files;
+fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, findings: &mut Vec<Finding>) -> Given {
+    let Files { options: options_name, symlink, .. } = files;
     let restart = format!("sudo systemctl restart {unit}");
     let mut given = Given::default();
     match options(machine, options_name) {
@@ -159,6 +186,7 @@ fn given(machine: &Machine, unit: &str, files: &Files, findings: &mut Vec<Findin
     }
     // On the unit's command line, after which come the options.
     given.symlink.get_or_insert_with(|| symlink.clone());
+    let Some(config_name) = config else { return given };
     let file = machine.path(config_name);
     if file.exists() {
         match config::load(&file) {
@@ -172,7 +200,7 @@ fn given(machine: &Machine, unit: &str, files: &Files, findings: &mut Vec<Findin
             }
         }
     } else if units::is_installed(machine, unit) {
-        let remedy = match config_name.as_str() {
+        let remedy = match config_name {
             SYSTEM_FILE => {
                 "sudo apt install --reinstall -o Dpkg::Options::=--force-confmiss pinion-mcu, or sudo make install"
                     .into()
@@ -282,6 +310,28 @@ mod tests {
         tree.link("home/pi/sim", "/dev/pts/4");
         tree.link("tmp/klipper_host_sim", "/home/pi/sim");
         assert_eq!(link().as_deref(), Some(Path::new("/tmp/klipper_host_sim")));
+    }
+
+    #[test]
+    fn the_file_to_change_is_the_one_that_the_instance_reads() {
+        let tree = Tree::new();
+        let config = || instances(&tree.machine()).0[0].config().to_owned();
+        assert_eq!(config(), "/etc/pinion/pinion.toml");
+        // A unit of one's own.
+        tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
+        tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
+        assert_eq!(config(), "its command line");
+        let command = "[Service]\nExecStart=/usr/bin/pinion run --config=/home/pi/pins.toml -r\n";
+        tree.put("etc/systemd/system/klipper-mcu.service", command);
+        assert_eq!(config(), "/home/pi/pins.toml");
+        // What runs counts, also that of another version.
+        tree.process(9, &["/usr/bin/pinion", "run", "--new", "--config", "/home/pi/other.toml"], 0, &[]);
+        assert_eq!(config(), "/home/pi/other.toml");
+        tree.process(9, &["/usr/bin/pinion", "run", "-r"], 0, &[]);
+        tree.put("proc/9/cgroup", "0::/system.slice/pinion-mcu.service\n");
+        tree.put("etc/pinion/pinion.toml", "cpus = 3\n");
+        assert_eq!(config(), "its command line");
+        assert!(instances(&tree.machine()).1.is_empty(), "nobody reads that file");
     }
 
     #[test]

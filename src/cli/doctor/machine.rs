@@ -15,6 +15,8 @@ use crate::cli::{config, run_args};
 use crate::klippy::process::{self, Process};
 use crate::runtime::guardian;
 
+use super::instance::named_config;
+
 /// Nothing that is read here is as long.
 const TEXT_MAX: u64 = 4 << 20;
 /// As many links as the kernel follows (path_resolution(7)).
@@ -67,6 +69,8 @@ pub(super) struct Running {
     pub(super) pid: u32,
     /// The unit that has started it, without `.service`.
     pub(super) unit: Option<String>,
+    /// The configuration file that its command line names.
+    pub(super) config: Option<String>,
     /// What it runs by, as far as its command line and its configuration file can be read.
     pub(super) settings: Option<Settings>,
 }
@@ -217,7 +221,9 @@ impl Machine {
                 // Another version of Pinion.
                 Err(_) => None,
             };
-            Some(Running { pid, unit: self.unit_of(pid), settings })
+            let words: Vec<_> = process.arguments.iter().map(|word| word.to_string_lossy()).collect();
+            let config = named_config(words.iter().map(AsRef::as_ref));
+            Some(Running { pid, unit: self.unit_of(pid), config, settings })
         };
         self.processes().into_iter().filter_map(running).collect()
     }
