@@ -16,6 +16,7 @@ use crate::klippy::process::{self, Process};
 use crate::runtime::guardian;
 
 use super::instance::named_config;
+use super::units::{self, setting};
 
 /// Nothing that is read here is as long.
 const TEXT_MAX: u64 = 4 << 20;
@@ -228,10 +229,23 @@ impl Machine {
         self.processes().into_iter().filter_map(running).collect()
     }
 
-    /// The unit that has started a process, without `.service`: that of its control group (systemd.resource-control(5)).
+    /// The unit whose program a process of ours or klippy's is, without `.service`: that of its control group
+    /// (systemd.resource-control(5)). None if it was started from a user's session or manager, which `sudo systemctl`
+    /// does not reach, or by another service's program, as by cron.
     pub(super) fn unit_of(&self, pid: u32) -> Option<String> {
         let groups = self.text(format!("/proc/{pid}/cgroup"))?;
-        groups.lines().find_map(|line| Some(line.rsplit('/').next()?.strip_suffix(".service")?.to_owned()))
+        let is_user = |name: &str| name.starts_with("user@") || name.starts_with("user-");
+        if groups.split(['/', '\n']).any(is_user) {
+            return None;
+        }
+        let unit = groups.lines().find_map(|line| line.rsplit('/').next()?.strip_suffix(".service"))?;
+        // A unit that the folders of units do not have, as that of a template, is taken at its name.
+        let text = units::text(self, unit).unwrap_or_default();
+        let starts_it = setting(&text, "ExecStart").is_none_or(|command| {
+            let command = command.to_lowercase();
+            ["pinion", "klippy", "klipper"].iter().any(|program| command.contains(program))
+        });
+        starts_it.then(|| unit.to_owned())
     }
 
     /// Whose permissions are looked at: the service's user for root, else the caller. None if root looks
@@ -245,5 +259,30 @@ impl Machine {
         let groups = getgroups().unwrap_or_default();
         let gids = std::iter::once(getegid()).chain(groups).map(nix::unistd::Gid::as_raw).collect();
         Some(Who { name, uid: uid.as_raw(), gids })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::Tree;
+
+    #[test]
+    fn the_unit_of_a_process_is_the_one_that_starts_it_again() {
+        let tree = Tree::new();
+        let unit = |group: &str| {
+            tree.put("proc/7/cgroup", &format!("0::{group}\n"));
+            tree.machine().unit_of(7)
+        };
+        assert_eq!(unit("/system.slice/system-pinion.slice/pinion-mcu@b.service").as_deref(), Some("pinion-mcu@b"));
+        assert_eq!(unit("/user.slice/user-1000.slice/session-2.scope"), None);
+        assert_eq!(unit("/user.slice/user-1000.slice/user@1000.service"), None);
+        assert_eq!(unit("/user.slice/user-1000.slice/user@1000.service/app.slice/klipper.service"), None);
+        tree.put("lib/systemd/system/cron.service", "[Service]\nExecStart=/usr/sbin/cron -f -P $EXTRA_OPTS\n");
+        assert_eq!(unit("/system.slice/cron.service"), None);
+        // The program's name may stand in a variable's only.
+        tree.put("etc/systemd/system/klipper.service", "[Service]\nExecStart=/home/pi/env/bin/python $KLIPPER_ARGS\n");
+        assert_eq!(unit("/system.slice/klipper.service").as_deref(), Some("klipper"));
+        tree.put("etc/systemd/system/mine.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
+        assert_eq!(unit("/system.slice/mine.service").as_deref(), Some("mine"));
     }
 }
