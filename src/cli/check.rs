@@ -21,7 +21,7 @@ use crate::time::Monotonic;
 
 use super::finding::{self, Finding, Group};
 use super::quietly;
-use super::run::{BoardName, Settings, WATCHDOG};
+use super::run::{BoardName, Settings, WATCHDOG, WATCHDOG_REMEDY};
 
 /// Checks and tells; `file` is the configuration file, which has been read.
 pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
@@ -175,8 +175,7 @@ fn real_time(settings: &Settings) -> Vec<Finding> {
 fn watchdog(device: &Path) -> Finding {
     let path = device.display();
     if !device.exists() {
-        let remedy = "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
-        return Finding::error("watchdog", format!("there is no {path}"), remedy);
+        return Finding::error("watchdog", format!("there is no {path}"), WATCHDOG_REMEDY);
     }
     match access(device, AccessFlags::W_OK) {
         Ok(()) => Finding::ok("watchdog", format!("{path} is there")),

@@ -23,6 +23,9 @@ use super::{check, config, end_by_panic, failed, logging};
 
 /// The device of the watchdog that -w feeds.
 pub(super) const WATCHDOG: &str = "/dev/watchdog";
+/// What to do where it is not there.
+pub(super) const WATCHDOG_REMEDY: &str =
+    "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
 /// The longest margin that may be asked for.
 pub(super) const MARGIN_MAX_US: u32 = 10_000;
 

@@ -40,12 +40,9 @@ pub enum Search {
 /// Those of looking at the terminal or at `proc` itself.
 pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
     let terminal = fs::metadata(device)?;
-    let pids = fs::read_dir(proc)?
-        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
-        .filter(|pid| *pid != std::process::id());
     let mut klippys = Vec::new();
     let mut others = Vec::new();
-    for pid in pids {
+    for pid in pids(proc)? {
         let arguments = arguments(proc, pid);
         if klippy(&arguments).is_some() {
             klippys.extend(Process::read(proc, pid, arguments));
@@ -82,11 +79,13 @@ pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
 ///
 /// Those of looking at `proc` itself.
 pub fn all(proc: &Path) -> io::Result<Vec<Process>> {
-    Ok(fs::read_dir(proc)?
-        .filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok())
-        .filter(|pid| *pid != std::process::id())
-        .filter_map(|pid| Process::read(proc, pid, arguments(proc, pid)))
-        .collect())
+    Ok(pids(proc)?.filter_map(|pid| Process::read(proc, pid, arguments(proc, pid))).collect())
+}
+
+/// The numbers of all processes but this one.
+fn pids(proc: &Path) -> io::Result<impl Iterator<Item = u32>> {
+    let pids = fs::read_dir(proc)?.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
+    Ok(pids.filter(|pid| *pid != std::process::id()))
 }
 
 impl Process {

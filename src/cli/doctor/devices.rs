@@ -128,8 +128,7 @@ fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &
     let (name, who) = (class.name, &user.name);
     let Some((node, about)) = refused.first() else {
         let first = machine.name(nodes.first()?.0);
-        let more = if nodes.len() > 1 { format!(" and {} more", nodes.len() - 1) } else { String::new() };
-        return Some(Finding::ok(class.check, format!("{name}: {who} may open {}{more}", first.display())));
+        return Some(Finding::ok(class.check, format!("{name}: {who} may open {}", with_others(&first, nodes.len()))));
     };
     let found = format!(
         "{name}: {who} may not open {}, which is {} ({} of {} refused)",
@@ -152,6 +151,12 @@ fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &
     Some(Finding::error(class.check, found, remedy))
 }
 
+/// The first of so many.
+fn with_others(first: &Path, count: usize) -> String {
+    let more = if count > 1 { format!(" and {} more", count - 1) } else { String::new() };
+    format!("{}{more}", first.display())
+}
+
 fn rules_are_there(machine: &Machine) -> bool {
     let folders = ["/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d"];
     folders.iter().any(|folder| machine.names(folder).iter().any(|name| name.ends_with("pinion-mcu.rules")))
@@ -164,11 +169,9 @@ pub(super) fn presence(machine: &Machine) -> Vec<Finding> {
 
 fn present(machine: &Machine, class: &Class) -> Finding {
     let Class { check, name, .. } = *class;
-    let nodes: Vec<String> =
-        (class.nodes)(machine).iter().map(|node| machine.name(node).display().to_string()).collect();
+    let nodes = (class.nodes)(machine);
     if let Some(first) = nodes.first() {
-        let more = if nodes.len() > 1 { format!(" and {} more", nodes.len() - 1) } else { String::new() };
-        return Finding::ok(check, format!("{name}: {first}{more}"));
+        return Finding::ok(check, format!("{name}: {}", with_others(&machine.name(first), nodes.len())));
     }
     if check == "gpio" {
         let remedy = "connect an I/O board that the kernel knows, or try pinion run --board sim";

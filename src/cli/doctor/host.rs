@@ -15,7 +15,7 @@ use crate::klippy::Checkout;
 use crate::klippy::process::{self, Process};
 use crate::mcu::DialectName;
 
-use super::instance::{HOST_PATHS, Instance};
+use super::instance::{HOST_PATHS, Instance, is_host_path, unit_for};
 use super::machine::{Access, Machine, Who};
 use super::printer;
 use super::units::{self, setting};
@@ -143,18 +143,6 @@ pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Kl
         }
     }
     findings
-}
-
-fn is_host_path(path: &Path) -> bool {
-    path.to_string_lossy().starts_with(HOST_PATHS)
-}
-
-/// The unit that makes a link.
-fn unit_for(link: &Path) -> String {
-    match link.to_string_lossy().strip_prefix(HOST_PATHS) {
-        None | Some("mcu") => "pinion-mcu".to_owned(),
-        Some(name) => format!("pinion-mcu@{name}"),
-    }
 }
 
 /// Whether those who are to open a link find a terminal there, and may open it. It is that of `instance`, or one that

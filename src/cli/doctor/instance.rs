@@ -18,6 +18,19 @@ const UNIT: &str = "pinion-mcu";
 /// How klippy knows a pseudo terminal by its path (klippy/mcu.py).
 pub(super) const HOST_PATHS: &str = "/tmp/klipper_host_";
 
+/// Whether klippy takes a path for a pseudo terminal's.
+pub(super) fn is_host_path(path: &Path) -> bool {
+    path.to_string_lossy().starts_with(HOST_PATHS)
+}
+
+/// The unit that makes a link, as [`Files`] tells which link a unit makes.
+pub(super) fn unit_for(link: &Path) -> String {
+    match link.to_string_lossy().strip_prefix(HOST_PATHS) {
+        None | Some("mcu") => UNIT.to_owned(),
+        Some(name) => format!("{UNIT}@{name}"),
+    }
+}
+
 /// A Pinion that runs, or is to run.
 pub(super) struct Instance {
     /// The unit that starts it, without `.service`; none if it was started by hand.
@@ -134,7 +147,7 @@ fn instance(
     };
     // The one that runs knows best. Of another version, whose command line is not understood, real time is expected.
     let settings = settings.unwrap_or_else(|| Given { realtime: Some(true), ..given }.settings());
-    let link = if settings.symlink.to_string_lossy().starts_with(HOST_PATHS) {
+    let link = if is_host_path(&settings.symlink) {
         Some(settings.symlink.clone())
     } else {
         // The unit's own, or one that somebody has made.

@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use crate::cli::finding::Finding;
-use crate::cli::run::WATCHDOG;
+use crate::cli::run::{WATCHDOG, WATCHDOG_REMEDY};
 
 use super::instance::{Instance, is_klipper_s};
 use super::machine::Machine;
@@ -123,8 +123,8 @@ pub(super) fn watchdog(machine: &Machine, instances: &[Instance]) -> Vec<Finding
         return vec![if is_there { finding.or(wanted) } else { finding }];
     }
     if !is_there {
-        let remedy = "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
-        return vec![Finding::error(CHECK, format!("there is no {WATCHDOG}, which Pinion is to feed"), remedy)];
+        let found = format!("there is no {WATCHDOG}, which Pinion is to feed");
+        return vec![Finding::error(CHECK, found, WATCHDOG_REMEDY)];
     }
     if let [first, second, ..] = feeding[..] {
         let found = format!(
