@@ -28,7 +28,7 @@ use rustyline::hint::Hinter;
 use rustyline::history::FileHistory;
 use rustyline::validate::Validator;
 use rustyline::{Config, Context, Editor, ExternalPrinter, Helper};
-use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
+use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::emulate_default_handler;
 
@@ -70,7 +70,8 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
     let done = match &args.board {
         None => {
             let ready = free(&args.pty).and_then(|()| {
-                let signals: Vec<i32> = [SIGQUIT, SIGTERM].into_iter().chain(hang_up()?).collect();
+                let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
+                let signals: Vec<i32> = [SIGQUIT, SIGTERM].into_iter().chain(hang_up).collect();
                 Terminal::remember().give_back_at(&signals)
             });
             ready.and_then(|()| speak(args, &args.pty))
@@ -111,19 +112,14 @@ fn free(pty: &Path) -> Result<(), String> {
     }
 }
 
-/// SIGHUP, unless the program was started with it ignored, as by nohup(1): who registers it would be ended by it.
-fn hang_up() -> Result<Option<i32>, String> {
-    let is_ignored = runtime::hang_up_is_ignored().map_err(|error| format!("/proc/self/status: {error}"))?;
-    Ok((!is_ignored).then_some(SIGHUP))
-}
-
 /// Runs a simulated machine, and speaks to it.
 fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     let terminal = Terminal::remember();
     // The others end the machine in order, which then tells which it was.
     terminal.clone().give_back_at(&[SIGQUIT])?;
     let signal = Arc::new(AtomicUsize::new(0));
-    for ending in [SIGINT, SIGTERM].into_iter().chain(hang_up()?) {
+    let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
+    for ending in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
         signal_hook::flag::register_usize(ending, signal.clone(), ending.unsigned_abs() as usize)
             .map_err(|error| format!("signals can not be taken in: {error}"))?;
     }

@@ -18,10 +18,10 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::signal::{Signal, raise};
 use nix::sys::termios::{LocalFlags, SetArg, SpecialCharacterIndices, Termios, tcgetattr, tcsetattr};
 use serde_json::Value;
-use signal_hook::consts::{SIGHUP, SIGINT, SIGQUIT, SIGTERM};
+use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
 
-use crate::runtime::socket_paths;
 use crate::runtime::status::connect;
+use crate::runtime::{hang_up, socket_paths};
 use crate::sys;
 
 use super::{failed, print};
@@ -384,7 +384,8 @@ impl Metrics {
 /// Prints the status each second, until it is asked to end.
 fn watch(args: &StatusArgs) -> Result<(), String> {
     let ended = Arc::new(AtomicBool::new(false));
-    for signal in [SIGINT, SIGQUIT, SIGTERM, SIGHUP] {
+    let hang_up = hang_up().map_err(|error| error.to_string())?;
+    for signal in [SIGINT, SIGQUIT, SIGTERM].into_iter().chain(hang_up) {
         signal_hook::flag::register(signal, ended.clone())
             .map_err(|error| format!("signals can not be taken in: {error}"))?;
     }

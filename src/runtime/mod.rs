@@ -42,7 +42,7 @@ mod workers;
 
 pub use guardian::Guardian;
 pub use pty::Access;
-pub(crate) use signals::hang_up_is_ignored;
+pub(crate) use signals::hang_up;
 pub use status::socket_paths;
 
 use self::core::{Core, Left, Request};

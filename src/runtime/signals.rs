@@ -39,11 +39,9 @@ impl Signals {
         }
         let (read, write) = UnixStream::pair()?;
         let mut known = vec![SIGTERM, SIGINT, SIGUSR1];
-        // SIGHUP, as a terminal closes, ends the program in order, unless nohup(1) has started it.
-        // (It kills the C program, which leaves its pins as they are.)
-        if !hang_up_is_ignored()? {
-            known.push(SIGHUP);
-        }
+        // SIGHUP, as a terminal closes, ends the program in order. (It kills the C program, which leaves its pins
+        // as they are.)
+        known.extend(hang_up()?);
         if std::env::var_os("PINION_TEST_HANG").is_some() {
             known.push(SIGUSR2);
         }
@@ -66,13 +64,17 @@ impl Signals {
     }
 }
 
-/// Whether the program was started with SIGHUP ignored, as long as nobody has registered it since.
+/// SIGHUP, unless the program was started with it ignored, as by nohup(1), and as long as nobody has registered it
+/// since: who registers it would be ended by it.
 ///
 /// # Errors
 ///
 /// Those of reading /proc/self/status.
-pub(crate) fn hang_up_is_ignored() -> io::Result<bool> {
-    Ok(is_hang_up_ignored_in(&fs::read_to_string("/proc/self/status")?))
+pub(crate) fn hang_up() -> io::Result<Option<i32>> {
+    const STATUS: &str = "/proc/self/status";
+    let status =
+        fs::read_to_string(STATUS).map_err(|error| io::Error::new(error.kind(), format!("{STATUS}: {error}")))?;
+    Ok((!is_hang_up_ignored_in(&status)).then_some(SIGHUP))
 }
 
 /// `status` is /proc/PID/status.
