@@ -2,27 +2,19 @@
 //! What the machine itself costs, in virtual time and with lines that do nothing: decoding and
 //! dispatch of commands, a step's event, the dictionary.
 
-#[path = "../tests/machine/bench.rs"]
-#[allow(dead_code)]
-mod bench;
-#[path = "../tests/machine/rig.rs"]
-#[allow(dead_code)]
-mod rig;
-
 use std::hint::black_box;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bench::{Bench, FakeBoard};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
-use pinion::board::{
+use pinion_firmware::board::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
-use pinion::feature::FEATURES;
-use pinion::mcu::{Dialect, DialectName, Generation, MOVE_COUNT, Snapshot};
-use pinion::shutdown::Shutdown;
-use pinion::wire::block::PAYLOAD_MAX;
-use rig::Rig;
+use pinion_firmware::mcu::{Dialect, DialectName, Generation, MOVE_COUNT, Snapshot};
+use pinion_firmware::shutdown::Shutdown;
+use pinion_protocol::block::PAYLOAD_MAX;
+use pinion_testbench::board::{Bench, FakeBoard};
+use pinion_testbench::rig::{FIRMWARE, Rig};
 
 /// The bench's board with outputs that do nothing: what is left is the machine.
 struct Quiet(FakeBoard);
@@ -227,7 +219,7 @@ fn status(c: &mut Criterion) {
 fn dictionary(c: &mut Criterion) {
     let board = FakeBoard(Rig::new().bench);
     c.bench_function("dictionary", |b| {
-        b.iter(|| Dialect::new(FEATURES, black_box(&board), DialectName::Of(Generation::Master)).unwrap())
+        b.iter(|| Dialect::new(&FIRMWARE, black_box(&board), DialectName::Of(Generation::Master)).unwrap())
     });
 }
 

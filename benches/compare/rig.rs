@@ -14,7 +14,7 @@ use nix::sched::{CloneFlags, unshare};
 use nix::sys::signal::{Signal, kill};
 use nix::sys::stat::{Mode, SFlag, makedev, mknod};
 use nix::unistd::{Pid, geteuid};
-use pinion::host::Client;
+use pinion_client::Client;
 
 /// A program to measure.
 #[derive(Clone, Debug)]

@@ -3,9 +3,9 @@
 
 use std::time::{Duration, Instant};
 
-use pinion::host::config::Config;
-use pinion::host::{Arg, Client, Error};
-use pinion::time::{Clock, NS_PER_TICK, Ticks};
+use pinion_client::config::Config;
+use pinion_client::{Arg, Client, Error};
+use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
 
 use super::process::{self, Others};
 use super::rig::{Launch, Program, Rig, Running};
@@ -48,7 +48,7 @@ pub struct Load {
 impl Load {
     /// A load whose edges are recorded; every step is a pulse.
     pub fn steady(rate_hz: u32, steppers: usize, transfers: bool, seconds: f64) -> Load {
-        let interval = f64::from(pinion::time::CLOCK_FREQ) / f64::from(rate_hz);
+        let interval = f64::from(pinion_firmware::time::CLOCK_FREQ) / f64::from(rate_hz);
         let intervals = SLOWER.iter().take(steppers).map(|slower| (interval * slower).round() as u32).collect();
         Load {
             intervals,
@@ -78,7 +78,7 @@ impl Load {
 }
 
 fn seconds(ticks: u32) -> f64 {
-    f64::from(ticks) / f64::from(pinion::time::CLOCK_FREQ)
+    f64::from(ticks) / f64::from(pinion_firmware::time::CLOCK_FREQ)
 }
 
 /// What became of a load.

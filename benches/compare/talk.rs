@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 
 use nix::fcntl::OFlag;
 use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
-use pinion::host::serial::WINDOW;
-use pinion::wire::block::{Found, PAYLOAD_MAX, Resync, Sequence, frame};
+use pinion_client::serial::WINDOW;
+use pinion_protocol::block::{Found, PAYLOAD_MAX, Resync, Sequence, frame};
 
 use super::rig::Running;
 

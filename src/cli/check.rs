@@ -13,11 +13,11 @@ use std::sync::Arc;
 
 use nix::unistd::{AccessFlags, Gid, Group as UserGroup, access, getegid, geteuid, getgroups};
 
-use crate::board::linux::Inventory;
-use crate::feature::FEATURES;
-use crate::mcu::{Dialect, DialectName};
+use crate::FIRMWARE;
 use crate::runtime::realtime::{self, Processors};
-use crate::time::Monotonic;
+use pinion_firmware::mcu::{Dialect, DialectName};
+use pinion_linux::Inventory;
+use pinion_linux::clock::Monotonic;
 
 use super::finding::{self, Finding, Group};
 use super::quietly;
@@ -62,7 +62,7 @@ fn board(settings: &Settings) -> Vec<Finding> {
     };
     findings.push(Finding::ok("board", format!("board {}", board.describe())));
     let name = settings.dialect.unwrap_or(DialectName::Union);
-    findings.push(match Dialect::new(FEATURES, &*board, name) {
+    findings.push(match Dialect::new(&FIRMWARE, &*board, name) {
         Ok(_) => match settings.dialect {
             Some(name) => Finding::ok("dialect", format!("dialect {name}")),
             None => Finding::ok("dialect", "dialect of whichever host comes"),

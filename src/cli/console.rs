@@ -32,13 +32,13 @@ use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::iterator::Signals;
 use signal_hook::low_level::emulate_default_handler;
 
-use crate::board::sim::SimBoard;
-use crate::host::console::{Console, Next, Vocabulary};
-use crate::host::{self, Client};
 use crate::klippy::process::{Search, find};
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Options};
-use crate::time::Monotonic;
+use pinion_client::console::{Console, Next, Vocabulary};
+use pinion_client::{self, Client};
+use pinion_linux::clock::Monotonic;
+use pinion_sim::SimBoard;
 
 use super::run::{BoardName, sim_config};
 use super::{failed, logging, print};
@@ -89,7 +89,7 @@ fn free(pty: &Path) -> Result<(), String> {
     // Anything else many a process may have open. One that may not be opened is told of later.
     let flags = (OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits();
     if fs::OpenOptions::new().read(true).custom_flags(flags).open(&device).is_ok_and(|file| !file.is_terminal()) {
-        return Err(host::Error::NoTerminal { port: pty.display().to_string() }.to_string());
+        return Err(pinion_client::Error::NoTerminal { port: pty.display().to_string() }.to_string());
     }
     let name = |processes: &[crate::klippy::process::Process]| {
         let names = processes.iter().map(|process| {

@@ -10,9 +10,9 @@ use std::sync::Arc;
 
 use clap::Args;
 
-use crate::feature::FEATURES;
-use crate::mcu::{Dialect, DialectName};
-use crate::time::Monotonic;
+use crate::FIRMWARE;
+use pinion_firmware::mcu::{Dialect, DialectName};
+use pinion_linux::clock::Monotonic;
 
 use super::run::BoardName;
 use super::{failed, print};
@@ -42,7 +42,7 @@ pub(super) fn run(args: &DictArgs) -> ExitCode {
 
 fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
     let board = args.board.open(Arc::new(Monotonic::start()), None)?;
-    let dialect = Dialect::new(FEATURES, &*board, args.dialect).map_err(|error| error.to_string())?;
+    let dialect = Dialect::new(&FIRMWARE, &*board, args.dialect).map_err(|error| error.to_string())?;
     dialect.dictionary().json().map_err(|error| error.to_string())
 }
 

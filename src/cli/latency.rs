@@ -14,10 +14,11 @@ use std::time::Duration;
 
 use clap::Args;
 
-use crate::lateness::{Lateness, us};
 use crate::runtime::realtime::{self, Processors, Role, Scheduling};
 use crate::runtime::wakeup::{MarginLimits, Waiter};
-use crate::time::{Clock, Monotonic, Ticks, TimeSource};
+use pinion_firmware::lateness::{Lateness, us};
+use pinion_firmware::time::{Clock, Ticks, TimeSource};
+use pinion_linux::clock::Monotonic;
 
 use super::doctor::is_preempt_rt;
 use super::{failed, print};

@@ -23,7 +23,7 @@ use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::unistd::write;
 
-use crate::sys;
+use pinion_linux::sys;
 
 /// How many lines may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
@@ -105,7 +105,7 @@ impl Style {
                 format!("<{priority}>{text}\n")
             }
             Style::Plain => {
-                let now = crate::time::monotonic().as_secs_f64();
+                let now = pinion_linux::clock::monotonic().as_secs_f64();
                 format!("[{now:12.6}] {level:5} {text}\n")
             }
         }

@@ -12,12 +12,12 @@ use std::process::ExitCode;
 use clap::Args;
 use serde::Serialize;
 
-use crate::board::linux::Inventory;
-use crate::board::linux::adc::IioDevice;
-use crate::board::linux::gpio::Chip;
-use crate::board::linux::pins::{Names, channel_number, line_number, pwm_number};
-use crate::board::linux::spi::Node;
-use crate::board::linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
+use pinion_linux::Inventory;
+use pinion_linux::adc::IioDevice;
+use pinion_linux::gpio::Chip;
+use pinion_linux::pins::{Names, channel_number, line_number, pwm_number};
+use pinion_linux::spi::Node;
+use pinion_linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
 
 use super::{failed, print};
 
@@ -487,9 +487,9 @@ fn w1_section(sensors: &[W1Sensor]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::board::linux::adc::{Channel, Format};
-    use crate::board::linux::gpio::LineInfo;
-    use crate::board::linux::sysfs::PwmChannel;
+    use pinion_linux::adc::{Channel, Format};
+    use pinion_linux::gpio::LineInfo;
+    use pinion_linux::sysfs::PwmChannel;
     use serde_json::{Value, json};
 
     fn pi() -> Inventory {

@@ -11,13 +11,14 @@ use std::sync::Arc;
 use clap::Args;
 use log::LevelFilter;
 
-use crate::board::Board;
-use crate::board::linux::{Guard, LinuxBoard};
-use crate::board::sim::{SimBoard, SimConfig, SimError};
-use crate::mcu::DialectName;
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Guardian, Options};
-use crate::time::{Monotonic, TimeSource};
+use pinion_firmware::board::Board;
+use pinion_firmware::mcu::DialectName;
+use pinion_firmware::time::TimeSource;
+use pinion_linux::clock::Monotonic;
+use pinion_linux::{Guard, LinuxBoard};
+use pinion_sim::{SimBoard, SimConfig, SimError};
 
 use super::{check, config, end_by_panic, failed, logging};
 

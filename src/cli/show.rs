@@ -12,9 +12,9 @@ use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::thread;
 use std::time::Duration;
 
-use crate::board::sim::SimProbe;
-use crate::sys;
-use crate::time::monotonic;
+use pinion_linux::clock::monotonic;
+use pinion_linux::sys;
+use pinion_sim::SimProbe;
 
 /// Between two pictures on a terminal, and between two looks for changes.
 const DRAW_PERIOD: Duration = Duration::from_millis(100);

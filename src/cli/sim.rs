@@ -17,14 +17,14 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::getpid;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-use crate::board::sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
-use crate::host::Client;
-use crate::host::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
-use crate::host::heater::{Goal, Thermistor};
-use crate::host::picture;
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Options};
-use crate::time::Monotonic;
+use pinion_client::Client;
+use pinion_client::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
+use pinion_client::heater::{Goal, Thermistor};
+use pinion_client::picture;
+use pinion_linux::clock::Monotonic;
+use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 
 use super::run::sim_config;
 use super::show::Show;

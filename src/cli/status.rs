@@ -22,7 +22,7 @@ use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
 
 use crate::runtime::status::connect;
 use crate::runtime::{hang_up, socket_paths};
-use crate::sys;
+use pinion_linux::sys;
 
 use super::{failed, print};
 

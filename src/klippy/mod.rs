@@ -10,7 +10,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
-use crate::mcu::{Feature, Generation, Generations};
+use pinion_firmware::mcu::{Feature, Generation, Generations};
 
 pub mod process;
 pub mod sources;
@@ -137,7 +137,7 @@ fn commit(folder: &Path) -> Option<String> {
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
-    use crate::feature::FEATURES;
+    use pinion_firmware::feature::FEATURES;
 
     /// A checkout that looks these messages up, each in a string of two pieces, and nothing else.
     fn checkout(shapes: impl IntoIterator<Item = String>) -> (tempfile::TempDir, PathBuf) {

@@ -13,7 +13,7 @@
 use std::fs;
 use std::time::Duration;
 
-use crate::time::{Clock, NS_PER_TICK, Ticks};
+use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
 
 /// The scheduling class that the core is to run in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -10,11 +10,12 @@ use std::time::Duration;
 
 use rtrb::Consumer;
 
-use crate::mcu::{Dialect, Mcu, base};
-use crate::shutdown::{Shutdown, reason};
-use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource, monotonic};
-use crate::wire::block::PAYLOAD_MAX;
-use crate::wire::vlq::Reader;
+use pinion_firmware::mcu::{Dialect, Mcu, base};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
+use pinion_linux::clock::monotonic;
+use pinion_protocol::block::PAYLOAD_MAX;
+use pinion_protocol::vlq::Reader;
 
 use super::outlet::{LinkWake, Progress};
 use super::pulse::{BEAT, Pulse};
@@ -401,15 +402,16 @@ mod tests {
     use nix::poll::{PollFd, PollFlags, poll};
     use rtrb::{Producer, RingBuffer};
 
-    use crate::bench::{Bench, FakeBoard};
-    use crate::feature::FEATURES;
-    use crate::mcu::{DialectName, Generation, Note, Outbox};
+    use crate::FIRMWARE;
     use crate::runtime::realtime::{Processors, Scheduling};
     use crate::runtime::status;
     use crate::runtime::wakeup::MarginLimits;
     use crate::runtime::workers::Threads;
-    use crate::time::{Monotonic, VirtualClock};
-    use crate::wire::vlq::Writer;
+    use pinion_firmware::mcu::{DialectName, Generation, Note, Outbox};
+    use pinion_firmware::time::VirtualClock;
+    use pinion_linux::clock::Monotonic;
+    use pinion_protocol::vlq::Writer;
+    use pinion_testbench::board::{Bench, FakeBoard};
 
     #[derive(Clone, Default)]
     struct Heard(Arc<Mutex<Vec<Vec<u8>>>>);
@@ -454,7 +456,7 @@ mod tests {
         fn new() -> Rig {
             let bench = Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
             let board = FakeBoard(bench.clone());
-            let dialect = Arc::new(Dialect::new(FEATURES, &board, DialectName::Of(Generation::Master)).unwrap());
+            let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master)).unwrap());
             let monotonic = Monotonic::start();
             let clock = Arc::new(Counting(monotonic, AtomicUsize::new(0)));
             let (requests, inbox) = RingBuffer::new(64);
@@ -618,7 +620,7 @@ mod tests {
     fn the_stop_of_a_host_that_came_meanwhile_is_read_in_its_dialect() {
         let mut rig = Rig::held();
         let board = FakeBoard(rig.bench.clone());
-        let dialect = Arc::new(Dialect::new(FEATURES, &board, DialectName::Of(Generation::V0_11)).unwrap());
+        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::V0_11)).unwrap());
         rig.request(Request::Speak(dialect.clone()));
         let stop = rig.encode("emergency_stop", &[]);
         let formats = dialect.dictionary().commands.keys().filter(|format| !format.contains('*'));

@@ -14,10 +14,10 @@ use std::time::{Duration, Instant, SystemTime};
 use log::{info, warn};
 use nix::unistd::{SysconfVar, sysconf};
 
-use crate::feature::FEATURES;
 use crate::klippy::Checkout;
 use crate::klippy::process::{Process, Search, find};
-use crate::mcu::DialectName;
+use pinion_firmware::feature::FEATURES;
+use pinion_firmware::mcu::DialectName;
 
 use super::outlet::LinkWake;
 use super::status::{FoundHost, HostBoard};

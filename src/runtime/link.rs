@@ -16,12 +16,13 @@ use log::{info, log, warn};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use rtrb::Producer;
 
-use crate::mcu::base::{ClockResponse, IdentifyResponse, identify_response};
-use crate::mcu::{Dialect, DialectName, Response};
-use crate::shutdown::{Shutdown, reason};
-use crate::time::{Clock, TimeSource, monotonic};
-use crate::wire::block::{Received, Receiver, Sequence, frame};
-use crate::wire::vlq::{Reader, Writer};
+use pinion_firmware::mcu::base::{ClockResponse, IdentifyResponse, identify_response};
+use pinion_firmware::mcu::{Dialect, DialectName, Response};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::{Clock, TimeSource};
+use pinion_linux::clock::monotonic;
+use pinion_protocol::block::{Received, Receiver, Sequence, frame};
+use pinion_protocol::vlq::{Reader, Writer};
 
 use super::core::{Payload, Request};
 use super::guardian::{GuardianWatch, in_ms};
@@ -75,7 +76,7 @@ impl Known {
         let mut reader = Reader::new(payload);
         let id = Some(reader.int().ok()?);
         if id == self.get_clock && reader.is_empty() {
-            return self.encode(&ClockResponse { clock: now() });
+            return self.encode(&ClockResponse::from(now()));
         }
         if id != self.identify {
             return None;

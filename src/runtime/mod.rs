@@ -17,10 +17,11 @@ use std::thread;
 use log::{error, info, warn};
 use rtrb::RingBuffer;
 
-use crate::board::Board;
-use crate::mcu::{DialectName, Generation, Mcu};
-use crate::sys;
-use crate::time::{Monotonic, TimeSource};
+use pinion_firmware::board::Board;
+use pinion_firmware::mcu::{DialectName, Generation, Mcu};
+use pinion_firmware::time::TimeSource;
+use pinion_linux::clock::Monotonic;
+use pinion_linux::sys;
 
 mod budget;
 mod core;

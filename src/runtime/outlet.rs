@@ -14,9 +14,9 @@ use log::Level;
 use nix::sys::eventfd::{EfdFlags, EventFd};
 use rtrb::{Consumer, Producer, RingBuffer};
 
-use crate::lateness::us;
-use crate::mcu::{Note, Outbox};
-use crate::shutdown::{Shutdown, reason};
+use pinion_firmware::lateness::us;
+use pinion_firmware::mcu::{Note, Outbox};
+use pinion_firmware::shutdown::{Shutdown, reason};
 
 /// The size of the ring of responses, of which some 1,000 fit.
 const RING_BYTES: usize = 1 << 16;

@@ -17,7 +17,7 @@ use nix::pty::openpty;
 use nix::sys::termios::{FlushArg, SetArg, cfmakeraw, tcflush, tcgetattr, tcsetattr};
 use nix::unistd::{Gid, Group, chown, geteuid, read, ttyname, write};
 
-use crate::sys;
+use pinion_linux::sys;
 
 /// The group that gets the terminal if the command line names none.
 const USUAL_GROUP: &str = "tty";

@@ -23,9 +23,10 @@ use std::time::Duration;
 
 use nix::time::{ClockId, clock_gettime};
 
-use crate::shutdown::{Shutdown, reason};
-use crate::sys::{self, SHARED_WORDS};
-use crate::time::{Clock, Monotonic, NS_PER_TICK, TimeSource, monotonic};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource};
+use pinion_linux::clock::{Monotonic, monotonic};
+use pinion_linux::sys::{self, SHARED_WORDS};
 
 /// How long the core may be silent while the machine runs.
 pub(super) const RUNNING: Duration = Duration::from_millis(550);
@@ -443,7 +444,7 @@ impl GuardianEar {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::{CLOCK_FREQ, Ticks};
+    use pinion_firmware::time::{CLOCK_FREQ, Ticks};
 
     /// What the stamps' resolution may add or take.
     const FINE: Duration = Duration::from_millis(2);
@@ -694,7 +695,7 @@ mod tests {
             assert!(pulse.worker("spi").is_none(), "round {round}");
             workers[3].begin();
             let now = pulse.now();
-            let later = pulse.at(crate::time::monotonic() + Duration::from_secs(11));
+            let later = pulse.at(pinion_linux::clock::monotonic() + Duration::from_secs(11));
             assert_eq!(pulse.stuck(now, Duration::from_secs(10)), None);
             assert_eq!(pulse.stuck(later, Duration::from_secs(10)).as_deref(), Some("spi3"));
             workers[3].end();

@@ -16,7 +16,7 @@ use nix::sys::prctl;
 use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
 use nix::unistd::Pid;
 
-use crate::sys;
+use pinion_linux::sys;
 
 use super::budget::Class;
 

@@ -26,10 +26,10 @@ use nix::sys::socket::{AddressFamily, SockFlag, SockType, UnixAddr, socket};
 use rtrb::{Consumer, Producer, RingBuffer};
 use serde_json::{Value, json};
 
-use crate::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
-use crate::lateness::{Lateness, us};
-use crate::mcu::{BusCounts, LineUse, Mcu, Present, Snapshot};
-use crate::time::{NS_PER_TICK, Ticks};
+use pinion_firmware::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
+use pinion_firmware::lateness::{Lateness, us};
+use pinion_firmware::mcu::{BusCounts, LineUse, Mcu, Present, Snapshot};
+use pinion_firmware::time::{NS_PER_TICK, Ticks};
 
 /// How long the core has for an answer: more than its longest nap.
 const PATIENCE: Duration = Duration::from_millis(1000);

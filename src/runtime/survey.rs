@@ -11,15 +11,15 @@ use std::thread;
 
 use log::{error, info};
 
-use crate::board::Board;
-use crate::feature::FEATURES;
-use crate::mcu::{Dialect, DialectName};
+use crate::FIRMWARE;
+use pinion_firmware::board::Board;
+use pinion_firmware::mcu::{Dialect, DialectName};
 
 use super::outlet::LinkWake;
 
 /// The dialects of these names, over what the board has.
 pub(super) fn dialects(board: &dyn Board, names: &[DialectName]) -> io::Result<Vec<Arc<Dialect>>> {
-    names.iter().map(|name| Dialect::new(FEATURES, board, *name).map(Arc::new)).collect()
+    names.iter().map(|name| Dialect::new(&FIRMWARE, board, *name).map(Arc::new)).collect()
 }
 
 /// The thread that looks around: it opens devices, which the link must not wait for without an end.

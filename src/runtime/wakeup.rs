@@ -13,7 +13,7 @@ use std::time::Duration;
 
 use nix::time::{ClockId, clock_gettime};
 
-use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
+use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 
 use super::budget::{Budget, Class, Throttle};
 use super::realtime::{self, Processors, Scheduling};
@@ -232,7 +232,7 @@ mod tests {
     use nix::unistd::Pid;
 
     use super::*;
-    use crate::time::Monotonic;
+    use pinion_linux::clock::Monotonic;
 
     #[test]
     fn the_margin_settles_where_one_wake_up_in_fifty_is_later() {

@@ -15,8 +15,8 @@ use std::time::Duration;
 
 use log::{error, info, warn};
 
-use crate::sys;
-use crate::time::monotonic;
+use pinion_linux::clock::monotonic;
+use pinion_linux::sys;
 
 use super::notify::Notify;
 use super::pulse::{BEAT, Pulse};
@@ -161,7 +161,7 @@ impl Vigil {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::Monotonic;
+    use pinion_linux::clock::Monotonic;
     use std::fs;
 
     fn vigil(path: &Path) -> (Vigil, Pulse) {

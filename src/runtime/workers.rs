@@ -12,9 +12,10 @@ use std::time::Duration;
 use log::error;
 use rtrb::{Consumer, Producer, RingBuffer};
 
-use crate::mcu::{Completion, Job, WorkerId, Workers};
-use crate::shutdown::{Shutdown, reason};
-use crate::time::{TimeSource, monotonic};
+use pinion_firmware::mcu::{Completion, Job, WorkerId, Workers};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::TimeSource;
+use pinion_linux::clock::monotonic;
 
 use super::pulse::{JobClock, Pulse};
 
@@ -178,8 +179,8 @@ impl Server {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::mcu::{Errand, Oid, Ticket};
-    use crate::time::Monotonic;
+    use pinion_firmware::mcu::{Errand, Oid, Ticket};
+    use pinion_linux::clock::Monotonic;
     use std::sync::mpsc::{self, Receiver, Sender};
 
     /// Waits to be let go on, then says which one it is.

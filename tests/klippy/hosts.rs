@@ -5,7 +5,7 @@
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
-use pinion::mcu::Generation;
+use pinion_firmware::mcu::Generation;
 
 use super::klippy::{Printer, rest};
 

@@ -12,10 +12,10 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, raise};
 use nix::unistd::geteuid;
-use pinion::board::sim::{SimBoard, SimConfig, SimProbe};
 use pinion::runtime::wakeup::MarginLimits;
 use pinion::runtime::{self, Access, Options};
-use pinion::time::Monotonic;
+use pinion_linux::clock::Monotonic;
+use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 

@@ -18,9 +18,9 @@ use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use pinion::wire::block::{Found, Resync};
-use pinion::wire::format;
-use pinion::wire::vlq::Reader;
+use pinion_protocol::block::{Found, Resync};
+use pinion_protocol::format;
+use pinion_protocol::vlq::Reader;
 use serde_json::{Map, Value, json};
 
 use crate::{checkout, klippy::python};

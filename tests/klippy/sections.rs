@@ -7,7 +7,7 @@ use std::process::Command;
 use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 
-use pinion::mcu::Generation;
+use pinion_firmware::mcu::Generation;
 
 use super::checkout;
 use super::hosts;

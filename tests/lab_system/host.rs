@@ -16,9 +16,9 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use pinion::host::config::Config;
-use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
-use pinion::host::{Client, Error};
+use pinion_client::config::Config;
+use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
+use pinion_client::{Client, Error};
 use serde_json::{Value, json};
 
 const PATIENCE: Duration = Duration::from_secs(10);

@@ -4,8 +4,8 @@
 
 use std::time::{Duration, Instant};
 
-use pinion::host::Client;
-use pinion::wire::block::Sequence;
+use pinion_client::Client;
+use pinion_protocol::block::Sequence;
 
 use crate::process::{PATIENCE, Pinion};
 

@@ -14,7 +14,7 @@ use nix::pty::{Winsize, openpty};
 use nix::sys::signal::{Signal, kill};
 use nix::sys::termios::{LocalFlags, tcgetattr};
 use nix::unistd::Pid;
-use pinion::host::config::Config;
+use pinion_client::config::Config;
 
 use crate::process::{PATIENCE, Pinion, folder_with};
 

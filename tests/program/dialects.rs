@@ -8,7 +8,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 
-use pinion::host::config::Config;
+use pinion_client::config::Config;
 use serde_json::Value;
 use tempfile::TempDir;
 
@@ -299,7 +299,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
         let mut host = Host(host.unwrap());
         std::io::Read::read_exact(host.0.stdout.as_mut().unwrap(), &mut [0; 4]).unwrap();
         // The test's own client is root's, and so is hidden, too; it is no klippy.
-        let client = pinion::host::Client::connect(&tty, crate::process::PATIENCE).unwrap();
+        let client = pinion_client::Client::connect(&tty, crate::process::PATIENCE).unwrap();
         let has_it = client.dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c");
         assert_eq!(has_it, may_look);
         if may_look {

@@ -12,9 +12,9 @@ use nix::fcntl::{FcntlArg, OFlag, fcntl};
 use nix::pty::openpty;
 use nix::sys::signal::Signal;
 use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
-use pinion::host::config::Config;
-use pinion::host::serial::Received;
-use pinion::wire::block::{PAYLOAD_MAX, Sequence, frame};
+use pinion_client::config::Config;
+use pinion_client::serial::Received;
+use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
 
 use crate::process::{PATIENCE, Pinion, exists};
 

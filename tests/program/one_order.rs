@@ -7,7 +7,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use nix::sys::signal::Signal;
-use pinion::host::{Arg, Client, Error};
+use pinion_client::{Arg, Client, Error};
 
 use crate::process::{PATIENCE, Pinion, output};
 

@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use pinion::host::Client;
-use pinion::host::serial::Port;
+use pinion_client::Client;
+use pinion_client::serial::Port;
 use tempfile::TempDir;
 
 /// Long enough for any machine; nothing here measures speed.

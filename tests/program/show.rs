@@ -10,7 +10,7 @@ use std::thread;
 
 use nix::pty::{Winsize, openpty};
 use nix::sys::signal::Signal;
-use pinion::host::Client;
+use pinion_client::Client;
 
 use crate::process::{Pinion, closed_pipe, exists, output};
 

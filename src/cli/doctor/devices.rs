@@ -11,8 +11,8 @@ use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::board::linux::gpio::Chip;
 use crate::cli::finding::Finding;
+use pinion_linux::gpio::Chip;
 
 use super::instance::Instance;
 use super::machine::{Access, Machine, Who};
@@ -327,8 +327,8 @@ mod tests {
     use super::super::instance::instances;
     use super::super::tests::{Tree, told};
     use super::*;
-    use crate::board::linux::gpio::LineInfo;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
+    use pinion_linux::gpio::LineInfo;
     use std::os::unix::fs::MetadataExt;
 
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {

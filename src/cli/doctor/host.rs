@@ -10,10 +10,10 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use crate::cli::finding::Finding;
-use crate::feature::FEATURES;
 use crate::klippy::Checkout;
 use crate::klippy::process::{self, Process};
-use crate::mcu::DialectName;
+use pinion_firmware::feature::FEATURES;
+use pinion_firmware::mcu::DialectName;
 
 use super::instance::{HOST_PATHS, Instance, is_host_path, unit_for};
 use super::machine::{Access, Machine, Who};
@@ -336,7 +336,7 @@ mod tests {
     use super::super::tests::{Tree, told};
     use super::*;
     use crate::cli::finding::Level::{Error, Ok, Warning};
-    use crate::mcu::Generation;
+    use pinion_firmware::mcu::Generation;
 
     const PI: u32 = 54_321;
 

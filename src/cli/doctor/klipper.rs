@@ -8,9 +8,9 @@ use std::fmt::Write as _;
 use std::path::Path;
 
 use crate::cli::finding::Finding;
-use crate::feature::FEATURES;
 use crate::klippy::Checkout;
 use crate::klippy::sources::Shape;
+use pinion_firmware::feature::FEATURES;
 
 /// Reads a checkout, named by itself or by klippy's folder in it.
 pub(super) fn read(folder: &Path) -> Result<Checkout, String> {

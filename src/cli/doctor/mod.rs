@@ -11,7 +11,7 @@ use std::process::ExitCode;
 
 use clap::Args;
 
-use crate::board::linux::Inventory;
+use pinion_linux::Inventory;
 
 use super::finding::{self, Finding, Group};
 use super::latency::{self, Fitness, Verdict};

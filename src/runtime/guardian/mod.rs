@@ -49,9 +49,9 @@ use nix::sys::time::TimeVal;
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::{Pid, getpid};
 
-use crate::board::linux::Guard;
-use crate::sys;
-use crate::time::{Monotonic, monotonic};
+use pinion_linux::Guard;
+use pinion_linux::clock::{Monotonic, monotonic};
+use pinion_linux::sys;
 
 use super::pulse::{GuardianEar, Pulse};
 

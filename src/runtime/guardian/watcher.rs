@@ -19,8 +19,8 @@ use nix::sys::socket::{MsgFlags, send};
 use nix::sys::uio::pwrite;
 use nix::unistd::{Pid, alarm, chdir, getppid, setsid};
 
-use crate::sys;
-use crate::time::monotonic;
+use pinion_linux::clock::monotonic;
+use pinion_linux::sys;
 
 use super::super::pulse::{Ear, Pulse};
 use super::super::realtime;

@@ -14,8 +14,8 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, kill};
 use nix::time::{clock_getcpuclockid, clock_gettime};
 use nix::unistd::Pid;
-use pinion::host::config::Config;
-use pinion::host::{Client, Error};
+use pinion_client::config::Config;
+use pinion_client::{Client, Error};
 
 use super::sysfs;
 

@@ -5,9 +5,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use gpio_cdev::Chip;
-use pinion::host::Client;
-use pinion::host::config::Config;
-use pinion::host::motion::Endstop;
+use pinion_client::Client;
+use pinion_client::config::Config;
+use pinion_client::motion::Endstop;
 
 use super::outside::Outside;
 use super::program::Pinion;

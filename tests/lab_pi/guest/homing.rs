@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A stepper's pulses counted from outside, and one homing.
 
-use pinion::host::Client;
-use pinion::host::config::Config;
-use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
+use pinion_client::Client;
+use pinion_client::config::Config;
+use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 
 use super::outside::Outside;
 use super::program::Pinion;

@@ -6,7 +6,7 @@ use std::path::Path;
 use std::process::{Child, Command};
 use std::time::Duration;
 
-use pinion::host::Client;
+use pinion_client::Client;
 
 const LINK: &str = "/tmp/tty";
 const LOG: &str = "/tmp/log";

@@ -4,9 +4,9 @@
 use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
-use pinion::host::Client;
-use pinion::host::config::Config;
-use pinion::host::motion::{MoveQueue, Profile, Stepper};
+use pinion_client::Client;
+use pinion_client::config::Config;
+use pinion_client::motion::{MoveQueue, Profile, Stepper};
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, refusal, run, shutdown_of};

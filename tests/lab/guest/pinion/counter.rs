@@ -6,8 +6,8 @@ use std::io::{Seek, SeekFrom, Write};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use pinion::host::Client;
-use pinion::time::monotonic;
+use pinion_client::Client;
+use pinion_linux::clock::monotonic;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, refusal, run};

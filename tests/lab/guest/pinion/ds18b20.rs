@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use pinion::host::Client;
+use pinion_client::Client;
 
 use crate::program::{Program, configure, refusal, run, shutdown_of};
 use crate::sysfs;

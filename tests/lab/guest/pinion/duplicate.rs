@@ -5,7 +5,7 @@ use std::fs;
 use std::os::unix::fs::symlink;
 use std::path::PathBuf;
 
-use pinion::host::Client;
+use pinion_client::Client;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, exists, refusal, run};

@@ -9,10 +9,10 @@ use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
 use nix::sys::signal::Signal;
-use pinion::host::Client;
-use pinion::host::config::Config;
-use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
-use pinion::time::monotonic;
+use pinion_client::Client;
+use pinion_client::config::Config;
+use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
+use pinion_linux::clock::monotonic;
 
 use crate::gpio_sim::GpioSim;
 use crate::i2c;

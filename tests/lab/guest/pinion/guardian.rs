@@ -11,7 +11,7 @@ use std::time::Duration;
 use nix::mount::{MntFlags, MsFlags, mount, umount2};
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use pinion::time::monotonic;
+use pinion_linux::clock::monotonic;
 
 use super::outputs::Outputs;
 use crate::gpio_sim::GpioSim;
@@ -128,7 +128,7 @@ impl Heater {
         Heater { sim: GpioSim::new("lab", 8) }
     }
 
-    fn switch_on(&self, program: &Program) -> pinion::host::Client {
+    fn switch_on(&self, program: &Program) -> pinion_client::Client {
         let mut client = program.connect();
         configure(&mut client, 1, &["config_digital_out oid=0 pin=lab/gpio0 value=0 default_value=0 max_duration=0"]);
         run(&mut client, "update_digital_out oid=0 value=1");
@@ -141,7 +141,7 @@ impl Heater {
     }
 
     /// The machine is stopped, and the program lives: nobody took it for one that hangs.
-    fn assert_stopped_in_order(&self, mut program: Program, mut client: pinion::host::Client) {
+    fn assert_stopped_in_order(&self, mut program: Program, mut client: pinion_client::Client) {
         assert_eq!(shutdown_of(&mut client), "Rescheduled timer in the past");
         sysfs::wait_until("the heater is off", || !self.is_on());
         program.wait_for_line(&["Pinion stood still for"]);

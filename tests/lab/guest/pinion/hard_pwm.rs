@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::sys::signal::Signal;
-use pinion::host::Client;
+use pinion_client::Client;
 
 use crate::program::{Program, configure, exists, refusal, run, shutdown_of};
 use crate::{pwm, sysfs};

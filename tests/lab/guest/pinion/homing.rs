@@ -3,9 +3,9 @@
 
 use std::time::Duration;
 
-use pinion::host::config::Config;
-use pinion::host::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
-use pinion::time::monotonic;
+use pinion_client::config::Config;
+use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
+use pinion_linux::clock::monotonic;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::Program;

@@ -2,9 +2,9 @@
 //! I2C devices on i2c-dev, and on GPIO lines.
 
 use nix::errno::Errno;
-use pinion::host::Client;
-use pinion::host::config::Config;
-use pinion::host::motion::{MoveQueue, Profile, Stepper};
+use pinion_client::Client;
+use pinion_client::config::Config;
+use pinion_client::motion::{MoveQueue, Profile, Stepper};
 
 use crate::gpio_sim::GpioSim;
 use crate::i2c;

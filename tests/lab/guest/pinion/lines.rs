@@ -5,7 +5,7 @@ use std::os::unix::process::ExitStatusExt;
 use std::process::Command;
 
 use nix::sys::signal::Signal;
-use pinion::host::Client;
+use pinion_client::Client;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, refusal, run, shutdown_of};

@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use pinion::host::Client;
+use pinion_client::Client;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{configure, run};

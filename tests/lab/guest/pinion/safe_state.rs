@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use nix::sys::signal::Signal;
-use pinion::host::Client;
+use pinion_client::Client;
 
 use super::outputs::Outputs;
 use crate::program::{Program, shutdown_of};

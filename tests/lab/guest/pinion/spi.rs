@@ -2,7 +2,7 @@
 //! SPI devices on spidev.
 
 use nix::errno::Errno;
-use pinion::host::Client;
+use pinion_client::Client;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, refusal, run, shutdown_of};

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Steps as they are seen in the lines.
 
-use pinion::host::config::Config;
-use pinion::host::motion::{MoveQueue, Profile, Stepper};
+use pinion_client::config::Config;
+use pinion_client::motion::{MoveQueue, Profile, Stepper};
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, run};

@@ -7,10 +7,10 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use pinion::host::config::Config;
-use pinion::host::motion::Stepper;
-use pinion::host::{Arg, Client, Error};
-use pinion::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks};
+use pinion_client::config::Config;
+use pinion_client::motion::Stepper;
+use pinion_client::{Arg, Client, Error};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks};
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{self, Program};

@@ -1,0 +1,135 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The other end of the wire: a small host client for the demonstration of `pinion sim`, for the
+//! tests over a real pty, for the lab and for the benches.
+//!
+//! - [`serial`]: blocks over a tty, acknowledged and sent again as klippy does
+//! - [`messages`]: commands and responses by name, as a dictionary has them
+//! - [`client`]: a session: the dictionary, commands and responses, the MCU's clock
+//! - [`config`]: oids, config commands, their check sum; resetting a machine in use
+//! - [`motion`]: step sequences, pacing them into the move queue, homing
+//! - [`heater`]: a sensor, an output and the loop between them
+//! - [`demo`]: all of it in one go, with progress and checks
+//! - [`console`]: a session in words
+//! - [`picture`]: an SVG of the homing just done
+//!
+//! There is one thread: a call that waits also reads, acknowledges and sends blocks again.
+
+#![forbid(unsafe_code)]
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+#![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
+
+pub mod client;
+pub mod config;
+pub mod console;
+pub mod demo;
+#[cfg(test)]
+mod fake;
+pub mod heater;
+pub mod messages;
+pub mod motion;
+pub mod picture;
+pub mod serial;
+
+use std::fmt;
+use std::io;
+use std::time::Duration;
+
+pub use client::Client;
+pub use messages::{Arg, Params};
+pub use serial::BlockLink;
+
+/// Why the host client could not do something. Each prints as one line with a remedy.
+#[derive(Debug)]
+pub enum Error {
+    /// The tty refused an operation.
+    Io {
+        /// What was being done.
+        doing: &'static str,
+        /// The tty's name.
+        port: String,
+        /// The kernel's answer.
+        source: io::Error,
+    },
+    /// The path leads to something else, to which nothing was written.
+    NoTerminal {
+        /// The path.
+        port: String,
+    },
+    /// The other end closed the connection.
+    Closed {
+        /// The tty's name.
+        port: String,
+    },
+    /// Nothing came in time.
+    Timeout {
+        /// What was waited for.
+        waiting_for: String,
+        /// How long.
+        after: Duration,
+    },
+    /// The micro-controller shut down.
+    Shutdown {
+        /// The firmware's text.
+        reason: String,
+    },
+    /// The data dictionary is not one.
+    Dictionary {
+        /// What is wrong with it.
+        why: String,
+    },
+    /// A message that does not fit the dictionary.
+    Message {
+        /// The command or response.
+        message: String,
+        /// What is wrong with it.
+        why: String,
+    },
+    /// A plan that cannot be carried out.
+    Plan {
+        /// The axis, heater or value.
+        subject: String,
+        /// What is wrong with it, and what would be right.
+        why: String,
+    },
+}
+
+impl fmt::Display for Error {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Error::Io { doing, port, source } => {
+                write!(f, "cannot {doing} {port}: {source}; is the MCU program running, and may you open it?")
+            }
+            Error::NoTerminal { port } => {
+                write!(f, "{port} is no terminal: name the link of a Pinion that runs, such as /tmp/klipper_host_mcu")
+            }
+            Error::Closed { port } => {
+                write!(f, "{port} was closed by the other end; look at its log")
+            }
+            Error::Timeout { waiting_for, after } => write!(
+                f,
+                "no {waiting_for} within {:.1} s; is the MCU program running, and is no other host \
+                 on its tty?",
+                after.as_secs_f64()
+            ),
+            Error::Shutdown { reason } => {
+                write!(f, "the MCU shut down: {reason}; its log says more, a reset makes it usable again")
+            }
+            Error::Dictionary { why } => {
+                write!(f, "the MCU's data dictionary is unusable: {why}; is a micro-controller on this tty?")
+            }
+            Error::Message { message, why } => {
+                write!(f, "{message}: {why}; `pinion dict` lists what the MCU takes")
+            }
+            Error::Plan { subject, why } => write!(f, "{subject}: {why}"),
+        }
+    }
+}
+
+impl std::error::Error for Error {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        match self {
+            Error::Io { source, .. } => Some(source),
+            _ => None,
+        }
+    }
+}

@@ -1,0 +1,664 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Blocks over a tty: a [`Port`] carries bytes and finds blocks in them, a [`BlockLink`] delivers
+//! payloads in order, each once.
+//!
+//! Blocks are sent again by klippy's rules (chelper/serialqueue.c). At most [`WINDOW`] blocks are
+//! sent without being acknowledged. After the retransmission time, or at once after a NAK, all of them
+//! are sent again, behind a sync byte. An empty block that repeats the last acknowledgement is a NAK.
+
+#![forbid(unsafe_code)]
+
+use std::collections::VecDeque;
+use std::fs::{File, OpenOptions};
+use std::io::{self, IsTerminal, Read, Write};
+use std::os::fd::{AsFd, OwnedFd};
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::poll::{PollFd, PollFlags, ppoll};
+use nix::sys::termios::{self, FlushArg, SetArg};
+use nix::sys::time::TimeSpec;
+
+use super::Error;
+use pinion_protocol::block::{BLOCK_MAX, BLOCK_MIN, Found, PAYLOAD_MAX, Resync, Sequence, frame};
+
+/// How many blocks may be sent without being acknowledged.
+pub const WINDOW: usize = 12;
+/// How long to wait for any acknowledgement before sending fails.
+pub const SILENCE: Duration = Duration::from_secs(5);
+
+/// How many payloads are kept until they are received. The oldest are dropped first.
+const RECEIVED_MAX: usize = 65_536;
+const SYNC: u8 = 0x7e;
+const RTO_MIN: Duration = Duration::from_millis(25);
+const RTO_MAX: Duration = Duration::from_secs(5);
+
+/// Carries bytes over a tty, pty, socket or anything else that can be polled, and finds the blocks in
+/// what comes in, in whatever order. Tests send bytes through it that a [`BlockLink`] would never send.
+#[derive(Debug)]
+pub struct Port {
+    file: File,
+    name: String,
+    resync: Resync,
+    input: Vec<u8>,
+    output: Vec<u8>,
+    /// Bytes that belonged to no intact block.
+    garbage: u64,
+}
+
+impl Port {
+    /// Opens a tty, makes it raw and throws away what an earlier session left in it.
+    pub fn open(path: &Path) -> Result<Port, Error> {
+        let name = path.display().to_string();
+        let file = OpenOptions::new()
+            .read(true)
+            .write(true)
+            .custom_flags((OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits())
+            .open(path)
+            .map_err(|source| Error::Io { doing: "open", port: name.clone(), source })?;
+        // What is written to a file would stay in it.
+        if !file.is_terminal() {
+            return Err(Error::NoTerminal { port: name });
+        }
+        Port::new(file, name)
+    }
+
+    /// Takes over an open descriptor. A tty is made raw. Errors call it `name`.
+    pub fn from_fd(fd: OwnedFd, name: &str) -> Result<Port, Error> {
+        Port::new(File::from(fd), name.to_owned())
+    }
+
+    fn new(file: File, name: String) -> Result<Port, Error> {
+        let set_up = || -> Result<(), Errno> {
+            let flags = OFlag::from_bits_truncate(fcntl(&file, FcntlArg::F_GETFL)?);
+            fcntl(&file, FcntlArg::F_SETFL(flags | OFlag::O_NONBLOCK))?;
+            match termios::tcgetattr(&file) {
+                Ok(mut attributes) => {
+                    termios::cfmakeraw(&mut attributes);
+                    termios::tcsetattr(&file, SetArg::TCSANOW, &attributes)?;
+                    termios::tcflush(&file, FlushArg::TCIFLUSH)
+                }
+                Err(Errno::ENOTTY) => Ok(()),
+                Err(errno) => Err(errno),
+            }
+        };
+        match set_up() {
+            Ok(()) => {
+                Ok(Port { file, name, resync: Resync::default(), input: Vec::new(), output: Vec::new(), garbage: 0 })
+            }
+            Err(errno) => Err(Error::Io { doing: "set up", port: name, source: errno.into() }),
+        }
+    }
+
+    /// The tty's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Appends bytes, just as they are, to those that wait to be written.
+    pub fn queue(&mut self, bytes: &[u8]) {
+        self.output.extend_from_slice(bytes);
+    }
+
+    /// Appends an intact block with this sequence number to the bytes that wait to be written.
+    pub fn queue_block(&mut self, payload: &[u8], sequence: Sequence) {
+        frame(payload, sequence, &mut self.output);
+    }
+
+    /// Writes what waits to be written, and reads until something comes in or the time is over. Returns
+    /// whether bytes came in.
+    pub fn exchange(&mut self, until: Instant) -> Result<bool, Error> {
+        self.write_some()?;
+        let wait = until.saturating_duration_since(Instant::now());
+        let mut interest = PollFlags::POLLIN;
+        if !self.output.is_empty() {
+            interest |= PollFlags::POLLOUT;
+        }
+        let mut fds = [PollFd::new(self.file.as_fd(), interest)];
+        match ppoll(&mut fds, Some(TimeSpec::from_duration(wait)), None) {
+            Ok(0) | Err(Errno::EINTR) => return Ok(false),
+            Ok(_) => {}
+            Err(errno) => return Err(self.failed("poll", errno.into())),
+        }
+        let ready = fds[0].revents().unwrap_or(PollFlags::empty());
+        if ready.contains(PollFlags::POLLOUT) {
+            self.write_some()?;
+        }
+        if ready.intersects(PollFlags::POLLIN | PollFlags::POLLHUP | PollFlags::POLLERR) {
+            return self.read_some();
+        }
+        Ok(false)
+    }
+
+    /// The next intact block among the bytes read so far.
+    fn next_block(&mut self) -> Option<(Sequence, Vec<u8>)> {
+        loop {
+            let (taken, found) = self.resync.next(&self.input);
+            let block = match found {
+                Found::Nothing => return None,
+                Found::Block(sequence, payload) => Some((sequence, payload.to_vec())),
+                Found::Garbage { .. } => {
+                    self.garbage += taken as u64;
+                    None
+                }
+            };
+            self.input.drain(..taken);
+            if block.is_some() {
+                return block;
+            }
+        }
+    }
+
+    /// The next intact block, `None` if none comes in time.
+    pub fn wait_block(&mut self, until: Instant) -> Result<Option<(Sequence, Vec<u8>)>, Error> {
+        loop {
+            if let Some(block) = self.next_block() {
+                return Ok(Some(block));
+            }
+            if !self.exchange(until)? && Instant::now() >= until {
+                return Ok(None);
+            }
+        }
+    }
+
+    fn write_some(&mut self) -> Result<(), Error> {
+        while !self.output.is_empty() {
+            match (&self.file).write(&self.output) {
+                Ok(written) => drop(self.output.drain(..written)),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => break,
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                Err(error) => return Err(self.failed("write to", error)),
+            }
+        }
+        Ok(())
+    }
+
+    fn read_some(&mut self) -> Result<bool, Error> {
+        let mut bytes = [0; 4096];
+        match (&self.file).read(&mut bytes) {
+            Ok(0) => Err(Error::Closed { port: self.name.clone() }),
+            Ok(count) => {
+                self.input.extend_from_slice(&bytes[..count]);
+                Ok(true)
+            }
+            Err(error) if matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted) => Ok(false),
+            Err(error) => Err(self.failed("read from", error)),
+        }
+    }
+
+    fn failed(&self, doing: &'static str, source: io::Error) -> Error {
+        // If the other end is gone, a pty fails with EIO, and a socket with EPIPE or ECONNRESET.
+        if let Some(libc::EIO | libc::EPIPE | libc::ECONNRESET) = source.raw_os_error() {
+            return Error::Closed { port: self.name.clone() };
+        }
+        Error::Io { doing, port: self.name.clone(), source }
+    }
+}
+
+/// A payload that came in.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Received {
+    /// The payload, not empty.
+    pub payload: Vec<u8>,
+    /// When it was read.
+    pub at: Instant,
+}
+
+/// What went over a link so far.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Traffic {
+    /// Blocks sent, each counted once.
+    pub blocks_sent: u64,
+    /// Blocks sent again.
+    pub blocks_again: u64,
+    /// Blocks received, acknowledgements included.
+    pub blocks_received: u64,
+    /// NAKs among them.
+    pub naks: u64,
+    /// Received bytes that belonged to no intact block.
+    pub garbage_bytes: u64,
+}
+
+#[derive(Debug)]
+struct Sent {
+    payload: Vec<u8>,
+    at: Instant,
+}
+
+/// Delivers payloads in order, each once.
+///
+/// Numbers count blocks from the session's start; the wire carries them modulo 16.
+#[derive(Debug)]
+pub struct BlockLink {
+    port: Port,
+    sequences: [Sequence; 16],
+    synchronised: bool,
+    /// The number of the next new block.
+    send: u64,
+    /// The number of the oldest block that is not acknowledged.
+    receive: u64,
+    last_ack: u64,
+    /// NAKs up to this number are ignored: they answer blocks that have been sent again since.
+    ignore_nak: u64,
+    /// Blocks below this number were sent more than once.
+    retransmitted: u64,
+    rtt_sample: Option<u64>,
+    sent: VecDeque<Sent>,
+    sent_bytes: usize,
+    window_bytes: usize,
+    round_trip: Option<(Duration, Duration)>,
+    rto: Duration,
+    retransmit_at: Instant,
+    heard_at: Instant,
+    received: VecDeque<Received>,
+    /// How many payloads have come in, and how many of them were received or dropped.
+    arrived: u64,
+    taken: u64,
+    /// What `arrived` was when the last block that was sent was acknowledged.
+    settled: Option<u64>,
+    traffic: Traffic,
+}
+
+impl BlockLink {
+    /// Opens a tty, and finds out which block the other end expects next.
+    pub fn open(path: &Path, timeout: Duration) -> Result<BlockLink, Error> {
+        BlockLink::new(Port::open(path)?, timeout)
+    }
+
+    /// Makes a link of a port: finds out which block the other end expects next.
+    pub fn new(port: Port, timeout: Duration) -> Result<BlockLink, Error> {
+        let now = Instant::now();
+        let mut sequences = [Sequence::default(); 16];
+        for i in 1..sequences.len() {
+            sequences[i] = sequences[i - 1].next();
+        }
+        let mut link = BlockLink {
+            port,
+            sequences,
+            synchronised: false,
+            send: 0,
+            receive: 0,
+            last_ack: 0,
+            ignore_nak: 0,
+            retransmitted: 0,
+            rtt_sample: None,
+            sent: VecDeque::new(),
+            sent_bytes: 0,
+            window_bytes: usize::MAX,
+            round_trip: None,
+            rto: RTO_MIN,
+            retransmit_at: now,
+            heard_at: now,
+            received: VecDeque::new(),
+            arrived: 0,
+            taken: 0,
+            settled: Some(0),
+            traffic: Traffic::default(),
+        };
+        link.synchronise(timeout)?;
+        Ok(link)
+    }
+
+    /// Finds out which block the other end expects next, by sending an empty one: the answer tells it
+    /// whether the number of the empty block was right or not. The sync bytes before it end a block
+    /// that an earlier host may have left incomplete.
+    fn synchronise(&mut self, timeout: Duration) -> Result<(), Error> {
+        let until = Instant::now() + timeout;
+        while !self.synchronised {
+            let now = Instant::now();
+            if now >= until {
+                return Err(Error::Timeout { waiting_for: format!("answer on {}", self.port.name), after: timeout });
+            }
+            if self.port.output.is_empty() {
+                self.port.queue(&[SYNC; BLOCK_MAX]);
+                self.port.queue_block(&[], Sequence::default());
+            }
+            let again = until.min(now + Duration::from_millis(100));
+            while !self.synchronised && Instant::now() < again {
+                self.exchange(again)?;
+            }
+        }
+        Ok(())
+    }
+
+    /// Limits the bytes that are sent without being acknowledged to what the other end can buffer: its
+    /// constant `RECEIVE_WINDOW`.
+    pub(super) fn set_window_bytes(&mut self, bytes: usize) {
+        self.window_bytes = bytes.max(BLOCK_MAX);
+    }
+
+    /// Sends a payload as one block; waits while the window is full.
+    ///
+    /// Fails if the payload does not fit a block, the other end closes, or acknowledges
+    /// nothing for [`SILENCE`].
+    pub fn send(&mut self, payload: &[u8]) -> Result<(), Error> {
+        if payload.len() > PAYLOAD_MAX {
+            return Err(Error::Message {
+                message: format!("a payload of {} bytes", payload.len()),
+                why: format!("a block takes {PAYLOAD_MAX}"),
+            });
+        }
+        self.wait_while(|link| {
+            link.sent.len() >= WINDOW || (!link.sent.is_empty() && link.sent_bytes + BLOCK_MAX > link.window_bytes)
+        })?;
+        let now = Instant::now();
+        if self.sent.is_empty() {
+            self.retransmit_at = now + self.rto;
+            self.heard_at = now;
+        }
+        self.port.queue_block(payload, self.sequence(self.send));
+        self.rtt_sample.get_or_insert(self.send);
+        self.send += 1;
+        self.sent_bytes += payload.len() + BLOCK_MIN;
+        self.traffic.blocks_sent += 1;
+        self.sent.push_back(Sent { payload: payload.to_vec(), at: now });
+        self.settled = None;
+        self.port.write_some()
+    }
+
+    /// Waits until all that was sent is acknowledged.
+    pub fn settle(&mut self) -> Result<(), Error> {
+        self.wait_while(|link| !link.sent.is_empty())
+    }
+
+    /// The next payload that came in; waits for one, `None` if none comes in time.
+    pub fn receive(&mut self, until: Instant) -> Result<Option<Received>, Error> {
+        loop {
+            if let Some(received) = self.next_received() {
+                return Ok(Some(received));
+            }
+            self.exchange(until)?;
+            if self.received.is_empty() && Instant::now() >= until {
+                return Ok(None);
+            }
+        }
+    }
+
+    /// The next of the payloads that come in before all that was sent is acknowledged, or together with
+    /// that. Waits for one; `None` once there are no more.
+    pub(super) fn receive_unsettled(&mut self) -> Result<Option<Received>, Error> {
+        self.wait_while(|link| link.received.is_empty() && link.settled.is_none())?;
+        match self.settled {
+            Some(before) if self.taken >= before => Ok(None),
+            _ => Ok(self.next_received()),
+        }
+    }
+
+    fn next_received(&mut self) -> Option<Received> {
+        let received = self.received.pop_front();
+        self.taken += u64::from(received.is_some());
+        received
+    }
+
+    /// How many blocks are sent and not acknowledged.
+    pub fn unacknowledged(&self) -> usize {
+        self.sent.len()
+    }
+
+    /// What went over the link so far.
+    pub fn traffic(&self) -> Traffic {
+        Traffic { garbage_bytes: self.port.garbage, ..self.traffic }
+    }
+
+    /// The port beneath, to send bytes that a link would never send.
+    pub fn port(&mut self) -> &mut Port {
+        &mut self.port
+    }
+
+    fn wait_while(&mut self, busy: impl Fn(&BlockLink) -> bool) -> Result<(), Error> {
+        while busy(self) {
+            let until = self.heard_at + SILENCE;
+            self.exchange(until)?;
+            if Instant::now() >= until && self.heard_at + SILENCE == until && busy(self) {
+                return Err(Error::Timeout {
+                    waiting_for: format!("acknowledgement on {}", self.port.name),
+                    after: SILENCE,
+                });
+            }
+        }
+        Ok(())
+    }
+
+    /// One round of writing, waiting, reading, acknowledging and sending again.
+    fn exchange(&mut self, until: Instant) -> Result<(), Error> {
+        self.port.write_some()?;
+        // The retransmission time runs only once everything has been written.
+        let timed = !self.sent.is_empty() && self.port.output.is_empty();
+        let until = if timed { until.min(self.retransmit_at) } else { until };
+        if self.port.exchange(until)? {
+            let at = Instant::now();
+            while let Some((sequence, payload)) = self.port.next_block() {
+                self.take(sequence, payload, at);
+            }
+        }
+        let now = Instant::now();
+        if !self.sent.is_empty() && self.port.output.is_empty() && now >= self.retransmit_at {
+            self.rto = (self.rto * 2).min(RTO_MAX);
+            self.ignore_nak = self.send;
+            self.send_again(now);
+        }
+        Ok(())
+    }
+
+    fn take(&mut self, sequence: Sequence, payload: Vec<u8>, at: Instant) {
+        let index = (0..16).find(|i| self.sequence(*i) == sequence).unwrap_or(0);
+        if !self.synchronised {
+            if payload.is_empty() {
+                self.synchronised = true;
+                self.send = 16 + index;
+                self.receive = self.send;
+                self.last_ack = self.send;
+                self.retransmitted = self.send;
+            }
+            return;
+        }
+        let acknowledged = index.wrapping_sub(self.receive) & 15;
+        if acknowledged > self.send - self.receive {
+            // It acknowledges a block that was never sent.
+            return;
+        }
+        self.traffic.blocks_received += 1;
+        if acknowledged > 0 {
+            self.acknowledge(acknowledged, at);
+        }
+        if !payload.is_empty() {
+            if self.received.len() >= RECEIVED_MAX {
+                self.next_received();
+            }
+            self.arrived += 1;
+            self.received.push_back(Received { payload, at });
+        } else if self.last_ack < self.receive {
+            self.last_ack = self.receive;
+        } else if self.receive > self.ignore_nak && !self.sent.is_empty() {
+            self.traffic.naks += 1;
+            self.ignore_nak = if self.receive < self.retransmitted {
+                // It is the second NAK since the blocks were sent again. Further ones are ignored.
+                self.retransmitted
+            } else {
+                self.receive
+            };
+            self.send_again(at);
+        }
+        if self.sent.is_empty() {
+            self.settled.get_or_insert(self.arrived);
+        }
+    }
+
+    fn acknowledge(&mut self, count: u64, at: Instant) {
+        self.heard_at = at;
+        self.receive += count;
+        let mut sent_at = at;
+        for _ in 0..count {
+            if let Some(sent) = self.sent.pop_front() {
+                self.sent_bytes -= sent.payload.len() + BLOCK_MIN;
+                sent_at = sent.at;
+            }
+        }
+        if self.rtt_sample.is_some_and(|sample| self.receive > sample) {
+            self.rtt_sample = None;
+            self.measure(at.saturating_duration_since(sent_at));
+        }
+        self.retransmit_at = at + self.rto;
+    }
+
+    /// Adapts the retransmission time to a round trip, after RFC 6298.
+    fn measure(&mut self, sample: Duration) {
+        let (smooth, variation) = match self.round_trip {
+            None => (sample * 10, sample / 2),
+            Some((smooth, variation)) => ((smooth * 7 + sample) / 8, (variation * 3 + smooth.abs_diff(sample)) / 4),
+        };
+        self.round_trip = Some((smooth, variation));
+        let spread = (variation * 4).max(Duration::from_millis(1));
+        self.rto = (smooth + spread).clamp(RTO_MIN, RTO_MAX);
+    }
+
+    fn send_again(&mut self, now: Instant) {
+        self.port.queue(&[SYNC]);
+        for (i, sent) in self.sent.iter().enumerate() {
+            let sequence = self.sequences[(self.receive as usize + i) & 15];
+            self.port.queue_block(&sent.payload, sequence);
+        }
+        self.traffic.blocks_again += self.sent.len() as u64;
+        self.retransmitted = self.send;
+        self.rtt_sample = None;
+        self.retransmit_at = now + self.rto;
+    }
+
+    fn sequence(&self, number: u64) -> Sequence {
+        self.sequences[(number & 15) as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::fd::AsRawFd;
+    use std::os::unix::net::UnixStream;
+
+    use nix::pty::openpty;
+    use proptest::prelude::*;
+
+    use super::super::fake::{Fault, Peer};
+    use super::*;
+
+    fn numbered(count: u32) -> Vec<Vec<u8>> {
+        (0..count).map(|i| i.to_be_bytes().to_vec()).collect()
+    }
+
+    fn deliver(faults: &[(u64, Fault)], count: u32) -> (Vec<Vec<u8>>, Traffic) {
+        let (peer, mut link) = Peer::start(3, faults, |_| Vec::new());
+        for payload in numbered(count) {
+            link.send(&payload).unwrap();
+        }
+        link.settle().unwrap();
+        let traffic = link.traffic();
+        drop(link);
+        (peer.join().unwrap(), traffic)
+    }
+
+    #[test]
+    fn payloads_arrive_in_order_over_a_faultless_wire() {
+        let (got, traffic) = deliver(&[], 100);
+        assert_eq!(got, numbered(100));
+        assert_eq!((traffic.blocks_sent, traffic.garbage_bytes), (100, 0));
+    }
+
+    #[test]
+    fn a_lost_and_a_corrupted_block_are_sent_again() {
+        let faults = [(5, Fault::Drop), (40, Fault::Corrupt), (99, Fault::Drop)];
+        let (got, traffic) = deliver(&faults, 100);
+        assert_eq!(got, numbered(100));
+        assert!(traffic.naks > 0, "{traffic:?}");
+        assert!(traffic.blocks_again >= 3, "{traffic:?}");
+    }
+
+    #[test]
+    fn the_last_block_lost_twice_is_sent_a_third_time() {
+        let (got, traffic) = deliver(&[(9, Fault::Drop), (10, Fault::Drop)], 10);
+        assert_eq!(got, numbered(10));
+        assert!(traffic.blocks_again >= 2, "{traffic:?}");
+    }
+
+    #[test]
+    fn a_lost_acknowledgement_delivers_nothing_twice() {
+        let (got, _) = deliver(&[(0, Fault::MuteAck), (19, Fault::MuteAck)], 20);
+        assert_eq!(got, numbered(20));
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(12))]
+        #[test]
+        fn whatever_is_lost_arrives_once_and_in_order(
+            faults in proptest::collection::vec((0u64..60, 0u8..4), 0..12),
+        ) {
+            let kinds = [Fault::Drop, Fault::Corrupt, Fault::MuteAck, Fault::DoubleAck];
+            let faults: Vec<_> = faults.iter().map(|(at, kind)| (*at, kinds[usize::from(*kind)])).collect();
+            prop_assert_eq!(deliver(&faults, 40).0, numbered(40));
+        }
+
+        #[test]
+        fn any_bytes_at_all_do_no_harm(noise in proptest::collection::vec(any::<u8>(), 0..300)) {
+            let (ours, theirs) = UnixStream::pair().unwrap();
+            let mut port = Port::from_fd(ours.into(), "noise").unwrap();
+            (&theirs).write_all(&noise).unwrap();
+            while port.wait_block(Instant::now() + Duration::from_millis(1)).unwrap().is_some() {}
+        }
+    }
+
+    #[test]
+    fn settling_waits_for_the_last_acknowledgement() {
+        let (peer, mut link) = Peer::start(0, &[], |_| Vec::new());
+        for _ in 0..5000 {
+            link.send(b"nop").unwrap();
+        }
+        link.settle().unwrap();
+        assert_eq!(link.unacknowledged(), 0);
+        drop(link);
+        assert_eq!(peer.join().unwrap().len(), 5000);
+    }
+
+    #[test]
+    fn a_narrow_receive_window_is_respected() {
+        let (peer, mut link) = Peer::start(0, &[], |_| Vec::new());
+        link.set_window_bytes(192);
+        for _ in 0..50 {
+            link.send(&[1; PAYLOAD_MAX]).unwrap();
+            assert!(link.unacknowledged() <= 3);
+        }
+        drop(link);
+        peer.join().unwrap();
+    }
+
+    #[test]
+    fn silence_and_a_closed_end_are_told() {
+        let (ours, theirs) = UnixStream::pair().unwrap();
+        let port = Port::from_fd(ours.into(), "mute").unwrap();
+        let error = BlockLink::new(port, Duration::from_millis(50)).unwrap_err();
+        assert!(error.to_string().starts_with("no answer on mute within 0.1 s"), "{error}");
+        drop(theirs);
+        let (ours, theirs) = UnixStream::pair().unwrap();
+        drop(theirs);
+        let port = Port::from_fd(ours.into(), "gone").unwrap();
+        let error = BlockLink::new(port, Duration::from_secs(60)).unwrap_err();
+        assert!(error.to_string().starts_with("gone was closed"), "{error}");
+        let error = BlockLink::open(Path::new("/dev/no-such-tty"), Duration::ZERO).unwrap_err();
+        assert!(error.to_string().starts_with("cannot open /dev/no-such-tty: No such file"), "{error}");
+    }
+
+    #[test]
+    fn a_pty_carries_every_byte() {
+        let pty = openpty(None, None).unwrap();
+        let path = std::fs::read_link(format!("/proc/self/fd/{}", pty.slave.as_raw_fd())).unwrap();
+        let mut port = Port::open(&path).unwrap();
+        let mut other = Port::from_fd(pty.master, "master").unwrap();
+        let until = Instant::now() + Duration::from_secs(60);
+        for first in (0..=255u8).step_by(32) {
+            let payload: Vec<u8> = (first..=first | 31).collect();
+            port.queue_block(&payload, Sequence::default());
+            port.exchange(Instant::now()).unwrap();
+            assert_eq!(other.wait_block(until).unwrap(), Some((Sequence::default(), payload)));
+        }
+    }
+}

@@ -1,0 +1,378 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! I2C devices.
+//!
+//! `i2c_transfer` answers with the status of the bus, and klippy decides what becomes of it. The older
+//! `i2c_read`, `i2c_write` and `i2c_modify_bits` have no status: what fails there stops the machine. A
+//! transfer is over, and answered, before the next command runs: klippy configures chips by one transfer
+//! after the other. A plain read is tried again ([`BusDevice::read_register`]); what writes is not.
+
+#![forbid(unsafe_code)]
+
+use crate::board::soft_i2c::SoftI2c;
+use crate::board::{BusDevice, BusError, BusStatus, I2cConfig, OnWorker, Pin, Range};
+use crate::mcu::{
+    Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_11,
+    Generation::V0_12, Generation::V0_13, Mcu, Object, Oid, Response, Talk, Ticket, command, only, response, since,
+    until,
+};
+use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
+use crate::time::Ticks;
+use pinion_protocol::block::PAYLOAD_MAX;
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "i2c",
+    commands: &[
+        CONFIG_I2C,
+        CONFIG_I2C_WITH_BUS,
+        I2C_SET_BUS,
+        I2C_SET_SOFTWARE_BUS,
+        I2C_SET_SW_BUS,
+        I2C_WRITE,
+        I2C_READ,
+        I2C_MODIFY_BITS,
+        I2C_TRANSFER,
+    ],
+    responses: &[ReadResponse::FORM, TransferResponse::FORM],
+    enumerations: &[
+        Enumeration::new("i2c_bus", |board| board.i2c_buses()),
+        Enumeration::new("i2c_bus_status", |_| statuses()).of(since(Master)),
+    ],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// A sensor did not acknowledge a byte.
+    I2C_NACK = "I2C NACK";
+    /// A sensor did not acknowledge its address.
+    I2C_START_NACK = "I2C START NACK";
+    /// A sensor did not acknowledge its address when it was to be read from.
+    I2C_START_READ_NACK = "I2C START READ NACK";
+    /// A sensor's bus was not free, or the clock was held, for too long.
+    I2C_TIMEOUT = "I2C Timeout";
+    /// Up to v0.12: writing to a device failed.
+    I2C_WRITE_FAILED = "Unable write i2c device";
+    /// Up to v0.12: reading from a device or a sensor failed.
+    I2C_READ_FAILED = "Unable to read i2c device";
+    /// v0.12: a device on lines did not acknowledge.
+    SOFT_I2C_NACK = "soft_i2c NACK";
+    /// `i2c_modify_bits` with bits to clear that have none to set beside them.
+    ODD_BITS = "i2c_modify_bits: Odd number of bits!";
+}
+
+response! {
+    /// What a device sent.
+    "i2c_read_response oid=%c response=%*s" => until(V0_13).and(Kalico);
+    pub(super) struct ReadResponse<'a> { oid: Oid, response: &'a [u8] }
+}
+
+response! {
+    /// How the bus answered, and what a device sent.
+    "i2c_response oid=%c i2c_bus_status=%c response=%*s" => since(Master);
+    pub(super) struct TransferResponse<'a> { oid: Oid, i2c_bus_status: u8, response: &'a [u8] }
+}
+
+/// Bytes that fit an answer beside its id and oid of two bytes each, status and length.
+const RESPONSE_MAX: usize = PAYLOAD_MAX - 6;
+
+const SUCCESS: u8 = 0;
+
+/// The number and the text of a status, from the firmware's i2ccmds.h and i2ccmds.c.
+fn on_wire(status: BusStatus) -> (u8, ShutdownReason) {
+    match status {
+        BusStatus::Nack => (1, I2C_NACK),
+        BusStatus::Timeout => (2, I2C_TIMEOUT),
+        BusStatus::StartNack => (3, I2C_START_NACK),
+        BusStatus::StartReadNack => (4, I2C_START_READ_NACK),
+    }
+}
+
+/// The dictionary's enumeration `i2c_bus_status`.
+fn statuses() -> Vec<Range> {
+    let names = ["SUCCESS", "NACK", "BUS_TIMEOUT", "START_NACK", "START_READ_NACK"];
+    names.iter().zip(SUCCESS.into()..).map(|(name, first)| Range { name: (*name).into(), first, count: 1 }).collect()
+}
+
+/// The stop of a machine whose sensor can not be talked to (the firmware's `i2c_shutdown_on_err`).
+pub(super) fn i2c_shutdown(mcu: &Mcu, error: BusError) -> Shutdown {
+    let reason = if mcu.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
+    Shutdown::because(reason, error.detail)
+}
+
+/// Bytes to a device, and bytes from it.
+struct Transfer {
+    /// Bits to be changed in what was read, which is then written to where it was read from: those to
+    /// be cleared, and behind them as many to be set.
+    modify: Option<([u8; PAYLOAD_MAX], usize)>,
+    /// Whether what was changed is being written.
+    writes_back: bool,
+    write: [u8; PAYLOAD_MAX],
+    write_len: usize,
+    read: [u8; u8::MAX as usize],
+    read_len: usize,
+}
+
+impl Transfer {
+    fn load(&mut self, write: &[u8], read_len: usize) {
+        self.write_len = write.len().min(PAYLOAD_MAX);
+        self.write[..self.write_len].copy_from_slice(&write[..self.write_len]);
+        self.read_len = read_len;
+        self.read = [0; u8::MAX as usize];
+        self.modify = None;
+        self.writes_back = false;
+    }
+
+    /// As many bytes from the register on as there are to be changed, and back.
+    fn load_modify(&mut self, register: &[u8], clear_set: &[u8]) {
+        let mut bits = [0; PAYLOAD_MAX];
+        let len = clear_set.len().min(PAYLOAD_MAX);
+        bits[..len].copy_from_slice(&clear_set[..len]);
+        self.load(register, len / 2);
+        self.modify = Some((bits, len / 2));
+    }
+
+    /// What the answer has room for, as in the firmware.
+    fn response(&self) -> &[u8] {
+        &self.read[..self.read_len.min(RESPONSE_MAX)]
+    }
+}
+
+impl Talk for Transfer {
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        let read = &mut self.read[..self.read_len];
+        match &self.write[..self.write_len] {
+            [] if !read.is_empty() => chip.read_register(&[], read),
+            write => chip.write_read(write, read),
+        }?;
+        let Some((bits, len)) = &self.modify else { return Ok(()) };
+        let (clear, set) = bits.split_at(*len);
+        let changed = read.iter().zip(clear.iter().zip(set)).map(|(byte, (clear, set))| byte & !clear | set);
+        for (place, byte) in self.write[self.write_len..].iter_mut().zip(changed) {
+            *place = byte;
+        }
+        let end = (self.write_len + len).min(PAYLOAD_MAX);
+        self.writes_back = true;
+        chip.write_read(&self.write[..end], &mut [])
+    }
+}
+
+// The tags of transfers, by the commands that ask for them.
+const TRANSFER: u8 = 0;
+const WRITE: u8 = 1;
+const READ: u8 = 2;
+const MODIFY: u8 = 3;
+
+/// An I2C device.
+pub(super) struct I2c {
+    bus: Option<Bus>,
+    /// Whether the bus is made of lines.
+    on_lines: bool,
+    /// Here while no command's transfer is under way.
+    transfer: Option<Box<Conversation<Transfer>>>,
+    /// Whether the last transfer failed: a display that is unplugged fails many times a second.
+    failing: bool,
+}
+
+impl I2c {
+    fn new() -> I2c {
+        let transfer = Transfer {
+            modify: None,
+            writes_back: false,
+            write: [0; PAYLOAD_MAX],
+            write_len: 0,
+            read: [0; u8::MAX as usize],
+            read_len: 0,
+        };
+        I2c { bus: None, on_lines: false, transfer: Some(Conversation::new(transfer)), failing: false }
+    }
+
+    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
+        let config = I2cConfig { bus, address: seven_bits(address), rate_hz };
+        let OnWorker { bus, device } = mcu.board()?.i2c(config)?;
+        self.bus = Some(Bus::new(mcu.worker(&bus)?, device));
+        Ok(())
+    }
+
+    fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 2], pulse: Ticks, address: u32) -> Result<(), Shutdown> {
+        let [scl, sda] = pins;
+        let lines = (mcu.shared_wire(scl)?, mcu.shared_wire(sda)?);
+        let name = format!("scl {} sda {} address {:#04x}", mcu.name(scl), mcu.name(sda), seven_bits(address));
+        let device = SoftI2c::new(lines.0, lines.1, seven_bits(address), pulse, mcu.clock(), name);
+        self.bus = Some(mcu.software_bus(Box::new(device))?);
+        self.on_lines = true;
+        Ok(())
+    }
+
+    /// Has a transfer; `load` says which.
+    fn transfer(&mut self, mcu: &mut Mcu, oid: Oid, tag: u8, load: impl FnOnce(&mut Transfer)) -> Result<(), Shutdown> {
+        // Commands wait for each other, so it is here.
+        let Some(mut transfer) = self.transfer.take() else {
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
+        };
+        load(&mut transfer.talk);
+        let Some(bus) = &self.bus else {
+            // As the firmware answers for a device without a bus.
+            let status = BusStatus::Nack;
+            if tag == TRANSFER {
+                let i2c_bus_status = on_wire(status).0;
+                mcu.send(TransferResponse { oid, i2c_bus_status, response: transfer.talk.response() });
+            }
+            self.transfer = Some(transfer);
+            if tag == TRANSFER {
+                return Ok(());
+            }
+            let detail = "it has no bus: a fault of the host, which did not send i2c_set_bus".into();
+            return Err(self.failure(mcu, tag == WRITE, BusError { status, detail }));
+        };
+        mcu.converse_on(bus, Ticket { oid, tag }, transfer)
+    }
+
+    /// Tells the host what came of a transfer. Where the answer has no status a failure stops the machine.
+    fn answer(
+        &mut self,
+        mcu: &mut Mcu,
+        oid: Oid,
+        tag: u8,
+        transfer: Box<Conversation<Transfer>>,
+        result: Result<(), BusError>,
+    ) -> Result<(), Shutdown> {
+        let response = transfer.talk.response();
+        match (tag, &result) {
+            (TRANSFER, result) => {
+                let i2c_bus_status = result.as_ref().map_or_else(|error| on_wire(error.status).0, |()| SUCCESS);
+                mcu.send(TransferResponse { oid, i2c_bus_status, response });
+            }
+            (READ, Ok(())) => mcu.send(ReadResponse { oid, response }),
+            _ => {}
+        }
+        let (writes_back, has_register) = (transfer.talk.writes_back, transfer.talk.write_len > 0);
+        self.transfer = Some(transfer);
+        let failed_before = std::mem::replace(&mut self.failing, result.is_err());
+        match result {
+            Err(error) if tag != TRANSFER => {
+                // v0.11 wrote the register by itself before it read.
+                let of_register = mcu.serves(only(V0_11)) && has_register && error.status != BusStatus::StartReadNack;
+                let writing = tag == WRITE || writes_back || of_register;
+                mcu.device_failed(oid, self.kind(), self.failure(mcu, writing, error))
+            }
+            Err(error) if !failed_before => {
+                mcu.warn(oid, self.kind(), i2c_shutdown(mcu, error));
+                Ok(())
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The stop for a transfer that failed, as it wrote or as it read.
+    fn failure(&self, mcu: &Mcu, writing: bool, error: BusError) -> Shutdown {
+        match writing {
+            _ if !mcu.serves(until(V0_12)) => i2c_shutdown(mcu, error),
+            _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.detail),
+            true => Shutdown::because(I2C_WRITE_FAILED, error.detail),
+            false => i2c_shutdown(mcu, error),
+        }
+    }
+}
+
+impl Object for I2c {
+    fn kind(&self) -> &'static str {
+        "I2C device"
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let tag = done.tag;
+        let Some(mut transfer) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
+        let result = std::mem::replace(&mut transfer.result, Ok(()));
+        self.answer(mcu, oid, tag, transfer, result)
+    }
+
+    fn bus(&self) -> Option<&Bus> {
+        self.bus.as_ref()
+    }
+}
+
+const CONFIG_I2C: Command = command!("config_i2c oid=%c", |mcu, oid: Oid| mcu.assign(oid, I2c::new())).of(since(V0_12));
+
+const CONFIG_I2C_WITH_BUS: Command = command!(
+    "config_i2c oid=%c i2c_bus=%u rate=%u address=%u",
+    |mcu, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
+        mcu.vacant(oid)?;
+        let mut i2c = I2c::new();
+        i2c.set_bus(mcu, i2c_bus, rate, address)?;
+        mcu.assign(oid, i2c)
+    }
+)
+.of(only(V0_11));
+
+const I2C_SET_BUS: Command = command!(
+    "i2c_set_bus oid=%c i2c_bus=%u rate=%u address=%u",
+    |mcu, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
+        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_bus(mcu, i2c_bus, rate, address))
+    }
+)
+.of(since(V0_12));
+
+/// Half a period of the 100 kHz that the firmware had where it was told a rate, whatever the rate.
+const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
+
+const I2C_SET_SOFTWARE_BUS: Command = command!(
+    "i2c_set_software_bus oid=%c scl_pin=%u sda_pin=%u rate=%u address=%u",
+    |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, rate: u32, address: u32| {
+        let _ = rate;
+        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_lines(mcu, [scl_pin, sda_pin], SOFTWARE_PULSE, address))
+    }
+)
+.of(since(V0_12).until(V0_13));
+
+const I2C_SET_SW_BUS: Command = command!(
+    "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",
+    |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, pulse_ticks: Ticks, address: u32| {
+        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_lines(mcu, [scl_pin, sda_pin], pulse_ticks, address))
+    }
+)
+.of(since(Master).and(Kalico));
+
+const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
+    mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.transfer(mcu, oid, WRITE, |transfer| transfer.load(data, 0)))
+})
+.of(until(V0_13).and(Kalico));
+
+const I2C_READ: Command =
+    command!("i2c_read oid=%c reg=%*s read_len=%u", |mcu, oid: Oid, reg: &[u8], read_len: u32| {
+        mcu.with::<I2c, _>(oid, |i2c, mcu| {
+            i2c.transfer(mcu, oid, READ, |transfer| transfer.load(reg, one_byte(read_len)))
+        })
+    })
+    .of(until(V0_13).and(Kalico));
+
+const I2C_MODIFY_BITS: Command = command!(
+    "i2c_modify_bits oid=%c reg=%*s clear_set_bits=%*s",
+    |mcu, oid: Oid, reg: &[u8], clear_set_bits: &[u8]| {
+        if clear_set_bits.len() % 2 != 0 {
+            let what = format_args!("{} bytes of bits are to be cleared and set", clear_set_bits.len());
+            return Err(Shutdown::by_host(ODD_BITS, what));
+        }
+        mcu.with::<I2c, _>(oid, |i2c, mcu| {
+            i2c.transfer(mcu, oid, MODIFY, |transfer| transfer.load_modify(reg, clear_set_bits))
+        })
+    }
+)
+.of(until(V0_12));
+
+const I2C_TRANSFER: Command =
+    command!("i2c_transfer oid=%c write=%*s read_len=%u", |mcu, oid: Oid, write: &[u8], read_len: u32| {
+        mcu.with::<I2c, _>(oid, |i2c, mcu| {
+            i2c.transfer(mcu, oid, TRANSFER, |transfer| transfer.load(write, one_byte(read_len)))
+        })
+    })
+    .of(since(Master));
+
+/// A count of bytes has one byte, as in the firmware.
+fn one_byte(count: u32) -> usize {
+    usize::from(count as u8)
+}
+
+/// An address has 7 bits; the firmware drops the others.
+fn seven_bits(address: u32) -> u8 {
+    (address & 0x7f) as u8
+}

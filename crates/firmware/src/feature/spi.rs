@@ -1,0 +1,300 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! SPI devices, with or without a GPIO line that selects the chip, and the messages that they are
+//! sent at a shutdown.
+//!
+//! A `spi_send` or `spi_transfer` is over, and answered, before the next command runs. klippy relies
+//! on that: for displays it sets the D/C line by the commands before and after a `spi_send`, and when
+//! the acknowledgement of a query arrives it does not wait for the answer any longer.
+
+#![forbid(unsafe_code)]
+
+use std::fmt;
+
+use crate::board::soft_spi::SoftSpi;
+use crate::board::{BusDevice, BusError, ChipSelect, OnWorker, Pin, SpiConfig};
+use crate::mcu::{
+    Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
+    Mcu, Object, Oid, Response, Safe, Talk, Ticket, command, response, since, until,
+};
+use crate::shutdown::{Shutdown, reason, shutdowns};
+use crate::time::{CLOCK_FREQ, Ticks};
+use pinion_protocol::block::PAYLOAD_MAX;
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "spi",
+    commands: &[
+        CONFIG_SPI,
+        CONFIG_SPI_WITHOUT_CS,
+        SPI_SET_BUS,
+        SPI_SET_SOFTWARE_BUS,
+        SPI_SET_SW_BUS,
+        SPI_TRANSFER,
+        SPI_SEND,
+        CONFIG_SPI_SHUTDOWN,
+    ],
+    responses: &[TransferResponse::FORM],
+    enumerations: &[Enumeration::new("spi_bus", |board| board.spi_buses())],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// An SPI mode above 3, or a second bus for one device.
+    INVALID_SPI = "Invalid spi config";
+    /// An SPI transfer failed.
+    pub(super) SPI_TRANSFER_FAILED = "Unable to issue spi ioctl";
+}
+
+response! {
+    /// What an SPI device sent back.
+    "spi_transfer_response oid=%c response=%*s"
+    pub(super) struct TransferResponse<'a> { oid: Oid, response: &'a [u8] }
+}
+
+/// The bytes for a device, and afterwards those that came back. A message block's bytes fit.
+#[derive(Clone)]
+pub(super) struct Transfer {
+    bytes: [u8; PAYLOAD_MAX],
+    len: usize,
+}
+
+impl Transfer {
+    pub(super) fn new(data: &[u8]) -> Box<Conversation<Transfer>> {
+        let mut transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0 };
+        transfer.load(data);
+        Conversation::new(transfer)
+    }
+
+    pub(super) fn load(&mut self, data: &[u8]) {
+        self.len = data.len().min(PAYLOAD_MAX);
+        self.bytes[..self.len].copy_from_slice(&data[..self.len]);
+    }
+
+    pub(super) fn bytes(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+}
+
+impl Talk for Transfer {
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        chip.exchange(&mut self.bytes[..self.len])
+    }
+}
+
+/// An SPI device.
+pub(super) struct Spi {
+    bus: Option<Bus>,
+    /// Kept here until the bus is set; from then on the device on the worker has it.
+    chip_select: Option<ChipSelect>,
+    has_chip_select: bool,
+    /// None while a transfer is under way: then the worker has the box.
+    transfer: Option<Box<Conversation<Transfer>>>,
+}
+
+// The tags of transfers: for `spi_send`, without an answer, and for `spi_transfer`.
+const SEND: u8 = 0;
+const TRANSFER: u8 = 1;
+
+impl Spi {
+    fn new(chip_select: Option<ChipSelect>) -> Spi {
+        Spi { bus: None, has_chip_select: chip_select.is_some(), chip_select, transfer: Some(Transfer::new(&[])) }
+    }
+
+    /// Whether it has a chip select line of its own.
+    pub(super) fn has_chip_select(&self) -> bool {
+        self.has_chip_select
+    }
+
+    /// Whether it may get a bus, of this mode.
+    fn may_have_bus(&self, mcu: &Mcu, mode: u8) -> Result<(), Shutdown> {
+        if mode > 3 {
+            return Err(invalid(format_args!("mode {mode} is none of 0 to 3")));
+        }
+        if self.bus.is_some() {
+            return Err(invalid("it has a bus already"));
+        }
+        // The firmware opens it even after that. Here the core would have to wait for the files, and
+        // steps with it.
+        if mcu.is_finalized() {
+            return Err(invalid("it gets a bus after finalize_config"));
+        }
+        Ok(())
+    }
+
+    fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
+        self.may_have_bus(mcu, mode)?;
+        let chip_select = self.chip_select.take();
+        let OnWorker { bus, device } = mcu.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
+        self.bus = Some(Bus::new(mcu.worker(&bus)?, device));
+        Ok(())
+    }
+
+    fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
+        self.may_have_bus(mcu, mode)?;
+        let [miso, mosi, sclk] = pins;
+        // In the firmware's order, which counts where one line is MISO and MOSI: it drives.
+        let device = SoftSpi {
+            miso: mcu.shared_input(miso)?,
+            mosi: mcu.shared_output(mosi, false)?,
+            sclk: mcu.shared_output(sclk, false)?,
+            mode,
+            pulse,
+            chip_select: self.chip_select.take(),
+            clock: mcu.clock(),
+        };
+        self.bus = Some(mcu.software_bus(Box::new(device))?);
+        Ok(())
+    }
+
+    fn transfer(&mut self, mcu: &mut Mcu, oid: Oid, tag: u8, data: &[u8]) -> Result<(), Shutdown> {
+        let Some(bus) = &self.bus else {
+            // A device without a bus echoes, as in the firmware.
+            answer(mcu, oid, tag, data);
+            return Ok(());
+        };
+        // The box is here, as no command runs while another one's transfer is under way.
+        let Some(mut transfer) = self.transfer.take() else {
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
+        };
+        transfer.talk.load(data);
+        mcu.converse_on(bus, Ticket { oid, tag }, transfer)
+    }
+}
+
+#[cold]
+fn invalid(what: impl fmt::Display) -> Shutdown {
+    Shutdown::by_host(INVALID_SPI, what)
+}
+
+fn answer(mcu: &mut Mcu, oid: Oid, tag: u8, response: &[u8]) {
+    if tag == TRANSFER {
+        mcu.send(TransferResponse { oid, response });
+    }
+}
+
+/// The stop for an SPI conversation that failed. Not a conversion of any `BusError`: one of an I2C
+/// bus has texts of its own (`i2c_shutdown`).
+pub(super) fn spi_shutdown(error: BusError) -> Shutdown {
+    Shutdown::because(SPI_TRANSFER_FAILED, error.detail)
+}
+
+impl Object for Spi {
+    fn kind(&self) -> &'static str {
+        "SPI device"
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let tag = done.tag;
+        let Some(mut transfer) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
+        let result = std::mem::replace(&mut transfer.result, Ok(()));
+        if result.is_ok() {
+            answer(mcu, oid, tag, transfer.talk.bytes());
+        }
+        self.transfer = Some(transfer);
+        result.or_else(|error| mcu.device_failed(oid, self.kind(), spi_shutdown(error)))
+    }
+
+    fn bus(&self) -> Option<&Bus> {
+        self.bus.as_ref()
+    }
+}
+
+/// The message that a device is sent at a shutdown.
+struct SpiShutdown {
+    spi: Oid,
+    /// None while the message is on its way: then the worker has the box.
+    message: Option<Box<Conversation<Transfer>>>,
+    bytes: Box<[u8]>,
+}
+
+impl Object for SpiShutdown {
+    fn kind(&self) -> &'static str {
+        "SPI shutdown message"
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let Some(mut message) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
+        let result = std::mem::replace(&mut message.result, Ok(()));
+        self.message = Some(message);
+        match result {
+            Ok(()) => {
+                mcu.is_safe(oid);
+                Ok(())
+            }
+            Err(error) => mcu.device_failed(oid, self.kind(), spi_shutdown(error)),
+        }
+    }
+
+    /// It can not: it holds no chips on a bus.
+    fn is_guarded(&self) -> bool {
+        false
+    }
+
+    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
+        let has_bus = mcu.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
+        if !has_bus {
+            return Ok(Safe::Now);
+        }
+        if let Some(mut message) = self.message.take() {
+            message.talk.load(&self.bytes);
+            mcu.converse(self.spi, Ticket { oid, tag: 0 }, message)?;
+        }
+        Ok(Safe::Later)
+    }
+}
+
+const CONFIG_SPI: Command =
+    command!("config_spi oid=%c pin=%u cs_active_high=%c", |mcu, oid: Oid, pin: Pin, cs_active_high: bool| {
+        mcu.vacant(oid)?;
+        let line = mcu.shared_output(pin, !cs_active_high)?;
+        mcu.assign_on(pin, oid, Spi::new(Some(ChipSelect { line, active_high: cs_active_high })))
+    });
+
+const CONFIG_SPI_WITHOUT_CS: Command =
+    command!("config_spi_without_cs oid=%c", |mcu, oid: Oid| mcu.assign(oid, Spi::new(None)));
+
+const SPI_SET_BUS: Command =
+    command!("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", |mcu, oid: Oid, spi_bus: u32, mode: u32, rate: u32| {
+        let mode = u8::try_from(mode).unwrap_or(u8::MAX);
+        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_bus(mcu, spi_bus, mode, rate))
+    });
+
+const SPI_SET_SOFTWARE_BUS: Command = command!(
+    "spi_set_software_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u rate=%u",
+    |mcu, oid: Oid, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
+        let mode = mode as u8;
+        let pins = [miso_pin, mosi_pin, sclk_pin];
+        // The firmware ignored the rate and was as fast as its system calls. Lines that are written
+        // through mapped registers would be too fast for a chip.
+        let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
+        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_lines(mcu, pins, mode, pulse))
+    }
+)
+.of(until(V0_13));
+
+const SPI_SET_SW_BUS: Command = command!(
+    "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
+    |mcu, oid: Oid, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
+        // Of one byte, as in the firmware.
+        let mode = mode as u8;
+        let pins = [miso_pin, mosi_pin, sclk_pin];
+        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_lines(mcu, pins, mode, pulse_ticks))
+    }
+)
+.of(since(Master).and(Kalico));
+
+const SPI_TRANSFER: Command = command!("spi_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
+    mcu.with::<Spi, _>(oid, |spi, mcu| spi.transfer(mcu, oid, TRANSFER, data))
+});
+
+const SPI_SEND: Command = command!("spi_send oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
+    mcu.with::<Spi, _>(oid, |spi, mcu| spi.transfer(mcu, oid, SEND, data))
+});
+
+const CONFIG_SPI_SHUTDOWN: Command = command!(
+    "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",
+    |mcu, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
+        mcu.with::<Spi, _>(spi_oid, |_, _| Ok(()))?;
+        mcu.assign(oid, SpiShutdown { spi: spi_oid, message: Some(Transfer::new(&[])), bytes: shutdown_msg.into() })
+    }
+);

@@ -1,0 +1,509 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The UART of Trinamic's stepper drivers (TMC2208, TMC2209 and their like), bit by bit on one wire
+//! or two. klippy writes the start and stop bits itself, checks those of the reply, and asks again.
+//!
+//! The firmware has a timer for each bit. Here an errand times a whole message on a worker: at 40
+//! kbaud that is up to 5 ms of edges 25 us apart, which would keep the core awake. How late bits
+//! are either way `bits_on_time` below measures (docs/performance.md).
+//!
+//! The firmware samples a reply wherever in a bit its timer happens to be. Here the start bit of each
+//! byte is looked for, and bits are read in their middle, so that half a bit of lateness does no harm.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use crate::board::{Bias, Direction, Line, Pin};
+use crate::mcu::{
+    Command, Done, Errand, Feature, Mcu, Next, Object, Oid, Response, Safe, Ticket, TimerId, WorkerId, command,
+    response,
+};
+use crate::shutdown::{Shutdown, shutdowns};
+use crate::time::{Clock, Ticks};
+
+use super::pace::Pace;
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "tmcuart",
+    commands: &[CONFIG_TMCUART, TMCUART_SEND],
+    responses: &[UartResponse::FORM],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// `tmcuart_send` with more than ten bytes, or for more.
+    DATA_TOO_LARGE = "tmcuart data too large";
+}
+
+response! {
+    /// A message was sent. The bits of the reply, from its first start bit on; none if none was asked
+    /// for or none came.
+    "tmcuart_response oid=%c read=%*s"
+    pub(super) struct UartResponse<'a> { oid: Oid, read: &'a [u8] }
+}
+
+/// All UARTs share a worker: klippy talks to one at a time (`PrinterTMCUartMutexes` in tmc_uart.py).
+const WORKER: &str = "tmcuart";
+/// Bytes of a message with start and stop bits: eight of ten bits.
+const DATA_MAX: usize = 10;
+/// Between the command and the first edge, as in the firmware: a driver wants the line to be quiet in
+/// between messages.
+const QUIET: Ticks = Ticks::from_us(200);
+/// From the end of a message, before the reply is looked for.
+const TURN_BITS: u32 = 4;
+/// For how long the reply is looked for.
+const REPLY_BITS: u32 = 65;
+/// A byte with its start and its stop bit.
+const FRAME_BITS: usize = 10;
+/// How often the line is looked at, while an edge is waited for, in each bit.
+const LOOKS: u32 = 16;
+/// How often a register is asked for where a bit was late. klippy itself asks five times, and can not
+/// know whether it was the driver or this machine.
+const TRIES: u32 = 3;
+/// A message that begins with a start bit and a sync nibble, from which the driver takes its rate.
+const SYNC: u8 = 0b10_1010;
+const SYNC_MASK: u8 = 0b11_1111;
+/// The bits between the first and the last falling edge of these.
+const SYNC_BITS: usize = 4;
+
+/// The two ends of the UART.
+#[derive(Clone)]
+struct Wires {
+    tx: Arc<dyn Line>,
+    rx: Arc<dyn Line>,
+    /// The resistor of a single wire while it listens; none if there are two.
+    single: Option<Bias>,
+}
+
+impl Wires {
+    /// Drives the line high, as it is between messages.
+    fn idle(&self) -> Result<(), Shutdown> {
+        match self.single {
+            Some(_) => self.tx.turn(Direction::Output { level: true, shutdown_level: true }),
+            None => self.tx.write(true),
+        }
+    }
+
+    fn listen(&self) -> Result<(), Shutdown> {
+        self.single.map_or(Ok(()), |bias| self.rx.turn(Direction::Input(bias)))
+    }
+}
+
+/// A message and its reply: there is one box for each UART.
+struct Exchange {
+    pace: Pace,
+    wires: Wires,
+    /// As configured.
+    bit: Ticks,
+    /// What is sent; the first bit is the lowest.
+    data: [u8; DATA_MAX],
+    write_len: usize,
+    reply: [u8; DATA_MAX],
+    read_len: usize,
+    /// Whether a reply came.
+    replied: bool,
+    /// Whether a bit was so late that it may have been taken for another.
+    spoilt: bool,
+    result: Result<(), Shutdown>,
+}
+
+impl Errand for Exchange {
+    fn run(&mut self) {
+        self.replied = false;
+        let exchanged = self.exchange();
+        self.result = exchanged.and(self.wires.idle());
+    }
+}
+
+impl Exchange {
+    /// To read a register changes nothing in the driver, so it may be done again; a write is klippy's to
+    /// repeat, which counts those that arrived.
+    fn exchange(&mut self) -> Result<(), Shutdown> {
+        for _ in 0..TRIES {
+            self.spoilt = false;
+            // The first call is slower than the others, and would make the first bit longer.
+            self.wires.tx.write(true)?;
+            let Some((end, bit)) = self.send(self.pace.now())? else { break };
+            if self.read_len == 0 {
+                break;
+            }
+            self.wires.listen()?;
+            self.replied = self.receive(end, bit)?;
+            if !self.spoilt {
+                break;
+            }
+            self.wires.idle()?;
+            if !self.pace.until(self.pace.now() + QUIET) {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    fn reply(&self) -> &[u8] {
+        if self.replied { &self.reply[..self.read_len] } else { &[] }
+    }
+
+    /// Sends the bits, from `at` on. Tells when the last one ended, and how long a bit was; nothing if it
+    /// was stopped.
+    fn send(&mut self, mut at: Clock) -> Result<Option<(Clock, Ticks)>, Shutdown> {
+        let mut bit = self.bit;
+        let mut first_late = 0;
+        let synced = self.write_len > 0 && self.data[0] & SYNC_MASK == SYNC;
+        let mut line = true;
+        // The first bit is a start bit, whatever the host says.
+        for place in 0..(8 * self.write_len).max(1) {
+            let level = place > 0 && self.data[place / 8] >> (place % 8) & 1 != 0;
+            if level != line {
+                if !self.pace.until(at) {
+                    return Ok(None);
+                }
+                self.wires.tx.write(level)?;
+                line = level;
+                let late = self.pace.now().since(at);
+                // A fault of the sync nibble's four bits is 2.5 times that at the end of a byte.
+                let fault = bit.0 / if place == SYNC_BITS && synced { 16 } else { 4 };
+                self.spoilt |= place > 0 && (late - first_late).abs() > i64::from(fault);
+                match place {
+                    0 => first_late = late,
+                    // The driver has measured these bits, and expects the others to be as long.
+                    SYNC_BITS if synced => {
+                        let longer = late - first_late;
+                        bit = longer_by(bit, div_round(longer, SYNC_BITS as i64));
+                        at = at.displaced(longer as u32);
+                    }
+                    _ => {}
+                }
+            }
+            at = at + bit;
+        }
+        Ok(self.pace.until(at).then_some((at, bit)))
+    }
+
+    /// Reads the reply to a message that ended at `end`. False if none came.
+    fn receive(&mut self, end: Clock, bit: Ticks) -> Result<bool, Shutdown> {
+        let half = Ticks(bit.0 / 2);
+        let from = end + bits(bit, TURN_BITS);
+        if !self.pace.until(from) {
+            return Ok(false);
+        }
+        let Some(edge) = self.falling_edge(from, from + bits(bit, REPLY_BITS), bit)? else { return Ok(false) };
+        let mut at = edge + half;
+        for place in 0..8 * self.read_len {
+            if place > 0 && place % FRAME_BITS == 0 {
+                // Each start bit tells anew where the bits are.
+                at = self.falling_edge(self.pace.now(), at, bit)?.map_or(at, |edge| edge + half);
+            }
+            if !self.pace.until(at) {
+                return Ok(false);
+            }
+            let (byte, mask) = (&mut self.reply[place / 8], 1 << (place % 8));
+            *byte = if self.wires.rx.read()? { *byte | mask } else { *byte & !mask };
+            self.spoilt |= self.pace.now().since(at) > i64::from(bit.0 / 4);
+            at = at + bit;
+        }
+        Ok(true)
+    }
+
+    /// Looks at the line until it falls; none if it does not until `limit`. `last` is when it was looked
+    /// at last, or need not be before.
+    fn falling_edge(&mut self, mut last: Clock, limit: Clock, bit: Ticks) -> Result<Option<Clock>, Shutdown> {
+        let pause = Ticks((bit.0 / LOOKS).max(1));
+        let mut was_high = false;
+        loop {
+            let level = self.wires.rx.read()?;
+            let now = self.pace.now();
+            // An edge may have been missed.
+            let gap = now.since(last);
+            self.spoilt |= gap > i64::from(bit.0 / 4);
+            last = now;
+            if level {
+                was_high = true;
+            } else if was_high {
+                // It lies between two looks.
+                return Ok(Some(now - Ticks(gap as u32 / 2)));
+            }
+            if now >= limit || !self.pace.until(now + pause) {
+                return Ok(None);
+            }
+        }
+    }
+}
+
+/// As long as so many bits: a rate that no driver has may last until a shutdown, but does not overflow.
+fn bits(bit: Ticks, count: u32) -> Ticks {
+    Ticks(bit.0.saturating_mul(count))
+}
+
+fn longer_by(bit: Ticks, by: i64) -> Ticks {
+    Ticks((i64::from(bit.0) + by).clamp(0, i64::from(u32::MAX)) as u32)
+}
+
+/// The nearest whole quotient.
+fn div_round(value: i64, by: i64) -> i64 {
+    (value + value.signum() * by / 2) / by
+}
+
+struct TmcUart {
+    worker: WorkerId,
+    pace: Pace,
+    /// Here while no message is under way.
+    exchange: Option<Box<Exchange>>,
+    /// Whether the host is owed an answer.
+    asked: bool,
+}
+
+impl TmcUart {
+    fn send(&mut self, mcu: &mut Mcu, oid: Oid, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
+        // As in the firmware: who is busy does not listen, and the host asks again.
+        let Some(exchange) = self.exchange.as_mut().filter(|_| !self.asked) else { return Ok(()) };
+        let read_len = usize::from(read_len);
+        if write.len() > DATA_MAX || read_len > DATA_MAX {
+            return Err(Shutdown::by_host(
+                DATA_TOO_LARGE,
+                format_args!("tmcuart_send wants {} bytes sent and {read_len} read, of {DATA_MAX} each", write.len()),
+            ));
+        }
+        exchange.data[..write.len()].copy_from_slice(write);
+        exchange.write_len = write.len();
+        exchange.read_len = read_len;
+        self.asked = true;
+        let at = mcu.now() + QUIET;
+        mcu.go_on(TimerId::new(oid, 0), at);
+        Ok(())
+    }
+}
+
+impl Object for TmcUart {
+    fn kind(&self) -> &'static str {
+        "TMC UART"
+    }
+
+    /// Sends the message from here, so that no command waits for it.
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
+        if let (Some(oid), Some(exchange)) = (timer.oid(), self.exchange.take()) {
+            mcu.dispatch(self.worker, Ticket { oid, tag: 0 }, exchange)?;
+        }
+        Ok(Next::Done)
+    }
+
+    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
+        let Some(mut exchange) = done.errand::<Exchange>() else { return Ok(()) };
+        let result = std::mem::replace(&mut exchange.result, Ok(()));
+        self.pace.resume();
+        if std::mem::take(&mut self.asked) && result.is_ok() {
+            mcu.send(UartResponse { oid, read: exchange.reply() });
+        }
+        self.exchange = Some(exchange);
+        match result {
+            Ok(()) => {
+                mcu.is_safe(oid);
+                Ok(())
+            }
+            Err(failure) => mcu.device_failed(oid, self.kind(), failure),
+        }
+    }
+
+    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+        self.asked = false;
+    }
+
+    /// A message that is under way is broken off, and leaves the line idle.
+    fn make_safe(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<Safe, Shutdown> {
+        match &self.exchange {
+            Some(exchange) => exchange.wires.idle().map(|()| Safe::Now),
+            None => {
+                self.pace.stop();
+                Ok(Safe::Later)
+            }
+        }
+    }
+}
+
+const CONFIG_TMCUART: Command = command!(
+    "config_tmcuart oid=%c rx_pin=%u pull_up=%c tx_pin=%u bit_time=%u",
+    |mcu, oid: Oid, rx_pin: Pin, pull_up: bool, tx_pin: Pin, bit_time: Ticks| {
+        mcu.vacant(oid)?;
+        let bias = if pull_up { Bias::PullUp } else { Bias::None };
+        let worker = mcu.worker(WORKER)?;
+        let rx = mcu.prompt_line(rx_pin, "UART", Direction::Input(bias))?;
+        let wires = if rx_pin == tx_pin {
+            Wires { tx: rx.clone(), rx, single: Some(bias) }
+        } else {
+            let idle = Direction::Output { level: true, shutdown_level: true };
+            Wires { tx: mcu.prompt_line(tx_pin, "UART", idle)?, rx, single: None }
+        };
+        wires.idle()?;
+        let pace = Pace::new(mcu);
+        let exchange = Box::new(Exchange {
+            pace: pace.clone(),
+            wires,
+            bit: bit_time,
+            data: [0; DATA_MAX],
+            write_len: 0,
+            reply: [0; DATA_MAX],
+            read_len: 0,
+            replied: false,
+            spoilt: false,
+            result: Ok(()),
+        });
+        mcu.assign_on(tx_pin, oid, TmcUart { worker, pace, exchange: Some(exchange), asked: false })
+    }
+);
+
+const TMCUART_SEND: Command =
+    command!("tmcuart_send oid=%c write=%*s read=%c", |mcu, oid: Oid, write: &[u8], read: u8| {
+        mcu.with::<TmcUart, _>(oid, |uart, mcu| uart.send(mcu, oid, write, read))
+    });
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Mutex;
+
+    use crate::time::{TimeSource, VirtualClock};
+
+    /// 40 kbaud.
+    const BIT: Ticks = Ticks::from_us(25);
+
+    /// A wire whose other end sends `reply` a while after the last edge, and which knows when each
+    /// edge came.
+    struct Wire {
+        clock: Arc<dyn TimeSource>,
+        edges: Mutex<Vec<(Clock, bool)>>,
+        reply: Vec<u8>,
+        /// Called at each edge, with how many there were.
+        at_edge: Box<dyn Fn(usize) + Send + Sync>,
+    }
+
+    /// From the last edge of a message to its reply: the end of its last byte, eight bits and some.
+    const REPLY_AFTER: i64 = 20 * BIT.0 as i64 + 333;
+
+    impl Line for Wire {
+        fn write(&self, level: bool) -> Result<(), Shutdown> {
+            let mut edges = self.edges.lock().unwrap();
+            edges.push((self.clock.now(), level));
+            (self.at_edge)(edges.len());
+            Ok(())
+        }
+
+        fn read(&self) -> Result<bool, Shutdown> {
+            let last = self.edges.lock().unwrap().last().map_or(Clock::EPOCH, |(at, _)| *at);
+            let into = self.clock.now().since(last) - REPLY_AFTER;
+            Ok(into < 0 || bit_of(&self.reply, (into / i64::from(BIT.0)) as usize))
+        }
+
+        fn set_direction(&self, _direction: Direction) -> Result<(), Shutdown> {
+            Ok(())
+        }
+    }
+
+    fn bit_of(bytes: &[u8], place: usize) -> bool {
+        bytes.get(place / 8).is_none_or(|byte| byte >> (place % 8) & 1 != 0)
+    }
+
+    /// What klippy sends to read a register (`_encode_read(0xf5, 0, 2)` of tmc_uart.py), and a reply.
+    const MESSAGE: [u8; 5] = [0xea, 0x03, 0x48, 0x20, 0xe4];
+    /// Its edges, and those back to idle.
+    const EDGES: usize = 16;
+    const REPLY: [u8; 10] = [0x0a, 0xfa, 0x4f, 0x20, 0x80, 0x00, 0x02, 0xe8, 0x20, 0xf1];
+
+    fn exchange(clock: Arc<dyn TimeSource>, at_edge: impl Fn(usize) + Send + Sync + 'static) -> (Arc<Wire>, Exchange) {
+        let wire = Arc::new(Wire {
+            clock: clock.clone(),
+            edges: Mutex::new(Vec::with_capacity(100)),
+            reply: REPLY.into(),
+            at_edge: Box::new(at_edge),
+        });
+        let mut data = [0; DATA_MAX];
+        data[..MESSAGE.len()].copy_from_slice(&MESSAGE);
+        let exchange = Exchange {
+            pace: Pace::of(clock),
+            wires: Wires { tx: wire.clone(), rx: wire.clone(), single: None },
+            bit: BIT,
+            data,
+            write_len: MESSAGE.len(),
+            reply: [0; DATA_MAX],
+            read_len: REPLY.len(),
+            replied: false,
+            spoilt: false,
+            result: Ok(()),
+        };
+        (wire, exchange)
+    }
+
+    #[test]
+    fn a_message_is_broken_off_amid_its_bits() {
+        let pace = Arc::new(Mutex::new(None::<Pace>));
+        let stopper = pace.clone();
+        let (wire, mut exchange) = exchange(Arc::new(VirtualClock::at(Clock::EPOCH)), move |edge| {
+            if edge == 4 {
+                stopper.lock().unwrap().as_ref().unwrap().stop();
+            }
+        });
+        *pace.lock().unwrap() = Some(exchange.pace.clone());
+        exchange.run();
+        assert!(exchange.reply().is_empty());
+        let levels: Vec<bool> = wire.edges.lock().unwrap().iter().map(|(_, level)| *level).collect();
+        assert_eq!(levels, [true, false, true, false, true], "and left high");
+    }
+
+    #[test]
+    fn bits_are_as_long_as_the_driver_measured_them() {
+        let clock = VirtualClock::at(Clock::EPOCH);
+        let late = clock.clone();
+        // The last edge of the sync nibble comes 80 ticks late.
+        let (wire, mut exchange) = exchange(Arc::new(clock), move |edge| {
+            if edge == 6 {
+                late.set(late.now() + Ticks(80));
+            }
+        });
+        exchange.read_len = 0;
+        exchange.run();
+        let edges = wire.edges.lock().unwrap()[1..].to_vec();
+        let edges: Vec<i64> = edges.iter().map(|(at, _)| at.since(edges[0].0)).collect();
+        let bit = i64::from(BIT.0);
+        assert_eq!(edges[..5], [0, bit, 2 * bit, 3 * bit, 4 * bit]);
+        assert_eq!(edges[5], 4 * bit + 80 + bit + 20);
+        assert!(edges[6..edges.len() - 1].iter().all(|at| (at - 4 * bit - 80) % (bit + 20) == 0), "{edges:?}");
+    }
+
+    #[test]
+    fn quotients_are_rounded() {
+        assert_eq!([-6, -5, -2, -1, 0, 1, 2, 5, 6].map(|n| div_round(n, 4)), [-2, -1, -1, 0, 0, 0, 1, 1, 2]);
+    }
+
+    /// A reply that came while the worker was without its processor is asked for again; a write is not.
+    #[test]
+    fn a_register_is_asked_for_again_where_this_machine_was_late() {
+        for (read_len, messages) in [(REPLY.len(), 2), (0, 1)] {
+            let clock = VirtualClock::at(Clock::EPOCH);
+            let late = clock.clone();
+            let (wire, mut exchange) = exchange(Arc::new(clock), move |edge| {
+                if edge == 7 {
+                    late.set(late.now() + Ticks(BIT.0 / 2));
+                }
+            });
+            exchange.read_len = read_len;
+            exchange.run();
+            assert_eq!(exchange.reply(), &REPLY[..read_len]);
+            let falls = wire.edges.lock().unwrap().windows(2).filter(|pair| pair[0].1 && !pair[1].1).count();
+            assert_eq!(falls, messages * EDGES / 2, "{read_len}");
+        }
+    }
+
+    #[test]
+    fn it_is_asked_for_three_times_at_most() {
+        let clock = VirtualClock::at(Clock::EPOCH);
+        let late = clock.clone();
+        let (wire, mut exchange) = exchange(Arc::new(clock), move |edge| {
+            if edge.is_multiple_of(7) {
+                late.set(late.now() + BIT);
+            }
+        });
+        exchange.run();
+        let falls = wire.edges.lock().unwrap().windows(2).filter(|pair| pair[0].1 && !pair[1].1).count();
+        assert_eq!(falls, 3 * EDGES / 2);
+    }
+}

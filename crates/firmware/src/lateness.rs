@@ -1,0 +1,151 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Distributions of how late things happened. To record a sample does not allocate.
+
+#![forbid(unsafe_code)]
+
+use std::fmt;
+
+use crate::time::{CLOCK_FREQ, Ticks};
+
+/// Into how many buckets each octave (from a power of two to the next) is parted. So a bucket is at
+/// most as wide as an eighth of its values.
+const PARTS: usize = 8;
+/// Enough buckets for 2^32 ticks (86 s). What is later counts as that late.
+const BUCKETS: usize = 30 * PARTS + PARTS;
+
+/// Counts samples by how late they were.
+#[derive(Clone, Debug)]
+pub struct Lateness {
+    counts: [u64; BUCKETS],
+    samples: u64,
+    max: u32,
+}
+
+impl Default for Lateness {
+    fn default() -> Lateness {
+        Lateness { counts: [0; BUCKETS], samples: 0, max: 0 }
+    }
+}
+
+/// The bucket of a value in ticks. Values below 16 have a bucket each; larger ones share the eight
+/// buckets of their octave.
+fn bucket(late: u32) -> usize {
+    if late < PARTS as u32 {
+        return late as usize;
+    }
+    let octave = late.ilog2() as usize - PARTS.ilog2() as usize;
+    (octave + 1) * PARTS + (late >> octave) as usize - PARTS
+}
+
+/// The largest value of a bucket.
+fn upper(bucket: usize) -> u32 {
+    if bucket < PARTS {
+        return bucket as u32;
+    }
+    let octave = bucket / PARTS - 1;
+    let next = ((bucket % PARTS + PARTS + 1) as u64) << octave;
+    u32::try_from(next - 1).unwrap_or(u32::MAX)
+}
+
+impl Lateness {
+    /// Takes a sample in ticks. One that came early, below zero, counts as not late.
+    #[inline]
+    pub fn record(&mut self, late: i64) {
+        let late = late.clamp(0, i64::from(u32::MAX)) as u32;
+        self.counts[bucket(late)] += 1;
+        self.samples += 1;
+        self.max = self.max.max(late);
+    }
+
+    /// How many samples there are.
+    pub fn samples(&self) -> u64 {
+        self.samples
+    }
+
+    /// The latest sample.
+    pub fn max(&self) -> Ticks {
+        Ticks(self.max)
+    }
+
+    /// How late at most the share `q` (0 to 1) of the samples was. It is up to an eighth too high, as
+    /// it is the upper end of a bucket.
+    pub fn quantile(&self, q: f64) -> Ticks {
+        let wanted = (q * self.samples as f64).ceil() as u64;
+        let mut seen = 0;
+        for (bucket, count) in self.counts.iter().enumerate() {
+            seen += count;
+            if seen >= wanted && *count > 0 {
+                return Ticks(upper(bucket).min(self.max));
+            }
+        }
+        self.max()
+    }
+
+    /// The buckets that hold samples: the largest value that belongs to each, and how many it holds.
+    pub fn buckets(&self) -> impl Iterator<Item = (Ticks, u64)> + '_ {
+        let filled = self.counts.iter().enumerate().filter(|(_, count)| **count > 0);
+        filled.map(|(bucket, count)| (Ticks(upper(bucket)), *count))
+    }
+}
+
+/// Ticks as microseconds.
+pub fn us(ticks: Ticks) -> f64 {
+    f64::from(ticks.0) * 1e6 / f64::from(CLOCK_FREQ)
+}
+
+impl fmt::Display for Lateness {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.samples == 0 {
+            return f.write_str("no events");
+        }
+        let q = |q| us(self.quantile(q));
+        write!(
+            f,
+            "{} events, late by p50 {:.2} us, p99 {:.2} us, p99.9 {:.2} us, at most {:.2} us",
+            self.samples,
+            q(0.5),
+            q(0.99),
+            q(0.999),
+            us(self.max())
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn a_bucket_holds_what_is_put_in_it_and_is_narrow(late: u32) {
+            let bucket = bucket(late);
+            prop_assert!(bucket < BUCKETS);
+            prop_assert!(upper(bucket) >= late);
+            prop_assert!(bucket == 0 || upper(bucket - 1) < late);
+            prop_assert!(u64::from(upper(bucket)) <= u64::from(late) + u64::from(late) / 8);
+        }
+    }
+
+    #[test]
+    fn quantiles_of_a_known_distribution() {
+        let mut lateness = Lateness::default();
+        for late in 0..1000 {
+            lateness.record(late);
+        }
+        lateness.record(-5);
+        for (q, exact) in [(0.5, 500.0), (0.99, 990.0), (0.1, 100.0)] {
+            let got = f64::from(lateness.quantile(q).0);
+            assert!((exact - 1.0..exact * 1.125 + 1.0).contains(&got), "{q}: {got}");
+        }
+        assert_eq!((lateness.samples(), lateness.max()), (1001, Ticks(999)));
+    }
+
+    #[test]
+    fn nothing_is_said_of_how_late_nothing_was() {
+        let mut lateness = Lateness::default();
+        assert_eq!(lateness.to_string(), "no events");
+        lateness.record(50);
+        assert!(lateness.to_string().starts_with("1 events, late by p50 1.00 us"), "{lateness}");
+    }
+}

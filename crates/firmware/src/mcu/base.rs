@@ -1,0 +1,216 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The commands that every machine has: identify, clock, configuration, shutdown, debugging.
+
+#![forbid(unsafe_code)]
+
+use crate::shutdown::{Shutdown, reason};
+use crate::time::{CLOCK_FREQ, Clock};
+use pinion_protocol::format::same;
+
+use super::stats::SUMSQ_BASE;
+use super::{Command, Constant, Enumeration, Feature, Form, Generations, Response, command, response};
+
+/// What this file adds to the dictionary.
+pub const FEATURE: Feature = Feature {
+    name: "base",
+    commands: &[
+        IDENTIFY,
+        GET_CLOCK,
+        GET_UPTIME,
+        GET_CONFIG,
+        ALLOCATE_OIDS,
+        FINALIZE_CONFIG,
+        CONFIG_RESET,
+        EMERGENCY_STOP,
+        CLEAR_SHUTDOWN,
+        DEBUG_NOP,
+        DEBUG_PING,
+        DEBUG_READ,
+        DEBUG_WRITE,
+    ],
+    responses: RESPONSES,
+    constants: &[
+        Constant::number("CLOCK_FREQ", CLOCK_FREQ),
+        Constant::text("MCU", "linux"),
+        Constant::number("RECEIVE_WINDOW", RECEIVE_WINDOW),
+        Constant::number("STATS_SUMSQ_BASE", SUMSQ_BASE),
+    ],
+    enumerations: &[Enumeration::new("pin", |board| board.pins())],
+    shutdowns: reason::SHUTDOWNS,
+};
+
+const RESPONSES: &[Form] = &[
+    IdentifyResponse::FORM,
+    ClockResponse::FORM,
+    Uptime::FORM,
+    Config::FORM,
+    Starting::FORM,
+    ShutdownReport::FORM,
+    IsShutdown::FORM,
+    Stats::FORM,
+    Pong::FORM,
+    // Never sent, as `debug_read` is refused; the firmware's dictionary has it.
+    Form { format: "debug_result val=%u", generations: Generations::ALL },
+];
+
+/// How many bytes the host may send before they are acknowledged: half of a pty's buffer of 4096
+/// bytes, so that all of them fit in it, and the host never blocks in its write.
+const RECEIVE_WINDOW: u32 = 2048;
+
+pub(super) const fn response_index(format: &str) -> usize {
+    let mut index = 0;
+    while index < RESPONSES.len() {
+        if same(RESPONSES[index].format, format) {
+            return index;
+        }
+        index += 1;
+    }
+    panic!("the response is not listed")
+}
+
+/// Whether the response with this place in the list of all is one of the machine's own.
+pub(super) const fn is_own_response(index: usize) -> bool {
+    index < RESPONSES.len()
+}
+
+response! {
+    /// A piece of the compressed dictionary.
+    "identify_response offset=%u data=%.*s"
+    pub struct IdentifyResponse<'a> { offset: u32, data: &'a [u8] }
+}
+response! {
+    /// The present instant.
+    "clock clock=%u"
+    pub struct ClockResponse { clock: Clock }
+}
+
+impl From<Clock> for ClockResponse {
+    fn from(clock: Clock) -> ClockResponse {
+        ClockResponse { clock }
+    }
+}
+
+response! {
+    /// The present instant as 64 bits.
+    "uptime high=%u clock=%u"
+    pub(super) struct Uptime { high: u32, clock: Clock }
+}
+response! {
+    /// Whether the machine is configured, and the check sum that the host gave its configuration.
+    "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
+    pub struct Config { is_config: bool, crc: u32, is_shutdown: bool, move_count: u16 }
+}
+response! {
+    /// The machine has started and waits for its configuration.
+    "starting"
+    pub struct Starting {}
+}
+response! {
+    /// The machine stops.
+    "shutdown clock=%u static_string_id=%hu"
+    pub(super) struct ShutdownReport { clock: Clock, static_string_id: u16 }
+}
+response! {
+    /// A command was not run, as the machine is stopped.
+    "is_shutdown static_string_id=%hu"
+    pub(super) struct IsShutdown { static_string_id: u16 }
+}
+response! {
+    /// How busy the core was.
+    "stats count=%u sum=%u sumsq=%u"
+    pub struct Stats { count: u32, sum: u32, sumsq: u32 }
+}
+response! {
+    /// The answer to `debug_ping`.
+    "pong data=%*s"
+    pub(super) struct Pong<'a> { data: &'a [u8] }
+}
+
+/// The answer to `identify`: `count` bytes of the compressed dictionary from `offset` on, or as many
+/// of them as there are and fit a block.
+pub fn identify_response(dictionary: &[u8], offset: u32, count: u8) -> IdentifyResponse<'_> {
+    // Besides the data, the payload has the id (1 byte), the offset (up to 5) and the length (1).
+    let count = usize::from(count).min(pinion_protocol::block::PAYLOAD_MAX - 7);
+    let start = (offset as usize).min(dictionary.len());
+    let end = (start + count).min(dictionary.len());
+    IdentifyResponse { offset, data: &dictionary[start..end] }
+}
+
+const IDENTIFY: Command = command!("identify offset=%u count=%c", |mcu, offset: u32, count: u8| {
+    let dialect = mcu.heard().clone();
+    mcu.send(identify_response(dialect.compressed(), offset, count));
+    Ok(())
+})
+.allowed_in_shutdown();
+
+const GET_CLOCK: Command = command!("get_clock", |mcu| {
+    let clock = mcu.now();
+    mcu.send(ClockResponse { clock });
+    Ok(())
+})
+.allowed_in_shutdown();
+
+const GET_UPTIME: Command = command!("get_uptime", |mcu| {
+    let clock = mcu.now();
+    mcu.send(Uptime { high: (clock.ticks() >> 32) as u32, clock });
+    Ok(())
+})
+.allowed_in_shutdown();
+
+const GET_CONFIG: Command = command!("get_config", |mcu| {
+    let config = Config {
+        is_config: mcu.is_finalized(),
+        // klippy resets a machine that another configuration has, before it sends it anything.
+        crc: if mcu.next_dialect.is_some() { !mcu.config_crc } else { mcu.config_crc },
+        is_shutdown: mcu.is_shutdown(),
+        move_count: mcu.moves.count,
+    };
+    mcu.send(config);
+    Ok(())
+})
+.allowed_in_shutdown();
+
+const ALLOCATE_OIDS: Command = command!("allocate_oids count=%c", |mcu, count: u8| mcu.allocate_oids(count));
+
+const FINALIZE_CONFIG: Command = command!("finalize_config crc=%u", |mcu, crc: u32| mcu.finalize(crc));
+
+const CONFIG_RESET: Command = command!("config_reset", |mcu| mcu.reset()).allowed_in_shutdown();
+
+pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(emergency())).allowed_in_shutdown();
+
+/// The stop that `emergency_stop` asks for.
+pub fn emergency() -> Shutdown {
+    Shutdown::because(
+        reason::COMMAND_REQUEST,
+        "the host asked for it (M112, or its log says why): FIRMWARE_RESTART once the cause is dealt with",
+    )
+}
+
+const CLEAR_SHUTDOWN: Command = command!("clear_shutdown", |mcu| mcu.clear_shutdown()).allowed_in_shutdown();
+
+const DEBUG_NOP: Command = command!("debug_nop", |_mcu| Ok(())).allowed_in_shutdown();
+
+const DEBUG_PING: Command = command!("debug_ping data=%*s", |mcu, data: &[u8]| {
+    mcu.send(Pong { data });
+    Ok(())
+})
+.allowed_in_shutdown();
+
+const DEBUG_READ: Command = command!("debug_read order=%c addr=%u", |_mcu, order: u8, addr: u32| {
+    let _ = (order, addr);
+    Err(debug_refused("debug_read"))
+})
+.allowed_in_shutdown();
+
+const DEBUG_WRITE: Command = command!("debug_write order=%c addr=%u val=%u", |_mcu, order: u8, addr: u32, val: u32| {
+    let _ = (order, addr, val);
+    Err(debug_refused("debug_write"))
+})
+.allowed_in_shutdown();
+
+fn debug_refused(command: &str) -> Shutdown {
+    Shutdown::because(
+        reason::DEBUG_MEMORY,
+        format!("the host sent {command}: a process of Linux does not poke memory for a host; remove the command"),
+    )
+}

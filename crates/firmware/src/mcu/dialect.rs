@@ -1,0 +1,302 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The ids of all messages, and the dictionary that tells them to the host.
+
+#![forbid(unsafe_code)]
+
+use std::collections::HashMap;
+use std::io;
+
+use serde_json::{Value, json};
+
+use crate::board::{Board, Range};
+use crate::shutdown::{Shutdown, ShutdownReason, reason};
+use pinion_protocol::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
+use pinion_protocol::format::{self, Conversion};
+use pinion_protocol::vlq::Reader;
+
+use super::command::{ConstantValue, Feature, Handler};
+use super::{DialectName, Generation, Generations, base, since};
+
+/// What the machine knows of a command that came by its id.
+pub(super) struct Entry {
+    pub(super) format: &'static str,
+    pub(super) handler: Handler,
+    pub(super) in_shutdown: bool,
+    /// Whether it is one of the machine's own, which has the same id in every dialect.
+    pub(super) is_own: bool,
+    conversions: Box<[Conversion]>,
+}
+
+impl Entry {
+    /// Takes the parameters off the reader without running the command.
+    pub(super) fn skip(&self, reader: &mut Reader<'_>) -> Result<(), Shutdown> {
+        for conversion in &self.conversions {
+            conversion.skip(reader)?;
+        }
+        Ok(())
+    }
+}
+
+/// The ids that take one byte on the wire (docs/Protocol.md, "Variable length quantities").
+const SHORT_IDS: std::ops::Range<i32> = -32..96;
+
+/// The ids in the order in which they are given: those of one byte first, beginning behind the two
+/// that a host knows beforehand.
+fn ids() -> impl Iterator<Item = i32> {
+    (IDENTIFY_ID + 1..SHORT_IDS.end).chain(SHORT_IDS.start..IDENTIFY_RESPONSE_ID).chain(SHORT_IDS.end..)
+}
+
+/// An id's place in the list of all.
+fn place(id: u32) -> usize {
+    (id as i32).wrapping_sub(SHORT_IDS.start) as u32 as usize
+}
+
+/// What all features have of one kind.
+fn all<'a, T>(
+    features: &'a [Feature],
+    of: fn(&'a Feature) -> &'static [T],
+) -> impl Iterator<Item = &'static T> + Clone {
+    features.iter().flat_map(of)
+}
+
+/// Which forms of one kind a dialect has.
+struct Choice<T: 'static> {
+    /// The name of a form, and who takes it.
+    facts: fn(&'static T) -> (&'static str, Generations),
+    /// For each name the generation whose form it is.
+    chosen: HashMap<&'static str, Generation>,
+}
+
+impl<T> Choice<T> {
+    fn new(
+        dialect: &DialectName,
+        forms: impl Iterator<Item = &'static T> + Clone,
+        facts: fn(&'static T) -> (&'static str, Generations),
+    ) -> Choice<T> {
+        let mut chosen = HashMap::new();
+        for generation in dialect.generations() {
+            for (name, _) in forms.clone().map(facts).filter(|(_, takers)| takers.contains(*generation)) {
+                chosen.entry(name).or_insert(*generation);
+            }
+        }
+        Choice { facts, chosen }
+    }
+
+    fn has(&self, form: &'static T) -> bool {
+        let (name, takers) = (self.facts)(form);
+        self.chosen.get(name).is_some_and(|generation| takers.contains(*generation))
+    }
+}
+
+/// What an MCU is made of, and what its dictionary says of it.
+pub struct Firmware {
+    /// What it can do; the MCU's own feature comes first.
+    pub features: &'static [Feature],
+    /// The program's name.
+    pub app: &'static str,
+    /// The program's version.
+    pub version: &'static str,
+    /// What the program was built with.
+    pub build_versions: &'static str,
+    /// The program's license.
+    pub license: &'static str,
+}
+
+/// The messages that a host may exchange with the machine, by their ids.
+pub struct Dialect {
+    name: DialectName,
+    /// By the [`place`] of the id.
+    commands: Vec<Option<Entry>>,
+    /// By [`super::Response::INDEX`].
+    response_ids: Vec<Option<u32>>,
+    /// The id of `emergency_stop`, for which each block is searched.
+    emergency_stop: Option<u32>,
+    /// By their number in the enumeration `static_string_id`.
+    shutdowns: Vec<ShutdownReason>,
+    dictionary: Dictionary,
+    /// The dictionary as `identify` serves it.
+    compressed: Vec<u8>,
+}
+
+impl Dialect {
+    /// Numbers the messages of the firmware's features that the hosts of this dialect take, and publishes them with
+    /// the board's names.
+    pub fn new(firmware: &Firmware, board: &dyn Board, name: DialectName) -> io::Result<Dialect> {
+        let features = firmware.features;
+        let serves = |hosts: Generations| name.generations().iter().any(|generation| hosts.contains(*generation));
+        let told = |text: &str| if serves(since(Generation::V0_13)) { text.to_owned() } else { String::new() };
+        let mut dictionary = Dictionary {
+            app: told(firmware.app),
+            build_versions: firmware.build_versions.into(),
+            license: told(firmware.license),
+            version: firmware.version.into(),
+            ..Dictionary::default()
+        };
+        let mut ids = ids();
+        let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
+        let mut response_ids = Vec::new();
+        let mut commands = Vec::new();
+        let responses = Choice::new(&name, all(features, |feature| feature.responses), |form| {
+            (format::name(form.format), form.generations)
+        });
+        let taken = Choice::new(&name, all(features, |feature| feature.commands), |command| {
+            (format::name(command.format), command.generations)
+        });
+        // The machine's own messages have the same ids in every dialect: an `emergency_stop` means the
+        // same to a machine that was given another one since its host read the dictionary.
+        let (base, others) = features.split_at(features.len().min(1));
+        for (features, is_own) in [(base, true), (others, false)] {
+            // Responses first: what they carry fills a block to the last byte, so their ids are short.
+            for form in all(features, |feature| feature.responses) {
+                if !responses.has(form) {
+                    response_ids.push(None);
+                    continue;
+                }
+                let id = match format::name(form.format) {
+                    "identify_response" => IDENTIFY_RESPONSE_ID,
+                    _ => next_id()?,
+                };
+                response_ids.push(Some(id as u32));
+                dictionary.responses.insert(form.format.into(), json!(id));
+            }
+            for command in all(features, |feature| feature.commands).filter(|command| taken.has(command)) {
+                let conversions = format::parameters(command.format)
+                    .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
+                let entry = Entry {
+                    format: command.format,
+                    handler: command.handler,
+                    in_shutdown: command.in_shutdown,
+                    is_own,
+                    conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
+                };
+                let id = match format::name(command.format) {
+                    "identify" => IDENTIFY_ID,
+                    _ => next_id()?,
+                };
+                let place = place(id as u32);
+                if commands.len() <= place {
+                    commands.resize_with(place + 1, || None);
+                }
+                commands[place] = Some(entry);
+                dictionary.commands.insert(command.format.into(), json!(id));
+            }
+        }
+        let constants = all(features, |feature| feature.constants);
+        let had = Choice::new(&name, constants.clone(), |constant| (constant.name, constant.generations));
+        for constant in constants.filter(|constant| had.has(constant)) {
+            let value = match constant.value {
+                ConstantValue::Number(number) => json!(number),
+                ConstantValue::Text(text) => json!(text),
+            };
+            dictionary.config.insert(constant.name.into(), value);
+        }
+        let enumerations = all(features, |feature| feature.enumerations);
+        let had = Choice::new(&name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.generations));
+        for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {
+            let values = names((enumeration.values)(board));
+            dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
+        }
+        let shutdowns: Vec<ShutdownReason> = features.iter().flat_map(|feature| feature.shutdowns).copied().collect();
+        let texts = shutdowns.iter().zip(0..).map(|(reason, id)| (reason.text().into(), json!(id)));
+        dictionary.enumerations.insert("static_string_id".into(), Value::Object(texts.collect()));
+        let compressed = dictionary.compress()?;
+        let mut dialect =
+            Dialect { name, commands, response_ids, emergency_stop: None, shutdowns, dictionary, compressed };
+        dialect.emergency_stop = dialect.command_id(base::EMERGENCY_STOP.format);
+        Ok(dialect)
+    }
+
+    /// Which dialect this is.
+    pub fn name(&self) -> DialectName {
+        self.name
+    }
+
+    /// Whether the machine is to behave as for these hosts, where the form of a message does not say.
+    pub(super) fn serves(&self, hosts: Generations) -> bool {
+        self.name.generations().first().is_some_and(|generation| hosts.contains(*generation))
+    }
+
+    /// The dictionary.
+    pub fn dictionary(&self) -> &Dictionary {
+        &self.dictionary
+    }
+
+    /// The dictionary, zlib-compressed JSON, as `identify` serves it.
+    pub fn compressed(&self) -> &[u8] {
+        &self.compressed
+    }
+
+    /// The id of the response of type `R`; none if the hosts of this dialect do not take it.
+    #[inline]
+    pub fn response_id<R: super::Response>(&self) -> Option<u32> {
+        self.response_ids[R::INDEX]
+    }
+
+    /// The number of a shutdown text.
+    pub(super) fn static_string_id(&self, reason: ShutdownReason) -> u16 {
+        // Every reason is in the list, as `shutdowns!` makes the list along with the constants.
+        self.shutdowns.iter().position(|listed| *listed == reason).unwrap_or(0) as u16
+    }
+
+    /// The id of the command with this format.
+    pub fn command_id(&self, format: &str) -> Option<u32> {
+        self.dictionary.commands.get(format)?.as_i64().map(|id| id as u32)
+    }
+
+    /// Whether a block asks for an emergency stop.
+    pub fn is_emergency(&self, payload: &[u8]) -> bool {
+        self.emergency_stop.is_some_and(|id| self.contains(payload, id))
+    }
+
+    /// Whether a payload is one of the machine's own responses, which mean the same in every dialect.
+    pub fn is_own_response(&self, payload: &[u8]) -> bool {
+        let id = Reader::new(payload).int().ok();
+        let mut ids = self.response_ids.iter().enumerate();
+        id.is_some() && ids.any(|(index, own)| base::is_own_response(index) && *own == id)
+    }
+
+    /// Whether a block's payload has the command with this id. What follows an unknown command, or one
+    /// that is cut short, does not count, as the machine stops there.
+    fn contains(&self, payload: &[u8], id: u32) -> bool {
+        // The last byte of the id's encoding must occur somewhere. It mostly does not, and then no
+        // command need be decoded.
+        if !payload.contains(&(id as u8 & 0x7f)) {
+            return false;
+        }
+        let mut reader = Reader::new(payload);
+        while let Ok(found) = reader.int() {
+            if found == id {
+                return true;
+            }
+            let Ok(command) = self.command(found) else { return false };
+            if command.skip(&mut reader).is_err() {
+                return false;
+            }
+        }
+        false
+    }
+
+    #[inline]
+    pub(super) fn command(&self, id: u32) -> Result<&Entry, Shutdown> {
+        match self.commands.get(place(id)) {
+            Some(Some(entry)) => Ok(entry),
+            _ => Err(Shutdown::because(
+                reason::INVALID_COMMAND,
+                format!(
+                    "the host sent command {}, which the dictionary does not have: restart the host so that it reads the dictionary anew",
+                    id as i32
+                ),
+            )),
+        }
+    }
+}
+
+fn names(ranges: Vec<Range>) -> serde_json::Map<String, Value> {
+    ranges
+        .into_iter()
+        .map(|range| match range.count {
+            1 => (range.name, json!(range.first)),
+            count => (range.name, json!([range.first, count])),
+        })
+        .collect()
+}

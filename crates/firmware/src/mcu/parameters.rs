@@ -1,0 +1,89 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The types that parameters of commands and responses may have, beside plain numbers and bytes.
+
+#![forbid(unsafe_code)]
+
+use std::fmt;
+
+use crate::board::Pin;
+use crate::time::Ticks;
+use pinion_protocol::Malformed;
+use pinion_protocol::format::{Arg, Field};
+use pinion_protocol::vlq::{Reader, Writer};
+
+#[cfg(doc)]
+use super::Mcu;
+
+/// An object's id: the one that the host uses, or that of an object which belongs to a feature
+/// ([`Mcu::own`]).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Oid(u16);
+
+impl Oid {
+    /// Ids below this one are the host's; those from here on are of features' own objects.
+    pub(super) const FIRST_OWN: usize = 256;
+
+    /// The id that has this number on the wire.
+    pub const fn new(oid: u8) -> Oid {
+        Oid(oid as u16)
+    }
+
+    /// The id of the object at a place of the table.
+    pub(super) fn at(index: usize) -> Oid {
+        Oid(u16::try_from(index).unwrap_or(u16::MAX))
+    }
+
+    /// The object's place in the table.
+    #[inline]
+    pub(super) fn index(self) -> usize {
+        usize::from(self.0)
+    }
+}
+
+impl Arg<'_> for Oid {
+    const CONVERSIONS: &'static [&'static str] = &["%c"];
+    #[inline]
+    fn decode(reader: &mut Reader<'_>) -> Result<Oid, Malformed> {
+        u8::decode(reader).map(Oid::new)
+    }
+}
+
+impl Field for Oid {
+    const CONVERSIONS: &'static [&'static str] = &["%c"];
+    fn encode(&self, writer: &mut Writer) {
+        writer.int(self.0.into());
+    }
+}
+
+impl Arg<'_> for Pin {
+    // `%c` suggests a byte, but the host encodes every integer whole, and a pin may exceed 255.
+    const CONVERSIONS: &'static [&'static str] = &["%u", "%c"];
+    fn decode(reader: &mut Reader<'_>) -> Result<Pin, Malformed> {
+        reader.int().map(Pin)
+    }
+}
+
+impl Arg<'_> for Ticks {
+    const CONVERSIONS: &'static [&'static str] = &["%u"];
+    #[inline]
+    fn decode(reader: &mut Reader<'_>) -> Result<Ticks, Malformed> {
+        reader.int().map(Ticks)
+    }
+}
+
+/// An instant as the host sends it: the low 32 bits of a clock. [`Mcu::instant`] makes it whole.
+#[derive(Clone, Copy, Debug)]
+pub struct WireClock(pub u32);
+
+impl Arg<'_> for WireClock {
+    const CONVERSIONS: &'static [&'static str] = &["%u"];
+    fn decode(reader: &mut Reader<'_>) -> Result<WireClock, Malformed> {
+        reader.int().map(WireClock)
+    }
+}
+
+impl fmt::Display for Oid {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.fmt(f)
+    }
+}

@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Instants and spans in ticks of 20 ns, and where they are read.
+
+#![forbid(unsafe_code)]
+
+use std::ops::{Add, Sub};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::Duration;
+
+pub use pinion_protocol::clock::Clock;
+
+/// Ticks in a second, as the linux MCU of Klipper has it (`CLOCK_FREQ`).
+pub const CLOCK_FREQ: u32 = 50_000_000;
+/// Nanoseconds in a tick.
+pub const NS_PER_TICK: u64 = 1_000_000_000 / CLOCK_FREQ as u64;
+
+/// A span in ticks, as the wire carries it.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Default, Hash, Debug)]
+pub struct Ticks(pub u32);
+
+impl Ticks {
+    /// The span of `us` microseconds.
+    pub const fn from_us(us: u32) -> Ticks {
+        Ticks(us * (CLOCK_FREQ / 1_000_000))
+    }
+}
+
+impl Add<Ticks> for Clock {
+    type Output = Clock;
+    fn add(self, span: Ticks) -> Clock {
+        self.later(u64::from(span.0))
+    }
+}
+
+impl Sub<Ticks> for Clock {
+    type Output = Clock;
+    fn sub(self, span: Ticks) -> Clock {
+        self.earlier(u64::from(span.0))
+    }
+}
+
+/// Where the machine reads the time.
+pub trait TimeSource: Send + Sync {
+    /// The present instant; never earlier than an instant that it told before.
+    fn now(&self) -> Clock;
+
+    /// An errand begins on this thread, which may have a time of its own
+    /// ([`crate::board::Board::errand_clock`]).
+    fn begin_errand(&self) {}
+
+    /// The errand has ended.
+    fn end_errand(&self) {}
+
+    /// The instant that CLOCK_MONOTONIC tells as `monotonic`: the kernel dates by that clock.
+    fn instant_of(&self, monotonic: Duration) -> Clock;
+
+    /// Waits until `end` without sleeping: for the pulses of a bus, which are shorter than a sleep.
+    fn spin_until(&self, end: Clock) {
+        while self.now() < end {
+            std::hint::spin_loop();
+        }
+    }
+}
+
+/// A clock that stands still until it is told to advance: the whole machine runs on it in
+/// tests, the same each time.
+#[derive(Clone, Debug)]
+pub struct VirtualClock(Arc<AtomicU64>);
+
+impl VirtualClock {
+    /// A clock that stands at `now`.
+    pub fn at(now: Clock) -> VirtualClock {
+        VirtualClock(Arc::new(AtomicU64::new(now.ticks())))
+    }
+
+    /// Moves the clock to `now`; never back.
+    pub fn set(&self, now: Clock) {
+        self.0.fetch_max(now.ticks(), Ordering::SeqCst);
+    }
+
+    /// Runs `work` in a time of its own that begins now, as another thread does, and tells when it
+    /// ended. The clock itself stands where it stood.
+    pub fn aside(&self, work: impl FnOnce()) -> Clock {
+        let now = self.now();
+        work();
+        Clock::from_ticks(self.0.swap(now.ticks(), Ordering::SeqCst))
+    }
+}
+
+impl TimeSource for VirtualClock {
+    fn now(&self) -> Clock {
+        Clock::from_ticks(self.0.load(Ordering::SeqCst))
+    }
+
+    /// Its tick 0 is that clock's zero.
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        let s = monotonic.as_secs();
+        Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
+    }
+
+    fn spin_until(&self, end: Clock) {
+        self.set(end);
+    }
+}

@@ -1,0 +1,222 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Buttons: debounced, told until they are acknowledged, those of expanders too.
+
+use pinion_firmware::board::{Bias, Direction};
+
+use pinion_testbench::rig::Rig;
+
+const A: u32 = 30;
+const B: u32 = 31;
+
+/// klippy adds the pins and asks only after `finalize_config`.
+fn start(rig: &mut Rig, retransmit_count: u8, invert: u8) {
+    rig.send_all(&["buttons_add oid=0 pos=0 pin=30 pull_up=1", "buttons_add oid=0 pos=1 pin=31 pull_up=0"]);
+    rig.send(&format!(
+        "buttons_query oid=0 clock=@1000 rest_ticks=1000 retransmit_count={retransmit_count} invert={invert}"
+    ));
+}
+
+fn buttons() -> Rig {
+    let mut rig = Rig::configured(&["config_buttons oid=0 button_count=2"]);
+    start(&mut rig, 50, 0);
+    rig
+}
+
+#[test]
+fn a_level_counts_once_two_samples_in_a_row_have_it() {
+    let mut rig = buttons();
+    // One sample long, at 3000; then from the sample at 6000 on.
+    rig.bench.script_input(A, &[(2500, 1), (3500, 0), (5500, 1)]);
+    rig.run_until(6999);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(7000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+    rig.send("buttons_ack oid=0 count=1");
+    rig.run_until(1_000_000);
+    assert_eq!(rig.responses(), [""; 0]);
+}
+
+#[test]
+fn a_button_that_bounces_does_not_hold_up_another() {
+    let mut rig = buttons();
+    rig.bench.script_input(A, &[(1500, 1), (2500, 0), (3500, 1), (4500, 0)]);
+    rig.bench.script_input(B, &[(2500, 1)]);
+    rig.run_until(10_000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=02"]);
+}
+
+#[test]
+fn a_button_that_rests_high_is_not_pressed_from_the_start() {
+    let mut rig = Rig::configured(&["config_buttons oid=0 button_count=2"]);
+    rig.bench.script_input(A, &[(0, 1), (5500, 0)]);
+    start(&mut rig, 50, 1);
+    rig.run_until(6999);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(7000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=00"]);
+}
+
+#[test]
+fn what_is_not_acknowledged_is_told_again() {
+    for count in [0_u8, 3] {
+        let mut rig = Rig::configured(&["config_buttons oid=0 button_count=2"]);
+        rig.bench.script_input(A, &[(500, 1)]);
+        start(&mut rig, count, 0);
+        // Seen at 1000 and 2000; told again so many samples later, and one.
+        let again = 2000 + 1000 * (u64::from(count) + 1);
+        rig.run_until(again - 1);
+        assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+        rig.run_until(again);
+        assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+        rig.send("buttons_ack oid=0 count=1");
+        rig.run_until(100_000);
+        assert_eq!(rig.responses(), [""; 0]);
+    }
+}
+
+#[test]
+fn reports_pile_up_in_order_and_leave_as_they_are_acknowledged() {
+    let mut rig = buttons();
+    rig.bench.script_input(A, &[(1500, 1), (5500, 0)]);
+    rig.bench.script_input(B, &[(9500, 1)]);
+    rig.run_until(20_000);
+    let reports: Vec<String> =
+        ["01", "0100", "010002"].iter().map(|s| format!("buttons_state oid=0 ack_count=0 state={s}")).collect();
+    assert_eq!(rig.responses(), reports);
+    rig.send("buttons_ack oid=0 count=1");
+    // The last was told at 11000: the rest comes 51 samples later.
+    rig.run_until(11_000 + 51_000 - 1);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(11_000 + 51_000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=1 state=0002"]);
+    // More than there are: klippy's count is the one that is kept.
+    rig.send("buttons_ack oid=0 count=255");
+    rig.bench.script_input(B, &[(70_500, 0)]);
+    rig.run_until(80_000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=00"]);
+}
+
+#[test]
+fn the_ninth_change_is_dropped_and_the_next_report_has_the_state() {
+    let mut rig = buttons();
+    let edges: Vec<(u64, u8)> = (0..9).map(|n| (1500 + 2000 * n, (n % 2 == 0).into())).collect();
+    rig.bench.script_input(A, &edges);
+    rig.run_until(30_000);
+    let reports = rig.responses();
+    assert_eq!(reports.len(), 8);
+    assert_eq!(reports[7], "buttons_state oid=0 ack_count=0 state=0100010001000100");
+    rig.send("buttons_ack oid=0 count=8");
+    rig.bench.script_input(B, &[(31_500, 1)]);
+    rig.run_until(40_000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=8 state=03"], "A is pressed as well");
+}
+
+#[test]
+fn a_query_begins_anew_and_one_without_rest_ends() {
+    let mut rig = buttons();
+    rig.bench.script_input(A, &[(500, 1)]);
+    rig.run_until(5000);
+    rig.send("buttons_ack oid=0 count=1");
+    rig.responses();
+    // As klippy does when it is restarted while this machine stays configured.
+    rig.send_all(&["buttons_add oid=0 pos=0 pin=30 pull_up=1", "buttons_add oid=0 pos=1 pin=31 pull_up=0"]);
+    rig.send("buttons_query oid=0 clock=@6000 rest_ticks=1000 retransmit_count=5 invert=0");
+    rig.run_until(7000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+    rig.send("buttons_query oid=0 clock=@0 rest_ticks=0 retransmit_count=5 invert=0");
+    rig.run_until(100_000);
+    assert_eq!(rig.responses(), [""; 0]);
+}
+
+#[test]
+fn what_can_not_be_configured() {
+    let refusal = |commands: &[&str]| {
+        let mut rig = Rig::new();
+        rig.send("allocate_oids count=1");
+        rig.send_all(commands);
+        rig.shutdown().unwrap_or_default()
+    };
+    assert_eq!(refusal(&["config_buttons oid=0 button_count=9"]), "Max of 8 buttons");
+    let two = "config_buttons oid=0 button_count=2";
+    assert_eq!(refusal(&[two, "buttons_add oid=0 pos=2 pin=30 pull_up=0"]), "Set button past maximum button count");
+    let query = "buttons_query oid=0 clock=@1000 rest_ticks=1000 retransmit_count=128 invert=0";
+    assert_eq!(refusal(&[two, query]), "Invalid buttons retransmit count");
+    assert_eq!(refusal(&[two, "buttons_add oid=0 pos=0 pin=999 pull_up=0"]), "Not an input pin");
+    assert_eq!(refusal(&["buttons_ack oid=0 count=1"]), "Invalid oid type");
+}
+
+#[test]
+fn resistors_reach_the_board_after_finalize_config() {
+    let rig = buttons();
+    assert_eq!(rig.bench.state().directions[&A], Direction::Input(Bias::PullUp));
+    assert_eq!(rig.bench.state().directions[&B], Direction::Input(Bias::None));
+}
+
+#[test]
+fn a_line_that_is_gone_stops_the_machine_and_a_stopped_machine_samples_no_more() {
+    let mut rig = buttons();
+    rig.bench.state().broken.insert(B);
+    rig.run_until(10_000);
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    rig.bench.state().broken.clear();
+    rig.bench.script_input(A, &[(11_000, 1)]);
+    rig.run_until(100_000);
+    assert_eq!(rig.responses(), [""; 0]);
+    // Configured anew it works.
+    rig.send("config_reset");
+    rig.configure(&["config_buttons oid=0 button_count=2"]);
+    rig.send("buttons_add oid=0 pos=0 pin=30 pull_up=0");
+    rig.send("buttons_query oid=0 clock=@101000 rest_ticks=1000 retransmit_count=5 invert=0");
+    rig.run_until(103_000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
+}
+
+/// Button B is an expander's, which takes 1500 ticks for a look.
+fn with_expander() -> Rig {
+    let mut rig = Rig::new();
+    rig.bench.state().sleeping.insert(B);
+    rig.bench.state().answer_ticks = 1500;
+    rig.configure(&["config_buttons oid=0 button_count=2"]);
+    start(&mut rig, 50, 0);
+    rig
+}
+
+#[test]
+fn an_expander_s_button_is_sampled_as_often_as_its_worker_looks() {
+    let mut rig = with_expander();
+    rig.bench.script_input(A, &[(2500, 1)]);
+    rig.bench.script_input(B, &[(4000, 1)]);
+    // Samples at 1000, 3000, 5000, 7000, each complete 1500 later.
+    rig.run_until(6499);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(6500);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=03"]);
+    rig.send("buttons_ack oid=0 count=1");
+    rig.run_until(100_000);
+    assert_eq!(rig.responses(), [""; 0]);
+}
+
+#[test]
+fn a_look_under_way_is_not_taken_for_one_of_a_later_query_or_line() {
+    let mut rig = with_expander();
+    rig.bench.script_input(B, &[(0, 1)]);
+    rig.run_until(3000);
+    // One sample is in, the second one under way.
+    rig.send_all(&[
+        "buttons_add oid=0 pos=1 pin=30 pull_up=0",
+        "buttons_query oid=0 clock=@3500 rest_ticks=1000 retransmit_count=50 invert=0",
+    ]);
+    rig.run_until(100_000);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.bench.script_input(A, &[(101_000, 1)]);
+    rig.run_until(110_000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=03"], "both places are pin 30 now");
+}
+
+#[test]
+fn an_expander_that_fails_stops_the_machine() {
+    let mut rig = with_expander();
+    rig.bench.state().broken.insert(B);
+    rig.run_until(2500);
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+}

@@ -1,0 +1,87 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A machine that is given the dialect of another host.
+
+use pinion_firmware::mcu::{DialectName, Generation};
+
+use pinion_testbench::rig::{Rig, hex};
+
+#[test]
+fn a_machine_speaks_as_it_is_told_at_once_or_after_its_reset() {
+    let mut rig = Rig::of(Generation::Master);
+    rig.speak(Generation::V0_12);
+    assert_eq!(rig.dialect().name(), DialectName::Of(Generation::V0_12));
+    // What identify serves is the new dictionary.
+    let served = hex(&rig.dialect().compressed()[..40]);
+    assert_eq!(rig.ask("identify offset=0 count=40"), format!("identify_response offset=0 data={served}"));
+    rig.configure(&[]);
+    rig.speak(Generation::Kalico);
+    assert_eq!(rig.dialect().name(), DialectName::Of(Generation::V0_12), "its objects speak the old dialect");
+    let crc = !7u32;
+    let config = format!("config is_config=1 crc={crc} is_shutdown=0 move_count=1024");
+    assert_eq!(rig.ask("get_config"), config, "a check sum that no host has, so that this one resets");
+    let served = hex(&Rig::of(Generation::Kalico).dialect().compressed()[400..440]);
+    assert_eq!(rig.ask("identify offset=400 count=40"), format!("identify_response offset=400 data={served}"));
+    rig.speak(Generation::V0_12);
+    assert_eq!(rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024", "the first is back");
+    rig.speak(Generation::Kalico);
+    rig.send_all(&["emergency_stop", "config_reset"]);
+    rig.responses();
+    assert_eq!(rig.dialect().name(), DialectName::Of(Generation::Kalico));
+    rig.configure(&[]);
+    assert_eq!(rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024");
+}
+
+#[test]
+fn a_configured_machine_does_not_take_the_other_hosts_words_for_its_own() {
+    let mut rig = Rig::of(Generation::V0_12);
+    rig.configure(&["config_digital_out oid=0 pin=1 value=1 default_value=0 max_duration=0"]);
+    rig.speak(Generation::Master);
+    rig.send("update_digital_out oid=0 value=1");
+    let stopped = rig.responses();
+    assert!(stopped.iter().any(|response| response.starts_with("shutdown ")), "{stopped:?}");
+    assert!(!rig.bench.level(1), "the output is at its shutdown value");
+    assert!(
+        rig.notes().iter().any(|note| note.contains("a host of the dialect v0.12, and the present one speaks master"))
+    );
+}
+
+#[test]
+fn a_stopped_machine_reads_the_other_hosts_blocks_to_their_end() {
+    let mut rig = Rig::of(Generation::V0_12);
+    rig.configure(&["config_digital_out oid=0 pin=1 value=1 default_value=0 max_duration=0"]);
+    rig.send("emergency_stop");
+    rig.responses();
+    rig.speak(Generation::Master);
+    // Their ids mean something else in the dialect of before, and are longer or shorter.
+    let commands = ["query_adxl345 oid=0 rest_ticks=0", "i2c_transfer oid=0 write=0011 read_len=2", "config_reset"];
+    let block = commands.map(|command| rig.encode(command)).concat();
+    assert!(rig.mcu.is_emergency(&[rig.encode(commands[1]), rig.encode("emergency_stop")].concat()));
+    rig.execute(&block);
+    assert_eq!(rig.responses(), ["is_shutdown static_string_id=Command request"; 2]);
+    assert_eq!(rig.dialect().name(), DialectName::Of(Generation::Master), "the reset was read");
+}
+
+#[test]
+fn another_host_is_not_told_what_the_objects_say() {
+    let mut rig = Rig::of(Generation::V0_12);
+    rig.configure(&["config_analog_in oid=0 pin=400"]);
+    rig.send("query_analog_in oid=0 clock=@20000 sample_ticks=1000 sample_count=2 rest_ticks=100000 min_value=0 max_value=4095 range_check_count=4");
+    rig.run_until(100_000);
+    assert_eq!(rig.responses().len(), 1);
+    rig.speak(Generation::Master);
+    rig.run_until(500_000);
+    assert_eq!(rig.responses(), [""; 0]);
+    assert!(rig.ask("get_uptime").starts_with("uptime "));
+    rig.speak(Generation::V0_12);
+    rig.run_until(600_000);
+    assert_eq!(rig.responses().len(), 1, "the first host is back, and gets the readings that it asked for");
+}
+
+#[test]
+fn the_machines_own_messages_have_the_same_ids_in_every_dialect() {
+    let own = ["emergency_stop", "get_config", "config_reset", "get_clock", "clear_shutdown"];
+    let ids = |generation| own.map(|command| Rig::of(generation).dialect().command_id(command));
+    for generation in Generation::ALL {
+        assert_eq!(ids(generation), ids(Generation::Master), "{generation}");
+    }
+}

@@ -1,0 +1,328 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Load cells on an HX711: a model of the chip after its data sheet, at 80 samples a second.
+
+use std::sync::{Arc, Mutex};
+
+use pinion_testbench::board::Bench;
+use pinion_testbench::rig::Rig;
+
+const DOUT: u32 = 10;
+const SCLK: u32 = 11;
+/// Between two samples of the chip.
+const PERIOD: u64 = 625_000;
+/// As klippy asks for: a tenth of it.
+const QUERY: &str = "query_hx71x oid=0 rest_ticks=62500";
+const END: &str = "query_hx71x oid=0 rest_ticks=0";
+const STATUS: &str = "query_hx71x_status oid=0";
+/// From the first to the last of them the data line tells the bits.
+const BITS: u32 = 24;
+/// The clock's longest high time in ticks: 60 us.
+const HIGH_MAX: u64 = 3000;
+
+#[derive(Default)]
+struct Hx711 {
+    /// What it measures: this value, and one more with each sample.
+    value: i32,
+    measured: u32,
+    /// When the next sample is there; none while it is off.
+    next: Option<u64>,
+    ready: bool,
+    pulses: u32,
+    rose: u64,
+    high: bool,
+    /// Pulses of each reading.
+    counts: Vec<u32>,
+    stuck_low: bool,
+}
+
+impl Hx711 {
+    fn pass(&mut self, at: u64) {
+        if self.high && at > self.rose + HIGH_MAX {
+            (self.next, self.ready) = (None, false);
+        }
+        while self.next.is_some_and(|next| next <= at) {
+            self.next = self.next.map(|next| next + PERIOD);
+            if self.pulses > 0 {
+                self.counts.push(self.pulses);
+            }
+            (self.ready, self.pulses) = (true, 0);
+            self.measured = self.value as u32 & 0xff_ffff;
+            self.value += 1;
+        }
+    }
+
+    fn clock(&mut self, at: u64, level: bool) {
+        self.pass(at);
+        self.high = level;
+        if level {
+            self.rose = at;
+            self.pulses += u32::from(self.next.is_some());
+        } else if self.next.is_none() {
+            // Reset: four samples are needed to settle.
+            (self.next, self.pulses) = (Some(at + 4 * PERIOD), 0);
+        }
+    }
+
+    fn data(&mut self, at: u64) -> bool {
+        self.pass(at);
+        match self.pulses {
+            _ if self.stuck_low => false,
+            _ if self.next.is_none() => true,
+            0 => !self.ready,
+            1..=BITS => self.measured >> (BITS - self.pulses) & 1 != 0,
+            _ => true,
+        }
+    }
+}
+
+fn plug(bench: &Bench, value: i32) -> Arc<Mutex<Hx711>> {
+    let chip = Arc::new(Mutex::new(Hx711 { value, high: true, ..Hx711::default() }));
+    let plugged = chip.clone();
+    bench.plug_line(DOUT, move |at, edge| {
+        let mut chip = plugged.lock().unwrap();
+        match edge {
+            Some((SCLK, level)) => chip.clock(at, level),
+            Some(_) => {}
+            None => return chip.data(at),
+        }
+        true
+    });
+    chip
+}
+
+fn objects(gain_channel: u8) -> [String; 5] {
+    [
+        format!("config_hx71x oid=0 gain_channel={gain_channel} dout_pin=10 sclk_pin=11"),
+        "config_sos_filter oid=1 max_sections=0".into(),
+        "config_trigger_analog oid=2 sos_filter_oid=1".into(),
+        "config_trsync oid=3".into(),
+        "config_stepper oid=4 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0".into(),
+    ]
+}
+
+fn rig(value: i32, gain_channel: u8, answer_ticks: u32) -> (Rig, Arc<Mutex<Hx711>>) {
+    let mut rig = Rig::new();
+    let chip = plug(&rig.bench, value);
+    rig.bench.state().answer_ticks = answer_ticks;
+    let objects = objects(gain_channel);
+    rig.configure(&objects.each_ref().map(String::as_str));
+    (rig, chip)
+}
+
+/// The samples in the `sensor_bulk_data` messages, whose sequence counts up from `first`.
+fn samples(rig: &Rig, first: u16) -> Vec<i32> {
+    let mut samples = Vec::new();
+    let responses = rig.responses();
+    let messages = responses.iter().filter(|response| response.starts_with("sensor_bulk_data"));
+    for (message, sequence) in messages.zip(first..) {
+        let data = message.strip_prefix(&format!("sensor_bulk_data oid=0 sequence={sequence} data=")).unwrap();
+        assert_eq!(data.len(), 2 * 48, "twelve samples");
+        for at in (0..data.len()).step_by(8) {
+            samples.push(u32::from_str_radix(&data[at..at + 8], 16).unwrap().swap_bytes() as i32);
+        }
+    }
+    samples
+}
+
+#[test]
+fn samples_arrive_in_messages_of_twelve() {
+    for first in [-8_388_608, -5, 0, 8_388_607 - 30] {
+        let (mut rig, _chip) = rig(first, 1, 0);
+        rig.send(QUERY);
+        rig.run_until(4 * PERIOD + 24 * PERIOD);
+        assert_eq!(samples(&rig, 0), (first..first + 24).collect::<Vec<_>>());
+    }
+}
+
+#[test]
+fn gain_and_channel_are_chosen_by_pulses_after_the_sample() {
+    for gain_channel in 1..=4 {
+        let (mut rig, chip) = rig(0, gain_channel, 0);
+        rig.send(QUERY);
+        rig.run_until(20 * PERIOD);
+        let counts = chip.lock().unwrap().counts.clone();
+        assert_eq!(counts.len(), 16);
+        assert!(counts.iter().all(|count| *count == 24 + u32::from(gain_channel)), "{counts:?}");
+    }
+}
+
+#[test]
+fn the_chip_is_off_while_nothing_is_measured() {
+    let (mut rig, _chip) = rig(0, 1, 500);
+    assert!(rig.bench.level(SCLK) && rig.bench.shutdown_level(SCLK));
+    rig.send(QUERY);
+    assert_eq!(rig.edges(SCLK), [(500, 0)], "a command is over before the next one runs");
+    rig.run_until(10 * PERIOD);
+    rig.edges(SCLK);
+    rig.send(END);
+    assert_eq!(rig.edges(SCLK), [(10 * PERIOD + 500, 1)]);
+    rig.responses();
+    rig.run_until(50 * PERIOD);
+    assert_eq!(rig.edges(SCLK), []);
+    assert_eq!(rig.responses(), [""; 0]);
+}
+
+#[test]
+fn a_status_counts_what_was_read_what_is_being_read_and_what_is_in_the_chip() {
+    let (mut rig, _chip) = rig(0, 1, 1000);
+    rig.send(QUERY);
+    // The chip is woken at 1000, has its first sample four periods later, and the timer looks every 62500.
+    let first = 1000 + 4 * PERIOD;
+    let look = 41 * 62_500;
+    let status = |at: u64, buffered: u32| {
+        format!(
+            "sensor_bulk_status oid=0 clock=@{at} query_ticks=0 next_sequence=0 buffered={buffered} possible_overflows=0"
+        )
+    };
+    for (at, buffered) in [
+        (first - 1, 0),
+        (first, 4),
+        (look + 1000 + 500, 4),
+        (look + 1000 + 1000, 4),
+        (first + PERIOD - 1, 4),
+        (first + PERIOD, 8),
+        (first + 2 * PERIOD, 12),
+    ] {
+        rig.run_until(at);
+        assert_eq!(rig.ask(STATUS), status(at, buffered));
+    }
+}
+
+#[test]
+fn a_chip_that_does_not_answer_as_it_should_sends_errors_until_it_is_asked_anew() {
+    let (mut rig, chip) = rig(7, 1, 0);
+    rig.send(QUERY);
+    rig.run_until(6 * PERIOD);
+    chip.lock().unwrap().stuck_low = true;
+    rig.run_until(7 * PERIOD);
+    chip.lock().unwrap().stuck_low = false;
+    rig.run_until(17 * PERIOD);
+    let samples = samples(&rig, 0);
+    let good = samples.iter().position(|sample| *sample == i32::MIN).unwrap();
+    assert!(good >= 2 && samples[..good].iter().zip(7..).all(|(sample, value)| *sample == value), "{samples:?}");
+    assert!(samples[good..].iter().all(|sample| *sample == i32::MIN), "{samples:?}");
+    let value = chip.lock().unwrap().value;
+    rig.send_all(&[END, QUERY]);
+    let from = rig.now();
+    rig.run_until(from + 17 * PERIOD);
+    let samples = self::samples(&rig, 0);
+    assert_eq!(samples[..12], (value..value + 12).collect::<Vec<_>>());
+}
+
+#[test]
+fn a_reading_that_is_not_back_in_time_is_an_error_and_counted() {
+    // Back after 10 looks instead of 8.
+    let (mut rig, _chip) = rig(7, 1, 600_000);
+    rig.send(QUERY);
+    rig.run_until(40 * PERIOD);
+    let samples = samples(&rig, 0);
+    assert!(samples.len() >= 12 && samples.iter().all(|sample| *sample == 1 << 30), "{samples:?}");
+    let status = rig.ask(STATUS);
+    assert!(!status.ends_with("possible_overflows=0"), "{status}");
+}
+
+#[test]
+fn a_clock_that_may_have_switched_the_chip_off_is_an_error() {
+    for (write_ticks, good) in [(1500, true), (1501, false)] {
+        let (mut rig, _chip) = rig(7, 1, 0);
+        rig.send(QUERY);
+        rig.bench.state().write_ticks = write_ticks;
+        rig.run_until(20 * PERIOD);
+        let samples = samples(&rig, 0);
+        assert_eq!(samples[0], if good { 7 } else { 1 << 30 }, "{write_ticks}");
+    }
+}
+
+#[test]
+fn a_probe_triggers_at_its_sample_and_not_at_errors() {
+    for stuck_low in [false, true] {
+        let (mut rig, chip) = rig(-3, 1, 1000);
+        rig.send_all(&[
+            "hx71x_attach_trigger_analog oid=0 trigger_analog_oid=2",
+            "sos_filter_set_offset_scale oid=1 offset=0 scale=1 scale_frac_bits=0 auto_offset=0",
+            "trigger_analog_set_raw_range oid=2 raw_min=-8388608 raw_max=8388607",
+            "trigger_analog_set_trigger oid=2 trigger_analog_type=1 trigger_value=0",
+            QUERY,
+        ]);
+        rig.run_until(5 * PERIOD);
+        chip.lock().unwrap().stuck_low = stuck_low;
+        let now = rig.now();
+        rig.send_all(&[
+            "trsync_start oid=3 report_clock=@0 report_ticks=0 expire_reason=2",
+            &format!("trigger_analog_home oid=2 trsync_oid=3 trigger_reason=1 error_reason=40 clock=@{} monitor_ticks=625000 monitor_max=3", now + 1000),
+        ]);
+        rig.run_until(20 * PERIOD);
+        let reports = rig.responses();
+        let report = reports.iter().find(|report| report.starts_with("trsync_state")).unwrap();
+        // An error is no sample, so the monitor finds the sensor silent.
+        let reason = if stuck_low { 42 } else { 1 };
+        assert!(report.contains(&format!("trigger_reason={reason} ")), "{report}");
+    }
+}
+
+#[test]
+fn measurements_that_begin_anew_amid_a_reading_have_none_of_it() {
+    let (mut rig, chip) = rig(7, 1, 30_000);
+    rig.send(QUERY);
+    // The clock falls at 30000, and the first look that finds a sample is at 2562500.
+    rig.run_until(2_580_000);
+    assert_eq!(chip.lock().unwrap().pulses, 0, "the reading is on its way");
+    rig.send(QUERY);
+    rig.run_until(2_700_000);
+    assert!(rig.ask(STATUS).contains("buffered=0"), "the sample belongs to what was before");
+    rig.run_until(20 * PERIOD);
+    assert_eq!(samples(&rig, 0)[0], 8);
+}
+
+#[test]
+fn what_is_wrong_with_it_is_refused() {
+    for gain_channel in [0, 5, 255] {
+        let mut rig = Rig::new();
+        rig.send("allocate_oids count=1");
+        rig.send(&format!("config_hx71x oid=0 gain_channel={gain_channel} dout_pin=10 sclk_pin=11"));
+        assert_eq!(rig.shutdown().as_deref(), Some("HX71x gain/channel out of range 1-4"));
+    }
+    for (pin, text) in [(DOUT, "Unable to open in GPIO chip line"), (SCLK, "Unable to open out GPIO chip line")] {
+        let mut rig = Rig::new();
+        rig.bench.state().sleeping.insert(pin);
+        rig.send("allocate_oids count=1");
+        rig.send("config_hx71x oid=0 gain_channel=1 dout_pin=10 sclk_pin=11");
+        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        assert!(rig.notes().pop().unwrap().contains("choose a pin of the processor itself"));
+    }
+}
+
+#[test]
+fn lines_that_fail_stop_the_machine_and_it_can_be_configured_anew() {
+    for (pin, text) in [(DOUT, "GPIO line read failed"), (SCLK, "GPIO line write failed")] {
+        let (mut rig, chip) = rig(7, 1, 1000);
+        rig.send(QUERY);
+        rig.run_until(6 * PERIOD);
+        rig.responses();
+        rig.bench.state().broken.insert(pin);
+        rig.run_until(8 * PERIOD);
+        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        assert!(rig.notes().pop().unwrap().contains("HX71x oid 0 (gpio10)"));
+        rig.bench.state().broken.clear();
+        rig.send("config_reset");
+        rig.configure(&objects(1).each_ref().map(String::as_str));
+        // Long enough for the chip to switch itself off.
+        rig.run_until(9 * PERIOD);
+        rig.send(QUERY);
+        let (from, value) = (rig.now(), chip.lock().unwrap().value);
+        rig.run_until(from + 17 * PERIOD);
+        let samples = samples(&rig, 0);
+        assert!(samples.len() == 12 && samples.windows(2).all(|pair| pair[1] == pair[0] + 1), "{samples:?}");
+        assert_eq!(samples[0], value);
+    }
+}
+
+#[test]
+fn a_shutdown_amid_a_reading_ends_the_samples() {
+    let (mut rig, _chip) = rig(7, 1, 30_000);
+    rig.send(QUERY);
+    rig.run_until(2_580_000);
+    rig.send("emergency_stop");
+    rig.run_until(60 * PERIOD);
+    assert_eq!(rig.responses(), ["shutdown clock=@2580000 static_string_id=Command request"]);
+}

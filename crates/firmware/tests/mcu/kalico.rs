@@ -1,0 +1,294 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What Kalico has of its own: limits that are ignored, probing by load cells.
+
+use std::sync::{Arc, Mutex};
+
+use pinion_firmware::mcu::Generation::{Kalico, Master, V0_13};
+
+use pinion_testbench::board::ANALOG;
+use pinion_testbench::rig::{Rig, hex};
+
+const MS: u64 = 50_000;
+
+#[test]
+fn a_ds18b20_may_ignore_its_limits() {
+    for (ignores, ends) in [(0, true), (1, false)] {
+        let mut rig = Rig::of(Kalico);
+        rig.bench.script_ds18b20("28-1", &[Some(90_000), Some(91_000)]);
+        let serial = hex(b"28-1");
+        rig.configure(&[&format!("config_ds18b20 oid=0 serial={serial} max_error_count=4 ignore_limits={ignores}")]);
+        rig.send("query_ds18b20 oid=0 clock=@1000 rest_ticks=150000000 min_value=0 max_value=80000");
+        rig.run_until(1000 * MS);
+        let responses = rig.responses();
+        assert!(responses[0].starts_with("ds18b20_result oid=0 ") && responses[0].contains(" value=90000 "));
+        assert_eq!(rig.mcu.is_shutdown(), ends);
+        assert_eq!(responses.iter().any(|response| response.ends_with("=DS18B20 out of range")), ends);
+    }
+}
+
+#[test]
+fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_machine() {
+    for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 1, true), (Master, 0, true)] {
+        let mut rig = Rig::of(generation);
+        // A fault, and out of range.
+        rig.bench.plug_spi(0, |_, bytes| bytes.fill(0xff));
+        rig.configure(&[
+            "config_spi_without_cs oid=0",
+            "config_thermocouple oid=1 spi_oid=0 thermocouple_type=0",
+            "spi_set_bus oid=0 spi_bus=0 mode=0 rate=4000000",
+        ]);
+        let query = "query_thermocouple oid=1 clock=@1000 rest_ticks=10000 min_value=1 max_value=2 max_invalid_count=";
+        rig.send(&format!("{query}{count}"));
+        rig.run_until(50_000);
+        assert_eq!(rig.mcu.is_shutdown(), ends, "{generation} {count}");
+        assert!(rig.responses()[0].starts_with("thermocouple_result "));
+    }
+}
+
+#[test]
+fn an_analog_input_without_a_count_of_invalid_readings_never_stops_the_machine() {
+    for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 2, true), (V0_13, 0, true)] {
+        let mut rig = Rig::of(generation);
+        rig.configure(&["config_analog_in oid=0 pin=400"]);
+        rig.bench.script_adc(ANALOG, &[4095; 20]);
+        rig.send(&format!(
+            "query_analog_in oid=0 clock=@5000 sample_ticks=1000 sample_count=2 rest_ticks=10000 min_value=1 \
+             max_value=2 range_check_count={count}"
+        ));
+        rig.run_until(30_000);
+        assert_eq!(rig.mcu.is_shutdown(), ends, "{generation} {count}");
+        if !ends {
+            assert_eq!(rig.responses()[0], "analog_in_state oid=0 next_clock=@15000 value=8190");
+        }
+    }
+}
+
+// ---- load cells
+
+const READY: u32 = 10;
+/// Between two samples; the line is looked at ten times as often.
+const PERIOD: u64 = 100_000;
+
+/// The channels of a sample by its number, for an ADS131M04 (four) or an ADS1220 (one).
+type Values = fn(u64) -> Vec<i32>;
+
+fn crc(words: &[u8]) -> u16 {
+    words.iter().fold(0xffff, |crc, byte| {
+        (0..8).rev().fold(crc, |crc, bit| {
+            let carry = (crc & 0x8000 != 0) != (byte >> bit & 1 != 0);
+            crc << 1 ^ if carry { 0x1021 } else { 0 }
+        })
+    })
+}
+
+/// A chip that has a sample every [`PERIOD`]; `status` is the first byte of an ADS131M04's frame, and
+/// `is_ads131` says that it is one.
+fn plug(rig: &Rig, is_ads131: bool, values: Values) -> Arc<Mutex<u8>> {
+    let status = Arc::new(Mutex::new(0));
+    let (read, told) = (Arc::new(Mutex::new(0)), status.clone());
+    let on_spi = read.clone();
+    rig.bench.plug_spi(0, move |at, bytes| {
+        *on_spi.lock().unwrap() = at / PERIOD;
+        let words = values(at / PERIOD).into_iter().flat_map(|value| value.to_be_bytes()[1..].to_vec());
+        let frame: Vec<u8> = if is_ads131 {
+            let mut frame: Vec<u8> = [*told.lock().unwrap(), 0, 0].into_iter().chain(words).collect();
+            let crc = crc(&frame).to_be_bytes();
+            frame.extend([crc[0], crc[1], 0]);
+            frame
+        } else {
+            words.collect()
+        };
+        bytes.copy_from_slice(&frame);
+    });
+    rig.bench.plug_line(READY, move |at, _| *read.lock().unwrap() == at / PERIOD);
+    status
+}
+
+const ADS1220: &str = "config_ads1220 oid=1 spi_oid=0 data_ready_pin=10";
+/// Channels 1 and 3 of four.
+const ADS131M04: &str = "config_ads131m0x oid=1 spi_oid=0 data_ready_pin=10 sensor_channel_count=4 channel_mask=10";
+
+/// A machine with a sensor and a probe: half a gram a count, tared at 100.
+fn rig(sensor: &str, values: Values) -> (Rig, Arc<Mutex<u8>>) {
+    let mut rig = Rig::of(Kalico);
+    let status = plug(&rig, sensor == ADS131M04, values);
+    let name = if sensor == ADS131M04 { "ads131m0x" } else { "ads1220" };
+    rig.configure(&[
+        "config_spi_without_cs oid=0",
+        sensor,
+        "spi_set_bus oid=0 spi_bus=0 mode=1 rate=512000",
+        "config_sos_filter oid=2 max_sections=1",
+        "config_load_cell_probe oid=3 sos_filter_oid=2",
+        "config_trsync oid=4",
+    ]);
+    rig.send_all(&[
+        "sos_filter_set_active oid=2 n_sections=0 coeff_int_bits=2",
+        &format!("{name}_attach_load_cell_probe oid=1 load_cell_probe_oid=3"),
+        &set_range(-10_000, 10_000, 50, 1 << 28),
+        &format!("query_{name} oid=1 rest_ticks=10000"),
+    ]);
+    (rig, status)
+}
+
+fn set_range(min: i32, max: i32, trigger_grams: u32, grams_per_count: i32) -> String {
+    format!(
+        "load_cell_probe_set_range oid=3 safety_counts_min={min} safety_counts_max={max} tare_counts=100 \
+         trigger_grams={trigger_grams} grams_per_count={grams_per_count}"
+    )
+}
+
+/// Homes from the fifth sample on: reason 1 for a trigger, 40 and what follows for errors.
+fn home(rig: &mut Rig) {
+    rig.send_all(&[
+        "trsync_start oid=4 report_clock=@0 report_ticks=0 expire_reason=2",
+        "load_cell_probe_home oid=3 trsync_oid=4 trigger_reason=1 error_reason=40 clock=@450000 rest_ticks=100000 timeout=3",
+    ]);
+}
+
+/// The reason and the instant of the trigger by the thirtieth sample, if it came.
+fn triggered(rig: &mut Rig) -> Option<(u32, u64)> {
+    rig.run_until(30 * PERIOD);
+    let responses = rig.responses();
+    let state = responses.iter().find(|response| response.starts_with("trsync_state oid=4 can_trigger=0 "))?;
+    let field = |name: &str| state.split_once(name).unwrap().1.split(' ').next().unwrap();
+    Some((field("trigger_reason=").parse().unwrap(), field(" clock=@").parse().unwrap()))
+}
+
+const STATE: &str = "load_cell_probe_query_state oid=3";
+
+#[test]
+fn a_probe_triggers_at_its_force_either_way_once_homing_has_begun() {
+    // 200 counts from the tare are 100 g, more than the 50; before the fifth sample that does not count.
+    let cases: [(Values, Option<u64>); 4] = [
+        (|n| vec![if !(5..8).contains(&n) { 200 } else { 199 }], Some(8)),
+        (|n| vec![if n >= 8 { 0 } else { 1 }], Some(8)),
+        (|n| vec![if n == 4 { 5000 } else { 199 }], None),
+        (|_| vec![200], Some(5)),
+    ];
+    for (values, sample) in cases {
+        let (mut rig, _) = rig(ADS1220, values);
+        home(&mut rig);
+        let trigger = triggered(&mut rig);
+        assert_eq!(trigger.map(|(reason, at)| (reason, at / PERIOD)), sample.map(|n| (1, n)));
+        let state = rig.ask(STATE);
+        let is_triggered = u8::from(sample.is_some());
+        assert!(
+            state.starts_with(&format!("load_cell_probe_state oid=3 is_homing_trigger={is_triggered} ")),
+            "{state}"
+        );
+        assert_eq!(sample.is_none(), state.ends_with("trigger_ticks=0"), "{state}");
+    }
+}
+
+#[test]
+fn what_goes_wrong_has_its_reason() {
+    // Out of the safe range, whose ends do not belong to it; grams that overflow.
+    let (mut rig_, _) = rig(ADS1220, |n| vec![if n == 7 { 10_000 } else { 100 }]);
+    home(&mut rig_);
+    assert_eq!(triggered(&mut rig_).map(|(reason, at)| (reason, at / PERIOD)), Some((40, 7)));
+    let (mut rig_, _) = rig(ADS1220, |n| vec![if n == 7 { 8_000_000 } else { 100 }]);
+    rig_.send(&set_range(-8_388_608, 8_388_607, 50, 1 << 28));
+    home(&mut rig_);
+    assert_eq!(triggered(&mut rig_).map(|(reason, at)| (reason, at / PERIOD)), Some((41, 7)));
+    // A sensor that falls silent: at its fifth turn, as three without a sample are allowed.
+    let (mut rig_, _) = rig(ADS1220, |_| vec![100]);
+    home(&mut rig_);
+    rig_.run_until(700_000);
+    rig_.bench.plug_line(READY, |_, _| true);
+    let (reason, at) = triggered(&mut rig_).unwrap();
+    assert_eq!(reason, 42);
+    assert!((1_000_000..1_300_000).contains(&at), "{at}");
+}
+
+#[test]
+fn a_homing_that_is_over_pulls_nothing_and_says_so() {
+    let (mut rig, _) = rig(ADS1220, |_| vec![1000]);
+    home(&mut rig);
+    rig.send("load_cell_probe_home oid=3 trsync_oid=4 trigger_reason=0 error_reason=0 clock=0 rest_ticks=0 timeout=0");
+    assert_eq!(triggered(&mut rig), None);
+    assert_eq!(rig.ask(STATE), "load_cell_probe_state oid=3 is_homing_trigger=0 trigger_ticks=0");
+}
+
+#[test]
+fn a_filter_must_be_active_and_must_not_overflow() {
+    let (mut inactive, _) = rig(ADS1220, |_| vec![100]);
+    inactive.send("sos_filter_set_section oid=2 section_idx=0 sos0=0 sos1=0 sos2=0 sos3=0 sos4=0");
+    home(&mut inactive);
+    inactive.run_until(10 * PERIOD);
+    assert_eq!(inactive.shutdown().as_deref(), Some("sos_filter not property initialized"));
+    // Twice each value, with 29 fractional bits.
+    let doubling = [
+        "sos_filter_set_section oid=2 section_idx=0 sos0=1073741824 sos1=0 sos2=0 sos3=0 sos4=0",
+        "sos_filter_set_active oid=2 n_sections=1 coeff_int_bits=2",
+    ];
+    // 26 g become 52; 24 become 48, below the trigger's 50.
+    for (counts, reason) in [(152, Some(1)), (148, None)] {
+        let values: Values = if counts == 152 { |_| vec![152] } else { |_| vec![148] };
+        let (mut rig, _) = rig(ADS1220, values);
+        rig.send_all(&doubling);
+        home(&mut rig);
+        assert_eq!(triggered(&mut rig).map(|(reason, _)| reason), reason, "{counts}");
+    }
+    let (mut overflowing, _) = rig(ADS1220, |n| vec![if n == 6 { 100_000 } else { 100 }]);
+    overflowing.send(&set_range(-8_388_608, 8_388_607, 60_000, 1 << 28));
+    overflowing.send_all(&doubling);
+    home(&mut overflowing);
+    overflowing.run_until(10 * PERIOD);
+    assert_eq!(overflowing.shutdown().as_deref(), Some("fixed_mul: overflow"));
+}
+
+#[test]
+fn ranges_that_make_no_sense_are_refused() {
+    for (range, text) in [
+        (set_range(5, 4, 50, 1 << 28), "Safety range reversed"),
+        (set_range(0, 0, 65_536, 1 << 28), "trigger_grams too large"),
+        (set_range(0, 0, 65_535, -1), "grams_per_count is invalid"),
+        (set_range(0, 0, 65_535, 1 << 29), "grams_per_count is invalid"),
+    ] {
+        let (mut rig, _) = rig(ADS1220, |_| vec![100]);
+        rig.send(&range);
+        assert_eq!(rig.shutdown().as_deref(), Some(text), "{range}");
+    }
+}
+
+#[test]
+fn an_ads131m04_sends_the_channels_of_its_mask_and_is_probed_by_their_sum() {
+    let (mut rig, status) = rig(ADS131M04, |n| vec![7_000_000, 15 * n as i32, 7_000_000, 20 * n as i32]);
+    home(&mut rig);
+    // The sum of the two is 35 n: 200, which are 50 g, are passed with the sixth sample.
+    rig.run_until(6 * PERIOD + PERIOD / 2);
+    let responses = rig.responses();
+    let triggered = |it: &String| it.starts_with("trsync_state oid=4 can_trigger=0 trigger_reason=1 clock=@6");
+    assert!(responses.iter().any(triggered), "{responses:?}");
+    let data: Vec<&String> = responses.iter().filter(|it| it.starts_with("sensor_bulk_data")).collect();
+    let expected: String = (1..=6).flat_map(|n: i32| [15 * n, 20 * n]).map(|value| hex(&value.to_le_bytes())).collect();
+    assert_eq!(data, [&format!("sensor_bulk_data oid=1 sequence=0 data={expected}")]);
+    let pending = rig.ask("query_ads131m0x_status oid=1");
+    assert!(pending.contains(" next_sequence=1 buffered=0 "), "{pending}");
+    // A reset is told in each channel's place until the measurements begin anew.
+    *status.lock().unwrap() = 4;
+    rig.run_until(7 * PERIOD + PERIOD / 2);
+    *status.lock().unwrap() = 0;
+    rig.run_until(12 * PERIOD + PERIOD / 2);
+    assert_eq!(rig.responses().pop().unwrap().split_once("data=").unwrap().1, "00000040".repeat(12));
+    rig.run_until(13 * PERIOD + 5);
+    let ready = rig.ask("query_ads131m0x_status oid=1");
+    assert!(ready.contains(" buffered=8 "), "two channels: {ready}");
+}
+
+#[test]
+fn an_ads131m0x_with_channels_that_it_does_not_have_is_refused() {
+    for (count, mask, text) in [
+        (0, 1, "ads131m0x invalid sensor_channel_count"),
+        (5, 1, "ads131m0x invalid sensor_channel_count"),
+        (2, 0, "ads131m0x invalid channel_mask"),
+        (2, 4, "ads131m0x invalid channel_mask"),
+    ] {
+        let mut rig = Rig::of(Kalico);
+        rig.send_all(&["allocate_oids count=2", "config_spi_without_cs oid=0"]);
+        rig.send(&format!(
+            "config_ads131m0x oid=1 spi_oid=0 data_ready_pin=10 sensor_channel_count={count} channel_mask={mask}"
+        ));
+        assert_eq!(rig.shutdown().as_deref(), Some(text));
+    }
+}

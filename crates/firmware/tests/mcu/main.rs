@@ -1,0 +1,38 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The machine in virtual time, through its public API: what a host can see of it, to the
+//! tick and the same each time.
+
+mod adxl345;
+mod analog_in;
+mod any_bytes;
+mod base;
+mod buttons;
+mod counter;
+mod dialects;
+mod digital_out;
+mod displays;
+mod ds18b20;
+mod endstop;
+mod fifo_sensors;
+mod hx71x;
+mod i2c;
+mod kalico;
+mod ldc1612;
+mod neopixel;
+mod older_hosts;
+mod one_order;
+mod pca9685;
+mod pwm_out;
+mod ready_adc;
+mod remedies;
+mod safe_ends;
+mod sleeping_lines;
+mod snapshot;
+mod software_buses;
+mod sos_filter;
+mod spi;
+mod spi_angle;
+mod stepper;
+mod thermocouple;
+mod tmcuart;
+mod trigger_analog;

@@ -1,0 +1,109 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Chains of WS2812 LEDs on an SPI controller's data output.
+
+use pinion_testbench::board::{MOSI, SPI_CHIPS, Transfer};
+use pinion_testbench::rig::Rig;
+
+/// Two LEDs, and 50 us of reset: 20 bytes at 3.2 MHz.
+const CHAIN: &str = "config_neopixel oid=0 pin=700 data_size=6 bit_max_ticks=200 reset_min_ticks=2500";
+
+fn sent(rig: &Rig) -> Vec<Vec<u8>> {
+    rig.bench.transfers().into_iter().map(|transfer| transfer.data).collect()
+}
+
+/// What an LED chain reads from the line: a pulse of two bits or more is a 1.
+fn colours(wire: &[u8]) -> Vec<u8> {
+    let bits: Vec<u8> = wire.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1)).collect();
+    let pulses = bits.split(|bit| *bit == 0).filter(|pulse| !pulse.is_empty());
+    let data: Vec<u8> = pulses.map(|pulse| u8::from(pulse.len() > 1)).collect();
+    data.chunks(8).map(|byte| byte.iter().fold(0, |value, bit| value << 1 | bit)).collect()
+}
+
+#[test]
+fn a_chain_gets_its_colours_between_two_resets() {
+    let mut rig = Rig::configured(&[CHAIN]);
+    rig.send_all(&["neopixel_update oid=0 pos=0 data=ff00a5", "neopixel_update oid=0 pos=4 data=0180"]);
+    assert_eq!(rig.responses(), [""; 0]);
+    assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
+    // Only what changes is told, and all of it is sent; nothing that came in is sent again.
+    rig.send("neopixel_update oid=0 pos=5 data=81");
+    assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
+    let Transfer { bus, mode, rate_hz, .. } = rig.bench.transfers().remove(0);
+    assert_eq!((bus, mode, rate_hz), (0, 0, 3_200_000));
+    let messages = sent(&rig);
+    for message in &messages {
+        assert_eq!(message.len(), 20 + 24 + 20);
+        assert!(message[..20].iter().chain(&message[44..]).all(|byte| *byte == 0));
+    }
+    assert_eq!(colours(&messages[0]), [0xff, 0, 0xa5, 0, 0x01, 0x80]);
+    assert_eq!(colours(&messages[1]), [0xff, 0, 0xa5, 0, 0x01, 0x81]);
+}
+
+#[test]
+fn a_send_is_over_before_the_next_command() {
+    let mut rig = Rig::with_workers(5000, &[CHAIN]);
+    rig.begin("neopixel_send oid=0");
+    assert!(rig.mcu.is_held());
+    rig.run_until(4999);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(5000);
+    assert_eq!(rig.responses(), ["neopixel_result oid=0 success=1"]);
+    assert!(!rig.mcu.is_held());
+    rig.begin("neopixel_send oid=0");
+    rig.mcu.shut_down(pinion_firmware::shutdown::Shutdown::because(
+        pinion_firmware::shutdown::reason::FORCE_SHUTDOWN,
+        "test",
+    ));
+    assert!(!rig.mcu.is_held());
+}
+
+#[test]
+fn a_bus_that_fails_is_told_once_and_stops_nothing() {
+    let mut rig = Rig::configured(&[CHAIN]);
+    rig.notes();
+    let warnings = |rig: &Rig| rig.notes().iter().filter(|note| note.starts_with("warning: ")).count();
+    for _ in 0..2 {
+        rig.bench.state().broken.insert(SPI_CHIPS);
+        for _ in 0..8 {
+            assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=0");
+        }
+        assert_eq!(warnings(&rig), 1);
+        rig.bench.state().broken.clear();
+        assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
+    }
+    assert_eq!(warnings(&rig), 0);
+    assert!(!rig.mcu.is_shutdown());
+}
+
+#[test]
+fn an_update_past_the_chain_is_refused() {
+    for (pos, data) in [(6, "01"), (5, "0102"), (7, ""), (0x8000, ""), (65_535, "01")] {
+        let mut rig = Rig::configured(&[CHAIN]);
+        rig.send("neopixel_update oid=0 pos=6 data=");
+        assert_eq!(rig.shutdown(), None);
+        rig.send(&format!("neopixel_update oid=0 pos={pos} data={data}"));
+        assert_eq!(rig.shutdown().as_deref(), Some("Invalid neopixel update command"), "{pos}");
+    }
+}
+
+#[test]
+fn what_can_not_be_configured() {
+    let refusal = |pin: u32, size: u32, reset: u32| {
+        let mut rig = Rig::new();
+        rig.send("allocate_oids count=1");
+        rig.send(&format!(
+            "config_neopixel oid=0 pin={pin} data_size={size} bit_max_ticks=200 reset_min_ticks={reset}"
+        ));
+        let notes = rig.notes().join(" ");
+        (rig.shutdown().unwrap_or_default(), notes)
+    };
+    assert_eq!(refusal(MOSI, 6, 2500).0, "");
+    // One more than the bench's bus takes at once; a reset that is too long for it.
+    for (size, reset) in [(7, 2500), (6, 2600), (0, u32::MAX)] {
+        let (text, note) = refusal(MOSI, size, reset);
+        assert_eq!(text, "Invalid neopixel data_size");
+        assert!(note.contains("takes 64 at once") && note.contains("bufsiz"), "{note}");
+    }
+    assert_eq!(refusal(MOSI, 0x8000, 2500).0, "Invalid neopixel data_size");
+    assert_eq!(refusal(5, 6, 2500).0, "Not an output pin");
+}

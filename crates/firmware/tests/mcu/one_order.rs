@@ -1,0 +1,133 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! One order: a conversation that a command began holds back the commands behind it, and nothing
+//! else.
+
+use pinion_testbench::board::SPI_CHIPS;
+use pinion_testbench::rig::Rig;
+
+const DISPLAY: &[&str] = &[
+    "config_spi_without_cs oid=0",
+    "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
+    "config_digital_out oid=1 pin=30 value=0 default_value=0 max_duration=0",
+];
+
+/// klippy's SPI4wire (extras/display/uc1701.py): the D/C line, the bytes, the line back.
+#[test]
+fn a_display_sees_its_line_and_its_bytes_in_order() {
+    let mut rig = Rig::with_workers(50_000, DISPLAY);
+    for n in 0..20 {
+        let block: Vec<u8> = [
+            "update_digital_out oid=1 value=1".to_owned(),
+            format!("spi_send oid=0 data={n:02x}"),
+            "update_digital_out oid=1 value=0".to_owned(),
+            format!("spi_send oid=0 data=ff{n:02x}"),
+        ]
+        .iter()
+        .flat_map(|command| rig.encode(command))
+        .collect();
+        rig.execute(&block);
+    }
+    let edges = rig.edges(30);
+    assert_eq!(edges.len(), 40);
+    for (n, transfer) in rig.bench.transfers().iter().enumerate() {
+        let level = edges.iter().rev().find(|(at, _)| *at < transfer.at).map(|(_, level)| *level);
+        let wanted = u8::from(n % 2 == 0);
+        assert_eq!((level, transfer.data.len()), (Some(wanted), 1 + n % 2), "message {n}");
+    }
+}
+
+#[test]
+fn an_answer_is_there_before_the_next_command_runs() {
+    let mut rig = Rig::with_workers(200_000, DISPLAY);
+    rig.begin("spi_transfer oid=0 data=0102");
+    assert!(rig.mcu.is_held());
+    rig.run_until(199_999);
+    assert!(rig.mcu.is_held());
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(200_000);
+    assert!(!rig.mcu.is_held());
+    assert_eq!(rig.responses(), ["spi_transfer_response oid=0 response=fefd"]);
+}
+
+#[test]
+fn steps_and_samples_go_on_beside_a_slow_bus() {
+    let mut rig = Rig::with_workers(
+        200_000,
+        &[
+            "config_spi_without_cs oid=0",
+            "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
+            "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0",
+            "config_endstop oid=2 pin=3 pull_up=0",
+            "config_trsync oid=3",
+        ],
+    );
+    rig.bench.script_input(3, &[(650_000, 1)]);
+    rig.send_all(&[
+        "trsync_start oid=3 report_clock=@0 report_ticks=0 expire_reason=4",
+        "stepper_stop_on_trigger oid=1 trsync_oid=3",
+        "endstop_home oid=2 clock=@1000 sample_ticks=10 sample_count=4 rest_ticks=100 pin_value=1 trsync_oid=3 trigger_reason=1",
+        "reset_step_clock oid=1 clock=@0",
+        "queue_step oid=1 interval=1000 count=1000 add=0",
+    ]);
+    rig.send_all(&["spi_transfer oid=0 data=00"; 5]);
+    assert_eq!(rig.now(), 1_000_000);
+    let edges = rig.edges(1);
+    assert_eq!(edges.len(), 650, "the endstop stops them in the middle of a transfer");
+    assert!(edges.iter().zip(1..).all(|((at, _), n)| *at == 1000 * n));
+    assert_eq!(rig.responses().iter().filter(|response| response.starts_with("spi_transfer_response")).count(), 5);
+}
+
+#[test]
+fn a_reading_that_a_timer_began_holds_nothing() {
+    let mut rig = Rig::with_workers(100_000, &["config_analog_in oid=0 pin=400"]);
+    rig.send("query_analog_in oid=0 clock=@1000 sample_ticks=0 sample_count=1 rest_ticks=300000 bytes_per_report=1 min_value=0 max_value=65535 range_check_count=1");
+    rig.run_until(50_000);
+    assert!(!rig.mcu.is_held());
+    assert_eq!(rig.ask("get_clock"), "clock clock=@50000");
+}
+
+#[test]
+fn a_stopped_machine_is_held_by_nothing() {
+    let mut rig = Rig::with_workers(200_000, DISPLAY);
+    rig.begin("spi_transfer oid=0 data=01");
+    rig.mcu.shut_down(pinion_firmware::shutdown::Shutdown::because(
+        pinion_firmware::shutdown::reason::FORCE_SHUTDOWN,
+        "a test",
+    ));
+    assert!(!rig.mcu.is_held());
+    assert_eq!(rig.ask("get_clock"), "clock clock=@0");
+    rig.run_until(1_000_000);
+    assert!(!rig.mcu.is_held());
+}
+
+#[test]
+fn a_bus_that_hangs_stops_the_machine_when_the_host_has_given_up() {
+    let mut rig = Rig::with_workers(4_000_000_000, DISPLAY);
+    rig.begin("spi_transfer oid=0 data=01");
+    rig.run_until(249_999_999);
+    assert_eq!(rig.shutdown(), None);
+    rig.run_until(250_000_001);
+    assert_eq!(rig.shutdown().as_deref(), Some("Bus does not answer"));
+    let notes = rig.notes();
+    assert!(notes.iter().any(|note| note.contains("SPI device oid 0 has not answered for 5 s")), "{notes:?}");
+}
+
+#[test]
+fn transfers_that_end_in_time_never_add_up_to_one_that_hangs() {
+    let mut rig = Rig::with_workers(200_000_000, DISPLAY);
+    rig.send_all(&["spi_transfer oid=0 data=01"; 4]);
+    assert_eq!(rig.responses().len(), 4);
+    assert_eq!(rig.shutdown(), None);
+}
+
+#[test]
+fn a_transfer_that_fails_stops_the_machine_once_and_the_next_configuration_works() {
+    let mut rig = Rig::with_workers(1000, DISPLAY);
+    rig.bench.state().broken.insert(SPI_CHIPS);
+    rig.send("spi_transfer oid=0 data=01");
+    assert_eq!(rig.responses(), ["shutdown clock=@1000 static_string_id=Unable to issue spi ioctl"]);
+    rig.bench.state().broken.clear();
+    rig.send("config_reset");
+    rig.configure(DISPLAY);
+    assert_eq!(rig.ask("spi_transfer oid=0 data=01"), "spi_transfer_response oid=0 response=fe");
+}

@@ -1,0 +1,145 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Lines of chips that may sleep, expanders: a worker calls them (the bench panics if the core
+//! does), and everything else goes on.
+
+use pinion_testbench::rig::Rig;
+
+const PIN: u32 = 50;
+const FAN: &str = "config_digital_out oid=0 pin=50 value=0 default_value=0 max_duration=0";
+const STEPPER: &str = "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0";
+
+/// A machine whose pins 50 and 51 are an expander's, which takes 20000 ticks (0.4 ms) for a call.
+fn rig(objects: &[&str]) -> Rig {
+    let mut rig = Rig::new();
+    rig.bench.state().sleeping.extend([PIN, PIN + 1]);
+    rig.bench.state().answer_ticks = 20_000;
+    rig.configure(objects);
+    rig
+}
+
+#[test]
+fn an_output_is_written_by_its_worker_and_steps_are_in_time() {
+    let mut rig = rig(&[FAN, STEPPER]);
+    rig.send_all(&["reset_step_clock oid=1 clock=@0", "queue_step oid=1 interval=1000 count=200 add=0"]);
+    rig.send_all(&[
+        "queue_digital_out oid=0 clock=@10000 on_ticks=1",
+        "queue_digital_out oid=0 clock=@90000 on_ticks=0",
+    ]);
+    rig.run_until(200_000);
+    assert_eq!(rig.edges(PIN), [(30_000, 1), (110_000, 0)]);
+    assert!(rig.edges(1).iter().zip(1..).all(|((at, _), n)| *at == 1000 * n));
+}
+
+#[test]
+fn a_command_that_sets_it_is_over_when_it_is_set() {
+    let mut rig = rig(&[FAN]);
+    rig.begin("update_digital_out oid=0 value=1");
+    assert!(rig.mcu.is_held());
+    rig.run_until(20_000);
+    assert!(!rig.mcu.is_held());
+    assert_eq!(rig.edges(PIN), [(20_000, 1)]);
+}
+
+#[test]
+fn a_command_waits_for_its_own_value_where_a_write_is_under_way() {
+    let mut rig = rig(&[FAN]);
+    rig.send("queue_digital_out oid=0 clock=@1000 on_ticks=1");
+    rig.run_until(2000);
+    rig.send("update_digital_out oid=0 value=0");
+    assert_eq!(rig.now(), 41_000);
+    assert_eq!(rig.edges(PIN), [(21_000, 1), (41_000, 0)]);
+}
+
+#[test]
+fn a_shutdown_reaches_it_through_what_is_under_way() {
+    let mut rig = rig(&[FAN, "config_digital_out oid=2 pin=51 value=1 default_value=0 max_duration=0"]);
+    rig.send("queue_digital_out oid=0 clock=@1000 on_ticks=1");
+    rig.run_until(2000);
+    rig.send("emergency_stop");
+    assert!(rig.mcu.owes());
+    rig.run_until(100_000);
+    assert_eq!(rig.edges(PIN), [(21_000, 1), (61_000, 0)]);
+    assert_eq!(rig.edges(PIN + 1), [(41_000, 0)]);
+    assert!(!rig.mcu.owes());
+}
+
+#[test]
+fn a_step_pin_is_refused_with_the_reason() {
+    for (step, dir) in [(50, 1), (1, 50)] {
+        let mut rig = Rig::new();
+        rig.bench.state().sleeping.insert(PIN);
+        rig.send("allocate_oids count=1");
+        rig.send(&format!("config_stepper oid=0 step_pin={step} dir_pin={dir} invert_step=0 step_pulse_ticks=100"));
+        assert_eq!(rig.shutdown().as_deref(), Some("Unable to open out GPIO chip line"));
+        let notes = rig.notes();
+        let named = |note: &String| ["gpio50", "behind a bus", "choose"].iter().all(|word| note.contains(word));
+        assert!(notes.iter().any(named), "{notes:?}");
+    }
+}
+
+const HOMING: &[&str] = &["config_endstop oid=2 pin=51 pull_up=0", "config_trsync oid=3"];
+
+fn home(rig: &mut Rig, at: u64) {
+    rig.send("trsync_start oid=3 report_clock=@0 report_ticks=0 expire_reason=4");
+    rig.send(&format!(
+        "endstop_home oid=2 clock=@{at} sample_ticks=100 sample_count=2 rest_ticks=50000 pin_value=1 trsync_oid=3 trigger_reason=1"
+    ));
+}
+
+#[test]
+fn an_endstop_is_sampled_by_the_worker() {
+    let mut rig = rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(115_000, 1)]);
+    home(&mut rig, 10_000);
+    rig.run_until(1_000_000);
+    // Looks begin at 10000, 60000 and 110000; that one ends at 130000, past the change, and the
+    // one that confirms it at 150000.
+    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@150050"]);
+}
+
+#[test]
+fn a_look_that_began_before_a_sample_is_due_is_not_taken_for_it() {
+    let mut rig = rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(0, 1), (25_000, 0)]);
+    home(&mut rig, 1000);
+    rig.run_until(5000);
+    // Homing begins anew amid the look.
+    home(&mut rig, 10_000);
+    rig.run_until(1_000_000);
+    assert_eq!(rig.responses(), [""; 0], "the switch was open at 41000, when the second look ended");
+}
+
+#[test]
+fn a_query_is_answered_with_a_fresh_look_before_the_next_command() {
+    let mut rig = rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(10_000, 1)]);
+    assert_eq!(rig.ask("endstop_query_state oid=2"), "endstop_state oid=2 homing=0 next_clock=@-10000000 pin_value=1");
+    assert_eq!(rig.now(), 20_000);
+    // Amid a sample of a homing, too.
+    rig.bench.script_input(PIN + 1, &[(20_000, 0)]);
+    home(&mut rig, 30_000);
+    rig.run_until(31_000);
+    rig.begin("endstop_query_state oid=2");
+    assert!(rig.mcu.is_held());
+    rig.run_until(60_000);
+    assert!(!rig.mcu.is_held());
+    assert_eq!(rig.responses(), ["endstop_state oid=2 homing=1 next_clock=@-10000000 pin_value=0"]);
+}
+
+#[test]
+fn a_chip_that_fails_stops_the_machine_and_is_tried_until_it_answers() {
+    let mut rig = rig(&[FAN]);
+    rig.send("update_digital_out oid=0 value=1");
+    rig.bench.state().broken.insert(PIN);
+    rig.send("update_digital_out oid=0 value=0");
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"));
+    rig.run_until(40_000_000);
+    assert_eq!(rig.mcu.debtor(), Some("digital output oid 0 (gpio50)"));
+    rig.bench.state().broken.clear();
+    rig.run_until(50_000_000);
+    assert_eq!(rig.mcu.debtor(), None);
+    assert!(!rig.bench.level(PIN));
+    let notes = rig.notes();
+    assert_eq!(notes.iter().filter(|note| note.starts_with("trouble: GPIO line write failed")).count(), 1, "{notes:?}");
+    assert_eq!(notes.last().unwrap(), "safe: digital output oid 0 (gpio50)");
+}

@@ -1,0 +1,259 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The UART of stepper drivers, on one wire and on two, with a driver played by the test.
+
+use pinion_firmware::board::{Bias, Direction};
+use proptest::prelude::*;
+
+use pinion_testbench::board::Edge;
+use pinion_testbench::rig::{Rig, hex};
+
+const TX: u32 = 10;
+const RX: u32 = 11;
+/// 40 kbaud.
+const BIT: u64 = 1250;
+/// From the command to the first edge.
+const QUIET: u64 = 10_000;
+
+const ONE_WIRE: &str = "config_tmcuart oid=0 rx_pin=10 pull_up=1 tx_pin=10 bit_time=1250";
+const TWO_WIRES: &str = "config_tmcuart oid=0 rx_pin=11 pull_up=0 tx_pin=10 bit_time=1250";
+
+/// Bytes with a start bit (0) and a stop bit (1) each, lowest bit first, as `_add_serial_bits` of
+/// klippy's tmc_uart.py has them.
+fn with_serial_bits(message: &[u8]) -> Vec<u8> {
+    let mut bits = Vec::new();
+    for byte in message {
+        bits.push(false);
+        bits.extend((0..8).map(|n| byte >> n & 1 != 0));
+        bits.push(true);
+    }
+    bits.chunks(8).map(|bits| bits.iter().rev().fold(0, |byte, bit| byte << 1 | u8::from(*bit))).collect()
+}
+
+/// What a UART hears, by a receiver of its own: it waits for a falling edge and looks at each bit's
+/// middle.
+fn hear(edges: &[Edge], bit: u64) -> Vec<u8> {
+    let level = |at: u64| edges.iter().rev().find(|(from, _)| *from <= at).is_none_or(|(_, level)| *level != 0);
+    let mut heard = Vec::new();
+    let mut from = 0;
+    while let Some((start, _)) = edges.iter().find(|(at, level)| *at >= from && *level == 0) {
+        let middle = |n: u64| start + n * bit + bit / 2;
+        assert!(level(middle(9)), "no stop bit after {heard:?}");
+        heard.push((1..9).rev().fold(0, |byte, n| byte << 1 | u8::from(level(middle(n)))));
+        from = middle(9);
+    }
+    heard
+}
+
+/// The levels of a driver that says this from an instant on, with bits of its own length.
+fn speak(message: &[u8], from: u64, bit: f64) -> Vec<Edge> {
+    let mut levels = vec![(0, 1)];
+    for (byte, n) in message.iter().zip(0u32..) {
+        let at = |bits: u32| from + (f64::from(10 * n + bits) * bit) as u64;
+        levels.push((at(0), 0));
+        levels.extend((0..8).map(|place| (at(1 + place), byte >> place & 1)));
+        levels.push((at(9), 1));
+    }
+    levels
+}
+
+fn send(message: &[u8], read: u8) -> String {
+    format!("tmcuart_send oid=0 write={} read={read}", hex(&with_serial_bits(message)))
+}
+
+fn response(bytes: &[u8]) -> String {
+    format!("tmcuart_response oid=0 read={}", hex(bytes))
+}
+
+const READ_IFCNT: &[u8] = &[0xf5, 0x00, 0x02, 0xc8];
+const IFCNT: &[u8] = &[0x05, 0xff, 0x02, 0x00, 0x00, 0x00, 0x07, 0xe2];
+
+proptest! {
+    /// A message of several drivers' rates: it arrives, and is answered when its last stop bit is over.
+    #[test]
+    fn any_bytes_arrive(message in proptest::collection::vec(any::<u8>(), 1..=8), one_wire: bool, bit in 100u64..6000) {
+        let rx = if one_wire { TX } else { RX };
+        let mut rig = Rig::configured(&[&format!("config_tmcuart oid=0 rx_pin={rx} pull_up=0 tx_pin={TX} bit_time={bit}")]);
+        rig.bench.forget_edges();
+        rig.send(&send(&message, 0));
+        // The answer comes once the padding of the last byte is out, too.
+        let bits = with_serial_bits(&message).len() as u64 * 8;
+        rig.run_until(QUIET + bits * bit - 1);
+        prop_assert_eq!(rig.responses(), [""; 0]);
+        rig.run_until(QUIET + bits * bit);
+        prop_assert_eq!(rig.responses(), [response(&[])]);
+        let edges = rig.edges(TX);
+        prop_assert_eq!(edges[0], (QUIET, 0));
+        prop_assert!(edges.iter().all(|(at, _)| (at - QUIET).is_multiple_of(bit)), "{:?}", edges);
+        // Bits of padding in the last byte are low, and a UART takes them for another byte.
+        let heard = hear(&edges, bit);
+        prop_assert_eq!(&heard[..message.len()], &message[..]);
+        prop_assert!(rig.bench.level(TX));
+    }
+
+    /// A reply is read wherever its start bit lies, and from a driver whose clock is off by 4 %.
+    #[test]
+    fn a_reply_arrives(
+        message: [u8; 8], wait in 0u64..60 * BIT, off in 0.96..1.04f64, one_wire: bool,
+    ) {
+        let (config, rx) = if one_wire { (ONE_WIRE, TX) } else { (TWO_WIRES, RX) };
+        let mut rig = Rig::configured(&[config]);
+        // Four bits of silence, in which the firmware does not listen.
+        let from = QUIET + 44 * BIT + wait + 200;
+        rig.bench.script_input(rx, &speak(&message, from, BIT as f64 * off));
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(10_000_000);
+        prop_assert_eq!(rig.responses(), [response(&with_serial_bits(&message))]);
+        prop_assert_eq!(hear(&rig.edges(TX), BIT), READ_IFCNT);
+    }
+}
+
+#[test]
+fn serial_bits_are_klippys() {
+    // What klippy's _encode_read(0xf5, 0, 2) sends.
+    assert_eq!(with_serial_bits(READ_IFCNT), [0xea, 0x03, 0x48, 0x20, 0xe4]);
+}
+
+#[test]
+fn a_single_wire_is_driven_but_while_it_listens() {
+    let mut rig = Rig::configured(&[ONE_WIRE]);
+    let direction = |rig: &Rig| rig.bench.state().directions[&TX];
+    let idle = Direction::Output { level: true, shutdown_level: true };
+    assert_eq!(direction(&rig), idle);
+    rig.bench.state().turns.clear();
+    rig.bench.script_input(TX, &speak(IFCNT, 100_000, 1250.0));
+    rig.send(&send(READ_IFCNT, 10));
+    rig.run_until(1_000_000);
+    assert_eq!(direction(&rig), idle);
+    assert_eq!(rig.bench.state().turns, [(TX, Direction::Input(Bias::PullUp)), (TX, idle)]);
+    assert_eq!(rig.responses(), [response(&with_serial_bits(IFCNT))]);
+}
+
+#[test]
+fn without_a_reply_the_answer_is_empty() {
+    for (level, what) in [(1, "nobody speaks"), (0, "the wire has no supply")] {
+        let mut rig = Rig::configured(&[TWO_WIRES]);
+        rig.bench.script_input(RX, &[(0, level)]);
+        rig.send(&send(READ_IFCNT, 10));
+        let end = QUIET + (40 + 4 + 65) * BIT;
+        rig.run_until(end - 1);
+        assert_eq!(rig.responses(), [""; 0], "{what}");
+        rig.run_until(end + BIT);
+        assert_eq!(rig.responses(), [response(&[])], "{what}");
+        // And it is asked again.
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(1_000_000);
+        assert_eq!(rig.responses(), [response(&[])], "{what}");
+    }
+}
+
+/// Where a write takes its time, the driver takes a bit to be longer; where each takes the same, it is
+/// not.
+#[test]
+fn a_message_arrives_over_slow_lines() {
+    for write_ticks in [50, 600] {
+        let mut rig = Rig::configured(&[TWO_WIRES]);
+        rig.bench.state().write_ticks = write_ticks;
+        rig.send(&send(READ_IFCNT, 0));
+        rig.run_until(1_000_000);
+        assert_eq!(hear(&rig.edges(TX), BIT), READ_IFCNT);
+        assert_eq!(rig.responses(), [response(&[])]);
+    }
+}
+
+#[test]
+fn rubbish_is_passed_on_for_klippy_to_refuse() {
+    let mut rig = Rig::configured(&[TWO_WIRES]);
+    rig.bench.script_input(RX, &[(0, 1), (QUIET + 50 * BIT, 0)]);
+    rig.send(&send(READ_IFCNT, 10));
+    rig.run_until(1_000_000);
+    assert_eq!(rig.responses(), [response(&[0; 10])]);
+}
+
+#[test]
+fn who_is_busy_does_not_listen() {
+    let mut rig = Rig::configured(&[TWO_WIRES]);
+    rig.send(&send(&[1, 2, 3], 0));
+    // Before the first edge, and amid the message.
+    rig.send(&send(&[4], 0));
+    rig.run_until(QUIET + 3 * BIT);
+    rig.send(&send(&[5], 0));
+    rig.run_until(1_000_000);
+    assert_eq!(rig.responses(), [response(&[])]);
+    assert_eq!(hear(&rig.edges(TX), BIT)[..3], [1, 2, 3]);
+    rig.send(&send(&[6], 0));
+    rig.run_until(2_000_000);
+    assert_eq!(hear(&rig.edges(TX), BIT)[0], 6);
+}
+
+#[test]
+fn commands_and_steps_do_not_wait_for_a_message() {
+    let mut rig =
+        Rig::configured(&[TWO_WIRES, "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=100"]);
+    rig.send_all(&["reset_step_clock oid=1 clock=@0", "queue_step oid=1 interval=1000 count=200 add=0"]);
+    rig.send(&send(READ_IFCNT, 10));
+    rig.run_until(QUIET + 5 * BIT);
+    rig.begin("get_clock");
+    assert!(!rig.mcu.is_held());
+    assert_eq!(rig.responses().len(), 1);
+    rig.run_until(300_000);
+    assert_eq!(rig.responses(), [response(&[])]);
+    assert!(rig.edges(1).iter().step_by(2).zip(1..=200).all(|((at, _), n)| *at == 1000 * n));
+}
+
+#[test]
+fn a_message_too_long_stops_the_machine() {
+    for command in ["tmcuart_send oid=0 write=0102030405060708090a0b read=0", "tmcuart_send oid=0 write=00 read=11"] {
+        let mut rig = Rig::configured(&[TWO_WIRES]);
+        rig.send(command);
+        assert_eq!(rig.shutdown().as_deref(), Some("tmcuart data too large"));
+    }
+}
+
+#[test]
+fn a_shutdown_leaves_the_line_high_and_says_nothing_more() {
+    for at in [5_000, QUIET + 3 * BIT, QUIET + 60 * BIT] {
+        let mut rig = Rig::configured(&[ONE_WIRE]);
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(at);
+        rig.send("emergency_stop");
+        assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
+        rig.run_until(1_000_000);
+        assert_eq!(rig.responses(), [""; 0]);
+        assert!(rig.bench.level(TX) && !rig.mcu.owes());
+        assert!(matches!(rig.bench.state().directions[&TX], Direction::Output { level: true, .. }));
+        // And it is there for the next configuration.
+        rig.send("config_reset");
+        rig.configure(&[TWO_WIRES]);
+        rig.edges(TX);
+        rig.send(&send(&[0x55], 0));
+        rig.run_until(2_000_000);
+        assert_eq!(rig.responses(), [response(&[])]);
+        assert_eq!(hear(&rig.edges(TX), BIT)[0], 0x55);
+    }
+}
+
+#[test]
+fn a_line_that_is_gone_stops_the_machine() {
+    for (pin, reason) in [(TX, "GPIO line write failed"), (RX, "GPIO line read failed")] {
+        let mut rig = Rig::configured(&[TWO_WIRES]);
+        rig.bench.state().broken.insert(pin);
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(1_000_000);
+        assert_eq!(rig.shutdown().as_deref(), Some(reason));
+        rig.bench.state().broken.clear();
+        rig.run_until(10_000_000);
+        assert!(!rig.mcu.owes() && rig.bench.level(TX));
+    }
+}
+
+#[test]
+fn a_line_of_an_expander_is_refused() {
+    for (config, sleeping) in [(ONE_WIRE, TX), (TWO_WIRES, TX), (TWO_WIRES, RX)] {
+        let mut rig = Rig::new();
+        rig.bench.state().sleeping.insert(sleeping);
+        rig.send_all(&["allocate_oids count=1", config]);
+        let text = rig.shutdown().unwrap();
+        assert!(text.starts_with("Unable to open"), "{text}");
+        assert!(rig.notes().iter().any(|note| note.contains("can not be a UART pin")));
+    }
+}

@@ -1,0 +1,70 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The kernel's clock.
+
+#![forbid(unsafe_code)]
+
+use std::time::Duration;
+
+use nix::time::{ClockId, clock_gettime};
+
+use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, TimeSource};
+
+/// CLOCK_MONOTONIC in ticks. Tick 0 is a whole second of it, so that the lateness of an edge
+/// can be measured from outside.
+#[derive(Clone, Copy, Debug)]
+pub struct Monotonic {
+    origin_s: u64,
+}
+
+impl Monotonic {
+    /// A clock whose tick 0 is the whole second before this call.
+    ///
+    /// (Klipper's own program takes the next second, which starts it with a clock near 2^32;
+    /// its host accepts both.)
+    pub fn start() -> Monotonic {
+        Monotonic { origin_s: monotonic().as_secs() }
+    }
+
+    /// The instant of CLOCK_MONOTONIC, as the time since the kernel's start.
+    pub fn duration_of(&self, clock: Clock) -> Duration {
+        Duration::from_secs(self.origin_s) + Duration::from_nanos(clock.ticks() * NS_PER_TICK)
+    }
+}
+
+impl TimeSource for Monotonic {
+    fn now(&self) -> Clock {
+        self.instant_of(monotonic())
+    }
+
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        let s = monotonic.as_secs().saturating_sub(self.origin_s);
+        Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
+    }
+}
+
+/// CLOCK_MONOTONIC as the time since the kernel's start.
+pub fn monotonic() -> Duration {
+    // clock_gettime(2) fails for an unknown clock or a bad pointer only.
+    clock_gettime(ClockId::CLOCK_MONOTONIC).map_or(Duration::ZERO, Duration::from)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn tick_zero_is_a_whole_second() {
+        let clock = Monotonic::start();
+        assert_eq!(clock.duration_of(Clock::EPOCH).subsec_nanos(), 0);
+        assert!(clock.now().ticks() < 2 * u64::from(CLOCK_FREQ));
+    }
+
+    #[test]
+    fn an_instant_of_the_kernel_s_clock_is_one_of_ours() {
+        let clock = Monotonic::start();
+        for ticks in [0, 1, 49_999_999, 50_000_000, 1 << 40] {
+            let instant = Clock::from_ticks(ticks);
+            assert_eq!(clock.instant_of(clock.duration_of(instant)), instant);
+        }
+    }
+}

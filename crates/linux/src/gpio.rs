@@ -1,0 +1,265 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! GPIO lines through the kernel's character device.
+//!
+//! Whether a chip has really switched a pull resistor on can not be seen: if its driver answers
+//! `ENOTSUPP`, the kernel takes that for success, and what the kernel tells of a line is what was
+//! asked for. So a resistor is refused where the kernel refuses it, and on the chips in
+//! [`WITHOUT_BIAS`], which are known to have none. On any other chip we have to trust the driver.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::os::fd::AsRawFd;
+use std::path::Path;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use gpio_cdev::{LineHandle, LineRequestFlags};
+
+use super::GPIO;
+use super::guard::SharedGuard;
+use crate::sys;
+use pinion_firmware::board::{Bias, Direction, Line};
+use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
+
+mod chip;
+mod edges;
+mod refusal;
+
+pub use chip::{Chip, LineInfo};
+use chip::{look_at, node};
+pub(super) use chip::{may_sleep, number_behind, scan};
+pub(super) use refusal::not_permitted;
+use refusal::{Subject, cannot_open, errno, missing};
+
+/// The name that the kernel shows as the consumer of our lines.
+const CONSUMER: &str = "pinion";
+/// GPIOHANDLE_REQUEST_BIAS_PULL_UP and _DOWN (Linux 5.5), which gpio-cdev does not name.
+const PULL_UP: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 5);
+const PULL_DOWN: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 6);
+/// How the labels of chips without certain resistors begin, and which resistors these chips lack.
+const WITHOUT_BIAS: [(&str, &[Bias]); 4] = [
+    ("raspberrypi-exp-gpio", &[Bias::PullUp, Bias::PullDown]),
+    ("brcmvirt-gpio", &[Bias::PullUp, Bias::PullDown]),
+    ("pcf857", &[Bias::PullUp, Bias::PullDown]),
+    ("mcp23", &[Bias::PullDown]),
+];
+
+/// A line of an open chip, not yet requested.
+pub(super) struct Handle {
+    line: gpio_cdev::Line,
+    subject: Subject,
+}
+
+/// Opens `/dev/gpiochip<number>` and picks a line.
+///
+/// # Errors
+///
+/// "GPIO chip device not found", "Unable to open GPIO chip device"; `refused` if the chip has no
+/// such line.
+pub(super) fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Result<Handle, Shutdown> {
+    let path = node(dev, number);
+    let mut chip = gpio_cdev::Chip::new(&path).map_err(|error| match errno(&error) {
+        libc::ENOENT => Shutdown::because(reason::CHIP_MISSING, missing(&path, &scan(dev, Path::new(GPIO)).0)),
+        code => Shutdown::because(reason::CHIP_OPEN, cannot_open(&path, code)),
+    })?;
+    let subject = Subject { chip: chip.name().to_owned(), label: chip.label().to_owned(), offset, name: None };
+    let lines = chip.num_lines();
+    let line = chip.get_line(offset).map_err(|_| Shutdown::because(refused, subject.beyond(lines)))?;
+    let name = look_at(&line).name;
+    Ok(Handle { line, subject: Subject { name, ..subject } })
+}
+
+impl Handle {
+    /// The kernel's name for the chip, such as `gpiochip0`, even if a link to it was opened.
+    pub(super) fn chip(&self) -> &str {
+        &self.subject.chip
+    }
+
+    /// The chip's label, such as `pinctrl-bcm2835`.
+    pub(super) fn label(&self) -> &str {
+        &self.subject.label
+    }
+
+    /// Requests the line from the kernel; an output is given to the guardian. `sleeping` is the name
+    /// of the line's chip if calls to that may block.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open out GPIO chip line", "Unable to open in GPIO chip line", "Guardian process
+    /// lost".
+    pub(super) fn request(
+        self,
+        direction: Direction,
+        guard: SharedGuard,
+        sleeping: Option<String>,
+    ) -> Result<HeldLine, Shutdown> {
+        let LineSetup { flags, level, refused } = self.subject.setting(direction)?;
+        let bits = flags.bits();
+        let handle = self
+            .line
+            .request(flags, level.into(), CONSUMER)
+            .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
+        let flags = AtomicU32::new(bits);
+        let line = HeldLine { handle, line: self.line, subject: self.subject, flags, guard, sleeping };
+        line.watch_over(direction, 0)?;
+        Ok(line)
+    }
+}
+
+/// What the kernel is asked for.
+struct LineSetup {
+    flags: LineRequestFlags,
+    level: bool,
+    /// The reason to stop with if the kernel refuses.
+    refused: ShutdownReason,
+}
+
+/// A line that we have requested.
+pub(super) struct HeldLine {
+    handle: LineHandle,
+    line: gpio_cdev::Line,
+    subject: Subject,
+    /// What its last set-up made it (`GPIOHANDLE_REQUEST_` flags).
+    flags: AtomicU32,
+    guard: SharedGuard,
+    /// The name of its chip, if calls to that may block.
+    sleeping: Option<String>,
+}
+
+impl HeldLine {
+    /// The error for a call to the chip that failed with the error number `code`.
+    #[cold]
+    #[inline(never)]
+    fn lost(&self, reason: ShutdownReason, what: &str, code: i32) -> Shutdown {
+        Shutdown::because(reason, self.subject.lost(what, code, self.sleeping.is_some()))
+    }
+
+    /// Has the guardian hold the line if it is an output now, and let go of it if it no longer is.
+    /// `before` are the flags of the set-up before this one.
+    fn watch_over(&self, direction: Direction, before: u32) -> Result<(), Shutdown> {
+        let name = format!("{} line {}", self.subject.chip, self.subject.offset);
+        let before = LineRequestFlags::from_bits_retain(before);
+        let was_watched = before.contains(LineRequestFlags::OUTPUT) && !before.contains(LineRequestFlags::OPEN_DRAIN);
+        match direction {
+            Direction::Output { shutdown_level, .. } => {
+                self.guard.output(&name, self.handle.as_raw_fd(), shutdown_level, self.sleeping.as_deref())?;
+            }
+            Direction::Input(_) | Direction::OpenDrain if was_watched => self.guard.forget(&name)?,
+            Direction::Input(_) | Direction::OpenDrain => {}
+        }
+        Ok(())
+    }
+}
+
+impl Line for HeldLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        let flags = self.flags.load(Ordering::Relaxed);
+        if flags & LineRequestFlags::OUTPUT.bits() == 0 {
+            return Ok(());
+        }
+        match &self.sleeping {
+            None => self
+                .handle
+                .set_value(level.into())
+                .map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error))),
+            Some(_) => sys::set_line_checked(&self.handle, flags, level)
+                .map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default())),
+        }
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        match self.handle.get_value() {
+            Ok(value) => Ok(value != 0),
+            Err(error) => Err(self.lost(reason::LINE_READ, "read", errno(&error))),
+        }
+    }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let before = self.flags.load(Ordering::Relaxed);
+        self.turn(direction)?;
+        self.watch_over(direction, before)
+    }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        let LineSetup { flags, level, refused } = self.subject.setting(direction)?;
+        sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
+            self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
+        })?;
+        self.flags.store(flags.bits(), Ordering::Relaxed);
+        Ok(())
+    }
+}
+
+impl Subject {
+    fn setting(&self, direction: Direction) -> Result<LineSetup, Shutdown> {
+        match direction {
+            Direction::Output { level, .. } => {
+                Ok(LineSetup { flags: LineRequestFlags::OUTPUT, level, refused: reason::OUTPUT_LINE })
+            }
+            // The kernel never drives it high: where the chip has no open drain, it makes the line an
+            // input instead.
+            Direction::OpenDrain => {
+                let pull = if lacks(&self.label, Bias::PullUp) { LineRequestFlags::empty() } else { PULL_UP };
+                let flags = LineRequestFlags::OUTPUT | LineRequestFlags::OPEN_DRAIN | pull;
+                Ok(LineSetup { flags, level: true, refused: reason::OUTPUT_LINE })
+            }
+            Direction::Input(bias) if lacks(&self.label, bias) => {
+                Err(Shutdown::because(reason::INPUT_LINE, self.no_bias(bias)))
+            }
+            Direction::Input(bias) => {
+                let pull = match bias {
+                    Bias::None => LineRequestFlags::empty(),
+                    Bias::PullUp => PULL_UP,
+                    Bias::PullDown => PULL_DOWN,
+                };
+                Ok(LineSetup { flags: LineRequestFlags::INPUT | pull, level: false, refused: reason::INPUT_LINE })
+            }
+        }
+    }
+
+    /// The error for a line that the kernel has refused with the error number `code`.
+    fn refused(&self, reason: ShutdownReason, code: i32, direction: Direction, line: &gpio_cdev::Line) -> Shutdown {
+        let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
+        let (action, bias) = match direction {
+            Direction::Output { .. } => ("an output", Bias::None),
+            Direction::Input(bias) => ("an input", bias),
+            Direction::OpenDrain => ("an open drain", Bias::PullUp),
+        };
+        Shutdown::because(reason, self.refusal(action, code, bias, &look_at(line), &release))
+    }
+}
+
+/// Whether the chip with this label is known not to have this resistor.
+fn lacks(label: &str, bias: Bias) -> bool {
+    WITHOUT_BIAS.iter().any(|(chip, lacking)| label.starts_with(chip) && lacking.contains(&bias))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::chip::nodes;
+    use super::*;
+
+    #[test]
+    fn chips_known_to_ignore_a_resistor() {
+        assert!(lacks("raspberrypi-exp-gpio", Bias::PullUp));
+        assert!(lacks("mcp23017", Bias::PullDown));
+        assert!(!lacks("mcp23017", Bias::PullUp));
+        assert!(!lacks("raspberrypi-exp-gpio", Bias::None));
+        assert!(!lacks("pinctrl-bcm2835", Bias::PullDown));
+    }
+
+    #[test]
+    fn a_missing_chip_is_told_from_one_that_is_none() {
+        let dev = tempfile::tempdir().unwrap();
+        let open = |chip| open(dev.path(), chip, 0, reason::NOT_OUTPUT).err().unwrap();
+        assert_eq!(open(3).reason, reason::CHIP_MISSING);
+        fs::write(dev.path().join("gpiochip3"), "").unwrap();
+        let none = open(3);
+        assert_eq!(none.reason, reason::CHIP_OPEN);
+        assert!(none.to_string().contains("is not a GPIO chip"), "{none}");
+        assert_eq!(nodes(dev.path()), [3]);
+        let (chips, problems) = scan(dev.path(), dev.path());
+        assert!(chips.is_empty());
+        assert_eq!(problems.len(), 1);
+    }
+}

@@ -1,0 +1,91 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The board's way to the guardian process, which is given every output.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::os::fd::RawFd;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use pinion_firmware::shutdown::{Shutdown, reason};
+
+/// Holds copies of the outputs' descriptors, to drive the outputs to their shutdown values if the
+/// program dies.
+///
+/// An output is known by its name, such as `gpiochip0 line 5` or `pwmchip0/pwm1`, which the log uses,
+/// too. An output that is given again under its name replaces the earlier one.
+///
+/// Each call fails if the guardian refuses or does not answer.
+pub trait Guard: Send {
+    /// Copies an output line's descriptor (a GPIO line handle of the character device).
+    /// `sleeping` is the name of the line's chip if calls to that may block. The lines of such a
+    /// chip are driven by a thread of their own, so that no other output waits for it.
+    fn output(&mut self, name: &str, line: RawFd, shutdown_value: bool, sleeping: Option<&str>) -> io::Result<()>;
+
+    /// Copies the descriptors of the files that set one output, such as a PWM's `duty_cycle` and
+    /// `enable`. `shutdown` has what is to be written at the beginning of each, in this order.
+    fn files(&mut self, name: &str, shutdown: &[(RawFd, &[u8])]) -> io::Result<()>;
+
+    /// Drops the copies of a line or channel that is no output any more.
+    fn forget(&mut self, name: &str) -> io::Result<()>;
+
+    /// Drops all copies. When this returns, the lines can be requested again.
+    fn release(&mut self) -> io::Result<()>;
+}
+
+/// The guard, if there is one, as the board and its workers share it. A call waits for the
+/// guardian's answer. So the core calls it only until the machine is configured, and workers later.
+#[derive(Clone)]
+pub(super) struct SharedGuard(Option<Arc<Mutex<Box<dyn Guard>>>>);
+
+impl SharedGuard {
+    pub(super) fn new(guard: Option<Box<dyn Guard>>) -> SharedGuard {
+        SharedGuard(guard.map(|guard| Arc::new(Mutex::new(guard))))
+    }
+
+    fn lock(&self) -> Option<MutexGuard<'_, Box<dyn Guard>>> {
+        self.0.as_ref().map(|guard| guard.lock().unwrap_or_else(PoisonError::into_inner))
+    }
+
+    /// See [`Guard::output`].
+    pub(super) fn output(
+        &self,
+        name: &str,
+        line: RawFd,
+        shutdown_value: bool,
+        sleeping: Option<&str>,
+    ) -> Result<(), Shutdown> {
+        match self.lock() {
+            Some(mut guard) => {
+                guard.output(name, line, shutdown_value, sleeping).map_err(|error| not_taken(name, &error))
+            }
+            None => Ok(()),
+        }
+    }
+
+    /// See [`Guard::files`].
+    pub(super) fn files(&self, name: &str, shutdown: &[(RawFd, &[u8])]) -> Result<(), Shutdown> {
+        match self.lock() {
+            Some(mut guard) => guard.files(name, shutdown).map_err(|error| not_taken(name, &error)),
+            None => Ok(()),
+        }
+    }
+
+    /// See [`Guard::forget`].
+    pub(super) fn forget(&self, name: &str) -> Result<(), Shutdown> {
+        match self.lock() {
+            Some(mut guard) => guard.forget(name).map_err(|error| not_taken(name, &error)),
+            None => Ok(()),
+        }
+    }
+
+    /// See [`Guard::release`].
+    pub(super) fn release(&self) -> io::Result<()> {
+        self.lock().map_or(Ok(()), |mut guard| guard.release())
+    }
+}
+
+fn not_taken(name: &str, error: &io::Error) -> Shutdown {
+    let detail = format!("the guardian does not take {name}: {error}: restart Pinion");
+    Shutdown::because(reason::GUARDIAN_LOST, detail)
+}

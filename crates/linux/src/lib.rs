@@ -1,0 +1,441 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The pins and buses of this computer.
+
+#![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
+#![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
+
+use std::collections::{BTreeSet, HashMap};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::AtomicU8;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use industrial_io::Context;
+
+pub use guard::Guard;
+use guard::SharedGuard;
+use pinion_firmware::board::{
+    Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
+    PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
+};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pins::{Names, Target};
+
+pub mod adc;
+pub mod clock;
+pub mod gpio;
+mod guard;
+pub mod i2c;
+pub mod pins;
+mod pwm;
+pub mod spi;
+#[allow(unsafe_code)]
+pub mod sys;
+pub mod sysfs;
+mod w1;
+
+const DEV: &str = "/dev";
+const GPIO: &str = "/sys/bus/gpio/devices";
+const PWM: &str = "/sys/class/pwm";
+const W1: &str = "/sys/bus/w1/devices";
+/// The worker that reads the edges of all lines.
+const EDGE_WORKER: &str = "edges";
+const IIO: &str = "/sys/bus/iio/devices";
+
+/// What this machine has.
+#[derive(Debug, Default)]
+pub struct Inventory {
+    /// GPIO chips.
+    pub chips: Vec<gpio::Chip>,
+    /// ADCs.
+    pub adcs: Vec<adc::IioDevice>,
+    /// SPI device nodes.
+    pub spi: Vec<spi::Node>,
+    /// Numbers of I2C buses.
+    pub i2c: Vec<u32>,
+    /// For the log: each thing that is there and can not be used, with its cause and remedy.
+    pub problems: Vec<String>,
+    /// libiio's view of this machine; none without IIO devices.
+    pub context: Option<Context>,
+}
+
+impl Inventory {
+    /// Looks for chips, ADCs and buses. A machine that has none of them is no error.
+    pub fn scan() -> Inventory {
+        let dev = Path::new(DEV);
+        let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
+        let mut inventory =
+            Inventory { chips, spi: spi::scan(dev), i2c: i2c::scan(dev), problems, ..Inventory::default() };
+        match adc::context(Path::new(IIO)) {
+            Ok(context) => {
+                inventory.adcs = context.as_ref().map(adc::scan).unwrap_or_default();
+                inventory.context = context;
+            }
+            Err(problem) => inventory.problems.push(problem),
+        }
+        inventory
+    }
+
+    /// Opens the channel that the driver of `iio:device<device>` calls `id`, if it is there.
+    pub fn adc(&self, device: u32, id: &str) -> Option<adc::ChannelReader> {
+        adc::ChannelReader::open(self.context.as_ref()?, device, id)
+    }
+
+    /// One line for people: each chip and ADC with the number of its lines or channels.
+    pub fn describe(&self) -> String {
+        let chips = self.chips.iter().map(|chip| {
+            let lines = chip.lines.len();
+            format!("gpiochip{} {} ({lines} lines)", chip.number, chip.label)
+        });
+        let adcs = self.adcs.iter().map(|adc| {
+            let channels = adc.channels.len();
+            format!("iio {} ({channels} channels)", adc.name)
+        });
+        let nodes: Vec<String> = self.spi.iter().map(spi::Node::to_string).collect();
+        let buses: Vec<String> = self.i2c.iter().map(|bus| format!("i2c.{bus}")).collect();
+        let (chips, adcs) = (chips.collect::<Vec<_>>().join(", "), adcs.collect::<Vec<_>>().join(", "));
+        let parts = [chips, adcs, nodes.join(" "), buses.join(" ")];
+        let parts: Vec<String> = parts.into_iter().filter(|part| !part.is_empty()).collect();
+        match parts.is_empty() {
+            true => "linux: no GPIO chip, ADC, SPI device or I2C bus is to be seen".to_owned(),
+            false => format!("linux: {}", parts.join("; ")),
+        }
+    }
+}
+
+/// What was found when somebody looked around last.
+#[derive(Default)]
+struct Seen {
+    inventory: Inventory,
+    names: Names,
+}
+
+impl Seen {
+    fn look() -> Seen {
+        Seen::of(Inventory::scan())
+    }
+
+    fn of(inventory: Inventory) -> Seen {
+        Seen { names: Names::of(&inventory), inventory }
+    }
+
+    /// All that a host is told of it.
+    fn told(&self) -> (String, [Vec<Range>; 3]) {
+        let Seen { inventory, names } = self;
+        (inventory.describe(), [names.ranges(), spi::ranges(&inventory.spi), i2c::ranges(&inventory.i2c)])
+    }
+}
+
+/// The board that is this computer.
+pub struct LinuxBoard {
+    /// Shared with the thread that looks again. The core asks for it while it is being configured only,
+    /// and who has it keeps it for a moment: nobody looks around meanwhile.
+    seen: Arc<Mutex<Seen>>,
+    guard: SharedGuard,
+    /// The mode that each spidev node in use is set to at present, shared by the chips behind it.
+    spi_modes: HashMap<spi::Node, Arc<AtomicU8>>,
+    /// The numbers of IIO devices that tell no resolution, and of which the log has said so.
+    assumed: BTreeSet<u32>,
+    dev: PathBuf,
+    gpio: PathBuf,
+    pwm: PathBuf,
+}
+
+impl LinuxBoard {
+    /// Looks around and publishes what is there. Every output is given to `guard`.
+    pub fn new(guard: Option<Box<dyn Guard>>) -> LinuxBoard {
+        let seen = Seen::look();
+        for problem in &seen.inventory.problems {
+            log::warn!("{problem}");
+        }
+        LinuxBoard::over(Arc::new(Mutex::new(seen)), SharedGuard::new(guard))
+    }
+
+    fn over(seen: Arc<Mutex<Seen>>, guard: SharedGuard) -> LinuxBoard {
+        LinuxBoard {
+            seen,
+            guard,
+            spi_modes: HashMap::new(),
+            assumed: BTreeSet::new(),
+            dev: DEV.into(),
+            gpio: GPIO.into(),
+            pwm: PWM.into(),
+        }
+    }
+
+    fn seen(&self) -> MutexGuard<'_, Seen> {
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The line of a pin, not yet requested from the kernel. Errors are those of outputs or inputs.
+    fn open_line(&self, pin: Pin, direction: Direction) -> Result<gpio::Handle, Shutdown> {
+        let (wanted, no_line, refused) = match direction {
+            Direction::Output { .. } | Direction::OpenDrain => ("an output", reason::NOT_OUTPUT, reason::OUTPUT_LINE),
+            Direction::Input(_) => ("an input", reason::NOT_INPUT, reason::INPUT_LINE),
+        };
+        let Target::Line { chip, offset } = Target::of(pin) else {
+            let detail = format!("{} can not be {wanted}: choose a GPIO pin (pinion pins lists them)", Target::of(pin));
+            return Err(Shutdown::because(no_line, detail));
+        };
+        gpio::open(&self.dev, chip, offset, refused)
+    }
+
+    /// The number of a pin's IIO device, and the name that its driver has for the channel.
+    fn channel(&self, pin: Pin) -> Result<(u32, String), Shutdown> {
+        match Target::of(pin) {
+            Target::Analog(n) => Ok((0, format!("voltage{n}"))),
+            Target::Channel { device, position } => {
+                let seen = self.seen();
+                let adc = seen.inventory.adcs.iter().find(|adc| adc.number == device);
+                let channel = adc.and_then(|adc| adc.channels.get(position as usize));
+                channel.map(|channel| (device, channel.id.clone())).ok_or_else(|| {
+                    let detail = adc::missing(device, &format!("channel {position}"), &seen.inventory.adcs);
+                    Shutdown::because(reason::ADC_OPEN, detail)
+                })
+            }
+            other => {
+                let detail = format!("{other} is no ADC channel: choose an analog pin (pinion pins lists them)");
+                Err(Shutdown::because(reason::ADC_OPEN, detail))
+            }
+        }
+    }
+}
+
+impl Board for LinuxBoard {
+    fn describe(&self) -> String {
+        self.seen().inventory.describe()
+    }
+
+    fn pins(&self) -> Vec<Range> {
+        self.seen().names.ranges()
+    }
+
+    fn spi_buses(&self) -> Vec<Range> {
+        spi::ranges(&self.seen().inventory.spi)
+    }
+
+    fn view(&self) -> Option<Box<dyn Board>> {
+        Some(Box::new(LinuxBoard::over(self.seen.clone(), SharedGuard::new(None))))
+    }
+
+    fn look_again(&mut self) -> bool {
+        let now = Seen::look();
+        let mut seen = self.seen();
+        if now.told() == seen.told() {
+            return false;
+        }
+        let before = std::mem::replace(&mut *seen, now);
+        for problem in seen.inventory.problems.iter().filter(|problem| !before.inventory.problems.contains(problem)) {
+            log::warn!("{problem}");
+        }
+        true
+    }
+
+    /// A chip may have several nodes in /dev: on a Raspberry Pi 5, `gpiochip4` is a link to
+    /// `gpiochip0`.
+    fn canonical(&self, pin: Pin) -> Pin {
+        let Target::Line { chip, offset } = Target::of(pin) else { return pin };
+        gpio::number_behind(&self.dev, chip).and_then(|chip| pins::line_number(chip, offset)).map_or(pin, Pin)
+    }
+
+    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
+        let handle = self.open_line(pin, direction)?;
+        let sleeps = gpio::may_sleep(&self.gpio, handle.chip(), handle.label());
+        let sleeps_on = sleeps.then(|| handle.chip().to_owned());
+        let line = handle.request(direction, self.guard.clone(), sleeps_on.clone())?;
+        Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
+    }
+
+    /// A line of a chip on a bus is polled: its driver has to ask the chip at each interrupt which line
+    /// it was, and dates and counts what it then finds.
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
+        let handle = self.open_line(pin, Direction::Input(bias))?;
+        let edges = match gpio::may_sleep(&self.gpio, handle.chip(), handle.label()) {
+            true => Err("its chip is behind a bus".into()),
+            false => handle.request_edges(&self.dev, bias),
+        };
+        match edges {
+            Ok((line, edges)) => {
+                let edges = OnWorker { bus: EDGE_WORKER.to_owned(), device: Box::new(edges) as Box<dyn Edges> };
+                Ok(CountedLine { line: ClaimedLine { line: Arc::new(line), sleeps_on: None }, edges: Ok(edges) })
+            }
+            Err(why) => Ok(CountedLine { line: self.line(pin, Direction::Input(bias))?, edges: Err(why) }),
+        }
+    }
+
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
+        let (device, id) = self.channel(pin)?;
+        let mut seen = self.seen();
+        if seen.inventory.adc(device, &id).is_none() {
+            // The device's driver may have been loaded after the host came: look again. The
+            // pin numbers stay as they were published then.
+            seen.inventory.context =
+                adc::context(Path::new(IIO)).map_err(|problem| Shutdown::because(reason::ADC_OPEN, problem))?;
+        }
+        let reader = seen.inventory.adc(device, &id).ok_or_else(|| {
+            let context = seen.inventory.context.as_ref();
+            let present = context.map(adc::scan).unwrap_or_default();
+            Shutdown::because(reason::ADC_OPEN, adc::missing(device, &id, &present))
+        })?;
+        drop(seen);
+        if reader.format().is_none() && self.assumed.insert(device) {
+            log::info!("iio:device{device} does not tell its resolution: 12 bits are assumed");
+        }
+        Ok(OnWorker { bus: format!("iio:device{device}"), device: Box::new(reader) })
+    }
+
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let node = spi::Node::of(config.bus);
+        let mode = self.spi_modes.entry(node).or_default().clone();
+        let device = spi::Spi::open(&self.dev, node, config.mode, config.rate_hz, config.chip_select, mode)?;
+        Ok(OnWorker { bus: format!("spi{}", node.bus), device: Box::new(device) })
+    }
+
+    fn i2c_buses(&self) -> Vec<Range> {
+        i2c::ranges(&self.seen().inventory.i2c)
+    }
+
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let device = i2c::I2c::open(&self.dev, config)?;
+        Ok(OnWorker { bus: format!("i2c{}", config.bus), device: Box::new(device) })
+    }
+
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
+        let Target::Pwm { chip, channel } = Target::of(config.pin) else {
+            let detail = format!("{} has no hardware PWM: choose pwmchipC/pwmN", Target::of(config.pin));
+            return Err(Shutdown::because(reason::PWM_CONFIG, detail));
+        };
+        let channel = pwm::Channel { chip, channel };
+        let device = pwm::Pwm::open(&self.pwm, channel, &config, self.guard.clone())?;
+        // A write to one channel may block in the driver of the chip, which the chip's other
+        // channels share: so they share a worker, too.
+        Ok(OnWorker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
+    }
+
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+        let Target::Mosi(node) = Target::of(pin) else {
+            return Err(not_mosi(&Target::of(pin).to_string()));
+        };
+        let bus = node.number().unwrap_or(u32::MAX);
+        let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
+        Ok(Mosi { line, message_max: spi::message_max() })
+    }
+
+    /// Each sensor has a worker: the kernel lets others use the bus while one measures.
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        let device = w1::Ds18b20::open(Path::new(W1), serial)?;
+        Ok(OnWorker { bus: format!("w1 {}", String::from_utf8_lossy(serial)), device: Box::new(device) })
+    }
+
+    fn reset(&mut self) {
+        if let Err(error) = self.guard.release() {
+            log::error!("the guardian does not give back the lines: {error}: restart Pinion");
+        }
+        self.spi_modes.clear();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const ON: Direction = Direction::Output { level: true, shutdown_level: false };
+
+    fn board(dev: &Path) -> LinuxBoard {
+        LinuxBoard {
+            dev: dev.into(),
+            gpio: dev.join("gpio"),
+            pwm: dev.join("pwm"),
+            ..LinuxBoard::over(Arc::default(), SharedGuard::new(None))
+        }
+    }
+
+    #[test]
+    fn a_pin_of_another_kind() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let error = board.line(Pin(4097), ON).err().unwrap();
+        assert_eq!(
+            error.to_string(),
+            "Not an output pin: analog1 (an ADC channel) can not be an output: choose a GPIO pin \
+             (pinion pins lists them)"
+        );
+        let error = board.line(Pin(3000), Direction::Input(Bias::None)).err().unwrap();
+        assert_eq!(error.reason, reason::NOT_INPUT);
+        let error = board.adc(Pin(17)).err().unwrap();
+        assert_eq!(error.reason, reason::ADC_OPEN);
+        assert!(error.to_string().contains("gpiochip0 line 17 is no ADC channel"), "{error}");
+    }
+
+    #[test]
+    fn leds_need_the_data_output_of_an_spi_device() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let error = board.mosi(Pin(17), 3_200_000).err().unwrap();
+        assert_eq!(error.reason, reason::NOT_OUTPUT);
+        assert!(error.detail.starts_with("gpiochip0 line 17 can not drive LEDs"), "{error}");
+        assert!(error.detail.contains("\"pin: spidev0.0\""), "{error}");
+        let names = Names::of(&Inventory { spi: vec![spi::Node::of(256), spi::Node::of(257)], ..Inventory::default() });
+        let range = names.ranges().into_iter().find(|range| range.name == "spidev1.0").unwrap();
+        assert_eq!(range.count, 2);
+        // It is named as what it is, and it is no GPIO line.
+        let error = board.mosi(Pin(range.first + 1), 3_200_000).err().unwrap();
+        assert_eq!(error.reason, reason::SPI_OPEN);
+        assert!(error.detail.contains("spidev1.1"), "{error}");
+        let error = board.line(Pin(range.first), ON).err().unwrap();
+        assert!(error.detail.starts_with("spidev1.0 (an SPI device's data output) can not be an output"), "{error}");
+    }
+
+    #[test]
+    fn nothing_is_there() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let error = board.line(Pin(5 * 288), ON).err().unwrap();
+        assert_eq!(error.reason, reason::CHIP_MISSING);
+        assert!(error.to_string().contains("gpiochip5: this machine has no GPIO chip"), "{error}");
+        assert_eq!(board.pins().len(), 19);
+        assert_eq!(board.spi_buses().len(), 8);
+        assert_eq!(board.i2c_buses().len(), 1);
+        assert!(board.describe().starts_with("linux: no GPIO"));
+    }
+
+    #[test]
+    fn each_pwm_chip_has_a_worker_of_its_own() {
+        let dev = tempfile::tempdir().unwrap();
+        let mut board = board(dev.path());
+        let mut bus = |chip: u32, channel: u32| {
+            let folder = dev.path().join(format!("pwm/pwmchip{chip}/pwm{channel}"));
+            std::fs::create_dir_all(&folder).unwrap();
+            for name in ["period", "duty_cycle", "enable"] {
+                std::fs::write(folder.join(name), "").unwrap();
+            }
+            let names = board.pins();
+            let range = names.iter().find(|range| range.name == format!("pwmchip{chip}/pwm0")).unwrap();
+            let pin = Pin(range.first + channel);
+            let config =
+                PwmConfig { pin, cycle: pinion_firmware::time::Ticks::from_us(100), value: 0, shutdown_value: 0 };
+            board.pwm(config).unwrap().bus
+        };
+        assert_eq!((bus(0, 0), bus(0, 1), bus(1, 0)), ("pwmchip0".into(), "pwmchip0".into(), "pwmchip1".into()));
+    }
+
+    #[test]
+    fn a_description_of_what_is_there() {
+        let inventory = Inventory {
+            chips: vec![gpio::Chip {
+                number: 0,
+                label: "pinctrl-bcm2835".into(),
+                sleeps: false,
+                lines: vec![gpio::LineInfo::default(); 54],
+            }],
+            adcs: vec![adc::IioDevice { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
+            spi: vec![spi::Node::of(0), spi::Node::of(1)],
+            i2c: vec![1],
+            ..Inventory::default()
+        };
+        assert_eq!(
+            inventory.describe(),
+            "linux: gpiochip0 pinctrl-bcm2835 (54 lines); iio ads1115 (0 channels); spidev0.0 \
+             spidev0.1; i2c.1"
+        );
+    }
+}

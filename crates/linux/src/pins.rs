@@ -1,0 +1,455 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Pin numbers and pin names.
+//!
+//! | number | what | names |
+//! |---|---|---|
+//! | 0..2592 | 288 lines of each of gpiochip0 to 8, as the C program | `gpiochip0/gpio17` |
+//! | 4096..4104 | voltage0 to voltage7 of iio:device0, as the C program | `analog3` |
+//! | 65536..65664 | 16 channels of each of pwmchip0 to 7, as the C program | `pwmchip0/pwm1` |
+//! | 2^24.. | every other line: 4096 numbers for each chip | `gpiochip9/gpio0` |
+//! | 2^25.. | every other ADC channel: 256 numbers for each device | |
+//! | 2^26.. | the data outputs (MOSI) of SPI devices, which LEDs may be connected to | `spidev0.0` |
+//!
+//! `gpio17` stands for `gpiochip0/gpio17`. The machine's own names are published as well: `GPIO17`
+//! (the name that the device tree gives a line), `pinctrl-rp1/gpio17` (by the chip's label) and
+//! `mcp3208/voltage3`. A name is left out if two things share it, if it looks like one of the numeric
+//! names, or if klippy can not read it from a configuration.
+
+#![forbid(unsafe_code)]
+
+use std::collections::HashMap;
+use std::fmt;
+
+use super::Inventory;
+use super::spi::Node;
+use pinion_firmware::board::{Pin, Range};
+
+/// How many chips have pin numbers in the C program.
+const CHIPS: u32 = 9;
+/// How many numbers each of these chips has (`MAX_GPIO_LINES`).
+const CHIP_LINES: u32 = 288;
+/// The number of the first ADC channel (`ANALOG_START`).
+const ANALOG: u32 = 1 << 12;
+/// How many ADC channels the C program has.
+const ANALOG_CHANNELS: u32 = 8;
+/// The number of the first hardware PWM channel (`HARD_PWM_START`).
+const PWM: u32 = 1 << 16;
+const PWM_CHIPS: u32 = 8;
+const PWM_CHIP_CHANNELS: u32 = 16;
+/// The first number of the lines for which the C program has none.
+const FURTHER_LINES: u32 = 1 << 24;
+const FURTHER_CHIPS: u32 = 1 << 12;
+const FURTHER_CHIP_LINES: u32 = 1 << 12;
+/// The first number of the ADC channels for which the C program has none.
+const FURTHER_CHANNELS: u32 = 1 << 25;
+const FURTHER_DEVICES: u32 = 1 << 12;
+const FURTHER_DEVICE_CHANNELS: u32 = 1 << 8;
+/// Data outputs of SPI devices, by the device's number on the wire.
+const MOSI: u32 = 1 << 26;
+const MOSI_NODES: u32 = 1 << 16;
+
+/// What a pin's number stands for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Target {
+    /// A line of `/dev/gpiochip<chip>`.
+    Line {
+        /// The chip's number.
+        chip: u32,
+        /// The line's offset.
+        offset: u32,
+    },
+    /// Channel `voltage<n>` of iio:device0.
+    Analog(u32),
+    /// A channel of an IIO device, by its place among the device's channels.
+    Channel {
+        /// The number of `iio:device<n>`.
+        device: u32,
+        /// Position in [`IioDevice::channels`](super::adc::IioDevice::channels).
+        position: u32,
+    },
+    /// A hardware PWM channel.
+    Pwm {
+        /// The number of `pwmchip<n>`.
+        chip: u32,
+        /// The channel's number in the chip.
+        channel: u32,
+    },
+    /// The data output of an SPI device.
+    Mosi(Node),
+    /// No pin has this number.
+    Nothing(u32),
+}
+
+impl Target {
+    /// What `pin` stands for.
+    pub fn of(pin: Pin) -> Target {
+        let within = |base: u32, count: u32| pin.0.checked_sub(base).filter(|at| *at < count);
+        if let Some(at) = within(0, CHIPS * CHIP_LINES) {
+            Target::Line { chip: at / CHIP_LINES, offset: at % CHIP_LINES }
+        } else if let Some(at) = within(ANALOG, ANALOG_CHANNELS) {
+            Target::Analog(at)
+        } else if let Some(at) = within(PWM, PWM_CHIPS * PWM_CHIP_CHANNELS) {
+            Target::Pwm { chip: at / PWM_CHIP_CHANNELS, channel: at % PWM_CHIP_CHANNELS }
+        } else if let Some(at) = within(FURTHER_LINES, FURTHER_CHIPS * FURTHER_CHIP_LINES) {
+            Target::Line { chip: at / FURTHER_CHIP_LINES, offset: at % FURTHER_CHIP_LINES }
+        } else if let Some(at) = within(FURTHER_CHANNELS, FURTHER_DEVICES * FURTHER_DEVICE_CHANNELS) {
+            Target::Channel { device: at / FURTHER_DEVICE_CHANNELS, position: at % FURTHER_DEVICE_CHANNELS }
+        } else if let Some(at) = within(MOSI, MOSI_NODES) {
+            Target::Mosi(Node::of(at))
+        } else {
+            Target::Nothing(pin.0)
+        }
+    }
+}
+
+impl fmt::Display for Target {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Target::Line { chip, offset } => write!(f, "gpiochip{chip} line {offset}"),
+            Target::Analog(n) => write!(f, "analog{n} (an ADC channel)"),
+            Target::Channel { device, position } => {
+                write!(f, "ADC channel {position} of iio:device{device}")
+            }
+            Target::Pwm { chip, channel } => write!(f, "pwmchip{chip}/pwm{channel} (hardware PWM)"),
+            Target::Mosi(node) => write!(f, "{node} (an SPI device's data output)"),
+            Target::Nothing(pin) => write!(f, "pin number {pin} (no pin has it)"),
+        }
+    }
+}
+
+/// The number of a line, if it has one.
+pub fn line_number(chip: u32, offset: u32) -> Option<u32> {
+    if chip < CHIPS && offset < CHIP_LINES {
+        Some(chip * CHIP_LINES + offset)
+    } else if chip < FURTHER_CHIPS && offset < FURTHER_CHIP_LINES {
+        Some(FURTHER_LINES + chip * FURTHER_CHIP_LINES + offset)
+    } else {
+        None
+    }
+}
+
+/// The number of an ADC channel, if it has one; `id` is the driver's, such as `voltage3`.
+pub fn channel_number(device: u32, position: usize, id: &str) -> Option<u32> {
+    let plain =
+        id.strip_prefix("voltage").and_then(|n| n.parse::<u32>().ok()).filter(|n| device == 0 && *n < ANALOG_CHANNELS);
+    let position = u32::try_from(position).ok()?;
+    match plain {
+        Some(n) => Some(ANALOG + n),
+        None if device < FURTHER_DEVICES && position < FURTHER_DEVICE_CHANNELS => {
+            Some(FURTHER_CHANNELS + device * FURTHER_DEVICE_CHANNELS + position)
+        }
+        None => None,
+    }
+}
+
+/// The number of a hardware PWM channel, if it has one.
+pub fn pwm_number(chip: u32, channel: u32) -> Option<u32> {
+    (chip < PWM_CHIPS && channel < PWM_CHIP_CHANNELS).then_some(PWM + chip * PWM_CHIP_CHANNELS + channel)
+}
+
+/// The names that this machine has beyond those of the C program, each with its number.
+#[derive(Debug, Default)]
+pub struct Names(Vec<(String, u32)>);
+
+impl Names {
+    /// The names of what was found.
+    pub fn of(inventory: &Inventory) -> Names {
+        let mut numeric = Vec::new();
+        let mut own = Vec::new();
+        for chip in &inventory.chips {
+            for (offset, line) in (0..).zip(&chip.lines) {
+                let Some(number) = line_number(chip.number, offset) else {
+                    continue;
+                };
+                if number >= FURTHER_LINES {
+                    numeric.push((format!("gpiochip{}/gpio{offset}", chip.number), number));
+                }
+                own.push((format!("{}/gpio{offset}", chip.label), number));
+                own.extend(line.name.clone().map(|name| (name, number)));
+            }
+        }
+        for adc in &inventory.adcs {
+            for (position, channel) in adc.channels.iter().enumerate() {
+                let Some(number) = channel_number(adc.number, position, &channel.id) else {
+                    continue;
+                };
+                let holders = [Some(&adc.name), adc.label.as_ref()];
+                for holder in holders.into_iter().flatten() {
+                    own.push((format!("{holder}/{}", channel.id), number));
+                }
+                // The driver's name alone does not tell two devices of one type apart.
+                own.push((format!("iio{}/{}", adc.number, channel.id), number));
+            }
+        }
+        for node in &inventory.spi {
+            if let Some(number) = node.number().filter(|number| *number < MOSI_NODES) {
+                numeric.push((node.to_string(), MOSI + number));
+            }
+        }
+        own.retain(|(name, _)| writable(name) && !numeric_name(name));
+        let mut names = unshared(own);
+        names.append(&mut numeric);
+        Names(names)
+    }
+
+    /// The names of one pin: the line's own name first, then those with the chip in front.
+    pub fn of_pin(&self, number: u32) -> Vec<&str> {
+        let mut names: Vec<&str> = self.0.iter().filter(|(_, n)| *n == number).map(|(name, _)| name.as_str()).collect();
+        // A line's own name has no slash, so it sorts first.
+        names.sort_by_key(|name| name.contains('/'));
+        names
+    }
+
+    /// The dictionary's enumeration `pin`: the C program's ranges and these names.
+    pub(super) fn ranges(&self) -> Vec<Range> {
+        let range = |name: String, first, count| Range { name, first, count };
+        let mut ranges = vec![range("gpio0".into(), 0, CHIP_LINES)];
+        for chip in 0..CHIPS {
+            let name = format!("gpiochip{chip}/gpio0");
+            ranges.push(range(name, chip * CHIP_LINES, CHIP_LINES));
+        }
+        ranges.push(range("analog0".into(), ANALOG, ANALOG_CHANNELS));
+        for chip in 0..PWM_CHIPS {
+            let name = format!("pwmchip{chip}/pwm0");
+            ranges.push(range(name, PWM + chip * PWM_CHIP_CHANNELS, PWM_CHIP_CHANNELS));
+        }
+        ranges.extend(runs(&self.0));
+        ranges
+    }
+}
+
+/// Leaves out names that stand for several pins, and the repetitions of a name and pin.
+fn unshared(names: Vec<(String, u32)>) -> Vec<(String, u32)> {
+    let mut owner: HashMap<String, Option<u32>> = HashMap::new();
+    for (name, number) in &names {
+        owner.entry(name.clone()).and_modify(|one| *one = one.filter(|one| one == number)).or_insert(Some(*number));
+    }
+    let mut names = names;
+    // Of a name that occurs twice for one pin the first is kept: `remove` finds nothing for the second.
+    names.retain(|(name, _)| owner.remove(name).flatten().is_some());
+    names
+}
+
+/// Whether klippy takes this name from a configuration unchanged.
+fn writable(name: &str) -> bool {
+    !name.starts_with('/')
+        && name.chars().any(|c| c.is_ascii_alphanumeric())
+        && name.chars().all(|c| c.is_ascii_graphic() && !":!^~,#;".contains(c))
+}
+
+/// Whether this looks like a name of the numeric kind (`gpio17`, `analog3`), whatever its number.
+fn numeric_name(name: &str) -> bool {
+    let digits = |s: &str| !s.is_empty() && s.bytes().all(|c| c.is_ascii_digit());
+    let counted = |s: &str, word: &str| s.strip_prefix(word).is_some_and(digits);
+    match name.split_once('/') {
+        None => counted(name, "gpio") || counted(name, "analog"),
+        Some((chip, line)) => {
+            counted(chip, "gpiochip") && counted(line, "gpio") || counted(chip, "pwmchip") && counted(line, "pwm")
+        }
+    }
+}
+
+/// Joins names whose numbers count up along with their values into ranges.
+fn runs(names: &[(String, u32)]) -> Vec<Range> {
+    let mut names: Vec<(&str, Option<u64>, u32, &str)> = names
+        .iter()
+        .map(|(name, value)| {
+            let root = name.trim_end_matches(|c: char| c.is_ascii_digit());
+            let digits = &name[root.len()..];
+            let counts = digits == "0" || !digits.starts_with('0');
+            let number = digits.parse().ok().filter(|_| counts);
+            (root, number, *value, name.as_str())
+        })
+        .collect();
+    names.sort_unstable();
+    let mut ranges: Vec<Range> = Vec::new();
+    let mut next = None;
+    for (root, number, value, name) in names {
+        match ranges.last_mut() {
+            Some(range) if number.is_some() && next == Some((root, number, value)) => {
+                range.count += 1;
+            }
+            _ => ranges.push(Range { name: name.to_owned(), first: value, count: 1 }),
+        }
+        next = Some((root, number.map(|n| n.saturating_add(1)), value.saturating_add(1)));
+    }
+    ranges
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::adc::{Channel, IioDevice};
+    use super::super::gpio::{Chip, LineInfo};
+    use super::*;
+    use proptest::prelude::*;
+
+    fn chip(number: u32, label: &str, names: &[&str]) -> Chip {
+        let line = |name: &&str| LineInfo { name: (!name.is_empty()).then(|| name.to_string()), ..LineInfo::default() };
+        Chip { number, label: label.into(), sleeps: false, lines: names.iter().map(line).collect() }
+    }
+
+    fn adc(number: u32, name: &str, ids: &[&str]) -> IioDevice {
+        let channel = |id: &&str| Channel { id: id.to_string(), format: None };
+        IioDevice { number, name: name.into(), label: None, channels: ids.iter().map(channel).collect() }
+    }
+
+    fn names(chips: Vec<Chip>, adcs: Vec<IioDevice>) -> Vec<(String, u32)> {
+        let inventory = Inventory { chips, adcs, ..Inventory::default() };
+        Names::of(&inventory).0
+    }
+
+    /// What klippy makes of the ranges (klippy/msgproto.py, `fill_enumerations`).
+    fn expanded(ranges: &[Range]) -> Vec<(String, u32)> {
+        let mut names = Vec::new();
+        for range in ranges {
+            if range.count == 1 {
+                names.push((range.name.clone(), range.first));
+                continue;
+            }
+            let root = range.name.trim_end_matches(|c: char| c.is_ascii_digit());
+            let start: u32 = range.name[root.len()..].parse().unwrap_or(0);
+            for i in 0..range.count {
+                names.push((format!("{root}{}", start + i), range.first + i));
+            }
+        }
+        names
+    }
+
+    #[test]
+    fn the_c_program_s_numbers() {
+        assert_eq!(line_number(0, 17), Some(17));
+        assert_eq!(line_number(8, 287), Some(2591));
+        assert_eq!(channel_number(0, 5, "voltage2"), Some(4098));
+        let ranges = Names::default().ranges();
+        assert_eq!(ranges.len(), 19);
+        let has = |name: &str, first, count| ranges.contains(&Range { name: name.into(), first, count });
+        assert!(has("gpio0", 0, 288));
+        assert!(has("gpiochip8/gpio0", 2304, 288));
+        assert!(has("analog0", 4096, 8));
+    }
+
+    #[test]
+    fn a_line_s_names() {
+        let chips = vec![chip(4, "pinctrl-rp1", &["ID_SDA", "GPIO1", ""])];
+        let found = names(chips, vec![]);
+        let number = 4 * 288 + 1;
+        assert!(found.contains(&("GPIO1".into(), number)));
+        assert!(found.contains(&("pinctrl-rp1/gpio1".into(), number)));
+        let names = Names(found);
+        assert_eq!(names.of_pin(number), ["GPIO1", "pinctrl-rp1/gpio1"]);
+    }
+
+    #[test]
+    fn a_shared_name_is_left_out() {
+        let chips = vec![chip(0, "expander", &["NC", "A", "NC"]), chip(1, "expander", &["B"])];
+        let found: Vec<String> = names(chips, vec![]).into_iter().map(|n| n.0).collect();
+        // expander/gpio0 stands for two lines, the others for one each.
+        assert_eq!(found, ["expander/gpio1", "A", "expander/gpio2", "B"]);
+    }
+
+    #[test]
+    fn names_that_a_configuration_cannot_hold_are_left_out() {
+        for name in [
+            "a:b",
+            "!a",
+            "^a",
+            "~a",
+            "a b",
+            "a,b",
+            "a#b",
+            "a;b",
+            "-",
+            "",
+            "/gpio0",
+            "gpio300",
+            "analog1",
+            "gpiochip1/gpio2",
+            "pwmchip0/pwm1",
+            "Größe",
+        ] {
+            assert!(!writable(name) || numeric_name(name), "{name}");
+        }
+        for name in ["GPIO17", "ID_SDA", "PIN.3", "gpio_led", "gpio-line1", "analog", "a/gpio1"] {
+            assert!(writable(name) && !numeric_name(name), "{name}");
+        }
+    }
+
+    #[test]
+    fn chips_and_channels_beyond_the_c_ranges_have_numbers_of_their_own() {
+        let chips = vec![chip(12, "usb", &["a", "b"]), chip(0, "big", &[""; 290])];
+        let adcs =
+            vec![adc(0, "ads1115", &["voltage0-voltage1", "voltage0"]), adc(3, "mcp3008", &["voltage0", "voltage1"])];
+        let found = names(chips, adcs);
+        let number = |name: &str| found.iter().find(|(n, _)| n == name).map(|n| Pin(n.1));
+        let target = |name: &str| number(name).map(Target::of);
+        assert_eq!(target("gpiochip12/gpio1"), Some(Target::Line { chip: 12, offset: 1 }));
+        assert_eq!(target("usb/gpio1"), target("b"));
+        assert_eq!(target("gpiochip0/gpio289"), Some(Target::Line { chip: 0, offset: 289 }));
+        assert_eq!(target("gpiochip0/gpio287"), None, "the range has it");
+        assert_eq!(number("ads1115/voltage0"), Some(Pin(4096)));
+        assert_eq!(target("ads1115/voltage0-voltage1"), Some(Target::Channel { device: 0, position: 0 }));
+        assert_eq!(target("mcp3008/voltage1"), Some(Target::Channel { device: 3, position: 1 }));
+        assert_eq!(target("iio3/voltage1"), target("mcp3008/voltage1"));
+    }
+
+    #[test]
+    fn two_adcs_of_one_name_are_told_apart_by_number() {
+        let adcs = vec![adc(0, "ads1115", &["voltage0"]), adc(1, "ads1115", &["voltage0"])];
+        let found: Vec<String> = names(vec![], adcs).into_iter().map(|n| n.0).collect();
+        assert_eq!(found, ["iio0/voltage0", "iio1/voltage0"]);
+    }
+
+    #[test]
+    fn hardware_pwm_keeps_its_numbers() {
+        assert_eq!(Target::of(Pin(65536)), Target::Pwm { chip: 0, channel: 0 });
+        assert_eq!(Target::of(Pin(65663)), Target::Pwm { chip: 7, channel: 15 });
+        for nothing in [65664, 66000, 2592, 4095, 4104] {
+            assert_eq!(Target::of(Pin(nothing)), Target::Nothing(nothing));
+        }
+    }
+
+    #[test]
+    fn names_that_count_up_make_one_range() {
+        let named: Vec<(String, u32)> =
+            [("A1", 1), ("A2", 2), ("A3", 9), ("B07", 3), ("B08", 4)].map(|(n, v)| (n.to_owned(), v)).into();
+        let ranges = runs(&named);
+        let counts: Vec<(&str, u32)> = ranges.iter().map(|r| (r.name.as_str(), r.count)).collect();
+        assert_eq!(counts, [("A1", 2), ("A3", 1), ("B07", 1), ("B08", 1)]);
+    }
+
+    proptest! {
+        #[test]
+        fn ranges_expand_to_the_names(
+            named in prop::collection::hash_map("[AB/]{0,2}[0-9]{0,3}", 0u32..40, 0..60)
+        ) {
+            let mut named: Vec<(String, u32)> = named.into_iter().collect();
+            let mut back = expanded(&runs(&named));
+            named.sort();
+            back.sort();
+            prop_assert_eq!(named, back);
+        }
+
+        #[test]
+        fn a_line_comes_back_from_its_number(chip in 0u32..5000, offset in 0u32..5000) {
+            match line_number(chip, offset) {
+                Some(pin) => prop_assert_eq!(Target::of(Pin(pin)), Target::Line { chip, offset }),
+                None => prop_assert!(chip >= FURTHER_CHIPS || offset >= FURTHER_CHIP_LINES),
+            }
+        }
+
+        #[test]
+        fn any_number_has_an_answer(pin: u32) {
+            match Target::of(Pin(pin)) {
+                Target::Line { chip, offset } => {
+                    let number = line_number(chip, offset);
+                    prop_assert!(number == Some(pin) || number.is_some_and(|n| n < FURTHER_LINES));
+                }
+                Target::Pwm { chip, channel } => prop_assert_eq!(PWM + chip * PWM_CHIP_CHANNELS + channel, pin),
+                Target::Nothing(same) => prop_assert_eq!(same, pin),
+                Target::Analog(n) => prop_assert_eq!(n + ANALOG, pin),
+                Target::Channel { .. } => prop_assert!((FURTHER_CHANNELS..MOSI).contains(&pin)),
+                Target::Mosi(node) => prop_assert_eq!(node.number().map(|number| MOSI + number), Some(pin)),
+            }
+        }
+    }
+}

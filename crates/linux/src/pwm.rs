@@ -1,0 +1,229 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Hardware PWM through sysfs (Documentation/ABI/testing/sysfs-class-pwm).
+
+#![forbid(unsafe_code)]
+
+use std::fmt::Write as _;
+use std::fs::{self, File, OpenOptions};
+use std::io;
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::Duration;
+
+use super::guard::SharedGuard;
+use pinion_firmware::board::{self, PWM_MAX, PwmConfig};
+use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::time::{NS_PER_TICK, Ticks};
+
+/// The files of a newly exported channel belong to root until udev has given them to the group.
+const UDEV_TRIES: u32 = 50;
+const UDEV_PAUSE: Duration = Duration::from_millis(10);
+
+/// A channel: `pwmchip<chip>/pwm<channel>`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Channel {
+    pub(super) chip: u32,
+    pub(super) channel: u32,
+}
+
+impl std::fmt::Display for Channel {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "pwmchip{}/pwm{}", self.chip, self.channel)
+    }
+}
+
+/// An exported channel, enabled unless its value is zero.
+pub(super) struct Pwm {
+    channel: Channel,
+    period_ns: u64,
+    period: File,
+    duty: File,
+    enable: File,
+    guard: SharedGuard,
+}
+
+impl Pwm {
+    /// Exports the channel if it is not, sets its period and value, and gives it to the guardian.
+    /// `class` is `/sys/class/pwm`.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to config pwm device", "Guardian process lost".
+    pub(super) fn open(
+        class: &Path,
+        channel: Channel,
+        config: &PwmConfig,
+        guard: SharedGuard,
+    ) -> Result<Pwm, Shutdown> {
+        let refused = |what: &str, error: io::Error| {
+            Shutdown::because(reason::PWM_CONFIG, format!("{channel}: {what}: {error}{}", remedy(&error)))
+        };
+        let folder = export(class, channel).map_err(|error| refused("exporting it", error))?;
+        let open = |name: &str| OpenOptions::new().write(true).open(folder.join(name));
+        let duty = open("duty_cycle").map_err(|error| refused("opening duty_cycle", error))?;
+        let enable = open("enable").map_err(|error| refused("opening enable", error))?;
+        let period = open("period").map_err(|error| refused("opening period", error))?;
+        let mut pwm = Pwm { channel, period_ns: 0, period, duty, enable, guard };
+        pwm.set_period(config.cycle)?;
+        pwm.write(config.value).map_err(|error| refused("its first value", error))?;
+        pwm.watch_over(config.shutdown_value)?;
+        Ok(pwm)
+    }
+
+    fn set_period(&mut self, cycle: Ticks) -> Result<(), Shutdown> {
+        self.period_ns = u64::from(cycle.0) * NS_PER_TICK;
+        // The kernel refuses a period shorter than the present duty cycle, so that becomes 0 first.
+        // If this fails, the write below fails as well, and is reported.
+        let _ = self.duty.write_at(b"0", 0);
+        self.period.write_all_at(self.period_ns.to_string().as_bytes(), 0).map_err(|error| {
+            let detail = format!("{}: a period of {} ns: {error}{}", self.channel, self.period_ns, remedy(&error));
+            Shutdown::because(reason::PWM_CONFIG, detail)
+        })
+    }
+
+    /// Tells the guardian what to set the channel to if the program dies.
+    fn watch_over(&self, shutdown_value: u16) -> Result<(), Shutdown> {
+        let name = self.channel.to_string();
+        if shutdown_value == 0 {
+            return self.guard.files(&name, &[(self.enable.as_raw_fd(), b"0")]);
+        }
+        let duty = self.duty_ns(shutdown_value).to_string();
+        self.guard.files(&name, &[(self.duty.as_raw_fd(), duty.as_bytes()), (self.enable.as_raw_fd(), b"1")])
+    }
+
+    fn duty_ns(&self, value: u16) -> u64 {
+        self.period_ns * u64::from(value.min(PWM_MAX)) / u64::from(PWM_MAX)
+    }
+
+    fn write(&mut self, value: u16) -> io::Result<()> {
+        if value == 0 {
+            return self.enable.write_all_at(b"0", 0);
+        }
+        let mut text = String::with_capacity(20);
+        // Writing to a String does not fail.
+        let _ = write!(text, "{}", self.duty_ns(value));
+        self.duty.write_all_at(text.as_bytes(), 0)?;
+        self.enable.write_all_at(b"1", 0)
+    }
+}
+
+impl board::Pwm for Pwm {
+    fn set(&mut self, value: u16) -> Result<(), Shutdown> {
+        self.write(value).map_err(|error| {
+            let detail = format!("{}: {error}: did its driver go away? (ls /sys/class/pwm)", self.channel);
+            Shutdown::because(reason::PWM_WRITE, detail)
+        })
+    }
+
+    /// An output of `set_pwm_out` stays as it is when the machine stops. So the guardian is told to
+    /// set it to this value, too.
+    fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
+        self.set_period(cycle)?;
+        self.set(value)?;
+        self.watch_over(value)
+    }
+}
+
+/// The channel's folder, which is made if it is not there. BeagleBone kernels call it `pwm-C:N`.
+fn export(class: &Path, channel: Channel) -> io::Result<PathBuf> {
+    let chip = class.join(format!("pwmchip{}", channel.chip));
+    let folder = chip.join(format!("pwm{}", channel.channel));
+    let other = class.join(format!("pwm-{}:{}", channel.chip, channel.channel));
+    if other.exists() {
+        return Ok(other);
+    }
+    if !folder.exists() {
+        fs::write(chip.join("export"), channel.channel.to_string())?;
+    }
+    for _ in 0..UDEV_TRIES {
+        match OpenOptions::new().write(true).open(folder.join("duty_cycle")) {
+            Err(error) if error.kind() == io::ErrorKind::PermissionDenied => thread::sleep(UDEV_PAUSE),
+            _ => break,
+        }
+    }
+    Ok(folder)
+}
+
+fn remedy(error: &io::Error) -> &'static str {
+    match (error.kind(), error.raw_os_error()) {
+        (io::ErrorKind::NotFound, _) => {
+            ": enable the PWM in the device tree (dtoverlay=pwm); ls /sys/class/pwm lists the chips"
+        }
+        (io::ErrorKind::PermissionDenied, _) => {
+            ": run Pinion as root, or install its udev rules and join the group gpio"
+        }
+        (_, Some(libc::EBUSY)) => ": a driver of the kernel uses it; choose another channel",
+        (_, Some(libc::EINVAL | libc::ERANGE)) => {
+            ": the chip can not do that; choose another cycle_time or another channel"
+        }
+        _ => "",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_firmware::board::{Pin, Pwm as _};
+
+    const CHANNEL: Channel = Channel { chip: 0, channel: 1 };
+
+    fn config(value: u16) -> PwmConfig {
+        PwmConfig { pin: Pin(65537), cycle: Ticks::from_us(1000), value, shutdown_value: 0 }
+    }
+
+    fn class(exported: bool) -> tempfile::TempDir {
+        let class = tempfile::tempdir().unwrap();
+        let folder = class.path().join("pwmchip0/pwm1");
+        fs::create_dir_all(&folder).unwrap();
+        fs::write(class.path().join("pwmchip0/export"), "").unwrap();
+        for name in ["period", "duty_cycle", "enable"] {
+            fs::write(folder.join(name), "").unwrap();
+        }
+        if !exported {
+            fs::remove_dir_all(folder).unwrap();
+        }
+        class
+    }
+
+    fn open(class: &tempfile::TempDir, value: u16) -> Result<Pwm, Shutdown> {
+        Pwm::open(class.path(), CHANNEL, &config(value), SharedGuard::new(None))
+    }
+
+    fn read(class: &tempfile::TempDir, name: &str) -> String {
+        fs::read_to_string(class.path().join("pwmchip0/pwm1").join(name)).unwrap()
+    }
+
+    #[test]
+    fn a_value_becomes_a_duty_cycle_and_zero_switches_off() {
+        let class = class(true);
+        let mut pwm = open(&class, 8192).unwrap();
+        let state = |name| read(&class, name);
+        assert_eq!(
+            (state("period"), state("duty_cycle"), state("enable")),
+            ("1000000".into(), "250000".into(), "1".into())
+        );
+        pwm.set(32768).unwrap();
+        assert_eq!(state("duty_cycle"), "1000000");
+        pwm.set(0).unwrap();
+        assert_eq!(state("enable"), "0");
+    }
+
+    #[test]
+    fn a_value_may_come_with_a_new_period() {
+        let class = class(true);
+        let mut pwm = open(&class, 8192).unwrap();
+        pwm.set_cycle(Ticks::from_us(2000), 16384).unwrap();
+        assert_eq!((read(&class, "period"), read(&class, "duty_cycle")), ("2000000".into(), "1000000".into()));
+    }
+
+    #[test]
+    fn a_channel_that_is_not_there_is_exported_and_its_absence_is_explained() {
+        let class = class(false);
+        let error = open(&class, 1).err().unwrap();
+        assert_eq!(fs::read_to_string(class.path().join("pwmchip0/export")).unwrap(), "1");
+        let text = error.to_string();
+        assert!(text.contains("pwmchip0/pwm1") && text.contains("device tree"), "{text}");
+    }
+}

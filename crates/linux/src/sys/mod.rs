@@ -1,0 +1,331 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Every `unsafe` of the project: system calls that no crate of ours wraps.
+
+use std::fs;
+use std::io::{self, IoSliceMut};
+use std::num::NonZeroUsize;
+use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::sync::atomic::AtomicU32;
+
+use nix::cmsg_space;
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::sys::mman::{MapFlags, ProtFlags, mmap_anonymous};
+use nix::sys::signal::{SigHandler, Signal, signal};
+use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg};
+use nix::unistd::{ForkResult, Pid};
+
+/// Puts the calling thread into SCHED_FIFO at `priority` (1 to 99).
+pub fn set_fifo(priority: i32) -> io::Result<()> {
+    set_scheduler(libc::SCHED_FIFO, priority)
+}
+
+/// Puts the calling thread into SCHED_OTHER.
+pub fn set_other() -> io::Result<()> {
+    set_scheduler(libc::SCHED_OTHER, 0)
+}
+
+fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
+    let param = libc::sched_param { sched_priority: priority };
+    // SAFETY: `param` lives through the call, which only reads it; 0 is the calling thread.
+    match unsafe { libc::sched_setscheduler(0, policy, &param) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+/// Gives the calling thread a nice value (-20 to 19), which counts while it is SCHED_OTHER
+/// (setpriority(2), "C library/kernel differences": per thread).
+pub fn set_nice(value: i32) -> io::Result<()> {
+    // SAFETY: takes no pointers; 0 is the calling thread.
+    match unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, value) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+/// CAP_DAC_READ_SEARCH and CAP_SYS_PTRACE (linux/capability.h): to look into the processes and files
+/// of other users.
+pub const LOOK_INTO_OTHERS: u32 = 1 << 2 | 1 << 19;
+
+/// Takes these capabilities, a bit for each of the first 32, from the calling thread and those that it
+/// starts from now on.
+pub fn give_up(capabilities: u32) -> io::Result<()> {
+    /// _LINUX_CAPABILITY_VERSION_3, for the calling thread (capset(2)).
+    const HEADER: [u32; 2] = [0x2008_0522, 0];
+    // Effective, permitted and inheritable of the first 32 capabilities, then of the rest.
+    let mut sets = [0u32; 6];
+    // SAFETY: with this version the kernel writes two structures of three words.
+    if unsafe { libc::syscall(libc::SYS_capget, HEADER.as_ptr(), sets.as_mut_ptr()) } != 0 {
+        return Err(io::Error::last_os_error());
+    }
+    sets[..3].iter_mut().for_each(|set| *set &= !capabilities);
+    // SAFETY: and reads as many.
+    match unsafe { libc::syscall(libc::SYS_capset, HEADER.as_ptr(), sets.as_ptr()) } {
+        0 => Ok(()),
+        _ => Err(io::Error::last_os_error()),
+    }
+}
+
+/// The rows of a terminal, if it tells them.
+pub fn terminal_rows(terminal: &impl AsRawFd) -> Option<usize> {
+    let mut size = libc::winsize { ws_row: 0, ws_col: 0, ws_xpixel: 0, ws_ypixel: 0 };
+    // SAFETY: `size` is what this request writes, and lives through the call.
+    match unsafe { libc::ioctl(terminal.as_raw_fd(), libc::TIOCGWINSZ, &mut size) } {
+        0 if size.ws_row > 0 => Some(size.ws_row.into()),
+        _ => None,
+    }
+}
+
+/// Words that stay common to this process and to those that it forks.
+pub const SHARED_WORDS: usize = 1024;
+
+/// A page of zeros that stays common to this process and to those that it forks. It is never
+/// given back.
+pub fn shared_words() -> io::Result<&'static [AtomicU32; SHARED_WORDS]> {
+    let length = NonZeroUsize::MIN.saturating_add(size_of::<[AtomicU32; SHARED_WORDS]>() - 1);
+    // SAFETY: a new anonymous mapping at an address of the kernel's choice touches no memory
+    // that is in use.
+    let page =
+        unsafe { mmap_anonymous(None, length, ProtFlags::PROT_READ | ProtFlags::PROT_WRITE, MapFlags::MAP_SHARED) }?;
+    // SAFETY: the mapping is long enough, aligned to a page, zeroed (a valid value of the
+    // atomics) and never unmapped; other processes change it through atomics only.
+    Ok(unsafe { page.cast::<[AtomicU32; SHARED_WORDS]>().as_ref() })
+}
+
+/// Threads that a process may have which forks. A test runs in a thread of its own, while the
+/// first one waits and holds no lock.
+const THREADS: usize = if cfg!(test) { 2 } else { 1 };
+
+/// Forks a process that runs `child` and ends with the status that it returns. An error if
+/// this process has other threads: the child would miss them, and the locks that they hold.
+pub fn fork(child: impl FnOnce() -> i32) -> io::Result<Pid> {
+    if fs::read_dir("/proc/self/task")?.count() > THREADS {
+        return Err(io::Error::other("threads have been started already"));
+    }
+    // SAFETY: this is the only thread, so the child is a whole copy of the process.
+    match unsafe { nix::unistd::fork() }? {
+        ForkResult::Parent { child } => Ok(child),
+        ForkResult::Child => {
+            let status = catch_unwind(AssertUnwindSafe(child)).unwrap_or(101);
+            // SAFETY: ends the process, without the parent's exit handlers.
+            unsafe { libc::_exit(status) }
+        }
+    }
+}
+
+/// Has this process ignore a signal.
+pub fn ignore(ignored: Signal) -> io::Result<()> {
+    // SAFETY: no handler is installed.
+    unsafe { signal(ignored, SigHandler::SigIgn) }?;
+    Ok(())
+}
+
+/// A descriptor that is readable once process `pid` has ended (Linux 5.3).
+pub fn pidfd(pid: Pid) -> io::Result<OwnedFd> {
+    // SAFETY: the call takes two numbers.
+    match unsafe { libc::syscall(libc::SYS_pidfd_open, pid.as_raw(), 0) } {
+        -1 => Err(io::Error::last_os_error()),
+        // SAFETY: a new descriptor that nobody else knows of; descriptors fit an i32.
+        fd => Ok(unsafe { OwnedFd::from_raw_fd(fd as i32) }),
+    }
+}
+
+/// Receives a message and the descriptor that may come with it; 0 bytes are the other end's end.
+pub fn receive(socket: BorrowedFd<'_>, buffer: &mut [u8]) -> io::Result<(usize, Option<OwnedFd>)> {
+    let mut control = cmsg_space!([i32; 1]);
+    let mut pieces = [IoSliceMut::new(buffer)];
+    let message = recvmsg::<()>(socket.as_raw_fd(), &mut pieces, Some(&mut control), MsgFlags::MSG_CMSG_CLOEXEC)?;
+    let mut received = None;
+    for control in message.cmsgs()? {
+        if let ControlMessageOwned::ScmRights(fds) = control {
+            for fd in fds {
+                // SAFETY: the kernel has just made this descriptor for us.
+                received = Some(unsafe { OwnedFd::from_raw_fd(fd) });
+            }
+        }
+    }
+    Ok((message.bytes, received))
+}
+
+/// `struct gpiohandle_data` (linux/gpio.h): the values of a line handle's lines.
+#[repr(C)]
+pub struct LineValues([u8; 64]);
+
+/// `struct gpiohandle_config` (linux/gpio.h, since Linux 5.5): flags and levels of a line handle's
+/// lines.
+#[repr(C)]
+pub struct LineConfig {
+    flags: u32,
+    default_values: [u8; 64],
+    padding: [u32; 4],
+}
+
+/// `struct gpio_v2_line_config` (linux/gpio.h, since Linux 5.10): flags and attributes of a line
+/// request's lines. An attribute is of 24 bytes.
+#[repr(C)]
+pub struct LineRequestConfig {
+    flags: u64,
+    num_attrs: u32,
+    padding: [u32; 5],
+    attrs: [[u64; 3]; 10],
+}
+
+/// `struct gpio_v2_line_request` (linux/gpio.h, since Linux 5.10).
+#[repr(C)]
+pub struct LineRequest {
+    offsets: [u32; 64],
+    consumer: [u8; 32],
+    config: LineRequestConfig,
+    num_lines: u32,
+    event_buffer_size: u32,
+    padding: [u32; 5],
+    fd: i32,
+}
+
+/// `struct gpio_v2_line_values` (linux/gpio.h, since Linux 5.10).
+#[repr(C)]
+pub struct LineRequestValues {
+    bits: u64,
+    mask: u64,
+}
+
+mod request {
+    nix::ioctl_readwrite!(gpio_v2_get_line, 0xB4, 0x07, super::LineRequest);
+    nix::ioctl_readwrite!(gpio_v2_line_set_config, 0xB4, 0x0d, super::LineRequestConfig);
+    nix::ioctl_readwrite!(gpio_v2_line_get_values, 0xB4, 0x0e, super::LineRequestValues);
+    nix::ioctl_readwrite!(gpiohandle_set_config, 0xB4, 0x0a, super::LineConfig);
+    nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
+    nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
+    // I2C_FUNCS (linux/i2c-dev.h).
+    nix::ioctl_read_bad!(i2c_funcs, 0x0705, libc::c_ulong);
+}
+
+/// Drives the only line of a handle of the GPIO character device.
+pub fn set_line(line: &impl AsRawFd, value: bool) -> io::Result<()> {
+    let mut values = LineValues([0; 64]);
+    values.0[0] = value.into();
+    // SAFETY: the request takes a `struct gpiohandle_data`, which lives through the call.
+    unsafe { request::gpiohandle_set_line_values(line.as_raw_fd(), &mut values) }?;
+    Ok(())
+}
+
+/// Gives the only line of a handle of the GPIO character device another direction and bias
+/// (`GPIOHANDLE_REQUEST_` flags), and as an output its level.
+pub fn set_line_config(line: &impl AsRawFd, flags: u32, level: bool) -> io::Result<()> {
+    let mut config = LineConfig { flags, default_values: [0; 64], padding: [0; 4] };
+    config.default_values[0] = level.into();
+    // SAFETY: the request takes a `struct gpiohandle_config`, which lives through the call.
+    unsafe { request::gpiohandle_set_config(line.as_raw_fd(), &mut config) }?;
+    Ok(())
+}
+
+/// GPIOHANDLE_REQUEST_OUTPUT.
+pub const OUTPUT: u32 = 1 << 1;
+
+/// Drives the only line of a handle, of a chip that is spoken to over a bus, and learns whether the
+/// chip has taken it. `flags` are those that the line was made an output with.
+///
+/// [`set_line`] does not tell: on many kernels, 6.1 among them, a driver's function that sets a level
+/// returns nothing, and a chip that does not answer goes unnoticed. The one that makes a line an
+/// output of some level does return an error. Linux before 5.5 offers that for new handles only, and
+/// says EINVAL.
+pub fn set_line_checked(line: &impl AsRawFd, flags: u32, value: bool) -> io::Result<()> {
+    match set_line_config(line, flags, value) {
+        Err(error) if error.raw_os_error() == Some(libc::EINVAL) => set_line(line, value),
+        set => set,
+    }
+}
+
+/// What `flags` (`GPIO_V2_LINE_FLAG_`) make a line, without attributes.
+fn line_request_config(flags: u64) -> LineRequestConfig {
+    LineRequestConfig { flags, num_attrs: 0, padding: [0; 5], attrs: [[0; 3]; 10] }
+}
+
+/// Requests one line of an open GPIO chip with `GPIO_V2_LINE_FLAG_` flags. What is read from the file is its
+/// edges, if the flags ask for them; a read without any does not wait.
+pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, consumer: &str) -> io::Result<fs::File> {
+    let mut request = LineRequest {
+        offsets: [0; 64],
+        consumer: [0; 32],
+        config: line_request_config(flags),
+        num_lines: 1,
+        event_buffer_size: 0,
+        padding: [0; 5],
+        fd: -1,
+    };
+    request.offsets[0] = offset;
+    // The last byte stays 0.
+    request.consumer.iter_mut().zip(consumer.bytes().take(31)).for_each(|(to, from)| *to = from);
+    // SAFETY: the request takes a `struct gpio_v2_line_request`, which lives through the call.
+    unsafe { request::gpio_v2_get_line(chip.as_raw_fd(), &mut request) }?;
+    // SAFETY: the kernel has just made this descriptor for us.
+    let line = unsafe { OwnedFd::from_raw_fd(request.fd) };
+    fcntl(&line, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
+    Ok(line.into())
+}
+
+/// Gives a line of [`request_line`] other flags.
+pub fn set_line_flags(line: &impl AsRawFd, flags: u64) -> io::Result<()> {
+    let mut config = line_request_config(flags);
+    // SAFETY: the request takes a `struct gpio_v2_line_config`, which lives through the call.
+    unsafe { request::gpio_v2_line_set_config(line.as_raw_fd(), &mut config) }?;
+    Ok(())
+}
+
+/// The level of a line of [`request_line`].
+pub fn line_level(line: &impl AsRawFd) -> io::Result<bool> {
+    let mut values = LineRequestValues { bits: 0, mask: 1 };
+    // SAFETY: the request takes a `struct gpio_v2_line_values`, which lives through the call.
+    unsafe { request::gpio_v2_line_get_values(line.as_raw_fd(), &mut values) }?;
+    Ok(values.bits & 1 != 0)
+}
+
+/// Whether the adapter of an I2C bus takes plain messages (I2C_FUNC_I2C of linux/i2c.h); those of many
+/// PC chipsets know SMBus only.
+pub fn is_plain_i2c(bus: &impl AsRawFd) -> io::Result<bool> {
+    let mut functions: libc::c_ulong = 0;
+    // SAFETY: the request writes an unsigned long, which lives through the call.
+    unsafe { request::i2c_funcs(bus.as_raw_fd(), &mut functions) }?;
+    Ok(functions & 1 != 0)
+}
+
+/// After how many seconds without food a hardware watchdog resets the machine.
+pub fn watchdog_timeout_s(watchdog: BorrowedFd<'_>) -> io::Result<i32> {
+    let mut seconds = 0;
+    // SAFETY: the request writes an int, which lives through the call.
+    unsafe { request::wdioc_gettimeout(watchdog.as_raw_fd(), &mut seconds) }?;
+    Ok(seconds)
+}
+
+/// Opens the other end of the pseudo terminal whose master this is, whatever its permissions are
+/// (Linux 4.13). It does not become the process's controlling terminal.
+pub fn pty_slave(master: BorrowedFd<'_>) -> io::Result<OwnedFd> {
+    let flags = libc::O_RDWR | libc::O_NOCTTY | libc::O_CLOEXEC;
+    // SAFETY: the request takes a number.
+    match unsafe { libc::ioctl(master.as_raw_fd(), libc::TIOCGPTPEER, flags) } {
+        -1 => Err(io::Error::last_os_error()),
+        // SAFETY: a new descriptor that nobody else knows of.
+        fd => Ok(unsafe { OwnedFd::from_raw_fd(fd) }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn line_values_are_laid_out_as_the_kernel_has_them() {
+        assert_eq!(size_of::<LineValues>(), 64);
+        // GPIOHANDLE_SET_LINE_VALUES_IOCTL.
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x09, size_of::<LineValues>()), 0xC040_B409);
+        // GPIOHANDLE_SET_CONFIG_IOCTL.
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x0a, size_of::<LineConfig>()), 0xC054_B40A);
+        // GPIO_V2_GET_LINE_IOCTL, GPIO_V2_LINE_SET_CONFIG_IOCTL, GPIO_V2_LINE_GET_VALUES_IOCTL.
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x07, size_of::<LineRequest>()), 0xC250_B407);
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x0d, size_of::<LineRequestConfig>()), 0xC110_B40D);
+        assert_eq!(nix::request_code_readwrite!(0xB4, 0x0e, size_of::<LineRequestValues>()), 0xC010_B40E);
+        // WDIOC_GETTIMEOUT.
+        assert_eq!(nix::request_code_read!(b'W', 7, size_of::<i32>()), 0x8004_5707);
+    }
+}

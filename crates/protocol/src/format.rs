@@ -1,0 +1,236 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Message formats such as `queue_step oid=%c interval=%u count=%hu add=%hi`: their parsing,
+//! and the Rust types that may stand for their parameters.
+
+#![forbid(unsafe_code)]
+
+use super::Malformed;
+use super::clock::Clock;
+use super::vlq::{Reader, Writer};
+
+/// How a parameter is written on the wire.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Conversion {
+    /// `%u`
+    U32,
+    /// `%i`
+    I32,
+    /// `%hu`
+    U16,
+    /// `%hi`
+    I16,
+    /// `%c`
+    Byte,
+    /// `%*s`, `%.*s` or `%s`
+    Bytes,
+}
+
+impl Conversion {
+    /// Parses a printf conversion.
+    pub fn parse(text: &str) -> Option<Conversion> {
+        Some(match text {
+            "%u" => Conversion::U32,
+            "%i" => Conversion::I32,
+            "%hu" => Conversion::U16,
+            "%hi" => Conversion::I16,
+            "%c" => Conversion::Byte,
+            "%*s" | "%.*s" | "%s" => Conversion::Bytes,
+            _ => return None,
+        })
+    }
+
+    /// Takes a value of this kind off the reader.
+    pub fn skip(self, reader: &mut Reader<'_>) -> Result<(), Malformed> {
+        match self {
+            Conversion::Bytes => reader.bytes().map(drop),
+            _ => reader.int().map(drop),
+        }
+    }
+}
+
+/// The name of a message: the first word of its format.
+pub fn name(format: &str) -> &str {
+    format.split(' ').next().unwrap_or(format)
+}
+
+/// The parameters of a message, `None` if the format is none.
+pub fn parameters(format: &str) -> Option<Vec<(&str, Conversion)>> {
+    format
+        .split(' ')
+        .skip(1)
+        .map(|word| {
+            let (name, conversion) = word.split_once('=')?;
+            Some((name, Conversion::parse(conversion)?))
+        })
+        .collect()
+}
+
+/// A Rust type that can stand for a command's parameter.
+pub trait Arg<'m>: Sized {
+    /// The conversions that this type may appear under.
+    const CONVERSIONS: &'static [&'static str];
+    /// Takes a value off the reader.
+    fn decode(reader: &mut Reader<'m>) -> Result<Self, Malformed>;
+}
+
+/// A Rust type that can stand for a response's parameter.
+pub trait Field {
+    /// The conversions that this type may appear under.
+    const CONVERSIONS: &'static [&'static str];
+    /// Appends the value.
+    fn encode(&self, writer: &mut Writer);
+}
+
+macro_rules! integers {
+    ($($t:ty: $($conversion:literal)|+;)*) => {$(
+        // The firmware takes an integer's low bits, whatever its conversion.
+        impl Arg<'_> for $t {
+            const CONVERSIONS: &'static [&'static str] = &[$($conversion),+];
+            #[inline]
+            fn decode(reader: &mut Reader<'_>) -> Result<$t, Malformed> {
+                reader.int().map(|value| value as $t)
+            }
+        }
+        impl Field for $t {
+            const CONVERSIONS: &'static [&'static str] = &[$($conversion),+];
+            fn encode(&self, writer: &mut Writer) {
+                writer.int(*self as u32);
+            }
+        }
+    )*};
+}
+
+integers! {
+    u8: "%c";
+    i8: "%c";
+    u16: "%hu";
+    i16: "%hi";
+    u32: "%u";
+    i32: "%i";
+}
+
+impl Arg<'_> for bool {
+    const CONVERSIONS: &'static [&'static str] = &["%c"];
+    fn decode(reader: &mut Reader<'_>) -> Result<bool, Malformed> {
+        reader.int().map(|value| value != 0)
+    }
+}
+
+impl Field for bool {
+    const CONVERSIONS: &'static [&'static str] = &["%c"];
+    fn encode(&self, writer: &mut Writer) {
+        writer.int(u32::from(*self));
+    }
+}
+
+impl<'m> Arg<'m> for &'m [u8] {
+    const CONVERSIONS: &'static [&'static str] = &["%*s", "%.*s"];
+    fn decode(reader: &mut Reader<'m>) -> Result<&'m [u8], Malformed> {
+        reader.bytes()
+    }
+}
+
+impl Field for &[u8] {
+    const CONVERSIONS: &'static [&'static str] = &["%*s", "%.*s"];
+    fn encode(&self, writer: &mut Writer) {
+        writer.string(self);
+    }
+}
+
+/// The low 32 bits.
+impl Field for Clock {
+    const CONVERSIONS: &'static [&'static str] = &["%u"];
+    fn encode(&self, writer: &mut Writer) {
+        writer.int(self.wire());
+    }
+}
+
+/// A parameter as a handler declares it: its name and the conversions of its type.
+pub struct Spec {
+    /// The parameter's name.
+    pub name: &'static str,
+    /// What its type may stand for.
+    pub conversions: &'static [&'static str],
+}
+
+/// Does `format` name exactly these parameters, in order, under conversions that their types
+/// accept? Evaluated by the compiler.
+pub const fn agrees(format: &str, specs: &[Spec]) -> bool {
+    let format = format.as_bytes();
+    let mut at = 0;
+    while at < format.len() && format[at] != b' ' {
+        at += 1;
+    }
+    let mut n = 0;
+    while n < specs.len() {
+        if !starts(format, at, b" ") {
+            return false;
+        }
+        at += 1;
+        let name = specs[n].name.as_bytes();
+        if !starts(format, at, name) || !starts(format, at + name.len(), b"=") {
+            return false;
+        }
+        at += name.len() + 1;
+        let mut c = 0;
+        let mut hit = 0;
+        while c < specs[n].conversions.len() {
+            let conversion = specs[n].conversions[c].as_bytes();
+            let end = at + conversion.len();
+            if starts(format, at, conversion) && (end == format.len() || format[end] == b' ') {
+                hit = conversion.len();
+            }
+            c += 1;
+        }
+        if hit == 0 {
+            return false;
+        }
+        at += hit;
+        n += 1;
+    }
+    at == format.len()
+}
+
+/// Are the two texts the same? (`==` is not for the compiler yet.)
+pub const fn same(a: &str, b: &str) -> bool {
+    a.len() == b.len() && starts(a.as_bytes(), 0, b.as_bytes())
+}
+
+const fn starts(bytes: &[u8], at: usize, prefix: &[u8]) -> bool {
+    let mut i = 0;
+    while i < prefix.len() {
+        if at + i >= bytes.len() || bytes[at + i] != prefix[i] {
+            return false;
+        }
+        i += 1;
+    }
+    true
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const OID: Spec = Spec { name: "oid", conversions: &["%c"] };
+    const CLOCK: Spec = Spec { name: "clock", conversions: &["%u"] };
+
+    #[test]
+    fn a_declaration_that_disagrees_is_seen() {
+        let format = "reset_step_clock oid=%c clock=%u";
+        assert!(agrees(format, &[OID, CLOCK]));
+        assert!(!agrees(format, &[CLOCK, OID]));
+        assert!(!agrees(format, &[OID]));
+        assert!(!agrees("reset_step_clock oid=%c clock=%hu", &[OID, CLOCK]));
+        assert!(!agrees("reset_step_clock oid=%c clock=%u ", &[OID, CLOCK]));
+        assert!(agrees("get_clock", &[]));
+    }
+
+    #[test]
+    fn formats_are_taken_apart() {
+        let format = "spi_transfer oid=%c data=%*s";
+        assert_eq!(name(format), "spi_transfer");
+        assert_eq!(parameters(format), Some(vec![("oid", Conversion::Byte), ("data", Conversion::Bytes)]));
+        assert_eq!(parameters("get_clock"), Some(vec![]));
+        assert_eq!(parameters("broken oid"), None);
+    }
+}

@@ -1,0 +1,535 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the pins move, heat and spin.
+//!
+//! One thread drives a pin, mostly the core; any thread may look. Nothing here locks, blocks or
+//! allocates: a state changes only when a pin does, and what lies between two changes is solved
+//! exactly by whoever asks.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
+
+use super::config::{AxisConfig, BedConfig, End, FanConfig, HeaterConfig};
+use super::thermistor::Thermistor;
+use super::track::Track;
+use pinion_firmware::time::{CLOCK_FREQ, Clock};
+
+/// Seconds from `earlier` to `later`; none if they are the other way round.
+pub fn seconds(earlier: Clock, later: Clock) -> f64 {
+    later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
+}
+
+/// A few words that belong together: one thread writes them, any thread reads them whole.
+///
+/// They stand in two places by turns, so that a writer that was stopped amid its work keeps nobody
+/// waiting: the words before are still whole. It may be a worker whose processor the core took, and
+/// then it goes on only after the core is done. A reader reads again only if a whole `store` was done
+/// meanwhile, as the next one writes where it reads.
+#[derive(Debug)]
+pub struct Together<const N: usize> {
+    /// How many times the words were stored. The place of the last ones is its lowest bit.
+    stores: AtomicU64,
+    places: [[AtomicU64; N]; 2],
+}
+
+impl<const N: usize> Together<N> {
+    pub fn new(words: [u64; N]) -> Together<N> {
+        let place = || words.map(AtomicU64::new);
+        Together { stores: AtomicU64::new(0), places: [place(), place()] }
+    }
+
+    fn place(&self, stores: u64) -> &[AtomicU64; N] {
+        &self.places[(stores & 1) as usize]
+    }
+
+    pub fn load(&self) -> [u64; N] {
+        loop {
+            let stores = self.stores.load(Ordering::Acquire);
+            let words = self.place(stores).each_ref().map(|word| word.load(Ordering::Relaxed));
+            fence(Ordering::Acquire);
+            if stores == self.stores.load(Ordering::Relaxed) {
+                return words;
+            }
+        }
+    }
+
+    /// Only one thread may store.
+    pub fn store(&self, words: [u64; N]) {
+        let stores = self.stores.load(Ordering::Relaxed).wrapping_add(1);
+        // Who sees a word of these sees that the ones of two stores ago are no longer the last.
+        fence(Ordering::Release);
+        for (word, value) in self.place(stores).iter().zip(words) {
+            word.store(value, Ordering::Relaxed);
+        }
+        self.stores.store(stores, Ordering::Release);
+    }
+}
+
+/// A stepper motor and what it moves.
+#[derive(Debug)]
+pub struct Axis {
+    pub name: String,
+    pub travel_mm: Option<f64>,
+    steps_per_mm: f64,
+    /// The steps at which it hits something.
+    hard_limits: Option<(i64, i64)>,
+    /// The endstop's end, and the step from which on it is closed.
+    endstop: Option<(End, i64)>,
+    /// Whether a falling edge is a step, too.
+    both_edges: AtomicBool,
+    /// Whether the step line is on.
+    stepped: AtomicBool,
+    /// Whether the direction line is low for forward.
+    dir_inverted: bool,
+    forward: AtomicBool,
+    enabled: AtomicBool,
+    position: AtomicI64,
+    /// Steps that its driver was given: those with a low direction line less those with a high one.
+    turned: AtomicI64,
+    lost_steps: AtomicU64,
+    track: Track,
+    /// The instant of the last step, the ticks between it and the one before, and how many steps
+    /// in a row were lost until then.
+    stride: Together<3>,
+}
+
+/// How a motor steps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stride {
+    /// Ticks between two steps.
+    pub ticks: u64,
+    /// Steps in a row that the motor could not do.
+    pub lost_in_a_row: u64,
+}
+
+impl Axis {
+    pub fn new(config: &AxisConfig) -> Axis {
+        // The bounds on the description keep this below 2^63.
+        let steps = |mm: f64| (mm * config.steps_per_mm).round() as i64;
+        Axis {
+            name: config.name.clone(),
+            travel_mm: config.travel_mm,
+            steps_per_mm: config.steps_per_mm,
+            hard_limits: config.travel_mm.map(|travel_mm| {
+                let over_mm = config.overtravel_mm;
+                (steps(-over_mm), steps(travel_mm + over_mm))
+            }),
+            endstop: config.endstop_pin.as_ref().map(|_| match config.endstop_at {
+                End::Min => (End::Min, 0),
+                End::Max => (End::Max, steps(config.travel_mm.unwrap_or(0.0))),
+            }),
+            both_edges: AtomicBool::new(config.step_both_edges),
+            stepped: AtomicBool::new(false),
+            dir_inverted: config.dir_pin.inverted,
+            forward: AtomicBool::new(false),
+            enabled: AtomicBool::new(config.enable_pin.is_none()),
+            position: AtomicI64::new(steps(config.start_mm)),
+            turned: AtomicI64::new(0),
+            lost_steps: AtomicU64::new(0),
+            track: Track::new(),
+            stride: Together::new([0, u64::MAX, 0]),
+        }
+    }
+
+    pub fn set_both_edges(&self, both_edges: bool) {
+        self.both_edges.store(both_edges, Ordering::Relaxed);
+    }
+
+    pub fn set_forward(&self, forward: bool) {
+        self.forward.store(forward, Ordering::Relaxed);
+    }
+
+    pub fn set_enabled(&self, enabled: bool) {
+        self.enabled.store(enabled, Ordering::Relaxed);
+    }
+
+    pub fn is_enabled(&self) -> bool {
+        self.enabled.load(Ordering::Relaxed)
+    }
+
+    /// Whether the level of the direction line is high.
+    pub fn is_dir_high(&self) -> bool {
+        self.forward.load(Ordering::Relaxed) != self.dir_inverted
+    }
+
+    pub fn is_stepped(&self) -> bool {
+        self.stepped.load(Ordering::Relaxed)
+    }
+
+    /// An edge of the step line.
+    pub fn edge(&self, on: bool, at: Clock) {
+        self.stepped.store(on, Ordering::Relaxed);
+        if on || self.both_edges.load(Ordering::Relaxed) {
+            let [last, _, lost_in_a_row] = self.stride.load();
+            let ticks = if last == 0 { u64::MAX } else { at.since(Clock::from_ticks(last)).max(0) as u64 };
+            let lost_in_a_row = if self.step(at) { 0 } else { lost_in_a_row + 1 };
+            self.stride.store([at.ticks(), ticks, lost_in_a_row]);
+        }
+    }
+
+    /// One step. False if the motor could not do it, as its axis had hit something.
+    fn step(&self, at: Clock) -> bool {
+        let turn = if self.is_dir_high() { -1 } else { 1 };
+        self.turned.store(self.turned_steps().wrapping_add(turn), Ordering::Relaxed);
+        if !self.is_enabled() {
+            return true;
+        }
+        let way = if self.forward.load(Ordering::Relaxed) { 1 } else { -1 };
+        let next = self.position_steps().wrapping_add(way);
+        match self.hard_limits {
+            Some((min, max)) if !(min..=max).contains(&next) => {
+                let lost = self.lost_steps.load(Ordering::Relaxed);
+                self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
+                return false;
+            }
+            _ => {
+                self.position.store(next, Ordering::Relaxed);
+                self.track.push(at, next);
+            }
+        }
+        true
+    }
+
+    /// How it steps at this instant. Since the last step the time to the next one is not known yet, and
+    /// is at least what went by.
+    pub fn stride(&self, now: Clock) -> Stride {
+        let [last, ticks, lost_in_a_row] = self.stride.load();
+        let since = now.since(Clock::from_ticks(last)).max(0) as u64;
+        Stride { ticks: ticks.max(since), lost_in_a_row }
+    }
+
+    /// Its last steps with their instants.
+    pub fn track(&self) -> &Track {
+        &self.track
+    }
+
+    pub fn position_steps(&self) -> i64 {
+        self.position.load(Ordering::Relaxed)
+    }
+
+    pub fn turned_steps(&self) -> i64 {
+        self.turned.load(Ordering::Relaxed)
+    }
+
+    /// Where so many steps are.
+    pub fn mm(&self, steps: i64) -> f64 {
+        steps as f64 / self.steps_per_mm
+    }
+
+    pub fn position_mm(&self) -> f64 {
+        self.mm(self.position_steps())
+    }
+
+    pub fn lost_steps(&self) -> u64 {
+        self.lost_steps.load(Ordering::Relaxed)
+    }
+
+    /// Whether the endstop is closed; none without an endstop.
+    pub fn endstop(&self) -> Option<bool> {
+        let position = self.position_steps();
+        self.endstop.map(|(end, at)| match end {
+            End::Min => position <= at,
+            End::Max => position >= at,
+        })
+    }
+}
+
+/// The bed under the nozzle of a cartesian printer.
+pub struct Bed {
+    shape: BedConfig,
+    x: Option<Arc<Axis>>,
+    y: Option<Arc<Axis>>,
+    z: Option<Arc<Axis>>,
+}
+
+impl Bed {
+    pub fn new(shape: BedConfig, x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Option<Arc<Axis>>) -> Bed {
+        Bed { shape, x, y, z }
+    }
+
+    /// The height of the bed under a place: two slopes and a bow, each 0 in the middle.
+    pub fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
+        // From -1 at the start of an axis to 1 at its end.
+        let place = |axis: &Option<Arc<Axis>>, mm: f64| match axis.as_ref().and_then(|axis| axis.travel_mm) {
+            Some(travel_mm) => (2.0 * mm / travel_mm - 1.0).clamp(-1.0, 1.0),
+            None => 0.0,
+        };
+        let (u, v) = (place(&self.x, x_mm), place(&self.y, y_mm));
+        let slopes = (self.shape.x_slope_mm * u + self.shape.y_slope_mm * v) / 2.0;
+        slopes - self.shape.bow_mm * (u * u + v * v) / 2.0
+    }
+
+    /// How far the point that stands off the nozzle by so much is above the bed; negative if it
+    /// presses into it.
+    pub fn clearance_mm(&self, [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3]) -> f64 {
+        let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| axis.position_mm());
+        let height_mm = self.height_mm(position(&self.x) + x_offset_mm, position(&self.y) + y_offset_mm);
+        position(&self.z) + z_offset_mm - height_mm
+    }
+}
+
+/// A heater, the mass that it heats, and the sensor in it.
+///
+/// The mass: `C dT/dt = P - L (T - Ta)` with the power `P` on or off, so from one change to the
+/// next `T(t) = T∞ + (T0 - T∞) exp(-t L/C)` with `T∞ = Ta + P/L`. The sensor follows it:
+/// `τ dS/dt = T - S`, a second exponential.
+#[derive(Debug)]
+pub struct Heater {
+    pub name: String,
+    pub thermistor: Thermistor,
+    pub noise_counts: f64,
+    ambient_celsius: f64,
+    /// What the temperature rises to above the surroundings at full power.
+    rise_k: f64,
+    time_constant_s: f64,
+    sensor_lag_s: f64,
+    /// Since when, the mass's and the sensor's temperature then, and whether power is on.
+    state: Together<4>,
+}
+
+/// A heater at one instant.
+#[derive(Clone, Copy, Debug)]
+pub struct Heat {
+    /// Temperature of the heated mass.
+    pub celsius: f64,
+    /// Temperature of the sensor.
+    pub sensor_celsius: f64,
+    /// Whether power is on.
+    pub on: bool,
+}
+
+impl Heater {
+    pub fn new(config: &HeaterConfig, thermistor: Thermistor, now: Clock) -> Heater {
+        let start = config.start_celsius().to_bits();
+        Heater {
+            name: config.name.clone(),
+            thermistor,
+            noise_counts: config.noise_counts,
+            ambient_celsius: config.ambient_celsius,
+            rise_k: config.heater_watts / config.loss_w_per_k,
+            time_constant_s: config.heat_capacity_j_per_k / config.loss_w_per_k,
+            sensor_lag_s: config.sensor_lag_s,
+            state: Together::new([now.ticks(), start, start, 0]),
+        }
+    }
+
+    pub fn at(&self, now: Clock) -> Heat {
+        let [since, celsius, sensor_celsius, on] = self.state.load();
+        let on = on != 0;
+        let elapsed_s = seconds(Clock::from_ticks(since), now);
+        let end = self.ambient_celsius + if on { self.rise_k } else { 0.0 };
+        let mass_k = f64::from_bits(celsius) - end;
+        let decay = (-elapsed_s / self.time_constant_s).exp();
+        let celsius = end + mass_k * decay;
+        let sensor_celsius = if self.sensor_lag_s > 0.0 {
+            // The part of the sensor's distance that goes with the mass, and the part that goes
+            // by itself.
+            let slow_k = mass_k * self.time_constant_s / (self.time_constant_s - self.sensor_lag_s);
+            let fast_k = f64::from_bits(sensor_celsius) - end - slow_k;
+            end + slow_k * decay + fast_k * (-elapsed_s / self.sensor_lag_s).exp()
+        } else {
+            celsius
+        };
+        Heat { celsius, sensor_celsius, on }
+    }
+
+    pub fn switch(&self, on: bool, now: Clock) {
+        let heat = self.at(now);
+        self.state.store([now.ticks(), heat.celsius.to_bits(), heat.sensor_celsius.to_bits(), on.into()]);
+    }
+}
+
+/// A fan. Its speed follows its power as a heater's temperature does: `n(t) = n∞ + (n0 - n∞)
+/// exp(-t/τ)`; the angle is the integral of that.
+#[derive(Debug)]
+pub struct Fan {
+    pub name: String,
+    max_rpm: f64,
+    spin_up_s: f64,
+    pulses_per_revolution: f64,
+    /// Since when, the speed (rpm) and the angle (revolutions) then, and the [`Switch`]es.
+    state: Together<4>,
+}
+
+/// What must be on for a fan to have power.
+#[derive(Clone, Copy, Debug)]
+pub enum Switch {
+    /// Its pin.
+    Power = 1,
+    /// Its enable pin.
+    Enable = 2,
+}
+
+impl Fan {
+    const POWERED: u64 = Switch::Power as u64 | Switch::Enable as u64;
+
+    pub fn new(config: &FanConfig, now: Clock) -> Fan {
+        let always_enabled = match config.enable_pin {
+            Some(_) => 0,
+            None => Switch::Enable as u64,
+        };
+        let standstill = 0f64.to_bits();
+        Fan {
+            name: config.name.clone(),
+            max_rpm: config.max_rpm,
+            spin_up_s: config.spin_up_s,
+            pulses_per_revolution: config.pulses_per_revolution.into(),
+            state: Together::new([now.ticks(), standstill, standstill, always_enabled]),
+        }
+    }
+
+    /// Speed (rpm), angle (revolutions) and switches.
+    fn at(&self, now: Clock) -> (f64, f64, u64) {
+        let [since, rpm, turns, switches] = self.state.load();
+        let elapsed_s = seconds(Clock::from_ticks(since), now);
+        let end_rpm = if switches == Fan::POWERED { self.max_rpm } else { 0.0 };
+        let excess_rpm = f64::from_bits(rpm) - end_rpm;
+        let decay = (-elapsed_s / self.spin_up_s).exp();
+        let minutes = (end_rpm * elapsed_s + excess_rpm * self.spin_up_s * (1.0 - decay)) / 60.0;
+        (end_rpm + excess_rpm * decay, f64::from_bits(turns) + minutes, switches)
+    }
+
+    pub fn rpm(&self, now: Clock) -> f64 {
+        self.at(now).0
+    }
+
+    /// The tachometer: high for the first half of each pulse.
+    pub fn tachometer(&self, now: Clock) -> bool {
+        (self.at(now).1 * self.pulses_per_revolution).fract() < 0.5
+    }
+
+    pub fn switch(&self, switch: Switch, on: bool, now: Clock) {
+        let (rpm, turns, switches) = self.at(now);
+        let switch = switch as u64;
+        let switches = if on { switches | switch } else { switches & !switch };
+        // Whole turns do not show, and an angle that stays small stays exact.
+        self.state.store([now.ticks(), rpm.to_bits(), turns.fract().to_bits(), switches]);
+    }
+}
+
+/// A light, or anything else that is on or off.
+#[derive(Debug)]
+pub struct Lamp {
+    pub name: String,
+    /// Since when, how bright an eye took it for then, and whether it is on.
+    state: Together<3>,
+}
+
+impl Lamp {
+    /// What is switched faster than an eye follows looks dimmed: brightness follows the light with this
+    /// time constant.
+    const EYE_S: f64 = 0.1;
+    /// What was not switched for so long is on or off, and nothing between.
+    const STEADY_S: f64 = 0.15;
+
+    pub fn new(name: &str) -> Lamp {
+        Lamp { name: name.to_owned(), state: Together::new([0; 3]) }
+    }
+
+    pub fn is_on(&self) -> bool {
+        let [.., on] = self.state.load();
+        on != 0
+    }
+
+    /// How bright an eye takes it for: 0 to 1.
+    pub fn brightness(&self, now: Clock) -> f64 {
+        let [since, brightness, on] = self.state.load();
+        let elapsed_s = seconds(Clock::from_ticks(since), now);
+        let end = if on == 0 { 0.0 } else { 1.0 };
+        if elapsed_s > Lamp::STEADY_S {
+            return end;
+        }
+        end + (f64::from_bits(brightness) - end) * (-elapsed_s / Lamp::EYE_S).exp()
+    }
+
+    pub fn switch(&self, on: bool, now: Clock) {
+        self.state.store([now.ticks(), self.brightness(now).to_bits(), on.into()]);
+    }
+}
+
+/// Noise of the normal kind, the same for the same seed.
+#[derive(Clone, Debug)]
+pub struct Noise(u64);
+
+impl Noise {
+    /// What SplitMix64 adds for each draw.
+    const STEP: u64 = 0x9e37_79b9_7f4a_7c15;
+
+    /// The noise of one part or pin: with the same seed each has another one.
+    pub fn of(whose: &str, seed: u64) -> Noise {
+        whose.bytes().fold(Noise(seed), |noise, byte| Noise((noise.0 ^ u64::from(byte)).wrapping_mul(Noise::STEP)))
+    }
+
+    /// The draw of this number, for who keeps no noise between two draws.
+    pub fn nth(&self, draw: u64) -> f64 {
+        Noise(self.0.wrapping_add(draw.wrapping_mul(Noise::STEP))).draw()
+    }
+
+    /// A draw with mean 0 and standard deviation 1: the sum of four uniform ones, which is within
+    /// 3.5 and close to normal. The bits are SplitMix64's (Steele, Lea, Flood, 2014).
+    pub fn draw(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(Noise::STEP);
+        let mut bits = self.0;
+        bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
+        bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
+        bits ^= bits >> 31;
+        let sum: u64 = (0..4).map(|quarter| (bits >> (16 * quarter)) & 0xffff).sum();
+        // Each uniform draw has variance 1/12, their sum 1/3.
+        (sum as f64 / 65_536.0 - 2.0) * 3f64.sqrt()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::sync::Arc;
+    use std::sync::atomic::AtomicBool;
+
+    #[test]
+    fn words_that_belong_together_are_never_seen_apart() {
+        let words = Arc::new(Together::new([0; 4]));
+        let done = Arc::new(AtomicBool::new(false));
+        let reader = std::thread::spawn({
+            let (words, done) = (words.clone(), done.clone());
+            move || {
+                let mut reads = 0;
+                while !done.load(Ordering::Acquire) || reads == 0 {
+                    let seen = words.load();
+                    assert!(seen.iter().all(|&word| word == seen[0]), "{seen:?}");
+                    reads += 1;
+                }
+            }
+        });
+        for i in 0..200_000 {
+            words.store([i; 4]);
+        }
+        done.store(true, Ordering::Release);
+        assert!(reader.join().is_ok());
+    }
+
+    #[test]
+    fn who_reads_while_the_writer_is_stopped_amid_its_work_does_not_wait() {
+        let words = Together::new([1; 3]);
+        words.store([2; 3]);
+        // The first word of the next ones.
+        words.place(2)[0].store(3, Ordering::Relaxed);
+        assert_eq!(words.load(), [2; 3]);
+    }
+
+    #[test]
+    fn noise_is_normal_and_the_same_each_time() {
+        let draws = |whose, seed| {
+            let mut noise = Noise::of(whose, seed);
+            (0..100_000).map(|_| noise.draw()).collect::<Vec<f64>>()
+        };
+        let first = draws("cell", 7);
+        assert_eq!(first, draws("cell", 7));
+        assert!([draws("cell", 8), draws("coil", 7)].iter().all(|other| other[0] != first[0] && other[1] != first[1]));
+        assert_eq!(Noise::of("cell", 7).nth(41), first[41]);
+        let mean = first.iter().sum::<f64>() / first.len() as f64;
+        let variance = first.iter().map(|x| x * x).sum::<f64>() / first.len() as f64;
+        assert!(mean.abs() < 0.02, "{mean}");
+        assert!((variance - 1.0).abs() < 0.02, "{variance}");
+    }
+}

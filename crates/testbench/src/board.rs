@@ -1,0 +1,717 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A board that records what the machine does to its pins, and lets a test play the rest.
+
+use std::collections::{HashMap, HashSet, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::time::Duration;
+
+use pinion_firmware::board::{
+    Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, EdgeCount, Edges, I2cConfig,
+    Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig, Thermometer,
+};
+use pinion_firmware::mcu::{Completion, Job, WorkerId, Workers};
+use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
+use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
+
+/// GPIO lines: pins 0 up to this.
+pub const GPIOS: u32 = 300;
+/// ADC channels: this pin and the seven after it.
+pub const ANALOG: u32 = 400;
+const ANALOGS: u32 = 8;
+/// Hardware PWM channels: this pin and the one after it.
+pub const PWM: u32 = 500;
+const PWMS: u32 = 2;
+/// SPI buses: 0 up to this.
+const SPI_BUSES: u32 = 2;
+/// I2C buses: 0 up to this.
+const I2C_BUSES: u32 = 2;
+/// The data output of SPI bus 0, and of 1.
+pub const MOSI: u32 = 700;
+/// To break the chips of SPI bus 0 or 1: this number, and the next.
+pub const SPI_CHIPS: u32 = 600;
+/// The chip of the lines that may sleep.
+const EXPANDER: &str = "gpiochip1";
+
+/// A pin's level from an instant on, in ticks.
+pub type Edge = (u64, u8);
+
+/// Up to 64 bytes, kept without an allocation.
+type Message = ([u8; 64], usize);
+
+/// A conversation with an SPI chip.
+#[derive(Debug, PartialEq, Eq)]
+pub struct Transfer {
+    /// The instant, in ticks.
+    pub at: u64,
+    /// The number of the bus.
+    pub bus: u32,
+    /// The mode, 0 to 3.
+    pub mode: u8,
+    /// The clock rate.
+    pub rate_hz: u32,
+    /// What the MCU sent.
+    pub data: Vec<u8>,
+}
+
+/// A chip on an SPI bus: it is told the instant in ticks, and replaces the bytes that it gets by those
+/// that it sends.
+pub type SpiChip = Box<dyn FnMut(u64, &mut [u8]) + Send>;
+
+/// A chip at an I2C address: it is told the instant in ticks and what is written, and fills in what is
+/// read.
+pub type I2cChip = Box<dyn FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus> + Send>;
+
+/// A chip behind an input: it is told the instant in ticks, and either which output now has which
+/// level, or nothing as its input is read, and tells the input's level.
+pub type LineChip = Box<dyn FnMut(u64, Option<(u32, bool)>) -> bool + Send>;
+
+#[derive(Default)]
+/// What a test sets and sees of the board.
+pub struct State {
+    /// By the input that they drive.
+    line_chips: HashMap<u32, LineChip>,
+    /// By bus.
+    spi_chips: HashMap<u32, SpiChip>,
+    /// By bus and address.
+    i2c_chips: HashMap<(u32, u8), I2cChip>,
+    /// What each claimed pin was made last.
+    pub directions: HashMap<u32, Direction>,
+    /// What each pin was made amid a conversation, in order.
+    pub turns: Vec<(u32, Direction)>,
+    /// Inputs whose edges an interrupt counts.
+    pub counted: HashSet<u32>,
+    /// Pins of chips that may sleep.
+    pub sleeping: HashSet<u32>,
+    /// Whether an errand is being run: only then may the line of such a chip be called.
+    on_worker: bool,
+    /// ADC and PWM channels in use.
+    pub claimed: HashSet<u32>,
+    /// The level of each output.
+    pub levels: HashMap<u32, bool>,
+    /// Every change of an output, in order.
+    pub edges: Vec<(u32, Edge)>,
+    /// Levels of inputs from instants on.
+    inputs: HashMap<u32, Vec<Edge>>,
+    /// Readings to come; the last one stays.
+    readings: HashMap<u32, VecDeque<u16>>,
+    /// What each DS18B20 reads, in thousandths of a degree; the last one stays. None fails.
+    thermometers: HashMap<Vec<u8>, VecDeque<Option<i32>>>,
+    /// Pins that can not be written or read any more, ADC channels too.
+    pub broken: HashSet<u32>,
+    /// Every SPI transfer, and when it began.
+    transfers: Vec<(u64, u32, u8, u32, Message)>,
+    /// Every value of a PWM channel: pin, instant, value.
+    pub pwm_values: Vec<(u32, u64, u16)>,
+    /// The period of each PWM channel.
+    pub pwm_cycles: HashMap<u32, u32>,
+    /// How long writing a line takes.
+    pub write_ticks: u32,
+    /// How long a device on a worker takes to answer; at first none does.
+    pub answer_ticks: u32,
+    /// How long each byte takes on a bus. If it does, an errand is run as it is handed over, and its
+    /// chip is told the instants at which it will be spoken to.
+    pub byte_ticks: u32,
+    /// How far the errand that is run has come, then.
+    bus_now: Option<Clock>,
+}
+
+/// What the board, its lines, its devices and the test share.
+#[derive(Clone)]
+pub struct Bench {
+    state: Arc<Mutex<State>>,
+    gate: Arc<Gate>,
+    clock: VirtualClock,
+    /// Instants that a test reads and writes count from here.
+    origin: Clock,
+}
+
+/// Lets the SPI chips hang, in the tests that run in real time.
+#[derive(Default)]
+struct Gate {
+    /// Whether it is closed, and whether somebody waits there.
+    state: Mutex<(bool, bool)>,
+    changed: Condvar,
+}
+
+impl Gate {
+    fn pass(&self) {
+        let mut state = self.state.lock().unwrap();
+        state.1 = true;
+        state = self.changed.wait_while(state, |(closed, _)| *closed).unwrap();
+        state.1 = false;
+    }
+}
+
+impl Bench {
+    /// Lets the SPI chips hang, or lets them go on.
+    pub fn hang(&self, hang: bool) {
+        self.gate.state.lock().unwrap().0 = hang;
+        self.gate.changed.notify_all();
+    }
+
+    /// Whether a conversation hangs.
+    pub fn hangs(&self) -> bool {
+        self.gate.state.lock().unwrap().1
+    }
+
+    /// A bench on this clock, whose ticks count from `origin`.
+    pub fn new(clock: VirtualClock, origin: Clock) -> Bench {
+        // Room enough: the bench does not allocate later, see tests/no_allocation.rs.
+        let state = State {
+            edges: Vec::with_capacity(1 << 16),
+            transfers: Vec::with_capacity(256),
+            pwm_values: Vec::with_capacity(256),
+            turns: Vec::with_capacity(256),
+            ..State::default()
+        };
+        Bench { state: Arc::new(Mutex::new(state)), gate: Arc::default(), clock, origin }
+    }
+
+    fn ticks(&self) -> u64 {
+        self.clock.now().since(self.origin) as u64
+    }
+
+    /// When a conversation of so many bytes begins.
+    fn bus_ticks(&self, bytes: usize) -> u64 {
+        let mut state = self.state();
+        let takes = Ticks(state.byte_ticks * bytes as u32);
+        let Some(now) = &mut state.bus_now else { return self.ticks() };
+        let at = *now;
+        *now = at + takes;
+        at.since(self.origin) as u64
+    }
+
+    /// What a test sets and sees.
+    pub fn state(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap()
+    }
+
+    /// The edges of a pin since the last call.
+    pub fn edges(&self, pin: u32) -> Vec<Edge> {
+        let mut edges = Vec::new();
+        self.state().edges.retain(|(of, edge)| {
+            if *of == pin {
+                edges.push(*edge);
+            }
+            *of != pin
+        });
+        edges
+    }
+
+    /// Every SPI transfer so far.
+    pub fn transfers(&self) -> Vec<Transfer> {
+        let transfer = |&(at, bus, mode, rate_hz, (bytes, len)): &(u64, u32, u8, u32, Message)| {
+            let data = bytes[..len].to_vec();
+            Transfer { at, bus, mode, rate_hz, data }
+        };
+        self.state().transfers.iter().map(transfer).collect()
+    }
+
+    /// Forgets every edge.
+    pub fn forget_edges(&self) {
+        self.state().edges.clear();
+    }
+
+    /// The level of an output.
+    pub fn level(&self, pin: u32) -> bool {
+        self.state().levels[&pin]
+    }
+
+    /// Where an output belongs if the program dies.
+    pub fn shutdown_level(&self, pin: u32) -> bool {
+        match self.state().directions[&pin] {
+            Direction::Output { shutdown_level, .. } => shutdown_level,
+            input => panic!("pin {pin} is {input:?}"),
+        }
+    }
+
+    /// Puts a chip on SPI bus 0 or 1.
+    pub fn plug_spi(&self, bus: u32, chip: impl FnMut(u64, &mut [u8]) + Send + 'static) {
+        self.state().spi_chips.insert(bus, Box::new(chip));
+    }
+
+    /// Puts a chip at an address of I2C bus 0 or 1.
+    pub fn plug_i2c(
+        &self,
+        bus: u32,
+        address: u8,
+        chip: impl FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus> + Send + 'static,
+    ) {
+        self.state().i2c_chips.insert((bus, address), Box::new(chip));
+    }
+
+    /// Takes a chip off an I2C bus.
+    pub fn unplug_i2c(&self, bus: u32, address: u8) {
+        self.state().i2c_chips.remove(&(bus, address));
+    }
+
+    /// Puts a chip behind an input.
+    pub fn plug_line(&self, pin: u32, chip: impl FnMut(u64, Option<(u32, bool)>) -> bool + Send + 'static) {
+        self.state().line_chips.insert(pin, Box::new(chip));
+    }
+
+    /// Lets an input change at instants in the future.
+    pub fn script_input(&self, pin: u32, levels: &[Edge]) {
+        self.state().inputs.entry(pin).or_default().extend(levels);
+    }
+
+    /// Lets an ADC channel read these values and then stay at the last.
+    pub fn script_adc(&self, pin: u32, values: &[u16]) {
+        self.state().readings.insert(pin, values.iter().copied().collect());
+    }
+
+    /// Plugs a DS18B20 in, which reads these values and then stays at the last; none fails.
+    pub fn script_ds18b20(&self, serial: &str, values: &[Option<i32>]) {
+        self.state().thermometers.insert(serial.into(), values.iter().copied().collect());
+    }
+
+    /// Claims an ADC or PWM channel.
+    fn claim(&self, pin: Pin, known: std::ops::Range<u32>, unknown: ShutdownReason) -> Result<u32, Shutdown> {
+        if !known.contains(&pin.0) {
+            let detail = format!("the bench has no pin {}: choose one of {} to {}", pin.0, known.start, known.end - 1);
+            return Err(Shutdown::because(unknown, detail));
+        }
+        self.state().claimed.insert(pin.0);
+        Ok(pin.0)
+    }
+
+    /// The core never waits for a chip that may sleep.
+    fn may_call(&self, pin: u32) {
+        let state = self.state();
+        assert!(state.on_worker || !state.sleeping.contains(&pin), "the core itself calls pin {pin}");
+    }
+
+    fn broken(&self, pin: u32, reason: ShutdownReason) -> Result<(), Shutdown> {
+        match self.state().broken.contains(&pin) {
+            true => Err(Shutdown::because(reason, format!("pin {pin} is gone: plug it in again"))),
+            false => Ok(()),
+        }
+    }
+}
+
+/// The board itself; the bench is its other side.
+pub struct FakeBoard(pub Bench);
+
+impl Board for FakeBoard {
+    fn describe(&self) -> String {
+        "a test bench".into()
+    }
+
+    fn pins(&self) -> Vec<Range> {
+        vec![
+            Range { name: "gpio0".into(), first: 0, count: GPIOS },
+            Range { name: "analog0".into(), first: ANALOG, count: ANALOGS },
+            Range { name: "pwm0".into(), first: PWM, count: PWMS },
+            Range { name: "spidev0".into(), first: MOSI, count: SPI_BUSES },
+        ]
+    }
+
+    fn spi_buses(&self) -> Vec<Range> {
+        vec![Range { name: "spi0".into(), first: 0, count: SPI_BUSES }]
+    }
+
+    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
+        let Pin(number) = pin;
+        if number >= GPIOS {
+            let detail = format!("the bench has no pin {number}: choose one of 0 to {}", GPIOS - 1);
+            let unknown = match direction {
+                Direction::Output { .. } | Direction::OpenDrain => reason::NOT_OUTPUT,
+                Direction::Input(_) => reason::NOT_INPUT,
+            };
+            return Err(Shutdown::because(unknown, detail));
+        }
+        let line = FakeLine { bench: self.0.clone(), pin: number };
+        line.set_direction(direction)?;
+        let sleeps_on = self.0.state().sleeping.contains(&number).then(|| EXPANDER.to_owned());
+        Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
+    }
+
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
+        let line = self.line(pin, Direction::Input(bias))?;
+        let edges = match self.0.state().counted.contains(&pin.0) {
+            true => {
+                let edges = FakeEdges { bench: self.0.clone(), pin: pin.0 };
+                Ok(OnWorker { bus: "edges".into(), device: Box::new(edges) as Box<dyn Edges> })
+            }
+            false => Err("this pin has no interrupt".into()),
+        };
+        Ok(CountedLine { line, edges })
+    }
+
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
+        let pin = self.0.claim(pin, ANALOG..ANALOG + ANALOGS, reason::ADC_OPEN)?;
+        Ok(OnWorker { bus: "iio".into(), device: Box::new(FakeAdc { bench: self.0.clone(), pin }) })
+    }
+
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        if config.bus >= SPI_BUSES {
+            let detail = format!("the bench has no SPI bus {}: choose spi0 or spi1", config.bus);
+            return Err(Shutdown::because(reason::SPI_OPEN, detail));
+        }
+        let bus = format!("spi{}", config.bus);
+        Ok(OnWorker { bus, device: Box::new(FakeSpi { bench: self.0.clone(), config }) })
+    }
+
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+        let Some(bus) = pin.0.checked_sub(MOSI).filter(|bus| *bus < SPI_BUSES) else {
+            let detail = format!("pin {} is no SPI data output: choose spidev0", pin.0);
+            return Err(Shutdown::because(reason::NOT_OUTPUT, detail));
+        };
+        let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
+        Ok(Mosi { line, message_max: 64 })
+    }
+
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        if !self.0.state().thermometers.contains_key(serial) {
+            let detail = format!("the bench has no {}: plug it in", String::from_utf8_lossy(serial));
+            return Err(Shutdown::because(reason::DS18B20_OPEN, detail));
+        }
+        let device = FakeThermometer { bench: self.0.clone(), serial: serial.into() };
+        Ok(OnWorker { bus: "w1".into(), device: Box::new(device) })
+    }
+
+    fn i2c_buses(&self) -> Vec<Range> {
+        vec![Range { name: "i2c.0".into(), first: 0, count: I2C_BUSES }]
+    }
+
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        if config.bus >= I2C_BUSES {
+            let detail = format!("the bench has no I2C bus {}: choose i2c.0 or i2c.1", config.bus);
+            return Err(Shutdown::because(reason::I2C_OPEN, detail));
+        }
+        let bus = format!("i2c{}", config.bus);
+        Ok(OnWorker { bus, device: Box::new(FakeI2c { bench: self.0.clone(), config }) })
+    }
+
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
+        let pin = self.0.claim(config.pin, PWM..PWM + PWMS, reason::PWM_CONFIG)?;
+        let mut pwm = FakePwm { bench: self.0.clone(), pin };
+        pwm.set_cycle(config.cycle, config.value)?;
+        Ok(OnWorker { bus: "pwm".into(), device: Box::new(pwm) })
+    }
+
+    fn reset(&mut self) {
+        let mut state = self.0.state();
+        state.claimed.clear();
+        state.directions.clear();
+    }
+}
+
+struct FakeThermometer {
+    bench: Bench,
+    serial: Vec<u8>,
+}
+
+impl Thermometer for FakeThermometer {
+    fn read(&mut self) -> Result<i32, Box<str>> {
+        let mut state = self.bench.state();
+        let values = state.thermometers.get_mut(&self.serial).unwrap();
+        let value = if values.len() > 1 { values.pop_front().unwrap() } else { values[0] };
+        value.ok_or_else(|| "the sensor on the bench has a wrong CRC: check the wires".into())
+    }
+}
+
+struct FakePwm {
+    bench: Bench,
+    pin: u32,
+}
+
+impl Pwm for FakePwm {
+    fn set(&mut self, value: u16) -> Result<(), Shutdown> {
+        self.bench.broken(self.pin, reason::PWM_WRITE)?;
+        let at = self.bench.ticks();
+        self.bench.state().pwm_values.push((self.pin, at, value));
+        Ok(())
+    }
+
+    fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
+        self.bench.state().pwm_cycles.insert(self.pin, cycle.0);
+        self.set(value)
+    }
+}
+
+struct FakeLine {
+    bench: Bench,
+    pin: u32,
+}
+
+impl Line for FakeLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        self.bench.may_call(self.pin);
+        self.bench.broken(self.pin, reason::LINE_WRITE)?;
+        let mut state = self.bench.state();
+        if matches!(state.directions.get(&self.pin), Some(Direction::Input(_))) {
+            return Ok(());
+        }
+        if state.levels.insert(self.pin, level) != Some(level) {
+            let at = self.bench.ticks();
+            state.edges.push((self.pin, (at, level.into())));
+            for chip in state.line_chips.values_mut() {
+                chip(at, Some((self.pin, level)));
+            }
+        }
+        self.bench.clock.set(self.bench.clock.now() + Ticks(state.write_ticks));
+        Ok(())
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        self.bench.may_call(self.pin);
+        self.bench.broken(self.pin, reason::LINE_READ)?;
+        let now = self.bench.ticks();
+        let mut state = self.bench.state();
+        if let Some(chip) = state.line_chips.get_mut(&self.pin) {
+            return Ok(chip(now, None));
+        }
+        let levels = state.inputs.get(&self.pin).map_or(&[][..], Vec::as_slice);
+        Ok(levels.iter().rev().find(|(from, _)| *from <= now).is_some_and(|(_, level)| *level != 0))
+    }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let mut state = self.bench.state();
+        let before = state.directions.insert(self.pin, direction);
+        if let Direction::Output { level, .. } = direction {
+            let was = state.levels.insert(self.pin, level);
+            let at = self.bench.ticks();
+            if before.is_some() && was != Some(level) {
+                state.edges.push((self.pin, (at, level.into())));
+            }
+            for chip in state.line_chips.values_mut() {
+                chip(at, Some((self.pin, level)));
+            }
+        }
+        Ok(())
+    }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.bench.may_call(self.pin);
+        self.bench.broken(self.pin, reason::LINE_WRITE)?;
+        self.bench.state().turns.push((self.pin, direction));
+        self.set_direction(direction)
+    }
+}
+
+/// The changes of a scripted input.
+struct FakeEdges {
+    bench: Bench,
+    pin: u32,
+}
+
+impl Edges for FakeEdges {
+    fn count(&mut self) -> Result<EdgeCount, Shutdown> {
+        self.bench.broken(self.pin, reason::LINE_READ)?;
+        let now = self.bench.ticks();
+        let state = self.bench.state();
+        assert!(state.counted.contains(&self.pin), "the interrupts were ended");
+        let levels = state.inputs.get(&self.pin).map_or(&[][..], Vec::as_slice);
+        let count = levels.partition_point(|(at, _)| *at <= now);
+        let monotonic = |at: u64| Duration::from_nanos((self.bench.origin.ticks() + at) * NS_PER_TICK);
+        let last = levels[..count].last().map(|(at, _)| monotonic(*at));
+        Ok(EdgeCount { count: count as u32, last })
+    }
+
+    fn end(&mut self) -> Result<(), Shutdown> {
+        self.bench.state().counted.remove(&self.pin);
+        Ok(())
+    }
+}
+
+struct FakeAdc {
+    bench: Bench,
+    pin: u32,
+}
+
+impl Adc for FakeAdc {
+    fn read(&mut self) -> Result<u16, Shutdown> {
+        self.bench.broken(self.pin, reason::ADC_READ)?;
+        let mut state = self.bench.state();
+        Ok(match state.readings.get_mut(&self.pin) {
+            Some(readings) if readings.len() > 1 => readings.pop_front().unwrap(),
+            Some(readings) => readings.front().copied().unwrap_or(0),
+            None => 0,
+        })
+    }
+}
+
+/// What stands at an I2C address: a chip that a test plugged in, or nothing.
+struct FakeI2c {
+    bench: Bench,
+    config: I2cConfig,
+}
+
+impl BusDevice for FakeI2c {
+    fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        let I2cConfig { bus, address, .. } = self.config;
+        // The address goes before what is written, and before what is read.
+        let addresses = usize::from(!write.is_empty()) + usize::from(!read.is_empty());
+        let at = self.bench.bus_ticks(write.len() + read.len() + addresses);
+        // Not locked while the chip answers: it may look at the bench.
+        let chip = self.bench.state().i2c_chips.remove(&(bus, address));
+        let Some(mut chip) = chip else {
+            let detail = format!("nothing answers at 0x{address:02x}: check the wiring");
+            return Err(BusError { status: BusStatus::StartNack, detail: detail.into() });
+        };
+        let answer = chip(at, write, read);
+        self.bench.state().i2c_chips.insert((bus, address), chip);
+        answer.map_err(|status| BusError { status, detail: "the chip on the bench says no: ask it again".into() })
+    }
+}
+
+/// A chip that sends back the complement of what it gets, or one that a test plugged in.
+struct FakeSpi {
+    bench: Bench,
+    config: SpiConfig,
+}
+
+impl BusDevice for FakeSpi {
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+        let failed = |failure: Shutdown| BusError { status: BusStatus::Nack, detail: failure.detail };
+        let SpiConfig { bus, mode, rate_hz, .. } = self.config;
+        self.bench.gate.pass();
+        self.bench.broken(SPI_CHIPS + bus, reason::LINE_READ).map_err(failed)?;
+        if let Some(chip_select) = &self.config.chip_select {
+            chip_select.select(true).map_err(failed)?;
+        }
+        let mut message = ([0; 64], bytes.len());
+        message.0[..bytes.len()].copy_from_slice(bytes);
+        let at = self.bench.bus_ticks(bytes.len());
+        self.bench.state().transfers.push((at, bus, mode, rate_hz, message));
+        let chip = self.bench.state().spi_chips.remove(&bus);
+        match chip {
+            Some(mut chip) => {
+                chip(at, bytes);
+                self.bench.state().spi_chips.insert(bus, chip);
+            }
+            None => bytes.iter_mut().for_each(|byte| *byte = !*byte),
+        }
+        if let Some(chip_select) = &self.config.chip_select {
+            chip_select.select(false).map_err(failed)?;
+        }
+        Ok(())
+    }
+}
+
+/// Workers in virtual time: one errand of a bus after the other, each takes its time.
+#[derive(Clone)]
+pub struct FakeWorkers {
+    bench: Bench,
+    shop: Arc<Mutex<Shop>>,
+}
+
+struct Shop {
+    /// Each bus, and when it is free again.
+    buses: Vec<(String, Clock)>,
+    /// In the order of their ends.
+    under_way: VecDeque<UnderWay>,
+}
+
+/// An errand on its way.
+struct UnderWay {
+    worker: usize,
+    begin: Clock,
+    end: Clock,
+    work: Work,
+}
+
+enum Work {
+    ToDo(Job),
+    Done(Completion),
+}
+
+impl Shop {
+    /// Room for more errands than a test sends: the bench does not allocate later.
+    fn new() -> Shop {
+        Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256) }
+    }
+
+    fn insert(&mut self, new: UnderWay) {
+        let place = self.under_way.partition_point(|other| other.end <= new.end);
+        self.under_way.insert(place, new);
+    }
+
+    /// An errand of this worker took its own time as well: those behind it wait for it.
+    fn delay(&mut self, worker: usize, ended: Clock, by: Ticks) {
+        self.buses[worker].1 = self.buses[worker].1.max(ended);
+        for other in self.under_way.iter_mut().filter(|other| other.worker == worker) {
+            other.begin = other.begin + by;
+            other.end = other.end + by;
+            self.buses[worker].1 = self.buses[worker].1.max(other.end);
+        }
+        self.under_way.make_contiguous().sort_by_key(|other| other.end);
+    }
+}
+
+impl FakeWorkers {
+    /// The workers of this bench.
+    pub fn new(bench: Bench) -> FakeWorkers {
+        FakeWorkers { bench, shop: Arc::new(Mutex::new(Shop::new())) }
+    }
+
+    /// When the next errand is done.
+    pub fn next_end(&self) -> Option<Clock> {
+        self.shop.lock().unwrap().under_way.front().map(|next| next.end)
+    }
+}
+
+impl Workers for FakeWorkers {
+    fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
+        let mut shop = self.shop.lock().unwrap();
+        let known = shop.buses.iter().position(|(name, _)| name == bus);
+        Ok(WorkerId(known.unwrap_or_else(|| {
+            shop.buses.push((bus.into(), Clock::EPOCH));
+            shop.buses.len() - 1
+        })))
+    }
+
+    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: Job) -> Result<(), Shutdown> {
+        let takes = Ticks(self.bench.state().answer_ticks);
+        let at_once = self.bench.state().byte_ticks != 0;
+        let mut shop = self.shop.lock().unwrap();
+        let free = &mut shop.buses[worker].1;
+        let begin = self.bench.clock.now().max(*free);
+        let mut end = begin + takes;
+        let work = if at_once {
+            self.bench.state().bus_now = Some(end);
+            job.errand.run();
+            end = self.bench.state().bus_now.take().unwrap_or(end);
+            let Job { ticket, errand, holds } = job;
+            Work::Done(Completion { ticket, errand, holds, began: begin, ended: end })
+        } else {
+            Work::ToDo(job)
+        };
+        *free = end;
+        shop.insert(UnderWay { worker, begin, end, work });
+        Ok(())
+    }
+
+    /// What an errand does to its device it does at its end, unless bytes take their time. One that
+    /// keeps time itself goes on from there in a time of its own, and is done when that has come.
+    fn completion(&mut self) -> Option<Completion> {
+        while self.has_completion() {
+            let UnderWay { worker, begin: began, end, work } = self.shop.lock().unwrap().under_way.pop_front()?;
+            let Job { ticket, mut errand, holds } = match work {
+                Work::ToDo(job) => job,
+                Work::Done(completion) => return Some(completion),
+            };
+            self.bench.state().on_worker = true;
+            let now = self.bench.clock.now();
+            let ended = self.bench.clock.aside(|| errand.run());
+            self.bench.state().on_worker = false;
+            if ended == now {
+                return Some(Completion { ticket, errand, holds, began, ended: end });
+            }
+            let mut shop = self.shop.lock().unwrap();
+            shop.delay(worker, ended, Ticks(ended.since(now) as u32));
+            let work = Work::Done(Completion { ticket, errand, holds, began, ended });
+            shop.insert(UnderWay { worker, begin: began, end: ended, work });
+        }
+        None
+    }
+
+    fn has_completion(&self) -> bool {
+        self.next_end().is_some_and(|end| end <= self.bench.clock.now())
+    }
+
+    fn reset(&mut self) {
+        *self.shop.lock().unwrap() = Shop::new();
+    }
+}

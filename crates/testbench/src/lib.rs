@@ -1,0 +1,10 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A micro-controller in virtual time, for tests and benches.
+//!
+//! - [`board`]: a board that records what the MCU does to its pins, and lets a test play the rest
+//! - [`rig`]: an MCU on that board, and the host's side of its wire
+
+#![forbid(unsafe_code)]
+
+pub mod board;
+pub mod rig;

@@ -1,0 +1,348 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A machine on a bench, in virtual time, spoken to in words.
+
+use std::sync::{Arc, Mutex};
+
+use pinion_firmware::board::Board;
+use pinion_firmware::feature::FEATURES;
+use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Generation, Mcu, Note, Outbox};
+use pinion_firmware::time::{Clock, Ticks, TimeSource, VirtualClock};
+use pinion_protocol::dictionary::Dictionary;
+use pinion_protocol::format::{self, Conversion};
+use pinion_protocol::vlq::{Reader, Writer};
+
+use crate::board::{Bench, Edge, FakeBoard, FakeWorkers};
+
+/// What a rig's MCU is.
+pub const FIRMWARE: Firmware =
+    Firmware { features: FEATURES, app: "Rig", version: "test", build_versions: "", license: "" };
+
+/// When a rig's story begins, unless a test says otherwise.
+const ORIGIN: u64 = 10_000_000;
+
+/// The machine's responses stand one after the other in one buffer that is large enough from
+/// the start: what is counted in `tests/no_allocation.rs` is the machine's alone.
+const RESPONSE_BYTES: usize = 1 << 20;
+
+#[derive(Clone)]
+struct FakeOutbox {
+    payloads: Arc<Mutex<Vec<u8>>>,
+    notes: Arc<Mutex<Vec<String>>>,
+}
+
+impl Outbox for FakeOutbox {
+    fn send(&mut self, payload: &[u8]) {
+        let mut payloads = self.payloads.lock().unwrap();
+        payloads.push(payload.len() as u8);
+        payloads.extend_from_slice(payload);
+    }
+
+    fn note(&mut self, note: Note<'_>) {
+        let text = match note {
+            Note::Shutdown(shutdown) => format!("shutdown: {shutdown}"),
+            Note::Warning(shutdown) => format!("warning: {shutdown}"),
+            Note::Trouble(shutdown) => format!("trouble: {shutdown}"),
+            Note::Configured(kinds) => format!("configured: {kinds:?}"),
+            Note::Safe(name) => format!("safe: {name}"),
+            Note::Lateness(..) => return,
+            Note::Reset => "reset".into(),
+        };
+        self.notes.lock().unwrap().push(text);
+    }
+}
+
+/// A machine on a bench. Instants count from its making.
+pub struct Rig {
+    /// The MCU.
+    pub mcu: Mcu,
+    /// Its pins and buses.
+    pub bench: Bench,
+    origin: Clock,
+    clock: VirtualClock,
+    workers: FakeWorkers,
+    outbox: FakeOutbox,
+}
+
+impl Rig {
+    /// A machine that waits for its configuration.
+    pub fn new() -> Rig {
+        Rig::at(ORIGIN)
+    }
+
+    /// A machine that is made at `start`.
+    pub fn at(start: u64) -> Rig {
+        Rig::on_board(start, FakeBoard)
+    }
+
+    /// A machine with another board than the bench's own.
+    pub fn on_board<B: Board + 'static>(start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
+        Rig::that_speaks(DialectName::Of(Generation::Master), start, board)
+    }
+
+    /// A machine for hosts of this generation.
+    pub fn of(generation: Generation) -> Rig {
+        Rig::that_speaks(DialectName::Of(generation), ORIGIN, FakeBoard)
+    }
+
+    fn that_speaks<B: Board + 'static>(name: DialectName, start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
+        let origin = Clock::from_ticks(start);
+        let clock = VirtualClock::at(origin);
+        let bench = Bench::new(clock.clone(), origin);
+        let board = board(bench.clone());
+        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, name).unwrap());
+        let workers = FakeWorkers::new(bench.clone());
+        let outbox =
+            FakeOutbox { payloads: Arc::new(Mutex::new(Vec::with_capacity(RESPONSE_BYTES))), notes: Arc::default() };
+        let mcu = Mcu::new(
+            dialect,
+            Box::new(board),
+            Arc::new(clock.clone()),
+            Box::new(workers.clone()),
+            Box::new(outbox.clone()),
+        );
+        let rig = Rig { mcu, bench, origin, clock, workers, outbox };
+        assert_eq!(rig.responses(), ["starting"]);
+        rig
+    }
+
+    /// A machine with these objects.
+    pub fn configured(commands: &[&str]) -> Rig {
+        let mut rig = Rig::new();
+        rig.configure(commands);
+        rig
+    }
+
+    /// As [`Rig::configured`], with devices that take `answer_ticks` on a worker.
+    pub fn with_workers(answer_ticks: u32, commands: &[&str]) -> Rig {
+        let mut rig = Rig::new();
+        rig.bench.state().answer_ticks = answer_ticks;
+        rig.configure(commands);
+        rig
+    }
+
+    /// Configures the MCU with these commands.
+    pub fn configure(&mut self, commands: &[&str]) {
+        self.send("allocate_oids count=20");
+        self.send_all(commands);
+        self.send("finalize_config crc=7");
+        assert_eq!(self.responses(), [""; 0], "{:?}", self.notes());
+    }
+
+    // ---- time
+
+    /// Ticks since the rig was made.
+    pub fn now(&self) -> u64 {
+        self.clock.now().since(self.origin) as u64
+    }
+
+    fn instant(&self, ticks: u64) -> Clock {
+        Clock::from_ticks(self.origin.ticks() + ticks)
+    }
+
+    /// Lets time pass without giving the machine a turn.
+    pub fn stall_until(&mut self, ticks: u64) {
+        self.clock.set(self.instant(ticks));
+    }
+
+    /// Jumps to an instant.
+    #[inline]
+    pub fn jump(&self, to: Clock) {
+        self.clock.set(to);
+    }
+
+    /// Runs the machine up to and with the instant `ticks`.
+    pub fn run_until(&mut self, ticks: u64) {
+        let end = self.instant(ticks);
+        while let Some(next) = self.turn().filter(|next| *next <= end) {
+            self.clock.set(next);
+        }
+        self.clock.set(end);
+    }
+
+    /// Lets the machine run what is due; at most so many times, as a host's command may ask
+    /// for an event without end.
+    pub fn run_turns(&mut self, turns: u32) {
+        for _ in 0..turns {
+            if let Some(next) = self.turn() {
+                self.clock.set(next);
+            }
+        }
+    }
+
+    /// Runs what is due, and tells when there is more to do.
+    #[inline]
+    pub fn turn(&mut self) -> Option<Clock> {
+        self.mcu.run_timers();
+        self.mcu.run_workers();
+        let next = [self.mcu.next_timer(), self.workers.next_end()].into_iter().flatten().min()?;
+        // An event that asks to run again in the past takes its time like any other.
+        Some(if next <= self.mcu.last_read() { self.mcu.now() + Ticks::from_us(1) } else { next })
+    }
+
+    // ---- words
+
+    /// Encodes a command such as `queue_step oid=0 interval=1000 count=5 add=-3`; bytes are
+    /// written in hex, `clock=@1000` is 1000 ticks after the rig was made.
+    pub fn encode(&self, command: &str) -> Vec<u8> {
+        let mut words = command.split(' ');
+        let name = words.next().unwrap();
+        let given: Vec<(&str, &str)> = words.map(|word| word.split_once('=').unwrap()).collect();
+        let dialect = self.mcu.heard();
+        let format = dialect.dictionary().commands.keys().find(|format| format::name(format) == name);
+        let format = format.unwrap_or_else(|| panic!("no command {name}"));
+        let parameters = format::parameters(format).unwrap();
+        assert_eq!(given.len(), parameters.len(), "{command} is no {format}");
+        let mut writer = Writer::default();
+        writer.int(dialect.command_id(format).unwrap());
+        for (name, conversion) in parameters {
+            let (_, value) = given.iter().find(|(given, _)| *given == name).unwrap_or_else(|| panic!("{format}"));
+            match conversion {
+                Conversion::Bytes => writer.string(&unhex(value)),
+                _ => writer.int(self.number(value)),
+            }
+        }
+        writer.payload().unwrap().to_vec()
+    }
+
+    fn number(&self, text: &str) -> u32 {
+        match text.strip_prefix('@') {
+            Some(ticks) => self.origin.wire().wrapping_add(ticks.parse::<i64>().unwrap() as u32),
+            None => text.parse::<i64>().unwrap() as u32,
+        }
+    }
+
+    /// Sends a command.
+    pub fn send(&mut self, command: &str) {
+        let payload = self.encode(command);
+        self.execute(&payload);
+    }
+
+    /// Sends these commands in order.
+    pub fn send_all(&mut self, commands: &[&str]) {
+        commands.iter().for_each(|command| self.send(command));
+    }
+
+    /// Runs one command, and returns before the conversation that it may have begun is over.
+    pub fn begin(&mut self, command: &str) {
+        let payload = self.encode(command);
+        self.mcu.execute(&mut Reader::new(&payload));
+    }
+
+    /// Runs the commands of a block's payload, each to the end of the conversation that it began.
+    #[inline]
+    pub fn execute(&mut self, payload: &[u8]) {
+        let mut reader = Reader::new(payload);
+        while !reader.is_empty() {
+            self.mcu.execute(&mut reader);
+            while self.mcu.is_held() {
+                let next = self.turn();
+                self.clock.set(next.filter(|_| self.mcu.is_held()).unwrap_or(self.clock.now()));
+            }
+        }
+    }
+
+    /// Sends a command and takes its answer, which comes last.
+    pub fn ask(&mut self, command: &str) -> String {
+        self.send(command);
+        self.responses().pop().unwrap_or_default()
+    }
+
+    /// What the machine said since the last call, `stats` left out, as text:
+    /// `shutdown clock=@5 static_string_id=Timer too close`.
+    pub fn responses(&self) -> Vec<String> {
+        let mut responses = self.everything();
+        responses.retain(|response| !response.starts_with("stats"));
+        responses
+    }
+
+    /// As [`Rig::responses`], with `stats`.
+    pub fn everything(&self) -> Vec<String> {
+        let mut buffer = self.outbox.payloads.lock().unwrap();
+        let mut payloads = &buffer[..];
+        let mut responses = Vec::new();
+        while let Some((len, rest)) = payloads.split_first() {
+            let (payload, rest) = rest.split_at(usize::from(*len));
+            responses.push(self.decode(payload));
+            payloads = rest;
+        }
+        buffer.clear();
+        responses
+    }
+
+    /// Forgets what the machine said.
+    pub fn forget_responses(&self) {
+        self.outbox.payloads.lock().unwrap().clear();
+    }
+
+    /// What the machine said for the log since the last call.
+    pub fn notes(&self) -> Vec<String> {
+        std::mem::take(&mut self.outbox.notes.lock().unwrap())
+    }
+
+    /// The text of the shutdown since the last call, if there was one; more than one is a
+    /// fault of its own.
+    pub fn shutdown(&self) -> Option<String> {
+        let mut responses = self.responses();
+        responses.retain(|response| response.starts_with("shutdown "));
+        assert!(responses.len() <= 1, "{responses:?}");
+        responses.pop().map(|response| response.split_once("static_string_id=").unwrap().1.into())
+    }
+
+    /// The edges of an output so far.
+    pub fn edges(&self, pin: u32) -> Vec<Edge> {
+        self.bench.edges(pin)
+    }
+
+    /// What the MCU tells a host of itself.
+    pub fn dictionary(&self) -> &Dictionary {
+        self.dialect().dictionary()
+    }
+
+    /// The dialect that the MCU speaks.
+    pub fn dialect(&self) -> &Dialect {
+        self.mcu.dialect()
+    }
+
+    /// Offers the machine the dialect of another generation; whether it takes it.
+    pub fn speak(&mut self, generation: Generation) {
+        let dialect = Dialect::new(&FIRMWARE, &FakeBoard(self.bench.clone()), DialectName::Of(generation));
+        self.mcu.speak(Arc::new(dialect.unwrap()));
+    }
+
+    fn decode(&self, payload: &[u8]) -> String {
+        let mut reader = Reader::new(payload);
+        let id = reader.int().unwrap();
+        let is_it = |(_, value): &(&String, &serde_json::Value)| value.as_i64() == Some((id as i32).into());
+        let (format, _) = self.dictionary().responses.iter().find(is_it).unwrap();
+        let mut text = format::name(format).to_owned();
+        for (name, conversion) in format::parameters(format).unwrap() {
+            let value = match conversion {
+                Conversion::Bytes => hex(reader.bytes().unwrap()),
+                Conversion::I32 => (reader.int().unwrap() as i32).to_string(),
+                _ if name.ends_with("clock") => {
+                    let clock = Clock::widen(reader.int().unwrap(), self.clock.now());
+                    format!("@{}", clock.since(self.origin))
+                }
+                _ if name == "static_string_id" => self.static_string(reader.int().unwrap()),
+                _ => reader.int().unwrap().to_string(),
+            };
+            text += &format!(" {name}={value}");
+        }
+        assert!(reader.is_empty(), "{text} has more than its format says");
+        text
+    }
+
+    fn static_string(&self, id: u32) -> String {
+        let strings = self.dictionary().enumerations["static_string_id"].as_object().unwrap();
+        strings.iter().find(|(_, value)| value.as_u64() == Some(id.into())).unwrap().0.clone()
+    }
+}
+
+/// Bytes in hexadecimal, as the commands of a rig have them.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn unhex(text: &str) -> Vec<u8> {
+    (0..text.len()).step_by(2).map(|at| u8::from_str_radix(&text[at..at + 2], 16).unwrap()).collect()
+}
