@@ -6,7 +6,7 @@ use std::env;
 use std::process::Command;
 
 /// What the program is made of.
-const SOURCES: [&str; 4] = ["src", "build.rs", "Cargo.toml", "Cargo.lock"];
+const SOURCES: [&str; 5] = ["src", "crates", "build.rs", "Cargo.toml", "Cargo.lock"];
 
 /// Where the sources are not a checkout of git, as when a package is built, whoever gives them may say
 /// which state they are of.

@@ -7,17 +7,12 @@
 //! among a few machines, and prints each test by name as libtest does.
 
 mod lab {
-    pub mod cache;
     pub mod emulator;
     pub mod guest_program;
-    pub mod initramfs;
-    pub mod kernel;
     pub mod options;
-    pub mod process;
     pub mod report;
     pub mod snapshot;
     pub mod table;
-    pub mod tools;
     pub mod vm;
 }
 
@@ -28,13 +23,13 @@ use std::thread;
 use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
 use nix::unistd::Pid;
 
-use lab::cache::Cache;
 use lab::guest_program::GuestProgram;
-use lab::kernel::{Flavour, Kernel, Offers};
 use lab::options::Options;
 use lab::report::Report;
 use lab::snapshot::Snapshot;
 use lab::vm::Run;
+use pinion_testkit::cache::Cache;
+use pinion_testkit::kernel::{Flavour, Kernel, Offers};
 
 /// A failed run exits as libtest's do.
 const FAILED: u8 = 101;

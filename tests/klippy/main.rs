@@ -9,9 +9,6 @@ mod drivers;
 mod filament;
 mod hosts;
 mod klippy;
-#[allow(dead_code)]
-#[path = "../pages/page.rs"]
-mod page;
 mod print;
 mod probes;
 mod readme;

@@ -8,8 +8,8 @@ use std::process::Command;
 
 use serde_json::{Value, json};
 
-use crate::page::{Page, pages};
 use crate::{checkout, klippy::python};
+use pinion_testkit::page::{Page, pages};
 
 /// What a printer has beside.
 const PRINTER: &str = "[mcu]\nserial: /dev/null\n[printer]\nkinematics: none\nmax_velocity: 1\nmax_accel: 1\n";

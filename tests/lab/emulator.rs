@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 
-use super::process;
+use pinion_testkit::process;
 
 /// Longer than a boot, or a test, takes on a busy computer.
 pub const SILENCE_MAX: Duration = Duration::from_secs(180);

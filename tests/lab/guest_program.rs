@@ -10,8 +10,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::str::FromStr;
 
-use super::initramfs::Archive;
-use super::process;
+use pinion_testkit::initramfs::Archive;
+use pinion_testkit::process;
 
 /// Programs of the host that busybox has no equivalent of.
 const HOST_PROGRAMS: [&str; 1] = ["/usr/bin/chrt"];

@@ -5,7 +5,7 @@ use std::env;
 use std::process;
 
 use super::guest_program::OtherProgram;
-use super::kernel::Flavour;
+use pinion_testkit::kernel::Flavour;
 
 const USAGE: &str = "\
 Usage: cargo test --test lab -- [OPTIONS] [FILTERS...]

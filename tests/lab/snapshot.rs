@@ -10,11 +10,11 @@ use std::process::Command;
 
 use serde_json::json;
 
-use super::cache::Cache;
 use super::emulator::Emulator;
 use super::guest_program::GuestProgram;
-use super::kernel::Kernel;
 use super::{process, vm};
+use pinion_testkit::cache::Cache;
+use pinion_testkit::kernel::Kernel;
 
 const PREFIX: &str = "booted-";
 
@@ -28,7 +28,7 @@ impl Snapshot {
         let path = folder.join(format!("{PREFIX}{:016x}", key(kernel, program)?));
         if !path.exists() {
             eprintln!("lab: booting Linux {}", kernel.release);
-            super::kernel::remove_others(folder, PREFIX, &path)?;
+            pinion_testkit::kernel::remove_others(folder, PREFIX, &path)?;
             let partial = path.with_extension("partial");
             make(kernel, program, cache, &partial)?;
             fs::rename(&partial, &path).map_err(|error| format!("cannot rename {}: {error}", partial.display()))?;

@@ -10,12 +10,12 @@ use std::time::{Duration, Instant};
 
 use serde_json::json;
 
-use super::cache::Cache;
 use super::emulator::{Emulator, SILENCE_MAX};
 use super::guest_program::OtherProgram;
-use super::kernel::{Flavour, Kernel};
 use super::report::{Outcome, Report};
 use super::snapshot::Snapshot;
+use pinion_testkit::cache::Cache;
+use pinion_testkit::kernel::{Flavour, Kernel};
 
 pub const EMULATOR: &str = "qemu-system-x86_64";
 

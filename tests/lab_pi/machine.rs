@@ -11,10 +11,10 @@ use std::time::Duration;
 
 use tempfile::TempDir;
 
-use super::cache::Cache;
 use super::debian::{EMULATOR, Sysroot};
 use super::gpio::{Gpio, LINES, Trigger};
 use super::process;
+use pinion_testkit::cache::Cache;
 
 /// Longer than a test may take, and longer than a boot on a busy computer.
 const SILENCE_MAX: Duration = Duration::from_secs(240);

@@ -10,27 +10,15 @@ mod debian;
 mod gpio;
 mod machine;
 
-// The lab's, which uses all of it.
-#[allow(dead_code)]
-#[path = "../lab/cache.rs"]
-mod cache;
-#[path = "../lab/initramfs.rs"]
-mod initramfs;
-#[path = "../lab/process.rs"]
-mod process;
-#[allow(dead_code)]
-#[path = "../lab/tools.rs"]
-mod tools;
-
 use std::env;
 use std::process::ExitCode;
 use std::time::Instant;
 
-use cache::Cache;
 use cross::Programs;
 use debian::Sysroot;
-use initramfs::Archive;
 use machine::{Machine, News};
+use pinion_testkit::cache::Cache;
+use pinion_testkit::initramfs::Archive;
 
 const USAGE: &str = "\
 Usage: cargo test --test lab_pi -- [OPTIONS] [FILTERS...]

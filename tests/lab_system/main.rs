@@ -9,25 +9,6 @@ mod machine;
 mod packages;
 mod pages;
 
-// The lab's, which uses all of it.
-#[allow(dead_code)]
-#[path = "../lab/cache.rs"]
-mod cache;
-#[allow(dead_code)]
-#[path = "../lab/initramfs.rs"]
-mod initramfs;
-#[allow(dead_code)]
-#[path = "../lab/kernel.rs"]
-mod kernel;
-#[allow(dead_code)]
-#[path = "../pages/page.rs"]
-mod page;
-#[path = "../lab/process.rs"]
-mod process;
-#[allow(dead_code)]
-#[path = "../lab/tools.rs"]
-mod tools;
-
 use std::collections::VecDeque;
 use std::env;
 use std::fs;
@@ -37,8 +18,8 @@ use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Instant;
 
-use cache::Cache;
 use machine::{Machine, Root};
+use pinion_testkit::cache::Cache;
 
 const USAGE: &str = "\
 Usage: cargo test --test lab_system -- [OPTIONS] [FILTERS...]

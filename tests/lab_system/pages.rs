@@ -5,7 +5,7 @@ use std::fs;
 use std::path::Path;
 
 use super::Check;
-use super::page::{COMMANDS, Page, pages};
+use pinion_testkit::page::{COMMANDS, Page, pages};
 
 /// How a check begins the line that has a page tried: `page docs/install.md`.
 const WORD: &str = "page ";

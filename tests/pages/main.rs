@@ -3,11 +3,9 @@
 //! Whether what they say is true, the tests beside them ask: the commands `tests/lab_system`, what is for
 //! `printer.cfg` `tests/klippy/readme.rs`.
 
-mod page;
-
 use std::path::Path;
 
-use page::{COMMANDS, Page, pages, reason};
+use pinion_testkit::page::{COMMANDS, Page, pages, reason};
 
 /// What a block may be.
 const KINDS: [&str; 6] = [COMMANDS, "ini", "toml", "text", "diff", "rust"];

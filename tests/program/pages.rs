@@ -52,7 +52,9 @@ fn files(folder: &Path) -> Vec<PathBuf> {
 /// The program's sources without their tests, with each literal as it is printed; and the service's script.
 fn sources() -> Vec<(String, String)> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut all = files(&root.join("src"));
+    let crates = ["client", "firmware", "linux", "protocol", "sim"].map(|name| format!("crates/{name}/src"));
+    let mut all: Vec<PathBuf> = crates.iter().flat_map(|folder| files(&root.join(folder))).collect();
+    all.extend(files(&root.join("src")));
     all.push(root.join("systemd/link"));
     let source = |path: PathBuf| {
         let text = fs::read_to_string(&path).unwrap();

@@ -60,6 +60,8 @@ use watcher::{Program, Watcher};
 
 /// What the kernel calls the guardian's process (proc_pid_comm(5)): its command line is the program's.
 pub(crate) const NAME: &CStr = c"pinion-guardian";
+/// Most threads the program may have when it forks the guardian; a test has that of its harness, too.
+const THREADS_MAX: usize = if cfg!(test) { 2 } else { 1 };
 /// How long the program waits for the guardian's answer, in seconds.
 const ANSWER_S: i64 = 5;
 /// How long to wait for the end of a process that was asked to end, or was killed.
@@ -91,7 +93,7 @@ impl Guardian {
         setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::new(ANSWER_S, 0))?;
         let program = Program::new(getpid());
         let ours = socket.as_raw_fd();
-        let pid = sys::fork(move || {
+        let pid = sys::fork(THREADS_MAX, move || {
             // The fork has copied the program's end of the socket. It must not stay open here: the
             // socket would not be closed when the program dies.
             let _ = nix::unistd::close(ours);

@@ -93,17 +93,14 @@ pub fn shared_words() -> io::Result<&'static [AtomicU32; SHARED_WORDS]> {
     Ok(unsafe { page.cast::<[AtomicU32; SHARED_WORDS]>().as_ref() })
 }
 
-/// Threads that a process may have which forks. A test runs in a thread of its own, while the
-/// first one waits and holds no lock.
-const THREADS: usize = if cfg!(test) { 2 } else { 1 };
-
-/// Forks a process that runs `child` and ends with the status that it returns. An error if
-/// this process has other threads: the child would miss them, and the locks that they hold.
-pub fn fork(child: impl FnOnce() -> i32) -> io::Result<Pid> {
-    if fs::read_dir("/proc/self/task")?.count() > THREADS {
+/// Forks a process that runs `child` and ends with the status that it returns. An error if this process has more
+/// than `threads_max` threads: the child would miss them, and the locks that they hold. A program allows one; a test
+/// runs in a second one while the first waits and holds no lock.
+pub fn fork(threads_max: usize, child: impl FnOnce() -> i32) -> io::Result<Pid> {
+    if fs::read_dir("/proc/self/task")?.count() > threads_max {
         return Err(io::Error::other("threads have been started already"));
     }
-    // SAFETY: this is the only thread, so the child is a whole copy of the process.
+    // SAFETY: this is the only thread that does anything, so the child is a whole copy of the process.
     match unsafe { nix::unistd::fork() }? {
         ForkResult::Parent { child } => Ok(child),
         ForkResult::Child => {

@@ -115,7 +115,7 @@ fn a_slow_bus_keeps_no_step() {
     assert_eq!(transfer(client, oid, &[0], 1), ("SUCCESS".into(), vec![1]));
 }
 
-/// gpio-sim has no chip that answers; how bits go over the wires is tested in `src/board/soft_i2c.rs`.
+/// gpio-sim has no chip that answers; how bits go over the wires is tested in `crates/firmware/src/board/soft_i2c.rs`.
 #[test]
 fn a_software_bus_pulls_low_or_lets_go_and_never_drives_high() {
     let sim = GpioSim::builder("lab", 8).name(2, "SDA").name(3, "SCL").build();

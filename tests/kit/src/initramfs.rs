@@ -33,18 +33,22 @@ impl Archive {
         Ok(archive)
     }
 
+    /// Adds a folder.
     pub fn folder(&mut self, path: &str) {
         self.add(path, FOLDER, b"");
     }
 
+    /// Adds a file that all may read.
     pub fn file(&mut self, path: &str, content: &[u8]) {
         self.add(path, FILE, content);
     }
 
+    /// Adds a file that all may run.
     pub fn program(&mut self, path: &str, content: &[u8]) {
         self.add(path, PROGRAM, content);
     }
 
+    /// Adds a symbolic link.
     pub fn symlink(&mut self, path: &str, target: &str) {
         self.add(path, SYMLINK, target.as_bytes());
     }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! What a machine boots: Debian's own kernel, those of its modules that the tests
-//! use, and the modules of `tests/lab/modules` built for it.
+//! use, and the modules of `tests/kit/modules` built for it.
 //!
 //! Modules fit one exact kernel, so every version is taken from what apt offers.
 //! Packages are unpacked below the cache, never installed.
@@ -19,14 +19,17 @@ use super::{process, tools};
 /// The kernels that Debian offers and Pinion meets.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Flavour {
+    /// Debian's default kernel.
     Stock,
     /// PREEMPT_RT.
     Rt,
 }
 
 impl Flavour {
+    /// Each flavour that the labs run.
     pub const ALL: [Flavour; 2] = [Flavour::Stock, Flavour::Rt];
 
+    /// The name at the beginning of a test.
     pub fn name(self) -> &'static str {
         match self {
             Flavour::Stock => "stock",
@@ -129,6 +132,7 @@ const UPSTREAM_RENAMED: [(&str, &str); 3] = [
 pub struct Kernel {
     /// As `uname -r` prints it.
     pub release: String,
+    /// The uncompressed kernel.
     pub vmlinux: PathBuf,
     /// Busybox, the modules, and `/lab/modules`, the list in loading order.
     pub initramfs: PathBuf,
@@ -146,7 +150,7 @@ impl Kernel {
         let release = newest.dependency("linux-image-")?.replace("linux-image-", "");
         let version = newest.field("Version")?;
         let of_version = cache.root().join(format!("linux-{version}"));
-        let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/lab/modules");
+        let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("modules");
         let folder = of_version.join(format!("{}-{:016x}", flavour.name(), key(&sources)?));
         if !folder.exists() {
             eprintln!("lab: building Linux {release}, version {version}");
@@ -164,6 +168,7 @@ pub struct Offers {
 }
 
 impl Offers {
+    /// Asks apt which kernels it has.
     pub fn ask() -> Result<Offers, String> {
         let names = Flavour::ALL.map(Flavour::package);
         let packages = Fields::of(&names).or_else(|_| {

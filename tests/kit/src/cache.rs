@@ -14,10 +14,11 @@ pub struct Cache {
 }
 
 impl Cache {
+    /// Opens the cache, and makes its folder if it is not there.
     pub fn open() -> Result<Cache, String> {
         let root = match env::var_os("PINION_LAB_CACHE") {
             Some(folder) => PathBuf::from(folder),
-            None => Path::new(env!("CARGO_TARGET_TMPDIR")).with_file_name("lab"),
+            None => target()?.join("lab"),
         };
         let runs = root.join("runs");
         fs::create_dir_all(&runs).map_err(|error| format!("cannot create {}: {error}", runs.display()))?;
@@ -26,6 +27,7 @@ impl Cache {
         Ok(Cache { root })
     }
 
+    /// The folder of the cache.
     pub fn root(&self) -> &Path {
         &self.root
     }
@@ -43,4 +45,11 @@ impl Cache {
         tempfile::tempdir_in(self.root.join("runs"))
             .map_err(|error| format!("cannot create a folder for the run: {error}"))
     }
+}
+
+/// Cargo's target folder: the harness that runs is in `debug/deps` there.
+fn target() -> Result<PathBuf, String> {
+    let harness = env::current_exe().map_err(|error| format!("cannot tell which program this is: {error}"))?;
+    let target = harness.ancestors().nth(3).map(Path::to_owned);
+    target.ok_or_else(|| format!("{} is not in cargo's target folder: set PINION_LAB_CACHE", harness.display()))
 }

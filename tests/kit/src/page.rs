@@ -14,6 +14,7 @@ const NOT_TRIED: &str = "<!-- not tried:";
 pub struct Page {
     /// From the project's folder on, such as `docs/install.md`.
     pub name: String,
+    /// The whole file.
     pub text: String,
 }
 
@@ -23,6 +24,7 @@ pub struct Block {
     pub kind: String,
     /// The number of its first line, counted from 1.
     pub line: usize,
+    /// What stands between the fences.
     pub text: String,
     /// The paragraph before it, which says what it is.
     pub before: String,
@@ -32,7 +34,7 @@ pub struct Block {
 
 /// README.md, then those of docs/ by their names.
 pub fn pages() -> Vec<Page> {
-    let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let project = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."));
     let docs = fs::read_dir(project.join("docs")).expect("the folder of the pages");
     let mut names: Vec<String> = docs
         .map(|entry| format!("docs/{}", entry.expect("a file of docs").file_name().to_string_lossy()))
