@@ -108,7 +108,7 @@ fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
 }
 
 fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -> Result<(), String> {
-    lab::tools::ensure()?;
+    pinion_testkit::tools::ensure()?;
     let cache = Cache::open()?;
     let offers = Offers::ask()?;
     let flavours: Vec<Flavour> =
@@ -181,7 +181,7 @@ fn stay_on_processor(number: usize) -> Result<(), String> {
 }
 
 fn shell(options: &Options, program: &GuestProgram<'_>) -> Result<bool, String> {
-    lab::tools::ensure()?;
+    pinion_testkit::tools::ensure()?;
     let cache = Cache::open()?;
     let flavour = options.flavour.unwrap_or(Flavour::Stock);
     let kernel = {

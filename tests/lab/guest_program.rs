@@ -108,7 +108,7 @@ impl<'a> GuestProgram<'a> {
 
     /// Changes with everything that the payload is made of.
     pub fn hash_files(&self, hasher: &mut impl Hasher) -> Result<(), String> {
-        for source in [include_str!("guest_program.rs"), include_str!("initramfs.rs"), include_str!("init.sh")] {
+        for source in [include_str!("guest_program.rs"), pinion_testkit::initramfs::SOURCE, include_str!("init.sh")] {
             source.hash(hasher);
         }
         let libraries = libraries(&self.programs())?;

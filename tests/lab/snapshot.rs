@@ -12,9 +12,10 @@ use serde_json::json;
 
 use super::emulator::Emulator;
 use super::guest_program::GuestProgram;
-use super::{process, vm};
+use super::vm;
 use pinion_testkit::cache::Cache;
 use pinion_testkit::kernel::Kernel;
+use pinion_testkit::process;
 
 const PREFIX: &str = "booted-";
 

@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use super::debian::{RUSTC, Sysroot, TOOL_PREFIX};
-use super::process;
 use pinion_testkit::initramfs::Archive;
+use pinion_testkit::process;
 
 const TARGET: &str = "aarch64-unknown-linux-gnu";
 const TESTS: &str = "guest_pi";

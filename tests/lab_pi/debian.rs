@@ -12,8 +12,8 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use super::{process, tools};
 use pinion_testkit::cache::Cache;
+use pinion_testkit::{process, tools};
 
 /// Rust's compiler as Debian has it: rustup's has no standard library that goes
 /// with Debian's for arm64.

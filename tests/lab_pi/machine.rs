@@ -13,8 +13,8 @@ use tempfile::TempDir;
 
 use super::debian::{EMULATOR, Sysroot};
 use super::gpio::{Gpio, LINES, Trigger};
-use super::process;
 use pinion_testkit::cache::Cache;
+use pinion_testkit::process;
 
 /// Longer than a test may take, and longer than a boot on a busy computer.
 const SILENCE_MAX: Duration = Duration::from_secs(240);

@@ -10,9 +10,9 @@ use std::sync::mpsc::{Receiver, channel};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use super::{process, tools};
 use pinion_testkit::cache::Cache;
 use pinion_testkit::kernel::{Flavour, Kernel, Offers, remove_others};
+use pinion_testkit::{process, tools};
 
 /// Longer than the agent lets a script run, which it measures by the guest's clock: on a busy computer that
 /// takes several seconds for one.

@@ -6,7 +6,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use super::process;
+use pinion_testkit::process;
 
 /// Fills the folder that the machine sees as /share.
 pub fn share(folder: &Path) -> Result<(), String> {

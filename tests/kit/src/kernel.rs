@@ -250,7 +250,7 @@ impl Fields {
 fn key(sources: &Path) -> Result<u64, String> {
     let mut hasher = DefaultHasher::new();
     include_str!("kernel.rs").hash(&mut hasher);
-    include_str!("initramfs.rs").hash(&mut hasher);
+    super::initramfs::SOURCE.hash(&mut hasher);
     include_str!("start.sh").hash(&mut hasher);
     for path in files(sources)? {
         path.file_name().hash(&mut hasher);
