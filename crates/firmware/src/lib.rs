@@ -1,10 +1,89 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A Klipper micro-controller without I/O.
+//! A Klipper micro-controller without I/O: its scheduler, its objects and its features.
+//!
+//! The MCU reads the time from the clock that it is given, asks a [`Board`](board::Board) for pins and buses, hands
+//! what takes time to [`Workers`](mcu::Workers), and leaves what it says in an [`Outbox`](mcu::Outbox). So a whole MCU
+//! runs in a test, in virtual time and the same each time.
 //!
 //! - [`feature`]: one file per Klipper feature, and the list of them all
 //! - [`mcu`]: the MCU: oids, timers, move queue, shutdown
 //! - [`board`]: what the MCU asks of the hardware, and buses made of bare lines
 //! - [`time`], [`shutdown`], [`lateness`]: the words that all of these share
+//!
+//! # An MCU with one feature of its own, in virtual time
+//!
+//! The feature answers `echo` with the number that it was sent, and the instant. The board is that of the crate
+//! `pinion-testbench`, which records what an MCU does to its pins.
+//!
+//! ```
+//! use std::sync::{Arc, Mutex};
+//!
+//! use pinion_firmware::mcu::{
+//!     Dialect, DialectName, Feature, Firmware, Generation, Mcu, Note, Outbox, Response, base, place_of_response,
+//! };
+//! use pinion_firmware::protocol::vlq::{Reader, Writer};
+//! use pinion_firmware::time::{Clock, VirtualClock};
+//! use pinion_testbench::board::{Bench, FakeBoard, FakeWorkers};
+//!
+//! mod echo {
+//!     use pinion_firmware::mcu::{Command, Feature, Response, command, response};
+//!     use pinion_firmware::time::Clock;
+//!
+//!     pub const FEATURE: Feature =
+//!         Feature { name: "echo", commands: &[ECHO], responses: &[Echoed::FORM], ..Feature::EMPTY };
+//!
+//!     response! {
+//!         /// What was sent, and when it came.
+//!         "echoed number=%u clock=%u"
+//!         pub struct Echoed { number: u32, clock: Clock }
+//!     }
+//!
+//!     const ECHO: Command = command!("echo number=%u", |mcu, number: u32| {
+//!         let clock = mcu.now();
+//!         mcu.send(Echoed { number, clock });
+//!         Ok(())
+//!     });
+//! }
+//!
+//! const FEATURES: &[Feature] = &[base::FEATURE, echo::FEATURE];
+//! const fn response_index(format: &str) -> usize {
+//!     place_of_response(FEATURES, format)
+//! }
+//!
+//! /// Keeps what the MCU says to its host.
+//! #[derive(Clone, Default)]
+//! struct Said(Arc<Mutex<Vec<Vec<u8>>>>);
+//!
+//! impl Outbox for Said {
+//!     fn send(&mut self, payload: &[u8]) {
+//!         self.0.lock().unwrap().push(payload.to_vec());
+//!     }
+//!     fn note(&mut self, _note: Note<'_>) {}
+//! }
+//!
+//! fn main() {
+//!     let clock = VirtualClock::at(Clock::from_ticks(1000));
+//!     let bench = Bench::new(clock.clone(), Clock::EPOCH);
+//!     let board = FakeBoard(bench.clone());
+//!     let firmware =
+//!         Firmware { features: FEATURES, app: "Echo", version: "1", build_versions: "", license: "GNU GPLv3" };
+//!     let dialect = Dialect::new(&firmware, &board, DialectName::Of(Generation::Master)).unwrap();
+//!     let (dialect, said) = (Arc::new(dialect), Said::default());
+//!     let workers = Box::new(FakeWorkers::new(bench));
+//!     let mut mcu = Mcu::new(dialect.clone(), Box::new(board), Arc::new(clock), workers, Box::new(said.clone()));
+//!
+//!     // A host sends the command's id and its parameter.
+//!     let mut command = Writer::default();
+//!     command.int(dialect.command_id("echo number=%u").unwrap());
+//!     command.int(42);
+//!     mcu.execute(&mut Reader::new(command.payload().unwrap()));
+//!
+//!     let answer = said.0.lock().unwrap().pop().unwrap();
+//!     let mut answer = Reader::new(&answer);
+//!     assert_eq!(answer.int().ok(), dialect.response_id::<echo::Echoed>());
+//!     assert_eq!((answer.int().ok(), answer.int().ok()), (Some(42), Some(1000)));
+//! }
+//! ```
 
 #![forbid(unsafe_code)]
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]

@@ -4,10 +4,9 @@
 #![forbid(unsafe_code)]
 
 use crate::board::{Bias, Pin, Range};
-use crate::mcu::{Feature, Mcu, base};
+use crate::mcu::{Feature, Mcu, base, place_of_response};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::Ticks;
-use pinion_protocol::format::same;
 
 mod ads1220;
 mod ads131m0x;
@@ -86,21 +85,7 @@ pub const FEATURES: &[Feature] = &[
 
 /// The place of a response in the list of all, found by the compiler.
 const fn response_index(format: &str) -> usize {
-    let mut index = 0;
-    let mut feature = 0;
-    while feature < FEATURES.len() {
-        let responses = FEATURES[feature].responses;
-        let mut response = 0;
-        while response < responses.len() {
-            if same(responses[response].format, format) {
-                return index;
-            }
-            index += 1;
-            response += 1;
-        }
-        feature += 1;
-    }
-    panic!("the response is not listed by any feature")
+    place_of_response(FEATURES, format)
 }
 
 /// The names of an enumeration that is the same on every board.

@@ -5,7 +5,6 @@
 
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{CLOCK_FREQ, Clock};
-use pinion_protocol::format::same;
 
 use super::stats::SUMSQ_BASE;
 use super::{Command, Constant, Enumeration, Feature, Form, Generations, Response, command, response};
@@ -56,17 +55,6 @@ const RESPONSES: &[Form] = &[
 /// How many bytes the host may send before they are acknowledged: half of a pty's buffer of 4096
 /// bytes, so that all of them fit in it, and the host never blocks in its write.
 const RECEIVE_WINDOW: u32 = 2048;
-
-pub(super) const fn response_index(format: &str) -> usize {
-    let mut index = 0;
-    while index < RESPONSES.len() {
-        if same(RESPONSES[index].format, format) {
-            return index;
-        }
-        index += 1;
-    }
-    panic!("the response is not listed")
-}
 
 /// Whether the response with this place in the list of all is one of the machine's own.
 pub(super) const fn is_own_response(index: usize) -> bool {

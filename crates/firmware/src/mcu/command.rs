@@ -7,6 +7,7 @@
 use crate::board::{Board, Range};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_protocol::Malformed;
+use pinion_protocol::format::same;
 use pinion_protocol::vlq::{Reader, Writer};
 
 use super::{Generations, Mcu};
@@ -150,6 +151,7 @@ impl Feature {
 }
 
 /// Declares a command: its format, and a closure with the machine and the typed parameters.
+#[macro_export]
 macro_rules! command {
     ($format:literal, |$mcu:ident $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
         const {
@@ -180,7 +182,9 @@ macro_rules! command {
 
 /// Declares a response as a struct. Behind the format stands which hosts take it, such as
 /// `=> until(V0_12);`; without it, all do. The module above must have a `response_index`, which finds
-/// its format in the list of responses; one that is not listed is a build error.
+/// its format in the list of responses ([`place_of_response`](crate::mcu::place_of_response)); one that is not listed is a
+/// build error.
+#[macro_export]
 macro_rules! response {
     ($(#[$doc:meta])* $format:literal $(=> $generations:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
         $($field:ident: $t:ty),* $(,)?
@@ -210,4 +214,22 @@ macro_rules! response {
     };
 }
 
-pub(crate) use {command, response};
+/// The place of a response in the list of all that these features send. Evaluated by the compiler, it fails the build
+/// if no feature lists the response.
+pub const fn place_of_response(features: &[Feature], format: &str) -> usize {
+    let mut index = 0;
+    let mut feature = 0;
+    while feature < features.len() {
+        let responses = features[feature].responses;
+        let mut response = 0;
+        while response < responses.len() {
+            if same(responses[response].format, format) {
+                return index;
+            }
+            index += 1;
+            response += 1;
+        }
+        feature += 1;
+    }
+    panic!("the response is not listed by any feature")
+}

@@ -32,8 +32,8 @@ mod stop;
 mod timers;
 
 pub use bus::{Bus, Conversation, Talk};
-pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response};
-pub(crate) use command::{command, response};
+pub use crate::{command, response};
+pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
 pub use dialect::{Dialect, Firmware};
 pub use errand::{Completion, Done, Errand, Job, Ticket, WorkerId, Workers};
 pub use generation::{DialectName, Generation, Generations, only, since, until};
@@ -54,7 +54,7 @@ use timers::Timers;
 
 /// The machine's own responses come first in the list of all.
 const fn response_index(format: &str) -> usize {
-    base::response_index(format)
+    place_of_response(&[base::FEATURE], format)
 }
 
 /// How far a timer may fall behind before the machine stops: 100 ms, as in the firmware.
