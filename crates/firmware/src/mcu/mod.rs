@@ -31,8 +31,8 @@ mod stats;
 mod stop;
 mod timers;
 
-pub use bus::{Bus, Conversation, Talk};
 pub use crate::{command, response};
+pub use bus::{Bus, Conversation, Talk};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
 pub use dialect::{Dialect, Firmware};
 pub use errand::{Completion, Done, Errand, Job, Ticket, WorkerId, Workers};

@@ -2,6 +2,7 @@
 //! A machine that is given the dialect of another host.
 
 use pinion_firmware::mcu::{DialectName, Generation};
+use pinion_protocol::vlq::Writer;
 
 use pinion_testbench::rig::{Rig, hex};
 
@@ -84,4 +85,24 @@ fn the_machines_own_messages_have_the_same_ids_in_every_dialect() {
     for generation in Generation::ALL {
         assert_eq!(ids(generation), ids(Generation::Master), "{generation}");
     }
+}
+
+#[test]
+fn an_emergency_stop_is_found_among_others_and_not_in_their_parameters() {
+    let rig = Rig::of(Generation::Master);
+    let dialect = rig.dialect();
+    let stop = dialect.command_id("emergency_stop").unwrap();
+    let step = dialect.command_id("queue_step oid=%c interval=%u count=%hu add=%hi").unwrap();
+    let contains = |ints: &[u32]| {
+        let mut writer = Writer::default();
+        ints.iter().for_each(|int| writer.int(*int));
+        dialect.is_emergency(writer.payload().unwrap())
+    };
+    assert!(contains(&[stop]));
+    assert!(contains(&[step, stop, stop, stop, stop, stop, step]));
+    assert!(!contains(&[step, stop, stop, stop, stop]));
+    assert!(!contains(&[step, 1, 2, 3, 4]));
+    assert!(!contains(&[]));
+    assert!(!contains(&[4711, stop]), "the machine stops at a command that there is not");
+    assert!(!contains(&[step, stop]), "and at one that is cut short");
 }
