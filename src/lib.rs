@@ -9,7 +9,7 @@
 //! - [`mcu`]: the machine: oids, timers, move queue, shutdown
 //! - [`board`]: what the machine asks of the hardware; the linux and the sim board
 //! - [`wire`]: bytes only: VLQ, CRC, message blocks, formats, dictionary
-//! - [`time`], [`shutdown`], [`lateness`]: the words that all layers share; `sys` holds every `unsafe`
+//! - [`time`], [`shutdown`], [`lateness`], `foreign`: the words that all layers share; `sys` holds every `unsafe`
 //!
 //! [`host`] is the other end of the wire: a small client for demonstrations and tests.
 
@@ -28,6 +28,7 @@ mod bench;
 pub mod board;
 pub mod cli;
 pub mod feature;
+mod foreign;
 pub mod host;
 pub mod klippy;
 pub mod lateness;
