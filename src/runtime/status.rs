@@ -27,6 +27,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 use serde_json::{Value, json};
 
 use crate::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
+use crate::foreign::plain_json;
 use crate::lateness::{Lateness, us};
 use crate::mcu::{BusCounts, LineUse, Mcu, Present, Snapshot};
 use crate::time::{NS_PER_TICK, Ticks};
@@ -306,7 +307,7 @@ impl Server {
             let clients: Vec<UnixStream> =
                 std::iter::from_fn(|| Some(listener.accept().ok()?.0)).take(CLIENTS_MAX).collect();
             if !clients.is_empty() {
-                let document = self.document().to_string();
+                let document = plain_json(&self.document().to_string());
                 for client in clients {
                     give(client, document.as_bytes());
                 }
