@@ -6,12 +6,14 @@
 //! - [`cli`]: the subcommands
 //! - [`runtime`]: threads, pty, real time, signals
 //! - [`klippy`]: what can be known of a host from outside
+//! - `foreign`: what others write: files that may be anything, and names that may hold anything
 
 // Printing panics when nobody reads, these when something is not as was thought: tests may.
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 #![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
 
 pub mod cli;
+mod foreign;
 pub mod klippy;
 pub mod runtime;
 

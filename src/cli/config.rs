@@ -5,16 +5,21 @@
 
 use std::fmt;
 use std::fs;
+use std::io;
 use std::ops::Range;
 use std::path::Path;
 use std::str::FromStr;
 
 use toml::de::{DeTable, DeValue};
 
+use crate::foreign;
+
 use super::run::{Given, MARGIN_MAX_US, mode};
 
 /// The file that the service reads.
 pub(super) const SYSTEM_FILE: &str = "/etc/pinion/pinion.toml";
+/// Longest configuration that is read because another process names it.
+const FOREIGN_BYTES_MAX: u64 = 1 << 20;
 
 /// A key of the file.
 struct Key {
@@ -97,8 +102,17 @@ fn word<T: FromStr<Err = String>>(value: &DeValue<'_>) -> Result<T, Option<Strin
 ///
 /// One line: the file, the line and column, the key, and what to write.
 pub(super) fn load(path: &Path) -> Result<Given, String> {
+    of_file(path, fs::read(path))
+}
+
+/// The same of a file that another process names, which may be anything.
+pub(super) fn load_foreign(path: &Path) -> Result<Given, String> {
+    of_file(path, foreign::read(path, FOREIGN_BYTES_MAX))
+}
+
+fn of_file(path: &Path, bytes: io::Result<Vec<u8>>) -> Result<Given, String> {
     let file = path.display();
-    let bytes = fs::read(path)
+    let bytes = bytes
         .map_err(|error| format!("{file}: {error}: name a configuration that can be read, or leave out --config"))?;
     match std::str::from_utf8(&bytes) {
         Ok(text) => parse(text, &file),

@@ -40,8 +40,9 @@ use pinion_client::{self, Client};
 use pinion_linux::clock::Monotonic;
 use pinion_sim::SimBoard;
 
+use super::page::{Page, print};
 use super::run::{BoardName, sim_config};
-use super::{failed, logging, print};
+use super::{failed, logging};
 
 /// How long a machine has to answer.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -228,7 +229,7 @@ fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
 fn script(mut console: Console, lines: impl BufRead) -> Result<(), String> {
     for (number, line) in (1..).zip(lines.lines()) {
         let line = line.map_err(|error| format!("line {number} can not be read: {error}"))?;
-        let told = &mut |text: &str| drop(print(&format!("{text}\n")));
+        let told = &mut |line: &str| drop(print(&one(line)));
         if !line.trim().is_empty() {
             told(&format!("{PROMPT}{}", line.trim()));
         }
@@ -239,6 +240,13 @@ fn script(mut console: Console, lines: impl BufRead) -> Result<(), String> {
         }
     }
     Ok(())
+}
+
+/// A page of one line.
+fn one(line: &str) -> Page {
+    let mut page = Page::default();
+    page.line(line);
+    page
 }
 
 // ---- a person
@@ -259,7 +267,7 @@ fn converse(console: Console) -> Result<(), String> {
     // Where nothing can be drawn, as the output goes elsewhere or the terminal is too simple, lines come as they are.
     let Ok(printer) = editor.create_external_printer() else { return script(console, io::stdin().lock()) };
     let greeting = console.greeting();
-    print(&format!("{greeting}\n"))?;
+    print(&one(&greeting))?;
     let (lines, inbox) = mpsc::channel();
     let (outbox, answers) = mpsc::channel();
     let gone = Arc::new(AtomicBool::new(false));
@@ -314,7 +322,7 @@ fn attend(
     answers: &Sender<Option<Vocabulary>>,
     gone: &AtomicBool,
 ) {
-    let mut told = |text: &str| drop(printer.print(format!("{text}\n")));
+    let mut told = |line: &str| drop(printer.print(one(line).to_string()));
     loop {
         match lines.recv_timeout(Duration::ZERO) {
             Ok(line) => {
@@ -355,7 +363,10 @@ impl Completer for Words {
     type Candidate = String;
 
     fn complete(&self, line: &str, at: usize, _: &Context<'_>) -> rustyline::Result<(usize, Vec<String>)> {
-        Ok(self.0.complete(&line[..at]))
+        let (start, mut words) = self.0.complete(&line[..at]);
+        // The editor writes them as they are.
+        words.retain(|word| !word.contains(char::is_control));
+        Ok((start, words))
     }
 }
 

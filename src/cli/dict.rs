@@ -14,8 +14,9 @@ use crate::FIRMWARE;
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::clock::Monotonic;
 
+use super::failed;
+use super::page::{Page, print};
 use super::run::BoardName;
-use super::{failed, print};
 
 /// Options of `pinion dict`.
 #[derive(Args, Clone, Debug)]
@@ -49,6 +50,6 @@ fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
 fn put(args: &DictArgs, json: &[u8]) -> Result<(), String> {
     match &args.output {
         Some(path) => fs::write(path, json).map_err(|error| format!("{} can not be written: {error}", path.display())),
-        None => print(&String::from_utf8_lossy(json)),
+        None => print(&Page::json(&String::from_utf8_lossy(json))),
     }
 }

@@ -4,13 +4,13 @@
 
 #![forbid(unsafe_code)]
 
-use std::fmt::Write as _;
 use std::process::ExitCode;
 
 use serde::Serialize;
 use serde_json::json;
 
-use super::{failed, print};
+use super::failed;
+use super::page::{Page, print};
 
 /// How grave a finding is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
@@ -82,27 +82,26 @@ impl Group {
 }
 
 /// For people: a line for each finding, and below it what mends it.
-pub(super) fn text(groups: &[Group]) -> String {
-    let mut text = String::new();
+pub(super) fn text(groups: &[Group]) -> Page {
+    let mut page = Page::default();
     for Group { name, findings } in groups.iter().filter(|group| !group.findings.is_empty()) {
-        // Writing to a String does not fail.
-        let _ = writeln!(text, "{name}");
+        page.line(name);
         for Finding { status, found, remedy, .. } in findings {
-            let _ = writeln!(text, "  {:<8} {found}", status.name());
+            page.line(format_args!("  {:<8} {found}", status.name()));
             if let Some(remedy) = remedy {
-                let _ = writeln!(text, "           -> {remedy}");
+                page.line(format_args!("           -> {remedy}"));
             }
         }
     }
     let [warnings, errors] = [Level::Warning, Level::Error].map(|level| count(groups, level));
-    let _ = writeln!(text, "{errors} error{}, {warnings} warning{}", plural(errors), plural(warnings));
-    text
+    page.line(format_args!("{errors} error{}, {warnings} warning{}", plural(errors), plural(warnings)));
+    page
 }
 
 /// For programs.
-pub(super) fn json(groups: &[Group]) -> String {
+pub(super) fn json(groups: &[Group]) -> Page {
     let [warnings, errors] = [Level::Warning, Level::Error].map(|level| count(groups, level));
-    format!("{:#}\n", json!({ "groups": groups, "errors": errors, "warnings": warnings }))
+    Page::json(&format!("{:#}\n", json!({ "groups": groups, "errors": errors, "warnings": warnings })))
 }
 
 /// The program's exit status: 1 if anything does not work.
@@ -111,8 +110,8 @@ pub(super) fn status(groups: &[Group]) -> ExitCode {
 }
 
 /// Prints a report, and returns the program's exit status.
-pub(super) fn finish(text: &str, groups: &[Group]) -> ExitCode {
-    print(text).map_or_else(failed, |()| status(groups))
+pub(super) fn finish(page: &Page, groups: &[Group]) -> ExitCode {
+    print(page).map_or_else(failed, |()| status(groups))
 }
 
 fn count(groups: &[Group], level: Level) -> usize {
@@ -126,6 +125,8 @@ fn plural(count: usize) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::page::tests::{any_name, assert_plain};
+    use proptest::prelude::*;
 
     fn groups() -> Vec<Group> {
         vec![
@@ -144,7 +145,7 @@ mod tests {
     #[test]
     fn people_get_lines_and_remedies() {
         assert_eq!(
-            text(&groups()),
+            text(&groups()).to_string(),
             "\
 kernel
   ok       it is PREEMPT_RT
@@ -158,9 +159,19 @@ pty
         );
     }
 
+    proptest! {
+        #[test]
+        fn whatever_was_found_stays_in_its_line(name in any_name()) {
+            let groups = |name: &str| [Group::new("pty", vec![Finding::error("link", name, name)])];
+            for show in [text, json] {
+                assert_plain(&show(&groups(&name)).to_string(), show(&groups("x")).lines().count());
+            }
+        }
+    }
+
     #[test]
     fn programs_get_the_same() {
-        let value: serde_json::Value = serde_json::from_str(&json(&groups())).unwrap();
+        let value: serde_json::Value = serde_json::from_str(&json(&groups()).to_string()).unwrap();
         assert_eq!(value["errors"], 1);
         assert_eq!(value["groups"][0]["name"], "kernel");
         let finding = &value["groups"][0]["findings"][1];

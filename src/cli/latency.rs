@@ -21,7 +21,8 @@ use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_linux::clock::Monotonic;
 
 use super::doctor::is_preempt_rt;
-use super::{failed, print};
+use super::failed;
+use super::page::{Page, print};
 
 /// Options of `pinion latency`.
 #[derive(Args, Clone, Debug)]
@@ -60,7 +61,7 @@ pub(super) fn run(args: &LatencyArgs) -> ExitCode {
         fs::write(path, draw(&halves, verdict.fitness))
             .map_err(|error| format!("{} can not be written: {error}", path.display()))
     });
-    print(&report(&halves, &verdict)).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
+    print(&Page::text(&report(&halves, &verdict))).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
 /// Measures for `span` idle and for as long under load.

@@ -23,6 +23,7 @@ use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::unistd::write;
 
+use crate::foreign::plain;
 use pinion_linux::sys;
 
 /// How many lines may wait to be written. Further ones are dropped and counted.
@@ -94,6 +95,9 @@ enum Style {
 
 impl Style {
     fn line(self, level: Level, text: fmt::Arguments<'_>) -> String {
+        let text = text.to_string();
+        // A line feed in a name would begin a line of its own, and with `<0>` one of any priority.
+        let text = plain(&text);
         match self {
             Style::Journal => {
                 let priority = match level {
@@ -230,6 +234,8 @@ pub(super) fn finish() {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::page::tests::{any_name, assert_plain};
+    use proptest::prelude::*;
 
     #[test]
     fn what_does_not_fit_is_counted_and_told_of_after_what_did() {
@@ -248,6 +254,15 @@ mod tests {
         let journal = stderr.metadata().unwrap();
         let journal = format!("{}:{}", journal.dev(), journal.ino());
         assert!(is_same(&journal, stderr.as_fd()) && !is_same(&journal, other.as_fd()) && !is_same("", stderr.as_fd()));
+    }
+
+    proptest! {
+        #[test]
+        fn a_line_is_one_line_whatever_is_named_in_it(name in any_name()) {
+            for style in [Style::Journal, Style::Plain] {
+                assert_plain(&style.line(Level::Warn, format_args!("the host is klippy of {name}")), 1);
+            }
+        }
     }
 
     #[test]

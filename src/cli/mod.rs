@@ -4,7 +4,6 @@
 #![forbid(unsafe_code)]
 
 use std::ffi::OsString;
-use std::io::{self, Write as _};
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
@@ -13,16 +12,20 @@ use log::LevelFilter;
 mod check;
 mod config;
 mod console;
-pub mod dict;
+pub mod demo;
+mod dict;
 mod doctor;
 mod finding;
 pub mod latency;
 mod logging;
+mod page;
 pub mod pins;
 pub mod run;
 mod show;
 pub mod sim;
 mod status;
+
+use page::{Page, print};
 
 /// A Klipper micro-controller made of a Linux process.
 ///
@@ -107,7 +110,7 @@ fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<run:
 fn completions(shell: clap_complete::Shell) -> ExitCode {
     let mut script = Vec::new();
     clap_complete::generate(shell, &mut Cli::command(), "pinion", &mut script);
-    match print(&String::from_utf8_lossy(&script)) {
+    match print(&Page::text(&String::from_utf8_lossy(&script))) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }
@@ -119,19 +122,10 @@ fn end_by_panic() {
     std::panic::set_hook(Box::new(|panic| {
         // First, as the lines that wait in the log's queue are lost once the process has ended.
         logging::finish();
+        let panic = panic.to_string().replace('\n', " ");
         log::error!("this is a bug in Pinion, which ends here: please report it with this line: {panic}");
         std::process::abort();
     }));
-}
-
-/// Prints on stdout. A reader that has closed it, such as `head`, is no failure: the program goes on
-/// with what else it has to do.
-fn print(text: &str) -> Result<(), String> {
-    let mut out = io::stdout().lock();
-    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout can not be written: {error}")),
-        _ => Ok(()),
-    }
 }
 
 /// Does `work` with nothing but errors logged, as what it finds is printed.

@@ -5,7 +5,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::fmt::Write as _;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -19,7 +18,8 @@ use pinion_linux::pins::{Names, channel_number, line_number, pwm_number};
 use pinion_linux::spi::Node;
 use pinion_linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
 
-use super::{failed, print};
+use super::failed;
+use super::page::{Page, print};
 
 /// Options of `pinion pins`.
 #[derive(Args, Clone, Debug, Default)]
@@ -45,13 +45,13 @@ pub(super) fn run(args: &PinsArgs) -> ExitCode {
     }
     // Programs want JSON of nothing, too.
     if args.json {
-        return print(&list.json()).map_or_else(failed, |()| ExitCode::SUCCESS);
+        return print(&Page::json(&list.json())).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
-    let text = list.text();
-    if text.is_empty() {
+    let page = list.page();
+    if page.is_empty() {
         return failed(nothing(args));
     }
-    print(&text).map_or_else(failed, |()| ExitCode::SUCCESS)
+    print(&page).map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
 fn nothing(args: &PinsArgs) -> String {
@@ -247,17 +247,20 @@ impl List {
         }
     }
 
-    fn text(&self) -> String {
+    fn page(&self) -> Page {
         let gpio = self.gpio.iter().map(gpio_section);
         let adc = self.adc.iter().map(adc_section);
         let pwm = self.pwm.iter().map(pwm_section);
-        let sections: Vec<String> = gpio
-            .chain(adc)
-            .chain(pwm)
-            .chain([spi_section(&self.spi), i2c_section(&self.i2c), w1_section(&self.w1)])
-            .filter(|section| !section.is_empty())
-            .collect();
-        sections.join("\n")
+        let sections =
+            gpio.chain(adc).chain(pwm).chain([spi_section(&self.spi), i2c_section(&self.i2c), w1_section(&self.w1)]);
+        let mut page = Page::default();
+        for section in sections.filter(|section| !section.is_empty()) {
+            if !page.is_empty() {
+                page.line("");
+            }
+            page.append(&section);
+        }
+        page
     }
 }
 
@@ -376,9 +379,10 @@ fn i2c(bus: &I2cBus, args: &PinsArgs) -> Option<I2cEntry> {
 }
 
 /// A heading and a table; nothing if there are no rows.
-fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> String {
+fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> Page {
+    let mut page = Page::default();
     if rows.is_empty() {
-        return String::new();
+        return page;
     }
     let width = |column: usize| {
         let cells = rows.iter().filter_map(|row| row.get(column));
@@ -386,18 +390,13 @@ fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> String {
         cells.map(|cell| cell.chars().count()).max().unwrap_or(0).max(title)
     };
     let widths: Vec<usize> = (0..titles.len()).map(width).collect();
-    let mut text = format!("{heading}\n");
+    page.line(heading);
     let titles = titles.iter().map(|title| (*title).to_owned()).collect();
     for row in std::iter::once(&titles).chain(rows) {
-        let mut line = String::new();
-        for (cell, width) in row.iter().zip(&widths) {
-            // Writing to a String does not fail.
-            let _ = write!(line, "  {cell:width$}");
-        }
-        text.push_str(line.trim_end());
-        text.push('\n');
+        let line: String = row.iter().zip(&widths).map(|(cell, width)| format!("  {cell:width$}")).collect();
+        page.line(line.trim_end());
     }
-    text
+    page
 }
 
 /// Cuts a text to 20 characters, so that a row fits into 100 columns.
@@ -408,7 +407,7 @@ fn cut(text: &str) -> String {
     }
 }
 
-fn gpio_section(chip: &GpioChip) -> String {
+fn gpio_section(chip: &GpioChip) -> Page {
     let row = |line: &GpioLine| {
         vec![
             line.line.to_string(),
@@ -425,7 +424,7 @@ fn gpio_section(chip: &GpioChip) -> String {
     section(&heading, &["line", "name", "dir", "used by", "in printer.cfg"], &rows)
 }
 
-fn adc_section(device: &AdcDevice) -> String {
+fn adc_section(device: &AdcDevice) -> Page {
     let row = |channel: &AdcChannel| {
         vec![
             channel.channel.clone(),
@@ -439,7 +438,7 @@ fn adc_section(device: &AdcDevice) -> String {
     section(&heading, &["channel", "resolution", "reads", "in printer.cfg"], &rows)
 }
 
-fn pwm_section(chip: &PwmEntry) -> String {
+fn pwm_section(chip: &PwmEntry) -> Page {
     let row = |line: &PwmLine| {
         let used_by = match (&line.consumer, line.exported) {
             (Some(consumer), _) if consumer == "sysfs" => "a program",
@@ -455,14 +454,14 @@ fn pwm_section(chip: &PwmEntry) -> String {
     section(&heading, &["channel", "used by", "in printer.cfg"], &rows)
 }
 
-fn spi_section(devices: &[SpiDevice]) -> String {
+fn spi_section(devices: &[SpiDevice]) -> Page {
     let row = |SpiDevice { device, spi_bus }: &SpiDevice| {
         vec![device.clone(), format!("spi_bus: {spi_bus}, or for LEDs pin: {spi_bus}")]
     };
     section("SPI", &["device", "in printer.cfg"], &devices.iter().map(row).collect::<Vec<_>>())
 }
 
-fn i2c_section(buses: &[I2cEntry]) -> String {
+fn i2c_section(buses: &[I2cEntry]) -> Page {
     let row = |bus: &I2cEntry| {
         let taken = bus.chips.iter().filter_map(|chip| {
             let driver = chip.driver.as_ref()?;
@@ -477,7 +476,7 @@ fn i2c_section(buses: &[I2cEntry]) -> String {
     section("I2C", &["device", "adapter", "used by the kernel", "in printer.cfg"], &rows)
 }
 
-fn w1_section(sensors: &[W1Sensor]) -> String {
+fn w1_section(sensors: &[W1Sensor]) -> Page {
     let row = |W1Sensor { serial_no }: &W1Sensor| {
         vec![serial_no.clone(), format!("sensor_type: DS18B20, with serial_no: {serial_no}")]
     };
@@ -487,9 +486,11 @@ fn w1_section(sensors: &[W1Sensor]) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::page::tests::{any_name, assert_plain};
     use pinion_linux::adc::{Channel, Format};
     use pinion_linux::gpio::LineInfo;
     use pinion_linux::sysfs::PwmChannel;
+    use proptest::prelude::*;
     use serde_json::{Value, json};
 
     fn pi() -> Inventory {
@@ -547,7 +548,7 @@ mod tests {
     }
 
     fn printed(args: &PinsArgs) -> String {
-        of(&pi(), args).text()
+        of(&pi(), args).page().to_string()
     }
 
     fn filtered(filter: &str) -> String {
@@ -590,11 +591,40 @@ I2C
         );
     }
 
+    proptest! {
+        #[test]
+        fn whatever_a_device_is_called_stays_in_its_line(name in any_name()) {
+            let page = |name: &str| {
+                let (mut inventory, mut sysfs) = (pi(), sysfs());
+                let chip = &mut inventory.chips[0];
+                sysfs.devices = [((name.to_owned(), 1), name.to_owned())].into();
+                chip.label = name.to_owned();
+                for line in &mut chip.lines {
+                    (line.name, line.consumer) = (Some(name.to_owned()), Some(name.to_owned()));
+                }
+                inventory.adcs[0].name = name.to_owned();
+                inventory.adcs[0].channels[0].id = name.to_owned();
+                (sysfs.pwm[0].device, sysfs.i2c[0].adapter) = (Some(name.to_owned()), Some(name.to_owned()));
+                sysfs.pwm[0].channels[1].consumer = Some(name.to_owned());
+                let chip = &mut sysfs.i2c[0].chips[0];
+                (chip.name, chip.driver) = (name.to_owned(), Some(name.to_owned()));
+                sysfs.thermometers = vec![name.to_owned()];
+                let error = || Reading::Failed { error: name.to_owned() };
+                let list = List::new(&inventory, &sysfs, &PinsArgs::default(), &|_, _| error());
+                (list.page().to_string(), Page::json(&list.json()).to_string())
+            };
+            let (text, json) = page(&name);
+            assert_plain(&text, page("x").0.matches('\n').count());
+            assert_plain(&json, json.matches('\n').count());
+            serde_json::from_str::<Value>(&json).unwrap();
+        }
+    }
+
     #[test]
     fn a_chip_behind_a_bus_says_what_it_is_no_good_for() {
         let mut inventory = pi();
         inventory.chips[0].sleeps = true;
-        let list = of(&inventory, &PinsArgs::default()).text();
+        let list = of(&inventory, &PinsArgs::default()).page().to_string();
         assert!(list.starts_with("gpiochip0 pinctrl-bcm2835, 3 lines, behind a bus: not for steps"), "{list}");
     }
 

@@ -7,14 +7,17 @@
 #![forbid(unsafe_code)]
 
 use std::fmt::Write as _;
-use std::io::{self, IsTerminal, Write};
+use std::io::{self, IsTerminal};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::thread;
 use std::time::Duration;
 
+use crate::foreign::plain;
 use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 use pinion_sim::SimProbe;
+
+use super::page::draw;
 
 /// Between two pictures on a terminal, and between two looks for changes.
 const DRAW_PERIOD: Duration = Duration::from_millis(100);
@@ -33,6 +36,14 @@ struct Item {
     number: Option<Number>,
     /// All that there is to say of it.
     text: String,
+}
+
+impl Item {
+    /// The same without control characters in the names that a description gives.
+    fn plain(self) -> Item {
+        let lines: Vec<_> = self.text.lines().map(plain).collect();
+        Item { name: plain(&self.name).into_owned(), text: lines.join("\n"), ..self }
+    }
 }
 
 /// A number that moves: it is told anew once it went by a step, or stands.
@@ -84,7 +95,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
     for (name, text) in probe.sights() {
         items.push(Item { kind: "", name: name.into(), number: None, text });
     }
-    items
+    items.into_iter().map(Item::plain).collect()
 }
 
 /// What was told of an item last, and what the look before this one saw.
@@ -303,10 +314,6 @@ fn is_screen() -> bool {
 }
 
 fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
-    let put = |text: &str| {
-        let mut out = io::stdout().lock();
-        out.write_all(text.as_bytes()).and_then(|()| out.flush())
-    };
     let is_over = |period| stopped.recv_timeout(period) != Err(RecvTimeoutError::Timeout);
     if !is_screen() {
         let mut changes = Changes::default();
@@ -314,7 +321,7 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
             let is_over = is_over(LOOK_PERIOD);
             let lines = changes.lines(look(probe), monotonic());
             if !lines.is_empty() {
-                put(&lines)?;
+                draw(&lines)?;
             }
             if is_over {
                 return Ok(());
@@ -332,7 +339,7 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
             drawing += &screen.leave();
         }
         if !drawing.is_empty() {
-            put(&drawing)?;
+            draw(&drawing)?;
         }
         if is_over {
             return Ok(());
@@ -343,6 +350,8 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::page::tests::{any_name, assert_plain};
+    use proptest::prelude::*;
 
     fn item(kind: &'static str, name: &str, value: Option<f64>, text: &str) -> Item {
         let number = value.map(|value| Number { value, step: 1.0 });
@@ -365,6 +374,23 @@ mod tests {
         );
         assert_eq!(told(1.5, "#ff8000 #000010"), "");
         assert_eq!(told(1.5, "⠁\n⠂"), "[    1.500000] x: 1.5 mm\n[    1.500000] strip:\n⠁\n⠂\n");
+    }
+
+    proptest! {
+        #[test]
+        fn a_name_stays_in_its_line_and_moves_nothing(name in any_name()) {
+            // Between the rows of a display stand line feeds of ours.
+            let text = name.replace('\n', "");
+            let items = || ["axes", ""].map(|kind| item(kind, &name, None, &text).plain());
+            for line in picture(&items(), false) {
+                assert_plain(&line, 0);
+            }
+            for line in picture(&items(), true) {
+                assert_plain(&line.replace("\x1b[48;2;", "").replace("\x1b[0m", ""), 0);
+            }
+            let lines = Changes::default().lines(items().into(), Duration::ZERO);
+            assert_plain(&lines, lines.matches('\n').count());
+        }
     }
 
     #[test]

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::fmt::Display;
 use std::fs;
 use std::io::{self, IsTerminal};
 use std::path::{Path, PathBuf};
@@ -17,18 +18,19 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::getpid;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
+use super::demo::heater::{Goal, Thermistor};
+use super::demo::picture;
+use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Options};
 use pinion_client::Client;
-use pinion_client::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
-use pinion_client::heater::{Goal, Thermistor};
-use pinion_client::picture;
 use pinion_linux::clock::Monotonic;
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 
+use super::page::{Page, print};
 use super::run::sim_config;
 use super::show::Show;
-use super::{failed, logging, print};
+use super::{failed, logging};
 
 /// Options of `pinion sim`.
 #[derive(Args, Clone, Debug)]
@@ -67,11 +69,11 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         Err(error) => return failed(error),
     };
     if args.print_board {
-        return print(SimConfig::default_toml()).map_or_else(failed, |()| ExitCode::SUCCESS);
+        return print(&Page::text(SimConfig::default_toml())).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
     if args.print_config {
         let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
-        return print(&printer_cfg).map_or_else(failed, |()| ExitCode::SUCCESS);
+        return print(&Page::text(&printer_cfg)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
     logging::detach();
     let plan = plan(&config);
@@ -161,12 +163,10 @@ fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended
 
 fn tell_how_to_connect(args: &SimArgs) {
     let file = args.file.as_ref().map_or(String::new(), |file| format!(" {}", file.display()));
-    tell(&format!(
-        "\nThe simulated printer goes on until Ctrl-C. To connect a Klipper host:\n  \
-         pinion sim{file} -I {symlink} --print-config > printer.cfg\n  \
-         klippy.py printer.cfg\n",
-        symlink = args.symlink.display()
-    ));
+    tell("");
+    tell("The simulated printer goes on until Ctrl-C. To connect a Klipper host:");
+    tell(format_args!("  pinion sim{file} -I {} --print-config > printer.cfg", args.symlink.display()));
+    tell("  klippy.py printer.cfg");
 }
 
 fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, String> {
@@ -178,24 +178,26 @@ fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, 
     // Reset the machine, so that the next host finds it as if just started.
     client.reset().map_err(|error| error.to_string())?;
     for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
-        tell(&format!(
-            "       the printer's {} axis stands at {:.3} mm, {} steps lost\n",
+        tell(format_args!(
+            "       the printer's {} axis stands at {:.3} mm, {} steps lost",
             axis.name, axis.position_mm, axis.lost_steps
         ));
     }
     for heater in probe.heaters() {
-        tell(&format!("       the printer's {} is at {:.1} C\n", heater.name, heater.celsius));
+        tell(format_args!("       the printer's {} is at {:.1} C", heater.name, heater.celsius));
     }
     let lost: u64 = probe.axes().map(|axis| axis.lost_steps).sum();
     let all_right = report.passed() && lost == 0;
-    tell(if all_right { "all of it was right\n" } else { "NOT all of it was right\n" });
+    tell(if all_right { "all of it was right" } else { "NOT all of it was right" });
     Ok(all_right)
 }
 
-/// Prints how the demonstration goes. Errors are ignored: the printer serves its host even if nothing
+/// Prints a line on how the demonstration goes. Errors are ignored: the printer serves its host even if nothing
 /// can be printed.
-fn tell(text: &str) {
-    if let Err(error) = print(text) {
+fn tell(line: impl Display) {
+    let mut page = Page::default();
+    page.line(line);
+    if let Err(error) = print(&page) {
         log::warn!("{error}");
     }
 }
@@ -203,7 +205,7 @@ fn tell(text: &str) {
 fn draw(path: &Path, report: &Report) -> Result<(), String> {
     fs::write(path, picture::homing(report))
         .map_err(|error| format!("{} can not be written: {error}", path.display()))?;
-    tell(&format!("drawn: {}\n", path.display()));
+    tell(format_args!("drawn: {}", path.display()));
     Ok(())
 }
 

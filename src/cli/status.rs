@@ -3,8 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::fmt::Write as _;
-use std::io::{self, IsTerminal, Read, Write as _};
+use std::io::{self, IsTerminal, Read};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -24,7 +23,8 @@ use crate::runtime::status::connect;
 use crate::runtime::{hang_up, socket_paths};
 use pinion_linux::sys;
 
-use super::{failed, print};
+use super::failed;
+use super::page::{Page, draw, print};
 
 /// How long the answer may take. The program gives its core a second.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -62,9 +62,9 @@ pub(super) fn run(args: &StatusArgs) -> ExitCode {
     done.map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
-fn show(args: &StatusArgs, status: &Value) -> String {
+fn show(args: &StatusArgs, status: &Value) -> Page {
     if args.json {
-        return format!("{status:#}\n");
+        return Page::json(&format!("{status:#}\n"));
     }
     if args.prometheus { metrics(status) } else { text(status) }
 }
@@ -123,10 +123,9 @@ fn ask_at(path: &Path) -> io::Result<Value> {
 
 // ---- for people
 
-/// A text of the status as a terminal may have it.
+/// A text of the status, or what else stands in its place.
 fn word(value: &Value) -> String {
-    let text = value.as_str().map_or_else(|| value.to_string(), str::to_owned);
-    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
+    value.as_str().map_or_else(|| value.to_string(), str::to_owned)
 }
 
 fn rows<'a>(status: &'a Value, key: &str) -> &'a [Value] {
@@ -145,12 +144,9 @@ fn span(seconds: &Value) -> String {
 }
 
 /// The status as a page.
-fn text(status: &Value) -> String {
-    let mut page = String::new();
-    // A String takes everything that is written to it.
-    let mut row = |head: &str, text: String| {
-        let _ = writeln!(page, "{head:<10}{text}");
-    };
+fn text(status: &Value) -> Page {
+    let mut page = Page::default();
+    let mut row = |head: &str, text: String| page.line(format_args!("{head:<10}{text}"));
     row(
         "pinion",
         format!("{}, process {}, up for {}", word(&status["version"]), status["pid"], span(&status["uptime_s"])),
@@ -261,21 +257,21 @@ fn host(status: &Value) -> String {
     }
 }
 
-fn table(page: &mut String, head: &str, rows: Vec<Vec<String>>) {
+fn table(page: &mut Page, head: &str, rows: Vec<Vec<String>>) {
     let columns = rows.first().map_or(0, Vec::len);
     let width = |column: usize| rows.iter().map(|row| row[column].chars().count()).max().unwrap_or(0);
     let widths: Vec<usize> = (0..columns).map(width).collect();
     for (n, row) in rows.iter().enumerate() {
         let cells: String = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:<width$}  ")).collect();
-        let _ = writeln!(page, "{:<10}{}", if n == 0 { head } else { "" }, cells.trim_end());
+        page.line(format_args!("{:<10}{}", if n == 0 { head } else { "" }, cells.trim_end()));
     }
 }
 
 // ---- for a scraper
 
 /// The status in Prometheus's text exposition format, version 0.0.4.
-fn metrics(status: &Value) -> String {
-    let mut out = Metrics(String::new());
+fn metrics(status: &Value) -> Page {
+    let mut out = Metrics(Page::default());
     let number = |value: &Value| value.as_f64().unwrap_or_default();
     out.head("pinion_info", "gauge", "The program and the host that it serves");
     out.sample(
@@ -356,11 +352,12 @@ fn metrics(status: &Value) -> String {
     out.0
 }
 
-struct Metrics(String);
+struct Metrics(Page);
 
 impl Metrics {
     fn head(&mut self, name: &str, kind: &str, help: &str) {
-        let _ = writeln!(self.0, "# HELP {name} {help}\n# TYPE {name} {kind}");
+        self.0.line(format_args!("# HELP {name} {help}"));
+        self.0.line(format_args!("# TYPE {name} {kind}"));
     }
 
     fn sample(&mut self, name: &str, labels: &[(&str, &Value)], value: f64) {
@@ -370,7 +367,7 @@ impl Metrics {
         });
         let labels = labels.collect::<Vec<_>>().join(",");
         let labels = if labels.is_empty() { labels } else { format!("{{{labels}}}") };
-        let _ = writeln!(self.0, "{name}{labels} {value}");
+        self.0.line(format_args!("{name}{labels} {value}"));
     }
 
     fn one(&mut self, name: &str, kind: &str, help: &str, value: f64) {
@@ -396,17 +393,15 @@ fn watch(args: &StatusArgs) -> Result<(), String> {
     loop {
         let page = match status.take().map_or_else(|| ask(args), Ok) {
             Ok(status) => show(args, &status),
-            Err(error) => format!("{error}\n"),
+            Err(error) => Page::text(&error),
         };
-        match &mut screen {
-            Some(screen) => screen.draw(&page)?,
-            None => {
-                let mut out = stdout.lock();
-                // A reader that is gone wants no more.
-                if writeln!(out, "{page}").and_then(|()| out.flush()).is_err() {
-                    return Ok(());
-                }
-            }
+        let shown = match &mut screen {
+            Some(screen) => screen.draw(&page),
+            None => draw(&format!("{page}\n")),
+        };
+        // A reader that is gone wants no more.
+        if shown.is_err() {
+            return Ok(());
         }
         let next = Instant::now() + PERIOD;
         while Instant::now() < next {
@@ -456,12 +451,12 @@ impl Screen {
             keyed.local_flags.remove(LocalFlags::ICANON | LocalFlags::ECHO | LocalFlags::ISIG);
             let _ = tcsetattr(keys, SetArg::TCSANOW, &keyed);
         }
-        let _ = print("\x1b[?1049h\x1b[?25l\x1b[?7l");
+        let _ = draw("\x1b[?1049h\x1b[?25l\x1b[?7l");
         Screen { before }
     }
 
     /// Draws the page, or as much of it as the terminal has rows for.
-    fn draw(&mut self, page: &str) -> Result<(), String> {
+    fn draw(&mut self, page: &Page) -> io::Result<()> {
         let mut drawn = "\x1b[H".to_owned();
         let all = page.lines().count();
         let room = sys::terminal_rows(&io::stdout()).unwrap_or(24).saturating_sub(1);
@@ -469,10 +464,10 @@ impl Screen {
             drawn += &format!("{line}\x1b[K\r\n");
         }
         if all > room {
-            let _ = write!(drawn, "... and {} lines more\x1b[K\r\n", all - room.saturating_sub(1));
+            drawn += &format!("... and {} lines more\x1b[K\r\n", all - room.saturating_sub(1));
         }
         drawn += "\x1b[J";
-        print(&(drawn + if self.before.is_some() { "q ends" } else { "Ctrl-C ends" }))
+        draw(&(drawn + if self.before.is_some() { "q ends" } else { "Ctrl-C ends" }))
     }
 
     /// What somebody has pressed a key for; waits a little for that.
@@ -504,7 +499,7 @@ impl Screen {
 
 impl Drop for Screen {
     fn drop(&mut self) {
-        let _ = print("\x1b[?7h\x1b[?25h\x1b[?1049l");
+        let _ = draw("\x1b[?7h\x1b[?25h\x1b[?1049l");
         if let Some(before) = &self.before {
             let _ = tcsetattr(io::stdin().as_fd(), SetArg::TCSANOW, before);
         }
@@ -514,6 +509,8 @@ impl Drop for Screen {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::page::tests::{any_name, assert_plain};
+    use proptest::prelude::*;
     use serde_json::json;
 
     fn status() -> Value {
@@ -537,7 +534,7 @@ mod tests {
 
     #[test]
     fn a_page_tells_all_and_obeys_nothing() {
-        let page = text(&status());
+        let page = text(&status()).to_string();
         for line in [
             "pinion    1, process 5, up for 1 h 1 min",
             "state     SHUT DOWN 1 min 1 s ago: ADC out of range: oid 3?[2J",
@@ -553,12 +550,36 @@ mod tests {
         }
         assert!(!page.contains('\x1b'));
         // What an instance does not tell is left out.
-        assert!(text(&json!({ "state": "unknown" })).contains("the core has not answered"));
+        assert!(text(&json!({ "state": "unknown" })).to_string().contains("the core has not answered"));
+    }
+
+    /// Puts a text in the place of each text that an instance tells.
+    fn rename(value: &mut Value, name: &str) {
+        match value {
+            Value::String(text) => *text = name.to_owned(),
+            Value::Array(values) => values.iter_mut().for_each(|value| rename(value, name)),
+            Value::Object(values) => values.values_mut().for_each(|value| rename(value, name)),
+            _ => {}
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_an_instance_tells_stays_in_its_line(name in any_name()) {
+            let (mut hostile, mut harmless) = (status(), status());
+            rename(&mut hostile, &name);
+            rename(&mut harmless, "x");
+            // By the state the page is another.
+            (hostile["state"], harmless["state"]) = (json!("shutdown"), json!("shutdown"));
+            for show in [text, metrics, |status: &Value| Page::json(&format!("{status:#}\n"))] {
+                assert_plain(&show(&hostile).to_string(), show(&harmless).lines().count());
+            }
+        }
     }
 
     #[test]
     fn metrics_have_a_type_each_and_labels_that_end() {
-        let metrics = metrics(&status());
+        let metrics = metrics(&status()).to_string();
         for line in [
             "pinion_state{state=\"shutdown\"} 1",
             "pinion_state{state=\"configured\"} 0",

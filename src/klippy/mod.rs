@@ -5,11 +5,11 @@
 #![forbid(unsafe_code)]
 
 use std::collections::BTreeSet;
-use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 use std::time::SystemTime;
 
+use crate::foreign;
 use pinion_firmware::mcu::{Feature, Generation, Generations};
 
 pub mod process;
@@ -19,6 +19,10 @@ use sources::{Shape, Sources};
 
 /// A klippy looks up more than 80 of our messages; what looks up fewer than these is something else.
 const SHAPES_MIN: usize = 20;
+/// Longest `.git/HEAD` and single reference that is read.
+const REF_BYTES_MAX: u64 = 4096;
+/// Longest `.git/packed-refs` that is read: a line for each branch and tag, of some 70 bytes.
+const PACKED_REFS_BYTES_MAX: u64 = 1 << 20;
 
 /// A message that a machine knows, and who takes it.
 struct KnownShape {
@@ -63,7 +67,7 @@ impl Checkout {
     ///
     /// Those of reading, and that the folder is none of klippy's.
     pub fn read(klippy: &Path, features: &[Feature]) -> io::Result<Checkout> {
-        let Sources { shapes, newest, unread } = Sources::read(klippy)?;
+        let Sources { shapes, newest, unread, .. } = Sources::read(klippy)?;
         let known = known(features);
         let names: BTreeSet<&str> = known.iter().map(|known| known.shape.name()).collect();
         let ours: BTreeSet<&Shape> = shapes.iter().filter(|shape| names.contains(shape.name())).collect();
@@ -120,11 +124,13 @@ fn known(features: &[Feature]) -> Vec<KnownShape> {
 /// The commit of a checkout, from the files that git keeps (gitrepository-layout(5)).
 fn commit(folder: &Path) -> Option<String> {
     let git = folder.join(".git");
-    let head = fs::read_to_string(git.join("HEAD")).ok()?;
+    let read = |name: &str, bytes_max| String::from_utf8(foreign::read(&git.join(name), bytes_max).ok()?).ok();
+    let head = read("HEAD", REF_BYTES_MAX)?;
     let commit = match head.trim().strip_prefix("ref: ") {
         None => head,
-        Some(name) => fs::read_to_string(git.join(name)).ok().or_else(|| {
-            let packed = fs::read_to_string(git.join("packed-refs")).ok()?;
+        Some(name) if !name.starts_with("refs/") || name.contains("..") => return None,
+        Some(name) => read(name, REF_BYTES_MAX).or_else(|| {
+            let packed = read("packed-refs", PACKED_REFS_BYTES_MAX)?;
             let line = packed.lines().find(|line| line.split(' ').nth(1) == Some(name))?;
             line.split(' ').next().map(str::to_owned)
         })?,
@@ -138,6 +144,7 @@ fn commit(folder: &Path) -> Option<String> {
 pub(crate) mod tests {
     use super::*;
     use pinion_firmware::feature::FEATURES;
+    use std::fs;
 
     /// A checkout that looks these messages up, each in a string of two pieces, and nothing else.
     fn checkout(shapes: impl IntoIterator<Item = String>) -> (tempfile::TempDir, PathBuf) {
@@ -218,6 +225,26 @@ pub(crate) mod tests {
         assert_eq!(commit(folder.path()).as_deref(), Some("bbbbbbbbb"));
         put("refs/heads/master", &format!("{third}\n"));
         assert_eq!(commit(folder.path()).as_deref(), Some("ccccccccc"));
+        fs::write(folder.path().join("elsewhere"), &first).unwrap();
+        put("HEAD", "ref: refs/../../elsewhere\n");
+        assert_eq!(commit(folder.path()), None);
+    }
+
+    #[test]
+    fn files_of_git_that_are_something_else_are_no_reason_to_hang_or_to_fill_the_memory() {
+        use std::os::unix::fs::symlink;
+        for file in ["HEAD", "refs/heads/master", "packed-refs"] {
+            let folder = tempfile::tempdir().unwrap();
+            let git = folder.path().join(".git");
+            fs::create_dir_all(git.join("refs/heads")).unwrap();
+            fs::write(git.join("HEAD"), "ref: refs/heads/master\n").unwrap();
+            let _ = fs::remove_file(git.join(file));
+            nix::unistd::mkfifo(&git.join(file), nix::sys::stat::Mode::S_IRWXU).unwrap();
+            assert_eq!(commit(folder.path()), None, "{file}: a pipe that nobody writes to");
+            fs::remove_file(git.join(file)).unwrap();
+            symlink("/dev/zero", git.join(file)).unwrap();
+            assert_eq!(commit(folder.path()), None, "{file}: a device without an end");
+        }
     }
 
     /// With checkouts of real hosts in KLIPPER_DIR_V0_11 and so on.

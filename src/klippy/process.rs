@@ -10,6 +10,15 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Component, Path, PathBuf};
 
+use crate::foreign;
+
+/// Longest part of a command line that is looked at: a process may have one of megabytes.
+const COMMAND_LINE_BYTES_MAX: u64 = 16 << 10;
+/// Longest part of the other files in /proc/PID that is looked at.
+const PROC_BYTES_MAX: u64 = 4096;
+/// Most open files of a process that are looked at: klippy has less than a hundred.
+const OPEN_FILES_MAX: usize = 4096;
+
 /// A process that may be a host.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Process {
@@ -47,7 +56,7 @@ pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
         if klippy(&arguments).is_some() {
             klippys.extend(Process::read(proc, pid, arguments));
         } else if !arguments.is_empty() {
-            others.push((pid, arguments));
+            others.push(pid);
         }
     }
     // A look into a process costs a call for each of its files, so the likely ones come first; of a
@@ -62,10 +71,10 @@ pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
             Ok(_) | Err(_) => {}
         }
     }
-    for (pid, arguments) in others {
+    for pid in others {
         if let Ok(true) = has_open(proc, pid, &terminal)
             && !serves(proc, pid, &terminal)
-            && let Some(process) = Process::read(proc, pid, arguments)
+            && let Some(process) = Process::read(proc, pid, arguments(proc, pid))
         {
             return Ok(Search::Found(process));
         }
@@ -90,7 +99,7 @@ fn pids(proc: &Path) -> io::Result<impl Iterator<Item = u32>> {
 
 impl Process {
     fn read(proc: &Path, pid: u32, arguments: Vec<PathBuf>) -> Option<Process> {
-        let stat = fs::read(proc.join(pid.to_string()).join("stat")).ok()?;
+        let stat = foreign::read(&proc.join(pid.to_string()).join("stat"), PROC_BYTES_MAX).ok()?;
         // The second field, the name in parentheses, may hold anything; starttime is the 22nd.
         let name_ends = stat.iter().rposition(|byte| *byte == b')')?;
         let fields = std::str::from_utf8(&stat[name_ends + 1..]).ok()?;
@@ -128,7 +137,8 @@ impl Process {
 
 /// The command line of a process; it is empty for the kernel's threads.
 fn arguments(proc: &Path, pid: u32) -> Vec<PathBuf> {
-    let line = fs::read(proc.join(pid.to_string()).join("cmdline")).unwrap_or_default();
+    let file = proc.join(pid.to_string()).join("cmdline");
+    let line = foreign::read(&file, COMMAND_LINE_BYTES_MAX).unwrap_or_default();
     let arguments = line.split(|byte| *byte == 0).filter(|argument| !argument.is_empty());
     arguments.map(|argument| PathBuf::from(OsStr::from_bytes(argument))).collect()
 }
@@ -223,13 +233,14 @@ fn inside(root: &Path, path: &Path) -> PathBuf {
 fn serves(proc: &Path, pid: u32, terminal: &fs::Metadata) -> bool {
     let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.rdev()));
     let Ok(files) = fs::read_dir(proc.join(pid.to_string()).join("fdinfo")) else { return false };
-    let mut told = files.flatten().filter_map(|file| fs::read_to_string(file.path()).ok());
-    told.any(|info| info.lines().any(|line| line == index))
+    let files = files.flatten().take(OPEN_FILES_MAX);
+    let mut told = files.filter_map(|file| foreign::read(&file.path(), PROC_BYTES_MAX).ok());
+    told.any(|info| info.split(|byte| *byte == b'\n').any(|line| line == index.as_bytes()))
 }
 
 /// Whether a process has the terminal open.
 fn has_open(proc: &Path, pid: u32, terminal: &fs::Metadata) -> io::Result<bool> {
-    for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))? {
+    for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))?.take(OPEN_FILES_MAX) {
         let file = match fs::metadata(entry?.path()) {
             // It was closed meanwhile.
             Err(error) if error.kind() == io::ErrorKind::NotFound => continue,

@@ -12,18 +12,20 @@
 #![forbid(unsafe_code)]
 
 use std::collections::{BTreeSet, VecDeque};
-use std::fs::{self, File};
+use std::fs;
 use std::io::{self, Read};
-use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 use std::time::SystemTime;
 
-use nix::libc;
+use crate::foreign;
 
-/// No checkout has more files or longer ones. klippy's own come first: further ones, of a plugin that
-/// brings much along, are left out.
+/// Most that is read of a checkout: names in its folders, files, bytes of one and of all of them, messages.
+/// klippy's own come first: further ones, of a plugin that brings much along, are left out.
+const NAMES_MAX: usize = 20_000;
 const FILES_MAX: usize = 2000;
 const FILE_BYTES_MAX: u64 = 1 << 20;
+const BYTES_MAX: u64 = 32 << 20;
+const SHAPES_MAX: usize = 10_000;
 /// klippy's own folder, `extras`, and packages in there.
 const DEPTH_MAX: usize = 3;
 
@@ -76,6 +78,7 @@ pub struct Sources {
     pub newest: SystemTime,
     /// What could not be read, if anything: the first of it.
     pub unread: Option<String>,
+    bytes: u64,
 }
 
 impl Sources {
@@ -85,8 +88,8 @@ impl Sources {
     ///
     /// Those of reading the folder itself. What can not be read in it is left out: it may be a plugin's.
     pub fn read(klippy: &Path) -> io::Result<Sources> {
-        let mut sources = Sources { shapes: BTreeSet::new(), newest: SystemTime::UNIX_EPOCH, unread: None };
-        let mut files = 0;
+        let mut sources = Sources { shapes: BTreeSet::new(), newest: SystemTime::UNIX_EPOCH, unread: None, bytes: 0 };
+        let (mut names, mut files) = (0, 0);
         let mut folders = VecDeque::from([(klippy.to_owned(), 1)]);
         while let Some((folder, depth)) = folders.pop_front() {
             let entries = match fs::read_dir(&folder) {
@@ -99,10 +102,11 @@ impl Sources {
             for entry in entries {
                 let entry = entry?;
                 let path = entry.path();
+                if names == NAMES_MAX || files == FILES_MAX || sources.bytes >= BYTES_MAX {
+                    return Ok(sources);
+                }
+                names += 1;
                 if path.extension().is_some_and(|extension| extension == "py") {
-                    if files == FILES_MAX {
-                        return Ok(sources);
-                    }
                     files += 1;
                     if let Err(error) = sources.add(&path) {
                         sources.leave_out(&path, &error);
@@ -116,22 +120,28 @@ impl Sources {
     }
 
     fn add(&mut self, path: &Path) -> io::Result<()> {
-        // Not to wait for what is no file, such as a FIFO.
-        let mut file = match File::options().read(true).custom_flags(libc::O_NONBLOCK).open(path) {
-            // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads.
-            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(()),
-            file => file?,
+        let (file, metadata) = match foreign::open(path) {
+            // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads. Nor
+            // does klippy load what is no file, such as a FIFO.
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidInput) => {
+                return Ok(());
+            }
+            opened => opened?,
         };
-        let metadata = file.metadata()?;
-        if !metadata.is_file() || metadata.len() > FILE_BYTES_MAX {
+        if metadata.len() > FILE_BYTES_MAX {
             return Ok(());
         }
         let mut text = Vec::with_capacity(metadata.len() as usize + 1);
-        (&mut file).take(FILE_BYTES_MAX).read_to_end(&mut text)?;
+        file.take(FILE_BYTES_MAX).read_to_end(&mut text)?;
+        self.bytes += text.len() as u64;
         self.newest = self.newest.max(metadata.modified()?);
         // Most files have no message, and need not be read as Python.
         if text.windows(2).any(|pair| pair == b"=%") {
-            strings(&text, |string| self.shapes.extend(Shape::of(string)));
+            strings(&text, |string| {
+                if self.shapes.len() < SHAPES_MAX {
+                    self.shapes.extend(Shape::of(string));
+                }
+            });
         }
         Ok(())
     }

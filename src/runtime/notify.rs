@@ -11,6 +11,8 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::time::Duration;
 
+use crate::foreign::plain;
+
 /// A socket to the service manager, if there is one.
 pub(super) struct Notify(Option<UnixDatagram>);
 
@@ -51,7 +53,8 @@ impl Notify {
 
     /// Sends the line that `systemctl status` shows.
     pub(super) fn status(&self, status: &str) {
-        self.send(&format!("STATUS={status}"));
+        // A line feed would begin an assignment of its own.
+        self.send(&format!("STATUS={}", plain(status)));
     }
 }
 
@@ -93,8 +96,8 @@ mod tests {
         let name = format!("pinion-test-{}", std::process::id());
         let socket = UnixDatagram::bind_addr(&SocketAddr::from_abstract_name(&name).unwrap()).unwrap();
         let notify = Notify::to(OsStr::new(&format!("@{name}"))).unwrap();
-        notify.status("host attached");
-        assert_eq!(heard(&socket), "STATUS=host attached");
+        notify.status("host attached\nMAINPID=1");
+        assert_eq!(heard(&socket), "STATUS=host attached?MAINPID=1");
     }
 
     #[test]

@@ -26,6 +26,7 @@ use nix::sys::socket::{AddressFamily, SockFlag, SockType, UnixAddr, socket};
 use rtrb::{Consumer, Producer, RingBuffer};
 use serde_json::{Value, json};
 
+use crate::foreign::plain_json;
 use pinion_firmware::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
 use pinion_firmware::lateness::{Lateness, us};
 use pinion_firmware::mcu::{BusCounts, LineUse, Mcu, Present, Snapshot};
@@ -306,7 +307,7 @@ impl Server {
             let clients: Vec<UnixStream> =
                 std::iter::from_fn(|| Some(listener.accept().ok()?.0)).take(CLIENTS_MAX).collect();
             if !clients.is_empty() {
-                let document = self.document().to_string();
+                let document = plain_json(&self.document().to_string());
                 for client in clients {
                     give(client, document.as_bytes());
                 }

@@ -93,7 +93,7 @@ impl Console {
         )
     }
 
-    /// Carries a line out, and prints what the machine says to it. Nothing is done for an empty line, or one that
+    /// Carries a line out, and prints line by line what the machine says to it. Nothing is done for an empty line, or one that
     /// begins with `#`.
     ///
     /// # Errors
@@ -106,8 +106,8 @@ impl Console {
         let Some(command) = words.next().filter(|word| !word.starts_with('#')) else { return Ok(Next::Line) };
         let rest: Vec<&str> = words.collect();
         match (command, &rest[..]) {
-            ("help", []) => print(&self.vocabulary.overview()),
-            ("help", [of]) => print(&self.vocabulary.explain(of)?),
+            ("help", []) => self.vocabulary.overview().iter().for_each(|line| print(line)),
+            ("help", [of]) => self.vocabulary.explain(of)?.iter().for_each(|line| print(line)),
             ("delay", [seconds]) => {
                 let seconds = seconds.strip_suffix('s').unwrap_or(seconds).parse().ok();
                 let seconds: f64 = seconds
@@ -280,23 +280,24 @@ impl Vocabulary {
         OWN.iter().map(|(name, _)| *name).chain(self.commands.iter().map(|format| format::name(format)))
     }
 
-    fn overview(&self) -> String {
-        let mut text = "The console's own:\n".to_owned();
-        text.extend(OWN.iter().map(|(_, help)| format!("  {help}\n")));
-        text += "The machine's:\n";
-        text.extend(self.commands.iter().map(|format| format!("  {format}\n")));
-        text + VALUES
+    fn overview(&self) -> Vec<String> {
+        let mut lines = vec!["The console's own:".to_owned()];
+        lines.extend(OWN.iter().map(|(_, help)| format!("  {help}")));
+        lines.push("The machine's:".to_owned());
+        lines.extend(self.commands.iter().map(|format| format!("  {format}")));
+        lines.extend(VALUES.lines().map(str::to_owned));
+        lines
     }
 
-    fn explain(&self, name: &str) -> Result<String, String> {
+    fn explain(&self, name: &str) -> Result<Vec<String>, String> {
         if let Some((_, help)) = OWN.iter().find(|(own, _)| *own == name) {
-            return Ok((*help).to_owned());
+            return Ok(vec![(*help).to_owned()]);
         }
         let response = || self.responses.iter().map(String::as_str).find(|format| format::name(format) == name);
         let Some(format) = self.command(name).or_else(response) else { return Err(self.unknown(name)) };
-        let mut text = format.to_owned();
+        let mut lines = vec![format.to_owned()];
         if self.command(name).is_none() {
-            text += "\n  (a response)";
+            lines.push("  (a response)".to_owned());
         }
         for (parameter, conversion) in format::parameters(format).unwrap_or_default() {
             let range = match conversion {
@@ -313,9 +314,9 @@ impl Vocabulary {
                 1..=NAMES_SHOWN => names.join(", "),
                 count => format!("{}, ... ({count} names; Tab completes)", names[..NAMES_SHOWN].join(", ")),
             };
-            let _ = write!(text, "\n  {parameter}: {shown}");
+            lines.push(format!("  {parameter}: {shown}"));
         }
-        Ok(text)
+        Ok(lines)
     }
 
     /// What is wrong with a command that there is not, and which may have been meant.
@@ -487,9 +488,9 @@ mod tests {
         assert_eq!(complete("config_endstop oid=1 o"), (21, vec![]), "it is given already");
         assert_eq!(complete("help config_e"), (5, vec!["config_endstop".to_owned()]));
         assert_eq!(complete("config_endstop oid=1 pin=gpio28").1.len(), 9, "gpio28, gpio280 to gpio287");
-        let help = console.vocabulary.explain("config_endstop").unwrap();
+        let help = console.vocabulary.explain("config_endstop").unwrap().join("\n");
         assert!(help.contains("\n  oid: 0 to 255") && help.contains("GPIO17"), "{help}");
-        assert!(console.vocabulary.explain("endstop_state").unwrap().contains("(a response)"));
+        assert!(console.vocabulary.explain("endstop_state").unwrap()[1].contains("(a response)"));
         drop(console);
         peer.join().unwrap();
     }

@@ -7,10 +7,7 @@
 //! - [`client`]: a session: the dictionary, commands and responses, the MCU's clock
 //! - [`config`]: oids, config commands, their check sum; resetting a machine in use
 //! - [`motion`]: step sequences, pacing them into the move queue, homing
-//! - [`heater`]: a sensor, an output and the loop between them
-//! - [`demo`]: all of it in one go, with progress and checks
 //! - [`console`]: a session in words
-//! - [`picture`]: an SVG of the homing just done
 //!
 //! There is one thread: a call that waits also reads, acknowledges and sends blocks again.
 
@@ -21,13 +18,10 @@
 pub mod client;
 pub mod config;
 pub mod console;
-pub mod demo;
 #[cfg(test)]
 mod fake;
-pub mod heater;
 pub mod messages;
 pub mod motion;
-pub mod picture;
 pub mod serial;
 
 use std::fmt;

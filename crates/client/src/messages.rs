@@ -256,7 +256,7 @@ impl Messages {
     }
 
     /// Whether there is such a command with such a parameter.
-    pub(super) fn has_parameter(&self, command: &str, parameter: &str) -> bool {
+    pub fn has_parameter(&self, command: &str, parameter: &str) -> bool {
         self.commands.get(command).is_some_and(|m| m.parameters.iter().any(|p| p.name == parameter))
     }
 

@@ -9,7 +9,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use crate::cli::finding::Finding;
+use crate::cli::finding::{Finding, Level};
 use crate::klippy::Checkout;
 use crate::klippy::process::{self, Process};
 use pinion_firmware::feature::FEATURES;
@@ -160,11 +160,19 @@ fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys
                 format!("there is no {shown}, which klippy opens, though Pinion runs (process {pid})"),
                 format!("{restart}, or pinion run -I {shown}"),
             ),
-            (None, _) => Finding::error(
-                CHECK,
-                format!("there is no {shown}, which klippy's configuration names{}: no Pinion has it", by(&opening)),
-                format!("sudo systemctl enable --now {}, or another serial", unit_for(path)),
-            ),
+            (None, _) => {
+                let found = format!(
+                    "there is no {shown}, which klippy's configuration names{}: no Pinion has it",
+                    by(&opening)
+                );
+                match opening.iter().any(|klippy| klippy.unit.is_some()) {
+                    true => {
+                        let remedy = format!("sudo systemctl enable --now {}, or another serial", unit_for(path));
+                        Finding::error(CHECK, found, remedy)
+                    }
+                    false => Finding::warning(CHECK, found, STRANGER),
+                }
+            }
         }];
     };
     if !link.file_type().is_symlink() {
@@ -224,8 +232,20 @@ struct Terminal<'a> {
     told: &'a str,
 }
 
-/// Whether a klippy's user may open a terminal.
+/// What to do about a process that is called as klippy is and that no unit started. Any user can have one, and what
+/// it wants is none of the administrator's affairs.
+const STRANGER: &str = "no service has started that process: if it is your klippy, have a service start it";
+
+/// Whether a klippy's user may open a terminal. Advice about users is for those of services.
 fn access(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
+    let judged = judged(machine, terminal, instance, klippy);
+    if klippy.unit.is_some() || judged.status == Level::Ok {
+        return judged;
+    }
+    Finding::warning(CHECK, judged.found, STRANGER)
+}
+
+fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
     let Klippy { who, found_by, is_running, .. } = klippy;
     let Terminal { path, link, way, about, told } = *terminal;
     let (name, told) = (&who.name, format!("{told}, for klippy's user {} ({found_by})", who.name));
@@ -369,6 +389,10 @@ mod tests {
         tree.process(8, &KLIPPY, PI, &[gid]);
         told(&looked(&tree), "terminal", Ok, "for klippy's user pi (process 8)");
         tree.process(8, &KLIPPY, PI, &[]);
+        // Whoever calls a process so gets no advice that is of use to him.
+        let remedy = told(&looked(&tree), "terminal", Warning, "pi, klippy's user (process 8), may not open it");
+        assert!(!remedy.contains("sudo"), "{remedy}");
+        tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
         assert_eq!(
             told(&looked(&tree), "terminal", Error, "pi, klippy's user (process 8), may not open it"),
             "sudo usermod -aG tty pi && sudo systemctl restart klipper"
@@ -516,6 +540,10 @@ mod tests {
         tree.put("home/other/printer.cfg", "[mcu]\nserial: /run/pinion/klipper_host_b\n");
         let remedy = told(&looked(&tree), "terminal", Error, "names /run/pinion/klipper_host_b, which it takes");
         assert_eq!(remedy, "serial: /tmp/klipper_host_b");
+        tree.put("home/other/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_c\n");
+        tree.put("proc/22/cgroup", "0::/user.slice/user-1000.slice/session-2.scope\n");
+        let remedy = told(&looked(&tree), "terminal", Warning, "there is no /tmp/klipper_host_c, which klippy's");
+        assert!(!remedy.contains("sudo"), "{remedy}");
         tree.process(13, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 1000, &[]);
         told(&looked(&tree), "terminal", Error, "process 13 wants the link /tmp/klipper_host_b, too");
     }

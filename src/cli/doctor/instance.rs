@@ -18,9 +18,11 @@ const UNIT: &str = "pinion-mcu";
 /// How klippy knows a pseudo terminal by its path (klippy/mcu.py).
 pub(super) const HOST_PATHS: &str = "/tmp/klipper_host_";
 
-/// Whether klippy takes a path for a pseudo terminal's.
+/// Whether klippy takes a path for a pseudo terminal's. One that any process may name, and that means more in a
+/// command than a name in that folder, counts as none.
 pub(super) fn is_host_path(path: &Path) -> bool {
-    path.to_string_lossy().starts_with(HOST_PATHS)
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "_.-".contains(c);
+    path.to_str().and_then(|path| path.strip_prefix(HOST_PATHS)).is_some_and(|name| name.chars().all(is_plain))
 }
 
 /// The unit that makes a link, as [`Files`] tells which link a unit makes.
@@ -202,7 +204,7 @@ fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, fin
     let Some(config_name) = config else { return given };
     let file = machine.path(config_name);
     if file.exists() {
-        match config::load(&file) {
+        match config::load_foreign(&file) {
             Ok(file) => {
                 findings.push(Finding::ok("config", format!("{config_name} has no mistake")));
                 given = given.or(file);
@@ -252,6 +254,21 @@ mod tests {
     use super::*;
     use crate::cli::finding::Level::{Error, Ok};
     use std::fs;
+
+    #[test]
+    fn a_path_that_goes_into_a_command_is_a_plain_name() {
+        for (path, is) in [
+            ("/tmp/klipper_host_mcu", true),
+            ("/tmp/klipper_host_b-2.old_one", true),
+            ("/tmp/klipper_host_x/../../etc/passwd", false),
+            ("/tmp/klipper_host_;reboot", false),
+            ("/tmp/klipper_host_$(reboot)", false),
+            ("/tmp/klipper_host_a b", false),
+            ("/dev/ttyACM0", false),
+        ] {
+            assert_eq!(is_host_path(Path::new(path)), is, "{path}");
+        }
+    }
 
     #[test]
     fn what_the_service_runs_by() {

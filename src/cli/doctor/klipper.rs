@@ -4,12 +4,12 @@
 #![forbid(unsafe_code)]
 
 use std::collections::BTreeSet;
-use std::fmt::Write as _;
 use std::path::Path;
 
 use crate::cli::finding::Finding;
-use crate::klippy::Checkout;
+use crate::cli::page::Page;
 use crate::klippy::sources::Shape;
+use crate::klippy::{Checkout, Verdict};
 use pinion_firmware::feature::FEATURES;
 
 /// Reads a checkout, named by itself or by klippy's folder in it.
@@ -39,64 +39,58 @@ pub(super) fn finding(checkout: &Checkout) -> Finding {
 }
 
 /// The report: each dialect, the forms in which they differ, the verdict.
-pub(super) fn report(checkout: &Checkout) -> String {
+pub(super) fn report(checkout: &Checkout, page: &mut Page) {
     let best = checkout.best();
     let all: BTreeSet<&Shape> = best.served.union(&best.other).collect();
     let commit = checkout.commit.as_ref().map_or(String::new(), |commit| format!(", commit {commit}"));
-    let mut text = format!(
-        "{}{commit}\nThis host looks up {} forms of messages that Pinion knows by name. Each dialect has of them:\n\n",
-        checkout.folder.display(),
+    page.line(format_args!("{}{commit}", checkout.folder.display()));
+    page.line(format_args!(
+        "This host looks up {} forms of messages that Pinion knows by name. Each dialect has of them:",
         all.len()
-    );
-    // Writing to a String does not fail.
+    ));
+    page.line("");
     for verdict in &checkout.verdicts {
         let mark = if verdict.generation == best.generation { "  <- the one that it is served" } else { "" };
-        let _ = writeln!(text, "  {:<8}{:>4}{mark}", verdict.generation.name(), verdict.served.len());
+        page.line(format_args!("  {:<8}{:>4}{mark}", verdict.generation.name(), verdict.served.len()));
     }
     if let Some(unread) = &checkout.unread {
-        let _ = writeln!(text, "\nNot all of it can be read, and what is left out here does not count: {unread}");
+        page.line("");
+        page.line(format_args!("Not all of it can be read, and what is left out here does not count: {unread}"));
     }
     let differing: Vec<&Shape> =
         all.into_iter().filter(|shape| checkout.verdicts.iter().any(|verdict| verdict.other.contains(shape))).collect();
     if !differing.is_empty() {
-        text += "\nNot every dialect has these forms:\n\n  ";
-        for verdict in &checkout.verdicts {
-            let _ = write!(text, "{:<8}", verdict.generation.name());
-        }
-        text += "\n";
+        let columns = |of: &dyn Fn(&Verdict) -> &'static str| -> String {
+            checkout.verdicts.iter().map(|verdict| format!("{:<8}", of(verdict))).collect()
+        };
+        page.append(&Page::text("\nNot every dialect has these forms:\n\n"));
+        page.line(format_args!("  {}", columns(&|verdict| verdict.generation.name())));
         for shape in differing {
-            text += "  ";
-            for verdict in &checkout.verdicts {
-                let _ = write!(text, "{:<8}", if verdict.served.contains(shape) { "yes" } else { "-" });
-            }
-            let _ = writeln!(text, "{}", shape.as_str());
+            let has = columns(&|verdict| if verdict.served.contains(shape) { "yes" } else { "-" });
+            page.line(format_args!("  {has}{}", shape.as_str()));
         }
     }
     let unknown: Vec<&Shape> = checkout.unknown().collect();
+    page.line("");
     if unknown.is_empty() {
-        let other = best.other.len();
-        let _ = writeln!(
-            text,
-            "\nok: this host is served in the dialect {}{}",
-            best.generation,
-            match other {
-                0 => ", which has all that it looks up".to_owned(),
-                _ => format!(
-                    "; of the forms above it looks up {other} for other micro-controllers' sake, as its own \
-                     firmware for Linux has no more than the dialect"
-                ),
-            }
-        );
+        let other = match best.other.len() {
+            0 => ", which has all that it looks up".to_owned(),
+            other => format!(
+                "; of the forms above it looks up {other} for other micro-controllers' sake, as its own firmware for \
+                 Linux has no more than the dialect"
+            ),
+        };
+        page.line(format_args!("ok: this host is served in the dialect {}{other}", best.generation));
     } else {
-        text += "\nwarning: this host is newer than Pinion. No dialect has these forms, and what needs them will not work:\n\n";
-        for shape in unknown {
-            let _ = writeln!(text, "  {}", shape.as_str());
-        }
-        let _ = writeln!(
-            text,
-            "\nIt would be served in the dialect {}. Update Pinion first (apt upgrade), or stay with the host's version.",
-            best.generation
+        page.line(
+            "warning: this host is newer than Pinion. No dialect has these forms, and what needs them will not work:",
         );
+        page.line("");
+        unknown.iter().for_each(|shape| page.line(format_args!("  {}", shape.as_str())));
+        page.line("");
+        page.line(format_args!(
+            "It would be served in the dialect {}. Update Pinion first (apt upgrade), or stay with the host's version.",
+            best.generation
+        ));
     }
-    text
 }

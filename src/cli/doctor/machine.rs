@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::fs;
-use std::io::{self, Read};
+use std::io;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
@@ -12,6 +12,7 @@ use nix::unistd::{User, getegid, geteuid, getgroups};
 
 use crate::cli::run::Settings;
 use crate::cli::{config, run_args};
+use crate::foreign;
 use crate::klippy::process::{self, Process};
 use crate::runtime::guardian;
 
@@ -97,13 +98,9 @@ impl Machine {
         Path::new("/").join(path.strip_prefix(&self.root).unwrap_or(path))
     }
 
-    /// A file's text without the white space around it. None if there is none or it can not be read, or if
-    /// it is no file, as reading a pipe would wait.
+    /// A file's text without the white space around it. None if there is none or it can not be read.
     pub(super) fn text(&self, path: impl AsRef<Path>) -> Option<String> {
-        let path = self.path(path);
-        let file = fs::metadata(&path).is_ok_and(|about| about.is_file()).then(|| fs::File::open(&path))?.ok()?;
-        let mut bytes = Vec::new();
-        file.take(TEXT_MAX).read_to_end(&mut bytes).ok()?;
+        let bytes = foreign::read(&self.path(path), TEXT_MAX).ok()?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
     }
 
@@ -216,7 +213,8 @@ impl Machine {
             let settings = match run_args(arguments) {
                 Ok(args) => {
                     let (given, file) = args?.into_parts();
-                    let file = file.map_or_else(|| Ok(Default::default()), |file| config::load(&self.path(file)));
+                    let file =
+                        file.map_or_else(|| Ok(Default::default()), |file| config::load_foreign(&self.path(file)));
                     file.ok().map(|file| given.or(file).settings())
                 }
                 // Another version of Pinion.

@@ -15,6 +15,7 @@ use pinion_linux::Inventory;
 
 use super::finding::{self, Finding, Group};
 use super::latency::{self, Fitness, Verdict};
+use super::page::Page;
 use super::{failed, quietly};
 
 mod devices;
@@ -64,8 +65,13 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
     if args.json {
         return finding::finish(&finding::json(&groups), &groups);
     }
-    let report = checkout.as_ref().map_or(String::new(), |checkout| klipper::report(checkout) + "\n");
-    finding::finish(&(report + &finding::text(&groups)), &groups)
+    let mut page = Page::default();
+    if let Some(checkout) = &checkout {
+        klipper::report(checkout, &mut page);
+        page.line("");
+    }
+    page.append(&finding::text(&groups));
+    finding::finish(&page, &groups)
 }
 
 fn examine(machine: &Machine) -> Vec<Group> {
@@ -214,7 +220,42 @@ mod tests {
         fs::create_dir_all(pipe.parent().unwrap()).unwrap();
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).unwrap();
         fs::create_dir_all(tree.machine().path("/etc/pinion/pinion.toml")).unwrap();
+        // Processes that call themselves Pinion and klippy, and name the pipe.
+        tree.process(7, &["/tmp/pinion", "run", "--config", "/sys/kernel/realtime"], 65534, &[]);
+        tree.process(8, &["python3", "/tmp/klippy.py", "/sys/kernel/realtime"], 65534, &[]);
         examine(&tree.machine());
+    }
+
+    #[test]
+    fn names_that_hold_anything_stay_in_their_lines() {
+        let tree = Tree::new();
+        let name = "a\n  error    forged\n<0>b\x1b[2Jc\r\u{9b}d";
+        let config = format!("/home/{name}/printer.cfg");
+        let klippy = format!("/home/{name}/klippy/klippy.py");
+        for pid in [7, 8] {
+            tree.process(pid, &["python3", &klippy, &config], 65534, &[]);
+            tree.process(pid + 10, &["/tmp/pinion", "run", "-I", &format!("/tmp/klipper_host_{name}")], 65534, &[]);
+        }
+        tree.put("proc/8/cgroup", &format!("0::/system.slice/klippy{name}.service\n"));
+        tree.put(&config[1..], &format!("[mcu]\nserial: /tmp/klipper_host_{}\n", name.replace('\n', "")));
+        tree.put(&format!("etc/systemd/system/multi-user.target.wants/pinion-mcu@{name}.service"), "");
+        tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=\"--cpux\x1b[2J\"");
+        tree.put("etc/pinion/pinion.toml", "symlink\x1b[2J = 1\n");
+        tree.put("proc/sys/kernel/osrelease", name);
+        tree.put("proc/device-tree/model", name);
+        tree.put("sys/devices/system/cpu/isolated", name);
+        tree.link("tmp/klipper_host_mcu", &format!("/dev/{name}"));
+        let groups = examine(&tree.machine());
+        let page = finding::text(&groups);
+        super::super::page::tests::assert_plain(&page.to_string(), page.lines().count());
+        let is_ours = |line: &str| {
+            ["  ok       ", "  warning  ", "  error    ", "           -> "].iter().any(|head| line.starts_with(head))
+                || groups.iter().any(|group| group.name == line)
+        };
+        let foreign: Vec<&str> = page.lines().filter(|line| !is_ours(line)).collect();
+        assert_eq!(foreign.len(), 1, "all but the last line: {foreign:#?}");
+        assert!(!page.lines().any(|line| line.starts_with("  error    forged")), "{page}");
+        assert!(page.to_string().contains("a?  error    forged?<0>b?[2Jc?"), "{page}");
     }
 
     #[test]

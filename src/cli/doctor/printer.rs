@@ -90,19 +90,31 @@ fn matching(machine: &Machine, pattern: &Path) -> Vec<PathBuf> {
             let names = names.filter(|name| !name.starts_with('.') || part.starts_with('.'));
             names.filter(|name| is_match(part.as_bytes(), name.as_bytes())).map(|name| folder.join(name))
         });
-        paths = found.collect();
+        // One more than is read: a pattern may name every file that there is.
+        paths = found.take(FILES_MAX + 1).collect();
     }
     paths
 }
 
 fn is_match(pattern: &[u8], name: &[u8]) -> bool {
-    match (pattern.split_first(), name.split_first()) {
-        (None, None) => true,
-        (Some((b'*', rest)), _) => (0..=name.len()).any(|skipped| is_match(rest, &name[skipped..])),
-        (Some((b'?', rest)), Some((_, left))) => is_match(rest, left),
-        (Some((wanted, rest)), Some((first, left))) => wanted == first && is_match(rest, left),
-        _ => false,
+    let (mut at, mut matched) = (0, 0);
+    // Where to go on behind the last `*`, which takes one byte more each time that the rest does not match.
+    let mut star = None;
+    while matched < name.len() {
+        match pattern.get(at) {
+            Some(b'*') => {
+                at += 1;
+                star = Some((at, matched));
+            }
+            Some(wanted) if *wanted == b'?' || *wanted == name[matched] => (at, matched) = (at + 1, matched + 1),
+            _ => {
+                let Some((behind, taken)) = star else { return false };
+                (at, matched) = (behind, taken + 1);
+                star = Some((behind, matched));
+            }
+        }
     }
+    pattern[at..].iter().all(|left| *left == b'*')
 }
 
 #[cfg(test)]
@@ -150,6 +162,12 @@ mod tests {
             ("a?c", "ac", false),
             ("*a*b", "xaxab", true),
             ("", "", true),
+            ("*a*a*b", "aaxab", true),
+            ("a*", "a", true),
+            ("?", "", false),
+            // In no time, though there are so many ways to try it.
+            (&"*a".repeat(40), &"a".repeat(200), true),
+            (&("*a".repeat(40) + "b"), &"a".repeat(200), false),
         ] {
             assert_eq!(is_match(pattern.as_bytes(), name.as_bytes()), is, "{pattern} {name}");
         }

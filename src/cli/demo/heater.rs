@@ -6,8 +6,8 @@
 
 use std::time::{Duration, Instant};
 
-use super::config::Config;
-use super::{Client, Error, Params};
+use pinion_client::config::Config;
+use pinion_client::{Client, Error, Params};
 use pinion_protocol::clock::Clock;
 
 const KELVIN: f64 = 273.15;

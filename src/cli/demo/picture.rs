@@ -5,7 +5,7 @@
 
 use std::fmt::Write;
 
-use super::demo::{AxisReport, AxisSample, Report};
+use super::{AxisReport, AxisSample, Report};
 
 const WIDTH: f64 = 900.0;
 const LEFT: f64 = 78.0;

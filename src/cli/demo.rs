@@ -7,10 +7,14 @@
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
 
-use super::config::Config;
-use super::heater::{Goal, Heater, Thermistor, Wiring};
-use super::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
-use super::{Client, Error};
+pub(super) mod heater;
+pub(super) mod picture;
+
+use crate::foreign::plain;
+use heater::{Goal, Heater, Thermistor, Wiring};
+use pinion_client::config::Config;
+use pinion_client::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
+use pinion_client::{Client, Error};
 use pinion_protocol::clock::Clock;
 
 /// An axis looks for its endstop over its travel times this.
@@ -208,8 +212,8 @@ impl<W: Write> ProgressLines<W> {
     }
 
     // Errors are ignored: the demonstration goes on even if nobody reads how it goes.
-    fn write(&mut self, line: &str) {
-        let _ = self.out.write_all(line.as_bytes()).and_then(|()| self.out.flush());
+    fn write(&mut self, before: &str, line: &str, after: &str) {
+        let _ = write!(self.out, "{before}{}{after}", plain(line)).and_then(|()| self.out.flush());
     }
 }
 
@@ -224,10 +228,10 @@ impl<W: Write> Observer for ProgressLines<W> {
             self.next = Some(now + Duration::from_millis(50));
             let full = (part.clamp(0.0, 1.0) * WIDTH as f64).round() as usize;
             let bar = "█".repeat(full) + &"░".repeat(WIDTH - full);
-            self.write(&format!("\r\x1b[K{what:<10} {bar} {detail}"));
+            self.write("\r\x1b[K", &format!("{what:<10} {bar} {detail}"), "");
         } else {
             self.next = Some(now + Duration::from_secs(1));
-            self.write(&format!("{what}: {detail}\n"));
+            self.write("", &format!("{what}: {detail}"), "\n");
         }
     }
 
@@ -235,7 +239,7 @@ impl<W: Write> Observer for ProgressLines<W> {
         self.next = None;
         let start = if self.live { "\r\x1b[K" } else { "" };
         let mark = if check.passed { "ok    " } else { "WRONG " };
-        self.write(&format!("{start}{mark}{}: {}\n", check.what, check.seen));
+        self.write(start, &format!("{mark}{}: {}", check.what, check.seen), "\n");
     }
 }
 

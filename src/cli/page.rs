@@ -1,0 +1,101 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The way to stdout: pages of whole lines.
+//!
+//! What a line says may come from anywhere: a host, a process, a file, a device. In a [`Page`] it stays in
+//! its line, and holds nothing that a terminal takes for a command. The log does the same (`logging.rs`).
+
+#![forbid(unsafe_code)]
+
+use std::fmt::{self, Display, Write as _};
+use std::io::{self, Write as _};
+
+use crate::foreign::{plain, plain_json};
+
+/// Lines, each with its line feed.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(super) struct Page(String);
+
+impl Page {
+    /// A text whose line feeds are ours.
+    pub(super) fn text(text: &str) -> Page {
+        let mut page = Page::default();
+        text.lines().for_each(|line| page.line(line));
+        page
+    }
+
+    /// JSON as serde_json writes it: it escapes the line feeds that are not its own.
+    pub(super) fn json(json: &str) -> Page {
+        Page(plain_json(json))
+    }
+
+    /// Adds a line.
+    pub(super) fn line(&mut self, line: impl Display) {
+        // A String takes everything that is written to it.
+        let _ = writeln!(self.0, "{}", plain(&line.to_string()));
+    }
+
+    /// Adds the lines of another page.
+    pub(super) fn append(&mut self, other: &Page) {
+        self.0 += &other.0;
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    pub(super) fn lines(&self) -> impl Iterator<Item = &str> {
+        self.0.lines()
+    }
+}
+
+impl Display for Page {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+/// Prints on stdout. A reader that has closed it, such as `head`, is no failure: the program goes on
+/// with what else it has to do.
+pub(super) fn print(page: &Page) -> Result<(), String> {
+    match draw(&page.0) {
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout can not be written: {error}")),
+        _ => Ok(()),
+    }
+}
+
+/// Writes on stdout what moves the cursor and paints. The texts in it come from a page or from [`plain`].
+pub(super) fn draw(text: &str) -> io::Result<()> {
+    let mut out = io::stdout().lock();
+    out.write_all(text.as_bytes())?;
+    out.flush()
+}
+
+#[cfg(test)]
+pub(in crate::cli) mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// Any text, often with control characters.
+    pub(in crate::cli) fn any_name() -> impl Strategy<Value = String> {
+        "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]|\x1b\\[31m|\n<0>){0,12}"
+    }
+
+    /// Asserts that nothing but lines leaves a printer, and no more of them than with harmless names.
+    #[track_caller]
+    pub(in crate::cli) fn assert_plain(text: &str, lines: usize) {
+        let control = text.chars().find(|c| c.is_control() && *c != '\n');
+        assert_eq!(control, None, "{text:?}");
+        assert_eq!(text.matches('\n').count(), lines, "{text:?}");
+    }
+
+    proptest! {
+        #[test]
+        fn a_line_stays_one(name in any_name()) {
+            let mut page = Page::default();
+            page.line(format_args!("the host {name}"));
+            assert_plain(&page.to_string(), 1);
+            let json = serde_json::to_string_pretty(&[&name]).unwrap();
+            assert_plain(&Page::json(&json).to_string(), 2);
+        }
+    }
+}

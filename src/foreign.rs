@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What others write: files that may be anything, and names that may hold anything.
+//!
+//! A host, its checkout, other processes and devices name things as they like. Their files are read with
+//! [`read`], and their names leave the program only after [`plain`] or [`plain_json`].
+
+#![forbid(unsafe_code)]
+
+use std::borrow::Cow;
+use std::fs::{File, Metadata, OpenOptions};
+use std::io::{self, Read};
+use std::os::fd::AsRawFd;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::Path;
+
+use nix::fcntl::OFlag;
+
+/// Opens a regular file to read it.
+///
+/// # Errors
+///
+/// Those of opening it. [`io::ErrorKind::InvalidInput`]: it is something else.
+pub(crate) fn open(path: &Path) -> io::Result<(File, Metadata)> {
+    // With O_PATH nothing is opened yet: a FIFO cannot block, and no device notices (a watchdog starts
+    // when it is opened). The second open is of that very file, whatever the path leads to by then.
+    let place = OpenOptions::new().read(true).custom_flags(OFlag::O_PATH.bits()).open(path)?;
+    let about = place.metadata()?;
+    if !about.is_file() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "it is no regular file"));
+    }
+    let flags = (OFlag::O_NONBLOCK | OFlag::O_NOCTTY).bits();
+    let same = format!("/proc/self/fd/{}", place.as_raw_fd());
+    Ok((OpenOptions::new().read(true).custom_flags(flags).open(same)?, about))
+}
+
+/// Reads the first `bytes_max` of a regular file.
+///
+/// # Errors
+///
+/// Those of [`open`] and of reading.
+pub(crate) fn read(path: &Path, bytes_max: u64) -> io::Result<Vec<u8>> {
+    let mut bytes = Vec::new();
+    open(path)?.0.take(bytes_max).read_to_end(&mut bytes)?;
+    Ok(bytes)
+}
+
+/// A text as part of one line for a terminal or a log: each control character is replaced.
+///
+/// The C0 and C1 controls and DEL have meanings to terminals, and a line feed would begin a line that
+/// passes for one of ours.
+pub(crate) fn plain(text: &str) -> Cow<'_, str> {
+    if text.contains(char::is_control) { text.replace(char::is_control, "?").into() } else { text.into() }
+}
+
+/// The same for JSON: line feeds stand between its lines. Inside its strings they are escaped already, as
+/// are other characters below 0x20; the remaining control characters are escaped here.
+pub(crate) fn plain_json(json: &str) -> String {
+    let mut plain = String::with_capacity(json.len());
+    for c in json.chars() {
+        match c {
+            '\n' => plain.push(c),
+            c if c.is_control() => plain += &format!("\\u{:04x}", u32::from(c)),
+            c => plain.push(c),
+        }
+    }
+    plain
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use std::fs;
+
+    #[test]
+    fn only_regular_files_are_read_and_not_for_ever() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("file");
+        let kind = || read(&path, 10).unwrap_err().kind();
+        assert_eq!(kind(), io::ErrorKind::NotFound);
+        fs::create_dir(&path).unwrap();
+        assert_eq!(kind(), io::ErrorKind::InvalidInput);
+        fs::remove_dir(&path).unwrap();
+        nix::unistd::mkfifo(&path, nix::sys::stat::Mode::S_IRWXU).unwrap();
+        assert_eq!(kind(), io::ErrorKind::InvalidInput);
+        fs::remove_file(&path).unwrap();
+        std::os::unix::fs::symlink("/dev/zero", &path).unwrap();
+        assert_eq!(kind(), io::ErrorKind::InvalidInput);
+        fs::remove_file(&path).unwrap();
+        fs::write(&path, "0123456789abc").unwrap();
+        assert_eq!(read(&path, 10).unwrap(), b"0123456789");
+        // Those of /proc have no length.
+        assert!(!read(Path::new("/proc/self/stat"), 4096).unwrap().is_empty());
+    }
+
+    proptest! {
+        #[test]
+        fn no_control_character_is_left(text in "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]){0,40}") {
+            let shown = plain(&text);
+            prop_assert!(!shown.contains(char::is_control));
+            prop_assert_eq!(shown.chars().count(), text.chars().count());
+            let json = plain_json(&serde_json::json!({ &text: [&text] }).to_string());
+            prop_assert!(!json.contains(char::is_control));
+            prop_assert_eq!(&serde_json::from_str::<serde_json::Value>(&json).unwrap()[&text][0], &text);
+        }
+    }
+}
