@@ -16,6 +16,7 @@ use crate::wire::vlq::{Reader, Writer};
 
 pub mod base;
 mod bus;
+mod calls;
 mod command;
 mod dialect;
 mod errand;
@@ -32,6 +33,7 @@ mod stop;
 mod timers;
 
 pub use bus::{Bus, Conversation, Talk};
+pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response};
 pub(crate) use command::{command, response};
 pub use dialect::Dialect;

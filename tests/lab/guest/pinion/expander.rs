@@ -391,3 +391,44 @@ fn pulses_at_an_expander_are_polled() {
     expander.set_inputs(0);
     count(2);
 }
+
+/// Buttons, a homing endstop, a counter and a line of `set_digital_out`.
+fn configure_inputs(client: &mut Client, expander: &Expander) {
+    let pin = |offset| expander.pin(offset);
+    configure(
+        client,
+        4,
+        &[
+            "config_buttons oid=0 button_count=1".to_owned(),
+            format!("config_endstop oid=1 pin={} pull_up=0", pin(1)),
+            "config_trsync oid=2".to_owned(),
+            format!("config_counter oid=3 pin={} pull_up=0", pin(2)),
+            format!("set_digital_out pin={} value=1", pin(3)),
+        ],
+    );
+    run(client, &format!("buttons_add oid=0 pos=0 pin={} pull_up=0", pin(0)));
+    let at = client.clock_in(0.05).expect("the clock").wire();
+    // Each 2 ms.
+    run(client, &format!("buttons_query oid=0 clock={at} rest_ticks=100000 retransmit_count=50 invert=0"));
+    run(client, &format!("query_counter oid=3 clock={at} poll_ticks=100000 sample_ticks=5000000"));
+}
+
+#[test]
+fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    let hangs = expander.slow_down(HANGS_MS);
+    thread::sleep(Duration::from_millis(50));
+    client.reset().expect("a reset");
+    drop(hangs);
+    program.wait_for_line(&[&expander.chip_name, "does not answer"]);
+    assert!(expander.is_held(), "the chip still hangs");
+    expander.wait_until_free();
+    assert!(!expander.is_held());
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    assert!(!client.status().expect("a session").is_shutdown);
+}
