@@ -208,7 +208,7 @@ fn text(status: &Value) -> Page {
             Some(_) => "low",
             None => "not looked at yet",
         };
-        vec![word(&line["pin"]), word(&line["use"]), level.to_owned()]
+        vec![word(&line["pin"]), word(&line["use"]), level.to_owned(), transfers(&line["bus"]).unwrap_or_default()]
     });
     table(&mut page, "lines", lines.collect());
     let objects = rows(status, "objects").iter().map(|object| {
@@ -226,17 +226,19 @@ fn text(status: &Value) -> Page {
         if object["queued"].as_u64().is_some_and(|queued| queued > 0) {
             facts.push(format!("{} queued", object["queued"]));
         }
-        let bus = &object["bus"];
-        if !bus.is_null() {
-            facts.push(format!(
-                "{} transfers, {} failed, {} of them tried again",
-                bus["transfers"], bus["errors"], bus["retries"]
-            ));
-        }
+        facts.extend(transfers(&object["bus"]));
         vec![oid, word(&object["kind"]), pin, facts.join(", ")]
     });
     table(&mut page, "objects", objects.collect());
     page
+}
+
+/// What went over a bus, if anything can.
+fn transfers(bus: &Value) -> Option<String> {
+    let counts = bus.as_object()?;
+    let count = |key: &str| counts.get(key).unwrap_or(&Value::Null);
+    let (transfers, errors, retries) = (count("transfers"), count("errors"), count("retries"));
+    Some(format!("{transfers} transfers, {errors} failed, {retries} of them tried again"))
 }
 
 fn host(status: &Value) -> String {
@@ -337,6 +339,9 @@ fn metrics(status: &Value) -> Page {
         out.head(&name, "counter", help);
         for object in rows(status, "objects").iter().filter(|object| !object["bus"].is_null()) {
             out.sample(&name, &[("oid", &object["oid"]), ("kind", &object["kind"])], number(&object["bus"][key]));
+        }
+        for line in rows(status, "lines").iter().filter(|line| !line["bus"].is_null()) {
+            out.sample(&name, &[("kind", &"line".into()), ("pin", &line["pin"])], number(&line["bus"][key]));
         }
     }
     for (name, kind, help) in [
@@ -520,7 +525,10 @@ mod tests {
             "dialect": "master", "owes": null,
             "host": { "attached": true, "pid": 7, "sure": true, "checkout": "/home/pi/klipper", "commit": "abc" },
             "guardian": { "present": true, "pid": 6 },
-            "lines": [{ "pin": "gpio\"1", "use": "output", "level": 1 }, { "pin": "gpio2", "use": "input", "level": null }],
+            "lines": [
+                { "pin": "gpio\"1", "use": "output", "level": 1, "bus": null },
+                { "pin": "gpio2", "use": "input", "level": null, "bus": { "transfers": 7, "errors": 3, "retries": 2 } },
+            ],
             "objects": [
                 { "oid": 0, "kind": "SPI device", "pin": "gpio8", "queued": 0, "value": null,
                   "bus": { "transfers": 9, "errors": 2, "retries": 1 } },
@@ -542,7 +550,7 @@ mod tests {
             "guardian  process 6",
             "queues    moves 3 of 1024, commands 0, spi0 1",
             "lines     gpio\"1  output  high",
-            "          gpio2   input   not looked at yet",
+            "          gpio2   input   not looked at yet  7 transfers, 3 failed, 2 of them tried again",
             "objects   oid 0  SPI device  gpio8  9 transfers, 2 failed, 1 of them tried again",
             "          oid 1  stepper     gpio9  at -5 steps, 3 queued",
         ] {
@@ -587,11 +595,12 @@ mod tests {
             "pinion_timer_lateness_seconds{quantile=\"0.99\"} 0.000002",
             "pinion_timer_lateness_seconds_count 10",
             "pinion_bus_errors_total{oid=\"0\",kind=\"SPI device\"} 2",
+            "pinion_bus_errors_total{kind=\"line\",pin=\"gpio2\"} 3",
             "pinion_worker_jobs{bus=\"spi0\"} 1",
         ] {
             assert!(metrics.lines().any(|shown| shown == line), "{line}\n{metrics}");
         }
-        assert!(!metrics.contains("gpio2"), "what was not looked at has no level");
+        assert!(!metrics.contains("pinion_line_level{pin=\"gpio2"), "what was not looked at has no level");
         for sample in metrics.lines().filter(|line| !line.starts_with('#')) {
             let name = sample.split(['{', ' ']).next().unwrap().trim_end_matches("_count");
             assert_eq!(metrics.matches(&format!("# TYPE {name} ")).count(), 1, "{name}");

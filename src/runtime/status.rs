@@ -392,7 +392,12 @@ fn machine(answer: &Answer, facts: &Facts, document: &mut serde_json::Map<String
             LineUse::Input => "input",
             LineUse::OpenDrain => "open drain",
         };
-        json!({ "pin": pin_name(&facts.pins, line.pin), "use": use_, "level": line.level.map(u8::from) })
+        json!({
+            "pin": pin_name(&facts.pins, line.pin),
+            "use": use_,
+            "level": line.level.map(u8::from),
+            "bus": line.bus.map(bus),
+        })
     });
     add("lines", lines.collect());
     let objects = machine.objects.iter().map(|object| {

@@ -122,7 +122,7 @@ impl Workers for Threads {
                 let _ = worker.thread.join();
             } else {
                 error!(
-                    "{} does not answer: its driver or chip hangs (dmesg), and what it holds stays in use until Pinion is restarted",
+                    "{} does not answer: its driver or chip hangs (dmesg), and what it holds stays in use until it answers, or Pinion is restarted",
                     worker.bus
                 );
             }
@@ -152,6 +152,10 @@ impl Server {
             // This must be read before the queue. A job that was submitted before `quit` was set is
             // then seen, and is still done: it may switch an output off.
             let ending = self.quit.load(Ordering::Acquire);
+            // It was left behind: what it was to do is another worker's now, and what it holds is wanted.
+            if self.jobs.is_abandoned() {
+                return;
+            }
             match self.jobs.pop() {
                 Ok(job) => self.serve(job),
                 Err(_) if ending => return,
@@ -222,19 +226,24 @@ mod tests {
     }
 
     #[test]
-    fn a_worker_that_hangs_is_left_behind() {
+    fn a_worker_that_hangs_is_left_behind_and_lets_go_of_all_once_it_is_back() {
         let (release, go_on) = mpsc::channel();
-        let (said, _heard) = mpsc::channel();
+        let (said, heard) = mpsc::channel();
         let go_on = Arc::new(std::sync::Mutex::new(go_on));
         let mut threads = threads();
         let worker = threads.start("i2c1").unwrap();
-        let errand = Box::new(Slow { go_on, number: 0, said });
-        let ticket = Ticket { oid: Oid::new(0), tag: 0 };
-        threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+        for number in 0..2 {
+            let errand = Box::new(Slow { go_on: go_on.clone(), number, said: said.clone() });
+            let ticket = Ticket { oid: Oid::new(0), tag: number };
+            threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+        }
+        drop(said);
         threads.reset();
         assert!(!threads.has_completion());
         // Another one takes its place.
         threads.start("i2c1").unwrap();
         drop(release);
+        // This ends as both errands are dropped; the second one is not begun.
+        assert_eq!(heard.iter().collect::<Vec<_>>(), [0]);
     }
 }

@@ -74,8 +74,8 @@ fn a_machine_tells_how_it_is_in_each_state() {
     let configured = status(&pinion);
     assert_eq!(configured["state"], "configured");
     assert_eq!(configured["host"]["attached"], true);
-    assert_eq!(*line(&configured, "led"), json!({ "pin": "led", "use": "output", "level": 1 }));
-    assert_eq!(*line(&configured, "x_step"), json!({ "pin": "x_step", "use": "output", "level": 0 }));
+    assert_eq!(*line(&configured, "led"), json!({ "pin": "led", "use": "output", "level": 1, "bus": null }));
+    assert_eq!(*line(&configured, "x_step"), json!({ "pin": "x_step", "use": "output", "level": 0, "bus": null }));
     let stop = line(&configured, "x_endstop");
     assert_eq!(stop["use"], "input");
     assert!(stop["level"].is_u64(), "it was sampled: {stop}");
@@ -85,6 +85,7 @@ fn a_machine_tells_how_it_is_in_each_state() {
     assert_eq!((&objects[2]["oid"], &objects[2]["pin"]), (&json!(2), &json!("bed_sensor")));
     let share = objects[2]["value"]["adc"].as_f64().unwrap();
     assert!(share > 0.0 && share < 1.0, "{share}");
+    assert!(objects[2]["bus"]["transfers"].as_u64().is_some_and(|transfers| transfers > 0), "{}", objects[2]);
     assert_eq!(objects[3]["value"]["steps"], 0);
     assert_eq!(configured["queues"]["moves"], json!({ "waiting": 0, "size": 1024 }));
     let timers = configured["lateness"]["timers"].as_u64().unwrap();

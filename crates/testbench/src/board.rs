@@ -2,7 +2,8 @@
 //! A board that records what the machine does to its pins, and lets a test play the rest.
 
 use std::collections::{HashMap, HashSet, VecDeque};
-use std::sync::{Arc, Condvar, Mutex, MutexGuard};
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use pinion_firmware::board::{
@@ -29,6 +30,8 @@ const I2C_BUSES: u32 = 2;
 pub const MOSI: u32 = 700;
 /// To break the chips of SPI bus 0 or 1: this number, and the next.
 pub const SPI_CHIPS: u32 = 600;
+/// How long the workers have to end.
+const WORKERS_END: Ticks = Ticks::from_us(2_000_000);
 /// The chip of the lines that may sleep.
 const EXPANDER: &str = "gpiochip1";
 
@@ -98,6 +101,12 @@ pub struct State {
     thermometers: HashMap<Vec<u8>, VecDeque<Option<i32>>>,
     /// Pins that can not be written or read any more, ADC channels too.
     pub broken: HashSet<u32>,
+    /// How many of a pin's next calls fail.
+    pub nacks: HashMap<u32, u32>,
+    /// How long a call that fails takes.
+    pub fail_ticks: u32,
+    /// Lines that somebody holds.
+    pub held: HashSet<u32>,
     /// Every SPI transfer, and when it began.
     transfers: Vec<(u64, u32, u8, u32, Message)>,
     /// Every value of a PWM channel: pin, instant, value.
@@ -121,6 +130,8 @@ pub struct Bench {
     state: Arc<Mutex<State>>,
     gate: Arc<Gate>,
     clock: VirtualClock,
+    /// How many ticks ago the worker did what the errand that is run does: the core may have stood still since.
+    ago: Arc<AtomicU32>,
     /// Instants that a test reads and writes count from here.
     origin: Clock,
 }
@@ -164,11 +175,17 @@ impl Bench {
             turns: Vec::with_capacity(256),
             ..State::default()
         };
-        Bench { state: Arc::new(Mutex::new(state)), gate: Arc::default(), clock, origin }
+        Bench { state: Arc::new(Mutex::new(state)), gate: Arc::default(), clock, ago: Arc::default(), origin }
     }
 
     fn ticks(&self) -> u64 {
-        self.clock.now().since(self.origin) as u64
+        let now = self.clock.now() - Ticks(self.ago.load(Ordering::Relaxed));
+        now.since(self.origin) as u64
+    }
+
+    /// A device takes its time.
+    pub fn pass(&self, ticks: Ticks) {
+        self.clock.set(self.clock.now() + ticks);
     }
 
     /// When a conversation of so many bytes begins.
@@ -282,10 +299,16 @@ impl Bench {
     }
 
     fn broken(&self, pin: u32, reason: ShutdownReason) -> Result<(), Shutdown> {
-        match self.state().broken.contains(&pin) {
-            true => Err(Shutdown::because(reason, format!("pin {pin} is gone: plug it in again"))),
-            false => Ok(()),
+        let mut state = self.state();
+        let nack = state.nacks.get_mut(&pin).filter(|left| **left > 0);
+        let fails = nack.map(|left| *left -= 1).is_some() || state.broken.contains(&pin);
+        let takes = Ticks(state.fail_ticks);
+        drop(state);
+        if !fails {
+            return Ok(());
         }
+        self.pass(takes);
+        Err(Shutdown::because(reason, format!("pin {pin} is gone: plug it in again")))
     }
 }
 
@@ -319,6 +342,9 @@ impl Board for FakeBoard {
                 Direction::Input(_) => reason::NOT_INPUT,
             };
             return Err(Shutdown::because(unknown, detail));
+        }
+        if !self.0.state().held.insert(number) {
+            return Err(Shutdown::because(reason::INPUT_LINE, format!("pin {number} is in use: free it")));
         }
         let line = FakeLine { bench: self.0.clone(), pin: number };
         line.set_direction(direction)?;
@@ -433,6 +459,13 @@ impl Pwm for FakePwm {
 struct FakeLine {
     bench: Bench,
     pin: u32,
+}
+
+impl Drop for FakeLine {
+    fn drop(&mut self) {
+        // Amid a panic of a test, too.
+        self.bench.state.lock().unwrap_or_else(PoisonError::into_inner).held.remove(&self.pin);
+    }
 }
 
 impl Line for FakeLine {
@@ -602,6 +635,8 @@ struct Shop {
     buses: Vec<(String, Clock)>,
     /// In the order of their ends.
     under_way: VecDeque<UnderWay>,
+    /// What hung when the workers were reset.
+    left_behind: Vec<UnderWay>,
 }
 
 /// An errand on its way.
@@ -620,7 +655,7 @@ enum Work {
 impl Shop {
     /// Room for more errands than a test sends: the bench does not allocate later.
     fn new() -> Shop {
-        Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256) }
+        Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256), left_behind: Vec::new() }
     }
 
     fn insert(&mut self, new: UnderWay) {
@@ -692,15 +727,17 @@ impl Workers for FakeWorkers {
                 Work::ToDo(job) => job,
                 Work::Done(completion) => return Some(completion),
             };
+            let ago = Ticks(self.bench.clock.now().since(end) as u32);
             self.bench.state().on_worker = true;
-            let now = self.bench.clock.now();
-            let ended = self.bench.clock.aside(|| errand.run());
+            self.bench.ago.store(ago.0, Ordering::Relaxed);
+            let ended = self.bench.clock.aside(|| errand.run()) - ago;
+            self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;
-            if ended == now {
-                return Some(Completion { ticket, errand, holds, began, ended: end });
+            if ended == end {
+                return Some(Completion { ticket, errand, holds, began, ended });
             }
             let mut shop = self.shop.lock().unwrap();
-            shop.delay(worker, ended, Ticks(ended.since(now) as u32));
+            shop.delay(worker, ended, Ticks(ended.since(end) as u32));
             let work = Work::Done(Completion { ticket, errand, holds, began, ended });
             shop.insert(UnderWay { worker, begin: began, end: ended, work });
         }
@@ -708,10 +745,21 @@ impl Workers for FakeWorkers {
     }
 
     fn has_completion(&self) -> bool {
-        self.next_end().is_some_and(|end| end <= self.bench.clock.now())
+        let now = self.bench.clock.now();
+        let mut shop = self.shop.lock().unwrap();
+        // A worker that hung comes back, and ends.
+        let back: Vec<UnderWay> = shop.left_behind.extract_if(.., |hung| hung.end <= now).collect();
+        drop(shop);
+        drop(back);
+        self.next_end().is_some_and(|end| end <= now)
     }
 
+    /// What takes longer than the two seconds that the program waits is left behind.
     fn reset(&mut self) {
-        *self.shop.lock().unwrap() = Shop::new();
+        let waits_until = self.bench.clock.now() + WORKERS_END;
+        let mut shop = self.shop.lock().unwrap();
+        let Shop { under_way, mut left_behind, .. } = std::mem::replace(&mut *shop, Shop::new());
+        left_behind.extend(under_way.into_iter().filter(|work| work.begin <= waits_until && work.end > waits_until));
+        shop.left_behind = left_behind;
     }
 }

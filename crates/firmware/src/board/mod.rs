@@ -223,9 +223,6 @@ pub struct BusError {
     pub detail: Box<str>,
 }
 
-/// How often a register is asked for before that counts as failed.
-const READ_TRIES: u32 = 3;
-
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
 ///
 /// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
@@ -251,31 +248,18 @@ pub trait BusDevice: Send {
         Err(BusError::other_kind("an I2C transfer", "an SPI device"))
     }
 
-    /// Reads from a register on, or with none from wherever the chip stands (I2C). What is not
-    /// acknowledged is asked for up to [`READ_TRIES`] times: a chip may be busy, and a spike on a long
-    /// cable is no reason to stop a print.
+    /// Reads from a register on, or with none from wherever the chip stands (I2C). The machine makes such
+    /// a transfer again if it fails (`mcu/calls.rs`).
     ///
     /// For registers that reading or naming does not change. A command, or a FIFO, is
     /// [`BusDevice::write_read`]'s: asked for twice it might be carried out twice.
     ///
     /// # Errors
     ///
-    /// What the bus said at last; a timeout at once, as it took long enough.
+    /// What the bus said at last.
     fn read_register(&mut self, register: &[u8], read: &mut [u8]) -> Result<(), BusError> {
-        let mut tries = 1;
-        loop {
-            match self.write_read(register, read) {
-                Err(error) if error.status != BusStatus::Timeout && tries < READ_TRIES => {
-                    tries += 1;
-                    self.tries_again();
-                }
-                done => return done,
-            }
-        }
+        self.write_read(register, read)
     }
-
-    /// A transfer that failed is about to be tried again: for whoever counts that.
-    fn tries_again(&mut self) {}
 }
 
 impl BusError {

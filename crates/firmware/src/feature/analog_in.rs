@@ -2,14 +2,15 @@
 //! Analog inputs: oversampling, range check, reports of several readings, homing by their values.
 //!
 //! A worker takes the readings, as each may block for a while. If the ADC is slower than the host
-//! wants, samples are left out; timers and steps do not wait for it.
+//! wants, samples are left out; timers and steps do not wait for it. A reading that fails leaves its sum out.
 
 #![forbid(unsafe_code)]
 
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
-    Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Next,
-    Object, Oid, Present, Report, Response, Ticket, TimerId, WireClock, WorkerId, command, response, since, until,
+    BusCounts, Calls, Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Mcu, Next, Object, Oid, Present, Report, Response, Ticket, TimerId, Unread, WireClock, WorkerId,
+    command, response, since, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -51,12 +52,13 @@ const SAMPLE_BYTES: usize = 2;
 /// One reading of a channel. Each input has one box of these, which is used again and again.
 struct Reading {
     adc: Box<dyn Adc>,
+    calls: Calls,
     counts: Result<u16, Shutdown>,
 }
 
 impl Errand for Reading {
     fn run(&mut self) {
-        self.counts = self.adc.read();
+        self.counts = self.calls.repeat(|| self.adc.read());
     }
 }
 
@@ -77,6 +79,8 @@ struct AnalogIn {
     worker: WorkerId,
     /// None while the ADC is being read: then the worker has the box.
     reading: Option<Box<Reading>>,
+    calls: Calls,
+    unread: Unread,
     /// Whether a sample waits until the ADC is done with one of an earlier query.
     waiting: bool,
     query: Query,
@@ -110,7 +114,10 @@ impl AnalogIn {
     /// Has the worker read the ADC, or remembers to once the reading under way is back.
     fn sample(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
         match self.reading.take() {
-            Some(reading) => mcu.dispatch(self.worker, Ticket { oid, tag: self.tag }, reading),
+            Some(reading) => {
+                self.unread.asked(mcu.now());
+                mcu.dispatch(self.worker, Ticket { oid, tag: self.tag }, reading)
+            }
             None => {
                 self.waiting = true;
                 Ok(())
@@ -203,18 +210,25 @@ impl Object for AnalogIn {
 
     fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
         let (tag, read_at) = (done.tag, done.ended);
-        let Some(mut reading) = done.errand::<Reading>() else { return Ok(()) };
-        let counts = std::mem::replace(&mut reading.counts, Ok(0));
-        self.reading = Some(reading);
+        let Some(reading) = done.errand::<Reading>() else { return Ok(()) };
+        let reading = self.reading.insert(reading);
+        if reading.counts.is_ok() {
+            self.unread.read();
+        }
         if tag != self.tag {
             return if std::mem::take(&mut self.waiting) { self.sample(mcu, oid) } else { Ok(()) };
         }
         let timer = TimerId::new(oid, 0);
-        let counts = match counts {
-            Ok(counts) => counts,
+        // A failure stays in its box, as the core would free it.
+        let counts = match &reading.counts {
+            Ok(counts) => *counts,
             Err(failure) => {
-                // In a stopped machine this sum is given up, and the next one begins in its turn.
-                mcu.try_shut_down(failure)?;
+                // A move may depend on it.
+                let at_once = !matches!(self.attached, Attached::Nothing);
+                if at_once || self.unread.is_too_long(read_at) {
+                    mcu.try_shut_down(failure.clone())?;
+                }
+                // This sum is given up, and the next one begins in its turn.
                 self.restart();
                 self.skip_missed(mcu.now());
                 mcu.go_on(timer, self.next_begin);
@@ -242,6 +256,10 @@ impl Object for AnalogIn {
         Report { queued: 0, value: self.last.map(Present::Adc) }
     }
 
+    fn counts(&self) -> Option<BusCounts> {
+        Some(self.calls.counts())
+    }
+
     fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
         // A reading that is under way does not count any more.
         self.restart();
@@ -259,10 +277,13 @@ impl Object for AnalogIn {
 
 const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mcu, oid: Oid, pin: Pin| {
     mcu.vacant(oid)?;
-    let OnWorker { bus, device } = mcu.board()?.adc(pin)?;
+    let OnWorker { bus, device: adc } = mcu.board()?.adc(pin)?;
+    let calls = Calls::new(mcu.clock());
     let input = AnalogIn {
         worker: mcu.worker(&bus)?,
-        reading: Some(Box::new(Reading { adc: device, counts: Ok(0) })),
+        reading: Some(Box::new(Reading { adc, calls: calls.clone(), counts: Ok(0) })),
+        calls,
+        unread: Unread::default(),
         waiting: false,
         query: Query::default(),
         next_begin: Clock::EPOCH,

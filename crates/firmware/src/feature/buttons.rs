@@ -64,6 +64,8 @@ struct Buttons {
     sample: u8,
     /// The buttons, a bit each, at which workers of expanders still look for this sample.
     awaited: u8,
+    /// Those at which they could not look.
+    unread: u8,
     /// Whether the sample that is being taken counts: not one of an earlier query.
     counts: bool,
     last_sample: u8,
@@ -84,6 +86,7 @@ impl Buttons {
             rest_ticks: Ticks(0),
             sample: 0,
             awaited: 0,
+            unread: 0,
             counts: false,
             last_sample: 0,
             pressed: 0,
@@ -109,7 +112,7 @@ impl Buttons {
 
     /// Looks at each button. A button that was not added reads low.
     fn take_sample(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        self.sample = 0;
+        (self.sample, self.unread) = (0, 0);
         self.counts = true;
         for (place, button) in self.buttons.iter_mut().enumerate() {
             let Some(button) = button else { continue };
@@ -122,11 +125,13 @@ impl Buttons {
         Ok(())
     }
 
-    /// Debounces a sample that is complete: a level counts if the sample before had it too. True if
-    /// there is something new to tell.
+    /// Debounces a sample that is complete: a level counts if the sample before had it too. A button that
+    /// could not be looked at keeps its last level, which that does not confirm. True if there is something
+    /// new to tell.
     fn debounce(&mut self) -> bool {
-        let steady = !(self.sample ^ self.last_sample);
-        self.last_sample = self.sample;
+        let read = !self.unread;
+        let steady = !(self.sample ^ self.last_sample) & read;
+        self.last_sample = self.sample & read | self.last_sample & self.unread;
         let changed = (self.sample ^ self.pressed) & steady;
         if changed == 0 {
             return false;
@@ -136,6 +141,12 @@ impl Buttons {
         *report = self.pressed;
         self.report_count += 1;
         true
+    }
+
+    /// Expanders still look for the last sample: whether they take too long.
+    fn wait(&self, mcu: &mut Mcu) -> Result<(), Shutdown> {
+        let awaited = (0..).zip(&self.buttons).filter(|(place, _)| self.awaited >> place & 1 != 0);
+        awaited.filter_map(|(_, button)| button.as_ref()).try_for_each(|button| button.line.awaited(mcu))
     }
 
     /// Takes in a complete sample, and tells what is new.
@@ -171,9 +182,12 @@ impl Object for Buttons {
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
         let Some(oid) = timer.oid() else { return Ok(Next::Done) };
         // Expanders that still look for the last sample miss this one.
-        let news = self.awaited == 0 && {
+        let news = if self.awaited == 0 {
             self.take_sample(mcu, oid)?;
             self.sampled(mcu, oid)
+        } else {
+            self.wait(mcu)?;
+            false
         };
         match self.retransmit {
             Some(0) if !news => self.report(mcu, oid),
@@ -192,8 +206,10 @@ impl Object for Buttons {
         if let Some(Some(button)) = self.buttons.get_mut(place)
             && button.tag(place) == tag
         {
-            let level = button.line.returned(done).or_else(|failure| mcu.try_shut_down(failure).map(|()| false))?;
-            self.sample |= u8::from(level) << place;
+            match button.line.sampled(mcu, done)? {
+                Some(level) => self.sample |= u8::from(level) << place,
+                None => self.unread |= 1 << place,
+            }
         }
         self.sampled(mcu, oid);
         Ok(())

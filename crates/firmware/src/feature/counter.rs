@@ -181,7 +181,9 @@ impl Object for Counter {
             return Ok(Next::At(at + self.sample_ticks.max(self.poll_ticks)));
         }
         // So does an expander that still looks.
-        if !self.looking {
+        if self.looking {
+            self.pin.awaited(mcu)?;
+        } else {
             match self.pin.read(mcu, Ticket { oid, tag: LOOK })? {
                 Some(level) => self.look(mcu, oid, level, at),
                 None => (self.looking, self.counts) = (true, true),
@@ -195,11 +197,12 @@ impl Object for Counter {
         if done.tag == READ_EDGES {
             return self.has_read(mcu, oid, done);
         }
-        let began = done.began;
+        let ended = done.ended;
         self.looking = false;
-        let level = self.pin.returned(done).or_else(|failure| mcu.try_shut_down(failure).map(|()| false))?;
+        let level = self.pin.sampled(mcu, done)?;
         if std::mem::take(&mut self.counts) {
-            self.look(mcu, oid, level, began);
+            // A pin that could not be looked at keeps its last level.
+            self.look(mcu, oid, level.unwrap_or(self.count % 2 == 1), ended);
         }
         Ok(())
     }

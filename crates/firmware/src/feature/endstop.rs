@@ -5,7 +5,8 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, command, response,
+    Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, UNREAD_LIMIT, WireClock,
+    command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -33,7 +34,8 @@ struct Endstop {
     homing: Option<Homing>,
     /// When sampling goes on if the samples after the last match do not confirm it.
     next_wake: Clock,
-    /// When the sample was due that the chip's worker is taking; none if it takes none.
+    /// When the sample was due that the chip's worker is taking; none if it takes none. The timer then runs
+    /// when that takes too long.
     due: Option<Clock>,
     /// A query waits for the worker's look at the line, too; `true` if further commands wait with it.
     asked: Option<bool>,
@@ -59,16 +61,16 @@ impl Endstop {
     /// Takes the sample that is due at `at`, or has the chip's worker take it.
     fn sample(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
         match self.pin.read(mcu, Self::ticket(oid))? {
-            Some(level) => self.judge(mcu, level, at),
+            Some(level) => self.judge(mcu, level, at, at),
             None => {
                 self.due = Some(at);
-                Ok(Next::Done)
+                Ok(Next::At(mcu.last_read() + UNREAD_LIMIT))
             }
         }
     }
 
-    /// Decides by a sample, which was due at `at`, how to go on.
-    fn judge(&mut self, mcu: &mut Mcu, level: bool, at: Clock) -> Result<Next, Shutdown> {
+    /// Decides how to go on by a sample that was due at `at` and is of the instant `seen`.
+    fn judge(&mut self, mcu: &mut Mcu, level: bool, at: Clock, seen: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(Next::Done) };
         let confirming = homing.wanted < homing.sample_count;
         if level != homing.pin_value {
@@ -76,7 +78,7 @@ impl Endstop {
             return Ok(Next::At(if confirming { self.next_wake } else { at + homing.rest_ticks }));
         }
         if !confirming {
-            self.next_wake = at + homing.rest_ticks;
+            self.next_wake = seen + homing.rest_ticks;
         }
         homing.wanted -= 1;
         if homing.wanted > 0 {
@@ -95,6 +97,17 @@ impl Endstop {
         Ok(())
     }
 
+    /// Answers the query that waits, with nothing in a stopped machine whose chip fails.
+    fn answer(&mut self, mcu: &mut Mcu, oid: Oid, level: Option<bool>) {
+        let Some(held) = self.asked.take() else { return };
+        if let Some(level) = level {
+            self.report(mcu, oid, level);
+        }
+        if held {
+            mcu.release();
+        }
+    }
+
     fn report(&self, mcu: &mut Mcu, oid: Oid, pin_value: bool) {
         mcu.send(State { oid, homing: self.homing.is_some(), next_clock: self.next_wake, pin_value });
     }
@@ -107,22 +120,27 @@ impl Object for Endstop {
 
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
         let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+        if self.due.is_some() {
+            self.pin.awaited(mcu)?;
+            return Ok(Next::At(at + UNREAD_LIMIT));
+        }
         self.sample(mcu, oid, at)
     }
 
     /// The chip's worker has looked.
     fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let began = done.began;
-        let level = self.pin.returned(done).or_else(|failure| mcu.try_shut_down(failure).map(|()| false))?;
-        if let Some(held) = self.asked.take() {
-            self.report(mcu, oid, level);
-            if held {
-                mcu.release();
-            }
+        let (began, ended) = (done.began, done.ended);
+        let is_homing = self.due.is_some();
+        let level = if is_homing { self.pin.seen(mcu, done)? } else { self.pin.sampled(mcu, done)? };
+        match level {
+            // A query is answered with a level that was seen.
+            None if self.asked.is_some() && !mcu.is_shutdown() => self.pin.read(mcu, Self::ticket(oid)).map(drop)?,
+            _ => self.answer(mcu, oid, level),
         }
-        let Some(at) = self.due.take() else { return Ok(()) };
+        let (Some(at), Some(level)) = (self.due.take(), level) else { return Ok(()) };
+        mcu.cancel(TimerId::new(oid, 0));
         // The worker may have looked for a query, before the sample was due: then it looks again.
-        let next = if began < at { self.sample(mcu, oid, at)? } else { self.judge(mcu, level, at)? };
+        let next = if began < at { self.sample(mcu, oid, at)? } else { self.judge(mcu, level, at, ended)? };
         if let Next::At(at) = next {
             let now = mcu.now();
             mcu.go_on(TimerId::new(oid, 0), at.max(now));

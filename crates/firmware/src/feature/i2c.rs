@@ -9,7 +9,7 @@
 #![forbid(unsafe_code)]
 
 use crate::board::soft_i2c::SoftI2c;
-use crate::board::{BusDevice, BusError, BusStatus, I2cConfig, OnWorker, Pin, Range};
+use crate::board::{BusDevice, BusError, BusStatus, I2cConfig, Pin, Range};
 use crate::mcu::{
     Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_11,
     Generation::V0_12, Generation::V0_13, Mcu, Object, Oid, Response, Talk, Ticket, command, only, response, since,
@@ -188,8 +188,8 @@ impl I2c {
 
     fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
         let config = I2cConfig { bus, address: seven_bits(address), rate_hz };
-        let OnWorker { bus, device } = mcu.board()?.i2c(config)?;
-        self.bus = Some(Bus::new(mcu.worker(&bus)?, device));
+        let opened = mcu.board()?.i2c(config)?;
+        self.bus = Some(mcu.bus(opened)?);
         Ok(())
     }
 

@@ -12,7 +12,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::board::{BusDevice, BusError, Mosi, OnWorker, Pin};
+use crate::board::{BusDevice, BusError, Mosi, Pin};
 use crate::mcu::{
     Bus, Command, Conversation, Done, Feature, Mcu, Object, Oid, Response, Talk, Ticket, command, response,
 };
@@ -142,7 +142,7 @@ const CONFIG_NEOPIXEL: Command = command!(
         if data_size >= SIZE_LIMIT {
             return Err(Shutdown::by_host(INVALID_SIZE, format_args!("a chain of {data_size} bytes")));
         }
-        let Mosi { line: OnWorker { bus, device }, message_max } = mcu.board()?.mosi(pin, RATE_HZ)?;
+        let Mosi { line, message_max } = mcu.board()?.mosi(pin, RATE_HZ)?;
         let size = usize::from(data_size);
         let low_bytes = low_bytes(reset_min_ticks);
         let len = low_bytes.saturating_mul(2).saturating_add(size * WIRE_BYTES);
@@ -155,7 +155,7 @@ const CONFIG_NEOPIXEL: Command = command!(
         }
         let frame = Frame { data: vec![0; size], message: vec![0; len], low_bytes };
         let chain = Neopixel {
-            bus: Bus::new(mcu.worker(&bus)?, device),
+            bus: mcu.bus(line)?,
             data: vec![0; size],
             frame: Some(Conversation::new(frame)),
             failing: false,

@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
 use crate::mcu::{
-    Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Remote, Safe, Settable, Ticket, TimerId, WireClock,
-    command,
+    BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Remote, Safe, Settable, Ticket,
+    TimerId, WireClock, command,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -92,21 +92,27 @@ fn message(first: u8, value: u16) -> [u8; 5] {
 /// the lock, and the core never takes it.
 struct Chip {
     device: Box<dyn BusDevice>,
+    calls: Calls,
     prescale: u8,
     is_set_up: bool,
 }
 
 impl Chip {
+    /// Writes registers, which may be done twice.
+    fn write(&mut self, bytes: &[u8]) -> Result<(), BusError> {
+        self.calls.repeat(|| self.device.write_read(bytes, &mut []))
+    }
+
     fn set_up(&mut self) -> Result<(), BusError> {
         if self.is_set_up {
             return Ok(());
         }
         // The prescaler takes a value in sleep only.
-        self.device.write_read(&[MODE1, AUTO_INCREMENT | SLEEP | ALL_CALL], &mut [])?;
-        self.device.write_read(&[PRE_SCALE, self.prescale], &mut [])?;
-        self.device.write_read(&[MODE1, AUTO_INCREMENT | ALL_CALL], &mut [])?;
+        self.write(&[MODE1, AUTO_INCREMENT | SLEEP | ALL_CALL])?;
+        self.write(&[PRE_SCALE, self.prescale])?;
+        self.write(&[MODE1, AUTO_INCREMENT | ALL_CALL])?;
         thread::sleep(OSCILLATOR_START);
-        self.device.write_read(&message(ALL_LED, 0), &mut [])?;
+        self.write(&message(ALL_LED, 0))?;
         self.is_set_up = true;
         Ok(())
     }
@@ -139,7 +145,7 @@ impl Settable for Channel {
         };
         chip.set_up().map_err(|error| Shutdown::because(NOT_SET_UP, error.detail))?;
         let Some(value) = value else { return Ok(()) };
-        let written = chip.device.write_read(&message(self.first_register, value), &mut []);
+        let written = chip.write(&message(self.first_register, value));
         written.map_err(|error| Shutdown::because(NOT_UPDATED, error.detail))
     }
 }
@@ -164,6 +170,8 @@ struct Address {
 #[derive(Default)]
 struct Chips {
     chips: Vec<Address>,
+    /// Of all the chips together; none before the first.
+    calls: Option<Calls>,
     /// 16 for each chip: an output's place is also the tag of its errands.
     outputs: Vec<Output>,
 }
@@ -202,7 +210,9 @@ impl Chips {
         let opened = mcu.board()?.i2c(config);
         let OnWorker { bus, device } = opened.map_err(|error| Shutdown::because(NOT_SET_UP, error.detail))?;
         let worker = mcu.worker(&bus)?;
-        let chip = Chip { device, prescale: prescale(address.cycle), is_set_up: false };
+        let clock = mcu.clock();
+        let calls = self.calls.get_or_insert_with(|| Calls::new(clock)).clone();
+        let chip = Chip { device, calls, prescale: prescale(address.cycle), is_set_up: false };
         let chip = Arc::new(Mutex::new(chip));
         self.chips.push(address);
         for channel in 0..CHANNELS as u8 {
@@ -237,6 +247,10 @@ impl Object for Chips {
             mcu.is_safe(oid);
         }
         Ok(())
+    }
+
+    fn counts(&self) -> Option<BusCounts> {
+        self.calls.as_ref().map(Calls::counts)
     }
 
     /// It can not: it holds descriptors of lines and of PWM channels, and no chips on a bus.

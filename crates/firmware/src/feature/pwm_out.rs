@@ -6,8 +6,8 @@
 
 use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
-    Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Present, Remote, Report, Safe, Settable, Ticket, TimerId,
-    WireClock, command,
+    BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Present, Remote, Report, Safe,
+    Settable, Ticket, TimerId, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -33,7 +33,10 @@ shutdowns! {
 const KIND: &str = "PWM output";
 
 /// A PWM channel, as the worker of its chip has it.
-struct Channel(Box<dyn Pwm>);
+struct Channel {
+    pwm: Box<dyn Pwm>,
+    calls: Calls,
+}
 
 /// What a channel is set to: a value of 0 to [`PWM_MAX`], and by `set_pwm_out` a new period as well.
 #[derive(Clone, Copy)]
@@ -46,25 +49,27 @@ impl Settable for Channel {
     type Value = Setting;
 
     fn set(&mut self, Setting { value, cycle }: Setting) -> Result<(), Shutdown> {
-        match cycle {
-            Some(cycle) => self.0.set_cycle(cycle, value),
-            None => self.0.set(value),
-        }
+        self.calls.repeat(|| match cycle {
+            Some(cycle) => self.pwm.set_cycle(cycle, value),
+            None => self.pwm.set(value),
+        })
     }
 }
 
 /// Opens a channel. As in the firmware, several objects may have the same one, each with files of its
 /// own.
-fn open(mcu: &mut Mcu, config: PwmConfig) -> Result<Remote<Channel>, Shutdown> {
-    let OnWorker { bus, device } = mcu.board()?.pwm(config)?;
-    let worker = mcu.worker(&bus)?;
-    Ok(Remote::new(worker, Channel(device), Setting { value: config.value, cycle: None }))
+fn open(mcu: &mut Mcu, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
+    let OnWorker { bus, device: pwm } = mcu.board()?.pwm(config)?;
+    let (worker, calls) = (mcu.worker(&bus)?, Calls::new(mcu.clock()));
+    let channel = Channel { pwm, calls: calls.clone() };
+    Ok((Remote::new(worker, channel, Setting { value: config.value, cycle: None }), calls))
 }
 
 const TEXTS: Texts = Texts { max_duration: PWM_MAX_DURATION, missed: MISSED_PWM };
 
 struct PwmOut {
     channel: Remote<Channel>,
+    calls: Calls,
     /// The value that it was set to last.
     value: u16,
     queue: ValueQueue,
@@ -106,6 +111,10 @@ impl Object for PwmOut {
         Report { queued: self.queue.len(), value: Some(Present::Pwm(self.value)) }
     }
 
+    fn counts(&self) -> Option<BusCounts> {
+        Some(self.calls.counts())
+    }
+
     fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
         self.queue.clear(mcu);
     }
@@ -134,14 +143,14 @@ impl SetChannels {
             }
             _ if mcu.is_finalized() => Err(set_too_late(mcu, reason::PWM_CONFIG, "set_pwm_out", pin)),
             Some(place) => {
-                self.0[place].1 = open(mcu, config)?;
+                self.0[place].1 = open(mcu, config)?.0;
                 Ok(())
             }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::PWM_CONFIG, "set_pwm_out wants more than 256 channels"))
             }
             None => {
-                self.0.push((pin, open(mcu, config)?));
+                self.0.push((pin, open(mcu, config)?.0));
                 Ok(())
             }
         }
@@ -167,9 +176,9 @@ const CONFIG_PWM_OUT: Command = command!(
     |mcu, oid: Oid, pin: Pin, cycle_ticks: Ticks, value: u16, default_value: u16, max_duration: Ticks| {
         mcu.vacant(oid)?;
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: default_value };
-        let channel = open(mcu, config)?;
+        let (channel, calls) = open(mcu, config)?;
         let queue = ValueQueue::new(default_value, max_duration, &TEXTS);
-        mcu.assign_on(pin, oid, PwmOut { channel, value, queue })
+        mcu.assign_on(pin, oid, PwmOut { channel, calls, value, queue })
     }
 );
 

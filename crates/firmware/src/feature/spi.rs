@@ -11,7 +11,7 @@
 use std::fmt;
 
 use crate::board::soft_spi::SoftSpi;
-use crate::board::{BusDevice, BusError, ChipSelect, OnWorker, Pin, SpiConfig};
+use crate::board::{BusDevice, BusError, ChipSelect, Pin, SpiConfig};
 use crate::mcu::{
     Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
     Mcu, Object, Oid, Response, Safe, Talk, Ticket, command, response, since, until,
@@ -124,8 +124,8 @@ impl Spi {
     fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
         self.may_have_bus(mcu, mode)?;
         let chip_select = self.chip_select.take();
-        let OnWorker { bus, device } = mcu.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
-        self.bus = Some(Bus::new(mcu.worker(&bus)?, device));
+        let opened = mcu.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
+        self.bus = Some(mcu.bus(opened)?);
         Ok(())
     }
 

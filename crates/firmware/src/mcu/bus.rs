@@ -9,11 +9,10 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::board::{BusDevice, BusError};
+use crate::board::{BusDevice, BusError, OnWorker};
 use crate::shutdown::Shutdown;
 
-use super::snapshot::Counters;
-use super::{BusCounts, Errand, Mcu, Oid, Ticket, WorkerId};
+use super::{BusCounts, Calls, Errand, Mcu, Oid, Ticket, WorkerId};
 
 /// A chip that several conversations use in turn. All of them run on the worker of its bus, one
 /// after the other, so the lock is always free. The core never takes it.
@@ -24,30 +23,26 @@ type SharedDevice = Arc<Mutex<Box<dyn BusDevice>>>;
 pub struct Bus {
     worker: WorkerId,
     device: SharedDevice,
-    counters: Arc<Counters>,
+    calls: Calls,
 }
 
-/// A chip whose transfers are counted.
+/// A chip whose transfers are counted, and made again where that may be.
 struct Counted {
     device: Box<dyn BusDevice>,
-    counters: Arc<Counters>,
+    calls: Calls,
 }
 
 impl BusDevice for Counted {
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
-        let done = self.device.exchange(bytes);
-        self.counters.count(done.is_err());
-        done
+        self.calls.once(|| self.device.exchange(bytes))
     }
 
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
-        let done = self.device.write_read(write, read);
-        self.counters.count(done.is_err());
-        done
+        self.calls.once(|| self.device.write_read(write, read))
     }
 
-    fn tries_again(&mut self) {
-        self.counters.retry();
+    fn read_register(&mut self, register: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        self.calls.repeat(|| self.device.write_read(register, read))
     }
 }
 
@@ -86,16 +81,9 @@ impl<T: Talk> Errand for Conversation<T> {
 }
 
 impl Bus {
-    /// A chip whose bus has this worker.
-    pub fn new(worker: WorkerId, device: Box<dyn BusDevice>) -> Bus {
-        let counters = Arc::new(Counters::default());
-        let counted = Counted { device, counters: counters.clone() };
-        Bus { worker, device: Arc::new(Mutex::new(Box::new(counted))), counters }
-    }
-
     /// What went over the bus to this chip.
     pub(super) fn counts(&self) -> BusCounts {
-        self.counters.get()
+        self.calls.counts()
     }
 }
 
@@ -104,13 +92,24 @@ impl Bus {
 const SOFTWARE: &str = "software";
 
 impl Mcu {
+    /// A chip that the board has opened.
+    ///
+    /// # Errors
+    ///
+    /// That the worker can not be started.
+    pub fn bus(&mut self, OnWorker { bus, device }: OnWorker<dyn BusDevice>) -> Result<Bus, Shutdown> {
+        let (worker, calls) = (self.worker(&bus)?, Calls::new(self.clock()));
+        let counted = Counted { device, calls: calls.clone() };
+        Ok(Bus { worker, device: Arc::new(Mutex::new(Box::new(counted))), calls })
+    }
+
     /// A device on a bus that is made of lines.
     ///
     /// # Errors
     ///
     /// That the worker can not be started.
     pub fn software_bus(&mut self, device: Box<dyn BusDevice>) -> Result<Bus, Shutdown> {
-        Ok(Bus::new(self.worker(SOFTWARE)?, device))
+        self.bus(OnWorker { bus: SOFTWARE.to_owned(), device })
     }
 
     /// Sends a conversation to the chip that object `device` stands for. It comes back to

@@ -12,17 +12,18 @@ use std::sync::Arc;
 
 use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line, OnWorker, Pin};
 use crate::shutdown::{Shutdown, reason};
+use crate::time::Ticks;
 
 use super::snapshot::Level;
-use super::{Done, Errand, LineState, Mcu, Remote, Safe, Settable, Ticket, WorkerId};
+use super::{Calls, Done, Errand, LineState, Mcu, Remote, Safe, Settable, Ticket, UNREAD_LIMIT, Unread, WorkerId};
 
 /// A line in use.
 pub(super) struct Claim {
     /// By the board's own number for it.
     pin: Pin,
     line: Arc<dyn Line>,
-    /// The worker of its chip, if calls to that may take their time.
-    worker: Option<WorkerId>,
+    /// The worker of its chip, if calls to that may take their time, and the calls that it makes.
+    slow: Option<(WorkerId, Calls)>,
     /// What it was set up as last.
     direction: Direction,
     /// Its level for whoever asks for the machine's status.
@@ -31,12 +32,17 @@ pub(super) struct Claim {
 
 impl Claim {
     pub(super) fn state(&self) -> LineState {
-        LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get() }
+        let bus = self.slow.as_ref().map(|(_, calls)| calls.counts());
+        LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get(), bus }
     }
 
     /// The line for a user that calls it itself, as errands do.
     fn shared(&self) -> Arc<dyn Line> {
-        Arc::new(Watched { line: self.line.clone(), shown: self.shown.clone() })
+        let watched = Arc::new(Watched { line: self.line.clone(), shown: self.shown.clone() });
+        match &self.slow {
+            None => watched,
+            Some((_, calls)) => Arc::new(Repeated { line: watched, calls: calls.clone() }),
+        }
     }
 }
 
@@ -64,6 +70,31 @@ impl Line for Watched {
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.shown.begin(direction);
         self.line.turn(direction)
+    }
+}
+
+/// A line of a chip that may sleep: each call may be made twice.
+#[derive(Clone)]
+struct Repeated {
+    line: Arc<dyn Line>,
+    calls: Calls,
+}
+
+impl Line for Repeated {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        self.calls.repeat(|| self.line.write(level))
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        self.calls.repeat(|| self.line.read())
+    }
+
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.calls.repeat(|| self.line.set_direction(direction))
+    }
+
+    fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
+        self.calls.repeat(|| self.line.turn(direction))
     }
 }
 
@@ -98,14 +129,11 @@ impl PromptLine {
     }
 }
 
-/// A line of a chip that may sleep, on the worker of that chip.
-struct SlowLine(Arc<dyn Line>);
-
-impl Settable for SlowLine {
+impl Settable for Repeated {
     type Value = bool;
 
     fn set(&mut self, level: bool) -> Result<(), Shutdown> {
-        self.0.write(level)
+        self.write(level)
     }
 }
 
@@ -118,7 +146,7 @@ pub struct OutputLine {
 
 enum Driver {
     Prompt(Arc<dyn Line>),
-    Slow(Remote<SlowLine>),
+    Slow(Remote<Repeated>),
 }
 
 impl OutputLine {
@@ -175,7 +203,7 @@ impl OutputLine {
 
 /// A look at an input of a chip that may sleep.
 struct Sampling {
-    line: Arc<dyn Line>,
+    line: Repeated,
     level: Result<bool, Shutdown>,
 }
 
@@ -187,6 +215,7 @@ impl Errand for Sampling {
 
 /// An input line of any chip.
 pub struct InputLine {
+    pin: Pin,
     sensor: Sensor,
     shown: Arc<Level>,
 }
@@ -197,17 +226,22 @@ enum Sensor {
         worker: WorkerId,
         /// Here while no look is under way.
         sampling: Option<Box<Sampling>>,
+        unread: Unread,
     },
 }
 
 impl InputLine {
     fn new(claim: &Claim) -> InputLine {
         let (line, shown) = (claim.line.clone(), claim.shown.clone());
-        let sensor = match claim.worker {
+        let sensor = match &claim.slow {
             None => Sensor::Prompt(line),
-            Some(worker) => Sensor::Slow { worker, sampling: Some(Box::new(Sampling { line, level: Ok(false) })) },
+            Some((worker, calls)) => {
+                let line = Repeated { line, calls: calls.clone() };
+                let sampling = Some(Box::new(Sampling { line, level: Ok(false) }));
+                Sensor::Slow { worker: *worker, sampling, unread: Unread::default() }
+            }
         };
-        InputLine { sensor, shown }
+        InputLine { pin: claim.pin, sensor, shown }
     }
 
     /// The line's level; none if it comes later, to the object's `returned`, as the chip's worker
@@ -220,8 +254,9 @@ impl InputLine {
     pub fn read(&mut self, mcu: &mut Mcu, ticket: Ticket) -> Result<Option<bool>, Shutdown> {
         match &mut self.sensor {
             Sensor::Prompt(line) => line.read().inspect(|level| self.shown.set(*level)).map(Some),
-            Sensor::Slow { worker, sampling } => {
+            Sensor::Slow { worker, sampling, unread } => {
                 if let Some(sampling) = sampling.take() {
+                    unread.asked(mcu.now());
                     mcu.dispatch(*worker, ticket, sampling)?;
                 }
                 Ok(None)
@@ -229,18 +264,57 @@ impl InputLine {
         }
     }
 
-    /// The level that the worker saw.
+    /// The level that the worker saw; none if it could not look, or the machine is stopped and it failed.
     ///
     /// # Errors
     ///
-    /// "GPIO line read failed".
-    pub fn returned(&mut self, done: Done) -> Result<bool, Shutdown> {
-        let (Sensor::Slow { sampling, .. }, Some(mut back)) = (&mut self.sensor, done.errand::<Sampling>()) else {
-            return Ok(false);
+    /// "GPIO line read failed", once nothing was seen for [`UNREAD_LIMIT`].
+    pub fn sampled(&mut self, mcu: &Mcu, done: Done) -> Result<Option<bool>, Shutdown> {
+        self.take_in(mcu, done, false)
+    }
+
+    /// The same where a move depends on it.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed" at once.
+    pub fn seen(&mut self, mcu: &Mcu, done: Done) -> Result<Option<bool>, Shutdown> {
+        self.take_in(mcu, done, true)
+    }
+
+    fn take_in(&mut self, mcu: &Mcu, done: Done, at_once: bool) -> Result<Option<bool>, Shutdown> {
+        let ended = done.ended;
+        let (Sensor::Slow { sampling, unread, .. }, Some(back)) = (&mut self.sensor, done.errand::<Sampling>()) else {
+            return Ok(None);
         };
-        let level = std::mem::replace(&mut back.level, Ok(false));
-        *sampling = Some(back);
-        level.inspect(|level| self.shown.set(*level))
+        // What failed stays in the box, as the core would free it.
+        match &sampling.insert(back).level {
+            Ok(level) => {
+                unread.read();
+                self.shown.set(*level);
+                Ok(Some(*level))
+            }
+            Err(failure) if at_once || unread.is_too_long(ended) => mcu.try_shut_down(failure.clone()).map(|()| None),
+            Err(_) => Ok(None),
+        }
+    }
+
+    /// To be called while a look is under way.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed", once nothing was seen for [`UNREAD_LIMIT`].
+    pub fn awaited(&self, mcu: &mut Mcu) -> Result<(), Shutdown> {
+        let Sensor::Slow { unread, .. } = &self.sensor else { return Ok(()) };
+        if !unread.is_too_long(mcu.now()) {
+            return Ok(());
+        }
+        let detail = format!(
+            "{} has not answered for {} ms: does its chip or its bus hang? Check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
+            mcu.name(self.pin),
+            UNREAD_LIMIT.0 / Ticks::from_us(1000).0
+        );
+        mcu.try_shut_down(Shutdown::because(reason::LINE_READ, detail))
     }
 }
 
@@ -284,9 +358,10 @@ impl Mcu {
     fn enter(&mut self, pin: Pin, claimed: ClaimedLine, direction: Direction) -> Result<&Claim, Shutdown> {
         let ClaimedLine { line, sleeps_on } = claimed;
         let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
+        let slow = worker.map(|worker| (worker, Calls::new(self.clock())));
         let shown = Arc::new(Level::of(direction));
         let place = self.claims.len();
-        self.claims.push(Claim { pin, line, worker, direction, shown });
+        self.claims.push(Claim { pin, line, slow, direction, shown });
         Ok(&self.claims[place])
     }
 
@@ -298,9 +373,9 @@ impl Mcu {
     pub fn output(&mut self, pin: Pin, level: bool, shutdown_level: bool) -> Result<OutputLine, Shutdown> {
         let claim = self.claim(pin, Direction::Output { level, shutdown_level })?;
         let (line, shown) = (claim.line.clone(), claim.shown.clone());
-        let driver = match claim.worker {
+        let driver = match &claim.slow {
             None => Driver::Prompt(line),
-            Some(worker) => Driver::Slow(Remote::new(worker, SlowLine(line), level)),
+            Some((worker, calls)) => Driver::Slow(Remote::new(*worker, Repeated { line, calls: calls.clone() }, level)),
         };
         Ok(OutputLine { level, driver, shown })
     }
@@ -333,7 +408,7 @@ impl Mcu {
     }
 
     fn prompt_claim(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<&Claim, Shutdown> {
-        if self.claim(pin, direction)?.worker.is_some() {
+        if self.claim(pin, direction)?.slow.is_some() {
             let name = self.name(pin);
             let refused = match direction {
                 Direction::Input(_) => reason::INPUT_LINE,

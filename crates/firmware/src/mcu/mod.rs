@@ -16,6 +16,7 @@ use pinion_protocol::vlq::{Reader, Writer};
 
 pub mod base;
 mod bus;
+mod calls;
 mod command;
 mod dialect;
 mod errand;
@@ -33,6 +34,7 @@ mod timers;
 
 pub use crate::{command, response};
 pub use bus::{Bus, Conversation, Talk};
+pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
 pub use dialect::{Dialect, Firmware};
 pub use errand::{Completion, Done, Errand, Job, Ticket, WorkerId, Workers};

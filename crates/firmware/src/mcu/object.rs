@@ -9,7 +9,7 @@ use crate::board::Pin;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
-use super::{Bus, Done, Mcu, Oid, Report, TimerId};
+use super::{Bus, BusCounts, Done, Mcu, Oid, Report, TimerId};
 
 /// What an event answers: what becomes of its timer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -69,6 +69,11 @@ pub trait Object: Any + Send {
     /// The chip that this object stands for, if it is a bus device whose bus is set.
     fn bus(&self) -> Option<&Bus> {
         None
+    }
+
+    /// The calls to its device, if a worker makes them.
+    fn counts(&self) -> Option<BusCounts> {
+        self.bus().map(Bus::counts)
     }
 
     /// What it tells to whoever asks for the machine's status.

@@ -6,7 +6,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::atomic::{AtomicU8, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicU8, Ordering};
 
 use crate::board::{Direction, Pin};
 use crate::lateness::Lateness;
@@ -70,6 +70,8 @@ pub struct LineState {
     pub use_: LineUse,
     /// The level that it was driven to or that was seen last; none if it was not looked at yet.
     pub level: Option<bool>,
+    /// The calls of its worker, if its chip is an expander.
+    pub bus: Option<BusCounts>,
 }
 
 /// What a line is.
@@ -104,7 +106,7 @@ pub struct ObjectState {
     pub pin: Option<Pin>,
     /// What it says of itself.
     pub report: Report,
-    /// The transfers of its chip, if it stands for one.
+    /// The calls to its device, if a worker makes them.
     pub bus: Option<BusCounts>,
 }
 
@@ -128,14 +130,14 @@ pub enum Present {
     Steps(i32),
 }
 
-/// What went over a bus to a chip since it was configured. The counts wrap around.
+/// Calls to a device since it was configured. The counts wrap around.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct BusCounts {
-    /// Transfers, those that failed among them.
+    /// Calls, those that failed among them.
     pub transfers: u32,
-    /// Transfers that failed.
+    /// Calls that failed.
     pub errors: u32,
-    /// Of these, those that were tried again.
+    /// Of these, those that were made again.
     pub retries: u32,
 }
 
@@ -259,7 +261,7 @@ impl Mcu {
             kind: object.kind(),
             pin: self.pins.iter().find(|(oid, _)| oid.index() == index).map(|(_, pin)| *pin),
             report: object.report(),
-            bus: object.bus().map(|bus| bus.counts()),
+            bus: object.counts(),
         })
     }
 }
@@ -295,29 +297,5 @@ impl Level {
             UNKNOWN => None,
             level => Some(level != 0),
         }
-    }
-}
-
-/// Counts what goes over a bus to a chip. The bus's worker counts.
-#[derive(Debug, Default)]
-pub(super) struct Counters {
-    transfers: AtomicU32,
-    errors: AtomicU32,
-    retries: AtomicU32,
-}
-
-impl Counters {
-    pub(super) fn count(&self, failed: bool) {
-        self.transfers.fetch_add(1, Ordering::Relaxed);
-        self.errors.fetch_add(u32::from(failed), Ordering::Relaxed);
-    }
-
-    pub(super) fn retry(&self) {
-        self.retries.fetch_add(1, Ordering::Relaxed);
-    }
-
-    pub(super) fn get(&self) -> BusCounts {
-        let load = |count: &AtomicU32| count.load(Ordering::Relaxed);
-        BusCounts { transfers: load(&self.transfers), errors: load(&self.errors), retries: load(&self.retries) }
     }
 }

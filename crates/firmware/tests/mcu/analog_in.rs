@@ -119,18 +119,39 @@ fn a_query_without_rest_reads_as_fast_as_the_adc_does_until_the_machine_stops() 
 }
 
 #[test]
-fn a_read_that_fails_stops_the_machine_and_reports_come_once_it_works_again() {
+fn reads_that_fail_for_100_ms_stop_the_machine_and_reports_come_once_it_works_again() {
     let mut rig = Rig::configured(&[SENSOR]);
     rig.bench.script_adc(ANALOG, &[1]);
     rig.send(&query(1, 0, 65535, 1));
     rig.bench.state().broken.insert(ANALOG);
-    rig.run_until(50_000);
+    // Sums of which nothing could be read are due every 100000 ticks from 5000 on.
+    rig.run_until(5_004_999);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(5_005_000);
     assert_eq!(rig.shutdown().as_deref(), Some("Error on analog read"));
-    rig.run_until(500_000);
+    rig.run_until(5_500_000);
     assert_eq!(rig.responses(), [""; 0]);
     rig.bench.state().broken.clear();
-    rig.run_until(800_000);
+    rig.run_until(5_800_000);
     assert_eq!(rig.responses().len(), 3);
+}
+
+#[test]
+fn a_read_that_fails_is_tried_again_and_then_its_sum_is_left_out() {
+    let mut rig = Rig::configured(&[SENSOR]);
+    rig.bench.script_adc(ANALOG, &[1]);
+    rig.send(&query(1, 0, 65535, 1));
+    rig.bench.state().nacks.insert(ANALOG, 2);
+    rig.run_until(50_000);
+    assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@105000 values=0400"]);
+    rig.bench.state().nacks.insert(ANALOG, 3);
+    rig.run_until(250_000);
+    assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@305000 values=0400"]);
+    // One more, long after: it is the first in its row.
+    rig.run_until(6_000_000);
+    rig.bench.state().nacks.insert(ANALOG, 3);
+    rig.run_until(12_000_000);
+    assert_eq!(rig.shutdown(), None);
 }
 
 #[test]

@@ -213,10 +213,50 @@ fn a_look_under_way_is_not_taken_for_one_of_a_later_query_or_line() {
     assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=03"], "both places are pin 30 now");
 }
 
+/// Ticks of 100 ms.
+const UNREAD_LIMIT: u64 = 5_000_000;
+
 #[test]
-fn an_expander_that_fails_stops_the_machine() {
+fn an_expander_that_fails_for_100_ms_stops_the_machine() {
     let mut rig = with_expander();
     rig.bench.state().broken.insert(B);
-    rig.run_until(2500);
+    rig.bench.script_input(A, &[(8500, 1)]);
+    rig.run_until(20_000);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"], "others go on");
+    rig.send("buttons_ack oid=0 count=1");
+    // The first sample that could not be read is of 1000; each is complete 1500 later.
+    rig.run_until(1000 + UNREAD_LIMIT - 1);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(1000 + UNREAD_LIMIT + 2000);
     assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+}
+
+#[test]
+fn a_look_that_fails_is_no_sample_and_changes_nothing() {
+    let mut rig = with_expander();
+    rig.bench.script_input(B, &[(2600, 1), (6000, 0)]);
+    // Samples at 1000, 3000, 5000, 7000: high at 3000, which nothing confirms, as the look at 5000 fails.
+    rig.run_until(5000);
+    rig.bench.state().nacks.insert(B, 3);
+    rig.run_until(100_000);
+    assert_eq!(rig.responses(), [""; 0]);
+    // High from then on: with one try that fails it is told as with none.
+    rig.bench.script_input(B, &[(100_600, 1)]);
+    rig.run_until(102_000);
+    rig.bench.state().nacks.insert(B, 2);
+    rig.run_until(104_500);
+    assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=02"]);
+}
+
+#[test]
+fn an_expander_that_hangs_for_100_ms_stops_the_machine() {
+    let mut rig = with_expander();
+    rig.run_until(4000);
+    rig.bench.state().answer_ticks = 500_000_000;
+    rig.run_until(5000 + UNREAD_LIMIT - 1);
+    assert_eq!(rig.shutdown(), None);
+    rig.run_until(5000 + UNREAD_LIMIT);
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    let notes = rig.notes();
+    assert!(notes.iter().any(|note| note.contains("buttons oid 0: gpio31 has not answered for 100 ms: ")), "{notes:?}");
 }

@@ -76,12 +76,17 @@ fn an_expander_s_pin_is_looked_at_as_often_as_its_worker_can() {
     assert_eq!(
         rig.responses(),
         [
-            "counter_state oid=0 next_clock=@13000 count=0 count_clock=@10000",
-            "counter_state oid=0 next_clock=@35000 count=1 count_clock=@14000",
+            // By the ends of the looks.
+            "counter_state oid=0 next_clock=@12500 count=0 count_clock=@10000",
+            "counter_state oid=0 next_clock=@34500 count=1 count_clock=@15500",
         ]
     );
+    // Looks that fail see the last level for 100 ms.
     rig.bench.state().broken.insert(TACHO);
-    rig.run_until(50_000);
+    rig.run_until(40_000 + 5_000_000 - 1);
+    let told = told(&rig);
+    assert!(told.len() > 200 && told.iter().all(|state| *state == (1, 15_500)), "{told:?}");
+    rig.run_until(50_000 + 5_000_000);
     assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
 }
 

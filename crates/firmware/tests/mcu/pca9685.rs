@@ -184,6 +184,22 @@ fn a_chip_that_goes_silent_stops_the_machine_and_is_tried_until_it_answers() {
 }
 
 #[test]
+fn a_value_that_is_not_acknowledged_is_written_again() {
+    let (mut rig, chip) = rig(0, &[FREE]);
+    bytes(&chip);
+    let (log, mut nacks) = (chip.clone(), 2);
+    rig.bench.plug_i2c(1, ADDRESS, move |at, write, _| {
+        log.lock().unwrap().push((at, write.to_vec()));
+        nacks -= 1;
+        if nacks >= 0 { Err(BusStatus::Nack) } else { Ok(()) }
+    });
+    rig.send("queue_pca9685_out oid=1 clock=@1000 value=1");
+    rig.run_until(2000);
+    assert_eq!(rig.shutdown(), None);
+    assert_eq!(bytes(&chip), [[66, 0, 0, 1, 0]; 3]);
+}
+
+#[test]
 fn a_chip_that_stays_silent_does_not_keep_the_machine_from_the_next_configuration() {
     let says_nothing = |_: u64, _: &[u8], _: &mut [u8]| Err(BusStatus::Nack);
     let (mut rig, _) = rig(1000, &[OUTPUT, FREE]);

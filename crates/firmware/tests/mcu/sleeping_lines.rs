@@ -143,3 +143,142 @@ fn a_chip_that_fails_stops_the_machine_and_is_tried_until_it_answers() {
     assert_eq!(notes.iter().filter(|note| note.starts_with("trouble: GPIO line write failed")).count(), 1, "{notes:?}");
     assert_eq!(notes.last().unwrap(), "safe: digital output oid 0 (gpio50)");
 }
+
+/// Ticks of 100 ms.
+const UNREAD_LIMIT: u64 = 5_000_000;
+
+/// The instant of the sample that closed the switch, as klippy works it out.
+fn trigger(rig: &mut Rig) -> i64 {
+    let state = rig.ask("endstop_query_state oid=2");
+    let next_clock = state.split(['@', ' ']).filter_map(|word| word.parse::<i64>().ok()).next().unwrap();
+    next_clock - 50_000
+}
+
+#[test]
+fn an_endstop_is_dated_by_the_end_of_the_look_that_saw_it() {
+    let mut rig = rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(115_000, 1)]);
+    home(&mut rig, 10_000);
+    rig.run_until(1_000_000);
+    // The look that saw it began at 110000.
+    assert_eq!(trigger(&mut rig), 130_000);
+}
+
+#[test]
+fn an_endstop_is_dated_by_its_look_after_a_stall_too() {
+    // The core stands still for 15 ms before the look is asked for.
+    let mut rig = rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(800_000, 1)]);
+    home(&mut rig, 10_000);
+    rig.run_until(80_000);
+    rig.stall_until(850_000);
+    rig.run_until(2_000_000);
+    assert_eq!(trigger(&mut rig), 870_000);
+    // It stands still while the worker looks: what the look saw is no younger than its end.
+    let mut rig = self::rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(75_000, 1)]);
+    home(&mut rig, 10_000);
+    rig.run_until(70_000);
+    rig.stall_until(820_000);
+    rig.run_until(2_000_000);
+    assert_eq!(trigger(&mut rig), 80_000);
+}
+
+#[test]
+fn one_failed_look_ends_no_homing_and_three_do_at_once() {
+    let mut rig = rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(115_000, 1)]);
+    home(&mut rig, 10_000);
+    rig.run_until(100_000);
+    rig.bench.state().nacks.insert(PIN + 1, 2);
+    rig.run_until(1_000_000);
+    assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@150050"]);
+    let mut rig = self::rig(HOMING);
+    home(&mut rig, 10_000);
+    rig.run_until(100_000);
+    rig.bench.state().nacks.insert(PIN + 1, 3);
+    rig.run_until(130_000);
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    let notes = rig.notes();
+    assert!(notes.iter().any(|note| note.contains("endstop oid 2 (gpio51): pin 51 is gone: plug")), "{notes:?}");
+}
+
+#[test]
+fn a_homing_whose_chip_hangs_stops_the_machine_after_100_ms() {
+    let mut rig = rig(HOMING);
+    home(&mut rig, 10_000);
+    rig.run_until(100_000);
+    rig.bench.state().answer_ticks = 500_000_000;
+    rig.run_until(110_000 + UNREAD_LIMIT - 1);
+    assert_eq!(rig.shutdown(), None);
+    rig.run_until(110_000 + UNREAD_LIMIT);
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+    let notes = rig.notes();
+    let said = "endstop oid 2 (gpio51): gpio51 has not answered for 100 ms: ";
+    assert!(notes.iter().any(|note| note.contains(said)), "{notes:?}");
+}
+
+#[test]
+fn a_query_looks_again_for_100_ms() {
+    let mut rig = rig(HOMING);
+    rig.bench.script_input(PIN + 1, &[(0, 1)]);
+    // 20 looks of three tries each.
+    rig.bench.state().nacks.insert(PIN + 1, 60);
+    let state = rig.ask("endstop_query_state oid=2");
+    assert_eq!(state, "endstop_state oid=2 homing=0 next_clock=@-10000000 pin_value=1");
+    assert_eq!(rig.now(), 21 * 20_000);
+    rig.bench.state().broken.insert(PIN + 1);
+    rig.send("endstop_query_state oid=2");
+    assert_eq!(rig.now(), 21 * 20_000 + UNREAD_LIMIT);
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line read failed"));
+}
+
+#[test]
+fn an_output_is_written_again_before_that_stops_the_machine() {
+    let mut rig = rig(&[FAN]);
+    rig.bench.state().nacks.insert(PIN, 2);
+    rig.send("update_digital_out oid=0 value=1");
+    assert_eq!(rig.edges(PIN), [(20_000, 1)]);
+    rig.bench.state().nacks.insert(PIN, 2);
+    rig.send("emergency_stop");
+    rig.run_until(40_000);
+    assert_eq!((rig.edges(PIN), rig.mcu.owes()), (vec![(40_000, 0)], false));
+    let notes = rig.notes();
+    assert!(!notes.iter().any(|note| note.contains("trouble")), "{notes:?}");
+}
+
+#[test]
+fn a_driver_that_took_its_time_to_give_up_is_not_asked_again() {
+    // 25 ms.
+    let mut rig = rig(&[FAN]);
+    rig.bench.state().fail_ticks = 1_250_000;
+    rig.bench.state().nacks.insert(PIN, 1);
+    rig.send("update_digital_out oid=0 value=1");
+    assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"));
+}
+
+#[test]
+fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
+    let mut rig = rig(HOMING);
+    home(&mut rig, 10_000);
+    // 12 s.
+    rig.bench.state().answer_ticks = 600_000_000;
+    rig.run_until(20_000);
+    rig.send_all(&["emergency_stop", "config_reset"]);
+    rig.forget_responses();
+    rig.send("allocate_oids count=20");
+    rig.send(HOMING[0]);
+    assert_eq!(rig.shutdown().as_deref(), Some("Unable to open in GPIO chip line"));
+    rig.send("config_reset");
+    let is_held = |rig: &Rig| rig.bench.state().held.contains(&(PIN + 1));
+    rig.run_until(600_000_000);
+    assert!(is_held(&rig), "the chip still hangs");
+    rig.run_until(600_010_000);
+    rig.run_until(600_010_001);
+    assert!(!is_held(&rig));
+    rig.bench.state().answer_ticks = 20_000;
+    rig.forget_responses();
+    rig.configure(HOMING);
+    rig.bench.script_input(PIN + 1, &[(0, 1)]);
+    assert!(rig.ask("endstop_query_state oid=2").ends_with("pin_value=1"));
+}

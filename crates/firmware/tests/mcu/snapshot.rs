@@ -91,6 +91,35 @@ fn what_fails_on_a_bus_is_counted_and_what_is_tried_again() {
 }
 
 #[test]
+fn calls_to_lines_of_expanders_to_adcs_and_to_pwm_channels_are_counted() {
+    let mut rig = Rig::new();
+    rig.bench.state().sleeping.extend([200, 201]);
+    rig.configure(&[
+        "config_digital_out oid=0 pin=200 value=0 default_value=0 max_duration=0",
+        "config_endstop oid=1 pin=201 pull_up=0",
+        "config_endstop oid=2 pin=6 pull_up=0",
+        "config_analog_in oid=3 pin=400",
+        "config_pwm_out oid=4 pin=500 cycle_ticks=50000 value=100 default_value=0 max_duration=0",
+    ]);
+    rig.bench.state().nacks.extend([(200, 1), (201, 4), (400, 2), (500, 1)]);
+    rig.send("update_digital_out oid=0 value=1");
+    rig.ask("endstop_query_state oid=1");
+    rig.ask("endstop_query_state oid=2");
+    rig.send("query_analog_in oid=3 clock=@1000 sample_ticks=1 sample_count=1 rest_ticks=1000000 bytes_per_report=1 min_value=0 max_value=65535 range_check_count=0");
+    rig.send("queue_pwm_out oid=4 clock=@2000 value=300");
+    rig.run_until(10_000);
+    assert_eq!(rig.shutdown(), None);
+    let told = tell(&rig);
+    let counts = |transfers, errors, retries| Some(BusCounts { transfers, errors, retries });
+    let line = |pin| told.lines.iter().find(|line| line.pin == Pin(pin)).unwrap().bus;
+    assert_eq!(line(200), counts(2, 1, 1));
+    // Two looks: three tries fail, then one.
+    assert_eq!(line(201), counts(5, 4, 3));
+    assert_eq!(line(6), None, "the core reads it");
+    assert_eq!((told.objects[3].bus, told.objects[4].bus), (counts(3, 2, 2), counts(2, 1, 1)));
+}
+
+#[test]
 fn values_and_queues_are_told() {
     let mut rig = Rig::configured(&[
         "config_pwm_out oid=0 pin=500 cycle_ticks=50000 value=100 default_value=0 max_duration=0",

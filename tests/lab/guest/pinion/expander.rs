@@ -4,6 +4,7 @@
 use std::fs;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
+use std::process::Command;
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -74,6 +75,11 @@ impl Expander {
     /// From now on each of its transfers takes so long.
     fn slow_down(&self, delay_ms: u64) -> sysfs::Setting {
         sysfs::set(format!("{MOCK}/delay_ms"), delay_ms.to_string(), "0")
+    }
+
+    /// One of its next transfers is not acknowledged.
+    fn miss_one(&self) {
+        sysfs::write(format!("{MOCK}/fail"), format!("{} 1", Errno::ENXIO as i32));
     }
 
     /// From now on it does not acknowledge.
@@ -233,11 +239,16 @@ fn an_axis_homes_to_an_endstop_on_it() {
     let homed = queue.home(client, stepper, endstop, false, &profile, &mut |sight| {
         if closed.is_none() && sight.position <= -700 {
             expander.set_inputs(1 << SWITCH);
-            closed = Some(sight.position);
+            closed = Some(Instant::now());
         }
     });
     let homed = homed.expect("a homing");
     assert_eq!(homed.reason, HomingEnd::Endstop);
+    // Dated by the end of the look: one that was due before the switch closed has seen it, too.
+    let dated = client.instant_of(homed.trigger.expect("a trigger"));
+    let after = dated + Duration::from_micros(200) - closed.expect("a switch that closed");
+    println!("dated {after:?} after the switch closed");
+    assert!(after < Duration::from_millis(12), "{after:?}");
     assert!(endstop.triggered(client).expect("a state"));
     let rising = trace.writes_to(step).iter().filter(|write| write.level).count();
     assert_eq!(homed.position, -(rising as i64), "it is where the lines say");
@@ -390,4 +401,133 @@ fn pulses_at_an_expander_are_polled() {
     count(1);
     expander.set_inputs(0);
     count(2);
+}
+
+/// Buttons, a homing endstop, a counter and a line of `set_digital_out`.
+fn configure_inputs(client: &mut Client, expander: &Expander) {
+    let pin = |offset| expander.pin(offset);
+    configure(
+        client,
+        4,
+        &[
+            "config_buttons oid=0 button_count=1".to_owned(),
+            format!("config_endstop oid=1 pin={} pull_up=0", pin(1)),
+            "config_trsync oid=2".to_owned(),
+            format!("config_counter oid=3 pin={} pull_up=0", pin(2)),
+            format!("set_digital_out pin={} value=1", pin(3)),
+        ],
+    );
+    run(client, &format!("buttons_add oid=0 pos=0 pin={} pull_up=0", pin(0)));
+    let at = client.clock_in(0.05).expect("the clock").wire();
+    // Each 2 ms.
+    run(client, &format!("buttons_query oid=0 clock={at} rest_ticks=100000 retransmit_count=50 invert=0"));
+    run(client, &format!("query_counter oid=3 clock={at} poll_ticks=100000 sample_ticks=5000000"));
+}
+
+/// Calls of the expander's lines that failed and that were made again.
+fn missed(program: &Program) -> (u64, u64) {
+    let link = program.link().to_str().expect("a path");
+    let told = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
+    let status: serde_json::Value = serde_json::from_slice(&told.stdout).expect("a status");
+    let lines = status["lines"].as_array().expect("lines").iter();
+    let counts: Vec<_> = lines.map(|line| &line["bus"]).filter(|bus| !bus.is_null()).collect();
+    assert_eq!(counts.len(), 4, "{status:#}");
+    let sum = |key: &str| counts.iter().map(|bus| bus[key].as_u64().expect("a count")).sum();
+    (sum("errors"), sum("retries"))
+}
+
+#[test]
+fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    for _ in 0..10 {
+        expander.miss_one();
+        thread::sleep(Duration::from_millis(20));
+    }
+    for level in [false, true] {
+        expander.miss_one();
+        run(client, &format!("set_digital_out pin={} value={}", expander.pin(3), u8::from(level)));
+        assert_eq!(expander.level(3), level);
+    }
+    expander.miss_one();
+    client.drain();
+    run(client, "endstop_query_state oid=1");
+    expander.set_inputs(1);
+    let until = Instant::now() + Duration::from_secs(5);
+    let state = client.wait("buttons_state", Some(0), until).expect("a session").expect("a state");
+    assert_eq!(state.bytes("state").expect("a state"), [1]);
+    assert!(!client.status().expect("a session").is_shutdown, "{}", program.log());
+    assert_eq!(missed(&program), (13, 13));
+}
+
+#[test]
+fn inputs_that_can_not_be_read_for_100_ms_stop_the_machine() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    let silent = expander.fall_silent();
+    let began_us = now_us();
+    assert_eq!(shutdown_of(client), "GPIO line read failed");
+    let took_us = now_us() - began_us;
+    println!("stopped after {took_us} us");
+    assert!((95_000..130_000).contains(&took_us), "{took_us} us");
+    program.wait_for_line(&[
+        "shutdown: GPIO line read failed",
+        &expander.chip_name,
+        "its chip does not answer",
+        "check",
+    ]);
+    drop(silent);
+    client.reset().expect("a reset");
+    configure_inputs(client, &expander);
+}
+
+#[test]
+fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    let start = client.clock_in(0.05).expect("the clock").wire();
+    run(client, &format!("trsync_start oid=2 report_clock={start} report_ticks=0 expire_reason=4"));
+    // Each 2 ms.
+    run(
+        client,
+        &format!(
+            "endstop_home oid=1 clock={start} sample_ticks=750 sample_count=4 rest_ticks=100000 pin_value=1 trsync_oid=2 trigger_reason=1"
+        ),
+    );
+    thread::sleep(Duration::from_millis(200));
+    let _silent = expander.fall_silent();
+    let began_us = now_us();
+    assert_eq!(shutdown_of(client), "GPIO line read failed");
+    let took_us = now_us() - began_us;
+    println!("stopped after {took_us} us");
+    assert!(took_us < 20_000, "{took_us} us");
+    program.wait_for_line(&["shutdown: GPIO line read failed: endstop oid 1", "its chip does not answer", "check"]);
+}
+
+#[test]
+fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    let hangs = expander.slow_down(HANGS_MS);
+    thread::sleep(Duration::from_millis(50));
+    client.reset().expect("a reset");
+    drop(hangs);
+    program.wait_for_line(&[&expander.chip_name, "does not answer"]);
+    assert!(expander.is_held(), "the chip still hangs");
+    expander.wait_until_free();
+    assert!(!expander.is_held());
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    assert!(!client.status().expect("a session").is_shutdown);
 }
