@@ -109,6 +109,29 @@ fn links_lead_somewhere() {
     assert!(count > 20, "only {count} links were seen");
 }
 
+/// A path from the project's folder, as pages name files of ours.
+fn is_path(text: &str) -> bool {
+    let folders = ["src/", "crates/", "tests/", "benches/", "systemd/", "udev/", "debian/"];
+    folders.iter().any(|folder| text.starts_with(folder)) && !text.contains([' ', '*', '<'])
+}
+
+#[test]
+fn files_that_pages_name_are_there() {
+    let project = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let map = "tests/README.md".to_owned();
+    let map = Page { text: std::fs::read_to_string(project.join(&map)).unwrap(), name: map };
+    let mut count = 0;
+    for page in pages().iter().chain([&map]) {
+        for (number, line) in prose(page) {
+            for path in line.split('`').skip(1).step_by(2).filter(|text| is_path(text)) {
+                assert!(project.join(path).exists(), "{}:{number}: there is no {path}", page.name);
+                count += 1;
+            }
+        }
+    }
+    assert!(count > 20, "only {count} paths were seen");
+}
+
 #[test]
 fn the_readme_leads_to_every_page() {
     let pages = pages();

@@ -21,7 +21,7 @@ pub const FIRMWARE: Firmware =
 const ORIGIN: u64 = 10_000_000;
 
 /// The machine's responses stand one after the other in one buffer that is large enough from
-/// the start: what is counted in `tests/no_allocation.rs` is the machine's alone.
+/// the start: what is counted in `crates/firmware/tests/no_allocation.rs` is the machine's alone.
 const RESPONSE_BYTES: usize = 1 << 20;
 
 #[derive(Clone)]
