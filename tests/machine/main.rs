@@ -11,6 +11,7 @@ mod rig;
 mod adxl345;
 mod analog_in;
 mod any_bytes;
+mod any_commands;
 mod base;
 mod buttons;
 mod counter;
