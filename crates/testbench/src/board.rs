@@ -681,6 +681,11 @@ impl FakeWorkers {
         FakeWorkers { bench, shop: Arc::new(Mutex::new(Shop::new())) }
     }
 
+    /// How many errands are under way.
+    pub fn under_way(&self) -> usize {
+        self.shop.lock().unwrap().under_way.len()
+    }
+
     /// When the next errand is done.
     pub fn next_end(&self) -> Option<Clock> {
         self.shop.lock().unwrap().under_way.front().map(|next| next.end)

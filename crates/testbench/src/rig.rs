@@ -135,6 +135,16 @@ impl Rig {
         self.clock.now().since(self.origin) as u64
     }
 
+    /// The present instant as it goes over the wire.
+    pub fn wire_clock(&self) -> u32 {
+        self.clock.now().wire()
+    }
+
+    /// How many errands are under way.
+    pub fn errands(&self) -> usize {
+        self.workers.under_way()
+    }
+
     fn instant(&self, ticks: u64) -> Clock {
         Clock::from_ticks(self.origin.ticks() + ticks)
     }

@@ -315,6 +315,7 @@ pub struct I2cConfig {
 }
 
 /// A line that selects a chip.
+#[derive(Clone)]
 pub struct ChipSelect {
     /// The line, an output.
     pub line: Arc<dyn Line>,

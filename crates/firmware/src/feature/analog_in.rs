@@ -62,6 +62,30 @@ impl Errand for Reading {
     }
 }
 
+/// How many bytes of sums are reported together: at most [`REPORT_BYTES`].
+#[derive(Clone, Copy)]
+struct BytesPerReport(u8);
+
+impl BytesPerReport {
+    /// # Errors
+    ///
+    /// "Invalid analog_in bytes_per_report".
+    fn of(bytes: u8) -> Result<BytesPerReport, Shutdown> {
+        if usize::from(bytes) > REPORT_BYTES {
+            return Err(Shutdown::by_host(
+                INVALID_BYTES_PER_REPORT,
+                format_args!("{bytes} bytes are asked for where a report has {REPORT_BYTES}"),
+            ));
+        }
+        Ok(BytesPerReport(bytes))
+    }
+
+    /// Whether a report of `len` bytes has room for one more sum.
+    fn has_room(self, len: usize) -> bool {
+        len + SAMPLE_BYTES <= usize::from(self.0)
+    }
+}
+
 /// What the host asks for.
 #[derive(Clone, Copy, Default)]
 struct Query {
@@ -72,7 +96,7 @@ struct Query {
     max_value: u16,
     range_check_count: u8,
     /// Of a batch; none if each sum is a report of its own.
-    bytes_per_report: Option<u8>,
+    bytes_per_report: Option<BytesPerReport>,
 }
 
 struct AnalogIn {
@@ -172,12 +196,6 @@ impl AnalogIn {
         if query.sample_count == 0 {
             return Ok(());
         }
-        if let Some(bytes_per_report) = query.bytes_per_report.filter(|bytes| usize::from(*bytes) > REPORT_BYTES) {
-            return Err(Shutdown::by_host(
-                INVALID_BYTES_PER_REPORT,
-                format_args!("{bytes_per_report} bytes are asked for where a report has {REPORT_BYTES}"),
-            ));
-        }
         mcu.schedule(TimerId::new(oid, 0), at)
     }
 
@@ -188,7 +206,7 @@ impl AnalogIn {
         let bytes = self.sum.to_le_bytes();
         self.report[self.report_len..self.report_len + SAMPLE_BYTES].copy_from_slice(&bytes);
         self.report_len += SAMPLE_BYTES;
-        if self.report_len + SAMPLE_BYTES > usize::from(bytes_per_report) {
+        if !bytes_per_report.has_room(self.report_len) {
             mcu.send(Batch { oid, next_clock: self.next_begin, values: &self.report[..self.report_len] });
             self.report_len = 0;
         }
@@ -333,10 +351,19 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
      max_value: u16,
      range_check_count: u8| {
         let at = mcu.instant(clock);
-        let bytes_per_report = Some(bytes_per_report);
-        let query =
-            Query { sample_ticks, sample_count, rest_ticks, min_value, max_value, range_check_count, bytes_per_report };
-        mcu.with::<AnalogIn, _>(oid, |input, mcu| input.query(mcu, oid, at, query))
+        mcu.with::<AnalogIn, _>(oid, |input, mcu| {
+            let bytes_per_report = Some(BytesPerReport::of(bytes_per_report)?);
+            let query = Query {
+                sample_ticks,
+                sample_count,
+                rest_ticks,
+                min_value,
+                max_value,
+                range_check_count,
+                bytes_per_report,
+            };
+            input.query(mcu, oid, at, query)
+        })
     }
 )
 .of(since(Master));

@@ -41,8 +41,25 @@ response! {
 const BUTTONS: usize = 8;
 /// States that wait for the host; later changes are dropped.
 const REPORTS: usize = 8;
-/// From here on a `retransmit_count` is refused, as in the firmware.
-const RETRANSMIT_LIMIT: u8 = 0x80;
+/// The largest `retransmit_count`, as in the firmware.
+const RETRANSMIT_MAX: u8 = 0x7f;
+
+/// How many samples there are between two tellings of the same reports.
+#[derive(Clone, Copy, Default)]
+struct RetransmitCount(u8);
+
+impl RetransmitCount {
+    /// # Errors
+    ///
+    /// "Invalid buttons retransmit count".
+    fn of(count: u8) -> Result<RetransmitCount, Shutdown> {
+        if count > RETRANSMIT_MAX {
+            let what = format_args!("a retransmit_count of {count} is above {RETRANSMIT_MAX}");
+            return Err(Shutdown::by_host(INVALID_RETRANSMIT, what));
+        }
+        Ok(RetransmitCount(count))
+    }
+}
 
 struct Button {
     line: InputLine,
@@ -74,7 +91,7 @@ struct Buttons {
     reports: [u8; REPORTS],
     report_count: usize,
     ack_count: u8,
-    retransmit_count: u8,
+    retransmit_count: RetransmitCount,
     /// Samples until the reports are sent once more; none if the host has them all.
     retransmit: Option<u8>,
 }
@@ -93,7 +110,7 @@ impl Buttons {
             reports: [0; REPORTS],
             report_count: 0,
             ack_count: 0,
-            retransmit_count: 0,
+            retransmit_count: RetransmitCount::default(),
             retransmit: None,
         }
     }
@@ -159,7 +176,7 @@ impl Buttons {
     }
 
     fn report(&mut self, mcu: &mut Mcu, oid: Oid) {
-        self.retransmit = Some(self.retransmit_count);
+        self.retransmit = Some(self.retransmit_count.0);
         mcu.send(State { oid, ack_count: self.ack_count, state: &self.reports[..self.report_count] });
     }
 
@@ -238,11 +255,8 @@ const BUTTONS_QUERY: Command = command!(
     |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, retransmit_count: u8, invert: u8| {
         let at = mcu.instant(clock);
         mcu.with::<Buttons, _>(oid, |buttons, mcu| {
+            let retransmit_count = RetransmitCount::of(retransmit_count)?;
             mcu.cancel(TimerId::new(oid, 0));
-            if retransmit_count >= RETRANSMIT_LIMIT {
-                let what = format_args!("a retransmit_count of {retransmit_count} is above 127");
-                return Err(Shutdown::by_host(INVALID_RETRANSMIT, what));
-            }
             buttons.rest_ticks = rest_ticks;
             buttons.retransmit_count = retransmit_count;
             buttons.pressed = invert;

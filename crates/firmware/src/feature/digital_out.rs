@@ -152,10 +152,10 @@ impl DigitalOut {
     }
 
     fn update(&mut self, mcu: &mut Mcu, oid: Oid, value: bool) -> Result<(), Shutdown> {
-        mcu.cancel(Self::timer(oid));
         if !self.queue.is_empty() {
             return Err(Shutdown::by_host(UPDATE_WITH_QUEUE, "update_digital_out came while changes are queued"));
         }
+        mcu.cancel(Self::timer(oid));
         self.line.write(mcu, Self::ticket(oid), value)?;
         self.on = value;
         self.toggling = false;

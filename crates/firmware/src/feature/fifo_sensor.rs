@@ -259,8 +259,10 @@ const SWITCH: u8 = 3;
 enum Phase {
     /// None.
     Idle,
-    /// The sensor is to be switched on by the timer, or is being switched on.
+    /// The sensor is to be switched on by the timer.
     Begins,
+    /// It is being switched on.
+    SwitchesOn,
     /// The sensor is being switched off, or was at these instants: the host is told so with the number of
     /// samples, once the FIFO is read, which may be done so many times more.
     Ends(Option<(Clock, Clock)>, u8),
@@ -355,7 +357,7 @@ impl<C: FifoChip> FifoSensor<C> {
     }
 
     fn switch(&mut self, mcu: &mut Mcu, oid: Oid, on: bool) -> Result<(), Shutdown> {
-        // While it is being switched on it can not be switched off: that follows.
+        // One after the other: what is wanted by then follows.
         let Some(mut switch) = self.switch.take() else { return Ok(()) };
         switch.talk.on = on;
         mcu.converse(self.device, Ticket { oid, tag: SWITCH }, switch)
@@ -364,8 +366,10 @@ impl<C: FifoChip> FifoSensor<C> {
     /// The sensor is on, or off.
     fn switched(&mut self, mcu: &mut Mcu, oid: Oid, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
         match self.phase {
-            Phase::Idle => Ok(()),
-            Phase::Begins => {
+            // That was for an earlier query.
+            Phase::Idle | Phase::Begins => Ok(()),
+            Phase::SwitchesOn if !on => self.switch(mcu, oid, true),
+            Phase::SwitchesOn => {
                 self.phase = Phase::Idle;
                 mcu.go_on(TimerId::new(oid, 0), span.1 + self.rest_ticks);
                 Ok(())
@@ -451,6 +455,7 @@ impl<C: FifoChip> Object for FifoSensor<C> {
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
         let Some(oid) = timer.oid() else { return Ok(Next::Done) };
         if self.phase == Phase::Begins {
+            self.phase = Phase::SwitchesOn;
             self.switch(mcu, oid, true)?;
         } else {
             self.read(mcu, oid)?;

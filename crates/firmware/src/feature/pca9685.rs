@@ -280,11 +280,10 @@ struct Pca9685 {
 
 impl Pca9685 {
     fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
-        let first = self.queue.push(mcu, at, value)?;
         if value > VALUE_MAX {
             return Err(Shutdown::by_host(INVALID_VALUE, format_args!("value {value} is above {VALUE_MAX}")));
         }
-        if first { self.queue.start(mcu, oid, at) } else { Ok(()) }
+        if self.queue.push(mcu, at, value)? { self.queue.start(mcu, oid, at) } else { Ok(()) }
     }
 }
 

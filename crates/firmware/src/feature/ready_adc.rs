@@ -202,9 +202,9 @@ pub(super) fn query<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) ->
         let timer = TimerId::new(oid, 0);
         mcu.cancel(timer);
         sensor.restart();
-        sensor.rest_ticks = rest_ticks;
         let on = rest_ticks != Ticks(0);
         sensor.chip.switch(mcu, oid, on)?;
+        sensor.rest_ticks = rest_ticks;
         if !on {
             return Ok(());
         }

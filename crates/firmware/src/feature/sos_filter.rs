@@ -133,12 +133,13 @@ impl SosFilter {
 
     /// A section to be changed: the filter is off until `sos_filter_set_active`.
     fn section(&mut self, index: u8) -> Result<&mut Section, Shutdown> {
+        let max_sections = self.sections.len();
+        let section = self.sections.get_mut(usize::from(index)).ok_or_else(|| {
+            Shutdown::by_host(SECTION_INDEX, format_args!("section {index} is set of a filter with {max_sections}"))
+        })?;
         self.active = 0;
         self.is_ready = false;
-        let max_sections = self.sections.len();
-        self.sections.get_mut(usize::from(index)).ok_or_else(|| {
-            Shutdown::by_host(SECTION_INDEX, format_args!("section {index} is set of a filter with {max_sections}"))
-        })
+        Ok(section)
     }
 
     fn activate(&mut self, n_sections: u8, coeff_frac_bits: u8) -> Result<(), Shutdown> {

@@ -84,9 +84,7 @@ impl Talk for Transfer {
 /// An SPI device.
 pub(super) struct Spi {
     bus: Option<Bus>,
-    /// Kept here until the bus is set; from then on the device on the worker has it.
     chip_select: Option<ChipSelect>,
-    has_chip_select: bool,
     /// None while a transfer is under way: then the worker has the box.
     transfer: Option<Box<Conversation<Transfer>>>,
 }
@@ -97,12 +95,12 @@ const TRANSFER: u8 = 1;
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
-        Spi { bus: None, has_chip_select: chip_select.is_some(), chip_select, transfer: Some(Transfer::new(&[])) }
+        Spi { bus: None, chip_select, transfer: Some(Transfer::new(&[])) }
     }
 
     /// Whether it has a chip select line of its own.
     pub(super) fn has_chip_select(&self) -> bool {
-        self.has_chip_select
+        self.chip_select.is_some()
     }
 
     /// Whether it may get a bus, of this mode.
@@ -123,7 +121,7 @@ impl Spi {
 
     fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, mode: u8, rate_hz: u32) -> Result<(), Shutdown> {
         self.may_have_bus(mcu, mode)?;
-        let chip_select = self.chip_select.take();
+        let chip_select = self.chip_select.clone();
         let opened = mcu.board()?.spi(SpiConfig { bus, mode, rate_hz, chip_select })?;
         self.bus = Some(mcu.bus(opened)?);
         Ok(())
@@ -139,7 +137,7 @@ impl Spi {
             sclk: mcu.shared_output(sclk, false)?,
             mode,
             pulse,
-            chip_select: self.chip_select.take(),
+            chip_select: self.chip_select.clone(),
             clock: mcu.clock(),
         };
         self.bus = Some(mcu.software_bus(Box::new(device))?);

@@ -9,7 +9,7 @@ use std::ops::Range;
 use crate::board::Pin;
 use crate::mcu::{
     Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, Present, PromptLine, Report,
-    Response, Safe, TimerId, WireClock, command, response, since,
+    Response, SPIN_MAX, Safe, TimerId, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -83,13 +83,13 @@ struct Stepper {
     next_dir: bool,
     /// After a stop, steps are dropped until the host sets a new clock.
     need_reset: bool,
+    /// The trsync that was last told to stop this stepper.
+    stopper: Option<Oid>,
 }
 
-/// So many ticks behind, steps are caught up with in order. A machine that runs is not 50 us late. One that is 50 ms
-/// behind is asked for more steps than it can make, and other timers are not to wait for these.
+/// How far behind, in ticks, a stepper that homes makes its steps in order. A machine that runs is not 50 us late. One
+/// that is 50 ms behind is asked for more steps than it can make, and other timers are not to wait for these.
 const IN_ORDER: Range<i64> = Ticks::from_us(50).0 as i64..Ticks::from_us(50_000).0 as i64;
-/// To wait in order for the end of a longer pulse than this would keep the core from all else for too long.
-const SHORT_PULSE: Ticks = Ticks::from_us(50);
 
 /// Keeps the position's top bit free to tell the direction.
 const POSITION_BIAS: u32 = 0x4000_0000;
@@ -101,7 +101,7 @@ impl Stepper {
 
     /// Takes the next move. `earliest` is when its first edge may come at the earliest, if the
     /// stepper is running.
-    fn load(&mut self, mcu: &mut Mcu, earliest: Option<Clock>) -> Result<Next, Shutdown> {
+    fn load(&mut self, mcu: &mut Mcu, oid: Oid, earliest: Option<Clock>) -> Result<Next, Shutdown> {
         let Some(Move { interval, count, add, reverses }) = self.queue.pop(&mut mcu.moves) else {
             self.edges = 0;
             return Ok(Next::Done);
@@ -115,6 +115,8 @@ impl Stepper {
             // After a long pause the interval has wrapped, and the step's clock is right.
             let clock = self.next_step.wire().wrapping_add(interval);
             self.next_step = mcu.instant(WireClock(clock));
+            // Whatever pulse there was before is over, as for the firmware.
+            self.earliest = self.next_step;
             if reverses {
                 self.dir.toggle()?;
             }
@@ -136,25 +138,31 @@ impl Stepper {
             if self.both_edges {
                 // The last step's pulse must end before the direction changes.
                 self.reverse_pending = true;
-                return Ok(self.edge_at(self.next_step.min(earliest), earliest));
+                return Ok(self.edge_at(mcu, oid, self.next_step.min(earliest), earliest));
             }
-            return self.reverse(mcu);
+            return self.reverse(mcu, oid);
         }
-        Ok(self.edge_at(self.next_step, earliest))
+        Ok(self.edge_at(mcu, oid, self.next_step, earliest))
     }
 
     /// Has the next edge come when it is due, or at `earliest`, the end of a pulse that begins now, if that is later.
     /// An edge that has no instant of its own (the end of a pulse, a reversal) is due by the step that it belongs to.
     ///
-    /// Edges that are behind keep their place among the other timers, in the order in which all were due, and
-    /// wait for `earliest` when it is their turn. Otherwise a machine that could not run for a while would take
-    /// every sample of an endstop before the first of the steps between them, and home at a wrong place.
+    /// While a trsync may stop the stepper, edges that are behind keep their place among the other timers, in the order
+    /// in which all were due, and wait for `earliest` when it is their turn. Otherwise a machine that could not run for
+    /// a while would take every sample of an endstop before the first of the steps between them, and home at a wrong
+    /// place. A stepper that nothing stops does not wait: the pulses of several would add up, and none would catch up.
     #[inline]
-    fn edge_at(&mut self, due: Clock, earliest: Clock) -> Next {
+    fn edge_at(&mut self, mcu: &mut Mcu, oid: Oid, due: Clock, earliest: Clock) -> Next {
         self.earliest = earliest;
         let behind = earliest.since(due) - i64::from(self.pulse_ticks.0);
-        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SHORT_PULSE;
+        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SPIN_MAX && self.may_be_stopped(mcu, oid);
         Next::At(if in_order { due } else { due.max(earliest) })
+    }
+
+    /// Whether a trsync waits for a trigger that stops this stepper.
+    fn may_be_stopped(&self, mcu: &mut Mcu, oid: Oid) -> bool {
+        self.stopper.is_some_and(|trsync| Trsync::may_stop(mcu, trsync, oid))
     }
 
     /// Moves on to the step after the present one, `interval` later by a clock of 32 bits: what
@@ -165,10 +173,10 @@ impl Stepper {
     }
 
     /// Changes the direction and leaves it its set-up time.
-    fn reverse(&mut self, mcu: &mut Mcu) -> Result<Next, Shutdown> {
+    fn reverse(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
         let earliest = mcu.now() + self.pulse_ticks;
-        Ok(self.edge_at(self.next_step, earliest))
+        Ok(self.edge_at(mcu, oid, self.next_step, earliest))
     }
 
     /// The position that the host knows: after the steps that were made.
@@ -185,6 +193,7 @@ impl Stepper {
         self.last_dir = false;
         self.next_dir = false;
         self.need_reset = true;
+        self.stopper = None;
         self.queue.clear(&mut mcu.moves);
     }
 
@@ -210,7 +219,7 @@ impl Stepper {
         if self.edges > 0 {
             return Ok(());
         }
-        match self.load(mcu, None)? {
+        match self.load(mcu, oid, None)? {
             Next::At(at) => mcu.schedule(Self::timer(oid), at),
             Next::Done => Ok(()),
         }
@@ -223,11 +232,12 @@ impl Object for Stepper {
     }
 
     #[inline]
-    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
+        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
         mcu.spin_until(self.earliest);
         if self.reverse_pending {
             self.reverse_pending = false;
-            return self.reverse(mcu);
+            return self.reverse(mcu, oid);
         }
         self.step.toggle()?;
         // Counted from a reading after the edge was written: a write may be slow.
@@ -235,15 +245,15 @@ impl Object for Stepper {
         let edges = self.edges.saturating_sub(1);
         if edges & 1 != 0 && !self.both_edges {
             self.edges = edges;
-            return Ok(self.edge_at((self.next_step + self.pulse_ticks).min(earliest), earliest));
+            return Ok(self.edge_at(mcu, oid, (self.next_step + self.pulse_ticks).min(earliest), earliest));
         }
         if edges > 0 {
             self.edges = edges;
             self.advance(self.interval, earliest);
             self.interval = self.interval.wrapping_add_signed(i32::from(self.add));
-            return Ok(self.edge_at(self.next_step, earliest));
+            return Ok(self.edge_at(mcu, oid, self.next_step, earliest));
         }
-        self.load(mcu, Some(earliest))
+        self.load(mcu, oid, Some(earliest))
     }
 
     fn triggered(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
@@ -291,6 +301,7 @@ const CONFIG_STEPPER: Command = command!(
             last_dir: false,
             next_dir: false,
             need_reset: false,
+            stopper: None,
         };
         mcu.assign_on(step_pin, oid, stepper)
     }
@@ -332,6 +343,9 @@ const STEPPER_GET_POSITION: Command = command!("stepper_get_position oid=%c", |m
 
 const STEPPER_STOP_ON_TRIGGER: Command =
     command!("stepper_stop_on_trigger oid=%c trsync_oid=%c", |mcu, oid: Oid, trsync_oid: Oid| {
-        mcu.with::<Stepper, _>(oid, |_, _| Ok(()))?;
-        Trsync::add_signal(mcu, trsync_oid, oid)
+        mcu.with::<Stepper, _>(oid, |stepper, mcu| {
+            Trsync::add_signal(mcu, trsync_oid, oid)?;
+            stepper.stopper = Some(trsync_oid);
+            Ok(())
+        })
     });

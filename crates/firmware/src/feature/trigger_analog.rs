@@ -9,7 +9,7 @@ use crate::mcu::{
     Command, Enumeration, Feature, Generation::Master, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command,
     response, since,
 };
-use crate::shutdown::Shutdown;
+use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
 use super::load_cell_probe::LoadCellProbe;
@@ -28,10 +28,8 @@ pub(super) const FEATURE: Feature = Feature {
     ],
     responses: &[State::FORM],
     enumerations: &[
-        Enumeration::new("trigger_analog_type", |_| {
-            named(&[("abs_ge", ABS_GE), ("gt", GT), ("diff_peak_gt", DIFF_PEAK_GT)])
-        })
-        .of(since(Master)),
+        Enumeration::new("trigger_analog_type", |_| named(&TriggerType::ALL.map(|(type_, name)| (name, type_ as u8))))
+            .of(since(Master)),
         Enumeration::new("trigger_analog_error:", |_| {
             named(&[
                 ("RAW_RANGE", RAW_RANGE),
@@ -42,8 +40,15 @@ pub(super) const FEATURE: Feature = Feature {
         })
         .of(since(Master)),
     ],
+    shutdowns: SHUTDOWNS,
     ..Feature::EMPTY
 };
+
+shutdowns! {
+    /// A `trigger_analog_type` that the enumeration does not have (Pinion's own text: in the firmware nothing triggers
+    /// then).
+    INVALID_TYPE = "Invalid trigger_analog_type";
+}
 
 response! {
     /// Whether samples are looked at, and when the trigger came.
@@ -51,11 +56,33 @@ response! {
     pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
 }
 
-// What pulls the trigger: its absolute value is at least the trigger value, it is above it, or it is
-// below the highest one so far by more than it.
-const ABS_GE: u8 = 0;
-const GT: u8 = 1;
-const DIFF_PEAK_GT: u8 = 2;
+/// What pulls the trigger.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum TriggerType {
+    /// The absolute value is at least the trigger value.
+    AbsGe = 0,
+    /// The value is above the trigger value.
+    Gt = 1,
+    /// The value is below the highest one so far by more than the trigger value.
+    DiffPeakGt = 2,
+}
+
+impl TriggerType {
+    /// All of them with their names in the dictionary, in the order of their numbers.
+    const ALL: [(TriggerType, &'static str); 3] =
+        [(TriggerType::AbsGe, "abs_ge"), (TriggerType::Gt, "gt"), (TriggerType::DiffPeakGt, "diff_peak_gt")];
+
+    /// The type with this number.
+    ///
+    /// # Errors
+    ///
+    /// "Invalid trigger_analog_type".
+    fn of(number: u8) -> Result<TriggerType, Shutdown> {
+        TriggerType::ALL.get(usize::from(number)).map(|(type_, _)| *type_).ok_or_else(|| {
+            Shutdown::by_host(INVALID_TYPE, format_args!("trigger_analog_type {number} is not in the dictionary"))
+        })
+    }
+}
 
 // Errors, which the host finds added to its `error_reason` in the trsync's reason.
 const RAW_RANGE: u8 = 0;
@@ -68,7 +95,7 @@ pub(super) struct TriggerAnalog {
     filter: Oid,
     raw_min: i32,
     raw_max: i32,
-    trigger_type: u8,
+    trigger_type: TriggerType,
     trigger_value: i32,
     /// The highest filtered value since `trigger_analog_home`.
     peak: i32,
@@ -110,17 +137,16 @@ impl TriggerAnalog {
     }
 
     /// Whether a filtered value pulls the trigger. The firmware compares a negative trigger value as
-    /// an unsigned one, but for [`GT`].
+    /// an unsigned one, except for [`TriggerType::Gt`].
     fn crosses(&mut self, value: i32) -> bool {
         match self.trigger_type {
-            ABS_GE => value.unsigned_abs() >= self.trigger_value as u32,
-            GT => value > self.trigger_value,
-            DIFF_PEAK_GT if value > self.peak => {
+            TriggerType::AbsGe => value.unsigned_abs() >= self.trigger_value as u32,
+            TriggerType::Gt => value > self.trigger_value,
+            TriggerType::DiffPeakGt if value > self.peak => {
                 self.peak = value;
                 false
             }
-            DIFF_PEAK_GT => self.peak.abs_diff(value) > self.trigger_value as u32,
-            _ => false,
+            TriggerType::DiffPeakGt => self.peak.abs_diff(value) > self.trigger_value as u32,
         }
     }
 
@@ -208,7 +234,7 @@ const CONFIG_TRIGGER_ANALOG: Command =
             filter: sos_filter_oid,
             raw_min: 0,
             raw_max: 0,
-            trigger_type: 0,
+            trigger_type: TriggerType::AbsGe,
             trigger_value: 0,
             peak: 0,
             homing: false,
@@ -241,7 +267,7 @@ const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
     "trigger_analog_set_trigger oid=%c trigger_analog_type=%c trigger_value=%i",
     |mcu, oid: Oid, trigger_analog_type: u8, trigger_value: i32| {
         mcu.with::<TriggerAnalog, _>(oid, |trigger, _| {
-            trigger.trigger_type = trigger_analog_type;
+            trigger.trigger_type = TriggerType::of(trigger_analog_type)?;
             trigger.trigger_value = trigger_value;
             Ok(())
         })
@@ -261,14 +287,15 @@ const TRIGGER_ANALOG_HOME: Command = command!(
      monitor_max: u32| {
         let at = mcu.instant(clock);
         mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| {
-            mcu.cancel(TimerId::new(oid, 0));
-            trigger.monitor_ticks = monitor_ticks;
+            let timer = TimerId::new(oid, 0);
             if monitor_ticks == Ticks(0) {
-                trigger.homing = false;
-                trigger.trsync = None;
+                mcu.cancel(timer);
+                (trigger.homing, trigger.trsync) = (false, None);
                 return Ok(());
             }
             mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
+            mcu.cancel(timer);
+            trigger.monitor_ticks = monitor_ticks;
             trigger.trsync = Some(trsync_oid);
             trigger.trigger_reason = trigger_reason;
             trigger.error_reason = error_reason;
@@ -279,7 +306,7 @@ const TRIGGER_ANALOG_HOME: Command = command!(
             trigger.homing = true;
             trigger.awaits = true;
             trigger.peak = i32::MIN;
-            mcu.schedule(TimerId::new(oid, 0), at)
+            mcu.schedule(timer, at)
         })
     }
 )

@@ -76,15 +76,18 @@ impl Trsync {
     /// "Can't add signal that is already active" if it waits for one already, "Invalid oid type".
     pub(super) fn add_signal(mcu: &mut Mcu, trsync: Oid, waiting: Oid) -> Result<(), Shutdown> {
         if mcu.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
-            return Err(Shutdown::by_host(
-                SIGNAL_ACTIVE,
-                format_args!("stepper oid {waiting} already waits for a trigger"),
-            ));
+            return Err(Shutdown::by_host(SIGNAL_ACTIVE, "it already waits for a trigger"));
         }
         mcu.with::<Trsync, _>(trsync, |trsync, _| {
             trsync.signals.push(waiting);
             Ok(())
         })
+    }
+
+    /// Whether this trsync still waits for a trigger, of which it then tells `waiting`.
+    pub(super) fn may_stop(mcu: &mut Mcu, trsync: Oid, waiting: Oid) -> bool {
+        let may = |trsync: &mut Trsync, _: &mut Mcu| Ok(trsync.can_trigger && trsync.signals.contains(&waiting));
+        mcu.with::<Trsync, _>(trsync, may).unwrap_or(false)
     }
 
     fn clear(&mut self, mcu: &mut Mcu, oid: Oid) {

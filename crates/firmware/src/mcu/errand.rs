@@ -156,13 +156,19 @@ impl Mcu {
     pub fn hold(&mut self, oid: Oid) -> bool {
         if self.commanded {
             if self.holds == 0 {
-                let limit = self.now() + HOLD_LIMIT;
-                self.timers.insert(limit, TimerId::HOLD);
+                self.limit_hold();
             }
             self.holds += 1;
             self.held_by = Some(oid);
         }
         self.commanded
+    }
+
+    /// Has the machine stop if commands still wait in [`HOLD_LIMIT`].
+    pub(super) fn limit_hold(&mut self) {
+        self.timers.remove(TimerId::HOLD);
+        let limit = self.now() + HOLD_LIMIT;
+        self.timers.insert(limit, TimerId::HOLD);
     }
 
     /// Takes back one [`Mcu::hold`] that returned true.

@@ -61,6 +61,8 @@ const fn response_index(format: &str) -> usize {
 
 /// How far a timer may fall behind before the machine stops: 100 ms, as in the firmware.
 const LATE_LIMIT: Ticks = Ticks::from_us(100_000);
+/// The longest wait within a timer's event. Meanwhile nothing else runs, not even a command that stops the machine.
+pub const SPIN_MAX: Ticks = Ticks::from_us(50);
 /// Timers that run before it is looked whether they fall behind, and commands get a turn
 /// (`TIMER_REPEAT_COUNT` of the firmware's linux/timer.c).
 const REPEAT_COUNT: u32 = 20;
@@ -164,12 +166,16 @@ impl Mcu {
         self.last_read
     }
 
-    /// Spins until `end`. No other timer or command runs meanwhile, so this is for spans as short as a step's pulse.
+    /// Spins until `end`, for [`SPIN_MAX`] at most. No other timer or command runs meanwhile, so this is for spans as
+    /// short as a step's pulse.
     #[inline]
     pub fn spin_until(&mut self, end: Clock) {
-        if self.last_read < end && self.now() < end {
-            self.clock.spin_until(end);
-            self.now();
+        if self.last_read < end {
+            let now = self.now();
+            if now < end {
+                self.clock.spin_until(end.min(now + SPIN_MAX));
+                self.now();
+            }
         }
     }
 

@@ -233,8 +233,14 @@ impl Mcu {
     }
 
     pub(super) fn clear_shutdown(&mut self) -> Result<(), Shutdown> {
-        self.stop.reason.take().map(drop).ok_or_else(|| {
-            Shutdown::by_host(reason::NOT_SHUTDOWN, "clear_shutdown came while the machine was not stopped")
-        })
+        if self.stop.reason.take().is_none() {
+            let what = "clear_shutdown came while the machine was not stopped";
+            return Err(Shutdown::by_host(reason::NOT_SHUTDOWN, what));
+        }
+        // A conversation from before the stop holds commands again. Its limit may be over.
+        if self.holds > 0 {
+            self.limit_hold();
+        }
+        Ok(())
     }
 }

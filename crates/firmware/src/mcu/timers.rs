@@ -68,9 +68,11 @@ impl Timers {
         self.waiting.pop()
     }
 
-    /// Inserts a timer behind those of the same instant.
+    /// Inserts a timer behind those of the same instant. A timer waits once, so that there are never more than the
+    /// objects have.
     #[inline]
     pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
+        debug_assert!(!self.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} waits already");
         let mut place = self.waiting.len();
         self.waiting.push((at, timer));
         // It mostly belongs near the end: to move one after the other beats a call of memmove.

@@ -50,6 +50,20 @@ fn more_bytes_than_a_report_has_are_refused() {
 }
 
 #[test]
+fn what_was_refused_is_not_kept() {
+    let mut rig = Rig::configured(&[SENSOR]);
+    rig.bench.script_adc(ANALOG, &[100]);
+    rig.send(&query(4, 0, 65535, 1));
+    rig.send(&query(255, 0, 65535, 1));
+    assert_eq!(rig.shutdown().as_deref(), Some("Invalid analog_in bytes_per_report"));
+    // Sampling goes on in the stopped machine as it was asked for before: the same as in a running one.
+    rig.run_until(10_000_000);
+    let reports = rig.responses();
+    assert!(reports.len() > 30, "{reports:?}");
+    assert!(reports.iter().all(|report| report.ends_with("values=90019001")), "{reports:?}");
+}
+
+#[test]
 fn so_many_readings_in_a_row_may_be_out_of_range() {
     let mut rig = Rig::configured(&[SENSOR]);
     // Sums of 0, 0, 400, 0, 0, 0.

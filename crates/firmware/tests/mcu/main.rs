@@ -5,6 +5,7 @@
 mod adxl345;
 mod analog_in;
 mod any_bytes;
+mod any_commands;
 mod base;
 mod buttons;
 mod counter;

@@ -413,6 +413,42 @@ fn a_measurement_may_be_ended_and_begun_at_any_instant() {
     }
 }
 
+/// A query amid the one before: the sensor is switched on at the later one's clock, and one timer looks at it.
+#[test]
+fn a_measurement_that_is_asked_for_anew_begins_at_its_own_clock() {
+    for again_at in (4900..6000).step_by(50) {
+        let mut rig = configured(V0_12, ADXL345);
+        let chip = plug_adxl345(&rig);
+        rig.bench.state().answer_ticks = 300;
+        rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=2000");
+        rig.run_until(again_at);
+        rig.begin("query_adxl345 oid=1 clock=@20000 rest_ticks=2000");
+        rig.run_until(19_000);
+        let (transfers, written) = (rig.bench.transfers().len(), chip.lock().unwrap().written.len());
+        rig.run_until(20_299);
+        assert_eq!(rig.bench.transfers().len(), transfers, "{again_at}");
+        rig.run_until(40_000);
+        assert_eq!(chip.lock().unwrap().written[written..], [(20_300, [0x2d, 0x08])], "{again_at}");
+        assert!(!rig.mcu.is_shutdown());
+    }
+}
+
+/// It is on, however soon after its end.
+#[test]
+fn a_measurement_may_begin_amid_the_end_of_another() {
+    let mut rig = configured(V0_12, ADXL345);
+    let chip = plug_adxl345(&rig);
+    rig.bench.state().answer_ticks = 300;
+    rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=2000");
+    rig.run_until(20_000);
+    rig.begin("query_adxl345 oid=1 clock=0 rest_ticks=0");
+    rig.begin("query_adxl345 oid=1 clock=@20100 rest_ticks=2000");
+    rig.run_until(40_000);
+    let written: Vec<u8> = chip.lock().unwrap().written.iter().map(|(_, [_, value])| *value).collect();
+    assert_eq!(written, [0x08, 0x00, 0x08]);
+    assert!(!rig.responses().is_empty());
+}
+
 #[test]
 fn a_machine_that_stops_amid_a_measurement_measures_no_more() {
     for stop_at in (4900..9000).step_by(100) {

@@ -112,6 +112,22 @@ fn a_bus_that_hangs_stops_the_machine_when_the_host_has_given_up() {
     assert!(notes.iter().any(|note| note.contains("SPI device oid 0 has not answered for 5 s")), "{notes:?}");
 }
 
+/// After a `clear_shutdown` commands wait for that bus again, and no longer than before.
+#[test]
+fn a_bus_that_still_hangs_stops_the_machine_again() {
+    let mut rig = Rig::with_workers(4_000_000_000, DISPLAY);
+    rig.begin("spi_transfer oid=0 data=01");
+    rig.run_until(260_000_000);
+    assert_eq!(rig.shutdown().as_deref(), Some("Bus does not answer"));
+    rig.begin("clear_shutdown");
+    assert!(rig.mcu.is_held());
+    rig.run_until(260_000_000 + 249_999_999);
+    assert_eq!(rig.shutdown(), None);
+    rig.run_until(260_000_000 + 250_000_001);
+    assert_eq!(rig.shutdown().as_deref(), Some("Bus does not answer"));
+    assert!(!rig.mcu.is_held());
+}
+
 #[test]
 fn transfers_that_end_in_time_never_add_up_to_one_that_hangs() {
     let mut rig = Rig::with_workers(200_000_000, DISPLAY);

@@ -84,7 +84,6 @@ fn each_type_triggers_at_its_value() {
         (DIFF_PEAK_GT, 100, &[1000, 1200, 1100, 1150, 1100, 1099], Some(5)),
         (DIFF_PEAK_GT, 0, &[1000, 1000, 1001, 1000], Some(3)),
         (DIFF_PEAK_GT, -1, &[1000, 3000, 10], None),
-        (3, 0, &[1000, 3000, 10], None),
     ];
     for (trigger_type, trigger_value, values, expected) in cases {
         let mut rig = homing(1000, *trigger_type, *trigger_value, values);
@@ -94,6 +93,14 @@ fn each_type_triggers_at_its_value() {
         let state = rig.ask("trigger_analog_query_state oid=4");
         assert_eq!(state, format!("trigger_analog_state oid=4 homing={homing} homing_clock=@{clock}"));
     }
+}
+
+/// A type that nothing triggers by would let a probe run into the bed.
+#[test]
+fn a_type_that_the_dictionary_does_not_have_is_refused() {
+    let mut rig = homing(1000, GT, 100, &[1000]);
+    rig.send("trigger_analog_set_trigger oid=4 trigger_analog_type=3 trigger_value=0");
+    assert_eq!(rig.shutdown().as_deref(), Some("Invalid trigger_analog_type"));
 }
 
 #[test]

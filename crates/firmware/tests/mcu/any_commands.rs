@@ -1,0 +1,731 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Whatever commands a host sends, the machine is there afterwards, with its outputs where they belong.
+//!
+//! The commands are those of the dictionary, so a new feature is covered as soon as it is listed: what arguments
+//! a command accepts is found by trying, once for each generation of hosts ([`Book`]). Each case then sends
+//! accepted arguments with some of them changed.
+
+use std::collections::{HashMap, HashSet};
+use std::sync::LazyLock;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use pinion_firmware::mcu::Generation;
+use pinion_firmware::time::{CLOCK_FREQ, Ticks};
+use pinion_protocol::block::PAYLOAD_MAX;
+use pinion_protocol::format::{self, Conversion};
+use pinion_protocol::vlq::{Reader, Writer};
+use proptest::collection::vec;
+use proptest::prelude::*;
+use proptest::test_runner::TestRunner;
+
+use pinion_testbench::board::{ANALOG, GPIOS, MOSI, PWM};
+use pinion_testbench::rig::Rig;
+
+/// Commands that never leave a running machine as it was, or not for every host that sends them.
+const STOPS: &[&str] = &[
+    "emergency_stop",
+    "config_reset",
+    "clear_shutdown",
+    "debug_read",
+    "debug_write",
+    "allocate_oids",
+    "finalize_config",
+];
+
+/// Values at which something might break.
+const EXTREMES: &[u32] = &[
+    0,
+    1,
+    u32::MAX,
+    2,
+    7,
+    8,
+    15,
+    16,
+    48,
+    49,
+    63,
+    64,
+    127,
+    128,
+    255,
+    256,
+    4096,
+    4097,
+    32767,
+    32768,
+    65535,
+    65536,
+    (1 << 31) - 1,
+    1 << 31,
+    (1 << 31) + 1,
+    u32::MAX - 1,
+];
+/// Pins of every kind, those of an expander among them.
+const PINS: &[u32] = &[
+    0,
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    9,
+    10,
+    11,
+    12,
+    13,
+    14,
+    15,
+    16,
+    17,
+    18,
+    19,
+    20,
+    21,
+    22,
+    23,
+    24,
+    EXPANDED,
+    EXPANDED + 1,
+    EXPANDED + 2,
+    EXPANDED + 3,
+    ANALOG,
+    ANALOG + 1,
+    ANALOG + 2,
+    PWM,
+    PWM + 1,
+    MOSI,
+    MOSI + 1,
+    300,
+    255,
+    u32::MAX,
+];
+/// Spans that a worker waits for between two edges. The bench runs an errand to its end at once and can not break it
+/// off, as a stop does, so these are short there.
+const PACED: &[&str] = &["delay_ticks", "sync_delay_ticks", "cmd_delay_ticks", "pulse_ticks", "bit_time"];
+const PACED_TICKS: u32 = 5000;
+/// The first line of the expander.
+const EXPANDED: u32 = 280;
+const EXPANDED_LINES: u32 = 8;
+/// A thermometer on the bench.
+const SERIAL: &[u8] = b"28";
+/// Oids that a configuration has room for.
+const OIDS: u8 = 100;
+/// Objects of each command that makes one.
+const OBJECTS_OF_A_KIND: usize = 3;
+/// Errands that may be under way: no object has more boxes for them than 32, but for PCA9685, which has one for each
+/// output.
+const ERRANDS_MAX: usize = 1024;
+
+/// A small generator of numbers, the same each time.
+struct Dice(u64);
+
+impl Dice {
+    fn roll(&mut self) -> u32 {
+        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+        (self.0 >> 33) as u32
+    }
+
+    fn below(&mut self, end: usize) -> usize {
+        self.roll() as usize % end.max(1)
+    }
+
+    fn of<T: Clone>(&mut self, values: &[T]) -> T {
+        values[self.below(values.len())].clone()
+    }
+}
+
+/// An argument as it can be sent at any time.
+#[derive(Clone, Debug)]
+enum Value {
+    Number(u32),
+    /// An instant, in ticks from now.
+    Soon(u32),
+    Bytes(Vec<u8>),
+}
+
+/// A command of the dictionary.
+struct Form {
+    format: String,
+    id: u32,
+    parameters: Vec<(String, Conversion)>,
+}
+
+impl Form {
+    fn name(&self) -> &str {
+        format::name(&self.format)
+    }
+
+    fn configures(&self) -> bool {
+        self.name().starts_with("config_") && self.name() != "config_reset"
+    }
+
+    /// The message; bytes that have no room are left out.
+    fn encode(&self, rig: &Rig, values: &[Value]) -> Vec<u8> {
+        let mut writer = Writer::default();
+        writer.int(self.id);
+        // An integer takes five bytes at most, the length of a string one.
+        let sizes = self.parameters.iter().map(|(_, conversion)| if *conversion == Conversion::Bytes { 1 } else { 5 });
+        let mut room = PAYLOAD_MAX - 2 - sizes.sum::<usize>().min(PAYLOAD_MAX - 2);
+        for (value, (name, _)) in values.iter().zip(&self.parameters) {
+            match value {
+                Value::Number(number) if PACED.contains(&name.as_str()) => writer.int(*number % PACED_TICKS),
+                Value::Number(number) if name == "rate" => writer.int((*number).max(CLOCK_FREQ / PACED_TICKS)),
+                Value::Number(number) => writer.int(*number),
+                Value::Soon(ticks) => writer.int(rig.wire_clock().wrapping_add(*ticks)),
+                Value::Bytes(bytes) => {
+                    let len = bytes.len().min(room);
+                    room -= len;
+                    writer.string(&bytes[..len]);
+                }
+            }
+        }
+        writer.payload().unwrap().to_vec()
+    }
+
+    /// The pins that it names.
+    fn pins<'a>(&'a self, values: &'a [Value]) -> impl Iterator<Item = u32> + 'a {
+        self.parameters.iter().zip(values).filter_map(|((name, _), value)| match value {
+            Value::Number(number) if is_pin(name) => Some(*number),
+            _ => None,
+        })
+    }
+
+    fn argument(&self, values: &[Value], name: &str) -> Option<u32> {
+        let place = self.parameters.iter().position(|(parameter, _)| parameter == name)?;
+        match values[place] {
+            Value::Number(number) => Some(number),
+            _ => None,
+        }
+    }
+}
+
+fn is_pin(parameter: &str) -> bool {
+    parameter == "pin" || parameter.ends_with("_pin")
+}
+
+/// A command with its arguments.
+type Call = (usize, Vec<Value>);
+
+/// What the hosts of a generation may send.
+struct Book {
+    generation: Generation,
+    forms: Vec<Form>,
+    /// A whole configuration.
+    setup: Vec<Call>,
+    /// Arguments that each command accepts while the machine is configured, and once it is.
+    before: Vec<Vec<Vec<Value>>>,
+    after: Vec<Vec<Vec<Value>>>,
+}
+
+static BOOKS: LazyLock<Vec<Book>> = LazyLock::new(|| Generation::ALL.iter().map(|of| Book::of(*of)).collect());
+
+impl Book {
+    fn of(generation: Generation) -> Book {
+        let rig = bench(generation);
+        let forms = rig.dictionary().commands.iter().map(|(format, id)| Form {
+            format: format.clone(),
+            id: id.as_i64().unwrap() as u32,
+            parameters: format::parameters(format).unwrap().into_iter().map(|(name, c)| (name.to_owned(), c)).collect(),
+        });
+        let forms: Vec<Form> = forms.collect();
+        let none = || vec![Vec::new(); forms.len()];
+        let mut book = Book { generation, before: none(), after: none(), setup: Vec::new(), forms };
+        let mut dice = Dice(0x9e37_79b9_7f4a_7c15);
+        book.find_setup(&mut dice);
+        book.find_calls(&mut dice);
+        book
+    }
+
+    /// The oids of the objects that commands with such a word in their names configure; all if there are none.
+    fn oids(&self, word: &str) -> Vec<u32> {
+        let oid = |(form, values): &Call| self.forms[*form].argument(values, "oid");
+        let named = |(form, _): &&Call| self.forms[*form].name().contains(word);
+        let objects = || self.setup.iter().filter(|(form, _)| self.forms[*form].configures());
+        let oids: Vec<u32> = objects().filter(named).filter_map(oid).collect();
+        if oids.is_empty() { objects().filter_map(oid).collect() } else { oids }
+    }
+
+    fn guess(&self, dice: &mut Dice, form: usize, new_oid: u32) -> Vec<Value> {
+        let form = &self.forms[form];
+        let guess = |(name, conversion): &(String, Conversion)| match (name.as_str(), conversion) {
+            ("serial", _) => Value::Bytes(SERIAL.into()),
+            (_, Conversion::Bytes) => Value::Bytes((0..dice.below(8)).map(|_| dice.roll() as u8).collect()),
+            ("oid", _) if form.configures() => Value::Number(new_oid),
+            ("oid", _) => Value::Number(dice.of(&self.oids("config_"))),
+            (name, _) if name.ends_with("_oid") => Value::Number(dice.of(&self.oids(name.trim_end_matches("_oid")))),
+            (name, _) if is_pin(name) && dice.below(2) == 0 => Value::Number(dice.roll() % GPIOS),
+            (name, _) if is_pin(name) => Value::Number(dice.of(PINS)),
+            (name, _) if name.ends_with("clock") => Value::Soon(dice.roll() % 100_000),
+            _ => Value::Number(match dice.below(4) {
+                0 | 1 => dice.roll() % 5,
+                2 => dice.roll() % 100_000,
+                _ => dice.of(EXTREMES),
+            }),
+        };
+        form.parameters.iter().map(guess).collect()
+    }
+
+    /// Tries every command on a machine that is being configured.
+    fn find_setup(&mut self, dice: &mut Dice) {
+        const TRIES: usize = 300;
+        let mut rig = bench(self.generation);
+        rig.send(&format!("allocate_oids count={OIDS}"));
+        let mut new_oid = 0;
+        // Sensors come behind their buses in the second round.
+        for round in 0..OBJECTS_OF_A_KIND {
+            for form in 0..self.forms.len() {
+                if STOPS.contains(&self.forms[form].name()) {
+                    continue;
+                }
+                for _ in 0..TRIES {
+                    if self.before[form].len() > round {
+                        break;
+                    }
+                    if self.setup.is_empty() && !self.forms[form].configures() {
+                        break;
+                    }
+                    let values = self.guess(dice, form, new_oid);
+                    if !accepts(&mut rig, &self.forms[form], &values) {
+                        continue;
+                    }
+                    if self.forms[form].configures() {
+                        new_oid += 1;
+                        self.setup.push((form, values.clone()));
+                    }
+                    self.before[form].push(values);
+                }
+            }
+        }
+    }
+
+    /// Tries every command on a configured machine, and puts those that are for its configuration into that.
+    fn find_calls(&mut self, dice: &mut Dice) {
+        const TRIES: usize = 1000;
+        const WANTED: usize = 4;
+        for with_buses in [false, true] {
+            let mut rig = bench(self.generation);
+            self.set_up(&mut rig);
+            for form in 0..self.forms.len() {
+                if STOPS.contains(&self.forms[form].name()) || self.forms[form].configures() {
+                    continue;
+                }
+                for _ in 0..TRIES {
+                    if self.after[form].len() >= WANTED {
+                        break;
+                    }
+                    let values = self.guess(dice, form, 0);
+                    if accepts(&mut rig, &self.forms[form], &values) {
+                        self.after[form].push(values);
+                    }
+                }
+            }
+            if !with_buses {
+                let mut calls: Vec<Call> = Vec::new();
+                for (form, values) in self.before.iter().enumerate() {
+                    if self.after[form].is_empty() && !self.forms[form].configures() {
+                        calls.extend(values.iter().map(|values| (form, values.clone())));
+                    }
+                }
+                // Buses on lines come first: no I2C chip answers there.
+                calls.sort_by_key(|(form, values)| self.forms[*form].pins(values).next().is_none());
+                self.setup.extend(calls);
+            }
+        }
+    }
+
+    /// Configures a machine, as far as it accepts that.
+    fn set_up(&self, rig: &mut Rig) {
+        rig.send(&format!("allocate_oids count={OIDS}"));
+        for (form, values) in &self.setup {
+            accepts(rig, &self.forms[*form], values);
+        }
+        rig.send("finalize_config crc=7");
+        assert_eq!(rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024");
+    }
+}
+
+/// A machine among devices that answer.
+fn bench(generation: Generation) -> Rig {
+    let rig = Rig::of(generation);
+    for (bus, address) in (0..2).flat_map(|bus| (0..128).map(move |address| (bus, address))) {
+        let mut count = address;
+        rig.bench.plug_i2c(bus, address, move |_, _, read| {
+            read.iter_mut().for_each(|byte| {
+                count = count.wrapping_mul(5).wrapping_add(77);
+                *byte = count;
+            });
+            Ok(())
+        });
+    }
+    for channel in 0..3 {
+        rig.bench.script_adc(ANALOG + channel, &[1000, 2000, 60_000, 0, 7]);
+    }
+    for pin in PINS {
+        let changes: Vec<_> = (1..100).map(|n| (n * 77_777 * u64::from(pin % 13 + 1), (n % 2) as u8)).collect();
+        rig.bench.script_input(*pin, &changes);
+    }
+    rig.bench.script_ds18b20("28", &[Some(20_000), None, Some(-5000), None, Some(85_000)]);
+    rig.bench.state().sleeping.extend(EXPANDED..EXPANDED + EXPANDED_LINES);
+    rig
+}
+
+/// A turn of the machine takes this long at least: events that come faster than that make it late.
+const TURN: Ticks = Ticks::from_us(20);
+
+/// Lets the machine run as long as `goes_on`.
+fn pass(rig: &mut Rig, mut goes_on: impl FnMut(&Rig) -> bool) {
+    while goes_on(rig) {
+        let now = rig.mcu.now();
+        let next = rig.turn();
+        if goes_on(rig) {
+            rig.jump(next.map_or(now + TURN, |next| next.max(now + TURN)));
+        }
+    }
+}
+
+/// Lets the machine run up to `ticks`, or for so many turns.
+fn pass_until(rig: &mut Rig, ticks: u64, turns: u32) {
+    let mut left = 2 * turns;
+    pass(rig, |rig| {
+        left = left.saturating_sub(1);
+        left > 0 && rig.now() < ticks
+    });
+}
+
+/// Runs a command to the end of what it began.
+fn run(rig: &mut Rig, payload: &[u8]) {
+    let mut reader = Reader::new(payload);
+    while !reader.is_empty() {
+        rig.mcu.execute(&mut reader);
+        // Commands wait for a bus for five seconds at most.
+        let limit = rig.now() + 6 * u64::from(CLOCK_FREQ);
+        pass(rig, |rig| {
+            assert!(rig.now() < limit, "commands are held for too long");
+            rig.mcu.is_held()
+        });
+    }
+}
+
+/// The same for a command in words.
+fn say(rig: &mut Rig, command: &str) {
+    let payload = rig.encode(command);
+    run(rig, &payload);
+}
+
+/// Whether a command leaves the machine running. Whatever it began is ended.
+fn accepts(rig: &mut Rig, form: &Form, values: &[Value]) -> bool {
+    let payload = form.encode(rig, values);
+    run(rig, &payload);
+    let accepted = !rig.mcu.is_shutdown();
+    let end = rig.now() + 50_000;
+    pass_until(rig, end, 20);
+    say(rig, "emergency_stop");
+    settle(rig);
+    say(rig, "clear_shutdown");
+    rig.everything();
+    rig.notes();
+    rig.bench.forget_edges();
+    accepted
+}
+
+/// Waits until the outputs are where they belong.
+fn settle(rig: &mut Rig) {
+    let limit = rig.now() + u64::from(CLOCK_FREQ);
+    pass(rig, |rig| {
+        assert!(rig.now() < limit, "{:?} is not at its shutdown value", rig.mcu.debtor());
+        rig.mcu.owes()
+    });
+}
+
+#[derive(Clone, Debug)]
+enum Action {
+    /// A command: which, which of the arguments that it accepts, and what is changed of these.
+    Send(usize, usize, Vec<Option<Change>>),
+    Turns(u32),
+    Stall(u64),
+    Stop,
+}
+
+#[derive(Clone, Debug)]
+enum Change {
+    Extreme(usize),
+    Small(u32),
+    Any(u32),
+    Pin(usize),
+    Bytes(u8, usize),
+}
+
+/// What becomes of a machine that has stopped.
+#[derive(Clone, Copy, Debug)]
+enum Recovery {
+    Nothing,
+    Clear,
+    /// A reset, and what comes next configures it.
+    Reset,
+    Configure,
+}
+
+fn change() -> impl Strategy<Value = Option<Change>> {
+    let change = prop_oneof![
+        4 => (0..EXTREMES.len()).prop_map(Change::Extreme),
+        3 => (0u32..10).prop_map(Change::Small),
+        1 => any::<u32>().prop_map(Change::Any),
+        1 => (0..PINS.len()).prop_map(Change::Pin),
+        2 => (any::<u8>(), 0..=PAYLOAD_MAX).prop_map(|(byte, len)| Change::Bytes(byte, len)),
+    ];
+    prop_oneof![
+        5 => Just(None),
+        1 => change.prop_map(Some),
+    ]
+}
+
+fn action() -> impl Strategy<Value = (Action, Recovery)> {
+    let action = prop_oneof![
+        20 => (any::<usize>(), any::<usize>(), vec(change(), 9)).prop_map(|(which, call, changes)| Action::Send(which, call, changes)),
+        6 => (1u32..40).prop_map(Action::Turns),
+        1 => (0u64..10_000_000).prop_map(Action::Stall),
+        1 => Just(Action::Stop),
+    ];
+    let recovery = prop_oneof![
+        2 => Just(Recovery::Nothing),
+        6 => Just(Recovery::Clear),
+        1 => Just(Recovery::Reset),
+        3 => Just(Recovery::Configure),
+    ];
+    (action, recovery)
+}
+
+/// Commands that were sent to a running machine, and those of them that it accepted.
+static SENT: AtomicU64 = AtomicU64::new(0);
+static ACCEPTED: AtomicU64 = AtomicU64::new(0);
+/// Outputs that were looked at in a stopped machine.
+static LOOKED_AT: AtomicU64 = AtomicU64::new(0);
+
+/// A machine under test, and what is known of its outputs.
+struct Trial<'a> {
+    book: &'a Book,
+    rig: Rig,
+    finalized: bool,
+    /// Each pin that was named to it, and how often.
+    named: HashMap<u32, u32>,
+    /// Digital outputs with the levels of a stopped machine.
+    outputs: HashMap<u32, bool>,
+    /// Lines that steppers step by, which rest in a stopped machine.
+    step_pins: HashSet<u32>,
+    /// Whether the machine was stopped after the last action, and its outputs were looked at.
+    stopped: bool,
+    /// What was sent since the last configuration, for a case that fails.
+    story: Vec<String>,
+}
+
+impl Drop for Trial<'_> {
+    fn drop(&mut self) {
+        if std::thread::panicking() {
+            eprintln!("{}, after a configuration:\n{}", self.book.generation, self.story.join("\n"));
+        }
+    }
+}
+
+impl<'a> Trial<'a> {
+    fn new(book: &'a Book, answer_ticks: u32) -> Trial<'a> {
+        let rig = bench(book.generation);
+        rig.bench.state().answer_ticks = answer_ticks;
+        let (named, outputs, step_pins) = (HashMap::new(), HashMap::new(), HashSet::new());
+        let story = Vec::new();
+        let mut trial = Trial { book, rig, finalized: false, named, outputs, step_pins, stopped: false, story };
+        trial.configure();
+        trial
+    }
+
+    fn configure(&mut self) {
+        self.rig.send(&format!("allocate_oids count={OIDS}"));
+        for (form, values) in &self.book.setup {
+            self.send(*form, values);
+            if self.rig.mcu.is_shutdown() {
+                settle(&mut self.rig);
+                say(&mut self.rig, "clear_shutdown");
+            }
+        }
+        say(&mut self.rig, "finalize_config crc=7");
+        self.finalized = true;
+        self.story.clear();
+    }
+
+    /// Has the machine forget everything.
+    fn reset(&mut self) {
+        let now = self.rig.now();
+        say(&mut self.rig, "emergency_stop");
+        let debtor = self.rig.mcu.debtor().map(str::to_owned);
+        say(&mut self.rig, "config_reset");
+        let took = self.rig.now() - now;
+        assert!(took < u64::from(CLOCK_FREQ), "a reset takes {took} ticks, for {debtor:?}");
+        self.named.clear();
+        self.outputs.clear();
+        self.step_pins.clear();
+        self.finalized = false;
+        assert!(self.rig.ask("get_config").starts_with("config is_config=0 crc=0 is_shutdown=0 "));
+    }
+
+    /// Sends a command. Whether a running machine accepted it; nothing is known of a stopped one.
+    fn send(&mut self, form: usize, values: &[Value]) -> Option<bool> {
+        let form = &self.book.forms[form];
+        self.story.push(format!("@{}: {} {values:?}", self.rig.now(), form.format));
+        let was_stopped = self.rig.mcu.is_shutdown();
+        let payload = form.encode(&self.rig, values);
+        if !was_stopped {
+            form.pins(values).for_each(|pin| *self.named.entry(pin).or_default() += 1);
+        }
+        run(&mut self.rig, &payload);
+        if was_stopped {
+            self.forget_if_reset(form);
+            return None;
+        }
+        if self.rig.mcu.is_shutdown() {
+            return Some(false);
+        }
+        match form.name() {
+            "config_digital_out" => {
+                let default = form.argument(values, "default_value").unwrap() != 0;
+                self.outputs.extend(form.argument(values, "pin").map(|pin| (pin, default)));
+            }
+            "config_stepper" => self.step_pins.extend(form.argument(values, "step_pin")),
+            "finalize_config" => self.finalized = true,
+            _ => {}
+        }
+        Some(true)
+    }
+
+    fn forget_if_reset(&mut self, form: &Form) {
+        if form.name() == "config_reset" {
+            self.named.clear();
+            self.outputs.clear();
+            self.step_pins.clear();
+            self.finalized = false;
+        }
+    }
+
+    fn recover(&mut self, recovery: Recovery) {
+        match recovery {
+            Recovery::Nothing => return,
+            Recovery::Clear => say(&mut self.rig, "clear_shutdown"),
+            Recovery::Reset => {
+                self.reset();
+                self.rig.send(&format!("allocate_oids count={OIDS}"));
+            }
+            Recovery::Configure => {
+                self.reset();
+                self.configure();
+            }
+        }
+        self.story.push(format!("@{}: {recovery:?}", self.rig.now()));
+    }
+
+    fn act(&mut self, action: &Action) {
+        if !matches!(action, Action::Send(..)) {
+            self.story.push(format!("@{}: {action:?}", self.rig.now()));
+        }
+        match action {
+            Action::Send(which, call, changes) => {
+                let calls = if self.finalized { &self.book.after } else { &self.book.before };
+                // Mostly a command that is accepted now.
+                let known: Vec<usize> = (0..calls.len()).filter(|form| !calls[*form].is_empty()).collect();
+                let form = if call % 8 == 0 { which % calls.len() } else { known[which % known.len()] };
+                let calls = if calls[form].is_empty() { &self.book.before[form] } else { &calls[form] };
+                let values = match calls.len() {
+                    0 => self.book.guess(&mut Dice(*call as u64), form, *call as u32 % 4),
+                    len => calls[call % len].clone(),
+                };
+                let values: Vec<Value> = values.into_iter().zip(changes).map(changed).collect();
+                if let Some(accepted) = self.send(form, &values) {
+                    SENT.fetch_add(1, Ordering::Relaxed);
+                    ACCEPTED.fetch_add(u64::from(accepted), Ordering::Relaxed);
+                }
+            }
+            Action::Turns(turns) => pass_until(&mut self.rig, u64::MAX, *turns),
+            Action::Stall(ticks) => self.rig.stall_until(self.rig.now() + ticks),
+            Action::Stop => say(&mut self.rig, "emergency_stop"),
+        }
+    }
+
+    /// Looks at the outputs of a machine that is stopped.
+    fn look(&mut self) {
+        let stopped = self.rig.mcu.is_shutdown();
+        if stopped && !self.stopped {
+            settle(&mut self.rig);
+            self.rig.bench.forget_edges();
+        }
+        if stopped {
+            // A line with several users belongs to the last one.
+            let alone = |pin: &u32| self.named.get(pin) == Some(&1);
+            for (pin, default) in self.outputs.iter().filter(|(pin, _)| alone(pin)) {
+                assert_eq!(self.rig.bench.level(*pin), *default, "pin {pin} of a stopped machine");
+                LOOKED_AT.fetch_add(1, Ordering::Relaxed);
+            }
+            for pin in self.step_pins.iter().filter(|pin| alone(pin)) {
+                assert_eq!(self.rig.edges(*pin), [], "stepper pin {pin} of a stopped machine");
+            }
+        }
+        self.stopped = stopped;
+        // Every response has the form that the dictionary says.
+        self.rig.everything();
+        self.rig.notes();
+        self.rig.bench.forget_edges();
+        assert!(self.rig.errands() <= ERRANDS_MAX, "{} errands are under way", self.rig.errands());
+    }
+}
+
+fn changed((value, change): (Value, &Option<Change>)) -> Value {
+    match (value, change) {
+        (value, None) => value,
+        (Value::Bytes(_), Some(Change::Bytes(byte, len))) => Value::Bytes(vec![*byte; *len]),
+        (Value::Bytes(bytes), _) => Value::Bytes(bytes),
+        (Value::Soon(_), Some(Change::Extreme(place))) => Value::Soon(EXTREMES[*place]),
+        (Value::Soon(soon), Some(Change::Small(n))) => Value::Soon(soon * n),
+        (_, Some(Change::Extreme(place))) => Value::Number(EXTREMES[*place]),
+        (_, Some(Change::Small(n) | Change::Any(n))) => Value::Number(*n),
+        (_, Some(Change::Pin(place))) => Value::Number(PINS[*place]),
+        (value, Some(Change::Bytes(..))) => value,
+    }
+}
+
+#[test]
+fn arguments_are_found_for_every_command() {
+    for book in &*BOOKS {
+        for (form, (before, after)) in book.forms.iter().zip(book.before.iter().zip(&book.after)) {
+            let is_found = if form.configures() { !before.is_empty() } else { !before.is_empty() || !after.is_empty() };
+            assert!(is_found || STOPS.contains(&form.name()), "{}: {}", book.generation, form.format);
+        }
+    }
+}
+
+#[test]
+fn no_commands_break_the_machine() {
+    let config = ProptestConfig { cases: 200, ..ProptestConfig::default() };
+    let config = ProptestConfig { source_file: Some(file!()), ..config };
+    let strategy = (0..Generation::ALL.len(), 0u32..50_000, vec(action(), 1..120));
+    LazyLock::force(&BOOKS);
+    let mut runner = TestRunner::new(config);
+    let done = runner.run(&strategy, |(generation, answer_ticks, actions)| {
+        let mut trial = Trial::new(&BOOKS[generation], answer_ticks);
+        for (action, recovery) in &actions {
+            if trial.rig.mcu.is_shutdown() {
+                trial.recover(*recovery);
+            }
+            trial.act(action);
+            trial.look();
+        }
+        trial.reset();
+        trial.configure();
+        prop_assert_eq!(trial.rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024");
+        Ok(())
+    });
+    let (sent, accepted) = (SENT.load(Ordering::Relaxed), ACCEPTED.load(Ordering::Relaxed));
+    println!("{sent} commands, {accepted} accepted, {} outputs looked at", LOOKED_AT.load(Ordering::Relaxed));
+    done.unwrap();
+    assert!(accepted * 2 > sent, "of {sent} commands {accepted} were accepted");
+    assert!(LOOKED_AT.load(Ordering::Relaxed) > 0);
+}
