@@ -135,11 +135,11 @@ impl FifoChip for Lis2dw {
     const OWN_WORDS: Option<&'static Words> = Some(&OWN_WORDS);
 
     fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.exchange(&mut [FIFO_CTRL, CONTINUOUS])
+        chip.send(&[FIFO_CTRL, CONTINUOUS])
     }
 
     fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.exchange(&mut [FIFO_CTRL, 0])
+        chip.send(&[FIFO_CTRL, 0])
     }
 
     fn bus_type(self) -> BusType {
