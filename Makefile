@@ -25,6 +25,9 @@ FISHDIR ?= $(PREFIX)/share/fish/vendor_completions.d
 COMPLETER ?= $(PINION)
 DEB_FOLDER ?= $(CARGO_TARGET_DIR)/deb
 
+# A computer of 32 bits.
+SMALL = armv7-unknown-linux-gnueabihf
+
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
@@ -42,7 +45,8 @@ help:
 	@echo 'make check    formatting, lints, documentation, man pages, what the package has'
 	@echo 'make build    the program: $(PINION)'
 	@echo 'make install  program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
-	@echo 'make deb      a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf'
+	@echo 'make deb      a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf,'
+	@echo '              in $(DEB_FOLDER)/arm64 or $(DEB_FOLDER)/armhf'
 	@echo 'make clean    remove what was built'
 
 run: build
@@ -82,6 +86,9 @@ bench: system-packages
 check: system-packages
 	$(CARGO) fmt --check
 	$(CARGO) clippy --locked --all-targets -- -D warnings
+	@if rustup target list --installed 2>/dev/null | grep -qx $(SMALL); then \
+	    echo '$(CARGO) check --target $(SMALL)'; $(CARGO) check --locked --all-targets --quiet --target $(SMALL); \
+	else echo 'NOT RUN: the check for 32 bits, which needs: rustup target add $(SMALL)' >&2; fi
 	RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links' $(CARGO) doc --locked --no-deps --document-private-items --quiet
 	$(CARGO) build --locked --quiet
 	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
@@ -119,8 +126,6 @@ install-system:
 	install -D -m 644 systemd/pinion-mcu.sysusers $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf
 	install -D -m 644 systemd/pinion-mcu.tmpfiles $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf
 	install -D -m 644 udev/60-pinion-mcu.rules $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules
-	test -e $(DESTDIR)/etc/default/pinion-mcu || \
-	    install -D -m 644 systemd/pinion-mcu.default $(DESTDIR)/etc/default/pinion-mcu
 	test -e $(DESTDIR)/etc/pinion/pinion.toml || \
 	    install -D -m 644 systemd/pinion.toml $(DESTDIR)/etc/pinion/pinion.toml
 ifeq ($(DESTDIR),)
@@ -149,6 +154,7 @@ endif
 	test ! -d $(DESTDIR)/etc/pinion || rmdir --ignore-fail-on-non-empty $(DESTDIR)/etc/pinion
 	-rmdir $(DESTDIR)$(LIBDIR)
 ifeq ($(DESTDIR),)
+	rm -rf /run/pinion
 	-systemctl daemon-reload
 	-udevadm control --reload
 endif

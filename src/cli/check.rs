@@ -14,6 +14,7 @@ use std::sync::Arc;
 use nix::unistd::{AccessFlags, Gid, Group as UserGroup, access, getegid, geteuid, getgroups};
 
 use crate::FIRMWARE;
+use crate::runtime;
 use crate::runtime::realtime::{self, Processors};
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::Inventory;
@@ -86,6 +87,12 @@ fn link(symlink: &Path) -> Finding {
     if access(folder, AccessFlags::W_OK | AccessFlags::X_OK).is_err() {
         let remedy = "run Pinion as another user, or choose another path (symlink)";
         return Finding::error("symlink", format!("{path}: nothing may be written in {}", folder.display()), remedy);
+    }
+    // As a rule it is the one that is to be restarted.
+    if let Some(served) = runtime::served(symlink)
+        && !leads_to_ours(symlink)
+    {
+        return Finding::ok("symlink", format!("no other program can serve there meanwhile: {served}"));
     }
     match fs::symlink_metadata(symlink) {
         Ok(there) if !there.file_type().is_symlink() => {

@@ -82,6 +82,18 @@ pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
     Ok(if hidden.is_empty() { Search::Nobody } else { Search::Hidden(hidden) })
 }
 
+/// The process that serves the terminal `device`, which is not its own: it has the master end open. None if there is
+/// none that this program may look into.
+///
+/// # Errors
+///
+/// Those of looking at the terminal or at `proc` itself.
+pub fn server(proc: &Path, device: &Path) -> io::Result<Option<Process>> {
+    let terminal = fs::metadata(device)?;
+    let pid = pids(proc)?.find(|pid| serves(proc, *pid, &terminal));
+    Ok(pid.and_then(|pid| Process::read(proc, pid, arguments(proc, pid))))
+}
+
 /// All processes but this one.
 ///
 /// # Errors
@@ -105,6 +117,16 @@ impl Process {
         let fields = std::str::from_utf8(&stat[name_ends + 1..]).ok()?;
         let started = fields.split_whitespace().nth(19)?.parse().ok()?;
         Some(Process { pid, started, arguments })
+    }
+
+    /// The file name of its program, as it was called.
+    pub fn program(&self) -> Option<&OsStr> {
+        self.arguments.first()?.file_name()
+    }
+
+    /// Whether its open files can not be told, as it is another user's.
+    pub fn is_hidden(&self, proc: &Path) -> bool {
+        fs::read_dir(proc.join(self.pid.to_string()).join("fdinfo")).is_err()
     }
 
     /// Whether it was started as klippy is.
@@ -133,6 +155,16 @@ impl Process {
         let through_root = inside(&folder.join("root"), &path);
         Some(if through_root.exists() { through_root } else { path })
     }
+}
+
+/// The unit of systemd that a text of /proc/PID/cgroup names, without `.service` (systemd.resource-control(5)). None if
+/// the process was started from a user's session or manager, which `sudo systemctl` does not reach.
+pub(crate) fn unit(groups: &str) -> Option<&str> {
+    let is_user = |name: &str| name.starts_with("user@") || name.starts_with("user-");
+    if groups.split(['/', '\n']).any(is_user) {
+        return None;
+    }
+    groups.lines().find_map(|line| line.rsplit('/').next()?.strip_suffix(".service"))
 }
 
 /// The command line of a process; it is empty for the kernel's threads.

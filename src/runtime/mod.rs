@@ -34,6 +34,7 @@ mod outlet;
 mod pty;
 mod pulse;
 pub mod realtime;
+mod served;
 mod signals;
 pub(crate) mod status;
 mod survey;
@@ -43,6 +44,7 @@ mod workers;
 
 pub use guardian::Guardian;
 pub use pty::Access;
+pub use served::{Served, served};
 pub(crate) use signals::hang_up;
 pub use status::socket_paths;
 

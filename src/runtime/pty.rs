@@ -19,6 +19,8 @@ use nix::unistd::{Gid, Group, chown, geteuid, read, ttyname, write};
 
 use pinion_linux::sys;
 
+use super::served::served;
+
 /// The group that gets the terminal if the command line names none.
 const USUAL_GROUP: &str = "tty";
 /// Where others leave files in the link's place.
@@ -64,6 +66,9 @@ impl Pty {
     ///
     /// One line with the cause and the remedy.
     pub(super) fn open(symlink: &Path, access: &Access) -> io::Result<Pty> {
+        if let Some(served) = served(symlink) {
+            return Err(io::Error::other(format!("{served}, or choose another path with -I")));
+        }
         let pty = said(openpty(None, None), "no pseudo terminal can be opened (is /dev/pts mounted?)")?;
         let mut raw = said(tcgetattr(&pty.slave), "the terminal's settings")?;
         cfmakeraw(&mut raw);

@@ -13,7 +13,7 @@ use log::{debug, info, warn};
 use nix::sched::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
 use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::sys::prctl;
-use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit};
+use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit, rlim_t};
 use nix::unistd::Pid;
 
 use pinion_linux::sys;
@@ -75,7 +75,7 @@ pub fn lock_memory() {
     }
 }
 
-fn memory_refusal(limit: u64) -> String {
+fn memory_refusal(limit: rlim_t) -> String {
     format!(
         "the limit is {} KiB: set LimitMEMLOCK=infinity in the service (ulimit -l unlimited in a shell), or grant \
          CAP_IPC_LOCK",
@@ -167,7 +167,7 @@ fn refusal(error: &io::Error) -> String {
     scheduling_refusal(error, limit(Resource::RLIMIT_RTPRIO), has_capability(CAP_SYS_NICE), group_runtime_us())
 }
 
-fn scheduling_refusal(error: &io::Error, limit: u64, capable: bool, group_runtime_us: Option<i64>) -> String {
+fn scheduling_refusal(error: &io::Error, limit: rlim_t, capable: bool, group_runtime_us: Option<i64>) -> String {
     if error.raw_os_error() != Some(libc::EPERM) {
         return format!("{error}: look at the kernel's log (dmesg)");
     }
@@ -177,7 +177,7 @@ fn scheduling_refusal(error: &io::Error, limit: u64, capable: bool, group_runtim
                 kernel.sched_rt_runtime_us=-1"
             .into();
     }
-    let wanted = GUARDIAN_PRIORITY as u64;
+    let wanted = GUARDIAN_PRIORITY as rlim_t;
     if !capable && limit < wanted {
         return format!(
             "the limit of real-time priorities is {limit} and CAP_SYS_NICE is missing: set LimitRTPRIO={wanted} in the \
@@ -187,7 +187,7 @@ fn scheduling_refusal(error: &io::Error, limit: u64, capable: bool, group_runtim
     format!("{error}: a container or a security module forbids it: allow sched_setscheduler there (CAP_SYS_NICE)")
 }
 
-fn limit(resource: Resource) -> u64 {
+fn limit(resource: Resource) -> rlim_t {
     getrlimit(resource).map_or(0, |(soft, _)| soft)
 }
 

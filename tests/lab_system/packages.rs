@@ -26,7 +26,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
             .env_remove("MAKEFLAGS")
             .env_remove("MAKELEVEL"),
     )?;
-    // The later package has another unit and another file of defaults.
+    // The later package has another unit and another configuration.
     process::pipeline(
         r#"cd "$1"
            mv pinion-mcu_*.deb pinion-mcu.deb
@@ -34,7 +34,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
            sed -i 's/^Version: .*/&+later/' later/DEBIAN/control
            unit=$(find later -name pinion-mcu.service)
            sed -i 's/^Description=.*/Description=The later unit/' "$unit"
-           echo '# of the later package' >>later/etc/default/pinion-mcu
+           echo '# of the later package' >>later/usr/share/pinion-mcu/pinion.toml
            dpkg-deb --root-owner-group -b later later.deb
            rm -r later"#,
         &[&folder.display().to_string()],
@@ -55,7 +55,9 @@ pub fn share_klippy(folder: &Path) -> Result<(), String> {
     let Some(checkout) = env::var_os("KLIPPER_DIR") else { return Ok(()) };
     let copy = folder.join("klipper");
     fs::create_dir(&copy).map_err(|error| format!("{}: {error}", copy.display()))?;
-    process::run(Command::new("cp").arg("-a").arg(Path::new(&checkout).join("klippy")).arg(&copy))?;
+    for part in ["klippy", "scripts/flash-linux.sh"] {
+        process::run(Command::new("cp").arg("-a").arg(Path::new(&checkout).join(part)).arg(&copy))?;
+    }
     let python = env::var_os("KLIPPER_PYTHON").unwrap_or("python3".into());
     process::run(Command::new(python).arg(copy.join("klippy/chelper/__init__.py")))
 }

@@ -5,13 +5,17 @@ use std::fs;
 use std::io::{BufRead, BufReader, PipeReader, PipeWriter, Write};
 use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
+use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::fcntl::{AT_FDCWD, FcntlArg, OFlag, fcntl};
 use nix::pty::openpty;
 use nix::sys::signal::Signal;
+use nix::sys::stat::{UtimensatFlags, utimensat};
 use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
+use nix::sys::time::{TimeSpec, TimeValLike as _};
+use nix::unistd::ttyname;
 use pinion_client::config::Config;
 use pinion_client::serial::Received;
 use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
@@ -30,6 +34,72 @@ fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
     pinion.signal(Signal::SIGTERM);
     assert_eq!(pinion.end().code(), Some(0));
     assert!(!exists(&link));
+}
+
+#[test]
+fn a_link_that_a_running_pinion_serves_is_refused_and_left_alone() {
+    let pinion = Pinion::simulated(&[]);
+    let target = fs::read_link(pinion.link()).unwrap();
+    let mut client = pinion.client();
+    let refusal = format!(
+        "{} leads to {}, which Pinion serves (process {}): stop it (sudo kill {}), or choose another path with -I",
+        pinion.link().display(),
+        target.display(),
+        pinion.pid(),
+        pinion.pid()
+    );
+    let refused = |args: &[&str], as_nobody: bool| {
+        let (status, log) = pinion.beside(args, as_nobody);
+        assert_eq!(status, Some(1), "{log}");
+        assert!(log.contains(&refusal), "{log}");
+        assert_eq!(fs::read_link(pinion.link()).unwrap(), target);
+    };
+    refused(&["run", "--board", "sim"], false);
+    refused(&["-r", "--board", "sim"], false);
+    refused(&["sim", "--show"], false);
+    if nix::unistd::geteuid().is_root() {
+        // Who may not look into the other's process, in a folder such as /tmp, is told the same.
+        let folder = pinion.link().parent().unwrap().to_owned();
+        fs::set_permissions(&folder, fs::Permissions::from_mode(0o1777)).unwrap();
+        refused(&["run", "--board", "sim"], true);
+    }
+    // A mode that somebody has given the terminal since makes no difference.
+    fs::set_permissions(&target, fs::Permissions::from_mode(0o666)).unwrap();
+    made_an_hour_ago(&pinion.link());
+    refused(&["run", "--board", "sim"], false);
+    assert!(client.status().is_ok(), "the host keeps its machine");
+    // What is to be restarted may be checked meanwhile.
+    let (status, _) = pinion.beside(&["run", "--board", "sim", "--check"], false);
+    assert_eq!(status, Some(0));
+}
+
+/// Has a link look older than it is.
+fn made_an_hour_ago(link: &Path) {
+    let then = TimeSpec::seconds(fs::symlink_metadata(link).unwrap().mtime() - 3600);
+    utimensat(AT_FDCWD, link, &then, &then, UtimensatFlags::NoFollowSymlink).unwrap();
+}
+
+#[test]
+fn a_link_that_a_killed_pinion_left_is_replaced_though_a_login_may_have_its_terminal() {
+    let mut killed = Pinion::simulated(&[]);
+    killed.signal(Signal::SIGKILL);
+    killed.end();
+    assert!(exists(&killed.link()), "it is left");
+    let (folder, _) = killed.into_folder();
+    let mut pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    pinion.logged("serving on");
+    pinion.client().status().unwrap();
+    pinion.signal(Signal::SIGKILL);
+    pinion.end();
+    // Its number is given to the next one who opens a terminal.
+    let login = openpty(None, None).unwrap();
+    let (folder, link) = pinion.into_folder();
+    fs::remove_file(&link).unwrap();
+    symlink(ttyname(&login.slave).unwrap(), &link).unwrap();
+    made_an_hour_ago(&link);
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    pinion.logged("serving on");
+    pinion.client().status().unwrap();
 }
 
 #[test]

@@ -2,6 +2,8 @@
 //! The program as a process of its own, with a pty and a log.
 
 use std::fs::{self, File};
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::process::CommandExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::thread;
@@ -55,6 +57,30 @@ impl Pinion {
             .spawn()
             .unwrap();
         Pinion { child, folder }
+    }
+
+    /// Another `pinion` at the same link, run to its end: its status and its log. `as_nobody` runs it as that user.
+    pub fn beside(&self, args: &[&str], as_nobody: bool) -> (Option<i32>, String) {
+        let folder = tempfile::tempdir().unwrap();
+        // Nobody else may read the folder where cargo builds.
+        let program = folder.path().join("pinion");
+        fs::copy(env!("CARGO_BIN_EXE_pinion"), &program).unwrap();
+        fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
+        let log = folder.path().join("log");
+        let mut command = Command::new(&program);
+        command.args(args).arg("-I").arg(self.link()).stdout(Stdio::null()).stderr(File::create(&log).unwrap());
+        if as_nobody {
+            command.uid(65534).gid(65534);
+        }
+        let child = command.env_remove("JOURNAL_STREAM").spawn().unwrap();
+        let status = Pinion { child, folder: tempfile::tempdir().unwrap() }.end();
+        (status.code(), fs::read_to_string(log).unwrap())
+    }
+
+    /// What is left of a program that has ended: its folder, and its link there.
+    pub fn into_folder(mut self) -> (TempDir, PathBuf) {
+        let link = self.link();
+        (std::mem::replace(&mut self.folder, tempfile::tempdir().unwrap()), link)
     }
 
     pub fn link(&self) -> PathBuf {

@@ -6,7 +6,6 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
-use std::sync::atomic::AtomicU8;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use industrial_io::Context;
@@ -36,6 +35,7 @@ mod w1;
 const DEV: &str = "/dev";
 const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
+const SPI_MASTERS: &str = "/sys/class/spi_master";
 const W1: &str = "/sys/bus/w1/devices";
 /// The worker that reads the edges of all lines.
 const EDGE_WORKER: &str = "edges";
@@ -131,8 +131,8 @@ pub struct LinuxBoard {
     /// and who has it keeps it for a moment: nobody looks around meanwhile.
     seen: Arc<Mutex<Seen>>,
     guard: SharedGuard,
-    /// The mode that each spidev node in use is set to at present, shared by the chips behind it.
-    spi_modes: HashMap<spi::Node, Arc<AtomicU8>>,
+    /// The SPI controllers in use.
+    spi_controllers: HashMap<u32, Arc<Mutex<spi::Controller>>>,
     /// The numbers of IIO devices that tell no resolution, and of which the log has said so.
     assumed: BTreeSet<u32>,
     dev: PathBuf,
@@ -154,7 +154,7 @@ impl LinuxBoard {
         LinuxBoard {
             seen,
             guard,
-            spi_modes: HashMap::new(),
+            spi_controllers: HashMap::new(),
             assumed: BTreeSet::new(),
             dev: DEV.into(),
             gpio: GPIO.into(),
@@ -177,6 +177,11 @@ impl LinuxBoard {
             return Err(Shutdown::because(no_line, detail));
         };
         gpio::open(&self.dev, chip, offset, refused)
+    }
+
+    fn open_spi(&mut self, config: SpiConfig) -> Result<spi::Spi, Shutdown> {
+        let controller = self.spi_controllers.entry(spi::Node::of(config.bus).bus).or_default().clone();
+        spi::Spi::open(&self.dev, config, controller)
     }
 
     /// The number of a pin's IIO device, and the name that its driver has for the channel.
@@ -284,10 +289,8 @@ impl Board for LinuxBoard {
     }
 
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
-        let node = spi::Node::of(config.bus);
-        let mode = self.spi_modes.entry(node).or_default().clone();
-        let device = spi::Spi::open(&self.dev, node, config.mode, config.rate_hz, config.chip_select, mode)?;
-        Ok(OnWorker { bus: format!("spi{}", node.bus), device: Box::new(device) })
+        let device = self.open_spi(config)?;
+        Ok(OnWorker { bus: device.worker(), device: Box::new(device) })
     }
 
     fn i2c_buses(&self) -> Vec<Range> {
@@ -316,7 +319,14 @@ impl Board for LinuxBoard {
             return Err(not_mosi(&Target::of(pin).to_string()));
         };
         let bus = node.number().unwrap_or(u32::MAX);
-        let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
+        let device = self.open_spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?.with_mosi_idle_low();
+        if let Some(driver) = spi::driver_without_dma(Path::new(SPI_MASTERS), node) {
+            log::warn!(
+                "/dev/{node}: its controller ({driver}) has no DMA and may pause amid a frame, which LEDs take for \
+                 other colours: use another controller (on a Raspberry Pi SPI0)"
+            );
+        }
+        let line = OnWorker { bus: device.worker(), device: Box::new(device) as Box<dyn BusDevice> };
         Ok(Mosi { line, message_max: spi::message_max() })
     }
 
@@ -330,7 +340,7 @@ impl Board for LinuxBoard {
         if let Err(error) = self.guard.release() {
             log::error!("the guardian does not give back the lines: {error}: restart Pinion");
         }
-        self.spi_modes.clear();
+        self.spi_controllers.clear();
     }
 }
 

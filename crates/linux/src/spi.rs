@@ -3,18 +3,17 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::HashMap;
 use std::fmt;
 use std::fs;
 use std::io;
 use std::path::Path;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicU8, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use linux_embedded_hal::SpidevDevice;
-use linux_embedded_hal::spidev::{SpiModeFlags, SpidevOptions, SpidevTransfer};
+use linux_embedded_hal::spidev::{SpiModeFlags, Spidev, SpidevOptions, SpidevTransfer};
 
 use super::gpio::not_permitted;
-use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect, Range};
+use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect, Range, SpiConfig};
 use pinion_firmware::shutdown::{Shutdown, reason};
 
 /// How many buses the C program has names for.
@@ -83,40 +82,91 @@ pub(super) fn message_max() -> usize {
     told.and_then(|text| text.trim().parse().ok()).unwrap_or(4096)
 }
 
+/// SPI_CPOL of a mode: the clock idles high.
+const CPOL: u32 = SpiModeFlags::SPI_CPOL.bits();
+/// SPI_MOSI_IDLE_LOW of a mode: the data output is low between two messages. Few kernels and controllers have it.
+const MOSI_IDLE_LOW: u32 = 1 << 17;
+
+/// What the chips of one controller have in common. A worker speaks to all of them, so the order of their
+/// conversations is clear.
+#[derive(Default)]
+pub(super) struct Controller {
+    /// The mode that each node is set to, by its chip select. Chips that lines select may share a node and need
+    /// different modes; the kernel keeps one for the node.
+    modes: HashMap<u32, u32>,
+    /// The level at which the clock stands since the last transfer; none if that is not known.
+    idles_high: Option<bool>,
+}
+
+/// What is asked of a node.
+pub(super) trait SpiNode: Send {
+    fn set_rate(&mut self, hz: u32) -> io::Result<()>;
+    fn set_mode(&mut self, mode: u32) -> io::Result<()>;
+    fn transfer(&mut self, rate_hz: u32, bytes: Bytes<'_>) -> io::Result<()>;
+}
+
+/// What goes over the wires. Without a buffer for what comes back, a controller of one data line takes it, too.
+pub(super) enum Bytes<'a> {
+    Exchanged(&'a mut [u8]),
+    Sent(&'a [u8]),
+}
+
+impl Bytes<'_> {
+    fn len(&self) -> usize {
+        match self {
+            Bytes::Exchanged(bytes) => bytes.len(),
+            Bytes::Sent(bytes) => bytes.len(),
+        }
+    }
+}
+
+impl SpiNode for Spidev {
+    fn set_rate(&mut self, hz: u32) -> io::Result<()> {
+        self.configure(SpidevOptions::new().max_speed_hz(hz))
+    }
+
+    fn set_mode(&mut self, mode: u32) -> io::Result<()> {
+        let flags = SpiModeFlags::from_bits_retain(mode);
+        self.configure(SpidevOptions::new().mode(flags))
+    }
+
+    fn transfer(&mut self, rate_hz: u32, bytes: Bytes<'_>) -> io::Result<()> {
+        let mut transfer = match bytes {
+            Bytes::Exchanged(bytes) => SpidevTransfer::read_write_in_place(bytes),
+            Bytes::Sent(bytes) => SpidevTransfer::write(bytes),
+        };
+        transfer.speed_hz = rate_hz;
+        transfer.bits_per_word = 8;
+        Spidev::transfer(self, &mut transfer)
+    }
+}
+
 /// An open SPI device.
-pub(super) struct Spi {
-    device: SpidevDevice,
+pub(super) struct Spi<N = Spidev> {
+    device: N,
     node: Node,
-    mode: u8,
+    mode: u32,
     rate_hz: u32,
     chip_select: Option<ChipSelect>,
-    /// The mode that the node is set to at present. Several chips may share a node, each selected by
-    /// a GPIO line, and may need different modes; the kernel keeps only one for the node. As one
-    /// worker speaks to all of them, the order of their accesses is clear.
-    node_mode: Arc<AtomicU8>,
+    controller: Arc<Mutex<Controller>>,
 }
 
 impl Spi {
-    /// Opens a node and sets its rate and mode. All devices on the node share `node_mode`.
+    /// Opens a node and sets its rate and mode. All devices on its controller share `controller`.
     ///
     /// # Errors
     ///
     /// "Unable to open spi device", "Unable to set SPI speed", "Unable to set SPI mode".
-    pub(super) fn open(
-        dev: &Path,
-        node: Node,
-        mode: u8,
-        rate_hz: u32,
-        chip_select: Option<ChipSelect>,
-        node_mode: Arc<AtomicU8>,
-    ) -> Result<Spi, Shutdown> {
+    pub(super) fn open(dev: &Path, config: SpiConfig, controller: Arc<Mutex<Controller>>) -> Result<Spi, Shutdown> {
+        let SpiConfig { bus, mode, rate_hz, chip_select } = config;
+        let node = Node::of(bus);
         let path = dev.join(node.to_string());
-        let device = SpidevDevice::open(&path).map_err(|error| {
-            let detail = cannot_open(&path, error.inner(), &scan(dev));
+        let device = Spidev::open(&path).map_err(|error| {
+            let detail = cannot_open(&path, &error, &scan(dev));
             Shutdown::because(reason::SPI_OPEN, detail)
         })?;
-        let mut spi = Spi { device, node, mode, rate_hz, chip_select, node_mode };
-        spi.device.configure(SpidevOptions::new().max_speed_hz(rate_hz)).map_err(|error| {
+        let mut spi = Spi { device, node, mode: mode.into(), rate_hz, chip_select, controller };
+        spi.device.set_rate(rate_hz).map_err(|error| {
             let detail = format!("/dev/{node} refuses {rate_hz} Hz: {error}: choose another spi_speed");
             Shutdown::because(reason::SPI_SPEED, detail)
         })?;
@@ -124,53 +174,103 @@ impl Spi {
         Ok(spi)
     }
 
+    /// The name of its worker.
+    pub(super) fn worker(&self) -> String {
+        format!("spi{}", self.node.bus)
+    }
+
+    /// Has the data output low between two messages, where the controller can do that.
+    pub(super) fn with_mosi_idle_low(mut self) -> Spi {
+        let plain = self.mode;
+        self.mode |= MOSI_IDLE_LOW;
+        if self.set_mode().is_err() {
+            self.mode = plain;
+        }
+        self
+    }
+}
+
+impl<N: SpiNode> Spi<N> {
+    fn controller(&self) -> MutexGuard<'_, Controller> {
+        self.controller.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Sets all mode bits of the node, as the C program does. That clears SPI_CS_HIGH, too, but the
     /// kernel itself keeps the polarity of a chip select that the device tree describes.
     fn set_mode(&mut self) -> Result<(), String> {
-        let flags = SpiModeFlags::from_bits_retain(self.mode.into());
-        self.device.configure(SpidevOptions::new().mode(flags)).map_err(|error| {
+        self.device.set_mode(self.mode).map_err(|error| {
             format!(
                 "/dev/{} refuses SPI mode {}: {error}: its controller can not serve this chip, choose another bus",
                 self.node, self.mode
             )
         })?;
-        self.node_mode.store(self.mode, Ordering::Relaxed);
+        self.controller().modes.insert(self.node.select, self.mode);
         Ok(())
     }
 
-    fn transfer(&mut self, bytes: &mut [u8]) -> Result<(), String> {
-        if bytes.is_empty() {
-            return Ok(());
-        }
-        if self.node_mode.load(Ordering::Relaxed) != self.mode {
-            self.set_mode()?;
-        }
+    fn transfer(&mut self, bytes: Bytes<'_>) -> Result<(), String> {
         let count = bytes.len();
-        let mut transfer = SpidevTransfer::read_write_in_place(bytes);
-        transfer.speed_hz = self.rate_hz;
-        transfer.bits_per_word = 8;
-        self.device.transfer(&mut transfer).map_err(|error| {
+        // A transfer that fails may have moved the clock, or not.
+        self.controller().idles_high = None;
+        self.device.transfer(self.rate_hz, bytes).map_err(|error| {
             format!(
                 "/dev/{} failed to transfer {count} bytes at {} Hz: {error}: look at the kernel's log (dmesg), try a \
                  lower spi_speed",
                 self.node, self.rate_hz
             )
-        })
+        })?;
+        self.controller().idles_high = Some(self.mode & CPOL != 0);
+        Ok(())
     }
 
-    fn select(&self, selected: bool) -> Result<(), String> {
-        let chip_select = self.chip_select.as_ref();
-        chip_select.map_or(Ok(()), |line| line.select(selected)).map_err(|failure| failure.detail.into())
+    /// Sets the node's mode, and has the clock stand at its idle level, before a line of ours selects the chip. A
+    /// driver moves the clock only as a transfer begins (spi-bcm2835: in `prepare_message`), which a chip that is
+    /// selected by then would count as an edge. So a byte goes to nobody first. A chip that the controller
+    /// selects is the kernel's affair.
+    fn prepare(&mut self) -> Result<(), String> {
+        let known = self.controller().modes.get(&self.node.select) == Some(&self.mode);
+        if !known {
+            self.set_mode()?;
+        }
+        let stands = self.controller().idles_high == Some(self.mode & CPOL != 0);
+        if self.chip_select.is_none() || stands { Ok(()) } else { self.transfer(Bytes::Sent(&[0])) }
+    }
+
+    /// Drives the line that selects the chip, if there is one.
+    fn drive(&self, how: impl FnOnce(&ChipSelect) -> Result<(), Shutdown>) -> Result<(), String> {
+        self.chip_select.as_ref().map_or(Ok(()), how).map_err(|failure| failure.detail.into())
+    }
+
+    fn converse(&mut self, bytes: Bytes<'_>) -> Result<(), BusError> {
+        let conversed = self.prepare().and_then(|()| match bytes.len() {
+            0 => self.drive(ChipSelect::pulse),
+            _ => {
+                let transferred = self.drive(|line| line.select(true)).and_then(|()| self.transfer(bytes));
+                // A chip that stayed selected after a failure would disturb the next conversation.
+                let deselected = self.drive(|line| line.select(false));
+                transferred.and(deselected)
+            }
+        });
+        conversed.map_err(|detail| BusError { status: BusStatus::Nack, detail: detail.into() })
     }
 }
 
-impl BusDevice for Spi {
+impl<N: SpiNode> BusDevice for Spi<N> {
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
-        let exchanged = self.select(true).and_then(|()| self.transfer(bytes));
-        // A chip that stayed selected after a failure would disturb the next conversation.
-        let deselected = self.select(false);
-        exchanged.and(deselected).map_err(|detail| BusError { status: BusStatus::Nack, detail: detail.into() })
+        self.converse(Bytes::Exchanged(bytes))
     }
+
+    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
+        self.converse(Bytes::Sent(bytes))
+    }
+}
+
+/// The driver of the node's controller, if it is known to have no DMA: its FIFO may run empty amid a message.
+pub(super) fn driver_without_dma(masters: &Path, node: Node) -> Option<String> {
+    const WITHOUT_DMA: [&str; 2] = ["spi-bcm2835aux", "spi_gpio"];
+    let driver = fs::read_link(masters.join(format!("spi{}/device/driver", node.bus))).ok()?;
+    let driver = driver.file_name()?.to_str()?;
+    WITHOUT_DMA.contains(&driver).then(|| driver.to_owned())
 }
 
 fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> String {
@@ -196,7 +296,7 @@ fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> String {
 mod tests {
     use super::*;
     use pinion_firmware::board::{Direction, Line};
-    use std::sync::Mutex;
+    use pinion_firmware::time::{Clock, TimeSource, VirtualClock};
 
     #[test]
     fn numbers_are_the_c_program_s() {
@@ -222,8 +322,7 @@ mod tests {
     }
 
     fn open(dev: &Path, chip_select: Option<ChipSelect>) -> Result<Spi, Shutdown> {
-        let node_mode = Arc::new(AtomicU8::new(0));
-        Spi::open(dev, Node::of(0), 3, 1_000_000, chip_select, node_mode)
+        Spi::open(dev, SpiConfig { bus: 0, mode: 3, rate_hz: 1_000_000, chip_select }, Arc::default())
     }
 
     #[test]
@@ -259,17 +358,179 @@ mod tests {
         }
     }
 
+    fn clock() -> Arc<dyn TimeSource> {
+        Arc::new(VirtualClock::at(Clock::EPOCH))
+    }
+
+    /// A controller as spi-bcm2835 has it, and the lines that select chips. The clock moves only with a transfer.
+    #[derive(Default)]
+    struct Wires {
+        clock: bool,
+        /// The mode of each node.
+        modes: HashMap<u32, u32>,
+        /// The mode of each chip, by the line that selects it, and whether that is low.
+        chips: HashMap<&'static str, (u32, bool)>,
+        /// The edges that a chip saw while it was selected.
+        seen: Vec<(&'static str, u32)>,
+        /// How many bytes went over the wires, and whether one data line is all that there is.
+        bytes: usize,
+        half_duplex: bool,
+        fails: bool,
+    }
+
+    impl Wires {
+        fn edges(&mut self, edges: u32) {
+            let selected: Vec<_> = self.chips.iter().filter(|(_, (_, low))| *low).map(|(name, _)| *name).collect();
+            self.seen.extend(selected.into_iter().filter(|_| edges > 0).map(|name| (name, edges)));
+        }
+    }
+
+    #[derive(Clone)]
+    struct FakeNode(u32, Arc<Mutex<Wires>>);
+
+    impl SpiNode for FakeNode {
+        fn set_rate(&mut self, _hz: u32) -> io::Result<()> {
+            Ok(())
+        }
+
+        fn set_mode(&mut self, mode: u32) -> io::Result<()> {
+            self.1.lock().unwrap().modes.insert(self.0, mode);
+            Ok(())
+        }
+
+        fn transfer(&mut self, _rate_hz: u32, bytes: Bytes<'_>) -> io::Result<()> {
+            let mut wires = self.1.lock().unwrap();
+            if wires.half_duplex && matches!(bytes, Bytes::Exchanged(_)) {
+                return Err(io::ErrorKind::InvalidInput.into());
+            }
+            let idle = wires.modes[&self.0] & CPOL != 0;
+            let moved = std::mem::replace(&mut wires.clock, idle) != idle;
+            if std::mem::take(&mut wires.fails) {
+                return Err(io::ErrorKind::TimedOut.into());
+            }
+            wires.edges(u32::from(moved));
+            wires.edges(16 * bytes.len() as u32);
+            wires.bytes += bytes.len();
+            Ok(())
+        }
+    }
+
+    struct Select(&'static str, Arc<Mutex<Wires>>);
+
+    impl Line for Select {
+        fn write(&self, level: bool) -> Result<(), Shutdown> {
+            let mut wires = self.1.lock().unwrap();
+            let clock = wires.clock;
+            let chip = wires.chips.get_mut(self.0).unwrap();
+            chip.1 = !level;
+            assert!(level || clock == (chip.0 & CPOL != 0), "{} is selected with the clock at its idle level", self.0);
+            Ok(())
+        }
+        fn read(&self) -> Result<bool, Shutdown> {
+            Ok(false)
+        }
+        fn set_direction(&self, _direction: Direction) -> Result<(), Shutdown> {
+            Ok(())
+        }
+    }
+
+    /// Chips of these names, nodes and modes, on one controller. One without a name is selected by its node.
+    fn chips<const N: usize>(chips: [(&'static str, u32, u32); N]) -> (Arc<Mutex<Wires>>, [Spi<FakeNode>; N]) {
+        let wires: Arc<Mutex<Wires>> = Arc::default();
+        let controller: Arc<Mutex<Controller>> = Arc::default();
+        let chips = chips.map(|(name, select, mode)| {
+            wires.lock().unwrap().chips.insert(name, (mode, false));
+            let line = Arc::new(Select(name, wires.clone()));
+            let chip_select = ChipSelect { line, active_high: false, clock: clock() };
+            let mut spi = Spi {
+                device: FakeNode(select, wires.clone()),
+                node: Node { bus: 0, select },
+                mode,
+                rate_hz: 1000,
+                chip_select: (!name.is_empty()).then_some(chip_select),
+                controller: controller.clone(),
+            };
+            spi.set_mode().unwrap();
+            spi
+        });
+        (wires, chips)
+    }
+
+    #[test]
+    fn the_clock_idles_at_a_chip_s_level_before_the_chip_is_selected() {
+        // Two chips of one node, and one of another node, whose lines all select, and one that its node selects.
+        let all = [("a", 0, 0), ("b", 0, 3), ("c", 1, 2), ("", 2, 0)];
+        for order in [[0, 1, 0, 2, 1], [1, 0, 3, 1, 2], [2, 3, 2, 1, 0], [3, 0, 1, 1, 3]] {
+            let (wires, mut spis) = chips(all);
+            for chip in order {
+                wires.lock().unwrap().seen.clear();
+                spis[chip].exchange(&mut [1, 2]).unwrap();
+                let (name, ..) = all[chip];
+                let expected = if name.is_empty() { vec![] } else { vec![(name, 32)] };
+                assert_eq!(wires.lock().unwrap().seen, expected, "{order:?}: {name}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_byte_goes_to_nobody_only_where_the_clock_has_to_move() {
+        let (wires, [mut low, mut high, mut other_high]) = chips([("a", 0, 0), ("b", 0, 3), ("c", 1, 2)]);
+        let bytes = |spi: &mut Spi<FakeNode>| {
+            spi.exchange(&mut [1, 2]).unwrap();
+            std::mem::take(&mut wires.lock().unwrap().bytes)
+        };
+        // Where it stands at the beginning is not known.
+        assert_eq!((bytes(&mut low), bytes(&mut low)), (3, 2));
+        assert_eq!((bytes(&mut high), bytes(&mut high), bytes(&mut other_high)), (3, 2, 2));
+        assert_eq!((bytes(&mut high), bytes(&mut low)), (2, 3));
+        // Nor after a failure.
+        wires.lock().unwrap().fails = true;
+        assert!(high.exchange(&mut [1]).is_err());
+        assert_eq!(bytes(&mut low), 3);
+    }
+
+    #[test]
+    fn what_is_only_sent_goes_to_a_controller_of_one_data_line() {
+        let (wires, [mut low, mut high]) = chips([("a", 0, 0), ("b", 0, 3)]);
+        wires.lock().unwrap().half_duplex = true;
+        low.send(&[1, 2]).unwrap();
+        high.send(&[1, 2]).unwrap();
+        assert_eq!(wires.lock().unwrap().seen, [("a", 32), ("b", 32)]);
+        let error = low.exchange(&mut [1, 2]).err().unwrap();
+        assert!(error.detail.contains("failed to transfer 2 bytes"), "{error:?}");
+    }
+
+    #[test]
+    fn an_empty_exchange_selects_the_chip_for_a_microsecond_and_moves_no_clock() {
+        let (wires, [mut spi]) = chips([("a", 0, 1)]);
+        spi.exchange(&mut []).unwrap();
+        assert_eq!(spi.chip_select.as_ref().unwrap().clock.now().since(Clock::EPOCH), 50);
+        assert!(wires.lock().unwrap().seen.is_empty());
+    }
+
+    #[test]
+    fn a_controller_without_dma_is_known_by_its_driver() {
+        let masters = tempfile::tempdir().unwrap();
+        for (bus, driver) in [(0, "spi-bcm2835"), (1, "spi-bcm2835aux")] {
+            let device = masters.path().join(format!("spi{bus}/device"));
+            fs::create_dir_all(&device).unwrap();
+            std::os::unix::fs::symlink(format!("../../bus/platform/drivers/{driver}"), device.join("driver")).unwrap();
+        }
+        let driver = |bus| driver_without_dma(masters.path(), Node { bus, select: 0 });
+        assert_eq!([0, 1, 2].map(driver), [None, Some("spi-bcm2835aux".into()), None]);
+    }
+
     #[test]
     fn a_failed_transfer_still_deselects_the_chip() {
         let node = tempfile::NamedTempFile::new().unwrap();
         let line = Arc::new(Recorder(Mutex::default()));
         let mut spi = Spi {
-            device: SpidevDevice::open(node.path()).unwrap(),
+            device: Spidev::open(node.path()).unwrap(),
             node: Node::of(0),
             mode: 0,
             rate_hz: 1000,
-            chip_select: Some(ChipSelect { line: line.clone(), active_high: false }),
-            node_mode: Arc::new(AtomicU8::new(0)),
+            chip_select: Some(ChipSelect { line: line.clone(), active_high: false, clock: clock() }),
+            controller: Arc::new(Mutex::new(Controller { modes: [(0, 0)].into(), idles_high: Some(false) })),
         };
         let error = spi.exchange(&mut [1, 2]).err().unwrap();
         assert_eq!(error.status, BusStatus::Nack);

@@ -366,9 +366,13 @@ fn lights_and_fixed_inputs() {
 }
 
 impl Bench {
+    fn chip_select(&mut self, pin: &str) -> ChipSelect {
+        ChipSelect { line: self.output(pin, true), active_high: false, clock: Arc::new(self.clock.clone()) }
+    }
+
     fn spi(&mut self, bus: &str, select_pin: Option<&str>) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         let bus = self.board.spi_buses().iter().find(|range| range.name == bus).map_or(99, |range| range.first);
-        let chip_select = select_pin.map(|pin| ChipSelect { line: self.output(pin, true), active_high: false });
+        let chip_select = select_pin.map(|pin| self.chip_select(pin));
         self.board.spi(SpiConfig { bus, mode: 3, rate_hz: 1_000_000, chip_select })
     }
 }
@@ -430,7 +434,7 @@ fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
 #[test]
 fn a_chip_that_is_spoken_to_in_another_mode_hears_nothing() {
     let mut bench = Bench::new(SimConfig::default_printer());
-    let chip_select = Some(ChipSelect { line: bench.output("z_cs", true), active_high: false });
+    let chip_select = Some(bench.chip_select("z_cs"));
     let OnWorker { mut device, .. } =
         bench.board.spi(SpiConfig { bus: 1, mode: 0, rate_hz: 1_000_000, chip_select }).unwrap();
     let mut bytes = [0; 5];

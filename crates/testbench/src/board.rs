@@ -38,8 +38,11 @@ const EXPANDER: &str = "gpiochip1";
 /// A pin's level from an instant on, in ticks.
 pub type Edge = (u64, u8);
 
-/// Up to 64 bytes, kept without an allocation.
-type Message = ([u8; 64], usize);
+/// Bytes that an SPI bus takes at once.
+pub const MESSAGE_MAX: usize = 512;
+
+/// Kept without an allocation.
+type Message = ([u8; MESSAGE_MAX], usize);
 
 /// A conversation with an SPI chip.
 #[derive(Debug, PartialEq, Eq)]
@@ -54,6 +57,8 @@ pub struct Transfer {
     pub rate_hz: u32,
     /// What the MCU sent.
     pub data: Vec<u8>,
+    /// Whether what came back was read.
+    pub read: bool,
 }
 
 /// A chip on an SPI bus: it is told the instant in ticks, and replaces the bytes that it gets by those
@@ -108,7 +113,7 @@ pub struct State {
     /// Lines that somebody holds.
     pub held: HashSet<u32>,
     /// Every SPI transfer, and when it began.
-    transfers: Vec<(u64, u32, u8, u32, Message)>,
+    transfers: Vec<(u64, u32, u8, u32, Message, bool)>,
     /// Every value of a PWM channel: pin, instant, value.
     pub pwm_values: Vec<(u32, u64, u16)>,
     /// The period of each PWM channel.
@@ -217,9 +222,9 @@ impl Bench {
 
     /// Every SPI transfer so far.
     pub fn transfers(&self) -> Vec<Transfer> {
-        let transfer = |&(at, bus, mode, rate_hz, (bytes, len)): &(u64, u32, u8, u32, Message)| {
+        let transfer = |&(at, bus, mode, rate_hz, (bytes, len), read): &(u64, u32, u8, u32, Message, bool)| {
             let data = bytes[..len].to_vec();
-            Transfer { at, bus, mode, rate_hz, data }
+            Transfer { at, bus, mode, rate_hz, data, read }
         };
         self.state().transfers.iter().map(transfer).collect()
     }
@@ -384,7 +389,7 @@ impl Board for FakeBoard {
             return Err(Shutdown::because(reason::NOT_OUTPUT, detail));
         };
         let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
-        Ok(Mosi { line, message_max: 64 })
+        Ok(Mosi { line, message_max: MESSAGE_MAX })
     }
 
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
@@ -595,19 +600,21 @@ struct FakeSpi {
     config: SpiConfig,
 }
 
-impl BusDevice for FakeSpi {
-    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+impl FakeSpi {
+    fn converse(&mut self, bytes: &mut [u8], read: bool) -> Result<(), BusError> {
         let failed = |failure: Shutdown| BusError { status: BusStatus::Nack, detail: failure.detail };
         let SpiConfig { bus, mode, rate_hz, .. } = self.config;
         self.bench.gate.pass();
         self.bench.broken(SPI_CHIPS + bus, reason::LINE_READ).map_err(failed)?;
-        if let Some(chip_select) = &self.config.chip_select {
-            chip_select.select(true).map_err(failed)?;
+        match &self.config.chip_select {
+            Some(line) if bytes.is_empty() => line.pulse().map_err(failed)?,
+            Some(line) => line.select(true).map_err(failed)?,
+            None => {}
         }
-        let mut message = ([0; 64], bytes.len());
+        let mut message = ([0; MESSAGE_MAX], bytes.len());
         message.0[..bytes.len()].copy_from_slice(bytes);
         let at = self.bench.bus_ticks(bytes.len());
-        self.bench.state().transfers.push((at, bus, mode, rate_hz, message));
+        self.bench.state().transfers.push((at, bus, mode, rate_hz, message, read));
         let chip = self.bench.state().spi_chips.remove(&bus);
         match chip {
             Some(mut chip) => {
@@ -616,10 +623,23 @@ impl BusDevice for FakeSpi {
             }
             None => bytes.iter_mut().for_each(|byte| *byte = !*byte),
         }
-        if let Some(chip_select) = &self.config.chip_select {
-            chip_select.select(false).map_err(failed)?;
+        match &self.config.chip_select {
+            Some(line) if !bytes.is_empty() => line.select(false).map_err(failed),
+            _ => Ok(()),
         }
-        Ok(())
+    }
+}
+
+impl BusDevice for FakeSpi {
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+        self.converse(bytes, true)
+    }
+
+    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
+        let mut copy = [0; MESSAGE_MAX];
+        let copy = &mut copy[..bytes.len()];
+        copy.copy_from_slice(bytes);
+        self.converse(copy, false)
     }
 }
 

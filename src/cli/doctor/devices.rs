@@ -4,6 +4,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io::Read;
 use std::path::{Path, PathBuf};
@@ -185,8 +186,7 @@ fn present(machine: &Machine, class: &Class) -> Finding {
     let Some((line, beginnings)) = class.enabled_by else {
         return Finding::ok(check, off).or("if there is one, load its driver (a device tree overlay, as a rule)");
     };
-    let config = is_pi(machine).then(|| machine.first(&["/boot/firmware/config.txt", "/boot/config.txt"])).flatten();
-    let Some(config) = config else {
+    let Some(config) = is_pi(machine).then(|| pi_config(machine)).flatten() else {
         return Finding::ok(check, off).or("if it is wanted, enable it in the device tree, and reboot");
     };
     let text = machine.text(config).unwrap_or_default();
@@ -207,8 +207,95 @@ fn present(machine: &Machine, class: &Class) -> Finding {
     }
 }
 
+fn model(machine: &Machine) -> String {
+    machine.text("/proc/device-tree/model").unwrap_or_default()
+}
+
 fn is_pi(machine: &Machine) -> bool {
-    machine.text("/proc/device-tree/model").is_some_and(|model| model.contains("Raspberry Pi"))
+    model(machine).contains("Raspberry Pi")
+}
+
+/// A Raspberry Pi's config.txt.
+fn pi_config(machine: &Machine) -> Option<&'static str> {
+    machine.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
+}
+
+/// How the VPU's clock of some Raspberry Pis is held, which SPI's is made of.
+struct Vpu {
+    models: &'static [&'static str],
+    /// How the sections of config.txt begin that are for these models alone.
+    sections: &'static [&'static str],
+    core_freq: u32,
+    /// What `core_freq_min` is where nothing is said.
+    slowest: u32,
+    lines: &'static str,
+}
+
+const VPUS: [Vpu; 3] = [
+    Vpu {
+        models: &["Pi 4", "Module 4"],
+        sections: &["pi4", "cm4"],
+        core_freq: 500,
+        slowest: 200,
+        lines: "core_freq=500\\ncore_freq_min=500",
+    },
+    Vpu {
+        models: &["Pi 3", "Module 3"],
+        sections: &["pi3", "cm3"],
+        core_freq: 400,
+        slowest: 250,
+        lines: "core_freq=250",
+    },
+    Vpu { models: &["Pi Zero"], sections: &["pi0"], core_freq: 400, slowest: 250, lines: "core_freq=250" },
+];
+
+impl Vpu {
+    /// Whether config.txt keeps the clock from changing. Sections whose condition is not the model count.
+    fn is_held(&self, config: &str) -> bool {
+        let (mut core_freq, mut slowest, mut is_forced, mut applies) = (self.core_freq, self.slowest, false, true);
+        for line in config.lines().map(str::trim) {
+            if let Some(section) = line.strip_prefix('[').and_then(|line| line.strip_suffix(']')) {
+                let is_model = ["pi", "cm"].iter().any(|model| section.starts_with(model));
+                let is_own = self.sections.iter().any(|own| section.starts_with(own));
+                applies = section != "none" && (!is_model || is_own);
+            }
+            let Some((key, value)) = line.split_once('=').filter(|_| applies) else { continue };
+            let Ok(value) = value.trim().parse() else { continue };
+            match key.trim() {
+                "core_freq" => core_freq = value,
+                "core_freq_min" => slowest = value,
+                "force_turbo" => is_forced = value == 1,
+                _ => {}
+            }
+        }
+        is_forced || slowest >= core_freq
+    }
+}
+
+/// Whether the SPI clock of a Raspberry Pi is one that LEDs on these pins can be driven by.
+pub(super) fn leds(machine: &Machine, pins: &BTreeSet<&str>) -> Vec<Finding> {
+    const CHECK: &str = "leds";
+    let model = model(machine);
+    let of = |vpu: &&Vpu| vpu.models.iter().any(|name| model.contains(name));
+    let Some(vpu) = VPUS.iter().find(of).filter(|_| is_pi(machine)) else { return Vec::new() };
+    let Some(first) = pins.first() else { return Vec::new() };
+    let text = pi_config(machine).and_then(|config| Some((config, machine.text(config)?)));
+    let Some((config, text)) = text else { return Vec::new() };
+    let lines = vpu.lines;
+    let clock = match vpu.is_held(&text) {
+        true => Finding::ok(CHECK, format!("LEDs: {config} holds the clock of SPI")),
+        false => Finding::warning(
+            CHECK,
+            format!("LEDs: nothing in {config} holds the clock of SPI, so at times all LEDs of {first} may be white"),
+            format!("printf '[all]\\n{lines}\\n' | sudo tee -a {config}, and reboot"),
+        ),
+    };
+    let without_dma = pins.iter().find(|pin| ["spidev1.", "spidev2."].iter().any(|bus| pin.contains(bus)));
+    let bus = without_dma.map(|pin| {
+        let found = format!("LEDs: the SPI bus of {pin} has no DMA and pauses amid a frame");
+        Finding::warning(CHECK, found, "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0")
+    });
+    [Some(clock), bus].into_iter().flatten().collect()
 }
 
 /// Who holds GPIO lines.
@@ -398,6 +485,58 @@ mod tests {
         let findings = presence(&tree.machine());
         assert!(findings.iter().all(|finding| finding.status == Fine && finding.remedy.is_none()), "{findings:?}");
         told(&findings, "i2c", Fine, "I2C: /dev/i2c-1");
+    }
+
+    #[test]
+    fn leds_on_a_pi_need_a_clock_that_is_held() {
+        let judged = |model: &str, config: &str, pin: &str| {
+            let tree = Tree::new();
+            tree.put("proc/device-tree/model", model);
+            tree.put("boot/firmware/config.txt", config);
+            leds(&tree.machine(), &[pin].into())
+        };
+        for (model, held, loose, remedy) in [
+            (
+                "Raspberry Pi 4 Model B Rev 1.4\0",
+                &["core_freq=500\ncore_freq_min=500\n", "[pi4]\ncore_freq_min = 500\n", "force_turbo=1\n"][..],
+                &["", "core_freq=500\n", "[pi3]\ncore_freq_min=500\n", "#core_freq_min=500\n", "[none]\nforce_turbo=1"]
+                    [..],
+                "core_freq=500\\ncore_freq_min=500",
+            ),
+            (
+                "Raspberry Pi 3 Model B Plus Rev 1.3\0",
+                &["core_freq=250\n", "[pi3+]\ncore_freq=250\n", "[pi4]\n[all]\ncore_freq=250"][..],
+                &["", "core_freq=400\n", "[pi4]\ncore_freq=250\n"][..],
+                "core_freq=250",
+            ),
+            ("Raspberry Pi Zero 2 W Rev 1.0\0", &["core_freq=250\n"][..], &[""][..], "core_freq=250"),
+        ] {
+            for config in held {
+                told(
+                    &judged(model, config, "host:spidev0.0"),
+                    "leds",
+                    Fine,
+                    "/boot/firmware/config.txt holds the clock",
+                );
+            }
+            for config in loose {
+                let findings = judged(model, config, "host:spidev0.0");
+                assert!(
+                    told(&findings, "leds", Warning, "of host:spidev0.0 may be white").contains(remedy),
+                    "{config}"
+                );
+                assert_eq!(findings.len(), 1);
+            }
+        }
+        let findings = judged("Raspberry Pi 4", "force_turbo=1", "host:spidev1.0");
+        assert!(told(&findings, "leds", Warning, "of host:spidev1.0 has no DMA").contains("SPI0"));
+        assert!(judged("Raspberry Pi 5 Model B", "", "host:spidev0.0").is_empty(), "its SPI has a clock of its own");
+        assert!(judged("Raspberry Pi 2", "", "host:spidev0.0").is_empty(), "its VPU has one clock");
+        assert!(judged("Pine64", "", "host:spidev0.0").is_empty());
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", "Raspberry Pi 4");
+        tree.put("boot/config.txt", "");
+        assert!(leds(&tree.machine(), &BTreeSet::new()).is_empty(), "there are no LEDs");
     }
 
     #[test]

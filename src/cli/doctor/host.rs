@@ -17,7 +17,7 @@ use pinion_firmware::mcu::DialectName;
 
 use super::instance::{HOST_PATHS, Instance, is_host_path, unit_for};
 use super::machine::{Access, Machine, Who};
-use super::printer;
+use super::printer::{self, Printer};
 use super::units::{self, setting};
 
 /// A klippy, running or set up.
@@ -25,8 +25,8 @@ pub(super) struct Klippy {
     who: Who,
     /// klippy's folder, that of klippy.py.
     folder: Option<PathBuf>,
-    /// The terminals that its configuration names; none if that can not be read.
-    opens: Option<BTreeSet<PathBuf>>,
+    /// What its configuration says; none if that can not be read.
+    printer: Option<Printer>,
     /// How it was found.
     found_by: String,
     /// The unit that starts it, without `.service`.
@@ -38,7 +38,7 @@ pub(super) struct Klippy {
 impl Klippy {
     /// Whether it opens this link, as far as is known.
     fn opens(&self, link: &Path) -> bool {
-        self.opens.as_ref().is_none_or(|opens| opens.contains(link))
+        self.printer.as_ref().is_none_or(|printer| printer.serials.contains(link))
     }
 
     fn restart(&self) -> String {
@@ -65,7 +65,7 @@ fn running(machine: &Machine, process: &Process) -> Option<Klippy> {
     Some(Klippy {
         who: machine.user_of(process.pid)?,
         folder: process.klippy_folder(&proc).map(|folder| reachable(machine, folder)),
-        opens: config.and_then(|config| printer::serials(machine, &config)),
+        printer: config.and_then(|config| printer::read(machine, &config)),
         found_by: format!("process {}", process.pid),
         unit: machine.unit_of(process.pid),
         is_running: true,
@@ -86,7 +86,7 @@ fn set_up(machine: &Machine, unit: &str) -> Option<Klippy> {
     Some(Klippy {
         who,
         folder: Some(machine.path(folder)),
-        opens: process::klippy_config(&arguments).and_then(|config| printer::serials(machine, config)),
+        printer: process::klippy_config(&arguments).and_then(|config| printer::read(machine, config)),
         found_by: format!("{unit}.service"),
         unit: Some(unit.to_owned()),
         is_running: false,
@@ -107,6 +107,15 @@ fn arguments(machine: &Machine, unit: &str) -> Option<Vec<PathBuf>> {
         let words: Vec<PathBuf> = words.map(PathBuf::from).collect();
         process::klippy(&words).is_some().then_some(words)
     })
+}
+
+fn printers(klippys: &[Klippy]) -> impl Iterator<Item = &Printer> {
+    klippys.iter().filter_map(|klippy| klippy.printer.as_ref())
+}
+
+/// The pins of LEDs on SPI buses that their configurations name.
+pub(super) fn leds(klippys: &[Klippy]) -> BTreeSet<&str> {
+    printers(klippys).flat_map(|printer| &printer.leds).map(String::as_str).collect()
 }
 
 const CHECK: &str = "terminal";
@@ -131,7 +140,7 @@ pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Kl
         links.push(link);
         findings.extend(terminal(machine, link, Some(instance), klippys));
     }
-    let named = klippys.iter().filter_map(|klippy| klippy.opens.as_ref()).flatten().map(PathBuf::as_path);
+    let named = printers(klippys).flat_map(|printer| &printer.serials).map(PathBuf::as_path);
     let others: BTreeSet<&Path> = named.filter(|path| !links.contains(path)).collect();
     for path in others {
         if is_host_path(path) {
@@ -207,7 +216,7 @@ fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys
             access(machine, &terminal, instance, klippy)
         })
         .collect();
-    let sure: Vec<&Klippy> = opening.into_iter().filter(|klippy| klippy.opens.is_some()).collect();
+    let sure: Vec<&Klippy> = opening.into_iter().filter(|klippy| klippy.printer.is_some()).collect();
     if sure.len() > 1 {
         let found = format!("more than one klippy's configuration names {shown}{}, and one can have it", by(&sure));
         let remedy = "another serial for one of them: an instance of its own (man pinion-mcu.service)";
@@ -450,10 +459,11 @@ mod tests {
             "KLIPPER_ARGS=\"/home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg -l /home/pi/k.log\"\n",
         );
         let found = klippys(&tree.machine()).remove(0);
-        assert_eq!((found.who.uid, found.found_by.as_str(), found.opens), (PI, "klipper.service", None));
+        assert_eq!((found.who.uid, found.found_by.as_str(), &found.printer), (PI, "klipper.service", &None));
         assert_eq!(found.folder.unwrap(), tree.machine().path("/home/pi/klipper/klippy"));
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
-        assert_eq!(klippys(&tree.machine())[0].opens, Some([PathBuf::from("/tmp/klipper_host_mcu")].into()));
+        let printer = klippys(&tree.machine()).remove(0).printer;
+        assert_eq!(printer.unwrap().serials, [PathBuf::from("/tmp/klipper_host_mcu")].into());
         // What is enabled counts, and one that runs is not counted twice.
         tree.put(
             "etc/systemd/system/klipper-2.service",

@@ -15,6 +15,8 @@ use super::units::{self, setting};
 
 /// The unit of the instance that there is as a rule.
 const UNIT: &str = "pinion-mcu";
+/// The configuration as the package delivers it.
+const DELIVERED: &str = "/usr/share/pinion-mcu/pinion.toml";
 /// How klippy knows a pseudo terminal by its path (klippy/mcu.py).
 pub(super) const HOST_PATHS: &str = "/tmp/klipper_host_";
 
@@ -216,10 +218,10 @@ fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, fin
         }
     } else if units::is_installed(machine, unit) {
         let remedy = match config_name {
-            SYSTEM_FILE => {
-                "sudo apt install --reinstall -o Dpkg::Options::=--force-confmiss pinion-mcu, or sudo make install"
-                    .into()
+            SYSTEM_FILE if machine.path(DELIVERED).exists() => {
+                format!("sudo install -D -m 644 {DELIVERED} {SYSTEM_FILE}, then {restart}")
             }
+            SYSTEM_FILE => "sudo make install".into(),
             name => format!("sudo cp {SYSTEM_FILE} {name}, then {restart}"),
         };
         findings.push(Finding::error(

@@ -232,11 +232,7 @@ impl Machine {
     /// does not reach, or by another service's program, as by cron.
     pub(super) fn unit_of(&self, pid: u32) -> Option<String> {
         let groups = self.text(format!("/proc/{pid}/cgroup"))?;
-        let is_user = |name: &str| name.starts_with("user@") || name.starts_with("user-");
-        if groups.split(['/', '\n']).any(is_user) {
-            return None;
-        }
-        let unit = groups.lines().find_map(|line| line.rsplit('/').next()?.strip_suffix(".service"))?;
+        let unit = process::unit(&groups)?;
         // A unit that the folders of units do not have, as that of a template, is taken at its name.
         let text = units::text(self, unit).unwrap_or_default();
         let starts_it = setting(&text, "ExecStart").is_none_or(|command| {

@@ -83,7 +83,10 @@ fn examine(machine: &Machine) -> Vec<Group> {
         Group::new("watchdog", service::watchdog(machine, &instances)),
         Group::new("terminal", host::terminals(machine, &instances, &klippys)),
         Group::new("host", host::dialects(machine, &instances, &klippys)),
-        Group::new("pins and buses", devices::presence(machine)),
+        Group::new(
+            "pins and buses",
+            [devices::presence(machine), devices::leds(machine, &host::leds(&klippys))].concat(),
+        ),
         Group::new(
             "permissions",
             match machine.service_user() {

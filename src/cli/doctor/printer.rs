@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What klippy's configuration says of micro-controllers, as far as pseudo terminals go.
+//! What klippy's configuration says of pseudo terminals, and of LEDs on SPI buses.
 
 #![forbid(unsafe_code)]
 
@@ -11,18 +11,32 @@ use super::machine::Machine;
 /// No configuration has as many files.
 const FILES_MAX: usize = 500;
 
-/// The `serial` of each `[mcu]` section of a configuration, with the files that it includes. None if one of them
-/// can not be read. As in klippy/configfile.py the last word on a section counts.
-pub(super) fn serials(machine: &Machine, config: &Path) -> Option<BTreeSet<PathBuf>> {
-    let mut reader = Reader { machine, serials: BTreeMap::new(), files: 0 };
+/// What counts of a configuration.
+#[derive(Debug, PartialEq)]
+pub(super) struct Printer {
+    /// The `serial` of each `[mcu]` section.
+    pub(super) serials: BTreeSet<PathBuf>,
+    /// The `pin` of each `[neopixel]` section that names an SPI device, such as `host:spidev0.0`.
+    pub(super) leds: BTreeSet<String>,
+}
+
+/// Reads a configuration, with the files that it includes. None if one of them can not be read. As in
+/// klippy/configfile.py the last word on a section counts.
+pub(super) fn read(machine: &Machine, config: &Path) -> Option<Printer> {
+    let mut reader = Reader { machine, serials: BTreeMap::new(), led_pins: BTreeMap::new(), files: 0 };
     reader.file(config, &mut Vec::new())?;
-    Some(reader.serials.into_values().collect())
+    let is_spi = |pin: &String| pin.rsplit(':').next().is_some_and(|name| name.trim().starts_with("spidev"));
+    Some(Printer {
+        serials: reader.serials.into_values().collect(),
+        leds: reader.led_pins.into_values().filter(is_spi).collect(),
+    })
 }
 
 struct Reader<'a> {
     machine: &'a Machine,
     /// By the section's name.
     serials: BTreeMap<String, PathBuf>,
+    led_pins: BTreeMap<String, String>,
     files: usize,
 }
 
@@ -51,8 +65,11 @@ impl Reader<'_> {
                 continue;
             }
             let Some((key, value)) = line.split_once([':', '=']) else { continue };
-            if key.trim_end() == "serial" && (section == "mcu" || section.starts_with("mcu ")) {
-                self.serials.insert(section.clone(), value.trim().into());
+            let value = value.trim();
+            match (section.split(' ').next(), key.trim_end()) {
+                (Some("mcu"), "serial") => drop(self.serials.insert(section.clone(), value.into())),
+                (Some("neopixel"), "pin") => drop(self.led_pins.insert(section.clone(), value.into())),
+                _ => {}
             }
         }
         within.pop();
@@ -122,27 +139,43 @@ mod tests {
     use super::super::tests::Tree;
     use super::*;
 
-    fn read(tree: &Tree) -> Option<Vec<String>> {
-        let serials = serials(&tree.machine(), Path::new("/home/pi/config/printer.cfg"))?;
-        Some(serials.iter().map(|path| path.display().to_string()).collect())
+    const CONFIG: &str = "/home/pi/config/printer.cfg";
+
+    fn serials(tree: &Tree) -> Option<Vec<String>> {
+        let printer = read(&tree.machine(), Path::new(CONFIG))?;
+        Some(printer.serials.iter().map(|path| path.display().to_string()).collect())
+    }
+
+    #[test]
+    fn leds_on_spi_buses() {
+        let tree = Tree::new();
+        let leds = |text: &str| {
+            tree.put("home/pi/config/printer.cfg", text);
+            read(&tree.machine(), Path::new(CONFIG)).unwrap().leds.into_iter().collect::<Vec<_>>()
+        };
+        let strip =
+            "[neopixel strip]\npin: host:spidev0.0 # MOSI\n[neopixel other]\npin: PA1\n[dotstar x]\npin: spidev1.0\n";
+        assert_eq!(leds(strip), ["host:spidev0.0"]);
+        assert_eq!(leds(&format!("{strip}[neopixel strip]\npin = host: spidev0.1\n")), ["host: spidev0.1"]);
+        assert!(leds("[mcu host]\npin: spidev0.0\n#[neopixel a]\n#pin: spidev0.0\n").is_empty());
     }
 
     #[test]
     fn each_micro_controller_s_serial_counts_as_it_was_said_last() {
         let tree = Tree::new();
-        assert_eq!(read(&tree), None);
+        assert_eq!(serials(&tree), None);
         tree.put("home/pi/config/printer.cfg", "[printer]\nserial: /no\n[mcu]\nserial: /dev/serial/by-id/x # a board\n#[mcu no]\n#serial: /no\n; [mcu no]\n;serial: /no\n[mcu host]\nserial=/tmp/klipper_host_mcu ; the Pi\n[mcu odd]\nserial: /tmp/a;b\n[include parts/*.cfg]\n[mcu last]\nrestart_method: command\n");
-        assert_eq!(read(&tree).unwrap(), ["/dev/serial/by-id/x", "/tmp/a;b", "/tmp/klipper_host_mcu"]);
+        assert_eq!(serials(&tree).unwrap(), ["/dev/serial/by-id/x", "/tmp/a;b", "/tmp/klipper_host_mcu"]);
         tree.put("home/pi/config/parts/b.cfg", "[mcu host]\nserial: /tmp/klipper_host_b\n");
         tree.put("home/pi/config/parts/a.cfg", "[mcu host]\nserial: /tmp/klipper_host_a\n[include ../up.cfg]\n");
         tree.put("home/pi/config/parts/.hidden.cfg", "[mcu hidden]\nserial: /no\n");
         tree.put("home/pi/config/up.cfg", "[mcu]\nserial: /tmp/klipper_host_up\n");
-        assert_eq!(read(&tree).unwrap(), ["/tmp/a;b", "/tmp/klipper_host_b", "/tmp/klipper_host_up"]);
+        assert_eq!(serials(&tree).unwrap(), ["/tmp/a;b", "/tmp/klipper_host_b", "/tmp/klipper_host_up"]);
         // A link by the path that the machine itself has for it.
         tree.link("home/pi/config/parts/c.cfg", "/usr/share/c.cfg");
-        assert_eq!(read(&tree), None, "it leads nowhere");
+        assert_eq!(serials(&tree), None, "it leads nowhere");
         tree.put("usr/share/c.cfg", "[mcu c]\nserial: /tmp/klipper_host_c\n");
-        assert_eq!(read(&tree).unwrap().len(), 4);
+        assert_eq!(serials(&tree).unwrap().len(), 4);
     }
 
     #[test]
@@ -150,7 +183,7 @@ mod tests {
         let tree = Tree::new();
         tree.put("home/pi/config/printer.cfg", "[include a.cfg]\n");
         tree.put("home/pi/config/a.cfg", "[include *.cfg]\n");
-        assert_eq!(read(&tree), None);
+        assert_eq!(serials(&tree), None);
     }
 
     #[test]

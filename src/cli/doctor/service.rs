@@ -17,7 +17,7 @@ pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding
     let of_each = instances
         .iter()
         .flat_map(|instance| [Some(state(machine, instance)), real_time(machine, instance)].into_iter().flatten());
-    of_each.chain(c_program(machine)).collect()
+    of_each.chain(c_program(machine, instances)).collect()
 }
 
 /// Whether an instance runs, and is started at boot.
@@ -78,9 +78,12 @@ fn real_time(machine: &Machine, instance: &Instance) -> Option<Finding> {
 }
 
 /// Klipper's own program, which wants the same link and the same pins.
-fn c_program(machine: &Machine) -> Vec<Finding> {
+fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "klipper_mcu";
     const STOP: &str = "sudo systemctl disable --now klipper-mcu";
+    const SCRIPT: &str = "/etc/init.d/klipper_mcu";
+    // scripts/flash-linux.sh of Klipper starts what it finds, enabled or not.
+    const STARTED_BY_FLASH: &str = "Klipper's make flash starts it, which stops Pinion, while printing, too";
     let mut findings = Vec::new();
     let is_it = |name: &std::ffi::OsStr| name == "klipper_mcu";
     let process = machine
@@ -91,15 +94,33 @@ fn c_program(machine: &Machine) -> Vec<Finding> {
         let found = format!("Klipper's own klipper_mcu runs (process {}): it has the link and the pins", process.pid);
         findings.push(Finding::error(CHECK, found, STOP));
     }
+    let is_enabled = |unit: &str| instances.iter().any(|instance| instance.unit.as_deref() == Some(unit));
+    let is_pinion_enabled = !units::enabled(machine, is_enabled).is_empty();
     if let Some(unit) = units::enabled(machine, |unit| is_klipper_s(machine, unit)).first() {
         let found = format!("{unit}.service is enabled: at boot it is started beside Pinion, and stops it");
         findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {unit}.service")));
+    } else if is_pinion_enabled
+        && let Some((unit, file)) = units::all(machine).into_iter().find_map(|unit| {
+            let file = units::file(machine, &unit).filter(|_| is_klipper_s(machine, &unit))?;
+            Some((unit, file))
+        })
+    {
+        // A link to /dev/null, as `systemctl mask` makes it, would be in the place of one in that folder.
+        let remedy = match file.starts_with(units::ADMINISTRATOR_S) {
+            true => format!("sudo mv {file} {file}.before-pinion && sudo systemctl daemon-reload"),
+            false => format!("sudo systemctl mask {unit}"),
+        };
+        findings.push(Finding::warning(CHECK, format!("{file} is still there: {STARTED_BY_FLASH}"), remedy));
     }
     // A script of System V's, as Klipper's documentation had it once.
     let script = machine.names("/etc").into_iter().filter(|name| name.starts_with("rc")).find_map(|folder| {
         let names = machine.names(format!("/etc/{folder}")).into_iter();
         names.into_iter().find(|name| name.starts_with('S') && name.ends_with("klipper_mcu"))
     });
+    if script.is_none() && is_pinion_enabled && machine.path(SCRIPT).exists() {
+        let found = format!("{SCRIPT} is still there: {STARTED_BY_FLASH}");
+        findings.push(Finding::warning(CHECK, found, format!("sudo mv {SCRIPT} /etc/klipper_mcu.before-pinion")));
+    }
     if script.is_some() {
         let found = "/etc/init.d/klipper_mcu starts Klipper's own program at boot";
         findings.push(Finding::error(CHECK, found, "sudo update-rc.d -f klipper_mcu remove"));
@@ -227,6 +248,28 @@ mod tests {
         let tree = Tree::new();
         tree.link("etc/rc2.d/S01klipper_mcu", "../init.d/klipper_mcu");
         told(&found(&tree), "klipper_mcu", Error, "/etc/init.d/klipper_mcu");
+    }
+
+    #[test]
+    fn a_unit_that_make_flash_would_start_is_in_the_way_though_it_is_not_enabled() {
+        const UNIT: &str = "etc/systemd/system/klipper-mcu.service";
+        let tree = Tree::new();
+        tree.put(UNIT, "[Service]\nExecStart=/usr/local/bin/klipper_mcu -r\n");
+        told(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
+        tree.put("lib/systemd/system/pinion-mcu.service", "");
+        tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "x");
+        assert_eq!(
+            told(&found(&tree), "klipper_mcu", Warning, &format!("/{UNIT} is still there")),
+            format!("sudo mv /{UNIT} /{UNIT}.before-pinion && sudo systemctl daemon-reload")
+        );
+        fs::remove_file(tree.machine().path(UNIT)).unwrap();
+        tree.put("lib/systemd/system/klipper-mcu.service", "");
+        let remedy = told(&found(&tree), "klipper_mcu", Warning, "/lib/systemd/system/klipper-mcu.service is still");
+        assert_eq!(remedy, "sudo systemctl mask klipper-mcu");
+        tree.link(UNIT, "/dev/null");
+        told(&found(&tree), "klipper_mcu", Ok, "neither runs nor is enabled");
+        tree.put("etc/init.d/klipper_mcu", "");
+        told(&found(&tree), "klipper_mcu", Warning, "/etc/init.d/klipper_mcu is still there");
     }
 
     #[test]

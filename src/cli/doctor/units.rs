@@ -11,23 +11,27 @@ use super::machine::Machine;
 
 /// Where units stand, those of the administrator first (systemd.unit(5)).
 const FOLDERS: [&str; 4] =
-    ["/etc/systemd/system", "/usr/local/lib/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"];
+    [ADMINISTRATOR_S, "/usr/local/lib/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"];
+pub(super) const ADMINISTRATOR_S: &str = "/etc/systemd/system";
 const ENDING: &str = ".service";
 
 /// Whether a unit is installed and not masked; an instance of a template if that is.
 pub(super) fn is_installed(machine: &Machine, unit: &str) -> bool {
     let template = unit.split_once('@').map(|(name, _)| format!("{name}@"));
-    let is_there = |unit: &str| {
-        let mut paths = FOLDERS.iter().map(|folder| machine.path(folder).join(unit.to_owned() + ENDING));
-        let first = paths.find(|path| fs::symlink_metadata(path).is_ok());
-        first.is_some_and(|path| fs::read_link(path).map_or(true, |target| target != Path::new("/dev/null")))
-    };
-    is_there(unit) || template.is_some_and(|template| is_there(&template))
+    file(machine, unit).or_else(|| file(machine, &template?)).is_some()
+}
+
+/// The file of a unit that is not masked.
+pub(super) fn file(machine: &Machine, unit: &str) -> Option<String> {
+    let mut files = FOLDERS.iter().map(|folder| format!("{folder}/{unit}{ENDING}"));
+    let file = files.find(|file| fs::symlink_metadata(machine.path(file)).is_ok())?;
+    let is_masked = fs::read_link(machine.path(&file)).is_ok_and(|target| target == Path::new("/dev/null"));
+    (!is_masked).then_some(file)
 }
 
 /// The units that are started at boot, as some target wants them, in order; of these the ones that are `wanted`.
 pub(super) fn enabled(machine: &Machine, wanted: impl Fn(&str) -> bool) -> Vec<String> {
-    const FOLDER: &str = FOLDERS[0];
+    const FOLDER: &str = ADMINISTRATOR_S;
     let folders = machine.names(FOLDER).into_iter();
     let folders = folders.filter(|folder| [".wants", ".requires"].iter().any(|kind| folder.ends_with(kind)));
     let names = folders.flat_map(|folder| machine.names(format!("{FOLDER}/{folder}")));

@@ -45,7 +45,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::sys::socket::{
     AddressFamily, ControlMessage, MsgFlags, SockFlag, SockType, recv, send, sendmsg, setsockopt, socketpair, sockopt,
 };
-use nix::sys::time::TimeVal;
+use nix::sys::time::{TimeVal, TimeValLike as _};
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::{Pid, getpid};
 
@@ -90,7 +90,7 @@ impl Guardian {
     fn try_start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
         let pulse = Pulse::new(clock)?;
         let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
-        setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::new(ANSWER_S, 0))?;
+        setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(ANSWER_S))?;
         let program = Program::new(getpid());
         let ours = socket.as_raw_fd();
         let pid = sys::fork(THREADS_MAX, move || {
@@ -310,7 +310,7 @@ mod tests {
         env_logger::Builder::new().filter_level(log::LevelFilter::Info).init();
         if script == "cramped" {
             // Less than the stack of one more thread.
-            let pages: u64 =
+            let pages: nix::sys::resource::rlim_t =
                 fs::read_to_string("/proc/self/statm").unwrap().split(' ').next().unwrap().parse().unwrap();
             let limit = pages * 4096 + (1 << 20);
             setrlimit(Resource::RLIMIT_AS, limit, limit).unwrap();

@@ -6,6 +6,9 @@
  * In /sys/devices/platform/mock-spi:
  *   sent      one line per transfer: "csN MODE HZ BYTE...", in hexadecimal bytes
  *   replies   hexadecimal digits that the next transfers read before the loop
+ *   clock     one line for each time the idle clock moved: "NANOSECONDS LEVEL",
+ *             which it does as spi-bcm2835's, when a message begins
+ *   half_duplex   1 for a controller with one data line
  *   fail, delay_ms   see mock_bus.h
  */
 #include <linux/module.h>
@@ -19,11 +22,31 @@
 
 struct mock_spi {
 	struct mock_bus bus;
+	struct spi_controller *controller;
 	u8 replies[PAGE_SIZE / 2];
 	size_t reply_count, reply_next;
+	bool clock;
+	char clocked[PAGE_SIZE / 4];
+	size_t clocked_len;
 };
 
 static struct platform_device *mock_spi_device;
+
+static int mock_spi_prepare_message(struct spi_controller *controller,
+				    struct spi_message *message)
+{
+	struct mock_spi *mock = spi_controller_get_devdata(controller);
+	bool idle = message->spi->mode & SPI_CPOL;
+
+	mutex_lock(&mock->bus.lock);
+	if (mock->clock != idle)
+		mock->clocked_len += scnprintf(mock->clocked + mock->clocked_len,
+					       sizeof(mock->clocked) - mock->clocked_len,
+					       "%llu %d\n", ktime_get_ns(), idle);
+	mock->clock = idle;
+	mutex_unlock(&mock->bus.lock);
+	return 0;
+}
 
 static int mock_spi_transfer_one(struct spi_controller *controller,
 				 struct spi_device *spi,
@@ -70,8 +93,52 @@ static ssize_t replies_store(struct device *dev, struct device_attribute *attr,
 }
 static DEVICE_ATTR_WO(replies);
 
+static ssize_t clock_show(struct device *dev, struct device_attribute *attr,
+			  char *buf)
+{
+	struct mock_spi *mock = dev_get_drvdata(dev);
+	ssize_t len;
+
+	mutex_lock(&mock->bus.lock);
+	len = mock->clocked_len;
+	memcpy(buf, mock->clocked, len);
+	mutex_unlock(&mock->bus.lock);
+	return len;
+}
+
+/* Any write clears the record. */
+static ssize_t clock_store(struct device *dev, struct device_attribute *attr,
+			   const char *buf, size_t len)
+{
+	struct mock_spi *mock = dev_get_drvdata(dev);
+
+	mutex_lock(&mock->bus.lock);
+	mock->clocked_len = 0;
+	mutex_unlock(&mock->bus.lock);
+	return len;
+}
+static DEVICE_ATTR_RW(clock);
+
+static ssize_t half_duplex_store(struct device *dev, struct device_attribute *attr,
+				 const char *buf, size_t len)
+{
+	struct mock_spi *mock = dev_get_drvdata(dev);
+	bool half_duplex;
+	int err = kstrtobool(buf, &half_duplex);
+
+	if (err)
+		return err;
+	if (half_duplex)
+		mock->controller->flags |= SPI_CONTROLLER_HALF_DUPLEX;
+	else
+		mock->controller->flags &= ~SPI_CONTROLLER_HALF_DUPLEX;
+	return len;
+}
+static DEVICE_ATTR_WO(half_duplex);
+
 static struct attribute *mock_spi_attrs[] = {
-	MOCK_BUS_ATTRS, &dev_attr_replies.attr, NULL
+	MOCK_BUS_ATTRS, &dev_attr_replies.attr, &dev_attr_clock.attr,
+	&dev_attr_half_duplex.attr, NULL
 };
 ATTRIBUTE_GROUPS(mock_spi);
 
@@ -85,6 +152,7 @@ static int mock_spi_probe(struct platform_device *pdev)
 	if (!controller)
 		return -ENOMEM;
 	mock = spi_controller_get_devdata(controller);
+	mock->controller = controller;
 	mutex_init(&mock->bus.lock);
 	platform_set_drvdata(pdev, mock);
 
@@ -92,6 +160,7 @@ static int mock_spi_probe(struct platform_device *pdev)
 	controller->num_chipselect = CHIP_SELECTS;
 	controller->mode_bits = SPI_CPOL | SPI_CPHA | SPI_CS_HIGH | SPI_LSB_FIRST |
 				SPI_3WIRE | SPI_LOOP | SPI_NO_CS;
+	controller->prepare_message = mock_spi_prepare_message;
 	controller->transfer_one = mock_spi_transfer_one;
 	err = devm_spi_register_controller(&pdev->dev, controller);
 	if (err)

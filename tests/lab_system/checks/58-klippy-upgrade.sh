@@ -4,7 +4,7 @@ klippy_is_ready
 gcode 'M140 S60'
 until_true 10 is_high 3
 before=$(pid)
-apt-get install -y -o Dpkg::Options::=--force-confdef /share/later.deb
+apt-get install -y /share/later.deb
 is "$(pid)" "$before" "the process"
 is "$(state)" ready "klippy"
 is_high 3
@@ -14,5 +14,5 @@ systemctl restart pinion-mcu
 firmware_restart
 systemctl stop klipper
 # What comes after this has the package of before.
-apt-get install -y --allow-downgrades -o Dpkg::Options::=--force-confdef /share/pinion-mcu.deb
+apt-get install -y --allow-downgrades /share/pinion-mcu.deb
 systemctl restart pinion-mcu

@@ -1,13 +1,17 @@
-# An upgrade leaves the print that runs, and what was edited; a restart then runs the new unit.
+# An upgrade leaves the print that runs, and what was edited; nobody has to answer it. A restart then runs the new unit.
+export DEBIAN_FRONTEND=noninteractive
+CONFIG=/etc/pinion/pinion.toml
 light
 before=$(pid)
-echo '# edited' >>/etc/default/pinion-mcu
-apt-get install -y -o Dpkg::Options::=--force-confdef /share/later.deb 2>&1 | tee /run/apt
+echo 'PINION_OPTIONS="--log-level debug"' >/etc/default/pinion-mcu
+apt-get install -y /share/later.deb </dev/null 2>&1 | tee /run/apt
 grep -q 'Pinion still runs as it was' /run/apt
 is "$(pid)" "$before" "the process"
 is_high 3
 is "$(systemctl show -P NeedDaemonReload pinion-mcu)" no NeedDaemonReload
-grep -q '^# edited' /etc/default/pinion-mcu
+grep -q 'log-level debug' /etc/default/pinion-mcu
+# It was as the package before delivered it.
+grep -q '^# of the later package' $CONFIG
 # It is still refreshed, by the same host.
 sleep 4
 is_high 3
@@ -15,3 +19,37 @@ dark
 systemctl restart pinion-mcu
 is "$(systemctl show -P Description pinion-mcu)" 'The later unit' "the unit"
 identifies
+rm /etc/default/pinion-mcu
+
+# One that was edited stays; one that is missing is there again.
+echo '# edited' >>$CONFIG
+apt-get install -y --allow-downgrades /share/pinion-mcu.deb </dev/null
+grep -q '^# edited' $CONFIG
+rm $CONFIG
+apt-get install -y /share/later.deb </dev/null
+cmp $CONFIG /usr/share/pinion-mcu/pinion.toml
+
+# A package of before, which had them as conffiles: what was edited stays, and nobody is asked.
+dpkg-deb -R /share/pinion-mcu.deb /run/before
+sed -i 's/^Version: /&0~/' /run/before/DEBIAN/control
+rm /run/before/DEBIAN/postinst /run/before/DEBIAN/postrm
+install -D /run/before/usr/share/pinion-mcu/pinion.toml /run/before/$CONFIG
+install -D /dev/null /run/before/etc/default/pinion-mcu
+printf '%s\n' $CONFIG /etc/default/pinion-mcu >/run/before/DEBIAN/conffiles
+dpkg-deb --root-owner-group -Znone -b /run/before /run/before.deb
+apt-get purge -y pinion-mcu </dev/null
+apt-get install -y /run/before.deb </dev/null
+echo 'log_level = "debug"' >>$CONFIG
+echo 'PINION_OPTIONS="--margin 300"' >>/etc/default/pinion-mcu
+apt-get install -y /share/pinion-mcu.deb </dev/null
+is "$(dpkg-query -W -f '${Status}' pinion-mcu)" 'install ok installed' "the package"
+grep -q '^log_level = "debug"' $CONFIG
+grep -q 'margin 300' /etc/default/pinion-mcu
+systemctl start pinion-mcu
+identifies
+# What comes after this has the package as it is delivered.
+apt-get purge -y pinion-mcu </dev/null
+[ ! -e $CONFIG ]
+[ ! -e /etc/default/pinion-mcu ]
+apt-get install -y /share/later.deb </dev/null
+systemctl start pinion-mcu

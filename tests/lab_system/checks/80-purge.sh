@@ -5,13 +5,14 @@ apt-get remove -y pinion-mcu
 not is_active pinion-mcu
 [ ! -e /usr/bin/pinion ]
 [ ! -L $LINK ]
-[ -e /etc/default/pinion-mcu ]
+[ -e /etc/pinion/pinion.toml ]
+[ ! -e /run/pinion ]
 is "$(systemctl list-units --all --plain --no-legend 'pinion-mcu*')" "" "the units that are there"
 [ ! -L /etc/systemd/system/multi-user.target.wants/pinion-mcu.service ]
 # An instance's configuration is who made it to remove.
 rm -f /etc/pinion/second.toml
 apt-get purge -y pinion-mcu
-[ ! -e /etc/default/pinion-mcu ]
+[ ! -e /etc/pinion ]
 id pinion
 left=$(find / -xdev \( -path /proc -o -path /sys -o -path /share -o -path /var/log -o -path /run \) -prune -o \
     -iname '*pinion*' -print)

@@ -9,6 +9,7 @@ for prefix in /usr /usr/local; do
     is "$(readlink "/proc/$(pid)/exe")" $prefix/bin/pinion "the program"
     systemctl stop pinion-mcu
     make uninstall PREFIX=$prefix CARGO=true
+    [ ! -e /run/pinion ]
     left=$(find / -xdev \( -path /proc -o -path /sys -o -path /share -o -path /var/log -o -path /run -o -path /root \) \
         -prune -o -iname '*pinion*' -print)
     is "$left" "" "what is left"

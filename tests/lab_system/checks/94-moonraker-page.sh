@@ -3,7 +3,7 @@ later() {
     rm -rf /run/later
     dpkg-deb -R /share/later.deb /run/later
     sed -i "s/^Version: .*/&$1/" /run/later/DEBIAN/control
-    echo "# of package $1" >>/run/later/etc/default/pinion-mcu
+    echo "# of package $1" >>/run/later/usr/share/pinion-mcu/pinion.toml
     dpkg-deb --root-owner-group -Znone -b /run/later "/srv/pinion/pinion-mcu_later$1.deb"
     (cd /srv/pinion && apt-ftparchive packages . >Packages)
     apt-get -qq update
@@ -18,22 +18,18 @@ chown pi: /home/pi/printer_data/moonraker.asvc
 echo 'deb [trusted=yes] file:/srv/pinion ./' >/etc/apt/sources.list.d/pinion.list
 later 1
 page docs/moonraker.md
-grep -x pinion-mcu /home/pi/printer_data/moonraker.asvc
-grep -x webcamd /home/pi/printer_data/moonraker.asvc
+is "$(cat /home/pi/printer_data/moonraker.asvc)" "$(printf 'klipper_mcu\nwebcamd\npinion-mcu')" "Moonraker's services"
+# Before Moonraker's first start there is none, and none is made: it would lack what Moonraker puts there.
+mkdir -p /run/fresh
+not sed -i '$a pinion-mcu' /run/fresh/moonraker.asvc
+[ ! -e /run/fresh/moonraker.asvc ]
 case $(version) in *later1) ;; *) fail "the version is $(version)" ;; esac
 
-# A changed configuration file, and nobody to answer: it fails as the page says, but not with what that tells to write.
-echo '# edited' >>/etc/default/pinion-mcu
+# A changed configuration, and nobody to answer.
+echo '# edited' >>/etc/pinion/pinion.toml
 later 2
-mv /etc/apt/apt.conf.d/90keep-configuration /run/keep
-not apt-get upgrade --yes </dev/null >/run/upgrade 2>&1
-grep 'end of file on stdin at conffile prompt' /run/upgrade
-dpkg --configure -a <$ENTERS
-grep '^# edited' /etc/default/pinion-mcu
-later 3
-mv /run/keep /etc/apt/apt.conf.d/90keep-configuration
-apt-get upgrade --yes </dev/null
-case $(version) in *later3) ;; *) fail "the version is $(version)" ;; esac
-grep '^# edited' /etc/default/pinion-mcu
-rm -r /etc/apt/apt.conf.d/90keep-configuration /etc/apt/sources.list.d/pinion.list /srv/pinion
+DEBIAN_FRONTEND=noninteractive apt-get upgrade --yes </dev/null
+case $(version) in *later2) ;; *) fail "the version is $(version)" ;; esac
+grep '^# edited' /etc/pinion/pinion.toml
+rm -r /etc/apt/sources.list.d/pinion.list /srv/pinion
 apt-get -qq update

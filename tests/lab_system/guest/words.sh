@@ -81,7 +81,8 @@ installed() {
 }
 is_as_delivered() {
     [ "$(dpkg-query -W -f '${Version}' pinion-mcu 2>/dev/null)" = "$(dpkg-deb -f /share/pinion-mcu.deb Version)" ] &&
-        [ -z "$(dpkg --verify pinion-mcu)" ]
+        [ -z "$(dpkg --verify pinion-mcu)" ] && [ ! -e /etc/default/pinion-mcu ] &&
+        cmp -s /etc/pinion/pinion.toml /usr/share/pinion-mcu/pinion.toml
 }
 # page NAME: tries its commands, block by block, each in a session of its own, in the folder of the clone.
 # Whatever asks something, as apt does, is answered by Enter.

@@ -196,7 +196,7 @@ pub trait Thermometer: Send {
 pub struct Mosi {
     /// The output; nobody answers there.
     pub line: OnWorker<dyn BusDevice>,
-    /// Bytes that are sent without a pause.
+    /// Bytes that are sent at once.
     pub message_max: usize,
 }
 
@@ -227,7 +227,8 @@ pub struct BusError {
 ///
 /// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
 pub trait BusDevice: Send {
-    /// Sends the bytes and replaces each by the one that came back meanwhile (SPI).
+    /// Sends the bytes and replaces each by the one that came back meanwhile (SPI). With no bytes the chip
+    /// is only [selected for a moment](ChipSelect::pulse).
     ///
     /// # Errors
     ///
@@ -235,6 +236,16 @@ pub trait BusDevice: Send {
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
         let _ = bytes;
         Err(BusError::other_kind("an SPI transfer", "an I2C device"))
+    }
+
+    /// Sends the bytes, and leaves what comes back meanwhile alone (SPI): a controller with one data line
+    /// cannot do both.
+    ///
+    /// # Errors
+    ///
+    /// What the bus said.
+    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
+        self.exchange(&mut bytes.to_vec())
     }
 
     /// Writes bytes and reads bytes, with a repeated start between the two (I2C). Nothing to read is
@@ -321,7 +332,13 @@ pub struct ChipSelect {
     pub line: Arc<dyn Line>,
     /// Whether a high level selects the chip, rather than a low one.
     pub active_high: bool,
+    /// What a pulse is timed by.
+    pub clock: Arc<dyn TimeSource>,
 }
+
+/// Shortest pulse on a line that selects a chip. The TLE5012B latches at the end of one of 1 us (Infineon,
+/// TLE5012B E1000 user manual, "SSC timing": t_CSupdate).
+const SELECT_MIN: Ticks = Ticks::from_us(1);
 
 impl ChipSelect {
     /// Drives the line so that the chip is selected, or not.
@@ -331,6 +348,18 @@ impl ChipSelect {
     /// "GPIO line write failed".
     pub fn select(&self, selected: bool) -> Result<(), Shutdown> {
         self.line.write(selected == self.active_high)
+    }
+
+    /// Selects the chip for 1 us at least, with no clock meanwhile.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line write failed".
+    pub fn pulse(&self) -> Result<(), Shutdown> {
+        let selected = self.select(true);
+        self.clock.spin_until(self.clock.now() + SELECT_MIN);
+        let deselected = self.select(false);
+        selected.and(deselected)
     }
 }
 

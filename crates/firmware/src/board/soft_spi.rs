@@ -39,26 +39,32 @@ impl SoftSpi {
         Ok(())
     }
 
-    fn select(&self, selected: bool) -> Result<(), Shutdown> {
-        self.chip_select.as_ref().map_or(Ok(()), |line| line.select(selected))
+    /// Has the chip selected while `shift` sends so many bytes, from the instant on that it is given.
+    fn converse(&self, count: usize, shift: impl FnOnce(Clock) -> Result<(), Shutdown>) -> Result<(), BusError> {
+        let select = |selected| self.chip_select.as_ref().map_or(Ok(()), |line| line.select(selected));
+        let begin = || self.clock.now() + Ticks(self.pulse.0 / 2);
+        let conversed = self.prepare().and_then(|()| match count {
+            0 => self.chip_select.as_ref().map_or(Ok(()), ChipSelect::pulse),
+            _ => {
+                let shifted = select(true).and_then(|()| shift(begin()));
+                // After a failure too.
+                let deselected = select(false);
+                shifted.and(deselected)
+            }
+        });
+        conversed.map_err(|failure| BusError { status: BusStatus::Nack, detail: failure.detail })
     }
 
-    fn transfer(&self, bytes: &mut [u8]) -> Result<(), Shutdown> {
-        let first_half = Ticks(self.pulse.0 / 2);
-        let mut end = self.clock.now() + first_half;
-        for byte in bytes {
-            let sent = *byte;
-            *byte = 0;
-            for bit in (0..8).rev() {
-                let received = self.bit(sent >> bit & 1 != 0, &mut end)?;
-                *byte |= u8::from(received) << bit;
-            }
-        }
-        Ok(())
+    /// One byte, and what came back if that is read.
+    fn byte(&self, sent: u8, read: bool, end: &mut Clock) -> Result<u8, Shutdown> {
+        (0..8).rev().try_fold(0, |received, bit| {
+            let bit = self.bit(sent >> bit & 1 != 0, read, end)?;
+            Ok(received << 1 | u8::from(bit))
+        })
     }
 
     /// One bit, whose first half begins at `end`; sets `end` to where the next one's does.
-    fn bit(&self, sent: bool, end: &mut Clock) -> Result<bool, Shutdown> {
+    fn bit(&self, sent: bool, read: bool, end: &mut Clock) -> Result<bool, Shutdown> {
         let first_half = Ticks(self.pulse.0 / 2);
         let second_half = Ticks(self.pulse.0 - first_half.0);
         let active = !self.idles_high();
@@ -69,12 +75,12 @@ impl SoftSpi {
             self.mosi.write(sent)?;
             self.clock.spin_until(self.clock.now() + second_half);
             self.sclk.write(!active)?;
-            self.miso.read()?
+            read && self.miso.read()?
         } else {
             self.mosi.write(sent)?;
             self.sclk.write(active)?;
             self.clock.spin_until(self.clock.now() + second_half);
-            let received = self.miso.read()?;
+            let received = read && self.miso.read()?;
             self.sclk.write(!active)?;
             received
         };
@@ -85,10 +91,15 @@ impl SoftSpi {
 
 impl BusDevice for SoftSpi {
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
-        let exchanged = self.prepare().and_then(|()| self.select(true)).and_then(|()| self.transfer(bytes));
-        // After a failure too.
-        let deselected = self.select(false);
-        exchanged.and(deselected).map_err(|failure| BusError { status: BusStatus::Nack, detail: failure.detail })
+        self.converse(bytes.len(), |mut end| {
+            bytes.iter_mut().try_for_each(|byte| self.byte(*byte, true, &mut end).map(|received| *byte = received))
+        })
+    }
+
+    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
+        self.converse(bytes.len(), |mut end| {
+            bytes.iter().try_for_each(|byte| self.byte(*byte, false, &mut end).map(|_| ()))
+        })
     }
 }
 
@@ -201,7 +212,11 @@ mod tests {
             sclk: wire(Which::Sclk),
             mode,
             pulse,
-            chip_select: Some(ChipSelect { line: wire(Which::Select), active_high: true }),
+            chip_select: Some(ChipSelect {
+                line: wire(Which::Select),
+                active_high: true,
+                clock: Arc::new(clock.clone()),
+            }),
             clock: Arc::new(clock.clone()),
         };
         (spi, wires)
@@ -228,6 +243,38 @@ mod tests {
             prop_assert!(wires.edges.windows(2).all(|pair| pair[1] - pair[0] >= half));
             prop_assert!(wires.edges.windows(3).all(|three| three[2] - three[0] >= u64::from(pulse)));
         }
+    }
+
+    #[test]
+    fn what_is_only_sent_leaves_miso_alone() {
+        let (mut spi, wires) = chip(0, Ticks(10), &[], false);
+        struct Deaf;
+        impl Line for Deaf {
+            fn write(&self, _level: bool) -> Result<(), Shutdown> {
+                panic!("nobody drives MISO")
+            }
+            fn read(&self) -> Result<bool, Shutdown> {
+                panic!("nobody reads MISO")
+            }
+            fn set_direction(&self, _direction: Direction) -> Result<(), Shutdown> {
+                Ok(())
+            }
+        }
+        spi.miso = Arc::new(Deaf);
+        spi.send(&[0x3a, 0xc5]).unwrap();
+        assert_eq!(wires.lock().unwrap().taken, bits(&[0x3a, 0xc5]));
+    }
+
+    #[test]
+    fn an_empty_exchange_selects_the_chip_for_a_microsecond_without_a_clock() {
+        let (mut spi, wires) = chip(1, Ticks(10), &[], false);
+        let clock = spi.clock.clone();
+        let began = clock.now();
+        spi.exchange(&mut []).unwrap();
+        // 10 ticks for the idle clock, and 1 us.
+        assert_eq!(clock.now().since(began), 60);
+        let wires = wires.lock().unwrap();
+        assert!(wires.edges.is_empty() && !wires.selected);
     }
 
     #[test]

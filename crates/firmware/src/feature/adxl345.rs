@@ -100,11 +100,11 @@ impl FifoChip for Adxl345 {
     const KEEPS_SAMPLES: bool = true;
 
     fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.exchange(&mut [POWER_CTL, MEASURE])
+        chip.send(&[POWER_CTL, MEASURE])
     }
 
     fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.exchange(&mut [POWER_CTL, 0])
+        chip.send(&[POWER_CTL, 0])
     }
 
     fn bus_type(self) -> BusType {

@@ -177,6 +177,8 @@ struct Ldc1612 {
     intb: Option<Arc<dyn Line>>,
     /// Here while no reading is under way.
     look: Option<Box<Conversation<Look>>>,
+    /// Turns of the timer that came meanwhile.
+    missed: u16,
     /// Whether the reading under way is of an earlier query, and counts no more.
     stale: bool,
     /// Here while no status is asked for.
@@ -198,6 +200,7 @@ impl Ldc1612 {
             i2c,
             intb,
             look: Some(Conversation::new(Look { found: Found::Nothing })),
+            missed: 0,
             stale: false,
             ask: Some(Conversation::new(Ask { ready: false })),
             rest_ticks: Ticks(0),
@@ -224,6 +227,29 @@ impl Ldc1612 {
         }
         if !failed_before {
             mcu.warn(oid, self.kind(), trouble);
+        }
+        Ok(())
+    }
+
+    /// Has the sensor read, if it may have a sample.
+    fn turn(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        if self.intb.as_ref().map_or(Ok(false), |intb| intb.read())? {
+            return Ok(());
+        }
+        let Some(look) = self.look.take() else { return Ok(()) };
+        mcu.converse(self.i2c, Ticket { oid, tag: LOOK }, look)
+    }
+
+    /// Makes up for the turns that came while the sensor was read, as in the firmware, whose timer waits for
+    /// the bus: the first one is taken now, each further one says that samples may be lost.
+    fn make_up(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+        let missed = std::mem::take(&mut self.missed);
+        if missed == 0 {
+            return Ok(());
+        }
+        self.turn(mcu, oid)?;
+        if self.is_pending() {
+            self.bulk.count_overflows(missed - 1);
         }
         Ok(())
     }
@@ -296,25 +322,26 @@ impl Object for Ldc1612 {
 
     fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
         let Some(oid) = timer.oid() else { return Ok(Next::Done) };
-        if self.is_pending() {
-            self.bulk.count_overflows(1);
-        } else if self.intb.as_ref().map_or(Ok(false), |intb| intb.read())? {
-            // Nothing is ready.
-        } else if let Some(look) = self.look.take() {
-            mcu.converse(self.i2c, Ticket { oid, tag: LOOK }, look)?;
+        match self.look {
+            Some(_) => self.turn(mcu, oid)?,
+            None => self.missed = self.missed.saturating_add(1),
         }
         Ok(Next::At(at + self.rest_ticks))
     }
 
     fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
         match done.tag {
-            LOOK => self.looked(mcu, oid, done),
+            LOOK => {
+                self.looked(mcu, oid, done)?;
+                self.make_up(mcu, oid)
+            }
             _ => self.asked(mcu, oid, done),
         }
     }
 
     fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
         self.stale = self.look.is_none();
+        self.missed = 0;
     }
 }
 
@@ -367,6 +394,7 @@ const QUERY_LDC1612: Command = command!("query_ldc1612 oid=%c rest_ticks=%u", |m
         let timer = TimerId::new(oid, 0);
         mcu.cancel(timer);
         sensor.stale = sensor.look.is_none();
+        sensor.missed = 0;
         if rest_ticks == Ticks(0) {
             return Ok(());
         }

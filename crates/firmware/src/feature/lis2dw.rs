@@ -99,7 +99,9 @@ impl Model {
             Model::Lis3dh if status & 0x20 != 0 => 0,
             Model::Lis3dh => status & 0x1f,
         };
-        Fill { bytes: u16::from(samples) * SAMPLE_BYTES as u16, overflowed: status & 0x40 != 0 }
+        // A wire that is all ones says 63 samples. The firmware keeps the bytes of that modulo 256, two blocks.
+        let bytes = samples.wrapping_mul(SAMPLE_BYTES as u8);
+        Fill { bytes: bytes.into(), overflowed: status & 0x40 != 0 }
     }
 }
 
@@ -133,11 +135,11 @@ impl FifoChip for Lis2dw {
     const OWN_WORDS: Option<&'static Words> = Some(&OWN_WORDS);
 
     fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.exchange(&mut [FIFO_CTRL, CONTINUOUS])
+        chip.send(&[FIFO_CTRL, CONTINUOUS])
     }
 
     fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.exchange(&mut [FIFO_CTRL, 0])
+        chip.send(&[FIFO_CTRL, 0])
     }
 
     fn bus_type(self) -> BusType {
@@ -194,6 +196,8 @@ mod tests {
             // FTH, the threshold's flag, says nothing here.
             (Model::Lis2dw, 0x80 | 31, 31, false),
             (Model::Lis2dw, 0xc0 | 32, 32, true),
+            // Nothing answers: 63 samples are 378 bytes, 122 modulo 256.
+            (Model::Lis2dw, 0xff, 122 / 6, true),
             (Model::Lis3dh, 0x20, 0, false),
             (Model::Lis3dh, 0x1f, 31, false),
             (Model::Lis3dh, 0xc0 | 31, 31, true),

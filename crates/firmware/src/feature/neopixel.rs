@@ -9,6 +9,10 @@
 //! not change a bit, and a controller that has only a lower rate, down to 2 MHz, will do: what is
 //! critical is the short pulse, below 500 ns (the firmware's src/neopixel.c on what chips really
 //! need).
+//!
+//! The firmware gives up a frame, and klippy sends it again, if a bit comes more than `bit_max_ticks` behind the one
+//! before. Nobody can see from here whether a controller pauses amid a message: the board says in the
+//! log of one that is known to, and a frame that its driver took counts as sent.
 
 #![forbid(unsafe_code)]
 
@@ -46,6 +50,10 @@ response! {
 const RATE_HZ: u32 = 3_200_000;
 /// Bytes of the SPI bus for one of the chain.
 const WIRE_BYTES: usize = 4;
+/// Shortest time for which the line is low before and behind the colours. klippy asks for 50 us, and newer WS2812B
+/// need 280 us (Worldsemi WS2812B-V5, "Data transfer time": RES) to take their colours; where the data output idles
+/// high, this is all that they get.
+const RESET_MIN: Ticks = Ticks::from_us(300);
 /// Sizes and positions from here on are refused, as in the firmware.
 const SIZE_LIMIT: u16 = 0x8000;
 
@@ -65,20 +73,18 @@ fn low_bytes(ticks: Ticks) -> usize {
 struct Frame {
     data: Vec<u8>,
     /// Low for the reset time, the colours, low for the reset time. Low before: the controller may
-    /// leave its output high when it rests. Low behind: then the LEDs take the colours at once.
+    /// leave its output high when it rests. Low behind: then the LEDs take the colours before that.
     message: Vec<u8>,
     low_bytes: usize,
 }
 
 impl Talk for Frame {
     fn talk(&mut self, line: &mut dyn BusDevice) -> Result<(), BusError> {
-        // What came in last time is still there.
-        self.message.fill(0);
         let colours = self.message.iter_mut().skip(self.low_bytes);
         for (wire, byte) in colours.zip(self.data.iter().copied().flat_map(encode)) {
             *wire = byte;
         }
-        line.exchange(&mut self.message)
+        line.send(&self.message)
     }
 }
 
@@ -136,7 +142,7 @@ impl Object for Neopixel {
 const CONFIG_NEOPIXEL: Command = command!(
     "config_neopixel oid=%c pin=%u data_size=%hu bit_max_ticks=%u reset_min_ticks=%u",
     |mcu, oid: Oid, pin: Pin, data_size: u16, bit_max_ticks: Ticks, reset_min_ticks: Ticks| {
-        // The controller's clock does not dawdle amid a message.
+        // The file's head says why.
         let _ = bit_max_ticks;
         mcu.vacant(oid)?;
         if data_size >= SIZE_LIMIT {
@@ -144,7 +150,7 @@ const CONFIG_NEOPIXEL: Command = command!(
         }
         let Mosi { line, message_max } = mcu.board()?.mosi(pin, RATE_HZ)?;
         let size = usize::from(data_size);
-        let low_bytes = low_bytes(reset_min_ticks);
+        let low_bytes = low_bytes(reset_min_ticks.max(RESET_MIN));
         let len = low_bytes.saturating_mul(2).saturating_add(size * WIRE_BYTES);
         if len > message_max {
             let detail = format!(

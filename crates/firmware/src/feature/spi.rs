@@ -56,18 +56,27 @@ response! {
 pub(super) struct Transfer {
     bytes: [u8; PAYLOAD_MAX],
     len: usize,
+    /// Whether what comes back is read.
+    reads: bool,
 }
 
 impl Transfer {
-    pub(super) fn new(data: &[u8]) -> Box<Conversation<Transfer>> {
-        let mut transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0 };
-        transfer.load(data);
-        Conversation::new(transfer)
+    /// One that is to be loaded.
+    pub(super) fn new() -> Box<Conversation<Transfer>> {
+        Conversation::new(Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true })
     }
 
+    /// These bytes are to be exchanged for what comes back.
     pub(super) fn load(&mut self, data: &[u8]) {
         self.len = data.len().min(PAYLOAD_MAX);
         self.bytes[..self.len].copy_from_slice(&data[..self.len]);
+        self.reads = true;
+    }
+
+    /// These bytes are to be sent, whatever comes back.
+    pub(super) fn load_to_send(&mut self, data: &[u8]) {
+        self.load(data);
+        self.reads = false;
     }
 
     pub(super) fn bytes(&self) -> &[u8] {
@@ -77,7 +86,8 @@ impl Transfer {
 
 impl Talk for Transfer {
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.exchange(&mut self.bytes[..self.len])
+        let bytes = &mut self.bytes[..self.len];
+        if self.reads { chip.exchange(bytes) } else { chip.send(bytes) }
     }
 }
 
@@ -95,7 +105,7 @@ const TRANSFER: u8 = 1;
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
-        Spi { bus: None, chip_select, transfer: Some(Transfer::new(&[])) }
+        Spi { bus: None, chip_select, transfer: Some(Transfer::new()) }
     }
 
     /// Whether it has a chip select line of its own.
@@ -154,7 +164,10 @@ impl Spi {
         let Some(mut transfer) = self.transfer.take() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
         };
-        transfer.talk.load(data);
+        match tag {
+            TRANSFER => transfer.talk.load(data),
+            _ => transfer.talk.load_to_send(data),
+        }
         mcu.converse_on(bus, Ticket { oid, tag }, transfer)
     }
 }
@@ -234,7 +247,7 @@ impl Object for SpiShutdown {
             return Ok(Safe::Now);
         }
         if let Some(mut message) = self.message.take() {
-            message.talk.load(&self.bytes);
+            message.talk.load_to_send(&self.bytes);
             mcu.converse(self.spi, Ticket { oid, tag: 0 }, message)?;
         }
         Ok(Safe::Later)
@@ -245,7 +258,8 @@ const CONFIG_SPI: Command =
     command!("config_spi oid=%c pin=%u cs_active_high=%c", |mcu, oid: Oid, pin: Pin, cs_active_high: bool| {
         mcu.vacant(oid)?;
         let line = mcu.shared_output(pin, !cs_active_high)?;
-        mcu.assign_on(pin, oid, Spi::new(Some(ChipSelect { line, active_high: cs_active_high })))
+        let chip_select = ChipSelect { line, active_high: cs_active_high, clock: mcu.clock() };
+        mcu.assign_on(pin, oid, Spi::new(Some(chip_select)))
     });
 
 const CONFIG_SPI_WITHOUT_CS: Command =
@@ -293,6 +307,6 @@ const CONFIG_SPI_SHUTDOWN: Command = command!(
     "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",
     |mcu, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
         mcu.with::<Spi, _>(spi_oid, |_, _| Ok(()))?;
-        mcu.assign(oid, SpiShutdown { spi: spi_oid, message: Some(Transfer::new(&[])), bytes: shutdown_msg.into() })
+        mcu.assign(oid, SpiShutdown { spi: spi_oid, message: Some(Transfer::new()), bytes: shutdown_msg.into() })
     }
 );

@@ -135,7 +135,7 @@ impl Chip {
     }
 
     /// What has to be said before the message: the end of this transfer is when the sensor latches.
-    /// The TLE5012B latches at the end of an empty one; the AS5047D at the end of the one that asks
+    /// The TLE5012B latches at the end of an empty one, which selects it for 1 us at least; the AS5047D at the end of the one that asks
     /// for the angle (ANGLECOM), which the next one brings.
     fn preface(self, purpose: Purpose) -> Option<&'static [u8]> {
         match (self, purpose) {
@@ -488,8 +488,8 @@ const CONFIG_SPI_ANGLE: Command = command!(
             stale: false,
             due: None,
             overflows: 0,
-            measurement: Some(Transfer::new(&[])),
-            transfer: Some(Transfer::new(&[])),
+            measurement: Some(Transfer::new()),
+            transfer: Some(Transfer::new()),
             transfer_waits: false,
             holds: false,
         };

@@ -170,7 +170,7 @@ pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err
 pub fn emergency() -> Shutdown {
     Shutdown::because(
         reason::COMMAND_REQUEST,
-        "the host asked for it (M112, or its log says why): FIRMWARE_RESTART once the cause is dealt with",
+        "the host asked for it, by FIRMWARE_RESTART, M112 or an error of its own (its log tells which): unless it was FIRMWARE_RESTART, deal with the cause, then FIRMWARE_RESTART",
     )
 }
 

@@ -37,6 +37,10 @@ impl BusDevice for Counted {
         self.calls.once(|| self.device.exchange(bytes))
     }
 
+    fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
+        self.calls.once(|| self.device.send(bytes))
+    }
+
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         self.calls.once(|| self.device.write_read(write, read))
     }

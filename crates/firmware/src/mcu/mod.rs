@@ -252,7 +252,7 @@ impl Mcu {
             self.shut_down(Shutdown::because(
                 reason::TIMER_PAST,
                 format!(
-                    "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running",
+                    "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running: run Pinion in real time (-r, as the service does), or move more slowly",
                     late as u64 / u64::from(Ticks::from_us(1000).0)
                 ),
             ));

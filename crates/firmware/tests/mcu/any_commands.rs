@@ -18,7 +18,7 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
-use pinion_testbench::board::{ANALOG, GPIOS, MOSI, PWM};
+use pinion_testbench::board::{ANALOG, GPIOS, MOSI, PWM, SPI_CHIPS};
 use pinion_testbench::rig::Rig;
 
 /// Commands that never leave a running machine as it was, or not for every host that sends them.
@@ -33,75 +33,17 @@ const STOPS: &[&str] = &[
 ];
 
 /// Values at which something might break.
+#[rustfmt::skip]
 const EXTREMES: &[u32] = &[
-    0,
-    1,
-    u32::MAX,
-    2,
-    7,
-    8,
-    15,
-    16,
-    48,
-    49,
-    63,
-    64,
-    127,
-    128,
-    255,
-    256,
-    4096,
-    4097,
-    32767,
-    32768,
-    65535,
-    65536,
-    (1 << 31) - 1,
-    1 << 31,
-    (1 << 31) + 1,
-    u32::MAX - 1,
+    0, 1, u32::MAX, 2, 7, 8, 15, 16, 48, 49, 63, 64, 127, 128, 255, 256, 4096, 4097, 32767, 32768, 65535, 65536,
+    (1 << 31) - 1, 1 << 31, (1 << 31) + 1, u32::MAX - 1,
 ];
-/// Pins of every kind, those of an expander among them.
+/// Pins of every kind, those of an expander among them, and what may break besides.
+#[rustfmt::skip]
 const PINS: &[u32] = &[
-    0,
-    1,
-    2,
-    3,
-    4,
-    5,
-    6,
-    7,
-    8,
-    9,
-    10,
-    11,
-    12,
-    13,
-    14,
-    15,
-    16,
-    17,
-    18,
-    19,
-    20,
-    21,
-    22,
-    23,
-    24,
-    EXPANDED,
-    EXPANDED + 1,
-    EXPANDED + 2,
-    EXPANDED + 3,
-    ANALOG,
-    ANALOG + 1,
-    ANALOG + 2,
-    PWM,
-    PWM + 1,
-    MOSI,
-    MOSI + 1,
-    300,
-    255,
-    u32::MAX,
+    0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24,
+    EXPANDED, EXPANDED + 1, EXPANDED + 2, EXPANDED + 3, ANALOG, ANALOG + 1, ANALOG + 2, PWM, PWM + 1, MOSI, MOSI + 1,
+    SPI_CHIPS, SPI_CHIPS + 1, 300, 255, u32::MAX,
 ];
 /// Spans that a worker waits for between two edges. The bench runs an errand to its end at once and can not break it
 /// off, as a stop does, so these are short there.
@@ -304,16 +246,15 @@ impl Book {
 
     /// Tries every command on a configured machine, and puts those that are for its configuration into that.
     fn find_calls(&mut self, dice: &mut Dice) {
-        const TRIES: usize = 1000;
         const WANTED: usize = 4;
-        for with_buses in [false, true] {
+        for (with_buses, tries) in [(false, 200), (true, 1000)] {
             let mut rig = bench(self.generation);
             self.set_up(&mut rig);
             for form in 0..self.forms.len() {
                 if STOPS.contains(&self.forms[form].name()) || self.forms[form].configures() {
                     continue;
                 }
-                for _ in 0..TRIES {
+                for _ in 0..tries {
                     if self.after[form].len() >= WANTED {
                         break;
                     }
@@ -420,13 +361,15 @@ fn say(rig: &mut Rig, command: &str) {
 fn accepts(rig: &mut Rig, form: &Form, values: &[Value]) -> bool {
     let payload = form.encode(rig, values);
     run(rig, &payload);
+    let end = rig.now() + 100_000;
+    pass_until(rig, end, if rig.mcu.is_shutdown() { 0 } else { 20 });
     let accepted = !rig.mcu.is_shutdown();
-    let end = rig.now() + 50_000;
-    pass_until(rig, end, 20);
-    say(rig, "emergency_stop");
+    if accepted {
+        say(rig, "emergency_stop");
+    }
     settle(rig);
     say(rig, "clear_shutdown");
-    rig.everything();
+    rig.forget_responses();
     rig.notes();
     rig.bench.forget_edges();
     accepted
@@ -448,6 +391,9 @@ enum Action {
     Turns(u32),
     Stall(u64),
     Stop,
+    /// A pin or the chips of a bus fail, until all are mended.
+    Break(usize),
+    Mend,
 }
 
 #[derive(Clone, Debug)]
@@ -489,6 +435,8 @@ fn action() -> impl Strategy<Value = (Action, Recovery)> {
         6 => (1u32..40).prop_map(Action::Turns),
         1 => (0u64..10_000_000).prop_map(Action::Stall),
         1 => Just(Action::Stop),
+        1 => (0..PINS.len()).prop_map(Action::Break),
+        1 => Just(Action::Mend),
     ];
     let recovery = prop_oneof![
         2 => Just(Recovery::Nothing),
@@ -516,7 +464,7 @@ struct Trial<'a> {
     outputs: HashMap<u32, bool>,
     /// Lines that steppers step by, which rest in a stopped machine.
     step_pins: HashSet<u32>,
-    /// Whether the machine was stopped after the last action, and its outputs were looked at.
+    /// Whether the machine was stopped after the last action, and its outputs were where they belong.
     stopped: bool,
     /// What was sent since the last configuration, for a case that fails.
     story: Vec<String>,
@@ -555,8 +503,9 @@ impl<'a> Trial<'a> {
         self.story.clear();
     }
 
-    /// Has the machine forget everything.
+    /// Has the machine forget everything. Outputs that fail would keep it from that.
     fn reset(&mut self) {
+        self.rig.bench.state().broken.clear();
         let now = self.rig.now();
         say(&mut self.rig, "emergency_stop");
         let debtor = self.rig.mcu.debtor().map(str::to_owned);
@@ -621,6 +570,7 @@ impl<'a> Trial<'a> {
                 self.configure();
             }
         }
+        self.stopped = false;
         self.story.push(format!("@{}: {recovery:?}", self.rig.now()));
     }
 
@@ -648,17 +598,20 @@ impl<'a> Trial<'a> {
             Action::Turns(turns) => pass_until(&mut self.rig, u64::MAX, *turns),
             Action::Stall(ticks) => self.rig.stall_until(self.rig.now() + ticks),
             Action::Stop => say(&mut self.rig, "emergency_stop"),
+            Action::Break(place) => drop(self.rig.bench.state().broken.insert(PINS[*place])),
+            Action::Mend => self.rig.bench.state().broken.clear(),
         }
     }
 
     /// Looks at the outputs of a machine that is stopped.
     fn look(&mut self) {
         let stopped = self.rig.mcu.is_shutdown();
-        if stopped && !self.stopped {
-            settle(&mut self.rig);
-            self.rig.bench.forget_edges();
-        }
-        if stopped {
+        let broken = !self.rig.bench.state().broken.is_empty();
+        if stopped && !broken {
+            if !self.stopped {
+                settle(&mut self.rig);
+                self.rig.bench.forget_edges();
+            }
             // A line with several users belongs to the last one.
             let alone = |pin: &u32| self.named.get(pin) == Some(&1);
             for (pin, default) in self.outputs.iter().filter(|(pin, _)| alone(pin)) {
@@ -669,7 +622,7 @@ impl<'a> Trial<'a> {
                 assert_eq!(self.rig.edges(*pin), [], "stepper pin {pin} of a stopped machine");
             }
         }
-        self.stopped = stopped;
+        self.stopped = stopped && !broken;
         // Every response has the form that the dictionary says.
         self.rig.everything();
         self.rig.notes();
@@ -704,8 +657,8 @@ fn arguments_are_found_for_every_command() {
 
 #[test]
 fn no_commands_break_the_machine() {
-    let config = ProptestConfig { cases: 200, ..ProptestConfig::default() };
-    let config = ProptestConfig { source_file: Some(file!()), ..config };
+    let cases = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(200);
+    let config = ProptestConfig { cases, source_file: Some(file!()), ..ProptestConfig::default() };
     let strategy = (0..Generation::ALL.len(), 0u32..50_000, vec(action(), 1..120));
     LazyLock::force(&BOOKS);
     let mut runner = TestRunner::new(config);

@@ -367,6 +367,19 @@ fn rubbish_keeps_the_machine_from_nothing() {
     }
 }
 
+/// 63 samples, whose bytes the firmware keeps in one byte.
+#[test]
+fn a_lis2dw_that_does_not_answer_takes_the_bus_for_two_blocks() {
+    for setup in SETUPS.iter().filter(|setup| setup.model == Lis2dw) {
+        let mut rig = Rig::configured(&setup.config());
+        setup.plug(&rig, 100).lock().unwrap().rubbish = Some(0xff);
+        rig.send(&setup.query(10_000));
+        rig.run_until(10_000);
+        assert_eq!(rig.responses().len(), 2, "{setup:?}");
+        assert_eq!(field(&rig.ask(&setup.status()), "buffered"), "122");
+    }
+}
+
 #[test]
 fn what_a_sensor_can_not_be_is_refused() {
     for (command, text) in [

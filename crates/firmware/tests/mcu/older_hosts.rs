@@ -372,6 +372,49 @@ fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
     }
 }
 
+/// The firmware asks the chip how much its FIFO has, and tells what it remembered from the last reading instead. klippy
+/// dates samples by this count, so here it is that of the instant.
+#[test]
+fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
+    const PERIOD: u64 = 12_500;
+    for generation in [V0_11, V0_12] {
+        let mut rig = Rig::of(generation);
+        rig.bench.state().byte_ticks = 1125;
+        let taken: Arc<Mutex<u64>> = Arc::default();
+        let began: Arc<Mutex<u64>> = Arc::default();
+        let (reads, switched) = (taken.clone(), began.clone());
+        rig.bench.plug_i2c(1, 0x48, move |at, write, read| {
+            let mut reads = reads.lock().unwrap();
+            match *write {
+                [0x72] => {
+                    let samples = at / PERIOD - *switched.lock().unwrap() / PERIOD - *reads;
+                    read.copy_from_slice(&(6 * samples as u16).to_be_bytes());
+                }
+                [0x74] => *reads += 8,
+                [0x23, 8] => *switched.lock().unwrap() = at,
+                _ => {}
+            }
+            Ok(())
+        });
+        let config: Vec<&str> = device(generation).iter().copied().chain(["config_mpu9250 oid=1 i2c_oid=0"]).collect();
+        rig.configure(&config);
+        rig.send(&format!("query_mpu9250 oid=1 clock=@5000 rest_ticks={}", 4 * PERIOD));
+        let number = |status: &str, name: &str| {
+            let value = status.split_once(&format!(" {name}=")).unwrap().1.split(' ').next().unwrap();
+            value.trim_start_matches('@').parse::<u64>().unwrap()
+        };
+        for at in (100_000..3_000_000).step_by(77_777) {
+            rig.run_until(at);
+            let status = rig.ask("query_mpu9250_status oid=1");
+            assert_eq!(number(&status, "buffered"), 0);
+            let told = 8 * number(&status, "next_sequence") + number(&status, "fifo");
+            let made = number(&status, "clock") / PERIOD - *began.lock().unwrap() / PERIOD;
+            assert_eq!(told, made, "{status}");
+        }
+        assert!(*taken.lock().unwrap() > 100);
+    }
+}
+
 #[test]
 fn a_sensor_whose_bus_fails_stops_the_machine_in_the_words_of_its_time() {
     for (generation, query, text) in [

@@ -52,6 +52,22 @@ fn levels_are_those_of_the_last_write_or_look() {
 }
 
 #[test]
+fn why_it_stopped_comes_with_what_helps() {
+    let mut rig = Rig::new();
+    rig.send("emergency_stop");
+    // Which is how a FIRMWARE_RESTART begins.
+    let detail = tell(&rig).detail.to_string();
+    assert!(detail.starts_with("the host asked for it, by FIRMWARE_RESTART, M112 or"), "{detail}");
+    let mut rig = Rig::configured(&["config_counter oid=0 pin=5 pull_up=0"]);
+    rig.send("query_counter oid=0 clock=@1000 poll_ticks=0 sample_ticks=1000");
+    rig.run_until(2000);
+    rig.stall_until(6_000_000);
+    rig.run_turns(200);
+    let detail = tell(&rig).detail.to_string();
+    assert!(detail.starts_with("events are ") && detail.contains("real time (-r, as the service does)"), "{detail}");
+}
+
+#[test]
 fn a_snapshot_begins_anew_where_objects_come_meanwhile() {
     let mut rig = Rig::new();
     rig.send("allocate_oids count=20");

@@ -23,8 +23,10 @@ fn a_transfer_has_the_devices_mode_and_rate_and_its_answer() {
     assert_eq!(rig.ask("spi_transfer oid=0 data=00ff0f"), "spi_transfer_response oid=0 response=ff00f0");
     assert_eq!(rig.ask("spi_transfer oid=0 data="), "spi_transfer_response oid=0 response=");
     assert_eq!(rig.ask("spi_send oid=0 data=aa"), "");
-    let transfer = |data: &[u8]| Transfer { at: 0, bus: 1, mode: 3, rate_hz: 5_000_000, data: data.into() };
-    assert_eq!(rig.bench.transfers(), [transfer(&[0, 0xff, 0x0f]), transfer(&[]), transfer(&[0xaa])]);
+    let transfer = |data: &[u8], read| Transfer { at: 0, bus: 1, mode: 3, rate_hz: 5_000_000, data: data.into(), read };
+    // What comes back for a `spi_send` is not read: a controller of one data line could not do both.
+    let expected = [transfer(&[0, 0xff, 0x0f], true), transfer(&[], true), transfer(&[0xaa], false)];
+    assert_eq!(rig.bench.transfers(), expected);
 }
 
 #[test]
@@ -56,8 +58,9 @@ fn a_device_gets_its_message_at_a_shutdown_and_says_nothing() {
         ]);
         rig.send("emergency_stop");
         rig.run_until(10_000);
-        let sent: Vec<Vec<u8>> = rig.bench.transfers().iter().map(|transfer| transfer.data.clone()).collect();
-        assert_eq!(sent, [[0xde, 0xad, 0xbe, 0xef]]);
+        let sent: Vec<(Vec<u8>, bool)> =
+            rig.bench.transfers().into_iter().map(|transfer| (transfer.data, transfer.read)).collect();
+        assert_eq!(sent, [(vec![0xde, 0xad, 0xbe, 0xef], false)]);
         assert_eq!(rig.responses(), ["shutdown clock=@0 static_string_id=Command request"]);
         assert!(rig.bench.level(CS));
     }

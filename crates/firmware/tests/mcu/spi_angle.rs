@@ -83,6 +83,20 @@ fn each_sensor_is_asked_in_its_way_and_its_angle_told_with_its_time() {
     }
 }
 
+/// The TLE5012B latches at the end of a pulse of 1 us on its select line, with no clock meanwhile.
+#[test]
+fn a_tle5012b_is_selected_for_a_microsecond_before_it_is_read() {
+    let mut rig = rig(TLE5012B, 0, 1);
+    plug(&rig, TLE5012B);
+    rig.send("query_spi_angle oid=1 clock=@1000 rest_ticks=20000 time_shift=2");
+    rig.run_until(2000);
+    let edges = rig.edges(CS);
+    assert_eq!(edges[..2], [(1001, 0), (1051, 1)]);
+    assert_eq!(edges.len(), 4);
+    let latched = rig.bench.transfers()[0].at;
+    assert_eq!(latched, 1051);
+}
+
 #[test]
 fn messages_are_counted_from_zero_in_each_query() {
     let mut rig = rig(A1333, 1, 0);
@@ -156,11 +170,11 @@ fn a_transfer_of_the_host_s_has_the_clock_of_its_latch() {
     let mut slow = rig(MT6816, 0, 2501);
     let answer = slow.ask("spi_angle_transfer oid=1 data=8442");
     assert_eq!(answer, "spi_angle_transfer_response oid=1 clock=@0 response=");
-    // The TLE5012B's is the end of the empty transfer, however long the next one takes.
+    // The TLE5012B's is the end of the empty transfer, with its microsecond, however long the next one takes.
     let mut tle = rig(TLE5012B, 0, 2501);
     plug(&tle, TLE5012B);
     let answer = tle.ask("spi_angle_transfer oid=1 data=84420000");
-    assert_eq!(answer, "spi_angle_transfer_response oid=1 clock=@2501 response=01020304");
+    assert_eq!(answer, "spi_angle_transfer_response oid=1 clock=@2551 response=01020304");
 }
 
 /// What a measurement latched is read before the host's transfer latches anew.
@@ -172,11 +186,12 @@ fn a_transfer_waits_for_the_measurement_under_way() {
     rig.run_until(1500);
     rig.begin("spi_angle_transfer oid=1 data=84420000");
     assert!(rig.mcu.is_held());
-    rig.run_until(4999);
+    // Two latches of a microsecond each.
+    rig.run_until(5099);
     assert!(rig.mcu.is_held(), "commands wait for it");
-    rig.run_until(5000);
+    rig.run_until(5100);
     assert!(!rig.mcu.is_held());
-    assert_eq!(rig.responses(), ["spi_angle_transfer_response oid=1 clock=@4000 response=01020304"]);
+    assert_eq!(rig.responses(), ["spi_angle_transfer_response oid=1 clock=@4100 response=01020304"]);
     let lengths: Vec<usize> = rig.bench.transfers().iter().map(|transfer| transfer.data.len()).collect();
     assert_eq!(lengths, [0, 10, 0, 4]);
     // And the other way round.

@@ -86,9 +86,65 @@ fn chip_selects_of_either_sense_and_modes_of_chips_on_one_node() {
     let writes = || trace.writes().iter().map(|write| (write.line, write.level)).collect::<Vec<_>>();
     sysfs::wait_until("five transfers are over", || writes().len() == expected.len());
     assert_eq!(writes(), expected);
-    let expected =
-        ["cs0 1 1000000 01", "cs0 2 1000000 02", "cs0 1 1000000 03", "cs0 2 1000000 04", "cs0 2 1000000 55 aa"];
+    // Before a chip of the other polarity is selected, a byte goes to nobody, which moves the clock.
+    let expected = [
+        "cs0 1 1000000 00",
+        "cs0 1 1000000 01",
+        "cs0 2 1000000 00",
+        "cs0 2 1000000 02",
+        "cs0 1 1000000 00",
+        "cs0 1 1000000 03",
+        "cs0 2 1000000 00",
+        "cs0 2 1000000 04",
+        "cs0 2 1000000 55 aa",
+    ];
     assert_eq!(sent(), expected);
+}
+
+#[test]
+fn the_idle_clock_moves_while_no_chip_is_selected() {
+    let sim = GpioSim::builder("lab", 8).name(2, "CS_A").name(3, "CS_B").name(4, "CS_C").build();
+    let program = Program::start();
+    let client = &mut program.connect();
+    // Two chips on one node, and one on another node of its controller.
+    let chips = [("CS_A", "spidev0.0", 0), ("CS_B", "spidev0.0", 3), ("CS_C", "spidev0.1", 2)];
+    let config = chips.iter().enumerate().flat_map(|(oid, (line, bus, mode))| {
+        [
+            format!("config_spi oid={oid} pin={line} cs_active_high=0"),
+            format!("spi_set_bus oid={oid} spi_bus={bus} mode={mode} rate=1000000"),
+        ]
+    });
+    configure(client, 3, &config.collect::<Vec<_>>());
+    sysfs::write(format!("{MOCK}/clock"), "0");
+    let trace = Trace::start();
+    for (oid, byte) in [(1, 1), (0, 2), (2, 3), (1, 4), (0, 5), (2, 6), (0, 7)] {
+        assert_eq!(transfer(client, oid, &[byte]), [byte]);
+    }
+    let record = sysfs::read(format!("{MOCK}/clock"));
+    let moves: Vec<u64> = record.lines().map(|line| line.split(' ').next().unwrap().parse().unwrap()).collect();
+    assert!(moves.len() >= 5, "{record}");
+    let lines = [2, 3, 4].map(|offset| sim.kernel_number(offset));
+    let writes: Vec<_> = trace.writes().into_iter().filter(|write| lines.contains(&write.line)).collect();
+    assert_eq!(writes.len(), 14);
+    for selected in writes.chunks(2) {
+        let (from, until) = (selected[0].at_ns, selected[1].at_ns);
+        assert!(!selected[0].level && selected[1].level && selected[0].line == selected[1].line);
+        assert!(!moves.iter().any(|at| (from..=until).contains(at)), "{from} to {until}: {record}");
+    }
+}
+
+#[test]
+fn a_controller_of_one_data_line_takes_what_is_only_sent() {
+    sysfs::write(format!("{MOCK}/half_duplex"), "1");
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &plain(0, "spidev0.0", 0));
+    sysfs::write(format!("{MOCK}/sent"), "0");
+    run(client, "spi_send oid=0 data=0102");
+    assert_eq!(sent(), ["cs0 0 4000000 01 02"]);
+    client.send("spi_transfer", &[("oid", 0_u8.into()), ("data", [3][..].into())]).expect("a session");
+    assert_eq!(shutdown_of(client), "Unable to issue spi ioctl");
+    sysfs::write(format!("{MOCK}/half_duplex"), "0");
 }
 
 #[test]
