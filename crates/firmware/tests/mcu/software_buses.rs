@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! SPI and I2C by GPIO lines, as a host configures them. How bits go over the wires is tested where
-//! that is done, `src/board/soft_spi.rs` and `soft_i2c.rs`.
+//! that is done, `crates/firmware/src/board/soft_spi.rs` and `soft_i2c.rs`.
 
 use pinion_firmware::board::{Bias, Direction};
 
