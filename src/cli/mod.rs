@@ -15,6 +15,7 @@ mod console;
 pub mod dict;
 mod doctor;
 mod finding;
+mod keys;
 pub mod latency;
 mod logging;
 mod page;
