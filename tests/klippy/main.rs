@@ -9,6 +9,7 @@ mod drivers;
 mod filament;
 mod hosts;
 mod klippy;
+mod leveling;
 #[allow(dead_code)]
 #[path = "../pages/page.rs"]
 mod page;
@@ -20,6 +21,7 @@ mod rings;
 mod sections;
 mod servo;
 mod shown;
+mod tools;
 
 use std::io::Write;
 use std::path::PathBuf;
