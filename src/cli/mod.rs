@@ -16,6 +16,7 @@ pub mod demo;
 mod dict;
 mod doctor;
 mod finding;
+mod keys;
 pub mod latency;
 mod logging;
 mod page;

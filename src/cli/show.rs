@@ -6,18 +6,24 @@
 
 #![forbid(unsafe_code)]
 
-use std::fmt::Write as _;
 use std::io::{self, IsTerminal};
 use std::sync::mpsc::{self, Receiver, RecvTimeoutError, Sender};
 use std::thread;
 use std::time::Duration;
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::getpid;
 
 use crate::foreign::plain;
 use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 use pinion_sim::SimProbe;
 
+use super::keys::Keys;
 use super::page::draw;
+use changes::Changes;
+
+mod changes;
 
 /// Between two pictures on a terminal, and between two looks for changes.
 const DRAW_PERIOD: Duration = Duration::from_millis(100);
@@ -27,10 +33,33 @@ const FAREWELL: Duration = Duration::from_secs(1);
 /// Rows of a terminal that are left to the log.
 const LOG_ROWS: usize = 3;
 
+/// What a thing is among. Those of a kind share a line on a terminal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Kind {
+    Axis,
+    Heater,
+    Fan,
+    Output,
+    /// Whatever has a line of its own.
+    Part,
+}
+
+impl Kind {
+    /// What many and one of them are called; a part has a name of its own.
+    fn names(self) -> Option<(&'static str, &'static str)> {
+        match self {
+            Kind::Axis => Some(("axes", "axis")),
+            Kind::Heater => Some(("heaters", "heater")),
+            Kind::Fan => Some(("fans", "fan")),
+            Kind::Output => Some(("outputs", "output")),
+            Kind::Part => None,
+        }
+    }
+}
+
 /// A thing that can be seen.
 struct Item {
-    /// What it is among: those of a kind share a line on a terminal.
-    kind: &'static str,
+    kind: Kind,
     name: String,
     /// What changes by small steps.
     number: Option<Number>,
@@ -61,7 +90,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
         // What is next to zero is not to be "-0.00".
         let mm = (axis.position_mm * 100.0).round() / 100.0 + 0.0;
         items.push(Item {
-            kind: "axes",
+            kind: Kind::Axis,
             name: axis.name.into(),
             number: Some(Number { value: axis.position_mm, step: 1.0 }),
             text: format!("{mm:.2} mm{lost}"),
@@ -69,7 +98,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
     }
     for heater in probe.heaters() {
         items.push(Item {
-            kind: "heaters",
+            kind: Kind::Heater,
             name: heater.name.into(),
             number: Some(Number { value: heater.celsius, step: 1.0 }),
             text: format!("{:.1} C", heater.celsius),
@@ -77,7 +106,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
     }
     for fan in probe.fans() {
         items.push(Item {
-            kind: "fans",
+            kind: Kind::Fan,
             name: fan.name.into(),
             number: Some(Number { value: fan.rpm, step: 100.0 }),
             text: format!("{:.0} rpm", fan.rpm),
@@ -90,56 +119,12 @@ fn look(probe: &SimProbe) -> Vec<Item> {
             percent => format!("{percent} %"),
         };
         let number = Some(Number { value: output.brightness, step: 0.05 });
-        items.push(Item { kind: "outputs", name: output.name.into(), number, text });
+        items.push(Item { kind: Kind::Output, name: output.name.into(), number, text });
     }
     for (name, text) in probe.sights() {
-        items.push(Item { kind: "", name: name.into(), number: None, text });
+        items.push(Item { kind: Kind::Part, name: name.into(), number: None, text });
     }
     items.into_iter().map(Item::plain).collect()
-}
-
-/// What was told of an item last, and what the look before this one saw.
-struct Told {
-    number: Option<Number>,
-    text: String,
-    seen: Option<Number>,
-}
-
-/// The lines that tell of what changed.
-#[derive(Default)]
-struct Changes {
-    /// In the order of the items.
-    told: Vec<Told>,
-}
-
-impl Changes {
-    fn lines(&mut self, items: Vec<Item>, at: Duration) -> String {
-        let mut lines = String::new();
-        for (n, item) in items.into_iter().enumerate() {
-            if let Some(told) = self.told.get_mut(n) {
-                let went = match (item.number, told.number) {
-                    (Some(now), Some(then)) => {
-                        let stands = item.number == told.seen;
-                        (now.value - then.value).abs() >= now.step || stands
-                    }
-                    _ => true,
-                };
-                told.seen = item.number;
-                if !went || item.text == told.text {
-                    continue;
-                }
-            }
-            let space = if item.text.contains('\n') { '\n' } else { ' ' };
-            // A String takes everything that is written to it.
-            let _ = writeln!(lines, "[{:12.6}] {}:{space}{}", at.as_secs_f64(), item.name, name_colours(&item.text));
-            let told = Told { number: item.number, text: item.text, seen: item.number };
-            match self.told.get_mut(n) {
-                Some(place) => *place = told,
-                None => self.told.push(told),
-            }
-        }
-        lines
-    }
 }
 
 /// Has `with` write each `#rrggbb` of a text.
@@ -190,25 +175,25 @@ fn paint_colours(text: &str) -> String {
 
 /// The picture's lines.
 fn picture(items: &[Item], paint: bool) -> Vec<String> {
-    let heads = items.iter().map(|item| if item.kind.is_empty() { &item.name } else { item.kind });
+    let heads = items.iter().map(|item| item.kind.names().map_or(item.name.as_str(), |(many, _)| many));
     let width = heads.map(str::len).max().unwrap_or(0) + 2;
     let mut lines: Vec<String> = Vec::new();
-    let mut kind = "";
+    let mut kind = Kind::Part;
     for item in items {
         let text = if paint { paint_colours(&item.text) } else { name_colours(&item.text) };
-        match item.kind {
-            "" if text.contains('\n') => {
+        match item.kind.names() {
+            None if text.contains('\n') => {
                 lines.push(item.name.clone());
                 lines.extend(text.lines().map(str::to_owned));
             }
-            "" => lines.push(format!("{:width$}{text}", item.name)),
+            None => lines.push(format!("{:width$}{text}", item.name)),
             // One more of the kind that the last line is of.
-            other if other == kind => {
+            Some(_) if item.kind == kind => {
                 if let Some(line) = lines.last_mut() {
                     *line += &format!("   {} {text}", item.name);
                 }
             }
-            other => lines.push(format!("{other:width$}{} {text}", item.name)),
+            Some((many, _)) => lines.push(format!("{many:width$}{} {text}", item.name)),
         }
         kind = item.kind;
     }
@@ -319,7 +304,7 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
         let mut changes = Changes::default();
         loop {
             let is_over = is_over(LOOK_PERIOD);
-            let lines = changes.lines(look(probe), monotonic());
+            let lines = changes.lines(&look(probe), monotonic(), is_over);
             if !lines.is_empty() {
                 draw(&lines)?;
             }
@@ -330,8 +315,13 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
     }
     let paint = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let mut screen = Screen::default();
+    let keys = Keys::take();
     loop {
         let is_over = is_over(DRAW_PERIOD);
+        if !is_over && keys.as_ref().is_some_and(|keys| keys.has(b'q')) {
+            // SIGTERM to ourselves: the program ends in order, as by Ctrl-C.
+            kill(getpid(), Signal::SIGTERM)?;
+        }
         // A terminal that does not tell its size has the VT100's.
         let rows = sys::terminal_rows(&io::stdout()).unwrap_or(24);
         let mut drawing = screen.draw(picture(&look(probe), paint), rows);
@@ -353,27 +343,9 @@ mod tests {
     use crate::cli::page::tests::{any_name, assert_plain};
     use proptest::prelude::*;
 
-    fn item(kind: &'static str, name: &str, value: Option<f64>, text: &str) -> Item {
+    pub(super) fn item(kind: Kind, name: &str, value: Option<f64>, text: &str) -> Item {
         let number = value.map(|value| Number { value, step: 1.0 });
         Item { kind, name: name.into(), number, text: text.into() }
-    }
-
-    #[test]
-    fn what_changed_is_told_once_and_a_number_by_steps_and_as_it_stands() {
-        let mut changes = Changes::default();
-        let mut told = |mm: f64, strip: &str| {
-            let items = vec![item("axes", "x", Some(mm), &format!("{mm} mm")), item("", "strip", None, strip)];
-            changes.lines(items, Duration::from_millis(1500))
-        };
-        assert_eq!(told(0.0, "off"), "[    1.500000] x: 0 mm\n[    1.500000] strip: off\n");
-        assert_eq!(told(0.0, "off"), "");
-        assert_eq!(told(0.5, "off"), "", "it moves, but not by a step yet");
-        assert_eq!(
-            told(1.25, "#ff8000 #000010"),
-            "[    1.500000] x: 1.25 mm\n[    1.500000] strip: yellow#ff8000 blue#000010\n"
-        );
-        assert_eq!(told(1.5, "#ff8000 #000010"), "");
-        assert_eq!(told(1.5, "⠁\n⠂"), "[    1.500000] x: 1.5 mm\n[    1.500000] strip:\n⠁\n⠂\n");
     }
 
     proptest! {
@@ -381,14 +353,14 @@ mod tests {
         fn a_name_stays_in_its_line_and_moves_nothing(name in any_name()) {
             // Between the rows of a display stand line feeds of ours.
             let text = name.replace('\n', "");
-            let items = || ["axes", ""].map(|kind| item(kind, &name, None, &text).plain());
+            let items = || [Kind::Axis, Kind::Part].map(|kind| item(kind, &name, None, &text).plain());
             for line in picture(&items(), false) {
                 assert_plain(&line, 0);
             }
             for line in picture(&items(), true) {
                 assert_plain(&line.replace("\x1b[48;2;", "").replace("\x1b[0m", ""), 0);
             }
-            let lines = Changes::default().lines(items().into(), Duration::ZERO);
+            let lines = Changes::default().lines(&items(), Duration::ZERO, false);
             assert_plain(&lines, lines.matches('\n').count());
         }
     }
@@ -403,11 +375,11 @@ mod tests {
     #[test]
     fn the_picture_has_a_line_for_each_kind() {
         let items = [
-            item("axes", "x", None, "1 mm"),
-            item("axes", "y", None, "2 mm"),
-            item("fans", "fan", None, "0 rpm"),
-            item("", "strip", None, "off"),
-            item("", "display", None, "⠁\n⠂"),
+            item(Kind::Axis, "x", None, "1 mm"),
+            item(Kind::Axis, "y", None, "2 mm"),
+            item(Kind::Fan, "fan", None, "0 rpm"),
+            item(Kind::Part, "strip", None, "off"),
+            item(Kind::Part, "display", None, "⠁\n⠂"),
         ];
         let lines = ["axes     x 1 mm   y 2 mm", "fans     fan 0 rpm", "strip    off", "display", "⠁", "⠂"];
         assert_eq!(picture(&items, true), lines);

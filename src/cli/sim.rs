@@ -135,7 +135,7 @@ fn show_as_it_changes(
     };
     let ready = || {
         if io::stdout().is_terminal() {
-            tell_how_to_connect(args);
+            tell_how_to_connect(args, "q or Ctrl-C");
         }
         show.begin();
     };
@@ -158,13 +158,13 @@ fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended
         }
         return;
     }
-    tell_how_to_connect(args);
+    tell_how_to_connect(args, "Ctrl-C");
 }
 
-fn tell_how_to_connect(args: &SimArgs) {
+fn tell_how_to_connect(args: &SimArgs, end: &str) {
     let file = args.file.as_ref().map_or(String::new(), |file| format!(" {}", file.display()));
     tell("");
-    tell("The simulated printer goes on until Ctrl-C. To connect a Klipper host:");
+    tell(format_args!("The simulated printer goes on until {end}. To connect a Klipper host:"));
     tell(format_args!("  pinion sim{file} -I {} --print-config > printer.cfg", args.symlink.display()));
     tell("  klippy.py printer.cfg");
 }
@@ -256,7 +256,7 @@ fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
     };
     Some(HeaterPlan {
         name: heater.name.clone(),
-        heater: pin(&heater.pin),
+        heater: pin(heater.pin.as_ref()?),
         sensor: heater.sensor_pin.name.clone(),
         thermistor,
         min_c: heater.min_celsius,

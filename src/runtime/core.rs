@@ -435,6 +435,10 @@ mod tests {
         fn instant_of(&self, monotonic: Duration) -> Clock {
             self.0.instant_of(monotonic)
         }
+
+        fn duration_of(&self, clock: Clock) -> Duration {
+            self.0.duration_of(clock)
+        }
     }
 
     /// A core at work with an SPI device and a digital output, and what stands for its link.

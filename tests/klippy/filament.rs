@@ -84,3 +84,18 @@ fn a_print_with_enough_filament_goes_on_to_its_end() {
     printer.gcode("G1 E0.01 F60\nM400");
     printer.until_object(SWITCH, "filament_detected", false);
 }
+
+#[test]
+fn a_new_spool_is_put_in() {
+    let Some(checkout) = checkout("a_new_spool_is_put_in") else { return };
+    let mut printer = start_print(&checkout, 40, "length_mm = 42.0\n");
+    printer.until_object("pause_resume", "is_paused", true);
+    printer.gcode("M400");
+    assert!(!detects(&mut printer, SWITCH));
+    printer.gcode("CANCEL_PRINT\nSET_PIN PIN=filament_refill VALUE=1\nSET_PIN PIN=filament_refill VALUE=0");
+    printer.until_object(SWITCH, "filament_detected", true);
+    printer.gcode("M83\nG1 E41 F1500\nM400");
+    assert!(detects(&mut printer, SWITCH));
+    printer.gcode("G1 E2 F1500\nM400");
+    printer.until_object(SWITCH, "filament_detected", false);
+}

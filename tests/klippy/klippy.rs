@@ -448,6 +448,23 @@ impl Printer {
     }
 }
 
+/// An example of docs/simulator.md: by itself, or appended to the built-in description as it says.
+pub fn example(built_in: &str, heading: &str) -> String {
+    const PAGE: &str = include_str!("../../docs/simulator.md");
+    let (_, section) = PAGE.split_once(&format!("\n### {heading}\n")).unwrap();
+    let (example, _) = section.split_once("\n```toml\n").unwrap().1.split_once("```\n").unwrap();
+    if example.starts_with("[delta]") {
+        return example.to_owned();
+    }
+    let rest = match built_in.split_once("[[axis]]\nname = \"z\"\n") {
+        Some((before, z)) if example.contains("name = \"z\"\n") => {
+            format!("{before}{}", z.split_once("\n\n").unwrap().1)
+        }
+        _ => built_in.to_owned(),
+    };
+    format!("{rest}\n{example}")
+}
+
 /// The configuration without a section.
 pub fn without(config: &str, section: &str) -> String {
     let head = format!("[{section}]\n");
@@ -482,6 +499,8 @@ pub fn batch(checkout: &Path, dictionary: &Path, config: &str, gcode: &str) -> R
         .arg(dictionary)
         .arg("-l")
         .arg(path("log"))
+        // Whatever it keeps there.
+        .env("HOME", folder.path())
         .output()
         .unwrap();
     if ended.status.success() {

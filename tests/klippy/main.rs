@@ -9,6 +9,7 @@ mod drivers;
 mod filament;
 mod hosts;
 mod klippy;
+mod leveling;
 mod print;
 mod probes;
 mod readme;
@@ -17,6 +18,7 @@ mod rings;
 mod sections;
 mod servo;
 mod shown;
+mod tools;
 
 use std::io::Write;
 use std::path::PathBuf;

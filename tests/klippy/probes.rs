@@ -7,13 +7,13 @@ use super::checkout;
 use super::klippy::{Printer, with, without};
 
 /// A step of the z axis.
-const STEP_MM: f64 = 1.0 / 400.0;
+pub const STEP_MM: f64 = 1.0 / 400.0;
 /// The travel of the x and y axis.
 const TRAVEL_MM: f64 = 220.0;
 
 /// The height of the default printer's bed: by `[bed]` 0.12 mm along x, -0.08 mm along y, and 0.1 mm lower
 /// at the corners than in the middle, which is at 0.
-fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
+pub fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
     let (u, v) = (x_mm / TRAVEL_MM - 0.5, y_mm / TRAVEL_MM - 0.5);
     0.12 * u - 0.08 * v - 0.2 * (u * u + v * v)
 }
@@ -29,10 +29,12 @@ fn homed_by_probe(config: &str) -> String {
 /// Homes, and does what else there is to do. Again where klippy came too late with its moves, as on a busy
 /// computer it does.
 #[track_caller]
-fn home(printer: &mut Printer, then: &str) {
+pub fn home(printer: &mut Printer, then: &str) {
     for _ in 0..5 {
         let Err(error) = printer.try_gcode(&format!("G28\n{then}")) else { return };
-        let late = printer.log().contains("the host asked for an event") || error.contains("Communication timeout");
+        let late = printer.log().contains("the host asked for an event")
+            || error.contains("Communication timeout")
+            || error.contains("due to printer shutdown");
         assert!(late, "{error}\n{}", printer.log());
         printer.restart("FIRMWARE_RESTART");
     }
@@ -47,7 +49,7 @@ fn number(said: &str, before: &str) -> f64 {
 }
 
 /// Where a PROBE of the bed ended: place and height.
-fn probed(printer: &mut Printer, probe: &str) -> [f64; 3] {
+pub fn probed(printer: &mut Printer, probe: &str) -> [f64; 3] {
     printer.gcode(probe);
     let position = printer.object("probe")["last_probe_position"].clone();
     // klippy computes them from steps.
@@ -66,7 +68,7 @@ fn mesh_fault_mm(printer: &mut Printer) -> f64 {
     points.fold(0.0, |worst: f64, (x, y)| worst.max((rows[y][x] - bed_mm(place(0, x), place(1, y))).abs()))
 }
 
-fn numbers(list: &Value) -> Vec<f64> {
+pub fn numbers(list: &Value) -> Vec<f64> {
     list.as_array().unwrap().iter().map(|value| value.as_f64().unwrap()).collect()
 }
 

@@ -2,17 +2,19 @@
 //! `pinion sim --show`: what a person sees while a host drives the printer.
 
 use std::fs::{self, File};
-use std::io::Read;
+use std::io::{Read, Write};
 use std::path::Path;
-use std::process::Stdio;
+use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
 use std::thread;
+use std::time::{Duration, Instant};
 
 use nix::pty::{Winsize, openpty};
 use nix::sys::signal::Signal;
+use nix::sys::termios::{LocalFlags, tcgetattr};
 use pinion_client::Client;
 
-use crate::process::{Pinion, closed_pipe, exists, output};
+use crate::process::{PATIENCE, Pinion, closed_pipe, exists, output};
 
 const STRIP: &[&str] = &[
     "allocate_oids count=2",
@@ -50,7 +52,14 @@ fn each_change_is_a_line() {
     let mut pinion = Pinion::start(&["sim", "-r", "--show"]);
     pinion.until("all things once", || pinion.out().contains("] dots: "));
     let first = pinion.out();
-    for line in ["x: 60.00 mm", "extruder: 25.0 C", "fan: 0 rpm", "light: off", "display: dark"] {
+    for line in [
+        "x: 60.00 mm",
+        "axis extruder: 0.00 mm",
+        "heater extruder: 25.0 C",
+        "fan: 0 rpm",
+        "light: off",
+        "display: dark",
+    ] {
         assert_eq!(first.lines().filter(|shown| shown.ends_with(&format!("] {line}"))).count(), 1, "{line}\n{first}");
     }
     assert_eq!(policy(&pinion, "show"), 0, "to show something is no hurry (SCHED_OTHER)");
@@ -106,6 +115,43 @@ fn on_a_terminal_there_is_a_picture_and_the_terminal_is_given_back() {
 }
 
 #[test]
+fn q_ends_the_program_and_gives_the_keys_back() {
+    let terminal = openpty(None, None).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let keys = || tcgetattr(&terminal.master).unwrap().local_flags.contains(LocalFlags::ICANON | LocalFlags::ECHO);
+    assert!(keys());
+    let mut pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["sim", "--show", "-I"])
+        .arg(folder.path().join("tty"))
+        .stdin(terminal.slave.try_clone().unwrap())
+        .stdout(terminal.slave)
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    // Whatever is not read fills the terminal.
+    let mut master = File::from(terminal.master.try_clone().unwrap());
+    let reader = thread::spawn(move || std::io::copy(&mut master, &mut std::io::sink()));
+    let end = Instant::now() + PATIENCE;
+    while keys() {
+        assert!(Instant::now() < end, "the program takes no keys");
+        thread::sleep(Duration::from_millis(20));
+    }
+    File::from(terminal.master.try_clone().unwrap()).write_all(b"xq").unwrap();
+    let end = Instant::now() + PATIENCE;
+    let status = loop {
+        if let Some(status) = pinion.try_wait().unwrap() {
+            break status;
+        }
+        assert!(Instant::now() < end, "the program does not end");
+        thread::sleep(Duration::from_millis(20));
+    };
+    assert_eq!(status.code(), Some(0));
+    assert!(!exists(&folder.path().join("tty")));
+    assert!(keys(), "the terminal is as before");
+    let _ = reader.join();
+}
+
+#[test]
 fn a_reader_that_goes_away_leaves_the_printer_serving() {
     let folder = tempfile::tempdir().unwrap();
     let log = File::create(folder.path().join("log")).unwrap();
@@ -137,7 +183,6 @@ fn a_terminal_that_takes_nothing_does_not_keep_the_program() {
 /// Fills a pipe.
 fn fill(pipe: &std::io::PipeWriter) {
     use nix::fcntl::{FcntlArg, OFlag, fcntl};
-    use std::io::Write;
     fcntl(pipe, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).unwrap();
     let mut pipe_end = pipe.try_clone().unwrap();
     while pipe_end.write(&[b' '; 4096]).is_ok() {}

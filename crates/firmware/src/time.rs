@@ -55,6 +55,9 @@ pub trait TimeSource: Send + Sync {
     /// The instant that CLOCK_MONOTONIC tells as `monotonic`: the kernel dates by that clock.
     fn instant_of(&self, monotonic: Duration) -> Clock;
 
+    /// What CLOCK_MONOTONIC tells at this instant.
+    fn duration_of(&self, clock: Clock) -> Duration;
+
     /// Waits until `end` without sleeping: for the pulses of a bus, which are shorter than a sleep.
     fn spin_until(&self, end: Clock) {
         while self.now() < end {
@@ -97,6 +100,10 @@ impl TimeSource for VirtualClock {
     fn instant_of(&self, monotonic: Duration) -> Clock {
         let s = monotonic.as_secs();
         Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
+    }
+
+    fn duration_of(&self, clock: Clock) -> Duration {
+        Duration::from_nanos(clock.ticks() * NS_PER_TICK)
     }
 
     fn spin_until(&self, end: Clock) {

@@ -24,11 +24,6 @@ impl Monotonic {
     pub fn start() -> Monotonic {
         Monotonic { origin_s: monotonic().as_secs() }
     }
-
-    /// The instant of CLOCK_MONOTONIC, as the time since the kernel's start.
-    pub fn duration_of(&self, clock: Clock) -> Duration {
-        Duration::from_secs(self.origin_s) + Duration::from_nanos(clock.ticks() * NS_PER_TICK)
-    }
 }
 
 impl TimeSource for Monotonic {
@@ -39,6 +34,10 @@ impl TimeSource for Monotonic {
     fn instant_of(&self, monotonic: Duration) -> Clock {
         let s = monotonic.as_secs().saturating_sub(self.origin_s);
         Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
+    }
+
+    fn duration_of(&self, clock: Clock) -> Duration {
+        Duration::from_secs(self.origin_s) + Duration::from_nanos(clock.ticks() * NS_PER_TICK)
     }
 }
 

@@ -222,7 +222,7 @@ impl SpiChip for Ads1220 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::physics::Bed;
+    use super::super::bed::Bed;
     use super::*;
     use pinion_firmware::time::VirtualClock;
 
@@ -241,7 +241,7 @@ mod tests {
                 weight_g: 128.0,
                 noise_counts: 0.0,
             };
-            let cell = Cell::over(config, Bed::new(Default::default(), None, None, None));
+            let cell = Cell::over(config, Bed::under(Default::default(), None, None, None));
             let clock = VirtualClock::at(Clock::from_ticks(0));
             let drdy = ReadyLine::new("drdy");
             let chip = Ads1220::new(cell, drdy.clone(), Arc::new(clock.clone()));

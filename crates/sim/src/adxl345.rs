@@ -162,18 +162,16 @@ impl Part for Adxl345Config {
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.section("adxl345");
         cfg.spi(&self.bus, self.select_pin.as_ref());
-        if !layout.is_cartesian {
+        if !layout.has_head() {
             return;
         }
         // klippy shakes the head there.
-        let middle = |name: &str| {
-            let axis = layout.config.axes.iter().find(|axis| axis.name == name);
-            axis.and_then(|axis| axis.travel_mm).unwrap_or(0.0) / 2.0
-        };
+        let [x_mm, y_mm] = layout.place_mm(0.5, 0.5);
+        let z_mm = (layout.height_mm() / 2.0).min(20.0);
         cfg.section("resonance_tester");
         cfg.needs("adxl345");
         cfg.key("accel_chip", "adxl345");
-        cfg.key("probe_points", format_args!("{}, {}, {}", middle("x"), middle("y"), middle("z").min(20.0)));
+        cfg.key("probe_points", format_args!("{x_mm}, {y_mm}, {z_mm}"));
         cfg.section("input_shaper");
     }
 }

@@ -18,9 +18,10 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
+use super::bed::Bed;
 use super::config::{Bound, PinName, SimConfig, SimError, check};
 use super::part::{Part, Sight, Workshop};
-use super::physics::{Bed, Together, seconds};
+use super::physics::{Together, seconds};
 use super::printer_cfg::{Layout, Sections};
 use super::probe::check_offsets;
 use super::wire::{Kind, Wire};
@@ -390,7 +391,7 @@ mod tests {
                 move_s: 0.3,
                 jams,
             };
-            let bed = Bed::new(Default::default(), None, None, Some(z.clone()));
+            let bed = Bed::under(Default::default(), None, None, Some(z.clone()));
             Bench { z, probe: Arc::new(Bltouch::new(&config, bed)), now: Clock::from_ticks(0) }.after(1.0)
         }
 

@@ -12,8 +12,11 @@ use serde::Deserialize;
 use super::part::PartConfig;
 use super::thermistor::{NoThermistor, Thermistor};
 
+mod axes;
 mod validate;
 
+pub(super) use axes::Kinematics;
+pub use axes::{AxisConfig, DeltaConfig, End};
 use validate::fault;
 pub(super) use validate::{Bound, check, check_lights, wrong};
 
@@ -82,6 +85,8 @@ pub struct SimConfig {
     /// The axes; `x`, `y`, `z` and `extruder` are those of a cartesian printer.
     #[serde(default, rename = "axis")]
     pub axes: Vec<AxisConfig>,
+    /// The towers, if it is a delta printer.
+    pub delta: Option<DeltaConfig>,
     /// The heaters with their sensors.
     #[serde(default, rename = "heater")]
     pub heaters: Vec<HeaterConfig>,
@@ -90,7 +95,7 @@ pub struct SimConfig {
     pub fans: Vec<FanConfig>,
     /// Lights, which the host may dim.
     #[serde(default, rename = "led")]
-    pub leds: Vec<OutputConfig>,
+    pub leds: Vec<LedConfig>,
     /// Outputs that switch something that needs no simulation.
     #[serde(default, rename = "output")]
     pub outputs: Vec<OutputConfig>,
@@ -136,78 +141,14 @@ impl Default for Limits {
     }
 }
 
-/// The end of an axis at which its endstop sits.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum End {
-    /// At 0 mm.
-    Min,
-    /// At `travel_mm`.
-    Max,
-}
-
-/// A stepper motor and what it moves.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct AxisConfig {
-    /// Such as `x`.
-    pub name: String,
-    /// The step pin. Each rising edge is a step.
-    pub step_pin: PinName,
-    /// The direction pin. While it is high, steps count up.
-    pub dir_pin: PinName,
-    /// The motor is held, and steps, only while this is high. Without this pin it always is.
-    pub enable_pin: Option<PinName>,
-    /// Whether the falling edge of the step pin is a step too.
-    #[serde(default)]
-    pub step_both_edges: bool,
-    /// Steps in a millimetre.
-    pub steps_per_mm: f64,
-    /// Microsteps in a full step, for printer.cfg. The motor has 200 full steps in a turn.
-    #[serde(default = "default_microsteps")]
-    pub microsteps: u32,
-    /// The axis goes from 0 to here. Without this it has no end.
-    pub travel_mm: Option<f64>,
-    /// How far beyond either end of its travel the axis goes before it hits something and loses steps.
-    #[serde(default = "default_overtravel_mm")]
-    pub overtravel_mm: f64,
-    /// The position of the axis at first.
-    #[serde(default)]
-    pub start_mm: f64,
-    /// The endstop's pin. It is high while the axis is at that end of its travel or beyond.
-    pub endstop_pin: Option<PinName>,
-    /// The end of the travel at which the endstop sits.
-    #[serde(default = "default_end")]
-    pub endstop_at: End,
-    /// Speed of homing, for printer.cfg.
-    #[serde(default = "default_homing_mm_per_s")]
-    pub homing_mm_per_s: f64,
-}
-
-fn default_microsteps() -> u32 {
-    16
-}
-
-fn default_overtravel_mm() -> f64 {
-    2.0
-}
-
-fn default_end() -> End {
-    End::Min
-}
-
-fn default_homing_mm_per_s() -> f64 {
-    5.0
-}
-
 /// A heater, the mass that it heats, and the thermistor in it.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HeaterConfig {
     /// Such as `extruder` or `heater_bed`.
     pub name: String,
-    /// Power is on while this is high.
-    pub pin: PinName,
+    /// Power is on while this is high; always, if left out.
+    pub pin: Option<PinName>,
     /// The ADC channel of the thermistor.
     pub sensor_pin: PinName,
     /// Power while on.
@@ -269,6 +210,12 @@ pub struct FanConfig {
     /// Time constant with which the speed follows the power.
     #[serde(default = "default_spin_up_s")]
     pub spin_up_s: f64,
+    /// The heater that it blows at.
+    pub cools: Option<String>,
+    /// What that loses while the fan has power, for each kelvin above the surroundings and beyond what it
+    /// loses without.
+    #[serde(default)]
+    pub cooling_w_per_k: f64,
 }
 
 fn default_pulses_per_revolution() -> u32 {
@@ -279,7 +226,35 @@ fn default_spin_up_s() -> f64 {
     0.5
 }
 
-/// An output that switches a light or something that needs no simulation.
+/// A light of one to four colours.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LedConfig {
+    /// Such as `light`.
+    pub name: String,
+    /// A light that is on while high; of one with colours, its white part.
+    pub pin: Option<PinName>,
+    /// Its red part.
+    pub red_pin: Option<PinName>,
+    /// Its green part.
+    pub green_pin: Option<PinName>,
+    /// Its blue part.
+    pub blue_pin: Option<PinName>,
+}
+
+impl LedConfig {
+    /// Its pins with their keys: red, green, blue, and white.
+    pub(super) fn pins(&self) -> [(&'static str, Option<&PinName>); 4] {
+        [
+            ("red_pin", self.red_pin.as_ref()),
+            ("green_pin", self.green_pin.as_ref()),
+            ("blue_pin", self.blue_pin.as_ref()),
+            ("pin", self.pin.as_ref()),
+        ]
+    }
+}
+
+/// An output that switches something that needs no simulation.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OutputConfig {
@@ -329,7 +304,7 @@ pub struct I2cBusConfig {
     pub delay_us: u64,
 }
 
-/// The shape of the bed under a cartesian printer's nozzle; its middle is at 0.
+/// The shape of the bed; its middle is at 0.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BedConfig {
@@ -382,9 +357,15 @@ impl SimConfig {
         Ok(config)
     }
 
-    /// All lights and other outputs.
-    pub(super) fn switched(&self) -> impl Iterator<Item = &OutputConfig> {
-        self.leds.iter().chain(&self.outputs)
+    /// The pins of all lights and other outputs.
+    pub(super) fn switched(&self) -> impl Iterator<Item = &PinName> {
+        let leds = self.leds.iter().flat_map(|led| led.pins().into_iter().filter_map(|(_, pin)| pin));
+        leds.chain(self.outputs.iter().map(|output| &output.pin))
+    }
+
+    /// The fan that cools a heater, if there is one.
+    pub(super) fn fan_of(&self, heater: &str) -> Option<&FanConfig> {
+        self.fans.iter().find(|fan| fan.cools.as_deref() == Some(heater))
     }
 }
 
@@ -456,149 +437,4 @@ fn place(text: &str, at: usize) -> (usize, Option<&str>) {
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    /// The error of the default printer with its first `from` replaced by `to`.
-    fn error_of(from: &str, to: &str) -> String {
-        assert!(DEFAULT.contains(from), "{from}");
-        let text = DEFAULT.replacen(from, to, 1);
-        match SimConfig::parse(&text, "my.toml") {
-            Ok(_) => panic!("accepted {to}"),
-            Err(error) => error.to_string(),
-        }
-    }
-
-    #[test]
-    fn the_default_printer_is_sound() {
-        let config = SimConfig::default_printer();
-        assert_eq!(config.axes.len(), 4);
-        assert_eq!(config.heaters.len(), 2);
-    }
-
-    #[test]
-    fn an_error_is_one_line_with_file_key_and_remedy() {
-        for (from, to, key, cause) in [
-            ("travel_mm = 220.0", "travel = 220.0", "`travel`", "unknown field"),
-            ("steps_per_mm = 80.0\n", "", "`steps_per_mm`", "missing field"),
-            ("steps_per_mm = 80.0", "steps_per_mm = \"many\"", "`steps_per_mm`", "invalid type"),
-            ("steps_per_mm = 80.0", "steps_per_mm = -80.0", "`steps_per_mm`", "not above zero"),
-            ("steps_per_mm = 80.0", "steps_per_mm = nan", "`steps_per_mm`", "out of range"),
-            ("microsteps = 16", "microsteps = 0", "`microsteps`", "not above zero"),
-            ("start_mm = 60.0", "start_mm = 600.0", "`start_mm`", "out of its reach"),
-            ("travel_mm = 220.0\n", "", "`travel_mm`", "an axis with an endstop needs it"),
-            ("\"y_step\"", "\"x_step\"", "`step_pin`", "`x_step` has a use already"),
-            ("\"x_step\"", "\"x step\"", "`step_pin`", "no pin name"),
-            ("\"x_step\"", "\"^x_step\"", "`step_pin`", "no pin name"),
-            ("name = \"y\"", "name = \"x\"", "`name`", "two are called `x`"),
-            ("endstop_at = \"min\"", "endstop_at = \"left\"", "`endstop_at`", "unknown variant"),
-            ("\"hotend_sensor\"", "\"!hotend_sensor\"", "`sensor_pin`", "no polarity"),
-            ("sensor_lag_s = 1.0", "sensor_lag_s = 60.0", "`sensor_lag_s`", "slower than"),
-            ("max_celsius = 280.0", "max_celsius = -1", "`max_celsius`", "not above min"),
-            ("beta_k = 3950.0\n", "", "`beta_k`", "one point"),
-            ("beta_k = 3950.0", "beta_k = 0.0", "`beta_k`", "above zero"),
-            (", [150.0, 1641.9]", "", "`points_celsius_ohm`", "two"),
-            ("1641.9", "-1", "`points_celsius_ohm`", "above zero"),
-            ("[25.0, 100000.0]", "[25.0, true]", "`points_celsius_ohm`", "invalid type"),
-            ("bus = \"spidev1.0\"", "bus = \"spidev2.0\"", "`bus`", "no `spidev2.0`"),
-            ("bus = \"spidev1.0\"", "bus = \"spidev0.0\"", "`select_pin`", "not the only chip"),
-            ("\"z_cs\"", "\"!z_cs\"", "`select_pin`", "low level only"),
-            ("\"z_cs\"", "\"z_dir\"", "`select_pin`", "has a use already"),
-            ("axis = \"z\"", "axis = \"w\"", "`axis`", "no `w`"),
-            ("kind = \"tmc5160\"", "kind = \"tmc9\"", "", "unknown variant `tmc9`"),
-            ("axis = \"z\"", "axes = \"z\"", "", "unknown field `axes`"),
-            ("axis = \"x\", hz", "axis = \"w\", hz", "`axis`", "no `w`"),
-            ("hz = 43.5", "hz = 0.0", "`y`", "not above zero"),
-            ("heater = \"extruder\"", "heater = \"oven\"", "`heater`", "no `oven`"),
-            ("name = \"arm\"", "name = \"an arm\"", "`name`", "`an arm` is no name"),
-            ("name = \"dots\"", "name = \"\"", "`name`", "`` is no name"),
-            ("count = 8", "count = 1001", "`count`", "too many"),
-            ("count = 4", "count = 1001", "`count`", "too many"),
-            ("drive_current = 16", "drive_current = 32", "`drive_current`", "no current"),
-            ("yielding = 0.9", "yielding = 1.1", "`yielding`", "more than all"),
-            ("conversion_ms = 750", "conversion_ms = 1000000001", "`conversion_ms`", "out of range"),
-            ("damping_ratio = 0.1", "damping_ratio = 1.0", "`x`", "does not ring"),
-            ("rate_off_percent = 0.4", "rate_off_percent = 40.0", "`rate_off_percent`", "so far off"),
-            ("encoder_mm = 1.44", "encoder_mm = 0.0", "`encoder_mm`", "not above zero"),
-            ("max_pulse_us = 2000.0", "max_pulse_us = 900.0", "`max_pulse_us`", "not above min_pulse_us"),
-            ("name = \"spidev1.0\"", "name = \"spidev0.0\"", "`name`", "two are called `spidev0.0`"),
-            (
-                "name = \"spidev1.0\"",
-                "name = \"spidev1.0\"\ntrace_pins = [\"x_dir\"]",
-                "`trace_pins`",
-                "`x_dir` is no pin",
-            ),
-            ("seed = 1", "seed = = 1", "`seed`", ""),
-            ("[[25.0, 100000.0], [150", "[[25.0, 100000.0],\n[true", "`points_celsius_ohm`", ""),
-        ] {
-            let error = error_of(from, to);
-            assert!(error.starts_with("my.toml"), "{error}");
-            assert!(error.contains(key), "{error}");
-            assert!(error.contains(cause), "{error}");
-            assert!(!error.contains('\n'), "{error}");
-        }
-    }
-
-    /// The words that an error offers for one that nobody knows.
-    fn offered(toml: &str) -> Vec<String> {
-        let Err(error) = SimConfig::parse(toml, "my.toml") else { panic!("accepted {toml}") };
-        let error = error.to_string();
-        let Some((_, offered)) = error.split_once(", expected ") else { panic!("{error}") };
-        offered.split('`').skip(1).step_by(2).map(str::to_owned).collect()
-    }
-
-    #[test]
-    fn the_documentation_has_every_kind_and_every_key() {
-        const DOCUMENTATION: &str = include_str!("../../../docs/simulator.md");
-        // A section ends at the next heading.
-        let has = |heading: &str, key: &str| {
-            let Some((_, section)) = DOCUMENTATION.split_once(&format!("\n{heading}\n")) else {
-                panic!("there is no `{heading}`");
-            };
-            let section = section.split("\n##").next().unwrap_or_default();
-            let mut words = section.split(|c: char| !(c.is_ascii_alphanumeric() || c == '_'));
-            assert!(words.any(|word| word == key), "{key} is not in `{heading}`");
-        };
-        for key in offered("nobody = 1") {
-            has("## Its description", &key);
-        }
-        for (table, heading) in [
-            ("[limits]", "### `[limits]`"),
-            ("[[axis]]", "### `[[axis]]`"),
-            ("[[heater]]", "### `[[heater]]`"),
-            ("[[fan]]", "### `[[fan]]`"),
-            ("[[led]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
-            ("[[input]]", "### `[[led]]`, `[[output]]`, `[[input]]`"),
-            ("[bed]", "### `[bed]`"),
-            ("[[spi_bus]]", "### `[[spi_bus]]`, `[[i2c_bus]]`"),
-            ("[[i2c_bus]]", "### `[[spi_bus]]`, `[[i2c_bus]]`"),
-            ("[[part]]\nkind = \"adxl345\"\n[part.x]", "### adxl345"),
-            ("[[part]]\nkind = \"hx71x\"\n[part.cell]", "### hx71x"),
-        ] {
-            offered(&format!("{table}\nnobody = 1")).iter().for_each(|key| has(heading, key));
-        }
-        let kinds = offered("[[part]]\nkind = \"nobody\"");
-        assert!(kinds.len() > 10, "{kinds:?}");
-        for kind in kinds {
-            let keys = offered(&format!("[[part]]\nkind = \"{kind}\"\nnobody = 1"));
-            // Of a chip's place on its bus the chapter's head tells.
-            let own = keys.iter().filter(|key| !["bus", "select_pin"].contains(&key.as_str()));
-            own.for_each(|key| has(&format!("### {kind}"), key));
-        }
-        has("## Parts", "bus");
-        has("## Parts", "select_pin");
-    }
-
-    #[test]
-    fn a_missing_file_is_named() {
-        let error = SimConfig::load(Path::new("/nonexistent/printer.toml"));
-        let error = error.map_or_else(|error| error.to_string(), |_| String::new());
-        assert!(error.starts_with("/nonexistent/printer.toml: "), "{error}");
-    }
-
-    #[test]
-    fn an_empty_description_is_a_board_without_pins() {
-        let config = SimConfig::parse("", "empty.toml");
-        assert!(config.is_ok_and(|config| config.axes.is_empty()));
-    }
-}
+pub(super) mod tests;

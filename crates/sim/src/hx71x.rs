@@ -270,7 +270,8 @@ impl Wire for SclkPin {
 
 #[cfg(test)]
 mod tests {
-    use super::super::physics::{Axis, Bed};
+    use super::super::bed::Bed;
+    use super::super::physics::Axis;
     use super::*;
     use pinion_firmware::time::CLOCK_FREQ;
 
@@ -293,7 +294,7 @@ mod tests {
                 weight_g,
                 noise_counts,
             };
-            let cell = Cell::over(config, Bed::new(Default::default(), None, None, Some(z.clone())));
+            let cell = Cell::over(config, Bed::under(Default::default(), None, None, Some(z.clone())));
             Bench { z, chip: Hx71x::new(Hx71xChip::Hx711, 80, cell), now: Clock::from_ticks(0) }
         }
 

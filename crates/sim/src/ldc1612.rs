@@ -19,10 +19,11 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
+use super::bed::Bed;
 use super::config::{Bound, PinName, SimConfig, SimError, check, wrong};
 use super::i2c::I2cChip;
 use super::part::{Part, Socket, Workshop};
-use super::physics::{Bed, Noise};
+use super::physics::Noise;
 use super::printer_cfg::{Layout, Sections};
 use super::ready::{Conversions, ReadyLine, ReadyPin};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
@@ -416,7 +417,7 @@ mod tests {
                 drive_current: 15,
                 yielding: 0.9,
             };
-            let bed = Bed::new(Default::default(), None, None, Some(z.clone()));
+            let bed = Bed::under(Default::default(), None, None, Some(z.clone()));
             let clock = VirtualClock::at(Clock::from_ticks(0));
             let intb = ReadyLine::new("intb");
             let coil = Coil { config, bed, noise: Noise::of("coil", 1) };

@@ -12,8 +12,8 @@
 use std::sync::Arc;
 
 use pinion_firmware::board::{
-    Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
-    Thermometer, not_mosi,
+    Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
+    PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
 };
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
@@ -22,6 +22,7 @@ mod ads1220;
 mod adxl345;
 mod angle;
 mod apa102;
+mod bed;
 mod bltouch;
 mod colour;
 mod config;
@@ -29,6 +30,7 @@ mod ds18b20;
 mod hx71x;
 mod i2c;
 mod ldc1612;
+mod led;
 mod load_cell;
 mod loopback;
 mod part;
@@ -57,8 +59,8 @@ pub use angle::{AngleChip, AngleConfig};
 pub use apa102::Apa102Config;
 pub use bltouch::{BltouchConfig, Jam};
 pub use config::{
-    AxisConfig, BedConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, Limits, OutputConfig, PinName,
-    SimConfig, SimError, SpiBusConfig,
+    AxisConfig, BedConfig, DeltaConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, LedConfig, Limits,
+    OutputConfig, PinName, SimConfig, SimError, SpiBusConfig,
 };
 pub use ds18b20::Ds18b20Config;
 pub use hx71x::{Hx71xChip, Hx71xConfig};
@@ -79,14 +81,15 @@ pub use ws2812::Ws2812Config;
 
 use ds18b20::Ds18b20;
 use i2c::{I2cBus, I2cDevice};
+use led::ColouredLed;
 use part::{Sight, Workshop};
 use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
 use pwm_channel::SimPwm;
 use spi::{MosiPin, SpiBus, SpiDevice};
 use time::{ErrandTime, PrinterTime};
 use wire::{
-    DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimLine, StepPin,
-    TachometerPin, ThermistorPin, WiredPin,
+    DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges, SimLine,
+    StepPin, TachometerPin, ThermistorPin, WiredPin,
 };
 
 /// A simulated motor follows at any pace: a computer without real time, as most that try the printer, is
@@ -95,6 +98,8 @@ const STEP_LATE_LIMIT: Ticks = Ticks::from_us(100_000);
 
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
+/// The worker that counts edges.
+const EDGES_WORKER: &str = "edges";
 /// The worker of the PWM channels.
 const PWM_WORKER: &str = "pwm";
 /// Bytes that an SPI bus sends without a pause: as many as by the kernel's default `spidev.bufsiz`.
@@ -147,21 +152,36 @@ impl SimBoard {
             workshop.world.axes.push(axis);
         }
         for part in &config.heaters {
-            let heater = Arc::new(Heater::new(part, part.thermistor()?, now));
-            workshop.wire(Some(&part.pin), HeaterPin(heater.clone()));
+            let cooling_w_per_k = config.fan_of(&part.name).map_or(0.0, |fan| fan.cooling_w_per_k);
+            let heater = Arc::new(Heater::new(part, part.thermistor()?, cooling_w_per_k, now));
+            workshop.wire(part.pin.as_ref(), HeaterPin(heater.clone()));
             workshop.wire(Some(&part.sensor_pin), ThermistorPin(heater.clone()));
             workshop.world.heaters.push(heater);
         }
         for part in &config.fans {
-            let fan = Arc::new(Fan::new(part, now));
+            let cools = part.cools.as_ref().and_then(|heater| workshop.heater(heater));
+            let fan = Arc::new(Fan::new(part, cools, now));
             workshop.wire(Some(&part.pin), FanPin(fan.clone(), Switch::Power));
             workshop.wire(part.enable_pin.as_ref(), FanPin(fan.clone(), Switch::Enable));
             workshop.wire(part.tachometer_pin.as_ref(), TachometerPin(fan.clone()));
             workshop.world.fans.push(fan);
         }
-        for part in config.switched() {
-            let lamp = Arc::new(Lamp::new(&part.name));
-            workshop.wire(Some(&part.pin), LampPin(lamp.clone()));
+        let mut switched: Vec<(&PinName, Arc<Lamp>)> = Vec::new();
+        let mut lamp = |workshop: &mut Workshop<'_>, name: &str, pin| {
+            let lamp = Arc::new(Lamp::new(name));
+            workshop.wire(Some(pin), LampPin(lamp.clone()));
+            switched.push((pin, lamp.clone()));
+            lamp
+        };
+        for part in &config.leds {
+            let lamps = part.pins().map(|(_, pin)| pin.map(|pin| lamp(&mut workshop, &part.name, pin)));
+            match lamps {
+                [None, None, None, Some(lamp)] => workshop.world.lamps.push(lamp),
+                lamps => workshop.show(Arc::new(ColouredLed { name: part.name.clone(), lamps })),
+            }
+        }
+        for part in &config.outputs {
+            let lamp = lamp(&mut workshop, &part.name, &part.pin);
             workshop.world.lamps.push(lamp);
         }
         for part in &config.inputs {
@@ -169,9 +189,8 @@ impl SimBoard {
         }
         for bus in &config.spi_buses {
             let bus = SpiBus::new(bus, |name| {
-                let (part, lamp) =
-                    config.switched().zip(&workshop.world.lamps).find(|(part, _)| part.pin.name == name)?;
-                Some((lamp.clone(), part.pin.inverted))
+                let (pin, lamp) = switched.iter().find(|(pin, _)| pin.name == name)?;
+                Some((lamp.clone(), pin.inverted))
             })?;
             workshop.spi_buses.push(bus);
         }
@@ -260,6 +279,16 @@ impl Board for SimBoard {
         let line = SimLine::new(self.pin(pin, no_pin)?.clone(), self.time.clone());
         pinion_firmware::board::Line::set_direction(&line, direction)?;
         Ok(ClaimedLine { line: Arc::new(line), sleeps_on: None })
+    }
+
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
+        let line = self.line(pin, Direction::Input(bias))?;
+        let wired = self.pin(pin, reason::NOT_INPUT)?;
+        let edges = match SimEdges::new(wired.wire.clone(), self.time.clone()) {
+            Some(edges) => Ok(OnWorker { bus: EDGES_WORKER.to_owned(), device: Box::new(edges) as Box<dyn Edges> }),
+            None => Err(format!("nobody counts the edges of {}", wired.wire.describe()).into()),
+        };
+        Ok(CountedLine { line, edges })
     }
 
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {

@@ -6,9 +6,10 @@
 
 use serde::Deserialize;
 
+use super::bed::Bed;
 use super::config::{Bound, SimError, check};
 use super::part::{Part, Workshop};
-use super::physics::{Bed, Noise};
+use super::physics::Noise;
 use super::printer_cfg::Sections;
 
 /// The cell's description.

@@ -9,9 +9,10 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::World;
-use super::config::{PinName, SimConfig, SimError};
+use super::bed::{Bed, Delta, Head, Plane};
+use super::config::{DeltaConfig, Kinematics, PinName, SimConfig, SimError};
 use super::i2c::{I2cBus, I2cChip};
-use super::physics::{Axis, Bed, Heater, Noise};
+use super::physics::{Axis, Heater, Noise};
 use super::printer_cfg::{Layout, Sections};
 use super::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use super::time::PrinterTime;
@@ -171,8 +172,23 @@ impl Workshop<'_> {
 
     /// The bed under the nozzle.
     pub(super) fn bed(&self) -> Bed {
-        let [x, y, z] = ["x", "y", "z"].map(|name| self.axis(name));
-        Bed::new(self.config.bed.clone(), x, y, z)
+        Bed::new(self.config.bed.clone(), self.delta().map_or_else(|| self.gantry(), Head::Delta))
+    }
+
+    /// The three arms of a delta printer.
+    fn delta(&self) -> Option<Delta> {
+        let Kinematics::Delta(delta) = self.config.kinematics() else { return None };
+        let [a, b, c] = DeltaConfig::TOWERS.map(|tower| self.axis(tower));
+        Some(Delta::new(delta, [a?, b?, c?]))
+    }
+
+    /// The head of any other printer.
+    fn gantry(&self) -> Head {
+        let motors = self.config.motors("z").filter_map(|motor| {
+            let at_mm = motor.at_mm.unwrap_or_default();
+            self.axis(&motor.name).map(|axis| (axis, at_mm))
+        });
+        Head::Cartesian { x: self.axis("x"), y: self.axis("y"), z: Plane::new(motors.collect()) }
     }
 
     /// Wires a pin, if the part has it.

@@ -10,7 +10,7 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
 
-use super::config::{AxisConfig, BedConfig, End, FanConfig, HeaterConfig};
+use super::config::{AxisConfig, End, FanConfig, HeaterConfig};
 use super::thermistor::Thermistor;
 use super::track::Track;
 use pinion_firmware::time::{CLOCK_FREQ, Clock};
@@ -235,57 +235,25 @@ impl Axis {
     }
 }
 
-/// The bed under the nozzle of a cartesian printer.
-pub struct Bed {
-    shape: BedConfig,
-    x: Option<Arc<Axis>>,
-    y: Option<Arc<Axis>>,
-    z: Option<Arc<Axis>>,
-}
-
-impl Bed {
-    pub fn new(shape: BedConfig, x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Option<Arc<Axis>>) -> Bed {
-        Bed { shape, x, y, z }
-    }
-
-    /// The height of the bed under a place: two slopes and a bow, each 0 in the middle.
-    pub fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
-        // From -1 at the start of an axis to 1 at its end.
-        let place = |axis: &Option<Arc<Axis>>, mm: f64| match axis.as_ref().and_then(|axis| axis.travel_mm) {
-            Some(travel_mm) => (2.0 * mm / travel_mm - 1.0).clamp(-1.0, 1.0),
-            None => 0.0,
-        };
-        let (u, v) = (place(&self.x, x_mm), place(&self.y, y_mm));
-        let slopes = (self.shape.x_slope_mm * u + self.shape.y_slope_mm * v) / 2.0;
-        slopes - self.shape.bow_mm * (u * u + v * v) / 2.0
-    }
-
-    /// How far the point that stands off the nozzle by so much is above the bed; negative if it
-    /// presses into it.
-    pub fn clearance_mm(&self, [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3]) -> f64 {
-        let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| axis.position_mm());
-        let height_mm = self.height_mm(position(&self.x) + x_offset_mm, position(&self.y) + y_offset_mm);
-        position(&self.z) + z_offset_mm - height_mm
-    }
-}
-
 /// A heater, the mass that it heats, and the sensor in it.
 ///
 /// The mass: `C dT/dt = P - L (T - Ta)` with the power `P` on or off, so from one change to the
 /// next `T(t) = T∞ + (T0 - T∞) exp(-t L/C)` with `T∞ = Ta + P/L`. The sensor follows it:
-/// `τ dS/dt = T - S`, a second exponential.
+/// `τ dS/dt = T - S`, a second exponential. A fan that blows at it adds to `L` while it has power.
 #[derive(Debug)]
 pub struct Heater {
     pub name: String,
     pub thermistor: Thermistor,
     pub noise_counts: f64,
     ambient_celsius: f64,
-    /// What the temperature rises to above the surroundings at full power.
-    rise_k: f64,
-    time_constant_s: f64,
+    watts: f64,
+    heat_capacity_j_per_k: f64,
+    /// To the surroundings, without its fan; and what that adds.
+    loss_w_per_k: f64,
+    cooling_w_per_k: f64,
     sensor_lag_s: f64,
-    /// Since when, the mass's and the sensor's temperature then, and whether power is on.
-    state: Together<4>,
+    /// Since when, the mass's and the sensor's temperature then, whether power is on, and whether the fan blows.
+    state: Together<5>,
 }
 
 /// A heater at one instant.
@@ -300,43 +268,64 @@ pub struct Heat {
 }
 
 impl Heater {
-    pub fn new(config: &HeaterConfig, thermistor: Thermistor, now: Clock) -> Heater {
+    /// The heater, and what a fan takes from it.
+    pub fn new(config: &HeaterConfig, thermistor: Thermistor, cooling_w_per_k: f64, now: Clock) -> Heater {
         let start = config.start_celsius().to_bits();
+        let always_on = config.pin.is_none();
         Heater {
             name: config.name.clone(),
             thermistor,
             noise_counts: config.noise_counts,
             ambient_celsius: config.ambient_celsius,
-            rise_k: config.heater_watts / config.loss_w_per_k,
-            time_constant_s: config.heat_capacity_j_per_k / config.loss_w_per_k,
+            watts: config.heater_watts,
+            heat_capacity_j_per_k: config.heat_capacity_j_per_k,
+            loss_w_per_k: config.loss_w_per_k,
+            cooling_w_per_k,
             sensor_lag_s: config.sensor_lag_s,
-            state: Together::new([now.ticks(), start, start, 0]),
+            state: Together::new([now.ticks(), start, start, always_on.into(), 0]),
         }
     }
 
-    pub fn at(&self, now: Clock) -> Heat {
-        let [since, celsius, sensor_celsius, on] = self.state.load();
-        let on = on != 0;
+    /// How it is, and whether a fan blows at it.
+    fn state_at(&self, now: Clock) -> (Heat, bool) {
+        let [since, celsius, sensor_celsius, on, blown] = self.state.load();
+        let (on, blown) = (on != 0, blown != 0);
         let elapsed_s = seconds(Clock::from_ticks(since), now);
-        let end = self.ambient_celsius + if on { self.rise_k } else { 0.0 };
+        let loss_w_per_k = self.loss_w_per_k + if blown { self.cooling_w_per_k } else { 0.0 };
+        let time_constant_s = self.heat_capacity_j_per_k / loss_w_per_k;
+        let end = self.ambient_celsius + if on { self.watts / loss_w_per_k } else { 0.0 };
         let mass_k = f64::from_bits(celsius) - end;
-        let decay = (-elapsed_s / self.time_constant_s).exp();
+        let decay = (-elapsed_s / time_constant_s).exp();
         let celsius = end + mass_k * decay;
         let sensor_celsius = if self.sensor_lag_s > 0.0 {
             // The part of the sensor's distance that goes with the mass, and the part that goes
             // by itself.
-            let slow_k = mass_k * self.time_constant_s / (self.time_constant_s - self.sensor_lag_s);
+            let slow_k = mass_k * time_constant_s / (time_constant_s - self.sensor_lag_s);
             let fast_k = f64::from_bits(sensor_celsius) - end - slow_k;
             end + slow_k * decay + fast_k * (-elapsed_s / self.sensor_lag_s).exp()
         } else {
             celsius
         };
-        Heat { celsius, sensor_celsius, on }
+        (Heat { celsius, sensor_celsius, on }, blown)
+    }
+
+    pub fn at(&self, now: Clock) -> Heat {
+        self.state_at(now).0
     }
 
     pub fn switch(&self, on: bool, now: Clock) {
-        let heat = self.at(now);
-        self.state.store([now.ticks(), heat.celsius.to_bits(), heat.sensor_celsius.to_bits(), on.into()]);
+        let (heat, blown) = self.state_at(now);
+        self.store(Heat { on, ..heat }, blown, now);
+    }
+
+    /// Its fan has power from now on, or has none any more.
+    fn blow(&self, blown: bool, now: Clock) {
+        self.store(self.at(now), blown, now);
+    }
+
+    fn store(&self, heat: Heat, blown: bool, now: Clock) {
+        let Heat { celsius, sensor_celsius, on } = heat;
+        self.state.store([now.ticks(), celsius.to_bits(), sensor_celsius.to_bits(), on.into(), blown.into()]);
     }
 }
 
@@ -348,6 +337,8 @@ pub struct Fan {
     max_rpm: f64,
     spin_up_s: f64,
     pulses_per_revolution: f64,
+    /// What it blows at.
+    cools: Option<Arc<Heater>>,
     /// Since when, the speed (rpm) and the angle (revolutions) then, and the [`Switch`]es.
     state: Together<4>,
 }
@@ -364,7 +355,7 @@ pub enum Switch {
 impl Fan {
     const POWERED: u64 = Switch::Power as u64 | Switch::Enable as u64;
 
-    pub fn new(config: &FanConfig, now: Clock) -> Fan {
+    pub fn new(config: &FanConfig, cools: Option<Arc<Heater>>, now: Clock) -> Fan {
         let always_enabled = match config.enable_pin {
             Some(_) => 0,
             None => Switch::Enable as u64,
@@ -375,6 +366,7 @@ impl Fan {
             max_rpm: config.max_rpm,
             spin_up_s: config.spin_up_s,
             pulses_per_revolution: config.pulses_per_revolution.into(),
+            cools,
             state: Together::new([now.ticks(), standstill, standstill, always_enabled]),
         }
     }
@@ -399,12 +391,22 @@ impl Fan {
         (self.at(now).1 * self.pulses_per_revolution).fract() < 0.5
     }
 
+    /// The tachometer's edges so far, and how long ago the last one was at the present speed; none while it stands.
+    pub fn edges(&self, now: Clock) -> (u64, Option<f64>) {
+        let (rpm, turns, _) = self.at(now);
+        let edges = turns * self.pulses_per_revolution * 2.0;
+        let edges_per_s = rpm / 60.0 * self.pulses_per_revolution * 2.0;
+        (edges as u64, (edges_per_s > 0.0).then(|| edges.fract() / edges_per_s))
+    }
+
     pub fn switch(&self, switch: Switch, on: bool, now: Clock) {
-        let (rpm, turns, switches) = self.at(now);
+        let (rpm, turns, before) = self.at(now);
         let switch = switch as u64;
-        let switches = if on { switches | switch } else { switches & !switch };
-        // Whole turns do not show, and an angle that stays small stays exact.
-        self.state.store([now.ticks(), rpm.to_bits(), turns.fract().to_bits(), switches]);
+        let switches = if on { before | switch } else { before & !switch };
+        self.state.store([now.ticks(), rpm.to_bits(), turns.to_bits(), switches]);
+        if let Some(heater) = &self.cools {
+            heater.blow(switches == Fan::POWERED, now);
+        }
     }
 }
 
@@ -412,39 +414,52 @@ impl Fan {
 #[derive(Debug)]
 pub struct Lamp {
     pub name: String,
-    /// Since when, how bright an eye took it for then, and whether it is on.
-    state: Together<3>,
+    /// When it was last switched, and whether on; when it was last switched on; how much of the time it is on.
+    state: Together<4>,
 }
 
 impl Lamp {
-    /// What is switched faster than an eye follows looks dimmed: brightness follows the light with this
-    /// time constant.
-    const EYE_S: f64 = 0.1;
-    /// What was not switched for so long is on or off, and nothing between.
+    /// What is switched at least as often as this looks dimmed: as bright as the share of the time that it is on.
+    /// What was not switched for longer is on or off.
     const STEADY_S: f64 = 0.15;
 
     pub fn new(name: &str) -> Lamp {
-        Lamp { name: name.to_owned(), state: Together::new([0; 3]) }
+        Lamp { name: name.to_owned(), state: Together::new([0; 4]) }
     }
 
     pub fn is_on(&self) -> bool {
-        let [.., on] = self.state.load();
+        let [_, on, ..] = self.state.load();
         on != 0
     }
 
     /// How bright an eye takes it for: 0 to 1.
     pub fn brightness(&self, now: Clock) -> f64 {
-        let [since, brightness, on] = self.state.load();
-        let elapsed_s = seconds(Clock::from_ticks(since), now);
-        let end = if on == 0 { 0.0 } else { 1.0 };
-        if elapsed_s > Lamp::STEADY_S {
-            return end;
+        let [edge, on, _, share] = self.state.load();
+        match seconds(Clock::from_ticks(edge), now) > Lamp::STEADY_S {
+            true if on == 0 => 0.0,
+            true => 1.0,
+            false => f64::from_bits(share),
         }
-        end + (f64::from_bits(brightness) - end) * (-elapsed_s / Lamp::EYE_S).exp()
     }
 
     pub fn switch(&self, on: bool, now: Clock) {
-        self.state.store([now.ticks(), self.brightness(now).to_bits(), on.into()]);
+        let [edge, was_on, rise, share] = self.state.load();
+        if on == (was_on != 0) {
+            return;
+        }
+        let here_s = seconds(Clock::from_ticks(edge), now);
+        let share = f64::from_bits(share);
+        let share = match (on, here_s > Lamp::STEADY_S) {
+            (true, true) => 0.0,
+            (false, true) => 1.0,
+            (true, false) => match seconds(Clock::from_ticks(rise), Clock::from_ticks(edge)) {
+                lit_s if lit_s > Lamp::STEADY_S => 1.0,
+                lit_s => lit_s / (lit_s + here_s),
+            },
+            (false, false) => share,
+        };
+        let rise = if on { now.ticks() } else { rise };
+        self.state.store([now.ticks(), on.into(), rise, share.to_bits()]);
     }
 }
 

@@ -6,9 +6,9 @@
 
 use serde::Deserialize;
 
+use super::bed::Bed;
 use super::config::{Bound, PinName, SimConfig, SimError, check};
 use super::part::{Part, Workshop};
-use super::physics::Bed;
 use super::printer_cfg::{Layout, Sections};
 use super::wire::{Kind, Wire};
 use pinion_firmware::time::Clock;
@@ -52,8 +52,10 @@ impl Part for ProbeConfig {
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.probe(layout, |cfg| {
             cfg.section("probe");
-            cfg.comment("To home the z axis by this probe or another one, let [stepper_z] have");
-            cfg.comment("endstop_pin: probe:z_virtual_endstop, and take position_endstop out there.");
+            if layout.is_homed("z") {
+                cfg.comment("To home the z axis by this probe or another one, let [stepper_z] have");
+                cfg.comment("endstop_pin: probe:z_virtual_endstop, and take position_endstop out there.");
+            }
             cfg.key("pin", &self.pin);
             cfg.offsets([self.x_offset_mm, self.y_offset_mm, self.z_offset_mm]);
         });
@@ -100,7 +102,7 @@ mod tests {
         for axis in [&x, &y, &z] {
             axis.set_enabled(true);
         }
-        let bed = || Bed::new(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z.clone()));
+        let bed = || Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z.clone()));
         let probe = Probe { bed: bed(), tip: [-30.0, 10.0, -2.5] };
         // The nozzle stands at 60, 45 and 12 mm.
         let height = bed().height_mm(60.0 - 30.0, 45.0 + 10.0);

@@ -403,7 +403,7 @@ mod tests {
             let mut printer = SimConfig::default_printer();
             let heater = &mut printer.heaters[0];
             (heater.ambient_celsius, heater.start_celsius) = (celsius, Some(celsius));
-            let heater = Heater::new(heater, heater.thermistor().unwrap(), clock.now());
+            let heater = Heater::new(heater, heater.thermistor().unwrap(), 0.0, clock.now());
             let config = ThermocoupleConfig {
                 name: "nozzle".into(),
                 chip,

@@ -49,6 +49,10 @@ impl TimeSource for PrinterTime {
     fn instant_of(&self, monotonic: Duration) -> Clock {
         self.clock.instant_of(monotonic)
     }
+
+    fn duration_of(&self, clock: Clock) -> Duration {
+        self.clock.duration_of(clock)
+    }
 }
 
 /// The time of the errands on a worker. While one runs it stands still but for the errand's waits, so
@@ -62,6 +66,10 @@ impl TimeSource for ErrandTime {
 
     fn instant_of(&self, monotonic: Duration) -> Clock {
         self.0.instant_of(monotonic)
+    }
+
+    fn duration_of(&self, clock: Clock) -> Duration {
+        self.0.duration_of(clock)
     }
 
     /// As the lines have the errand's time, whatever it is meanwhile, nothing has to spin: between two
@@ -130,6 +138,10 @@ mod tests {
 
         fn instant_of(&self, monotonic: Duration) -> Clock {
             Clock::from_ticks(monotonic.as_nanos() as u64 / NS_PER_TICK)
+        }
+
+        fn duration_of(&self, clock: Clock) -> Duration {
+            Duration::from_nanos(clock.ticks() * NS_PER_TICK)
         }
     }
 

@@ -102,7 +102,7 @@ pub(super) fn offer_sensorless_homing(
     axis: &str,
     (sensitivity, value): (&str, u32),
 ) {
-    let config = layout.config.axes.iter().find(|other| other.name == axis && other.endstop_pin.is_some());
+    let config = layout.config.axes.iter().find(|other| other.name == axis && layout.is_homed(axis));
     let Some((config, travel_mm)) = config.and_then(|config| Some((config, config.travel_mm?))) else { return };
     let stepper = layout.stepper(axis);
     cfg.comment("To home without the endstop, by the load (these keys replace those above, which may stay):");

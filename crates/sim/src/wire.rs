@@ -7,11 +7,11 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::config::PinName;
-use super::physics::{Axis, Fan, Heater, Lamp, Switch};
+use super::physics::{Axis, Fan, Heater, Lamp, Switch, seconds};
 use super::time::PrinterTime;
-use pinion_firmware::board::{Adc, Direction, Line};
+use pinion_firmware::board::{Adc, Direction, EdgeCount, Edges, Line};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
-use pinion_firmware::time::{Clock, TimeSource};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// What the machine may do with a pin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -60,6 +60,13 @@ pub(super) trait Wire: Send + Sync {
     fn sense(&self, driven: bool, at: Clock) -> bool {
         let _ = at;
         driven
+    }
+
+    /// The edges of an input so far, and how many seconds ago the last one was; none of an input that its part does
+    /// not count.
+    fn edges(&self, at: Clock) -> Option<(u64, Option<f64>)> {
+        let _ = at;
+        None
     }
 
     /// A PWM channel gets another value, 0 to [`PWM_MAX`](pinion_firmware::board::PWM_MAX).
@@ -168,6 +175,47 @@ pub(super) struct SimAdc {
 impl Adc for SimAdc {
     fn read(&mut self) -> Result<u16, Shutdown> {
         Ok(self.wire.counts(self.time.now(), self.noise.draw()))
+    }
+}
+
+/// The edges of an input, as a kernel's interrupts would count them.
+pub(super) struct SimEdges {
+    wire: Arc<dyn Wire>,
+    time: Arc<PrinterTime>,
+    /// Those before it was claimed.
+    before: u64,
+    /// When they were last asked for, and what was told.
+    asked: Clock,
+    told: EdgeCount,
+}
+
+impl SimEdges {
+    /// None where the part does not count them.
+    pub(super) fn new(wire: Arc<dyn Wire>, time: Arc<PrinterTime>) -> Option<SimEdges> {
+        let asked = time.now();
+        let (before, _) = wire.edges(asked)?;
+        Some(SimEdges { wire, time, before, asked, told: EdgeCount { count: 0, last: None } })
+    }
+}
+
+impl Edges for SimEdges {
+    fn count(&mut self) -> Result<EdgeCount, Shutdown> {
+        let now = self.time.now();
+        let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.before, None));
+        // The edges of 2^32 are 0 again, as in the kernel.
+        let count = edges.wrapping_sub(self.before) as u32;
+        if count != self.told.count {
+            // The last one came after those that were told before.
+            let ago_s = ago_s.unwrap_or(0.0).min(seconds(self.asked, now));
+            let last = now.earlier((ago_s * f64::from(CLOCK_FREQ)) as u64);
+            self.told = EdgeCount { count, last: Some(self.time.duration_of(last)) };
+        }
+        self.asked = now;
+        Ok(self.told)
+    }
+
+    fn end(&mut self) -> Result<(), Shutdown> {
+        Ok(())
     }
 }
 
@@ -310,6 +358,10 @@ impl Wire for TachometerPin {
 
     fn sense(&self, _driven: bool, at: Clock) -> bool {
         self.0.tachometer(at)
+    }
+
+    fn edges(&self, at: Clock) -> Option<(u64, Option<f64>)> {
+        Some(self.0.edges(at))
     }
 }
 

@@ -6,8 +6,8 @@
 use std::collections::HashSet;
 
 use super::{
-    AxisConfig, BedConfig, FanConfig, HeaterConfig, I2cBusConfig, Limits, PinName, SimConfig, SimError, SpiBusConfig,
-    is_word,
+    AxisConfig, BedConfig, DeltaConfig, End, FanConfig, HeaterConfig, I2cBusConfig, Kinematics, LedConfig, Limits,
+    PinName, SimConfig, SimError, SpiBusConfig, is_word,
 };
 use crate::part::{Part, PartConfig, Socket};
 use crate::thermistor::KELVIN;
@@ -29,11 +29,13 @@ impl SimConfig {
         unique("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name))?;
         let mut pins = UsedPins::default();
         self.axes.iter().try_for_each(|axis| axis.validate(&mut pins))?;
-        self.heaters.iter().try_for_each(|heater| heater.validate(&mut pins))?;
-        self.fans.iter().try_for_each(|fan| fan.validate(&mut pins))?;
-        for led in &self.leds {
-            pins.claim(&format!("led `{}`", led.name), "pin", Some(&led.pin))?;
+        self.validate_places()?;
+        if let Some(delta) = &self.delta {
+            delta.validate(self)?;
         }
+        self.heaters.iter().try_for_each(|heater| heater.validate(self, &mut pins))?;
+        self.fans.iter().try_for_each(|fan| fan.validate(self, &mut pins))?;
+        self.leds.iter().try_for_each(|led| led.validate(&mut pins))?;
         for output in &self.outputs {
             pins.claim(&format!("output `{}`", output.name), "pin", Some(&output.pin))?;
         }
@@ -48,6 +50,27 @@ impl SimConfig {
         }
         self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)?;
         self.parts.iter().try_for_each(|part| self.validate_part(part.part(), &mut pins))
+    }
+
+    /// Checks where the motors of the z axis hold what they lift.
+    fn validate_places(&self) -> Result<(), SimError> {
+        let is_cartesian = self.kinematics() == Kinematics::Cartesian;
+        let motors: Vec<&AxisConfig> = self.motors("z").filter(|_| is_cartesian).collect();
+        let whose = |axis: &AxisConfig| format!("axis `{}`", axis.name);
+        if let Some(other) =
+            self.axes.iter().find(|axis| axis.at_mm.is_some() && !motors.iter().any(|motor| motor.name == axis.name))
+        {
+            let cause = "only a motor of the z axis of a cartesian printer has a place";
+            return wrong(&whose(other), "at_mm", cause, "remove it, or call the axes z, z1, z2 and so on");
+        }
+        let lost = motors.iter().find(|axis| axis.at_mm.is_none());
+        if let (Some(lost), true) = (lost, motors.iter().any(|axis| axis.at_mm.is_some())) {
+            return wrong(&whose(lost), "at_mm", "the other motors of the z axis have one", "add it");
+        }
+        motors.iter().try_for_each(|axis| {
+            let mut places = axis.at_mm.into_iter().flatten();
+            places.try_for_each(|mm| check(&whose(axis), "at_mm", mm, Bound::Any))
+        })
     }
 
     /// Checks that there is the axis that a part's key `axis` names.
@@ -127,6 +150,53 @@ impl Limits {
     }
 }
 
+impl DeltaConfig {
+    /// Checks the towers, and that each has its axis.
+    fn validate(&self, printer: &SimConfig) -> Result<(), SimError> {
+        const WHOSE: &str = "[delta]";
+        check(WHOSE, "radius_mm", self.radius_mm, Bound::AboveZero)?;
+        check(WHOSE, "bed_radius_mm", self.bed_radius_mm, Bound::AboveZero)?;
+        check(WHOSE, "arm_mm", self.arm_mm, Bound::AboveZero)?;
+        if self.arm_mm <= self.radius_mm {
+            let cause = format!("{} does not reach over radius_mm", self.arm_mm);
+            return wrong(WHOSE, "arm_mm", &cause, "give longer arms");
+        }
+        self.angles_degrees.iter().try_for_each(|degrees| check(WHOSE, "angles_degrees", *degrees, Bound::Any))?;
+        let [a, b, c] = self.angles_degrees;
+        let apart = [a - b, b - c, c - a].map(|degrees| (degrees.to_radians() / 2.0).sin().abs());
+        if apart.into_iter().any(|apart| apart < 0.1) {
+            return wrong(WHOSE, "angles_degrees", "two towers stand at one place", "set them apart");
+        }
+        for tower in DeltaConfig::TOWERS {
+            let Some(axis) = printer.axis(tower) else {
+                return Err(SimError(format!("{WHOSE}: there is no axis `{tower}`: add an [[axis]] for each tower")));
+            };
+            let whose = &format!("axis `{tower}`");
+            if axis.endstop_pin.is_none() || axis.endstop_at != End::Max {
+                let cause = "a delta printer homes to the upper ends of its towers";
+                return wrong(whose, "endstop_at", cause, "give it an `endstop_pin`, and `endstop_at = \"max\"`");
+            }
+            let lowest_mm = self.lowest_mm();
+            if axis.travel_mm.unwrap_or(0.0) <= lowest_mm {
+                let cause = format!("the nozzle is on the bed while the carriages are at {lowest_mm:.1}");
+                return wrong(whose, "travel_mm", &cause, "raise it");
+            }
+        }
+        Ok(())
+    }
+}
+
+impl LedConfig {
+    /// Checks that it has a pin, and that its pins are free.
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+        let whose = &format!("led `{}`", self.name);
+        if self.pins().into_iter().all(|(_, pin)| pin.is_none()) {
+            return wrong(whose, "pin", "it has none", "add it, or `red_pin`, `green_pin` and `blue_pin`");
+        }
+        self.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))
+    }
+}
+
 impl AxisConfig {
     /// Checks the axis by itself, and that its pins are free.
     fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
@@ -169,9 +239,9 @@ impl AxisConfig {
 }
 
 impl FanConfig {
-    /// Checks the fan by itself, and that its pins are free.
-    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
-        use Bound::AboveZero;
+    /// Checks the fan, and that its pins are free.
+    fn validate(&self, printer: &SimConfig, pins: &mut UsedPins) -> Result<(), SimError> {
+        use Bound::{AboveZero, NotNegative};
         let whose = &format!("fan `{}`", self.name);
         pins.claim(whose, "pin", Some(&self.pin))?;
         pins.claim(whose, "enable_pin", self.enable_pin.as_ref())?;
@@ -179,6 +249,17 @@ impl FanConfig {
         check(whose, "pulses_per_revolution", self.pulses_per_revolution.into(), AboveZero)?;
         check(whose, "max_rpm", self.max_rpm, AboveZero)?;
         check(whose, "spin_up_s", self.spin_up_s, AboveZero)?;
+        check(whose, "cooling_w_per_k", self.cooling_w_per_k, NotNegative)?;
+        let Some(heater) = &self.cools else {
+            return match self.cooling_w_per_k {
+                0.0 => Ok(()),
+                _ => wrong(whose, "cooling_w_per_k", "it cools nothing", "add `cools`, or remove this"),
+            };
+        };
+        there_is(whose, "cools", heater, printer.heaters.iter().map(|heater| &heater.name), "[[heater]]")?;
+        if printer.fans.iter().filter(|fan| fan.cools == self.cools).count() > 1 {
+            return wrong(whose, "cools", &format!("two fans cool `{heater}`"), "keep one");
+        }
         Ok(())
     }
 }
@@ -188,7 +269,7 @@ impl SpiBusConfig {
     fn validate(&self, printer: &SimConfig) -> Result<(), SimError> {
         let whose = &format!("spi_bus `{}`", self.name);
         check(whose, "delay_us", self.delay_us as f64, Bound::NotNegative)?;
-        let unknown = self.trace_pins.iter().find(|name| !printer.switched().any(|part| part.pin.name == **name));
+        let unknown = self.trace_pins.iter().find(|name| !printer.switched().any(|pin| pin.name == **name));
         unknown.map_or(Ok(()), |name| {
             let cause = format!("`{name}` is no pin of an [[output]] or [[led]]");
             wrong(whose, "trace_pins", &cause, "name such a pin, without `!`")
@@ -213,11 +294,16 @@ impl BedConfig {
 }
 
 impl HeaterConfig {
-    /// Checks the heater by itself, and that its pins are free.
-    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+    /// Checks the heater with its fan, and that its pins are free.
+    fn validate(&self, printer: &SimConfig, pins: &mut UsedPins) -> Result<(), SimError> {
         use Bound::{AboveZero, NotNegative};
         let whose = &format!("heater `{}`", self.name);
-        pins.claim(whose, "pin", Some(&self.pin))?;
+        pins.claim(whose, "pin", self.pin.as_ref())?;
+        if self.pin.is_none()
+            && (self.name == "heater_bed" || printer.hot_ends().any(|hot_end| hot_end.name == self.name))
+        {
+            return wrong(whose, "pin", "klippy's heater of this name has one", "add it, or rename the heater");
+        }
         pins.claim(whose, "sensor_pin", Some(&self.sensor_pin))?;
         if self.sensor_pin.inverted {
             return wrong(whose, "sensor_pin", "an analog pin has no polarity", "remove the `!`");
@@ -226,7 +312,8 @@ impl HeaterConfig {
         check(whose, "heat_capacity_j_per_k", self.heat_capacity_j_per_k, AboveZero)?;
         check(whose, "loss_w_per_k", self.loss_w_per_k, AboveZero)?;
         check(whose, "sensor_lag_s", self.sensor_lag_s, NotNegative)?;
-        let time_constant_s = self.heat_capacity_j_per_k / self.loss_w_per_k;
+        let cooling_w_per_k = printer.fan_of(&self.name).map_or(0.0, |fan| fan.cooling_w_per_k);
+        let time_constant_s = self.heat_capacity_j_per_k / (self.loss_w_per_k + cooling_w_per_k);
         if self.sensor_lag_s > time_constant_s / 2.0 {
             return wrong(
                 whose,

@@ -1,0 +1,121 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Gantries on several motors, and a delta printer: klippy levels and calibrates them by the probe.
+
+use std::path::Path;
+
+use super::checkout;
+use super::klippy::{Printer, example};
+use super::probes::{STEP_MM, home, probed};
+
+/// The positions of the motors of the z axis.
+fn motors(printer: &Printer) -> Vec<f64> {
+    let axes = printer.probe().axes().filter(|axis| axis.name.starts_with('z'));
+    axes.map(|axis| axis.position_mm).collect()
+}
+
+/// Where the probe finds the bed, at places of the nozzle.
+fn heights<const N: usize>(printer: &mut Printer, places: [[f64; 2]; N]) -> [f64; N] {
+    places.map(|[x, y]| {
+        printer.gcode(&format!("G1 Z5 F600\nG1 X{x} Y{y} F9000"));
+        probed(printer, "PROBE")[2]
+    })
+}
+
+fn range(values: &[f64]) -> f64 {
+    let (low, high) = values.iter().fold((f64::MAX, f64::MIN), |(low, high), mm| (low.min(*mm), high.max(*mm)));
+    high - low
+}
+
+/// Homes a gantry that hangs askew, and has it leveled.
+fn level(checkout: &Path, change: fn(String) -> String, command: &str, corners: &[[f64; 2]; 4]) {
+    let describe = |board: String, _: &Path| change(example(&board, "Four Z motors"));
+    let mut printer = Printer::start_here(checkout, describe, |config| config);
+    home(&mut printer, "");
+    assert!(range(&heights(&mut printer, *corners)) > 0.2, "it is level from the start");
+    let said = printer.answer(&format!("G1 Z5 F600\n{command}"));
+    let after = heights(&mut printer, *corners);
+    assert!(range(&after) < 4.0 * STEP_MM, "{after:?}\n{said}");
+    let motors = motors(&printer);
+    assert!(range(&motors) < 1.0, "{motors:?}");
+    assert!(printer.probe().axes().all(|axis| axis.lost_steps == 0));
+}
+
+const CORNERS: [[f64; 2]; 4] = [[44.0, 44.0], [44.0, 176.0], [176.0, 176.0], [176.0, 44.0]];
+
+#[test]
+fn klippy_levels_a_gantry_on_four_motors() {
+    let Some(checkout) = checkout("klippy_levels_a_gantry_on_four_motors") else { return };
+    level(&checkout, |board| board, "QUAD_GANTRY_LEVEL", &CORNERS);
+}
+
+#[test]
+fn klippy_levels_a_bed_on_three_motors() {
+    let Some(checkout) = checkout("klippy_levels_a_bed_on_three_motors") else { return };
+    let three = |board: String| board.split("\n[[axis]]\nname = \"z3\"").next().unwrap().to_owned();
+    level(&checkout, three, "Z_TILT_ADJUST RETRIES=4", &[CORNERS[0], CORNERS[1], CORNERS[2], CORNERS[0]]);
+}
+
+#[test]
+fn klippy_levels_a_gantry_on_two_motors() {
+    let Some(checkout) = checkout("klippy_levels_a_gantry_on_two_motors") else { return };
+    // In the middle of the left and of the right side.
+    let two = |board: String| {
+        let board = board.split("\n[[axis]]\nname = \"z2\"").next().unwrap().to_owned();
+        board.replace("[-30.0, -10.0]", "[-30.0, 110.0]").replace("[-30.0, 230.0]", "[250.0, 110.0]")
+    };
+    let [left, right] = [[44.0, 110.0], [176.0, 110.0]];
+    level(&checkout, two, "Z_TILT_ADJUST RETRIES=4", &[left, right, left, right]);
+}
+
+/// The bed of the delta of the example: by `[bed]` 0.1 mm along x, and 0.05 mm lower at the ends of both ways than
+/// in the middle.
+fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
+    let (u, v) = (x_mm / 90.0, y_mm / 90.0);
+    0.05 * u - 0.025 * (u * u + v * v)
+}
+
+#[test]
+fn klippy_probes_the_bed_of_a_delta_printer() {
+    let Some(checkout) = checkout("klippy_probes_the_bed_of_a_delta_printer") else { return };
+    let describe = |board: String, _: &Path| example(&board, "A delta printer");
+    let mut printer = Printer::start_here(&checkout, describe, |config| config);
+    home(&mut printer, "");
+    for [x, y] in [[0.0, 0.0], [60.0, 10.0], [-40.0, 50.0]] {
+        let [z] = heights(&mut printer, [[x, y]]);
+        assert!((z - bed_mm(x, y)).abs() < 0.02, "{x} {y}: {z} {}", bed_mm(x, y));
+    }
+    assert!(printer.probe().axes().all(|axis| axis.lost_steps == 0));
+}
+
+#[test]
+fn klippy_calibrates_a_delta_printer() {
+    let Some(checkout) = checkout("klippy_calibrates_a_delta_printer") else { return };
+    // A flat bed, and a printer.cfg that is wrong of the radius and of where the towers end.
+    let describe = |board: String, _: &Path| {
+        example(&board, "A delta printer").replace("[bed]\nx_slope_mm = 0.1\nbow_mm = 0.05\n", "")
+    };
+    let mut true_endstop = 0.0;
+    let mut printer = Printer::start_here(&checkout, describe, |config| {
+        let (_, endstop) = config.split_once("position_endstop: ").unwrap();
+        let endstop = endstop.lines().next().unwrap();
+        true_endstop = endstop.parse().unwrap();
+        let config = config.replace("delta_radius: 105\n", "delta_radius: 105.4\n");
+        let of_a = format!("position_endstop: {endstop}");
+        config.replacen(&of_a, &format!("position_endstop: {}", true_endstop + 0.3), 1)
+    });
+    home(&mut printer, "");
+    let places = [[0.0, 0.0], [60.0, 0.0], [-30.0, 50.0], [-30.0, -50.0]];
+    let before = heights(&mut printer, places);
+    assert!(range(&before) > 0.15, "{before:?}");
+    printer.gcode("G1 Z5 F600\nDELTA_CALIBRATE");
+    let saved = printer.object("configfile")["save_config_pending_items"].clone();
+    let number = |section: &str, key: &str| saved[section][key].as_str().unwrap().parse::<f64>().unwrap();
+    let radius = number("printer", "delta_radius");
+    assert!((radius - 105.0).abs() < 0.05, "{radius}");
+    // The arms' height differs by the radius that was found.
+    let arms = |radius: f64| (215.0f64 * 215.0 - radius * radius).sqrt();
+    for tower in ["a", "b", "c"] {
+        let endstop = number(&format!("stepper_{tower}"), "position_endstop") + arms(radius);
+        assert!((endstop - true_endstop - arms(105.0)).abs() < 0.05, "{tower}: {endstop}");
+    }
+}
