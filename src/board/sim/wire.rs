@@ -10,9 +10,9 @@ use std::time::Duration;
 use super::config::PinName;
 use super::physics::{Axis, Fan, Heater, Lamp, Switch, seconds};
 use super::time::PrinterTime;
-use crate::board::{Adc, Direction, EdgeCount, Edges, Line};
+use crate::board::{Adc, Direction, Edge, Edges, Line};
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
-use crate::time::{Clock, TimeSource, monotonic};
+use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource, monotonic};
 
 /// What the machine may do with a pin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -179,39 +179,52 @@ impl Adc for SimAdc {
     }
 }
 
-/// The edges of an input, as a kernel's interrupts would count them.
+/// The edges of an input, as a kernel's interrupts would date them.
 pub(super) struct SimEdges {
     wire: Arc<dyn Wire>,
     time: Arc<PrinterTime>,
-    /// Those before it was claimed.
-    before: u64,
-    /// When they were last asked for, and what was told.
-    asked: Clock,
-    told: EdgeCount,
+    /// How many there were when they were last taken, and the level behind the last of them.
+    taken: u64,
+    level: bool,
+    /// When the last of them came, or what is earlier than the next: when the line was claimed.
+    last: Clock,
 }
 
+/// As many edges are kept as by the kernel.
+const EDGES_KEPT: u64 = 1024;
+
 impl SimEdges {
-    /// None where the part does not count them.
-    pub(super) fn new(wire: Arc<dyn Wire>, time: Arc<PrinterTime>) -> Option<SimEdges> {
-        let asked = time.now();
-        let (before, _) = wire.edges(asked)?;
-        Some(SimEdges { wire, time, before, asked, told: EdgeCount { count: 0, last: None } })
+    /// None where the part does not count them. `level` is the line's.
+    pub(super) fn new(wire: Arc<dyn Wire>, time: Arc<PrinterTime>, level: bool) -> Option<SimEdges> {
+        let last = time.now();
+        let (taken, _) = wire.edges(last)?;
+        Some(SimEdges { wire, time, taken, level, last })
     }
 }
 
 impl Edges for SimEdges {
-    fn count(&mut self) -> Result<EdgeCount, Shutdown> {
+    /// A part knows how many there were and when the last one was. The others came evenly before it.
+    fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown> {
         let (now, kernels) = (self.time.now(), monotonic());
-        let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.before, None));
-        // The edges of 2^32 are 0 again, as in the kernel.
-        let count = edges.wrapping_sub(self.before) as u32;
-        if count != self.told.count {
-            // The last one came after those that were told before.
-            let ago_s = ago_s.unwrap_or(0.0).min(seconds(self.asked, now));
-            self.told = EdgeCount { count, last: Some(kernels.saturating_sub(Duration::from_secs_f64(ago_s))) };
+        let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.taken, None));
+        let new = edges.saturating_sub(self.taken);
+        if new == 0 {
+            return Ok(());
         }
-        self.asked = now;
-        Ok(self.told)
+        let since_s = seconds(self.last, now);
+        // The last one came after those that were taken before.
+        let ago_s = ago_s.unwrap_or(0.0).min(since_s);
+        let each_s = (since_s - ago_s) / new as f64;
+        let dropped = new.saturating_sub(EDGES_KEPT);
+        for number in dropped + 1..=new {
+            let at = kernels.saturating_sub(Duration::from_secs_f64(ago_s + (new - number) as f64 * each_s));
+            let dropped = if number == dropped + 1 { u32::try_from(dropped).unwrap_or(u32::MAX) } else { 0 };
+            see(Edge { at, level: self.level ^ (number % 2 == 1), dropped });
+        }
+        self.taken = edges;
+        self.level ^= new % 2 == 1;
+        self.last = now - Ticks((ago_s * f64::from(CLOCK_FREQ)) as u32);
+        Ok(())
     }
 
     fn end(&mut self) -> Result<(), Shutdown> {
