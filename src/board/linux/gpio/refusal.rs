@@ -81,7 +81,7 @@ impl Subject {
                      lists them)"
                 )
             }
-            libc::EINVAL if bias != Bias::None && before(release, (5, 5)) => format!(
+            libc::EINVAL if bias != Bias::None && is_before(release, BIAS_SINCE) => format!(
                 "{self} can not have a {pull} resistor: Linux {} knows none before 5.5: update \
                  the kernel, or solder one",
                 release.trim_end()
@@ -114,8 +114,13 @@ fn pull(bias: Bias) -> (&'static str, char) {
     }
 }
 
+/// The first Linux that switches resistors on.
+pub(crate) const BIAS_SINCE: (u32, u32) = (5, 5);
+/// The first Linux that tells of a line's edges as Pinion asks for them.
+pub(crate) const EDGES_SINCE: (u32, u32) = (5, 10);
+
 /// Whether a kernel's release, such as `5.4.0-rpi`, comes before a version.
-fn before(release: &str, version: (u32, u32)) -> bool {
+pub(crate) fn is_before(release: &str, version: (u32, u32)) -> bool {
     let mut numbers = release.split(|c: char| !c.is_ascii_digit()).map_while(|n| n.parse::<u32>().ok());
     match (numbers.next(), numbers.next()) {
         (Some(major), Some(minor)) => (major, minor) < version,
@@ -242,9 +247,9 @@ mod tests {
 
     #[test]
     fn kernel_releases() {
-        assert!(before("5.4.0", (5, 5)) && before("4.19.0-rc1", (5, 5)));
-        assert!(!before("5.5.0", (5, 5)) && !before("6.1-rpi", (5, 5)));
-        assert!(!before("", (5, 5)) && !before("six.one", (5, 5)));
+        assert!(is_before("5.4.0", (5, 5)) && is_before("4.19.0-rc1", (5, 5)));
+        assert!(!is_before("5.5.0", (5, 5)) && !is_before("6.1-rpi", (5, 5)));
+        assert!(!is_before("", (5, 5)) && !is_before("six.one", (5, 5)));
     }
 
     #[test]
