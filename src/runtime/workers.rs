@@ -262,9 +262,14 @@ mod tests {
         let mut threads = threads();
         let worker = threads.start("w1 28-1").unwrap();
         threads.leave_behind(worker);
+        let waiting = |threads: &Threads| QUEUE_JOBS - threads.workers[0].jobs.slots();
         let errand = Box::new(Slow { go_on, number: 7, said });
         let ticket = Ticket { oid: Oid::new(0), tag: 0 };
         threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+        // What is not under way yet is dropped.
+        while waiting(&threads) > 0 {
+            thread::sleep(Duration::from_millis(1));
+        }
         let began = monotonic();
         threads.reset();
         assert!(monotonic() - began < END_LIMIT, "it was waited for");

@@ -30,7 +30,7 @@ pub use chip::{Chip, LineInfo};
 use chip::{look_at, node};
 pub(super) use chip::{may_sleep, number_behind, scan};
 pub(super) use refusal::not_permitted;
-pub(crate) use refusal::{BIAS_SINCE, EDGES_SINCE, is_before};
+pub(crate) use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
 use refusal::{Subject, cannot_open, errno, missing};
 
 /// The name that the kernel shows as the consumer of our lines.

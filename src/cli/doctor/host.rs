@@ -426,6 +426,7 @@ mod tests {
         let (tree, gid) = with_terminal(0o660);
         tree.put("etc/group", &format!("root:x:{gid}:\n"));
         tree.process(8, &KLIPPY, PI, &[]);
+        tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
         let remedy = told(&looked(&tree), "terminal", Error, "may not open it");
         assert!(remedy.starts_with("mode = \"0660\" and group = \"tty\" in "), "{remedy}");
     }

@@ -9,7 +9,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::Args;
+use clap::{Args, ValueHint};
 
 use crate::board::linux::Inventory;
 
@@ -44,13 +44,13 @@ const UPGRADE: &str =
 pub(super) struct DoctorArgs {
     /// Look at a checkout of Klipper or Kalico as well: whether this Pinion serves that host, before you
     /// restart it
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     klipper: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
     /// Look at the system whose files are below DIR, such as a card's that is mounted there
-    #[arg(long, value_name = "DIR", default_value = "/")]
+    #[arg(long, value_name = "DIR", default_value = "/", value_hint = ValueHint::DirPath)]
     root: PathBuf,
 }
 

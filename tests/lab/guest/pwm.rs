@@ -16,7 +16,7 @@ pub fn output(channel: usize) -> String {
 
 /// Forgets what the outputs did.
 pub fn forget() {
-    sysfs::write(format!("{MOCK}/history"), "");
+    sysfs::write(format!("{MOCK}/history"), "0");
 }
 
 /// What the channel did since then: period and duty cycle in ns, and whether it is enabled.
