@@ -95,6 +95,11 @@ fn link(symlink: &Path) -> Finding {
         return Finding::ok("symlink", format!("no other program can serve there meanwhile: {served}"));
     }
     match fs::symlink_metadata(symlink) {
+        Ok(there) if there.is_dir() => Finding::error(
+            "symlink",
+            format!("{path} is a folder, and no symbolic link"),
+            "choose another path, such as one in that folder (symlink)",
+        ),
         Ok(there) if !there.file_type().is_symlink() => {
             Finding::error("symlink", format!("{path} exists and is no symbolic link"), format!("sudo rm {path}"))
         }
@@ -140,7 +145,11 @@ fn group(name: Option<&str>) -> Finding {
     if is_ours {
         return Finding::ok("group", format!("the terminal goes to the group {wanted}"));
     }
-    let remedy = format!("sudo usermod -aG {wanted} {}, and log in anew", user_name());
+    let remedy = match gid.as_raw() {
+        // Its members could do more than open a terminal.
+        0 => "choose another group, such as tty".to_owned(),
+        _ => format!("sudo usermod -aG {wanted} {}, and log in anew", user_name()),
+    };
     let what = format!("the terminal can not be given to the group {wanted}, of which this user is no member");
     match name {
         Some(_) => Finding::error("group", what, remedy),
@@ -210,6 +219,8 @@ mod tests {
         fs::write(&path, "").unwrap();
         let refused = link(&path);
         assert_eq!((refused.status, refused.remedy), (Level::Error, Some(format!("sudo rm {}", path.display()))));
+        let refused = link(folder.path());
+        assert!(refused.remedy.as_ref().is_some_and(|remedy| remedy.starts_with("choose another path")), "{refused:?}");
         let refused = link(&folder.path().join("none/tty"));
         assert!(refused.status == Level::Error && refused.found.contains("there is no folder"), "{refused:?}");
     }

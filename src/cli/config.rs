@@ -30,6 +30,21 @@ struct Key {
     set: fn(&mut Given, &DeValue<'_>) -> Result<(), Option<String>>,
 }
 
+impl Key {
+    /// How it is to be written.
+    fn form(&self) -> String {
+        let Key { name, example, .. } = self;
+        format!("{name}: write it such as {name} = {example}")
+    }
+}
+
+/// The key whose value a mistake is in that is no TOML, such as `mode = 0660`: it tells more than the parser.
+fn key_at(text: &str, mistake: Option<Range<usize>>) -> Option<&'static Key> {
+    let before = text.get(..mistake?.start)?;
+    let (name, _) = before.rsplit('\n').next()?.split_once('=')?;
+    KEYS.iter().find(|key| key.name == name.trim())
+}
+
 /// Every option of `pinion run`, in the order of its `--help`.
 const KEYS: [Key; 11] = [
     Key {
@@ -130,7 +145,10 @@ fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, String> {
         format!("{file}:{}: {what}", Place::of(text, at))
     };
     let table = DeTable::parse(text)
-        .map_err(|error| wrong(error.span(), error.message().trim().replace('\n', ": ")))?
+        .map_err(|error| {
+            let what = key_at(text, error.span()).map_or_else(|| error.message().trim().replace('\n', ": "), Key::form);
+            wrong(error.span(), what)
+        })?
         .into_inner();
     // A map sorts its keys; whoever corrects a file does so from its top.
     let mut entries: Vec<_> = table.iter().collect();
@@ -141,9 +159,8 @@ fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, String> {
             return Err(wrong(Some(name.span()), unknown(name.get_ref())));
         };
         (key.set)(&mut given, value.get_ref()).map_err(|why| {
-            let why = why.map_or_else(String::new, |why| format!("{why}: "));
-            let Key { name, example, .. } = key;
-            wrong(Some(value.span()), format!("{name}: {why}write it such as {name} = {example}"))
+            let what = why.map_or_else(|| key.form(), |why| key.form().replacen(": ", &format!(": {why}: "), 1));
+            wrong(Some(value.span()), what)
         })?;
     }
     Ok(given)
@@ -268,6 +285,19 @@ mod tests {
             let error = error(text);
             assert!(error.starts_with(&format!("f.toml:{place}")) && !error.contains('\n'), "{text}: {error}");
         }
+    }
+
+    #[test]
+    fn what_is_no_toml_is_told_with_the_way_to_write_it() {
+        for (text, told) in [
+            ("mode = 0660", "1:8: mode: write it such as mode = \"0660\""),
+            ("mode = 0o660", "1:8: mode: write it such as mode = \"0660\""),
+            ("cpu = 3\nmode=0660 # octal", "2:6: mode: write it such as mode = \"0660\""),
+            ("symlink = /tmp/x", "1:11: symlink: write it such as symlink = \"/tmp/klipper_host_mcu\""),
+        ] {
+            assert_eq!(error(text), format!("f.toml:{told}"));
+        }
+        assert_eq!(parse("mode = \"0640\"", &"").unwrap().mode, Some(0o640));
     }
 
     #[test]

@@ -40,9 +40,10 @@ use pinion_client::{self, Client};
 use pinion_linux::clock::Monotonic;
 use pinion_sim::SimBoard;
 
+use super::complete::{SIMULATED, offering};
 use super::page::{Page, print};
 use super::run::{BoardName, sim_config};
-use super::{failed, logging};
+use super::{failed, logging, not_permitted};
 
 /// How long a machine has to answer.
 const PATIENCE: Duration = Duration::from_secs(2);
@@ -62,7 +63,8 @@ pub(super) struct ConsoleArgs {
     #[arg(short = 'f', value_name = "FILE")]
     file: Option<PathBuf>,
     /// Speak to a simulated machine of its own: sim, or sim:FILE.toml
-    #[arg(long, value_name = "BOARD", conflicts_with = "pty")]
+    #[arg(long, value_name = "BOARD", conflicts_with = "pty", value_parser = offering::<BoardName>(SIMULATED),
+        hide_possible_values = true)]
     board: Option<BoardName>,
 }
 
@@ -87,10 +89,15 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
 fn free(pty: &Path) -> Result<(), String> {
     let device = fs::canonicalize(pty)
         .map_err(|error| format!("{}: {error}: is Pinion running, and with this link?", pty.display()))?;
-    // Anything else many a process may have open. One that may not be opened is told of later.
     let flags = (OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits();
-    if fs::OpenOptions::new().read(true).custom_flags(flags).open(&device).is_ok_and(|file| !file.is_terminal()) {
-        return Err(pinion_client::Error::NoTerminal { port: pty.display().to_string() }.to_string());
+    match fs::OpenOptions::new().read(true).write(true).custom_flags(flags).open(&device) {
+        // Anything else many a process may have open.
+        Ok(file) if !file.is_terminal() => {
+            return Err(pinion_client::Error::NoTerminal { port: pty.display().to_string() }.to_string());
+        }
+        Err(error) if error.kind() == io::ErrorKind::PermissionDenied => return Err(not_permitted(pty, &device)),
+        // What else is wrong is told of later.
+        Ok(_) | Err(_) => {}
     }
     let name = |processes: &[crate::klippy::process::Process]| {
         let names = processes.iter().map(|process| {

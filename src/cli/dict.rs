@@ -14,6 +14,7 @@ use crate::FIRMWARE;
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::clock::Monotonic;
 
+use super::complete::{BOARDS, DIALECTS, offering};
 use super::failed;
 use super::page::{Page, print};
 use super::run::BoardName;
@@ -25,11 +26,13 @@ pub(super) struct DictArgs {
     #[arg(short = 'o', value_name = "FILE")]
     output: Option<PathBuf>,
     /// The board whose pins the dictionary names: linux, sim or sim:FILE.toml
-    #[arg(long, value_name = "BOARD", default_value = "linux")]
+    #[arg(long, value_name = "BOARD", default_value = "linux", value_parser = offering::<BoardName>(BOARDS),
+        hide_possible_values = true)]
     board: BoardName,
     /// The hosts that it is for: v0.11, v0.12, v0.13 or master (of Klipper), kalico, or union (of the
     /// last three, as far as they agree)
-    #[arg(long, value_name = "NAME", default_value = "master")]
+    #[arg(long, value_name = "NAME", default_value = "master", value_parser = offering::<DialectName>(DIALECTS),
+        hide_possible_values = true)]
     dialect: DialectName,
 }
 

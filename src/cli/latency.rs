@@ -28,7 +28,7 @@ use super::page::{Page, print};
 #[derive(Args, Clone, Debug)]
 pub(super) struct LatencyArgs {
     /// How long to measure, half of it idle and half under load
-    #[arg(long, value_name = "N", default_value_t = 10, value_parser = clap::value_parser!(u32).range(2..=3600))]
+    #[arg(long, value_name = "N", default_value_t = 10, value_hint = clap::ValueHint::Other, value_parser = clap::value_parser!(u32).range(2..=3600))]
     seconds: u32,
     /// Draw the histograms
     #[arg(long, value_name = "FILE")]

@@ -4,12 +4,17 @@
 #![forbid(unsafe_code)]
 
 use std::ffi::OsString;
+use std::path::Path;
 use std::process::ExitCode;
 
 use clap::{Args, CommandFactory as _, Parser, Subcommand};
 use log::LevelFilter;
 
+use complete::{LEVELS, offering};
+use pinion_linux::gpio::Opener;
+
 mod check;
+mod complete;
 mod config;
 mod console;
 pub mod demo;
@@ -47,7 +52,8 @@ pub(crate) struct Cli {
 #[derive(Args, Debug, Clone)]
 struct LogArgs {
     /// How much to log: error, warn, info, debug, trace or off [default: info]
-    #[arg(long, value_name = "LEVEL", global = true)]
+    #[arg(long, value_name = "LEVEL", global = true, value_parser = offering::<LevelFilter>(LEVELS),
+        hide_possible_values = true)]
     log_level: Option<LevelFilter>,
 }
 
@@ -136,6 +142,15 @@ fn quietly<T>(work: impl FnOnce() -> T) -> T {
     let done = work();
     log::set_max_level(level);
     done
+}
+
+/// Why somebody may not ask a running Pinion by a link of it, which leads to this file.
+fn not_permitted(link: &Path, file: &Path) -> String {
+    let remedy = match Opener::of(file).command() {
+        Some(command) => format!("\"{command}\" and log in anew, or use sudo"),
+        None => "use sudo".to_owned(),
+    };
+    format!("{} may not be opened by this user: {remedy}", link.display())
 }
 
 /// Logs why a subcommand failed, and returns its exit status.

@@ -31,7 +31,7 @@ pub(super) struct PinsArgs {
     #[arg(long)]
     pub json: bool,
     /// Show only what has this in a name, in any case (such as gpio17, pinctrl, voltage)
-    #[arg(value_name = "NAME")]
+    #[arg(value_name = "NAME", value_hint = clap::ValueHint::Other)]
     pub filter: Option<String>,
 }
 
@@ -40,16 +40,21 @@ pub(super) fn run(args: &PinsArgs) -> ExitCode {
     let inventory = Inventory::scan();
     let sysfs = Sysfs::scan(Path::new("/"));
     let list = List::new(&inventory, &sysfs, args, &|device, id| reading(&inventory, device, id));
+    let page = list.page();
+    let is_nothing = !args.json && page.is_empty();
     for problem in &inventory.problems {
-        log::warn!("{problem}");
+        // Where nothing is listed, this is why.
+        log::log!(if is_nothing { log::Level::Error } else { log::Level::Warn }, "{problem}");
     }
     // Programs want JSON of nothing, too.
     if args.json {
         return print(&Page::json(&list.json())).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
-    let page = list.page();
-    if page.is_empty() {
-        return failed(nothing(args));
+    if is_nothing {
+        return match args.filter.is_none() && !inventory.problems.is_empty() {
+            true => ExitCode::FAILURE,
+            false => failed(nothing(args)),
+        };
     }
     print(&page).map_or_else(failed, |()| ExitCode::SUCCESS)
 }

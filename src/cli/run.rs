@@ -8,7 +8,7 @@ use std::process::ExitCode;
 use std::str::FromStr;
 use std::sync::Arc;
 
-use clap::Args;
+use clap::{Args, ValueHint};
 use log::LevelFilter;
 
 use crate::runtime::wakeup::MarginLimits;
@@ -20,6 +20,7 @@ use pinion_linux::clock::Monotonic;
 use pinion_linux::{Guard, LinuxBoard};
 use pinion_sim::{SimBoard, SimConfig, SimError};
 
+use super::complete::{BOARDS, SPOKEN, offering};
 use super::{check, config, end_by_panic, failed, logging};
 
 /// The device of the watchdog that -w feeds.
@@ -55,27 +56,27 @@ pub(super) struct Given {
     #[arg(short = 'r', num_args = 0, default_missing_value = "true")]
     pub(super) realtime: Option<bool>,
     /// Run the core on this processor only
-    #[arg(long, value_name = "N")]
+    #[arg(long, value_name = "N", value_hint = ValueHint::Other)]
     pub(super) cpu: Option<usize>,
     /// How early, at most, the core may wake for a timer and spin the rest: it learns how early
     /// it has to. 0 saves power and makes steps late [default: 200]
-    #[arg(long, value_name = "US", value_parser = clap::value_parser!(u32).range(0..=i64::from(MARGIN_MAX_US)))]
+    #[arg(long, value_name = "US", value_hint = ValueHint::Other, value_parser = clap::value_parser!(u32).range(0..=i64::from(MARGIN_MAX_US)))]
     pub(super) margin: Option<u32>,
     /// Feed the hardware watchdog /dev/watchdog
     #[arg(short = 'w', num_args = 0, default_missing_value = "true")]
     pub(super) watchdog: Option<bool>,
     /// Permission bits of the pty, octal [default: 0660]
-    #[arg(short = 'm', value_name = "MODE", value_parser = mode)]
+    #[arg(short = 'm', value_name = "MODE", value_hint = ValueHint::Other, value_parser = mode)]
     pub(super) mode: Option<u32>,
     /// Group of the pty, by name or number [default: tty, where that is permitted]
-    #[arg(short = 'g', value_name = "GROUP")]
+    #[arg(short = 'g', value_name = "GROUP", value_hint = ValueHint::Other)]
     pub(super) group: Option<String>,
     /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml [default: linux]
-    #[arg(long, value_name = "BOARD")]
+    #[arg(long, value_name = "BOARD", value_parser = offering::<BoardName>(BOARDS), hide_possible_values = true)]
     pub(super) board: Option<BoardName>,
     /// The hosts to serve: auto (whichever comes), v0.11, v0.12, v0.13 or master (of Klipper), kalico,
     /// or union (of the last three, as far as they agree) [default: auto]
-    #[arg(long, value_name = "NAME")]
+    #[arg(long, value_name = "NAME", value_parser = offering::<Spoken>(SPOKEN), hide_possible_values = true)]
     pub(super) dialect: Option<Spoken>,
     /// Where to put the socket for `pinion status` [default: named for the link, in /run/pinion or beside it]
     #[arg(long, value_name = "PATH")]

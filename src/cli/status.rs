@@ -23,8 +23,8 @@ use crate::runtime::status::connect;
 use crate::runtime::{hang_up, socket_paths};
 use pinion_linux::sys;
 
-use super::failed;
 use super::page::{Page, draw, print};
+use super::{failed, not_permitted};
 
 /// How long the answer may take. The program gives its core a second.
 const PATIENCE: Duration = Duration::from_secs(5);
@@ -42,7 +42,8 @@ pub(super) struct StatusArgs {
     /// Print metrics for a Prometheus scraper
     #[arg(long, conflicts_with = "json")]
     prometheus: bool,
-    /// Print it anew each second: in place on a terminal, until q or Ctrl-C; elsewhere one after the other
+    /// Print it anew each second: in place on a terminal, where arrows and page keys scroll, until q or Ctrl-C;
+    /// elsewhere one after the other
     #[arg(long)]
     watch: bool,
     /// The link of the instance to ask
@@ -80,10 +81,12 @@ fn ask(args: &StatusArgs) -> Result<Value, String> {
                 missing.push(path.display().to_string());
             }
             Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
+                return Err(not_permitted(path, path));
+            }
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                 return Err(format!(
-                    "{} may not be opened: it belongs to those who may open the terminal; become a member of its group (ls -lL {}), or ask with sudo",
-                    path.display(),
-                    args.symlink.display()
+                    "{} is asked by too many at once: end those who ask it again and again (sudo ss -xp tells who they are)",
+                    path.display()
                 ));
             }
             Err(error) => {
@@ -99,8 +102,17 @@ fn ask(args: &StatusArgs) -> Result<Value, String> {
 }
 
 fn ask_at(path: &Path) -> io::Result<Value> {
-    let mut socket = connect(path)?;
-    let (until, mut answer, mut piece) = (Instant::now() + PATIENCE, Vec::new(), [0; 16384]);
+    let until = Instant::now() + PATIENCE;
+    // Others may ask as well: then it takes a while until there is room for one more.
+    let mut socket = loop {
+        match connect(path) {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock && Instant::now() < until => {
+                thread::sleep(Duration::from_millis(10));
+            }
+            connected => break connected?,
+        }
+    };
+    let (mut answer, mut piece) = (Vec::new(), [0; 16384]);
     loop {
         match socket.read(&mut piece) {
             Ok(0) => break,
@@ -401,7 +413,7 @@ fn watch(args: &StatusArgs) -> Result<(), String> {
             Err(error) => Page::text(&error),
         };
         let shown = match &mut screen {
-            Some(screen) => screen.draw(&page),
+            Some(screen) => screen.show(page),
             None => draw(&format!("{page}\n")),
         };
         // A reader that is gone wants no more.
@@ -410,13 +422,18 @@ fn watch(args: &StatusArgs) -> Result<(), String> {
         }
         let next = Instant::now() + PERIOD;
         while Instant::now() < next {
-            let wish = match &screen {
+            let wish = match &mut screen {
                 Some(screen) => screen.wish(stdin.as_fd()),
                 None => {
                     thread::sleep(Duration::from_millis(20));
                     None
                 }
             };
+            if let (Some(Wish::Scroll(scroll)), Some(screen)) = (wish, &mut screen)
+                && screen.scroll(scroll).is_err()
+            {
+                return Ok(());
+            }
             if ended.load(Ordering::Relaxed) || wish == Some(Wish::End) {
                 return Ok(());
             }
@@ -438,6 +455,79 @@ enum Wish {
     End,
     /// To stop until the shell has it go on.
     Stop,
+    /// To see another part of the page.
+    Scroll(Scroll),
+}
+
+/// Which part of a page.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Scroll {
+    /// So many lines further down.
+    Lines(isize),
+    /// So many screens further down.
+    Screens(isize),
+    Top,
+    Bottom,
+}
+
+/// The keys that scroll, as terminals send them.
+const SCROLL_KEYS: [(&[u8], Scroll); 18] = [
+    (b"\x1b[A", Scroll::Lines(-1)),
+    (b"\x1bOA", Scroll::Lines(-1)),
+    (b"k", Scroll::Lines(-1)),
+    (b"\x1b[B", Scroll::Lines(1)),
+    (b"\x1bOB", Scroll::Lines(1)),
+    (b"j", Scroll::Lines(1)),
+    (b"\x1b[5~", Scroll::Screens(-1)),
+    (b"b", Scroll::Screens(-1)),
+    (b"\x1b[6~", Scroll::Screens(1)),
+    (b" ", Scroll::Screens(1)),
+    (b"\x1b[H", Scroll::Top),
+    (b"\x1bOH", Scroll::Top),
+    (b"\x1b[1~", Scroll::Top),
+    (b"g", Scroll::Top),
+    (b"\x1b[F", Scroll::Bottom),
+    (b"\x1bOF", Scroll::Bottom),
+    (b"\x1b[4~", Scroll::Bottom),
+    (b"G", Scroll::Bottom),
+];
+
+/// The lines of a page that are to be seen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct View {
+    /// How many are above.
+    above: usize,
+    /// How many there is room for.
+    room: usize,
+}
+
+impl View {
+    /// Moves over a page of so many lines.
+    fn scroll(&mut self, scroll: Scroll, lines: usize) {
+        let lowest = lines.saturating_sub(self.room);
+        // What is at the edge stays in sight.
+        let screen = self.room.saturating_sub(1).max(1) as isize;
+        self.above = match scroll {
+            Scroll::Lines(by) => self.above.saturating_add_signed(by),
+            Scroll::Screens(by) => self.above.saturating_add_signed(by.saturating_mul(screen)),
+            Scroll::Top => 0,
+            Scroll::Bottom => lowest,
+        }
+        .min(lowest);
+    }
+
+    /// The lines of a page that are to be seen, and what is said below them.
+    fn of<'a>(&mut self, page: &'a Page, ends: &str) -> (Vec<&'a str>, String) {
+        let lines = page.lines().count();
+        self.scroll(Scroll::Lines(0), lines);
+        let shown: Vec<&str> = page.lines().skip(self.above).take(self.room).collect();
+        let last = self.above + shown.len();
+        let foot = match lines > self.room {
+            true => format!("lines {} to {last} of {lines}: arrows and page keys show others; {ends}", self.above + 1),
+            false => ends.to_owned(),
+        };
+        (shown, foot)
+    }
 }
 
 /// A terminal that is drawn on in place: its alternate screen, without a cursor, long
@@ -445,6 +535,8 @@ enum Wish {
 struct Screen {
     /// The settings to give back, if keys can be read.
     before: Option<Termios>,
+    page: Page,
+    view: View,
 }
 
 impl Screen {
@@ -457,22 +549,27 @@ impl Screen {
             let _ = tcsetattr(keys, SetArg::TCSANOW, &keyed);
         }
         let _ = draw("\x1b[?1049h\x1b[?25l\x1b[?7l");
-        Screen { before }
+        Screen { before, page: Page::default(), view: View::default() }
     }
 
-    /// Draws the page, or as much of it as the terminal has rows for.
-    fn draw(&mut self, page: &Page) -> io::Result<()> {
-        let mut drawn = "\x1b[H".to_owned();
-        let all = page.lines().count();
-        let room = sys::terminal_rows(&io::stdout()).unwrap_or(24).saturating_sub(1);
-        for line in page.lines().take(if all > room { room.saturating_sub(1) } else { room }) {
-            drawn += &format!("{line}\x1b[K\r\n");
-        }
-        if all > room {
-            drawn += &format!("... and {} lines more\x1b[K\r\n", all - room.saturating_sub(1));
-        }
-        drawn += "\x1b[J";
-        draw(&(drawn + if self.before.is_some() { "q ends" } else { "Ctrl-C ends" }))
+    /// Shows a new page, at the place that the last one was seen at.
+    fn show(&mut self, page: Page) -> io::Result<()> {
+        self.page = page;
+        self.draw()
+    }
+
+    fn scroll(&mut self, scroll: Scroll) -> io::Result<()> {
+        self.view.scroll(scroll, self.page.lines().count());
+        self.draw()
+    }
+
+    /// Draws as much of the page as the terminal has rows for.
+    fn draw(&mut self) -> io::Result<()> {
+        self.view.room = sys::terminal_rows(&io::stdout()).unwrap_or(24).saturating_sub(1);
+        let ends = if self.before.is_some() { "q ends" } else { "Ctrl-C ends" };
+        let (lines, foot) = self.view.of(&self.page, ends);
+        let lines: String = lines.iter().map(|line| format!("{line}\x1b[K\r\n")).collect();
+        draw(&format!("\x1b[H{lines}\x1b[J{foot}"))
     }
 
     /// What somebody has pressed a key for; waits a little for that.
@@ -487,6 +584,11 @@ impl Screen {
         }
         let mut pressed = [0; 64];
         match nix::unistd::read(keys, &mut pressed) {
+            Ok(read @ 1..)
+                if let Some((_, scroll)) = SCROLL_KEYS.iter().find(|(key, _)| pressed[..read].starts_with(key)) =>
+            {
+                Some(Wish::Scroll(*scroll))
+            }
             Ok(read @ 1..) => pressed[..read].iter().find_map(|key| {
                 let is = |special: SpecialCharacterIndices| before.control_chars[special as usize] == *key;
                 match key {
@@ -583,6 +685,39 @@ mod tests {
                 assert_plain(&show(&hostile).to_string(), show(&harmless).lines().count());
             }
         }
+    }
+
+    #[test]
+    fn a_page_that_is_longer_than_the_screen_is_scrolled() {
+        let lines = |count: u32| Page::text(&(1..=count).map(|n| format!("line {n}\n")).collect::<String>());
+        let page = lines(40);
+        let mut view = View { above: 0, room: 23 };
+        let mut seen = |scroll: Scroll| {
+            view.scroll(scroll, 40);
+            let (lines, foot) = view.of(&page, "q ends");
+            assert_eq!(lines.len(), 23);
+            assert!(foot.chars().count() < 80 && foot.ends_with("; q ends"), "{foot}");
+            let (first, last) = (lines[0].to_owned(), lines[22].to_owned());
+            assert!(foot.starts_with(&format!("{first} to {}", &last[5..]).replacen("line", "lines", 1)), "{foot}");
+            first
+        };
+        for (scroll, first) in [
+            (Scroll::Lines(0), "line 1"),
+            (Scroll::Lines(-1), "line 1"),
+            (Scroll::Lines(1), "line 2"),
+            (Scroll::Screens(1), "line 18"),
+            (Scroll::Lines(1), "line 18"),
+            (Scroll::Screens(-1), "line 1"),
+            (Scroll::Bottom, "line 18"),
+            (Scroll::Top, "line 1"),
+        ] {
+            assert_eq!(seen(scroll), first, "{scroll:?}");
+        }
+        // A page that has become shorter is seen whole, or from where its last line is the last.
+        let mut view = View { above: 17, room: 23 };
+        assert_eq!(view.of(&lines(25), "q ends").0[0], "line 3");
+        assert_eq!(view.of(&lines(2), "q ends"), (vec!["line 1", "line 2"], "q ends".to_owned()));
+        assert_eq!(View::default().of(&lines(1), "q ends").0.len(), 0, "there is no room");
     }
 
     #[test]

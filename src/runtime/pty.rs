@@ -190,6 +190,10 @@ fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
             info!("{} was a file that holds nothing but {FORCE_SHUTDOWN}: removed", symlink.display());
             said(fs::remove_file(symlink), &format!("removing {}", symlink.display()))?;
         }
+        Ok(found) if found.is_dir() => {
+            let what = "is a folder: choose another path with -I, such as one in that folder";
+            return Err(io::Error::other(format!("{} {what}", symlink.display())));
+        }
         Ok(found) if !found.file_type().is_symlink() => {
             return Err(io::Error::other(format!(
                 "{} exists and is no symbolic link: remove it, or choose another path with -I",
@@ -288,6 +292,10 @@ mod tests {
             let error = Pty::open(&path, &access).err().unwrap().to_string();
             assert!(error.contains("exists and is no symbolic link: remove it"), "{error}");
             assert_eq!(fs::read_to_string(&path).unwrap(), content);
+        }
+        for folder in [Path::new("/"), elsewhere.path()] {
+            let error = Pty::open(folder, &access).err().unwrap().to_string();
+            assert!(error.contains("is a folder: choose another path with -I"), "{error}");
         }
     }
 

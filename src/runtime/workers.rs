@@ -30,6 +30,8 @@ struct Worker {
     done: Consumer<Completion>,
     quit: Arc<AtomicBool>,
     thread: JoinHandle<()>,
+    /// Whether nobody waits for its end.
+    left_behind: bool,
 }
 
 /// What the thread of each new worker calls first.
@@ -68,7 +70,7 @@ impl Threads {
             .map_err(|error| {
                 overflow(bus, &format!("its thread can not be started ({error}): raise TasksMax or ulimit -u"))
             })?;
-        Ok(Worker { bus: bus.into(), jobs, done, quit, thread })
+        Ok(Worker { bus: bus.into(), jobs, done, quit, thread, left_behind: false })
     }
 }
 
@@ -83,6 +85,12 @@ impl Workers for Threads {
         }
         self.workers.push(self.spawn(bus)?);
         Ok(WorkerId(self.workers.len() - 1))
+    }
+
+    fn leave_behind(&mut self, WorkerId(worker): WorkerId) {
+        if let Some(worker) = self.workers.get_mut(worker) {
+            worker.left_behind = true;
+        }
     }
 
     fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Shutdown> {
@@ -114,7 +122,7 @@ impl Workers for Threads {
             worker.thread.thread().unpark();
         }
         let end = monotonic() + END_LIMIT;
-        for worker in self.workers.drain(..) {
+        for worker in self.workers.drain(..).filter(|worker| !worker.left_behind) {
             while !worker.thread.is_finished() && monotonic() < end {
                 thread::sleep(Duration::from_millis(1));
             }
@@ -245,5 +253,32 @@ mod tests {
         drop(release);
         // This ends as both errands are dropped; the second one is not begun.
         assert_eq!(heard.iter().collect::<Vec<_>>(), [0]);
+    }
+
+    #[test]
+    fn a_worker_that_only_reads_is_not_waited_for() {
+        let (release, go_on) = mpsc::channel();
+        let (said, heard) = mpsc::channel();
+        let go_on = Arc::new(std::sync::Mutex::new(go_on));
+        let mut threads = threads();
+        let worker = threads.start("w1 28-1").unwrap();
+        threads.leave_behind(worker);
+        let waiting = |threads: &Threads| QUEUE_JOBS - threads.workers[0].jobs.slots();
+        let errand = Box::new(Slow { go_on, number: 7, said });
+        let ticket = Ticket { oid: Oid::new(0), tag: 0 };
+        threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+        // What is not under way yet is dropped.
+        while waiting(&threads) > 0 {
+            thread::sleep(Duration::from_millis(1));
+        }
+        let began = monotonic();
+        threads.reset();
+        assert!(monotonic() - began < END_LIMIT, "it was waited for");
+        assert!(heard.try_recv().is_err());
+        // It goes on, and what it says is nobody's.
+        threads.start("w1 28-1").unwrap();
+        drop(release);
+        assert_eq!(heard.recv(), Ok(7));
+        assert!(!threads.has_completion());
     }
 }

@@ -375,5 +375,25 @@ fn shells_get_completions_with_every_subcommand_and_option() {
         for word in ["doctor", "latency", "print-config", "dialect"] {
             assert!(script.contains(word), "{shell} knows no {word}");
         }
+        // The values of the options that have names, rather than files.
+        for word in ["linux", "auto", "kalico", "trace"] {
+            assert!(script.contains(word), "{shell} offers no {word}");
+        }
+    }
+    // What bash itself makes of it.
+    let script = String::from_utf8(output(&["completions", "bash"]).stdout).unwrap();
+    for (words, offered) in [
+        ("--board ''", "linux sim"),
+        ("run --dialect v0.1", "v0.11 v0.12 v0.13"),
+        ("status --log-level de", "debug"),
+        ("console --board ''", "sim"),
+        ("run --cpu ''", ""),
+    ] {
+        let last = words.split(' ').count();
+        let ask = format!(
+            "COMP_WORDS=(pinion {words}); COMP_CWORD={last}; _pinion pinion \"${{COMP_WORDS[-1]}}\" \"${{COMP_WORDS[-2]}}\"; echo \"${{COMPREPLY[*]}}\""
+        );
+        let bash = Command::new("bash").args(["--norc", "-c", &format!("{script}\n{ask}")]).output().unwrap();
+        assert_eq!(String::from_utf8_lossy(&bash.stdout).trim(), offered, "{words}");
     }
 }

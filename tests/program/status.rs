@@ -3,8 +3,9 @@
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
+use std::os::fd::AsRawFd;
 use std::os::unix::fs::{FileTypeExt, PermissionsExt};
-use std::os::unix::net::UnixStream;
+use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::thread;
@@ -12,6 +13,7 @@ use std::time::Instant;
 
 use nix::pty::{Winsize, openpty};
 use nix::sys::signal::Signal;
+use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
 use nix::sys::termios::{LocalFlags, tcgetattr};
 use serde_json::{Value, json};
 
@@ -205,6 +207,67 @@ fn watching_goes_on_until_q_and_gives_the_terminal_back() {
     let read = master.read(&mut piece).unwrap();
     shown += &String::from_utf8_lossy(&piece[..read]);
     assert!(shown.ends_with("\x1b[?7h\x1b[?25h\x1b[?1049l"), "{shown:?}");
+}
+
+#[test]
+fn a_page_that_is_longer_than_the_terminal_is_scrolled_by_keys() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.until("the socket", || exists(&socket(&pinion)));
+    let size = Winsize { ws_row: 5, ws_col: 80, ws_xpixel: 0, ws_ypixel: 0 };
+    let terminal = openpty(Some(&size), None).unwrap();
+    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
+    let mut watch = watch(&pinion, dup(), dup());
+    let mut master = File::from(terminal.master);
+    let mut until_shown = |key: &[u8], wanted: &str| {
+        master.write_all(key).unwrap();
+        let (mut shown, mut piece) = (String::new(), [0; 4096]);
+        while !shown.contains(wanted) {
+            let read = master.read(&mut piece).unwrap();
+            shown += &String::from_utf8_lossy(&piece[..read]);
+        }
+    };
+    until_shown(b"", "lines 1 to 4 of ");
+    until_shown(b"\x1b[B", "lines 2 to 5 of ");
+    until_shown(b"\x1b[A", "lines 1 to 4 of ");
+    until_shown(b"\x1b[6~", "lines 4 to 7 of ");
+    until_shown(b"\x1b[H", "lines 1 to 4 of ");
+    until_shown(b"q", "\x1b[?1049l");
+    assert!(watch.wait().unwrap().success());
+}
+
+/// Others ask as well, more than there is room for in the socket's queue.
+#[test]
+fn a_crowd_is_waited_for_and_then_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("mcu.sock");
+    let socket_of = |flags| nix::sys::socket::socket(AddressFamily::Unix, SockType::Stream, flags, None).unwrap();
+    let address = UnixAddr::new(&path).unwrap();
+    let listener = socket_of(SockFlag::SOCK_CLOEXEC);
+    nix::sys::socket::bind(listener.as_raw_fd(), &address).unwrap();
+    nix::sys::socket::listen(&listener, Backlog::new(1).unwrap()).unwrap();
+    let listener = UnixListener::from(listener);
+    let crowd: Vec<_> = std::iter::from_fn(|| {
+        let client = socket_of(SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK);
+        nix::sys::socket::connect(client.as_raw_fd(), &address).is_ok().then_some(client)
+    })
+    .collect();
+    let ask = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        command.args(["status", "--socket"]).arg(&path).stdout(Stdio::piped()).stderr(Stdio::piped()).spawn().unwrap()
+    };
+    let refused = ask().wait_with_output().unwrap();
+    let log = String::from_utf8_lossy(&refused.stderr);
+    assert!(!refused.status.success() && log.contains("mcu.sock is asked by too many at once: end those"), "{log}");
+    let waiting = ask();
+    thread::sleep(std::time::Duration::from_millis(200));
+    for _ in 0..=crowd.len() {
+        let (mut client, _) = listener.accept().unwrap();
+        // The crowd does not read.
+        let _ = client.write_all(b"{\"state\": \"waiting\"}");
+    }
+    let answered = waiting.wait_with_output().unwrap();
+    let page = String::from_utf8_lossy(&answered.stdout);
+    assert!(answered.status.success() && page.contains("waiting for a host's configuration"), "{page}");
 }
 
 #[test]

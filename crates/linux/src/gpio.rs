@@ -9,9 +9,10 @@
 #![forbid(unsafe_code)]
 
 use std::fs;
+use std::io;
 use std::os::fd::AsRawFd;
 use std::path::Path;
-use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use gpio_cdev::{LineHandle, LineRequestFlags};
 
@@ -29,6 +30,7 @@ pub use chip::{Chip, LineInfo};
 use chip::{look_at, node};
 pub(super) use chip::{may_sleep, number_behind, scan};
 pub(super) use refusal::not_permitted;
+pub use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
 use refusal::{Subject, cannot_open, errno, missing};
 
 /// The name that the kernel shows as the consumer of our lines.
@@ -99,9 +101,9 @@ impl Handle {
             .line
             .request(flags, level.into(), CONSUMER)
             .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
-        let flags = AtomicU32::new(bits);
-        let line = HeldLine { handle, line: self.line, subject: self.subject, flags, guard, sleeping };
-        line.watch_over(direction, 0)?;
+        let (flags, watched) = (AtomicU32::new(bits), AtomicBool::new(false));
+        let line = HeldLine { handle, line: self.line, subject: self.subject, flags, guard, watched, sleeping };
+        line.watch_over(direction)?;
         Ok(line)
     }
 }
@@ -122,6 +124,8 @@ pub(super) struct HeldLine {
     /// What its last set-up made it (`GPIOHANDLE_REQUEST_` flags).
     flags: AtomicU32,
     guard: SharedGuard,
+    /// Whether the guardian has a copy of it.
+    watched: AtomicBool,
     /// The name of its chip, if calls to that may block.
     sleeping: Option<String>,
 }
@@ -135,20 +139,51 @@ impl HeldLine {
     }
 
     /// Has the guardian hold the line if it is an output now, and let go of it if it no longer is.
-    /// `before` are the flags of the set-up before this one.
-    fn watch_over(&self, direction: Direction, before: u32) -> Result<(), Shutdown> {
-        let name = format!("{} line {}", self.subject.chip, self.subject.offset);
-        let before = LineRequestFlags::from_bits_retain(before);
-        let was_watched = before.contains(LineRequestFlags::OUTPUT) && !before.contains(LineRequestFlags::OPEN_DRAIN);
+    fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
         match direction {
             Direction::Output { shutdown_level, .. } => {
+                let name = self.guarded_name();
                 self.guard.output(&name, self.handle.as_raw_fd(), shutdown_level, self.sleeping.as_deref())?;
+                self.watched.store(true, Ordering::Relaxed);
+                Ok(())
             }
-            Direction::Input(_) | Direction::OpenDrain if was_watched => self.guard.forget(&name)?,
-            Direction::Input(_) | Direction::OpenDrain => {}
+            Direction::Input(_) | Direction::OpenDrain => self.watch_no_more(),
         }
-        Ok(())
     }
+
+    fn watch_no_more(&self) -> Result<(), Shutdown> {
+        match self.watched.swap(false, Ordering::Relaxed) {
+            true => self.guard.forget(&self.guarded_name()),
+            false => Ok(()),
+        }
+    }
+
+    fn guarded_name(&self) -> String {
+        format!("{} line {}", self.subject.chip, self.subject.offset)
+    }
+
+    /// Lets the line go and requests it anew, as Linux before 5.5 can not change one that is held. That
+    /// is what Klipper's C program always does. If it is refused, the line stays what it was.
+    fn request_anew(&self, setup: &LineSetup) -> Result<i32, Shutdown> {
+        let before = LineRequestFlags::from_bits_retain(self.flags.load(Ordering::Relaxed));
+        let level = self.handle.get_value().unwrap_or_default();
+        // The kernel keeps a line for as long as anybody has a copy.
+        self.watch_no_more()?;
+        let request = |flags, level| match self.line.request(flags, level, CONSUMER) {
+            Ok(handle) => sys::replace(&self.handle, &handle).map_or_else(code_of, |()| 0),
+            Err(error) => errno(&error),
+        };
+        let let_go = fs::File::open("/dev/null").and_then(|null| sys::replace(&self.handle, &null));
+        let refused = let_go.map_or_else(code_of, |()| request(setup.flags.clone(), setup.level.into()));
+        if refused != 0 {
+            request(before, level);
+        }
+        Ok(refused)
+    }
+}
+
+fn code_of(error: io::Error) -> i32 {
+    error.raw_os_error().unwrap_or(libc::EIO)
 }
 
 impl Line for HeldLine {
@@ -175,17 +210,21 @@ impl Line for HeldLine {
     }
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
-        let before = self.flags.load(Ordering::Relaxed);
         self.turn(direction)?;
-        self.watch_over(direction, before)
+        self.watch_over(direction)
     }
 
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
-        let LineSetup { flags, level, refused } = self.subject.setting(direction)?;
-        sys::set_line_config(&self.handle, flags.bits(), level).map_err(|error| {
-            self.subject.refused(refused, error.raw_os_error().unwrap_or_default(), direction, &self.line)
-        })?;
-        self.flags.store(flags.bits(), Ordering::Relaxed);
+        let setup = self.subject.setting(direction)?;
+        let code = match sys::set_line_config(&self.handle, setup.flags.bits(), setup.level).map_err(code_of) {
+            Ok(()) => 0,
+            Err(libc::EINVAL | libc::ENOTTY) => self.request_anew(&setup)?,
+            Err(code) => code,
+        };
+        if code != 0 {
+            return Err(self.subject.refused(setup.refused, code, direction, &self.line));
+        }
+        self.flags.store(setup.flags.bits(), Ordering::Relaxed);
         Ok(())
     }
 }

@@ -61,26 +61,42 @@ impl Pwm {
             Shutdown::because(reason::PWM_CONFIG, format!("{channel}: {what}: {error}{}", remedy(&error)))
         };
         let folder = export(class, channel).map_err(|error| refused("exporting it", error))?;
-        let open = |name: &str| OpenOptions::new().write(true).open(folder.join(name));
-        let duty = open("duty_cycle").map_err(|error| refused("opening duty_cycle", error))?;
-        let enable = open("enable").map_err(|error| refused("opening enable", error))?;
-        let period = open("period").map_err(|error| refused("opening period", error))?;
+        let open = |name: &str| {
+            let file = OpenOptions::new().read(name == "period").write(true).open(folder.join(name));
+            file.map_err(|error| refused(&format!("opening {name}"), error))
+        };
+        let (duty, enable, period) = (open("duty_cycle")?, open("enable")?, open("period")?);
         let mut pwm = Pwm { channel, period_ns: 0, period, duty, enable, guard };
-        pwm.set_period(config.cycle)?;
+        pwm.set_period(config.cycle, config.value)?;
         pwm.write(config.value).map_err(|error| refused("its first value", error))?;
         pwm.watch_over(config.shutdown_value)?;
         Ok(pwm)
     }
 
-    fn set_period(&mut self, cycle: Ticks) -> Result<(), Shutdown> {
+    /// Sets the period, on the way to a value. An output that is on stays on, and is on for a smaller part of
+    /// the time than before or after for the moment between two writes: a longer period is set before its
+    /// duty cycle, a shorter one behind it. So the duty cycle is at no time longer than the period, which
+    /// the kernel would refuse.
+    fn set_period(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         self.period_ns = u64::from(cycle.0) * NS_PER_TICK;
-        // The kernel refuses a period shorter than the present duty cycle, so that becomes 0 first.
-        // If this fails, the write below fails as well, and is reported.
-        let _ = self.duty.write_at(b"0", 0);
-        self.period.write_all_at(self.period_ns.to_string().as_bytes(), 0).map_err(|error| {
-            let detail = format!("{}: a period of {} ns: {error}{}", self.channel, self.period_ns, remedy(&error));
-            Shutdown::because(reason::PWM_CONFIG, detail)
-        })
+        if self.period_ns < self.present_period_ns() {
+            let duty = self.duty_ns(value);
+            self.duty.write_all_at(duty.to_string().as_bytes(), 0).map_err(|error| self.not_configured(&error))?;
+        }
+        let written = self.period.write_all_at(self.period_ns.to_string().as_bytes(), 0);
+        written.map_err(|error| self.not_configured(&error))
+    }
+
+    /// The period that the channel has from before, which may be another object's or program's; 0 if none.
+    fn present_period_ns(&self) -> u64 {
+        let mut text = [0; 24];
+        let read = self.period.read_at(&mut text, 0).unwrap_or_default();
+        str::from_utf8(&text[..read]).ok().and_then(|text| text.trim().parse().ok()).unwrap_or_default()
+    }
+
+    fn not_configured(&self, error: &io::Error) -> Shutdown {
+        let detail = format!("{}: a period of {} ns: {error}{}", self.channel, self.period_ns, remedy(error));
+        Shutdown::because(reason::PWM_CONFIG, detail)
     }
 
     /// Tells the guardian what to set the channel to if the program dies.
@@ -120,7 +136,7 @@ impl board::Pwm for Pwm {
     /// An output of `set_pwm_out` stays as it is when the machine stops. So the guardian is told to
     /// set it to this value, too.
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
-        self.set_period(cycle)?;
+        self.set_period(cycle, value)?;
         self.set(value)?;
         self.watch_over(value)
     }
@@ -216,6 +232,21 @@ mod tests {
         let mut pwm = open(&class, 8192).unwrap();
         pwm.set_cycle(Ticks::from_us(2000), 16384).unwrap();
         assert_eq!((read(&class, "period"), read(&class, "duty_cycle")), ("2000000".into(), "1000000".into()));
+    }
+
+    /// In which order the files are written the lab shows.
+    #[test]
+    fn a_shorter_period_may_come_with_any_value() {
+        for value in [0, 1, 8192, 32768] {
+            let class = class(true);
+            let mut pwm = open(&class, 32768).unwrap();
+            assert_eq!(pwm.present_period_ns(), 1_000_000);
+            pwm.set_cycle(Ticks::from_us(100), value).unwrap();
+            let duty = (100_000 * u64::from(value) / 32768).to_string();
+            // (A file keeps what is behind that, which a shorter number does not replace.)
+            assert!(read(&class, "duty_cycle").starts_with(&duty) && read(&class, "period").starts_with("100000"));
+            assert!(read(&class, "enable").starts_with(if value == 0 { '0' } else { '1' }));
+        }
     }
 
     #[test]

@@ -98,7 +98,7 @@ const STEP_LATE_LIMIT: Ticks = Ticks::from_us(100_000);
 
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
-/// The worker that counts edges.
+/// The worker that takes edges.
 const EDGES_WORKER: &str = "edges";
 /// The worker of the PWM channels.
 const PWM_WORKER: &str = "pwm";
@@ -284,7 +284,7 @@ impl Board for SimBoard {
     fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
         let line = self.line(pin, Direction::Input(bias))?;
         let wired = self.pin(pin, reason::NOT_INPUT)?;
-        let edges = match SimEdges::new(wired.wire.clone(), self.time.clone()) {
+        let edges = match SimEdges::new(wired.wire.clone(), self.time.clone(), line.line.read()?) {
             Some(edges) => Ok(OnWorker { bus: EDGES_WORKER.to_owned(), device: Box::new(edges) as Box<dyn Edges> }),
             None => Err(format!("nobody counts the edges of {}", wired.wire.describe()).into()),
         };

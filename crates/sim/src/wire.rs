@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use super::config::PinName;
 use super::physics::{Axis, Fan, Heater, Lamp, Switch, seconds};
 use super::time::PrinterTime;
-use pinion_firmware::board::{Adc, Direction, EdgeCount, Edges, Line};
+use pinion_firmware::board::{Adc, Direction, Edge, Edges, Line};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
@@ -178,40 +178,56 @@ impl Adc for SimAdc {
     }
 }
 
-/// The edges of an input, as a kernel's interrupts would count them.
+/// The edges of an input, as a kernel's interrupts would date them.
 pub(super) struct SimEdges {
     wire: Arc<dyn Wire>,
     time: Arc<PrinterTime>,
-    /// Those before it was claimed.
-    before: u64,
-    /// When they were last asked for, and what was told.
-    asked: Clock,
-    told: EdgeCount,
+    /// How many there were when they were last taken, and the level behind the last of them.
+    taken: u64,
+    level: bool,
+    /// When the last of them came, or what is earlier than the next: when the line was claimed.
+    last: Clock,
 }
 
+/// As many edges are kept as by the kernel.
+const EDGES_KEPT: u64 = 1024;
+
 impl SimEdges {
-    /// None where the part does not count them.
-    pub(super) fn new(wire: Arc<dyn Wire>, time: Arc<PrinterTime>) -> Option<SimEdges> {
-        let asked = time.now();
-        let (before, _) = wire.edges(asked)?;
-        Some(SimEdges { wire, time, before, asked, told: EdgeCount { count: 0, last: None } })
+    /// None where the part does not count them. `level` is the line's.
+    pub(super) fn new(wire: Arc<dyn Wire>, time: Arc<PrinterTime>, level: bool) -> Option<SimEdges> {
+        let last = time.now();
+        let (taken, _) = wire.edges(last)?;
+        Some(SimEdges { wire, time, taken, level, last })
     }
 }
 
+fn ticks(seconds: f64) -> u64 {
+    (seconds * f64::from(CLOCK_FREQ)) as u64
+}
+
 impl Edges for SimEdges {
-    fn count(&mut self) -> Result<EdgeCount, Shutdown> {
+    /// A part knows how many there were and when the last one was. The others came evenly before it.
+    fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown> {
         let now = self.time.now();
-        let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.before, None));
-        // The edges of 2^32 are 0 again, as in the kernel.
-        let count = edges.wrapping_sub(self.before) as u32;
-        if count != self.told.count {
-            // The last one came after those that were told before.
-            let ago_s = ago_s.unwrap_or(0.0).min(seconds(self.asked, now));
-            let last = now.earlier((ago_s * f64::from(CLOCK_FREQ)) as u64);
-            self.told = EdgeCount { count, last: Some(self.time.duration_of(last)) };
+        let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.taken, None));
+        let new = edges.saturating_sub(self.taken);
+        if new == 0 {
+            return Ok(());
         }
-        self.asked = now;
-        Ok(self.told)
+        let since_s = seconds(self.last, now);
+        // The last one came after those that were taken before.
+        let ago_s = ago_s.unwrap_or(0.0).min(since_s);
+        let each_s = (since_s - ago_s) / new as f64;
+        let dropped = new.saturating_sub(EDGES_KEPT);
+        for number in dropped + 1..=new {
+            let at = now.earlier(ticks(ago_s + (new - number) as f64 * each_s));
+            let dropped = if number == dropped + 1 { u32::try_from(dropped).unwrap_or(u32::MAX) } else { 0 };
+            see(Edge { at: self.time.duration_of(at), level: self.level ^ (number % 2 == 1), dropped });
+        }
+        self.taken = edges;
+        self.level ^= new % 2 == 1;
+        self.last = now.earlier(ticks(ago_s));
+        Ok(())
     }
 
     fn end(&mut self) -> Result<(), Shutdown> {

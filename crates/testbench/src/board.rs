@@ -7,7 +7,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use pinion_firmware::board::{
-    Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, EdgeCount, Edges, I2cConfig,
+    self, Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges, I2cConfig,
     Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig, Thermometer,
 };
 use pinion_firmware::mcu::{Completion, Job, WorkerId, Workers};
@@ -361,7 +361,7 @@ impl Board for FakeBoard {
         let line = self.line(pin, Direction::Input(bias))?;
         let edges = match self.0.state().counted.contains(&pin.0) {
             true => {
-                let edges = FakeEdges { bench: self.0.clone(), pin: pin.0 };
+                let edges = FakeEdges { bench: self.0.clone(), pin: pin.0, taken: 0 };
                 Ok(OnWorker { bus: "edges".into(), device: Box::new(edges) as Box<dyn Edges> })
             }
             false => Err("this pin has no interrupt".into()),
@@ -532,19 +532,23 @@ impl Line for FakeLine {
 struct FakeEdges {
     bench: Bench,
     pin: u32,
+    /// How many of them were taken.
+    taken: usize,
 }
 
 impl Edges for FakeEdges {
-    fn count(&mut self) -> Result<EdgeCount, Shutdown> {
+    fn take(&mut self, see: &mut dyn FnMut(board::Edge)) -> Result<(), Shutdown> {
         self.bench.broken(self.pin, reason::LINE_READ)?;
         let now = self.bench.ticks();
         let state = self.bench.state();
         assert!(state.counted.contains(&self.pin), "the interrupts were ended");
         let levels = state.inputs.get(&self.pin).map_or(&[][..], Vec::as_slice);
-        let count = levels.partition_point(|(at, _)| *at <= now);
         let monotonic = |at: u64| Duration::from_nanos((self.bench.origin.ticks() + at) * NS_PER_TICK);
-        let last = levels[..count].last().map(|(at, _)| monotonic(*at));
-        Ok(EdgeCount { count: count as u32, last })
+        for (at, level) in levels[self.taken..].iter().take_while(|(at, _)| *at <= now) {
+            self.taken += 1;
+            see(board::Edge { at: monotonic(*at), level: *level != 0, dropped: 0 });
+        }
+        Ok(())
     }
 
     fn end(&mut self) -> Result<(), Shutdown> {

@@ -7,16 +7,19 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::io::Read;
+use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::cli::finding::Finding;
+use crate::cli::run::BoardName;
 use pinion_linux::gpio::Chip;
 
 use super::instance::Instance;
 use super::machine::{Access, Machine, Who};
+use super::{INSTALL, REINSTALL};
 
 /// A kind of devices.
 struct Class {
@@ -97,13 +100,32 @@ fn inside(folder: &Path, beginning: &str) -> Vec<PathBuf> {
     found.map(|entry| entry.path()).collect()
 }
 
-/// Whether `user` may open what is there.
-pub(super) fn permissions(machine: &Machine, instances: &[Instance], user: &Who) -> Vec<Finding> {
+/// Whether the users that Pinion runs as may open what is there; where there is no service, the caller.
+pub(super) fn permissions(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+    let on_pins = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
+    let mut users: Vec<(Who, Vec<&Instance>)> = Vec::new();
+    for (who, instance) in on_pins.filter_map(|instance| Some((instance.user(machine)?, instance))) {
+        match users.iter_mut().find(|(user, _)| *user == who) {
+            Some((_, instances)) => instances.push(instance),
+            None => users.push((who, vec![instance])),
+        }
+    }
+    if users.is_empty() {
+        users.extend(machine.caller().map(|caller| (caller, Vec::new())));
+    }
+    if users.is_empty() {
+        let found = "there is no user pinion: the service is not installed, and what it may open is unknown";
+        return vec![Finding::warning("user", found, INSTALL)];
+    }
+    users.iter().flat_map(|(user, instances)| permissions_of(machine, instances, user)).collect()
+}
+
+/// Whether `user`, as whom these instances run, may open what is there.
+fn permissions_of(machine: &Machine, instances: &[&Instance], user: &Who) -> Vec<Finding> {
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
-    let anew = match (user.name.as_str(), &units[..]) {
-        ("pinion", []) => "start Pinion anew".to_owned(),
-        ("pinion", units) => format!("sudo systemctl restart {}", units.join(" ")),
-        _ => "log in anew".to_owned(),
+    let anew = match &units[..] {
+        [] => "log in anew, and start Pinion anew".to_owned(),
+        units => format!("sudo systemctl restart {}", units.join(" ")),
     };
     let permission = |class: &Class| permission(machine, user, &anew, class, &(class.nodes)(machine));
     let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
@@ -138,8 +160,8 @@ fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &
         refused.len(),
         nodes.len()
     );
-    let group = machine.group_name(std::os::unix::fs::MetadataExt::gid(about));
-    let remedy = if class.access.is_given_to_group(about) && group != "root" && group != "0" {
+    let group = machine.common_group(about).filter(|_| class.access.is_given_to_group(about));
+    let remedy = if let Some(group) = group {
         format!("sudo usermod -aG {group} {who}, then {anew}")
     } else if rules_are_there(machine) {
         format!(
@@ -147,7 +169,7 @@ fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &
             class.subsystem
         )
     } else {
-        "install the udev rules: sudo apt install --reinstall pinion-mcu, or sudo make install".into()
+        format!("install the udev rules: {REINSTALL}")
     };
     Some(Finding::error(class.check, found, remedy))
 }
@@ -171,6 +193,13 @@ pub(super) fn presence(machine: &Machine) -> Vec<Finding> {
 fn present(machine: &Machine, class: &Class) -> Finding {
     let Class { check, name, .. } = *class;
     let nodes = (class.nodes)(machine);
+    if let Some((node, other)) = nodes.iter().find_map(|node| Some((node, other_subsystem(machine, class, node)?))) {
+        let node = machine.name(node);
+        let (shown, subsystem) = (node.display(), class.subsystem);
+        let found = format!("{name}: {shown} is no {subsystem} device, but one of {other}");
+        let remedy = format!("sudo rm {shown} && sudo udevadm trigger --action=add --subsystem-match={subsystem}");
+        return Finding::error(check, found, remedy);
+    }
     if let Some(first) = nodes.first() {
         return Finding::ok(check, format!("{name}: {}", with_others(&machine.name(first), nodes.len())));
     }
@@ -209,6 +238,16 @@ fn present(machine: &Machine, class: &Class) -> Finding {
 
 fn model(machine: &Machine) -> String {
     machine.text("/proc/device-tree/model").unwrap_or_default()
+}
+
+/// The subsystem of a node in /dev that is another device than its name says, such as a null device.
+fn other_subsystem(machine: &Machine, class: &Class, node: &Path) -> Option<String> {
+    let about = fs::metadata(node).ok().filter(|about| about.file_type().is_char_device())?;
+    let (major, minor) = (nix::sys::stat::major(about.rdev()), nix::sys::stat::minor(about.rdev()));
+    // What the kernel does not tell is taken to be right.
+    let subsystem = fs::read_link(machine.path(format!("/sys/dev/char/{major}:{minor}/subsystem"))).ok()?;
+    let subsystem = subsystem.file_name()?.to_string_lossy().into_owned();
+    (subsystem != class.subsystem).then_some(subsystem)
 }
 
 fn is_pi(machine: &Machine) -> bool {
@@ -416,10 +455,10 @@ mod tests {
     use super::*;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
     use pinion_linux::gpio::LineInfo;
-    use std::os::unix::fs::MetadataExt;
 
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
-        permissions(&tree.machine(), &instances(&tree.machine()).0, user)
+        let instances = instances(&tree.machine()).0;
+        permissions_of(&tree.machine(), &instances.iter().collect::<Vec<_>>(), user)
     }
 
     /// Somebody who is neither root nor the one who runs the tests.
@@ -452,6 +491,57 @@ mod tests {
             let remedy = told(&findings, check, Error, &format!("pinion may not open /{path}, which is "));
             assert_eq!(remedy, "sudo usermod -aG gpio pinion, then sudo systemctl restart pinion-mcu");
         }
+    }
+
+    #[test]
+    fn the_users_are_judged_that_pinion_runs_as() {
+        let tree = Tree::new();
+        let look = || permissions(&tree.machine(), &instances(&tree.machine()).0);
+        assert_eq!(told(&look(), "user", Warning, "there is no user pinion"), INSTALL);
+        tree.put_mode("dev/gpiochip0", "", 0o660);
+        let gid = fs::metadata(tree.machine().path("/dev/gpiochip0")).unwrap().gid();
+        let passwd = "root:x:0:0:::\npinion:x:54321:54321:::\npi:x:54322:54322:::\n";
+        tree.put("etc/passwd", passwd);
+        tree.put("etc/group", &format!("gpio:x:{gid}:pi\n"));
+        // The service would run as pinion.
+        told(&look(), "gpio", Error, "pinion may not open");
+        // What runs counts, with the groups that it has.
+        tree.process(10, &["/usr/bin/pinion", "run"], 54_321, &[gid]);
+        told(&look(), "gpio", Fine, "pinion may open");
+        // Two users, one of a unit of their own.
+        tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\nUser=pi\n");
+        tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
+        let findings = look();
+        assert_eq!(findings.len(), 2, "{findings:?}");
+        told(&findings, "gpio", Fine, "pi may open");
+        tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
+        let remedy = told(&look(), "gpio", Error, "pi may not open");
+        assert_eq!(remedy, "sudo usermod -aG gpio pi, then sudo systemctl restart klipper-mcu");
+        let unit = "[Service]\nExecStart=/usr/bin/pinion -r\nUser=pi\nSupplementaryGroups=gpio\n";
+        tree.put("etc/systemd/system/klipper-mcu.service", unit);
+        told(&look(), "gpio", Fine, "pi may open");
+        tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
+        told(&look(), "gpio", Fine, "root may open");
+        // The simulated printer opens nothing.
+        fs::remove_file(tree.machine().path("/etc/systemd/system/multi-user.target.wants/klipper-mcu.service"))
+            .unwrap();
+        tree.process(10, &["/usr/bin/pinion", "run", "--board", "sim"], 54_322, &[]);
+        told(&look(), "user", Warning, "there is no user pinion");
+    }
+
+    /// A link to a device of this computer in the place of a node, as a test can not make nodes.
+    #[test]
+    fn a_node_of_another_kind_is_no_chip() {
+        let tree = Tree::new();
+        tree.link("dev/gpiochip0", "/dev/null");
+        told(&presence(&tree.machine()), "gpio", Fine, "GPIO: /dev/gpiochip0");
+        tree.link("sys/dev/char/1:3/subsystem", "../../../../class/mem");
+        let remedy =
+            told(&presence(&tree.machine()), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
+        assert!(remedy.starts_with("sudo rm /dev/gpiochip0 && sudo udevadm trigger"), "{remedy}");
+        fs::remove_file(tree.machine().path("/sys/dev/char/1:3/subsystem")).unwrap();
+        tree.link("sys/dev/char/1:3/subsystem", "../../../../bus/gpio");
+        told(&presence(&tree.machine()), "gpio", Fine, "GPIO: /dev/gpiochip0");
     }
 
     #[test]

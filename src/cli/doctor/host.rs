@@ -15,6 +15,7 @@ use crate::klippy::process::{self, Process};
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::DialectName;
 
+use super::UPGRADE;
 use super::instance::{HOST_PATHS, Instance, is_host_path, unit_for};
 use super::machine::{Access, Machine, Who};
 use super::printer::{self, Printer};
@@ -185,8 +186,13 @@ fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys
         }];
     };
     if !link.file_type().is_symlink() {
-        let found = format!("{shown} is a file that something else has written, and no link");
-        return vec![Finding::error(CHECK, found, format!("sudo rm {shown} && {restart}"))];
+        let (what, remedy) = match link.is_dir() {
+            // It may have something in it.
+            true => ("folder", format!("sudo mv {shown} {shown}.old")),
+            false => ("file", format!("sudo rm {shown}")),
+        };
+        let found = format!("{shown} is a {what} that something else has made, and no link");
+        return vec![Finding::error(CHECK, found, format!("{remedy} && {restart}"))];
     }
     let Ok(way) = machine.follow(path) else {
         let target = fs::read_link(machine.path(path)).unwrap_or_default();
@@ -275,16 +281,17 @@ fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance
     if who.may(Access::READ_WRITE, about) {
         return Finding::ok(CHECK, told);
     }
-    let group = machine.group_name(about.gid());
+    let group = machine.common_group(about);
     let is_member = machine.user(name).is_some_and(|user| user.gids.contains(&about.gid()));
-    let remedy = match instance {
-        Some(instance) if !Access::READ_WRITE.is_given_to_group(about) => {
+    let remedy = match (instance, group) {
+        (Some(instance), group) if group.is_none() || !Access::READ_WRITE.is_given_to_group(about) => {
             format!("mode = \"0660\" and group = \"tty\" in {}, then {}", instance.config(), instance.restart())
         }
+        (None, None) => format!("have what serves {} give it to the group tty", path.display()),
         _ if is_member && *is_running => {
             format!("{}, as the user was made a member after it was started", klippy.restart())
         }
-        _ => format!("sudo usermod -aG {group} {name} && {}", klippy.restart()),
+        (_, group) => format!("sudo usermod -aG {} {name} && {}", group.unwrap_or_default(), klippy.restart()),
     };
     Finding::error(CHECK, format!("{name}, klippy's user ({found_by}), may not open it: {told}"), remedy)
 }
@@ -353,7 +360,7 @@ fn dialect(machine: &Machine, instances: &[Instance], klippy: &Klippy) -> Vec<Fi
         findings.push(Finding::error(
             DIALECT,
             format!("the host is newer than Pinion, which does not know: {}", unknown.join("; ")),
-            "sudo apt install --only-upgrade pinion-mcu",
+            UPGRADE,
         ));
     }
     findings
@@ -415,6 +422,16 @@ mod tests {
     }
 
     #[test]
+    fn nobody_is_made_a_member_of_root_s_group() {
+        let (tree, gid) = with_terminal(0o660);
+        tree.put("etc/group", &format!("root:x:{gid}:\n"));
+        tree.process(8, &KLIPPY, PI, &[]);
+        tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
+        let remedy = told(&looked(&tree), "terminal", Error, "may not open it");
+        assert!(remedy.starts_with("mode = \"0660\" and group = \"tty\" in "), "{remedy}");
+    }
+
+    #[test]
     fn a_link_of_another_user_s_in_tmp() {
         let (tree, gid) = with_terminal(0o660);
         tree.process(8, &KLIPPY, PI, &[gid]);
@@ -439,6 +456,10 @@ mod tests {
         let tree = Tree::new();
         tree.link("tmp/klipper_host_mcu", "klipper_host_mcu");
         told(&looked(&tree), "terminal", Warning, "which is not there");
+        let tree = Tree::new();
+        tree.put("tmp/klipper_host_mcu/file", "");
+        let remedy = told(&looked(&tree), "terminal", Error, "is a folder that something else has made");
+        assert!(remedy.starts_with("sudo mv /tmp/klipper_host_mcu /tmp/klipper_host_mcu.old && "), "{remedy}");
         let tree = Tree::new();
         tree.put("tmp/klipper_host_mcu", "FORCE_SHUTDOWN\n");
         let remedy = told(&looked(&tree), "terminal", Error, "no link");

@@ -10,7 +10,7 @@ use crate::cli::finding::Finding;
 use crate::cli::run::{Given, Settings};
 use crate::cli::run_args;
 
-use super::machine::{Machine, Running};
+use super::machine::{Machine, Running, Who};
 use super::units::{self, setting};
 
 /// The unit of the instance that there is as a rule.
@@ -90,6 +90,21 @@ impl Instance {
             Some(unit) => format!("sudo systemctl restart {unit}"),
             None => "start it anew".to_owned(),
         }
+    }
+
+    /// The user that it runs as, or will; none if that is not known.
+    pub(super) fn user(&self, machine: &Machine) -> Option<Who> {
+        if let Some(who) = self.pid.and_then(|pid| machine.user_of(pid)) {
+            return Some(who);
+        }
+        let unit = self.unit.as_deref()?;
+        // An instance of a template has no text of its own.
+        let text =
+            units::text(machine, unit).filter(|_| Files::of(unit).is_none()).unwrap_or_else(|| "User=pinion".into());
+        let mut who = machine.user(setting(&text, "User").unwrap_or("root"))?;
+        let groups = setting(&text, "SupplementaryGroups").unwrap_or_default().split_whitespace();
+        who.gids.extend(groups.filter_map(|group| machine.gid_of(group)));
+        Some(who)
     }
 
     /// What to change its settings in.

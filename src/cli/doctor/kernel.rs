@@ -6,12 +6,16 @@
 use std::path::Path;
 
 use crate::cli::finding::Finding;
+use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
 
 use super::instance::Instance;
 use super::machine::Machine;
 
+/// The oldest kernel, which opens a terminal whatever its permissions are (TIOCGPTPEER).
+const OLDEST: (u32, u32) = (4, 13);
+
 pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
-    let kernel = [preempt_rt(machine), throttle(machine)].into_iter();
+    let kernel = [version(machine), preempt_rt(machine), throttle(machine)].into_iter();
     kernel.chain(isolation(machine, instances)).chain(governor(machine)).collect()
 }
 
@@ -24,6 +28,34 @@ pub(in crate::cli) fn is_preempt_rt(root: &Path) -> Option<bool> {
     }
     let version = machine.text("/proc/version")?;
     Some(version.contains("PREEMPT_RT") || version.contains("PREEMPT RT"))
+}
+
+/// Whether the kernel has what Pinion asks of it.
+fn version(machine: &Machine) -> Finding {
+    const CHECK: &str = "kernel_version";
+    const REMEDY: &str = "update the system, or install a newer kernel";
+    let release = machine.text("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let lacks = |version| is_before(&release, version);
+    match () {
+        () if lacks(OLDEST) => {
+            let found =
+                format!("Linux {release} is too old: {}.{} is the oldest that Pinion runs on", OLDEST.0, OLDEST.1);
+            Finding::error(CHECK, found, REMEDY)
+        }
+        () if lacks(BIAS_SINCE) => Finding::warning(
+            CHECK,
+            format!(
+                "Linux {release} can not switch pull-up and pull-down resistors on (5.5 can), and tachometers are polled (5.10 counts)"
+            ),
+            REMEDY,
+        ),
+        () if lacks(EDGES_SINCE) => {
+            let found = format!("with Linux {release} tachometers are polled (5.10 counts their edges)");
+            Finding::warning(CHECK, found, REMEDY)
+        }
+        () if release.is_empty() => Finding::ok(CHECK, "the kernel's version is unknown"),
+        () => Finding::ok(CHECK, format!("Linux {release} has all that Pinion asks of it")),
+    }
 }
 
 fn preempt_rt(machine: &Machine) -> Finding {
@@ -70,18 +102,22 @@ fn isolation(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     let Some(isolated) = machine.text("/sys/devices/system/cpu/isolated") else {
         return vec![Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell")];
     };
-    let among = |cpu: usize| {
-        isolated.split(',').any(|range| {
-            let (first, last) = range.split_once('-').unwrap_or((range, range));
-            matches!((first.parse(), last.parse()), (Ok(first), Ok(last)) if (first..=last).contains(&cpu))
-        })
-    };
+    // Where the kernel does not tell, any may be there.
+    let present = machine.text("/sys/devices/system/cpu/present").filter(|present| !present.is_empty());
     let mut findings = Vec::new();
     let mut taken: Vec<usize> = Vec::new();
     for instance in instances {
         let Some(cpu) = instance.settings.cpu else { continue };
         let (name, config) = (instance.name(), instance.config());
         findings.push(match isolated.as_str() {
+            _ if present.as_ref().is_some_and(|present| !is_among(present, cpu)) => {
+                let present = present.as_deref().unwrap_or_default();
+                Finding::error(
+                    CHECK,
+                    format!("{name} is to stay on processor {cpu}, which is not there: this computer has {present}"),
+                    format!("cpu = {} in {config}", last(present)),
+                )
+            }
             _ if taken.contains(&cpu) => Finding::warning(
                 CHECK,
                 format!("{name} stays on processor {cpu}, as another Pinion does: each keeps the other waiting"),
@@ -92,7 +128,7 @@ fn isolation(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
                 format!("{name} stays on processor {cpu}, which is not isolated: other programs use it, too"),
                 format!("append isolcpus={cpu} to the kernel's command line, and reboot"),
             ),
-            isolated if among(cpu) => {
+            isolated if is_among(isolated, cpu) => {
                 Finding::ok(CHECK, format!("{name} stays on processor {cpu}; isolated: {isolated}"))
             }
             isolated => Finding::warning(
@@ -114,6 +150,18 @@ fn isolation(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
         });
     }
     findings
+}
+
+/// Whether a list such as `1,3-5` has this number.
+fn is_among(list: &str, number: usize) -> bool {
+    list.split(',').any(|range| {
+        let (first, last) = range.split_once('-').unwrap_or((range, range));
+        matches!((first.parse(), last.parse()), (Ok(first), Ok(last)) if (first..=last).contains(&number))
+    })
+}
+
+fn last(list: &str) -> &str {
+    list.rsplit([',', '-']).next().unwrap_or(list)
 }
 
 fn first(range: &str) -> &str {
@@ -163,7 +211,7 @@ mod tests {
         tree.put("sys/devices/system/cpu/isolated", "1,3-5\n");
         tree.put("sys/devices/system/cpu/cpu0/cpufreq/scaling_governor", "performance\n");
         let findings = found(&tree, Some(4));
-        assert!(findings.len() == 4 && findings.iter().all(|finding| finding.status == Ok), "{findings:?}");
+        assert!(findings.len() == 5 && findings.iter().all(|finding| finding.status == Ok), "{findings:?}");
         tree.put("proc/version", "Linux version 5.15.0 #1 SMP PREEMPT RT\n");
         told(&found(&tree, Some(4)), "preempt_rt", Ok, "is PREEMPT_RT");
         tree.put("proc/version", "Linux\n");
@@ -194,6 +242,14 @@ mod tests {
         told(&found(&tree, Some(2)), "isolated_cpus", Warning, "and others are isolated: 3");
         tree.put("sys/devices/system/cpu/isolated", "\n");
         assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
+        tree.put("sys/devices/system/cpu/present", "0-3\n");
+        assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
+        // One that is not there can not be isolated either.
+        for isolated in ["", "99", "2-3"] {
+            tree.put("sys/devices/system/cpu/isolated", isolated);
+            let remedy = told(&found(&tree, Some(99)), "isolated_cpus", Error, "99, which is not there");
+            assert_eq!(remedy, "cpu = 3 in /etc/pinion/pinion.toml");
+        }
     }
 
     #[test]
@@ -216,9 +272,25 @@ mod tests {
     }
 
     #[test]
+    fn kernels_that_are_too_old_for_some_or_for_all() {
+        let tree = Tree::new();
+        for (release, status, words) in [
+            ("4.9.337-h616", Error, "4.13 is the oldest"),
+            ("4.13.0", Warning, "pull-up"),
+            ("5.4.83-v7l+", Warning, "pull-up"),
+            ("5.5.0", Warning, "tachometers are polled"),
+            ("5.10.0", Ok, "has all"),
+            ("6.12.25+rpt-rpi-v8", Ok, "has all"),
+        ] {
+            tree.put("proc/sys/kernel/osrelease", release);
+            told(&found(&tree, None), "kernel_version", status, words);
+        }
+    }
+
+    #[test]
     fn what_the_kernel_does_not_tell_is_unknown() {
         let findings = found(&Tree::new(), None);
-        assert_eq!(findings.len(), 3);
+        assert_eq!(findings.len(), 4);
         assert!(
             findings.iter().all(|finding| finding.status == Ok && finding.found.contains("unknown")),
             "{findings:?}"

@@ -12,6 +12,8 @@ use crate::klippy::sources::Shape;
 use crate::klippy::{Checkout, Verdict};
 use pinion_firmware::feature::FEATURES;
 
+use super::UPGRADE;
+
 /// Reads a checkout, named by itself or by klippy's folder in it.
 pub(super) fn read(folder: &Path) -> Result<Checkout, String> {
     let inside = folder.join("klippy");
@@ -33,7 +35,7 @@ pub(super) fn finding(checkout: &Checkout) -> Finding {
         forms => Finding::error(
             CHECK,
             format!("{host}, and looks up {forms} forms of messages that no dialect has"),
-            "sudo apt install --only-upgrade pinion-mcu, before the host is restarted",
+            format!("before the host is restarted, {UPGRADE}"),
         ),
     }
 }

@@ -179,6 +179,20 @@ impl Machine {
         self.name_of("/etc/group", gid)
     }
 
+    /// The group of a file, if membership of it is no more than a way to such files: root's would be.
+    pub(super) fn common_group(&self, file: &fs::Metadata) -> Option<String> {
+        let group = self.group_name(file.gid());
+        (group != "root" && group != "0").then_some(group)
+    }
+
+    /// The number of a group, given by name or number.
+    pub(super) fn gid_of(&self, group: &str) -> Option<u32> {
+        let text = self.text("/etc/group").unwrap_or_default();
+        let mut lines = text.lines().map(|line| line.split(':').collect::<Vec<_>>());
+        let line = lines.find(|fields| fields[0] == group);
+        line.map_or_else(|| group.parse().ok(), |fields| fields.get(2)?.parse().ok())
+    }
+
     /// The name that a number has in /etc/passwd or /etc/group; the number if it has none.
     fn name_of(&self, file: &str, number: u32) -> String {
         let text = self.text(file).unwrap_or_default();
@@ -242,13 +256,12 @@ impl Machine {
         starts_it.then(|| unit.to_owned())
     }
 
-    /// Whose permissions are looked at: the service's user for root, else the caller. None if root looks
-    /// and there is no such user.
-    pub(super) fn service_user(&self) -> Option<Who> {
-        if geteuid().is_root() || !self.is_this() {
-            return self.user("pinion");
-        }
+    /// Who has started this program, if this machine is looked at, and it is not root, who may do anything.
+    pub(super) fn caller(&self) -> Option<Who> {
         let uid = geteuid();
+        if uid.is_root() || !self.is_this() {
+            return None;
+        }
         let name = User::from_uid(uid).ok().flatten().map_or_else(|| uid.to_string(), |user| user.name);
         let groups = getgroups().unwrap_or_default();
         let gids = std::iter::once(getegid()).chain(groups).map(nix::unistd::Gid::as_raw).collect();

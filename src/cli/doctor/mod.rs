@@ -9,7 +9,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use clap::Args;
+use clap::{Args, ValueHint};
 
 use pinion_linux::Inventory;
 
@@ -31,18 +31,26 @@ mod units;
 pub(super) use kernel::is_preempt_rt;
 use machine::Machine;
 
+/// How the package is had, which no repository of a distribution's has.
+const INSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install ./target/deb/pinion-mcu_*.deb (or sudo make install)";
+/// How its files are put in place once more.
+const REINSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install --reinstall ./target/deb/pinion-mcu_*.deb (or sudo make install)";
+/// How a newer one is had.
+const UPGRADE: &str =
+    "in the folder with Pinion's sources: git pull && make deb && sudo apt install ./target/deb/pinion-mcu_*.deb";
+
 /// Options of `pinion doctor`.
 #[derive(Args, Clone, Debug)]
 pub(super) struct DoctorArgs {
     /// Look at a checkout of Klipper or Kalico as well: whether this Pinion serves that host, before you
     /// restart it
-    #[arg(long, value_name = "DIR")]
+    #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     klipper: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
     /// Look at the system whose files are below DIR, such as a card's that is mounted there
-    #[arg(long, value_name = "DIR", default_value = "/")]
+    #[arg(long, value_name = "DIR", default_value = "/", value_hint = ValueHint::DirPath)]
     root: PathBuf,
 }
 
@@ -87,17 +95,7 @@ fn examine(machine: &Machine) -> Vec<Group> {
             "pins and buses",
             [devices::presence(machine), devices::leds(machine, &host::leds(&klippys))].concat(),
         ),
-        Group::new(
-            "permissions",
-            match machine.service_user() {
-                Some(user) => devices::permissions(machine, &instances, &user),
-                None => vec![Finding::warning(
-                    "user",
-                    "there is no user pinion: the service is not installed, and what it may open is unknown",
-                    "sudo apt install pinion-mcu, or sudo make install",
-                )],
-            },
-        ),
+        Group::new("permissions", devices::permissions(machine, &instances)),
         Group::new("power", devices::power(machine, machine.is_this().then_some(Path::new("/usr/bin/vcgencmd")))),
     ];
     if machine.is_this() {

@@ -4,8 +4,9 @@
 #![forbid(unsafe_code)]
 
 use crate::cli::finding::Finding;
-use crate::cli::run::{WATCHDOG, WATCHDOG_REMEDY};
+use crate::cli::run::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
 
+use super::INSTALL;
 use super::instance::{Instance, is_klipper_s};
 use super::machine::Machine;
 use super::units;
@@ -16,7 +17,8 @@ const SCHED_FIFO: &str = "1";
 pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     let of_each = instances
         .iter()
-        .flat_map(|instance| [Some(state(machine, instance)), real_time(machine, instance)].into_iter().flatten());
+        .flat_map(|instance| [Some(state(machine, instance)), board(instance), real_time(machine, instance)])
+        .flatten();
     of_each.chain(c_program(machine, instances)).collect()
 }
 
@@ -42,11 +44,26 @@ fn state(machine: &Machine, instance: &Instance) -> Finding {
             format!("sudo systemctl restart {unit}; journalctl -u {unit} says why it ended"),
         ),
         (None, false) if is_installed => Finding::warning(CHECK, "Pinion does not run", enable),
-        (None, false) => Finding::warning(
+        (None, false) => Finding::warning(CHECK, "Pinion does not run, and its service is not installed", INSTALL),
+    }
+}
+
+/// None for an instance that has this computer's pins, as it should be.
+fn board(instance: &Instance) -> Option<Finding> {
+    const CHECK: &str = "board";
+    let name = instance.name();
+    match (&instance.settings.board, &instance.unit) {
+        (BoardName::Linux, _) => None,
+        (BoardName::Sim(_), None) => Some(Finding::ok(CHECK, format!("{name} has a simulated printer"))),
+        (BoardName::Sim(_), Some(_)) => Some(Finding::warning(
             CHECK,
-            "Pinion does not run, and its service is not installed",
-            "sudo apt install pinion-mcu, or sudo make install",
-        ),
+            format!("{name} has a simulated printer: no pin of this computer moves, whatever the host says"),
+            format!(
+                "leave out --board in PINION_OPTIONS and board in {}, then {}",
+                instance.config(),
+                instance.restart()
+            ),
+        )),
     }
 }
 
@@ -209,6 +226,27 @@ mod tests {
         let findings = found(&tree);
         told(&findings, "service", Error, "does not run, though its service is enabled (pinion-mcu)");
         assert_eq!(findings.iter().filter(|finding| finding.check == "service").count(), 1);
+    }
+
+    #[test]
+    fn a_service_with_the_simulated_printer_moves_nothing() {
+        let tree = Tree::new();
+        tree.put("usr/lib/systemd/system/pinion-mcu.service", "");
+        tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "x");
+        tree.put("etc/pinion/pinion.toml", "");
+        let is_told = || found(&tree).iter().any(|finding| finding.check == "board");
+        assert!(!is_told());
+        tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=--board sim\n");
+        let remedy = told(&found(&tree), "board", Warning, "pinion-mcu has a simulated printer: no pin");
+        assert!(
+            remedy.contains("board in /etc/pinion/pinion.toml, then sudo systemctl restart pinion-mcu"),
+            "{remedy}"
+        );
+        tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=--board linux\n");
+        assert!(!is_told());
+        // By hand that is how it is tried.
+        tree.process(10, &["pinion", "run", "--board", "sim"], 1000, &[]);
+        told(&found(&tree), "board", Ok, "process 10 has a simulated printer");
     }
 
     #[test]

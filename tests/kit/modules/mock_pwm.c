@@ -6,17 +6,27 @@
  *   fail      written: an errno with which each change fails, or 0
  *   outputs   one line per channel, "CHANNEL PERIOD_NS DUTY_NS ENABLED WRITES":
  *             what the pins would do, whoever has the channel exported
+ *   history   the first changes since anything was written to it,
+ *             "CHANNEL PERIOD_NS DUTY_NS ENABLED" each
  */
 #include <linux/module.h>
 #include <linux/platform_device.h>
 #include <linux/pwm.h>
 
 #define CHANNELS 8
+#define CHANGES 32
+
+struct change {
+	unsigned int channel;
+	struct pwm_state state;
+};
 
 struct mock_pwm {
 	struct pwm_chip chip;
 	struct pwm_state outputs[CHANNELS];
 	unsigned int writes[CHANNELS];
+	struct change history[CHANGES];
+	unsigned int changes;
 	int fail_errno;
 };
 
@@ -37,6 +47,10 @@ static int mock_pwm_apply(struct pwm_chip *chip, struct pwm_device *pwm,
 		return -fail_errno;
 	mock->outputs[pwm->hwpwm] = *state;
 	mock->writes[pwm->hwpwm]++;
+	if (mock->changes < CHANGES) {
+		mock->history[mock->changes].channel = pwm->hwpwm;
+		mock->history[mock->changes++].state = *state;
+	}
 	return 0;
 }
 
@@ -85,8 +99,35 @@ static ssize_t fail_store(struct device *dev, struct device_attribute *attr,
 }
 static DEVICE_ATTR_WO(fail);
 
+static ssize_t history_show(struct device *dev, struct device_attribute *attr,
+			    char *buf)
+{
+	struct mock_pwm *mock = dev_get_drvdata(dev);
+	ssize_t len = 0;
+	int i;
+
+	for (i = 0; i < mock->changes; i++)
+		len += sysfs_emit_at(buf, len, "%u %llu %llu %d\n",
+				     mock->history[i].channel,
+				     mock->history[i].state.period,
+				     mock->history[i].state.duty_cycle,
+				     mock->history[i].state.enabled);
+	return len;
+}
+
+static ssize_t history_store(struct device *dev, struct device_attribute *attr,
+			     const char *buf, size_t len)
+{
+	struct mock_pwm *mock = dev_get_drvdata(dev);
+
+	mock->changes = 0;
+	return len;
+}
+static DEVICE_ATTR_RW(history);
+
 static struct attribute *mock_pwm_attrs[] = {
-	&dev_attr_outputs.attr, &dev_attr_fail.attr, NULL
+	&dev_attr_outputs.attr, &dev_attr_fail.attr, &dev_attr_history.attr,
+	NULL
 };
 ATTRIBUTE_GROUPS(mock_pwm);
 

@@ -1,6 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! GPIO chips as the kernel simulates them.
 
+use std::io::Read;
+use std::thread;
+use std::time::Duration;
+
 use gpio_cdev::{Chip, LineHandle, LineRequestFlags};
 use nix::errno::Errno;
 use nix::time::{ClockId, clock_gettime};
@@ -132,4 +136,22 @@ fn every_write_is_traced_with_its_time() {
     assert!(writes.iter().all(|write| write.line == sim.kernel_number(7)));
     assert!(writes.is_sorted_by_key(|write| write.at_ns));
     assert!(before_ns <= writes[0].at_ns && writes[99].at_ns <= after_ns);
+}
+
+/// Why Pinion tells glitches from edges itself: the kernel debounces by a timer in jiffies where the chip
+/// can not, and a fan of 10,000 rpm with two pulses a turn is still for it.
+#[test]
+fn the_kernel_s_debouncing_loses_the_pulses_of_a_fan() {
+    let sim = GpioSim::new("lab", 8);
+    let mut events = uapi::debounced_input(&sim.path(), 3, 375);
+    for edge in 0..200 {
+        sim.pull(3, edge % 2 == 0);
+        thread::sleep(Duration::from_micros(1500));
+    }
+    thread::sleep(Duration::from_millis(50));
+    sim.pull(3, true);
+    thread::sleep(Duration::from_millis(50));
+    let mut bytes = vec![0; 300 * 48];
+    let seen = events.read(&mut bytes).expect("the last edge at least") / 48;
+    assert!((1..150).contains(&seen), "{seen} of 201 edges");
 }

@@ -11,13 +11,14 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use nix::errno::Errno;
 use nix::sys::signal::{Signal, kill};
 use nix::time::{clock_getcpuclockid, clock_gettime};
 use nix::unistd::Pid;
 use pinion_client::config::Config;
 use pinion_client::{Client, Error};
 
-use super::sysfs;
+use super::{sysfs, uapi};
 
 /// Far longer than anything takes.
 const PATIENCE: Duration = Duration::from_secs(10);
@@ -41,6 +42,14 @@ impl Program {
     pub fn with(args: &[&str], environment: &[(&str, &str)]) -> Program {
         let mut command = Command::new("pinion");
         command.args(["run", "-g", "0"]).args(args).envs(environment.iter().copied());
+        Program::spawn(command)
+    }
+
+    /// As on a kernel that answers an ioctl with this error.
+    pub fn without_ioctl(request: u32, errno: Errno) -> Program {
+        let mut command = Command::new("pinion");
+        command.args(["run", "-g", "0", "-r"]);
+        uapi::without_ioctl(&mut command, request, errno as i32);
         Program::spawn(command)
     }
 

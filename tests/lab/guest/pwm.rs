@@ -14,6 +14,19 @@ pub fn output(channel: usize) -> String {
     line.rsplit_once(' ').expect("a count").0.to_owned()
 }
 
+/// Forgets what the outputs did.
+pub fn forget() {
+    sysfs::write(format!("{MOCK}/history"), "0");
+}
+
+/// What the channel did since then: period and duty cycle in ns, and whether it is enabled.
+pub fn history(channel: u64) -> Vec<(u64, u64, bool)> {
+    let changes = sysfs::read(format!("{MOCK}/history"));
+    let numbers = |line: &str| line.split(' ').map(|word| word.parse().expect("a number")).collect::<Vec<u64>>();
+    let of = |change: Vec<u64>| (change[0] == channel).then(|| (change[1], change[2], change[3] == 1));
+    changes.lines().filter_map(|line| of(numbers(line))).collect()
+}
+
 fn chip() -> PathBuf {
     let chip = Path::new("/sys/class/pwm/pwmchip0");
     assert_eq!(sysfs::read(chip.join("npwm")), "8");

@@ -7,7 +7,9 @@ use std::fs::File;
 use std::io;
 use std::mem;
 use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::os::unix::process::CommandExt;
 use std::path::Path;
+use std::process::Command;
 
 use super::sysfs;
 
@@ -41,6 +43,91 @@ pub fn line_info(chip: &Path, offset: u32) -> LineInfo {
     // SAFETY: the structure is the one that this ioctl fills.
     unsafe { gpio_get_lineinfo(file.as_raw_fd(), &mut info) }.expect("line information");
     LineInfo { flags: info.flags, name: text(&info.name), consumer: text(&info.consumer) }
+}
+
+/// `struct gpio_v2_line_attribute` with its mask.
+#[repr(C)]
+#[derive(Clone, Copy)]
+struct RawLineAttribute {
+    id: u32,
+    padding: u32,
+    value: u64,
+    mask: u64,
+}
+
+/// `struct gpio_v2_line_request`.
+#[repr(C)]
+struct RawLineRequest {
+    offsets: [u32; 64],
+    consumer: [u8; 32],
+    flags: u64,
+    num_attrs: u32,
+    padding: [u32; 5],
+    attrs: [RawLineAttribute; 10],
+    num_lines: u32,
+    event_buffer_size: u32,
+    more_padding: [u32; 5],
+    fd: i32,
+}
+
+const V2_INPUT: u64 = 1 << 2;
+const V2_BOTH_EDGES: u64 = 1 << 4 | 1 << 5;
+const V2_DEBOUNCE: u32 = 3;
+
+nix::ioctl_readwrite!(gpio_v2_get_line, 0xb4, 0x07, RawLineRequest);
+
+/// An input whose edges the kernel debounces: each event that is read has 48 bytes.
+pub fn debounced_input(chip: &Path, offset: u32, period_us: u64) -> File {
+    let file = open(chip);
+    let mut request = RawLineRequest {
+        offsets: [0; 64],
+        consumer: [0; 32],
+        flags: V2_INPUT | V2_BOTH_EDGES,
+        num_attrs: 1,
+        padding: [0; 5],
+        attrs: [RawLineAttribute { id: V2_DEBOUNCE, padding: 0, value: period_us, mask: 1 }; 10],
+        num_lines: 1,
+        event_buffer_size: 1024,
+        more_padding: [0; 5],
+        fd: -1,
+    };
+    request.offsets[0] = offset;
+    request.attrs[1..].fill(RawLineAttribute { id: 0, padding: 0, value: 0, mask: 0 });
+    // SAFETY: the structure is the one that this ioctl takes, and the descriptor that it makes is ours.
+    unsafe {
+        gpio_v2_get_line(file.as_raw_fd(), &mut request).expect("a line");
+        File::from_raw_fd(request.fd)
+    }
+}
+
+/// GPIOHANDLE_SET_CONFIG_IOCTL, which Linux has since 5.5.
+pub const GPIOHANDLE_SET_CONFIG: u32 = 0xc054_b40a;
+
+/// Has an ioctl fail in the program that is to be started, as in a kernel that does not know it.
+pub fn without_ioctl(command: &mut Command, request: u32, errno: i32) {
+    let load = |at: u32| (libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0, at);
+    let is = |value: u32, otherwise: u8| (libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K, 0, otherwise, value);
+    let answer = |value: u32| (libc::BPF_RET | libc::BPF_K, 0, 0, value);
+    // Of `struct seccomp_data` the number of the call, and the lower half of its second argument.
+    let program = [
+        load(0),
+        is(libc::SYS_ioctl as u32, 3),
+        load(24),
+        is(request, 1),
+        answer(libc::SECCOMP_RET_ERRNO | errno as u32),
+        answer(libc::SECCOMP_RET_ALLOW),
+    ];
+    let filter = program.map(|(code, jt, jf, k)| libc::sock_filter { code: code as u16, jt, jf, k });
+    // SAFETY: between fork and exec there are two system calls, on memory that the closure has.
+    unsafe {
+        command.pre_exec(move || {
+            let program = libc::sock_fprog { len: filter.len() as u16, filter: filter.as_ptr().cast_mut() };
+            if libc::prctl(libc::PR_SET_SECCOMP, libc::SECCOMP_MODE_FILTER, &raw const program) != 0 {
+                return Err(io::Error::last_os_error());
+            }
+            Ok(())
+        });
+    }
 }
 
 /// `struct spi_ioc_transfer`.

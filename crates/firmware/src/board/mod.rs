@@ -120,23 +120,25 @@ pub struct ClaimedLine {
     pub sleeps_on: Option<String>,
 }
 
-/// What an interrupt has counted of a line's edges.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct EdgeCount {
-    /// Edges of both directions since the line was claimed, modulo 2^32.
-    pub count: u32,
-    /// When the last one came, in CLOCK_MONOTONIC; none before the first.
-    pub last: Option<Duration>,
+/// An edge of a line, as an interrupt saw it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Edge {
+    /// When it came, in CLOCK_MONOTONIC.
+    pub at: Duration,
+    /// The level that the interrupt found. It equals the level before where a pulse was over by then.
+    pub level: bool,
+    /// Edges before this one that were dropped, as nobody took them in time.
+    pub dropped: u32,
 }
 
-/// The edges of a line, which an interrupt counts and dates. A worker makes these calls.
+/// The edges of a line, which an interrupt dates. A worker makes these calls.
 pub trait Edges: Send {
-    /// The edges up to now.
+    /// Shows the edges since the last call, the oldest first.
     ///
     /// # Errors
     ///
     /// "GPIO line read failed".
-    fn count(&mut self) -> Result<EdgeCount, Shutdown>;
+    fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown>;
 
     /// Ends the interrupts. The line can still be read.
     ///

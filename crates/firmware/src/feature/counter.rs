@@ -2,8 +2,13 @@
 //! Counters of a pin's edges, such as a fan's tachometer.
 //!
 //! The firmware polls the pin, and so do we where nothing else can be had. Where the board has
-//! interrupts, the kernel counts and dates the edges, and a worker asks it at each sample: no edge is
-//! too short after the one before, and the core has one timer in a second to run instead of a thousand.
+//! interrupts, the kernel dates the edges and a worker takes them: the core has 20 timers in a second to
+//! run instead of a thousand.
+//!
+//! Polling hardly ever sees a pulse much shorter than `poll_ticks`, such as noise on a fan's wire. An
+//! interrupt sees each, so a level counts here only once it has lasted a part of that time. The kernel
+//! can debounce a line, too, but most often by a timer in jiffies of 1 to 10 ms: a fan of 10,000 rpm
+//! has levels of 1.5 ms.
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +16,7 @@ use std::sync::Arc;
 
 use log::warn;
 
-use crate::board::{EdgeCount, Edges, Pin};
+use crate::board::{Edge, Edges, Pin};
 use crate::mcu::{
     Command, Done, Errand, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId,
     command, response,
@@ -46,43 +51,105 @@ const EDGES_PER_S_MAX: u32 = 20_000;
 /// The time over which they are counted, at least: a contact that bounces is no such pin.
 const STORM_TICKS: Ticks = Ticks::from_us(100_000);
 
-/// A worker's look at what the kernel has counted.
+/// How often the edges are taken. The kernel keeps 1024, and [`EDGES_PER_S_MAX`] are 1000 in this time.
+const TAKE_TICKS: Ticks = Ticks::from_us(50_000);
+/// A level counts if it lasts `poll_ticks` divided by this. klippy's documentation wants a
+/// `tachometer_poll_interval` below the time of one level at the highest speed. So all pulses count at
+/// that speed if the shorter level takes an eighth of a pulse or more, and at twice the speed if it takes
+/// a quarter.
+const SETTLE_DIVISOR: u32 = 4;
+
+/// Counts the edges of a line, but for those of glitches.
+#[derive(Debug)]
+struct Settling {
+    /// The level that lasted last.
+    level: bool,
+    /// Since when the line has had the other one.
+    left: Option<Clock>,
+    /// Edges, modulo 2^32.
+    count: u32,
+    /// When the last one was.
+    last: Option<Clock>,
+}
+
+impl Settling {
+    fn new(level: bool) -> Settling {
+        Settling { level, left: None, count: 0, last: None }
+    }
+
+    /// Takes in an edge, after which the line was at `level`.
+    fn see(&mut self, at: Clock, level: bool, settle: Ticks) {
+        self.pass(at, settle);
+        self.left = (level != self.level).then_some(at);
+    }
+
+    /// Takes in that edges were dropped, before one after which the line was at `level`. Nothing is known of
+    /// them, nor how long the level before them lasted: so all count.
+    fn lose(&mut self, edges: u32, level: bool) {
+        self.last = self.left.or(self.last);
+        self.count = self.count.wrapping_add(edges).wrapping_add(self.left.take().is_some().into());
+        self.level = !level;
+    }
+
+    /// Takes in that no edge came until now.
+    fn pass(&mut self, now: Clock, settle: Ticks) {
+        if let Some(at) = self.left.filter(|at| now.since(*at) >= i64::from(settle.0)) {
+            self.level = !self.level;
+            self.left = None;
+            self.last = Some(at);
+            self.count = self.count.wrapping_add(1);
+        }
+    }
+}
+
+/// A worker's look at the edges that the kernel has dated.
 struct Reading {
     edges: Box<dyn Edges>,
     clock: Arc<dyn TimeSource>,
     /// What the log calls the pin.
     name: String,
-    /// Since when edges are counted in order to see whether there are too many, and how many there
-    /// were then.
-    since: (Clock, u32),
+    settling: Settling,
+    /// How long a level must last to count.
+    settle: Ticks,
+    /// Since when edges are counted in order to see whether there are too many.
+    since: Clock,
+    /// How many there were since then, glitches too.
+    interrupts: u32,
     /// Whether there were, so that there are no more interrupts.
     given_up: bool,
-    /// How many edges there were, and when the last one was.
-    seen: Result<(u32, Option<Clock>), Shutdown>,
+    result: Result<(), Shutdown>,
 }
 
 impl Reading {
-    fn read(&mut self) -> Result<(u32, Option<Clock>), Shutdown> {
-        let EdgeCount { count, last } = self.edges.count()?;
+    fn read(&mut self) -> Result<(), Shutdown> {
+        // The kernel has all edges up to now.
         let now = self.clock.now();
-        let (since, before) = self.since;
-        let ticks = now.since(since).unsigned_abs();
+        let Reading { edges, clock, settling, settle, interrupts, .. } = self;
+        edges.take(&mut |Edge { at, level, dropped }| {
+            if dropped > 0 {
+                settling.lose(dropped, level);
+            }
+            settling.see(clock.instant_of(at), level, *settle);
+            *interrupts = interrupts.saturating_add(dropped).saturating_add(1);
+        })?;
+        settling.pass(now, *settle);
+        let ticks = now.since(self.since).unsigned_abs();
         if ticks >= u64::from(STORM_TICKS.0) {
-            self.since = (now, count);
-            let per_s = u64::from(count.wrapping_sub(before)) * u64::from(CLOCK_FREQ) / ticks;
+            self.since = now;
+            let per_s = u64::from(std::mem::take(&mut self.interrupts)) * u64::from(CLOCK_FREQ) / ticks;
             if per_s > u64::from(EDGES_PER_S_MAX) {
                 self.edges.end()?;
                 self.given_up = true;
                 warn!("{}", too_many(&self.name, per_s));
             }
         }
-        Ok((count, last.map(|last| self.clock.instant_of(last))))
+        Ok(())
     }
 }
 
 impl Errand for Reading {
     fn run(&mut self) {
-        self.seen = self.read();
+        self.result = self.read();
     }
 }
 
@@ -98,7 +165,7 @@ fn polled(name: &str, why: &str) -> String {
     format!("counter ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
 }
 
-/// The kernel's count of the edges, and who asks for it.
+/// The edges that the kernel dates, and who takes them.
 struct Counted {
     worker: WorkerId,
     /// Here while the worker does not read.
@@ -111,7 +178,7 @@ struct Counter {
     counted: Option<Counted>,
     poll_ticks: Ticks,
     sample_ticks: Ticks,
-    /// The count is told at the first look after this.
+    /// The count is told at the first look after this, or of a worker's looks at the first from this on.
     next_sample: Clock,
     /// Edges, modulo 2^32. While the pin is polled it is odd as long as that is high.
     count: u32,
@@ -143,23 +210,18 @@ impl Counter {
         mcu.send(State { oid, next_clock, count: self.count, count_clock: self.count_clock });
     }
 
-    /// Takes in what the kernel has counted.
+    /// Takes in what the worker has seen of the edges.
     fn has_read(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
         let ended = done.ended;
         let (Some(counted), Some(mut reading)) = (&mut self.counted, done.errand::<Reading>()) else { return Ok(()) };
-        let seen = std::mem::replace(&mut reading.seen, Ok((0, None)));
+        let result = std::mem::replace(&mut reading.result, Ok(()));
+        self.count = reading.settling.count;
+        self.count_clock = reading.settling.last.unwrap_or(self.count_clock);
         counted.reading = Some(reading);
-        match seen {
-            Ok((count, last)) => {
-                self.count = count;
-                self.count_clock = last.unwrap_or(self.count_clock);
-                if std::mem::take(&mut self.counts) {
-                    self.tell(mcu, oid, ended);
-                }
-                Ok(())
-            }
-            Err(failure) => mcu.try_shut_down(failure),
+        if std::mem::take(&mut self.counts) && result.is_ok() {
+            self.tell(mcu, oid, ended);
         }
+        result.or_else(|failure| mcu.try_shut_down(failure))
     }
 }
 
@@ -173,12 +235,16 @@ impl Object for Counter {
         if let Some(Counted { worker, reading }) = &mut self.counted
             && !reading.as_ref().is_some_and(|reading| reading.given_up)
         {
-            // A worker that still reads misses this turn.
-            if let Some(reading) = reading.take() {
+            if self.next_sample <= at {
+                self.next_sample = at + self.sample_ticks.max(self.poll_ticks);
                 self.counts = true;
+            }
+            // A worker that still reads misses this turn.
+            if let Some(mut reading) = reading.take() {
+                reading.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
                 mcu.dispatch(*worker, Ticket { oid, tag: READ_EDGES }, reading)?;
             }
-            return Ok(Next::At(at + self.sample_ticks.max(self.poll_ticks)));
+            return Ok(Next::At(self.next_sample.min(at + TAKE_TICKS)));
         }
         // So does an expander that still looks.
         if self.looking {
@@ -215,12 +281,22 @@ impl Object for Counter {
 const CONFIG_COUNTER: Command =
     command!("config_counter oid=%c pin=%u pull_up=%c", |mcu, oid: Oid, pin: Pin, pull_up: i8| {
         mcu.vacant(oid)?;
-        let (line, edges) = mcu.counted_input(pin, bias(pull_up))?;
+        let (mut line, edges) = mcu.counted_input(pin, bias(pull_up))?;
         let name = mcu.name(pin);
         let counted = match edges {
             Ok((worker, edges)) => {
-                let since = (mcu.now(), 0);
-                let reading = Reading { edges, clock: mcu.clock(), name, since, given_up: false, seen: Ok((0, None)) };
+                let level = line.read(mcu, Ticket { oid, tag: LOOK })?.unwrap_or_default();
+                let reading = Reading {
+                    edges,
+                    clock: mcu.clock(),
+                    name,
+                    settling: Settling::new(level),
+                    settle: Ticks(0),
+                    since: mcu.now(),
+                    interrupts: 0,
+                    given_up: false,
+                    result: Ok(()),
+                };
                 Some(Counted { worker, reading: Some(Box::new(reading)) })
             }
             Err(why) => {
@@ -259,3 +335,68 @@ const QUERY_COUNTER: Command = command!(
         })
     }
 );
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const SETTLE: Ticks = Ticks(100);
+
+    /// Lets a line see levels that each last for so many ticks, of which some edges are dropped.
+    fn seen(levels: &[u64], dropped: std::ops::Range<usize>) -> Settling {
+        let (mut settling, mut at, mut level) = (Settling::new(false), 1000, false);
+        let mut lost = 0;
+        for (n, lasts) in levels.iter().enumerate() {
+            level = !level;
+            if dropped.contains(&n) {
+                lost += 1;
+            } else {
+                if lost > 0 {
+                    settling.lose(std::mem::take(&mut lost), level);
+                }
+                settling.see(Clock::from_ticks(at), level, SETTLE);
+            }
+            at += lasts;
+        }
+        settling.pass(Clock::from_ticks(at), SETTLE);
+        settling
+    }
+
+    proptest! {
+        /// Pulses count exactly, also where some edges were dropped amid them.
+        #[test]
+        fn levels_that_last_all_count(
+            levels in proptest::collection::vec(100u64..5000, 1..50), from in 0usize..60, count in 0usize..20,
+        ) {
+            let all = levels.len();
+            // The last edge is seen.
+            let dropped = from.min(all - 1)..(from + count).min(all - 1);
+            let settling = seen(&levels, dropped);
+            prop_assert_eq!(settling.count, all as u32);
+            let last: u64 = 1000 + levels[..all - 1].iter().sum::<u64>();
+            prop_assert_eq!(settling.last, Some(Clock::from_ticks(last)));
+        }
+
+        /// Of a line that mostly rests, nothing that is shorter counts, however often it comes.
+        #[test]
+        fn glitches_count_never(glitches in proptest::collection::vec((1u64..100, 100u64..5000), 0..50)) {
+            let levels: Vec<u64> = glitches.iter().flat_map(|(glitch, rest)| [*glitch, *rest]).collect();
+            let settling = seen(&levels, 0..0);
+            prop_assert_eq!((settling.count, settling.last), (0, None));
+        }
+
+        /// An interrupt may find a pulse over: then both edges tell the same level.
+        #[test]
+        fn pulses_that_were_over_count_never(at in proptest::collection::vec(1u64..5000, 0..50)) {
+            let (mut settling, mut now) = (Settling::new(true), 1000);
+            for ticks in at {
+                now += ticks;
+                settling.see(Clock::from_ticks(now), true, SETTLE);
+                settling.see(Clock::from_ticks(now + 1), true, SETTLE);
+            }
+            settling.pass(Clock::from_ticks(now + 1000), SETTLE);
+            prop_assert_eq!(settling.count, 0);
+        }
+    }
+}

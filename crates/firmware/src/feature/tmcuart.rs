@@ -7,7 +7,8 @@
 //! are either way `bits_on_time` below measures (docs/performance.md).
 //!
 //! The firmware samples a reply wherever in a bit its timer happens to be. Here the start bit of each
-//! byte is looked for, and bits are read in their middle, so that half a bit of lateness does no harm.
+//! byte is looked for, and bits are read in their middle, so that half a bit of lateness does no harm. A
+//! start bit that is high again in its middle is a glitch, and none.
 
 #![forbid(unsafe_code)]
 
@@ -183,17 +184,15 @@ impl Exchange {
 
     /// Reads the reply to a message that ended at `end`. False if none came.
     fn receive(&mut self, end: Clock, bit: Ticks) -> Result<bool, Shutdown> {
-        let half = Ticks(bit.0 / 2);
         let from = end + bits(bit, TURN_BITS);
         if !self.pace.until(from) {
             return Ok(false);
         }
-        let Some(edge) = self.falling_edge(from, from + bits(bit, REPLY_BITS), bit)? else { return Ok(false) };
-        let mut at = edge + half;
+        let Some(mut at) = self.start_bit(from, from + bits(bit, REPLY_BITS), bit)? else { return Ok(false) };
         for place in 0..8 * self.read_len {
             if place > 0 && place % FRAME_BITS == 0 {
                 // Each start bit tells anew where the bits are.
-                at = self.falling_edge(self.pace.now(), at, bit)?.map_or(at, |edge| edge + half);
+                at = self.start_bit(self.pace.now(), at, bit)?.unwrap_or(at);
             }
             if !self.pace.until(at) {
                 return Ok(false);
@@ -204,6 +203,24 @@ impl Exchange {
             at = at + bit;
         }
         Ok(true)
+    }
+
+    /// Looks for a start bit until `limit`, and tells its middle. A line that falls and is high again by then
+    /// had a glitch.
+    fn start_bit(&mut self, from: Clock, limit: Clock, bit: Ticks) -> Result<Option<Clock>, Shutdown> {
+        let mut last = from;
+        while let Some(edge) = self.falling_edge(last, limit, bit)? {
+            let middle = edge + Ticks(bit.0 / 2);
+            if !self.pace.until(middle) {
+                return Ok(None);
+            }
+            if !self.wires.rx.read()? {
+                return Ok(Some(middle));
+            }
+            last = self.pace.now();
+            self.spoilt |= last.since(middle) > i64::from(bit.0 / 4);
+        }
+        Ok(None)
     }
 
     /// Looks at the line until it falls; none if it does not until `limit`. `last` is when it was looked

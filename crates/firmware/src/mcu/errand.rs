@@ -97,6 +97,12 @@ pub trait Workers: Send {
     /// "Bus worker queue overflow" if it can not be started.
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown>;
 
+    /// Says that a worker's devices need not be free to be opened again: [`Workers::reset`] does not wait
+    /// for what it has under way.
+    fn leave_behind(&mut self, worker: WorkerId) {
+        let _ = worker;
+    }
+
     /// Hands a job over, without waiting.
     ///
     /// # Errors
@@ -127,6 +133,18 @@ impl Mcu {
     /// "Bus worker queue overflow" if it can not be started.
     pub fn worker(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         self.workers.start(bus)
+    }
+
+    /// The worker of a device that is only read, may take its time, and may be opened twice. A
+    /// `config_reset` does not wait for it.
+    ///
+    /// # Errors
+    ///
+    /// "Bus worker queue overflow" if it can not be started.
+    pub fn reader(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
+        let worker = self.workers.start(bus)?;
+        self.workers.leave_behind(worker);
+        Ok(worker)
     }
 
     /// Sends an errand, which comes back to [`Object::returned`]. If a command sends it, further

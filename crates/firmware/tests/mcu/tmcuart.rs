@@ -107,6 +107,42 @@ proptest! {
     }
 }
 
+proptest! {
+    /// A glitch shorter than half a bit, before the reply or in the stop bit between two bytes, is no start
+    /// bit.
+    #[test]
+    fn a_glitch_starts_no_byte(
+        message: [u8; 8], at in 20u64..60 * BIT, width in 100u64..BIT / 2 - 80, gap in 0u64..BIT / 16,
+    ) {
+        let mut rig = Rig::configured(&[TWO_WIRES]);
+        let from = QUIET + 44 * BIT + 200;
+        let reply = from + at + width + BIT;
+        let mut levels = speak(&message, reply, BIT as f64);
+        levels.extend([(from + at, 0), (from + at + width, 1)]);
+        // In the stop bit of the third byte, behind its middle, where the driver pauses for a moment.
+        let stop = reply + 29 * BIT;
+        let glitch = stop + 5 * BIT / 8 + gap;
+        levels.retain(|(at, _)| *at <= stop);
+        levels.extend([(glitch, 0), (glitch + width / 2, 1)]);
+        levels.extend(speak(&message[3..], stop + 21 * BIT / 16, BIT as f64).drain(1..));
+        levels.sort_by_key(|(at, _)| *at);
+        rig.bench.script_input(RX, &levels);
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(10_000_000);
+        prop_assert_eq!(rig.responses(), [response(&with_serial_bits(&message))]);
+    }
+}
+
+#[test]
+fn a_glitch_alone_is_no_reply() {
+    let mut rig = Rig::configured(&[TWO_WIRES]);
+    let at = QUIET + 60 * BIT;
+    rig.bench.script_input(RX, &[(0, 1), (at, 0), (at + BIT / 3, 1)]);
+    rig.send(&send(READ_IFCNT, 10));
+    rig.run_until(1_000_000);
+    assert_eq!(rig.responses(), [response(&[])]);
+}
+
 #[test]
 fn serial_bits_are_klippys() {
     // What klippy's _encode_read(0xf5, 0, 2) sends.

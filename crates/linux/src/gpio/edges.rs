@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Lines whose edges the kernel counts, by its newer kind of request (`gpio_v2`, Linux 5.10).
+//! Lines whose edges the kernel dates, by its newer kind of request (`gpio_v2`, Linux 5.10).
 
 #![forbid(unsafe_code)]
 
@@ -14,7 +14,7 @@ use super::chip::LineInfo;
 use super::refusal::{Subject, text};
 use super::{CONSUMER, Handle, lacks};
 use crate::sys;
-use pinion_firmware::board::{Bias, Direction, EdgeCount, Edges, Line};
+use pinion_firmware::board::{Bias, Direction, Edge, Edges, Line};
 use pinion_firmware::shutdown::{Shutdown, reason};
 
 /// `GPIO_V2_LINE_FLAG_` flags.
@@ -25,12 +25,14 @@ mod flag {
     pub(super) const PULL_DOWN: u64 = 1 << 9;
 }
 
-/// Edges that the kernel keeps for us, if we ask for no other number (gpiolib-cdev.c). Only the last one
-/// matters, as each carries the number of those before it, so the fewer the better: so many are read at
-/// a time, however many come.
+/// Edges that the kernel keeps for us: the most that it offers (gpiolib-cdev.c).
+const EVENTS_KEPT: u32 = 1024;
+/// Edges taken by one read.
 const EVENTS: usize = 16;
-/// `struct gpio_v2_line_event` (linux/gpio.h): `timestamp_ns` at 0, `line_seqno` at 20.
+/// `struct gpio_v2_line_event` (linux/gpio.h): `timestamp_ns` at 0, `id` at 8, `line_seqno` at 20.
 const EVENT_BYTES: usize = 48;
+/// GPIO_V2_LINE_EVENT_RISING_EDGE.
+const RISING: u32 = 1;
 
 /// A request of the newer kind (`gpio_v2`), for a line with edges.
 struct EdgeRequest {
@@ -65,7 +67,8 @@ pub(crate) struct EdgeLine(Arc<EdgeRequest>);
 /// The edges of an [`EdgeLine`].
 pub(crate) struct LineEdges {
     request: Arc<EdgeRequest>,
-    so_far: EdgeCount,
+    /// The `line_seqno` of the last edge that was taken.
+    seen: u32,
 }
 
 impl Handle {
@@ -77,10 +80,10 @@ impl Handle {
         }
         let flags = flag::INPUT | flag::BOTH_EDGES | bias_flag(bias);
         let file = File::open(dev.join(&self.subject.chip))
-            .and_then(|chip| sys::request_line(&chip, self.subject.offset, flags, CONSUMER))
+            .and_then(|chip| sys::request_line(&chip, self.subject.offset, flags, EVENTS_KEPT, CONSUMER))
             .map_err(|error| no_edges(error.raw_os_error().unwrap_or_default()))?;
         let request = Arc::new(EdgeRequest { file, subject: self.subject, flags: AtomicU64::new(flags) });
-        Ok((EdgeLine(request.clone()), LineEdges { request, so_far: EdgeCount::default() }))
+        Ok((EdgeLine(request.clone()), LineEdges { request, seen: 0 }))
     }
 }
 
@@ -128,18 +131,24 @@ impl Line for EdgeLine {
 }
 
 impl Edges for LineEdges {
-    /// One read takes all that the kernel keeps. It drops the oldest where there is no room, and has
-    /// counted them before that.
-    fn count(&mut self) -> Result<EdgeCount, Shutdown> {
+    /// Takes no more than the kernel keeps, so that a line that never rests does not hold the worker.
+    fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown> {
         let mut events = [0; EVENTS * EVENT_BYTES];
-        let bytes = match (&self.request.file).read(&mut events) {
-            Err(error) if error.kind() == io::ErrorKind::WouldBlock => 0,
-            read => read.map_err(|error| self.request.unreadable(&error))?,
-        };
-        if let Some(last) = events[..bytes].chunks_exact(EVENT_BYTES).next_back() {
-            self.so_far = edge_count(last);
+        for _ in 0..EVENTS_KEPT as usize / EVENTS {
+            let bytes = match (&self.request.file).read(&mut events) {
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock => return Ok(()),
+                read => read.map_err(|error| self.request.unreadable(&error))?,
+            };
+            for event in events[..bytes].chunks_exact(EVENT_BYTES) {
+                let (edge, line_seqno) = edge_of(event, self.seen);
+                self.seen = line_seqno;
+                see(edge);
+            }
+            if bytes < events.len() {
+                return Ok(());
+            }
         }
-        Ok(self.so_far)
+        Ok(())
     }
 
     fn end(&mut self) -> Result<(), Shutdown> {
@@ -147,14 +156,16 @@ impl Edges for LineEdges {
     }
 }
 
-/// What a line's last event tells.
-fn edge_count(event: &[u8]) -> EdgeCount {
-    let (timestamp_ns, rest) = event.split_first_chunk().unwrap_or((&[0; 8], &[]));
-    let line_seqno = rest.get(12..).and_then(|rest| rest.first_chunk()).unwrap_or(&[0; 4]);
-    EdgeCount {
-        count: u32::from_ne_bytes(*line_seqno),
-        last: Some(Duration::from_nanos(u64::from_ne_bytes(*timestamp_ns))),
-    }
+/// What an event tells, and its `line_seqno`; that of the event before it is `seen`.
+fn edge_of(event: &[u8], seen: u32) -> (Edge, u32) {
+    let word = |at: usize| {
+        let bytes = event.get(at..).and_then(|rest| rest.first_chunk());
+        u32::from_ne_bytes(*bytes.unwrap_or(&[0; 4]))
+    };
+    let timestamp_ns = u64::from_ne_bytes(*event.first_chunk().unwrap_or(&[0; 8]));
+    let (id, line_seqno) = (word(8), word(20));
+    let dropped = line_seqno.wrapping_sub(seen).saturating_sub(1);
+    (Edge { at: Duration::from_nanos(timestamp_ns), level: id == RISING, dropped }, line_seqno)
 }
 
 #[cfg(test)]
@@ -167,8 +178,15 @@ mod tests {
         let mut event = [0xee; EVENT_BYTES];
         event[..8].copy_from_slice(&5_000_000_007_u64.to_ne_bytes());
         event[20..24].copy_from_slice(&70_000_u32.to_ne_bytes());
-        let last = Some(Duration::new(5, 7));
-        assert_eq!(edge_count(&event), EdgeCount { count: 70_000, last });
+        for (id, level) in [(1_u32, true), (2, false)] {
+            event[8..12].copy_from_slice(&id.to_ne_bytes());
+            for (seen, dropped) in [(69_999, 0), (69_990, 9), (0, 69_999)] {
+                assert_eq!(edge_of(&event, seen), (Edge { at: Duration::new(5, 7), level, dropped }, 70_000));
+            }
+        }
+        // The kernel's number starts over at 2^32.
+        event[20..24].copy_from_slice(&1_u32.to_ne_bytes());
+        assert_eq!(edge_of(&event, u32::MAX).0.dropped, 1);
     }
 
     #[test]

@@ -81,7 +81,7 @@ impl Subject {
                      lists them)"
                 )
             }
-            libc::EINVAL if bias != Bias::None && before(release, (5, 5)) => format!(
+            libc::EINVAL if bias != Bias::None && is_before(release, BIAS_SINCE) => format!(
                 "{self} can not have a {pull} resistor: Linux {} knows none before 5.5: update \
                  the kernel, or solder one",
                 release.trim_end()
@@ -114,8 +114,13 @@ fn pull(bias: Bias) -> (&'static str, char) {
     }
 }
 
+/// The first Linux that switches resistors on.
+pub const BIAS_SINCE: (u32, u32) = (5, 5);
+/// The first Linux that tells of a line's edges as Pinion asks for them.
+pub const EDGES_SINCE: (u32, u32) = (5, 10);
+
 /// Whether a kernel's release, such as `5.4.0-rpi`, comes before a version.
-fn before(release: &str, version: (u32, u32)) -> bool {
+pub fn is_before(release: &str, version: (u32, u32)) -> bool {
     let mut numbers = release.split(|c: char| !c.is_ascii_digit()).map_while(|n| n.parse::<u32>().ok());
     match (numbers.next(), numbers.next()) {
         (Some(major), Some(minor)) => (major, minor) < version,
@@ -145,31 +150,47 @@ pub(super) fn cannot_open(path: &Path, code: i32) -> String {
 }
 
 /// For the log: to whom a device node belongs, and how to get permission to open it.
-pub(crate) fn not_permitted(path: &Path) -> String {
-    let who = User::from_uid(geteuid()).ok().flatten().map_or_else(|| format!("user {}", geteuid()), |user| user.name);
-    let (mode, group) = match fs::metadata(path) {
-        Ok(node) => {
-            let gid = Gid::from_raw(node.gid());
-            let group = Group::from_gid(gid).ok().flatten();
-            (node.mode(), group.map_or_else(|| gid.to_string(), |g| g.name))
-        }
-        Err(_) => (0, String::new()),
-    };
-    permission_text(path, &who, mode, &group)
+pub fn not_permitted(path: &Path) -> String {
+    permission_text(path, &Opener::of(path))
 }
 
-fn permission_text(path: &Path, who: &str, mode: u32, group: &str) -> String {
-    let path = path.display();
-    if mode & 0o060 == 0o060 && group != "root" {
-        format!(
-            "{who} may not open {path}, which belongs to group {group}: \"sudo usermod -aG \
-             {group} {who}\" and start Pinion again"
-        )
-    } else {
-        format!(
+/// Who asks for a file, and the group whose members may open it, if there is one.
+pub struct Opener {
+    who: String,
+    group: Option<String>,
+}
+
+impl Opener {
+    /// Who runs this program, for this file.
+    pub fn of(path: &Path) -> Opener {
+        let user = User::from_uid(geteuid()).ok().flatten();
+        let who = user.map_or_else(|| format!("user {}", geteuid()), |user| user.name);
+        let about = fs::metadata(path).ok().filter(|about| about.mode() & 0o060 == 0o060);
+        let group = about.map(|about| {
+            let gid = Gid::from_raw(about.gid());
+            Group::from_gid(gid).ok().flatten().map_or_else(|| gid.to_string(), |group| group.name)
+        });
+        // Who is in root's group may do more than that.
+        Opener { who, group: group.filter(|group| group != "root") }
+    }
+
+    /// The command that has the user open such files.
+    pub fn command(&self) -> Option<String> {
+        let Opener { who, group } = self;
+        group.as_ref().map(|group| format!("sudo usermod -aG {group} {who}"))
+    }
+}
+
+fn permission_text(path: &Path, opener: &Opener) -> String {
+    let (path, who) = (path.display(), &opener.who);
+    match (&opener.group, opener.command()) {
+        (Some(group), Some(command)) => format!(
+            "{who} may not open {path}, which belongs to group {group}: \"{command}\", log in anew and start Pinion again"
+        ),
+        _ => format!(
             "{who} may not open {path}, which is root's alone: \"sudo udevadm trigger\" or a reboot puts \
              Pinion's udev rules in force, where they are installed; or run Pinion as root"
-        )
+        ),
     }
 }
 
@@ -198,6 +219,7 @@ pub(super) fn text(code: i32) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::os::unix::fs::PermissionsExt;
 
     fn gpio17() -> Subject {
         Subject { chip: "gpiochip0".into(), label: "pinctrl-bcm2835".into(), offset: 17, name: Some("GPIO17".into()) }
@@ -242,9 +264,9 @@ mod tests {
 
     #[test]
     fn kernel_releases() {
-        assert!(before("5.4.0", (5, 5)) && before("4.19.0-rc1", (5, 5)));
-        assert!(!before("5.5.0", (5, 5)) && !before("6.1-rpi", (5, 5)));
-        assert!(!before("", (5, 5)) && !before("six.one", (5, 5)));
+        assert!(is_before("5.4.0", (5, 5)) && is_before("4.19.0-rc1", (5, 5)));
+        assert!(!is_before("5.5.0", (5, 5)) && !is_before("6.1-rpi", (5, 5)));
+        assert!(!is_before("", (5, 5)) && !is_before("six.one", (5, 5)));
     }
 
     #[test]
@@ -262,12 +284,27 @@ mod tests {
     #[test]
     fn a_forbidden_node_names_its_group() {
         let path = Path::new("/dev/gpiochip0");
+        let text =
+            |group: Option<&str>| permission_text(path, &Opener { who: "pi".into(), group: group.map(str::to_owned) });
         assert_eq!(
-            permission_text(path, "pi", 0o660, "gpio"),
-            "pi may not open /dev/gpiochip0, which belongs to group gpio: \"sudo usermod -aG gpio \
-             pi\" and start Pinion again"
+            text(Some("gpio")),
+            "pi may not open /dev/gpiochip0, which belongs to group gpio: \"sudo usermod -aG gpio pi\", log in \
+             anew and start Pinion again"
         );
-        assert!(permission_text(path, "pi", 0o600, "root").contains("udev"));
+        assert!(text(None).contains("udev"));
+    }
+
+    #[test]
+    fn a_file_s_group_helps_where_it_may_open_the_file_and_is_not_root_s() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let command = |mode: u32| {
+            fs::set_permissions(file.path(), fs::Permissions::from_mode(mode)).unwrap();
+            Opener::of(file.path()).command()
+        };
+        assert_eq!(command(0o600), None);
+        // Who runs the tests may be root, and have root's group.
+        let gid = fs::metadata(file.path()).unwrap().gid();
+        assert_eq!(command(0o660).is_some(), gid != 0);
     }
 
     #[test]

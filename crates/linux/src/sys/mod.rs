@@ -234,20 +234,29 @@ pub fn set_line_checked(line: &impl AsRawFd, flags: u32, value: bool) -> io::Res
     }
 }
 
+/// Closes what `held` is and puts a copy of another descriptor in its place, under the same number.
+pub fn replace(held: &impl AsRawFd, by: &impl AsRawFd) -> io::Result<()> {
+    // SAFETY: takes numbers. The one of `held` stays open, and belongs to `held` as before.
+    match unsafe { libc::dup3(by.as_raw_fd(), held.as_raw_fd(), libc::O_CLOEXEC) } {
+        -1 => Err(io::Error::last_os_error()),
+        _ => Ok(()),
+    }
+}
+
 /// What `flags` (`GPIO_V2_LINE_FLAG_`) make a line, without attributes.
 fn line_request_config(flags: u64) -> LineRequestConfig {
     LineRequestConfig { flags, num_attrs: 0, padding: [0; 5], attrs: [[0; 3]; 10] }
 }
 
 /// Requests one line of an open GPIO chip with `GPIO_V2_LINE_FLAG_` flags. What is read from the file is its
-/// edges, if the flags ask for them; a read without any does not wait.
-pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, consumer: &str) -> io::Result<fs::File> {
+/// edges, if the flags ask for them; a read without any does not wait. The kernel keeps `events` edges.
+pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, events: u32, consumer: &str) -> io::Result<fs::File> {
     let mut request = LineRequest {
         offsets: [0; 64],
         consumer: [0; 32],
         config: line_request_config(flags),
         num_lines: 1,
-        event_buffer_size: 0,
+        event_buffer_size: events,
         padding: [0; 5],
         fd: -1,
     };

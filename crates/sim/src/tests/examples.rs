@@ -144,7 +144,9 @@ fn the_edges_of_a_tachometer_are_counted_and_dated() {
     let pin = bench.pin("fan_tachometer");
     let mut counted = bench.board.counted_line(pin, Bias::PullUp).unwrap();
     let edges = &mut counted.edges.as_mut().unwrap().device;
-    assert_eq!((edges.count().unwrap().count, edges.count().unwrap().last), (0, None));
+    let mut seen = Vec::new();
+    edges.take(&mut |edge| seen.push(edge)).unwrap();
+    assert_eq!(seen, []);
     let fan = bench.output("fan", true);
     let (mut levels, mut level) = (0, true);
     for _ in 0..300_000 {
@@ -153,18 +155,31 @@ fn the_edges_of_a_tachometer_are_counted_and_dated() {
             counted.line.line.read().unwrap() != std::mem::replace(&mut level, counted.line.line.read().unwrap()),
         );
     }
-    let first = edges.count().unwrap();
-    assert_eq!(first.count, levels);
-    // 75 turns a second, and so 300 edges.
+    edges.take(&mut |edge| seen.push(edge)).unwrap();
+    assert_eq!(seen.len(), levels as usize);
+    assert_eq!(seen.last().unwrap().level, level);
+    assert!(seen.windows(2).all(|pair| pair[0].level != pair[1].level && pair[0].at <= pair[1].at));
+    // 75 turns a second, and so 300 edges, each 1/300 s after the one before.
     bench.advance(1.0);
-    let second = edges.count().unwrap();
-    assert!((299..=301).contains(&(second.count - first.count)), "{first:?} {second:?}");
-    // A fan that stands has no more of them, and the last one stays where it was.
+    seen.clear();
+    edges.take(&mut |edge| seen.push(edge)).unwrap();
+    assert!((299..=301).contains(&seen.len()), "{}", seen.len());
+    let gaps = seen.windows(2).map(|pair| (pair[1].at - pair[0].at).as_secs_f64());
+    assert!(gaps.into_iter().all(|gap| (gap - 1.0 / 300.0).abs() < 5e-5), "{seen:?}");
+    // A fan that stands has no more of them. What nobody took in time is dropped.
     fan.write(false).unwrap();
     bench.advance(20.0);
-    let stood = edges.count().unwrap();
+    seen.clear();
+    edges.take(&mut |edge| seen.push(edge)).unwrap();
+    assert!(!seen.is_empty() && seen.iter().all(|edge| edge.dropped == 0), "{seen:?}");
     bench.advance(20.0);
-    assert_eq!(edges.count().unwrap(), stood);
+    edges.take(&mut |_| panic!("it stands")).unwrap();
+    fan.write(true).unwrap();
+    bench.advance(60.0);
+    seen.clear();
+    edges.take(&mut |edge| seen.push(edge)).unwrap();
+    assert_eq!(seen.len(), 1024);
+    assert!(seen[0].dropped > 10_000 && seen[1..].iter().all(|edge| edge.dropped == 0), "{:?}", seen[0]);
     let pin = bench.pin("x_endstop");
     let endstop = bench.board.counted_line(pin, Bias::PullUp).unwrap();
     assert_eq!(endstop.edges.err().unwrap(), "nobody counts the edges of endstop of axis x".into());

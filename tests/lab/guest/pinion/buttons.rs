@@ -3,10 +3,12 @@
 
 use std::time::{Duration, Instant};
 
+use nix::errno::Errno;
 use pinion_client::Client;
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure, run};
+use crate::uapi;
 
 fn state(client: &mut Client) -> Vec<u8> {
     let until = Instant::now() + Duration::from_secs(10);
@@ -17,8 +19,18 @@ fn state(client: &mut Client) -> Vec<u8> {
 
 #[test]
 fn buttons_are_added_after_the_configuration_and_once_more_after_a_restart() {
+    add_twice(&Program::start());
+}
+
+#[test]
+fn buttons_are_added_once_more_on_linux_before_5_5() {
+    for errno in [Errno::EINVAL, Errno::ENOTTY] {
+        add_twice(&Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, errno));
+    }
+}
+
+fn add_twice(program: &Program) {
     let sim = GpioSim::new("lab", 8);
-    let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &["config_buttons oid=0 button_count=2"]);
     for _ in 0..2 {

@@ -16,10 +16,17 @@ use crate::sysfs;
 const TACHO: u32 = 3;
 const COUNTER: &str = "config_counter oid=0 pin=lab/gpio3 pull_up=0";
 
-/// Has the count told every 0.1 s. A level is looked at every 50 ms, where the pin is polled.
-fn query(client: &mut Client) {
+/// Where the pin is polled, a level is looked at every 50 ms.
+const SLOW: u32 = 2_500_000;
+/// klippy's default, 1.5 ms.
+const USUAL: u32 = 75_000;
+/// The shortest level counts.
+const FAST: u32 = 1;
+
+/// Has the count told every 0.1 s.
+fn query(client: &mut Client, poll_ticks: u32) {
     let at = client.clock_in(0.02).expect("the clock").wire();
-    run(client, &format!("query_counter oid=0 clock={at} poll_ticks=2500000 sample_ticks=5000000"));
+    run(client, &format!("query_counter oid=0 clock={at} poll_ticks={poll_ticks} sample_ticks=5000000"));
 }
 
 /// The next count that is told, and the clock of its last edge.
@@ -54,15 +61,15 @@ fn set(pull: &mut File, up: bool) {
 }
 
 #[test]
-fn more_edges_than_the_kernel_keeps_are_all_counted_and_the_last_one_dated() {
+fn all_edges_are_counted_and_the_last_one_dated() {
     let sim = GpioSim::new("lab", 8);
     let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &[COUNTER]);
-    query(client);
+    query(client, FAST);
     assert_eq!(settled(client).0, 0);
     let mut expected = 0;
-    // The kernel keeps 16. An even number: each time the line ends low.
+    // An even number: each time the line ends low.
     for count in [2, 16, 18, 400] {
         let (before, after) = edges(&sim, count);
         expected += count;
@@ -83,7 +90,7 @@ fn a_fan_of_20_000_rpm_is_measured() {
     let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &[COUNTER]);
-    query(client);
+    query(client, USUAL);
     settled(client);
     let told: Vec<(u32, u32)> = thread::scope(|scope| {
         // Two pulses a turn are 1333 edges a second.
@@ -104,13 +111,40 @@ fn a_fan_of_20_000_rpm_is_measured() {
     }
 }
 
+/// At the slowest `poll_ticks`, so that what the emulated machine takes for a level is no matter.
+#[test]
+fn glitches_are_not_counted_and_pulses_are_exactly() {
+    let sim = GpioSim::new("lab", 8);
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &[COUNTER]);
+    // A level counts that lasts 50 ms.
+    query(client, 4 * SLOW);
+    let (before, _) = settled(client);
+    let mut pull = sim.pull_file(TACHO);
+    let mut longest = Duration::ZERO;
+    for level in [true, false, true, false, true] {
+        set(&mut pull, level);
+        thread::sleep(Duration::from_millis(80));
+        for _ in 0..50 {
+            let began = monotonic();
+            set(&mut pull, !level);
+            set(&mut pull, level);
+            longest = longest.max(monotonic() - began);
+        }
+    }
+    thread::sleep(Duration::from_millis(80));
+    assert!(longest < Duration::from_millis(50), "{longest:?} is no glitch");
+    assert_eq!(settled(client).0 - before, 5);
+}
+
 #[test]
 fn a_pin_that_floats_is_polled_and_can_be_an_output_after_a_restart() {
     let sim = GpioSim::new("lab", 8);
     let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &[COUNTER]);
-    query(client);
+    query(client, SLOW);
     // The kernel lists who asked for interrupts.
     let has_interrupt = || sysfs::read("/proc/interrupts").lines().any(|line| line.ends_with("pinion"));
     assert!(has_interrupt());
@@ -145,7 +179,7 @@ fn a_counter_shares_its_pin_with_inputs_and_is_polled_if_it_comes_second() {
     };
     for (first, second, polled) in [(COUNTER, endstop, false), (endstop, COUNTER, true)] {
         configure(client, 2, &[first, second]);
-        query(client);
+        query(client, if polled { SLOW } else { FAST });
         let (before, _) = settled(client);
         // (The pull of the endstop moved the line, in either order.)
         sim.pull(TACHO, false);

@@ -42,6 +42,28 @@ fn a_channel_is_exported_and_driven() {
     sysfs::write(format!("{CHIP}/unexport"), "6");
 }
 
+/// A fan or heater that runs is neither switched off nor driven harder for a moment.
+#[test]
+fn a_channel_that_runs_is_configured_anew_without_a_moment_off() {
+    let part = |(period, duty, enabled): (u64, u64, bool)| if enabled { duty as f64 / period as f64 } else { 0.0 };
+    for (before, after) in [(50_000, 50_000), (50_000, 5_000), (5_000, 50_000), (50_000, 40_000), (40_000, 50_000)] {
+        // In an instance of its own, as after an upgrade.
+        let first = Program::start();
+        configure(&mut first.connect(), 1, &[config("pwmchip0/pwm6", before)]);
+        drop(first);
+        sysfs::write(format!("{CHIP}/pwm6/enable"), "1");
+        pwm::forget();
+        let second = Program::start();
+        configure(&mut second.connect(), 1, &[config("pwmchip0/pwm6", after)]);
+        let history = pwm::history(6);
+        assert_eq!(pwm::output(6), format!("6 {} {} 1", after * 20, after * 5));
+        assert_eq!(history.is_empty(), before == after, "{history:?}");
+        assert!(history.iter().map(|state| part(*state)).all(|part| part > 0.0 && part <= 0.25), "{history:?}");
+        drop(second);
+        sysfs::write(format!("{CHIP}/unexport"), "6");
+    }
+}
+
 #[test]
 fn channels_that_can_not_be_are_refused_and_the_log_says_why() {
     let program = Program::start();

@@ -4,11 +4,12 @@
 use std::os::unix::process::ExitStatusExt;
 use std::process::Command;
 
+use nix::errno::Errno;
 use nix::sys::signal::Signal;
 use pinion_client::Client;
 
 use crate::gpio_sim::GpioSim;
-use crate::program::{Program, configure, refusal, run, shutdown_of};
+use crate::program::{Program, configure, exists, refusal, run, shutdown_of};
 use crate::sysfs;
 use crate::uapi::{self, BIAS_DISABLE, BIAS_PULL_DOWN, BIAS_PULL_UP};
 
@@ -82,6 +83,42 @@ fn inputs_have_the_bias_that_was_asked_for() {
             assert_eq!(sees_high(client, oid), up);
         }
     }
+}
+
+/// The kernel offers no way to change a held line: it is let go and requested anew.
+#[test]
+fn a_line_is_set_up_again_on_linux_before_5_5() {
+    let sim = GpioSim::new("lab", 8);
+    let mut program = Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, Errno::EINVAL);
+    let client = &mut program.connect();
+    // An input that becomes an output, an output that becomes an input, and one that stays one.
+    let high = |oid, pin| format!("config_digital_out oid={oid} pin={pin} value=1 default_value=0 max_duration=0");
+    configure(
+        client,
+        5,
+        &[
+            input(0, "lab/gpio0", 0),
+            high(1, "lab/gpio0"),
+            output(2, "lab/gpio1"),
+            input(3, "lab/gpio1", 0),
+            "set_digital_out pin=lab/gpio2 value=1".to_owned(),
+            high(4, "lab/gpio2"),
+        ],
+    );
+    assert!(sim.level(0) && sim.level(2));
+    for up in [true, false, true] {
+        sim.pull(1, up);
+        assert_eq!(sees_high(client, 3), up);
+    }
+    run(client, "update_digital_out oid=4 value=0");
+    run(client, "update_digital_out oid=4 value=1");
+    assert!(sim.level(2));
+    // The guardian has the outputs as they are now.
+    let guardian = program.guardian();
+    program.kill();
+    sysfs::wait_until("the guardian ends", || !exists(guardian));
+    program.wait_for_line(&["guardian: ", "all 2 outputs are driven"]);
+    assert!(!sim.level(0) && !sim.level(2));
 }
 
 #[test]

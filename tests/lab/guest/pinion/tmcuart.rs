@@ -3,6 +3,8 @@
 
 use std::time::{Duration, Instant};
 
+use nix::errno::Errno;
+
 use crate::gpio_sim::GpioSim;
 use crate::program::{Program, configure};
 use crate::trace::{Trace, Write};
@@ -31,8 +33,16 @@ fn hear(writes: &[Write]) -> Vec<u8> {
 
 #[test]
 fn a_single_wire_is_driven_for_the_message_and_let_go_for_the_reply() {
+    message_and_reply(&Program::start());
+}
+
+#[test]
+fn a_single_wire_is_let_go_on_linux_before_5_5() {
+    message_and_reply(&Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, Errno::EINVAL));
+}
+
+fn message_and_reply(program: &Program) {
     let sim = GpioSim::new("lab", 8);
-    let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &[CONFIG]);
     let is_output = || uapi::line_info(&sim.path(), WIRE).flags & uapi::IS_OUT != 0;

@@ -1,0 +1,70 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What a shell offers for an option's value: the names that it may have, where it may be more than these.
+
+#![forbid(unsafe_code)]
+
+use std::ffi::OsStr;
+use std::fmt::Display;
+use std::str::FromStr;
+
+use clap::builder::{PossibleValue, TypedValueParser};
+use clap::{Arg, Command};
+
+/// Names of boards.
+pub(super) const BOARDS: &[&str] = &["linux", "sim"];
+/// The board that `pinion console` takes.
+pub(super) const SIMULATED: &[&str] = &["sim"];
+/// Names of dialects.
+pub(super) const DIALECTS: &[&str] = &["v0.11", "v0.12", "v0.13", "master", "kalico", "union"];
+/// The same, with the one that is found by the host.
+pub(super) const SPOKEN: &[&str] = &["auto", "v0.11", "v0.12", "v0.13", "master", "kalico", "union"];
+/// How much is logged.
+pub(super) const LEVELS: &[&str] = &["error", "warn", "info", "debug", "trace", "off"];
+
+/// Reads a value; a shell is told these names of it.
+pub(super) fn offering<T>(names: &'static [&'static str]) -> impl TypedValueParser<Value = T>
+where
+    T: FromStr<Err: Display> + Clone + Send + Sync + 'static,
+{
+    let parser = |text: &str| text.parse::<T>().map_err(|error| error.to_string());
+    Offering { parser, names }
+}
+
+#[derive(Clone)]
+struct Offering<P> {
+    parser: P,
+    names: &'static [&'static str],
+}
+
+impl<P: TypedValueParser> TypedValueParser for Offering<P> {
+    type Value = P::Value;
+
+    fn parse_ref(&self, command: &Command, arg: Option<&Arg>, value: &OsStr) -> Result<P::Value, clap::Error> {
+        self.parser.parse_ref(command, arg, value)
+    }
+
+    fn possible_values(&self) -> Option<Box<dyn Iterator<Item = PossibleValue> + '_>> {
+        Some(Box::new(self.names.iter().map(PossibleValue::new)))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cli::run::{BoardName, Spoken};
+    use pinion_firmware::mcu::DialectName;
+
+    #[test]
+    fn what_is_offered_is_taken_and_all_of_it() {
+        assert!(BOARDS.iter().chain(SIMULATED).all(|name| name.parse::<BoardName>().is_ok()));
+        assert!(SPOKEN.iter().all(|name| name.parse::<Spoken>().is_ok()));
+        let mut dialects: Vec<String> = DialectName::all().map(|name| name.to_string()).collect();
+        dialects.sort();
+        let mut offered = DIALECTS.to_vec();
+        offered.sort_unstable();
+        assert_eq!(offered, dialects);
+        assert_eq!(&SPOKEN[1..], DIALECTS);
+        assert!(LEVELS.iter().all(|name| name.parse::<log::LevelFilter>().is_ok()));
+        assert_eq!(LEVELS.len(), log::LevelFilter::iter().count());
+    }
+}
