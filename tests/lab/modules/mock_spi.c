@@ -6,7 +6,7 @@
  * In /sys/devices/platform/mock-spi:
  *   sent      one line per transfer: "csN MODE HZ BYTE...", in hexadecimal bytes
  *   replies   hexadecimal digits that the next transfers read before the loop
- *   fail, delay_ms   see mock_bus.h
+ *   fail, delay_ms, delay_us   see mock_bus.h
  */
 #include <linux/module.h>
 #include <linux/platform_device.h>
