@@ -25,6 +25,6 @@ pub const FIRMWARE: Firmware = Firmware {
     features: FEATURES,
     app: "Pinion",
     version: concat!("pinion-", env!("PINION_VERSION")),
-    build_versions: concat!("rustc: ", env!("CARGO_PKG_RUST_VERSION"), " or later"),
+    build_versions: concat!("rustc: ", env!("PINION_COMPILER")),
     license: "GNU GPLv3",
 };

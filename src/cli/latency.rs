@@ -20,7 +20,7 @@ use pinion_firmware::lateness::{Lateness, us};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_linux::clock::Monotonic;
 
-use super::doctor::is_preempt_rt;
+use super::doctor::{is_preempt_rt, print_at_risk};
 use super::failed;
 use super::page::{Page, print};
 
@@ -51,6 +51,9 @@ struct Half {
 
 /// Measures, prints and judges.
 pub(super) fn run(args: &LatencyArgs) -> ExitCode {
+    if let Some(why) = print_at_risk() {
+        return failed(format!("the latency is not measured: {why}"));
+    }
     let span = Duration::from_secs(args.seconds.into()) / 2;
     let (scheduling, halves) = match measure_both(span) {
         Ok(measured) => measured,
@@ -142,7 +145,7 @@ fn measure(
 fn run_for(clock: &Arc<dyn TimeSource>, mut waiter: Waiter, end: u64, lateness: &mut Lateness) -> Ticks {
     let mut at = clock.now() + PERIOD;
     while at < Clock::from_ticks(end) {
-        waiter.wait(Some(at), || false);
+        waiter.wait(at, Some(at), || false);
         let now = clock.now();
         lateness.record(now.since(at));
         at = at + PERIOD;
