@@ -491,7 +491,8 @@ fn w1_section(sensors: &[W1Sensor]) -> Page {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::{any_name, assert_plain};
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
     use pinion_linux::adc::{Channel, Format};
     use pinion_linux::gpio::LineInfo;
     use pinion_linux::sysfs::PwmChannel;

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, raise};
 use nix::unistd::geteuid;
 use pinion::runtime::wakeup::MarginLimits;
-use pinion::runtime::{self, Access, Options};
+use pinion::runtime::{self, Access, Helpers, Options};
 use pinion_linux::clock::Monotonic;
 use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use serde_json::{Value, json};
@@ -130,7 +130,7 @@ impl Printer {
                 sockets: Vec::new(),
                 dialect: None,
             };
-            let run = move || runtime::run(&options, Box::new(board), clock, None, || {}).unwrap();
+            let run = move || runtime::run(&options, Box::new(board), clock, Helpers::default(), || {}).unwrap();
             Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
         });
         printer.until_state("ready");

@@ -87,7 +87,8 @@ pub(super) fn print_at_risk(machine: &Machine) -> Option<String> {
         let link = pinion.settings.map_or_else(|| HOST_PATHS.to_owned() + "mcu", |by| by.symlink.display().to_string());
         // An absolute link replaces the folder before it.
         let link = proc.join(format!("{}/cwd", pinion.pid)).join(&link);
-        let found = fs::canonicalize(&link).and_then(|terminal| process::find(&proc, &terminal));
+        let terminal = fs::canonicalize(&link).and_then(|device| process::Terminal::of(&device));
+        let found = terminal.and_then(|terminal| process::find(&proc, terminal));
         let (host, is) = match found {
             Ok(Search::Nobody) => return None,
             Ok(Search::Found(host)) => (host, "is"),

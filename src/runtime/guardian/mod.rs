@@ -53,6 +53,7 @@ use pinion_linux::Guard;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys;
 
+use super::helpers::THREADS_MAX;
 use super::pulse::{GuardianEar, Pulse};
 
 use message::{Message, TAKEN};
@@ -60,8 +61,6 @@ use watcher::{Program, Watcher};
 
 /// What the kernel calls the guardian's process (proc_pid_comm(5)): its command line is the program's.
 pub(crate) const NAME: &CStr = c"pinion-guardian";
-/// Most threads the program may have when it forks the guardian; a test has that of its harness, too.
-const THREADS_MAX: usize = if cfg!(test) { 2 } else { 1 };
 /// How long the program waits for the guardian's answer, in seconds.
 const ANSWER_S: i64 = 5;
 /// How long to wait for the end of a process that was asked to end, or was killed.
@@ -92,12 +91,8 @@ impl Guardian {
         let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
         setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(ANSWER_S))?;
         let program = Program::new(getpid());
-        let ours = socket.as_raw_fd();
         let pid = sys::fork(THREADS_MAX, move || {
-            // The fork has copied the program's end of the socket. It must not stay open here: the
-            // socket would not be closed when the program dies.
-            let _ = nix::unistd::close(ours);
-            watcher::settle(realtime);
+            watcher::settle(realtime, &theirs, &program);
             Watcher::new(theirs, program, pulse).watch();
             0
         })?;
