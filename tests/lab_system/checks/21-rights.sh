@@ -24,5 +24,5 @@ kill -9 "$search"
 identifies
 is "$(pid)" "$before" "the process"
 systemctl stop pinion-mcu
-said pinion-mcu -p warning | grep 'the search for the host has ended'
+said pinion-mcu | grep 'the search for the host has ended'
 not pgrep -x pinion-search
