@@ -259,16 +259,21 @@ impl Rig {
 
     /// As [`Rig::responses`], with `stats`.
     pub fn everything(&self) -> Vec<String> {
+        let mut responses = Vec::new();
+        self.each_response(|payload| responses.push(self.decode(payload)));
+        responses
+    }
+
+    /// Looks at each response since the last call as it goes over the wire.
+    pub fn each_response(&self, mut look: impl FnMut(&[u8])) {
         let mut buffer = self.outbox.payloads.lock().unwrap();
         let mut payloads = &buffer[..];
-        let mut responses = Vec::new();
         while let Some((len, rest)) = payloads.split_first() {
             let (payload, rest) = rest.split_at(usize::from(*len));
-            responses.push(self.decode(payload));
+            look(payload);
             payloads = rest;
         }
         buffer.clear();
-        responses
     }
 
     /// Forgets what the machine said.
