@@ -190,20 +190,20 @@ mod tests {
 
     #[test]
     fn the_status_register() {
-        for (model, status, samples, overflowed) in [
+        for (model, status, bytes, overflowed) in [
             (Model::Lis2dw, 0x00, 0, false),
-            (Model::Lis2dw, 0x07, 7, false),
+            (Model::Lis2dw, 0x07, 7 * 6, false),
             // FTH, the threshold's flag, says nothing here.
-            (Model::Lis2dw, 0x80 | 31, 31, false),
-            (Model::Lis2dw, 0xc0 | 32, 32, true),
+            (Model::Lis2dw, 0x80 | 31, 31 * 6, false),
+            (Model::Lis2dw, 0xc0 | 32, 32 * 6, true),
             // Nothing answers: 63 samples are 378 bytes, 122 modulo 256.
-            (Model::Lis2dw, 0xff, 122 / 6, true),
+            (Model::Lis2dw, 0xff, 122, true),
             (Model::Lis3dh, 0x20, 0, false),
-            (Model::Lis3dh, 0x1f, 31, false),
-            (Model::Lis3dh, 0xc0 | 31, 31, true),
-            (Model::Lis3dh, 0x80 | 9, 9, false),
+            (Model::Lis3dh, 0x1f, 31 * 6, false),
+            (Model::Lis3dh, 0xc0 | 31, 31 * 6, true),
+            (Model::Lis3dh, 0x80 | 9, 9 * 6, false),
         ] {
-            let fill = Fill { bytes: samples * 6, overflowed };
+            let fill = Fill { bytes, overflowed };
             assert_eq!(model.fill(status), fill, "{model:?} {status:#x}");
         }
     }
