@@ -408,9 +408,14 @@ impl Printer {
         log(self)
     }
 
+    /// All that `--show` showed.
+    pub fn all_shown(&self) -> String {
+        fs::read_to_string(self.path("shown")).unwrap()
+    }
+
     /// What `--show` showed of a thing last: the rest of its line, or the lines below it.
     pub fn shown(&self, name: &str) -> String {
-        let shown = fs::read_to_string(self.path("shown")).unwrap();
+        let shown = self.all_shown();
         // A block that is still being written counts for nothing.
         let whole = shown.rsplit_once('\n').map_or("", |(whole, _)| whole);
         let head = format!("] {name}:");

@@ -173,3 +173,23 @@ fn a_broken_sensor_stops_the_machine_at_its_third_bad_value() {
         printer.until_logged("reports fault bits");
     }
 }
+
+#[test]
+fn a_fan_at_half_speed_is_told_where_it_ends_up_and_not_for_each_ripple() {
+    let Some(checkout) = checkout("a_fan_at_half_speed_is_told_where_it_ends_up_and_not_for_each_ripple") else {
+        return;
+    };
+    let mut printer = Printer::start_shown(&checkout, |board, _| board, |config| config);
+    printer.until_state("ready");
+    // klippy's cycle of 10 ms, and a fan that takes 0.4 s to follow.
+    printer.gcode("M106 S128\nG4 P8000");
+    let rpm = |printer: &Printer| printer.shown("fan").trim_end_matches(" rpm").parse::<f64>().unwrap();
+    let first = rpm(&printer);
+    assert!((first - 4500.0 * 128.0 / 255.0).abs() < 40.0, "{first}");
+    let lines = |printer: &Printer| printer.all_shown().matches("] fan: ").count();
+    let before = lines(&printer);
+    printer.gcode("G4 P20000");
+    assert!(lines(&printer) - before <= 3, "{}", printer.all_shown());
+    printer.gcode("M107\nG4 P8000");
+    assert!(rpm(&printer) < 5.0, "{}", rpm(&printer));
+}
