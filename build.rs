@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Tells the program which state of the sources it is built from: `pinion --version` and the data
-//! dictionary say it.
+//! Tells the program which state of the sources it is built from, and with which compiler. `pinion --version`, the
+//! status and the data dictionary say it.
 
 use std::env;
 use std::process::Command;
@@ -26,6 +26,15 @@ fn main() {
         "" => println!("cargo::rustc-env=PINION_VERSION={version}"),
         state => println!("cargo::rustc-env=PINION_VERSION={version}-{state}"),
     }
+    println!("cargo::rustc-env=PINION_COMPILER={}", compiler().unwrap_or_else(|| "?".into()));
+}
+
+/// The compiler's version, such as `1.88.0 (6b00bc388 2025-06-23)`: as Klipper's build, without the compiler's name.
+/// The same compiler says the same everywhere, so a build stays reproducible.
+fn compiler() -> Option<String> {
+    let said = output(Command::new(env::var_os("RUSTC")?).arg("--version"))?;
+    let said = said.lines().next()?;
+    Some(said.strip_prefix("rustc ").unwrap_or(said).trim().to_owned())
 }
 
 /// The commit, such as `g167fa41abcde`, with `-dirty` behind it if what the program is made of was
@@ -44,6 +53,10 @@ fn checkout() -> Option<String> {
 }
 
 fn git(args: &[&str]) -> Option<String> {
-    let output = Command::new("git").args(args).output().ok()?;
+    output(Command::new("git").args(args))
+}
+
+fn output(command: &mut Command) -> Option<String> {
+    let output = command.output().ok()?;
     output.status.success().then(|| String::from_utf8_lossy(&output.stdout).into_owned())
 }

@@ -112,7 +112,7 @@ impl Dialect {
         let told = |text: &str| if serves(since(Generation::V0_13)) { text.to_owned() } else { String::new() };
         let mut dictionary = Dictionary {
             app: told("Pinion"),
-            build_versions: concat!("rustc: ", env!("CARGO_PKG_RUST_VERSION"), " or later").into(),
+            build_versions: concat!("rustc: ", env!("PINION_COMPILER")).into(),
             license: told("GNU GPLv3"),
             version: concat!("pinion-", env!("PINION_VERSION")).into(),
             ..Dictionary::default()

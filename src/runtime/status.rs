@@ -325,7 +325,7 @@ impl Server {
         }
         let mut document = json!({
             "form": FORM,
-            "version": env!("CARGO_PKG_VERSION"),
+            "version": env!("PINION_VERSION"),
             "pid": std::process::id(),
             "uptime_s": rounded(self.begun.elapsed().as_secs_f64()),
             "link": facts.link.to_string_lossy(),

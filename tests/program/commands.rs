@@ -364,6 +364,10 @@ fn the_version_tells_the_state_of_the_sources_and_the_dictionary_tells_the_same(
     }
     let dictionary: Value = serde_json::from_slice(&output(&["dict", "--board", "sim"]).stdout).unwrap();
     assert_eq!(dictionary["version"], format!("pinion-{version}"));
+    // As `rustc --version` says it, without its own name.
+    let compiler = dictionary["build_versions"].as_str().unwrap().strip_prefix("rustc: ").unwrap();
+    let number = compiler.split_whitespace().next().unwrap();
+    assert!(number.split('.').count() == 3 && !compiler.contains("later"), "{compiler}");
 }
 
 #[test]
