@@ -19,7 +19,7 @@ use crate::runtime::realtime::{self, Processors, Role, Scheduling};
 use crate::runtime::wakeup::{MarginLimits, Waiter};
 use crate::time::{Clock, Monotonic, Ticks, TimeSource};
 
-use super::doctor::is_preempt_rt;
+use super::doctor::{is_preempt_rt, print_at_risk};
 use super::failed;
 use super::page::{Page, print};
 
@@ -50,6 +50,9 @@ struct Half {
 
 /// Measures, prints and judges.
 pub(super) fn run(args: &LatencyArgs) -> ExitCode {
+    if let Some(why) = print_at_risk() {
+        return failed(format!("the latency is not measured: {why}"));
+    }
     let span = Duration::from_secs(args.seconds.into()) / 2;
     let (scheduling, halves) = match measure_both(span) {
         Ok(measured) => measured,

@@ -4,6 +4,7 @@
 use std::collections::HashMap;
 use std::fs;
 use std::process::{Command, Stdio};
+use std::sync::{Mutex, PoisonError};
 
 use nix::sys::signal::Signal;
 use serde_json::Value;
@@ -299,8 +300,33 @@ fn a_board_that_is_none_is_explained() {
     assert!(String::from_utf8_lossy(&refused.stderr).contains("linux, sim and sim:FILE.toml"));
 }
 
+/// Held by tests that measure the latency, or keep others from it.
+static LATENCY: Mutex<()> = Mutex::new(());
+
+#[test]
+fn the_latency_is_not_measured_while_a_host_may_print() {
+    let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
+    // Not a simulated printer, though this computer may have no pins.
+    let pinion = Pinion::start(&["run", "--dialect", "master"]);
+    pinion.wait_for_link();
+    let client = pinion.client();
+    let refused = output(&["latency", "--seconds", "2"]);
+    let text = String::from_utf8(refused.stderr).unwrap();
+    assert_eq!((refused.status.code(), refused.stdout.len()), (Some(1), 0), "{text}");
+    for part in [
+        format!("a host (process {}) is attached to Pinion (process {}", std::process::id(), pinion.pid()),
+        format!("wait until the print is done, then end process {}", std::process::id()),
+    ] {
+        assert!(text.contains(&part), "no \"{part}\" in: {text}");
+    }
+    drop(client);
+    let measured = output(&["latency", "--seconds", "2"]);
+    assert!(measured.status.success(), "{}", String::from_utf8_lossy(&measured.stderr));
+}
+
 #[test]
 fn latency_judges_the_machine() {
+    let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
     let (_folder, svg) = folder_with("latency.svg", "");
     let measured = output(&["latency", "--seconds", "2", "--svg", svg.to_str().unwrap()]);
     let text = String::from_utf8(measured.stdout).unwrap();
@@ -313,6 +339,7 @@ fn latency_judges_the_machine() {
 
 #[test]
 fn a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed() {
+    let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
     for args in [
         &["sim", "--print-config"][..],
         &["sim", "--print-board"],

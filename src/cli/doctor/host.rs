@@ -10,14 +10,15 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use crate::cli::finding::{Finding, Level};
+use crate::cli::run::BoardName;
 use crate::feature::FEATURES;
 use crate::klippy::Checkout;
-use crate::klippy::process::{self, Process};
+use crate::klippy::process::{self, Process, Search};
 use crate::mcu::DialectName;
 
 use super::UPGRADE;
 use super::instance::{HOST_PATHS, Instance, is_host_path, unit_for};
-use super::machine::{Access, Machine, Who};
+use super::machine::{Access, Machine, Running, Who};
 use super::printer::{self, Printer};
 use super::units::{self, setting};
 
@@ -70,6 +71,43 @@ fn running(machine: &Machine, process: &Process) -> Option<Klippy> {
         found_by: format!("process {}", process.pid),
         unit: machine.unit_of(process.pid),
         is_running: true,
+    })
+}
+
+/// Why this computer must not be kept busy: a host may have a Pinion print on its pins. A simulated printer has
+/// nothing to spoil.
+pub(super) fn print_at_risk(machine: &Machine) -> Option<String> {
+    let proc = machine.path("/proc");
+    let is_simulated = |pinion: &Running| matches!(&pinion.settings, Some(by) if matches!(by.board, BoardName::Sim(_)));
+    machine.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {
+        let who = match &pinion.unit {
+            Some(unit) => format!("Pinion (process {}, {unit})", pinion.pid),
+            None => format!("Pinion (process {})", pinion.pid),
+        };
+        let link = pinion.settings.map_or_else(|| HOST_PATHS.to_owned() + "mcu", |by| by.symlink.display().to_string());
+        // An absolute link replaces the folder before it.
+        let link = proc.join(format!("{}/cwd", pinion.pid)).join(&link);
+        let found = fs::canonicalize(&link).and_then(|terminal| process::find(&proc, &terminal));
+        let (host, is) = match found {
+            Ok(Search::Nobody) => return None,
+            Ok(Search::Found(host)) => (host, "is"),
+            Ok(Search::Hidden(klippys)) => (klippys.into_iter().next()?, "may be"),
+            Err(error) => {
+                return Some(format!(
+                    "whether a host is attached to {who} cannot be told: {}: {error}: stop this Pinion, or try with sudo",
+                    link.display()
+                ));
+            }
+        };
+        let name = if host.is_klippy() { "klippy" } else { "a host" };
+        let stop = match machine.unit_of(host.pid).filter(|_| host.is_klippy()) {
+            Some(unit) => format!("sudo systemctl stop {unit}"),
+            None => format!("end process {}", host.pid),
+        };
+        Some(format!(
+            "{name} (process {}) {is} attached to {who}, and measuring keeps every processor busy, which makes steps late: wait until the print is done, then {stop}; pinion doctor measures gently meanwhile",
+            host.pid
+        ))
     })
 }
 

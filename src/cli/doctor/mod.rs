@@ -106,6 +106,11 @@ fn examine(machine: &Machine) -> Vec<Group> {
     groups
 }
 
+/// Why this computer must not be kept busy now.
+pub(super) fn print_at_risk() -> Option<String> {
+    host::print_at_risk(&Machine::at(Path::new("/")))
+}
+
 /// A sample of two seconds proves nothing: what it shows is no error.
 fn latency(sample: Result<Verdict, String>) -> Finding {
     const CHECK: &str = "latency";
