@@ -188,7 +188,7 @@ impl AnalogIn {
     }
 
     fn query(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, query: Query) -> Result<(), Shutdown> {
-        mcu.cancel(TimerId::new(oid, 0));
+        mcu.cancel(TimerId::sampling(oid, 0));
         self.restart();
         self.next_begin = at;
         self.query = query;
@@ -196,7 +196,7 @@ impl AnalogIn {
         if query.sample_count == 0 {
             return Ok(());
         }
-        mcu.schedule(TimerId::new(oid, 0), at)
+        mcu.schedule(TimerId::sampling(oid, 0), at)
     }
 
     fn report(&mut self, mcu: &mut Mcu, oid: Oid) {
@@ -236,7 +236,7 @@ impl Object for AnalogIn {
         if tag != self.tag {
             return if std::mem::take(&mut self.waiting) { self.sample(mcu, oid) } else { Ok(()) };
         }
-        let timer = TimerId::new(oid, 0);
+        let timer = TimerId::sampling(oid, 0);
         // A failure stays in its box, as the core would free it.
         let counts = match &reading.counts {
             Ok(counts) => *counts,
@@ -289,7 +289,7 @@ impl Object for AnalogIn {
         // Sampling goes on, as in the firmware, so that the host sees the temperatures of a stopped
         // machine, too.
         self.skip_missed(mcu.now());
-        mcu.go_on(TimerId::new(oid, 0), self.next_begin);
+        mcu.go_on(TimerId::sampling(oid, 0), self.next_begin);
     }
 }
 

@@ -256,7 +256,7 @@ const BUTTONS_QUERY: Command = command!(
         let at = mcu.instant(clock);
         mcu.with::<Buttons, _>(oid, |buttons, mcu| {
             let retransmit_count = RetransmitCount::of(retransmit_count)?;
-            mcu.cancel(TimerId::new(oid, 0));
+            mcu.cancel(TimerId::sampling(oid, 0));
             buttons.rest_ticks = rest_ticks;
             buttons.retransmit_count = retransmit_count;
             buttons.pressed = invert;
@@ -268,7 +268,7 @@ const BUTTONS_QUERY: Command = command!(
             if rest_ticks == Ticks(0) {
                 return Ok(());
             }
-            mcu.schedule(TimerId::new(oid, 0), at)
+            mcu.schedule(TimerId::sampling(oid, 0), at)
         })
     }
 );

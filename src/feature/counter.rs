@@ -323,7 +323,7 @@ const QUERY_COUNTER: Command = command!(
     |mcu, oid: Oid, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
         let at = mcu.instant(clock);
         mcu.with::<Counter, _>(oid, |counter, mcu| {
-            mcu.cancel(TimerId::new(oid, 0));
+            mcu.cancel(TimerId::sampling(oid, 0));
             counter.poll_ticks = poll_ticks;
             counter.sample_ticks = sample_ticks;
             counter.next_sample = at;
@@ -331,7 +331,7 @@ const QUERY_COUNTER: Command = command!(
                 counter.count_clock = at;
             }
             counter.counts = false;
-            mcu.schedule(TimerId::new(oid, 0), at)
+            mcu.schedule(TimerId::sampling(oid, 0), at)
         })
     }
 );

@@ -201,7 +201,7 @@ const QUERY_DS18B20: Command = command!(
     |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
         let at = mcu.instant(clock);
         mcu.with::<Ds18b20, _>(oid, |sensor, mcu| {
-            mcu.cancel(TimerId::new(oid, 0));
+            mcu.cancel(TimerId::sampling(oid, 0));
             sensor.tag = sensor.tag.wrapping_add(1);
             if rest_ticks == Ticks(0) {
                 return Ok(());
@@ -209,7 +209,7 @@ const QUERY_DS18B20: Command = command!(
             sensor.rest_ticks = rest_ticks;
             sensor.min_value = min_value;
             sensor.max_value = max_value;
-            mcu.schedule(TimerId::new(oid, 0), at)
+            mcu.schedule(TimerId::sampling(oid, 0), at)
         })
     }
 );

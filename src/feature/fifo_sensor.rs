@@ -337,7 +337,7 @@ impl<C: FifoChip> FifoSensor<C> {
             _ if more => return self.read(mcu, oid),
             _ => {}
         }
-        mcu.go_on(TimerId::new(oid, 0), ended + self.rest_ticks);
+        mcu.go_on(TimerId::sampling(oid, 0), ended + self.rest_ticks);
         Ok(())
     }
 
@@ -371,7 +371,7 @@ impl<C: FifoChip> FifoSensor<C> {
             Phase::SwitchesOn if !on => self.switch(mcu, oid, true),
             Phase::SwitchesOn => {
                 self.phase = Phase::Idle;
-                mcu.go_on(TimerId::new(oid, 0), span.1 + self.rest_ticks);
+                mcu.go_on(TimerId::sampling(oid, 0), span.1 + self.rest_ticks);
                 Ok(())
             }
             Phase::Ends(..) if on => self.switch(mcu, oid, false),
@@ -384,7 +384,7 @@ impl<C: FifoChip> FifoSensor<C> {
 
     /// Measures from `at` on, for a host that leaves it to the machine to switch the sensor on.
     fn query_at(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, rest_ticks: Ticks) -> Result<(), Shutdown> {
-        let timer = TimerId::new(oid, 0);
+        let timer = TimerId::sampling(oid, 0);
         mcu.cancel(timer);
         self.end();
         self.rest_ticks = rest_ticks;
@@ -396,7 +396,7 @@ impl<C: FifoChip> FifoSensor<C> {
     /// Switches the sensor off, sends what there is, and tells the host how much that was. What is being
     /// read counts.
     fn stop(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        mcu.cancel(TimerId::new(oid, 0));
+        mcu.cancel(TimerId::sampling(oid, 0));
         self.waiting = false;
         self.phase = Phase::Ends(None, LAST_READS);
         self.switch(mcu, oid, false)
@@ -415,7 +415,7 @@ impl<C: FifoChip> FifoSensor<C> {
     }
 
     fn query(&mut self, mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) {
-        let timer = TimerId::new(oid, 0);
+        let timer = TimerId::sampling(oid, 0);
         mcu.cancel(timer);
         self.end();
         if rest_ticks == Ticks(0) {

@@ -391,7 +391,7 @@ const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid
 
 const QUERY_LDC1612: Command = command!("query_ldc1612 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
     mcu.with::<Ldc1612, _>(oid, |sensor, mcu| {
-        let timer = TimerId::new(oid, 0);
+        let timer = TimerId::sampling(oid, 0);
         mcu.cancel(timer);
         sensor.stale = sensor.look.is_none();
         sensor.missed = 0;

@@ -199,7 +199,7 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
 /// Begins measurements, or with `rest_ticks` of 0 ends them.
 pub(super) fn query<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) -> Result<(), Shutdown> {
     mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| {
-        let timer = TimerId::new(oid, 0);
+        let timer = TimerId::sampling(oid, 0);
         mcu.cancel(timer);
         sensor.restart();
         let on = rest_ticks != Ticks(0);

@@ -385,7 +385,7 @@ impl SpiAngle {
     }
 
     fn query(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, rest_ticks: Ticks, time_shift: u8) -> Result<(), Shutdown> {
-        let timer = TimerId::new(oid, 0);
+        let timer = TimerId::sampling(oid, 0);
         mcu.cancel(timer);
         self.end();
         if rest_ticks == Ticks(0) {

@@ -236,7 +236,7 @@ const QUERY_THERMOCOUPLE: Command = command!(
     |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
         let at = mcu.instant(clock);
         mcu.with::<Thermocouple, _>(oid, |sensor, mcu| {
-            mcu.cancel(TimerId::new(oid, 0));
+            mcu.cancel(TimerId::sampling(oid, 0));
             sensor.tag = sensor.tag.wrapping_add(1);
             if rest_ticks == Ticks(0) {
                 return Ok(());
@@ -246,7 +246,7 @@ const QUERY_THERMOCOUPLE: Command = command!(
             sensor.max_value = max_value;
             sensor.max_invalid_count = max_invalid_count;
             sensor.invalid_count = 0;
-            mcu.schedule(TimerId::new(oid, 0), at)
+            mcu.schedule(TimerId::sampling(oid, 0), at)
         })
     }
 );

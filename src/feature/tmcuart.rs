@@ -547,7 +547,7 @@ mod tests {
         while !end.load(Ordering::Relaxed) {
             let (at, every, is_bit) = timers.iter_mut().min_by_key(|(at, ..)| *at).unwrap();
             if clock.now() < *at {
-                waiter.wait(Some(*at), || false);
+                waiter.wait(*at, Some(*at), || false);
             }
             let now = clock.now();
             let late = now.since(*at);

@@ -233,6 +233,12 @@ impl Mcu {
         self.timers.next()
     }
 
+    /// The instant of the next timer that the core is to be awake for.
+    #[inline]
+    pub fn next_exact_timer(&self) -> Option<Clock> {
+        self.timers.next_exact()
+    }
+
     /// Runs the timers that are due, some at most, so that commands get their turn. True if there
     /// are more of them: then one command is to have its turn, if there is any.
     ///
@@ -264,7 +270,9 @@ impl Mcu {
     #[inline]
     fn run_timer(&mut self) {
         let Some((at, timer)) = self.timers.pop() else { return };
-        self.lateness.record(self.last_read.since(at));
+        if timer.is_exact() {
+            self.lateness.record(self.last_read.since(at));
+        }
         self.running = Some(at);
         self.board.runs(Some(at));
         let result = match timer.oid() {

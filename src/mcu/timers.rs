@@ -13,20 +13,36 @@ pub struct TimerId {
     /// The object; the machine's own timers have none.
     oid: Option<Oid>,
     which: u8,
+    is_exact: bool,
 }
 
 impl TimerId {
     /// The machine's own timer, which sends `stats`.
-    pub(super) const STATS: TimerId = TimerId { oid: None, which: 0 };
+    pub(super) const STATS: TimerId = TimerId::own(0);
 
     /// The machine's own timer, which tries shutdown values again that could not be written.
-    pub(super) const RETRY: TimerId = TimerId { oid: None, which: 1 };
+    pub(super) const RETRY: TimerId = TimerId::own(1);
     /// The machine's own timer, which ends the wait for a bus that hangs.
-    pub(super) const HOLD: TimerId = TimerId { oid: None, which: 2 };
+    pub(super) const HOLD: TimerId = TimerId::own(2);
+
+    const fn own(which: u8) -> TimerId {
+        TimerId { oid: None, which, is_exact: false }
+    }
 
     /// Timer number `which` of an object.
     pub const fn new(oid: Oid, which: u8) -> TimerId {
-        TimerId { oid: Some(oid), which }
+        TimerId { oid: Some(oid), which, is_exact: true }
+    }
+
+    /// The same, of one that may be late by a wake-up: it asks for a sample at a steady pace. The core sleeps until
+    /// it is due, where for others it is awake earlier and spins.
+    pub const fn sampling(oid: Oid, which: u8) -> TimerId {
+        TimerId { oid: Some(oid), which, is_exact: false }
+    }
+
+    /// Whether the core is to be awake when it is due.
+    pub(super) const fn is_exact(self) -> bool {
+        self.is_exact
     }
 
     /// The object whose timer it is.
@@ -61,6 +77,12 @@ impl Timers {
     #[inline]
     pub(super) fn next(&self) -> Option<Clock> {
         self.waiting.last().map(|(at, _)| *at)
+    }
+
+    /// The instant of the next that the core is to be awake for.
+    #[inline]
+    pub(super) fn next_exact(&self) -> Option<Clock> {
+        self.waiting.iter().rev().find(|(_, timer)| timer.is_exact).map(|(at, _)| *at)
     }
 
     #[inline]

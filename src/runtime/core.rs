@@ -201,16 +201,17 @@ impl Core {
             }
             self.mcu.account(Ticks(now.since(busy_since) as u32));
             let to_go = deadline.map_or(2 * FAR, |deadline| deadline.since(now));
-            if to_go > FAR {
+            let Some(deadline) = deadline.filter(|_| to_go <= FAR) else {
                 // Half the way leaves room for a late wake-up.
                 self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));
                 busy_since = self.clock.now();
                 continue;
-            }
+            };
+            let exact = self.mcu.next_exact_timer();
             let calls = Calls { core: &self.progress, stops_taken: self.stops_taken, mcu: &self.mcu };
             let (requests, begun) = (&self.requests, self.block.is_some());
             // Within reach of a timer a call has to wait its turn.
-            let woken = self.waiter.wait(deadline, || !near && calls.any(begun, requests));
+            let woken = self.waiter.wait(deadline, exact, || !near && calls.any(begun, requests));
             busy_since = self.clock.now();
             if woken == Woken::Due {
                 self.gave_way += 1;
@@ -448,7 +449,7 @@ mod tests {
     }
 
     const RESPONSE: &str = "spi_transfer_response oid=%c response=%*s";
-    const CONFIGURATION: u32 = 5;
+    const CONFIGURATION: u32 = 7;
 
     impl Rig {
         fn new() -> Rig {
@@ -474,17 +475,20 @@ mod tests {
                     Box::new(workers),
                     Box::new(core_heard),
                 );
-                let (limits, processors) = (MarginLimits::default(), Processors::new(None).unwrap());
+                let early = Ticks::from_us(200);
+                let (limits, processors) = (MarginLimits { min: early, max: early }, Processors::new(None).unwrap());
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
                 let (clock, progress, wake) = (core_clock, core_progress, core_wake);
                 let teller = status::ends().0;
                 Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake, teller }).run()
             });
             let mut rig = Rig { thread, dialect, clock, requests, progress, wake, heard, bench };
-            rig.run("allocate_oids count=%c", &[2]);
+            rig.run("allocate_oids count=%c", &[3]);
             rig.run("config_spi_without_cs oid=%c", &[0]);
             rig.run("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", &[0, 0, 0, 1]);
             rig.run("config_digital_out oid=%c pin=%u value=%c default_value=%c max_duration=%u", &[1, 30, 0, 0, 0]);
+            rig.run("config_buttons oid=%c button_count=%c", &[2, 1]);
+            rig.run("buttons_add oid=%c pos=%c pin=%u pull_up=%c", &[2, 0, 31, 0]);
             rig.run("finalize_config crc=%u", &[1]);
             rig.wait_until("it is configured", |rig| rig.progress.done() == CONFIGURATION);
             rig
@@ -580,6 +584,23 @@ mod tests {
         }
         rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 22);
         assert_eq!(rig.said(RESPONSE).len(), 21);
+        assert_eq!(rig.quit(), Left::Safe);
+    }
+
+    #[test]
+    fn the_core_sleeps_until_a_sample_is_due_and_does_not_spin_before_it() {
+        const REST: Ticks = Ticks::from_us(2000);
+        let mut rig = Rig::new();
+        let first = (rig.clock.now() + Ticks::from_us(100_000)).wire();
+        let query = "buttons_query oid=%c clock=%u rest_ticks=%u retransmit_count=%c invert=%c";
+        rig.run(query, &[2, first, REST.0, 1, 0]);
+        rig.wait_until("it is configured", |rig| rig.progress.done() == CONFIGURATION + 1);
+        thread::sleep(Duration::from_millis(150));
+        let turns = rig.clock.1.load(Ordering::Relaxed);
+        thread::sleep(Duration::from_millis(100));
+        let turns = rig.clock.1.load(Ordering::Relaxed) - turns;
+        // 50 samples; to be awake 200 us before each would take thousands of looks at the clock.
+        assert!(turns < 10_000, "the clock was read {turns} times");
         assert_eq!(rig.quit(), Left::Safe);
     }
 

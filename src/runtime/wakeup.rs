@@ -183,23 +183,17 @@ impl Waiter {
     }
 
     /// Waits for `deadline`, or until `called` says that there is something to do; whoever
-    /// changes what it looks at unparks this thread. Without a deadline it waits for the call
-    /// only.
-    pub fn wait(&mut self, deadline: Option<Clock>, mut called: impl FnMut() -> bool) -> Woken {
-        let Some(deadline) = deadline else {
-            while !called() {
-                thread::park();
-            }
-            return Woken::Called;
-        };
+    /// changes what it looks at unparks this thread. It sleeps until a margin before `exact`, which is the deadline or
+    /// a later one, so that it is awake then; from there on it spins.
+    pub fn wait(&mut self, deadline: Clock, exact: Option<Clock>, mut called: impl FnMut() -> bool) -> Woken {
         let mut now = self.clock.now();
         let mut slept = deadline.since(now) < i64::from(self.margin.limits.min.0);
         loop {
             if called() {
                 return Woken::Called;
             }
-            let early = self.margin.get();
-            let asleep = deadline.since(now) - i64::from(early.0);
+            let wake_at = wake_at(deadline, exact, self.margin.get());
+            let asleep = wake_at.since(now);
             if asleep <= NAP_MIN {
                 break;
             }
@@ -207,7 +201,7 @@ impl Waiter {
             self.ran(now);
             thread::park_timeout(Duration::from_nanos(asleep as u64 * NS_PER_TICK));
             now = self.clock.now();
-            let late = i64::from(early.0) - deadline.since(now);
+            let late = now.since(wake_at);
             // Woken before its time: by a call, which says nothing of the margin.
             if late >= 0 {
                 self.margin.learn(late);
@@ -224,6 +218,11 @@ impl Waiter {
         }
         Woken::Due
     }
+}
+
+/// When to end the sleep before `deadline` for a thread that is to be awake a margin before `exact`.
+fn wake_at(deadline: Clock, exact: Option<Clock>, margin: Ticks) -> Clock {
+    exact.map_or(deadline, |exact| (exact - margin).min(deadline))
 }
 
 #[cfg(test)]
@@ -266,6 +265,16 @@ mod tests {
             margin.unslept();
         }
         assert_eq!(margin.get().0, start.0 - start.0.div_ceil(8));
+    }
+
+    #[test]
+    fn it_is_awake_early_for_what_is_exact_only() {
+        let at = Clock::from_ticks;
+        let wake = |deadline, exact: Option<u64>| wake_at(at(deadline), exact.map(at), Ticks(1_000)).ticks();
+        assert_eq!(wake(10_000, None), 10_000);
+        assert_eq!(wake(10_000, Some(10_000)), 9_000);
+        assert_eq!(wake(10_000, Some(10_500)), 9_500);
+        assert_eq!(wake(10_000, Some(50_000)), 10_000);
     }
 
     #[test]
