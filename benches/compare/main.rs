@@ -16,6 +16,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::{Parser, ValueEnum};
+use pinion::host::Arg;
 
 mod process;
 mod rig;
@@ -69,6 +70,8 @@ enum Measure {
     Transfers,
     /// Round trips of get_clock and get_uptime
     Roundtrip,
+    /// SPI transfers of 30 us
+    Spi,
     /// Commands a second
     Commands,
     /// The smallest step interval that survives
@@ -83,6 +86,8 @@ enum Measure {
 const STEPPERS: [usize; 2] = [1, 3];
 /// How long the SPI driver takes for a transfer.
 const BUS_US: u32 = 4_000;
+/// How long it takes for a short one.
+const SHORT_US: u32 = 30;
 
 fn main() -> ExitCode {
     let options = Options::parse();
@@ -131,6 +136,7 @@ enum Case {
     Floor,
     Steps { rate_khz: u32, steppers: usize, transfers: bool },
     RoundTrip,
+    Spi,
     Commands { realtime: bool },
     Interval { steppers: usize, realtime: bool },
     Idle,
@@ -146,6 +152,7 @@ fn cases(measure: Measure, options: &Options) -> Vec<Case> {
         Measure::Lateness => iter::once(Case::Floor).chain(steps(false)).collect(),
         Measure::Transfers => steps(true),
         Measure::Roundtrip => vec![Case::RoundTrip],
+        Measure::Spi => vec![Case::Spi],
         Measure::Commands => vec![Case::Commands { realtime: false }, Case::Commands { realtime: true }],
         Measure::Interval => [true, false]
             .into_iter()
@@ -192,10 +199,30 @@ impl Case {
             Case::RoundTrip => {
                 let running = rig.start(program, &realtime)?;
                 for command in ["get_clock", "get_uptime"] {
-                    let times = talk::round_trips(&running, command, if quick { 1_000 } else { 5_000 })?;
+                    let times = talk::round_trips(&running, (command, &[]), if quick { 1_000 } else { 5_000 })?;
                     for (name, share) in [("p50", 0.5), ("p99", 0.99)] {
                         run.add("Round trip", command, name, "us", table::quantile(&times, share) as f64 / 1e3);
                     }
+                }
+            }
+            Case::Spi => {
+                let running = rig.start(program, &Launch { bus_us: SHORT_US, ..realtime })?;
+                drop(steps::configured(&running, &Load::steady(1_000, 3, true, 0.0))?);
+                let args = [("oid", steps::SPI_OID.into()), ("data", Arg::Bytes(&[0x5a]))];
+                let count = if quick { 1_000 } else { 5_000 };
+                let before = process::cpu(running.pid());
+                let each = talk::each_alone(&running, ("spi_send", &args), count)?;
+                let cpu = process::cpu(running.pid()).saturating_sub(before).div_f64(count as f64);
+                let case = format!("{count} spi_send of 30 us, one a block");
+                for (name, share) in [("p50", 0.5), ("p90", 0.9)] {
+                    let us = table::quantile(&each, share) as f64 / 1e3;
+                    run.add("Time for each SPI transfer, means of 100", &case, name, "us", us);
+                }
+                run.add("CPU time for each SPI transfer", &case, "", "us", cpu.as_secs_f64() * 1e6);
+                let times = talk::round_trips(&running, ("spi_transfer", &args), count)?;
+                for (name, share) in [("p50", 0.5), ("p99", 0.99)] {
+                    let us = table::quantile(&times, share) as f64 / 1e3;
+                    run.add("Round trip", "spi_transfer of 30 us", name, "us", us);
                 }
             }
             Case::Commands { realtime } => {

@@ -8,7 +8,7 @@
 //                      nanoseconds << 8 | line << 1 | level, in order, up to the first zero
 //   BENCH_EDGES_MAX=N  how many at most
 //   BENCH_SYSCALL=1    spend a system call on each value ioctl, as a real chip does
-//   BENCH_BUS_US=N     an SPI transfer sleeps N microseconds, and echoes
+//   BENCH_BUS_US=N     an SPI transfer sleeps N microseconds, and echoes; a write(2) to spidev is one
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <fcntl.h>
@@ -22,6 +22,7 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/syscall.h>
+#include <sys/types.h>
 #include <time.h>
 #include <unistd.h>
 
@@ -35,6 +36,8 @@ struct request {
 };
 
 static struct request requests[DESCRIPTORS];
+// Descriptors of spidev: those that were asked for something of SPI.
+static uint8_t buses[DESCRIPTORS];
 static uint8_t levels[LINES];
 static _Atomic uint64_t *edges;
 static _Atomic uint64_t edge_count;
@@ -43,6 +46,7 @@ static int spends_syscall;
 static long bus_us;
 static int (*real_ioctl)(int, unsigned long, ...);
 static int (*real_close)(int);
+static ssize_t (*real_write)(int, const void *, size_t);
 
 static long number(const char *name)
 {
@@ -54,6 +58,7 @@ __attribute__((constructor)) static void set_up(void)
 {
     real_ioctl = dlsym(RTLD_NEXT, "ioctl");
     real_close = dlsym(RTLD_NEXT, "close");
+    real_write = dlsym(RTLD_NEXT, "write");
     spends_syscall = number("BENCH_SYSCALL") != 0;
     bus_us = number("BENCH_BUS_US");
     const char *file = getenv("BENCH_EDGES");
@@ -101,7 +106,7 @@ static int new_request(unsigned count, const uint32_t *lines)
 int close(int fd)
 {
     if (fd >= 0 && fd < DESCRIPTORS)
-        requests[fd].used = 0;
+        requests[fd].used = buses[fd] = 0;
     return real_close(fd);
 }
 
@@ -117,8 +122,18 @@ static void transfer(void)
         ;
 }
 
-static int spi(unsigned long command, void *argument)
+ssize_t write(int fd, const void *bytes, size_t count)
 {
+    if (fd < 0 || fd >= DESCRIPTORS || !buses[fd])
+        return real_write(fd, bytes, count);
+    transfer();
+    return count;
+}
+
+static int spi(int fd, unsigned long command, void *argument)
+{
+    if (fd >= 0 && fd < DESCRIPTORS)
+        buses[fd] = 1;
     if (_IOC_NR(command) != 0)
         return 0;
     struct spi_ioc_transfer *parts = argument;
@@ -224,6 +239,6 @@ int ioctl(int fd, unsigned long long_command, ...)
     }
     }
     if (_IOC_TYPE(command) == SPI_IOC_MAGIC && _IOC_NR(command) <= 5)
-        return spi(command, argument);
+        return spi(fd, command, argument);
     return real_ioctl(fd, long_command, argument);
 }

@@ -28,7 +28,8 @@ const FEED: Duration = Duration::from_millis(25);
 /// The second and third stepper step a little slower, so that their edges meet those of the
 /// others at every distance.
 const SLOWER: [f64; 3] = [1.0, 1.003, 1.011];
-const SPI_OID: u8 = 3;
+/// The SPI device of a load with transfers.
+pub const SPI_OID: u8 = 3;
 
 /// What the steppers do.
 #[derive(Clone, Debug)]

@@ -14,6 +14,7 @@ use std::time::{Duration, Instant};
 
 use nix::fcntl::OFlag;
 use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
+use pinion::host::Arg;
 use pinion::host::serial::WINDOW;
 use pinion::wire::block::{Found, PAYLOAD_MAX, Resync, Sequence, frame};
 
@@ -86,9 +87,16 @@ impl Bare {
     }
 }
 
+/// A command with its arguments.
+pub type Command<'a> = (&'a str, &'a [(&'a str, Arg<'a>)]);
+
+fn encoded(running: &Running, (command, args): Command<'_>) -> Result<Vec<u8>, String> {
+    running.client()?.messages().encode(command, args).map_err(|error| error.to_string())
+}
+
 /// Times in nanoseconds from the write of a command to the read of its response, sorted.
-pub fn round_trips(running: &Running, command: &str, count: usize) -> Result<Vec<i64>, String> {
-    let payload = running.client()?.messages().encode(command, &[]).map_err(|error| error.to_string())?;
+pub fn round_trips(running: &Running, command: Command<'_>, count: usize) -> Result<Vec<i64>, String> {
+    let payload = encoded(running, command)?;
     let mut bare = Bare::open(running.tty())?;
     let mut times = Vec::with_capacity(count);
     let mut block = Vec::new();
@@ -102,7 +110,7 @@ pub fn round_trips(running: &Running, command: &str, count: usize) -> Result<Vec
             bare.block() == Some(true)
         } {
             if start.elapsed() > SILENCE {
-                return Err(format!("no answer to {command}"));
+                return Err(format!("no answer to {}", command.0));
             }
         }
         times.push(start.elapsed().as_nanos() as i64);
@@ -116,42 +124,78 @@ pub fn round_trips(running: &Running, command: &str, count: usize) -> Result<Vec
     Ok(times)
 }
 
-/// How many `debug_nop` a program takes in a second: blocks full of them, as many under way as
-/// klippy has at most.
+/// How many `debug_nop` a program takes in a second, in blocks full of them.
 pub fn commands_a_second(running: &Running, span: Duration) -> Result<f64, String> {
-    let nop = running.client()?.messages().encode("debug_nop", &[]).map_err(|error| error.to_string())?;
+    let nop = encoded(running, ("debug_nop", &[]))?;
     let in_block = PAYLOAD_MAX / nop.len();
-    let mut bare = Bare::open(running.tty())?;
-    let payload = nop.repeat(in_block);
-    let mut numbers = vec![bare.expected];
-    for at in 0..15 {
-        numbers.push(Sequence::next(numbers[at]));
-    }
-    let blocks: Vec<Vec<u8>> = numbers.iter().map(|number| framed(&payload, *number)).collect();
-    let (mut sent, mut taken) = (0u64, 0u64);
-    let mut bytes = Vec::new();
+    let mut stream = Stream::open(running, &nop.repeat(in_block))?;
     let start = Instant::now();
-    let mut heard = start;
-    while heard.duration_since(start) < span {
-        bytes.clear();
-        while sent - taken < WINDOW as u64 {
-            bytes.extend_from_slice(&blocks[(sent & 15) as usize]);
-            sent += 1;
+    let mut blocks = 0;
+    while start.elapsed() < span {
+        blocks += stream.acknowledged()?;
+    }
+    Ok(blocks as f64 * in_block as f64 / start.elapsed().as_secs_f64())
+}
+
+/// How long, in nanoseconds, each of `count` commands takes that are sent one a block: the mean of each hundred, sorted.
+pub fn each_alone(running: &Running, command: Command<'_>, count: usize) -> Result<Vec<i64>, String> {
+    const HUNDRED: u64 = 100;
+    let mut stream = Stream::open(running, &encoded(running, command)?)?;
+    let mut each = Vec::new();
+    for _ in 0..count as u64 / HUNDRED {
+        let (start, mut blocks) = (Instant::now(), 0);
+        while blocks < HUNDRED {
+            blocks += stream.acknowledged()?;
+        }
+        each.push(start.elapsed().as_nanos() as i64 / blocks as i64);
+    }
+    each.sort_unstable();
+    Ok(each)
+}
+
+/// Blocks of one payload, as many under way as klippy has at most.
+struct Stream {
+    bare: Bare,
+    numbers: Vec<Sequence>,
+    blocks: Vec<Vec<u8>>,
+    sent: u64,
+    taken: u64,
+}
+
+impl Stream {
+    fn open(running: &Running, payload: &[u8]) -> Result<Stream, String> {
+        let bare = Bare::open(running.tty())?;
+        let mut numbers = vec![bare.expected];
+        for at in 0..15 {
+            numbers.push(Sequence::next(numbers[at]));
+        }
+        let blocks = numbers.iter().map(|number| framed(payload, *number)).collect();
+        Ok(Stream { bare, numbers, blocks, sent: 0, taken: 0 })
+    }
+
+    /// Sends what may be sent, and waits until further blocks are acknowledged. Returns how many.
+    fn acknowledged(&mut self) -> Result<u64, String> {
+        let mut bytes = Vec::new();
+        while self.sent - self.taken < WINDOW as u64 {
+            bytes.extend_from_slice(&self.blocks[(self.sent & 15) as usize]);
+            self.sent += 1;
         }
         if !bytes.is_empty() {
-            bare.write(&bytes)?;
+            self.bare.write(&bytes)?;
         }
-        bare.read()?;
-        while bare.block().is_some() {
-            let number = numbers.iter().position(|number| *number == bare.expected).unwrap_or(0) as u64;
-            taken += number.wrapping_sub(taken) & 15;
-            heard = Instant::now();
+        let (start, before) = (Instant::now(), self.taken);
+        while self.taken == before {
+            self.bare.read()?;
+            while self.bare.block().is_some() {
+                let number = self.numbers.iter().position(|number| *number == self.bare.expected).unwrap_or(0) as u64;
+                self.taken += number.wrapping_sub(self.taken) & 15;
+            }
+            if start.elapsed() > SILENCE {
+                return Err("the blocks are not acknowledged".into());
+            }
         }
-        if heard.elapsed() > SILENCE {
-            return Err("the blocks are not acknowledged".into());
-        }
+        Ok(self.taken - before)
     }
-    Ok(taken as f64 * in_block as f64 / heard.duration_since(start).as_secs_f64())
 }
 
 fn framed(payload: &[u8], number: Sequence) -> Vec<u8> {

@@ -78,6 +78,12 @@ impl Budget {
         self.class == Class::Fifo
     }
 
+    /// Whether there is more than half of it, so that what is not urgent may use some.
+    #[inline]
+    pub(super) fn is_ample(&self) -> bool {
+        self.level > self.full / 2
+    }
+
     /// Whether it is time to [`Budget::look`].
     #[inline]
     pub(super) fn is_due(&self, now: Clock) -> bool {
@@ -173,6 +179,25 @@ mod tests {
                     prop_assert!(used(&fifo, from) < SECOND * 95 / 100, "from {}", from);
                 }
             }
+        }
+    }
+
+    #[test]
+    fn polling_leaves_half_of_it() {
+        for works in [0, 300, 600, 800] {
+            let mut budget = Budget::new(THROTTLE, Clock::from_ticks(0), Duration::ZERO);
+            let (mut polled, mut ran) = (0, 0);
+            for ms in 0..10_000 {
+                // A part of each millisecond is work; the rest is polled away where that may be.
+                let runs = if budget.is_ample() { 1000 } else { works };
+                polled += runs - works;
+                ran += runs;
+                let change = budget.look(Clock::from_ticks((ms + 1) * 50_000), Duration::from_micros(ran));
+                assert_eq!(change, None, "{works} after {ms} ms");
+                assert!(budget.level > budget.full / 2 - budget.full / 20);
+            }
+            // All that the share leaves is used.
+            assert!(polled > (840 - works) * 10_000, "{polled} of {works}");
         }
     }
 

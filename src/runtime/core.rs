@@ -16,6 +16,7 @@ use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource, monotonic};
 use crate::wire::block::PAYLOAD_MAX;
 use crate::wire::vlq::Reader;
 
+use super::lookout::Lookout;
 use super::outlet::{LinkWake, Progress};
 use super::pulse::{BEAT, Pulse};
 use super::status::Teller;
@@ -65,9 +66,14 @@ const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
 /// To tell a part of its status takes a microsecond, or several where nothing of it is in the cache: that is done
 /// only if no timer is within this span.
 const TELL: Ticks = Ticks::from_us(30);
-/// For so long the core looks for the next command before it sleeps: hosts send in bursts, and to
-/// be woken takes as long (20 to 50 us on the machines measured). A lone processor is the host's.
-const LOOKOUT: Ticks = Ticks::from_us(30);
+/// A core that waits for a bus has the blocks before acknowledged, if there are no more than these to go on with. To
+/// acknowledge each block costs as much as to run it.
+const FEW: usize = 3;
+/// How long the core polls for the next command before it sleeps: hosts send in bursts, and a wake-up takes as long
+/// (20 to 50 us on the machines measured).
+const NEXT_COMMAND: Ticks = Ticks::from_us(30);
+/// How long the core polls for the answer of a bus that a command waits for.
+const ANSWER: Ticks = Ticks::from_us(100);
 /// For so long another thread may keep the processor of one that yields (3.5 ms were measured).
 const SLICE: Ticks = Ticks::from_us(5000);
 /// So often commands give way to a timer that is near, then one gets its turn.
@@ -89,9 +95,9 @@ pub(super) struct Core {
     gave_way: u32,
     /// Requests to stop that were taken in, of those that the link handed over.
     stops_taken: u32,
-    lookout: Ticks,
-    /// Until when to look for the next command.
-    lookout_until: Clock,
+    /// Blocks are done that the link was not woken for.
+    untold: bool,
+    lookout: Lookout,
     /// What the guardian was told that the machine owes.
     debtor: Option<String>,
     teller: Teller,
@@ -107,6 +113,8 @@ pub(super) struct Parts {
     pub(super) progress: Arc<Progress>,
     pub(super) wake: Arc<LinkWake>,
     pub(super) teller: Teller,
+    /// There are processors to poll on.
+    pub(super) may_poll: bool,
 }
 
 /// What a turn for commands came to.
@@ -127,11 +135,10 @@ pub(super) enum Left {
 
 impl Core {
     pub(super) fn new(parts: Parts) -> Core {
-        let Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller } = parts;
-        let several = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
+        let Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, may_poll } = parts;
         Core {
-            lookout: if several { LOOKOUT } else { Ticks(0) },
-            lookout_until: clock.now(),
+            untold: false,
+            lookout: Lookout::new(may_poll, clock.now()),
             mcu,
             clock,
             requests,
@@ -173,7 +180,8 @@ impl Core {
             if behind || !near || self.gave_way >= PATIENCE {
                 match self.run_commands(behind) {
                     Turn::Done => {
-                        self.lookout_until = self.mcu.last_read() + self.lookout;
+                        let span = if self.mcu.is_held() { ANSWER } else { NEXT_COMMAND };
+                        self.lookout.expect(self.mcu.last_read(), span);
                         continue;
                     }
                     Turn::Quit => {
@@ -195,7 +203,10 @@ impl Core {
                 self.teller.tell(&self.mcu, self.requests.slots(), self.waiter.margin());
                 continue;
             }
-            if now < self.lookout_until && may_yield(self.waiter.is_realtime(), now, deadline) {
+            if self.lookout.goes_on(now)
+                && self.waiter.has_time_to_spare()
+                && may_yield(self.waiter.is_realtime(), now, deadline)
+            {
                 thread::yield_now();
                 continue;
             }
@@ -304,7 +315,10 @@ impl Core {
             return Turn::Idle;
         }
         let (payload, mut at) = match self.block.take() {
-            Some(block) => block,
+            Some(block) => {
+                self.progress.hold(false);
+                block
+            }
             None => match self.requests.pop() {
                 Ok(Request::Run(payload)) => {
                     self.progress.begin();
@@ -325,6 +339,14 @@ impl Core {
         at = bytes.len() - reader.rest().len();
         if at < bytes.len() || self.mcu.is_held() {
             self.block = Some((payload, at));
+            if self.mcu.is_held() {
+                self.progress.hold(true);
+                // The bus takes its time: the host can send more meanwhile.
+                if self.untold && self.requests.slots() <= FEW {
+                    self.untold = false;
+                    self.wake.wake();
+                }
+            }
             return Turn::Done;
         }
         if self.progress.stops_handed() != self.stops_taken && self.mcu.is_emergency(bytes) {
@@ -333,7 +355,8 @@ impl Core {
         self.progress.finish();
         // The end of the next block will do, if that may begin; but a machine that is being
         // configured takes its time for a block.
-        if self.requests.is_empty() || !self.mcu.is_running() {
+        self.untold = !self.requests.is_empty() && self.mcu.is_running();
+        if !self.untold {
             self.wake.wake();
         }
         Turn::Done
@@ -467,7 +490,7 @@ mod tests {
             let core_wake = wake.clone();
             let thread = thread::spawn(move || {
                 let pulse = Pulse::new(monotonic).unwrap();
-                let workers = Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), pulse);
+                let workers = Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), pulse, true);
                 let mcu = Mcu::new(
                     core_dialect,
                     Box::new(board),
@@ -480,7 +503,8 @@ mod tests {
                 let waiter = Waiter::new(core_clock.clone(), limits, Scheduling::Ordinary, processors);
                 let (clock, progress, wake) = (core_clock, core_progress, core_wake);
                 let teller = status::ends().0;
-                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake, teller }).run()
+                let may_poll = true;
+                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake, teller, may_poll }).run()
             });
             let mut rig = Rig { thread, dialect, clock, requests, progress, wake, heard, bench };
             rig.run("allocate_oids count=%c", &[3]);
@@ -584,6 +608,23 @@ mod tests {
         }
         rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 22);
         assert_eq!(rig.said(RESPONSE).len(), 21);
+        assert_eq!(rig.quit(), Left::Safe);
+    }
+
+    #[test]
+    fn a_block_is_acknowledged_while_a_bus_holds_the_next_one() {
+        let mut rig = Rig::new();
+        // The core is asleep, and finds both blocks when it is woken.
+        thread::sleep(Duration::from_millis(20));
+        rig.bench.hang(true);
+        rig.wake.sleeping();
+        let first = rig.encode("update_digital_out oid=%c value=%c", &[1, 1]);
+        rig.requests.push(Request::Run(first)).ok().unwrap();
+        rig.transfer(7);
+        let mut fds = [PollFd::new(rig.wake.event(), PollFlags::POLLIN)];
+        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the link is not told");
+        rig.wait_until("the transfer is under way", |rig| rig.bench.hangs());
+        assert_eq!(rig.progress.done(), CONFIGURATION + 1);
         assert_eq!(rig.quit(), Left::Safe);
     }
 

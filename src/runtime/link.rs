@@ -40,8 +40,10 @@ const FORCE_SHUTDOWN: &[u8] = b"FORCE_SHUTDOWN\n";
 const INPUT_BYTES: usize = 4096;
 /// Bytes for a host that does not read; then responses wait in the ring, then they are lost.
 const OUTPUT_BYTES: usize = 16 * 1024;
-/// How long to wait awake for the core to be done with blocks.
+/// How long to poll for the core to be done with the blocks that it was handed.
 const AWAIT_CORE: Duration = Duration::from_micros(100);
+/// How long to wait for more once there is something to tell the host: one write is to tell of many blocks.
+const AWAIT_MORE: Duration = Duration::from_micros(20);
 /// How long to wait for a core that has no room for requests.
 const STALL_MS: u64 = 1;
 /// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
@@ -127,8 +129,8 @@ pub(super) struct Link {
     progress: Arc<Progress>,
     wake: Arc<LinkWake>,
     ledger: Ledger,
-    /// Whether there is a processor beside the core's, to wait on for the core.
-    has_own_processor: bool,
+    /// Whether there is a processor beside the core's, to poll on for the core.
+    may_poll: bool,
     signals: Signals,
     guardian: Option<GuardianWatch>,
     vigil: Vigil,
@@ -173,6 +175,8 @@ pub(super) struct Parts {
     pub(super) signals: Signals,
     pub(super) guardian: Option<GuardianWatch>,
     pub(super) vigil: Vigil,
+    /// There are processors to poll on.
+    pub(super) may_poll: bool,
 }
 
 impl Link {
@@ -192,6 +196,7 @@ impl Link {
             signals,
             guardian,
             vigil,
+            may_poll,
         } = parts;
         Link {
             pty,
@@ -215,7 +220,7 @@ impl Link {
             progress,
             wake,
             ledger: Ledger::default(),
-            has_own_processor: thread::available_parallelism().is_ok_and(|count| count.get() > 1),
+            may_poll,
             signals,
             guardian,
             vigil,
@@ -239,8 +244,11 @@ impl Link {
             if self.guardian.as_mut().is_some_and(|guardian| guardian.due().is_some() && guardian.hangs(monotonic())) {
                 self.lose_guardian("the guardian gives no sign of life: was it stopped? (a restart ends it)");
             }
+            let handed = self.ledger.handed();
             let stalled = self.take_in();
-            self.await_core();
+            if self.may_poll && self.ledger.handed() != handed {
+                self.await_core();
+            }
             self.give_out();
             let woken = self.wait(stalled)?;
             if woken.by_signal {
@@ -544,15 +552,26 @@ impl Link {
         self.ledger.hand();
     }
 
-    /// Leaves the core the microseconds that it needs for the blocks: to sleep and be woken takes
-    /// longer.
+    /// Polls for what the core makes of the blocks that it was handed just now: to sleep and be woken takes longer.
+    /// If a bus holds the core, the blocks wait for longer still.
     fn await_core(&self) {
         let handed = self.ledger.handed();
-        if !self.has_own_processor || self.progress.done() == handed {
+        let (start, mut done) = (monotonic(), self.progress.done());
+        if self.progress.is_held() {
             return;
         }
-        let end = monotonic() + AWAIT_CORE;
-        while self.progress.done() != handed && monotonic() < end {
+        let (mut tells, mut until) = (false, start + AWAIT_CORE);
+        while done != handed {
+            let (now, done_now) = (monotonic(), self.progress.done());
+            let progresses = done_now != done || !tells && self.inlet.has_response();
+            done = done_now;
+            if progresses {
+                tells = true;
+                until = (start + AWAIT_CORE).min(now + AWAIT_MORE);
+            }
+            if now >= until {
+                return;
+            }
             thread::yield_now();
         }
     }

@@ -28,6 +28,7 @@ pub mod guardian;
 mod host;
 mod ledger;
 mod link;
+mod lookout;
 mod notify;
 mod outlet;
 mod pty;
@@ -138,6 +139,8 @@ pub fn run(
     let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
     let (requests, inbox) = RingBuffer::new(REQUESTS);
 
+    // Before the core is confined to one of them.
+    let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
     let (realtime, margin) = (options.realtime, options.margin);
     if realtime {
         realtime::lock_memory();
@@ -156,7 +159,8 @@ pub fn run(
                 realtime::enter(Role::Worker);
             }
         });
-        let workers = Box::new(Threads::new(thread::current(), prepare, board.errand_clock(core_clock.clone()), pulse));
+        let errand_clock = board.errand_clock(core_clock.clone());
+        let workers = Box::new(Threads::new(thread::current(), prepare, errand_clock, pulse, may_poll));
         let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
         let waiter = Waiter::new(core_clock.clone(), margin, scheduling, processors);
         Core::new(self::core::Parts {
@@ -168,6 +172,7 @@ pub fn run(
             progress: core_progress,
             wake: core_wake,
             teller,
+            may_poll,
         })
         .run()
     }))?;
@@ -188,6 +193,7 @@ pub fn run(
         signals,
         guardian: guardian.as_ref().map(Guardian::watch),
         vigil: Vigil::new(notify, notify::watchdog_interval(), pulse),
+        may_poll,
     });
     if realtime {
         realtime::enter(Role::Link);

@@ -87,6 +87,7 @@ impl LinkWake {
 pub(super) struct Progress {
     begun: AtomicU32,
     done: AtomicU32,
+    held: AtomicBool,
     stops_handed: AtomicU32,
 }
 
@@ -104,6 +105,16 @@ impl Progress {
     /// How many blocks are done.
     pub(super) fn done(&self) -> u32 {
         self.done.load(Ordering::Acquire)
+    }
+
+    /// Whether a bus holds the core's block back from now on.
+    pub(super) fn hold(&self, held: bool) {
+        self.held.store(held, Ordering::Relaxed);
+    }
+
+    /// Whether a bus holds the core's block back.
+    pub(super) fn is_held(&self) -> bool {
+        self.held.load(Ordering::Relaxed)
     }
 
     /// The link is about to hand the core a request to stop: a block with `emergency_stop`,

@@ -164,6 +164,12 @@ impl Waiter {
         self.scheduling == Scheduling::RealTime && self.budget.as_ref().is_none_or(Budget::is_fifo)
     }
 
+    /// Whether to poll leaves the thread enough running time for what is due.
+    #[inline]
+    pub(super) fn has_time_to_spare(&self) -> bool {
+        self.budget.as_ref().is_none_or(Budget::is_ample)
+    }
+
     /// The thread ran until now. Past its budget it goes on on another processor, or as
     /// SCHED_OTHER.
     #[inline]

@@ -14,12 +14,16 @@ use rtrb::{Consumer, Producer, RingBuffer};
 
 use crate::mcu::{Completion, Job, WorkerId, Workers};
 use crate::shutdown::{Shutdown, reason};
-use crate::time::{TimeSource, monotonic};
+use crate::time::{Ticks, TimeSource, monotonic};
 
+use super::lookout::Lookout;
 use super::pulse::{JobClock, Pulse};
 
 /// How many errands may wait for one bus. There are at most 256 objects, with one or two errands each.
 const QUEUE_JOBS: usize = 1024;
+/// How long a worker polls for the next job after one that a command waited for: the core runs the next command
+/// within microseconds, if the host has sent it already.
+const NEXT_JOB: Ticks = Ticks::from_us(50);
 /// How long to wait for workers to end: most drivers give up a chip that is silent within this time.
 const END_LIMIT: Duration = Duration::from_secs(2);
 
@@ -42,14 +46,21 @@ pub(super) struct Threads {
     prepare: Prepare,
     clock: Arc<dyn TimeSource>,
     pulse: Pulse,
+    may_poll: bool,
     workers: Vec<Worker>,
 }
 
 impl Threads {
     /// No workers yet. Those to come unpark `core` when an errand is done, and note in `pulse` since
-    /// when they run it. They pace themselves by the clock.
-    pub(super) fn new(core: Thread, prepare: Prepare, clock: Arc<dyn TimeSource>, pulse: Pulse) -> Threads {
-        Threads { core, prepare, clock, pulse, workers: Vec::new() }
+    /// when they run it. They pace themselves by the clock. `may_poll`: there are processors to poll on.
+    pub(super) fn new(
+        core: Thread,
+        prepare: Prepare,
+        clock: Arc<dyn TimeSource>,
+        pulse: Pulse,
+        may_poll: bool,
+    ) -> Threads {
+        Threads { core, prepare, clock, pulse, may_poll, workers: Vec::new() }
     }
 
     fn spawn(&self, bus: &str) -> Result<Worker, Shutdown> {
@@ -58,7 +69,9 @@ impl Threads {
         let quit = Arc::new(AtomicBool::new(false));
         let shown = self.pulse.worker(bus).ok_or_else(|| overflow(bus, "so many buses at once are not possible"))?;
         let core = self.core.clone();
-        let server = Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock: self.clock.clone(), shown };
+        let clock = self.clock.clone();
+        let lookout = Lookout::new(self.may_poll, clock.now());
+        let server = Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, lookout };
         let prepare = self.prepare.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
@@ -151,6 +164,7 @@ struct Server {
     core: Thread,
     clock: Arc<dyn TimeSource>,
     shown: JobClock,
+    lookout: Lookout,
 }
 
 impl Server {
@@ -166,6 +180,7 @@ impl Server {
             match self.jobs.pop() {
                 Ok(job) => self.serve(job),
                 Err(_) if ending => return,
+                Err(_) if self.lookout.goes_on(self.clock.now()) => thread::yield_now(),
                 Err(_) => thread::park(),
             }
         }
@@ -184,6 +199,10 @@ impl Server {
         // is as long as the one that they came by.
         let _ = self.done.push(Completion { ticket, errand, holds, began, ended });
         self.core.unpark();
+        // Samples, which timers ask for, come at their own pace.
+        if holds {
+            self.lookout.expect(ended, NEXT_JOB);
+        }
     }
 }
 
@@ -191,7 +210,8 @@ impl Server {
 mod tests {
     use super::*;
     use crate::mcu::{Errand, Oid, Ticket};
-    use crate::time::Monotonic;
+    use crate::time::{Clock, Monotonic};
+    use std::sync::atomic::AtomicU64;
     use std::sync::mpsc::{self, Receiver, Sender};
 
     /// Waits to be let go on, then says which one it is.
@@ -208,9 +228,64 @@ mod tests {
         }
     }
 
+    /// A clock on which each look takes a microsecond.
+    #[derive(Default)]
+    struct Looks(AtomicU64);
+
+    impl TimeSource for Looks {
+        fn now(&self) -> Clock {
+            Clock::from_ticks((self.0.fetch_add(1, Ordering::Relaxed) + 1) * u64::from(Ticks::from_us(1).0))
+        }
+
+        fn instant_of(&self, _monotonic: Duration) -> Clock {
+            self.now()
+        }
+    }
+
+    struct Quick;
+
+    impl Errand for Quick {
+        fn run(&mut self) {}
+    }
+
+    /// How often a worker looks at its clock after it was given a job, until it sleeps.
+    fn looks_after_a_job(holds: bool, may_poll: bool) -> u64 {
+        let clock = Arc::new(Looks::default());
+        let pulse = Pulse::new(Monotonic::start()).unwrap();
+        let mut threads = Threads::new(thread::current(), Arc::new(|| ()), clock.clone(), pulse, may_poll);
+        let worker = threads.start("spi0").unwrap();
+        // It looks once as it falls asleep.
+        let asleep = || {
+            let mut before = 0;
+            loop {
+                thread::sleep(Duration::from_millis(50));
+                let looks = clock.0.load(Ordering::Relaxed);
+                if looks == before {
+                    return looks;
+                }
+                before = looks;
+            }
+        };
+        let before = asleep();
+        let ticket = Ticket { oid: Oid::new(0), tag: 0 };
+        threads.submit(worker, Job { ticket, errand: Box::new(Quick), holds }).unwrap();
+        while threads.completion().is_none() {
+            thread::yield_now();
+        }
+        asleep() - before
+    }
+
+    #[test]
+    fn a_worker_polls_for_the_next_job_of_a_conversation_only() {
+        // When the job began and ended, and one look before it sleeps.
+        assert_eq!(looks_after_a_job(false, true), 3);
+        assert_eq!(looks_after_a_job(true, false), 3);
+        assert_eq!(looks_after_a_job(true, true), 2 + u64::from(NEXT_JOB.0 / Ticks::from_us(1).0));
+    }
+
     fn threads() -> Threads {
         let clock = Monotonic::start();
-        Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), Pulse::new(clock).unwrap())
+        Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), Pulse::new(clock).unwrap(), true)
     }
 
     #[test]

@@ -18,7 +18,7 @@ struct mock_bus {
 	size_t sent_len;
 	int fail_errno;
 	unsigned int fail_count;
-	unsigned int delay_ms;
+	unsigned int delay_us;
 };
 
 static inline void mock_bus_record(struct mock_bus *bus, const char *what,
@@ -43,11 +43,11 @@ static inline void mock_bus_record(struct mock_bus *bus, const char *what,
  */
 static inline int mock_bus_trouble(struct mock_bus *bus)
 {
-	unsigned int delay_ms = READ_ONCE(bus->delay_ms);
+	unsigned int delay_us = READ_ONCE(bus->delay_us);
 	int err = 0;
 
-	if (delay_ms)
-		usleep_range(delay_ms * 1000UL, delay_ms * 1000UL);
+	if (delay_us)
+		usleep_range(delay_us, delay_us);
 	mutex_lock(&bus->lock);
 	if (bus->fail_count) {
 		bus->fail_count--;
@@ -101,21 +101,35 @@ static ssize_t fail_store(struct device *dev, struct device_attribute *attr,
 }
 static DEVICE_ATTR_WO(fail);
 
-static ssize_t delay_ms_store(struct device *dev, struct device_attribute *attr,
-			      const char *buf, size_t len)
+static inline ssize_t mock_bus_delay(struct device *dev, const char *buf,
+				     size_t len, unsigned int unit_us)
 {
 	struct mock_bus *bus = dev_get_drvdata(dev);
-	unsigned int delay_ms;
-	int err = kstrtouint(buf, 0, &delay_ms);
+	unsigned int delay;
+	int err = kstrtouint(buf, 0, &delay);
 
 	if (err)
 		return err;
-	WRITE_ONCE(bus->delay_ms, delay_ms);
+	WRITE_ONCE(bus->delay_us, delay * unit_us);
 	return len;
+}
+
+static ssize_t delay_ms_store(struct device *dev, struct device_attribute *attr,
+			      const char *buf, size_t len)
+{
+	return mock_bus_delay(dev, buf, len, 1000);
 }
 static DEVICE_ATTR_WO(delay_ms);
 
+static ssize_t delay_us_store(struct device *dev, struct device_attribute *attr,
+			      const char *buf, size_t len)
+{
+	return mock_bus_delay(dev, buf, len, 1);
+}
+static DEVICE_ATTR_WO(delay_us);
+
 #define MOCK_BUS_ATTRS \
-	&dev_attr_sent.attr, &dev_attr_fail.attr, &dev_attr_delay_ms.attr
+	&dev_attr_sent.attr, &dev_attr_fail.attr, &dev_attr_delay_ms.attr, \
+	&dev_attr_delay_us.attr
 
 #endif

@@ -8,7 +8,7 @@
  *   sent             one line per write: "ADDRESS BYTE...", in hexadecimal
  *   change           written: "ADDRESS REGISTER VALUE", in hexadecimal: the chip
  *                    changes a register by itself, whatever the bus is at
- *   fail, delay_ms   see mock_bus.h
+ *   fail, delay_ms, delay_us   see mock_bus.h
  */
 #include <linux/i2c.h>
 #include <linux/module.h>

@@ -9,7 +9,7 @@
  *   clock     one line for each time the idle clock moved: "NANOSECONDS LEVEL",
  *             which it does as spi-bcm2835's, when a message begins
  *   half_duplex   1 for a controller with one data line
- *   fail, delay_ms   see mock_bus.h
+ *   fail, delay_ms, delay_us   see mock_bus.h
  */
 #include <linux/module.h>
 #include <linux/platform_device.h>

@@ -34,6 +34,7 @@ const PULSE_TICKS: u32 = 5;
 const LINES: u32 = 2 * SLOWER.len() as u32;
 /// Of spidev.
 const DELAY_MS: &str = "/sys/devices/platform/mock-spi/delay_ms";
+const DELAY_US: &str = "/sys/devices/platform/mock-spi/delay_us";
 const SPI_DATA: Arg<'_> = Arg::Bytes(&[0x5a; 8]);
 
 /// Thousands of steps a second, how many moves of them are made, and how many steppers there are.
@@ -331,6 +332,22 @@ fn round_trip() {
         figure("Round trip of a command, instructions", command, &format!("{median:.0}"));
         assert!(!is_pinion() || median <= 200_000.0);
     }
+}
+
+#[test]
+fn transfers_one_a_block() {
+    const COUNT: u32 = 500;
+    let _delay = sysfs::set(DELAY_US, "30", "0");
+    let mut session = Session::start();
+    let (client, spi_oid) = (&mut session.client, session.spi_oid);
+    let sent = Instant::now();
+    for _ in 0..COUNT {
+        client.send("spi_send", &[("oid", spi_oid.into()), ("data", Arg::Bytes(&[0x5a]))]).expect("a session");
+    }
+    client.query("get_uptime", &[], "uptime", None).expect("an answer");
+    let each = instructions(sent.elapsed()) / f64::from(COUNT);
+    figure("SPI transfers of 30 us, instructions for each", "spi_send, one a block", &format!("{each:.0}"));
+    assert!(!is_pinion() || each <= 200_000.0);
 }
 
 #[test]
