@@ -595,10 +595,15 @@ mod tests {
         assert_eq!(rig.progress.done(), CONFIGURATION, "it is not acknowledged");
         assert!(!rig.bench.level(30), "what is behind it has not run");
 
+        // The core is not woken for what it cannot run yet.
+        assert!(rig.progress.is_held());
+        let payload = rig.encode("update_digital_out oid=%c value=%c", &[1, 1]);
+        rig.requests.push(Request::Run(payload)).ok().unwrap();
+
         // The link sleeps, and the bus answers.
         rig.wake.sleeping();
         rig.bench.hang(false);
-        rig.wait_until("both blocks are done", |rig| rig.progress.done() == CONFIGURATION + 2);
+        rig.wait_until("all blocks are done", |rig| rig.progress.done() == CONFIGURATION + 3);
         assert_eq!(rig.said(RESPONSE), [[0, 1, !7]]);
         assert!(rig.bench.level(30));
         let mut fds = [PollFd::new(rig.wake.event(), PollFlags::POLLIN)];
@@ -606,7 +611,7 @@ mod tests {
         for byte in 0..20 {
             rig.transfer(byte);
         }
-        rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 22);
+        rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 23);
         assert_eq!(rig.said(RESPONSE).len(), 21);
         assert_eq!(rig.quit(), Left::Safe);
     }

@@ -499,7 +499,7 @@ impl Link {
         }
         let mut taken = 0;
         let mut stalled = false;
-        let handed = self.ledger.handed();
+        let (handed, stops) = (self.ledger.handed(), self.progress.stops_handed());
         loop {
             if self.requests.slots() <= REQUESTS_KEPT {
                 stalled = taken < self.input.len();
@@ -519,8 +519,9 @@ impl Link {
                 }
             }
         }
-        // The core need not know of what is answered here: awake, it would keep the answer waiting.
-        if self.ledger.handed() != handed {
+        // The core need not know of what is answered here: awake, it would keep the answer waiting. Nor of what it cannot
+        // run yet.
+        if self.ledger.handed() != handed && (self.progress.stops_handed() != stops || !self.progress.is_held()) {
             self.core.unpark();
         }
         self.input.drain(..taken);

@@ -8,7 +8,7 @@
 use std::io::{self, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering, fence};
 
 use log::Level;
 use nix::sys::eventfd::{EfdFlags, EventFd};
@@ -107,13 +107,18 @@ impl Progress {
         self.done.load(Ordering::Acquire)
     }
 
-    /// Whether a bus holds the core's block back from now on.
+    /// Says whether a bus holds the core's block back from now on. Before the core sleeps after that it looks for
+    /// further blocks.
     pub(super) fn hold(&self, held: bool) {
         self.held.store(held, Ordering::Relaxed);
+        fence(Ordering::SeqCst);
     }
 
-    /// Whether a bus holds the core's block back.
+    /// Whether a bus holds the core's block back. Then the core need not be unparked for a block that it was handed
+    /// before: of the two fences one comes first, so either this sees that the core is held no longer, or the core
+    /// sees the block.
     pub(super) fn is_held(&self) -> bool {
+        fence(Ordering::SeqCst);
         self.held.load(Ordering::Relaxed)
     }
 

@@ -69,6 +69,8 @@ fn a_machine_tells_how_it_is_in_each_state() {
     }
     client.send_line("update_digital_out oid=0 value=1").unwrap();
     let clock = client.clock_in(0.1).unwrap().wire();
+    // An edge, which is what the core is to be awake for.
+    client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
     client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
     assert!(client.status().unwrap().is_config);
     assert!(client.wait("analog_in_state", Some(2), Instant::now() + PATIENCE).unwrap().is_some());
@@ -94,7 +96,7 @@ fn a_machine_tells_how_it_is_in_each_state() {
     let timers = configured["lateness"]["timers"].as_u64().unwrap();
     let buckets = configured["lateness"]["buckets_us"].as_array().unwrap();
     assert_eq!(buckets.iter().map(|bucket| bucket[1].as_u64().unwrap()).sum::<u64>(), timers);
-    assert!(timers > 0);
+    assert_eq!(timers, 1, "the edge, and none of the samples");
 
     client.emergency_stop().unwrap();
     let stopped = status(&pinion);
