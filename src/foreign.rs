@@ -67,10 +67,15 @@ pub(crate) fn plain_json(json: &str) -> String {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use proptest::prelude::*;
     use std::fs;
+
+    /// Any text, often with control characters.
+    pub(crate) fn any_name() -> impl Strategy<Value = String> {
+        "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]|\x1b\\[31m|\n<0>){0,12}"
+    }
 
     #[test]
     fn only_regular_files_are_read_and_not_for_ever() {
@@ -95,7 +100,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn no_control_character_is_left(text in "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]){0,40}") {
+        fn no_control_character_is_left(text in any_name()) {
             let shown = plain(&text);
             prop_assert!(!shown.contains(char::is_control));
             prop_assert_eq!(shown.chars().count(), text.chars().count());

@@ -35,9 +35,9 @@ use signal_hook::low_level::emulate_default_handler;
 use crate::board::sim::SimBoard;
 use crate::host::console::{Console, Next, Vocabulary};
 use crate::host::{self, Client};
-use crate::klippy::process::{Search, find};
+use crate::klippy::process::{Search, Terminal as Device, find};
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Options};
+use crate::runtime::{self, Access, Helpers, Options};
 use crate::time::Monotonic;
 
 use super::complete::{SIMULATED, offering};
@@ -106,7 +106,7 @@ fn free(pty: &Path) -> Result<(), String> {
         });
         names.collect::<Vec<_>>().join(", ")
     };
-    match find(Path::new("/proc"), &device) {
+    match Device::of(&device).and_then(|device| find(Path::new("/proc"), device)) {
         Ok(Search::Found(host)) => {
             Err(format!("{} has {} open: stop it first (sudo systemctl stop klipper)", name(&[host]), pty.display()))
         }
@@ -122,6 +122,8 @@ fn free(pty: &Path) -> Result<(), String> {
 
 /// Runs a simulated machine, and speaks to it.
 fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
+    // The one host is this console, which speaks every dialect.
+    let helpers = Helpers::default();
     let terminal = Terminal::remember();
     // The others end the machine in order, which then tells which it was.
     terminal.clone().give_back_at(&[SIGQUIT])?;
@@ -170,7 +172,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
             }
         }
     };
-    let ended = runtime::run(&options, Box::new(board), clock, None, ready);
+    let ended = runtime::run(&options, Box::new(board), clock, helpers, ready);
     terminal.give_back();
     ended.map_err(|error| error.to_string())?;
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();

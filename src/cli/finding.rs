@@ -125,7 +125,8 @@ fn plural(count: usize) -> &'static str {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::{any_name, assert_plain};
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
     use proptest::prelude::*;
 
     fn groups() -> Vec<Group> {

@@ -24,7 +24,6 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::unistd::write;
 
 use crate::foreign::plain;
-use crate::sys;
 
 /// How many lines may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
@@ -210,12 +209,7 @@ pub(super) fn start(level: LevelFilter) {
 /// Starts the thread that writes, so that no other thread waits for whoever reads stderr. To be called
 /// after the guardian is forked, as a process with threads can not be.
 pub(super) fn detach() {
-    let write_on = || {
-        // It is of no use here, and failing to give it up of no harm.
-        let _ = sys::give_up(sys::LOOK_INTO_OTHERS);
-        STDERR.write_on();
-    };
-    match thread::Builder::new().name("log".into()).spawn(write_on) {
+    match thread::Builder::new().name("log".into()).spawn(|| STDERR.write_on()) {
         Ok(_) => STDERR.queue().has_writer = true,
         Err(error) => log::warn!("a log that nobody reads will stop the machine: no thread can be started: {error}"),
     }
@@ -234,7 +228,8 @@ pub(super) fn finish() {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::{any_name, assert_plain};
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
     use proptest::prelude::*;
 
     #[test]

@@ -73,12 +73,8 @@ pub(super) fn draw(text: &str) -> io::Result<()> {
 #[cfg(test)]
 pub(in crate::cli) mod tests {
     use super::*;
+    use crate::foreign::tests::any_name;
     use proptest::prelude::*;
-
-    /// Any text, often with control characters.
-    pub(in crate::cli) fn any_name() -> impl Strategy<Value = String> {
-        "(\\PC|[\\x00-\\x1f\\x7f-\\x9f]|\x1b\\[31m|\n<0>){0,12}"
-    }
 
     /// Asserts that nothing but lines leaves a printer, and no more of them than with harmless names.
     #[track_caller]

@@ -494,7 +494,8 @@ mod tests {
     use crate::board::linux::adc::{Channel, Format};
     use crate::board::linux::gpio::LineInfo;
     use crate::board::linux::sysfs::PwmChannel;
-    use crate::cli::page::tests::{any_name, assert_plain};
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
     use proptest::prelude::*;
     use serde_json::{Value, json};
 

@@ -16,7 +16,7 @@ use crate::board::linux::{Guard, LinuxBoard};
 use crate::board::sim::{SimBoard, SimConfig, SimError};
 use crate::mcu::DialectName;
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Guardian, Options};
+use crate::runtime::{self, Access, Guardian, Helpers, Options};
 use crate::time::{Monotonic, TimeSource};
 
 use super::complete::{BOARDS, SPOKEN, offering};
@@ -248,24 +248,21 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     }
     end_by_panic();
     let clock = Monotonic::start();
-    // The guardian must be forked before any thread is started. A simulated printer needs none.
-    let guardian = match settings.board {
-        BoardName::Linux => Some(Guardian::start(clock, settings.realtime)),
-        BoardName::Sim(_) => None,
-    };
-    let guardian = match guardian.transpose() {
-        Ok(guardian) => guardian,
+    // A simulated printer needs no guardian.
+    let guarded = (settings.board == BoardName::Linux).then_some((clock, settings.realtime));
+    let helpers = match Helpers::start(guarded, settings.dialect.is_none()) {
+        Ok(helpers) => helpers,
         Err(error) => return failed(error),
     };
     logging::detach();
     if let Some(file) = &args.config {
         log::info!("configuration {}", file.display());
     }
-    let board = match settings.board.open(Arc::new(clock), guardian.as_ref().map(Guardian::guard)) {
+    let board = match settings.board.open(Arc::new(clock), helpers.guardian.as_ref().map(Guardian::guard)) {
         Ok(board) => board,
         Err(error) => return failed(error),
     };
-    match runtime::run(&settings.options(), board, clock, guardian, || ()) {
+    match runtime::run(&settings.options(), board, clock, helpers, || ()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }

@@ -340,7 +340,8 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::{any_name, assert_plain};
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
     use proptest::prelude::*;
 
     pub(super) fn item(kind: Kind, name: &str, value: Option<f64>, text: &str) -> Item {

@@ -24,7 +24,7 @@ use crate::host::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Rep
 use crate::host::heater::{Goal, Thermistor};
 use crate::host::picture;
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Options};
+use crate::runtime::{self, Access, Helpers, Options};
 use crate::time::Monotonic;
 
 use super::page::{Page, print};
@@ -75,6 +75,10 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
         return print(&Page::text(&printer_cfg)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
+    let helpers = match Helpers::start(None, true) {
+        Ok(helpers) => helpers,
+        Err(error) => return failed(error),
+    };
     logging::detach();
     let plan = plan(&config);
     let clock = Monotonic::start();
@@ -94,7 +98,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         sockets: runtime::socket_paths(&args.symlink),
     };
     if args.show {
-        return show_as_it_changes(args, board, probe, &options, clock);
+        return show_as_it_changes(args, board, probe, &options, clock, helpers);
     }
     let right = Arc::new(AtomicBool::new(false));
     // Set once the program is asked to end: a demonstration that this interrupts has not failed.
@@ -114,7 +118,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
             }
         }
     };
-    match runtime::run(&options, Box::new(board), clock, None, ready) {
+    match runtime::run(&options, Box::new(board), clock, helpers, ready) {
         Ok(()) if args.demo && !right.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
@@ -128,6 +132,7 @@ fn show_as_it_changes(
     probe: SimProbe,
     options: &Options,
     clock: Monotonic,
+    helpers: Helpers,
 ) -> ExitCode {
     let show = match Show::prepare(probe) {
         Ok(show) => show,
@@ -139,7 +144,7 @@ fn show_as_it_changes(
         }
         show.begin();
     };
-    let ended = runtime::run(options, Box::new(board), clock, None, ready);
+    let ended = runtime::run(options, Box::new(board), clock, helpers, ready);
     show.end();
     ended.map_or_else(failed, |()| ExitCode::SUCCESS)
 }

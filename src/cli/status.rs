@@ -616,7 +616,8 @@ impl Drop for Screen {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::page::tests::{any_name, assert_plain};
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
     use proptest::prelude::*;
     use serde_json::json;
 

@@ -10,6 +10,8 @@ use std::os::unix::ffi::OsStrExt;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Component, Path, PathBuf};
 
+use serde::{Deserialize, Serialize};
+
 use crate::foreign;
 
 /// Longest part of a command line that is looked at: a process may have one of megabytes.
@@ -42,13 +44,35 @@ pub enum Search {
     Nobody,
 }
 
-/// Finds the process that has the terminal `device` open, another than this one. `proc` is /proc.
+/// A terminal by its numbers: its own, and that of the devpts that it is on. Containers have terminals of the same
+/// numbers, on devices of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Terminal {
+    number: u64,
+    devpts: u64,
+}
+
+impl Terminal {
+    /// That of a device, such as `/dev/pts/3`.
+    ///
+    /// # Errors
+    ///
+    /// Those of looking at it.
+    pub fn of(device: &Path) -> io::Result<Terminal> {
+        fs::metadata(device).map(|about| Terminal { number: about.rdev(), devpts: about.dev() })
+    }
+
+    fn is(self, file: &fs::Metadata) -> bool {
+        file.file_type().is_char_device() && (file.rdev(), file.dev()) == (self.number, self.devpts)
+    }
+}
+
+/// Finds the process that has a terminal open, another than this one. `proc` is /proc.
 ///
 /// # Errors
 ///
-/// Those of looking at the terminal or at `proc` itself.
-pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
-    let terminal = fs::metadata(device)?;
+/// Those of looking at `proc` itself.
+pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
     let mut klippys = Vec::new();
     let mut others = Vec::new();
     for pid in pids(proc)? {
@@ -64,16 +88,16 @@ pub fn find(proc: &Path, device: &Path) -> io::Result<Search> {
     klippys.sort_by_key(|process| process.started);
     let mut hidden = Vec::new();
     for process in klippys {
-        match has_open(proc, process.pid, &terminal) {
-            Ok(true) if !serves(proc, process.pid, &terminal) => return Ok(Search::Found(process)),
+        match has_open(proc, process.pid, terminal) {
+            Ok(true) if !serves(proc, process.pid, terminal) => return Ok(Search::Found(process)),
             Err(error) if error.kind() == io::ErrorKind::PermissionDenied => hidden.push(process),
             // One that ended meanwhile.
             Ok(_) | Err(_) => {}
         }
     }
     for pid in others {
-        if let Ok(true) = has_open(proc, pid, &terminal)
-            && !serves(proc, pid, &terminal)
+        if let Ok(true) = has_open(proc, pid, terminal)
+            && !serves(proc, pid, terminal)
             && let Some(process) = Process::read(proc, pid, arguments(proc, pid))
         {
             return Ok(Search::Found(process));
@@ -262,8 +286,8 @@ fn inside(root: &Path, path: &Path) -> PathBuf {
 
 /// Whether a process has the master end of the terminal open, as Pinion itself. Which terminal a master belongs to
 /// is the `tty-index` of its fdinfo (proc_pid_fdinfo(5)).
-fn serves(proc: &Path, pid: u32, terminal: &fs::Metadata) -> bool {
-    let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.rdev()));
+fn serves(proc: &Path, pid: u32, terminal: Terminal) -> bool {
+    let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.number));
     let Ok(files) = fs::read_dir(proc.join(pid.to_string()).join("fdinfo")) else { return false };
     let files = files.flatten().take(OPEN_FILES_MAX);
     let mut told = files.filter_map(|file| foreign::read(&file.path(), PROC_BYTES_MAX).ok());
@@ -271,16 +295,14 @@ fn serves(proc: &Path, pid: u32, terminal: &fs::Metadata) -> bool {
 }
 
 /// Whether a process has the terminal open.
-fn has_open(proc: &Path, pid: u32, terminal: &fs::Metadata) -> io::Result<bool> {
+fn has_open(proc: &Path, pid: u32, terminal: Terminal) -> io::Result<bool> {
     for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))?.take(OPEN_FILES_MAX) {
         let file = match fs::metadata(entry?.path()) {
             // It was closed meanwhile.
             Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
             file => file?,
         };
-        // Containers have terminals of the same numbers, on devices of their own.
-        let is_it = file.file_type().is_char_device() && file.rdev() == terminal.rdev();
-        if is_it && file.dev() == terminal.dev() {
+        if terminal.is(&file) {
             return Ok(true);
         }
     }
@@ -305,6 +327,10 @@ mod tests {
         (pty, device)
     }
 
+    fn look(device: &Path) -> io::Result<Search> {
+        find(Path::new("/proc"), Terminal::of(device)?)
+    }
+
     /// A process that has the terminal open as its input, called as klippy is.
     fn host(device: &Path, script: &Path) -> Child {
         let terminal = fs::File::open(device).unwrap();
@@ -326,12 +352,12 @@ mod tests {
     #[test]
     fn the_process_that_has_the_terminal_open_is_found_among_all() {
         let (_pty, device) = terminal();
-        assert_eq!(find(Path::new("/proc"), &device).unwrap(), Search::Nobody, "this process does not count");
+        assert_eq!(look(&device).unwrap(), Search::Nobody, "this process does not count");
         let folder = tempfile::tempdir().unwrap();
         let script = folder.path().join("klippy.py");
         fs::write(&script, "").unwrap();
         let mut host = host(&device, &script);
-        let found = find(Path::new("/proc"), &device).unwrap();
+        let found = look(&device).unwrap();
         let Search::Found(process) = found else { panic!("{found:?}") };
         assert_eq!(process.pid, host.id());
         let reached = process.klippy_folder(Path::new("/proc")).unwrap();
@@ -339,7 +365,7 @@ mod tests {
         assert!(reached.ends_with(folder.path().strip_prefix("/").unwrap()), "{reached:?}");
         host.kill().unwrap();
         host.wait().unwrap();
-        assert_eq!(find(Path::new("/proc"), &device).unwrap(), Search::Nobody);
+        assert_eq!(look(&device).unwrap(), Search::Nobody);
     }
 
     #[test]
@@ -352,9 +378,9 @@ mod tests {
             .stderr(Stdio::from(pty.master.try_clone().unwrap()))
             .spawn()
             .unwrap();
-        assert_eq!(find(Path::new("/proc"), &device).unwrap(), Search::Nobody);
+        assert_eq!(look(&device).unwrap(), Search::Nobody);
         let mut host = host(&device, Path::new("klippy.py"));
-        let found = find(Path::new("/proc"), &device).unwrap();
+        let found = look(&device).unwrap();
         let Search::Found(process) = found else { panic!("{found:?}") };
         assert_eq!(process.pid, host.id());
         for child in [&mut server, &mut host] {
@@ -369,7 +395,7 @@ mod tests {
         let mut host = host(&device, Path::new("klippy.py"));
         // A file is on another device than the terminal, whatever it is.
         let file = tempfile::NamedTempFile::new().unwrap();
-        assert_eq!(find(Path::new("/proc"), file.path()).unwrap(), Search::Nobody);
+        assert_eq!(look(file.path()).unwrap(), Search::Nobody);
         host.kill().unwrap();
         host.wait().unwrap();
     }

@@ -19,12 +19,12 @@ use rtrb::RingBuffer;
 
 use crate::board::Board;
 use crate::mcu::{DialectName, Generation, Mcu};
-use crate::sys;
 use crate::time::{Monotonic, TimeSource};
 
 mod budget;
 mod core;
 pub mod guardian;
+pub(crate) mod helpers;
 mod host;
 mod ledger;
 mod link;
@@ -42,6 +42,8 @@ mod watchdog;
 mod workers;
 
 pub use guardian::Guardian;
+pub use helpers::Helpers;
+pub use host::HostSearch;
 pub use pty::Access;
 pub use served::{Served, served};
 pub(crate) use signals::hang_up;
@@ -87,14 +89,15 @@ pub struct Options {
 }
 
 /// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP; calls `ready` once a host may come.
-/// `guardian` is that of the board's outputs.
+/// `helpers` has the guardian of the board's outputs.
 pub fn run(
     options: &Options,
     board: Box<dyn Board>,
     clock: Monotonic,
-    guardian: Option<Guardian>,
+    helpers: Helpers,
     ready: impl FnOnce(),
 ) -> io::Result<()> {
+    let Helpers { guardian, search } = helpers;
     let pulse = guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse()))?;
     let processors = Processors::new(options.cpu)?;
     // First: who sees the link may send a signal, which must not leave the link behind.
@@ -112,16 +115,9 @@ pub fn run(
     let wake = Arc::new(LinkWake::new()?);
     let host = Arc::new(HostBoard::default());
     // Before the link is of real time, which its threads would inherit.
-    let finder = match options.dialect {
-        Some(_) => None,
-        None => Some(started(HostFinder::start(pty.device(), wake.clone(), host.clone()))?),
-    };
-    // The thread that looks for the host alone may look into others from here on.
-    if let Err(error) = sys::give_up(sys::LOOK_INTO_OTHERS) {
-        warn!(
-            "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH can not be given up: {error}: Pinion works, with more rights than it needs"
-        );
-    }
+    let search = search.filter(|_| options.dialect.is_none());
+    let finder = search.map(|search| HostFinder::start(search, pty.device(), wake.clone(), host.clone()));
+    let finder = finder.map(started).transpose()?;
     let (teller, asker) = status::ends();
     let facts = Facts {
         link: options.symlink.clone(),

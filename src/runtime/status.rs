@@ -24,6 +24,7 @@ use log::{info, warn};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::socket::{AddressFamily, SockFlag, SockType, UnixAddr, socket};
 use rtrb::{Consumer, Producer, RingBuffer};
+use serde::{Deserialize, Serialize};
 use serde_json::{Value, json};
 
 use crate::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
@@ -131,13 +132,13 @@ pub(super) struct HostBoard {
 }
 
 /// The host that was found.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Serialize, Deserialize)]
 pub(super) struct FoundHost {
     pub(super) pid: u32,
     /// Whether it is sure that this process is the host.
     pub(super) is_sure: bool,
     /// The checkout that it runs from, if it is a klippy whose sources can be read.
-    pub(super) checkout: Option<PathBuf>,
+    pub(super) checkout: Option<String>,
     pub(super) commit: Option<String>,
 }
 
@@ -157,7 +158,7 @@ impl HostBoard {
             "attached": attached,
             "pid": found.as_ref().map(|host| host.pid),
             "sure": found.as_ref().map(|host| host.is_sure),
-            "checkout": found.as_ref().and_then(|host| host.checkout.as_ref()).map(|folder| folder.to_string_lossy()),
+            "checkout": found.as_ref().and_then(|host| host.checkout.as_ref()),
             "commit": found.as_ref().and_then(|host| host.commit.as_ref()),
         })
     }

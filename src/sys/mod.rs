@@ -4,7 +4,7 @@
 use std::fs;
 use std::io::{self, IoSliceMut};
 use std::num::NonZeroUsize;
-use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::sync::atomic::AtomicU32;
 
@@ -14,6 +14,10 @@ use nix::sys::mman::{MapFlags, ProtFlags, mmap_anonymous};
 use nix::sys::signal::{SigHandler, Signal, signal};
 use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg};
 use nix::unistd::{ForkResult, Pid};
+
+mod filter;
+
+pub(crate) use filter::allow_only_reading;
 
 /// Puts the calling thread into SCHED_FIFO at `priority` (1 to 99).
 pub(crate) fn set_fifo(priority: i32) -> io::Result<()> {
@@ -48,18 +52,34 @@ pub(crate) fn set_nice(value: i32) -> io::Result<()> {
 /// of other users.
 pub(crate) const LOOK_INTO_OTHERS: u32 = 1 << 2 | 1 << 19;
 
-/// Takes these capabilities, a bit for each of the first 32, from the calling thread and those that it
-/// starts from now on.
-pub(crate) fn give_up(capabilities: u32) -> io::Result<()> {
+/// What the program itself may need: CAP_IPC_LOCK and CAP_SYS_NICE for real time; and if root starts it,
+/// CAP_CHOWN, CAP_DAC_OVERRIDE and CAP_FOWNER, for the terminal's group and for links and sockets in folders of
+/// other users.
+pub(crate) const SERVE: u32 = 1 << 14 | 1 << 23 | 1 << 0 | 1 << 1 | 1 << 3;
+
+/// Takes all capabilities but these, a bit for each of the first 32, from the calling thread and those that it
+/// starts from now on, and from programs that it may become as far as that is permitted.
+pub(crate) fn keep_only(capabilities: u32) -> io::Result<()> {
     /// _LINUX_CAPABILITY_VERSION_3, for the calling thread (capset(2)).
     const HEADER: [u32; 2] = [0x2008_0522, 0];
+    let dropped = (0..).filter(|number| *number >= u32::BITS || capabilities >> number & 1 == 0);
+    for number in dropped {
+        // SAFETY: takes a number. It ends behind the last capability, and where CAP_SETPCAP is missing.
+        if unsafe { libc::prctl(libc::PR_CAPBSET_DROP, libc::c_ulong::from(number)) } != 0 {
+            break;
+        }
+    }
+    // Linux before 4.3 has no ambient ones.
+    // SAFETY: takes numbers.
+    unsafe { libc::prctl(libc::PR_CAP_AMBIENT, libc::PR_CAP_AMBIENT_CLEAR_ALL as libc::c_ulong, 0, 0, 0) };
     // Effective, permitted and inheritable of the first 32 capabilities, then of the rest.
     let mut sets = [0u32; 6];
     // SAFETY: with this version the kernel writes two structures of three words.
     if unsafe { libc::syscall(libc::SYS_capget, HEADER.as_ptr(), sets.as_mut_ptr()) } != 0 {
         return Err(io::Error::last_os_error());
     }
-    sets[..3].iter_mut().for_each(|set| *set &= !capabilities);
+    sets[..3].iter_mut().for_each(|set| *set &= capabilities);
+    sets[3..].fill(0);
     // SAFETY: and reads as many.
     match unsafe { libc::syscall(libc::SYS_capset, HEADER.as_ptr(), sets.as_ptr()) } {
         0 => Ok(()),
@@ -112,6 +132,18 @@ pub(crate) fn fork(child: impl FnOnce() -> i32) -> io::Result<Pid> {
             unsafe { libc::_exit(status) }
         }
     }
+}
+
+/// Closes all descriptors of this process but these. To be called in a new process only, in which nothing that
+/// owns another is used any more.
+pub(crate) fn close_all_but(kept: &[RawFd]) -> io::Result<()> {
+    let entries = fs::read_dir("/proc/self/fd")?;
+    let open: Vec<RawFd> = entries.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok()).collect();
+    for fd in open.into_iter().filter(|fd| !kept.contains(fd)) {
+        // SAFETY: as the caller promises, no owner uses it. That of the folder itself is closed by now.
+        unsafe { libc::close(fd) };
+    }
+    Ok(())
 }
 
 /// Has this process ignore a signal.

@@ -14,7 +14,7 @@ use nix::sys::signal::{Signal, raise};
 use nix::unistd::geteuid;
 use pinion::board::sim::{SimBoard, SimConfig, SimProbe};
 use pinion::runtime::wakeup::MarginLimits;
-use pinion::runtime::{self, Access, Options};
+use pinion::runtime::{self, Access, Helpers, Options};
 use pinion::time::Monotonic;
 use serde_json::{Value, json};
 use tempfile::TempDir;
@@ -130,7 +130,7 @@ impl Printer {
                 sockets: Vec::new(),
                 dialect: None,
             };
-            let run = move || runtime::run(&options, Box::new(board), clock, None, || {}).unwrap();
+            let run = move || runtime::run(&options, Box::new(board), clock, Helpers::default(), || {}).unwrap();
             Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
         });
         printer.until_state("ready");

@@ -13,6 +13,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 use crate::process::{Pinion, output};
+use crate::search::{field, search_of};
 
 /// The form of `query_analog_in` up to v0.13, and today's.
 const ONE_VALUE: &str = "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u min_value=%hu max_value=%hu range_check_count=%c";
@@ -134,6 +135,24 @@ fn a_host_that_is_no_klippy_gets_what_most_hosts_take() {
 }
 
 #[test]
+fn a_host_that_is_named_for_mischief_gets_its_dialect_and_no_line_of_its_own() {
+    let pinion = Pinion::simulated(&[]);
+    let folder = tempfile::Builder::new().prefix("x\n<0>forged\x1b[2J\u{9b}31m\r").tempdir().unwrap();
+    let checkout = Checkout(folder);
+    checkout.change("v0.12", |formats| formats);
+    // What git keeps is a pipe that nobody writes to.
+    fs::create_dir(checkout.0.path().join(".git")).unwrap();
+    nix::unistd::mkfifo(&checkout.0.path().join(".git/HEAD"), nix::sys::stat::Mode::S_IRWXU).unwrap();
+    let _host = Host::start(&pinion, &checkout);
+    assert!(pinion.client().dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c"));
+    let line = pinion.logged("the host is klippy of ");
+    assert!(line.contains("/x?<0>forged?[2J?31m?") && line.contains("dialect v0.12, which"), "{line}");
+    let log = pinion.log();
+    assert!(!log.contains(|c: char| c.is_control() && c != '\n'), "{log:?}");
+    assert!(!log.lines().any(|line| line.starts_with("<0>")), "{log:?}");
+}
+
+#[test]
 fn a_dialect_that_is_named_is_spoken_whoever_comes() {
     let pinion = Pinion::simulated(&["--dialect", "v0.12"]);
     let checkout = Checkout::of("master");
@@ -230,18 +249,12 @@ fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
     assert!(error.contains("/nonexistent") && error.contains("name a checkout of Klipper or Kalico"), "{error}");
 }
 
-/// A program's threads by their names, each with its effective capabilities.
-fn capabilities(pid: u32) -> Vec<(String, u64)> {
+/// All capabilities that any thread of a process has, could take or would hand on.
+fn capabilities(pid: u32) -> u64 {
     let threads = fs::read_dir(format!("/proc/{pid}/task")).unwrap().map(|thread| thread.unwrap().path());
-    let of = |thread: PathBuf| {
-        let status = fs::read_to_string(thread.join("status")).unwrap();
-        let field = |name: &str| {
-            let line = status.lines().find_map(|line| line.strip_prefix(name)).unwrap();
-            line.trim().to_owned()
-        };
-        (field("Name:"), u64::from_str_radix(&field("CapEff:"), 16).unwrap())
-    };
-    threads.map(of).collect()
+    threads
+        .flat_map(|thread| ["CapEff", "CapPrm", "CapInh", "CapAmb"].map(|set| field(&thread, set)))
+        .fold(0, |all, set| all | u64::from_str_radix(&set, 16).unwrap())
 }
 
 #[test]
@@ -305,10 +318,8 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
         if may_look {
             let line = until("the host is klippy of ");
             assert!(line.contains(&format!("process {}: dialect v0.12", host.0.id())), "{line}");
-            for (thread, effective) in capabilities(pinion.0.id()) {
-                let looks = if thread == "host" { LOOKS } else { 0 };
-                assert_eq!(effective & LOOKS, looks, "{thread}");
-            }
+            let search = search_of(pinion.0.id()).unwrap();
+            assert_eq!((capabilities(pinion.0.id()), capabilities(search)), (0, LOOKS));
         } else {
             // Other klippys may run here, which are hidden as well.
             until("CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them");

@@ -11,5 +11,6 @@ mod life;
 mod one_order;
 mod pages;
 mod process;
+mod search;
 mod show;
 mod status;

@@ -10,6 +10,8 @@ use serde_json::Value;
 use crate::process::output;
 
 const PAGE: &str = include_str!("../../docs/troubleshooting.md");
+/// What a line of the log is made by; the search for the host has the program log its lines.
+const LOGGING: [&str; 5] = ["error!(", "warn!(", "info!(", ".warn(format!(", ".info(format!("];
 /// What stands in a quotation for what varies.
 const ANYTHING: &str = "...";
 /// Fewer letters could be anybody's.
@@ -105,8 +107,7 @@ fn each_line_that_the_program_logs_is_on_the_page() {
     let quotations: Vec<&str> = cells.into_iter().flat_map(quotations).collect();
     for (file, text) in sources() {
         // The core's lines are made there.
-        let macros: &[&str] =
-            if file.ends_with("runtime/outlet.rs") { &["format_args!("] } else { &["error!(", "warn!(", "info!("] };
+        let macros: &[&str] = if file.ends_with("runtime/outlet.rs") { &["format_args!("] } else { &LOGGING };
         for line in logged(&text, macros) {
             let parts = fixed_parts(&line);
             if parts.iter().all(|part| part.chars().filter(|c| c.is_alphabetic()).count() < LETTERS_MIN) {

@@ -14,7 +14,7 @@ use crate::cli::run::Settings;
 use crate::cli::{config, run_args};
 use crate::foreign;
 use crate::klippy::process::{self, Process};
-use crate::runtime::guardian;
+use crate::runtime::helpers;
 
 use super::instance::named_config;
 use super::units::{self, setting};
@@ -214,13 +214,13 @@ impl Machine {
         processes
     }
 
-    /// The Pinions that run, without their guardians.
+    /// The Pinions that run, without their helpers.
     pub(super) fn running(&self) -> Vec<Running> {
         let running = |process: Process| {
             let program = process.arguments.first()?;
             let pid = process.pid;
-            let is_guardian = |name: String| name.as_bytes() == guardian::NAME.to_bytes();
-            if program.file_name()? != "pinion" || self.text(format!("/proc/{pid}/comm")).is_some_and(is_guardian) {
+            let is_helper = |name: String| helpers::NAMES.iter().any(|helper| name.as_bytes() == helper.to_bytes());
+            if program.file_name()? != "pinion" || self.text(format!("/proc/{pid}/comm")).is_some_and(is_helper) {
                 return None;
             }
             let arguments = process.arguments.iter().map(|argument| argument.clone().into_os_string());

@@ -90,12 +90,8 @@ impl Guardian {
         let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
         setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(ANSWER_S))?;
         let program = Program::new(getpid());
-        let ours = socket.as_raw_fd();
         let pid = sys::fork(move || {
-            // The fork has copied the program's end of the socket. It must not stay open here: the
-            // socket would not be closed when the program dies.
-            let _ = nix::unistd::close(ours);
-            watcher::settle(realtime);
+            watcher::settle(realtime, &theirs, &program);
             Watcher::new(theirs, program, pulse).watch();
             0
         })?;

@@ -13,15 +13,15 @@ use std::time::Duration;
 
 use log::error;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use nix::sys::prctl;
 use nix::sys::signal::{Signal, kill};
 use nix::sys::socket::{MsgFlags, send};
 use nix::sys::uio::pwrite;
-use nix::unistd::{Pid, alarm, chdir, getppid, setsid};
+use nix::unistd::{Pid, alarm, getppid};
 
 use crate::sys;
 use crate::time::monotonic;
 
+use super::super::helpers;
 use super::super::pulse::{Ear, Pulse};
 use super::super::realtime;
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
@@ -35,28 +35,15 @@ const TRY_EVERY: Duration = Duration::from_millis(50);
 /// How long writing to the log may take, in seconds.
 const LOG_S: u32 = 2;
 
-/// Gives the new process its name, session, signals and priority.
-pub(super) fn settle(realtime: bool) {
+/// Gives the new process its name, session, signals, rights and priority.
+pub(super) fn settle(realtime: bool, socket: &OwnedFd, program: &Program) {
+    // Not the program's ends of its sockets: the guardian and the search would not notice that it closes them.
+    let kept = [0, 1, 2, socket.as_raw_fd()].into_iter().chain(program.pidfd.as_ref().map(AsRawFd::as_raw_fd));
+    helpers::settle(super::NAME, &kept.collect::<Vec<_>>());
     // Failures are ignored here: without any of these the guardian can still do its work.
-    let _ = prctl::set_name(super::NAME);
-    let _ = setsid();
-    let _ = chdir("/");
-    for ignored in [
-        Signal::SIGTERM,
-        Signal::SIGINT,
-        Signal::SIGHUP,
-        Signal::SIGQUIT,
-        Signal::SIGTSTP,
-        Signal::SIGTTIN,
-        Signal::SIGTTOU,
-        Signal::SIGUSR1,
-        Signal::SIGUSR2,
-    ] {
-        let _ = sys::ignore(ignored);
-    }
-    let _ = sys::give_up(sys::LOOK_INTO_OTHERS);
     // When memory is short, the kernel now kills other processes first. Only root may ask for this.
     let _ = std::fs::write("/proc/self/oom_score_adj", "-1000");
+    let _ = sys::keep_only(sys::SERVE);
     if realtime {
         realtime::enter_guardian();
     }

@@ -1,0 +1,157 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Finds out which dialect the host speaks: from the process that has the pty open, and the sources that it runs from.
+//!
+//! That takes capabilities which open every file and every process of the computer, and it reads what a host has
+//! written. So a process of its own does it. It is forked before the program has threads, keeps these capabilities alone
+//! and gives up everything else: its only descriptor is the socket to the program, and the kernel lets it read files and
+//! nothing more (`sys/filter.rs`). It gets a terminal's number, and answers a dialect, whom it found, and lines for the log.
+//! The program keeps none of those capabilities, and takes no answer on trust.
+//!
+//! This file is the program's side, `looker.rs` the process, and `message.rs` what they say to each other.
+
+#![forbid(unsafe_code)]
+
+mod looker;
+mod message;
+
+use std::ffi::CStr;
+use std::io;
+use std::os::fd::{AsRawFd, OwnedFd};
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, TryRecvError, channel};
+use std::thread;
+
+use log::{Level, log, warn};
+use nix::errno::Errno;
+use nix::sys::socket::{AddressFamily, MsgFlags, SockFlag, SockType, recv, send, setsockopt, socketpair, sockopt};
+use nix::sys::time::{TimeVal, TimeValLike as _};
+
+use crate::klippy::process::Terminal;
+use crate::mcu::DialectName;
+use crate::sys;
+
+use super::outlet::LinkWake;
+use super::status::HostBoard;
+use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
+
+/// What the kernel calls its process (proc_pid_comm(5)): its command line is the program's.
+pub(crate) const NAME: &CStr = c"pinion-search";
+/// How long the new process has until it is ready, in seconds.
+const START_S: i64 = 5;
+
+/// The search, before it is asked anything.
+pub struct HostSearch(OwnedFd);
+
+impl HostSearch {
+    /// Forks the process. To be called before any thread is started.
+    pub(super) fn start() -> io::Result<HostSearch> {
+        let started = HostSearch::try_start();
+        started.map_err(|error| {
+            io::Error::new(error.kind(), format!("the search for the host can not be started: {error}"))
+        })
+    }
+
+    fn try_start() -> io::Result<HostSearch> {
+        let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
+        setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(START_S))?;
+        sys::fork(move || {
+            looker::live(&theirs);
+            0
+        })?;
+        let mut message = vec![0; MESSAGE_BYTES_MAX];
+        let hello = match receive(&socket, &mut message) {
+            Ok(hello) => serde_json::from_slice::<Hello>(hello).map_err(io::Error::other)?,
+            Err(Errno::EAGAIN) => return Err(io::Error::other(format!("it is not ready within {START_S} s"))),
+            Err(error) => return Err(error.into()),
+        };
+        if let Some(why) = hello.unconfined {
+            warn!(
+                "the kernel does not confine the search for the host: {why}: Pinion works, and that process may do more than it needs to"
+            );
+        }
+        setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(0))?;
+        Ok(HostSearch(socket))
+    }
+}
+
+/// The next message, if it is not too long.
+fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]> {
+    loop {
+        return match recv(socket.as_raw_fd(), message, MsgFlags::MSG_TRUNC) {
+            Err(Errno::EINTR) => continue,
+            Err(error) => Err(error),
+            Ok(0) => Err(Errno::ECONNRESET),
+            Ok(len) => message.get(..len).ok_or(Errno::EMSGSIZE),
+        };
+    }
+}
+
+/// The link's way to the search. A thread hears the answers.
+pub(super) struct HostFinder {
+    socket: Arc<OwnedFd>,
+    terminal: Terminal,
+    board: Arc<HostBoard>,
+    answers: Receiver<(u32, DialectName)>,
+    /// The number of the last question.
+    asked: u32,
+}
+
+impl HostFinder {
+    /// Has the search look for the host on the terminal `device`. The link is woken with each answer, and `board` shows
+    /// whom it found.
+    pub(super) fn start(
+        search: HostSearch,
+        device: &Path,
+        wake: Arc<LinkWake>,
+        board: Arc<HostBoard>,
+    ) -> io::Result<HostFinder> {
+        let terminal = Terminal::of(device)?;
+        let socket = Arc::new(search.0);
+        let (tell, answers) = channel();
+        let (ear, shown) = (socket.clone(), board.clone());
+        thread::Builder::new().name("host".into()).spawn(move || {
+            let mut message = vec![0; MESSAGE_BYTES_MAX];
+            // Until nobody asks any more.
+            while let Ok(bytes) = receive(&ear, &mut message) {
+                let Some(answer) = Answer::decode(bytes) else { break };
+                for line in &answer.lines {
+                    log!(if line.is_warning { Level::Warn } else { Level::Info }, "{}", line.text);
+                }
+                let dialect = answer.dialect();
+                shown.found(answer.host);
+                let told = tell.send((answer.number, dialect));
+                wake.wake();
+                if told.is_err() {
+                    return;
+                }
+            }
+            warn!("the search for the host has ended, or says what makes no sense: every host is served as Klipper v0.13, master and Kalico; restart Pinion when no print is going on");
+            drop(tell);
+            wake.wake();
+        })?;
+        Ok(HostFinder { socket, terminal, board, answers, asked: 0 })
+    }
+
+    /// Asks which dialect the host speaks that came just now.
+    pub(super) fn ask(&mut self) {
+        self.asked = self.asked.wrapping_add(1);
+        self.board.found(None);
+        let question = Question { number: self.asked, terminal: self.terminal };
+        // One that hangs has the link wait for as long as for an answer, and one that is gone gives none.
+        let flags = MsgFlags::MSG_NOSIGNAL | MsgFlags::MSG_DONTWAIT;
+        let _ = send(self.socket.as_raw_fd(), &serde_json::to_vec(&question).unwrap_or_default(), flags);
+    }
+
+    /// The answer to the last question, once it is there.
+    pub(super) fn answer(&self) -> Option<DialectName> {
+        loop {
+            match self.answers.try_recv() {
+                Ok((number, dialect)) if number == self.asked => return Some(dialect),
+                Ok(_) => {}
+                Err(TryRecvError::Empty) => return None,
+                Err(TryRecvError::Disconnected) => return Some(DialectName::Union),
+            }
+        }
+    }
+}
