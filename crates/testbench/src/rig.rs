@@ -63,6 +63,12 @@ pub struct Rig {
     outbox: FakeOutbox,
 }
 
+impl Default for Rig {
+    fn default() -> Rig {
+        Rig::new()
+    }
+}
+
 impl Rig {
     /// A machine that waits for its configuration.
     pub fn new() -> Rig {
