@@ -9,8 +9,8 @@ use std::path::{Path, PathBuf};
 
 use serde::Deserialize;
 
-use super::part::PartConfig;
-use super::thermistor::{NoThermistor, Thermistor};
+use crate::catalog::PartConfig;
+use crate::description::thermistor::{NoThermistor, Thermistor};
 
 mod axes;
 mod validate;

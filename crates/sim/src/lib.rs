@@ -18,83 +18,50 @@ use pinion_firmware::board::{
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 
-mod ads1220;
-mod adxl345;
-mod angle;
-mod apa102;
-mod bed;
-mod bltouch;
-mod colour;
+mod catalog;
 mod config;
-mod ds18b20;
-mod hx71x;
-mod i2c;
-mod ldc1612;
-mod led;
-mod load_cell;
-mod loopback;
+mod description;
+mod engine;
 mod part;
-mod physics;
 mod printer_cfg;
-mod probe;
-mod pwm_channel;
-mod ready;
-mod servo;
-mod spi;
-mod spool;
-mod ssd1306;
-mod thermistor;
-mod thermocouple;
-mod time;
-mod tmc2209;
-mod tmc5160;
-mod track;
-mod trinamic;
-mod wire;
-mod ws2812;
 
-pub use ads1220::Ads1220Config;
-pub use adxl345::Adxl345Config;
-pub use angle::{AngleChip, AngleConfig};
-pub use apa102::Apa102Config;
-pub use bltouch::{BltouchConfig, Jam};
+pub use catalog::PartConfig;
 pub use config::{
     AxisConfig, BedConfig, DeltaConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, LedConfig, Limits,
     OutputConfig, PinName, SimConfig, SimError, SpiBusConfig,
 };
-pub use ds18b20::Ds18b20Config;
-pub use hx71x::{Hx71xChip, Hx71xConfig};
-pub use ldc1612::Ldc1612Config;
-pub use load_cell::CellConfig;
-pub use loopback::LoopbackConfig;
-pub use part::PartConfig;
+pub use part::ads1220::Ads1220Config;
+pub use part::adxl345::Adxl345Config;
+pub use part::angle::{AngleChip, AngleConfig};
+pub use part::apa102::Apa102Config;
+pub use part::bltouch::{BltouchConfig, Jam};
+pub use part::ds18b20::Ds18b20Config;
+pub use part::hx71x::{Hx71xChip, Hx71xConfig};
+pub use part::ldc1612::Ldc1612Config;
+pub use part::load_cell::CellConfig;
+pub use part::loopback::LoopbackConfig;
+pub use part::probe::ProbeConfig;
+pub use part::pwm_channel::PwmChannelConfig;
+pub use part::servo::ServoConfig;
+pub use part::spool::SpoolConfig;
+pub use part::ssd1306::Ssd1306Config;
+pub use part::thermocouple::{Converter, SensorFault, ThermocoupleConfig};
+pub use part::tmc2209::Tmc2209Config;
+pub use part::tmc5160::Tmc5160Config;
+pub use part::ws2812::Ws2812Config;
 pub use printer_cfg::printer_cfg;
-pub use probe::ProbeConfig;
-pub use pwm_channel::PwmChannelConfig;
-pub use servo::ServoConfig;
-pub use spool::SpoolConfig;
-pub use ssd1306::Ssd1306Config;
-pub use thermocouple::{Converter, SensorFault, ThermocoupleConfig};
-pub use tmc2209::Tmc2209Config;
-pub use tmc5160::Tmc5160Config;
-pub use ws2812::Ws2812Config;
 
-use ds18b20::Ds18b20;
-use i2c::{I2cBus, I2cDevice};
-use led::ColouredLed;
-use part::{Sight, Workshop};
-use physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
-use pwm_channel::SimPwm;
-use spi::{MosiPin, SpiBus, SpiDevice};
-use time::{ErrandTime, PrinterTime};
-use wire::{
+use engine::i2c::{I2cBus, I2cDevice};
+use engine::led::ColouredLed;
+use engine::physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
+use engine::spi::{MosiPin, SpiBus, SpiDevice};
+use engine::time::{ErrandTime, PrinterTime, STEP_LATE_LIMIT};
+use engine::wire::{
     DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges, SimLine,
-    StepPin, TachometerPin, ThermistorPin, WiredPin,
+    SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
 };
-
-/// A simulated motor follows at any pace: a computer without real time, as most that try the printer, is
-/// late by milliseconds now and then.
-const STEP_LATE_LIMIT: Ticks = Ticks::from_us(100_000);
+use engine::world::World;
+use part::workshop::Workshop;
 
 /// The worker of the thermistors.
 const ADC_WORKER: &str = "adc";
@@ -104,18 +71,6 @@ const EDGES_WORKER: &str = "edges";
 const PWM_WORKER: &str = "pwm";
 /// Bytes that an SPI bus sends without a pause: as many as by the kernel's default `spidev.bufsiz`.
 const MESSAGE_MAX: usize = 4096;
-
-/// Everything that moves, heats, spins, shines, and can be seen.
-#[derive(Default)]
-struct World {
-    axes: Vec<Arc<Axis>>,
-    heaters: Vec<Arc<Heater>>,
-    fans: Vec<Arc<Fan>>,
-    lamps: Vec<Arc<Lamp>>,
-    sights: Vec<Arc<dyn Sight>>,
-    /// By their serial numbers.
-    thermometers: Vec<(String, Ds18b20)>,
-}
 
 /// A simulated printer.
 pub struct SimBoard {
@@ -336,12 +291,12 @@ impl Board for SimBoard {
 
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
         let found = self.world.thermometers.iter().find(|(name, _)| name.as_bytes() == serial);
-        let (name, thermometer) = found.ok_or_else(|| {
+        let (name, open) = found.ok_or_else(|| {
             let names = self.world.thermometers.iter().map(|(name, _)| name.as_str());
             let what = format!("DS18B20 {}", String::from_utf8_lossy(serial));
             is_missing(&what, names, reason::DS18B20_OPEN)
         })?;
-        Ok(OnWorker { bus: name.clone(), device: Box::new(thermometer.clone()) })
+        Ok(OnWorker { bus: name.clone(), device: open() })
     }
 
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {

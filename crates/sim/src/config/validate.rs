@@ -9,8 +9,9 @@ use super::{
     AxisConfig, BedConfig, DeltaConfig, End, FanConfig, HeaterConfig, I2cBusConfig, Kinematics, LedConfig, Limits,
     PinName, SimConfig, SimError, SpiBusConfig, is_word,
 };
-use crate::part::{Part, PartConfig, Socket};
-use crate::thermistor::KELVIN;
+use crate::catalog::PartConfig;
+use crate::description::thermistor::KELVIN;
+use crate::part::workshop::{Part, Socket};
 
 impl SimConfig {
     /// Checks that the values make a printer.
