@@ -22,14 +22,18 @@ mod catalog;
 mod config;
 mod description;
 mod engine;
+mod klippy;
 mod part;
 mod printer_cfg;
 
 pub use catalog::PartConfig;
-pub use config::{
-    AxisConfig, BedConfig, DeltaConfig, End, FanConfig, HeaterConfig, I2cBusConfig, InputConfig, LedConfig, Limits,
-    OutputConfig, PinName, SimConfig, SimError, SpiBusConfig,
-};
+pub use config::SimConfig;
+pub use description::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};
+pub use description::buses::{I2cBusConfig, SpiBusConfig};
+pub use description::check::SimError;
+pub use description::heater::{FanConfig, HeaterConfig};
+pub use description::outputs::{InputConfig, LedConfig, OutputConfig};
+pub use description::pin::PinName;
 pub use part::ads1220::Ads1220Config;
 pub use part::adxl345::Adxl345Config;
 pub use part::angle::{AngleChip, AngleConfig};
@@ -89,9 +93,10 @@ impl SimBoard {
     /// The printer of a description, at rest.
     pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, SimError> {
         config.validate()?;
+        let printer = config.printer();
         let now = clock.now();
         let mut workshop = Workshop {
-            config: &config,
+            printer,
             time: Arc::new(PrinterTime::new(clock)),
             world: World::default(),
             pins: Vec::new(),
@@ -107,7 +112,7 @@ impl SimBoard {
             workshop.world.axes.push(axis);
         }
         for part in &config.heaters {
-            let cooling_w_per_k = config.fan_of(&part.name).map_or(0.0, |fan| fan.cooling_w_per_k);
+            let cooling_w_per_k = printer.fan_of(&part.name).map_or(0.0, |fan| fan.cooling_w_per_k);
             let heater = Arc::new(Heater::new(part, part.thermistor()?, cooling_w_per_k, now));
             workshop.wire(part.pin.as_ref(), HeaterPin(heater.clone()));
             workshop.wire(Some(&part.sensor_pin), ThermistorPin(heater.clone()));

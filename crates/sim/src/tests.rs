@@ -626,3 +626,16 @@ fn use_with_each_number(toml: &str, behind: &str) -> u32 {
     }
     used
 }
+
+#[test]
+fn a_thermometer_is_found_by_its_serial_and_reads_in_sixteenths() {
+    let toml = SimConfig::default_toml().replace("conversion_ms = 750", "conversion_ms = 0");
+    let mut config = SimConfig::parse(&toml, "test").unwrap();
+    config.heaters[1].start_celsius = Some(30.7);
+    let mut board = SimBoard::new(config, Arc::new(VirtualClock::at(Clock::EPOCH))).unwrap();
+    let mut thermometer = board.ds18b20(b"28-0316b5f6a2ff").unwrap();
+    assert_eq!(thermometer.device.read(), Ok(30_687), "30.6875 C, which the kernel cuts off");
+    let error = board.ds18b20(b"28-000000000000").err().unwrap();
+    assert_eq!(error.reason, reason::DS18B20_OPEN);
+    assert!(error.detail.contains("28-0316b5f6a2ff"), "{}", error.detail);
+}

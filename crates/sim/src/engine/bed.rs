@@ -10,7 +10,7 @@
 use std::sync::Arc;
 
 use super::physics::Axis;
-use crate::config::{BedConfig, DeltaConfig};
+use crate::description::axes::{BedConfig, DeltaConfig};
 
 /// A plane that motors hold up, each at a place: a gantry over the bed, or the bed under it.
 ///
@@ -175,7 +175,7 @@ impl Bed {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::AxisConfig;
+    use crate::description::axes::AxisConfig;
     use proptest::prelude::*;
 
     /// An axis that stands at a place.

@@ -7,7 +7,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use crate::config::I2cBusConfig;
+use crate::description::buses::I2cBusConfig;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus};
 
 /// A chip as its data sheet describes it. Its calls come in the order of the wires: a start with its

@@ -11,7 +11,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
 
 use super::track::Track;
-use crate::config::{AxisConfig, End, FanConfig, HeaterConfig};
+use crate::description::axes::{AxisConfig, End};
+use crate::description::heater::{FanConfig, HeaterConfig};
 use crate::description::thermistor::Thermistor;
 use pinion_firmware::time::{CLOCK_FREQ, Clock};
 

@@ -15,7 +15,8 @@ use std::time::{Duration, Instant};
 
 use super::physics::Lamp;
 use super::wire::{Kind, Wire};
-use crate::config::{SimError, SpiBusConfig};
+use crate::description::buses::SpiBusConfig;
+use crate::description::check::SimError;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect};
 use pinion_firmware::time::Clock;
 

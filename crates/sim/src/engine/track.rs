@@ -121,7 +121,7 @@ impl Follower {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::SimConfig;
+    use crate::description::default::DefaultPrinter;
     use std::sync::atomic::AtomicBool;
 
     #[test]
@@ -162,7 +162,7 @@ mod tests {
 
     #[test]
     fn who_falls_behind_goes_on_from_where_the_axis_is() {
-        let axis = Arc::new(Axis::new(&SimConfig::default_printer().axes[3]));
+        let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[3]));
         axis.set_enabled(true);
         axis.set_forward(true);
         let mut follower = Follower::new(axis.clone());

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, Ordering};
 
 use super::physics::{Axis, Fan, Heater, Lamp, Switch, seconds};
 use super::time::PrinterTime;
-use crate::config::PinName;
+use crate::description::pin::PinName;
 use pinion_firmware::board::{Adc, Direction, EdgeCount, Edges, Line, Pwm};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};

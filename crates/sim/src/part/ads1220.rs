@@ -17,9 +17,12 @@ use serde::Deserialize;
 use super::load_cell::{Cell, CellConfig};
 use super::ready::{Conversions, ReadyLine, ReadyPin};
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{PinName, SimConfig, SimError};
+use crate::description::check::SimError;
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::spi::SpiChip;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// CPOL is 0 and CPHA is 1.
@@ -65,7 +68,7 @@ impl Part for Ads1220Config {
         vec![("drdy_pin", Some(&self.drdy_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         self.cell.validate(whose)
     }
 

@@ -22,12 +22,15 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check, wrong};
+use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::{Axis, Noise};
 use crate::engine::spi::SpiChip;
 use crate::engine::time::STEP_LATE_LIMIT;
 use crate::engine::track::{Follower, Motion};
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// CPOL and CPHA are 1.
@@ -130,7 +133,7 @@ impl Part for Adxl345Config {
         Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
     }
 
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         check(whose, "rate_off_percent", self.rate_off_percent, Bound::Any)?;
         if self.rate_off_percent.abs() > 10.0 {
             return wrong(whose, "rate_off_percent", "no chip is so far off", "stay between -10 and 10");
@@ -496,6 +499,7 @@ impl SpiChip for Adxl345 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::default::DefaultPrinter;
     use pinion_firmware::time::VirtualClock;
 
     const X_HZ: f64 = 57.0;
@@ -511,7 +515,7 @@ mod tests {
         /// A chip without noise whose x rings.
         fn new(rate_off_percent: f64) -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(1_000_000_000));
-            let axis = Arc::new(Axis::new(&SimConfig::default_printer().axes[0]));
+            let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[0]));
             axis.set_enabled(true);
             axis.set_forward(true);
             let ring = RingConfig { axis: "x".into(), hz: X_HZ, damping_ratio: DAMPING };

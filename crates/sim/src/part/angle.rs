@@ -19,10 +19,13 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check};
+use crate::description::check::{Bound, SimError, check};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
 use crate::engine::spi::SpiChip;
-use crate::printer_cfg::{FULL_STEPS, Layout, Sections};
+use crate::klippy::layout::{FULL_STEPS, Layout};
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// Which of the sensors it is.
@@ -82,14 +85,14 @@ impl Part for AngleConfig {
         Some(Socket::Spi { bus: &self.bus, select_pin: Some(&self.select_pin) })
     }
 
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         check(whose, "offset_degrees", self.offset_degrees, Bound::Any)?;
         check(whose, "eccentricity_degrees", self.eccentricity_degrees, Bound::NotNegative)?;
         printer.check_axis(whose, &self.axis)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
-        let config = workshop.config.axes.iter().find(|axis| axis.name == self.axis);
+        let config = workshop.printer.axis(&self.axis);
         let Some((axis, config)) = workshop.axis(&self.axis).zip(config) else { return Ok(()) };
         let time = workshop.time.clone();
         let shaft = Shaft {
@@ -591,12 +594,12 @@ impl SpiChip for Mt6826s {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::SimConfig;
+    use crate::description::default::DefaultPrinter;
     use pinion_firmware::time::{Ticks, VirtualClock};
 
     /// A shaft at this many 3200th of a turn: 60 mm are one turn and a half.
     fn shaft(steps: i64) -> Shaft {
-        let mut config = SimConfig::default_printer();
+        let mut config = DefaultPrinter::read();
         config.axes[0].start_mm = 60.0 + steps as f64 / 80.0;
         let axis = Arc::new(Axis::new(&config.axes[0]));
         Shaft { axis, steps_per_turn: 3200.0, offset: 0.0, eccentricity: 0.0 }

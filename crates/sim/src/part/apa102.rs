@@ -15,11 +15,14 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::config::{PinName, SimConfig, SimError, check_lights, wrong};
+use crate::description::check::{SimError, check_lights, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::colour::{self, Colour};
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// The bits of a frame.
@@ -52,7 +55,7 @@ impl Part for Apa102Config {
         vec![("data_pin", Some(&self.data_pin)), ("clock_pin", Some(&self.clock_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         check_lights(whose, self.count)?;
         if self.data_pin.inverted || self.clock_pin.inverted {
             return wrong(whose, "data_pin", "klippy's lines to such a strip have no polarity", "remove the `!`");

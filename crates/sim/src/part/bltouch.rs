@@ -18,14 +18,16 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::probe::check_offsets;
 use super::workshop::{Part, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check};
+use crate::description::check::{Bound, SimError, check, check_offsets};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
 use crate::engine::physics::{Together, seconds};
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// How long the sensor line is high after a touch.
@@ -83,7 +85,7 @@ impl Part for BltouchConfig {
         vec![("control_pin", Some(&self.control_pin)), ("sensor_pin", Some(&self.sensor_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         check_offsets(whose, [self.x_offset_mm, self.y_offset_mm, self.z_offset_mm])?;
         check(whose, "move_s", self.move_s, Bound::AboveZero)
     }
@@ -368,6 +370,7 @@ impl Wire for SensorPin {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::default::DefaultPrinter;
     use crate::engine::physics::Axis;
     use pinion_firmware::time::CLOCK_FREQ;
 
@@ -380,7 +383,7 @@ mod tests {
 
     impl Bench {
         fn new(jams: Option<Jam>) -> Bench {
-            let printer = SimConfig::default_printer();
+            let printer = DefaultPrinter::read();
             let z = Arc::new(Axis::new(&printer.axes[2]));
             z.set_enabled(true);
             let config = BltouchConfig {

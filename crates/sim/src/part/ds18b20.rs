@@ -11,10 +11,12 @@ use std::time::Duration;
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::config::{Bound, SimConfig, SimError, check, wrong};
+use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::printer::Printer;
 use crate::engine::physics::Heater;
 use crate::engine::time::PrinterTime;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::TimeSource;
 
@@ -42,7 +44,7 @@ impl Part for Ds18b20Config {
         format!("ds18b20 {}", self.serial)
     }
 
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         let digits = self.serial.strip_prefix("28-").unwrap_or_default();
         if digits.len() != 12 || !digits.chars().all(|c| c.is_ascii_hexdigit()) {
             let cause = format!("`{}` is no serial number", self.serial);
@@ -83,27 +85,5 @@ impl Thermometer for Ds18b20 {
         thread::sleep(self.conversion);
         let sixteenths = (self.heater.at(self.time.now()).celsius * 16.0).floor() as i32;
         Ok((sixteenths * 1000).div_euclid(16))
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use crate::{SimBoard, SimConfig};
-    use pinion_firmware::board::Board;
-    use pinion_firmware::shutdown::reason;
-    use pinion_firmware::time::{Clock, VirtualClock};
-    use std::sync::Arc;
-
-    #[test]
-    fn a_thermometer_is_found_by_its_serial_and_reads_in_sixteenths() {
-        let toml = SimConfig::default_toml().replace("conversion_ms = 750", "conversion_ms = 0");
-        let mut config = SimConfig::parse(&toml, "test").unwrap();
-        config.heaters[1].start_celsius = Some(30.7);
-        let mut board = SimBoard::new(config, Arc::new(VirtualClock::at(Clock::EPOCH))).unwrap();
-        let mut thermometer = board.ds18b20(b"28-0316b5f6a2ff").unwrap();
-        assert_eq!(thermometer.device.read(), Ok(30_687), "30.6875 C, which the kernel cuts off");
-        let error = board.ds18b20(b"28-000000000000").err().unwrap();
-        assert_eq!(error.reason, reason::DS18B20_OPEN);
-        assert!(error.detail.contains("28-0316b5f6a2ff"), "{}", error.detail);
     }
 }

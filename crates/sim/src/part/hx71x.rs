@@ -19,10 +19,13 @@ use serde::Deserialize;
 
 use super::load_cell::{Cell, CellConfig};
 use super::workshop::{Part, Workshop};
-use crate::config::{PinName, SimConfig, SimError, wrong};
+use crate::description::check::{SimError, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::{Together, seconds};
 use crate::engine::wire::{Kind, Wire};
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// So long the clock may be high before the chip switches itself off.
@@ -92,7 +95,7 @@ impl Part for Hx71xConfig {
         vec![("dout_pin", Some(&self.dout_pin)), ("sclk_pin", Some(&self.sclk_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         if !self.chip.rates().contains(&self.samples_per_s) {
             let cause = format!("{} is none of the chip's rates", self.samples_per_s);
             return wrong(whose, "samples_per_s", &cause, &format!("give one of {:?}", self.chip.rates()));
@@ -271,6 +274,7 @@ impl Wire for SclkPin {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::default::DefaultPrinter;
     use crate::engine::bed::Bed;
     use crate::engine::physics::Axis;
     use pinion_firmware::time::CLOCK_FREQ;
@@ -285,7 +289,7 @@ mod tests {
 
     impl Bench {
         fn new(weight_g: f64, noise_counts: f64) -> Bench {
-            let z = Arc::new(Axis::new(&SimConfig::default_printer().axes[2]));
+            let z = Arc::new(Axis::new(&DefaultPrinter::read().axes[2]));
             z.set_enabled(true);
             let config = CellConfig {
                 stiffness_g_per_mm: 4000.0,

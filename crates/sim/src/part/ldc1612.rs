@@ -21,11 +21,14 @@ use serde::Deserialize;
 
 use super::ready::{Conversions, ReadyLine, ReadyPin};
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check, wrong};
+use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
 use crate::engine::i2c::I2cChip;
 use crate::engine::physics::Noise;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// What is connected to CLKIN, as klippy takes for granted.
@@ -145,7 +148,7 @@ impl Part for Ldc1612Config {
         vec![("intb_pin", self.intb_pin.as_ref())]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         use Bound::{AboveZero, Any, NotNegative};
         for (key, value, bound) in [
             ("x_offset_mm", self.x_offset_mm, Any),
@@ -389,6 +392,7 @@ impl I2cChip for Ldc1612 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::default::DefaultPrinter;
     use crate::engine::physics::Axis;
     use pinion_firmware::time::VirtualClock;
 
@@ -401,7 +405,7 @@ mod tests {
 
     impl Bench {
         fn new() -> Bench {
-            let z = Arc::new(Axis::new(&SimConfig::default_printer().axes[2]));
+            let z = Arc::new(Axis::new(&DefaultPrinter::read().axes[2]));
             z.set_enabled(true);
             let config = Ldc1612Config {
                 bus: "i2c.1".into(),

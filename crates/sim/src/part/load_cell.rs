@@ -7,10 +7,10 @@
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::config::{Bound, SimError, check};
+use crate::description::check::{Bound, SimError, check};
 use crate::engine::bed::Bed;
 use crate::engine::physics::Noise;
-use crate::printer_cfg::Sections;
+use crate::klippy::sections::Sections;
 
 /// The cell's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]

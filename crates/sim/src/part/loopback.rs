@@ -7,7 +7,8 @@
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{PinName, SimError};
+use crate::description::check::SimError;
+use crate::description::pin::PinName;
 use crate::engine::spi::SpiChip;
 
 /// The wire's description.

@@ -7,10 +7,13 @@
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check};
+use crate::description::check::{SimError, check_offsets};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
 use crate::engine::wire::{Kind, Wire};
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// The probe's description.
@@ -38,7 +41,7 @@ impl Part for ProbeConfig {
         vec![("pin", Some(&self.pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         check_offsets(whose, [self.x_offset_mm, self.y_offset_mm, self.z_offset_mm])
     }
 
@@ -60,12 +63,6 @@ impl Part for ProbeConfig {
             cfg.offsets([self.x_offset_mm, self.y_offset_mm, self.z_offset_mm]);
         });
     }
-}
-
-/// Checks where a probe stands from the nozzle.
-pub(crate) fn check_offsets(whose: &str, offsets_mm: [f64; 3]) -> Result<(), SimError> {
-    let mut keys = ["x_offset_mm", "y_offset_mm", "z_offset_mm"].into_iter().zip(offsets_mm);
-    keys.try_for_each(|(key, mm)| check(whose, key, mm, Bound::Any))
 }
 
 /// The switch.
@@ -92,12 +89,13 @@ impl Wire for Probe {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::default::DefaultPrinter;
     use crate::engine::physics::Axis;
     use std::sync::Arc;
 
     #[test]
     fn it_closes_at_the_step_that_takes_it_to_the_bed() {
-        let printer = SimConfig::default_printer();
+        let printer = DefaultPrinter::read();
         let [x, y, z] = [0, 1, 2].map(|place| Arc::new(Axis::new(&printer.axes[place])));
         for axis in [&x, &y, &z] {
             axis.set_enabled(true);

@@ -9,10 +9,13 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::config::{PinName, SimConfig, SimError, wrong};
+use crate::description::check::{SimError, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::board::PWM_MAX;
 use pinion_firmware::time::Clock;
 
@@ -35,7 +38,7 @@ impl Part for PwmChannelConfig {
         vec![("pin", Some(&self.pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         if self.pin.inverted {
             return wrong(whose, "pin", "a PWM channel has no polarity here", "remove the `!`");
         }

@@ -13,11 +13,14 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check, wrong};
+use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::{Together, seconds};
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{Clock, TimeSource};
 
 /// The servo's description.
@@ -67,7 +70,7 @@ impl Part for ServoConfig {
         vec![("pin", Some(&self.pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         check(whose, "min_pulse_us", self.min_pulse_us, Bound::AboveZero)?;
         check(whose, "max_pulse_us", self.max_pulse_us, Bound::AboveZero)?;
         check(whose, "travel_degrees", self.travel_degrees, Bound::AboveZero)?;

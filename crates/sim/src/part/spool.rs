@@ -14,10 +14,13 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check};
+use crate::description::check::{Bound, SimError, check};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
 use crate::engine::wire::{Kind, Wire};
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// The spool's description.
@@ -60,7 +63,7 @@ impl Part for SpoolConfig {
         ]
     }
 
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         printer.check_axis(whose, &self.axis)?;
         check(whose, "length_mm", self.length_mm, Bound::NotNegative)?;
         check(whose, "stuck_after_mm", self.stuck_after_mm.unwrap_or(0.0), Bound::NotNegative)?;
@@ -197,6 +200,7 @@ impl Wire for RefillPin {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::default::DefaultPrinter;
 
     /// A spool of 50 mm, and what pulls it.
     struct Bench {
@@ -206,7 +210,7 @@ mod tests {
 
     impl Bench {
         fn new(stuck_after_mm: Option<f64>) -> Bench {
-            let axis = Arc::new(Axis::new(&SimConfig::default_printer().axes[3]));
+            let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[3]));
             axis.set_enabled(true);
             let config = SpoolConfig {
                 name: "filament".into(),

@@ -18,13 +18,16 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{PinName, SimConfig, SimError, wrong};
+use crate::description::check::{SimError, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::i2c::I2cChip;
 use crate::engine::physics::Noise;
 use crate::engine::spi::SpiChip;
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 const COLUMNS: u8 = 128;
@@ -72,7 +75,7 @@ impl Part for Ssd1306Config {
         vec![("dc_pin", self.dc_pin.as_ref()), ("reset_pin", self.reset_pin.as_ref())]
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         if self.dc_pin.is_none() && self.select_pin.is_some() {
             return wrong(whose, "select_pin", "a chip on I2C has none", "remove it, or add `dc_pin` for SPI");
         }

@@ -15,10 +15,13 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{Bound, PinName, SimConfig, SimError, check, wrong};
+use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::Heater;
 use crate::engine::spi::SpiChip;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 
 /// A converter's description.
@@ -130,7 +133,7 @@ impl Part for ThermocoupleConfig {
         Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
     }
 
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         printer.check_heater(whose, &self.heater)?;
         if self.fault.is_some_and(|fault| !self.chip.knows(fault)) {
             let cause = format!("what a {} makes of that is not known", self.chip.name());
@@ -160,7 +163,7 @@ impl Part for ThermocoupleConfig {
             cfg.key("rtd_nominal_r", self.rtd_ohm);
             cfg.key("rtd_reference_r", self.reference_ohm);
         }
-        if let Some(heater) = layout.config.heaters.iter().find(|heater| heater.name == self.heater) {
+        if let Some(heater) = layout.printer.heaters.iter().find(|heater| heater.name == self.heater) {
             cfg.key("min_temp", heater.min_celsius);
             cfg.key("max_temp", heater.max_celsius);
         }
@@ -389,6 +392,7 @@ impl SpiChip for Chip {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::description::default::DefaultPrinter;
     use pinion_firmware::time::{CLOCK_FREQ, VirtualClock};
 
     struct Bench {
@@ -400,7 +404,7 @@ mod tests {
         /// A chip whose sensor is in a mass of this temperature.
         fn new(chip: Converter, celsius: f64, fault: Option<SensorFault>) -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(1_000_000));
-            let mut printer = SimConfig::default_printer();
+            let mut printer = DefaultPrinter::read();
             let heater = &mut printer.heaters[0];
             (heater.ambient_celsius, heater.start_celsius) = (celsius, Some(celsius));
             let heater = Heater::new(heater, heater.thermistor().unwrap(), 0.0, clock.now());

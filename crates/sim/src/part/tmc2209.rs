@@ -24,10 +24,13 @@ use super::trinamic::{
     offer_sensorless_homing,
 };
 use super::workshop::{Part, Workshop};
-use crate::config::{PinName, SimConfig, SimError, wrong};
+use crate::description::check::{SimError, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
 use crate::engine::wire::{Kind, Wire};
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
 /// The low nibble of a message's first byte; the high one may be anything.
@@ -136,7 +139,7 @@ impl Part for Tmc2209Config {
         [("uart_pin", Some(&self.uart_pin))].into_iter().chain(pins).collect()
     }
 
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         if self.address > 3 {
             return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 3");
         }
@@ -515,7 +518,7 @@ impl Wire for UartPin {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::SimConfig;
+    use crate::description::default::DefaultPrinter;
     use pinion_firmware::time::Ticks;
 
     /// 40 kbaud.
@@ -530,7 +533,7 @@ mod tests {
 
     impl Bench {
         fn new(address: u8) -> Bench {
-            let axis = Arc::new(Axis::new(&SimConfig::default_printer().axes[1]));
+            let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[1]));
             let uart = Arc::new(Mutex::new(Uart::new(Tmc2209::new("tmc2209 y", address, axis.clone()))));
             let pin = UartPin { name: "tmc2209 y".into(), role: Role::Both, uart };
             pin.settle(true, Clock::EPOCH);

@@ -26,10 +26,13 @@ use super::trinamic::{
     offer_sensorless_homing,
 };
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{PinName, SimConfig, SimError};
+use crate::description::check::SimError;
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
 use crate::engine::spi::SpiChip;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{Clock, TimeSource};
 
 /// CPOL and CPHA are 1.
@@ -169,7 +172,7 @@ impl Part for Tmc5160Config {
         vec![("diag1_pin", self.diag1_pin.as_ref())]
     }
 
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         printer.check_axis(whose, &self.axis)
     }
 
@@ -343,7 +346,7 @@ impl SpiChip for Tmc5160 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::SimConfig;
+    use crate::description::default::DefaultPrinter;
     use pinion_firmware::time::{CLOCK_FREQ, VirtualClock};
 
     struct Bench {
@@ -355,7 +358,7 @@ mod tests {
     impl Bench {
         fn new() -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(0));
-            let axis = Arc::new(Axis::new(&SimConfig::default_printer().axes[2]));
+            let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[2]));
             let chip = Tmc5160::new("z".into(), axis.clone(), Arc::new(clock.clone()));
             Bench { axis, clock, chip }
         }

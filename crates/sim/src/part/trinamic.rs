@@ -12,10 +12,11 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use crate::config::End;
+use crate::description::axes::End;
 use crate::engine::physics::Axis;
 use crate::engine::wire::{Kind, Wire};
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock};
 
 /// The internal clock.
@@ -102,7 +103,7 @@ pub(crate) fn offer_sensorless_homing(
     axis: &str,
     (sensitivity, value): (&str, u32),
 ) {
-    let config = layout.config.axes.iter().find(|other| other.name == axis && layout.is_homed(axis));
+    let config = layout.printer.axis(axis).filter(|_| layout.is_homed(axis));
     let Some((config, travel_mm)) = config.and_then(|config| Some((config, config.travel_mm?))) else { return };
     let stepper = layout.stepper(axis);
     cfg.comment("To home without the endstop, by the load (these keys replace those above, which may stay):");
@@ -310,7 +311,7 @@ impl Wire for StallOutput {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::SimConfig;
+    use crate::description::default::DefaultPrinter;
 
     #[test]
     fn the_wave_of_power_up_is_a_sine() {
@@ -323,7 +324,7 @@ mod tests {
 
     #[test]
     fn a_stall_is_told_while_the_motor_drives_against_its_end_within_the_velocities() {
-        let mut config = SimConfig::default_printer();
+        let mut config = DefaultPrinter::read();
         config.axes[0].start_mm = 0.0;
         config.axes[0].overtravel_mm = 0.0;
         let axis = Arc::new(Axis::new(&config.axes[0]));

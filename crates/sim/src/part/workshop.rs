@@ -5,7 +5,10 @@
 
 use std::sync::Arc;
 
-use crate::config::{DeltaConfig, Kinematics, PinName, SimConfig, SimError};
+use crate::description::axes::DeltaConfig;
+use crate::description::check::SimError;
+use crate::description::pin::PinName;
+use crate::description::printer::{Kinematics, Printer};
 use crate::engine::bed::{Bed, Delta, Head, Plane};
 use crate::engine::i2c::{I2cBus, I2cChip};
 use crate::engine::physics::{Axis, Heater, Noise};
@@ -13,7 +16,8 @@ use crate::engine::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use crate::engine::time::PrinterTime;
 use crate::engine::wire::{Wire, WiredPin};
 use crate::engine::world::{Sight, World};
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 
 /// Where a part hangs on a bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -42,7 +46,7 @@ pub(crate) trait Part {
     }
 
     /// Checks the values that are its own; `whose` begins an error's line.
-    fn validate(&self, whose: &str, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
         let _ = (whose, printer);
         Ok(())
     }
@@ -58,7 +62,7 @@ pub(crate) trait Part {
 
 /// Where a printer is put together.
 pub(crate) struct Workshop<'a> {
-    pub(crate) config: &'a SimConfig,
+    pub(crate) printer: Printer<'a>,
     pub(crate) time: Arc<PrinterTime>,
     pub(crate) world: World,
     pub(crate) pins: Vec<WiredPin>,
@@ -79,24 +83,24 @@ impl Workshop<'_> {
 
     /// A part's noise.
     pub(crate) fn noise(&self, part: &dyn Part) -> Noise {
-        Noise::of(&part.name(), self.config.seed)
+        Noise::of(&part.name(), self.printer.seed)
     }
 
     /// The bed under the nozzle.
     pub(crate) fn bed(&self) -> Bed {
-        Bed::new(self.config.bed.clone(), self.delta().map_or_else(|| self.gantry(), Head::Delta))
+        Bed::new(self.printer.bed.clone(), self.delta().map_or_else(|| self.gantry(), Head::Delta))
     }
 
     /// The three arms of a delta printer.
     fn delta(&self) -> Option<Delta> {
-        let Kinematics::Delta(delta) = self.config.kinematics() else { return None };
+        let Kinematics::Delta(delta) = self.printer.kinematics() else { return None };
         let [a, b, c] = DeltaConfig::TOWERS.map(|tower| self.axis(tower));
         Some(Delta::new(delta, [a?, b?, c?]))
     }
 
     /// The head of any other printer.
     fn gantry(&self) -> Head {
-        let motors = self.config.motors("z").filter_map(|motor| {
+        let motors = self.printer.motors("z").filter_map(|motor| {
             let at_mm = motor.at_mm.unwrap_or_default();
             self.axis(&motor.name).map(|axis| (axis, at_mm))
         });

@@ -16,11 +16,13 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::config::{SimConfig, SimError, check_lights, wrong};
+use crate::description::check::{SimError, check_lights, wrong};
+use crate::description::printer::Printer;
 use crate::engine::colour::{self, Colour};
 use crate::engine::spi::MosiListener;
 use crate::engine::world::Sight;
-use crate::printer_cfg::{Layout, Sections};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// High times of a 0 and of a 1 (T0H, T1H), and how far they may be off.
@@ -61,7 +63,7 @@ impl Part for Ws2812Config {
         Some(Socket::Mosi { bus: &self.bus })
     }
 
-    fn validate(&self, whose: &str, _printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
         check_lights(whose, self.count)?;
         let mut letters: Vec<char> = self.color_order.chars().collect();
         letters.sort_unstable();

@@ -3,23 +3,21 @@
 
 #![forbid(unsafe_code)]
 
-use std::collections::HashSet;
+use super::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};
+use super::buses::{I2cBusConfig, SpiBusConfig};
+use super::check::{Bound, SimError, UsedPins, check, there_is, unique, wrong};
+use super::heater::{FanConfig, HeaterConfig};
+use super::outputs::LedConfig;
+use super::printer::{Kinematics, Printer};
+use super::thermistor::KELVIN;
 
-use super::{
-    AxisConfig, BedConfig, DeltaConfig, End, FanConfig, HeaterConfig, I2cBusConfig, Kinematics, LedConfig, Limits,
-    PinName, SimConfig, SimError, SpiBusConfig, is_word,
-};
-use crate::catalog::PartConfig;
-use crate::description::thermistor::KELVIN;
-use crate::part::workshop::{Part, Socket};
-
-impl SimConfig {
+impl Printer<'_> {
     /// Checks that the values make a printer.
     ///
     /// # Errors
     ///
     /// The first value that is wrong, with its key and a remedy.
-    pub(crate) fn validate(&self) -> Result<(), SimError> {
+    pub(crate) fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
         self.limits.validate()?;
         unique("[[axis]]", self.axes.iter().map(|axis| &axis.name))?;
         unique("[[heater]]", self.heaters.iter().map(|heater| &heater.name))?;
@@ -28,29 +26,27 @@ impl SimConfig {
         unique("[[output]]", self.outputs.iter().map(|output| &output.name))?;
         unique("[[input]]", self.inputs.iter().map(|input| &input.name))?;
         unique("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name))?;
-        let mut pins = UsedPins::default();
-        self.axes.iter().try_for_each(|axis| axis.validate(&mut pins))?;
+        self.axes.iter().try_for_each(|axis| axis.validate(pins))?;
         self.validate_places()?;
-        if let Some(delta) = &self.delta {
+        if let Some(delta) = self.delta {
             delta.validate(self)?;
         }
-        self.heaters.iter().try_for_each(|heater| heater.validate(self, &mut pins))?;
-        self.fans.iter().try_for_each(|fan| fan.validate(self, &mut pins))?;
-        self.leds.iter().try_for_each(|led| led.validate(&mut pins))?;
-        for output in &self.outputs {
+        self.heaters.iter().try_for_each(|heater| heater.validate(self, pins))?;
+        self.fans.iter().try_for_each(|fan| fan.validate(self, pins))?;
+        self.leds.iter().try_for_each(|led| led.validate(pins))?;
+        for output in self.outputs {
             pins.claim(&format!("output `{}`", output.name), "pin", Some(&output.pin))?;
         }
-        for input in &self.inputs {
+        for input in self.inputs {
             pins.claim(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
         }
         unique("[[i2c_bus]]", self.i2c_buses.iter().map(|bus| &bus.name))?;
         self.bed.validate()?;
-        for bus in &self.spi_buses {
+        for bus in self.spi_buses {
             bus.validate(self)?;
             pins.claim(&format!("spi_bus `{}`", bus.name), "name", Some(&bus.mosi_pin()))?;
         }
-        self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)?;
-        self.parts.iter().try_for_each(|part| self.validate_part(part.part(), &mut pins))
+        self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)
     }
 
     /// Checks where the motors of the z axis hold what they lift.
@@ -73,68 +69,6 @@ impl SimConfig {
             places.try_for_each(|mm| check(&whose(axis), "at_mm", mm, Bound::Any))
         })
     }
-
-    /// Checks that there is the axis that a part's key `axis` names.
-    pub(crate) fn check_axis(&self, whose: &str, axis: &str) -> Result<(), SimError> {
-        there_is(whose, "axis", axis, self.axes.iter().map(|axis| &axis.name), "[[axis]]")
-    }
-
-    /// Checks that there is the heater that a part's key `heater` names.
-    pub(crate) fn check_heater(&self, whose: &str, heater: &str) -> Result<(), SimError> {
-        there_is(whose, "heater", heater, self.heaters.iter().map(|heater| &heater.name), "[[heater]]")
-    }
-
-    fn check_spi_bus(&self, whose: &str, bus: &str) -> Result<(), SimError> {
-        there_is(whose, "bus", bus, self.spi_buses.iter().map(|bus| &bus.name), "[[spi_bus]]")
-    }
-
-    fn check_i2c_bus(&self, whose: &str, bus: &str) -> Result<(), SimError> {
-        there_is(whose, "bus", bus, self.i2c_buses.iter().map(|bus| &bus.name), "[[i2c_bus]]")
-    }
-
-    /// Checks a part against the rest of the printer, and that its pins are free.
-    fn validate_part(&self, part: &dyn Part, pins: &mut UsedPins) -> Result<(), SimError> {
-        let whose = &format!("part `{}`", part.name());
-        if self.parts.iter().filter(|other| other.part().name() == part.name()).count() > 1 {
-            return Err(SimError(format!("{whose}: there are two of it: remove one, or tell them apart")));
-        }
-        part.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))?;
-        let socket = part.socket();
-        let neighbours = self.parts.iter().map(PartConfig::part).filter(|other| other.name() != part.name());
-        let mut neighbours = neighbours.filter_map(Part::socket);
-        match socket {
-            Some(Socket::Spi { bus, select_pin }) => {
-                pins.claim(whose, "select_pin", select_pin)?;
-                self.check_spi_bus(whose, bus)?;
-                if select_pin.is_some_and(|pin| pin.inverted) {
-                    let cause = "klippy knows chips that are selected by a low level only";
-                    return wrong(whose, "select_pin", cause, "remove the `!`");
-                }
-                let shares = neighbours.any(|other| matches!(other, Socket::Spi { bus: its, .. } if its == bus));
-                if select_pin.is_none() && shares {
-                    return wrong(whose, "select_pin", "it is not the only chip on its bus", "add it");
-                }
-            }
-            Some(Socket::I2c { bus, address }) => {
-                self.check_i2c_bus(whose, bus)?;
-                if !(0x08..0x78).contains(&address) {
-                    return wrong(whose, "address", &format!("{address} is no 7 bit address"), "give 8 to 119");
-                }
-                if neighbours.any(|other| Some(other) == socket) {
-                    return wrong(whose, "address", &format!("{address} is taken on this bus"), "give another");
-                }
-            }
-            Some(Socket::Mosi { bus }) => self.check_spi_bus(whose, bus)?,
-            None => {}
-        }
-        part.validate(whose, self)?;
-        // What stands behind the kind was named by the description, and names a section of printer.cfg.
-        let name = part.name();
-        match name.split_once(' ') {
-            Some((_, own)) if !is_word(own) => no_name(whose, own),
-            _ => Ok(()),
-        }
-    }
 }
 
 impl Limits {
@@ -153,7 +87,7 @@ impl Limits {
 
 impl DeltaConfig {
     /// Checks the towers, and that each has its axis.
-    fn validate(&self, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>) -> Result<(), SimError> {
         const WHOSE: &str = "[delta]";
         check(WHOSE, "radius_mm", self.radius_mm, Bound::AboveZero)?;
         check(WHOSE, "bed_radius_mm", self.bed_radius_mm, Bound::AboveZero)?;
@@ -241,7 +175,7 @@ impl AxisConfig {
 
 impl FanConfig {
     /// Checks the fan, and that its pins are free.
-    fn validate(&self, printer: &SimConfig, pins: &mut UsedPins) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), SimError> {
         use Bound::{AboveZero, NotNegative};
         let whose = &format!("fan `{}`", self.name);
         pins.claim(whose, "pin", Some(&self.pin))?;
@@ -267,7 +201,7 @@ impl FanConfig {
 
 impl SpiBusConfig {
     /// Checks the bus, and that the pins to trace are outputs of the printer.
-    fn validate(&self, printer: &SimConfig) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>) -> Result<(), SimError> {
         let whose = &format!("spi_bus `{}`", self.name);
         check(whose, "delay_us", self.delay_us as f64, Bound::NotNegative)?;
         let unknown = self.trace_pins.iter().find(|name| !printer.switched().any(|pin| pin.name == **name));
@@ -296,7 +230,7 @@ impl BedConfig {
 
 impl HeaterConfig {
     /// Checks the heater with its fan, and that its pins are free.
-    fn validate(&self, printer: &SimConfig, pins: &mut UsedPins) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), SimError> {
         use Bound::{AboveZero, NotNegative};
         let whose = &format!("heater `{}`", self.name);
         pins.claim(whose, "pin", self.pin.as_ref())?;
@@ -348,96 +282,4 @@ impl HeaterConfig {
         }
         Ok(())
     }
-}
-
-/// The range that a number must be in.
-pub(crate) enum Bound {
-    Any,
-    NotNegative,
-    AboveZero,
-}
-
-/// The pins that have a use already, by name.
-#[derive(Default)]
-struct UsedPins(HashSet<String>);
-
-impl UsedPins {
-    /// Uses a pin, if there is one; fails if it has a use already.
-    fn claim(&mut self, whose: &str, key: &str, pin: Option<&PinName>) -> Result<(), SimError> {
-        match pin {
-            Some(pin) if !self.0.insert(pin.name.clone()) => {
-                wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name")
-            }
-            _ => Ok(()),
-        }
-    }
-}
-
-/// Checks that the parts of a kind have names, and that no two share one.
-fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>) -> Result<(), SimError> {
-    let mut seen = HashSet::new();
-    names.try_for_each(|name| {
-        if !is_word(name) {
-            no_name(kind, name)
-        } else if !seen.insert(name) {
-            wrong(kind, "name", &format!("two are called `{name}`"), "rename one")
-        } else {
-            Ok(())
-        }
-    })
-}
-
-/// The error of a name that klippy would not take.
-fn no_name(whose: &str, name: &str) -> Result<(), SimError> {
-    wrong(whose, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
-}
-
-/// Checks that something of this name is in the description; `kind` is its table.
-fn there_is<'a>(
-    whose: &str,
-    key: &str,
-    name: &str,
-    mut names: impl Iterator<Item = &'a String>,
-    kind: &str,
-) -> Result<(), SimError> {
-    if names.any(|other| other == name) {
-        return Ok(());
-    }
-    wrong(whose, key, &format!("there is no `{name}`"), &format!("name an {kind}"))
-}
-
-/// The error of a key.
-pub(super) fn fault(whose: &str, key: &str, cause: &str, remedy: &str) -> SimError {
-    SimError(format!("{whose}, key `{key}`: {cause}: {remedy}"))
-}
-
-/// The error of a key, as a result.
-pub(crate) fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), SimError> {
-    Err(fault(whose, key, cause, remedy))
-}
-
-/// Larger numbers describe no printer, and could overflow a position or a time.
-const MAX_NUMBER: f64 = 1e9;
-
-/// The lights of the longest strip.
-const MAX_LIGHTS: u32 = 1000;
-
-/// Checks how many lights a strip has.
-pub(crate) fn check_lights(whose: &str, count: u32) -> Result<(), SimError> {
-    check(whose, "count", count.into(), Bound::AboveZero)?;
-    if count > MAX_LIGHTS {
-        return wrong(whose, "count", &format!("{count} is too many"), &format!("{MAX_LIGHTS} at most"));
-    }
-    Ok(())
-}
-
-/// Checks that a number is in its range.
-pub(crate) fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimError> {
-    let fault = match bound {
-        _ if !(-MAX_NUMBER..=MAX_NUMBER).contains(&value) => "is out of range",
-        Bound::NotNegative if value < 0.0 => "is below zero",
-        Bound::AboveZero if value < 1.0 / MAX_NUMBER => "is not above zero",
-        _ => return Ok(()),
-    };
-    wrong(whose, key, &format!("{value} {fault}"), "set a value of the printer's")
 }

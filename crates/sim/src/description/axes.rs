@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The axes of a description, and how they move the head.
+//! The axes of a description, the bed, and the limits of the motion.
 
 #![forbid(unsafe_code)]
 
 use serde::Deserialize;
 
-use super::{HeaterConfig, PinName, SimConfig};
+use super::pin::PinName;
 
 /// The end of an axis at which its endstop sits.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
@@ -93,28 +93,6 @@ fn default_angles_degrees() -> [f64; 3] {
     [210.0, 330.0, 90.0]
 }
 
-/// How the axes move the head.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Kinematics<'a> {
-    /// `x`, `y` and `z` with endstops, each for itself.
-    Cartesian,
-    /// `a`, `b` and `c` together.
-    Delta(&'a DeltaConfig),
-    /// Each is a motor, and no more.
-    None,
-}
-
-impl Kinematics<'_> {
-    /// The axes of klippy's kinematics. Each may have more than one motor.
-    pub(crate) fn rails(&self) -> &'static [&'static str] {
-        match self {
-            Kinematics::Cartesian => &["x", "y", "z"],
-            Kinematics::Delta(_) => &DeltaConfig::TOWERS,
-            Kinematics::None => &[],
-        }
-    }
-}
-
 impl DeltaConfig {
     /// The axes of the carriages.
     pub(crate) const TOWERS: [&'static str; 3] = ["a", "b", "c"];
@@ -133,34 +111,39 @@ impl DeltaConfig {
     }
 }
 
-impl SimConfig {
-    /// An axis by its name.
-    pub(crate) fn axis(&self, name: &str) -> Option<&AxisConfig> {
-        self.axes.iter().find(|axis| axis.name == name)
-    }
+/// The limits of the motion in printer.cfg. The simulated axes themselves follow at any speed.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Highest speed of the head.
+    pub velocity_mm_per_s: f64,
+    /// Highest acceleration of the head.
+    pub accel_mm_per_s2: f64,
+    /// Highest speed of the z axis.
+    pub z_velocity_mm_per_s: f64,
+    /// Highest acceleration of the z axis.
+    pub z_accel_mm_per_s2: f64,
+}
 
-    pub(crate) fn kinematics(&self) -> Kinematics<'_> {
-        let can_home = |name| self.axis(name).is_some_and(|axis| axis.endstop_pin.is_some());
-        match &self.delta {
-            Some(delta) => Kinematics::Delta(delta),
-            None if ["x", "y", "z"].into_iter().all(can_home) => Kinematics::Cartesian,
-            None => Kinematics::None,
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits {
+            velocity_mm_per_s: 300.0,
+            accel_mm_per_s2: 3000.0,
+            z_velocity_mm_per_s: 15.0,
+            z_accel_mm_per_s2: 100.0,
         }
-    }
-
-    /// The motors of a rail, such as `z`, `z1` and `z2`.
-    pub(crate) fn motors(&self, rail: &str) -> impl Iterator<Item = &AxisConfig> {
-        in_a_row(rail, |name| self.axis(name))
-    }
-
-    /// The heaters of the hot ends: `extruder`, `extruder1` and so on.
-    pub(crate) fn hot_ends(&self) -> impl Iterator<Item = &HeaterConfig> {
-        in_a_row("extruder", |name| self.heaters.iter().find(|heater| heater.name == name))
     }
 }
 
-/// What is called `first`, and the same with 1, 2 and so on behind it until one is missing, as klippy looks for it.
-fn in_a_row<T>(first: &str, find: impl Fn(&str) -> Option<T>) -> impl Iterator<Item = T> {
-    let name = move |n| if n == 0 { first.to_owned() } else { format!("{first}{n}") };
-    (0..).map_while(move |n| find(&name(n)))
+/// The shape of the bed; its middle is at 0.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BedConfig {
+    /// How much higher it is at the end of the x axis than at its start.
+    pub x_slope_mm: f64,
+    /// How much higher it is at the end of the y axis than at its start.
+    pub y_slope_mm: f64,
+    /// How much lower it is at the corners than in the middle.
+    pub bow_mm: f64,
 }
