@@ -57,7 +57,8 @@ pub use printer_cfg::printer_cfg;
 
 use engine::i2c::{I2cBus, I2cDevice};
 use engine::led::ColouredLed;
-use engine::physics::{Axis, Fan, Heater, Lamp, Noise, Switch};
+use engine::noise::Noise;
+use engine::physics::{Axis, Fan, Heater, Lamp, Switch};
 use engine::spi::{MosiPin, SpiBus, SpiDevice};
 use engine::time::{ErrandTime, PrinterTime, STEP_LATE_LIMIT};
 use engine::wire::{

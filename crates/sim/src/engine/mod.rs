@@ -5,11 +5,14 @@
 
 pub(crate) mod bed;
 pub(crate) mod colour;
+pub(crate) mod follower;
 pub(crate) mod i2c;
 pub(crate) mod led;
+pub(crate) mod noise;
 pub(crate) mod physics;
 pub(crate) mod spi;
 pub(crate) mod time;
+pub(crate) mod together;
 pub(crate) mod track;
 pub(crate) mod wire;
 pub(crate) mod world;

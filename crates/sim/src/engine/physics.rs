@@ -8,64 +8,15 @@
 #![forbid(unsafe_code)]
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering, fence};
+use std::sync::atomic::{AtomicBool, AtomicI64, AtomicU64, Ordering};
 
+use super::time::seconds;
+use super::together::Together;
 use super::track::Track;
 use crate::description::axes::{AxisConfig, End};
 use crate::description::heater::{FanConfig, HeaterConfig};
 use crate::description::thermistor::Thermistor;
-use pinion_firmware::time::{CLOCK_FREQ, Clock};
-
-/// Seconds from `earlier` to `later`; none if they are the other way round.
-pub fn seconds(earlier: Clock, later: Clock) -> f64 {
-    later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
-}
-
-/// A few words that belong together: one thread writes them, any thread reads them whole.
-///
-/// They stand in two places by turns, so that a writer that was stopped amid its work keeps nobody
-/// waiting: the words before are still whole. It may be a worker whose processor the core took, and
-/// then it goes on only after the core is done. A reader reads again only if a whole `store` was done
-/// meanwhile, as the next one writes where it reads.
-#[derive(Debug)]
-pub struct Together<const N: usize> {
-    /// How many times the words were stored. The place of the last ones is its lowest bit.
-    stores: AtomicU64,
-    places: [[AtomicU64; N]; 2],
-}
-
-impl<const N: usize> Together<N> {
-    pub fn new(words: [u64; N]) -> Together<N> {
-        let place = || words.map(AtomicU64::new);
-        Together { stores: AtomicU64::new(0), places: [place(), place()] }
-    }
-
-    fn place(&self, stores: u64) -> &[AtomicU64; N] {
-        &self.places[(stores & 1) as usize]
-    }
-
-    pub fn load(&self) -> [u64; N] {
-        loop {
-            let stores = self.stores.load(Ordering::Acquire);
-            let words = self.place(stores).each_ref().map(|word| word.load(Ordering::Relaxed));
-            fence(Ordering::Acquire);
-            if stores == self.stores.load(Ordering::Relaxed) {
-                return words;
-            }
-        }
-    }
-
-    /// Only one thread may store.
-    pub fn store(&self, words: [u64; N]) {
-        let stores = self.stores.load(Ordering::Relaxed).wrapping_add(1);
-        // Who sees a word of these sees that the ones of two stores ago are no longer the last.
-        fence(Ordering::Release);
-        for (word, value) in self.place(stores).iter().zip(words) {
-            word.store(value, Ordering::Relaxed);
-        }
-        self.stores.store(stores, Ordering::Release);
-    }
-}
+use pinion_firmware::time::Clock;
 
 /// A stepper motor and what it moves.
 #[derive(Debug)]
@@ -461,91 +412,5 @@ impl Lamp {
         };
         let rise = if on { now.ticks() } else { rise };
         self.state.store([now.ticks(), on.into(), rise, share.to_bits()]);
-    }
-}
-
-/// Noise of the normal kind, the same for the same seed.
-#[derive(Clone, Debug)]
-pub struct Noise(u64);
-
-impl Noise {
-    /// What SplitMix64 adds for each draw.
-    const STEP: u64 = 0x9e37_79b9_7f4a_7c15;
-
-    /// The noise of one part or pin: with the same seed each has another one.
-    pub fn of(whose: &str, seed: u64) -> Noise {
-        whose.bytes().fold(Noise(seed), |noise, byte| Noise((noise.0 ^ u64::from(byte)).wrapping_mul(Noise::STEP)))
-    }
-
-    /// The draw of this number, for who keeps no noise between two draws.
-    pub fn nth(&self, draw: u64) -> f64 {
-        Noise(self.0.wrapping_add(draw.wrapping_mul(Noise::STEP))).draw()
-    }
-
-    /// A draw with mean 0 and standard deviation 1: the sum of four uniform ones, which is within
-    /// 3.5 and close to normal. The bits are SplitMix64's (Steele, Lea, Flood, 2014).
-    pub fn draw(&mut self) -> f64 {
-        self.0 = self.0.wrapping_add(Noise::STEP);
-        let mut bits = self.0;
-        bits = (bits ^ (bits >> 30)).wrapping_mul(0xbf58_476d_1ce4_e5b9);
-        bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
-        bits ^= bits >> 31;
-        let sum: u64 = (0..4).map(|quarter| (bits >> (16 * quarter)) & 0xffff).sum();
-        // Each uniform draw has variance 1/12, their sum 1/3.
-        (sum as f64 / 65_536.0 - 2.0) * 3f64.sqrt()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use std::sync::Arc;
-    use std::sync::atomic::AtomicBool;
-
-    #[test]
-    fn words_that_belong_together_are_never_seen_apart() {
-        let words = Arc::new(Together::new([0; 4]));
-        let done = Arc::new(AtomicBool::new(false));
-        let reader = std::thread::spawn({
-            let (words, done) = (words.clone(), done.clone());
-            move || {
-                let mut reads = 0;
-                while !done.load(Ordering::Acquire) || reads == 0 {
-                    let seen = words.load();
-                    assert!(seen.iter().all(|&word| word == seen[0]), "{seen:?}");
-                    reads += 1;
-                }
-            }
-        });
-        for i in 0..200_000 {
-            words.store([i; 4]);
-        }
-        done.store(true, Ordering::Release);
-        assert!(reader.join().is_ok());
-    }
-
-    #[test]
-    fn who_reads_while_the_writer_is_stopped_amid_its_work_does_not_wait() {
-        let words = Together::new([1; 3]);
-        words.store([2; 3]);
-        // The first word of the next ones.
-        words.place(2)[0].store(3, Ordering::Relaxed);
-        assert_eq!(words.load(), [2; 3]);
-    }
-
-    #[test]
-    fn noise_is_normal_and_the_same_each_time() {
-        let draws = |whose, seed| {
-            let mut noise = Noise::of(whose, seed);
-            (0..100_000).map(|_| noise.draw()).collect::<Vec<f64>>()
-        };
-        let first = draws("cell", 7);
-        assert_eq!(first, draws("cell", 7));
-        assert!([draws("cell", 8), draws("coil", 7)].iter().all(|other| other[0] != first[0] && other[1] != first[1]));
-        assert_eq!(Noise::of("cell", 7).nth(41), first[41]);
-        let mean = first.iter().sum::<f64>() / first.len() as f64;
-        let variance = first.iter().map(|x| x * x).sum::<f64>() / first.len() as f64;
-        assert!(mean.abs() < 0.02, "{mean}");
-        assert!((variance - 1.0).abs() < 0.02, "{variance}");
     }
 }

@@ -8,7 +8,12 @@ use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
 
-use pinion_firmware::time::{Clock, Ticks, TimeSource};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
+
+/// Seconds from `earlier` to `later`; none if they are the other way round.
+pub fn seconds(earlier: Clock, later: Clock) -> f64 {
+    later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
+}
 
 /// A simulated motor follows at any pace: a computer without real time, as most that try the printer, is
 /// late by milliseconds now and then.

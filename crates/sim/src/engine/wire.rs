@@ -6,8 +6,8 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use super::physics::{Axis, Fan, Heater, Lamp, Switch, seconds};
-use super::time::PrinterTime;
+use super::physics::{Axis, Fan, Heater, Lamp, Switch};
+use super::time::{PrinterTime, seconds};
 use crate::description::pin::PinName;
 use pinion_firmware::board::{Adc, Direction, EdgeCount, Edges, Line, Pwm};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
@@ -169,7 +169,7 @@ impl Line for SimLine {
 pub(crate) struct SimAdc {
     pub(crate) wire: Arc<dyn Wire>,
     pub(crate) time: Arc<PrinterTime>,
-    pub(crate) noise: super::physics::Noise,
+    pub(crate) noise: super::noise::Noise,
 }
 
 impl Adc for SimAdc {

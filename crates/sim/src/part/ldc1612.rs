@@ -26,7 +26,7 @@ use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
 use crate::engine::i2c::I2cChip;
-use crate::engine::physics::Noise;
+use crate::engine::noise::Noise;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};

@@ -9,7 +9,7 @@ use serde::Deserialize;
 use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, SimError, check};
 use crate::engine::bed::Bed;
-use crate::engine::physics::Noise;
+use crate::engine::noise::Noise;
 use crate::klippy::sections::Sections;
 
 /// The cell's description.

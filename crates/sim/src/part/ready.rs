@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use crate::engine::physics::Together;
+use crate::engine::together::Together;
 use crate::engine::wire::{Kind, Wire};
 use pinion_firmware::time::Clock;
 

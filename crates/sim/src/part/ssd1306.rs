@@ -22,7 +22,7 @@ use crate::description::check::{SimError, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::i2c::I2cChip;
-use crate::engine::physics::Noise;
+use crate::engine::noise::Noise;
 use crate::engine::spi::SpiChip;
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
