@@ -16,18 +16,16 @@
 #![forbid(unsafe_code)]
 
 use std::collections::VecDeque;
-use std::f64::consts::TAU;
 use std::sync::Arc;
 
 use serde::Deserialize;
 
+use super::ring::{Ring, RingConfig};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, SimError, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::follower::{Follower, Motion};
 use crate::engine::noise::Noise;
-use crate::engine::physics::Axis;
 use crate::engine::spi::SpiChip;
 use crate::engine::time::STEP_LATE_LIMIT;
 use crate::klippy::layout::Layout;
@@ -107,18 +105,6 @@ pub struct Adxl345Config {
     pub z: Option<RingConfig>,
 }
 
-/// An axis that rings.
-#[derive(Clone, Debug, PartialEq, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct RingConfig {
-    /// The axis.
-    pub axis: String,
-    /// Its resonance, without damping.
-    pub hz: f64,
-    /// 0 would ring for ever, 1 not at all.
-    pub damping_ratio: f64,
-}
-
 impl Adxl345Config {
     fn rings(&self) -> [(&'static str, Option<&RingConfig>); 3] {
         [("x", self.x.as_ref()), ("y", self.y.as_ref()), ("z", self.z.as_ref())]
@@ -177,67 +163,6 @@ impl Part for Adxl345Config {
         cfg.key("accel_chip", "adxl345");
         cfg.key("probe_points", format_args!("{x_mm}, {y_mm}, {z_mm}"));
         cfg.section("input_shaper");
-    }
-}
-
-/// A mass on a spring, whose other end an axis moves.
-struct Ring {
-    follower: Follower,
-    /// Angular frequency in rad/s, and how it fades, in 1/s.
-    omega: f64,
-    fade: f64,
-    /// Until when it is solved.
-    now: Clock,
-    /// Where the axis is, how far the mass is ahead of it, and how fast it goes.
-    axis_mm: f64,
-    ahead_mm: f64,
-    mm_per_s: f64,
-}
-
-impl Ring {
-    fn new(axis: Arc<Axis>, config: &RingConfig, now: Clock) -> Ring {
-        let omega = TAU * config.hz;
-        Ring {
-            axis_mm: axis.position_mm(),
-            follower: Follower::new(axis),
-            omega,
-            fade: config.damping_ratio * omega,
-            now,
-            ahead_mm: 0.0,
-            mm_per_s: 0.0,
-        }
-    }
-
-    /// Goes on to an instant, step by step, and gives the speed there.
-    fn speed_at(&mut self, until: Clock) -> f64 {
-        while let Some(motion) = self.follower.next(until) {
-            let (Motion::Step(at, mm) | Motion::Lost(at, mm)) = motion;
-            self.swing(at);
-            self.ahead_mm -= mm - self.axis_mm;
-            self.axis_mm = mm;
-            if matches!(motion, Motion::Lost(..)) {
-                // What it did meanwhile nobody knows: it starts from rest.
-                (self.ahead_mm, self.mm_per_s) = (0.0, 0.0);
-            }
-        }
-        self.swing(until);
-        self.mm_per_s
-    }
-
-    /// The damped oscillation while the axis stands: with the damped frequency `n`,
-    /// `y = e^-ft (y0 cos nt + (v0 + f y0)/n sin nt)`, `v = e^-ft (v0 cos nt - (w^2 y0 + f v0)/n sin nt)`.
-    /// A step that comes out of order happens now.
-    fn swing(&mut self, until: Clock) {
-        let ticks = until.since(self.now).max(0);
-        self.now = self.now.max(until);
-        let (omega, fade) = (self.omega, self.fade);
-        let (y, v) = (self.ahead_mm, self.mm_per_s);
-        let seconds = ticks as f64 / f64::from(CLOCK_FREQ);
-        let damped = (omega * omega - fade * fade).sqrt();
-        let (sin, cos) = (damped * seconds).sin_cos();
-        let decay = (-fade * seconds).exp();
-        self.ahead_mm = decay * (y * cos + (v + fade * y) / damped * sin);
-        self.mm_per_s = decay * (v * cos - (omega * omega * y + fade * v) / damped * sin);
     }
 }
 
@@ -501,7 +426,9 @@ impl SpiChip for Adxl345 {
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
+    use crate::engine::physics::Axis;
     use pinion_firmware::time::VirtualClock;
+    use std::f64::consts::TAU;
 
     const X_HZ: f64 = 57.0;
     const DAMPING: f64 = 0.1;

@@ -13,20 +13,28 @@
 
 #![forbid(unsafe_code)]
 
-use std::f64::consts::TAU;
-use std::sync::Arc;
-
 use serde::Deserialize;
+
+mod a1333;
+mod as5047d;
+mod mt6816;
+mod mt6826s;
+mod shaft;
+mod tle5012b;
+
+use a1333::A1333;
+use as5047d::As5047d;
+use mt6816::Mt6816;
+use mt6826s::Mt6826s;
+use shaft::Shaft;
+use tle5012b::Tle5012b;
 
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, SimError, check};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::physics::Axis;
-use crate::engine::spi::SpiChip;
 use crate::klippy::layout::{FULL_STEPS, Layout};
 use crate::klippy::sections::Sections;
-use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// Which of the sensors it is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
@@ -102,10 +110,10 @@ impl Part for AngleConfig {
             eccentricity: self.eccentricity_degrees / 360.0,
         };
         match self.chip {
-            AngleChip::A1333 => workshop.solder_spi(self, A1333 { shaft, frame: Frame::default(), address: 0 }),
+            AngleChip::A1333 => workshop.solder_spi(self, A1333::new(shaft)),
             AngleChip::As5047d => workshop.solder_spi(self, As5047d::new(shaft)),
             AngleChip::Tle5012b => workshop.solder_spi(self, Tle5012b::new(shaft, time)),
-            AngleChip::Mt6816 => workshop.solder_spi(self, Mt6816 { shaft, latched: 0, place: None, address: 0 }),
+            AngleChip::Mt6816 => workshop.solder_spi(self, Mt6816::new(shaft)),
             AngleChip::Mt6826s => workshop.solder_spi(self, Mt6826s::new(shaft)),
         }
         Ok(())
@@ -121,481 +129,15 @@ impl Part for AngleConfig {
     }
 }
 
-/// What a sensor measures.
-struct Shaft {
-    axis: Arc<Axis>,
-    steps_per_turn: f64,
-    /// In turns.
-    offset: f64,
-    eccentricity: f64,
-}
-
-impl Shaft {
-    /// The turns of the motor.
-    fn turns(&self) -> f64 {
-        self.axis.position_steps() as f64 / self.steps_per_turn
-    }
-
-    /// The angle that the sensor finds: of so many bits.
-    fn angle(&self, bits: u32) -> u16 {
-        let angle = (self.turns() + self.offset).rem_euclid(1.0);
-        let measured = angle + self.eccentricity * (TAU * angle).sin();
-        let steps = f64::from(1u32 << bits);
-        // One turn is none.
-        (measured.rem_euclid(1.0) * steps) as u16 & ((1u32 << bits) - 1) as u16
-    }
-}
-
-/// 1 where that makes the number of ones even.
-fn even_parity(word: u16) -> u16 {
-    (word.count_ones() & 1) as u16
-}
-
-/// A cyclic redundancy check of 8 bits.
-fn crc8(polynomial: u8, start: u8, bytes: &[u8]) -> u8 {
-    bytes.iter().fold(start, |crc, byte| {
-        (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 != 0 { (crc << 1) ^ polynomial } else { crc << 1 })
-    })
-}
-
-/// A frame of 16 bits both ways.
-#[derive(Default)]
-struct Frame {
-    out: u16,
-    into: u16,
-    bytes: usize,
-}
-
-impl Frame {
-    fn begin(&mut self, out: u16) {
-        *self = Frame { out, into: 0, bytes: 0 };
-    }
-
-    fn exchange(&mut self, byte: u8) -> u8 {
-        let [high, low] = self.out.to_be_bytes();
-        self.out = u16::from(low) << 8;
-        self.into = self.into << 8 | u16::from(byte);
-        self.bytes += 1;
-        high
-    }
-
-    fn whole(&self) -> Option<u16> {
-        (self.bytes == 2).then_some(self.into)
-    }
-}
-
-/// A frame has a zero, whether to write, six bits of address and eight of data. What is read comes with the
-/// next frame, as it is when that begins.
-struct A1333 {
-    shaft: Shaft,
-    frame: Frame,
-    /// What is read.
-    address: u8,
-}
-
-impl A1333 {
-    const ANG: u8 = 0x20;
-    const STA: u8 = 0x22;
-    const ANG15: u8 = 0x32;
-
-    fn register(&self) -> u16 {
-        match self.address {
-            A1333::ANG => {
-                // Odd parity in bit 12.
-                let angle = self.shaft.angle(12);
-                angle | (even_parity(angle) ^ 1) << 12
-            }
-            // Its identifier, and nothing to report.
-            A1333::STA => 0x8000,
-            A1333::ANG15 => self.shaft.angle(15),
-            _ => 0,
-        }
-    }
-}
-
-impl SpiChip for A1333 {
-    fn knows_mode(&self, mode: u8) -> bool {
-        mode == 3
-    }
-
-    fn select(&mut self, _rate_hz: u32) {
-        self.frame.begin(self.register());
-    }
-
-    fn exchange(&mut self, byte: u8) -> u8 {
-        self.frame.exchange(byte)
-    }
-
-    fn deselect(&mut self) {
-        // To write needs a code that no host here has.
-        if let Some(frame) = self.frame.whole().filter(|frame| frame & 0x4000 == 0) {
-            self.address = (frame >> 8 & 0x3f) as u8;
-        }
-    }
-}
-
-/// A frame has its even parity, whether to read, and 14 bits of address; an answer its parity, whether an error
-/// is to be told, and 14 bits of data. What is read is latched as the frame ends, and comes with the next.
-struct As5047d {
-    shaft: Shaft,
-    frame: Frame,
-    answer: u16,
-    /// Where the next frame's data goes.
-    writes: Option<u16>,
-    errors: u16,
-    /// SETTINGS1 and SETTINGS2.
-    settings: [u16; 2],
-}
-
-impl As5047d {
-    const READ: u16 = 1 << 14;
-    const FRAMING: u16 = 1;
-    const INVALID: u16 = 1 << 1;
-    const PARITY: u16 = 1 << 2;
-
-    fn new(shaft: Shaft) -> As5047d {
-        As5047d { shaft, frame: Frame::default(), answer: 0, writes: None, errors: 0, settings: [0x01, 0] }
-    }
-
-    /// What is at an address; none if there is no such register.
-    fn register(&mut self, address: u16) -> Option<u16> {
-        match address {
-            0x0000 | 0x0003 | 0x0016 | 0x0017 => Some(0),
-            0x0001 => Some(std::mem::take(&mut self.errors)),
-            0x0018 | 0x0019 => Some(self.settings[usize::from(address & 1)]),
-            // DIAAGC: the loop of the offset is finished, gain in the middle.
-            0x3ffc => Some(0x0180),
-            // MAG: of a magnet that fits.
-            0x3ffd => Some(0x1200),
-            // ANGLEUNC and ANGLECOM, which differ while the motor turns fast.
-            0x3ffe | 0x3fff => Some(self.shaft.angle(14)),
-            _ => None,
-        }
-    }
-
-    fn take_in(&mut self, frame: u16) -> u16 {
-        if even_parity(frame) != 0 {
-            self.errors |= As5047d::PARITY;
-            return 0;
-        }
-        let address = frame & 0x3fff;
-        if let Some(setting) = self.writes.take() {
-            self.settings[usize::from(setting & 1)] = frame & 0xff;
-            return frame & 0xff;
-        }
-        let value = self.register(address);
-        if frame & As5047d::READ == 0 && matches!(address, 0x0018 | 0x0019) {
-            self.writes = Some(address);
-        }
-        value.unwrap_or_else(|| {
-            self.errors |= As5047d::INVALID;
-            0
-        })
-    }
-}
-
-impl SpiChip for As5047d {
-    fn knows_mode(&self, mode: u8) -> bool {
-        mode == 1
-    }
-
-    fn select(&mut self, _rate_hz: u32) {
-        self.frame.begin(self.answer);
-    }
-
-    fn exchange(&mut self, byte: u8) -> u8 {
-        self.frame.exchange(byte)
-    }
-
-    fn deselect(&mut self) {
-        // Reading the error flags clears them: the answer tells of those before.
-        let had_errors = self.errors != 0;
-        let data = match self.frame.whole() {
-            Some(frame) => self.take_in(frame),
-            None => {
-                self.errors |= As5047d::FRAMING;
-                0
-            }
-        };
-        let answer = data | u16::from(had_errors || self.errors != 0) << 14;
-        self.answer = answer | even_parity(answer) << 15;
-    }
-}
-
-/// One wire both ways: a command word (read, lock, whether to read what was latched, address, count), so many
-/// data words, and the chip's safety word with a check sum. An empty selection latches angle, revolutions and
-/// clock.
-struct Tle5012b {
-    shaft: Shaft,
-    time: Arc<dyn TimeSource>,
-    registers: [u16; 0x40],
-    /// AVAL to FSYNC as they were latched.
-    latched: [u16; 4],
-    /// The frame whose angle was read.
-    read_frame: Option<u64>,
-    /// Since power-up nobody has read STAT.
-    was_reset: bool,
-    /// The bytes of the command and the data.
-    said: Vec<u8>,
-    bytes: usize,
-}
-
-impl Tle5012b {
-    const STAT: usize = 0x00;
-    const AVAL: usize = 0x02;
-    const FSYNC: usize = 0x05;
-    const MOD1: usize = 0x06;
-    /// Registers that need the lock code to be written.
-    const LOCKED: std::ops::RangeInclusive<usize> = 0x05..=0x11;
-    const LOCK: u16 = 0b1010;
-    /// Of its timer.
-    const TIMER_HZ: u64 = 750_000;
-    /// TEMPER at 25 degrees: 2.776 for each degree from -152 at 0 on.
-    const TEMPER: i16 = -83;
-
-    fn new(shaft: Shaft, time: Arc<dyn TimeSource>) -> Tle5012b {
-        let mut registers = [0; 0x40];
-        // MOD1 with updates each 42.7 us, MOD2 with the range of 360 degrees, MOD4.
-        registers[Tle5012b::MOD1] = 0x4001;
-        registers[0x08] = 0x0801;
-        registers[0x0e] = 0x0080;
-        Tle5012b {
-            shaft,
-            time,
-            registers,
-            latched: [0; 4],
-            read_frame: None,
-            was_reset: true,
-            said: Vec::new(),
-            bytes: 0,
-        }
-    }
-
-    /// Ticks of its timer since power-up, and those from one measurement to the next.
-    fn timer(&self) -> (u64, u64) {
-        let ticks = self.time.now().since(Clock::EPOCH).max(0) as u64;
-        let timer = u128::from(ticks) * u128::from(Tle5012b::TIMER_HZ) / u128::from(CLOCK_FREQ);
-        (timer as u64, 16 << (self.registers[Tle5012b::MOD1] >> 14))
-    }
-
-    /// AVAL to FSYNC.
-    fn measured(&self) -> [u16; 4] {
-        let (timer, period) = self.timer();
-        let frame = timer / period;
-        let is_new = u16::from(self.read_frame != Some(frame)) << 15;
-        let revolutions = self.shaft.turns().floor() as i64 as u16 & 0x1ff;
-        let counter = (frame & 0x3f) as u16;
-        let within = (timer % period) as u16 & 0x7f;
-        [
-            is_new | self.shaft.angle(15),
-            is_new,
-            is_new | counter << 9 | revolutions,
-            within << 9 | Tle5012b::TEMPER as u16 & 0x1ff,
-        ]
-    }
-
-    fn command(&self) -> Option<u16> {
-        Some(u16::from_be_bytes(self.said.get(..2)?.try_into().ok()?))
-    }
-
-    /// The word of a read at this place behind the command.
-    fn word(&mut self, command: u16, place: usize) -> u16 {
-        let address = (usize::from(command >> 4 & 0x3f) + place) & 0x3f;
-        match address {
-            Tle5012b::STAT => {
-                // Bit 0 tells of a reset, bit 15 that this is new.
-                0x8000 | u16::from(std::mem::take(&mut self.was_reset))
-            }
-            Tle5012b::AVAL..=Tle5012b::FSYNC => {
-                let measured = if command & 0x0400 != 0 { self.latched } else { self.measured() };
-                if address == Tle5012b::AVAL {
-                    let (timer, period) = self.timer();
-                    self.read_frame = Some(timer / period);
-                }
-                measured[address - Tle5012b::AVAL]
-            }
-            address => self.registers[address],
-        }
-    }
-
-    fn safety(&self) -> [u8; 2] {
-        // All is well but for a reset; and which sensor answers: the first.
-        let status = if self.was_reset { 0x7e } else { 0xfe };
-        [status, !crc8(0x1d, 0xff, &self.said)]
-    }
-}
-
-impl SpiChip for Tle5012b {
-    fn knows_mode(&self, mode: u8) -> bool {
-        mode == 1
-    }
-
-    fn select(&mut self, _rate_hz: u32) {
-        self.said.clear();
-        self.bytes = 0;
-    }
-
-    fn exchange(&mut self, byte: u8) -> u8 {
-        let place = self.bytes;
-        self.bytes += 1;
-        let Some(command) = self.command() else {
-            self.said.push(byte);
-            return byte;
-        };
-        let data = 2 + 2 * usize::from(command & 0xf);
-        if place < data && command & 0x8000 == 0 {
-            self.said.push(byte);
-            return byte;
-        }
-        if place >= data {
-            return self.safety()[(place - data) & 1];
-        }
-        if place.is_multiple_of(2) {
-            let word = self.word(command, place / 2 - 1);
-            self.said.extend(word.to_be_bytes());
-        }
-        self.said[place]
-    }
-
-    fn deselect(&mut self) {
-        if self.bytes == 0 {
-            self.latched = self.measured();
-            return;
-        }
-        let Some(command) = self.command().filter(|command| command & 0x8000 == 0) else { return };
-        let address = usize::from(command >> 4 & 0x3f);
-        let locked = Tle5012b::LOCKED.contains(&address) && command >> 11 & 0xf != Tle5012b::LOCK;
-        if let (Some(&[high, low]), false) = (self.said.get(2..4).and_then(|word| word.first_chunk()), locked) {
-            self.registers[address] = u16::from_be_bytes([high, low]);
-        }
-    }
-}
-
-/// A byte with the address and whether to read, then as many registers as the host clocks out. The angle is
-/// latched as the chip is selected.
-struct Mt6816 {
-    shaft: Shaft,
-    latched: u16,
-    /// Of the register that goes out next; none until the address came.
-    place: Option<u8>,
-    address: u8,
-}
-
-impl SpiChip for Mt6816 {
-    fn knows_mode(&self, mode: u8) -> bool {
-        mode == 3
-    }
-
-    fn select(&mut self, _rate_hz: u32) {
-        self.latched = self.shaft.angle(14);
-        self.place = None;
-    }
-
-    fn exchange(&mut self, byte: u8) -> u8 {
-        let Some(place) = self.place else {
-            self.address = byte & 0x7f;
-            // What is written programs the chip, which is done in a factory.
-            self.place = (byte & 0x80 != 0).then_some(self.address);
-            return 0xff;
-        };
-        self.place = Some(place.wrapping_add(1) & 0x7f);
-        let angle = self.latched << 2;
-        let [high, low] = (angle | even_parity(angle)).to_be_bytes();
-        match place {
-            0x03 => high,
-            0x04 => low,
-            _ => 0,
-        }
-    }
-}
-
-/// Four bits of command and twelve of address, then data: to read as many registers as the host clocks out.
-/// The angle is latched as the chip is selected.
-struct Mt6826s {
-    shaft: Shaft,
-    latched: u16,
-    head: u16,
-    bytes: usize,
-    registers: [u8; 0x156],
-    /// Where the motor stood as a calibration began.
-    calibrates_from: Option<f64>,
-}
-
-impl Mt6826s {
-    const READ: u16 = 0x3;
-    const WRITE: u16 = 0x6;
-    const ANGLE: usize = 0x003;
-    const CRC: usize = 0x006;
-    const AUTOCAL_FREQ: usize = 0x00e;
-    const AUTOCAL_STATUS: usize = 0x113;
-    const AUTOCAL_KEY: usize = 0x155;
-    const AUTOCAL_START: u8 = 0x5e;
-    /// Turns that its calibration takes.
-    const AUTOCAL_TURNS: f64 = 16.0;
-
-    fn new(shaft: Shaft) -> Mt6826s {
-        let mut registers = [0; 0x156];
-        // To be calibrated at 100 to 200 turns in a minute.
-        registers[Mt6826s::AUTOCAL_FREQ] = 5 << 4;
-        Mt6826s { shaft, latched: 0, head: 0, bytes: 0, registers, calibrates_from: None }
-    }
-
-    fn register(&self, address: usize) -> u8 {
-        let [high, low] = (self.latched << 1).to_be_bytes();
-        // The magnet and the supply are well.
-        let angle = [high, low, 0];
-        match address {
-            Mt6826s::ANGLE..Mt6826s::CRC => angle[address - Mt6826s::ANGLE],
-            Mt6826s::CRC => crc8(0x07, 0, &angle),
-            Mt6826s::AUTOCAL_STATUS => match self.calibrates_from {
-                None => 0,
-                Some(from) if (self.shaft.turns() - from).abs() < Mt6826s::AUTOCAL_TURNS => 1 << 6,
-                Some(_) => 3 << 6,
-            },
-            _ => self.registers.get(address).copied().unwrap_or(0),
-        }
-    }
-}
-
-impl SpiChip for Mt6826s {
-    fn knows_mode(&self, mode: u8) -> bool {
-        mode == 3
-    }
-
-    fn select(&mut self, _rate_hz: u32) {
-        self.latched = self.shaft.angle(15);
-        (self.head, self.bytes) = (0, 0);
-    }
-
-    fn exchange(&mut self, byte: u8) -> u8 {
-        let place = self.bytes;
-        self.bytes += 1;
-        if place < 2 {
-            self.head = self.head << 8 | u16::from(byte);
-            return 0xff;
-        }
-        let address = usize::from(self.head & 0xfff) + place - 2;
-        match self.head >> 12 {
-            Mt6826s::READ => return self.register(address),
-            Mt6826s::WRITE if place == 2 => {
-                if let Some(register) = self.registers.get_mut(address) {
-                    *register = byte;
-                }
-                if address == Mt6826s::AUTOCAL_KEY && byte == Mt6826s::AUTOCAL_START {
-                    self.calibrates_from = Some(self.shaft.turns());
-                }
-            }
-            _ => {}
-        }
-        0xff
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use super::shaft::{crc8, even_parity};
     use super::*;
     use crate::description::default::DefaultPrinter;
-    use pinion_firmware::time::{Ticks, VirtualClock};
+    use crate::engine::physics::Axis;
+    use crate::engine::spi::SpiChip;
+    use pinion_firmware::time::{Clock, Ticks, VirtualClock};
+    use std::sync::Arc;
 
     /// A shaft at this many 3200th of a turn: 60 mm are one turn and a half.
     fn shaft(steps: i64) -> Shaft {
@@ -623,7 +165,7 @@ mod tests {
 
     #[test]
     fn an_a1333_tells_the_angle_of_the_next_frame() {
-        let mut chip = A1333 { shaft: shaft(1), frame: Frame::default(), address: 0 };
+        let mut chip = A1333::new(shaft(1));
         assert_eq!(transfer(&mut chip, &[0x32, 0]), [0, 0]);
         // Half a turn and 10.24 of 32768.
         assert_eq!(transfer(&mut chip, &[0x20, 0]), (0x4000u16 + 10).to_be_bytes());
@@ -694,7 +236,7 @@ mod tests {
 
     #[test]
     fn an_mt6816_and_an_mt6826s_go_on_from_the_register_that_was_named() {
-        let mut chip = Mt6816 { shaft: shaft(2), latched: 0, place: None, address: 0 };
+        let mut chip = Mt6816::new(shaft(2));
         let angle = 0x200au16 << 2;
         assert_eq!(transfer(&mut chip, &[0x83, 0, 0])[1..], (angle | even_parity(angle)).to_be_bytes());
         assert_eq!(transfer(&mut chip, &[0x84, 0])[1..], [(angle | even_parity(angle)) as u8]);

@@ -15,7 +15,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::sync::{Arc, Mutex, TryLockError};
+use std::sync::{Arc, Mutex};
 
 use serde::Deserialize;
 
@@ -23,31 +23,15 @@ use super::trinamic::{
     Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
     offer_sensorless_homing,
 };
+use super::uart::{HOST, Role, SYNC, Uart, UartChip, UartPin, WRITE, WRITE_LEN, crc8};
 use super::workshop::{Part, Workshop};
 use crate::description::check::{SimError, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
-use crate::engine::wire::{Kind, Wire};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
-
-/// The low nibble of a message's first byte; the high one may be anything.
-const SYNC: u8 = 0x05;
-/// The address in an answer: the host's.
-const HOST: u8 = 0xff;
-const WRITE: u8 = 0x80;
-const READ_LEN: usize = 4;
-const WRITE_LEN: usize = 8;
-/// A byte with its start and its stop bit.
-const FRAME_BITS: u64 = 10;
-/// After a pause of so many bit times between two start bits, or after a fault and so many of silence, a
-/// message begins anew.
-const PAUSE_BITS: u64 = 63;
-const RECOVERY_BITS: u64 = 12;
-/// The baud rates that the chip hears: 9000 to its clock / 16.
-const LONGEST_BIT: u64 = pinion_firmware::time::CLOCK_FREQ as u64 / 9000;
 
 const GCONF: u8 = 0x00;
 const GSTAT: u8 = 0x01;
@@ -155,7 +139,7 @@ impl Part for Tmc2209Config {
         let Some(axis) = workshop.axis(&self.axis) else { return Ok(()) };
         let chip = Tmc2209::new(&self.name(), self.address, axis);
         workshop.wire_shared(self.diag_pin.as_ref(), chip.diag.clone());
-        let uart = Arc::new(Mutex::new(Uart::new(chip)));
+        let uart = Arc::new(Mutex::new(Uart::new(Box::new(chip))));
         let end = |role| UartPin { name: self.name(), role, uart: uart.clone() };
         match &self.tx_pin {
             None => workshop.wire(Some(&self.uart_pin), end(Role::Both)),
@@ -251,8 +235,9 @@ impl Tmc2209 {
             self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
         }
     }
+}
 
-    /// Takes a message in; what it answers.
+impl UartChip for Tmc2209 {
     fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]> {
         let &[_, address, register, ref rest @ ..] = message else { return None };
         if address != self.address {
@@ -268,7 +253,6 @@ impl Tmc2209 {
         Some([a, b, c, d, e, f, g, crc8(&answer)])
     }
 
-    /// Bit times from a message to its answer.
     fn send_delay(&self) -> u64 {
         // 8, 24, 40 ... 120 by pairs of values.
         8 * u64::from(self.registers.get(SLAVECONF) >> 8 & 0xf | 1)
@@ -289,236 +273,11 @@ fn stall_rule(registers: &Registers, mres: u32) -> StallRule {
     }
 }
 
-/// CRC8-ATM, each byte from its lowest bit on ("CRC Calculation").
-fn crc8(bytes: &[u8]) -> u8 {
-    bytes.iter().fold(0, |crc, byte| {
-        (0..8).fold(crc, |crc: u8, bit| {
-            let carry = (crc >> 7) ^ (byte >> bit & 1);
-            (crc << 1) ^ (carry * 0x07)
-        })
-    })
-}
-
-/// What the chip's receiver waits for.
-#[derive(Clone, Copy, Debug, PartialEq)]
-enum Expects {
-    /// The start bit of a message.
-    Message,
-    /// The edges of the sync nibble after the first one, of which so many came.
-    Sync(u32),
-    /// The middle of this bit of a byte (0 is the start bit).
-    Bit(u64),
-    /// The start bit of the next byte.
-    Byte,
-    /// Silence, as what came was no message.
-    Silence,
-}
-
-/// The chip's UART on its wire, which is high when nobody drives it low.
-struct Uart {
-    chip: Tmc2209,
-    expects: Expects,
-    /// The wire's level as the machine drives it, and since when.
-    high: bool,
-    since: Clock,
-    /// Ticks of a bit; 0 before the first sync nibble.
-    bit: u64,
-    /// The start bit of the byte that comes, or came last.
-    start: Clock,
-    bytes: [u8; WRITE_LEN],
-    len: usize,
-    answer: Option<Answer>,
-}
-
-#[derive(Clone, Copy)]
-struct Answer {
-    at: Clock,
-    bit: u64,
-    bytes: [u8; WRITE_LEN],
-}
-
-impl Answer {
-    /// The level of the wire at an instant.
-    fn level(&self, now: Clock) -> bool {
-        let Ok(into) = u64::try_from(now.since(self.at)) else { return true };
-        let place = into / self.bit;
-        let byte = usize::try_from(place / FRAME_BITS).ok().and_then(|byte| self.bytes.get(byte));
-        byte.is_none_or(|byte| match place % FRAME_BITS {
-            0 => false,
-            9 => true,
-            bit => byte >> (bit - 1) & 1 != 0,
-        })
-    }
-}
-
-impl Uart {
-    fn new(chip: Tmc2209) -> Uart {
-        Uart {
-            chip,
-            expects: Expects::Message,
-            high: true,
-            since: Clock::EPOCH,
-            bit: 0,
-            start: Clock::EPOCH,
-            bytes: [0; WRITE_LEN],
-            len: 0,
-            answer: None,
-        }
-    }
-
-    /// The machine drives the wire, or lets go of it, which pulls it up.
-    fn set(&mut self, high: bool, at: Clock) {
-        self.look(at);
-        if high == self.high {
-            return;
-        }
-        let silent = at.since(self.since).max(0) as u64;
-        (self.high, self.since) = (high, at);
-        let since_start = at.since(self.start).max(0) as u64;
-        match self.expects {
-            Expects::Sync(edges) => self.sync(edges, at),
-            Expects::Silence if silent < RECOVERY_BITS * self.bit => {}
-            Expects::Byte if !high && since_start <= PAUSE_BITS * self.bit => {
-                self.start = at;
-                self.expects = Expects::Bit(0);
-            }
-            Expects::Message | Expects::Byte | Expects::Silence if !high => {
-                self.start = at;
-                self.len = 0;
-                self.answer = None;
-                self.expects = Expects::Sync(0);
-            }
-            _ => {}
-        }
-    }
-
-    /// An edge of the sync nibble, 1010, which takes the chip as long as four bits from the falling edge
-    /// of the start bit to the last falling one.
-    fn sync(&mut self, edges: u32, at: Clock) {
-        let edges = edges + 1;
-        self.expects = Expects::Sync(edges);
-        if edges == 4 {
-            self.bit = at.since(self.start).max(0) as u64 / 4;
-            let fits = (1..=LONGEST_BIT).contains(&self.bit);
-            if !fits {
-                self.bit = LONGEST_BIT;
-            }
-            self.bytes[0] = SYNC;
-            self.expects = if fits { Expects::Bit(5) } else { Expects::Silence };
-        }
-    }
-
-    /// The middle of a bit of the byte that comes.
-    fn middle(&self, bit: u64) -> Clock {
-        Clock::from_ticks(self.start.ticks() + bit * self.bit + self.bit / 2)
-    }
-
-    /// Takes in what went by until now, while the wire stood as it stands.
-    fn look(&mut self, now: Clock) {
-        while let Expects::Bit(bit) = self.expects {
-            let middle = self.middle(bit);
-            if now <= middle {
-                return;
-            }
-            self.expects = Expects::Bit(bit + 1);
-            let mask = 1u8.checked_shl(bit.wrapping_sub(1) as u32).unwrap_or(0);
-            match bit {
-                0 if self.high => self.expects = Expects::Silence,
-                0 => self.bytes[self.len] = 0,
-                9 if !self.high => self.expects = Expects::Silence,
-                9 => self.byte(middle),
-                _ if self.high => self.bytes[self.len] |= mask,
-                _ => {}
-            }
-        }
-    }
-
-    /// A byte is whole, in the middle of its stop bit.
-    fn byte(&mut self, now: Clock) {
-        self.len += 1;
-        self.expects = Expects::Byte;
-        let len = if self.bytes[2] & WRITE == 0 { READ_LEN } else { WRITE_LEN };
-        if self.len < 3 || self.len < len {
-            return;
-        }
-        let message = &self.bytes[..self.len];
-        let (last, checked) = message.split_last().unwrap_or((&0, &[]));
-        if crc8(checked) != *last {
-            self.expects = Expects::Silence;
-            return;
-        }
-        self.expects = Expects::Message;
-        let bytes = self.chip.hear(message, now);
-        let end = self.start.ticks() + (FRAME_BITS + self.chip.send_delay()) * self.bit;
-        self.answer = bytes.map(|bytes| Answer { at: Clock::from_ticks(end), bit: self.bit, bytes });
-    }
-
-    /// The level of the wire when the machine does not drive it.
-    fn level(&mut self, now: Clock) -> bool {
-        self.look(now);
-        self.answer.is_none_or(|answer| answer.level(now))
-    }
-}
-
-/// What an end of the UART does.
-#[derive(Clone, Copy, PartialEq)]
-enum Role {
-    /// Sends and receives, by turns.
-    Both,
-    Sender,
-    Receiver,
-}
-
-/// The board's end of the wire, or one of two.
-struct UartPin {
-    name: String,
-    role: Role,
-    uart: Arc<Mutex<Uart>>,
-}
-
-impl UartPin {
-    /// Something happens on the wire. One thread at a time drives it; should another come in between, the
-    /// chip does not hear it.
-    fn on_wire<T>(&self, happens: impl FnOnce(&mut Uart) -> T) -> Option<T> {
-        match self.uart.try_lock() {
-            Ok(mut uart) => Some(happens(&mut uart)),
-            Err(TryLockError::Poisoned(uart)) => Some(happens(&mut uart.into_inner())),
-            Err(TryLockError::WouldBlock) => None,
-        }
-    }
-}
-
-impl Wire for UartPin {
-    fn kind(&self) -> Kind {
-        match self.role {
-            Role::Both => Kind::Shared,
-            Role::Sender => Kind::Output,
-            Role::Receiver => Kind::Input,
-        }
-    }
-
-    fn describe(&self) -> String {
-        format!("UART of {}", self.name)
-    }
-
-    fn drive(&self, on: bool, at: Clock) {
-        self.on_wire(|uart| uart.set(on, at));
-    }
-
-    fn release(&self, at: Clock) {
-        self.on_wire(|uart| uart.set(true, at));
-    }
-
-    /// The machine's own low level is on the wire, too.
-    fn sense(&self, _driven: bool, at: Clock) -> bool {
-        self.on_wire(|uart| uart.level(at) && uart.high).unwrap_or(true)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
+    use crate::engine::wire::Wire;
     use pinion_firmware::time::Ticks;
 
     /// 40 kbaud.
@@ -534,7 +293,7 @@ mod tests {
     impl Bench {
         fn new(address: u8) -> Bench {
             let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[1]));
-            let uart = Arc::new(Mutex::new(Uart::new(Tmc2209::new("tmc2209 y", address, axis.clone()))));
+            let uart = Arc::new(Mutex::new(Uart::new(Box::new(Tmc2209::new("tmc2209 y", address, axis.clone())))));
             let pin = UartPin { name: "tmc2209 y".into(), role: Role::Both, uart };
             pin.settle(true, Clock::EPOCH);
             Bench { axis, pin, bit: BIT, now: Clock::EPOCH + Ticks(100_000) }
