@@ -3,18 +3,17 @@
 
 #![forbid(unsafe_code)]
 
-use std::fmt::{self, Display, Write};
-
-use super::config::{
-    AxisConfig, DeltaConfig, End, FanConfig, HeaterConfig, InputConfig, Kinematics, LedConfig, PinName, SimConfig,
-};
+use super::config::SimConfig;
+use super::description::axes::{AxisConfig, DeltaConfig, End};
+use super::description::heater::{FanConfig, HeaterConfig};
+use super::description::outputs::{InputConfig, LedConfig};
+use super::description::printer::Kinematics;
+use super::klippy::layout::{CLEAR_MM, FULL_STEPS, Layout, WITHIN_REACH, rounded};
+use super::klippy::sections::Sections;
 
 mod software;
 #[cfg(test)]
 mod tests;
-
-/// Full steps in a turn of the usual stepper motor.
-pub(super) const FULL_STEPS: f64 = 200.0;
 
 /// The printer.cfg that matches a board, for a klippy of today's Klipper with `pty` as its serial
 /// port.
@@ -38,7 +37,7 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     cfg.comment("mkdir -p ~/printer_data/gcodes");
     cfg.key("path", "~/printer_data/gcodes");
 
-    let layout = Layout::of(config);
+    let layout = Layout::of(config.printer());
     cfg.motion(&layout);
     for heater in &config.heaters {
         cfg.thermistor(heater);
@@ -62,211 +61,10 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     cfg.text
 }
 
-/// The second carriage of the x axis.
-const DUAL_CARRIAGE: &str = "dual_carriage";
-
-/// Which of klippy's sections the axes belong to.
-pub(super) struct Layout<'a> {
-    pub(super) config: &'a SimConfig,
-    kinematics: Kinematics<'a>,
-}
-
-impl<'a> Layout<'a> {
-    fn of(config: &'a SimConfig) -> Layout<'a> {
-        Layout { config, kinematics: config.kinematics() }
-    }
-
-    /// Whether klippy moves a head over the bed.
-    pub(super) fn has_head(&self) -> bool {
-        self.kinematics != Kinematics::None
-    }
-
-    /// Whether an axis has klippy's keys of an axis that is homed.
-    pub(super) fn is_homed(&self, axis: &str) -> bool {
-        self.kinematics == Kinematics::Cartesian
-            && (self.kinematics.rails().contains(&axis) || self.is_dual_carriage(axis))
-    }
-
-    fn is_dual_carriage(&self, axis: &str) -> bool {
-        let config = self.config.axis(axis).filter(|_| axis == DUAL_CARRIAGE);
-        self.kinematics == Kinematics::Cartesian && config.is_some_and(|axis| axis.endstop_pin.is_some())
-    }
-
-    /// Whether there is a hot end of this name: klippy has its heater and its stepper in one section.
-    pub(super) fn is_hot_end(&self, name: &str) -> bool {
-        self.config.hot_ends().any(|heater| heater.name == name)
-    }
-
-    /// The section of an axis' stepper.
-    pub(super) fn stepper(&self, axis: &str) -> String {
-        let is_of = |rail: &&str| self.config.motors(rail).any(|motor| motor.name == axis);
-        if self.kinematics.rails().iter().any(is_of) {
-            format!("stepper_{axis}")
-        } else if self.is_hot_end(axis) || self.is_dual_carriage(axis) {
-            axis.to_owned()
-        } else {
-            format!("manual_stepper {axis}")
-        }
-    }
-
-    /// The section of a heater, or of the sensor in what nobody switches.
-    fn heater(&self, heater: &HeaterConfig) -> String {
-        match heater.name.as_str() {
-            "heater_bed" => "heater_bed".to_owned(),
-            name if self.is_hot_end(name) => name.to_owned(),
-            name if heater.pin.is_some() => format!("heater_generic {name}"),
-            name => format!("temperature_sensor {name}"),
-        }
-    }
-
-    /// A place on the bed: 0 is where x and y start, 1 is where they end.
-    pub(super) fn place_mm(&self, x: f64, y: f64) -> [f64; 2] {
-        let travel_mm = |name| self.config.axis(name).and_then(|axis| axis.travel_mm).unwrap_or(0.0);
-        match self.kinematics {
-            // The square in the circle.
-            Kinematics::Delta(delta) => [x, y].map(|share| (2.0 * share - 1.0) * delta.bed_radius_mm / 2f64.sqrt()),
-            _ => [x * travel_mm("x"), y * travel_mm("y")],
-        }
-    }
-
-    /// The highest that the nozzle goes.
-    pub(super) fn height_mm(&self) -> f64 {
-        let travel_mm = |name| self.config.axis(name).and_then(|axis| axis.travel_mm).unwrap_or(0.0);
-        match self.kinematics {
-            Kinematics::Delta(delta) => travel_mm("a") - delta.lowest_mm(),
-            _ => travel_mm("z"),
-        }
-    }
-}
-
-/// What a probe beside the nozzle reaches: up to this share of the bed, and from the rest of it on.
-const WITHIN_REACH: f64 = 0.8;
-/// Above the bed by so much no probe touches it.
-const CLEAR_MM: f64 = 5.0;
-
-/// To a micrometre, without what a fraction of two adds.
-fn rounded(mm: f64) -> f64 {
-    (mm * 1000.0).round() / 1000.0 + 0.0
-}
-
-/// A place on the bed, as klippy reads it.
-struct Place([f64; 2]);
-
-impl Display for Place {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let [x_mm, y_mm] = self.0.map(rounded);
-        write!(f, "{x_mm}, {y_mm}")
-    }
-}
-
-/// A printer.cfg as it grows.
-#[derive(Default)]
-pub(super) struct Sections {
-    text: String,
-    /// Whether what comes is only offered: a `#` stands before each line.
-    offered: bool,
-    /// Whether there is a section of a probe, of which klippy takes one.
-    has_probe: bool,
-}
-
 impl Sections {
-    /// Adds a line. Writing to a String does not fail.
-    fn line(&mut self, line: fmt::Arguments<'_>) {
-        let mark = if self.offered { "#" } else { "" };
-        let written = self.text.write_fmt(format_args!("{mark}{line}\n"));
-        debug_assert!(written.is_ok());
-    }
-
-    /// Adds sections that take the place of others: a `#` before each of their lines keeps them out
-    /// of use.
-    pub(super) fn offer(&mut self, sections: impl FnOnce(&mut Sections)) {
-        self.offered = true;
-        sections(self);
-        self.offered = false;
-    }
-
-    /// Adds the section of a probe: klippy takes one, so the first is in use, and the others are offered.
-    pub(super) fn probe(&mut self, layout: &Layout<'_>, section: impl FnOnce(&mut Sections)) {
-        if !layout.has_head() {
-            return;
-        }
-        if std::mem::replace(&mut self.has_probe, true) {
-            self.section_break();
-            self.comment("Another probe, in place of the one that is in use:");
-            return self.offer(section);
-        }
-        section(self);
-        self.section("bed_mesh");
-        match layout.kinematics {
-            Kinematics::Delta(delta) => {
-                self.key("mesh_radius", rounded(WITHIN_REACH * delta.bed_radius_mm));
-                self.key("round_probe_count", 5);
-            }
-            _ => {
-                self.key("mesh_min", Place(layout.place_mm(1.0 - WITHIN_REACH, 1.0 - WITHIN_REACH)));
-                self.key("mesh_max", Place(layout.place_mm(WITHIN_REACH, WITHIN_REACH)));
-                self.key("probe_count", "5, 5");
-            }
-        }
-        self.key("horizontal_move_z", CLEAR_MM);
-        self.key("speed", layout.config.limits.velocity_mm_per_s);
-    }
-
-    /// The keys of a probe that stands off the nozzle by so much.
-    pub(super) fn offsets(&mut self, [x_mm, y_mm, z_mm]: [f64; 3]) {
-        self.key("x_offset", x_mm);
-        self.key("y_offset", y_mm);
-        self.key("z_offset", z_mm);
-    }
-
-    /// The keys of a chip on an SPI bus.
-    pub(super) fn spi(&mut self, bus: &str, select_pin: Option<&PinName>) {
-        match select_pin {
-            Some(pin) => self.key("cs_pin", pin),
-            None => self.key("cs_pin", "None"),
-        }
-        self.key("spi_bus", bus);
-    }
-
-    /// Adds a line for people.
-    pub(super) fn comment(&mut self, text: impl Display) {
-        let text = text.to_string();
-        self.line(format_args!("#{}{text}", if text.is_empty() { "" } else { " " }));
-    }
-
-    /// Tells that klippy takes this section only beside another one.
-    pub(super) fn needs(&mut self, section: impl Display) {
-        self.comment(format_args!("Needs [{section}]."));
-    }
-
-    fn section_break(&mut self) {
-        self.text.push('\n');
-    }
-
-    pub(super) fn section(&mut self, name: impl Display) {
-        self.section_break();
-        self.line(format_args!("[{name}]"));
-    }
-
-    pub(super) fn key(&mut self, key: impl Display, value: impl Display) {
-        self.line(format_args!("{key}: {value}"));
-    }
-
-    pub(super) fn key_if(&mut self, key: &str, value: Option<impl Display>) {
-        if let Some(value) = value {
-            self.key(key, value);
-        }
-    }
-
-    /// A key with a line for each place.
-    fn places(&mut self, key: &str, places: impl IntoIterator<Item = [f64; 2]>) {
-        self.line(format_args!("{key}:"));
-        places.into_iter().for_each(|place| self.line(format_args!("  {}", Place(place))));
-    }
-
     /// `[printer]`, and a section for each axis but the hot ends'.
     fn motion(&mut self, layout: &Layout<'_>) {
-        let limits = &layout.config.limits;
+        let limits = &layout.printer.limits;
         self.section("printer");
         self.key(
             "kinematics",
@@ -292,7 +90,7 @@ impl Sections {
             }
             Kinematics::None => {}
         }
-        for axis in &layout.config.axes {
+        for axis in layout.printer.axes {
             if !layout.is_hot_end(&axis.name) {
                 self.axis(axis, layout);
             }
@@ -346,7 +144,7 @@ impl Sections {
 
     /// What levels the gantry, or the bed, by the motors of the z axis.
     fn leveling(&mut self, layout: &Layout<'_>) {
-        let at_mm: Vec<[f64; 2]> = layout.config.motors("z").filter_map(|motor| motor.at_mm).collect();
+        let at_mm: Vec<[f64; 2]> = layout.printer.motors("z").filter_map(|motor| motor.at_mm).collect();
         if at_mm.len() < 2 {
             return;
         }
@@ -368,7 +166,7 @@ impl Sections {
         }
         self.places("points", at_mm.iter().map(near));
         self.key("horizontal_move_z", CLEAR_MM);
-        self.key("speed", layout.config.limits.velocity_mm_per_s);
+        self.key("speed", layout.printer.limits.velocity_mm_per_s);
         self.key("retries", 5);
         self.key("retry_tolerance", 0.01);
     }
@@ -406,14 +204,14 @@ impl Sections {
     }
 
     fn heater(&mut self, heater: &HeaterConfig, layout: &Layout<'_>) {
-        let fan = layout.config.fan_of(&heater.name);
+        let fan = layout.printer.fan_of(&heater.name);
         if heater.pin.is_none() && fan.is_some() {
             // The fan's section has its keys.
             return;
         }
         self.section(layout.heater(heater));
         if layout.is_hot_end(&heater.name) {
-            if let Some(axis) = layout.config.axis(&heater.name) {
+            if let Some(axis) = layout.printer.axis(&heater.name) {
                 self.stepper(axis);
             }
             self.key("nozzle_diameter", 0.4);
@@ -455,8 +253,8 @@ impl Sections {
     }
 
     fn fan(&mut self, fan: &FanConfig, layout: &Layout<'_>) {
-        let config = layout.config;
-        let cooled = config.heaters.iter().find(|heater| fan.cools.as_ref() == Some(&heater.name));
+        let printer = layout.printer;
+        let cooled = printer.heaters.iter().find(|heater| fan.cools.as_ref() == Some(&heater.name));
         match cooled {
             _ if fan.name == "fan" => self.section("fan"),
             Some(heater) if heater.pin.is_some() => {

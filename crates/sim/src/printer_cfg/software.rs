@@ -3,7 +3,9 @@
 
 #![forbid(unsafe_code)]
 
-use super::{Kinematics, Layout, Place, Sections, WITHIN_REACH, rounded};
+use crate::description::printer::Kinematics;
+use crate::klippy::layout::{CLEAR_MM, Layout, Place, WITHIN_REACH, rounded};
+use crate::klippy::sections::Sections;
 
 /// Those that any printer takes, with their keys.
 const ANYWHERE: [(&str, &[(&str, &str)]); 10] = [
@@ -69,7 +71,7 @@ impl Sections {
         self.places("points", corners.map(|(_, at_mm)| at_mm));
         self.section("safe_z_home");
         self.key("home_xy_position", Place(layout.place_mm(0.5, 0.5)));
-        self.key("z_hop", super::CLEAR_MM);
+        self.key("z_hop", CLEAR_MM);
         if self.has_probe {
             let [[start_mm, _], [end_mm, middle_mm]] =
                 [[1.0 - WITHIN_REACH, 0.5], [WITHIN_REACH, 0.5]].map(|[x, y]| layout.place_mm(x, y));

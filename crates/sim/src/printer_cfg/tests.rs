@@ -3,8 +3,8 @@
 
 #![forbid(unsafe_code)]
 
-use super::super::config::tests::example;
 use super::*;
+use crate::config::tests::example;
 
 /// The printer.cfg of an example.
 fn printed(heading: &str) -> String {

@@ -1,0 +1,289 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A simulated printer, put together and driven as a board.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use pinion_firmware::board::{
+    Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
+    PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
+};
+use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
+use pinion_firmware::time::{Clock, Ticks, TimeSource};
+
+use super::config::SimConfig;
+use super::description::check::SimError;
+use super::description::pin::PinName;
+use super::engine::i2c::{I2cBus, I2cDevice};
+use super::engine::led::ColouredLed;
+use super::engine::noise::Noise;
+use super::engine::physics::{Axis, Fan, Heater, Lamp, Switch};
+use super::engine::spi::{MosiPin, SpiBus, SpiDevice};
+use super::engine::time::{ErrandTime, PrinterTime, STEP_LATE_LIMIT};
+use super::engine::wire::{
+    DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges, SimLine,
+    SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
+};
+use super::engine::world::World;
+use super::part::workshop::Workshop;
+use super::view::SimProbe;
+
+/// The worker of the thermistors.
+const ADC_WORKER: &str = "adc";
+/// The worker that takes edges.
+const EDGES_WORKER: &str = "edges";
+/// The worker of the PWM channels.
+const PWM_WORKER: &str = "pwm";
+/// Bytes that an SPI bus sends without a pause: as many as by the kernel's default `spidev.bufsiz`.
+const MESSAGE_MAX: usize = 4096;
+
+/// A simulated printer.
+pub struct SimBoard {
+    time: Arc<PrinterTime>,
+    seed: u64,
+    world: Arc<World>,
+    /// By pin number.
+    pins: Vec<WiredPin>,
+    /// By number.
+    spi_buses: Vec<Arc<SpiBus>>,
+    /// By number.
+    i2c_buses: Vec<Arc<I2cBus>>,
+}
+
+impl SimBoard {
+    /// The printer of a description, at rest.
+    pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, SimError> {
+        config.validate()?;
+        let printer = config.printer();
+        let now = clock.now();
+        let mut workshop = Workshop {
+            printer,
+            time: Arc::new(PrinterTime::new(clock)),
+            world: World::default(),
+            pins: Vec::new(),
+            spi_buses: Vec::new(),
+            i2c_buses: config.i2c_buses.iter().map(I2cBus::new).collect(),
+        };
+        for part in &config.axes {
+            let axis = Arc::new(Axis::new(part));
+            workshop.wire(Some(&part.step_pin), StepPin(axis.clone()));
+            workshop.wire(Some(&part.dir_pin), DirectionPin(axis.clone()));
+            workshop.wire(part.enable_pin.as_ref(), EnablePin(axis.clone()));
+            workshop.wire(part.endstop_pin.as_ref(), EndstopPin(axis.clone()));
+            workshop.world.axes.push(axis);
+        }
+        for part in &config.heaters {
+            let cooling_w_per_k = printer.fan_of(&part.name).map_or(0.0, |fan| fan.cooling_w_per_k);
+            let heater = Arc::new(Heater::new(part, part.thermistor()?, cooling_w_per_k, now));
+            workshop.wire(part.pin.as_ref(), HeaterPin(heater.clone()));
+            workshop.wire(Some(&part.sensor_pin), ThermistorPin(heater.clone()));
+            workshop.world.heaters.push(heater);
+        }
+        for part in &config.fans {
+            let cools = part.cools.as_ref().and_then(|heater| workshop.heater(heater));
+            let fan = Arc::new(Fan::new(part, cools, now));
+            workshop.wire(Some(&part.pin), FanPin(fan.clone(), Switch::Power));
+            workshop.wire(part.enable_pin.as_ref(), FanPin(fan.clone(), Switch::Enable));
+            workshop.wire(part.tachometer_pin.as_ref(), TachometerPin(fan.clone()));
+            workshop.world.fans.push(fan);
+        }
+        let mut switched: Vec<(&PinName, Arc<Lamp>)> = Vec::new();
+        let mut lamp = |workshop: &mut Workshop<'_>, name: &str, pin| {
+            let lamp = Arc::new(Lamp::new(name));
+            workshop.wire(Some(pin), LampPin(lamp.clone()));
+            switched.push((pin, lamp.clone()));
+            lamp
+        };
+        for part in &config.leds {
+            let lamps = part.pins().map(|(_, pin)| pin.map(|pin| lamp(&mut workshop, &part.name, pin)));
+            match lamps {
+                [None, None, None, Some(lamp)] => workshop.world.lamps.push(lamp),
+                lamps => workshop.show(Arc::new(ColouredLed { name: part.name.clone(), lamps })),
+            }
+        }
+        for part in &config.outputs {
+            let lamp = lamp(&mut workshop, &part.name, &part.pin);
+            workshop.world.lamps.push(lamp);
+        }
+        for part in &config.inputs {
+            workshop.wire(Some(&part.pin), FixedInput { name: part.name.clone(), on: part.level });
+        }
+        for bus in &config.spi_buses {
+            let bus = SpiBus::new(bus, |name| {
+                let (pin, lamp) = switched.iter().find(|(pin, _)| pin.name == name)?;
+                Some((lamp.clone(), pin.inverted))
+            })?;
+            workshop.spi_buses.push(bus);
+        }
+        for part in &config.parts {
+            part.part().build(&mut workshop)?;
+        }
+        for bus in &config.spi_buses {
+            workshop.wire(Some(&bus.mosi_pin()), MosiPin { bus: bus.name.clone() });
+        }
+        let Workshop { time, world, pins, spi_buses, i2c_buses, .. } = workshop;
+        Ok(SimBoard {
+            time,
+            seed: config.seed,
+            world: Arc::new(world),
+            pins,
+            spi_buses: spi_buses.into_iter().map(Arc::new).collect(),
+            i2c_buses: i2c_buses.into_iter().map(Arc::new).collect(),
+        })
+    }
+
+    /// A view of the printer for demonstrations, drawings and tests.
+    pub fn probe(&self) -> SimProbe {
+        SimProbe { world: self.world.clone(), time: self.time.clone() }
+    }
+
+    fn pin(&self, pin: Pin, no_pin: ShutdownReason) -> Result<&WiredPin, Shutdown> {
+        usize::try_from(pin.0).ok().and_then(|place| self.pins.get(place)).ok_or_else(|| {
+            let detail = format!(
+                "the simulated printer has no pin {}: name one of its {} pins (pinion sim --print-config shows them)",
+                pin.0,
+                self.pins.len(),
+            );
+            Shutdown::because(no_pin, detail)
+        })
+    }
+}
+
+/// The bus with a number, or why there is none.
+fn numbered<'a, T>(
+    buses: &'a [Arc<T>],
+    number: u32,
+    kind: &str,
+    name: impl Fn(&T) -> &str,
+    reason: ShutdownReason,
+) -> Result<&'a Arc<T>, Shutdown> {
+    usize::try_from(number)
+        .ok()
+        .and_then(|place| buses.get(place))
+        .ok_or_else(|| is_missing(&format!("{kind} bus {number}"), buses.iter().map(|bus| name(bus)), reason))
+}
+
+/// Says that there is no such thing, but these.
+fn is_missing<'a>(what: &str, names: impl Iterator<Item = &'a str>, reason: ShutdownReason) -> Shutdown {
+    let names: Vec<&str> = names.collect();
+    let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
+    Shutdown::because(reason, format!("the simulated printer has no {what}: {has}"))
+}
+
+impl Board for SimBoard {
+    fn describe(&self) -> String {
+        let count = |count: usize, one: &str, many: &str| format!("{count} {}", if count == 1 { one } else { many });
+        format!(
+            "simulated printer: {}, {}, {}, {}",
+            count(self.world.axes.len(), "axis", "axes"),
+            count(self.world.heaters.len(), "heater", "heaters"),
+            count(self.world.fans.len(), "fan", "fans"),
+            count(self.pins.len(), "pin", "pins"),
+        )
+    }
+
+    fn pins(&self) -> Vec<Range> {
+        let range = |(first, pin): (u32, &WiredPin)| Range { name: pin.name.clone(), first, count: 1 };
+        (0..).zip(&self.pins).map(range).collect()
+    }
+
+    fn spi_buses(&self) -> Vec<Range> {
+        let range = |(first, bus): (u32, &Arc<SpiBus>)| Range { name: bus.name.clone(), first, count: 1 };
+        (0..).zip(&self.spi_buses).map(range).collect()
+    }
+
+    fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
+        let no_pin = match direction {
+            Direction::Output { .. } | Direction::OpenDrain => reason::NOT_OUTPUT,
+            Direction::Input(_) => reason::NOT_INPUT,
+        };
+        let line = SimLine::new(self.pin(pin, no_pin)?.clone(), self.time.clone());
+        pinion_firmware::board::Line::set_direction(&line, direction)?;
+        Ok(ClaimedLine { line: Arc::new(line), sleeps_on: None })
+    }
+
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
+        let line = self.line(pin, Direction::Input(bias))?;
+        let wired = self.pin(pin, reason::NOT_INPUT)?;
+        let edges = match SimEdges::new(wired.wire.clone(), self.time.clone(), line.line.read()?) {
+            Some(edges) => Ok(OnWorker { bus: EDGES_WORKER.to_owned(), device: Box::new(edges) as Box<dyn Edges> }),
+            None => Err(format!("nobody counts the edges of {}", wired.wire.describe()).into()),
+        };
+        Ok(CountedLine { line, edges })
+    }
+
+    fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
+        let wired = self.pin(pin, reason::ADC_OPEN)?;
+        if wired.wire.kind() != Kind::Analog {
+            return Err(wired.is_no("ADC channel", reason::ADC_OPEN));
+        }
+        let noise = Noise::of(&wired.name, self.seed);
+        let adc = SimAdc { wire: wired.wire.clone(), time: self.time.clone(), noise };
+        Ok(OnWorker { bus: ADC_WORKER.to_owned(), device: Box::new(adc) })
+    }
+
+    fn runs(&mut self, due: Option<Clock>) {
+        self.time.set_due(due);
+    }
+
+    fn errand_clock(&self, machine: Arc<dyn TimeSource>) -> Arc<dyn TimeSource> {
+        Arc::new(ErrandTime(machine))
+    }
+
+    fn step_late_limit(&self) -> Ticks {
+        STEP_LATE_LIMIT
+    }
+
+    fn i2c_buses(&self) -> Vec<Range> {
+        let range = |(first, bus): (u32, &Arc<I2cBus>)| Range { name: bus.name.clone(), first, count: 1 };
+        (0..).zip(&self.i2c_buses).map(range).collect()
+    }
+
+    fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let bus = numbered(&self.i2c_buses, config.bus, "I2C", |bus| &bus.name, reason::I2C_OPEN)?;
+        let device = I2cDevice { bus: bus.clone(), address: config.address };
+        Ok(OnWorker { bus: format!("i2c{}", config.bus), device: Box::new(device) })
+    }
+
+    fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
+        let wired = self.pin(config.pin, reason::PWM_CONFIG)?;
+        if wired.wire.kind() != Kind::Pwm {
+            return Err(wired.is_no("hardware PWM channel", reason::PWM_CONFIG));
+        }
+        let mut pwm = SimPwm(wired.wire.clone());
+        pwm.set(config.value)?;
+        Ok(OnWorker { bus: PWM_WORKER.to_owned(), device: Box::new(pwm) })
+    }
+
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        let found = self.world.thermometers.iter().find(|(name, _)| name.as_bytes() == serial);
+        let (name, open) = found.ok_or_else(|| {
+            let names = self.world.thermometers.iter().map(|(name, _)| name.as_str());
+            let what = format!("DS18B20 {}", String::from_utf8_lossy(serial));
+            is_missing(&what, names, reason::DS18B20_OPEN)
+        })?;
+        Ok(OnWorker { bus: name.clone(), device: open() })
+    }
+
+    fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let bus = numbered(&self.spi_buses, config.bus, "SPI", |bus| &bus.name, reason::SPI_OPEN)?;
+        let device =
+            SpiDevice { bus: bus.clone(), mode: config.mode, rate_hz: config.rate_hz, chip_select: config.chip_select };
+        Ok(OnWorker { bus: format!("spi{}", config.bus), device: Box::new(device) })
+    }
+
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+        let wired = self.pin(pin, reason::NOT_OUTPUT)?;
+        let bus = self.spi_buses().into_iter().find(|bus| wired.wire.kind() == Kind::Mosi && bus.name == wired.name);
+        let bus = bus.ok_or_else(|| not_mosi(&wired.name))?.first;
+        let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
+        Ok(Mosi { line, message_max: MESSAGE_MAX })
+    }
+
+    /// Nothing is claimed for good: the parts are there whoever drives them.
+    fn reset(&mut self) {}
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,118 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The simulated board's buses in virtual time: who hears what, and who answers.
+
+#![forbid(unsafe_code)]
+
+use super::*;
+use crate::catalog::PartConfig;
+use crate::part::tmc5160::Tmc5160Config;
+
+impl Bench {
+    fn chip_select(&mut self, pin: &str) -> ChipSelect {
+        ChipSelect { line: self.output(pin, true), active_high: false, clock: Arc::new(self.clock.clone()) }
+    }
+
+    fn spi(&mut self, bus: &str, select_pin: Option<&str>) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        let bus = self.board.spi_buses().iter().find(|range| range.name == bus).map_or(99, |range| range.first);
+        let chip_select = select_pin.map(|pin| self.chip_select(pin));
+        self.board.spi(SpiConfig { bus, mode: 3, rate_hz: 1_000_000, chip_select })
+    }
+}
+
+fn exchange(device: &mut OnWorker<dyn BusDevice>, bytes: &str) -> String {
+    let byte = |at| u8::from_str_radix(&bytes[at..at + 2], 16).unwrap();
+    let mut bytes: Vec<u8> = (0..bytes.len()).step_by(2).map(byte).collect();
+    device.device.exchange(&mut bytes).unwrap();
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[test]
+fn each_spi_bus_has_its_worker_and_the_first_one_sends_back_what_it_is_sent() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let mut loopback = bench.spi("spidev0.0", None).unwrap();
+    assert_eq!(exchange(&mut loopback, "0070696e"), "0070696e");
+    let driver = bench.spi("spidev1.0", Some("z_cs")).unwrap();
+    assert_eq!((loopback.bus.as_str(), driver.bus.as_str()), ("spi0", "spi1"));
+    let error = bench.spi("spidev7.0", None).err().unwrap();
+    assert_eq!(error.reason, reason::SPI_OPEN);
+    assert!(error.detail.contains("use spidev0.0 or spidev1.0"), "{}", error.detail);
+}
+
+#[test]
+fn a_chip_hears_what_is_said_while_its_pin_selects_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut config = SimConfig::default_printer();
+    let driver = |axis: &str| {
+        PartConfig::Tmc5160(Tmc5160Config {
+            diag1_pin: None,
+            bus: "spidev1.0".into(),
+            select_pin: PinName::try_from(format!("{axis}_cs")).ok(),
+            axis: axis.into(),
+        })
+    };
+    config.parts = vec![driver("x"), driver("y")];
+    config.spi_buses[1].trace_file = Some(folder.path().join("trace"));
+    config.spi_buses[1].trace_pins = vec!["led".into(), "beeper".into()];
+    let mut bench = Bench::new(config);
+    let led = bench.output("led", true);
+    let [mut x, mut y] = ["x_cs", "y_cs"].map(|pin| bench.spi("spidev1.0", Some(pin)).unwrap());
+    assert_eq!(exchange(&mut x, "8000000004"), "0900000000");
+    assert_eq!(exchange(&mut y, "0000000000"), "0900000000");
+    led.write(false).unwrap();
+    assert_eq!(exchange(&mut x, "0000000000"), "0900000004");
+    assert_eq!(exchange(&mut y, "0000000000"), "0900000008", "the reset value");
+    let mut nobody = bench.spi("spidev1.0", None).unwrap();
+    assert_eq!(exchange(&mut nobody, "0000"), "ffff", "pulled up");
+    assert_eq!(
+        std::fs::read_to_string(folder.path().join("trace")).unwrap(),
+        "chips=tmc5160 x sent=8000000004 received=0900000000 led=11111 beeper=00000\n\
+         chips=tmc5160 y sent=0000000000 received=0900000000 led=11111 beeper=00000\n\
+         chips=tmc5160 x sent=0000000000 received=0900000004 led=00000 beeper=00000\n\
+         chips=tmc5160 y sent=0000000000 received=0900000008 led=00000 beeper=00000\n\
+         chips= sent=0000 received=ffff led=00 beeper=00\n"
+    );
+}
+
+#[test]
+fn a_chip_that_is_spoken_to_in_another_mode_hears_nothing() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let chip_select = Some(bench.chip_select("z_cs"));
+    let OnWorker { mut device, .. } =
+        bench.board.spi(SpiConfig { bus: 1, mode: 0, rate_hz: 1_000_000, chip_select }).unwrap();
+    let mut bytes = [0; 5];
+    device.exchange(&mut bytes).unwrap();
+    assert_eq!(bytes, [0xff; 5]);
+}
+
+#[test]
+fn the_data_output_of_a_bus_drives_lights_and_nothing_else() {
+    let mut bench = Bench::new(SimConfig::default_printer());
+    let pin = bench.pin("spidev3.0");
+    let mut mosi = bench.board.mosi(pin, 3_200_000).unwrap();
+    assert_eq!(mosi.line.bus, "spi2");
+    // Green, as `neopixel` encodes it, and 50 us low.
+    let mut message = [[0xee; 4], [0x88; 4], [0x88; 4]].concat();
+    message.extend([0; 20]);
+    mosi.line.device.exchange(&mut message).unwrap();
+    let strip = bench.probe.sights().find(|(name, _)| *name == "strip").unwrap();
+    assert_eq!(strip.1, "#00ff00 off off off off off off off");
+    let error = bench.board.line(pin, Direction::Output { level: false, shutdown_level: false }).err().unwrap();
+    assert!(error.detail.contains("spidev3.0 of the simulated printer is an SPI bus's data output"), "{error}");
+    let led = bench.pin("led");
+    let error = bench.board.mosi(led, 3_200_000).err().unwrap();
+    assert_eq!(error.reason, reason::NOT_OUTPUT);
+    assert!(error.detail.starts_with("led can not drive LEDs"), "{error}");
+}
+
+#[test]
+fn a_thermometer_is_found_by_its_serial_and_reads_in_sixteenths() {
+    let toml = SimConfig::default_toml().replace("conversion_ms = 750", "conversion_ms = 0");
+    let mut config = SimConfig::parse(&toml, "test").unwrap();
+    config.heaters[1].start_celsius = Some(30.7);
+    let mut board = SimBoard::new(config, Arc::new(VirtualClock::at(Clock::EPOCH))).unwrap();
+    let mut thermometer = board.ds18b20(b"28-0316b5f6a2ff").unwrap();
+    assert_eq!(thermometer.device.read(), Ok(30_687), "30.6875 C, which the kernel cuts off");
+    let error = board.ds18b20(b"28-000000000000").err().unwrap();
+    assert_eq!(error.reason, reason::DS18B20_OPEN);
+    assert!(error.detail.contains("28-0316b5f6a2ff"), "{}", error.detail);
+}

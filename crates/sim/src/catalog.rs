@@ -1,0 +1,82 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! All parts that a description may have.
+
+#![forbid(unsafe_code)]
+
+use serde::Deserialize;
+
+use super::part::workshop::Part;
+use super::part::{
+    ads1220, adxl345, angle, apa102, bltouch, ds18b20, hx71x, ldc1612, loopback, probe, pwm_channel, servo, spool,
+    ssd1306, thermocouple, tmc2209, tmc5160, ws2812,
+};
+
+/// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(tag = "kind", rename_all = "lowercase")]
+pub enum PartConfig {
+    /// An accelerometer.
+    Adxl345(adxl345::Adxl345Config),
+    /// A thermometer on the one-wire bus.
+    Ds18b20(ds18b20::Ds18b20Config),
+    /// A hardware PWM channel.
+    #[serde(rename = "pwm_channel")]
+    PwmChannel(pwm_channel::PwmChannelConfig),
+    /// Sends back what it is sent.
+    Loopback(loopback::LoopbackConfig),
+    /// A servo.
+    Servo(servo::ServoConfig),
+    /// Filament and its sensors.
+    Spool(spool::SpoolConfig),
+    /// An angle sensor on a motor's shaft.
+    #[serde(rename = "angle_sensor")]
+    Angle(angle::AngleConfig),
+    /// A stepper driver on a UART.
+    Tmc2209(tmc2209::Tmc2209Config),
+    /// A stepper driver.
+    Tmc5160(tmc5160::Tmc5160Config),
+    /// A strip of lights on an SPI bus's data output.
+    Ws2812(ws2812::Ws2812Config),
+    /// A strip of lights on two lines.
+    Apa102(apa102::Apa102Config),
+    /// A display.
+    Ssd1306(ssd1306::Ssd1306Config),
+    /// A thermocouple's or a platinum resistor's converter.
+    Thermocouple(thermocouple::ThermocoupleConfig),
+    /// A switch beside the nozzle.
+    Probe(probe::ProbeConfig),
+    /// A probe with a push-pin.
+    Bltouch(bltouch::BltouchConfig),
+    /// The ADC of a load cell.
+    Hx71x(hx71x::Hx71xConfig),
+    /// Another ADC of a load cell.
+    Ads1220(ads1220::Ads1220Config),
+    /// A coil over the bed.
+    Ldc1612(ldc1612::Ldc1612Config),
+}
+
+impl PartConfig {
+    /// What all of them can do.
+    pub(crate) fn part(&self) -> &dyn Part {
+        match self {
+            PartConfig::Adxl345(config) => config,
+            PartConfig::Ds18b20(config) => config,
+            PartConfig::PwmChannel(config) => config,
+            PartConfig::Loopback(config) => config,
+            PartConfig::Servo(config) => config,
+            PartConfig::Spool(config) => config,
+            PartConfig::Angle(config) => config,
+            PartConfig::Tmc2209(config) => config,
+            PartConfig::Tmc5160(config) => config,
+            PartConfig::Ws2812(config) => config,
+            PartConfig::Apa102(config) => config,
+            PartConfig::Ssd1306(config) => config,
+            PartConfig::Thermocouple(config) => config,
+            PartConfig::Probe(config) => config,
+            PartConfig::Bltouch(config) => config,
+            PartConfig::Hx71x(config) => config,
+            PartConfig::Ads1220(config) => config,
+            PartConfig::Ldc1612(config) => config,
+        }
+    }
+}

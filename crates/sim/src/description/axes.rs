@@ -1,0 +1,149 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The axes of a description, the bed, and the limits of the motion.
+
+#![forbid(unsafe_code)]
+
+use serde::Deserialize;
+
+use super::pin::PinName;
+
+/// The end of an axis at which its endstop sits.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum End {
+    /// At 0 mm.
+    Min,
+    /// At `travel_mm`.
+    Max,
+}
+
+/// A stepper motor and what it moves.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AxisConfig {
+    /// Such as `x`.
+    pub name: String,
+    /// The step pin. Each rising edge is a step.
+    pub step_pin: PinName,
+    /// The direction pin. While it is high, steps count up.
+    pub dir_pin: PinName,
+    /// The motor is held, and steps, only while this is high. Without this pin it always is.
+    pub enable_pin: Option<PinName>,
+    /// Whether the falling edge of the step pin is a step too.
+    #[serde(default)]
+    pub step_both_edges: bool,
+    /// Steps in a millimetre.
+    pub steps_per_mm: f64,
+    /// Microsteps in a full step, for printer.cfg. The motor has 200 full steps in a turn.
+    #[serde(default = "default_microsteps")]
+    pub microsteps: u32,
+    /// The axis goes from 0 to here. Without this it has no end.
+    pub travel_mm: Option<f64>,
+    /// How far beyond either end of its travel the axis goes before it hits something and loses steps.
+    #[serde(default = "default_overtravel_mm")]
+    pub overtravel_mm: f64,
+    /// The position of the axis at first.
+    #[serde(default)]
+    pub start_mm: f64,
+    /// The endstop's pin. It is high while the axis is at that end of its travel or beyond.
+    pub endstop_pin: Option<PinName>,
+    /// The end of the travel at which the endstop sits.
+    #[serde(default = "default_end")]
+    pub endstop_at: End,
+    /// Speed of homing, for printer.cfg.
+    #[serde(default = "default_homing_mm_per_s")]
+    pub homing_mm_per_s: f64,
+    /// Where on the bed a motor of the z axis holds the gantry, or the bed: x and y.
+    pub at_mm: Option<[f64; 2]>,
+}
+
+fn default_microsteps() -> u32 {
+    16
+}
+
+fn default_overtravel_mm() -> f64 {
+    2.0
+}
+
+fn default_end() -> End {
+    End::Min
+}
+
+fn default_homing_mm_per_s() -> f64 {
+    5.0
+}
+
+/// A delta printer: three towers around the bed, whose carriages hold the nozzle by arms. The carriages
+/// are the axes `a`, `b` and `c`, at 0 where the arms would lie flat on the bed.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DeltaConfig {
+    /// What the arms span, seen from above, while the nozzle is in the middle of the bed.
+    pub radius_mm: f64,
+    /// The length of the arms.
+    pub arm_mm: f64,
+    /// From the middle of the bed to its edge.
+    pub bed_radius_mm: f64,
+    /// The directions in which the towers a, b and c stand, counted from the x axis towards the y axis.
+    #[serde(default = "default_angles_degrees")]
+    pub angles_degrees: [f64; 3],
+}
+
+fn default_angles_degrees() -> [f64; 3] {
+    [210.0, 330.0, 90.0]
+}
+
+impl DeltaConfig {
+    /// The axes of the carriages.
+    pub(crate) const TOWERS: [&'static str; 3] = ["a", "b", "c"];
+
+    /// How high the carriages are while the nozzle is on the bed's middle.
+    pub(crate) fn lowest_mm(&self) -> f64 {
+        (self.arm_mm * self.arm_mm - self.radius_mm * self.radius_mm).max(0.0).sqrt()
+    }
+
+    /// Where the towers stand: x and y.
+    pub(crate) fn towers_mm(&self) -> [[f64; 2]; 3] {
+        self.angles_degrees.map(|degrees| {
+            let (sine, cosine) = degrees.to_radians().sin_cos();
+            [self.radius_mm * cosine, self.radius_mm * sine]
+        })
+    }
+}
+
+/// The limits of the motion in printer.cfg. The simulated axes themselves follow at any speed.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct Limits {
+    /// Highest speed of the head.
+    pub velocity_mm_per_s: f64,
+    /// Highest acceleration of the head.
+    pub accel_mm_per_s2: f64,
+    /// Highest speed of the z axis.
+    pub z_velocity_mm_per_s: f64,
+    /// Highest acceleration of the z axis.
+    pub z_accel_mm_per_s2: f64,
+}
+
+impl Default for Limits {
+    fn default() -> Limits {
+        Limits {
+            velocity_mm_per_s: 300.0,
+            accel_mm_per_s2: 3000.0,
+            z_velocity_mm_per_s: 15.0,
+            z_accel_mm_per_s2: 100.0,
+        }
+    }
+}
+
+/// The shape of the bed; its middle is at 0.
+#[derive(Clone, Debug, Default, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+pub struct BedConfig {
+    /// How much higher it is at the end of the x axis than at its start.
+    pub x_slope_mm: f64,
+    /// How much higher it is at the end of the y axis than at its start.
+    pub y_slope_mm: f64,
+    /// How much lower it is at the corners than in the middle.
+    pub bow_mm: f64,
+}

@@ -1,0 +1,128 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The heaters of a description, and the fans.
+
+#![forbid(unsafe_code)]
+
+use serde::Deserialize;
+
+use super::check::{SimError, fault};
+use super::pin::PinName;
+use super::thermistor::{NoThermistor, Thermistor};
+
+/// A heater, the mass that it heats, and the thermistor in it.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct HeaterConfig {
+    /// Such as `extruder` or `heater_bed`.
+    pub name: String,
+    /// Power is on while this is high; always, if left out.
+    pub pin: Option<PinName>,
+    /// The ADC channel of the thermistor.
+    pub sensor_pin: PinName,
+    /// Power while on.
+    pub heater_watts: f64,
+    /// Heat capacity of the heated mass.
+    pub heat_capacity_j_per_k: f64,
+    /// Heat lost to the surroundings for each kelvin above them.
+    pub loss_w_per_k: f64,
+    /// Time constant with which the sensor follows the heated mass; 0 means at once.
+    #[serde(default)]
+    pub sensor_lag_s: f64,
+    /// Temperature of the surroundings.
+    #[serde(default = "default_ambient_celsius")]
+    pub ambient_celsius: f64,
+    /// Temperature at first. Without this it is that of the surroundings.
+    pub start_celsius: Option<f64>,
+    /// `min_temp` in printer.cfg: below this the host stops.
+    #[serde(default)]
+    pub min_celsius: f64,
+    /// `max_temp` in printer.cfg: above this the host stops.
+    pub max_celsius: f64,
+    /// Standard deviation of a reading, in counts of the ADC.
+    #[serde(default)]
+    pub noise_counts: f64,
+    /// Resistor from the ADC's input to its reference.
+    #[serde(default = "default_pullup_ohm")]
+    pub pullup_ohm: f64,
+    /// The thermistor's resistance at one temperature (with `beta_k`) or at three.
+    pub points_celsius_ohm: Vec<(f64, f64)>,
+    /// The thermistor's beta.
+    pub beta_k: Option<f64>,
+}
+
+fn default_ambient_celsius() -> f64 {
+    25.0
+}
+
+fn default_pullup_ohm() -> f64 {
+    4700.0
+}
+
+/// A fan that takes its time to spin up and down.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FanConfig {
+    /// Such as `fan`, which is the part's cooling fan.
+    pub name: String,
+    /// Power is on while this is high.
+    pub pin: PinName,
+    /// A second pin that must be high, too, for the fan to have power.
+    pub enable_pin: Option<PinName>,
+    /// An input that is high for the first half of each pulse of the tachometer.
+    pub tachometer_pin: Option<PinName>,
+    /// Pulses of the tachometer in a revolution.
+    #[serde(default = "default_pulses_per_revolution")]
+    pub pulses_per_revolution: u32,
+    /// Speed at full power.
+    pub max_rpm: f64,
+    /// Time constant with which the speed follows the power.
+    #[serde(default = "default_spin_up_s")]
+    pub spin_up_s: f64,
+    /// The heater that it blows at.
+    pub cools: Option<String>,
+    /// What that loses while the fan has power, for each kelvin above the surroundings and beyond what it
+    /// loses without.
+    #[serde(default)]
+    pub cooling_w_per_k: f64,
+}
+
+fn default_pulses_per_revolution() -> u32 {
+    2
+}
+
+fn default_spin_up_s() -> f64 {
+    0.5
+}
+
+impl HeaterConfig {
+    /// The temperature at first, in °C.
+    pub(crate) fn start_celsius(&self) -> f64 {
+        self.start_celsius.unwrap_or(self.ambient_celsius)
+    }
+
+    /// The thermistor that these points and this beta describe.
+    ///
+    /// # Errors
+    ///
+    /// The key whose values no thermistor has, and a remedy.
+    pub(crate) fn thermistor(&self) -> Result<Thermistor, SimError> {
+        const POINTS: &str = "points_celsius_ohm";
+        Thermistor::new(&self.points_celsius_ohm, self.beta_k, self.pullup_ohm).map_err(|why| {
+            let (key, cause, remedy) = match why {
+                NoThermistor::PointOutOfRange => {
+                    (POINTS, "kelvins and resistances are above zero", "take the points from the data sheet")
+                }
+                NoThermistor::BetaOutOfRange => ("beta_k", "a beta is above zero", "such as 3950.0"),
+                NoThermistor::BetaMissing => ("beta_k", "one point needs a beta", "add it, or three points"),
+                NoThermistor::PointsBesideBeta => (POINTS, "with `beta_k` there is one point", "keep one"),
+                NoThermistor::PointCount => {
+                    (POINTS, "none, two or more than three points", "give three, or one and `beta_k`")
+                }
+                NoThermistor::PointsOnNoCurve => {
+                    (POINTS, "no thermistor has these three", "take others from the data sheet, or one and `beta_k`")
+                }
+            };
+            fault(&format!("heater `{}`", self.name), key, cause, remedy)
+        })
+    }
+}

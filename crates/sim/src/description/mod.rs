@@ -1,0 +1,16 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The words of descriptions, and what is checked of them. It names neither the engine nor a part.
+
+#![forbid(unsafe_code)]
+
+pub(crate) mod axes;
+pub(crate) mod buses;
+pub(crate) mod check;
+#[cfg(test)]
+pub(crate) mod default;
+pub(crate) mod heater;
+pub(crate) mod outputs;
+pub(crate) mod pin;
+pub(crate) mod printer;
+pub(crate) mod thermistor;
+mod validate;

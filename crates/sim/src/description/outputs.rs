@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The lights of a description, and whatever else is on or off.
+
+#![forbid(unsafe_code)]
+
+use serde::Deserialize;
+
+use super::pin::PinName;
+
+/// A light of one to four colours.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LedConfig {
+    /// Such as `light`.
+    pub name: String,
+    /// A light that is on while high; of one with colours, its white part.
+    pub pin: Option<PinName>,
+    /// Its red part.
+    pub red_pin: Option<PinName>,
+    /// Its green part.
+    pub green_pin: Option<PinName>,
+    /// Its blue part.
+    pub blue_pin: Option<PinName>,
+}
+
+impl LedConfig {
+    /// Its pins with their keys: red, green, blue, and white.
+    pub(crate) fn pins(&self) -> [(&'static str, Option<&PinName>); 4] {
+        [
+            ("red_pin", self.red_pin.as_ref()),
+            ("green_pin", self.green_pin.as_ref()),
+            ("blue_pin", self.blue_pin.as_ref()),
+            ("pin", self.pin.as_ref()),
+        ]
+    }
+}
+
+/// An output that switches something that needs no simulation.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OutputConfig {
+    /// Such as `light`.
+    pub name: String,
+    /// On while high.
+    pub pin: PinName,
+}
+
+/// An input that stays at one level.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct InputConfig {
+    /// Such as `door`.
+    pub name: String,
+    /// The input.
+    pub pin: PinName,
+    /// Whether it is on.
+    pub level: bool,
+}

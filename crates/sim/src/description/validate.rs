@@ -1,0 +1,285 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Whether the values of a description make a printer. An error names the first one that is wrong, and a remedy.
+
+#![forbid(unsafe_code)]
+
+use super::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};
+use super::buses::{I2cBusConfig, SpiBusConfig};
+use super::check::{Bound, SimError, UsedPins, check, there_is, unique, wrong};
+use super::heater::{FanConfig, HeaterConfig};
+use super::outputs::LedConfig;
+use super::printer::{Kinematics, Printer};
+use super::thermistor::KELVIN;
+
+impl Printer<'_> {
+    /// Checks that the values make a printer.
+    ///
+    /// # Errors
+    ///
+    /// The first value that is wrong, with its key and a remedy.
+    pub(crate) fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+        self.limits.validate()?;
+        unique("[[axis]]", self.axes.iter().map(|axis| &axis.name))?;
+        unique("[[heater]]", self.heaters.iter().map(|heater| &heater.name))?;
+        unique("[[fan]]", self.fans.iter().map(|fan| &fan.name))?;
+        unique("[[led]]", self.leds.iter().map(|led| &led.name))?;
+        unique("[[output]]", self.outputs.iter().map(|output| &output.name))?;
+        unique("[[input]]", self.inputs.iter().map(|input| &input.name))?;
+        unique("[[spi_bus]]", self.spi_buses.iter().map(|bus| &bus.name))?;
+        self.axes.iter().try_for_each(|axis| axis.validate(pins))?;
+        self.validate_places()?;
+        if let Some(delta) = self.delta {
+            delta.validate(self)?;
+        }
+        self.heaters.iter().try_for_each(|heater| heater.validate(self, pins))?;
+        self.fans.iter().try_for_each(|fan| fan.validate(self, pins))?;
+        self.leds.iter().try_for_each(|led| led.validate(pins))?;
+        for output in self.outputs {
+            pins.claim(&format!("output `{}`", output.name), "pin", Some(&output.pin))?;
+        }
+        for input in self.inputs {
+            pins.claim(&format!("input `{}`", input.name), "pin", Some(&input.pin))?;
+        }
+        unique("[[i2c_bus]]", self.i2c_buses.iter().map(|bus| &bus.name))?;
+        self.bed.validate()?;
+        for bus in self.spi_buses {
+            bus.validate(self)?;
+            pins.claim(&format!("spi_bus `{}`", bus.name), "name", Some(&bus.mosi_pin()))?;
+        }
+        self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)
+    }
+
+    /// Checks where the motors of the z axis hold what they lift.
+    fn validate_places(&self) -> Result<(), SimError> {
+        let is_cartesian = self.kinematics() == Kinematics::Cartesian;
+        let motors: Vec<&AxisConfig> = self.motors("z").filter(|_| is_cartesian).collect();
+        let whose = |axis: &AxisConfig| format!("axis `{}`", axis.name);
+        if let Some(other) =
+            self.axes.iter().find(|axis| axis.at_mm.is_some() && !motors.iter().any(|motor| motor.name == axis.name))
+        {
+            let cause = "only a motor of the z axis of a cartesian printer has a place";
+            return wrong(&whose(other), "at_mm", cause, "remove it, or call the axes z, z1, z2 and so on");
+        }
+        let lost = motors.iter().find(|axis| axis.at_mm.is_none());
+        if let (Some(lost), true) = (lost, motors.iter().any(|axis| axis.at_mm.is_some())) {
+            return wrong(&whose(lost), "at_mm", "the other motors of the z axis have one", "add it");
+        }
+        motors.iter().try_for_each(|axis| {
+            let mut places = axis.at_mm.into_iter().flatten();
+            places.try_for_each(|mm| check(&whose(axis), "at_mm", mm, Bound::Any))
+        })
+    }
+}
+
+impl Limits {
+    fn validate(&self) -> Result<(), SimError> {
+        for (key, value) in [
+            ("velocity_mm_per_s", self.velocity_mm_per_s),
+            ("accel_mm_per_s2", self.accel_mm_per_s2),
+            ("z_velocity_mm_per_s", self.z_velocity_mm_per_s),
+            ("z_accel_mm_per_s2", self.z_accel_mm_per_s2),
+        ] {
+            check("[limits]", key, value, Bound::AboveZero)?;
+        }
+        Ok(())
+    }
+}
+
+impl DeltaConfig {
+    /// Checks the towers, and that each has its axis.
+    fn validate(&self, printer: &Printer<'_>) -> Result<(), SimError> {
+        const WHOSE: &str = "[delta]";
+        check(WHOSE, "radius_mm", self.radius_mm, Bound::AboveZero)?;
+        check(WHOSE, "bed_radius_mm", self.bed_radius_mm, Bound::AboveZero)?;
+        check(WHOSE, "arm_mm", self.arm_mm, Bound::AboveZero)?;
+        if self.arm_mm <= self.radius_mm {
+            let cause = format!("{} does not reach over radius_mm", self.arm_mm);
+            return wrong(WHOSE, "arm_mm", &cause, "give longer arms");
+        }
+        self.angles_degrees.iter().try_for_each(|degrees| check(WHOSE, "angles_degrees", *degrees, Bound::Any))?;
+        let [a, b, c] = self.angles_degrees;
+        let apart = [a - b, b - c, c - a].map(|degrees| (degrees.to_radians() / 2.0).sin().abs());
+        if apart.into_iter().any(|apart| apart < 0.1) {
+            return wrong(WHOSE, "angles_degrees", "two towers stand at one place", "set them apart");
+        }
+        for tower in DeltaConfig::TOWERS {
+            let Some(axis) = printer.axis(tower) else {
+                return Err(SimError(format!("{WHOSE}: there is no axis `{tower}`: add an [[axis]] for each tower")));
+            };
+            let whose = &format!("axis `{tower}`");
+            if axis.endstop_pin.is_none() || axis.endstop_at != End::Max {
+                let cause = "a delta printer homes to the upper ends of its towers";
+                return wrong(whose, "endstop_at", cause, "give it an `endstop_pin`, and `endstop_at = \"max\"`");
+            }
+            let lowest_mm = self.lowest_mm();
+            if axis.travel_mm.unwrap_or(0.0) <= lowest_mm {
+                let cause = format!("the nozzle is on the bed while the carriages are at {lowest_mm:.1}");
+                return wrong(whose, "travel_mm", &cause, "raise it");
+            }
+        }
+        Ok(())
+    }
+}
+
+impl LedConfig {
+    /// Checks that it has a pin, and that its pins are free.
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+        let whose = &format!("led `{}`", self.name);
+        if self.pins().into_iter().all(|(_, pin)| pin.is_none()) {
+            return wrong(whose, "pin", "it has none", "add it, or `red_pin`, `green_pin` and `blue_pin`");
+        }
+        self.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))
+    }
+}
+
+impl AxisConfig {
+    /// Checks the axis by itself, and that its pins are free.
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+        use Bound::{AboveZero, Any, NotNegative};
+        let whose = &format!("axis `{}`", self.name);
+        pins.claim(whose, "step_pin", Some(&self.step_pin))?;
+        pins.claim(whose, "dir_pin", Some(&self.dir_pin))?;
+        pins.claim(whose, "enable_pin", self.enable_pin.as_ref())?;
+        pins.claim(whose, "endstop_pin", self.endstop_pin.as_ref())?;
+        check(whose, "steps_per_mm", self.steps_per_mm, AboveZero)?;
+        check(whose, "microsteps", self.microsteps.into(), AboveZero)?;
+        check(whose, "overtravel_mm", self.overtravel_mm, NotNegative)?;
+        check(whose, "start_mm", self.start_mm, Any)?;
+        check(whose, "homing_mm_per_s", self.homing_mm_per_s, AboveZero)?;
+        match self.travel_mm {
+            Some(travel_mm) => {
+                check(whose, "travel_mm", travel_mm, AboveZero)?;
+                let free = -self.overtravel_mm..=travel_mm + self.overtravel_mm;
+                if !free.contains(&self.start_mm) {
+                    return wrong(
+                        whose,
+                        "start_mm",
+                        &format!("{} is out of its reach", self.start_mm),
+                        &format!("start between 0 and {travel_mm}"),
+                    );
+                }
+            }
+            None if self.endstop_pin.is_some() => {
+                return wrong(
+                    whose,
+                    "travel_mm",
+                    "an axis with an endstop needs it",
+                    "add it, or remove `endstop_pin`",
+                );
+            }
+            None => {}
+        }
+        Ok(())
+    }
+}
+
+impl FanConfig {
+    /// Checks the fan, and that its pins are free.
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), SimError> {
+        use Bound::{AboveZero, NotNegative};
+        let whose = &format!("fan `{}`", self.name);
+        pins.claim(whose, "pin", Some(&self.pin))?;
+        pins.claim(whose, "enable_pin", self.enable_pin.as_ref())?;
+        pins.claim(whose, "tachometer_pin", self.tachometer_pin.as_ref())?;
+        check(whose, "pulses_per_revolution", self.pulses_per_revolution.into(), AboveZero)?;
+        check(whose, "max_rpm", self.max_rpm, AboveZero)?;
+        check(whose, "spin_up_s", self.spin_up_s, AboveZero)?;
+        check(whose, "cooling_w_per_k", self.cooling_w_per_k, NotNegative)?;
+        let Some(heater) = &self.cools else {
+            return match self.cooling_w_per_k {
+                0.0 => Ok(()),
+                _ => wrong(whose, "cooling_w_per_k", "it cools nothing", "add `cools`, or remove this"),
+            };
+        };
+        there_is(whose, "cools", heater, printer.heaters.iter().map(|heater| &heater.name), "[[heater]]")?;
+        if printer.fans.iter().filter(|fan| fan.cools == self.cools).count() > 1 {
+            return wrong(whose, "cools", &format!("two fans cool `{heater}`"), "keep one");
+        }
+        Ok(())
+    }
+}
+
+impl SpiBusConfig {
+    /// Checks the bus, and that the pins to trace are outputs of the printer.
+    fn validate(&self, printer: &Printer<'_>) -> Result<(), SimError> {
+        let whose = &format!("spi_bus `{}`", self.name);
+        check(whose, "delay_us", self.delay_us as f64, Bound::NotNegative)?;
+        let unknown = self.trace_pins.iter().find(|name| !printer.switched().any(|pin| pin.name == **name));
+        unknown.map_or(Ok(()), |name| {
+            let cause = format!("`{name}` is no pin of an [[output]] or [[led]]");
+            wrong(whose, "trace_pins", &cause, "name such a pin, without `!`")
+        })
+    }
+}
+
+impl I2cBusConfig {
+    fn validate(&self) -> Result<(), SimError> {
+        check(&format!("i2c_bus `{}`", self.name), "delay_us", self.delay_us as f64, Bound::NotNegative)
+    }
+}
+
+impl BedConfig {
+    fn validate(&self) -> Result<(), SimError> {
+        for (key, value) in [("x_slope_mm", self.x_slope_mm), ("y_slope_mm", self.y_slope_mm), ("bow_mm", self.bow_mm)]
+        {
+            check("[bed]", key, value, Bound::Any)?;
+        }
+        Ok(())
+    }
+}
+
+impl HeaterConfig {
+    /// Checks the heater with its fan, and that its pins are free.
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), SimError> {
+        use Bound::{AboveZero, NotNegative};
+        let whose = &format!("heater `{}`", self.name);
+        pins.claim(whose, "pin", self.pin.as_ref())?;
+        if self.pin.is_none()
+            && (self.name == "heater_bed" || printer.hot_ends().any(|hot_end| hot_end.name == self.name))
+        {
+            return wrong(whose, "pin", "klippy's heater of this name has one", "add it, or rename the heater");
+        }
+        pins.claim(whose, "sensor_pin", Some(&self.sensor_pin))?;
+        if self.sensor_pin.inverted {
+            return wrong(whose, "sensor_pin", "an analog pin has no polarity", "remove the `!`");
+        }
+        check(whose, "heater_watts", self.heater_watts, AboveZero)?;
+        check(whose, "heat_capacity_j_per_k", self.heat_capacity_j_per_k, AboveZero)?;
+        check(whose, "loss_w_per_k", self.loss_w_per_k, AboveZero)?;
+        check(whose, "sensor_lag_s", self.sensor_lag_s, NotNegative)?;
+        let cooling_w_per_k = printer.fan_of(&self.name).map_or(0.0, |fan| fan.cooling_w_per_k);
+        let time_constant_s = self.heat_capacity_j_per_k / (self.loss_w_per_k + cooling_w_per_k);
+        if self.sensor_lag_s > time_constant_s / 2.0 {
+            return wrong(
+                whose,
+                "sensor_lag_s",
+                &format!("{} is slower than the heater itself", self.sensor_lag_s),
+                &format!("stay below {:.1}", time_constant_s / 2.0),
+            );
+        }
+        self.validate_temperatures(whose)?;
+        check(whose, "noise_counts", self.noise_counts, NotNegative)?;
+        check(whose, "pullup_ohm", self.pullup_ohm, AboveZero)?;
+        self.thermistor()?;
+        Ok(())
+    }
+
+    fn validate_temperatures(&self, whose: &str) -> Result<(), SimError> {
+        let absolute_zero = -KELVIN;
+        for (key, celsius) in [
+            ("ambient_celsius", self.ambient_celsius),
+            ("start_celsius", self.start_celsius()),
+            ("min_celsius", self.min_celsius),
+        ] {
+            check(whose, key, celsius, Bound::Any)?;
+            if celsius <= absolute_zero {
+                return wrong(whose, key, &format!("{celsius} is below absolute zero"), "use degrees Celsius");
+            }
+        }
+        check(whose, "max_celsius", self.max_celsius, Bound::Any)?;
+        if self.max_celsius <= self.min_celsius {
+            return wrong(whose, "max_celsius", &format!("{} is not above min_celsius", self.max_celsius), "raise it");
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,279 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The bed, and where the head is over it.
+//!
+//! A cartesian printer's nozzle is lifted over the bed by motors that hold a gantry, or the bed, each at its own
+//! place; a delta's hangs on three carriages. Either way the bed feels a distance, which follows from where the
+//! motors stand.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use super::physics::Axis;
+use crate::description::axes::{BedConfig, DeltaConfig};
+
+/// A plane that motors hold up, each at a place: a gantry over the bed, or the bed under it.
+///
+/// It is stiff. Three motors define it; two leave it level across their line, and one leaves it level. More than
+/// three pull at it like springs, and it settles as near to all of them as it can (least squares).
+pub struct Plane {
+    /// The middle of the motors.
+    middle: [f64; 2],
+    /// The motors, and how much each one tilts it: per millimetre of it, along x and y.
+    motors: Vec<(Arc<Axis>, [f64; 2])>,
+}
+
+impl Plane {
+    /// The plane that these motors hold at these places.
+    pub fn new(motors: Vec<(Arc<Axis>, [f64; 2])>) -> Plane {
+        let count = motors.len().max(1) as f64;
+        let sum = |term: &dyn Fn(&[f64; 2]) -> f64| motors.iter().map(|(_, at)| term(at)).sum::<f64>();
+        let middle = [sum(&|at| at[0]) / count, sum(&|at| at[1]) / count];
+        let [mx, my] = middle;
+        let xx = sum(&|at| (at[0] - mx).powi(2));
+        let xy = sum(&|at| (at[0] - mx) * (at[1] - my));
+        let yy = sum(&|at| (at[1] - my).powi(2));
+        // The inverse of [[xx, xy], [xy, yy]]; where the motors stand in a line, its pseudo-inverse.
+        let (trace, determinant) = (xx + yy, xx * yy - xy * xy);
+        let [ixx, ixy, iyy] = if trace == 0.0 {
+            [0.0; 3]
+        } else if determinant > 1e-9 * trace * trace {
+            [yy / determinant, -xy / determinant, xx / determinant]
+        } else {
+            [xx, xy, yy].map(|term| term / (trace * trace))
+        };
+        let tilt = |[x, y]: [f64; 2]| {
+            let (x, y) = (x - mx, y - my);
+            [ixx * x + ixy * y, ixy * x + iyy * y]
+        };
+        Plane { middle, motors: motors.into_iter().map(|(axis, at)| (axis, tilt(at))).collect() }
+    }
+
+    /// How high it is at a place.
+    fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
+        let mean = 1.0 / self.motors.len().max(1) as f64;
+        let (x_mm, y_mm) = (x_mm - self.middle[0], y_mm - self.middle[1]);
+        self.motors.iter().map(|(axis, [x, y])| axis.position_mm() * (mean + x * x_mm + y * y_mm)).sum()
+    }
+}
+
+/// A delta printer's head. It stays upright.
+pub struct Delta {
+    carriages: [Arc<Axis>; 3],
+    towers_mm: [[f64; 2]; 3],
+    arm_mm: f64,
+    bed_radius_mm: f64,
+}
+
+impl Delta {
+    pub fn new(config: &DeltaConfig, carriages: [Arc<Axis>; 3]) -> Delta {
+        Delta { carriages, towers_mm: config.towers_mm(), arm_mm: config.arm_mm, bed_radius_mm: config.bed_radius_mm }
+    }
+
+    /// Where the nozzle is: as far as an arm from each carriage, and below them.
+    fn nozzle_mm(&self) -> [f64; 3] {
+        let [a, b, c] = [0, 1, 2].map(|tower| {
+            let [x, y] = self.towers_mm[tower];
+            let z = self.carriages[tower].position_mm();
+            ([x, y, z], x * x + y * y + z * z)
+        });
+        // The difference of two spheres is a plane: [x, y, z] · plane = level. Two of them leave x and y as lines
+        // of z: x = x0 + x1 z, y = y0 + y1 z.
+        let plane = |other: ([f64; 3], f64)| {
+            let normal = [0, 1, 2].map(|axis| other.0[axis] - a.0[axis]);
+            (normal, (other.1 - a.1) / 2.0)
+        };
+        let ((n, nd), (m, md)) = (plane(b), plane(c));
+        let determinant = n[0] * m[1] - n[1] * m[0];
+        let solve = |p: f64, q: f64| [(p * m[1] - q * n[1]) / determinant, (q * n[0] - p * m[0]) / determinant];
+        let ([x0, y0], [x1, y1]) = (solve(nd, md), solve(-n[2], -m[2]));
+        let (dx, dy, az) = (x0 - a.0[0], y0 - a.0[1], a.0[2]);
+        let square = x1 * x1 + y1 * y1 + 1.0;
+        let half = x1 * dx + y1 * dy - az;
+        let rest = dx * dx + dy * dy + az * az - self.arm_mm * self.arm_mm;
+        // Carriages that the arms cannot join are taken to stretch them.
+        let z = (-half - (half * half - square * rest).max(0.0).sqrt()) / square;
+        [x0 + x1 * z, y0 + y1 * z, z]
+    }
+}
+
+/// What holds the nozzle over the bed.
+pub enum Head {
+    /// Axes along x and y, and the motors of the z axis.
+    Cartesian { x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Plane },
+    /// Three arms.
+    Delta(Delta),
+}
+
+impl Head {
+    /// Where a point of the head is that stands off the nozzle by so much.
+    fn point_mm(&self, [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3]) -> [f64; 3] {
+        match self {
+            Head::Cartesian { x, y, z } => {
+                let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| axis.position_mm());
+                let (x_mm, y_mm) = (position(x) + x_offset_mm, position(y) + y_offset_mm);
+                // The head is tilted as the gantry is; or it is the bed that is.
+                [x_mm, y_mm, z.height_mm(x_mm, y_mm) + z_offset_mm]
+            }
+            Head::Delta(delta) => {
+                let [x_mm, y_mm, z_mm] = delta.nozzle_mm();
+                [x_mm + x_offset_mm, y_mm + y_offset_mm, z_mm + z_offset_mm]
+            }
+        }
+    }
+
+    /// The ends of the bed along x and y; none where nothing moves along that.
+    fn ends_mm(&self) -> [Option<(f64, f64)>; 2] {
+        match self {
+            Head::Cartesian { x, y, .. } => {
+                [x, y].map(|axis| axis.as_ref().and_then(|axis| Some((0.0, axis.travel_mm?))))
+            }
+            Head::Delta(delta) => [Some((-delta.bed_radius_mm, delta.bed_radius_mm)); 2],
+        }
+    }
+}
+
+/// The bed under the nozzle.
+pub struct Bed {
+    shape: BedConfig,
+    ends_mm: [Option<(f64, f64)>; 2],
+    head: Head,
+}
+
+impl Bed {
+    pub fn new(shape: BedConfig, head: Head) -> Bed {
+        Bed { shape, ends_mm: head.ends_mm(), head }
+    }
+
+    /// The bed under a cartesian printer with one motor for each axis.
+    #[cfg(test)]
+    pub fn under(shape: BedConfig, x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Option<Arc<Axis>>) -> Bed {
+        let z = Plane::new(z.into_iter().map(|z| (z, [0.0; 2])).collect());
+        Bed::new(shape, Head::Cartesian { x, y, z })
+    }
+
+    /// The height of the bed under a place: two slopes and a bow, each 0 in the middle.
+    pub fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
+        // From -1 at one end of the bed to 1 at the other.
+        let place = |ends_mm: Option<(f64, f64)>, mm: f64| match ends_mm {
+            Some((start_mm, end_mm)) => (2.0 * (mm - start_mm) / (end_mm - start_mm) - 1.0).clamp(-1.0, 1.0),
+            None => 0.0,
+        };
+        let (u, v) = (place(self.ends_mm[0], x_mm), place(self.ends_mm[1], y_mm));
+        let slopes = (self.shape.x_slope_mm * u + self.shape.y_slope_mm * v) / 2.0;
+        slopes - self.shape.bow_mm * (u * u + v * v) / 2.0
+    }
+
+    /// How far the point that stands off the nozzle by so much is above the bed; negative if it
+    /// presses into it.
+    pub fn clearance_mm(&self, offset_mm: [f64; 3]) -> f64 {
+        let [x_mm, y_mm, z_mm] = self.head.point_mm(offset_mm);
+        z_mm - self.height_mm(x_mm, y_mm)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::description::axes::AxisConfig;
+    use proptest::prelude::*;
+
+    /// An axis that stands at a place.
+    fn axis_at(start_mm: f64) -> Arc<Axis> {
+        let text = "name = \"z\"\nstep_pin = \"s\"\ndir_pin = \"d\"\nsteps_per_mm = 1000000.0\n";
+        let mut config: AxisConfig = toml::from_str(text).unwrap();
+        config.start_mm = start_mm;
+        Arc::new(Axis::new(&config))
+    }
+
+    fn plane(motors: &[([f64; 2], f64)]) -> Plane {
+        Plane::new(motors.iter().map(|(at, mm)| (axis_at(*mm), *at)).collect())
+    }
+
+    fn assert_near(value: f64, expected: f64) {
+        assert!((value - expected).abs() < 1e-5, "{value} {expected}");
+    }
+
+    #[test]
+    fn one_motor_lifts_all_of_it_and_two_tilt_it_along_their_line() {
+        let one = plane(&[([30.0, 40.0], 2.5)]);
+        assert_near(one.height_mm(-500.0, 900.0), 2.5);
+        let two = plane(&[([0.0, 100.0], 1.0), ([200.0, 100.0], 3.0)]);
+        for y_mm in [-50.0, 100.0, 220.0] {
+            assert_near(two.height_mm(0.0, y_mm), 1.0);
+            assert_near(two.height_mm(50.0, y_mm), 1.5);
+            assert_near(two.height_mm(300.0, y_mm), 4.0);
+        }
+        // Without places all of them stand at one.
+        let nowhere = plane(&[([0.0, 0.0], 1.0), ([0.0, 0.0], 3.0)]);
+        assert_near(nowhere.height_mm(170.0, 20.0), 2.0);
+        assert_near(plane(&[]).height_mm(1.0, 1.0), 0.0);
+    }
+
+    #[test]
+    fn a_fourth_motor_that_disagrees_is_met_halfway() {
+        let at = [[0.0, 0.0], [0.0, 200.0], [200.0, 200.0], [200.0, 0.0]];
+        let twisted = plane(&[(at[0], 1.0), (at[1], 0.0), (at[2], 1.0), (at[3], 0.0)]);
+        for [x_mm, y_mm] in at {
+            assert_near(twisted.height_mm(x_mm, y_mm), 0.5);
+        }
+    }
+
+    proptest! {
+        /// Whatever plane three or four motors agree on is the plane.
+        #[test]
+        fn motors_that_agree_define_the_plane(
+            level in -5.0..5.0, slopes in prop::array::uniform2(-0.02..0.02), four: bool,
+            place in prop::array::uniform2(-300.0..300.0),
+        ) {
+            let height = |[x, y]: [f64; 2]| level + slopes[0] * x + slopes[1] * y;
+            let at = [[-20.0, 10.0], [110.0, 260.0], [240.0, 15.0], [250.0, 280.0]];
+            let motors: Vec<_> = at.iter().take(if four { 4 } else { 3 }).map(|at| (*at, height(*at))).collect();
+            assert_near(plane(&motors).height_mm(place[0], place[1]), height(place));
+        }
+
+        /// The nozzle of a delta is where klippy's formula for its towers puts the carriages.
+        #[test]
+        fn a_delta_is_where_its_carriages_put_it(
+            x in -80.0..80.0f64, y in -80.0..80.0f64, z in -1.0..250.0f64, turn in -5.0..5.0f64,
+        ) {
+            let config = DeltaConfig {
+                radius_mm: 105.0,
+                arm_mm: 215.0,
+                bed_radius_mm: 90.0,
+                angles_degrees: [210.0 + turn, 330.0, 90.0],
+            };
+            let carriage = |tower: usize| {
+                let [tower_x, tower_y] = config.towers_mm()[tower];
+                z + (215.0f64.powi(2) - (x - tower_x).powi(2) - (y - tower_y).powi(2)).sqrt()
+            };
+            let carriages = [0, 1, 2].map(|tower| axis_at(carriage(tower)));
+            let head = Head::Delta(Delta::new(&config, carriages));
+            let point = head.point_mm([1.0, -2.0, -3.0]);
+            for (value, expected) in point.into_iter().zip([x + 1.0, y - 2.0, z - 3.0]) {
+                assert_near(value, expected);
+            }
+        }
+    }
+
+    #[test]
+    fn the_bed_of_a_delta_has_its_middle_at_zero() {
+        let config =
+            DeltaConfig { radius_mm: 105.0, arm_mm: 215.0, bed_radius_mm: 90.0, angles_degrees: [210.0, 330.0, 90.0] };
+        let carriages = [0, 1, 2].map(|_| axis_at(config.lowest_mm() + 7.0));
+        let shape = BedConfig { x_slope_mm: 0.2, y_slope_mm: 0.0, bow_mm: 0.1 };
+        let bed = Bed::new(shape, Head::Delta(Delta::new(&config, carriages)));
+        assert_near(bed.clearance_mm([0.0, 0.0, -2.0]), 5.0);
+        assert_near(bed.height_mm(90.0, 0.0), 0.1 - 0.05);
+        assert_near(bed.height_mm(-90.0, 0.0), -0.1 - 0.05);
+    }
+
+    #[test]
+    fn a_probe_beside_the_nozzle_feels_the_tilt() {
+        let (x, y) = (axis_at(50.0), axis_at(50.0));
+        let z = plane(&[([0.0, 50.0], 1.0), ([100.0, 50.0], 2.0)]);
+        let bed = Bed::new(BedConfig::default(), Head::Cartesian { x: Some(x), y: Some(y), z });
+        assert_near(bed.clearance_mm([0.0; 3]), 1.5);
+        assert_near(bed.clearance_mm([20.0, 5.0, -0.5]), 1.2);
+    }
+}

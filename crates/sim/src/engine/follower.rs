@@ -1,0 +1,88 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! One who feels a motion: every step of an axis, with its instant.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use super::physics::Axis;
+use super::track::{KEPT, Recorded};
+use pinion_firmware::time::Clock;
+
+/// One who follows an axis.
+#[derive(Debug)]
+pub(crate) struct Follower {
+    axis: Arc<Axis>,
+    next: u64,
+}
+
+/// What an axis did.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Motion {
+    /// A step at this instant, to this place in mm.
+    Step(Clock, f64),
+    /// More than the track holds; at this instant it stepped to here, in mm.
+    Lost(Clock, f64),
+}
+
+impl Follower {
+    /// Follows from the first step that the axis makes.
+    pub(crate) fn new(axis: Arc<Axis>) -> Follower {
+        Follower { axis, next: 0 }
+    }
+
+    /// What came next, if it was no later than this.
+    pub(crate) fn next(&mut self, until: Clock) -> Option<Motion> {
+        let mut lost = false;
+        loop {
+            match self.axis.track().get(self.next) {
+                Recorded::Step(at, position) if at <= until => {
+                    self.next += 1;
+                    let mm = self.axis.mm(position);
+                    return Some(if lost { Motion::Lost(at, mm) } else { Motion::Step(at, mm) });
+                }
+                Recorded::Step(..) | Recorded::NotYet => return None,
+                // Half of the track is left to go on from, while the writer overwrites the other half.
+                Recorded::Overwritten => {
+                    self.next = self.axis.track().next().saturating_sub(KEPT as u64 / 2);
+                    lost = true;
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::description::default::DefaultPrinter;
+
+    #[test]
+    fn who_falls_behind_goes_on_from_where_the_axis_is() {
+        let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[3]));
+        axis.set_enabled(true);
+        axis.set_forward(true);
+        let mut follower = Follower::new(axis.clone());
+        let steps = |from: u64, to: u64| {
+            for step in from..=to {
+                axis.edge(true, Clock::from_ticks(step));
+                axis.edge(false, Clock::from_ticks(step));
+            }
+        };
+        let at = Clock::from_ticks;
+        steps(1, 10);
+        // No further than asked for.
+        for step in 1..=4 {
+            assert_eq!(follower.next(at(4)), Some(Motion::Step(at(step), step as f64 / 100.0)));
+        }
+        assert_eq!(follower.next(at(4)), None);
+        let end = 2 * KEPT as u64;
+        steps(11, end);
+        let from = end - KEPT as u64 / 2 + 1;
+        assert_eq!(follower.next(at(end)), Some(Motion::Lost(at(from), from as f64 / 100.0)));
+        for step in from + 1..=end {
+            assert_eq!(follower.next(at(end)), Some(Motion::Step(at(step), step as f64 / 100.0)));
+        }
+        assert_eq!(follower.next(at(end)), None);
+    }
+}

@@ -1,0 +1,30 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A light of several colours, each dimmed by a pin of its own.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use super::colour::Colour;
+use super::physics::Lamp;
+use super::world::Sight;
+use pinion_firmware::time::Clock;
+
+/// The light.
+pub(crate) struct ColouredLed {
+    pub(crate) name: String,
+    /// Red, green, blue and white, as far as there are such.
+    pub(crate) lamps: [Option<Arc<Lamp>>; 4],
+}
+
+impl Sight for ColouredLed {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn look(&self, now: Clock) -> String {
+        let brightness = |lamp: &Arc<Lamp>| (lamp.brightness(now) * 255.0).round() as u8;
+        let [red, green, blue, white] = self.lamps.each_ref().map(|lamp| lamp.as_ref().map_or(0, brightness));
+        Colour { red, green, blue, white }.to_string()
+    }
+}

@@ -1,0 +1,18 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What any printer is made of: what moves and heats, the wires and buses, the time. It names no part.
+
+#![forbid(unsafe_code)]
+
+pub(crate) mod bed;
+pub(crate) mod colour;
+pub(crate) mod follower;
+pub(crate) mod i2c;
+pub(crate) mod led;
+pub(crate) mod noise;
+pub(crate) mod physics;
+pub(crate) mod spi;
+pub(crate) mod time;
+pub(crate) mod together;
+pub(crate) mod track;
+pub(crate) mod wire;
+pub(crate) mod world;

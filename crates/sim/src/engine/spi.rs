@@ -1,0 +1,249 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The simulated printer's SPI buses: chips, the lines that select them, and a record of what was
+//! said, as a logic analyser would make it.
+
+#![forbid(unsafe_code)]
+
+use std::fmt::Write as _;
+use std::fs::File;
+use std::io::Write as _;
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use super::physics::Lamp;
+use super::wire::{Kind, Wire};
+use crate::description::buses::SpiBusConfig;
+use crate::description::check::SimError;
+use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect};
+use pinion_firmware::time::Clock;
+
+/// A chip as its data sheet describes it. Its calls come in the order of the wires: selected,
+/// bytes, deselected.
+pub(crate) trait SpiChip: Send {
+    /// Whether the chip works in this SPI mode (0 to 3). In another one it is not heard.
+    fn knows_mode(&self, mode: u8) -> bool;
+
+    /// The chip is selected; the bus's clock has this rate.
+    fn select(&mut self, rate_hz: u32) {
+        let _ = rate_hz;
+    }
+
+    /// Takes a byte in, and gives the one that leaves the chip meanwhile.
+    fn exchange(&mut self, byte: u8) -> u8;
+
+    /// The chip is no longer selected: many act only now.
+    fn deselect(&mut self) {}
+}
+
+/// What hangs on a bus's data output (MOSI) alone: without clock and select line it hears whatever is
+/// sent on the bus.
+pub(crate) trait MosiListener: Send {
+    /// The output sends these bytes, the highest bit first, and so many bits in a second. Then it stays
+    /// at the level of the last one.
+    fn hear(&mut self, rate_hz: u32, bytes: &[u8]);
+}
+
+/// The data output of a bus as a pin.
+pub(crate) struct MosiPin {
+    /// The bus's name.
+    pub(crate) bus: String,
+}
+
+impl Wire for MosiPin {
+    fn kind(&self) -> Kind {
+        Kind::Mosi
+    }
+
+    fn describe(&self) -> String {
+        format!("of {}", self.bus)
+    }
+}
+
+/// A line that selects a chip while it is low.
+pub(crate) struct SelectLine {
+    /// Whose it is.
+    chip: String,
+    low: AtomicBool,
+}
+
+impl SelectLine {
+    /// The line of a chip, at its idle level.
+    pub(crate) fn new(chip: &str) -> SelectLine {
+        SelectLine { chip: chip.to_owned(), low: AtomicBool::new(false) }
+    }
+}
+
+impl Wire for SelectLine {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("chip select of {}", self.chip)
+    }
+
+    fn drive(&self, on: bool, _at: Clock) {
+        self.low.store(!on, Ordering::Relaxed);
+    }
+}
+
+/// A chip's place on its bus.
+struct Socket {
+    name: String,
+    /// None for the only chip of a bus, which is always selected.
+    select: Option<Arc<SelectLine>>,
+    chip: Box<dyn SpiChip>,
+}
+
+/// A record of transfers, one line each.
+struct Trace {
+    path: PathBuf,
+    file: File,
+    /// Outputs whose levels are recorded at each byte.
+    pins: Vec<(String, Arc<Lamp>, bool)>,
+}
+
+impl Trace {
+    fn record(
+        &mut self,
+        chips: &[&mut Socket],
+        sent: &[u8],
+        received: &[u8],
+        levels: &[String],
+    ) -> Result<(), BusError> {
+        let mut line = String::from("chips=");
+        let names: Vec<&str> = chips.iter().map(|socket| socket.name.as_str()).collect();
+        line += &names.join("+");
+        for (key, bytes) in [("sent", sent), ("received", received)] {
+            line += &format!(" {key}=");
+            for byte in bytes {
+                // A String takes everything that is written to it.
+                let _ = write!(line, "{byte:02x}");
+            }
+        }
+        for ((name, ..), levels) in self.pins.iter().zip(levels) {
+            line += &format!(" {name}={levels}");
+        }
+        line.push('\n');
+        // In one write, so that a reader never sees half a line.
+        self.file.write_all(line.as_bytes()).map_err(|error| BusError {
+            status: BusStatus::Nack,
+            detail: format!("{} can not be written: {error}: choose another trace_file", self.path.display()).into(),
+        })
+    }
+}
+
+/// What hangs on a bus.
+struct Wires {
+    sockets: Vec<Socket>,
+    listeners: Vec<Box<dyn MosiListener>>,
+    trace: Option<Trace>,
+}
+
+/// A bus.
+pub(crate) struct SpiBus {
+    /// As the dictionary has it.
+    pub(crate) name: String,
+    delay: Duration,
+    /// One transfer at a time, as on any bus; only workers wait here.
+    wires: Mutex<Wires>,
+}
+
+impl SpiBus {
+    /// The bus of a description, without chips. `lamp` finds the output of a pin.
+    pub(crate) fn new(
+        config: &SpiBusConfig,
+        lamp: impl Fn(&str) -> Option<(Arc<Lamp>, bool)>,
+    ) -> Result<SpiBus, SimError> {
+        let trace = match &config.trace_file {
+            None => None,
+            Some(path) => {
+                let pins = config.trace_pins.iter();
+                let pins = pins.filter_map(|name| lamp(name).map(|(lamp, inverted)| (name.clone(), lamp, inverted)));
+                let file = File::create(path).map_err(|error| config.no_trace_file(&error))?;
+                Some(Trace { path: path.clone(), file, pins: pins.collect() })
+            }
+        };
+        let wires = Mutex::new(Wires { sockets: Vec::new(), listeners: Vec::new(), trace });
+        Ok(SpiBus { name: config.name.clone(), delay: Duration::from_micros(config.delay_us), wires })
+    }
+
+    /// Puts a chip on the bus.
+    pub(crate) fn solder(&mut self, name: String, select: Option<Arc<SelectLine>>, chip: Box<dyn SpiChip>) {
+        let wires = self.wires.get_mut().unwrap_or_else(PoisonError::into_inner);
+        wires.sockets.push(Socket { name, select, chip });
+    }
+
+    /// Puts something on the data output alone.
+    pub(crate) fn listen(&mut self, listener: Box<dyn MosiListener>) {
+        self.wires.get_mut().unwrap_or_else(PoisonError::into_inner).listeners.push(listener);
+    }
+
+    /// One transfer with whatever is selected.
+    fn transfer(&self, mode: u8, rate_hz: u32, bytes: &mut [u8]) -> Result<(), BusError> {
+        let mut wires = self.wires.lock().unwrap_or_else(PoisonError::into_inner);
+        let Wires { sockets, listeners, trace } = &mut *wires;
+        let is_selected = |socket: &Socket| socket.select.as_ref().is_none_or(|line| line.low.load(Ordering::Relaxed));
+        let mut chips: Vec<&mut Socket> =
+            sockets.iter_mut().filter(|socket| is_selected(socket) && socket.chip.knows_mode(mode)).collect();
+        let sent = bytes.to_vec();
+        let mut levels = vec![String::new(); trace.as_ref().map_or(0, |trace| trace.pins.len())];
+        let pace = Pace { start: Instant::now(), delay: self.delay, bytes: bytes.len() };
+        chips.iter_mut().for_each(|socket| socket.chip.select(rate_hz));
+        for (n, byte) in bytes.iter_mut().enumerate() {
+            pace.wait(n + 1);
+            for ((_, lamp, inverted), levels) in trace.iter().flat_map(|trace| &trace.pins).zip(&mut levels) {
+                levels.push(if lamp.is_on() != *inverted { '1' } else { '0' });
+            }
+            // A wire that nobody drives is pulled up, and a chip that drives it low wins.
+            *byte = chips.iter_mut().fold(0xff, |wire, socket| wire & socket.chip.exchange(*byte));
+        }
+        pace.wait(pace.bytes);
+        chips.iter_mut().for_each(|socket| socket.chip.deselect());
+        listeners.iter_mut().for_each(|listener| listener.hear(rate_hz, &sent));
+        trace.as_mut().map_or(Ok(()), |trace| trace.record(&chips, &sent, bytes, &levels))
+    }
+}
+
+/// Spreads the bytes of a transfer over the time that it is to take.
+struct Pace {
+    start: Instant,
+    delay: Duration,
+    bytes: usize,
+}
+
+impl Pace {
+    /// Waits until so many bytes are over.
+    fn wait(&self, over: usize) {
+        let share = over as f64 / self.bytes.max(1) as f64;
+        let share = if self.bytes == 0 { 1.0 } else { share };
+        thread::sleep(self.delay.mul_f64(share).saturating_sub(self.start.elapsed()));
+    }
+}
+
+/// The host's end: a bus as one device of the machine's uses it.
+pub(crate) struct SpiDevice {
+    pub(crate) bus: Arc<SpiBus>,
+    pub(crate) mode: u8,
+    pub(crate) rate_hz: u32,
+    pub(crate) chip_select: Option<ChipSelect>,
+}
+
+impl SpiDevice {
+    fn select(&self, selected: bool) -> Result<(), BusError> {
+        let chip_select = self.chip_select.as_ref();
+        let driven = chip_select.map_or(Ok(()), |chip_select| chip_select.select(selected));
+        driven.map_err(|failure| BusError { status: BusStatus::Nack, detail: failure.detail })
+    }
+}
+
+impl BusDevice for SpiDevice {
+    fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
+        self.select(true)?;
+        let exchanged = self.bus.transfer(self.mode, self.rate_hz, bytes);
+        self.select(false).and(exchanged)
+    }
+}

@@ -1,0 +1,433 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the board's pins are wired to, and how the machine drives and senses it.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+
+use super::physics::{Axis, Fan, Heater, Lamp, Switch};
+use super::time::{PrinterTime, seconds};
+use crate::description::pin::PinName;
+use pinion_firmware::board::{Adc, Direction, Edge, Edges, Line, Pwm};
+use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
+
+/// What the machine may do with a pin.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Kind {
+    /// Drive it.
+    Output,
+    /// Sense it.
+    Input,
+    /// Both by turns: a wire that several drive.
+    Shared,
+    /// Measure it.
+    Analog,
+    /// Dim it, by a hardware PWM channel.
+    Pwm,
+    /// Have an SPI controller send on it.
+    Mosi,
+}
+
+/// A part's end of a pin. "On" is what the description calls so: a high level, unless the pin is
+/// inverted.
+///
+/// The core calls these: none may block, lock or allocate.
+pub(crate) trait Wire: Send + Sync {
+    /// What may be done with it.
+    fn kind(&self) -> Kind;
+
+    /// What it is and whose, such as `step of axis x`.
+    fn describe(&self) -> String;
+
+    /// The machine begins to drive the pin; the first level is no edge.
+    fn settle(&self, on: bool, at: Clock) {
+        self.drive(on, at);
+    }
+
+    /// The machine drives the pin to another level.
+    fn drive(&self, on: bool, at: Clock) {
+        let _ = (on, at);
+    }
+
+    /// The machine lets go of a shared pin.
+    fn release(&self, at: Clock) {
+        let _ = at;
+    }
+
+    /// What the machine senses. `driven` is the level that it drove last.
+    fn sense(&self, driven: bool, at: Clock) -> bool {
+        let _ = at;
+        driven
+    }
+
+    /// The edges of an input so far, and how many seconds ago the last one was; none of an input that its part does
+    /// not count.
+    fn edges(&self, at: Clock) -> Option<(u64, Option<f64>)> {
+        let _ = at;
+        None
+    }
+
+    /// A PWM channel gets another value, 0 to [`PWM_MAX`](pinion_firmware::board::PWM_MAX).
+    fn dim(&self, value: u16) {
+        let _ = value;
+    }
+
+    /// What an ADC reads of an analog pin, in counts. `noise` is a draw of a standard normal
+    /// distribution.
+    fn counts(&self, at: Clock, noise: f64) -> u16 {
+        let _ = (at, noise);
+        0
+    }
+}
+
+/// A pin of the board.
+#[derive(Clone)]
+pub(crate) struct WiredPin {
+    pub(crate) name: String,
+    inverted: bool,
+    pub(crate) wire: Arc<dyn Wire>,
+}
+
+impl WiredPin {
+    pub(crate) fn new(pin: &PinName, wire: Arc<dyn Wire>) -> WiredPin {
+        WiredPin { name: pin.name.clone(), inverted: pin.inverted, wire }
+    }
+
+    /// Says that it is no `wanted` kind of pin.
+    pub(crate) fn is_no(&self, wanted: &str, reason: ShutdownReason) -> Shutdown {
+        let is = match self.wire.kind() {
+            Kind::Output => "an output",
+            Kind::Input => "an input",
+            Kind::Shared => "a wire that several drive",
+            Kind::Analog => "an ADC channel",
+            Kind::Pwm => "a hardware PWM channel",
+            Kind::Mosi => "an SPI bus's data output",
+        };
+        let detail = format!(
+            "pin {} of the simulated printer is {is} ({}), no {wanted}: choose another pin",
+            self.name,
+            self.wire.describe()
+        );
+        Shutdown::because(reason, detail)
+    }
+}
+
+/// A line of the board, claimed.
+pub(crate) struct SimLine {
+    pin: WiredPin,
+    /// Whether it was driven on last.
+    on: AtomicBool,
+    time: Arc<PrinterTime>,
+}
+
+impl SimLine {
+    pub(crate) fn new(pin: WiredPin, time: Arc<PrinterTime>) -> SimLine {
+        SimLine { pin, on: AtomicBool::new(false), time }
+    }
+
+    fn begin(&self, level: bool) {
+        let on = level != self.pin.inverted;
+        self.on.store(on, Ordering::Relaxed);
+        self.pin.wire.settle(on, self.time.of_the_caller());
+    }
+}
+
+impl Line for SimLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        let on = level != self.pin.inverted;
+        if self.on.swap(on, Ordering::Relaxed) != on {
+            self.pin.wire.drive(on, self.time.of_the_caller());
+        }
+        Ok(())
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        let driven = self.on.load(Ordering::Relaxed);
+        Ok(self.pin.wire.sense(driven, self.time.of_the_caller()) != self.pin.inverted)
+    }
+
+    /// The parts drive their lines harder than any bias pulls.
+    fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
+        let kind = self.pin.wire.kind();
+        match direction {
+            Direction::Output { level, .. } if matches!(kind, Kind::Output | Kind::Shared) => self.begin(level),
+            Direction::OpenDrain if matches!(kind, Kind::Output | Kind::Shared) => self.begin(true),
+            Direction::Output { .. } | Direction::OpenDrain => {
+                return Err(self.pin.is_no("output", reason::NOT_OUTPUT));
+            }
+            Direction::Input(_) if kind == Kind::Shared => self.pin.wire.release(self.time.of_the_caller()),
+            Direction::Input(_) if kind == Kind::Input => {}
+            Direction::Input(_) => return Err(self.pin.is_no("input", reason::NOT_INPUT)),
+        }
+        Ok(())
+    }
+}
+
+/// An ADC at an analog pin.
+pub(crate) struct SimAdc {
+    pub(crate) wire: Arc<dyn Wire>,
+    pub(crate) time: Arc<PrinterTime>,
+    pub(crate) noise: super::noise::Noise,
+}
+
+impl Adc for SimAdc {
+    fn read(&mut self) -> Result<u16, Shutdown> {
+        Ok(self.wire.counts(self.time.now(), self.noise.draw()))
+    }
+}
+
+/// A hardware PWM channel.
+pub(crate) struct SimPwm(pub(crate) Arc<dyn Wire>);
+
+impl Pwm for SimPwm {
+    fn set(&mut self, value: u16) -> Result<(), Shutdown> {
+        self.0.dim(value);
+        Ok(())
+    }
+
+    fn set_cycle(&mut self, _cycle: Ticks, value: u16) -> Result<(), Shutdown> {
+        self.set(value)
+    }
+}
+
+/// The edges of an input, as a kernel's interrupts would date them.
+pub(crate) struct SimEdges {
+    wire: Arc<dyn Wire>,
+    time: Arc<PrinterTime>,
+    /// How many there were when they were last taken, and the level behind the last of them.
+    taken: u64,
+    level: bool,
+    /// When the last of them came, or what is earlier than the next: when the line was claimed.
+    last: Clock,
+}
+
+/// As many edges are kept as by the kernel.
+const EDGES_KEPT: u64 = 1024;
+
+impl SimEdges {
+    /// None where the part does not count them. `level` is the line's.
+    pub(crate) fn new(wire: Arc<dyn Wire>, time: Arc<PrinterTime>, level: bool) -> Option<SimEdges> {
+        let last = time.now();
+        let (taken, _) = wire.edges(last)?;
+        Some(SimEdges { wire, time, taken, level, last })
+    }
+}
+
+fn ticks(seconds: f64) -> u64 {
+    (seconds * f64::from(CLOCK_FREQ)) as u64
+}
+
+impl Edges for SimEdges {
+    /// A part knows how many there were and when the last one was. The others came evenly before it.
+    fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown> {
+        let now = self.time.now();
+        let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.taken, None));
+        let new = edges.saturating_sub(self.taken);
+        if new == 0 {
+            return Ok(());
+        }
+        let since_s = seconds(self.last, now);
+        // The last one came after those that were taken before.
+        let ago_s = ago_s.unwrap_or(0.0).min(since_s);
+        let each_s = (since_s - ago_s) / new as f64;
+        let dropped = new.saturating_sub(EDGES_KEPT);
+        for number in dropped + 1..=new {
+            let at = now.earlier(ticks(ago_s + (new - number) as f64 * each_s));
+            let dropped = if number == dropped + 1 { u32::try_from(dropped).unwrap_or(u32::MAX) } else { 0 };
+            see(Edge { at: self.time.duration_of(at), level: self.level ^ (number % 2 == 1), dropped });
+        }
+        self.taken = edges;
+        self.level ^= new % 2 == 1;
+        self.last = now.earlier(ticks(ago_s));
+        Ok(())
+    }
+
+    fn end(&mut self) -> Result<(), Shutdown> {
+        Ok(())
+    }
+}
+
+/// The step input of an axis' driver.
+pub(crate) struct StepPin(pub(crate) Arc<Axis>);
+
+impl Wire for StepPin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("step of axis {}", self.0.name)
+    }
+
+    /// The line stands at its first level before the motor looks at it.
+    fn settle(&self, _on: bool, _at: Clock) {}
+
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.edge(on, at);
+    }
+}
+
+/// The direction input of an axis' driver.
+pub(crate) struct DirectionPin(pub(crate) Arc<Axis>);
+
+impl Wire for DirectionPin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("direction of axis {}", self.0.name)
+    }
+
+    fn drive(&self, on: bool, _at: Clock) {
+        self.0.set_forward(on);
+    }
+}
+
+/// The enable input of an axis' driver.
+pub(crate) struct EnablePin(pub(crate) Arc<Axis>);
+
+impl Wire for EnablePin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("enable of axis {}", self.0.name)
+    }
+
+    fn drive(&self, on: bool, _at: Clock) {
+        self.0.set_enabled(on);
+    }
+}
+
+/// An axis' endstop.
+pub(crate) struct EndstopPin(pub(crate) Arc<Axis>);
+
+impl Wire for EndstopPin {
+    fn kind(&self) -> Kind {
+        Kind::Input
+    }
+
+    fn describe(&self) -> String {
+        format!("endstop of axis {}", self.0.name)
+    }
+
+    fn sense(&self, _driven: bool, _at: Clock) -> bool {
+        self.0.endstop().unwrap_or(false)
+    }
+}
+
+/// A heater's switch.
+pub(crate) struct HeaterPin(pub(crate) Arc<Heater>);
+
+impl Wire for HeaterPin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("heater {}", self.0.name)
+    }
+
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.switch(on, at);
+    }
+}
+
+/// A heater's thermistor.
+pub(crate) struct ThermistorPin(pub(crate) Arc<Heater>);
+
+impl Wire for ThermistorPin {
+    fn kind(&self) -> Kind {
+        Kind::Analog
+    }
+
+    fn describe(&self) -> String {
+        format!("sensor of heater {}", self.0.name)
+    }
+
+    fn counts(&self, at: Clock, noise: f64) -> u16 {
+        self.0.thermistor.counts(self.0.at(at).sensor_celsius, noise * self.0.noise_counts)
+    }
+}
+
+/// A fan's power, or its second switch.
+pub(crate) struct FanPin(pub(crate) Arc<Fan>, pub(crate) Switch);
+
+impl Wire for FanPin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        match self.1 {
+            Switch::Power => format!("fan {}", self.0.name),
+            Switch::Enable => format!("enable of fan {}", self.0.name),
+        }
+    }
+
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.switch(self.1, on, at);
+    }
+}
+
+/// A fan's tachometer.
+pub(crate) struct TachometerPin(pub(crate) Arc<Fan>);
+
+impl Wire for TachometerPin {
+    fn kind(&self) -> Kind {
+        Kind::Input
+    }
+
+    fn describe(&self) -> String {
+        format!("tachometer of fan {}", self.0.name)
+    }
+
+    fn sense(&self, _driven: bool, at: Clock) -> bool {
+        self.0.tachometer(at)
+    }
+
+    fn edges(&self, at: Clock) -> Option<(u64, Option<f64>)> {
+        Some(self.0.edges(at))
+    }
+}
+
+/// A light's switch, or another output's.
+pub(crate) struct LampPin(pub(crate) Arc<Lamp>);
+
+impl Wire for LampPin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        self.0.name.clone()
+    }
+
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.switch(on, at);
+    }
+}
+
+/// An input that stays at one level.
+pub(crate) struct FixedInput {
+    pub(crate) name: String,
+    pub(crate) on: bool,
+}
+
+impl Wire for FixedInput {
+    fn kind(&self) -> Kind {
+        Kind::Input
+    }
+
+    fn describe(&self) -> String {
+        self.name.clone()
+    }
+
+    fn sense(&self, _driven: bool, _at: Clock) -> bool {
+        self.on
+    }
+}

@@ -1,0 +1,61 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A1333 (Allegro, "SPI Interface").
+
+#![forbid(unsafe_code)]
+
+use super::shaft::{Frame, Shaft, even_parity};
+use crate::engine::spi::SpiChip;
+
+/// A frame has a zero, whether to write, six bits of address and eight of data. What is read comes with the
+/// next frame, as it is when that begins.
+pub(super) struct A1333 {
+    pub(super) shaft: Shaft,
+    frame: Frame,
+    /// What is read.
+    address: u8,
+}
+
+impl A1333 {
+    const ANG: u8 = 0x20;
+    const STA: u8 = 0x22;
+    const ANG15: u8 = 0x32;
+
+    pub(super) fn new(shaft: Shaft) -> A1333 {
+        A1333 { shaft, frame: Frame::default(), address: 0 }
+    }
+
+    fn register(&self) -> u16 {
+        match self.address {
+            A1333::ANG => {
+                // Odd parity in bit 12.
+                let angle = self.shaft.angle(12);
+                angle | (even_parity(angle) ^ 1) << 12
+            }
+            // Its identifier, and nothing to report.
+            A1333::STA => 0x8000,
+            A1333::ANG15 => self.shaft.angle(15),
+            _ => 0,
+        }
+    }
+}
+
+impl SpiChip for A1333 {
+    fn knows_mode(&self, mode: u8) -> bool {
+        mode == 3
+    }
+
+    fn select(&mut self, _rate_hz: u32) {
+        self.frame.begin(self.register());
+    }
+
+    fn exchange(&mut self, byte: u8) -> u8 {
+        self.frame.exchange(byte)
+    }
+
+    fn deselect(&mut self) {
+        // To write needs a code that no host here has.
+        if let Some(frame) = self.frame.whole().filter(|frame| frame & 0x4000 == 0) {
+            self.address = (frame >> 8 & 0x3f) as u8;
+        }
+    }
+}

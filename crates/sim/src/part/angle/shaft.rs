@@ -1,0 +1,72 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A motor's shaft with a magnet, and what the frames of several sensors share.
+
+#![forbid(unsafe_code)]
+
+use std::f64::consts::TAU;
+use std::sync::Arc;
+
+use crate::engine::physics::Axis;
+
+/// What a sensor measures.
+pub(super) struct Shaft {
+    pub(super) axis: Arc<Axis>,
+    pub(super) steps_per_turn: f64,
+    /// In turns.
+    pub(super) offset: f64,
+    pub(super) eccentricity: f64,
+}
+
+impl Shaft {
+    /// The turns of the motor.
+    pub(super) fn turns(&self) -> f64 {
+        self.axis.position_steps() as f64 / self.steps_per_turn
+    }
+
+    /// The angle that the sensor finds: of so many bits.
+    pub(super) fn angle(&self, bits: u32) -> u16 {
+        let angle = (self.turns() + self.offset).rem_euclid(1.0);
+        let measured = angle + self.eccentricity * (TAU * angle).sin();
+        let steps = f64::from(1u32 << bits);
+        // One turn is none.
+        (measured.rem_euclid(1.0) * steps) as u16 & ((1u32 << bits) - 1) as u16
+    }
+}
+
+/// 1 where that makes the number of ones even.
+pub(super) fn even_parity(word: u16) -> u16 {
+    (word.count_ones() & 1) as u16
+}
+
+/// A cyclic redundancy check of 8 bits.
+pub(super) fn crc8(polynomial: u8, start: u8, bytes: &[u8]) -> u8 {
+    bytes.iter().fold(start, |crc, byte| {
+        (0..8).fold(crc ^ byte, |crc, _| if crc & 0x80 != 0 { (crc << 1) ^ polynomial } else { crc << 1 })
+    })
+}
+
+/// A frame of 16 bits both ways.
+#[derive(Default)]
+pub(super) struct Frame {
+    out: u16,
+    into: u16,
+    bytes: usize,
+}
+
+impl Frame {
+    pub(super) fn begin(&mut self, out: u16) {
+        *self = Frame { out, into: 0, bytes: 0 };
+    }
+
+    pub(super) fn exchange(&mut self, byte: u8) -> u8 {
+        let [high, low] = self.out.to_be_bytes();
+        self.out = u16::from(low) << 8;
+        self.into = self.into << 8 | u16::from(byte);
+        self.bytes += 1;
+        high
+    }
+
+    pub(super) fn whole(&self) -> Option<u16> {
+        (self.bytes == 2).then_some(self.into)
+    }
+}

@@ -1,0 +1,222 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A strip of APA102 lights ("dotstars") on two lines, clock and data, after their data sheet (Shiji
+//! APA102: "Series data structure").
+//!
+//! The strip takes a bit at each rising edge of the clock. A start frame is 32 zeros; a light's frame
+//! is three ones, 5 bits of brightness, and blue, green, red of 8 bits each. Not simulated: that each
+//! light passes data on half a clock later, for which a host sends ones at the end; here the last light
+//! has its colour with its last bit.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+
+use serde::Deserialize;
+
+use super::workshop::{Part, Workshop};
+use crate::description::check::{SimError, check_lights, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
+use crate::engine::colour::{self, Colour};
+use crate::engine::wire::{Kind, Wire};
+use crate::engine::world::Sight;
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
+use pinion_firmware::time::Clock;
+
+/// The bits of a frame.
+const FRAME: u32 = 32;
+/// What a light's frame begins with.
+const MARK: u32 = 0xe000_0000;
+/// Full brightness.
+const BRIGHTEST: u32 = 31;
+
+/// A strip's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Apa102Config {
+    /// Such as `dots`.
+    pub name: String,
+    /// The data line.
+    pub data_pin: PinName,
+    /// The clock line.
+    pub clock_pin: PinName,
+    /// How many lights it has.
+    pub count: u32,
+}
+
+impl Part for Apa102Config {
+    fn name(&self) -> String {
+        format!("apa102 {}", self.name)
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("data_pin", Some(&self.data_pin)), ("clock_pin", Some(&self.clock_pin))]
+    }
+
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+        check_lights(whose, self.count)?;
+        if self.data_pin.inverted || self.clock_pin.inverted {
+            return wrong(whose, "data_pin", "klippy's lines to such a strip have no polarity", "remove the `!`");
+        }
+        Ok(())
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        let strip = Arc::new(Strip::new(self));
+        workshop.wire(Some(&self.data_pin), DataPin(strip.clone()));
+        workshop.wire(Some(&self.clock_pin), ClockPin(strip.clone()));
+        workshop.show(strip);
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, _layout: &Layout<'_>) {
+        cfg.section(format_args!("dotstar {}", self.name));
+        cfg.key("data_pin", &self.data_pin);
+        cfg.key("clock_pin", &self.clock_pin);
+        cfg.key("chain_count", self.count);
+    }
+}
+
+/// The lights and their shift register. One thread drives the lines; any may look.
+struct Strip {
+    name: String,
+    data: AtomicBool,
+    clocked: AtomicBool,
+    /// The last 32 bits, and how many of them belong to a light's frame.
+    shift: AtomicU32,
+    bits: AtomicU32,
+    /// The light whose frame is next; none before the first start frame.
+    next: AtomicU32,
+    /// Each light's last frame.
+    lights: Vec<AtomicU32>,
+}
+
+impl Strip {
+    fn new(config: &Apa102Config) -> Strip {
+        Strip {
+            name: config.name.clone(),
+            data: AtomicBool::new(false),
+            clocked: AtomicBool::new(false),
+            shift: AtomicU32::new(u32::MAX),
+            bits: AtomicU32::new(0),
+            next: AtomicU32::new(config.count),
+            lights: (0..config.count).map(|_| AtomicU32::new(MARK)).collect(),
+        }
+    }
+
+    /// A rising edge of the clock.
+    fn take(&self) {
+        let load = |word: &AtomicU32| word.load(Ordering::Relaxed);
+        let shift = load(&self.shift) << 1 | u32::from(self.data.load(Ordering::Relaxed));
+        self.shift.store(shift, Ordering::Relaxed);
+        let bits = load(&self.bits) + 1;
+        let (next, bits) = match shift {
+            // A start frame, however long.
+            0 => (0, 0),
+            // A light's frame begins with a one: what is before is the start frame's, too.
+            _ if bits == 1 && shift & 1 == 0 => (load(&self.next), 0),
+            _ if bits == FRAME => {
+                let next = load(&self.next);
+                if let Some(light) = self.lights.get(next as usize).filter(|_| shift & MARK == MARK) {
+                    light.store(shift, Ordering::Relaxed);
+                }
+                (next.saturating_add(1), 0)
+            }
+            _ => (load(&self.next), bits),
+        };
+        self.next.store(next, Ordering::Relaxed);
+        self.bits.store(bits, Ordering::Relaxed);
+    }
+}
+
+impl Sight for Strip {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn look(&self, _now: Clock) -> String {
+        colour::list(self.lights.iter().map(|light| {
+            let [head, blue, green, red] = light.load(Ordering::Relaxed).to_be_bytes();
+            let dimmed = |part: u8| (u32::from(part) * u32::from(head & 0x1f) / BRIGHTEST) as u8;
+            Colour { red: dimmed(red), green: dimmed(green), blue: dimmed(blue), white: 0 }
+        }))
+    }
+}
+
+/// The data line. klippy names it as its input, too, on which nobody answers.
+struct DataPin(Arc<Strip>);
+
+impl Wire for DataPin {
+    fn kind(&self) -> Kind {
+        Kind::Shared
+    }
+
+    fn describe(&self) -> String {
+        format!("data of lights {}", self.0.name)
+    }
+
+    fn drive(&self, on: bool, _at: Clock) {
+        self.0.data.store(on, Ordering::Relaxed);
+    }
+}
+
+/// The clock line.
+struct ClockPin(Arc<Strip>);
+
+impl Wire for ClockPin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("clock of lights {}", self.0.name)
+    }
+
+    fn drive(&self, on: bool, _at: Clock) {
+        if on && !self.0.clocked.swap(on, Ordering::Relaxed) {
+            self.0.take();
+        }
+        self.0.clocked.store(on, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn strip(count: u32) -> Arc<Strip> {
+        let pin = |name: &str| PinName::try_from(name.to_owned()).unwrap();
+        let config = Apa102Config { name: "dots".into(), data_pin: pin("d"), clock_pin: pin("c"), count };
+        Arc::new(Strip::new(&config))
+    }
+
+    fn send(strip: &Arc<Strip>, words: &[u32]) {
+        let at = Clock::from_ticks(0);
+        let (data, clock) = (DataPin(strip.clone()), ClockPin(strip.clone()));
+        for bit in words.iter().flat_map(|word| (0..32).rev().map(move |bit| word >> bit & 1 != 0)) {
+            data.drive(bit, at);
+            clock.drive(true, at);
+            clock.drive(false, at);
+        }
+    }
+
+    #[test]
+    fn lights_take_their_frames_after_a_start_frame() {
+        let strip = strip(3);
+        let look = || strip.look(Clock::from_ticks(0));
+        send(&strip, &[0xff03_0201, 0, 0xff03_0201, 0xff00_0000, 0xf0ff_00ff, 0xff44_4444, u32::MAX]);
+        assert_eq!(look(), "#010203 off #830083", "the last one at 16 of 31, and a fourth that is not there");
+        // Black at the least brightness is no start frame, and a frame without its mark is none.
+        send(&strip, &[0, 0xe000_0000, 0x9fff_ffff, 0xffff_ffff, u32::MAX]);
+        assert_eq!(look(), "off off #ffffff");
+    }
+
+    #[test]
+    fn a_start_frame_may_be_longer() {
+        let strip = strip(1);
+        send(&strip, &[0, 0, 0x0000_07f8, 0x0810_1807]);
+        assert_eq!(strip.look(Clock::from_ticks(0)), "#030201", "21 zeros more");
+    }
+}

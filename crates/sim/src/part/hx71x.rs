@@ -1,0 +1,430 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The load cell ADCs HX711 and HX717 (Avia Semiconductor's data sheets, "Serial Interface" and "Reset and
+//! Power-Down Sequence").
+//!
+//! The data line goes low when a conversion is ready. 24 pulses of the clock shift its bits out, the
+//! highest first; one to four more take the data line high and choose channel and gain of what follows. A
+//! clock that is high for over 60 us switches the chip off; as it falls, the chip begins anew, with
+//! channel A and its highest gain, and is ready when it has settled for four conversions.
+//!
+//! Simulated: all of that, by the clock. What is shifted out is what the cell bears at the first pulse,
+//! not at the end of the conversion just before. Channel B is connected to nothing and reads noise. The
+//! settling after a change of the gain is left out.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use serde::Deserialize;
+
+use super::load_cell::{Cell, CellConfig};
+use super::workshop::{Part, Workshop};
+use crate::description::check::{SimError, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
+use crate::engine::time::seconds;
+use crate::engine::together::Together;
+use crate::engine::wire::{Kind, Wire};
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
+use pinion_firmware::time::Clock;
+
+/// So long the clock may be high before the chip switches itself off.
+const POWER_DOWN_S: f64 = 60e-6;
+const SAMPLE_BITS: u64 = 24;
+/// The conversions that it takes to settle after a start.
+const SETTLING: u64 = 4;
+
+/// The chip's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Hx71xConfig {
+    /// Which of the two it is.
+    pub chip: Hx71xChip,
+    /// Its data line.
+    pub dout_pin: PinName,
+    /// Its clock line.
+    pub sclk_pin: PinName,
+    /// The rate that its pins are wired to.
+    pub samples_per_s: u32,
+    /// The load cell.
+    pub cell: CellConfig,
+}
+
+/// The chips of this kind.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Hx71xChip {
+    /// 10 or 80 samples a second.
+    Hx711,
+    /// 10, 20, 80 or 320 samples a second.
+    Hx717,
+}
+
+impl Hx71xChip {
+    fn name(self) -> &'static str {
+        match self {
+            Hx71xChip::Hx711 => "hx711",
+            Hx71xChip::Hx717 => "hx717",
+        }
+    }
+
+    fn rates(self) -> &'static [u32] {
+        match self {
+            Hx71xChip::Hx711 => &[10, 80],
+            Hx71xChip::Hx717 => &[10, 20, 80, 320],
+        }
+    }
+
+    /// What so many pulses beyond the sample's choose: the gain as a share of the highest one; 0 for
+    /// channel B.
+    fn gain(self, pulses: u64) -> f64 {
+        match (self, pulses) {
+            (_, 3) => 0.5,
+            (_, 2 | 4) => 0.0,
+            _ => 1.0,
+        }
+    }
+}
+
+impl Part for Hx71xConfig {
+    fn name(&self) -> String {
+        self.chip.name().into()
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("dout_pin", Some(&self.dout_pin)), ("sclk_pin", Some(&self.sclk_pin))]
+    }
+
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+        if !self.chip.rates().contains(&self.samples_per_s) {
+            let cause = format!("{} is none of the chip's rates", self.samples_per_s);
+            return wrong(whose, "samples_per_s", &cause, &format!("give one of {:?}", self.chip.rates()));
+        }
+        self.cell.validate(whose)
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        let cell = Cell::new(&self.cell, workshop, self);
+        let chip = Arc::new(Hx71x::new(self.chip, self.samples_per_s, cell));
+        workshop.wire(Some(&self.dout_pin), DoutPin(chip.clone()));
+        workshop.wire(Some(&self.sclk_pin), SclkPin(chip));
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
+        let keys = |cfg: &mut Sections| {
+            cfg.key("sensor_type", self.chip.name());
+            cfg.key("dout_pin", &self.dout_pin);
+            cfg.key("sclk_pin", &self.sclk_pin);
+            cfg.key("sample_rate", self.samples_per_s);
+            self.cell.calibration(cfg);
+        };
+        cfg.section("load_cell");
+        keys(cfg);
+        cfg.probe(layout, |cfg| {
+            cfg.section("load_cell_probe");
+            cfg.comment("Takes the place of [load_cell], too. The nozzle is the probe.");
+            keys(cfg);
+            cfg.key("z_offset", 0);
+        });
+    }
+}
+
+/// What the clock line has done to the chip. Only the thread that drives it changes this.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct State {
+    /// Whether the clock is high, and since when.
+    high: bool,
+    rise: Clock,
+    /// The chip converts since then.
+    start: Clock,
+    /// Conversions that were read or passed over.
+    taken: u64,
+    /// Pulses since the last sample was begun; 0 after a start.
+    pulses: u64,
+    /// The pulses that chose the gain of the sample: 1 to 4.
+    gain: u64,
+    sample: u32,
+}
+
+impl State {
+    fn words(self) -> [u64; 5] {
+        let small = u64::from(self.high) | self.gain << 1 | self.pulses << 4;
+        [small, self.rise.ticks(), self.start.ticks(), self.taken, self.sample.into()]
+    }
+
+    fn of([small, rise, start, taken, sample]: [u64; 5]) -> State {
+        State {
+            high: small & 1 != 0,
+            rise: Clock::from_ticks(rise),
+            start: Clock::from_ticks(start),
+            taken,
+            pulses: small >> 4,
+            gain: small >> 1 & 7,
+            sample: sample as u32,
+        }
+    }
+}
+
+/// The chip.
+struct Hx71x {
+    chip: Hx71xChip,
+    samples_per_s: f64,
+    cell: Cell,
+    state: Together<5>,
+}
+
+impl Hx71x {
+    fn new(chip: Hx71xChip, samples_per_s: u32, cell: Cell) -> Hx71x {
+        let start = Clock::from_ticks(0);
+        let state = State { high: false, rise: start, start, taken: 0, pulses: 0, gain: 1, sample: 0 };
+        Hx71x { chip, samples_per_s: samples_per_s.into(), cell, state: Together::new(state.words()) }
+    }
+
+    /// The conversions since the start that are over and were not taken.
+    fn waiting(&self, state: &State, at: Clock) -> u64 {
+        let conversions = (seconds(state.start, at) * self.samples_per_s) as u64;
+        conversions.saturating_sub(SETTLING - 1).saturating_sub(state.taken)
+    }
+
+    fn is_off(state: &State, at: Clock) -> bool {
+        state.high && seconds(state.rise, at) > POWER_DOWN_S
+    }
+
+    /// The clock line has a level.
+    fn clock(&self, high: bool, at: Clock) {
+        let mut state = State::of(self.state.load());
+        if high == state.high {
+            return;
+        }
+        if high {
+            state.rise = at;
+            self.pulse(&mut state, at);
+        } else if Hx71x::is_off(&state, at) {
+            state = State { start: at, taken: 0, pulses: 0, gain: 1, ..state };
+        }
+        state.high = high;
+        self.state.store(state.words());
+    }
+
+    fn pulse(&self, state: &mut State, at: Clock) {
+        let is_over = state.pulses == 0 || state.pulses > SAMPLE_BITS;
+        let waiting = self.waiting(state, at);
+        if is_over && waiting > 0 {
+            if state.pulses > 0 {
+                state.gain = (state.pulses - SAMPLE_BITS).min(4);
+            }
+            state.pulses = 0;
+            state.taken += waiting;
+            let gain = self.chip.gain(state.gain);
+            state.sample = self.cell.counts(gain, state.start.ticks().wrapping_add(state.taken)) as u32;
+        } else if state.pulses == 0 {
+            // There is nothing to shift out.
+            return;
+        }
+        // Beyond the last that has a meaning they only keep the line high.
+        state.pulses = (state.pulses + 1).min(SAMPLE_BITS + 4);
+    }
+
+    /// The data line.
+    fn data(&self, at: Clock) -> bool {
+        let state = State::of(self.state.load());
+        match state.pulses {
+            _ if Hx71x::is_off(&state, at) => true,
+            1..=SAMPLE_BITS => state.sample >> (SAMPLE_BITS - state.pulses) & 1 != 0,
+            _ => self.waiting(&state, at) == 0,
+        }
+    }
+}
+
+/// The data line.
+struct DoutPin(Arc<Hx71x>);
+
+impl Wire for DoutPin {
+    fn kind(&self) -> Kind {
+        Kind::Input
+    }
+
+    fn describe(&self) -> String {
+        format!("data of {}", self.0.chip.name())
+    }
+
+    fn sense(&self, _driven: bool, at: Clock) -> bool {
+        self.0.data(at)
+    }
+}
+
+/// The clock line.
+struct SclkPin(Arc<Hx71x>);
+
+impl Wire for SclkPin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("clock of {}", self.0.chip.name())
+    }
+
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.clock(on, at);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::description::default::DefaultPrinter;
+    use crate::engine::bed::Bed;
+    use crate::engine::physics::Axis;
+    use pinion_firmware::time::CLOCK_FREQ;
+
+    struct Bench {
+        z: Arc<Axis>,
+        chip: Hx71x,
+        now: Clock,
+    }
+
+    const COUNTS_PER_GRAM: f64 = 100.0;
+
+    impl Bench {
+        fn new(weight_g: f64, noise_counts: f64) -> Bench {
+            let z = Arc::new(Axis::new(&DefaultPrinter::read().axes[2]));
+            z.set_enabled(true);
+            let config = CellConfig {
+                stiffness_g_per_mm: 4000.0,
+                counts_per_gram: COUNTS_PER_GRAM,
+                zero_counts: -5000.0,
+                weight_g,
+                noise_counts,
+            };
+            let cell = Cell::over(config, Bed::under(Default::default(), None, None, Some(z.clone())));
+            Bench { z, chip: Hx71x::new(Hx71xChip::Hx711, 80, cell), now: Clock::from_ticks(0) }
+        }
+
+        fn wait(&mut self, seconds: f64) {
+            self.now = Clock::from_ticks(self.now.ticks() + (seconds * f64::from(CLOCK_FREQ)).round() as u64);
+        }
+
+        fn is_ready(&self) -> bool {
+            !self.chip.data(self.now)
+        }
+
+        /// The bits that come with so many pulses, the last one lowest.
+        fn shift(&mut self, pulses: u32) -> u32 {
+            (0..pulses).fold(0, |bits, _| {
+                self.chip.clock(true, self.now);
+                self.wait(1e-6);
+                self.chip.clock(false, self.now);
+                let bit = self.chip.data(self.now);
+                self.wait(1e-6);
+                bits << 1 | u32::from(bit)
+            })
+        }
+
+        /// The next sample, read with 24 and so many further pulses.
+        fn sample(&mut self, further: u32) -> i32 {
+            while !self.is_ready() {
+                self.wait(1e-4);
+            }
+            let bits = self.shift(24 + further);
+            assert_eq!(bits & ((1 << further) - 1), (1 << further) - 1, "the line is high after the sample");
+            ((bits >> further) << 8) as i32 >> 8
+        }
+    }
+
+    #[test]
+    fn conversions_come_at_the_chip_s_rate_after_it_has_settled() {
+        let mut bench = Bench::new(0.0, 0.0);
+        bench.wait(0.0499);
+        assert!(!bench.is_ready());
+        assert_eq!(bench.shift(3), 7, "nothing to shift out");
+        bench.wait(0.0002);
+        assert!(bench.is_ready());
+        assert_eq!(bench.sample(1), -5000);
+        assert!(!bench.is_ready());
+        bench.wait(0.0120);
+        assert!(!bench.is_ready());
+        bench.wait(0.0005);
+        assert!(bench.is_ready());
+        // One that nobody reads gives way to the next.
+        bench.wait(0.1);
+        bench.sample(1);
+        assert!(!bench.is_ready());
+    }
+
+    #[test]
+    fn it_counts_the_weight_and_the_nozzle_in_the_bed() {
+        let mut bench = Bench::new(250.0, 0.0);
+        let zero = -5000 + 250 * 100;
+        assert_eq!(bench.sample(1), zero);
+        // From 12 mm to 0.1 mm below the bed.
+        bench.z.set_forward(false);
+        for _ in 0..4840 {
+            bench.z.edge(true, bench.now);
+        }
+        assert_eq!(bench.sample(1), zero + 40_000);
+        bench.z.set_forward(true);
+        for _ in 0..40 {
+            bench.z.edge(true, bench.now);
+        }
+        assert_eq!(bench.sample(1), zero);
+    }
+
+    #[test]
+    fn further_pulses_choose_the_gain_of_the_next_sample() {
+        let mut bench = Bench::new(0.0, 0.0);
+        assert_eq!(bench.sample(3), -5000);
+        assert_eq!(bench.sample(2), -2500);
+        assert_eq!(bench.sample(1), 0, "channel B");
+        assert_eq!(bench.sample(1), -5000);
+    }
+
+    #[test]
+    fn a_clock_that_stays_high_switches_it_off_and_a_falling_one_starts_it_anew() {
+        let mut bench = Bench::new(0.0, 0.0);
+        bench.sample(3);
+        bench.chip.clock(true, bench.now);
+        bench.wait(1.0);
+        assert!(!bench.is_ready(), "off");
+        bench.chip.clock(false, bench.now);
+        bench.wait(0.0499);
+        assert!(!bench.is_ready(), "it settles");
+        bench.wait(0.0002);
+        assert!(bench.is_ready());
+        assert_eq!(bench.sample(1), -5000, "the highest gain again");
+        // Amid a sample.
+        while !bench.is_ready() {
+            bench.wait(1e-4);
+        }
+        bench.shift(5);
+        bench.chip.clock(true, bench.now);
+        bench.wait(70e-6);
+        bench.chip.clock(false, bench.now);
+        assert_eq!(bench.shift(20), (1 << 20) - 1, "all ones");
+    }
+
+    #[test]
+    fn a_reading_beyond_the_range_stays_at_its_end_and_noise_is_seeded() {
+        assert_eq!(Bench::new(1e6, 0.0).sample(1), 0x7f_ffff);
+        assert_eq!(Bench::new(-1e6, 0.0).sample(1), -0x80_0000);
+        let readings = || {
+            let mut bench = Bench::new(0.0, 50.0);
+            (0..200).map(|_| bench.sample(1)).collect::<Vec<i32>>()
+        };
+        let (some, same) = (readings(), readings());
+        assert_eq!(some, same);
+        let mean = some.iter().sum::<i32>() as f64 / 200.0;
+        let variance = some.iter().map(|value| (f64::from(*value) - mean).powi(2)).sum::<f64>() / 200.0;
+        assert!((mean + 5000.0).abs() < 15.0, "{mean}");
+        assert!((30.0..70.0).contains(&variance.sqrt()), "{}", variance.sqrt());
+    }
+
+    #[test]
+    fn a_state_is_the_same_after_it_was_stored() {
+        let at = Clock::from_ticks;
+        let state = State { high: true, rise: at(7), start: at(9), taken: 5, pulses: 28, gain: 4, sample: 0xff_1234 };
+        assert_eq!(State::of(state.words()), state);
+    }
+}

@@ -1,0 +1,89 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A load cell under the hot end: the nozzle that presses into the bed bends it, and so does a weight that
+//! hangs on it. The chips that measure it are parts of their own.
+
+#![forbid(unsafe_code)]
+
+use serde::Deserialize;
+
+use super::workshop::{Part, Workshop};
+use crate::description::check::{Bound, SimError, check};
+use crate::engine::bed::Bed;
+use crate::engine::noise::Noise;
+use crate::klippy::sections::Sections;
+
+/// The cell's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CellConfig {
+    /// The force for each millimetre that the nozzle is below the bed's surface.
+    pub stiffness_g_per_mm: f64,
+    /// What the chip counts for each gram.
+    pub counts_per_gram: f64,
+    /// What the chip counts without any force.
+    #[serde(default)]
+    pub zero_counts: f64,
+    /// A weight that hangs on it.
+    #[serde(default)]
+    pub weight_g: f64,
+    /// Standard deviation of a reading.
+    #[serde(default)]
+    pub noise_counts: f64,
+}
+
+impl CellConfig {
+    /// Checks the values.
+    pub(crate) fn validate(&self, whose: &str) -> Result<(), SimError> {
+        for (key, value, bound) in [
+            ("stiffness_g_per_mm", self.stiffness_g_per_mm, Bound::AboveZero),
+            ("counts_per_gram", self.counts_per_gram, Bound::AboveZero),
+            ("zero_counts", self.zero_counts, Bound::Any),
+            ("weight_g", self.weight_g, Bound::Any),
+            ("noise_counts", self.noise_counts, Bound::NotNegative),
+        ] {
+            check(whose, key, value, bound)?;
+        }
+        Ok(())
+    }
+
+    /// The keys of a section whose cell is calibrated.
+    pub(crate) fn calibration(&self, cfg: &mut Sections) {
+        cfg.key("counts_per_gram", self.counts_per_gram);
+        let tare = self.zero_counts + self.weight_g * self.counts_per_gram;
+        cfg.key("reference_tare_counts", tare.round());
+    }
+}
+
+/// The cell.
+pub(crate) struct Cell {
+    config: CellConfig,
+    bed: Bed,
+    noise: Noise,
+}
+
+impl Cell {
+    /// The cell of a chip.
+    pub(crate) fn new(config: &CellConfig, workshop: &Workshop<'_>, chip: &dyn Part) -> Cell {
+        Cell { config: config.clone(), bed: workshop.bed(), noise: workshop.noise(chip) }
+    }
+
+    #[cfg(test)]
+    pub(crate) fn over(config: CellConfig, bed: Bed) -> Cell {
+        Cell { config, bed, noise: Noise::of("cell", 0) }
+    }
+
+    /// What it bears at this moment.
+    fn grams(&self) -> f64 {
+        let depth_mm = (-self.bed.clearance_mm([0.0; 3])).max(0.0);
+        self.config.weight_g + self.config.stiffness_g_per_mm * depth_mm
+    }
+
+    /// The reading of this number, of a chip of 24 bits whose gain is this share of the description's.
+    pub(crate) fn counts(&self, gain: f64, reading: u64) -> i32 {
+        const MAX: f64 = 0x7f_ffff as f64;
+        let noise = self.noise.nth(reading) * self.config.noise_counts;
+        let signal = self.config.zero_counts + self.config.counts_per_gram * self.grams();
+        // A chip that is driven beyond its range stays at its end.
+        (signal * gain + noise).round().clamp(-MAX - 1.0, MAX) as i32
+    }
+}

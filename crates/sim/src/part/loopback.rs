@@ -1,0 +1,50 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A wire from the bus's output (MOSI) to its input (MISO): every byte comes back. klippy has no
+//! section for a wire; a test's own commands talk to it.
+
+#![forbid(unsafe_code)]
+
+use serde::Deserialize;
+
+use super::workshop::{Part, Socket, Workshop};
+use crate::description::check::SimError;
+use crate::description::pin::PinName;
+use crate::engine::spi::SpiChip;
+
+/// The wire's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LoopbackConfig {
+    /// Its SPI bus.
+    pub bus: String,
+    /// Low selects it; without it, it is the only chip on its bus.
+    pub select_pin: Option<PinName>,
+}
+
+impl Part for LoopbackConfig {
+    fn name(&self) -> String {
+        format!("loopback {}", self.bus)
+    }
+
+    fn socket(&self) -> Option<Socket<'_>> {
+        Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        workshop.solder_spi(self, Loopback);
+        Ok(())
+    }
+}
+
+/// The wire.
+struct Loopback;
+
+impl SpiChip for Loopback {
+    fn knows_mode(&self, _mode: u8) -> bool {
+        true
+    }
+
+    fn exchange(&mut self, byte: u8) -> u8 {
+        byte
+    }
+}

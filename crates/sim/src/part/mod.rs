@@ -1,0 +1,30 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The parts: each is a file of its own with its description, its wires, its behaviour and its sections of
+//! printer.cfg. A part knows the engine and the words of descriptions; it knows no other part.
+
+#![forbid(unsafe_code)]
+
+pub(crate) mod ads1220;
+pub(crate) mod adxl345;
+pub(crate) mod angle;
+pub(crate) mod apa102;
+pub(crate) mod bltouch;
+pub(crate) mod ds18b20;
+pub(crate) mod hx71x;
+pub(crate) mod ldc1612;
+pub(crate) mod load_cell;
+pub(crate) mod loopback;
+pub(crate) mod probe;
+pub(crate) mod pwm_channel;
+pub(crate) mod ready;
+pub(crate) mod ring;
+pub(crate) mod servo;
+pub(crate) mod spool;
+pub(crate) mod ssd1306;
+pub(crate) mod thermocouple;
+pub(crate) mod tmc2209;
+pub(crate) mod tmc5160;
+pub(crate) mod trinamic;
+pub(crate) mod uart;
+pub(crate) mod workshop;
+pub(crate) mod ws2812;

@@ -1,0 +1,109 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A hardware PWM channel, with something on it that is dimmed.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
+
+use serde::Deserialize;
+
+use super::workshop::{Part, Workshop};
+use crate::description::check::{SimError, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
+use crate::engine::wire::{Kind, Wire};
+use crate::engine::world::Sight;
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
+use pinion_firmware::board::PWM_MAX;
+use pinion_firmware::time::Clock;
+
+/// The channel's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PwmChannelConfig {
+    /// Such as `laser`.
+    pub name: String,
+    /// The channel.
+    pub pin: PinName,
+}
+
+impl Part for PwmChannelConfig {
+    fn name(&self) -> String {
+        format!("pwm_channel {}", self.name)
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("pin", Some(&self.pin))]
+    }
+
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+        if self.pin.inverted {
+            return wrong(whose, "pin", "a PWM channel has no polarity here", "remove the `!`");
+        }
+        Ok(())
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        let channel = Arc::new(PwmChannel { name: self.name.clone(), value: AtomicU32::new(0) });
+        workshop.wire_shared(Some(&self.pin), channel.clone());
+        workshop.show(channel);
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, _layout: &Layout<'_>) {
+        cfg.section(format_args!("output_pin {}", self.name));
+        cfg.key("pin", &self.pin);
+        cfg.key("pwm", "True");
+        cfg.key("hardware_pwm", "True");
+        cfg.key("cycle_time", 0.001);
+    }
+}
+
+/// The channel.
+struct PwmChannel {
+    name: String,
+    /// 0 to [`PWM_MAX`].
+    value: AtomicU32,
+}
+
+impl Wire for PwmChannel {
+    fn kind(&self) -> Kind {
+        Kind::Pwm
+    }
+
+    fn describe(&self) -> String {
+        format!("hardware PWM of {}", self.name)
+    }
+
+    fn dim(&self, value: u16) {
+        self.value.store(value.into(), Ordering::Relaxed);
+    }
+}
+
+impl Sight for PwmChannel {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn look(&self, _now: Clock) -> String {
+        let share = f64::from(self.value.load(Ordering::Relaxed)) / f64::from(PWM_MAX);
+        format!("{:.0} %", share * 100.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_channel_shows_the_percent_that_klippy_was_told() {
+        let channel = PwmChannel { name: "laser".into(), value: AtomicU32::new(0) };
+        for percent in 0..=100 {
+            // As klippy computes it (klippy/mcu.py).
+            channel.dim((f64::from(percent) / 100.0 * f64::from(PWM_MAX) + 0.5) as u16);
+            assert_eq!(channel.look(Clock::EPOCH), format!("{percent} %"));
+        }
+    }
+}

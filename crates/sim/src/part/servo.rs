@@ -1,0 +1,222 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A hobby servo: the width of its pulses tells the angle to which it turns.
+//!
+//! Simulated: the widths between the edges' instants, the stops at both ends, the pace at which it
+//! turns. A servo without pulses stays where it is. Not simulated: the load, and a refresh rate that is too low or
+//! too high.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+use serde::Deserialize;
+
+use super::workshop::{Part, Workshop};
+use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
+use crate::engine::time::seconds;
+use crate::engine::together::Together;
+use crate::engine::wire::{Kind, Wire};
+use crate::engine::world::Sight;
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
+use pinion_firmware::time::{Clock, TimeSource};
+
+/// The servo's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ServoConfig {
+    /// Such as `arm`.
+    pub name: String,
+    /// High during a pulse.
+    pub pin: PinName,
+    /// The pulse for 0 degrees.
+    #[serde(default = "default_min_pulse_us")]
+    pub min_pulse_us: f64,
+    /// The pulse for the other stop.
+    #[serde(default = "default_max_pulse_us")]
+    pub max_pulse_us: f64,
+    /// Where the other stop is.
+    #[serde(default = "default_travel_degrees")]
+    pub travel_degrees: f64,
+    /// How fast it turns.
+    #[serde(default = "default_degrees_per_s")]
+    pub degrees_per_s: f64,
+}
+
+fn default_min_pulse_us() -> f64 {
+    1000.0
+}
+
+fn default_max_pulse_us() -> f64 {
+    2000.0
+}
+
+fn default_travel_degrees() -> f64 {
+    180.0
+}
+
+fn default_degrees_per_s() -> f64 {
+    500.0
+}
+
+impl Part for ServoConfig {
+    fn name(&self) -> String {
+        format!("servo {}", self.name)
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("pin", Some(&self.pin))]
+    }
+
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+        check(whose, "min_pulse_us", self.min_pulse_us, Bound::AboveZero)?;
+        check(whose, "max_pulse_us", self.max_pulse_us, Bound::AboveZero)?;
+        check(whose, "travel_degrees", self.travel_degrees, Bound::AboveZero)?;
+        check(whose, "degrees_per_s", self.degrees_per_s, Bound::AboveZero)?;
+        if self.max_pulse_us <= self.min_pulse_us {
+            let cause = format!("{} is not above min_pulse_us", self.max_pulse_us);
+            return wrong(whose, "max_pulse_us", &cause, "raise it");
+        }
+        Ok(())
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        let servo = Arc::new(Servo::new(self, workshop.time.now()));
+        workshop.wire(Some(&self.pin), PulsePin(servo.clone()));
+        workshop.show(servo);
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, _layout: &Layout<'_>) {
+        cfg.section(format_args!("servo {}", self.name));
+        cfg.key("pin", &self.pin);
+        cfg.key("minimum_pulse_width", self.min_pulse_us / 1e6);
+        cfg.key("maximum_pulse_width", self.max_pulse_us / 1e6);
+        cfg.key("maximum_servo_angle", self.travel_degrees);
+    }
+}
+
+/// No pulse is under way.
+const NO_PULSE: u64 = u64::MAX;
+
+/// The servo.
+struct Servo {
+    config: ServoConfig,
+    name: String,
+    /// When the pulse began that is under way.
+    pulse: AtomicU64,
+    /// Since when it turns, from which angle and to which one.
+    turn: Together<3>,
+}
+
+impl Servo {
+    /// At its first stop.
+    fn new(config: &ServoConfig, now: Clock) -> Servo {
+        let stop = 0f64.to_bits();
+        Servo {
+            name: config.name(),
+            config: config.clone(),
+            pulse: AtomicU64::new(NO_PULSE),
+            turn: Together::new([now.ticks(), stop, stop]),
+        }
+    }
+
+    fn degrees(&self, now: Clock) -> f64 {
+        let [since, from, to] = self.turn.load();
+        let (from, to) = (f64::from_bits(from), f64::from_bits(to));
+        let far = self.config.degrees_per_s * seconds(Clock::from_ticks(since), now);
+        from + (to - from).clamp(-far, far)
+    }
+
+    fn edge(&self, on: bool, at: Clock) {
+        let began = self.pulse.swap(if on { at.ticks() } else { NO_PULSE }, Ordering::Relaxed);
+        if on || began == NO_PULSE {
+            return;
+        }
+        let width_us = seconds(Clock::from_ticks(began), at) * 1e6;
+        let ServoConfig { min_pulse_us, max_pulse_us, travel_degrees, .. } = self.config;
+        // What is shorter or longer by far is no pulse for it.
+        if (min_pulse_us / 2.0..=max_pulse_us * 1.5).contains(&width_us) {
+            let share = (width_us - min_pulse_us) / (max_pulse_us - min_pulse_us);
+            let to = share.clamp(0.0, 1.0) * travel_degrees;
+            self.turn.store([at.ticks(), self.degrees(at).to_bits(), to.to_bits()]);
+        }
+    }
+}
+
+impl Sight for Servo {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn look(&self, now: Clock) -> String {
+        format!("{:.1} degrees", self.degrees(now))
+    }
+}
+
+/// The servo's input.
+struct PulsePin(Arc<Servo>);
+
+impl Wire for PulsePin {
+    fn kind(&self) -> Kind {
+        Kind::Output
+    }
+
+    fn describe(&self) -> String {
+        format!("pulse of {}", self.0.name)
+    }
+
+    fn drive(&self, on: bool, at: Clock) {
+        self.0.edge(on, at);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_firmware::time::CLOCK_FREQ;
+
+    #[test]
+    fn it_turns_to_the_angle_of_the_pulses_at_its_own_pace() {
+        let config = ServoConfig {
+            name: "arm".into(),
+            pin: PinName { name: "servo".into(), inverted: false },
+            min_pulse_us: 500.0,
+            max_pulse_us: 2500.0,
+            travel_degrees: 180.0,
+            degrees_per_s: 300.0,
+        };
+        let servo = Arc::new(Servo::new(&config, Clock::EPOCH));
+        let pin = PulsePin(servo.clone());
+        let at = |us: f64| Clock::from_ticks((us * f64::from(CLOCK_FREQ) / 1e6) as u64);
+        let pulses = |first: u32, width_us: f64| {
+            for n in first..first + 50 {
+                let start_us = f64::from(n) * 20_000.0;
+                pin.drive(true, at(start_us));
+                pin.drive(false, at(start_us + width_us));
+            }
+            at(f64::from(first + 50) * 20_000.0)
+        };
+        // The level at which a line is set up is no pulse.
+        pin.settle(false, Clock::EPOCH);
+        assert_eq!(servo.look(at(1e6)), "0.0 degrees");
+        let now = pulses(50, 1500.0);
+        assert_eq!(servo.look(now), "90.0 degrees");
+        assert_eq!(servo.degrees(at(50.0 * 20_000.0 + 1500.0 + 100_000.0)), 90.0, "there long ago");
+        let now = pulses(100, 2500.0);
+        assert_eq!(servo.degrees(now), 180.0);
+        // Beyond its stop it can not go, and what is no pulse moves nothing.
+        assert_eq!(servo.degrees(pulses(150, 2700.0)), 180.0);
+        assert_eq!(servo.degrees(pulses(200, 5000.0)), 180.0);
+        assert_eq!(servo.degrees(pulses(250, 100.0)), 180.0);
+        // A single pulse turns it all the way, at its pace.
+        pin.drive(true, at(300.0 * 20_000.0));
+        let end_us = 300.0 * 20_000.0 + 500.0;
+        pin.drive(false, at(end_us));
+        assert!((servo.degrees(at(end_us + 200_000.0)) - 120.0).abs() < 1e-6);
+        assert_eq!(servo.degrees(at(end_us + 600_000.0)), 0.0);
+    }
+}

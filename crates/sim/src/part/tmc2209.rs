@@ -1,0 +1,509 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The stepper driver TMC2209 on its UART, after its data sheet (Trinamic, TMC2209, rev. 1.09: "UART
+//! Single Wire Interface", "Register Map", "StallGuard4 Load Measurement").
+//!
+//! A message begins with a sync nibble, by which the chip measures the length of a bit, and has the
+//! chip's address, a register, with bit 7 set to write 32 bits to it, and a check sum. To a read the chip
+//! answers after the bit times of SENDDELAY; what was written it counts (IFCNT). It does not hear a
+//! message that is for another address, or not whole.
+//!
+//! Simulated: the UART by its edges; every register with its access and its reset value, the microstep
+//! counter and its currents, standstill and the time between steps, the inputs, StallGuard and DIAG
+//! (`trinamic.rs`). The motor turns as that of a TMC5160 (`tmc5160.rs`). Not simulated: CoolStep,
+//! temperatures and faults, the automatic tuning of StealthChop, the pulse generator (VACTUAL), INDEX,
+//! and what the OTP memory changes.
+
+#![forbid(unsafe_code)]
+
+use std::sync::{Arc, Mutex};
+
+use serde::Deserialize;
+
+use super::trinamic::{
+    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
+    offer_sensorless_homing,
+};
+use super::uart::{HOST, Role, SYNC, Uart, UartChip, UartPin, WRITE, WRITE_LEN, crc8};
+use super::workshop::{Part, Workshop};
+use crate::description::check::{SimError, wrong};
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
+use crate::engine::physics::Axis;
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
+use pinion_firmware::time::Clock;
+
+const GCONF: u8 = 0x00;
+const GSTAT: u8 = 0x01;
+const IFCNT: u8 = 0x02;
+const SLAVECONF: u8 = 0x03;
+const IOIN: u8 = 0x06;
+const IHOLD_IRUN: u8 = 0x10;
+const TSTEP: u8 = 0x12;
+const TPWMTHRS: u8 = 0x13;
+const TCOOLTHRS: u8 = 0x14;
+const SGTHRS: u8 = 0x40;
+const SG_RESULT: u8 = 0x41;
+const MSCNT: u8 = 0x6a;
+const MSCURACT: u8 = 0x6b;
+const CHOPCONF: u8 = 0x6c;
+const DRV_STATUS: u8 = 0x6f;
+const PWMCONF: u8 = 0x70;
+const PWM_AUTO: u8 = 0x72;
+
+/// FCLKTRIM as the factory wrote it to the chip.
+const OTP: u32 = 0x0f;
+/// IOIN: VERSION, and the level of PDN_UART, which is high after a message.
+const VERSION: u32 = 0x21 << 24;
+const PDN_UART: u32 = 1 << 6;
+const GCONF_EN_SPREADCYCLE: u32 = 1 << 2;
+const GCONF_SHAFT: u32 = 1 << 3;
+const GCONF_MSTEP_REG_SELECT: u32 = 1 << 7;
+const CHOPCONF_DEDGE: u32 = 1 << 29;
+
+/// SG_RESULT of a free motor; the full load makes it 0. The data sheet gives no formula.
+const SG_FREE: u32 = 250;
+/// SGTHRS with which a fifth of the full load counts as a stall.
+const SGTHRS_FOR_HOMING: u32 = 100;
+
+use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
+
+/// What is at no address here reads as zero.
+const REGISTERS: &[Register] = &[
+    Register(GCONF, RW, 10, 0x0000_0101),
+    Register(GSTAT, C, 3, 0x0000_0001),
+    Register(IFCNT, R, 8, 0), // computed
+    Register(SLAVECONF, W, 12, 0),
+    Register(0x04, W, 16, 0),    // OTP_PROG: is done in a factory, not here
+    Register(0x05, R, 24, OTP),  // OTP_READ
+    Register(IOIN, R, 32, 0),    // computed
+    Register(0x07, RW, 10, OTP), // FACTORY_CONF: starts as the OTP has it
+    Register(IHOLD_IRUN, W, 20, 0x0001_1f10),
+    Register(0x11, W, 8, 20),  // TPOWERDOWN
+    Register(TSTEP, R, 20, 0), // computed
+    Register(TPWMTHRS, W, 20, 0),
+    Register(TCOOLTHRS, W, 20, 0),
+    Register(0x22, W, 24, 0), // VACTUAL
+    Register(SGTHRS, W, 8, 0),
+    Register(SG_RESULT, R, 10, 0), // computed
+    Register(0x42, W, 16, 0),      // COOLCONF
+    Register(MSCNT, R, 10, 0),     // computed
+    Register(MSCURACT, R, 25, 0),  // computed
+    Register(CHOPCONF, RW, 32, 0x1000_0053),
+    Register(DRV_STATUS, R, 32, 0), // computed
+    Register(PWMCONF, RW, 32, 0xc10d_0024),
+    Register(0x71, R, 25, 0),     // PWM_SCALE
+    Register(PWM_AUTO, R, 24, 0), // computed
+];
+
+/// The chip's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tmc2209Config {
+    /// PDN_UART, the wire both ways; with `tx_pin` the board's receiving end.
+    pub uart_pin: PinName,
+    /// The board's sending end, joined to the wire by a resistor.
+    pub tx_pin: Option<PinName>,
+    /// Its address, 0 to 3, by MS1 and MS2.
+    #[serde(default)]
+    pub address: u8,
+    /// The axis whose motor it drives.
+    pub axis: String,
+    /// DIAG: high while the motor is stalled.
+    pub diag_pin: Option<PinName>,
+}
+
+impl Part for Tmc2209Config {
+    fn name(&self) -> String {
+        format!("tmc2209 {}", self.axis)
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        let pins = [("tx_pin", self.tx_pin.as_ref()), ("diag_pin", self.diag_pin.as_ref())];
+        [("uart_pin", Some(&self.uart_pin))].into_iter().chain(pins).collect()
+    }
+
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+        if self.address > 3 {
+            return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 3");
+        }
+        for (key, pin) in [("uart_pin", Some(&self.uart_pin)), ("tx_pin", self.tx_pin.as_ref())] {
+            if pin.is_some_and(|pin| pin.inverted) {
+                return wrong(whose, key, "klippy inverts no UART", "remove the `!`");
+            }
+        }
+        printer.check_axis(whose, &self.axis)
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        let Some(axis) = workshop.axis(&self.axis) else { return Ok(()) };
+        let chip = Tmc2209::new(&self.name(), self.address, axis);
+        workshop.wire_shared(self.diag_pin.as_ref(), chip.diag.clone());
+        let uart = Arc::new(Mutex::new(Uart::new(Box::new(chip))));
+        let end = |role| UartPin { name: self.name(), role, uart: uart.clone() };
+        match &self.tx_pin {
+            None => workshop.wire(Some(&self.uart_pin), end(Role::Both)),
+            Some(tx_pin) => {
+                workshop.wire(Some(&self.uart_pin), end(Role::Receiver));
+                workshop.wire(Some(tx_pin), end(Role::Sender));
+            }
+        }
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
+        cfg.section(format_args!("tmc2209 {}", layout.stepper(&self.axis)));
+        may_be_left_out(cfg);
+        cfg.key("uart_pin", &self.uart_pin);
+        cfg.key_if("tx_pin", self.tx_pin.as_ref());
+        cfg.key("uart_address", self.address);
+        cfg.key("run_current", 0.8);
+        cfg.key("sense_resistor", 0.11);
+        if let Some(pin) = &self.diag_pin {
+            cfg.key("diag_pin", pin);
+            offer_sensorless_homing(cfg, layout, "tmc2209", &self.axis, ("driver_SGTHRS", SGTHRS_FOR_HOMING));
+        }
+    }
+}
+
+/// The chip behind its UART.
+struct Tmc2209 {
+    address: u8,
+    motor: Motor,
+    diag: Arc<StallOutput>,
+    registers: Registers,
+    /// Messages that wrote a register.
+    written: u8,
+}
+
+impl Tmc2209 {
+    /// The driver of an axis, at power-up.
+    fn new(name: &str, address: u8, axis: Arc<Axis>) -> Tmc2209 {
+        let registers = Registers::new(REGISTERS);
+        let diag = Arc::new(StallOutput::new(name.to_owned(), axis.clone(), stall_rule(&registers, 0)));
+        let mut chip = Tmc2209 { address, motor: Motor::new(axis), diag, registers, written: 0 };
+        chip.set_up();
+        chip
+    }
+
+    /// Follows the registers.
+    fn set_up(&mut self) {
+        let mres = if self.registers.is_set(GCONF, GCONF_MSTEP_REG_SELECT) {
+            self.registers.get(CHOPCONF) >> 24 & 0xf
+        } else {
+            // 8, 32, 64 and 16 microsteps by MS1 and MS2.
+            [5, 3, 2, 4][usize::from(self.address & 3)]
+        };
+        self.motor.set_up(mres, self.registers.is_set(GCONF, GCONF_SHAFT));
+        self.diag.set(stall_rule(&self.registers, self.motor.mres()));
+    }
+
+    /// What a host reads at this instant.
+    fn read(&self, address: u8, now: Clock) -> u32 {
+        let stands = self.motor.tstep(now) == STANDSTILL;
+        match address {
+            IFCNT => self.written.into(),
+            IOIN => {
+                let axis = &self.motor.axis;
+                let [off, step, dir] = [!axis.is_enabled(), axis.is_stepped(), axis.is_dir_high()].map(u32::from);
+                let [ms1, ms2] = [self.address & 1, self.address >> 1].map(u32::from);
+                let diag = u32::from(self.diag.is_stalled(now));
+                VERSION | PDN_UART | dir << 9 | step << 7 | diag << 4 | ms2 << 3 | ms1 << 2 | off
+            }
+            TSTEP => self.motor.tstep(now),
+            SG_RESULT if stands => 0,
+            SG_RESULT => SG_FREE - SG_FREE * self.motor.load(now) / FULL_LOAD,
+            MSCNT => self.motor.mscnt(),
+            MSCURACT => self.motor.currents(&Wave::DEFAULT),
+            DRV_STATUS => {
+                let spread = self.registers.is_set(GCONF, GCONF_EN_SPREADCYCLE);
+                let stealth = !spread && self.motor.tstep(now) >= self.registers.get(TPWMTHRS);
+                let current = self.registers.get(IHOLD_IRUN) >> if stands { 0 } else { 8 } & 0x1f;
+                u32::from(stands) << 31 | u32::from(stealth) << 30 | current << 16
+            }
+            // PWM_GRAD and PWM_OFS, from which the tuning starts.
+            PWM_AUTO => (self.registers.get(PWMCONF) >> 8 & 0xff) << 16 | self.registers.get(PWMCONF) & 0xff,
+            _ => self.registers.read(address),
+        }
+    }
+
+    fn write(&mut self, address: u8, data: u32) {
+        self.written = self.written.wrapping_add(1);
+        self.registers.write(address, data);
+        self.set_up();
+        if address == CHOPCONF {
+            self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
+        }
+    }
+}
+
+impl UartChip for Tmc2209 {
+    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]> {
+        let &[_, address, register, ref rest @ ..] = message else { return None };
+        if address != self.address {
+            return None;
+        }
+        if let &[d3, d2, d1, d0, _] = rest {
+            self.write(register & !WRITE, u32::from_be_bytes([d3, d2, d1, d0]));
+            return None;
+        }
+        let [d3, d2, d1, d0] = self.read(register, now).to_be_bytes();
+        let answer = [SYNC, HOST, register, d3, d2, d1, d0];
+        let [a, b, c, d, e, f, g] = answer;
+        Some([a, b, c, d, e, f, g, crc8(&answer)])
+    }
+
+    fn send_delay(&self) -> u64 {
+        // 8, 24, 40 ... 120 by pairs of values.
+        8 * u64::from(self.registers.get(SLAVECONF) >> 8 & 0xf | 1)
+    }
+}
+
+/// When DIAG tells of a stall: SG_RESULT is not above twice SGTHRS, at velocities from TCOOLTHRS on up to
+/// where SpreadCycle begins.
+fn stall_rule(registers: &Registers, mres: u32) -> StallRule {
+    let fall = SG_FREE.saturating_sub(2 * registers.get(SGTHRS));
+    let stealth = !registers.is_set(GCONF, GCONF_EN_SPREADCYCLE);
+    StallRule {
+        least_load: stealth.then_some((fall * FULL_LOAD).div_ceil(SG_FREE)),
+        fastest: registers.get(TPWMTHRS),
+        slowest: registers.get(TCOOLTHRS),
+        mres,
+        push_pull: true,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::description::default::DefaultPrinter;
+    use crate::engine::wire::Wire;
+    use pinion_firmware::time::Ticks;
+
+    /// 40 kbaud.
+    const BIT: u64 = 1250;
+
+    struct Bench {
+        axis: Arc<Axis>,
+        pin: UartPin,
+        bit: u64,
+        now: Clock,
+    }
+
+    impl Bench {
+        fn new(address: u8) -> Bench {
+            let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[1]));
+            let uart = Arc::new(Mutex::new(Uart::new(Box::new(Tmc2209::new("tmc2209 y", address, axis.clone())))));
+            let pin = UartPin { name: "tmc2209 y".into(), role: Role::Both, uart };
+            pin.settle(true, Clock::EPOCH);
+            Bench { axis, pin, bit: BIT, now: Clock::EPOCH + Ticks(100_000) }
+        }
+
+        fn wait(&mut self, bits: u64) {
+            self.now = Clock::from_ticks(self.now.ticks() + bits * self.bit);
+        }
+
+        /// Sends bytes, and lets go of the wire.
+        fn send(&mut self, bytes: &[u8]) {
+            let mut level = true;
+            for byte in bytes {
+                for bit in 0..10 {
+                    let next = (u32::from(*byte) << 1 | 0x200) >> bit & 1 != 0;
+                    if next != level {
+                        self.pin.drive(next, self.now);
+                        level = next;
+                    }
+                    self.wait(1);
+                }
+            }
+            self.pin.release(self.now);
+        }
+
+        /// What comes back, and after how many bit times.
+        fn receive(&mut self) -> Option<(u64, Vec<u8>)> {
+            let silent = (0..200).find(|_| {
+                let low = !self.pin.sense(true, self.now);
+                self.wait(u64::from(!low));
+                low
+            })?;
+            let from = self.now.ticks() + self.bit / 2;
+            let bit = |place: u64| self.pin.sense(true, Clock::from_ticks(from + place * self.bit));
+            let bytes = (0..8).map(|byte| {
+                assert!(!bit(10 * byte) && bit(10 * byte + 9), "start and stop bits");
+                (0..8).map(|n| u8::from(bit(10 * byte + 1 + n)) << n).sum()
+            });
+            let bytes = bytes.collect();
+            assert!(bit(80) && bit(90), "silence");
+            self.wait(90);
+            Some((silent, bytes))
+        }
+
+        fn message(&mut self, bytes: &[u8]) {
+            let crc = crc8(bytes);
+            self.send(&[bytes, &[crc]].concat());
+        }
+
+        fn read(&mut self, register: u8) -> u32 {
+            self.message(&[0xf5, 2, register]);
+            let (_, bytes) = self.receive().expect("an answer");
+            assert_eq!(bytes[..3], [0x05, 0xff, register]);
+            assert_eq!(crc8(&bytes[..7]), bytes[7]);
+            u32::from_be_bytes(bytes[3..7].try_into().unwrap())
+        }
+
+        fn write(&mut self, register: u8, value: u32) {
+            let [d3, d2, d1, d0] = value.to_be_bytes();
+            self.message(&[0xf5, 2, register | 0x80, d3, d2, d1, d0]);
+            self.wait(12);
+        }
+
+        /// Pulses of the step pin, one each 250 us.
+        fn steps(&mut self, count: u32) {
+            self.axis.set_enabled(true);
+            for _ in 0..count {
+                self.now = self.now + Ticks::from_us(250);
+                self.axis.edge(true, self.now);
+                self.axis.edge(false, self.now);
+            }
+        }
+    }
+
+    /// The example that the data sheet's CRC and klippy agree on: a read of IFCNT.
+    #[test]
+    fn the_check_sum_is_crc8_atm() {
+        assert_eq!(crc8(&[0x05, 0x00, 0x02]), 0x8f);
+        assert_eq!(crc8(&[0xf5, 0x00, 0x02]), 0xc8);
+    }
+
+    #[test]
+    fn registers_are_read_and_written_as_their_access_says() {
+        for bit in [BIT, 5555, 100] {
+            let mut bench = Bench::new(2);
+            bench.bit = bit;
+            assert_eq!(bench.read(GCONF), 0x101);
+            bench.write(GCONF, 0xffff_f1c0);
+            assert_eq!(bench.read(GCONF), 0x1c0, "it has ten bits");
+            assert_eq!(bench.read(IFCNT), 1);
+            assert_eq!(bench.read(GSTAT), 1);
+            bench.write(GSTAT, 6);
+            assert_eq!(bench.read(GSTAT), 1);
+            bench.write(GSTAT, 1);
+            assert_eq!((bench.read(GSTAT), bench.read(IFCNT)), (0, 3));
+            bench.write(IHOLD_IRUN, 0x0008_1f08);
+            assert_eq!(bench.read(IHOLD_IRUN), 0, "write only");
+            assert_eq!(bench.read(DRV_STATUS), 0xc008_0000, "standstill at IHOLD in StealthChop");
+            bench.write(GCONF, 0x1c4);
+            assert_eq!(bench.read(DRV_STATUS), 0x8008_0000);
+            bench.write(IOIN, 7);
+            assert_eq!(bench.read(IOIN), 0x2100_0249, "DIR, PDN_UART, MS2 and ENN are high");
+            assert_eq!(bench.read(0x7e), 0, "there is none");
+            assert_eq!(bench.read(PWM_AUTO), 0x24);
+            assert_eq!(bench.read(CHOPCONF), 0x1000_0053);
+            assert_eq!(bench.read(MSCURACT), 0x00f7_0000);
+            for _ in 0..250 {
+                bench.write(0x11, 20);
+            }
+            assert_eq!(bench.read(IFCNT), 0, "it has eight bits");
+        }
+    }
+
+    #[test]
+    fn an_answer_comes_after_the_bit_times_of_senddelay() {
+        for (delay, bits) in [(0, 8), (1, 8), (2, 24), (3, 24), (15, 120)] {
+            let mut bench = Bench::new(2);
+            bench.write(SLAVECONF, delay << 8);
+            bench.message(&[0xf5, 2, IFCNT]);
+            assert_eq!(bench.receive().unwrap().0, bits);
+        }
+    }
+
+    #[test]
+    fn what_is_not_whole_or_for_another_chip_is_not_heard() {
+        let mut bench = Bench::new(2);
+        bench.message(&[0xf5, 1, IFCNT]);
+        assert_eq!(bench.receive(), None, "another address");
+        bench.send(&[0xf5, 2, IFCNT, 0]);
+        assert_eq!(bench.receive(), None, "a wrong check sum");
+        bench.send(&[0xf5, 2, 0x80 | GSTAT, 0, 0]);
+        assert_eq!(bench.receive(), None, "half of a message");
+        bench.wait(64);
+        assert_eq!((bench.read(GSTAT), bench.read(IFCNT)), (1, 0), "the next one is heard");
+        // A bit that is too long makes a stop bit low.
+        let now = bench.now;
+        for (bit, level) in [(0, false), (1, true), (2, false), (3, true), (4, false), (20, true)] {
+            bench.pin.drive(level, Clock::from_ticks(now.ticks() + bit * BIT));
+        }
+        bench.wait(40);
+        assert_eq!(bench.read(GSTAT), 1);
+    }
+
+    /// The chip takes the length of a bit from the sync nibble: what is sent 4 % too slowly all the way
+    /// is heard as well as what is not.
+    #[test]
+    fn bits_are_read_in_their_middle() {
+        let mut bench = Bench::new(2);
+        let whole = [0xf5, 2, IFCNT, crc8(&[0xf5, 2, IFCNT])];
+        // Each edge as late or early as 40 % of a bit, as a fixed pattern has it; not those of the sync nibble.
+        let mut level = true;
+        let mut edges = 0u64;
+        let begin = bench.now.ticks();
+        for place in 0..40u64 {
+            let next = (u32::from(whole[(place / 10) as usize]) << 1 | 0x200) >> (place % 10) & 1 != 0;
+            if next != level {
+                edges += 1;
+                // A start bit sets the clock anew: no edge of a byte may be farther off than from that one.
+                let off = if place < 5 || place % 10 == 0 { 0 } else { [40i64, -40, 20][(edges % 3) as usize] };
+                let at = (begin + place * BIT).wrapping_add_signed(off * BIT as i64 / 100);
+                bench.pin.drive(next, Clock::from_ticks(at));
+                level = next;
+            }
+        }
+        bench.wait(40);
+        bench.pin.release(bench.now);
+        assert_eq!(bench.receive().unwrap().1[2], IFCNT);
+    }
+
+    #[test]
+    fn the_motor_is_seen_to_move_and_to_stall() {
+        let mut bench = Bench::new(2);
+        bench.write(GCONF, GCONF_MSTEP_REG_SELECT);
+        bench.write(CHOPCONF, 0x1000_0053 | 4 << 24);
+        bench.write(SGTHRS, 100);
+        bench.write(TCOOLTHRS, STANDSTILL);
+        bench.bit = 100;
+        bench.axis.set_forward(false);
+        bench.steps(10);
+        // 3000 clocks and 16 microsteps of 1/256. The message itself takes 80 us.
+        assert_eq!(bench.read(TSTEP), 187);
+        assert_eq!(bench.read(SG_RESULT), SG_FREE);
+        // The direction line of this axis is high for back.
+        assert_eq!(bench.read(MSCNT), 1024 - 160);
+        assert_eq!(bench.read(DRV_STATUS) >> 30, 1);
+        assert_eq!(bench.read(IOIN) & 1 << 4, 0);
+        // To its end at -2 mm, and 3 of 16 microsteps on.
+        bench.steps(47 * 80 - 10 + 3);
+        assert_eq!(bench.read(SG_RESULT), SG_FREE - 46);
+        assert_eq!(bench.read(IOIN) & 1 << 4, 0);
+        bench.steps(1);
+        assert_eq!(bench.read(IOIN) & 1 << 4, 1 << 4, "SG_RESULT is below twice SGTHRS");
+        bench.steps(50);
+        assert_eq!(bench.read(SG_RESULT), 0);
+        bench.write(GCONF, GCONF_MSTEP_REG_SELECT | GCONF_EN_SPREADCYCLE);
+        assert_eq!(bench.read(IOIN) & 1 << 4, 0, "in StealthChop only");
+        bench.write(GCONF, GCONF_MSTEP_REG_SELECT);
+        bench.axis.set_forward(true);
+        bench.steps(1);
+        assert_eq!(bench.read(IOIN) & 1 << 4, 0, "free again");
+    }
+
+    #[test]
+    fn with_two_wires_the_answer_comes_by_the_other_one() {
+        let bench = Bench::new(2);
+        let other = |role| UartPin { name: "y".into(), role, uart: bench.pin.uart.clone() };
+        let receiver = other(Role::Receiver);
+        let mut bench = Bench { pin: other(Role::Sender), ..bench };
+        bench.message(&[0xf5, 2, GCONF]);
+        bench.pin = receiver;
+        assert_eq!(bench.receive().unwrap().1[..7], [0x05, 0xff, GCONF, 0, 0, 1, 1]);
+    }
+}

@@ -1,0 +1,509 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The stepper driver TMC5160 in its step and direction mode, after its data sheet (Trinamic,
+//! TMC5160A, rev. 1.14: "SPI Interface", "Register Mapping", "Sine-Wave Look-up Table").
+//!
+//! A datagram has 40 bits: an address, with bit 7 set to write, and 32 bits of data. What comes
+//! back is a status byte, and what the datagram *before* this one asked for. The chip keeps what it
+//! was told until its power is off, whatever the machine is reset.
+//!
+//! Simulated: every register with its access and its reset value, the microstep counter and the
+//! currents of the wave table, standstill and the time between steps, the inputs, StallGuard and DIAG1
+//! (`trinamic.rs`). The motor is
+//! simulated by its [`Axis`], which turns whether the chip's power stage is on or not and however
+//! many microsteps the chip is told to make, so that a host may do without the chip; of the set-up
+//! only the edges that are steps (DEDGE) are the axis's, too. Not simulated: DIAG0, CoolStep, temperatures
+//! and faults, the automatic tuning of StealthChop, and the ramp generator and encoder (their
+//! registers keep what is written).
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use serde::Deserialize;
+
+use super::trinamic::{
+    Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
+    offer_sensorless_homing,
+};
+use super::workshop::{Part, Socket, Workshop};
+use crate::description::check::SimError;
+use crate::description::pin::PinName;
+use crate::description::printer::Printer;
+use crate::engine::physics::Axis;
+use crate::engine::spi::SpiChip;
+use crate::klippy::layout::Layout;
+use crate::klippy::sections::Sections;
+use pinion_firmware::time::{Clock, TimeSource};
+
+/// CPOL and CPHA are 1.
+const MODE: u8 = 3;
+const DATAGRAM_BYTES: usize = 5;
+const WRITE: u8 = 0x80;
+
+const GCONF: u8 = 0x00;
+const GSTAT: u8 = 0x01;
+const IOIN: u8 = 0x04;
+const IHOLD_IRUN: u8 = 0x10;
+const TSTEP: u8 = 0x12;
+const TPWMTHRS: u8 = 0x13;
+const TCOOLTHRS: u8 = 0x14;
+const MSLUT: u8 = 0x60;
+const MSLUTSEL: u8 = 0x68;
+const MSLUTSTART: u8 = 0x69;
+const MSCNT: u8 = 0x6a;
+const MSCURACT: u8 = 0x6b;
+const CHOPCONF: u8 = 0x6c;
+const COOLCONF: u8 = 0x6d;
+const DRV_STATUS: u8 = 0x6f;
+const PWMCONF: u8 = 0x70;
+const PWM_AUTO: u8 = 0x72;
+
+/// FCLKTRIM as the factory wrote it to the chip.
+const OTP: u32 = 0x0f;
+/// IOIN: VERSION, and SD_MODE, which is wired high for steps and directions.
+const VERSION: u32 = 0x30 << 24;
+const SD_MODE: u32 = 1 << 6;
+const GCONF_EN_PWM_MODE: u32 = 1 << 2;
+const GCONF_SHAFT: u32 = 1 << 4;
+const GCONF_DIAG1_STALL: u32 = 1 << 8;
+const GCONF_DIAG1_PUSHPULL: u32 = 1 << 13;
+const GSTAT_DRV_ERR: u32 = 1 << 1;
+const CHOPCONF_DEDGE: u32 = 1 << 29;
+const DRV_STATUS_STALLGUARD: u32 = 1 << 24;
+
+/// SG_RESULT of a free motor with SGT at 0, what it falls by up to the full load, and what it rises by with
+/// each step of SGT: values of a common motor. The data sheet gives no formula.
+const SG_FREE: i32 = 200;
+const SG_FALL: i32 = 300;
+const SG_PER_SGT: i32 = 10;
+
+use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
+
+/// What is at no address here reads as zero.
+const REGISTERS: &[Register] = &[
+    Register(GCONF, RW, 18, 0x0000_0008),
+    Register(GSTAT, C, 3, 0x0000_0001),
+    Register(0x02, R, 8, 0),            // IFCNT: of the UART, which is not in use
+    Register(0x03, W, 12, 0),           // SLAVECONF
+    Register(IOIN, R, 32, 0),           // computed
+    Register(0x05, W, 32, 0),           // X_COMPARE
+    Register(0x06, W, 16, 0),           // OTP_PROG: is done in a factory, not here
+    Register(0x07, R, 8, OTP),          // OTP_READ
+    Register(0x08, RW, 5, OTP),         // FACTORY_CONF: starts as the OTP has it
+    Register(0x09, W, 19, 0x0001_0606), // SHORT_CONF
+    Register(0x0a, W, 22, 0x0008_0400), // DRV_CONF
+    Register(0x0b, W, 8, 0),            // GLOBALSCALER
+    Register(0x0c, R, 16, 0),           // OFFSET_READ
+    Register(IHOLD_IRUN, W, 20, 0),
+    Register(0x11, W, 8, 10),  // TPOWERDOWN
+    Register(TSTEP, R, 20, 0), // computed
+    Register(TPWMTHRS, W, 20, 0),
+    Register(TCOOLTHRS, W, 20, 0),
+    Register(0x15, W, 20, 0),           // THIGH
+    Register(0x20, RW, 2, 0),           // RAMPMODE
+    Register(0x21, RW, 32, 0),          // XACTUAL
+    Register(0x22, R, 24, 0),           // VACTUAL
+    Register(0x23, W, 18, 0),           // VSTART
+    Register(0x24, W, 16, 0),           // A1
+    Register(0x25, W, 20, 0),           // V1
+    Register(0x26, W, 16, 0),           // AMAX
+    Register(0x27, W, 23, 0),           // VMAX
+    Register(0x28, W, 16, 0),           // DMAX
+    Register(0x2a, W, 16, 0),           // D1
+    Register(0x2b, W, 18, 1),           // VSTOP
+    Register(0x2c, W, 16, 0),           // TZEROWAIT
+    Register(0x2d, RW, 32, 0),          // XTARGET
+    Register(0x33, W, 23, 0),           // VDCMIN
+    Register(0x34, RW, 12, 0),          // SW_MODE
+    Register(0x35, C, 14, 0),           // RAMP_STAT
+    Register(0x36, R, 32, 0),           // XLATCH
+    Register(0x38, RW, 11, 0),          // ENCMODE
+    Register(0x39, RW, 32, 0),          // X_ENC
+    Register(0x3a, W, 32, 0x0001_0000), // ENC_CONST
+    Register(0x3b, C, 2, 0),            // ENC_STATUS
+    Register(0x3c, R, 32, 0),           // ENC_LATCH
+    Register(0x3d, W, 20, 0),           // ENC_DEVIATION
+    Register(MSLUT, W, 32, 0xaaaa_b554),
+    Register(0x61, W, 32, 0x4a95_54aa), // MSLUT1 to 7
+    Register(0x62, W, 32, 0x2449_2929),
+    Register(0x63, W, 32, 0x1010_4222),
+    Register(0x64, W, 32, 0xfbff_ffff),
+    Register(0x65, W, 32, 0xb5bb_777d),
+    Register(0x66, W, 32, 0x4929_5556),
+    Register(0x67, W, 32, 0x0040_4222),
+    Register(MSLUTSEL, W, 32, 0xffff_8056),
+    Register(MSLUTSTART, W, 24, 0x00f7_0000),
+    Register(MSCNT, R, 10, 0),    // computed
+    Register(MSCURACT, R, 25, 0), // computed
+    Register(CHOPCONF, RW, 32, 0x1041_0150),
+    Register(COOLCONF, W, 25, 0),
+    Register(0x6e, W, 24, 0),       // DCCTRL
+    Register(DRV_STATUS, R, 32, 0), // computed
+    Register(PWMCONF, W, 32, 0xc40c_001e),
+    Register(0x71, R, 25, 0),     // PWM_SCALE
+    Register(PWM_AUTO, R, 24, 0), // computed
+    Register(0x73, R, 20, 0),     // LOST_STEPS: counts in DcStep mode only
+];
+
+/// The chip's description.
+#[derive(Clone, Debug, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Tmc5160Config {
+    /// Its SPI bus.
+    pub bus: String,
+    /// Low selects it; without it, it is the only chip on its bus.
+    pub select_pin: Option<PinName>,
+    /// The axis whose motor it drives.
+    pub axis: String,
+    /// DIAG1, an open drain with a pull-up resistor: low while the motor is stalled.
+    pub diag1_pin: Option<PinName>,
+}
+
+impl Part for Tmc5160Config {
+    fn name(&self) -> String {
+        format!("tmc5160 {}", self.axis)
+    }
+
+    fn socket(&self) -> Option<Socket<'_>> {
+        Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
+    }
+
+    fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
+        vec![("diag1_pin", self.diag1_pin.as_ref())]
+    }
+
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+        printer.check_axis(whose, &self.axis)
+    }
+
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+        if let Some(axis) = workshop.axis(&self.axis) {
+            let chip = Tmc5160::new(self.name(), axis, workshop.time.clone());
+            workshop.wire_shared(self.diag1_pin.as_ref(), chip.diag1.clone());
+            workshop.solder_spi(self, chip);
+        }
+        Ok(())
+    }
+
+    fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
+        cfg.section(format_args!("tmc5160 {}", layout.stepper(&self.axis)));
+        may_be_left_out(cfg);
+        cfg.spi(&self.bus, self.select_pin.as_ref());
+        cfg.key("run_current", 0.8);
+        cfg.key("sense_resistor", 0.075);
+        if let Some(pin) = &self.diag1_pin {
+            // An open drain: a low level tells of a stall.
+            let inverted = if pin.inverted { "" } else { "!" };
+            cfg.key("diag1_pin", format_args!("^{inverted}{}", pin.name));
+            offer_sensorless_homing(cfg, layout, "tmc5160", &self.axis, ("driver_SGT", 0));
+        }
+    }
+}
+
+/// The chip.
+struct Tmc5160 {
+    motor: Motor,
+    time: Arc<dyn TimeSource>,
+    diag1: Arc<StallOutput>,
+    registers: Registers,
+    /// The shift register of 40 bits, and the bytes that came in since the chip was selected.
+    shift: u64,
+    bytes: usize,
+    /// What the next datagram brings back.
+    reply: u32,
+}
+
+impl Tmc5160 {
+    /// The driver of an axis, at power-up.
+    fn new(name: String, axis: Arc<Axis>, time: Arc<dyn TimeSource>) -> Tmc5160 {
+        let registers = Registers::new(REGISTERS);
+        let rule = stall_rule(&registers);
+        let diag1 = Arc::new(StallOutput::new(name, axis.clone(), rule));
+        let mut chip = Tmc5160 { motor: Motor::new(axis), time, diag1, registers, shift: 0, bytes: 0, reply: 0 };
+        chip.set_up_motor();
+        chip
+    }
+
+    fn set_up_motor(&mut self) {
+        let reversed = self.registers.is_set(GCONF, GCONF_SHAFT);
+        self.motor.set_up(self.registers.get(CHOPCONF) >> 24 & 0xf, reversed);
+    }
+
+    /// What a host reads.
+    fn read(&self, address: u8) -> u32 {
+        let now = self.time.now();
+        match address {
+            IOIN => {
+                let inputs = [self.motor.axis.is_stepped(), self.motor.axis.is_dir_high()].map(u32::from);
+                // DRV_ENN switches the power stage off.
+                let off = u32::from(!self.motor.axis.is_enabled());
+                VERSION | SD_MODE | off << 4 | inputs[1] << 1 | inputs[0]
+            }
+            TSTEP => self.motor.tstep(now),
+            MSCNT => self.motor.mscnt(),
+            MSCURACT => {
+                let increments = std::array::from_fn(|n| self.registers.get(MSLUT + n as u8));
+                let [segments, start] = [MSLUTSEL, MSLUTSTART].map(|address| self.registers.get(address));
+                self.motor.currents(&Wave { increments, segments, start })
+            }
+            DRV_STATUS => self.drv_status(now),
+            // PWM_GRAD and PWM_OFS, from which the tuning starts.
+            PWM_AUTO => (self.registers.get(PWMCONF) >> 8 & 0xff) << 16 | self.registers.get(PWMCONF) & 0xff,
+            _ => self.registers.read(address),
+        }
+    }
+
+    fn write(&mut self, address: u8, data: u32) {
+        self.registers.write(address, data);
+        if matches!(address, GCONF | CHOPCONF) {
+            self.set_up_motor();
+            self.motor.axis.set_both_edges(self.registers.is_set(CHOPCONF, CHOPCONF_DEDGE));
+        }
+        self.diag1.set(stall_rule(&self.registers));
+    }
+
+    fn drv_status(&self, now: Clock) -> u32 {
+        let tstep = self.motor.tstep(now);
+        let stands = tstep == STANDSTILL;
+        let stealth = self.registers.is_set(GCONF, GCONF_EN_PWM_MODE) && tstep >= self.registers.get(TPWMTHRS);
+        let current = self.registers.get(IHOLD_IRUN) >> if stands { 0 } else { 8 } & 0x1f;
+        let mut status = u32::from(stands) << 31 | current << 16 | u32::from(stealth) << 14;
+        // The measurement is SpreadCycle's.
+        if !stealth && !stands {
+            let fall = SG_FALL * self.motor.load(now) as i32 / FULL_LOAD as i32;
+            let result = (SG_FREE + SG_PER_SGT * sgt(&self.registers) - fall).clamp(0, 0x3ff) as u32;
+            status |= result | if result == 0 { DRV_STATUS_STALLGUARD } else { 0 };
+        }
+        status
+    }
+
+    fn status(&self) -> u8 {
+        let now = self.time.now();
+        let stalled = self.drv_status(now) & DRV_STATUS_STALLGUARD != 0;
+        let driver_error = self.registers.is_set(GSTAT, GSTAT_DRV_ERR);
+        let stands = self.motor.tstep(now) == STANDSTILL;
+        let reset = self.registers.is_set(GSTAT, 1);
+        u8::from(stands) << 3 | u8::from(stalled) << 2 | u8::from(driver_error) << 1 | u8::from(reset)
+    }
+}
+
+/// SGT of COOLCONF, which has a sign.
+fn sgt(registers: &Registers) -> i32 {
+    let bits = (registers.get(COOLCONF) >> 16 & 0x7f) as i32;
+    if bits < 0x40 { bits } else { bits - 0x80 }
+}
+
+/// When DIAG1 tells of a stall: SG_RESULT is 0, at velocities from TCOOLTHRS on, and in SpreadCycle.
+fn stall_rule(registers: &Registers) -> StallRule {
+    let is_set = |bit| registers.is_set(GCONF, bit);
+    // The load from which on SG_RESULT is 0.
+    let load = (SG_FREE + SG_PER_SGT * sgt(registers)) * FULL_LOAD as i32;
+    let load = (load.max(0) as u32).div_ceil(SG_FALL as u32);
+    let stealth_from = if is_set(GCONF_EN_PWM_MODE) { registers.get(TPWMTHRS) } else { STANDSTILL };
+    StallRule {
+        least_load: (is_set(GCONF_DIAG1_STALL) && load <= FULL_LOAD && stealth_from > 0).then_some(load),
+        fastest: 0,
+        slowest: registers.get(TCOOLTHRS).min(stealth_from.saturating_sub(1)),
+        mres: (registers.get(CHOPCONF) >> 24 & 0xf).min(8),
+        push_pull: is_set(GCONF_DIAG1_PUSHPULL),
+    }
+}
+
+impl SpiChip for Tmc5160 {
+    fn knows_mode(&self, mode: u8) -> bool {
+        mode == MODE
+    }
+
+    fn select(&mut self, _rate_hz: u32) {
+        self.shift = u64::from(self.status()) << 32 | u64::from(self.reply);
+        self.bytes = 0;
+    }
+
+    fn exchange(&mut self, byte: u8) -> u8 {
+        let [.., out, _, _, _, _] = self.shift.to_be_bytes();
+        self.shift = self.shift << 8 | u64::from(byte);
+        self.bytes += 1;
+        out
+    }
+
+    /// Of a longer datagram the last 40 bits count (the others are those of chips behind this one
+    /// in a chain); a shorter one is none.
+    fn deselect(&mut self) {
+        if self.bytes < DATAGRAM_BYTES {
+            return;
+        }
+        let [.., address, d3, d2, d1, d0] = self.shift.to_be_bytes();
+        let data = u32::from_be_bytes([d3, d2, d1, d0]);
+        self.reply = if address & WRITE == 0 {
+            self.read(address)
+        } else {
+            self.write(address & !WRITE, data);
+            data
+        };
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::description::default::DefaultPrinter;
+    use pinion_firmware::time::{CLOCK_FREQ, VirtualClock};
+
+    struct Bench {
+        axis: Arc<Axis>,
+        clock: VirtualClock,
+        chip: Tmc5160,
+    }
+
+    impl Bench {
+        fn new() -> Bench {
+            let clock = VirtualClock::at(Clock::from_ticks(0));
+            let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[2]));
+            let chip = Tmc5160::new("z".into(), axis.clone(), Arc::new(clock.clone()));
+            Bench { axis, clock, chip }
+        }
+
+        fn transfer(&mut self, bytes: &[u8]) -> Vec<u8> {
+            self.chip.select(1_000_000);
+            let reply = bytes.iter().map(|byte| self.chip.exchange(*byte)).collect();
+            self.chip.deselect();
+            reply
+        }
+
+        fn datagram(&mut self, address: u8, data: u32) -> (u8, u32) {
+            let [d3, d2, d1, d0] = data.to_be_bytes();
+            let reply = self.transfer(&[address, d3, d2, d1, d0]);
+            (reply[0], u32::from_be_bytes(reply[1..].try_into().unwrap()))
+        }
+
+        fn write(&mut self, address: u8, data: u32) {
+            self.datagram(address | WRITE, data);
+        }
+
+        fn read(&mut self, address: u8) -> u32 {
+            self.datagram(address, 0);
+            self.datagram(address, 0).1
+        }
+
+        fn advance_ms(&self, ms: u64) {
+            self.clock.set(Clock::from_ticks(self.clock.now().ticks() + ms * u64::from(CLOCK_FREQ) / 1000));
+        }
+
+        /// Pulses of the step pin, one in so many milliseconds.
+        fn steps(&self, count: u32, ms: u64) {
+            self.axis.set_enabled(true);
+            for _ in 0..count {
+                self.advance_ms(ms);
+                self.axis.edge(true, self.clock.now());
+                self.axis.edge(false, self.clock.now());
+            }
+        }
+    }
+
+    #[test]
+    fn a_read_comes_back_with_the_next_datagram_and_a_write_comes_back_itself() {
+        let mut bench = Bench::new();
+        assert_eq!(bench.datagram(IOIN, 0), (0x09, 0), "standstill and reset");
+        assert_eq!(bench.datagram(CHOPCONF, 0).1, 0x3000_0050);
+        assert_eq!(bench.datagram(GCONF | WRITE, 0x1234_5678).1, 0x1041_0150);
+        assert_eq!(bench.datagram(GCONF, 0).1, 0x1234_5678, "what was written, though it has 18 bits");
+        assert_eq!(bench.datagram(GCONF, 0).1, 0x0000_5678);
+    }
+
+    #[test]
+    fn registers_are_read_and_written_as_their_access_says() {
+        let mut bench = Bench::new();
+        assert_eq!(bench.read(GSTAT), 1);
+        bench.write(GSTAT, 0b110);
+        assert_eq!(bench.read(GSTAT), 1);
+        bench.write(GSTAT, 0b001);
+        assert_eq!((bench.read(GSTAT), bench.datagram(GSTAT, 0).0), (0, 0x08));
+        bench.write(IOIN, u32::MAX);
+        assert_eq!(bench.read(IOIN), 0x3000_0050);
+        bench.write(0x07, u32::MAX);
+        assert_eq!(bench.read(0x07), OTP);
+        bench.write(IHOLD_IRUN, 0x0006_1f08);
+        assert_eq!(bench.read(IHOLD_IRUN), 0, "write only");
+        assert_eq!(bench.read(DRV_STATUS), 0x8008_0000, "standstill at IHOLD");
+        bench.write(0x7f, 5);
+        assert_eq!(bench.read(0x7f), 0, "there is none");
+        assert_eq!(bench.read(PWM_AUTO), 0x1e);
+        bench.write(PWMCONF, 0x1234);
+        assert_eq!(bench.read(PWM_AUTO), 0x0012_0034);
+    }
+
+    #[test]
+    fn a_long_datagram_passes_on_and_a_short_one_is_none() {
+        let mut bench = Bench::new();
+        let reply = bench.transfer(&[1, 2, 3, 4, 5, GCONF | WRITE, 0, 0, 0, 4]);
+        assert_eq!(reply, [0x09, 0, 0, 0, 0, 1, 2, 3, 4, 5], "to the next chip of the chain");
+        assert_eq!(bench.read(GCONF), 4);
+        bench.transfer(&[GCONF | WRITE, 0, 0, 0]);
+        assert_eq!(bench.read(GCONF), 4);
+    }
+
+    #[test]
+    fn the_motor_is_seen_to_move_and_to_stand() {
+        let mut bench = Bench::new();
+        bench.write(CHOPCONF, 0x1041_0150 | 4 << 24);
+        bench.write(IHOLD_IRUN, 31 << 8 | 8);
+        bench.axis.set_forward(true);
+        bench.steps(10, 2);
+        // 24000 clocks for 16 microsteps of 1/256.
+        assert_eq!(bench.read(TSTEP), 1500);
+        assert_eq!(bench.read(DRV_STATUS), 0x001f_00c8);
+        assert_eq!(bench.read(IOIN), 0x3000_0042);
+        assert_eq!(bench.read(MSCNT), 1024 - 160, "DIR is high");
+        // The counter goes on from there in steps of another size, and backwards.
+        bench.write(CHOPCONF, 0x1041_0150 | 8 << 24);
+        bench.steps(3, 1);
+        bench.write(GCONF, GCONF_SHAFT);
+        bench.write(CHOPCONF, 0x1041_0150);
+        bench.steps(5, 1);
+        assert_eq!(bench.read(MSCNT), 1024 - 160 - 3 * 256 + 5);
+        bench.advance_ms(90);
+        assert_eq!(bench.read(TSTEP), STANDSTILL);
+        assert_eq!(bench.read(DRV_STATUS), 0x8008_0000);
+    }
+
+    #[test]
+    fn with_dedge_each_edge_is_a_step() {
+        let mut bench = Bench::new();
+        let start = bench.axis.position_steps();
+        bench.axis.set_forward(true);
+        bench.steps(3, 1);
+        assert_eq!(bench.axis.position_steps(), start + 3);
+        bench.write(CHOPCONF, 0x1041_0150 | CHOPCONF_DEDGE);
+        bench.steps(3, 1);
+        assert_eq!(bench.axis.position_steps(), start + 9);
+    }
+
+    /// Half a full step against the end of the axis is half of the full load.
+    #[test]
+    fn a_load_makes_sg_result_fall_and_sgt_makes_it_rise() {
+        let mut bench = Bench::new();
+        bench.write(CHOPCONF, 0x1041_0150 | 4 << 24);
+        bench.axis.set_forward(false);
+        // It stands at 12 mm and goes 2 mm beyond its end.
+        bench.steps(14 * 400 + 8, 1);
+        assert_eq!(bench.read(DRV_STATUS) & 0x3ff, 50);
+        assert_eq!(bench.datagram(DRV_STATUS, 0).0 & 4, 0);
+        bench.write(COOLCONF, 0x7c << 16);
+        assert_eq!(bench.read(DRV_STATUS) & 0x3ff, 10, "SGT of -4");
+        bench.write(COOLCONF, 0);
+        bench.write(GCONF, GCONF_DIAG1_STALL | GCONF_DIAG1_PUSHPULL);
+        bench.write(TCOOLTHRS, STANDSTILL);
+        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()));
+        bench.steps(3, 1);
+        assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, DRV_STATUS_STALLGUARD);
+        assert_eq!(bench.datagram(DRV_STATUS, 0).0 & 4, 4);
+        assert!(bench.chip.diag1.is_stalled(bench.clock.now()));
+        // In StealthChop there is no StallGuard.
+        bench.write(GCONF, GCONF_DIAG1_STALL | GCONF_EN_PWM_MODE);
+        assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, 0);
+        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()));
+        bench.advance_ms(90);
+        bench.write(GCONF, GCONF_DIAG1_STALL);
+        assert!(!bench.chip.diag1.is_stalled(bench.clock.now()), "it stands still");
+    }
+}

@@ -1,0 +1,261 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The UART of Trinamic's drivers on one wire, after the data sheet of the TMC2209 ("UART Single Wire
+//! Interface").
+
+#![forbid(unsafe_code)]
+
+use std::sync::{Arc, Mutex, TryLockError};
+
+use crate::engine::wire::{Kind, Wire};
+use pinion_firmware::time::Clock;
+
+/// The low nibble of a message's first byte; the high one may be anything.
+pub(crate) const SYNC: u8 = 0x05;
+/// The address in an answer: the host's.
+pub(crate) const HOST: u8 = 0xff;
+pub(crate) const WRITE: u8 = 0x80;
+const READ_LEN: usize = 4;
+pub(crate) const WRITE_LEN: usize = 8;
+/// A byte with its start and its stop bit.
+const FRAME_BITS: u64 = 10;
+/// After a pause of so many bit times between two start bits, or after a fault and so many of silence, a
+/// message begins anew.
+const PAUSE_BITS: u64 = 63;
+const RECOVERY_BITS: u64 = 12;
+/// The baud rates that the chip hears: 9000 to its clock / 16.
+const LONGEST_BIT: u64 = pinion_firmware::time::CLOCK_FREQ as u64 / 9000;
+
+/// CRC8-ATM, each byte from its lowest bit on ("CRC Calculation").
+pub(crate) fn crc8(bytes: &[u8]) -> u8 {
+    bytes.iter().fold(0, |crc, byte| {
+        (0..8).fold(crc, |crc: u8, bit| {
+            let carry = (crc >> 7) ^ (byte >> bit & 1);
+            (crc << 1) ^ (carry * 0x07)
+        })
+    })
+}
+
+/// What the chip's receiver waits for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Expects {
+    /// The start bit of a message.
+    Message,
+    /// The edges of the sync nibble after the first one, of which so many came.
+    Sync(u32),
+    /// The middle of this bit of a byte (0 is the start bit).
+    Bit(u64),
+    /// The start bit of the next byte.
+    Byte,
+    /// Silence, as what came was no message.
+    Silence,
+}
+
+/// A chip that a UART talks to.
+pub(crate) trait UartChip: Send {
+    /// Takes a message in; what it answers.
+    fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]>;
+
+    /// Bit times from a message to its answer.
+    fn send_delay(&self) -> u64;
+}
+
+/// The chip's UART on its wire, which is high when nobody drives it low.
+pub(crate) struct Uart {
+    chip: Box<dyn UartChip>,
+    expects: Expects,
+    /// The wire's level as the machine drives it, and since when.
+    high: bool,
+    since: Clock,
+    /// Ticks of a bit; 0 before the first sync nibble.
+    bit: u64,
+    /// The start bit of the byte that comes, or came last.
+    start: Clock,
+    bytes: [u8; WRITE_LEN],
+    len: usize,
+    answer: Option<Answer>,
+}
+
+#[derive(Clone, Copy)]
+struct Answer {
+    at: Clock,
+    bit: u64,
+    bytes: [u8; WRITE_LEN],
+}
+
+impl Answer {
+    /// The level of the wire at an instant.
+    fn level(&self, now: Clock) -> bool {
+        let Ok(into) = u64::try_from(now.since(self.at)) else { return true };
+        let place = into / self.bit;
+        let byte = usize::try_from(place / FRAME_BITS).ok().and_then(|byte| self.bytes.get(byte));
+        byte.is_none_or(|byte| match place % FRAME_BITS {
+            0 => false,
+            9 => true,
+            bit => byte >> (bit - 1) & 1 != 0,
+        })
+    }
+}
+
+impl Uart {
+    pub(crate) fn new(chip: Box<dyn UartChip>) -> Uart {
+        Uart {
+            chip,
+            expects: Expects::Message,
+            high: true,
+            since: Clock::EPOCH,
+            bit: 0,
+            start: Clock::EPOCH,
+            bytes: [0; WRITE_LEN],
+            len: 0,
+            answer: None,
+        }
+    }
+
+    /// The machine drives the wire, or lets go of it, which pulls it up.
+    fn set(&mut self, high: bool, at: Clock) {
+        self.look(at);
+        if high == self.high {
+            return;
+        }
+        let silent = at.since(self.since).max(0) as u64;
+        (self.high, self.since) = (high, at);
+        let since_start = at.since(self.start).max(0) as u64;
+        match self.expects {
+            Expects::Sync(edges) => self.sync(edges, at),
+            Expects::Silence if silent < RECOVERY_BITS * self.bit => {}
+            Expects::Byte if !high && since_start <= PAUSE_BITS * self.bit => {
+                self.start = at;
+                self.expects = Expects::Bit(0);
+            }
+            Expects::Message | Expects::Byte | Expects::Silence if !high => {
+                self.start = at;
+                self.len = 0;
+                self.answer = None;
+                self.expects = Expects::Sync(0);
+            }
+            _ => {}
+        }
+    }
+
+    /// An edge of the sync nibble, 1010, which takes the chip as long as four bits from the falling edge
+    /// of the start bit to the last falling one.
+    fn sync(&mut self, edges: u32, at: Clock) {
+        let edges = edges + 1;
+        self.expects = Expects::Sync(edges);
+        if edges == 4 {
+            self.bit = at.since(self.start).max(0) as u64 / 4;
+            let fits = (1..=LONGEST_BIT).contains(&self.bit);
+            if !fits {
+                self.bit = LONGEST_BIT;
+            }
+            self.bytes[0] = SYNC;
+            self.expects = if fits { Expects::Bit(5) } else { Expects::Silence };
+        }
+    }
+
+    /// The middle of a bit of the byte that comes.
+    fn middle(&self, bit: u64) -> Clock {
+        Clock::from_ticks(self.start.ticks() + bit * self.bit + self.bit / 2)
+    }
+
+    /// Takes in what went by until now, while the wire stood as it stands.
+    fn look(&mut self, now: Clock) {
+        while let Expects::Bit(bit) = self.expects {
+            let middle = self.middle(bit);
+            if now <= middle {
+                return;
+            }
+            self.expects = Expects::Bit(bit + 1);
+            let mask = 1u8.checked_shl(bit.wrapping_sub(1) as u32).unwrap_or(0);
+            match bit {
+                0 if self.high => self.expects = Expects::Silence,
+                0 => self.bytes[self.len] = 0,
+                9 if !self.high => self.expects = Expects::Silence,
+                9 => self.byte(middle),
+                _ if self.high => self.bytes[self.len] |= mask,
+                _ => {}
+            }
+        }
+    }
+
+    /// A byte is whole, in the middle of its stop bit.
+    fn byte(&mut self, now: Clock) {
+        self.len += 1;
+        self.expects = Expects::Byte;
+        let len = if self.bytes[2] & WRITE == 0 { READ_LEN } else { WRITE_LEN };
+        if self.len < 3 || self.len < len {
+            return;
+        }
+        let message = &self.bytes[..self.len];
+        let (last, checked) = message.split_last().unwrap_or((&0, &[]));
+        if crc8(checked) != *last {
+            self.expects = Expects::Silence;
+            return;
+        }
+        self.expects = Expects::Message;
+        let bytes = self.chip.hear(message, now);
+        let end = self.start.ticks() + (FRAME_BITS + self.chip.send_delay()) * self.bit;
+        self.answer = bytes.map(|bytes| Answer { at: Clock::from_ticks(end), bit: self.bit, bytes });
+    }
+
+    /// The level of the wire when the machine does not drive it.
+    fn level(&mut self, now: Clock) -> bool {
+        self.look(now);
+        self.answer.is_none_or(|answer| answer.level(now))
+    }
+}
+
+/// What an end of the UART does.
+#[derive(Clone, Copy, PartialEq)]
+pub(crate) enum Role {
+    /// Sends and receives, by turns.
+    Both,
+    Sender,
+    Receiver,
+}
+
+/// The board's end of the wire, or one of two.
+pub(crate) struct UartPin {
+    pub(crate) name: String,
+    pub(crate) role: Role,
+    pub(crate) uart: Arc<Mutex<Uart>>,
+}
+
+impl UartPin {
+    /// Something happens on the wire. One thread at a time drives it; should another come in between, the
+    /// chip does not hear it.
+    fn on_wire<T>(&self, happens: impl FnOnce(&mut Uart) -> T) -> Option<T> {
+        match self.uart.try_lock() {
+            Ok(mut uart) => Some(happens(&mut uart)),
+            Err(TryLockError::Poisoned(uart)) => Some(happens(&mut uart.into_inner())),
+            Err(TryLockError::WouldBlock) => None,
+        }
+    }
+}
+
+impl Wire for UartPin {
+    fn kind(&self) -> Kind {
+        match self.role {
+            Role::Both => Kind::Shared,
+            Role::Sender => Kind::Output,
+            Role::Receiver => Kind::Input,
+        }
+    }
+
+    fn describe(&self) -> String {
+        format!("UART of {}", self.name)
+    }
+
+    fn drive(&self, on: bool, at: Clock) {
+        self.on_wire(|uart| uart.set(on, at));
+    }
+
+    fn release(&self, at: Clock) {
+        self.on_wire(|uart| uart.set(true, at));
+    }
+
+    /// The machine's own low level is on the wire, too.
+    fn sense(&self, _driven: bool, at: Clock) -> bool {
+        self.on_wire(|uart| uart.level(at) && uart.high).unwrap_or(true)
+    }
+}
