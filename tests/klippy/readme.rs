@@ -29,7 +29,7 @@ const PINS: [(&str, u32); 15] = [
     ("pinctrl-bcm2711/gpio27", 27),
     ("ads1015/voltage0", 4096),
     ("mcp3208/voltage0", 4097),
-    ("spidev1.0", 1 << 26),
+    ("spidev0.0", 1 << 26),
 ];
 
 /// A configuration, and where it stands.
