@@ -50,6 +50,9 @@ pub fn served(link: &Path) -> Option<Served> {
     }
     let proc = Path::new("/proc");
     let server = server(proc, device).ok().flatten();
+    if server.as_ref().is_some_and(|server| has_another_link(proc, server, &way)) {
+        return None;
+    }
     if server.as_ref().and_then(known).is_none() && is_younger(&terminal, &fs::symlink_metadata(last_link).ok()?) {
         return None;
     }
@@ -81,6 +84,23 @@ fn follow(link: &Path) -> Vec<PathBuf> {
         way.push(next);
     }
     way
+}
+
+/// Whether the program was told to serve the terminal at another link. Then the one here was left behind by a program
+/// that had a terminal of the same number before.
+fn has_another_link(proc: &Path, server: &Process, way: &[PathBuf]) -> bool {
+    let Some(link) = server.arguments.iter().skip_while(|argument| *argument != Path::new("-I")).nth(1) else {
+        return false;
+    };
+    let Ok(folder) = fs::read_link(proc.join(server.pid.to_string()).join("cwd")) else { return false };
+    let link = folder.join(link);
+    // Not by their names: a link has more than one.
+    let identity = |path: &Path| fs::symlink_metadata(path).ok().map(|about| (about.dev(), about.ino()));
+    match identity(&link) {
+        // It has its terminal, and has not made its link yet.
+        None => true,
+        theirs => way.iter().all(|path| identity(path) != theirs) && follow(&link).last() == way.last(),
+    }
 }
 
 /// Whether the terminal was made after the link. What it is changed by later, such as its mode, makes it younger, too.

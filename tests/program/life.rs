@@ -103,6 +103,18 @@ fn a_link_that_a_killed_pinion_left_is_replaced_though_a_login_may_have_its_term
 }
 
 #[test]
+fn a_link_that_was_left_is_replaced_though_another_pinion_has_the_terminal_of_its_number() {
+    let other = Pinion::start(&["run", "--board", "sim"]);
+    other.logged("serving on");
+    let folder = tempfile::tempdir().unwrap();
+    symlink(fs::read_link(other.link()).unwrap(), folder.path().join("tty")).unwrap();
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    pinion.logged("serving on");
+    pinion.client().status().unwrap();
+    other.client().status().unwrap();
+}
+
+#[test]
 fn a_signal_at_the_first_sight_of_the_link_ends_the_program_in_order() {
     for _ in 0..10 {
         let mut pinion = Pinion::start(&["run", "--board", "sim"]);
