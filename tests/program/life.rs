@@ -317,7 +317,7 @@ fn a_host_that_never_reads_neither_blocks_the_machine_nor_makes_it_grow() {
         });
         finished.recv_timeout(PATIENCE).expect("the machine takes commands in");
         let grown = pinion.private_kb().saturating_sub(before);
-        assert!(grown < 2048, "{query}: grew by {grown} kB");
+        assert!(grown < 2048, "{query}: grew by {grown} kB; the log:\n{}", pinion.log());
         // And why the machine stops is in the log all the same. (It counts only if it is read apart
         // from the blocks.)
         pinion.until("the reason of the stop in the log", || {
