@@ -96,11 +96,9 @@ fn has_another_link(proc: &Path, server: &Process, way: &[PathBuf]) -> bool {
     let link = folder.join(link);
     // Not by their names: a link has more than one.
     let identity = |path: &Path| fs::symlink_metadata(path).ok().map(|about| (about.dev(), about.ino()));
-    match identity(&link) {
-        // It has its terminal, and has not made its link yet.
-        None => true,
-        theirs => way.iter().all(|path| identity(path) != theirs) && follow(&link).last() == way.last(),
-    }
+    // It may have its terminal, and not have made its link yet.
+    let theirs = identity(&link);
+    theirs.is_none() || way.iter().all(|path| identity(path) != theirs)
 }
 
 /// Whether the terminal was made after the link. What it is changed by later, such as its mode, makes it younger, too.

@@ -9,7 +9,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use nix::fcntl::{AT_FDCWD, FcntlArg, OFlag, fcntl};
+use nix::fcntl::{AT_FDCWD, FcntlArg, FdFlag, OFlag, fcntl};
 use nix::pty::openpty;
 use nix::sys::signal::Signal;
 use nix::sys::stat::{UtimensatFlags, utimensat};
@@ -93,6 +93,8 @@ fn a_link_that_a_killed_pinion_left_is_replaced_though_a_login_may_have_its_term
     pinion.end();
     // Its number is given to the next one who opens a terminal.
     let login = openpty(None, None).unwrap();
+    // No program of another test is to have it as well.
+    fcntl(&login.master, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC)).unwrap();
     let (folder, link) = pinion.into_folder();
     fs::remove_file(&link).unwrap();
     symlink(ttyname(&login.slave).unwrap(), &link).unwrap();
