@@ -56,7 +56,7 @@ demo: build
 	@$(PINION) sim --demo $(REALTIME) $(ARGS)
 
 build: system-packages
-	@$(CARGO) build --release --locked --quiet
+	@$(CARGO) build --release --locked --quiet --bin pinion
 
 test: cargo
 	@scripts/system-packages lab
@@ -84,7 +84,7 @@ bench: system-packages
 	$(CARGO) bench --locked
 
 check: system-packages
-	$(CARGO) fmt --check
+	$(CARGO) fmt --all --check
 	$(CARGO) clippy --locked --all-targets -- -D warnings
 	@if rustup target list --installed 2>/dev/null | grep -qx $(SMALL); then \
 	    echo '$(CARGO) check --target $(SMALL)'; $(CARGO) check --locked --all-targets --quiet --target $(SMALL); \

@@ -2,7 +2,7 @@
 //! The bytes of Klipper's micro-controller protocol, as in its docs/Protocol.md. No I/O, and no state of an MCU.
 //!
 //! - [`vlq`]: integers and byte strings of a message
-//! - [`format`]: a message's format, such as `get_clock` or `clock clock=%u`
+//! - [`mod@format`]: a message's format, such as `get_clock` or `clock clock=%u`
 //! - [`block`]: messages travel in blocks, which are numbered and checked
 //! - [`dictionary`]: what an MCU tells of itself: its messages, constants and names
 //! - [`clock`]: instants of an MCU's clock, 32 bits of which go over the wire

@@ -182,7 +182,7 @@ macro_rules! command {
 
 /// Declares a response as a struct. Behind the format stands which hosts take it, such as
 /// `=> until(V0_12);`; without it, all do. The module above must have a `response_index`, which finds
-/// its format in the list of responses ([`place_of_response`](crate::mcu::place_of_response)); one that is not listed is a
+/// its format in the list of responses ([`place_of_response`]); one that is not listed is a
 /// build error.
 #[macro_export]
 macro_rules! response {
