@@ -178,9 +178,11 @@ impl Spi {
     pub(super) fn worker(&self) -> String {
         format!("spi{}", self.node.bus)
     }
+}
 
+impl<N: SpiNode> Spi<N> {
     /// Has the data output low between two messages, where the controller can do that.
-    pub(super) fn with_mosi_idle_low(mut self) -> Spi {
+    pub(super) fn with_mosi_idle_low(mut self) -> Spi<N> {
         let plain = self.mode;
         self.mode |= MOSI_IDLE_LOW;
         if self.set_mode().is_err() {
@@ -188,9 +190,7 @@ impl Spi {
         }
         self
     }
-}
 
-impl<N: SpiNode> Spi<N> {
     fn controller(&self) -> MutexGuard<'_, Controller> {
         self.controller.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -376,6 +376,8 @@ mod tests {
         bytes: usize,
         half_duplex: bool,
         fails: bool,
+        /// Bits of the mode that the controller refuses.
+        refused: u32,
     }
 
     impl Wires {
@@ -394,7 +396,11 @@ mod tests {
         }
 
         fn set_mode(&mut self, mode: u32) -> io::Result<()> {
-            self.1.lock().unwrap().modes.insert(self.0, mode);
+            let mut wires = self.1.lock().unwrap();
+            if mode & wires.refused != 0 {
+                return Err(io::ErrorKind::InvalidInput.into());
+            }
+            wires.modes.insert(self.0, mode);
             Ok(())
         }
 
@@ -498,6 +504,18 @@ mod tests {
         assert_eq!(wires.lock().unwrap().seen, [("a", 32), ("b", 32)]);
         let error = low.exchange(&mut [1, 2]).err().unwrap();
         assert!(error.detail.contains("failed to transfer 2 bytes"), "{error:?}");
+    }
+
+    #[test]
+    fn the_data_output_idles_low_where_the_controller_can_do_that() {
+        for (refused, mode) in [(0, MOSI_IDLE_LOW), (MOSI_IDLE_LOW, 0)] {
+            let (wires, [spi]) = chips([("", 0, 0)]);
+            wires.lock().unwrap().refused = refused;
+            let mut spi = spi.with_mosi_idle_low();
+            assert_eq!(wires.lock().unwrap().modes[&0], mode);
+            spi.send(&[1]).unwrap();
+            assert_eq!(wires.lock().unwrap().modes[&0], mode);
+        }
     }
 
     #[test]
