@@ -6,7 +6,6 @@
  * In /sys/devices/platform/mock-w1:
  *   temperature   write "SENSOR MILLICELSIUS"; the next conversion measures it
  *   present       write "SENSOR 0" to take a sensor off the bus, 1 to put it back
- *   garbled       write "SENSOR 1" to give its scratchpad a wrong CRC, 0 to end that
  */
 #include <asm/unaligned.h>
 #include <linux/module.h>
@@ -28,7 +27,6 @@ struct sensor {
 	u8 scratchpad[9];
 	int millicelsius;
 	bool present;
-	bool garbled;
 };
 
 struct mock_w1 {
@@ -95,8 +93,7 @@ static void mock_w1_function(struct mock_w1 *mock, u8 command)
 				   sensor->scratchpad);
 		break;
 	case READ_SCRATCHPAD:
-		sensor->scratchpad[8] = w1_calc_crc8(sensor->scratchpad, 8) ^
-					READ_ONCE(sensor->garbled);
+		sensor->scratchpad[8] = w1_calc_crc8(sensor->scratchpad, 8);
 		mock->state = SCRATCHPAD_OUT;
 		break;
 	case WRITE_SCRATCHPAD:
@@ -192,23 +189,8 @@ static ssize_t present_store(struct device *dev, struct device_attribute *attr,
 }
 static DEVICE_ATTR_WO(present);
 
-static ssize_t garbled_store(struct device *dev, struct device_attribute *attr,
-			     const char *buf, size_t len)
-{
-	struct mock_w1 *mock = dev_get_drvdata(dev);
-	int sensor, garbled;
-
-	if (sscanf(buf, "%d %d", &sensor, &garbled) != 2 ||
-	    sensor < 0 || sensor >= SENSORS)
-		return -EINVAL;
-	WRITE_ONCE(mock->sensors[sensor].garbled, garbled);
-	return len;
-}
-static DEVICE_ATTR_WO(garbled);
-
 static struct attribute *mock_w1_attrs[] = {
-	&dev_attr_temperature.attr, &dev_attr_present.attr,
-	&dev_attr_garbled.attr, NULL
+	&dev_attr_temperature.attr, &dev_attr_present.attr, NULL
 };
 ATTRIBUTE_GROUPS(mock_w1);
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! DS18B20 thermometers, read by the kernel's one-wire driver.
 //!
-//! A reading takes 750 ms on a worker, and five times as long where the sensor's answers have a wrong CRC.
-//! So a `config_reset` does not wait for it. It is told as soon as it is there; the firmware tells it when
+//! A reading takes 750 ms on a worker. Sensors that live on the data wire alone take turns, as the kernel
+//! keeps the bus while one of them measures: three take 2.25 s. So a `config_reset` does not wait for it. It is told as soon as it is there; the firmware tells it when
 //! the next one is due.
 
 #![forbid(unsafe_code)]

@@ -68,7 +68,6 @@ fn sensors_are_read_by_name_and_one_that_is_taken_away_stops_the_machine() {
     assert_eq!(shutdown_of(client), "DS18B20 out of range");
 }
 
-/// A sensor whose answers have a wrong CRC is asked five times by the kernel, which takes 4 s.
 #[test]
 fn a_sensor_that_is_being_read_keeps_no_restart_waiting() {
     sysfs::wait_until("the bus was searched", || {
@@ -78,16 +77,15 @@ fn a_sensor_that_is_being_read_keeps_no_restart_waiting() {
     let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &[config(0, &sensor(1))]);
-    let garbled = sysfs::set(format!("{MOCK}/garbled"), "0 1", "0 0");
     query(client, 0, -55_000);
-    std::thread::sleep(Duration::from_millis(300));
+    // It measures from 100 to 850 ms.
+    std::thread::sleep(Duration::from_millis(200));
     let began = Instant::now();
     client.reset().expect("a reset");
     configure(client, 1, &[config(0, &sensor(1))]);
     let took = began.elapsed();
-    drop(garbled);
+    assert!(took < Duration::from_millis(400), "{took:?}");
     query(client, 0, -55_000);
     assert_eq!(reading(client, 0), (20_000, 0));
-    assert!(took < Duration::from_secs(1), "{took:?}");
     assert!(!program.log().contains("does not answer"), "{}", program.log());
 }
