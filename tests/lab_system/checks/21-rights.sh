@@ -17,12 +17,13 @@ not inside 'test -L /tmp/klipper_host_mcu'
 # A host of klippy's user is looked into.
 mark
 identifies
-until_true 10 sh -c "journalctl --sync; journalctl --after-cursor='$(cat /run/mark)' -o cat -u pinion-mcu | grep 'is no klippy'"
+looked() { said | grep 'is no klippy'; }
+until_true 10 looked
 # One that is killed is told of, and the service serves on.
 before=$(pid)
 kill -9 "$search"
 identifies
 is "$(pid)" "$before" "the process"
 systemctl stop pinion-mcu
-said pinion-mcu | grep 'the search for the host has ended'
+said pinion-mcu -p warning | grep 'the search for the host has ended'
 not pgrep -x pinion-search

@@ -39,8 +39,9 @@ light() {
 }
 dark() { pkill -f '/share/host light' || true; }
 # What the journal has of the service, since the mark that `mark` sets.
-mark() { journalctl --sync; journalctl -n 1 --show-cursor -q | sed -n 's/^-- cursor: //p' >/run/mark; }
-said() { journalctl --sync; journalctl --after-cursor="$(cat /run/mark)" -o cat -u "${1:-pinion-mcu}" "${@:2}"; }
+# (Not by a cursor: with a filter journalctl --after-cursor leaves out the first line that the filter lets through.)
+mark() { date +@%s.%6N >/run/mark; }
+said() { journalctl --sync; journalctl -q --since="$(cat /run/mark)" -o cat -u "${1:-pinion-mcu}" "${@:2}"; }
 
 # What somebody types who takes whatever is proposed.
 ENTERS=/run/enters
