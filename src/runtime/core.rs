@@ -64,9 +64,9 @@ pub(super) enum Request {
 const NEAR: Ticks = Ticks::from_us(5);
 /// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
 const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
-/// To tell a part of its status takes a microsecond, or several where nothing of it is in the cache: that is done
-/// only if no timer is within this span.
-const TELL: Ticks = Ticks::from_us(30);
+/// What can wait is done only if no timer is within this span: to wake the link, which takes some microseconds, and to
+/// tell a part of the status, which takes one, or several where nothing of it is in the cache.
+const SOON: Ticks = Ticks::from_us(30);
 /// A core that waits for a bus has the blocks before acknowledged, if there are no more than these to go on with. To
 /// acknowledge each block costs as much as to run it.
 const FEW: usize = 3;
@@ -200,8 +200,13 @@ impl Core {
                 self.gave_way += 1;
                 continue;
             }
-            if self.teller.is_asked() && deadline.is_none_or(|deadline| deadline > now + TELL) {
+            if self.teller.is_asked() && !soon(deadline, now) {
                 self.teller.tell(&self.mcu, self.requests.slots(), self.waiter.margin());
+                continue;
+            }
+            if self.untold && self.mcu.is_held() && self.requests.slots() <= FEW && !soon(deadline, now) {
+                self.untold = false;
+                self.wake.wake();
                 continue;
             }
             if self.lookout.goes_on(now)
@@ -342,11 +347,6 @@ impl Core {
             self.block = Some((payload, at));
             if self.mcu.is_held() {
                 self.progress.hold(true);
-                // The bus takes its time: the host can send more meanwhile.
-                if self.untold && self.requests.slots() <= FEW {
-                    self.untold = false;
-                    self.wake.wake();
-                }
             }
             return Turn::Done;
         }
@@ -407,6 +407,11 @@ impl Calls<'_> {
                 true => !self.mcu.is_shutdown() && self.core.stops_handed() != self.stops_taken,
             }
     }
+}
+
+/// Whether a timer leaves no time for what can wait.
+fn soon(deadline: Option<Clock>, now: Clock) -> bool {
+    deadline.is_some_and(|deadline| deadline <= now + SOON)
 }
 
 /// Whether to yield does not cost a timer its time: an ordinary thread may then be without a
