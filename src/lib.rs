@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Pinion: a Klipper micro-controller made of a Linux process.
 //!
-//! This crate is the program; what it is made of are crates of their own (docs/architecture.md):
+//! This crate is the program; what it is made of are crates of their own (docs/develop/architecture.md):
 //!
 //! - [`cli`]: the subcommands
 //! - [`runtime`]: threads, pty, real time, signals

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The lab: the tests of `tests/lab/guest`, run against real kernel drivers in a
-//! virtual machine, on each kernel flavour. docs/lab.md tells how to use it.
+//! virtual machine, on each kernel flavour. docs/develop/lab.md tells how to use it.
 //!
 //! This is the host's side, a test harness of its own. It builds what the
 //! machines boot, lists the tests that the guest binary holds, shares each flavour's

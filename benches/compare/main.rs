@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Runs micro-controller programs under the same load, in turn, and prints their figures side
-//! by side. docs/performance.md says what is measured and how.
+//! by side. docs/develop/performance.md says what is measured and how.
 //!
 //! - [`rig`]: a /dev of null devices, the stand-in for their drivers, the program's start
 //! - [`steps`]: step edges at a steady rate: how late, how much CPU, how fast at most

@@ -453,9 +453,9 @@ impl Printer {
     }
 }
 
-/// An example of docs/simulator.md: by itself, or appended to the built-in description as it says.
+/// An example of docs/guide/simulator.md: by itself, or appended to the built-in description as it says.
 pub fn example(built_in: &str, heading: &str) -> String {
-    const PAGE: &str = include_str!("../../docs/simulator.md");
+    const PAGE: &str = include_str!("../../docs/guide/simulator.md");
     let (_, section) = PAGE.split_once(&format!("\n### {heading}\n")).unwrap();
     let (example, _) = section.split_once("\n```toml\n").unwrap().1.split_once("```\n").unwrap();
     if example.starts_with("[delta]") {

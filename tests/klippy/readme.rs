@@ -94,7 +94,7 @@ fn klippy_takes(checkout: &Path, config: &Config, dictionary: &Value) {
 fn klippy_takes_the_configuration_of_the_pages() {
     let Some(checkout) = checkout("klippy_takes_the_configuration_of_the_pages") else { return };
     let configs: Vec<Config> = pages().iter().flat_map(configs).collect();
-    for (place, part) in [("README.md", "[temperature_sensor"), ("docs/migrate.md", "adc_voltage")] {
+    for (place, part) in [("README.md", "[temperature_sensor"), ("docs/guide/migrate.md", "adc_voltage")] {
         let found = configs.iter().any(|config| config.place.starts_with(place) && config.text.contains(part));
         assert!(found, "{place} has no such configuration any more");
     }
@@ -114,7 +114,7 @@ fn klippy_takes_the_configuration_of_the_pages() {
 /// `adc_voltage`, and takes the scaled one for a part of the true full scale.
 #[test]
 fn the_change_for_an_adc_is_right() {
-    let page = pages().into_iter().find(|page| page.name == "docs/migrate.md").unwrap();
+    let page = pages().into_iter().find(|page| page.name == "docs/guide/migrate.md").unwrap();
     let voltage = |config: &Config| {
         let line = config.text.lines().find_map(|line| line.strip_prefix("adc_voltage: ")).unwrap();
         line.parse::<f64>().unwrap()

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The lab on a Raspberry Pi 3: the tests of `tests/lab_pi/guest`, run against the real
-//! driver of its GPIO chip on an emulated Pi. docs/lab-pi.md tells how to use it.
+//! driver of its GPIO chip on an emulated Pi. docs/develop/lab-pi.md tells how to use it.
 //!
 //! This is the host's side, a test harness of its own. It builds for arm64 and plays
 //! the world outside of the pins, as the tests ask for it over the console.

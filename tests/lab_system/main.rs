@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The package, installed in a Debian 12 that was booted with systemd in the emulator: the scripts
 //! of `tests/lab_system/checks`, in their order, and in some of them the commands of the pages.
-//! docs/lab-system.md tells how to use it.
+//! docs/develop/lab-system.md tells how to use it.
 //!
 //! This is the computer's side, a test harness of its own.
 

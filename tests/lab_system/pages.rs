@@ -7,7 +7,7 @@ use std::path::Path;
 use super::Check;
 use pinion_testkit::page::{COMMANDS, Page, pages};
 
-/// How a check begins the line that has a page tried: `page docs/install.md`.
+/// How a check begins the line that has a page tried: `page docs/guide/install.md`.
 const WORD: &str = "page ";
 /// The page of a check that is run once for each page that no other check tries.
 const ANY: &str = "\"$PAGE\"";

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! docs/troubleshooting.md explains what the program says, all of it and nothing else.
+//! docs/guide/troubleshooting.md explains what the program says, all of it and nothing else.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -9,7 +9,7 @@ use serde_json::Value;
 
 use crate::process::output;
 
-const PAGE: &str = include_str!("../../docs/troubleshooting.md");
+const PAGE: &str = include_str!("../../docs/guide/troubleshooting.md");
 /// What a line of the log is made by; the search for the host has the program log its lines.
 const LOGGING: [&str; 5] = ["error!(", "warn!(", "info!(", ".warn(format!(", ".info(format!("];
 /// What stands in a quotation for what varies.

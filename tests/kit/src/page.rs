@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The pages that users read, README.md and docs/*.md, and the fenced blocks in them. `docs/lab-system.md` tells
-//! what the kinds of blocks mean.
+//! README.md and the pages below docs/, with their fenced blocks. `docs/develop/lab-system.md` says what each kind of
+//! block means.
 
 use std::fs;
 use std::path::Path;
@@ -12,7 +12,7 @@ const NOT_TRIED: &str = "<!-- not tried:";
 
 /// A file of Markdown.
 pub struct Page {
-    /// From the project's folder on, such as `docs/install.md`.
+    /// Path from the project's folder, such as `docs/guide/install.md`.
     pub name: String,
     /// The whole file.
     pub text: String,
@@ -32,14 +32,15 @@ pub struct Block {
     pub not_tried: Option<String>,
 }
 
-/// README.md, then those of docs/ by their names.
+/// README.md, then the pages below docs/ sorted by name.
 pub fn pages() -> Vec<Page> {
     let project = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."));
-    let docs = fs::read_dir(project.join("docs")).expect("the folder of the pages");
-    let mut names: Vec<String> = docs
-        .map(|entry| format!("docs/{}", entry.expect("a file of docs").file_name().to_string_lossy()))
-        .filter(|name| name.ends_with(".md"))
-        .collect();
+    let mut names = Vec::new();
+    for folder in ["docs", "docs/develop", "docs/guide"] {
+        let files = fs::read_dir(project.join(folder)).expect("a folder of pages");
+        let files = files.map(|file| format!("{folder}/{}", file.expect("a file").file_name().to_string_lossy()));
+        names.extend(files.filter(|name| name.ends_with(".md")));
+    }
     names.sort();
     names.insert(0, "README.md".to_owned());
     let page = |name: String| Page { text: fs::read_to_string(project.join(&name)).expect("a page"), name };

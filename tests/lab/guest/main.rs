@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The tests that run in the lab's guest, as root, against real kernel drivers.
 //!
-//! `cargo test --test lab` runs them; docs/lab.md tells how to add one. Each test
+//! `cargo test --test lab` runs them; docs/develop/lab.md tells how to add one. Each test
 //! has a process of its own. Those in the modules `timing` and `pinion` run on a
 //! machine whose time counts instructions.
 

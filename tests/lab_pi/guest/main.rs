@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The tests that run on the emulated Raspberry Pi 3, as root, against the driver of
-//! its GPIO chip. `make lab-pi` runs them; docs/lab-pi.md tells more.
+//! its GPIO chip. `make lab-pi` runs them; docs/develop/lab-pi.md tells more.
 
 mod outside;
 mod program;

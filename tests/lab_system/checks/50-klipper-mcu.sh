@@ -18,7 +18,7 @@ is "$(systemctl is-active klipper-mcu || true)" inactive
 identifies
 
 # Klipper's `make flash` starts its unit though it is disabled, which stops Pinion; not once the unit was moved away as
-# docs/migrate.md says. doctor tells.
+# docs/guide/migrate.md says. doctor tells.
 systemctl enable pinion-mcu
 flash() {
     install -D -m 755 /bin/sleep /run/flashed/klipper.elf

@@ -1,2 +1,2 @@
 bare
-page docs/install.md
+page docs/guide/install.md

@@ -24,7 +24,7 @@ RestartSec=5
 UNIT
 systemctl daemon-reload
 systemctl enable --now klipper-mcu
-page docs/migrate.md
+page docs/guide/migrate.md
 systemctl disable --now klipper-mcu
 rm -rf /etc/systemd/system/klipper-mcu.service* /usr/local/bin/klipper_mcu $LINK
 systemctl daemon-reload

@@ -17,7 +17,7 @@ printf 'klipper_mcu\nwebcamd' >/home/pi/printer_data/moonraker.asvc
 chown pi: /home/pi/printer_data/moonraker.asvc
 echo 'deb [trusted=yes] file:/srv/pinion ./' >/etc/apt/sources.list.d/pinion.list
 later 1
-page docs/moonraker.md
+page docs/guide/moonraker.md
 is "$(cat /home/pi/printer_data/moonraker.asvc)" "$(printf 'klipper_mcu\nwebcamd\npinion-mcu')" "Moonraker's services"
 # Before Moonraker's first start there is none, and none is made: it would lack what Moonraker puts there.
 mkdir -p /run/fresh

@@ -67,7 +67,7 @@ bare() {
     apt-get -qq autoremove -y --purge libiio0
     new_user
 }
-# What docs/install.md leaves a new user: the package is installed, its service runs, and he is in the group tty.
+# What docs/guide/install.md leaves a new user: the package is installed, its service runs, and he is in the group tty.
 installed() {
     fresh
     if is_as_delivered; then

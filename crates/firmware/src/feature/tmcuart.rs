@@ -4,7 +4,7 @@
 //!
 //! The firmware has a timer for each bit. Here an errand times a whole message on a worker: at 40
 //! kbaud that is up to 5 ms of edges 25 us apart, which would keep the core awake. How late bits
-//! are either way `bits_on_time` below measures (docs/performance.md).
+//! are either way `bits_on_time` below measures (docs/develop/performance.md).
 //!
 //! The firmware samples a reply wherever in a bit its timer happens to be. Here the start bit of each
 //! byte is looked for, and bits are read in their middle, so that half a bit of lateness does no harm. A

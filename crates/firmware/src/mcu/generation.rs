@@ -2,7 +2,7 @@
 //! The generations of hosts, and which of them take a message.
 //!
 //! To add a generation, add it here: its name, and the generation that it grew out of, whose messages
-//! it then has. docs/dialects.md goes through the rest.
+//! it then has. docs/guide/dialects.md goes through the rest.
 
 #![forbid(unsafe_code)]
 
@@ -151,7 +151,7 @@ pub enum DialectName {
     Of(Generation),
     /// What Klipper v0.13, its master and Kalico take, for a host of which nothing is known. A host
     /// looks a message up by its name alone, so of each name it has one form: that of v0.13, which the
-    /// two others often take as well (docs/dialects.md), or else master's, or else Kalico's.
+    /// two others often take as well (docs/guide/dialects.md), or else master's, or else Kalico's.
     Union,
 }
 

@@ -15,7 +15,7 @@ fn error_of(from: &str, to: &str) -> String {
     }
 }
 
-const DOCUMENTATION: &str = include_str!("../../../../docs/simulator.md");
+const DOCUMENTATION: &str = include_str!("../../../../docs/guide/simulator.md");
 
 /// An example of the documentation: by itself, or appended to the built-in description as it says.
 pub(crate) fn example(heading: &str) -> String {
