@@ -151,7 +151,7 @@ fn the_documentation_has_every_kind_and_every_key() {
         assert!(words.any(|word| word == key), "{key} is not in `{heading}`");
     };
     for key in offered("nobody = 1") {
-        has("## Its description", &key);
+        has("## Description files", &key);
     }
     for (table, heading) in [
         ("[limits]", "### `[limits]`"),
