@@ -145,15 +145,12 @@ impl Pinion {
         }
     }
 
-    /// Memory of its own, in kB.
-    pub fn private_kb(&self) -> u64 {
-        let rollup = fs::read_to_string(format!("/proc/{}/smaps_rollup", self.pid())).unwrap();
-        let field = |name: &str| {
-            let line = rollup.lines().find(|line| line.starts_with(name)).unwrap();
-            line.split_whitespace().nth(1).unwrap().parse::<u64>().unwrap()
-        };
-        // Clean pages are the program's file: private once the other tests' programs have ended.
-        field("Private_Dirty:")
+    /// Memory of the process itself, without files, in kB. It counts pages that a forked process shares: these do not
+    /// become more when that process writes to its copies or ends.
+    pub fn anonymous_kb(&self) -> u64 {
+        let status = fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
+        line.split_whitespace().next().unwrap().parse().unwrap()
     }
 }
 
