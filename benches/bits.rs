@@ -17,7 +17,7 @@ use pinion_firmware::board::{
 use pinion_firmware::lateness::Lateness;
 use pinion_firmware::mcu::{Completion, Dialect, DialectName, Generation, Job, Mcu, Note, Outbox, WorkerId, Workers};
 use pinion_firmware::shutdown::Shutdown;
-use pinion_firmware::time::{Clock, Ticks, TimeSource};
+use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
 use pinion_linux::clock::Monotonic;
 use pinion_protocol::vlq::{Reader, Writer};
 use pinion_testbench::board::{Bench, FakeBoard};
@@ -183,7 +183,8 @@ impl Uart {
         let id = dialect.dictionary().responses["tmcuart_response oid=%c read=%*s"].as_i64().unwrap_or(0) as u32;
         let heard = Heard { id, last: Arc::default() };
         let worker = Box::new(Worker::start(clock));
-        let mcu = Mcu::new(dialect.clone(), Box::new(board), Arc::new(clock), worker, Box::new(heard.clone()));
+        let timing = Timing::of(Arc::new(clock));
+        let mcu = Mcu::new(dialect.clone(), Box::new(board), timing, worker, Box::new(heard.clone()));
         let mut uart = Uart { mcu, dialect, edges, heard };
         uart.run("allocate_oids count=%c", &[1], None);
         let config = "config_tmcuart oid=%c rx_pin=%u pull_up=%c tx_pin=%u bit_time=%u";

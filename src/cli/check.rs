@@ -55,7 +55,7 @@ fn board(settings: &Settings) -> Vec<Finding> {
     // Its problems are among the findings already.
     let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None));
     let board = match board {
-        Ok(board) => board,
+        Ok((board, _)) => board,
         Err(error) => {
             findings.push(Finding::error("board", error, "correct the file, or choose another board"));
             return findings;

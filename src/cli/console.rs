@@ -172,7 +172,8 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
             }
         }
     };
-    let ended = runtime::run(&options, Box::new(board), clock, helpers, ready);
+    let timing = board.timing();
+    let ended = runtime::run(&options, Box::new(board), timing, clock, helpers, ready);
     terminal.give_back();
     ended.map_err(|error| error.to_string())?;
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();

@@ -15,7 +15,7 @@ use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Guardian, Helpers, Options};
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
-use pinion_firmware::time::TimeSource;
+use pinion_firmware::time::{TimeSource, Timing};
 use pinion_linux::clock::Monotonic;
 use pinion_linux::{Guard, LinuxBoard};
 use pinion_sim::{SimBoard, SimConfig, SimError};
@@ -182,17 +182,19 @@ impl FromStr for Spoken {
 }
 
 impl BoardName {
-    /// Opens the board. Its outputs are given to `guard`.
+    /// Opens the board. Its outputs are given to `guard`. The timing is that of its MCU.
     pub(super) fn open(
         &self,
         clock: Arc<dyn TimeSource>,
         guard: Option<Box<dyn Guard>>,
-    ) -> Result<Box<dyn Board>, String> {
+    ) -> Result<(Box<dyn Board>, Timing), String> {
         match self {
-            BoardName::Linux => Ok(Box::new(LinuxBoard::new(guard))),
+            BoardName::Linux => Ok((Box::new(LinuxBoard::new(guard)), Timing::of(clock))),
             BoardName::Sim(file) => {
                 let board = sim_config(file.as_deref()).and_then(|config| SimBoard::new(config, clock));
-                Ok(Box::new(board.map_err(|error| error.to_string())?))
+                let board = board.map_err(|error| error.to_string())?;
+                let timing = board.timing();
+                Ok((Box::new(board), timing))
             }
         }
     }
@@ -259,11 +261,12 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     if let Some(file) = &args.config {
         log::info!("configuration {}", file.display());
     }
-    let board = match settings.board.open(Arc::new(clock), helpers.guardian.as_ref().map(Guardian::guard)) {
-        Ok(board) => board,
+    let guard = helpers.guardian.as_ref().map(Guardian::guard);
+    let (board, timing) = match settings.board.open(Arc::new(clock), guard) {
+        Ok(opened) => opened,
         Err(error) => return failed(error),
     };
-    match runtime::run(&settings.options(), board, clock, helpers, || ()) {
+    match runtime::run(&settings.options(), board, timing, clock, helpers, || ()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }

@@ -118,7 +118,8 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
             }
         }
     };
-    match runtime::run(&options, Box::new(board), clock, helpers, ready) {
+    let timing = board.timing();
+    match runtime::run(&options, Box::new(board), timing, clock, helpers, ready) {
         Ok(()) if args.demo && !right.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
@@ -144,7 +145,8 @@ fn show_as_it_changes(
         }
         show.begin();
     };
-    let ended = runtime::run(options, Box::new(board), clock, helpers, ready);
+    let timing = board.timing();
+    let ended = runtime::run(options, Box::new(board), timing, clock, helpers, ready);
     show.end();
     ended.map_or_else(failed, |()| ExitCode::SUCCESS)
 }

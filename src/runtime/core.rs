@@ -437,7 +437,7 @@ mod tests {
     use crate::runtime::wakeup::MarginLimits;
     use crate::runtime::workers::Threads;
     use pinion_firmware::mcu::{DialectName, Generation, Note, Outbox};
-    use pinion_firmware::time::VirtualClock;
+    use pinion_firmware::time::{Timing, VirtualClock};
     use pinion_linux::clock::Monotonic;
     use pinion_protocol::vlq::Writer;
     use pinion_testbench::board::{Bench, FakeBoard};
@@ -505,7 +505,7 @@ mod tests {
                 let mcu = Mcu::new(
                     core_dialect,
                     Box::new(board),
-                    core_clock.clone(),
+                    Timing::of(core_clock.clone()),
                     Box::new(workers),
                     Box::new(core_heard),
                 );

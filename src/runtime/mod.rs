@@ -19,7 +19,7 @@ use rtrb::RingBuffer;
 
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{DialectName, Generation, Mcu};
-use pinion_firmware::time::TimeSource;
+use pinion_firmware::time::Timing;
 use pinion_linux::clock::Monotonic;
 
 mod budget;
@@ -91,10 +91,12 @@ pub struct Options {
 }
 
 /// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP; calls `ready` once a host may come.
-/// `helpers` has the guardian of the board's outputs.
+/// The MCU drives `board` by `timing`, whose instants are those of `clock`. `helpers` has the guardian of the board's
+/// outputs.
 pub fn run(
     options: &Options,
     board: Box<dyn Board>,
+    timing: Timing,
     clock: Monotonic,
     helpers: Helpers,
     ready: impl FnOnce(),
@@ -113,7 +115,7 @@ pub fn run(
         None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
     };
     let dialects = survey::dialects(&*board, &names)?;
-    let clock: Arc<dyn TimeSource> = Arc::new(clock);
+    let clock = timing.clock.clone();
     let wake = Arc::new(LinkWake::new()?);
     let host = Arc::new(HostBoard::default());
     // Before the link is of real time, which its threads would inherit.
@@ -156,9 +158,8 @@ pub fn run(
                 realtime::enter(Role::Worker);
             }
         });
-        let errand_clock = board.errand_clock(core_clock.clone());
-        let workers = Box::new(Threads::new(thread::current(), prepare, errand_clock, pulse, may_poll));
-        let mcu = Mcu::new(core_dialect, board, core_clock.clone(), workers, Box::new(outlet));
+        let workers = Box::new(Threads::new(thread::current(), prepare, core_clock.clone(), pulse, may_poll));
+        let mcu = Mcu::new(core_dialect, board, timing, workers, Box::new(outlet));
         let waiter = Waiter::new(core_clock.clone(), margin, scheduling, processors);
         Core::new(self::core::Parts {
             mcu,

@@ -191,10 +191,7 @@ impl Server {
         let Job { ticket, mut errand, holds } = job;
         self.shown.begin();
         let began = self.clock.now();
-        self.clock.begin_errand();
-        errand.run();
-        self.clock.end_errand();
-        let ended = self.clock.now();
+        let ended = self.clock.errand(&mut || errand.run());
         self.shown.end();
         // This does not fail: no more errands are under way than there are boxes, and the queue back
         // is as long as the one that they came by.

@@ -119,7 +119,7 @@ impl Printer {
             let clock = Monotonic::start();
             let config = SimConfig::load(&folder.join("board.toml")).unwrap();
             let board = SimBoard::new(config, Arc::new(clock)).unwrap();
-            let probe = board.probe();
+            let (probe, timing) = (board.probe(), board.timing());
             let options = Options {
                 symlink: folder.join("tty"),
                 access: Access { mode: 0o660, group: None },
@@ -130,7 +130,8 @@ impl Printer {
                 sockets: Vec::new(),
                 dialect: None,
             };
-            let run = move || runtime::run(&options, Box::new(board), clock, Helpers::default(), || {}).unwrap();
+            let run =
+                move || runtime::run(&options, Box::new(board), timing, clock, Helpers::default(), || {}).unwrap();
             Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
         });
         printer.until_state("ready");

@@ -22,7 +22,7 @@
 //!     Dialect, DialectName, Feature, Firmware, Generation, Mcu, Note, Outbox, Response, base, place_of_response,
 //! };
 //! use pinion_firmware::protocol::vlq::{Reader, Writer};
-//! use pinion_firmware::time::{Clock, VirtualClock};
+//! use pinion_firmware::time::{Clock, Timing, VirtualClock};
 //! use pinion_testbench::board::{Bench, FakeBoard, FakeWorkers};
 //!
 //! mod echo {
@@ -70,7 +70,8 @@
 //!     let dialect = Dialect::new(&firmware, &board, DialectName::Of(Generation::Master)).unwrap();
 //!     let (dialect, said) = (Arc::new(dialect), Said::default());
 //!     let workers = Box::new(FakeWorkers::new(bench));
-//!     let mut mcu = Mcu::new(dialect.clone(), Box::new(board), Arc::new(clock), workers, Box::new(said.clone()));
+//!     let timing = Timing::of(Arc::new(clock));
+//!     let mut mcu = Mcu::new(dialect.clone(), Box::new(board), timing, workers, Box::new(said.clone()));
 //!
 //!     // A host sends the command's id and its parameter.
 //!     let mut command = Writer::default();

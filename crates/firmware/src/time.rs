@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Instants and spans in ticks of 20 ns, and where they are read.
+//! Instants and spans in ticks of 20 ns, and what an MCU times itself by.
 
 #![forbid(unsafe_code)]
 
@@ -40,17 +40,17 @@ impl Sub<Ticks> for Clock {
     }
 }
 
-/// Where the machine reads the time.
+/// Where an MCU reads the time.
 pub trait TimeSource: Send + Sync {
     /// The present instant; never earlier than an instant that it told before.
     fn now(&self) -> Clock;
 
-    /// An errand begins on this thread, which may have a time of its own
-    /// ([`crate::board::Board::errand_clock`]).
-    fn begin_errand(&self) {}
-
-    /// The errand has ended.
-    fn end_errand(&self) {}
+    /// Runs the work of an errand on this thread, and tells when it ended. A clock that is not of this world gives
+    /// the work a time of its own.
+    fn errand(&self, work: &mut dyn FnMut()) -> Clock {
+        work();
+        self.now()
+    }
 
     /// The instant that CLOCK_MONOTONIC tells as `monotonic`: the kernel dates by that clock.
     fn instant_of(&self, monotonic: Duration) -> Clock;
@@ -63,6 +63,52 @@ pub trait TimeSource: Send + Sync {
         while self.now() < end {
             std::hint::spin_loop();
         }
+    }
+}
+
+/// What an MCU times itself by.
+#[derive(Clone)]
+pub struct Timing {
+    /// The clock of the core, and of the errands on its workers.
+    pub clock: Arc<dyn TimeSource>,
+    /// What the MCU tells of the timer that runs.
+    pub due: Due,
+    /// How late a step may be before the MCU stops: a motor that is stepped too late loses steps.
+    pub step_late_limit: Ticks,
+}
+
+impl Timing {
+    /// By this clock, with steps that may be 1 ms late, as in the firmware.
+    pub fn of(clock: Arc<dyn TimeSource>) -> Timing {
+        Timing { clock, due: Due::default(), step_late_limit: Ticks::from_us(1000) }
+    }
+}
+
+/// The instant for which the timer that runs was set. The core sets it; a simulated printer reads it, whose parts are
+/// not to feel how late the computer is.
+#[derive(Clone, Debug)]
+pub struct Due(Arc<AtomicU64>);
+
+impl Due {
+    /// No timer runs. No instant has these bits: they lie 11,000 years ahead.
+    const NO_TIMER: u64 = u64::MAX;
+
+    /// A timer runs that was due at this instant; `None`: no timer runs.
+    #[inline]
+    pub fn set(&self, due: Option<Clock>) {
+        self.0.store(due.map_or(Due::NO_TIMER, Clock::to_bits), Ordering::Relaxed);
+    }
+
+    /// When the timer that runs was due; `None` if no timer runs.
+    #[inline]
+    pub fn get(&self) -> Option<Clock> {
+        Some(self.0.load(Ordering::Relaxed)).filter(|bits| *bits != Due::NO_TIMER).map(Clock::from_bits)
+    }
+}
+
+impl Default for Due {
+    fn default() -> Due {
+        Due(Arc::new(AtomicU64::new(Due::NO_TIMER)))
     }
 }
 
@@ -80,14 +126,6 @@ impl VirtualClock {
     /// Moves the clock to `now`; never back.
     pub fn set(&self, now: Clock) {
         self.0.fetch_max(now.ticks(), Ordering::SeqCst);
-    }
-
-    /// Runs `work` in a time of its own that begins now, as another thread does, and tells when it
-    /// ended. The clock itself stands where it stood.
-    pub fn aside(&self, work: impl FnOnce()) -> Clock {
-        let now = self.now();
-        work();
-        Clock::from_ticks(self.0.swap(now.ticks(), Ordering::SeqCst))
     }
 }
 
@@ -108,5 +146,12 @@ impl TimeSource for VirtualClock {
 
     fn spin_until(&self, end: Clock) {
         self.set(end);
+    }
+
+    /// The work has a time of its own that begins now, as on another thread. The clock itself stands where it stood.
+    fn errand(&self, work: &mut dyn FnMut()) -> Clock {
+        let now = self.now();
+        work();
+        Clock::from_ticks(self.0.swap(now.ticks(), Ordering::SeqCst))
     }
 }

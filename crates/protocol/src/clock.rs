@@ -27,6 +27,16 @@ impl Clock {
         self.0.saturating_sub(Clock::EPOCH.0)
     }
 
+    /// The instant as [`Clock::to_bits`] gave it.
+    pub const fn from_bits(bits: u64) -> Clock {
+        Clock(bits)
+    }
+
+    /// The instant as a number that an atomic can hold.
+    pub const fn to_bits(self) -> u64 {
+        self.0
+    }
+
     /// The 32 bits that the host sees.
     pub const fn wire(self) -> u32 {
         self.0 as u32

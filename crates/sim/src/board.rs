@@ -10,7 +10,7 @@ use pinion_firmware::board::{
     PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
 };
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
-use pinion_firmware::time::{Clock, Ticks, TimeSource};
+use pinion_firmware::time::{TimeSource, Timing};
 
 use super::config::SimConfig;
 use super::description::check::SimError;
@@ -20,7 +20,7 @@ use super::engine::led::ColouredLed;
 use super::engine::noise::Noise;
 use super::engine::physics::{Axis, Fan, Heater, Lamp, Switch};
 use super::engine::spi::{MosiPin, SpiBus, SpiDevice};
-use super::engine::time::{ErrandTime, PrinterTime, STEP_LATE_LIMIT};
+use super::engine::time::{PrinterTime, STEP_LATE_LIMIT};
 use super::engine::wire::{
     DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges, SimLine,
     SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
@@ -40,6 +40,8 @@ const MESSAGE_MAX: usize = 4096;
 
 /// A simulated printer.
 pub struct SimBoard {
+    clock: Arc<dyn TimeSource>,
+    /// The time of its pins, and of the MCU that drives them.
     time: Arc<PrinterTime>,
     seed: u64,
     world: Arc<World>,
@@ -59,7 +61,7 @@ impl SimBoard {
         let now = clock.now();
         let mut workshop = Workshop {
             printer,
-            time: Arc::new(PrinterTime::new(clock)),
+            clock: clock.clone(),
             world: World::default(),
             pins: Vec::new(),
             spi_buses: Vec::new(),
@@ -122,9 +124,10 @@ impl SimBoard {
         for bus in &config.spi_buses {
             workshop.wire(Some(&bus.mosi_pin()), MosiPin { bus: bus.name.clone() });
         }
-        let Workshop { time, world, pins, spi_buses, i2c_buses, .. } = workshop;
+        let Workshop { world, pins, spi_buses, i2c_buses, .. } = workshop;
         Ok(SimBoard {
-            time,
+            time: Arc::new(PrinterTime::new(clock.clone())),
+            clock,
             seed: config.seed,
             world: Arc::new(world),
             pins,
@@ -135,7 +138,12 @@ impl SimBoard {
 
     /// A view of the printer for demonstrations, drawings and tests.
     pub fn probe(&self) -> SimProbe {
-        SimProbe { world: self.world.clone(), time: self.time.clone() }
+        SimProbe { world: self.world.clone(), clock: self.clock.clone() }
+    }
+
+    /// The time of the MCU that drives the printer.
+    pub fn timing(&self) -> Timing {
+        Timing { clock: self.time.clone(), due: self.time.due(), step_late_limit: STEP_LATE_LIMIT }
     }
 
     fn pin(&self, pin: Pin, no_pin: ShutdownReason) -> Result<&WiredPin, Shutdown> {
@@ -206,7 +214,7 @@ impl Board for SimBoard {
     fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
         let line = self.line(pin, Direction::Input(bias))?;
         let wired = self.pin(pin, reason::NOT_INPUT)?;
-        let edges = match SimEdges::new(wired.wire.clone(), self.time.clone(), line.line.read()?) {
+        let edges = match SimEdges::new(wired.wire.clone(), self.clock.clone(), line.line.read()?) {
             Some(edges) => Ok(OnWorker { bus: EDGES_WORKER.to_owned(), device: Box::new(edges) as Box<dyn Edges> }),
             None => Err(format!("nobody counts the edges of {}", wired.wire.describe()).into()),
         };
@@ -219,20 +227,8 @@ impl Board for SimBoard {
             return Err(wired.is_no("ADC channel", reason::ADC_OPEN));
         }
         let noise = Noise::of(&wired.name, self.seed);
-        let adc = SimAdc { wire: wired.wire.clone(), time: self.time.clone(), noise };
+        let adc = SimAdc { wire: wired.wire.clone(), clock: self.clock.clone(), noise };
         Ok(OnWorker { bus: ADC_WORKER.to_owned(), device: Box::new(adc) })
-    }
-
-    fn runs(&mut self, due: Option<Clock>) {
-        self.time.set_due(due);
-    }
-
-    fn errand_clock(&self, machine: Arc<dyn TimeSource>) -> Arc<dyn TimeSource> {
-        Arc::new(ErrandTime(machine))
-    }
-
-    fn step_late_limit(&self) -> Ticks {
-        STEP_LATE_LIMIT
     }
 
     fn i2c_buses(&self) -> Vec<Range> {

@@ -5,7 +5,6 @@
 
 use std::sync::Arc;
 
-use super::engine::time::PrinterTime;
 use super::engine::world::World;
 use pinion_firmware::time::{Clock, TimeSource};
 
@@ -13,7 +12,7 @@ use pinion_firmware::time::{Clock, TimeSource};
 #[derive(Clone)]
 pub struct SimProbe {
     pub(super) world: Arc<World>,
-    pub(super) time: Arc<PrinterTime>,
+    pub(super) clock: Arc<dyn TimeSource>,
 }
 
 /// An axis as it stands.
@@ -69,7 +68,7 @@ pub struct OutputView<'a> {
 impl SimProbe {
     /// The instant of the printer's clock.
     pub fn now(&self) -> Clock {
-        self.time.now()
+        self.clock.now()
     }
 
     /// The axes, in the description's order.

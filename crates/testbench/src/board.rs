@@ -759,7 +759,7 @@ impl Workers for FakeWorkers {
             let ago = Ticks(self.bench.clock.now().since(end) as u32);
             self.bench.state().on_worker = true;
             self.bench.ago.store(ago.0, Ordering::Relaxed);
-            let ended = self.bench.clock.aside(|| errand.run()) - ago;
+            let ended = self.bench.clock.errand(&mut || errand.run()) - ago;
             self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;
             if ended == end {

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use pinion_firmware::board::Board;
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Generation, Mcu, Note, Outbox};
-use pinion_firmware::time::{Clock, Ticks, TimeSource, VirtualClock};
+use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing, VirtualClock};
 use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::{Reader, Writer};
@@ -102,7 +102,7 @@ impl Rig {
         let mcu = Mcu::new(
             dialect,
             Box::new(board),
-            Arc::new(clock.clone()),
+            Timing::of(Arc::new(clock.clone())),
             Box::new(workers.clone()),
             Box::new(outbox.clone()),
         );

@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use crate::shutdown::{Shutdown, reason};
-use crate::time::{Clock, Ticks, TimeSource};
+use crate::time::{Ticks, TimeSource};
 
 pub mod soft_i2c;
 pub mod soft_spi;
@@ -456,24 +456,6 @@ pub trait Board: Send {
         let serial = String::from_utf8_lossy(serial);
         let detail = format!("{serial:?}: this board has no one-wire bus: take another sensor");
         Err(Shutdown::because(reason::DS18B20_OPEN, detail))
-    }
-
-    /// How late a step may be before the machine stops, as a motor that is stepped too late loses
-    /// steps. 1 ms, as in the firmware.
-    fn step_late_limit(&self) -> Ticks {
-        Ticks::from_us(1000)
-    }
-
-    /// The machine now runs what was due at this instant; with none, what just came to it. For a
-    /// simulated board, whose parts are not to feel how late the computer is.
-    fn runs(&mut self, due: Option<Clock>) {
-        let _ = due;
-    }
-
-    /// The clock by which workers pace what they do with lines: the machine's own. A simulated board may
-    /// have another, for the same reason.
-    fn errand_clock(&self, machine: Arc<dyn TimeSource>) -> Arc<dyn TimeSource> {
-        machine
     }
 
     /// Forgets all claims. The machine has dropped the lines and devices before.

@@ -11,7 +11,7 @@ use std::sync::Arc;
 use crate::board::{Board, Pin};
 use crate::lateness::Lateness;
 use crate::shutdown::{Shutdown, reason};
-use crate::time::{Clock, Ticks, TimeSource};
+use crate::time::{Clock, Ticks, TimeSource, Timing};
 use pinion_protocol::vlq::{Reader, Writer};
 
 pub mod base;
@@ -79,7 +79,7 @@ const TIMERS_MAX: usize = 2 * OBJECTS_MAX + 3;
 pub struct Mcu {
     /// The moves that are free.
     pub moves: MovePool,
-    clock: Arc<dyn TimeSource>,
+    timing: Timing,
     board: Box<dyn Board>,
     workers: Box<dyn Workers>,
     outbox: Box<dyn Outbox>,
@@ -93,9 +93,6 @@ pub struct Mcu {
     /// The GPIO lines in use.
     claims: Vec<Claim>,
     timers: Timers,
-    /// The instant of the timer whose event runs: in the firmware it is still the queue's
-    /// first, which decides whether an added timer is too close.
-    running: Option<Clock>,
     /// Whether the last timers that ran left some that were due.
     busy: bool,
     last_read: Clock,
@@ -120,16 +117,16 @@ impl Mcu {
     pub fn new(
         dialect: Arc<Dialect>,
         board: Box<dyn Board>,
-        clock: Arc<dyn TimeSource>,
+        timing: Timing,
         workers: Box<dyn Workers>,
         outbox: Box<dyn Outbox>,
     ) -> Mcu {
-        let now = clock.now();
+        let now = timing.clock.now();
         let mut timers = Timers::with_capacity(TIMERS_MAX);
         timers.insert(now + STATS_TICKS, TimerId::STATS);
         let mut mcu = Mcu {
             moves: MovePool::default(),
-            clock,
+            timing,
             board,
             workers,
             outbox,
@@ -139,7 +136,6 @@ impl Mcu {
             pins: Vec::new(),
             claims: Vec::new(),
             timers,
-            running: None,
             busy: false,
             last_read: now,
             commanded: false,
@@ -162,7 +158,7 @@ impl Mcu {
     /// The present instant.
     #[inline]
     pub fn now(&mut self) -> Clock {
-        self.last_read = self.clock.now();
+        self.last_read = self.timing.clock.now();
         self.last_read
     }
 
@@ -173,7 +169,7 @@ impl Mcu {
         if self.last_read < end {
             let now = self.now();
             if now < end {
-                self.clock.spin_until(end.min(now + SPIN_MAX));
+                self.timing.clock.spin_until(end.min(now + SPIN_MAX));
                 self.now();
             }
         }
@@ -181,7 +177,7 @@ impl Mcu {
 
     /// The clock, for what a worker paces by it.
     pub fn clock(&self) -> Arc<dyn TimeSource> {
-        self.board.errand_clock(self.clock.clone())
+        self.timing.clock.clone()
     }
 
     /// The instant that was read last: in the past, by little while timers run.
@@ -200,7 +196,8 @@ impl Mcu {
 
     /// Starts a timer. One that is the next of all and has passed is too close.
     pub fn schedule(&mut self, timer: TimerId, at: Clock) -> Result<(), Shutdown> {
-        let first = self.running.or(self.timers.next());
+        // In the firmware the timer that runs still is the first of the queue.
+        let first = self.timing.due.get().or(self.timers.next());
         self.timers.insert(at, timer);
         if first.is_none_or(|first| at < first) && self.stop.reason.is_none() {
             let late = self.now().since(at);
@@ -273,8 +270,7 @@ impl Mcu {
         if timer.is_exact() {
             self.lateness.record(self.last_read.since(at));
         }
-        self.running = Some(at);
-        self.board.runs(Some(at));
+        self.timing.due.set(Some(at));
         let result = match timer.oid() {
             Some(oid) => match self.take(oid) {
                 Some(mut object) => {
@@ -286,8 +282,7 @@ impl Mcu {
             },
             None => Ok(self.run_own_timer(timer, at)),
         };
-        self.running = None;
-        self.board.runs(None);
+        self.timing.due.set(None);
         match result {
             Ok(Next::At(at)) => self.timers.insert(at, timer),
             Ok(Next::Done) => {}
@@ -524,8 +519,8 @@ impl Mcu {
         self.outbox.note(Note::Reset);
     }
 
-    /// How late a step may be on this board before the machine stops.
+    /// How late a step may be before the machine stops.
     pub fn step_late_limit(&self) -> Ticks {
-        self.board.step_late_limit()
+        self.timing.step_late_limit
     }
 }

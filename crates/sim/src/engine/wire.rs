@@ -168,13 +168,13 @@ impl Line for SimLine {
 /// An ADC at an analog pin.
 pub(crate) struct SimAdc {
     pub(crate) wire: Arc<dyn Wire>,
-    pub(crate) time: Arc<PrinterTime>,
+    pub(crate) clock: Arc<dyn TimeSource>,
     pub(crate) noise: super::noise::Noise,
 }
 
 impl Adc for SimAdc {
     fn read(&mut self) -> Result<u16, Shutdown> {
-        Ok(self.wire.counts(self.time.now(), self.noise.draw()))
+        Ok(self.wire.counts(self.clock.now(), self.noise.draw()))
     }
 }
 
@@ -195,7 +195,7 @@ impl Pwm for SimPwm {
 /// The edges of an input, as a kernel's interrupts would date them.
 pub(crate) struct SimEdges {
     wire: Arc<dyn Wire>,
-    time: Arc<PrinterTime>,
+    clock: Arc<dyn TimeSource>,
     /// How many there were when they were last taken, and the level behind the last of them.
     taken: u64,
     level: bool,
@@ -208,10 +208,10 @@ const EDGES_KEPT: u64 = 1024;
 
 impl SimEdges {
     /// None where the part does not count them. `level` is the line's.
-    pub(crate) fn new(wire: Arc<dyn Wire>, time: Arc<PrinterTime>, level: bool) -> Option<SimEdges> {
-        let last = time.now();
+    pub(crate) fn new(wire: Arc<dyn Wire>, clock: Arc<dyn TimeSource>, level: bool) -> Option<SimEdges> {
+        let last = clock.now();
         let (taken, _) = wire.edges(last)?;
-        Some(SimEdges { wire, time, taken, level, last })
+        Some(SimEdges { wire, clock, taken, level, last })
     }
 }
 
@@ -222,7 +222,7 @@ fn ticks(seconds: f64) -> u64 {
 impl Edges for SimEdges {
     /// A part knows how many there were and when the last one was. The others came evenly before it.
     fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown> {
-        let now = self.time.now();
+        let now = self.clock.now();
         let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.taken, None));
         let new = edges.saturating_sub(self.taken);
         if new == 0 {
@@ -236,7 +236,7 @@ impl Edges for SimEdges {
         for number in dropped + 1..=new {
             let at = now.earlier(ticks(ago_s + (new - number) as f64 * each_s));
             let dropped = if number == dropped + 1 { u32::try_from(dropped).unwrap_or(u32::MAX) } else { 0 };
-            see(Edge { at: self.time.duration_of(at), level: self.level ^ (number % 2 == 1), dropped });
+            see(Edge { at: self.clock.duration_of(at), level: self.level ^ (number % 2 == 1), dropped });
         }
         self.taken = edges;
         self.level ^= new % 2 == 1;

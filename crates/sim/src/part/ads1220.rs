@@ -76,7 +76,7 @@ impl Part for Ads1220Config {
         let drdy = ReadyLine::new("data ready of ads1220");
         workshop.wire(Some(&self.drdy_pin), ReadyPin(drdy.clone()));
         let cell = Cell::new(&self.cell, workshop, self);
-        workshop.solder_spi(self, Ads1220::new(cell, drdy, workshop.time.clone()));
+        workshop.solder_spi(self, Ads1220::new(cell, drdy, workshop.clock.clone()));
         Ok(())
     }
 

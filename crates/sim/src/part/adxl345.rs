@@ -139,13 +139,13 @@ impl Part for Adxl345Config {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
-        let now = workshop.time.now();
+        let now = workshop.clock.now();
         let rings = self.rings().map(|(_, ring)| {
             let ring = ring?;
             Some(Ring::new(workshop.axis(&ring.axis)?, ring, now))
         });
         let noise = workshop.noise(self);
-        workshop.solder_spi(self, Adxl345::new(self, rings, noise, workshop.time.clone()));
+        workshop.solder_spi(self, Adxl345::new(self, rings, noise, workshop.clock.clone()));
         Ok(())
     }
 

@@ -102,7 +102,7 @@ impl Part for AngleConfig {
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         let config = workshop.printer.axis(&self.axis);
         let Some((axis, config)) = workshop.axis(&self.axis).zip(config) else { return Ok(()) };
-        let time = workshop.time.clone();
+        let clock = workshop.clock.clone();
         let shaft = Shaft {
             axis,
             steps_per_turn: FULL_STEPS * f64::from(config.microsteps),
@@ -112,7 +112,7 @@ impl Part for AngleConfig {
         match self.chip {
             AngleChip::A1333 => workshop.solder_spi(self, A1333::new(shaft)),
             AngleChip::As5047d => workshop.solder_spi(self, As5047d::new(shaft)),
-            AngleChip::Tle5012b => workshop.solder_spi(self, Tle5012b::new(shaft, time)),
+            AngleChip::Tle5012b => workshop.solder_spi(self, Tle5012b::new(shaft, clock)),
             AngleChip::Mt6816 => workshop.solder_spi(self, Mt6816::new(shaft)),
             AngleChip::Mt6826s => workshop.solder_spi(self, Mt6826s::new(shaft)),
         }

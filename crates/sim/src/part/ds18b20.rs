@@ -14,7 +14,6 @@ use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, SimError, check, wrong};
 use crate::description::printer::Printer;
 use crate::engine::physics::Heater;
-use crate::engine::time::PrinterTime;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::board::Thermometer;
@@ -57,7 +56,7 @@ impl Part for Ds18b20Config {
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         if let Some(heater) = workshop.heater(&self.heater) {
             let conversion = Duration::from_millis(self.conversion_ms);
-            let thermometer = Ds18b20 { heater, conversion, time: workshop.time.clone() };
+            let thermometer = Ds18b20 { heater, conversion, clock: workshop.clock.clone() };
             let open = move || Box::new(thermometer.clone()) as Box<dyn Thermometer>;
             workshop.world.thermometers.push((self.serial.clone(), Box::new(open)));
         }
@@ -77,13 +76,13 @@ impl Part for Ds18b20Config {
 struct Ds18b20 {
     heater: Arc<Heater>,
     conversion: Duration,
-    time: Arc<PrinterTime>,
+    clock: Arc<dyn TimeSource>,
 }
 
 impl Thermometer for Ds18b20 {
     fn read(&mut self) -> Result<i32, Box<str>> {
         thread::sleep(self.conversion);
-        let sixteenths = (self.heater.at(self.time.now()).celsius * 16.0).floor() as i32;
+        let sixteenths = (self.heater.at(self.clock.now()).celsius * 16.0).floor() as i32;
         Ok((sixteenths * 1000).div_euclid(16))
     }
 }

@@ -176,7 +176,7 @@ impl Part for Ldc1612Config {
         let intb = ReadyLine::new("interrupt of ldc1612");
         workshop.wire(self.intb_pin.as_ref(), ReadyPin(intb.clone()));
         let coil = Coil { config: self.clone(), bed: workshop.bed(), noise: workshop.noise(self) };
-        workshop.solder_i2c(self, Ldc1612::new(coil, intb, workshop.time.clone()));
+        workshop.solder_i2c(self, Ldc1612::new(coil, intb, workshop.clock.clone()));
         Ok(())
     }
 

@@ -84,7 +84,7 @@ impl Part for ServoConfig {
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
-        let servo = Arc::new(Servo::new(self, workshop.time.now()));
+        let servo = Arc::new(Servo::new(self, workshop.clock.now()));
         workshop.wire(Some(&self.pin), PulsePin(servo.clone()));
         workshop.show(servo);
         Ok(())

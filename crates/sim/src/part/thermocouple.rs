@@ -146,7 +146,7 @@ impl Part for ThermocoupleConfig {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         if let Some(heater) = workshop.heater(&self.heater) {
-            workshop.solder_spi(self, Chip::new(self.clone(), heater, workshop.time.clone()));
+            workshop.solder_spi(self, Chip::new(self.clone(), heater, workshop.clock.clone()));
         }
         Ok(())
     }

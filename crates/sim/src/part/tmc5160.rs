@@ -178,7 +178,7 @@ impl Part for Tmc5160Config {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         if let Some(axis) = workshop.axis(&self.axis) {
-            let chip = Tmc5160::new(self.name(), axis, workshop.time.clone());
+            let chip = Tmc5160::new(self.name(), axis, workshop.clock.clone());
             workshop.wire_shared(self.diag1_pin.as_ref(), chip.diag1.clone());
             workshop.solder_spi(self, chip);
         }

@@ -14,11 +14,11 @@ use crate::engine::i2c::{I2cBus, I2cChip};
 use crate::engine::noise::Noise;
 use crate::engine::physics::{Axis, Heater};
 use crate::engine::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
-use crate::engine::time::PrinterTime;
 use crate::engine::wire::{Wire, WiredPin};
 use crate::engine::world::{Sight, World};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
+use pinion_firmware::time::TimeSource;
 
 /// Where a part hangs on a bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -64,7 +64,7 @@ pub(crate) trait Part {
 /// Where a printer is put together.
 pub(crate) struct Workshop<'a> {
     pub(crate) printer: Printer<'a>,
-    pub(crate) time: Arc<PrinterTime>,
+    pub(crate) clock: Arc<dyn TimeSource>,
     pub(crate) world: World,
     pub(crate) pins: Vec<WiredPin>,
     pub(crate) spi_buses: Vec<SpiBus>,

@@ -76,7 +76,7 @@ impl Part for Ws2812Config {
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
         let strip = Arc::new(Strip::new(self));
-        workshop.listen(self, Input { strip: strip.clone(), clock: workshop.time.clone() });
+        workshop.listen(self, Input { strip: strip.clone(), clock: workshop.clock.clone() });
         workshop.show(strip);
         Ok(())
     }
