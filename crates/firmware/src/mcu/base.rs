@@ -149,7 +149,7 @@ const GET_CONFIG: Command = command!("get_config", |mcu| {
     let config = Config {
         is_config: mcu.is_finalized(),
         // klippy resets a machine that another configuration has, before it sends it anything.
-        crc: if mcu.next_dialect.is_some() { !mcu.config_crc } else { mcu.config_crc },
+        crc: if mcu.spoken.next.is_some() { !mcu.configuration.crc } else { mcu.configuration.crc },
         is_shutdown: mcu.is_shutdown(),
         move_count: mcu.moves.count,
     };

@@ -7,11 +7,7 @@
 //! of any size, and no object has more errands under way than it has boxes, so that the queue of a bus
 //! can not grow beyond their number.
 //!
-//! **One order.** The firmware runs a command to its end before it looks at the next, and
-//! acknowledges a block after its last command; klippy relies on both. So an errand that a
-//! command sends *holds*: until it is back, the core runs no further command and leaves the block
-//! unacknowledged ([`Mcu::is_held`]). Timers go on, and errands that they send hold nothing. A
-//! stopped machine is not held.
+//! Commands wait for errands that a command sent (`hold.rs`).
 
 #![forbid(unsafe_code)]
 
@@ -20,7 +16,7 @@ use std::any::Any;
 use crate::shutdown::Shutdown;
 use crate::time::Clock;
 
-use super::{HOLD_LIMIT, Mcu, Oid, TimerId};
+use super::{Mcu, Oid};
 
 #[cfg(doc)]
 use super::Object;
@@ -169,41 +165,6 @@ impl Mcu {
         sent
     }
 
-    /// If a command runs now, makes further commands wait for this object, until [`Mcu::release`] was
-    /// called as often as this. Returns whether they wait.
-    pub fn hold(&mut self, oid: Oid) -> bool {
-        if self.commanded {
-            if self.holds == 0 {
-                self.limit_hold();
-            }
-            self.holds += 1;
-            self.held_by = Some(oid);
-        }
-        self.commanded
-    }
-
-    /// Has the machine stop if commands still wait in [`HOLD_LIMIT`].
-    pub(super) fn limit_hold(&mut self) {
-        self.timers.remove(TimerId::HOLD);
-        let limit = self.now() + HOLD_LIMIT;
-        self.timers.insert(limit, TimerId::HOLD);
-    }
-
-    /// Takes back one [`Mcu::hold`] that returned true.
-    pub fn release(&mut self) {
-        self.holds = self.holds.saturating_sub(1);
-        if self.holds == 0 {
-            self.timers.remove(TimerId::HOLD);
-        }
-    }
-
-    /// Whether no further command may run now, as an errand that a command sent is under way, or a
-    /// `config_reset` waits for the outputs.
-    #[inline]
-    pub fn is_held(&self) -> bool {
-        self.holds > 0 && self.stop.reason.is_none() || self.reset_due
-    }
-
     /// Whether [`Mcu::run_workers`] has something to do.
     #[inline]
     pub fn has_completion(&self) -> bool {
@@ -223,10 +184,10 @@ impl Mcu {
         let Completion { ticket: Ticket { oid, tag }, errand, holds, began, ended } = completion;
         if let Some(mut object) = self.take(oid) {
             // If a command sent this errand, what the object sends now belongs to the command, too.
-            self.commanded = holds;
+            self.hold.is_commanded = holds;
             let done = object.returned(self, oid, Done { tag, errand, began, ended });
             let done = done.map_err(|stop| self.blame(stop, object.kind(), oid));
-            self.commanded = false;
+            self.hold.is_commanded = false;
             self.put_back(oid, object);
             if let Err(shutdown) = done {
                 self.shut_down(shutdown);

@@ -343,8 +343,8 @@ impl Mcu {
 
     fn claim_at_any_time(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
         let pin = self.board.canonical(pin);
-        if let Some(place) = self.claims.iter().position(|claim| claim.pin == pin) {
-            let claim = &mut self.claims[place];
+        if let Some(place) = self.configuration.claims.iter().position(|claim| claim.pin == pin) {
+            let claim = &mut self.configuration.claims[place];
             claim.line.set_direction(direction)?;
             claim.direction = direction;
             claim.shown.begin(direction);
@@ -360,9 +360,9 @@ impl Mcu {
         let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
         let slow = worker.map(|worker| (worker, Calls::new(self.clock())));
         let shown = Arc::new(Level::of(direction));
-        let place = self.claims.len();
-        self.claims.push(Claim { pin, line, slow, direction, shown });
-        Ok(&self.claims[place])
+        let place = self.configuration.claims.len();
+        self.configuration.claims.push(Claim { pin, line, slow, direction, shown });
+        Ok(&self.configuration.claims[place])
     }
 
     /// Claims an output, driven to `level`; it belongs to `shutdown_level` when the machine stops.
@@ -422,7 +422,7 @@ impl Mcu {
             ));
         }
         let own = self.board.canonical(pin);
-        let claimed = self.claims.iter().find(|claim| claim.pin == own);
+        let claimed = self.configuration.claims.iter().find(|claim| claim.pin == own);
         claimed.ok_or_else(|| Shutdown::because(reason::OUTPUT_LINE, "a line that was claimed is in no table"))
     }
 
@@ -470,7 +470,7 @@ impl Mcu {
     /// Those of the board, such as "Unable to open in GPIO chip line".
     pub fn counted_input(&mut self, pin: Pin, bias: Bias) -> Result<(InputLine, CountedEdges), Shutdown> {
         let own = self.board()?.canonical(pin);
-        if self.claims.iter().any(|claim| claim.pin == own) {
+        if self.configuration.claims.iter().any(|claim| claim.pin == own) {
             return Ok((self.input(pin, bias)?, Err("the pin has another use, too, from before".into())));
         }
         let CountedLine { line, edges } = self.board.counted_line(own, bias)?;

@@ -86,12 +86,12 @@ impl Mcu {
     /// Takes an object out of the table, for as long as one of its methods runs.
     #[inline]
     pub(super) fn take(&mut self, oid: Oid) -> Option<Box<dyn Object>> {
-        self.objects.get_mut(oid.index()).and_then(Option::take)
+        self.configuration.objects.get_mut(oid.index()).and_then(Option::take)
     }
 
     #[inline]
     pub(super) fn put_back(&mut self, oid: Oid, object: Box<dyn Object>) {
-        if let Some(slot) = self.objects.get_mut(oid.index()) {
+        if let Some(slot) = self.configuration.objects.get_mut(oid.index()) {
             *slot = Some(object);
         }
     }
@@ -124,11 +124,11 @@ impl Mcu {
             let any = object.as_ref().map(|object| -> &dyn Any { &**object });
             any.is_some_and(|any| any.is::<T>())
         };
-        let place = self.objects.iter().skip(Oid::FIRST_OWN).position(is_it);
-        let index = place.map_or(self.objects.len().max(Oid::FIRST_OWN), |place| Oid::FIRST_OWN + place);
+        let place = self.configuration.objects.iter().skip(Oid::FIRST_OWN).position(is_it);
+        let index = place.map_or(self.configuration.objects.len().max(Oid::FIRST_OWN), |place| Oid::FIRST_OWN + place);
         if place.is_none() {
-            self.objects.resize_with(index, || None);
-            self.objects.push(Some(Box::new(T::default())));
+            self.configuration.objects.resize_with(index, || None);
+            self.configuration.objects.push(Some(Box::new(T::default())));
         }
         Oid::at(index)
     }
@@ -139,13 +139,13 @@ impl Mcu {
     ///
     /// "Invalid oid type" if it stands for none, or its bus is not set.
     pub(super) fn lend(&self, oid: Oid) -> Result<Bus, Shutdown> {
-        let object = self.objects.get(oid.index()).and_then(Option::as_ref);
+        let object = self.configuration.objects.get(oid.index()).and_then(Option::as_ref);
         object.and_then(|object| object.bus()).cloned().ok_or_else(|| not_configured(oid))
     }
 
     /// Whether `f` holds for any object of type `T`.
     pub fn any<T: Object>(&self, mut f: impl FnMut(&T) -> bool) -> bool {
-        self.objects.iter().flatten().any(|object| {
+        self.configuration.objects.iter().flatten().any(|object| {
             let any: &dyn Any = &**object;
             any.downcast_ref::<T>().is_some_and(&mut f)
         })
@@ -176,9 +176,11 @@ impl Mcu {
     pub fn vacant(&self, oid: Oid) -> Result<(), Shutdown> {
         let taken =
             |why: &str| Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, format_args!("oid {} is {why}", oid.index())));
-        match self.objects.get(oid.index()) {
+        match self.configuration.objects.get(oid.index()) {
             _ if self.is_finalized() => taken("assigned after finalize_config"),
-            _ if oid.index() >= self.oid_count => taken("not below the count of allocate_oids"),
+            _ if self.configuration.oid_count.is_none_or(|count| oid.index() >= count) => {
+                taken("not below the count of allocate_oids")
+            }
             Some(Some(_)) => taken("assigned twice"),
             _ => Ok(()),
         }
@@ -202,7 +204,7 @@ impl Mcu {
     /// "Can't assign oid".
     pub fn assign_on(&mut self, pin: Pin, oid: Oid, object: impl Object) -> Result<(), Shutdown> {
         self.assign(oid, object)?;
-        self.pins.push((oid, pin));
+        self.configuration.pins.push((oid, pin));
         Ok(())
     }
 
@@ -214,7 +216,7 @@ impl Mcu {
 
     /// What the log calls an object.
     pub(super) fn name_object(&self, kind: &str, oid: Oid) -> String {
-        match self.pins.iter().find(|(of, _)| *of == oid) {
+        match self.configuration.pins.iter().find(|(of, _)| *of == oid) {
             _ if oid.index() >= Oid::FIRST_OWN => kind.to_owned(),
             Some((_, pin)) => format!("{kind} oid {} ({})", oid.index(), self.name(*pin)),
             None => format!("{kind} oid {}", oid.index()),

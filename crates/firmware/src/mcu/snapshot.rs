@@ -205,7 +205,7 @@ impl Mcu {
     /// Tells the next part of a snapshot: the head first, then a few lines or objects. True once it is whole. It
     /// begins anew if lines or objects came or went meanwhile. Does not allocate.
     pub fn tell(&self, to: &mut Snapshot) -> bool {
-        let shape = (self.claims.len(), self.objects.len());
+        let shape = (self.configuration.claims.len(), self.configuration.objects.len());
         if to.told == 0 || to.shape != shape {
             to.shape = shape;
             to.told = 1;
@@ -216,7 +216,7 @@ impl Mcu {
         let next = (first + ROWS).min(rows);
         for row in first..next {
             match row.checked_sub(shape.0) {
-                None => append(&mut to.lines, self.claims[row].state()),
+                None => append(&mut to.lines, self.configuration.claims[row].state()),
                 Some(index) => {
                     if let Some(state) = self.object_state(index) {
                         append(&mut to.objects, state);
@@ -238,28 +238,28 @@ impl Mcu {
     }
 
     fn tell_head(&self, to: &mut Snapshot) {
-        to.at = self.last_read;
+        to.at = self.schedule.last_read;
         to.is_configured = self.is_finalized();
-        to.oids_allocated = self.oids_allocated;
-        to.dialect = Some(self.dialect.name());
-        let (detail, at) = self.stop.last.as_ref().map_or(("", self.last_read), |(detail, at)| (detail, *at));
+        to.oids_allocated = self.is_allocated();
+        to.dialect = Some(self.spoken.dialect.name());
+        let (detail, at) = self.stop.last.as_ref().map_or(("", self.schedule.last_read), |(detail, at)| (detail, *at));
         to.stopped = self.stop.reason.map(|reason| (reason, at));
         put(&mut to.detail, if self.is_shutdown() { detail } else { "" });
         put(&mut to.debtor, self.debtor().unwrap_or_default());
         to.is_held = self.is_held();
         to.moves = self.moves.used();
-        to.lateness.clone_from(&self.lateness);
+        to.lateness.clone_from(&self.schedule.lateness);
         to.lines.clear();
         to.objects.clear();
         to.queues.clear();
     }
 
     fn object_state(&self, index: usize) -> Option<ObjectState> {
-        let object = self.objects.get(index)?.as_ref()?;
+        let object = self.configuration.objects.get(index)?.as_ref()?;
         Some(ObjectState {
             oid: (index < Oid::FIRST_OWN).then_some(index as u8),
             kind: object.kind(),
-            pin: self.pins.iter().find(|(oid, _)| oid.index() == index).map(|(_, pin)| *pin),
+            pin: self.configuration.pins.iter().find(|(oid, _)| oid.index() == index).map(|(_, pin)| *pin),
             report: object.report(),
             bus: object.counts(),
         })

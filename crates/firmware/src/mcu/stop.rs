@@ -20,12 +20,6 @@ use super::Object;
 /// The pause between two attempts to write a shutdown value.
 pub const RETRY_TICKS: Ticks = Ticks::from_us(50_000);
 
-/// How long commands may wait for an errand before the machine stops. klippy, too, gives up waiting
-/// for an answer after five seconds (`SerialRetryCommand` in serialhdl.py). Without this limit a bus
-/// that hangs would keep the host from stopping the machine: once its window of unacknowledged blocks
-/// is full, it can not even send an `emergency_stop`.
-pub(super) const HOLD_LIMIT: Ticks = Ticks::from_us(5_000_000);
-
 /// How long the machine waits for shutdown values that only it can write: less than the second after which
 /// the guardian takes over.
 const UNGUARDED_LIMIT: Ticks = Ticks::from_us(500_000);
@@ -76,7 +70,7 @@ impl Mcu {
         if first {
             self.stop.owed.iter_mut().for_each(|debt| (debt.since, debt.given_up) = (clock, false));
         }
-        self.timers.clear();
+        self.schedule.timers.clear();
         for oid in self.oids() {
             if let Some(mut object) = self.take(oid) {
                 object.shutdown(self, oid);
@@ -88,7 +82,7 @@ impl Mcu {
         }
         self.stop.under_way = false;
         self.retry_later();
-        let static_string_id = self.dialect.static_string_id(reason);
+        let static_string_id = self.spoken.dialect.static_string_id(reason);
         self.send(base::ShutdownReport { clock, static_string_id });
         if first {
             self.outbox.note(Note::Shutdown(&shutdown));
@@ -162,7 +156,7 @@ impl Mcu {
     }
 
     fn oids(&self) -> impl Iterator<Item = Oid> + use<> {
-        (0..self.objects.len()).map(Oid::at)
+        (0..self.configuration.objects.len()).map(Oid::at)
     }
 
     fn make_safe(&mut self, oid: Oid) {
@@ -172,7 +166,7 @@ impl Mcu {
         self.put_back(oid, object);
         if !matches!(safe, Ok(Safe::Now)) && !self.stop.owed.iter().any(|debt| debt.oid == oid) {
             let name = self.name_object(kind, oid);
-            let since = self.last_read;
+            let since = self.schedule.last_read;
             self.stop.owed.push(Debt { oid, name, failed: false, guarded, since, given_up: false });
         }
         match safe {
@@ -189,9 +183,9 @@ impl Mcu {
     /// up.
     fn retry_later(&mut self) {
         if self.stop.owed.iter().any(|debt| debt.failed || !debt.guarded && !debt.given_up) {
-            self.timers.remove(TimerId::RETRY);
-            let at = self.last_read + RETRY_TICKS;
-            self.timers.insert(at, TimerId::RETRY);
+            self.schedule.timers.remove(TimerId::RETRY);
+            let at = self.schedule.last_read + RETRY_TICKS;
+            self.schedule.timers.insert(at, TimerId::RETRY);
         }
     }
 
@@ -219,28 +213,12 @@ impl Mcu {
         self.retry_later();
     }
 
-    /// The timer of [`HOLD_LIMIT`]: commands have waited too long for an errand.
-    pub(super) fn held_too_long(&mut self) {
-        if self.is_held() {
-            let holder = self.held_by.and_then(|oid| Some((oid, self.objects.get(oid.index())?.as_ref()?.kind())));
-            let what = holder.map_or_else(|| "a device".to_owned(), |(oid, kind)| self.name_object(kind, oid));
-            let detail = format!(
-                "{what} has not answered for {} s: does its bus or its driver hang (dmesg)?",
-                HOLD_LIMIT.0 / crate::time::CLOCK_FREQ
-            );
-            self.shut_down(Shutdown::because(reason::BUS_HANGS, detail));
-        }
-    }
-
     pub(super) fn clear_shutdown(&mut self) -> Result<(), Shutdown> {
         if self.stop.reason.take().is_none() {
             let what = "clear_shutdown came while the machine was not stopped";
             return Err(Shutdown::by_host(reason::NOT_SHUTDOWN, what));
         }
-        // A conversation from before the stop holds commands again. Its limit may be over.
-        if self.holds > 0 {
-            self.limit_hold();
-        }
+        self.hold_again();
         Ok(())
     }
 }

@@ -17,7 +17,7 @@ mod buses;
 mod examples;
 
 use pinion_firmware::board::{Bias, ChipSelect, Line};
-use pinion_firmware::time::{CLOCK_FREQ, Clock, VirtualClock};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, VirtualClock};
 
 /// A board in virtual time.
 struct Bench {

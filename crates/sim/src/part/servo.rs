@@ -22,7 +22,7 @@ use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
-use pinion_firmware::time::{Clock, TimeSource};
+use pinion_firmware::time::Clock;
 
 /// The servo's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]

@@ -1,0 +1,132 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What host and MCU say to each other: commands, responses, and the dialect of both.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use crate::shutdown::{Shutdown, reason};
+use pinion_protocol::vlq::{Reader, Writer};
+
+use super::{Dialect, Generations, Mcu, Response, base};
+
+/// The dialects of the host that configured the MCU, and of one that came since.
+pub(super) struct Spoken {
+    pub(super) dialect: Arc<Dialect>,
+    /// The dialect of a host that came since the MCU was configured.
+    pub(super) next: Option<Arc<Dialect>>,
+}
+
+impl Mcu {
+    /// Runs one command off the front of a block's payload. If it stops the machine, the rest
+    /// of the block is dropped, as in the firmware. None may run while the machine
+    /// [is held](Mcu::is_held).
+    #[inline]
+    pub fn execute(&mut self, payload: &mut Reader<'_>) {
+        let command = *payload;
+        self.schedule.is_behind = false;
+        self.hold.is_commanded = true;
+        let done = self.try_execute(payload);
+        self.hold.is_commanded = false;
+        if let Err(mut shutdown) = done {
+            if shutdown.reason == reason::COMMAND_PARSER {
+                shutdown = self.cut_short(command);
+            }
+            *payload = Reader::new(&[]);
+            self.shut_down(shutdown);
+        }
+    }
+
+    /// Whether a block asks for an emergency stop.
+    pub fn is_emergency(&self, payload: &[u8]) -> bool {
+        self.heard().is_emergency(payload)
+    }
+
+    /// The dialect in which the host speaks that is there, which the machine may not be able to serve yet.
+    pub fn heard(&self) -> &Arc<Dialect> {
+        self.spoken.next.as_ref().unwrap_or(&self.spoken.dialect)
+    }
+
+    /// Says which command ends before its parameters do.
+    #[cold]
+    fn cut_short(&self, mut command: Reader<'_>) -> Shutdown {
+        let id = command.int().ok();
+        let format = id.and_then(|id| self.heard().command(id).ok()).map_or("a command's id", |entry| entry.format);
+        Shutdown::because(
+            reason::COMMAND_PARSER,
+            format!(
+                "a message ends in the middle of \"{format}\": restart the host so that it reads the dictionary anew"
+            ),
+        )
+    }
+
+    #[inline]
+    fn try_execute(&mut self, payload: &mut Reader<'_>) -> Result<(), Shutdown> {
+        let id = payload.int()?;
+        let command = self.heard().command(id)?;
+        let is_foreign = self.spoken.next.is_some() && !command.is_own;
+        match self.stop.reason {
+            // Some of another dialect's commands would run here, on objects that are not their host's.
+            Some(reason) if is_foreign || !command.in_shutdown => {
+                command.skip(payload)?;
+                let static_string_id = self.spoken.dialect.static_string_id(reason);
+                self.send(base::IsShutdown { static_string_id });
+                Ok(())
+            }
+            None if is_foreign => Err(Shutdown::because(
+                reason::INVALID_COMMAND,
+                format!(
+                    "the machine is configured by a host of the dialect {}, and the present one speaks {}: FIRMWARE_RESTART",
+                    self.spoken.dialect.name(),
+                    self.heard().name()
+                ),
+            )),
+            _ => (command.handler)(self, payload),
+        }
+    }
+
+    /// Has the machine speak another dialect, for another host: at once, or, if a host has begun to
+    /// configure it, after the reset. Until then only the messages of the machine itself are exchanged, which
+    /// have the same ids in every dialect: what the objects say would mean something else to the other host, or
+    /// nothing, and klippy's reader ends with the first message that it can not decode. `get_config` tells no
+    /// check sum that the other host could take for its own.
+    /// The same dialect over a board that has changed differs in its names of pins alone.
+    pub fn speak(&mut self, dialect: Arc<Dialect>) {
+        self.spoken.next = None;
+        if dialect.name() == self.spoken.dialect.name() || !self.is_allocated() && !self.is_finalized() {
+            self.spoken.dialect = dialect;
+        } else {
+            self.spoken.next = Some(dialect);
+        }
+    }
+
+    /// The dialect that the machine speaks.
+    pub fn dialect(&self) -> &Arc<Dialect> {
+        &self.spoken.dialect
+    }
+
+    /// Whether the host takes responses of type `R`.
+    pub fn speaks<R: Response>(&self) -> bool {
+        self.spoken.dialect.response_id::<R>().is_some()
+    }
+
+    /// Whether the machine is to behave as for hosts of these generations, where no form of a message
+    /// tells them apart.
+    pub fn serves(&self, hosts: Generations) -> bool {
+        self.spoken.dialect.serves(hosts)
+    }
+
+    /// Sends a response, if the host takes it.
+    pub fn send<R: Response>(&mut self, response: R) {
+        if self.spoken.next.is_some() && !base::is_own_response(R::INDEX) {
+            return;
+        }
+        let Some(id) = self.spoken.dialect.response_id::<R>() else { return };
+        let mut writer = Writer::default();
+        writer.int(id);
+        response.encode(&mut writer);
+        if let Some(payload) = writer.payload() {
+            self.outbox.send(payload);
+        }
+    }
+}

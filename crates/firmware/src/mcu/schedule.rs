@@ -1,0 +1,227 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The MCU's time, and the timers that are due by it.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+
+use crate::lateness::Lateness;
+use crate::shutdown::{Shutdown, reason};
+use crate::time::{Clock, Ticks, TimeSource, Timing};
+
+use super::stats::Stats;
+use super::timers::Timers;
+use super::{Mcu, Next, Note, OBJECTS_MAX, TimerId, WireClock, base};
+
+/// How far a timer may fall behind before the machine stops: 100 ms, as in the firmware.
+const LATE_LIMIT: Ticks = Ticks::from_us(100_000);
+/// The longest wait within a timer's event. Meanwhile nothing else runs, not even a command that stops the machine.
+pub const SPIN_MAX: Ticks = Ticks::from_us(50);
+/// Timers that run before it is looked whether they fall behind, and commands get a turn
+/// (`TIMER_REPEAT_COUNT` of the firmware's linux/timer.c).
+const REPEAT_COUNT: u32 = 20;
+/// The same, where there was no command to run (`TIMER_IDLE_REPEAT_COUNT`).
+const IDLE_REPEAT_COUNT: u32 = 100;
+/// Between two `stats` responses.
+const STATS_TICKS: Ticks = Ticks::from_us(5_000_000);
+/// Two timers for each object and three for the machine.
+const TIMERS_MAX: usize = 2 * OBJECTS_MAX + 3;
+
+/// The time, and the timers that wait for it.
+pub(super) struct Schedule {
+    timing: Timing,
+    pub(super) timers: Timers,
+    pub(super) last_read: Clock,
+    /// Whether the last timers that ran left some that were due.
+    pub(super) is_behind: bool,
+    /// How late the timers were.
+    pub(super) lateness: Lateness,
+    /// How busy the core was.
+    stats: Stats,
+}
+
+impl Schedule {
+    /// A schedule with nothing but the next `stats`.
+    pub(super) fn new(timing: Timing) -> Schedule {
+        let now = timing.clock.now();
+        let mut timers = Timers::with_capacity(TIMERS_MAX);
+        timers.insert(now + STATS_TICKS, TimerId::STATS);
+        let (lateness, stats) = (Lateness::default(), Stats::default());
+        Schedule { timing, timers, last_read: now, is_behind: false, lateness, stats }
+    }
+
+    /// Makes room for all timers that an MCU can have.
+    pub(super) fn reserve(&mut self) {
+        self.timers.reserve(TIMERS_MAX);
+    }
+}
+
+impl Mcu {
+    /// The present instant.
+    #[inline]
+    pub fn now(&mut self) -> Clock {
+        self.schedule.last_read = self.schedule.timing.clock.now();
+        self.schedule.last_read
+    }
+
+    /// Spins until `end`, for [`SPIN_MAX`] at most. No other timer or command runs meanwhile, so this is for spans as
+    /// short as a step's pulse.
+    #[inline]
+    pub fn spin_until(&mut self, end: Clock) {
+        if self.schedule.last_read < end {
+            let now = self.now();
+            if now < end {
+                self.schedule.timing.clock.spin_until(end.min(now + SPIN_MAX));
+                self.now();
+            }
+        }
+    }
+
+    /// The clock, for what a worker paces by it.
+    pub fn clock(&self) -> Arc<dyn TimeSource> {
+        self.schedule.timing.clock.clone()
+    }
+
+    /// The instant that was read last: in the past, by little while timers run.
+    #[inline]
+    pub fn last_read(&self) -> Clock {
+        self.schedule.last_read
+    }
+
+    /// The instant that the host means: the one nearest to now.
+    pub fn instant(&mut self, clock: WireClock) -> Clock {
+        let now = self.now();
+        Clock::widen(clock.0, now)
+    }
+
+    /// Starts a timer. One that is the next of all and has passed is too close.
+    pub fn schedule(&mut self, timer: TimerId, at: Clock) -> Result<(), Shutdown> {
+        // In the firmware the timer that runs still is the first of the queue.
+        let first = self.schedule.timing.due.get().or(self.schedule.timers.next());
+        self.schedule.timers.insert(at, timer);
+        if first.is_none_or(|first| at < first) && self.stop.reason.is_none() {
+            let late = self.now().since(at);
+            if late > 0 {
+                return Err(Shutdown::because(
+                    reason::TIMER_TOO_CLOSE,
+                    format!(
+                        "the host asked for an event {} us after its time: the host or this machine is overloaded",
+                        late as u64 / u64::from(Ticks::from_us(1).0)
+                    ),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// Goes on with an activity of the machine's own: late is late, but no fault of the host.
+    pub fn go_on(&mut self, timer: TimerId, at: Clock) {
+        self.schedule.timers.insert(at, timer);
+    }
+
+    /// Stops a timer, if it runs.
+    pub fn cancel(&mut self, timer: TimerId) {
+        self.schedule.timers.remove(timer);
+    }
+
+    /// The next timer's instant.
+    #[inline]
+    pub fn next_timer(&self) -> Option<Clock> {
+        self.schedule.timers.next()
+    }
+
+    /// The instant of the next timer that the core is to be awake for.
+    #[inline]
+    pub fn next_exact_timer(&self) -> Option<Clock> {
+        self.schedule.timers.next_exact()
+    }
+
+    /// Runs the timers that are due, some at most, so that commands get their turn. True if there
+    /// are more of them: then one command is to have its turn, if there is any.
+    ///
+    /// The firmware runs 20, looks whether they are 100 ms late, lets commands run, and if there
+    /// are none runs 100 more before it looks again; so does this machine, as where it looks
+    /// decides whether it stops.
+    pub fn run_timers(&mut self) -> bool {
+        for _ in 0..if self.schedule.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
+            if self.schedule.timers.next().is_none_or(|at| at > self.schedule.last_read && at > self.now()) {
+                self.schedule.is_behind = false;
+                return false;
+            }
+            self.run_timer();
+        }
+        let late = self.schedule.timers.next().map_or(0, |at| self.now().since(at));
+        if late > i64::from(LATE_LIMIT.0) && self.stop.reason.is_none() {
+            self.shut_down(Shutdown::because(
+                reason::TIMER_PAST,
+                format!(
+                    "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running: run Pinion in real time (-r, as the service does), or move more slowly",
+                    late as u64 / u64::from(Ticks::from_us(1000).0)
+                ),
+            ));
+        }
+        self.schedule.is_behind = self.schedule.timers.next().is_some_and(|at| at <= self.schedule.last_read);
+        self.schedule.is_behind
+    }
+
+    #[inline]
+    fn run_timer(&mut self) {
+        let Some((at, timer)) = self.schedule.timers.pop() else { return };
+        if timer.is_exact() {
+            self.schedule.lateness.record(self.schedule.last_read.since(at));
+        }
+        self.schedule.timing.due.set(Some(at));
+        let result = match timer.oid() {
+            Some(oid) => match self.take(oid) {
+                Some(mut object) => {
+                    let result = object.event(self, timer, at).map_err(|stop| self.blame(stop, object.kind(), oid));
+                    self.put_back(oid, object);
+                    result
+                }
+                None => Ok(Next::Done),
+            },
+            None => Ok(self.run_own_timer(timer, at)),
+        };
+        self.schedule.timing.due.set(None);
+        match result {
+            Ok(Next::At(at)) => self.schedule.timers.insert(at, timer),
+            Ok(Next::Done) => {}
+            Err(shutdown) => self.shut_down(shutdown),
+        }
+    }
+
+    fn run_own_timer(&mut self, timer: TimerId, at: Clock) -> Next {
+        match timer {
+            TimerId::RETRY => self.retry(),
+            TimerId::HOLD => self.held_too_long(),
+            _ => return self.send_stats(at),
+        }
+        Next::Done
+    }
+
+    /// Counts a span in which the core was busy.
+    #[inline]
+    pub fn account(&mut self, busy: Ticks) {
+        self.schedule.stats.add(busy);
+    }
+
+    /// Says in the log how late timers were; `margin` is how early whoever runs them wakes.
+    pub fn report_lateness(&mut self, margin: Ticks) {
+        self.outbox.note(Note::Lateness(&self.schedule.lateness, margin));
+    }
+
+    fn send_stats(&mut self, at: Clock) -> Next {
+        let Stats { count, sum, sumsq } = std::mem::take(&mut self.schedule.stats);
+        // klippy divides by it, and a machine that stood still since the last time counted none.
+        let count = count.max(1);
+        self.send(base::Stats { count, sum, sumsq });
+        // A suspended machine owes no statistics of its sleep.
+        let next = at + STATS_TICKS;
+        Next::At(next.max(self.schedule.last_read))
+    }
+
+    /// How late a step may be before the machine stops.
+    pub fn step_late_limit(&self) -> Ticks {
+        self.schedule.timing.step_late_limit
+    }
+}
