@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What holds of all pages: the form that their blocks are tried in, and that their links lead somewhere.
-//! Whether what they say is true, the tests beside them ask: the commands `tests/lab_system`, what is for
-//! `printer.cfg` `tests/klippy/readme.rs`.
+//! Checks the form of all pages and their links. Other tests check their content: `tests/lab_system` runs their
+//! commands, and `tests/klippy/readme.rs` gives their configurations to klippy.
 
 use std::path::Path;
 
@@ -9,8 +8,8 @@ use pinion_testkit::page::{COMMANDS, Page, pages, reason};
 
 /// What a block may be.
 const KINDS: [&str; 6] = [COMMANDS, "ini", "toml", "text", "diff", "rust"];
-/// The folder of the pages for developers. Their commands stand in indented blocks, and no test runs them.
-const FOR_DEVELOPERS: &str = "docs/develop/";
+/// Where the pages for developers are. Their commands stand in indented blocks, and no test runs them.
+const FOR_DEVELOPERS: [&str; 2] = ["CONTRIBUTING.md", "docs/develop/"];
 
 /// The lines outside of fenced blocks, each with its number counted from 1.
 fn prose(page: &Page) -> Vec<(usize, &str)> {
@@ -65,7 +64,7 @@ fn what_is_not_tried_is_said_in_the_right_place() {
 
 #[test]
 fn users_find_no_commands_that_nobody_tries() {
-    for page in pages().iter().filter(|page| !page.name.starts_with(FOR_DEVELOPERS)) {
+    for page in pages().iter().filter(|page| !FOR_DEVELOPERS.iter().any(|place| page.name.starts_with(place))) {
         let mut after_empty = false;
         for (number, line) in prose(page) {
             assert!(!(after_empty && line.starts_with("    ")), "{}:{number}: an indented block: {line}", page.name);

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! README.md and the pages below docs/, with their fenced blocks. `docs/develop/lab-system.md` says what each kind of
-//! block means.
+//! The pages of the project, with their fenced blocks. `docs/develop/lab-system.md` says what each kind of block means.
 
 use std::fs;
 use std::path::Path;
@@ -32,17 +31,18 @@ pub struct Block {
     pub not_tried: Option<String>,
 }
 
-/// README.md, then the pages below docs/ sorted by name.
+/// The pages of the top folder, README.md first, then those below docs/ sorted by name.
 pub fn pages() -> Vec<Page> {
     let project = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."));
-    let mut names = Vec::new();
+    let mut names: Vec<String> = ["README.md", "CONTRIBUTING.md", "SECURITY.md"].map(str::to_owned).into();
+    let mut below = Vec::new();
     for folder in ["docs", "docs/develop", "docs/guide"] {
         let files = fs::read_dir(project.join(folder)).expect("a folder of pages");
         let files = files.map(|file| format!("{folder}/{}", file.expect("a file").file_name().to_string_lossy()));
-        names.extend(files.filter(|name| name.ends_with(".md")));
+        below.extend(files.filter(|name| name.ends_with(".md")));
     }
-    names.sort();
-    names.insert(0, "README.md".to_owned());
+    below.sort();
+    names.append(&mut below);
     let page = |name: String| Page { text: fs::read_to_string(project.join(&name)).expect("a page"), name };
     names.into_iter().map(page).collect()
 }
