@@ -7,6 +7,7 @@
 //! - [`runtime`]: threads, pty, real time, signals
 //! - [`klippy`]: what can be known of a host from outside
 //! - `foreign`: what others write: files that may be anything, and names that may hold anything
+//! - `status`: what a running Pinion tells, as `pinion status` prints it
 
 // Printing panics when nobody reads, these when something is not as was thought: tests may.
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
@@ -16,6 +17,7 @@ pub mod cli;
 mod foreign;
 pub mod klippy;
 pub mod runtime;
+mod status;
 
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::Firmware;

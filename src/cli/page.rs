@@ -54,6 +54,18 @@ impl Display for Page {
     }
 }
 
+/// The rows of a table as lines: each column is as wide as its widest cell, with two spaces between columns.
+pub(super) fn aligned(rows: &[Vec<String>]) -> Vec<String> {
+    let columns = rows.iter().map(Vec::len).max().unwrap_or(0);
+    let width = |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
+    let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
+    let line = |row: &Vec<String>| -> String {
+        let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}")).collect();
+        cells.join("  ").trim_end().to_owned()
+    };
+    rows.iter().map(line).collect()
+}
+
 /// Prints on stdout. A reader that has closed it, such as `head`, is no failure: the program goes on
 /// with what else it has to do.
 pub(super) fn print(page: &Page) -> Result<(), String> {

@@ -5,6 +5,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::iter;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -19,7 +20,7 @@ use pinion_linux::spi::Node;
 use pinion_linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
 
 use super::failed;
-use super::page::{Page, print};
+use super::page::{Page, aligned, print};
 
 /// Options of `pinion pins`.
 #[derive(Args, Clone, Debug, Default)]
@@ -389,18 +390,10 @@ fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> Page {
     if rows.is_empty() {
         return page;
     }
-    let width = |column: usize| {
-        let cells = rows.iter().filter_map(|row| row.get(column));
-        let title = titles.get(column).map_or(0, |title| title.chars().count());
-        cells.map(|cell| cell.chars().count()).max().unwrap_or(0).max(title)
-    };
-    let widths: Vec<usize> = (0..titles.len()).map(width).collect();
     page.line(heading);
     let titles = titles.iter().map(|title| (*title).to_owned()).collect();
-    for row in std::iter::once(&titles).chain(rows) {
-        let line: String = row.iter().zip(&widths).map(|(cell, width)| format!("  {cell:width$}")).collect();
-        page.line(line.trim_end());
-    }
+    let rows: Vec<Vec<String>> = iter::once(titles).chain(rows.iter().cloned()).collect();
+    aligned(&rows).iter().for_each(|line| page.line(format_args!("  {line}")));
     page
 }
 

@@ -266,11 +266,11 @@ fn a_crowd_is_waited_for_and_then_named() {
     for _ in 0..=crowd.len() {
         let (mut client, _) = listener.accept().unwrap();
         // The crowd does not read.
-        let _ = client.write_all(b"{\"state\": \"waiting\"}");
+        let _ = client.write_all(include_bytes!("../../src/status/recorded.json"));
     }
     let answered = waiting.wait_with_output().unwrap();
     let page = String::from_utf8_lossy(&answered.stdout);
-    assert!(answered.status.success() && page.contains("waiting for a host's configuration"), "{page}");
+    assert!(answered.status.success() && page.contains("ago: Command request: "), "{page}");
 }
 
 #[test]

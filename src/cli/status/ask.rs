@@ -1,0 +1,156 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Asks a running Pinion for its status.
+
+#![forbid(unsafe_code)]
+
+use std::io::{self, Read};
+use std::os::fd::AsFd;
+use std::path::Path;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use serde::Deserialize;
+
+use crate::cli::not_permitted;
+use crate::runtime::socket_paths;
+use crate::runtime::status::connect;
+use crate::status::{self, Status};
+
+use super::StatusArgs;
+
+/// Longest wait for the answer. The server gives its core a second.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// Longest answer that is read.
+const ANSWER_MAX: usize = 4 << 20;
+
+/// What a Pinion answered.
+pub(super) struct Answer {
+    pub(super) status: Status,
+    /// One line about what it told that this version does not know.
+    pub(super) notice: Option<String>,
+}
+
+/// Asks the first of the sockets that answers.
+pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
+    let paths = args.socket.clone().map_or_else(|| socket_paths(&args.symlink), |path| vec![path]);
+    let mut missing = Vec::new();
+    for path in &paths {
+        match document_at(path) {
+            Ok(document) => return answer(path, &document),
+            Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
+                missing.push(path.display().to_string());
+            }
+            Err(error) if error.kind() == io::ErrorKind::PermissionDenied => {
+                return Err(not_permitted(path, path));
+            }
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                return Err(format!(
+                    "{} is asked by too many at once: end those who ask it again and again (sudo ss -xp tells who they are)",
+                    path.display()
+                ));
+            }
+            Err(error) => {
+                return Err(format!("{} gives no answer: {error}; does Pinion hang? (its log)", path.display()));
+            }
+        }
+    }
+    Err(format!(
+        "no Pinion answers on {}: is it running (systemctl status pinion-mcu), and with the link {}?",
+        missing.join(" or "),
+        args.symlink.display()
+    ))
+}
+
+/// Reads a document.
+fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
+    /// What every document has, whatever its version.
+    #[derive(Deserialize)]
+    struct Sender {
+        version: String,
+    }
+    let path = path.display();
+    let own = env!("PINION_VERSION");
+    match status::read(document) {
+        Ok((status, unknown)) => {
+            let notice = (!unknown.is_empty()).then(|| {
+                format!(
+                    "{path}: Pinion {} tells what pinion {own} does not know, and leaves out: {}: use the pinion of that version",
+                    status.version,
+                    unknown.join(", ")
+                )
+            });
+            Ok(Answer { status, notice })
+        }
+        Err(error) => Err(match serde_json::from_slice::<Sender>(document) {
+            Ok(Sender { version }) => format!(
+                "{path}: pinion {own} cannot read the status of Pinion {version}: {error}: use the pinion of that version"
+            ),
+            Err(_) => format!("{path}: what answers there tells no status: {error}: is it a Pinion? (--socket)"),
+        }),
+    }
+}
+
+/// The document that is sent at a socket.
+fn document_at(path: &Path) -> io::Result<Vec<u8>> {
+    let until = Instant::now() + PATIENCE;
+    // Others may ask as well: then it takes a while until there is room for one more.
+    let mut socket = loop {
+        match connect(path) {
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock && Instant::now() < until => {
+                thread::sleep(Duration::from_millis(10));
+            }
+            connected => break connected?,
+        }
+    };
+    let (mut document, mut piece) = (Vec::new(), [0; 16384]);
+    loop {
+        match socket.read(&mut piece) {
+            Ok(0) => return Ok(document),
+            Ok(read) if document.len() + read <= ANSWER_MAX => document.extend_from_slice(&piece[..read]),
+            Ok(_) => return Err(io::Error::other("what it says has no end")),
+            Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
+                let left = until.saturating_duration_since(Instant::now());
+                if left.is_zero() {
+                    return Err(io::ErrorKind::TimedOut.into());
+                }
+                let mut fds = [PollFd::new(socket.as_fd(), PollFlags::POLLIN)];
+                let _ = poll(&mut fds, PollTimeout::try_from(left).unwrap_or(PollTimeout::MAX));
+            }
+            Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+            Err(error) => return Err(error),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::tests::recorded;
+    use serde_json::json;
+
+    fn answered(document: &serde_json::Value) -> Result<Answer, String> {
+        answer(Path::new("/run/pinion/mcu.sock"), document.to_string().as_bytes())
+    }
+
+    #[test]
+    fn a_document_of_another_version_is_read_as_far_as_it_is_known_or_refused_by_name() {
+        let status = recorded();
+        let mut document = json!(status);
+        let same = answered(&document).unwrap();
+        assert_eq!((&same.status, &same.notice), (&status, &None));
+        document["colour"] = json!("red");
+        let more = answered(&document).unwrap();
+        assert_eq!(more.status, status);
+        let notice = more.notice.unwrap();
+        assert!(notice.contains(&format!("Pinion {}", status.version)) && notice.contains(": colour: use"), "{notice}");
+        document["form"] = json!(null);
+        let error = answered(&document).map(|_| ()).unwrap_err();
+        assert!(
+            error.contains(&format!("of Pinion {}: ", status.version)) && error.contains("use the pinion"),
+            "{error}"
+        );
+        let error = answered(&json!({ "HTTP": 1.1 })).map(|_| ()).unwrap_err();
+        assert!(error.starts_with("/run/pinion/mcu.sock: what answers there tells no status: "), "{error}");
+    }
+}

@@ -1,0 +1,286 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion status --watch`: the status again each second.
+
+#![forbid(unsafe_code)]
+
+use std::io::{self, IsTerminal};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::poll::{PollFd, PollFlags, poll};
+use nix::sys::signal::{Signal, raise};
+use nix::sys::termios::{LocalFlags, SetArg, SpecialCharacterIndices, Termios, tcgetattr, tcsetattr};
+use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
+
+use crate::cli::page::{Page, draw};
+use crate::runtime::hang_up;
+use pinion_linux::sys;
+
+use super::ask::ask;
+use super::{StatusArgs, show};
+
+/// Time between two looks.
+const PERIOD: Duration = Duration::from_secs(1);
+
+/// Prints the status each second, until it is asked to end.
+pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
+    let ended = Arc::new(AtomicBool::new(false));
+    let hang_up = hang_up().map_err(|error| error.to_string())?;
+    for signal in [SIGINT, SIGQUIT, SIGTERM].into_iter().chain(hang_up) {
+        signal_hook::flag::register(signal, ended.clone())
+            .map_err(|error| format!("signals can not be taken in: {error}"))?;
+    }
+    // An instance that cannot be asked at first is a mistake. Later it is one that is being restarted.
+    let first = ask(args)?;
+    if let Some(notice) = &first.notice {
+        log::warn!("{notice}");
+    }
+    let mut first = Some(first);
+    let (stdin, stdout) = (io::stdin(), io::stdout());
+    let mut screen = stdout.is_terminal().then(|| Screen::enter(stdin.as_fd()));
+    loop {
+        let page = match first.take().map_or_else(|| ask(args), Ok) {
+            Ok(answer) => show(args, &answer.status),
+            Err(error) => Page::text(&error),
+        };
+        let shown = match &mut screen {
+            Some(screen) => screen.show(page),
+            None => draw(&format!("{page}\n")),
+        };
+        // A reader that is gone wants no more.
+        if shown.is_err() {
+            return Ok(());
+        }
+        let next = Instant::now() + PERIOD;
+        while Instant::now() < next {
+            let wish = match &mut screen {
+                Some(screen) => screen.wish(stdin.as_fd()),
+                None => {
+                    thread::sleep(Duration::from_millis(20));
+                    None
+                }
+            };
+            if let (Some(Wish::Scroll(scroll)), Some(screen)) = (wish, &mut screen)
+                && screen.scroll(scroll).is_err()
+            {
+                return Ok(());
+            }
+            if ended.load(Ordering::Relaxed) || wish == Some(Wish::End) {
+                return Ok(());
+            }
+            if wish == Some(Wish::Stop) {
+                drop(screen.take());
+                // Where nobody could have it go on again, the kernel does not stop it.
+                let _ = raise(Signal::SIGTSTP);
+                screen = Some(Screen::enter(stdin.as_fd()));
+                break;
+            }
+        }
+    }
+}
+
+/// What a key asks for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Wish {
+    /// To end.
+    End,
+    /// To stop until the shell has it go on.
+    Stop,
+    /// To see another part of the page.
+    Scroll(Scroll),
+}
+
+/// Which part of a page.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Scroll {
+    /// So many lines further down.
+    Lines(isize),
+    /// So many screens further down.
+    Screens(isize),
+    Top,
+    Bottom,
+}
+
+/// The keys that scroll, as terminals send them.
+const SCROLL_KEYS: [(&[u8], Scroll); 18] = [
+    (b"\x1b[A", Scroll::Lines(-1)),
+    (b"\x1bOA", Scroll::Lines(-1)),
+    (b"k", Scroll::Lines(-1)),
+    (b"\x1b[B", Scroll::Lines(1)),
+    (b"\x1bOB", Scroll::Lines(1)),
+    (b"j", Scroll::Lines(1)),
+    (b"\x1b[5~", Scroll::Screens(-1)),
+    (b"b", Scroll::Screens(-1)),
+    (b"\x1b[6~", Scroll::Screens(1)),
+    (b" ", Scroll::Screens(1)),
+    (b"\x1b[H", Scroll::Top),
+    (b"\x1bOH", Scroll::Top),
+    (b"\x1b[1~", Scroll::Top),
+    (b"g", Scroll::Top),
+    (b"\x1b[F", Scroll::Bottom),
+    (b"\x1bOF", Scroll::Bottom),
+    (b"\x1b[4~", Scroll::Bottom),
+    (b"G", Scroll::Bottom),
+];
+
+/// The lines of a page that are to be seen.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct View {
+    /// How many are above.
+    above: usize,
+    /// How many there is room for.
+    room: usize,
+}
+
+impl View {
+    /// Moves over a page of so many lines.
+    fn scroll(&mut self, scroll: Scroll, lines: usize) {
+        let lowest = lines.saturating_sub(self.room);
+        // What is at the edge stays in sight.
+        let screen = self.room.saturating_sub(1).max(1) as isize;
+        self.above = match scroll {
+            Scroll::Lines(by) => self.above.saturating_add_signed(by),
+            Scroll::Screens(by) => self.above.saturating_add_signed(by.saturating_mul(screen)),
+            Scroll::Top => 0,
+            Scroll::Bottom => lowest,
+        }
+        .min(lowest);
+    }
+
+    /// The lines of a page that are to be seen, and what is said below them.
+    fn of<'a>(&mut self, page: &'a Page, ends: &str) -> (Vec<&'a str>, String) {
+        let lines = page.lines().count();
+        self.scroll(Scroll::Lines(0), lines);
+        let shown: Vec<&str> = page.lines().skip(self.above).take(self.room).collect();
+        let last = self.above + shown.len();
+        let foot = match lines > self.room {
+            true => format!("lines {} to {last} of {lines}: arrows and page keys show others; {ends}", self.above + 1),
+            false => ends.to_owned(),
+        };
+        (shown, foot)
+    }
+}
+
+/// A terminal that is drawn on in place: its alternate screen, without a cursor, long
+/// lines cut off. Dropped, it is as before.
+struct Screen {
+    /// The settings to give back, if keys can be read.
+    before: Option<Termios>,
+    page: Page,
+    view: View,
+}
+
+impl Screen {
+    fn enter(keys: BorrowedFd<'_>) -> Screen {
+        let before = tcgetattr(keys).ok();
+        if let Some(before) = &before {
+            let mut keyed = before.clone();
+            // Those that make signals are keys, too: the kernel's would leave the terminal as it is here.
+            keyed.local_flags.remove(LocalFlags::ICANON | LocalFlags::ECHO | LocalFlags::ISIG);
+            let _ = tcsetattr(keys, SetArg::TCSANOW, &keyed);
+        }
+        let _ = draw("\x1b[?1049h\x1b[?25l\x1b[?7l");
+        Screen { before, page: Page::default(), view: View::default() }
+    }
+
+    /// Shows a new page, at the place that the last one was seen at.
+    fn show(&mut self, page: Page) -> io::Result<()> {
+        self.page = page;
+        self.draw()
+    }
+
+    fn scroll(&mut self, scroll: Scroll) -> io::Result<()> {
+        self.view.scroll(scroll, self.page.lines().count());
+        self.draw()
+    }
+
+    /// Draws as much of the page as the terminal has rows for.
+    fn draw(&mut self) -> io::Result<()> {
+        self.view.room = sys::terminal_rows(&io::stdout()).unwrap_or(24).saturating_sub(1);
+        let ends = if self.before.is_some() { "q ends" } else { "Ctrl-C ends" };
+        let (lines, foot) = self.view.of(&self.page, ends);
+        let lines: String = lines.iter().map(|line| format!("{line}\x1b[K\r\n")).collect();
+        draw(&format!("\x1b[H{lines}\x1b[J{foot}"))
+    }
+
+    /// What somebody has pressed a key for; waits a little for that.
+    fn wish(&self, keys: BorrowedFd<'_>) -> Option<Wish> {
+        let Some(before) = &self.before else {
+            thread::sleep(Duration::from_millis(20));
+            return None;
+        };
+        let mut fds = [PollFd::new(keys, PollFlags::POLLIN)];
+        if !matches!(poll(&mut fds, 50u16), Ok(1)) {
+            return None;
+        }
+        let mut pressed = [0; 64];
+        match nix::unistd::read(keys, &mut pressed) {
+            Ok(read @ 1..)
+                if let Some((_, scroll)) = SCROLL_KEYS.iter().find(|(key, _)| pressed[..read].starts_with(key)) =>
+            {
+                Some(Wish::Scroll(*scroll))
+            }
+            Ok(read @ 1..) => pressed[..read].iter().find_map(|key| {
+                let is = |special: SpecialCharacterIndices| before.control_chars[special as usize] == *key;
+                match key {
+                    b'q' | b'Q' => Some(Wish::End),
+                    _ if is(SpecialCharacterIndices::VINTR) || is(SpecialCharacterIndices::VQUIT) => Some(Wish::End),
+                    _ => is(SpecialCharacterIndices::VSUSP).then_some(Wish::Stop),
+                }
+            }),
+            Err(nix::errno::Errno::EINTR) => None,
+            // Without a terminal any more there is nobody to show anything.
+            Ok(_) | Err(_) => Some(Wish::End),
+        }
+    }
+}
+
+impl Drop for Screen {
+    fn drop(&mut self) {
+        let _ = draw("\x1b[?7h\x1b[?25h\x1b[?1049l");
+        if let Some(before) = &self.before {
+            let _ = tcsetattr(io::stdin().as_fd(), SetArg::TCSANOW, before);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_page_that_is_longer_than_the_screen_is_scrolled() {
+        let lines = |count: u32| Page::text(&(1..=count).map(|n| format!("line {n}\n")).collect::<String>());
+        let page = lines(40);
+        let mut view = View { above: 0, room: 23 };
+        let mut seen = |scroll: Scroll| {
+            view.scroll(scroll, 40);
+            let (lines, foot) = view.of(&page, "q ends");
+            assert_eq!(lines.len(), 23);
+            assert!(foot.chars().count() < 80 && foot.ends_with("; q ends"), "{foot}");
+            let (first, last) = (lines[0].to_owned(), lines[22].to_owned());
+            assert!(foot.starts_with(&format!("{first} to {}", &last[5..]).replacen("line", "lines", 1)), "{foot}");
+            first
+        };
+        for (scroll, first) in [
+            (Scroll::Lines(0), "line 1"),
+            (Scroll::Lines(-1), "line 1"),
+            (Scroll::Lines(1), "line 2"),
+            (Scroll::Screens(1), "line 18"),
+            (Scroll::Lines(1), "line 18"),
+            (Scroll::Screens(-1), "line 1"),
+            (Scroll::Bottom, "line 18"),
+            (Scroll::Top, "line 1"),
+        ] {
+            assert_eq!(seen(scroll), first, "{scroll:?}");
+        }
+        // A page that has become shorter is seen whole, or from where its last line is the last.
+        let mut view = View { above: 17, room: 23 };
+        assert_eq!(view.of(&lines(25), "q ends").0[0], "line 3");
+        assert_eq!(view.of(&lines(2), "q ends"), (vec!["line 1", "line 2"], "q ends".to_owned()));
+        assert_eq!(View::default().of(&lines(1), "q ends").0.len(), 0, "there is no room");
+    }
+}

@@ -1,0 +1,204 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Makes the status of what the core, the search for the host and the program's start tell.
+
+#![forbid(unsafe_code)]
+
+use std::path::PathBuf;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use serde::{Deserialize, Serialize};
+
+use crate::status::{self, Guardian, Host, McuStatus, State, Status};
+use pinion_firmware::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
+use pinion_firmware::lateness::{Lateness, us};
+use pinion_firmware::mcu::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Snapshot};
+use pinion_firmware::time::{NS_PER_TICK, Ticks};
+
+use super::{Answer, Asker};
+
+/// What is known of the host, as the threads that find it out leave it.
+#[derive(Default)]
+pub(in crate::runtime) struct HostBoard {
+    /// Whether a host has the terminal open. The link says so.
+    attached: AtomicBool,
+    found: Mutex<Option<FoundHost>>,
+}
+
+/// The host that was found.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub(in crate::runtime) struct FoundHost {
+    pub(in crate::runtime) pid: u32,
+    /// Whether this process is the host for certain.
+    pub(in crate::runtime) is_sure: bool,
+    /// The checkout that it runs from, if it is a klippy whose sources can be read.
+    pub(in crate::runtime) checkout: Option<String>,
+    pub(in crate::runtime) commit: Option<String>,
+}
+
+impl HostBoard {
+    pub(in crate::runtime) fn attach(&self, attached: bool) {
+        self.attached.store(attached, Ordering::Relaxed);
+    }
+
+    pub(in crate::runtime) fn found(&self, host: Option<FoundHost>) {
+        *self.found.lock().unwrap_or_else(PoisonError::into_inner) = host;
+    }
+
+    fn host(&self) -> Host {
+        if !self.attached.load(Ordering::Relaxed) {
+            return Host::default();
+        }
+        match self.found.lock().unwrap_or_else(PoisonError::into_inner).clone() {
+            Some(FoundHost { pid, is_sure, checkout, commit }) => {
+                Host { attached: true, pid: Some(pid), sure: Some(is_sure), checkout, commit }
+            }
+            None => Host { attached: true, ..Host::default() },
+        }
+    }
+}
+
+/// What the program knows from its start.
+pub(in crate::runtime) struct Facts {
+    pub(in crate::runtime) link: PathBuf,
+    pub(in crate::runtime) device: PathBuf,
+    /// Description of the board.
+    pub(in crate::runtime) board: String,
+    /// Names of its pins.
+    pub(in crate::runtime) pins: Vec<Range>,
+    /// Where to ask for both again, as chips come and go; `None` if nothing does.
+    pub(in crate::runtime) view: Option<Box<dyn Board>>,
+    /// The guardian's process.
+    pub(in crate::runtime) guardian: Option<u32>,
+    /// How many requests to the core there is room for.
+    pub(in crate::runtime) requests: usize,
+}
+
+/// Writes the status.
+pub(super) struct Reporter {
+    asker: Asker,
+    facts: Facts,
+    host: Arc<HostBoard>,
+    started: Instant,
+}
+
+impl Reporter {
+    pub(super) fn new(asker: Asker, facts: Facts, host: Arc<HostBoard>) -> Reporter {
+        Reporter { asker, facts, host, started: Instant::now() }
+    }
+
+    /// The status now. It asks the core, and waits for it.
+    pub(super) fn status(&mut self) -> Status {
+        let answer = self.asker.ask();
+        let facts = &mut self.facts;
+        if let Some(view) = &facts.view {
+            (facts.board, facts.pins) = (view.describe(), view.pins());
+        }
+        Status {
+            form: status::FORM,
+            version: env!("PINION_VERSION").to_owned(),
+            pid: std::process::id(),
+            uptime_s: rounded(self.started.elapsed().as_secs_f64()),
+            link: facts.link.to_string_lossy().into_owned(),
+            terminal: facts.device.to_string_lossy().into_owned(),
+            board: facts.board.clone(),
+            state: answer.map_or(State::Unknown, |answer| state(&answer.mcu)),
+            host: self.host.host(),
+            // Where it is lost the program ends.
+            guardian: Guardian { present: facts.guardian.is_some(), pid: facts.guardian },
+            mcu: answer.map(|answer| mcu(answer, facts)),
+        }
+    }
+}
+
+fn rounded(value: f64) -> f64 {
+    (value * 1000.0).round() / 1000.0
+}
+
+fn rounded_us(ticks: Ticks) -> f64 {
+    rounded(us(ticks))
+}
+
+fn pin_name(pins: &[Range], pin: Pin) -> String {
+    pins.iter().find_map(|range| range.name_of(pin.0)).unwrap_or_else(|| format!("pin number {}", pin.0))
+}
+
+fn state(mcu: &Snapshot) -> State {
+    match (mcu.stopped, mcu.is_configured, mcu.oids_allocated) {
+        (Some(_), _, _) => State::Shutdown,
+        (None, true, _) => State::Configured,
+        (None, false, true) => State::Configuring,
+        (None, false, false) => State::Waiting,
+    }
+}
+
+fn mcu(Answer { mcu, waiting, margin }: &Answer, facts: &Facts) -> McuStatus {
+    let shutdown = mcu.stopped.map(|(reason, at)| status::Stop {
+        reason: reason.text().to_owned(),
+        detail: mcu.detail.clone(),
+        ago_s: rounded(mcu.at.since(at) as f64 * NS_PER_TICK as f64 / 1e9),
+    });
+    let (queued, room) = mcu.moves;
+    McuStatus {
+        shutdown,
+        owes: (!mcu.debtor.is_empty()).then(|| mcu.debtor.clone()),
+        dialect: mcu.dialect.map(|dialect| dialect.to_string()),
+        lines: mcu.lines.iter().map(|state| line(state, &facts.pins)).collect(),
+        objects: mcu.objects.iter().map(|state| object(state, &facts.pins)).collect(),
+        lateness: lateness(&mcu.lateness, *margin),
+        queues: status::Queues {
+            moves: status::MoveQueue { waiting: queued, size: room },
+            commands: status::CommandQueue { waiting: *waiting, size: facts.requests, held: mcu.is_held },
+            workers: mcu.queues.iter().map(worker).collect(),
+        },
+    }
+}
+
+fn line(state: &LineState, pins: &[Range]) -> status::Line {
+    status::Line {
+        pin: pin_name(pins, state.pin),
+        use_: match state.use_ {
+            LineUse::Output => status::Use::Output,
+            LineUse::Input => status::Use::Input,
+            LineUse::OpenDrain => status::Use::OpenDrain,
+        },
+        level: state.level.map(u8::from),
+        bus: state.bus.map(bus),
+    }
+}
+
+fn object(state: &ObjectState, pins: &[Range]) -> status::Object {
+    status::Object {
+        oid: state.oid,
+        kind: state.kind.to_owned(),
+        pin: state.pin.map(|pin| pin_name(pins, pin)),
+        queued: state.report.queued,
+        value: state.report.value.map(|value| match value {
+            Present::Adc(counts) => status::Present::Adc(rounded(f64::from(counts) / f64::from(ADC_MAX))),
+            Present::Pwm(value) => status::Present::Duty(rounded(f64::from(value) / f64::from(PWM_MAX))),
+            Present::Steps(steps) => status::Present::Steps(steps),
+        }),
+        bus: state.bus.map(bus),
+    }
+}
+
+fn worker(queue: &QueueState) -> status::WorkerQueue {
+    status::WorkerQueue { name: queue.name(), waiting: queue.waiting }
+}
+
+fn bus(BusCounts { transfers, errors, retries }: BusCounts) -> status::BusCounts {
+    status::BusCounts { transfers, errors, retries }
+}
+
+fn lateness(lateness: &Lateness, margin: Ticks) -> status::Lateness {
+    status::Lateness {
+        timers: lateness.samples(),
+        p50_us: rounded_us(lateness.quantile(0.5)),
+        p99_us: rounded_us(lateness.quantile(0.99)),
+        p999_us: rounded_us(lateness.quantile(0.999)),
+        max_us: rounded_us(lateness.max()),
+        margin_us: rounded_us(margin),
+        buckets_us: lateness.buckets().map(|(upper, count)| (rounded_us(upper), count)).collect(),
+    }
+}
