@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The status of a running Pinion: the document on its socket.
 //!
-//! The server fills it in (`runtime/status.rs`). `pinion status` reads it, and prints it as a page, as JSON
+//! The server fills it in (`runtime/status`). `pinion status` reads it, and prints it as a page, as JSON
 //! or as metrics (`cli/status`). The field names are the keys of the JSON. Other programs rely on them, so no
 //! field is renamed, moved or removed. Add a field with `#[serde(default)]`: a running Pinion may be older
 //! than the command that asks it.
