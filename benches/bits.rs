@@ -15,7 +15,9 @@ use pinion_firmware::board::{
     Adc, Board, BusDevice, ClaimedLine, Direction, I2cConfig, Line, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig,
 };
 use pinion_firmware::lateness::Lateness;
-use pinion_firmware::mcu::{Completion, Dialect, DialectName, Generation, Job, Mcu, Note, Outbox, WorkerId, Workers};
+use pinion_firmware::mcu::{
+    Completion, Dialect, DialectName, Generation, Job, Mcu, Note, Outbox, Refused, WorkerId, Workers,
+};
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
 use pinion_linux::clock::Monotonic;
@@ -117,10 +119,10 @@ impl Worker {
         let (outbox, done) = mpsc::channel();
         thread::spawn(move || {
             realtime::enter(Role::Worker);
-            for Job { ticket, mut errand, holds } in inbox {
+            for Job { oid, mut parcel, holds } in inbox {
                 let began = clock.now();
-                errand.run();
-                let _ = outbox.send(Completion { ticket, errand, holds, began, ended: clock.now() });
+                parcel.run();
+                let _ = outbox.send(Completion { oid, parcel, holds, began, ended: clock.now() });
             }
         });
         Worker { jobs, done: Mutex::new(done), waiting: Mutex::new(None) }
@@ -131,7 +133,7 @@ impl Workers for Worker {
     fn start(&mut self, _: &str) -> Result<WorkerId, Shutdown> {
         Ok(WorkerId(0))
     }
-    fn submit(&mut self, _: WorkerId, job: Job) -> Result<(), Shutdown> {
+    fn submit(&mut self, _: WorkerId, job: Job) -> Result<(), Refused> {
         self.jobs.send(job).map_err(|error| panic!("the worker ended: {error}"))
     }
     fn completion(&mut self) -> Option<Completion> {

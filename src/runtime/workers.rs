@@ -10,9 +10,9 @@ use std::thread::{self, JoinHandle, Thread};
 use std::time::Duration;
 
 use log::error;
-use rtrb::{Consumer, Producer, RingBuffer};
+use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
-use pinion_firmware::mcu::{Completion, Job, WorkerId, Workers};
+use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Ticks, TimeSource};
 use pinion_linux::clock::monotonic;
@@ -106,10 +106,13 @@ impl Workers for Threads {
         }
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Shutdown> {
-        let Some(worker) = self.workers.get_mut(worker) else { return Ok(()) };
-        if worker.jobs.push(job).is_err() {
-            return Err(overflow(&worker.bus, "more is asked of it at once than there are devices; please report it"));
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
+        let Some(worker) = self.workers.get_mut(worker) else {
+            return Err(Refused { job, why: overflow("a bus", "it is not there; please report it") });
+        };
+        if let Err(PushError::Full(job)) = worker.jobs.push(job) {
+            let why = overflow(&worker.bus, "more is asked of it at once than there are devices; please report it");
+            return Err(Refused { job, why });
         }
         worker.thread.thread().unpark();
         Ok(())
@@ -188,14 +191,14 @@ impl Server {
     }
 
     fn serve(&mut self, job: Job) {
-        let Job { ticket, mut errand, holds } = job;
+        let Job { oid, mut parcel, holds } = job;
         self.shown.begin();
         let began = self.clock.now();
-        let ended = self.clock.errand(&mut || errand.run());
+        let ended = self.clock.errand(&mut || parcel.run());
         self.shown.end();
         // This does not fail: no more errands are under way than there are boxes, and the queue back
         // is as long as the one that they came by.
-        let _ = self.done.push(Completion { ticket, errand, holds, began, ended });
+        let _ = self.done.push(Completion { oid, parcel, holds, began, ended });
         self.core.unpark();
         // Samples, which timers ask for, come at their own pace.
         if holds {
@@ -207,7 +210,7 @@ impl Server {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_firmware::mcu::{Errand, Oid, Ticket};
+    use pinion_firmware::mcu::{Oid, Parcel};
     use pinion_firmware::time::Clock;
     use pinion_linux::clock::Monotonic;
     use std::sync::atomic::AtomicU64;
@@ -220,7 +223,7 @@ mod tests {
         said: Sender<u8>,
     }
 
-    impl Errand for Slow {
+    impl Parcel for Slow {
         fn run(&mut self) {
             let _ = self.go_on.lock().unwrap().recv();
             let _ = self.said.send(self.number);
@@ -247,8 +250,13 @@ mod tests {
 
     struct Quick;
 
-    impl Errand for Quick {
+    impl Parcel for Quick {
         fn run(&mut self) {}
+    }
+
+    fn submit(threads: &mut Threads, worker: WorkerId, parcel: Box<dyn Parcel>, holds: bool) {
+        let taken = threads.submit(worker, Job { oid: Oid::new(0), parcel, holds });
+        assert!(taken.is_ok());
     }
 
     /// How often a worker looks at its clock after it was given a job, until it sleeps.
@@ -270,8 +278,7 @@ mod tests {
             }
         };
         let before = asleep();
-        let ticket = Ticket { oid: Oid::new(0), tag: 0 };
-        threads.submit(worker, Job { ticket, errand: Box::new(Quick), holds }).unwrap();
+        submit(&mut threads, worker, Box::new(Quick), holds);
         while threads.completion().is_none() {
             thread::yield_now();
         }
@@ -300,9 +307,8 @@ mod tests {
         let worker = threads.start("pwm").unwrap();
         assert_eq!(threads.start("pwm").unwrap(), worker);
         for number in 0..5 {
-            let errand = Box::new(Slow { go_on: go_on.clone(), number, said: said.clone() });
-            let ticket = Ticket { oid: Oid::new(0), tag: number };
-            threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+            let slow = Slow { go_on: go_on.clone(), number, said: said.clone() };
+            submit(&mut threads, worker, Box::new(slow), false);
         }
         drop(release);
         threads.reset();
@@ -318,9 +324,8 @@ mod tests {
         let mut threads = threads();
         let worker = threads.start("i2c1").unwrap();
         for number in 0..2 {
-            let errand = Box::new(Slow { go_on: go_on.clone(), number, said: said.clone() });
-            let ticket = Ticket { oid: Oid::new(0), tag: number };
-            threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+            let slow = Slow { go_on: go_on.clone(), number, said: said.clone() };
+            submit(&mut threads, worker, Box::new(slow), false);
         }
         drop(said);
         threads.reset();
@@ -341,9 +346,7 @@ mod tests {
         let worker = threads.start("w1 28-1").unwrap();
         threads.leave_behind(worker);
         let waiting = |threads: &Threads| QUEUE_JOBS - threads.workers[0].jobs.slots();
-        let errand = Box::new(Slow { go_on, number: 7, said });
-        let ticket = Ticket { oid: Oid::new(0), tag: 0 };
-        threads.submit(worker, Job { ticket, errand, holds: false }).unwrap();
+        submit(&mut threads, worker, Box::new(Slow { go_on, number: 7, said }), false);
         // What is not under way yet is dropped.
         while waiting(&threads) > 0 {
             thread::sleep(Duration::from_millis(1));

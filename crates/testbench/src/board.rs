@@ -10,7 +10,7 @@ use pinion_firmware::board::{
     self, Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges, I2cConfig,
     Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig, Thermometer,
 };
-use pinion_firmware::mcu::{Completion, Job, WorkerId, Workers};
+use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 
@@ -726,7 +726,7 @@ impl Workers for FakeWorkers {
         })))
     }
 
-    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: Job) -> Result<(), Shutdown> {
+    fn submit(&mut self, WorkerId(worker): WorkerId, mut job: Job) -> Result<(), Refused> {
         let takes = Ticks(self.bench.state().answer_ticks);
         let at_once = self.bench.state().byte_ticks != 0;
         let mut shop = self.shop.lock().unwrap();
@@ -735,10 +735,10 @@ impl Workers for FakeWorkers {
         let mut end = begin + takes;
         let work = if at_once {
             self.bench.state().bus_now = Some(end);
-            job.errand.run();
+            job.parcel.run();
             end = self.bench.state().bus_now.take().unwrap_or(end);
-            let Job { ticket, errand, holds } = job;
-            Work::Done(Completion { ticket, errand, holds, began: begin, ended: end })
+            let Job { oid, parcel, holds } = job;
+            Work::Done(Completion { oid, parcel, holds, began: begin, ended: end })
         } else {
             Work::ToDo(job)
         };
@@ -752,22 +752,22 @@ impl Workers for FakeWorkers {
     fn completion(&mut self) -> Option<Completion> {
         while self.has_completion() {
             let UnderWay { worker, begin: began, end, work } = self.shop.lock().unwrap().under_way.pop_front()?;
-            let Job { ticket, mut errand, holds } = match work {
+            let Job { oid, mut parcel, holds } = match work {
                 Work::ToDo(job) => job,
                 Work::Done(completion) => return Some(completion),
             };
             let ago = Ticks(self.bench.clock.now().since(end) as u32);
             self.bench.state().on_worker = true;
             self.bench.ago.store(ago.0, Ordering::Relaxed);
-            let ended = self.bench.clock.errand(&mut || errand.run()) - ago;
+            let ended = self.bench.clock.errand(&mut || parcel.run()) - ago;
             self.bench.ago.store(0, Ordering::Relaxed);
             self.bench.state().on_worker = false;
             if ended == end {
-                return Some(Completion { ticket, errand, holds, began, ended });
+                return Some(Completion { oid, parcel, holds, began, ended });
             }
             let mut shop = self.shop.lock().unwrap();
             shop.delay(worker, ended, Ticks(ended.since(end) as u32));
-            let work = Work::Done(Completion { ticket, errand, holds, began, ended });
+            let work = Work::Done(Completion { oid, parcel, holds, began, ended });
             shop.insert(UnderWay { worker, begin: began, end: ended, work });
         }
         None

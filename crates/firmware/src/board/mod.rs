@@ -217,7 +217,7 @@ pub enum BusStatus {
 }
 
 /// Why a conversation with a chip failed.
-#[derive(Debug, PartialEq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct BusError {
     /// How the bus answered, for the wire.
     pub status: BusStatus,

@@ -8,15 +8,15 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Conversation, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Ticket,
+    Command, Conversation, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Oid, Slot, Turn,
     command, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
 
-use super::ready_adc::{
-    Frame, ReadyChip, Sample, attach, attach_probe, configure_spi, query, query_status, signed_24, spi_result,
-};
+use super::ready_adc::{Frame, ReadyChip, Sample, attach, attach_probe, configure_spi, query, query_status, signed_24};
+use super::spi::spi_shutdown;
+use crate::board::BusError;
 
 pub(super) const FEATURE: Feature = Feature {
     name: "ads1220",
@@ -40,16 +40,16 @@ impl ReadyChip for Ads1220 {
     const NAME: &'static str = "ADS1220";
     type Reading = Conversation<Frame<SAMPLE_BYTES>>;
 
-    fn read(&mut self, mcu: &mut Mcu, ticket: Ticket, reading: Box<Self::Reading>) -> Result<(), Shutdown> {
-        mcu.converse(self.spi, ticket, reading)
+    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown> {
+        reading.converse(turn, self.spi)
     }
 
-    fn result(reading: &mut Self::Reading) -> Result<(), Shutdown> {
-        spi_result(reading)
+    fn stop(failure: &BusError) -> Shutdown {
+        spi_shutdown(failure.clone())
     }
 
-    fn sample(&mut self, reading: &Self::Reading, _late: bool) -> Sample {
-        Sample::Value(reading.talk.received().first_chunk().map_or(0, |bytes| signed_24(*bytes)))
+    fn sample(&mut self, frame: Frame<SAMPLE_BYTES>, _late: bool) -> Sample {
+        Sample::Value(frame.received().first_chunk().map_or(0, |bytes| signed_24(*bytes)))
     }
 }
 

@@ -8,7 +8,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Conversation, Enumeration, Feature, Generation::Kalico, Generation::Master, Mcu, Oid, Ticket, command,
+    Command, Conversation, Enumeration, Feature, Generation::Kalico, Generation::Master, Oid, Slot, Turn, command,
     since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
@@ -17,8 +17,9 @@ use crate::time::Ticks;
 use super::named;
 use super::ready_adc::{
     CHANNELS_MAX, Frame, ReadyChip, Sample, attach, attach_probe, configure_spi, query, query_status, signed_24,
-    spi_result,
 };
+use super::spi::spi_shutdown;
+use crate::board::BusError;
 
 pub(super) const FEATURE: Feature = Feature {
     name: "ads131m0x",
@@ -156,16 +157,16 @@ impl ReadyChip for Ads131m0x {
     const NAME: &'static str = "ADS131M0x";
     type Reading = Conversation<Frame<FRAME_MAX>>;
 
-    fn read(&mut self, mcu: &mut Mcu, ticket: Ticket, reading: Box<Self::Reading>) -> Result<(), Shutdown> {
-        mcu.converse(self.spi, ticket, reading)
+    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown> {
+        reading.converse(turn, self.spi)
     }
 
-    fn result(reading: &mut Self::Reading) -> Result<(), Shutdown> {
-        spi_result(reading)
+    fn stop(failure: &BusError) -> Shutdown {
+        spi_shutdown(failure.clone())
     }
 
-    fn sample(&mut self, reading: &Self::Reading, _late: bool) -> Sample {
-        self.judge(decode(reading.talk.received()))
+    fn sample(&mut self, frame: Frame<FRAME_MAX>, _late: bool) -> Sample {
+        self.judge(decode(frame.received()))
     }
 
     fn channels(&self) -> usize {
@@ -175,7 +176,7 @@ impl ReadyChip for Ads131m0x {
         }
     }
 
-    fn switch(&mut self, _mcu: &mut Mcu, _oid: Oid, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, _turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
         if on {
             self.was_reset = false;
         }

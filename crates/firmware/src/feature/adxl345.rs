@@ -9,12 +9,12 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Command, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, response, since, until,
+    Command, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, since, until,
 };
-use crate::time::{Clock, Ticks};
+use crate::time::Ticks;
 
 use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_at, query_status};
-use super::sensor_bulk::{BulkData, Status, Words};
+use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "adxl345",
@@ -23,42 +23,23 @@ pub(super) const FEATURE: Feature = Feature {
     ..Feature::EMPTY
 };
 
-response! {
-    /// Samples.
-    "adxl345_data oid=%c sequence=%hu data=%*s" => until(V0_12);
-    pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
-}
-
-response! {
-    /// How many samples there were, of them `fifo` in the chip.
+own_words! {
+    "adxl345_data oid=%c sequence=%hu data=%*s",
     "adxl345_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => until(V0_12);
-    pub(super) struct OwnStatus {
-        oid: Oid,
-        clock: Clock,
-        query_ticks: u32,
-        next_sequence: u16,
-        buffered: u8,
-        fifo: u8,
-        limit_count: u16
-    }
+    data_max: 50, sample_bytes: SAMPLE_BYTES, fifo: u8
 }
 
-const OWN_WORDS: Words = Words {
-    data_max: 50,
-    data: |mcu, BulkData { oid, sequence, data }| mcu.send(OwnData { oid, sequence, data }),
-    status: |mcu, Status { oid, clock, query_ticks, next_sequence, in_message, in_sensor, possible_overflows }| {
-        let fifo = (in_sensor / SAMPLE_BYTES as u32) as u8;
-        let (buffered, limit_count) = (in_message, possible_overflows);
-        mcu.send(OwnStatus { oid, clock, query_ticks, next_sequence, buffered, fifo, limit_count });
-    },
-};
+/// "Register Map".
+#[derive(Clone, Copy)]
+enum Register {
+    PowerCtl = 0x2d,
+    /// The first of the six data registers; FIFO_CTL and FIFO_STATUS follow them.
+    DataX0 = 0x32,
+    FifoStatus = 0x39,
+}
 
-const POWER_CTL: u8 = 0x2d;
 /// Measure, of POWER_CTL.
 const MEASURE: u8 = 0x08;
-/// DATAX0, the first of the six data registers; FIFO_CTL and FIFO_STATUS follow them.
-const DATAX0: u8 = 0x32;
-const FIFO_STATUS: u8 = 0x39;
 /// Bits of the first byte.
 const READ: u8 = 0x80;
 const MULTIPLE_BYTES: u8 = 0x40;
@@ -100,11 +81,11 @@ impl FifoChip for Adxl345 {
     const KEEPS_SAMPLES: bool = true;
 
     fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.send(&[POWER_CTL, MEASURE])
+        chip.send(&[Register::PowerCtl as u8, MEASURE])
     }
 
     fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.send(&[POWER_CTL, 0])
+        chip.send(&[Register::PowerCtl as u8, 0])
     }
 
     fn bus_type(self) -> BusType {
@@ -113,7 +94,7 @@ impl FifoChip for Adxl345 {
 
     fn read(self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError> {
         while reading.has_room(SAMPLE_BYTES) {
-            let mut message = [DATAX0 | READ | MULTIPLE_BYTES, 0, 0, 0, 0, 0, 0, 0, 0];
+            let mut message = [Register::DataX0 as u8 | READ | MULTIPLE_BYTES, 0, 0, 0, 0, 0, 0, 0, 0];
             chip.exchange(&mut message)?;
             let (sample, filled) = decode(&message);
             reading.push(&sample, filled, FULL);
@@ -125,7 +106,7 @@ impl FifoChip for Adxl345 {
     }
 
     fn fill(self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError> {
-        let mut message = [FIFO_STATUS | READ, 0];
+        let mut message = [Register::FifoStatus as u8 | READ, 0];
         chip.exchange(&mut message)?;
         let filled = entries(message[1]);
         let bytes = u16::from(filled) * SAMPLE_BYTES as u16;

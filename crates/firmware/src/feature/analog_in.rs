@@ -8,9 +8,9 @@
 
 use crate::board::{ADC_MAX, Adc, OnWorker, Pin};
 use crate::mcu::{
-    BusCounts, Calls, Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master,
-    Generation::V0_13, Mcu, Next, Object, Oid, Present, Report, Response, Ticket, TimerId, Unread, WireClock, WorkerId,
-    command, response, since, until,
+    Back, BusCounts, Calls, Command, Constant, Done, Errand, Feature, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Mcu, Next, Object, Oid, Present, Report, Response, Slot, Timer, Turn, Unread, WireClock,
+    WorkerId, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -49,16 +49,20 @@ response! {
 const REPORT_BYTES: usize = 48;
 const SAMPLE_BYTES: usize = 2;
 
-/// One reading of a channel. Each input has one box of these, which is used again and again.
+const TIMER: Timer = Timer::sampling(0);
+
+/// One reading of a channel.
 struct Reading {
     adc: Box<dyn Adc>,
     calls: Calls,
-    counts: Result<u16, Shutdown>,
 }
 
 impl Errand for Reading {
-    fn run(&mut self) {
-        self.counts = self.calls.repeat(|| self.adc.read());
+    type Answer = u16;
+    type Failure = Shutdown;
+
+    fn run(&mut self) -> Result<u16, Shutdown> {
+        self.calls.repeat(|| self.adc.read())
     }
 }
 
@@ -101,8 +105,7 @@ struct Query {
 
 struct AnalogIn {
     worker: WorkerId,
-    /// None while the ADC is being read: then the worker has the box.
-    reading: Option<Box<Reading>>,
+    reading: Slot<Reading>,
     calls: Calls,
     unread: Unread,
     /// Whether a sample waits until the ADC is done with one of an earlier query.
@@ -121,9 +124,6 @@ struct AnalogIn {
     invalid_count: u8,
     report: [u8; REPORT_BYTES],
     report_len: usize,
-    /// Changes with every [`AnalogIn::restart`]: a reading with another tag was begun before it, and
-    /// does not count.
-    tag: u8,
     attached: Attached,
 }
 
@@ -132,21 +132,17 @@ impl AnalogIn {
         self.taken = 0;
         self.sum = 0;
         self.waiting = false;
-        self.tag = self.tag.wrapping_add(1);
+        self.reading.drop_pending();
     }
 
     /// Has the worker read the ADC, or remembers to once the reading under way is back.
-    fn sample(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        match self.reading.take() {
-            Some(reading) => {
-                self.unread.asked(mcu.now());
-                mcu.dispatch(self.worker, Ticket { oid, tag: self.tag }, reading)
-            }
-            None => {
-                self.waiting = true;
-                Ok(())
-            }
+    fn sample(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        if !self.reading.is_here() {
+            self.waiting = true;
+            return Ok(());
         }
+        self.unread.asked(turn.now());
+        self.reading.send(turn, self.worker)
     }
 
     /// Moves `next_begin` on by `rest_ticks`, or by as many of them as it takes to lie in the future:
@@ -187,8 +183,8 @@ impl AnalogIn {
         ))
     }
 
-    fn query(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, query: Query) -> Result<(), Shutdown> {
-        mcu.cancel(TimerId::sampling(oid, 0));
+    fn query(&mut self, turn: &mut Turn, at: Clock, query: Query) -> Result<(), Shutdown> {
+        turn.cancel(TIMER);
         self.restart();
         self.next_begin = at;
         self.query = query;
@@ -196,18 +192,18 @@ impl AnalogIn {
         if query.sample_count == 0 {
             return Ok(());
         }
-        mcu.schedule(TimerId::sampling(oid, 0), at)
+        turn.schedule(TIMER, at)
     }
 
-    fn report(&mut self, mcu: &mut Mcu, oid: Oid) {
+    fn report(&mut self, turn: &mut Turn) {
         let Some(bytes_per_report) = self.query.bytes_per_report else {
-            return mcu.send(State { oid, next_clock: self.next_begin, value: self.sum });
+            return turn.send(State { oid: turn.oid(), next_clock: self.next_begin, value: self.sum });
         };
         let bytes = self.sum.to_le_bytes();
         self.report[self.report_len..self.report_len + SAMPLE_BYTES].copy_from_slice(&bytes);
         self.report_len += SAMPLE_BYTES;
         if !bytes_per_report.has_room(self.report_len) {
-            mcu.send(Batch { oid, next_clock: self.next_begin, values: &self.report[..self.report_len] });
+            turn.send(Batch { oid: turn.oid(), next_clock: self.next_begin, values: &self.report[..self.report_len] });
             self.report_len = 0;
         }
     }
@@ -218,55 +214,49 @@ impl Object for AnalogIn {
         "analog input"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         self.sample_at = at;
-        if let Some(oid) = timer.oid() {
-            self.sample(mcu, oid)?;
-        }
+        self.sample(turn)?;
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let (tag, read_at) = (done.tag, done.ended);
-        let Some(reading) = done.errand::<Reading>() else { return Ok(()) };
-        let reading = self.reading.insert(reading);
-        if reading.counts.is_ok() {
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, counts, ended: read_at, .. }) = self.reading.back(done) else { return Ok(()) };
+        if result.is_ok() {
             self.unread.read();
         }
-        if tag != self.tag {
-            return if std::mem::take(&mut self.waiting) { self.sample(mcu, oid) } else { Ok(()) };
+        if !counts {
+            return if std::mem::take(&mut self.waiting) { self.sample(turn) } else { Ok(()) };
         }
-        let timer = TimerId::sampling(oid, 0);
-        // A failure stays in its box, as the core would free it.
-        let counts = match &reading.counts {
-            Ok(counts) => *counts,
+        let sample = match result {
+            Ok(sample) => sample,
             Err(failure) => {
                 // A move may depend on it.
                 let at_once = !matches!(self.attached, Attached::Nothing);
                 if at_once || self.unread.is_too_long(read_at) {
-                    mcu.try_shut_down(failure.clone())?;
+                    turn.try_shut_down(failure.clone())?;
                 }
                 // This sum is given up, and the next one begins in its turn.
                 self.restart();
-                self.skip_missed(mcu.now());
-                mcu.go_on(timer, self.next_begin);
+                self.skip_missed(turn.now());
+                turn.go_on(TIMER, self.next_begin);
                 return Ok(());
             }
         };
-        self.last = Some(counts);
-        self.sum = self.sum.wrapping_add(counts);
+        self.last = Some(sample);
+        self.sum = self.sum.wrapping_add(sample);
         self.taken += 1;
-        let now = mcu.now();
+        let now = turn.now();
         if self.taken < self.query.sample_count {
-            mcu.go_on(timer, (self.sample_at + self.query.sample_ticks).max(now));
+            turn.go_on(TIMER, (self.sample_at + self.query.sample_ticks).max(now));
             return Ok(());
         }
-        self.check_range(mcu)?;
+        self.check_range(turn)?;
         self.skip_missed(now);
-        self.attached.update(mcu, self.sum.into(), read_at)?;
-        self.report(mcu, oid);
+        self.attached.update(turn, self.sum.into(), read_at)?;
+        self.report(turn);
         self.restart();
-        mcu.go_on(timer, self.next_begin);
+        turn.go_on(TIMER, self.next_begin);
         Ok(())
     }
 
@@ -278,7 +268,7 @@ impl Object for AnalogIn {
         Some(self.calls.counts())
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
+    fn shutdown(&mut self, turn: &mut Turn) {
         // A reading that is under way does not count any more.
         self.restart();
         self.attached = Attached::default();
@@ -288,8 +278,8 @@ impl Object for AnalogIn {
         }
         // Sampling goes on, as in the firmware, so that the host sees the temperatures of a stopped
         // machine, too.
-        self.skip_missed(mcu.now());
-        mcu.go_on(TimerId::sampling(oid, 0), self.next_begin);
+        self.skip_missed(turn.now());
+        turn.go_on(TIMER, self.next_begin);
     }
 }
 
@@ -299,7 +289,7 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
     let calls = Calls::new(mcu.clock());
     let input = AnalogIn {
         worker: mcu.worker(&bus)?,
-        reading: Some(Box::new(Reading { adc, calls: calls.clone(), counts: Ok(0) })),
+        reading: Slot::new(Reading { adc, calls: calls.clone() }),
         calls,
         unread: Unread::default(),
         waiting: false,
@@ -312,7 +302,6 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
         invalid_count: 0,
         report: [0; REPORT_BYTES],
         report_len: 0,
-        tag: 0,
         attached: Attached::default(),
     };
     mcu.assign_on(pin, oid, input)
@@ -333,7 +322,7 @@ const QUERY_ANALOG_IN: Command = command!(
         let bytes_per_report = None;
         let query =
             Query { sample_ticks, sample_count, rest_ticks, min_value, max_value, range_check_count, bytes_per_report };
-        mcu.with::<AnalogIn, _>(oid, |input, mcu| input.query(mcu, oid, at, query))
+        mcu.with::<AnalogIn, _>(oid, |input, turn| input.query(turn, at, query))
     }
 )
 .of(until(V0_13).and(Kalico));
@@ -351,7 +340,7 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
      max_value: u16,
      range_check_count: u8| {
         let at = mcu.instant(clock);
-        mcu.with::<AnalogIn, _>(oid, |input, mcu| {
+        mcu.with::<AnalogIn, _>(oid, |input, turn| {
             let bytes_per_report = Some(BytesPerReport::of(bytes_per_report)?);
             let query = Query {
                 sample_ticks,
@@ -362,7 +351,7 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
                 range_check_count,
                 bytes_per_report,
             };
-            input.query(mcu, oid, at, query)
+            input.query(turn, at, query)
         })
     }
 )
@@ -371,7 +360,7 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
 const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
     "analog_in_attach_trigger_analog oid=%c trigger_analog_oid=%c",
     |mcu, oid: Oid, trigger_analog_oid: Oid| {
-        mcu.with::<AnalogIn, _>(oid, |input, mcu| input.attached.attach(mcu, trigger_analog_oid))
+        mcu.with::<AnalogIn, _>(oid, |input, turn| input.attached.attach(turn, trigger_analog_oid))
     }
 )
 .of(since(Master));

@@ -15,8 +15,12 @@ use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, que
 pub(super) const FEATURE: Feature =
     Feature { name: "bmi160", commands: &[CONFIG_BMI160, QUERY_BMI160, QUERY_BMI160_STATUS], ..Feature::EMPTY };
 
-const FIFO_LENGTH: u8 = 0x22;
-const FIFO_DATA: u8 = 0x24;
+#[derive(Clone, Copy)]
+enum Register {
+    FifoLength = 0x22,
+    FifoData = 0x24,
+}
+
 /// Bytes that the FIFO holds.
 const FIFO_BYTES: u16 = 1024;
 
@@ -34,7 +38,7 @@ struct Bmi160 {
 impl Bmi160 {
     fn ask_fill(self, chip: &mut dyn BusDevice) -> Result<Fill, BusError> {
         let mut length = [0; 2];
-        self.bus_type.read(chip, FIFO_LENGTH, &mut length)?;
+        self.bus_type.read_register(chip, Register::FifoLength as u8, &mut length)?;
         Ok(fill(length))
     }
 }
@@ -48,7 +52,8 @@ impl FifoChip for Bmi160 {
     }
 
     fn read(self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError> {
-        let read = |chip: &mut dyn BusDevice, block: &mut [u8]| self.bus_type.read(chip, FIFO_DATA, block);
+        let read =
+            |chip: &mut dyn BusDevice, block: &mut [u8]| self.bus_type.read_once(chip, Register::FifoData as u8, block);
         reading.block(chip, |chip| self.ask_fill(chip), read)
     }
 

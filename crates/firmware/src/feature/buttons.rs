@@ -6,7 +6,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, command, response,
+    Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock, command, response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -44,6 +44,8 @@ const REPORTS: usize = 8;
 /// The largest `retransmit_count`, as in the firmware.
 const RETRANSMIT_MAX: u8 = 0x7f;
 
+const TIMER: Timer = Timer::sampling(0);
+
 /// How many samples there are between two tellings of the same reports.
 #[derive(Clone, Copy, Default)]
 struct RetransmitCount(u8);
@@ -61,27 +63,12 @@ impl RetransmitCount {
     }
 }
 
-struct Button {
-    line: InputLine,
-    /// Tells a look at this line from one at the line that was here before.
-    generation: u8,
-}
-
-impl Button {
-    /// The place is in the low three bits of the tag.
-    fn tag(&self, place: usize) -> u8 {
-        self.generation << 3 | place as u8
-    }
-}
-
 struct Buttons {
-    buttons: Vec<Option<Button>>,
+    buttons: Vec<Option<InputLine>>,
     rest_ticks: Ticks,
     /// The levels of the sample that is being taken.
     sample: u8,
-    /// The buttons, a bit each, at which workers of expanders still look for this sample.
-    awaited: u8,
-    /// Those at which they could not look.
+    /// The buttons, a bit each, at which workers of expanders could not look for it.
     unread: u8,
     /// Whether the sample that is being taken counts: not one of an earlier query.
     counts: bool,
@@ -102,7 +89,6 @@ impl Buttons {
             buttons: (0..count).map(|_| None).collect(),
             rest_ticks: Ticks(0),
             sample: 0,
-            awaited: 0,
             unread: 0,
             counts: false,
             last_sample: 0,
@@ -121,22 +107,19 @@ impl Buttons {
             let what = format_args!("button {place} is set of {count}");
             return Err(Shutdown::by_host(PAST_COUNT, what));
         };
-        let generation = slot.as_ref().map_or(0, |button| button.generation.wrapping_add(1));
-        *slot = Some(Button { line: mcu.late_input(pin, bias(pull_up))?, generation });
+        *slot = Some(mcu.late_input(pin, bias(pull_up))?);
         self.counts = false;
         Ok(())
     }
 
     /// Looks at each button. A button that was not added reads low.
-    fn take_sample(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn take_sample(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         (self.sample, self.unread) = (0, 0);
         self.counts = true;
         for (place, button) in self.buttons.iter_mut().enumerate() {
             let Some(button) = button else { continue };
-            let tag = button.tag(place);
-            match button.line.read(mcu, Ticket { oid, tag })? {
-                Some(level) => self.sample |= u8::from(level) << place,
-                None => self.awaited |= 1 << place,
+            if let Some(level) = button.read(turn)? {
+                self.sample |= u8::from(level) << place;
             }
         }
         Ok(())
@@ -160,24 +143,23 @@ impl Buttons {
         true
     }
 
-    /// Expanders still look for the last sample: whether they take too long.
-    fn wait(&self, mcu: &mut Mcu) -> Result<(), Shutdown> {
-        let awaited = (0..).zip(&self.buttons).filter(|(place, _)| self.awaited >> place & 1 != 0);
-        awaited.filter_map(|(_, button)| button.as_ref()).try_for_each(|button| button.line.awaited(mcu))
+    /// Whether expanders still look for the last sample.
+    fn is_awaited(&self) -> bool {
+        self.buttons.iter().flatten().any(InputLine::is_looking)
     }
 
     /// Takes in a complete sample, and tells what is new.
-    fn sampled(&mut self, mcu: &mut Mcu, oid: Oid) -> bool {
-        let news = self.awaited == 0 && std::mem::take(&mut self.counts) && self.debounce();
+    fn sampled(&mut self, turn: &mut Turn) -> bool {
+        let news = !self.is_awaited() && std::mem::take(&mut self.counts) && self.debounce();
         if news {
-            self.report(mcu, oid);
+            self.report(turn);
         }
         news
     }
 
-    fn report(&mut self, mcu: &mut Mcu, oid: Oid) {
+    fn report(&mut self, turn: &mut Turn) {
         self.retransmit = Some(self.retransmit_count.0);
-        mcu.send(State { oid, ack_count: self.ack_count, state: &self.reports[..self.report_count] });
+        turn.send(State { oid: turn.oid(), ack_count: self.ack_count, state: &self.reports[..self.report_count] });
     }
 
     fn acknowledge(&mut self, count: u8) {
@@ -196,18 +178,17 @@ impl Object for Buttons {
         "buttons"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         // Expanders that still look for the last sample miss this one.
-        let news = if self.awaited == 0 {
-            self.take_sample(mcu, oid)?;
-            self.sampled(mcu, oid)
-        } else {
-            self.wait(mcu)?;
+        let news = if self.is_awaited() {
+            self.buttons.iter().flatten().try_for_each(|button| button.awaited(turn))?;
             false
+        } else {
+            self.take_sample(turn)?;
+            self.sampled(turn)
         };
         match self.retransmit {
-            Some(0) if !news => self.report(mcu, oid),
+            Some(0) if !news => self.report(turn),
             Some(left) if !news => self.retransmit = Some(left - 1),
             _ => {}
         }
@@ -215,24 +196,20 @@ impl Object for Buttons {
     }
 
     /// An expander's worker has looked.
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let tag = done.tag;
-        let place = usize::from(tag) % BUTTONS;
-        self.awaited &= !(1 << place);
-        // Not if another line took the place meanwhile: that has a look of its own.
-        if let Some(Some(button)) = self.buttons.get_mut(place)
-            && button.tag(place) == tag
-        {
-            match button.line.sampled(mcu, done)? {
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        // Not if another line took its place meanwhile: that has a look of its own.
+        for (place, button) in self.buttons.iter_mut().enumerate() {
+            let Some(look) = button.as_mut().and_then(|button| button.sampled(turn, done)) else { continue };
+            match look?.level {
                 Some(level) => self.sample |= u8::from(level) << place,
                 None => self.unread |= 1 << place,
             }
         }
-        self.sampled(mcu, oid);
+        self.sampled(turn);
         Ok(())
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, _turn: &mut Turn) {
         self.counts = false;
     }
 }
@@ -247,16 +224,16 @@ const CONFIG_BUTTONS: Command = command!("config_buttons oid=%c button_count=%c"
 
 const BUTTONS_ADD: Command =
     command!("buttons_add oid=%c pos=%c pin=%u pull_up=%c", |mcu, oid: Oid, pos: u8, pin: Pin, pull_up: i8| {
-        mcu.with::<Buttons, _>(oid, |buttons, mcu| buttons.add(mcu, pos, pin, pull_up))
+        mcu.with::<Buttons, _>(oid, |buttons, turn| buttons.add(turn, pos, pin, pull_up))
     });
 
 const BUTTONS_QUERY: Command = command!(
     "buttons_query oid=%c clock=%u rest_ticks=%u retransmit_count=%c invert=%c",
     |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, retransmit_count: u8, invert: u8| {
         let at = mcu.instant(clock);
-        mcu.with::<Buttons, _>(oid, |buttons, mcu| {
+        mcu.with::<Buttons, _>(oid, |buttons, turn| {
             let retransmit_count = RetransmitCount::of(retransmit_count)?;
-            mcu.cancel(TimerId::sampling(oid, 0));
+            turn.cancel(TIMER);
             buttons.rest_ticks = rest_ticks;
             buttons.retransmit_count = retransmit_count;
             buttons.pressed = invert;
@@ -268,7 +245,7 @@ const BUTTONS_QUERY: Command = command!(
             if rest_ticks == Ticks(0) {
                 return Ok(());
             }
-            mcu.schedule(TimerId::sampling(oid, 0), at)
+            turn.schedule(TIMER, at)
         })
     }
 );

@@ -18,8 +18,8 @@ use log::warn;
 
 use crate::board::{Edge, Edges, Pin};
 use crate::mcu::{
-    Command, Done, Errand, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, WorkerId,
-    command, response,
+    Back, Command, Done, Errand, Feature, InputLine, Look, Next, Object, Oid, Response, Slot, Timer, Turn, WireClock,
+    WorkerId, command, response,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
@@ -40,10 +40,6 @@ response! {
     pub(super) struct State { oid: Oid, next_clock: Clock, count: u32, count_clock: Clock }
 }
 
-/// Tags of errands.
-const LOOK: u8 = 0;
-const READ_EDGES: u8 = 1;
-
 /// More interrupts than these are none of a tachometer (20,000 rpm with two pulses are 1333 edges a
 /// second), but of a pin that floats or oscillates. Each costs the kernel 10 us and more, and whatever
 /// else this computer does comes after them.
@@ -58,6 +54,8 @@ const TAKE_TICKS: Ticks = Ticks::from_us(50_000);
 /// that speed if the shorter level takes an eighth of a pulse or more, and at twice the speed if it takes
 /// a quarter.
 const SETTLE_DIVISOR: u32 = 4;
+
+const TIMER: Timer = Timer::sampling(0);
 
 /// Counts the edges of a line, but for those of glitches.
 #[derive(Debug)]
@@ -117,11 +115,14 @@ struct Reading {
     interrupts: u32,
     /// Whether there were, so that there are no more interrupts.
     given_up: bool,
-    result: Result<(), Shutdown>,
 }
 
-impl Reading {
-    fn read(&mut self) -> Result<(), Shutdown> {
+impl Errand for Reading {
+    /// How many edges there were, and when the last one was.
+    type Answer = (u32, Option<Clock>);
+    type Failure = Shutdown;
+
+    fn run(&mut self) -> Result<(u32, Option<Clock>), Shutdown> {
         // The kernel has all edges up to now.
         let now = self.clock.now();
         let Reading { edges, clock, settling, settle, interrupts, .. } = self;
@@ -143,13 +144,7 @@ impl Reading {
                 warn!("{}", too_many(&self.name, per_s));
             }
         }
-        Ok(())
-    }
-}
-
-impl Errand for Reading {
-    fn run(&mut self) {
-        self.result = self.read();
+        Ok((self.settling.count, self.settling.last))
     }
 }
 
@@ -168,8 +163,7 @@ fn polled(name: &str, why: &str) -> String {
 /// The edges that the kernel dates, and who takes them.
 struct Counted {
     worker: WorkerId,
-    /// Here while the worker does not read.
-    reading: Option<Box<Reading>>,
+    reading: Slot<Reading>,
 }
 
 struct Counter {
@@ -185,43 +179,48 @@ struct Counter {
     /// When the last edge was seen; before the first one, when counting began (the firmware says 0,
     /// which klippy takes for some instant that may lie ahead).
     count_clock: Clock,
-    /// Whether an expander's worker looks at the pin.
-    looking: bool,
     /// Whether what a worker does is for the present query.
     counts: bool,
 }
 
 impl Counter {
     /// Takes in the level at an instant.
-    fn look(&mut self, mcu: &mut Mcu, oid: Oid, level: bool, at: Clock) {
+    fn look(&mut self, turn: &mut Turn, level: bool, at: Clock) {
         if level != (self.count % 2 == 1) {
             self.count = self.count.wrapping_add(1);
             self.count_clock = at;
         }
         if self.next_sample < at {
             self.next_sample = at + self.sample_ticks;
-            self.tell(mcu, oid, at);
+            self.tell(turn, at);
         }
     }
 
     /// Tells the count that was right at an instant.
-    fn tell(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) {
+    fn tell(&mut self, turn: &mut Turn, at: Clock) {
         let next_clock = at + self.poll_ticks;
-        mcu.send(State { oid, next_clock, count: self.count, count_clock: self.count_clock });
+        turn.send(State { oid: turn.oid(), next_clock, count: self.count, count_clock: self.count_clock });
     }
 
     /// Takes in what the worker has seen of the edges.
-    fn has_read(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let ended = done.ended;
-        let (Some(counted), Some(mut reading)) = (&mut self.counted, done.errand::<Reading>()) else { return Ok(()) };
-        let result = std::mem::replace(&mut reading.result, Ok(()));
-        self.count = reading.settling.count;
-        self.count_clock = reading.settling.last.unwrap_or(self.count_clock);
-        counted.reading = Some(reading);
-        if std::mem::take(&mut self.counts) && result.is_ok() {
-            self.tell(mcu, oid, ended);
+    fn has_read(
+        &mut self,
+        turn: &mut Turn,
+        edges: Result<(u32, Option<Clock>), Shutdown>,
+        ended: Clock,
+    ) -> Result<(), Shutdown> {
+        let counts = std::mem::take(&mut self.counts);
+        match edges {
+            Ok((count, last)) => {
+                self.count = count;
+                self.count_clock = last.unwrap_or(self.count_clock);
+                if counts {
+                    self.tell(turn, ended);
+                }
+                Ok(())
+            }
+            Err(failure) => turn.try_shut_down(failure),
         }
-        result.or_else(|failure| mcu.try_shut_down(failure))
     }
 }
 
@@ -230,50 +229,51 @@ impl Object for Counter {
         "counter"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if let Some(Counted { worker, reading }) = &mut self.counted
-            && !reading.as_ref().is_some_and(|reading| reading.given_up)
+            && !reading.here().is_some_and(|reading| reading.given_up)
         {
             if self.next_sample <= at {
                 self.next_sample = at + self.sample_ticks.max(self.poll_ticks);
                 self.counts = true;
             }
             // A worker that still reads misses this turn.
-            if let Some(mut reading) = reading.take() {
-                reading.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
-                mcu.dispatch(*worker, Ticket { oid, tag: READ_EDGES }, reading)?;
+            if let Some(ready) = reading.here() {
+                ready.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
+                reading.send(turn, *worker)?;
             }
             return Ok(Next::At(self.next_sample.min(at + TAKE_TICKS)));
         }
         // So does an expander that still looks.
-        if self.looking {
-            self.pin.awaited(mcu)?;
+        if self.pin.is_looking() {
+            self.pin.awaited(turn)?;
         } else {
-            match self.pin.read(mcu, Ticket { oid, tag: LOOK })? {
-                Some(level) => self.look(mcu, oid, level, at),
-                None => (self.looking, self.counts) = (true, true),
+            match self.pin.read(turn)? {
+                Some(level) => self.look(turn, level, at),
+                None => self.counts = true,
             }
         }
         Ok(Next::At(at + self.poll_ticks))
     }
 
     /// A worker has read the count, or looked at an expander's pin.
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        if done.tag == READ_EDGES {
-            return self.has_read(mcu, oid, done);
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        if let Some(counted) = &mut self.counted
+            && let Some(Back { result, ended, .. }) = counted.reading.back(done)
+        {
+            let edges = result.map_err(Shutdown::clone);
+            return self.has_read(turn, edges, ended);
         }
-        let ended = done.ended;
-        self.looking = false;
-        let level = self.pin.sampled(mcu, done)?;
+        let Some(look) = self.pin.sampled(turn, done) else { return Ok(()) };
+        let Look { level, ended, .. } = look?;
         if std::mem::take(&mut self.counts) {
             // A pin that could not be looked at keeps its last level.
-            self.look(mcu, oid, level.unwrap_or(self.count % 2 == 1), ended);
+            self.look(turn, level.unwrap_or(self.count % 2 == 1), ended);
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, _turn: &mut Turn) {
         self.counts = false;
     }
 }
@@ -281,11 +281,11 @@ impl Object for Counter {
 const CONFIG_COUNTER: Command =
     command!("config_counter oid=%c pin=%u pull_up=%c", |mcu, oid: Oid, pin: Pin, pull_up: i8| {
         mcu.vacant(oid)?;
-        let (mut line, edges) = mcu.counted_input(pin, bias(pull_up))?;
+        let (line, edges) = mcu.counted_input(pin, bias(pull_up))?;
         let name = mcu.name(pin);
         let counted = match edges {
             Ok((worker, edges)) => {
-                let level = line.read(mcu, Ticket { oid, tag: LOOK })?.unwrap_or_default();
+                let level = line.prompt_level()?.unwrap_or_default();
                 let reading = Reading {
                     edges,
                     clock: mcu.clock(),
@@ -295,9 +295,8 @@ const CONFIG_COUNTER: Command =
                     since: mcu.now(),
                     interrupts: 0,
                     given_up: false,
-                    result: Ok(()),
                 };
-                Some(Counted { worker, reading: Some(Box::new(reading)) })
+                Some(Counted { worker, reading: Slot::new(reading) })
             }
             Err(why) => {
                 warn!("{}", polled(&name, &why));
@@ -312,7 +311,6 @@ const CONFIG_COUNTER: Command =
             next_sample: Clock::EPOCH,
             count: 0,
             count_clock: Clock::EPOCH,
-            looking: false,
             counts: false,
         };
         mcu.assign_on(pin, oid, counter)
@@ -322,8 +320,8 @@ const QUERY_COUNTER: Command = command!(
     "query_counter oid=%c clock=%u poll_ticks=%u sample_ticks=%u",
     |mcu, oid: Oid, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
         let at = mcu.instant(clock);
-        mcu.with::<Counter, _>(oid, |counter, mcu| {
-            mcu.cancel(TimerId::sampling(oid, 0));
+        mcu.with::<Counter, _>(oid, |counter, turn| {
+            turn.cancel(TIMER);
             counter.poll_ticks = poll_ticks;
             counter.sample_ticks = sample_ticks;
             counter.next_sample = at;
@@ -331,7 +329,7 @@ const QUERY_COUNTER: Command = command!(
                 counter.count_clock = at;
             }
             counter.counts = false;
-            mcu.schedule(TimerId::sampling(oid, 0), at)
+            turn.schedule(TIMER, at)
         })
     }
 );

@@ -6,8 +6,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, Mcu, MoveQueue, Next, Object, Oid, OutputLine, Report, Safe, Ticket, TimerId, WireClock,
-    command,
+    Command, Done, Feature, MoveQueue, Next, Object, Oid, OutputLine, Report, Safe, Timer, Turn, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -31,6 +30,8 @@ shutdowns! {
     /// The host did not refresh an output before its `max_duration` ran out.
     MISSED_DIGITAL = "Missed scheduling of next digital out event";
 }
+
+const TIMER: Timer = Timer::exact(0);
 
 struct Move {
     at: Clock,
@@ -66,21 +67,13 @@ struct DigitalOut {
 }
 
 impl DigitalOut {
-    fn timer(oid: Oid) -> TimerId {
-        TimerId::new(oid, 0)
-    }
-
-    fn ticket(oid: Oid) -> Ticket {
-        Ticket { oid, tag: 0 }
-    }
-
     /// Applies the oldest change of the queue, which was due at `at`.
-    fn load(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
-        let Some(Move { on_ticks, .. }) = self.queue.pop(&mut mcu.moves) else {
+    fn load(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
+        let Some(Move { on_ticks, .. }) = self.queue.pop(&mut turn.moves) else {
             return Err(not_refreshed(MISSED_DIGITAL, self.max_duration));
         };
         let on = on_ticks.0 != 0;
-        self.line.write(mcu, Self::ticket(oid), on)?;
+        self.line.write(turn, on)?;
         self.on = on;
         self.toggling = on && on_ticks < self.cycle;
         let limited = self.max_duration.0 != 0 && (self.toggling || on != self.default);
@@ -108,8 +101,8 @@ impl DigitalOut {
     }
 
     /// Makes the edge of a pulse, which was due at `at`.
-    fn toggle(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
-        self.line.toggle(mcu, Self::ticket(oid))?;
+    fn toggle(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
+        self.line.toggle(turn)?;
         self.on = !self.on;
         let mut next = at + if self.on { self.on_ticks } else { self.off_ticks };
         if let Some(end) = self.end
@@ -131,9 +124,9 @@ impl DigitalOut {
         }
     }
 
-    fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, on_ticks: Ticks) -> Result<(), Shutdown> {
+    fn queue(&mut self, turn: &mut Turn, at: Clock, on_ticks: Ticks) -> Result<(), Shutdown> {
         let first = self.queue.is_empty();
-        self.queue.push(&mut mcu.moves, Move { at, on_ticks })?;
+        self.queue.push(&mut turn.moves, Move { at, on_ticks })?;
         if !first {
             return Ok(());
         }
@@ -145,27 +138,27 @@ impl DigitalOut {
             // `toggle` sees the new end and loads the change then.
             return Ok(());
         }
-        mcu.cancel(Self::timer(oid));
+        turn.cancel(TIMER);
         self.phase = Phase::Load;
         self.wake = at;
-        mcu.schedule(Self::timer(oid), at)
+        turn.schedule(TIMER, at)
     }
 
-    fn update(&mut self, mcu: &mut Mcu, oid: Oid, value: bool) -> Result<(), Shutdown> {
+    fn update(&mut self, turn: &mut Turn, value: bool) -> Result<(), Shutdown> {
         if !self.queue.is_empty() {
             return Err(Shutdown::by_host(UPDATE_WITH_QUEUE, "update_digital_out came while changes are queued"));
         }
-        mcu.cancel(Self::timer(oid));
-        self.line.write(mcu, Self::ticket(oid), value)?;
+        turn.cancel(TIMER);
+        self.line.write(turn, value)?;
         self.on = value;
         self.toggling = false;
         self.end = None;
         if value != self.default && self.max_duration.0 != 0 {
-            let end = mcu.now() + self.max_duration;
+            let end = turn.now() + self.max_duration;
             self.end = Some(end);
             self.phase = Phase::Load;
             self.wake = end;
-            mcu.schedule(Self::timer(oid), end)?;
+            turn.schedule(TIMER, end)?;
         }
         Ok(())
     }
@@ -176,36 +169,30 @@ impl Object for DigitalOut {
         KIND
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         match self.phase {
-            Phase::Load => self.load(mcu, oid, at),
-            Phase::Toggle => self.toggle(mcu, oid, at),
+            Phase::Load => self.load(turn, at),
+            Phase::Toggle => self.toggle(turn, at),
         }
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        match self.line.returned(mcu, Self::ticket(oid), done) {
-            Ok(true) => mcu.is_safe(oid),
-            Ok(false) => {}
-            Err(failure) => return mcu.device_failed(oid, KIND, failure),
-        }
-        Ok(())
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        self.line.settle(turn, KIND, done)
     }
 
     fn report(&self) -> Report {
         Report { queued: self.queue.len(), value: None }
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, turn: &mut Turn) {
         self.on = self.default;
         self.toggling = false;
         self.end = None;
-        self.queue.clear(&mut mcu.moves);
+        self.queue.clear(&mut turn.moves);
     }
 
-    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
-        self.line.make_safe(mcu, Self::ticket(oid), self.default)
+    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
+        self.line.make_safe(turn, self.default)
     }
 }
 
@@ -225,21 +212,21 @@ impl SetLines {
     ///
     /// "Unable to open out GPIO chip line" for such a line, or the 257th; those of [`Mcu::output`];
     /// "GPIO line write failed".
-    fn set(&mut self, mcu: &mut Mcu, oid: Oid, pin: Pin, value: bool) -> Result<(), Shutdown> {
+    fn set(&mut self, turn: &mut Turn, pin: Pin, value: bool) -> Result<(), Shutdown> {
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
-            Some(place) if mcu.is_finalized() => self.0[place].1.write(mcu, Ticket { oid, tag: place as u8 }, value),
-            _ if mcu.is_finalized() => Err(set_too_late(mcu, reason::OUTPUT_LINE, "set_digital_out", pin)),
+            Some(place) if turn.is_finalized() => self.0[place].1.write(turn, value),
+            _ if turn.is_finalized() => Err(set_too_late(turn, reason::OUTPUT_LINE, "set_digital_out", pin)),
             // Claimed anew, so that the guardian learns the new level.
             Some(place) => {
-                self.0[place].1 = mcu.output(pin, value, value)?;
+                self.0[place].1 = turn.output(pin, value, value)?;
                 Ok(())
             }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::OUTPUT_LINE, "set_digital_out wants more than 256 lines"))
             }
             None => {
-                self.0.push((pin, mcu.output(pin, value, value)?));
+                self.0.push((pin, turn.output(pin, value, value)?));
                 Ok(())
             }
         }
@@ -251,12 +238,9 @@ impl Object for SetLines {
         "set_digital_out"
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let ticket = Ticket { oid, tag: done.tag };
-        match self.0.get_mut(usize::from(done.tag)).map(|(_, line)| line.returned(mcu, ticket, done)) {
-            Some(Err(failure)) => mcu.device_failed(oid, self.kind(), failure),
-            _ => Ok(()),
-        }
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let mut lines = self.0.iter_mut();
+        lines.try_for_each(|(_, line)| line.settle(turn, "set_digital_out", done))
     }
 }
 
@@ -300,14 +284,14 @@ const SET_DIGITAL_OUT_PWM_CYCLE: Command =
 const QUEUE_DIGITAL_OUT: Command =
     command!("queue_digital_out oid=%c clock=%u on_ticks=%u", |mcu, oid: Oid, clock: WireClock, on_ticks: Ticks| {
         let at = mcu.instant(clock);
-        mcu.with::<DigitalOut, _>(oid, |output, mcu| output.queue(mcu, oid, at, on_ticks))
+        mcu.with::<DigitalOut, _>(oid, |output, turn| output.queue(turn, at, on_ticks))
     });
 
 const UPDATE_DIGITAL_OUT: Command = command!("update_digital_out oid=%c value=%c", |mcu, oid: Oid, value: bool| {
-    mcu.with::<DigitalOut, _>(oid, |output, mcu| output.update(mcu, oid, value))
+    mcu.with::<DigitalOut, _>(oid, |output, turn| output.update(turn, value))
 });
 
 const SET_DIGITAL_OUT: Command = command!("set_digital_out pin=%u value=%c", |mcu, pin: Pin, value: bool| {
     let oid = mcu.own::<SetLines>();
-    mcu.with::<SetLines, _>(oid, |lines, mcu| lines.set(mcu, oid, pin, value))
+    mcu.with::<SetLines, _>(oid, |lines, turn| lines.set(turn, pin, value))
 });

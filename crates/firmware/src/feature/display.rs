@@ -7,7 +7,7 @@
 use std::sync::Arc;
 
 use crate::board::{Line, Pin};
-use crate::mcu::{Done, Mcu, Object, Oid, Remote, Safe, Settable, Ticket};
+use crate::mcu::{Done, Mcu, Object, Remote, Safe, Settable, Turn};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
@@ -76,15 +76,11 @@ impl<P: Panel> Display<P> {
     }
 
     /// Writes bytes; the commands behind this one wait until they are with the display.
-    pub(super) fn write(&mut self, mcu: &mut Mcu, oid: Oid, register: Register, data: &[u8]) -> Result<(), Shutdown> {
+    pub(super) fn write(&mut self, turn: &mut Turn, register: Register, data: &[u8]) -> Result<(), Shutdown> {
         let mut bytes = [0; PAYLOAD_MAX];
         let len = data.len().min(PAYLOAD_MAX);
         bytes[..len].copy_from_slice(&data[..len]);
-        self.panel.set(mcu, Self::ticket(oid), Update::Write { register, bytes, len })
-    }
-
-    fn ticket(oid: Oid) -> Ticket {
-        Ticket { oid, tag: 0 }
+        self.panel.set(turn, Update::Write { register, bytes, len })
     }
 }
 
@@ -93,19 +89,14 @@ impl<P: Panel> Object for Display<P> {
         self.kind
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        match self.panel.returned(mcu, Self::ticket(oid), done) {
-            Ok(true) => mcu.is_safe(oid),
-            Ok(false) => {}
-            Err(failure) => return mcu.device_failed(oid, self.kind, failure),
-        }
-        Ok(())
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        self.panel.settle(turn, self.kind, done)
     }
 
     /// What is being written is broken off.
-    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
+    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
         self.pace.stop();
-        self.panel.set(mcu, Self::ticket(oid), Update::Idle)?;
+        self.panel.set(turn, Update::Idle)?;
         Ok(Safe::Later)
     }
 }

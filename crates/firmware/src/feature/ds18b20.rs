@@ -9,8 +9,8 @@
 
 use crate::board::{OnWorker, Thermometer};
 use crate::mcu::{
-    Command, Done, Errand, Feature, Generation::Kalico, Generations, Mcu, Next, Object, Oid, Response, Ticket, TimerId,
-    WireClock, WorkerId, command, response, since,
+    Back, Command, Done, Errand, Feature, Generation::Kalico, Generations, Mcu, Next, Object, Oid, Response, Slot,
+    Timer, Turn, WireClock, WorkerId, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -44,22 +44,23 @@ response! {
 /// How long a reading may take (`W1_READ_TIMEOUT_SEC` of the firmware).
 const READ_LIMIT: i64 = 5 * CLOCK_FREQ as i64;
 
-/// One reading: there is one box for each sensor.
-struct Look {
-    sensor: Box<dyn Thermometer>,
-    result: Result<i32, Box<str>>,
-}
+const TIMER: Timer = Timer::sampling(0);
+
+/// One reading.
+struct Look(Box<dyn Thermometer>);
 
 impl Errand for Look {
-    fn run(&mut self) {
-        self.result = self.sensor.read();
+    type Answer = i32;
+    type Failure = Box<str>;
+
+    fn run(&mut self) -> Result<i32, Box<str>> {
+        self.0.read()
     }
 }
 
 struct Ds18b20 {
     worker: WorkerId,
-    /// Here while the sensor is not being read.
-    look: Option<Box<Look>>,
+    look: Slot<Look>,
     /// When the reading under way was asked for.
     asked: Clock,
     /// The turn after that.
@@ -73,8 +74,6 @@ struct Ds18b20 {
     /// Readings that failed since the last one that did not.
     error_count: u8,
     value: i32,
-    /// Tells readings of an earlier query.
-    tag: u8,
 }
 
 impl Ds18b20 {
@@ -100,35 +99,26 @@ impl Object for Ds18b20 {
         "DS18B20"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
-        match self.look.take() {
-            Some(look) => {
-                self.asked = at;
-                self.next_clock = next;
-                mcu.dispatch(self.worker, Ticket { oid, tag: self.tag }, look)?;
-            }
-            None if at.since(self.asked) > READ_LIMIT => mcu.try_shut_down(Shutdown::because(
+        if self.look.is_here() {
+            self.asked = at;
+            self.next_clock = next;
+            self.look.send(turn, self.worker)?;
+        } else if at.since(self.asked) > READ_LIMIT {
+            turn.try_shut_down(Shutdown::because(
                 TOO_SLOW,
                 "its reading is under way for more than 5 s: does the bus or its driver hang (dmesg), or do too many sensors share it?",
-            ))?,
-            // This turn is left out.
-            None => {}
+            ))?;
         }
         Ok(Next::At(next))
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let tag = done.tag;
-        let Some(look) = done.errand::<Look>() else { return Ok(()) };
-        let look = self.look.insert(look);
-        if tag != self.tag {
-            return Ok(());
-        }
-        match &look.result {
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, counts: true, .. }) = self.look.back(done) else { return Ok(()) };
+        match result {
             Ok(value) => {
-                self.value = *value;
+                self.value = value;
                 self.error_count = 0;
             }
             Err(detail) => {
@@ -136,17 +126,17 @@ impl Object for Ds18b20 {
                 if self.error_count > self.max_error_count {
                     let times = self.error_count;
                     let detail = format!("{detail} ({times} readings in a row failed)");
-                    return mcu.try_shut_down(Shutdown::because(READ_FAILED, detail));
+                    return turn.try_shut_down(Shutdown::because(READ_FAILED, detail));
                 }
             }
         }
         let fault = self.error_count;
-        mcu.send(Reading { oid, next_clock: self.next_clock, value: self.value, fault: fault.into() });
-        if fault == 0 { self.check_range(mcu) } else { Ok(()) }
+        turn.send(Reading { oid: turn.oid(), next_clock: self.next_clock, value: self.value, fault: fault.into() });
+        if fault == 0 { self.check_range(turn) } else { Ok(()) }
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
-        self.tag = self.tag.wrapping_add(1);
+    fn shutdown(&mut self, _turn: &mut Turn) {
+        self.look.drop_pending();
     }
 }
 
@@ -167,7 +157,7 @@ fn configure(
     let OnWorker { bus, device } = mcu.board()?.ds18b20(serial)?;
     let sensor = Ds18b20 {
         worker: mcu.reader(&bus)?,
-        look: Some(Box::new(Look { sensor: device, result: Ok(0) })),
+        look: Slot::new(Look(device)),
         asked: Clock::EPOCH,
         next_clock: Clock::EPOCH,
         rest_ticks: Ticks(0),
@@ -177,7 +167,6 @@ fn configure(
         ignores_limits,
         error_count: 0,
         value: 0,
-        tag: 0,
     };
     mcu.assign(oid, sensor)
 }
@@ -200,16 +189,16 @@ const QUERY_DS18B20: Command = command!(
     "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",
     |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
         let at = mcu.instant(clock);
-        mcu.with::<Ds18b20, _>(oid, |sensor, mcu| {
-            mcu.cancel(TimerId::sampling(oid, 0));
-            sensor.tag = sensor.tag.wrapping_add(1);
+        mcu.with::<Ds18b20, _>(oid, |sensor, turn| {
+            turn.cancel(TIMER);
+            sensor.look.drop_pending();
             if rest_ticks == Ticks(0) {
                 return Ok(());
             }
             sensor.rest_ticks = rest_ticks;
             sensor.min_value = min_value;
             sensor.max_value = max_value;
-            mcu.schedule(TimerId::sampling(oid, 0), at)
+            turn.schedule(TIMER, at)
         })
     }
 );

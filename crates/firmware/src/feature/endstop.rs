@@ -5,7 +5,7 @@
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Done, Feature, InputLine, Mcu, Next, Object, Oid, Response, Ticket, TimerId, UNREAD_LIMIT, WireClock,
+    Command, Done, Feature, Hold, InputLine, Look, Next, Object, Oid, Response, Timer, Turn, UNREAD_LIMIT, WireClock,
     command, response,
 };
 use crate::shutdown::Shutdown;
@@ -27,6 +27,8 @@ response! {
     pub(super) struct State { oid: Oid, homing: bool, next_clock: Clock, pin_value: bool }
 }
 
+const TIMER: Timer = Timer::exact(0);
+
 struct Endstop {
     pin: InputLine,
     /// The last `endstop_home`. It stays after the trigger, so that `endstop_query_state` can still
@@ -37,8 +39,8 @@ struct Endstop {
     /// When the sample was due that the chip's worker is taking; none if it takes none. The timer then runs
     /// when that takes too long.
     due: Option<Clock>,
-    /// A query waits for the worker's look at the line, too; `true` if further commands wait with it.
-    asked: Option<bool>,
+    /// A query waits for the worker's look at the line, too, and further commands wait with it.
+    asked: Option<Hold>,
 }
 
 #[derive(Clone, Copy)]
@@ -54,23 +56,19 @@ struct Homing {
 }
 
 impl Endstop {
-    fn ticket(oid: Oid) -> Ticket {
-        Ticket { oid, tag: 0 }
-    }
-
     /// Takes the sample that is due at `at`, or has the chip's worker take it.
-    fn sample(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<Next, Shutdown> {
-        match self.pin.read(mcu, Self::ticket(oid))? {
-            Some(level) => self.judge(mcu, level, at, at),
+    fn sample(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
+        match self.pin.read(turn)? {
+            Some(level) => self.judge(turn, level, at, at),
             None => {
                 self.due = Some(at);
-                Ok(Next::At(mcu.last_read() + UNREAD_LIMIT))
+                Ok(Next::At(turn.last_read() + UNREAD_LIMIT))
             }
         }
     }
 
     /// Decides how to go on by a sample that was due at `at` and is of the instant `seen`.
-    fn judge(&mut self, mcu: &mut Mcu, level: bool, at: Clock, seen: Clock) -> Result<Next, Shutdown> {
+    fn judge(&mut self, turn: &mut Turn, level: bool, at: Clock, seen: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(Next::Done) };
         let confirming = homing.wanted < homing.sample_count;
         if level != homing.pin_value {
@@ -85,31 +83,29 @@ impl Endstop {
             return Ok(Next::At(at + homing.sample_ticks));
         }
         let Homing { trsync, trigger_reason, .. } = *homing;
-        mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, trigger_reason))?;
+        turn.with::<Trsync, _>(trsync, |trsync, turn| trsync.trigger(turn, trigger_reason))?;
         Ok(Next::Done)
     }
 
-    fn query(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        match self.pin.read(mcu, Self::ticket(oid))? {
-            Some(level) => self.report(mcu, oid, level),
-            None => self.asked = Some(mcu.hold(oid)),
+    fn query(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        match self.pin.read(turn)? {
+            Some(level) => self.report(turn, level),
+            None => self.asked = Some(turn.hold()),
         }
         Ok(())
     }
 
     /// Answers the query that waits, with nothing in a stopped machine whose chip fails.
-    fn answer(&mut self, mcu: &mut Mcu, oid: Oid, level: Option<bool>) {
-        let Some(held) = self.asked.take() else { return };
+    fn answer(&mut self, turn: &mut Turn, level: Option<bool>) {
+        let Some(hold) = self.asked.take() else { return };
         if let Some(level) = level {
-            self.report(mcu, oid, level);
+            self.report(turn, level);
         }
-        if held {
-            mcu.release();
-        }
+        turn.release(hold);
     }
 
-    fn report(&self, mcu: &mut Mcu, oid: Oid, pin_value: bool) {
-        mcu.send(State { oid, homing: self.homing.is_some(), next_clock: self.next_wake, pin_value });
+    fn report(&self, turn: &mut Turn, pin_value: bool) {
+        turn.send(State { oid: turn.oid(), homing: self.homing.is_some(), next_clock: self.next_wake, pin_value });
     }
 }
 
@@ -118,37 +114,37 @@ impl Object for Endstop {
         "endstop"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if self.due.is_some() {
-            self.pin.awaited(mcu)?;
+            self.pin.awaited(turn)?;
             return Ok(Next::At(at + UNREAD_LIMIT));
         }
-        self.sample(mcu, oid, at)
+        self.sample(turn, at)
     }
 
     /// The chip's worker has looked.
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let (began, ended) = (done.began, done.ended);
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         let is_homing = self.due.is_some();
-        let level = if is_homing { self.pin.seen(mcu, done)? } else { self.pin.sampled(mcu, done)? };
+        let look = if is_homing { self.pin.seen(turn, done) } else { self.pin.sampled(turn, done) };
+        let Some(look) = look else { return Ok(()) };
+        let Look { level, began, ended } = look?;
         match level {
             // A query is answered with a level that was seen.
-            None if self.asked.is_some() && !mcu.is_shutdown() => self.pin.read(mcu, Self::ticket(oid)).map(drop)?,
-            _ => self.answer(mcu, oid, level),
+            None if self.asked.is_some() && !turn.is_shutdown() => self.pin.read(turn).map(drop)?,
+            _ => self.answer(turn, level),
         }
         let (Some(at), Some(level)) = (self.due.take(), level) else { return Ok(()) };
-        mcu.cancel(TimerId::new(oid, 0));
+        turn.cancel(TIMER);
         // The worker may have looked for a query, before the sample was due: then it looks again.
-        let next = if began < at { self.sample(mcu, oid, at)? } else { self.judge(mcu, level, at, ended)? };
+        let next = if began < at { self.sample(turn, at)? } else { self.judge(turn, level, at, ended)? };
         if let Next::At(at) = next {
-            let now = mcu.now();
-            mcu.go_on(TimerId::new(oid, 0), at.max(now));
+            let now = turn.now();
+            turn.go_on(TIMER, at.max(now));
         }
         Ok(())
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, _turn: &mut Turn) {
         self.due = None;
     }
 }
@@ -173,14 +169,14 @@ const ENDSTOP_HOME: Command = command!(
      trsync_oid: Oid,
      trigger_reason: u8| {
         let at = mcu.instant(clock);
-        mcu.with::<Endstop, _>(oid, |endstop, mcu| {
-            mcu.cancel(TimerId::new(oid, 0));
+        mcu.with::<Endstop, _>(oid, |endstop, turn| {
+            turn.cancel(TIMER);
             endstop.homing = None;
             endstop.due = None;
             if sample_count == 0 {
                 return Ok(());
             }
-            mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
+            turn.require::<Trsync>(trsync_oid)?;
             endstop.homing = Some(Homing {
                 sample_ticks,
                 sample_count,
@@ -190,11 +186,11 @@ const ENDSTOP_HOME: Command = command!(
                 trigger_reason,
                 wanted: sample_count,
             });
-            mcu.schedule(TimerId::new(oid, 0), at)
+            turn.schedule(TIMER, at)
         })
     }
 );
 
 const ENDSTOP_QUERY_STATE: Command = command!("endstop_query_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Endstop, _>(oid, |endstop, mcu| endstop.query(mcu, oid))
+    mcu.with::<Endstop, _>(oid, |endstop, turn| endstop.query(turn))
 });

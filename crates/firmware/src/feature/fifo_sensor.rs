@@ -12,7 +12,7 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Conversation, Done, Enumeration, Feature, Generation::V0_13, Mcu, Next, Object, Oid, Talk, Ticket, TimerId,
+    Back, Conversation, Done, Enumeration, Feature, Generation::V0_13, Mcu, Next, Object, Oid, Slot, Talk, Timer, Turn,
     WireClock, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
@@ -35,6 +35,8 @@ shutdowns! {
     INVALID_BUS_TYPE = "bus_type invalid";
 }
 
+const TIMER: Timer = Timer::sampling(0);
+
 /// Which kind of bus a chip is on (`bus_oid_type`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum BusType {
@@ -56,18 +58,20 @@ impl BusType {
         }
     }
 
-    /// Reads registers of a chip that takes bit 7 of a register's number on SPI for a read; what a
-    /// chip wants else in the number is in `register` already. Up to [`DATA_MAX`] bytes.
-    pub(super) fn read(self, chip: &mut dyn BusDevice, register: u8, into: &mut [u8]) -> Result<(), BusError> {
+    /// Reads registers of a chip that takes bit 7 of a register's number on SPI for a read. What else a
+    /// chip wants in the number is in `register` already. Up to [`DATA_MAX`] bytes. Reading must not change the
+    /// registers: I2C may read twice.
+    pub(super) fn read_register(self, chip: &mut dyn BusDevice, register: u8, into: &mut [u8]) -> Result<(), BusError> {
         match self {
-            BusType::Spi => {
-                let mut message = [0; 1 + DATA_MAX];
-                let message = &mut message[..=into.len()];
-                message[0] = register | 0x80;
-                chip.exchange(message)?;
-                into.copy_from_slice(&message[1..]);
-                Ok(())
-            }
+            BusType::Spi => exchange_register(chip, register, into),
+            BusType::I2c => chip.read_register(&[register], into),
+        }
+    }
+
+    /// The same where reading changes them: a FIFO, or flags.
+    pub(super) fn read_once(self, chip: &mut dyn BusDevice, register: u8, into: &mut [u8]) -> Result<(), BusError> {
+        match self {
+            BusType::Spi => exchange_register(chip, register, into),
             BusType::I2c => chip.write_read(&[register], into),
         }
     }
@@ -79,6 +83,15 @@ impl BusType {
             BusType::I2c => i2c_shutdown(mcu, error),
         }
     }
+}
+
+fn exchange_register(chip: &mut dyn BusDevice, register: u8, into: &mut [u8]) -> Result<(), BusError> {
+    let mut message = [0; 1 + DATA_MAX];
+    let message = &mut message[..=into.len()];
+    message[0] = register | 0x80;
+    chip.exchange(message)?;
+    into.copy_from_slice(&message[1..]);
+    Ok(())
 }
 
 /// What a chip says of its FIFO.
@@ -133,6 +146,7 @@ pub(super) trait FifoChip: Copy + Send + 'static {
 }
 
 /// What a reading brings.
+#[derive(Clone, Copy)]
 pub(super) struct Reading {
     samples: [u8; DATA_MAX],
     len: usize,
@@ -204,35 +218,34 @@ struct Read<C> {
 }
 
 impl<C: FifoChip> Talk for Read<C> {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        self.chip.read(chip, &mut self.reading)
+    type Answer = Reading;
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Reading, BusError> {
+        self.chip.read(chip, &mut self.reading)?;
+        Ok(self.reading)
     }
 }
 
 /// Asks how full the FIFO is.
-struct LookAtFill<C> {
-    chip: C,
-    fill: Option<Fill>,
-}
+struct LookAtFill<C>(C);
 
 impl<C: FifoChip> Talk for LookAtFill<C> {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        self.fill = self.chip.fill(chip)?;
-        Ok(())
+    type Answer = Option<Fill>;
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError> {
+        self.0.fill(chip)
     }
 }
 
 /// Asks for overflows, where that is a register of its own. A conversation of its own too, as the
 /// time of a status is that of the question for the fill alone.
-struct LookForOverflow<C> {
-    chip: C,
-    overflowed: bool,
-}
+struct LookForOverflow<C>(C);
 
 impl<C: FifoChip> Talk for LookForOverflow<C> {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        self.overflowed = self.chip.overflowed(chip)?;
-        Ok(())
+    type Answer = bool;
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+        self.0.overflowed(chip)
     }
 }
 
@@ -243,16 +256,14 @@ struct Switch<C> {
 }
 
 impl<C: FifoChip> Talk for Switch<C> {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        if self.on { self.chip.switch_on(chip) } else { self.chip.switch_off(chip) }
+    /// Whether it is on now.
+    type Answer = bool;
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+        if self.on { self.chip.switch_on(chip) } else { self.chip.switch_off(chip) }?;
+        Ok(self.on)
     }
 }
-
-// The errands.
-const READ: u8 = 0;
-const FILL: u8 = 1;
-const OVERFLOW: u8 = 2;
-const SWITCH: u8 = 3;
 
 /// What a measurement of a host up to v0.12 is at.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -270,174 +281,174 @@ enum Phase {
 
 /// How often a FIFO of 32 samples is read after the end, so that one that never gets empty ends, too.
 const LAST_READS: u8 = 33;
-/// What is told of a FIFO that makes no sense, in samples: more than any has, so the host asks again.
-const NONSENSE: u32 = 0x7f;
-
 /// A sensor.
-struct FifoSensor<C> {
+struct FifoSensor<C: FifoChip> {
     chip: C,
     device: Oid,
     bulk: SensorBulk,
     rest_ticks: Ticks,
     phase: Phase,
-    /// Here while the sensor is not being switched.
-    switch: Option<Box<Conversation<Switch<C>>>>,
-    /// Here while no reading is under way.
-    read: Option<Box<Conversation<Read<C>>>>,
-    /// Whether the reading under way is of an earlier query, and counts no more.
-    stale: bool,
-    /// Whether a reading is due as soon as that one is over.
+    switch: Slot<Conversation<Switch<C>>>,
+    read: Slot<Conversation<Read<C>>>,
+    /// Whether a reading is due as soon as the one that is under way is over.
     waiting: bool,
-    /// Here while no status is asked for.
-    fill: Option<Box<Conversation<LookAtFill<C>>>>,
-    overflow: Option<Box<Conversation<LookForOverflow<C>>>>,
+    fill: Slot<Conversation<LookAtFill<C>>>,
+    overflow: Slot<Conversation<LookForOverflow<C>>>,
 }
 
 impl<C: FifoChip> FifoSensor<C> {
+    /// What is told of a FIFO that makes no sense: more samples than any has, so the host asks again.
+    const NONSENSE_BYTES: u32 = 0x7f * C::SAMPLE_BYTES as u32;
+
     /// Has samples read, as soon as an earlier reading is over.
-    fn read(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        let Some(mut read) = self.read.take() else {
+    fn read(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        let Some(Conversation { talk: Read { reading, .. }, .. }) = self.read.here() else {
             self.waiting = true;
             return Ok(());
         };
-        let Reading { len, room, overflows, .. } = &mut read.talk.reading;
-        (*len, *room, *overflows) = (0, self.bulk.room(), 0);
-        mcu.converse(self.device, Ticket { oid, tag: READ }, read)
+        (reading.len, reading.room, reading.overflows) = (0, self.bulk.room(), 0);
+        self.read.converse(turn, self.device)
     }
 
-    fn take_in(
-        &mut self,
-        mcu: &mut Mcu,
-        oid: Oid,
-        mut read: Box<Conversation<Read<C>>>,
-        ended: Clock,
-    ) -> Result<(), Shutdown> {
-        let result = std::mem::replace(&mut read.result, Ok(()));
-        let Reading { samples, len, overflows, pending, more, .. } = &mut read.talk.reading;
-        let (samples, len, overflows, more) = (*samples, *len, *overflows, *more);
-        let stale = std::mem::take(&mut self.stale);
-        if stale {
-            *pending = 0;
-        }
-        self.read = Some(read);
-        if let Err(error) = result {
-            return self.failed(mcu, oid, error);
-        }
-        if stale {
-            return if std::mem::take(&mut self.waiting) { self.read(mcu, oid) } else { Ok(()) };
-        }
-        self.bulk.count_overflows(overflows);
-        for sample in samples[..len].chunks(C::SAMPLE_BYTES) {
-            self.bulk.add(mcu, oid, sample);
+    fn has_read(&mut self, turn: &mut Turn, reading: Reading, ended: Clock) -> Result<(), Shutdown> {
+        self.bulk.count_overflows(reading.overflows);
+        for sample in reading.samples[..reading.len].chunks(C::SAMPLE_BYTES) {
+            self.bulk.add(turn, sample);
         }
         match self.phase {
             // Nothing further is read before it is off.
-            Phase::Ends(None, _) => return Ok(()),
-            Phase::Ends(Some(_), _) => return self.ask_status(mcu, oid),
-            _ if more => return self.read(mcu, oid),
-            _ => {}
+            Phase::Ends(None, _) => Ok(()),
+            Phase::Ends(Some(_), _) => self.ask_status(turn),
+            _ if reading.more => self.read(turn),
+            _ => {
+                turn.go_on(TIMER, ended + self.rest_ticks);
+                Ok(())
+            }
         }
-        mcu.go_on(TimerId::sampling(oid, 0), ended + self.rest_ticks);
-        Ok(())
     }
 
     /// Ends the measurement.
     fn end(&mut self) {
-        self.stale = self.read.is_none();
+        self.read.drop_pending();
+        self.has_pending(0);
         self.waiting = false;
         self.phase = Phase::Idle;
-        if let Some(read) = &mut self.read {
-            read.talk.reading.pending = 0;
+    }
+
+    /// The chip has so many bytes. A reading that is under way knows better.
+    fn has_pending(&mut self, bytes: u16) {
+        if let Some(read) = self.read.here() {
+            read.talk.reading.pending = bytes;
         }
     }
 
-    fn failed(&mut self, mcu: &mut Mcu, oid: Oid, error: BusError) -> Result<(), Shutdown> {
-        let failure = self.chip.bus_type().failed(mcu, error);
-        mcu.device_failed(oid, C::NAME, failure)
+    fn failed(&mut self, turn: &mut Turn, error: BusError) -> Result<(), Shutdown> {
+        let failure = self.chip.bus_type().failed(turn, error);
+        turn.device_failed(C::NAME, failure)
     }
 
-    fn switch(&mut self, mcu: &mut Mcu, oid: Oid, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
         // One after the other: what is wanted by then follows.
-        let Some(mut switch) = self.switch.take() else { return Ok(()) };
+        let Some(switch) = self.switch.here() else { return Ok(()) };
         switch.talk.on = on;
-        mcu.converse(self.device, Ticket { oid, tag: SWITCH }, switch)
+        self.switch.converse(turn, self.device)
     }
 
     /// The sensor is on, or off.
-    fn switched(&mut self, mcu: &mut Mcu, oid: Oid, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
+    fn switched(&mut self, turn: &mut Turn, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
         match self.phase {
             // That was for an earlier query.
             Phase::Idle | Phase::Begins => Ok(()),
-            Phase::SwitchesOn if !on => self.switch(mcu, oid, true),
+            Phase::SwitchesOn if !on => self.switch(turn, true),
             Phase::SwitchesOn => {
                 self.phase = Phase::Idle;
-                mcu.go_on(TimerId::sampling(oid, 0), span.1 + self.rest_ticks);
+                turn.go_on(TIMER, span.1 + self.rest_ticks);
                 Ok(())
             }
-            Phase::Ends(..) if on => self.switch(mcu, oid, false),
+            Phase::Ends(..) if on => self.switch(turn, false),
             Phase::Ends(..) => {
                 self.phase = Phase::Ends(Some(span), LAST_READS);
-                self.ask_status(mcu, oid)
+                self.ask_status(turn)
             }
         }
     }
 
     /// Measures from `at` on, for a host that leaves it to the machine to switch the sensor on.
-    fn query_at(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, rest_ticks: Ticks) -> Result<(), Shutdown> {
-        let timer = TimerId::sampling(oid, 0);
-        mcu.cancel(timer);
+    fn query_at(&mut self, turn: &mut Turn, at: Clock, rest_ticks: Ticks) -> Result<(), Shutdown> {
+        turn.cancel(TIMER);
         self.end();
         self.rest_ticks = rest_ticks;
         self.bulk.reset();
         self.phase = Phase::Begins;
-        mcu.schedule(timer, at)
+        turn.schedule(TIMER, at)
     }
 
     /// Switches the sensor off, sends what there is, and tells the host how much that was. What is being
     /// read counts.
-    fn stop(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        mcu.cancel(TimerId::sampling(oid, 0));
+    fn stop(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        turn.cancel(TIMER);
         self.waiting = false;
         self.phase = Phase::Ends(None, LAST_READS);
-        self.switch(mcu, oid, false)
+        self.switch(turn, false)
     }
 
-    /// The sensor that was switched off said how many bytes it has.
-    fn ended(&mut self, mcu: &mut Mcu, oid: Oid, off: (Clock, Clock), bytes: u32, reads: u8) -> Result<(), Shutdown> {
-        if C::KEEPS_SAMPLES && bytes > 0 && reads > 0 {
-            self.phase = Phase::Ends(Some(off), reads - 1);
-            return self.read(mcu, oid);
+    /// The chip has said how full its FIFO is; `None` makes no sense.
+    fn has_filled(&mut self, turn: &mut Turn, fill: Option<Fill>, span: (Clock, Clock)) -> Result<(), Shutdown> {
+        if let Phase::Ends(Some(off), reads) = self.phase {
+            return self.ended(turn, off, fill, reads);
         }
-        self.phase = Phase::Idle;
-        self.bulk.flush(mcu, oid);
-        self.bulk.send_status(mcu, oid, off, bytes);
+        match fill {
+            Some(Fill { bytes, overflowed }) => {
+                self.bulk.count_overflows(overflowed.into());
+                self.has_pending(bytes);
+                self.bulk.send_status(turn, span, bytes.into());
+            }
+            None if C::OWN_WORDS.is_some() && !turn.speaks::<BulkData<'_>>() => {
+                self.bulk.send_status(turn, span, Self::NONSENSE_BYTES);
+            }
+            // Without an answer klippy asks again, since v0.13.
+            None => {}
+        }
         Ok(())
     }
 
-    fn query(&mut self, mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) {
-        let timer = TimerId::sampling(oid, 0);
-        mcu.cancel(timer);
+    /// The same after the sensor was switched off.
+    fn ended(&mut self, turn: &mut Turn, off: (Clock, Clock), fill: Option<Fill>, reads: u8) -> Result<(), Shutdown> {
+        let bytes = fill.map(|fill| fill.bytes);
+        // What makes no sense is asked again, as samples may be left.
+        if C::KEEPS_SAMPLES && bytes != Some(0) && reads > 0 {
+            self.phase = Phase::Ends(Some(off), reads - 1);
+            return if bytes.is_none() { self.ask_status(turn) } else { self.read(turn) };
+        }
+        self.phase = Phase::Idle;
+        self.bulk.flush(turn);
+        self.bulk.send_status(turn, off, bytes.map_or(Self::NONSENSE_BYTES, u32::from));
+        Ok(())
+    }
+
+    fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) {
+        turn.cancel(TIMER);
         self.end();
         if rest_ticks == Ticks(0) {
             return;
         }
         self.rest_ticks = rest_ticks;
         self.bulk.reset();
-        let at = mcu.now() + rest_ticks;
-        mcu.go_on(timer, at);
+        let at = turn.now() + rest_ticks;
+        turn.go_on(TIMER, at);
     }
 
-    fn ask_status(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn ask_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         if !C::HAS_OVERFLOW_REGISTER {
-            return self.ask_fill(mcu, oid);
+            return self.ask_fill(turn);
         }
-        let overflow = self.overflow.take().ok_or_else(status_amid_status)?;
-        mcu.converse(self.device, Ticket { oid, tag: OVERFLOW }, overflow)
+        self.overflow.here().ok_or_else(status_amid_status)?;
+        self.overflow.converse(turn, self.device)
     }
 
-    fn ask_fill(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        let fill = self.fill.take().ok_or_else(status_amid_status)?;
-        mcu.converse(self.device, Ticket { oid, tag: FILL }, fill)
+    fn ask_fill(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        self.fill.here().ok_or_else(status_amid_status)?;
+        self.fill.converse(turn, self.device)
     }
 }
 
@@ -452,78 +463,52 @@ impl<C: FifoChip> Object for FifoSensor<C> {
         C::NAME
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         if self.phase == Phase::Begins {
             self.phase = Phase::SwitchesOn;
-            self.switch(mcu, oid, true)?;
+            self.switch(turn, true)?;
         } else {
-            self.read(mcu, oid)?;
+            self.read(turn)?;
         }
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let span = (done.began, done.ended);
-        let result = match done.tag {
-            READ => {
-                let Some(read) = done.errand::<Conversation<Read<C>>>() else { return Ok(()) };
-                return self.take_in(mcu, oid, read, span.1);
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let error = if let Some(Back { result, counts, ended, .. }) = self.read.back(done) {
+            let result = result.map_err(BusError::clone);
+            if !counts {
+                self.has_pending(0);
             }
-            SWITCH => {
-                let Some(mut switch) = done.errand::<Conversation<Switch<C>>>() else { return Ok(()) };
-                let result = std::mem::replace(&mut switch.result, Ok(()));
-                let on = switch.talk.on;
-                self.switch = Some(switch);
-                if result.is_ok() {
-                    return self.switched(mcu, oid, on, span);
-                }
-                result
+            match result {
+                Ok(reading) if counts => return self.has_read(turn, reading, ended),
+                Ok(_) => return if std::mem::take(&mut self.waiting) { self.read(turn) } else { Ok(()) },
+                Err(error) => error,
             }
-            OVERFLOW => {
-                let Some(mut overflow) = done.errand::<Conversation<LookForOverflow<C>>>() else { return Ok(()) };
-                let result = std::mem::replace(&mut overflow.result, Ok(()));
-                let overflowed = overflow.talk.overflowed;
-                self.overflow = Some(overflow);
-                if result.is_ok() {
+        } else if let Some(Back { result, began, ended, .. }) = self.switch.back(done) {
+            match result {
+                Ok(on) => return self.switched(turn, on, (began, ended)),
+                Err(error) => error.clone(),
+            }
+        } else if let Some(Back { result, .. }) = self.overflow.back(done) {
+            match result {
+                Ok(overflowed) => {
                     self.bulk.count_overflows(overflowed.into());
-                    return self.ask_fill(mcu, oid);
+                    return self.ask_fill(turn);
                 }
-                result
+                Err(error) => error.clone(),
             }
-            _ => {
-                let Some(mut fill) = done.errand::<Conversation<LookAtFill<C>>>() else { return Ok(()) };
-                let result = std::mem::replace(&mut fill.result, Ok(()));
-                let told = fill.talk.fill;
-                self.fill = Some(fill);
-                if let (Ok(()), Phase::Ends(Some(off), reads)) = (&result, self.phase) {
-                    // What makes no sense is asked again, as samples may be left.
-                    if told.is_none() && C::KEEPS_SAMPLES && reads > 0 {
-                        self.phase = Phase::Ends(Some(off), reads - 1);
-                        return self.ask_status(mcu, oid);
-                    }
-                    let bytes = told.map_or(NONSENSE * C::SAMPLE_BYTES as u32, |fill| fill.bytes.into());
-                    return self.ended(mcu, oid, off, bytes, reads);
-                }
-                if told.is_none() && result.is_ok() && C::OWN_WORDS.is_some() && !mcu.speaks::<BulkData<'_>>() {
-                    self.bulk.send_status(mcu, oid, span, NONSENSE * C::SAMPLE_BYTES as u32);
-                }
-                // Without an answer klippy asks again, since v0.13.
-                if let (Ok(()), Some(Fill { bytes, overflowed })) = (&result, told) {
-                    self.bulk.count_overflows(overflowed.into());
-                    // A reading under way knows better.
-                    if let Some(read) = &mut self.read {
-                        read.talk.reading.pending = bytes;
-                    }
-                    self.bulk.send_status(mcu, oid, span, bytes.into());
-                }
-                result
+        } else if let Some(Back { result, began, ended, .. }) = self.fill.back(done) {
+            match result {
+                Ok(fill) => return self.has_filled(turn, fill, (began, ended)),
+                Err(error) => error.clone(),
             }
+        } else {
+            return Ok(());
         };
-        result.or_else(|error| self.failed(mcu, oid, error))
+        self.failed(turn, error)
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, _turn: &mut Turn) {
         self.end();
     }
 }
@@ -531,8 +516,8 @@ impl<C: FifoChip> Object for FifoSensor<C> {
 /// Puts a sensor under `oid` that is the bus device `device`.
 pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip: C) -> Result<(), Shutdown> {
     match chip.bus_type() {
-        BusType::Spi => mcu.with::<Spi, _>(device, |_, _| Ok(()))?,
-        BusType::I2c => mcu.with::<I2c, _>(device, |_, _| Ok(()))?,
+        BusType::Spi => mcu.require::<Spi>(device)?,
+        BusType::I2c => mcu.require::<I2c>(device)?,
     }
     let sensor = FifoSensor {
         chip,
@@ -540,20 +525,19 @@ pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip:
         bulk: C::OWN_WORDS.map_or_else(SensorBulk::new, |own| SensorBulk::with_own(mcu, own)),
         rest_ticks: Ticks(0),
         phase: Phase::Idle,
-        switch: Some(Conversation::new(Switch { chip, on: false })),
-        read: Some(Conversation::new(Read { chip, reading: Reading::new() })),
-        stale: false,
+        switch: Slot::talking(Switch { chip, on: false }),
+        read: Slot::talking(Read { chip, reading: Reading::new() }),
         waiting: false,
-        fill: Some(Conversation::new(LookAtFill { chip, fill: None })),
-        overflow: Some(Conversation::new(LookForOverflow { chip, overflowed: false })),
+        fill: Slot::talking(LookAtFill(chip)),
+        overflow: Slot::talking(LookForOverflow(chip)),
     };
     mcu.assign(oid, sensor)
 }
 
 /// Measures, with `rest_ticks` between two looks into the FIFO; none ends it.
 pub(super) fn query<C: FifoChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) -> Result<(), Shutdown> {
-    mcu.with::<FifoSensor<C>, _>(oid, |sensor, mcu| {
-        sensor.query(mcu, oid, rest_ticks);
+    mcu.with::<FifoSensor<C>, _>(oid, |sensor, turn| {
+        sensor.query(turn, rest_ticks);
         Ok(())
     })
 }
@@ -562,13 +546,13 @@ pub(super) fn query<C: FifoChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) -> 
 /// and its end is answered by the number of samples.
 pub(super) fn query_at<C: FifoChip>(mcu: &mut Mcu, oid: Oid, at: WireClock, rest_ticks: Ticks) -> Result<(), Shutdown> {
     let at = mcu.instant(at);
-    mcu.with::<FifoSensor<C>, _>(oid, |sensor, mcu| match rest_ticks {
-        Ticks(0) => sensor.stop(mcu, oid),
-        _ => sensor.query_at(mcu, oid, at, rest_ticks),
+    mcu.with::<FifoSensor<C>, _>(oid, |sensor, turn| match rest_ticks {
+        Ticks(0) => sensor.stop(turn),
+        _ => sensor.query_at(turn, at, rest_ticks),
     })
 }
 
 /// Asks the sensor how many samples it has.
 pub(super) fn query_status<C: FifoChip>(mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-    mcu.with::<FifoSensor<C>, _>(oid, |sensor, mcu| sensor.ask_status(mcu, oid))
+    mcu.with::<FifoSensor<C>, _>(oid, |sensor, turn| sensor.ask_status(turn))
 }

@@ -90,9 +90,9 @@ const CONFIG_HD44780: Command = command!(
 );
 
 const HD44780_SEND_CMDS: Command = command!("hd44780_send_cmds oid=%c cmds=%*s", |mcu, oid: Oid, cmds: &[u8]| {
-    mcu.with::<Display<Hd44780>, _>(oid, |display, mcu| display.write(mcu, oid, Register::Commands, cmds))
+    mcu.with::<Display<Hd44780>, _>(oid, |display, turn| display.write(turn, Register::Commands, cmds))
 });
 
 const HD44780_SEND_DATA: Command = command!("hd44780_send_data oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Display<Hd44780>, _>(oid, |display, mcu| display.write(mcu, oid, Register::Data, data))
+    mcu.with::<Display<Hd44780>, _>(oid, |display, turn| display.write(turn, Register::Data, data))
 });

@@ -18,12 +18,12 @@ use log::warn;
 use crate::board::{Bias, Direction, Line, Pin};
 use crate::mcu::{
     Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
-    Settable, Ticket, WorkerId, command, since,
+    Settable, Slot, Turn, WorkerId, command, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Ticks, TimeSource};
 
-use super::ready_adc::{ReadyAdc, ReadyChip, SWITCH, Sample, attach, attach_probe, query, query_status};
+use super::ready_adc::{ReadyAdc, ReadyChip, Sample, attach, attach_probe, query, query_status};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "hx71x",
@@ -74,18 +74,24 @@ struct Shift {
     time: Arc<dyn TimeSource>,
     /// What the log calls the clock line.
     name: String,
-    /// What came of it.
+    /// Whether the log was told of a clock that was high for too long.
+    told: bool,
+}
+
+/// What was shifted out.
+#[derive(Clone, Copy)]
+struct Shifted {
     raw: u32,
     /// Whether the chip may have switched itself off amid the pulses.
     too_long: bool,
-    /// Whether the log was told of that.
-    told: bool,
-    result: Result<(), Shutdown>,
 }
 
-impl Shift {
-    fn shift(&mut self) -> Result<(), Shutdown> {
-        self.raw = 0;
+impl Errand for Shift {
+    type Answer = Shifted;
+    type Failure = Shutdown;
+
+    fn run(&mut self) -> Result<Shifted, Shutdown> {
+        let mut raw = 0;
         let mut longest = 0;
         for _ in 0..self.pulses {
             let rises = self.time.now();
@@ -93,15 +99,15 @@ impl Shift {
             wait();
             self.sclk.write(false)?;
             longest = self.time.now().since(rises).max(longest);
-            self.raw = self.raw << 1 | u32::from(self.dout.read()?);
+            raw = raw << 1 | u32::from(self.dout.read()?);
             wait();
         }
-        self.too_long = longest > i64::from(POWER_DOWN.0);
-        if self.too_long && !self.told {
+        let too_long = longest > i64::from(POWER_DOWN.0);
+        if too_long && !self.told {
             self.told = true;
             warn!("{}", too_slow(&self.name, longest));
         }
-        Ok(())
+        Ok(Shifted { raw, too_long })
     }
 }
 
@@ -117,12 +123,6 @@ fn wait() {
     let start = Instant::now();
     while start.elapsed() < PULSE {
         std::hint::spin_loop();
-    }
-}
-
-impl Errand for Shift {
-    fn run(&mut self) {
-        self.result = self.shift();
     }
 }
 
@@ -149,32 +149,34 @@ impl ReadyChip for Hx71x {
     const NAME: &'static str = "HX71x";
     type Reading = Shift;
 
-    fn read(&mut self, mcu: &mut Mcu, ticket: Ticket, reading: Box<Shift>) -> Result<(), Shutdown> {
-        mcu.dispatch(self.worker, ticket, reading)
+    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Shift>) -> Result<(), Shutdown> {
+        reading.send(turn, self.worker)
     }
 
-    fn result(reading: &mut Shift) -> Result<(), Shutdown> {
-        std::mem::replace(&mut reading.result, Ok(()))
+    fn stop(failure: &Shutdown) -> Shutdown {
+        failure.clone()
     }
 
-    fn sample(&mut self, reading: &Shift, late: bool) -> Sample {
-        match decode(reading.raw, self.gain_channel) {
+    fn sample(&mut self, Shifted { raw, too_long }: Shifted, late: bool) -> Sample {
+        match decode(raw, self.gain_channel) {
             Err(error) => self.last_error = Some(error),
-            Ok(_) if late || reading.too_long => self.last_error = Some(ERROR_READ_TOO_LONG),
+            Ok(_) if late || too_long => self.last_error = Some(ERROR_READ_TOO_LONG),
             Ok(value) if self.last_error.is_none() => return Sample::Value(value),
             Ok(_) => {}
         }
         Sample::Error { code: None, value: self.last_error.unwrap_or(ERROR_DESYNC) }
     }
 
-    fn switch(&mut self, mcu: &mut Mcu, oid: Oid, on: bool) -> Result<(), Shutdown> {
+    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
         self.last_error = None;
-        self.power_down.set(mcu, Ticket { oid, tag: SWITCH }, !on)
+        self.power_down.set(turn, !on)
     }
 
-    fn switched(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let done = self.power_down.returned(mcu, Ticket { oid, tag: SWITCH }, done);
-        done.map(drop).or_else(|failure| mcu.try_shut_down(failure))
+    fn switched(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        match self.power_down.back(turn, done) {
+            Some(Err(failure)) => turn.try_shut_down(failure),
+            _ => Ok(()),
+        }
     }
 }
 
@@ -196,14 +198,11 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
         pulses: SAMPLE_BITS + gain_channel,
         time: mcu.clock(),
         name: mcu.name(sclk_pin),
-        raw: 0,
-        too_long: false,
         told: false,
-        result: Ok(()),
     };
     let power_down = Remote::new(worker, PowerDown(sclk), true);
     let chip = Hx71x { worker, gain_channel, power_down, last_error: None };
-    mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, dout, Box::new(shift)))
+    mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, dout, Slot::new(shift)))
 }
 
 const CONFIG_HX71X: Command = command!(

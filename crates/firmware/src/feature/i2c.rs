@@ -11,9 +11,9 @@
 use crate::board::soft_i2c::SoftI2c;
 use crate::board::{BusDevice, BusError, BusStatus, I2cConfig, Pin, Range};
 use crate::mcu::{
-    Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_11,
-    Generation::V0_12, Generation::V0_13, Mcu, Object, Oid, Response, Talk, Ticket, command, only, response, since,
-    until,
+    Back, Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
+    Generation::V0_11, Generation::V0_12, Generation::V0_13, Mcu, Object, Oid, Response, Slot, Talk, Turn, command,
+    only, response, since, until,
 };
 use crate::shutdown::{Shutdown, ShutdownReason, reason, shutdowns};
 use crate::time::Ticks;
@@ -99,11 +99,32 @@ pub(super) fn i2c_shutdown(mcu: &Mcu, error: BusError) -> Shutdown {
     Shutdown::because(reason, error.detail)
 }
 
+/// What a transfer is for.
+#[derive(Clone, Copy)]
+enum Purpose {
+    /// `i2c_transfer`, which is answered with the status of the bus.
+    Transfer,
+    /// `i2c_write`.
+    Write,
+    /// `i2c_read`.
+    Read,
+    /// `i2c_modify_bits`: bits to be changed in what was read, which is then written to where it was read from. Those
+    /// to be cleared come first, and behind them as many bytes to be set.
+    Modify { bits: [u8; PAYLOAD_MAX], len: usize },
+}
+
+impl Purpose {
+    fn modify(clear_set: &[u8]) -> Purpose {
+        let mut bits = [0; PAYLOAD_MAX];
+        let len = clear_set.len().min(PAYLOAD_MAX);
+        bits[..len].copy_from_slice(&clear_set[..len]);
+        Purpose::Modify { bits, len: len / 2 }
+    }
+}
+
 /// Bytes to a device, and bytes from it.
 struct Transfer {
-    /// Bits to be changed in what was read, which is then written to where it was read from: those to
-    /// be cleared, and behind them as many to be set.
-    modify: Option<([u8; PAYLOAD_MAX], usize)>,
+    purpose: Purpose,
     /// Whether what was changed is being written.
     writes_back: bool,
     write: [u8; PAYLOAD_MAX],
@@ -113,22 +134,11 @@ struct Transfer {
 }
 
 impl Transfer {
-    fn load(&mut self, write: &[u8], read_len: usize) {
-        self.write_len = write.len().min(PAYLOAD_MAX);
-        self.write[..self.write_len].copy_from_slice(&write[..self.write_len]);
-        self.read_len = read_len;
-        self.read = [0; u8::MAX as usize];
-        self.modify = None;
-        self.writes_back = false;
-    }
-
-    /// As many bytes from the register on as there are to be changed, and back.
-    fn load_modify(&mut self, register: &[u8], clear_set: &[u8]) {
-        let mut bits = [0; PAYLOAD_MAX];
-        let len = clear_set.len().min(PAYLOAD_MAX);
-        bits[..len].copy_from_slice(&clear_set[..len]);
-        self.load(register, len / 2);
-        self.modify = Some((bits, len / 2));
+    fn new(purpose: Purpose, write: &[u8], read_len: usize) -> Transfer {
+        let mut bytes = [0; PAYLOAD_MAX];
+        let write_len = write.len().min(PAYLOAD_MAX);
+        bytes[..write_len].copy_from_slice(&write[..write_len]);
+        Transfer { purpose, writes_back: false, write: bytes, write_len, read: [0; u8::MAX as usize], read_len }
     }
 
     /// What the answer has room for, as in the firmware.
@@ -138,14 +148,16 @@ impl Transfer {
 }
 
 impl Talk for Transfer {
+    type Answer = ();
+
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
         let read = &mut self.read[..self.read_len];
         match &self.write[..self.write_len] {
             [] if !read.is_empty() => chip.read_register(&[], read),
             write => chip.write_read(write, read),
         }?;
-        let Some((bits, len)) = &self.modify else { return Ok(()) };
-        let (clear, set) = bits.split_at(*len);
+        let Purpose::Modify { bits, len } = self.purpose else { return Ok(()) };
+        let (clear, set) = bits.split_at(len);
         let changed = read.iter().zip(clear.iter().zip(set)).map(|(byte, (clear, set))| byte & !clear | set);
         for (place, byte) in self.write[self.write_len..].iter_mut().zip(changed) {
             *place = byte;
@@ -156,34 +168,20 @@ impl Talk for Transfer {
     }
 }
 
-// The tags of transfers, by the commands that ask for them.
-const TRANSFER: u8 = 0;
-const WRITE: u8 = 1;
-const READ: u8 = 2;
-const MODIFY: u8 = 3;
-
 /// An I2C device.
 pub(super) struct I2c {
     bus: Option<Bus>,
     /// Whether the bus is made of lines.
     on_lines: bool,
-    /// Here while no command's transfer is under way.
-    transfer: Option<Box<Conversation<Transfer>>>,
+    transfer: Slot<Conversation<Transfer>>,
     /// Whether the last transfer failed: a display that is unplugged fails many times a second.
     failing: bool,
 }
 
 impl I2c {
     fn new() -> I2c {
-        let transfer = Transfer {
-            modify: None,
-            writes_back: false,
-            write: [0; PAYLOAD_MAX],
-            write_len: 0,
-            read: [0; u8::MAX as usize],
-            read_len: 0,
-        };
-        I2c { bus: None, on_lines: false, transfer: Some(Conversation::new(transfer)), failing: false }
+        let transfer = Slot::talking(Transfer::new(Purpose::Transfer, &[], 0));
+        I2c { bus: None, on_lines: false, transfer, failing: false }
     }
 
     fn set_bus(&mut self, mcu: &mut Mcu, bus: u32, rate_hz: u32, address: u32) -> Result<(), Shutdown> {
@@ -203,64 +201,25 @@ impl I2c {
         Ok(())
     }
 
-    /// Has a transfer; `load` says which.
-    fn transfer(&mut self, mcu: &mut Mcu, oid: Oid, tag: u8, load: impl FnOnce(&mut Transfer)) -> Result<(), Shutdown> {
-        // Commands wait for each other, so it is here.
-        let Some(mut transfer) = self.transfer.take() else {
-            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
-        };
-        load(&mut transfer.talk);
+    /// Has a transfer of the command that runs.
+    fn transfer(&mut self, turn: &mut Turn, transfer: Transfer) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
             // As the firmware answers for a device without a bus.
             let status = BusStatus::Nack;
-            if tag == TRANSFER {
+            if let Purpose::Transfer = transfer.purpose {
                 let i2c_bus_status = on_wire(status).0;
-                mcu.send(TransferResponse { oid, i2c_bus_status, response: transfer.talk.response() });
-            }
-            self.transfer = Some(transfer);
-            if tag == TRANSFER {
+                turn.send(TransferResponse { oid: turn.oid(), i2c_bus_status, response: transfer.response() });
                 return Ok(());
             }
             let detail = "it has no bus: a fault of the host, which did not send i2c_set_bus".into();
-            return Err(self.failure(mcu, tag == WRITE, BusError { status, detail }));
+            return Err(self.failure(turn, matches!(transfer.purpose, Purpose::Write), BusError { status, detail }));
         };
-        mcu.converse_on(bus, Ticket { oid, tag }, transfer)
-    }
-
-    /// Tells the host what came of a transfer. Where the answer has no status a failure stops the machine.
-    fn answer(
-        &mut self,
-        mcu: &mut Mcu,
-        oid: Oid,
-        tag: u8,
-        transfer: Box<Conversation<Transfer>>,
-        result: Result<(), BusError>,
-    ) -> Result<(), Shutdown> {
-        let response = transfer.talk.response();
-        match (tag, &result) {
-            (TRANSFER, result) => {
-                let i2c_bus_status = result.as_ref().map_or_else(|error| on_wire(error.status).0, |()| SUCCESS);
-                mcu.send(TransferResponse { oid, i2c_bus_status, response });
-            }
-            (READ, Ok(())) => mcu.send(ReadResponse { oid, response }),
-            _ => {}
-        }
-        let (writes_back, has_register) = (transfer.talk.writes_back, transfer.talk.write_len > 0);
-        self.transfer = Some(transfer);
-        let failed_before = std::mem::replace(&mut self.failing, result.is_err());
-        match result {
-            Err(error) if tag != TRANSFER => {
-                // v0.11 wrote the register by itself before it read.
-                let of_register = mcu.serves(only(V0_11)) && has_register && error.status != BusStatus::StartReadNack;
-                let writing = tag == WRITE || writes_back || of_register;
-                mcu.device_failed(oid, self.kind(), self.failure(mcu, writing, error))
-            }
-            Err(error) if !failed_before => {
-                mcu.warn(oid, self.kind(), i2c_shutdown(mcu, error));
-                Ok(())
-            }
-            _ => Ok(()),
-        }
+        // Commands wait for each other, so it is here.
+        let Some(conversation) = self.transfer.here() else {
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
+        };
+        conversation.talk = transfer;
+        self.transfer.converse_on(turn, bus)
     }
 
     /// The stop for a transfer that failed, as it wrote or as it read.
@@ -279,11 +238,35 @@ impl Object for I2c {
         "I2C device"
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let tag = done.tag;
-        let Some(mut transfer) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
-        let result = std::mem::replace(&mut transfer.result, Ok(()));
-        self.answer(mcu, oid, tag, transfer, result)
+    /// Tells the host what came of a transfer. Where the answer has no status a failure stops the machine.
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.transfer.back(done) else { return Ok(()) };
+        let result = result.map_err(BusError::clone);
+        let Some(Conversation { talk: transfer, .. }) = self.transfer.here() else { return Ok(()) };
+        let response = transfer.response();
+        match (transfer.purpose, &result) {
+            (Purpose::Transfer, result) => {
+                let i2c_bus_status = result.as_ref().map_or_else(|error| on_wire(error.status).0, |()| SUCCESS);
+                turn.send(TransferResponse { oid: turn.oid(), i2c_bus_status, response });
+            }
+            (Purpose::Read, Ok(())) => turn.send(ReadResponse { oid: turn.oid(), response }),
+            _ => {}
+        }
+        let failed_before = std::mem::replace(&mut self.failing, result.is_err());
+        let Err(error) = result else { return Ok(()) };
+        if let Purpose::Transfer = transfer.purpose {
+            if !failed_before {
+                let trouble = i2c_shutdown(turn, error);
+                turn.warn(self.kind(), trouble);
+            }
+            return Ok(());
+        }
+        // v0.11 wrote the register by itself before it read.
+        let of_register =
+            turn.serves(only(V0_11)) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
+        let writing = matches!(transfer.purpose, Purpose::Write) || transfer.writes_back || of_register;
+        let failure = self.failure(turn, writing, error);
+        turn.device_failed(self.kind(), failure)
     }
 
     fn bus(&self) -> Option<&Bus> {
@@ -307,7 +290,7 @@ const CONFIG_I2C_WITH_BUS: Command = command!(
 const I2C_SET_BUS: Command = command!(
     "i2c_set_bus oid=%c i2c_bus=%u rate=%u address=%u",
     |mcu, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_bus(mcu, i2c_bus, rate, address))
+        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.set_bus(turn, i2c_bus, rate, address))
     }
 )
 .of(since(V0_12));
@@ -319,7 +302,7 @@ const I2C_SET_SOFTWARE_BUS: Command = command!(
     "i2c_set_software_bus oid=%c scl_pin=%u sda_pin=%u rate=%u address=%u",
     |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, rate: u32, address: u32| {
         let _ = rate;
-        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_lines(mcu, [scl_pin, sda_pin], SOFTWARE_PULSE, address))
+        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.set_lines(turn, [scl_pin, sda_pin], SOFTWARE_PULSE, address))
     }
 )
 .of(since(V0_12).until(V0_13));
@@ -327,21 +310,19 @@ const I2C_SET_SOFTWARE_BUS: Command = command!(
 const I2C_SET_SW_BUS: Command = command!(
     "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",
     |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, pulse_ticks: Ticks, address: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.set_lines(mcu, [scl_pin, sda_pin], pulse_ticks, address))
+        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.set_lines(turn, [scl_pin, sda_pin], pulse_ticks, address))
     }
 )
 .of(since(Master).and(Kalico));
 
 const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<I2c, _>(oid, |i2c, mcu| i2c.transfer(mcu, oid, WRITE, |transfer| transfer.load(data, 0)))
+    mcu.with::<I2c, _>(oid, |i2c, turn| i2c.transfer(turn, Transfer::new(Purpose::Write, data, 0)))
 })
 .of(until(V0_13).and(Kalico));
 
 const I2C_READ: Command =
     command!("i2c_read oid=%c reg=%*s read_len=%u", |mcu, oid: Oid, reg: &[u8], read_len: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, mcu| {
-            i2c.transfer(mcu, oid, READ, |transfer| transfer.load(reg, one_byte(read_len)))
-        })
+        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.transfer(turn, Transfer::new(Purpose::Read, reg, one_byte(read_len))))
     })
     .of(until(V0_13).and(Kalico));
 
@@ -352,8 +333,9 @@ const I2C_MODIFY_BITS: Command = command!(
             let what = format_args!("{} bytes of bits are to be cleared and set", clear_set_bits.len());
             return Err(Shutdown::by_host(ODD_BITS, what));
         }
-        mcu.with::<I2c, _>(oid, |i2c, mcu| {
-            i2c.transfer(mcu, oid, MODIFY, |transfer| transfer.load_modify(reg, clear_set_bits))
+        mcu.with::<I2c, _>(oid, |i2c, turn| {
+            let purpose = Purpose::modify(clear_set_bits);
+            i2c.transfer(turn, Transfer::new(purpose, reg, clear_set_bits.len() / 2))
         })
     }
 )
@@ -361,8 +343,8 @@ const I2C_MODIFY_BITS: Command = command!(
 
 const I2C_TRANSFER: Command =
     command!("i2c_transfer oid=%c write=%*s read_len=%u", |mcu, oid: Oid, write: &[u8], read_len: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, mcu| {
-            i2c.transfer(mcu, oid, TRANSFER, |transfer| transfer.load(write, one_byte(read_len)))
+        mcu.with::<I2c, _>(oid, |i2c, turn| {
+            i2c.transfer(turn, Transfer::new(Purpose::Transfer, write, one_byte(read_len)))
         })
     })
     .of(since(Master));

@@ -12,8 +12,8 @@ use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
 use crate::mcu::{
-    Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
-    Generations, Mcu, Next, Object, Oid, Response, Talk, Ticket, TimerId, WireClock, command, only, response, since,
+    Back, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
+    Generations, Mcu, Next, Object, Oid, Response, Slot, Talk, Timer, Turn, WireClock, command, only, response, since,
 };
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
@@ -64,10 +64,14 @@ const I2C_DATA_ERROR: u8 = 2;
 /// A sample that looks like one of the errors that the host is sent.
 const INVALID_READ_DATA: u8 = 3;
 
-// Registers ("Register Maps").
-const DATA0_MSB: u8 = 0x00;
-const DATA0_LSB: u8 = 0x01;
-const STATUS: u8 = 0x18;
+/// "Register Maps".
+#[derive(Clone, Copy)]
+enum Register {
+    Data0Msb = 0x00,
+    Data0Lsb = 0x01,
+    Status = 0x18,
+}
+
 /// UNREADCONV0 of STATUS: channel 0 has a sample that was not read.
 const UNREADCONV0: u16 = 1 << 3;
 
@@ -77,61 +81,56 @@ const SAMPLE_BYTES: u32 = 4;
 const ERROR_FLAGS: u32 = 0xe000_0000;
 const DATA: u32 = 0x0fff_ffff;
 
-/// What a reading came to.
-#[derive(Clone, Copy)]
-enum Found {
-    Nothing,
-    /// Both words of channel 0.
-    Sample(u32),
-    Error(u8),
-}
+const TIMER: Timer = Timer::sampling(0);
 
 /// Whether klippy would take such a sample for an error of the machine's.
 fn looks_like_an_error(words: u32) -> bool {
     words >> 16 == 0xffff
 }
 
-fn read_word(chip: &mut dyn BusDevice, register: u8) -> Result<u16, BusError> {
+fn read_word(chip: &mut dyn BusDevice, register: Register) -> Result<u16, BusError> {
     let mut word = [0; 2];
-    chip.read_register(&[register], &mut word)?;
+    chip.read_register(&[register as u8], &mut word)?;
     Ok(u16::from_be_bytes(word))
+}
+
+/// Whether channel 0 has a sample that was not read.
+fn is_ready(chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+    Ok(read_word(chip, Register::Status)? & UNREADCONV0 != 0)
 }
 
 /// Reads a sample, if there is one.
 struct Look {
-    found: Found,
+    /// What the host is told if the bus fails now.
+    error: u8,
 }
 
 impl Talk for Look {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        self.found = Found::Error(I2C_STATUS_ERROR);
-        if read_word(chip, STATUS)? & UNREADCONV0 == 0 {
-            self.found = Found::Nothing;
-            return Ok(());
+    /// Both words of channel 0.
+    type Answer = Option<u32>;
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Option<u32>, BusError> {
+        self.error = I2C_STATUS_ERROR;
+        if !is_ready(chip)? {
+            return Ok(None);
         }
-        self.found = Found::Error(I2C_DATA_ERROR);
-        let high = read_word(chip, DATA0_MSB)?;
-        let low = read_word(chip, DATA0_LSB)?;
-        self.found = Found::Sample(u32::from(high) << 16 | u32::from(low));
-        Ok(())
+        self.error = I2C_DATA_ERROR;
+        let high = read_word(chip, Register::Data0Msb)?;
+        let low = read_word(chip, Register::Data0Lsb)?;
+        Ok(Some(u32::from(high) << 16 | u32::from(low)))
     }
 }
 
 /// Asks whether there is a sample.
-struct Ask {
-    ready: bool,
-}
+struct Ask;
 
 impl Talk for Ask {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        self.ready = read_word(chip, STATUS)? & UNREADCONV0 != 0;
-        Ok(())
+    type Answer = bool;
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
+        is_ready(chip)
     }
 }
-
-// The errands.
-const LOOK: u8 = 0;
-const ASK: u8 = 1;
 
 /// Homing by the sensor itself.
 struct Homing {
@@ -167,22 +166,20 @@ impl Homing {
             return Ok(());
         };
         self.trsync = None;
-        mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, reason))
+        mcu.with::<Trsync, _>(trsync, |trsync, turn| trsync.trigger(turn, reason))
     }
 }
+
+const KIND: &str = "LDC1612";
 
 struct Ldc1612 {
     i2c: Oid,
     /// Low while a sample is ready.
     intb: Option<Arc<dyn Line>>,
-    /// Here while no reading is under way.
-    look: Option<Box<Conversation<Look>>>,
-    /// Turns of the timer that came meanwhile.
+    look: Slot<Conversation<Look>>,
+    /// Turns of the timer that came while a reading was under way.
     missed: u16,
-    /// Whether the reading under way is of an earlier query, and counts no more.
-    stale: bool,
-    /// Here while no status is asked for.
-    ask: Option<Box<Conversation<Ask>>>,
+    ask: Slot<Conversation<Ask>>,
     rest_ticks: Ticks,
     bulk: SensorBulk,
     attached: Attached,
@@ -194,15 +191,14 @@ struct Ldc1612 {
 impl Ldc1612 {
     fn configure(mcu: &mut Mcu, oid: Oid, i2c: Oid, intb_pin: Option<Pin>) -> Result<(), Shutdown> {
         mcu.vacant(oid)?;
-        mcu.with::<I2c, _>(i2c, |_, _| Ok(()))?;
+        mcu.require::<I2c>(i2c)?;
         let intb = intb_pin.map(|pin| mcu.prompt_line(pin, "intb", Direction::Input(Bias::PullUp))).transpose()?;
         let sensor = Ldc1612 {
             i2c,
             intb,
-            look: Some(Conversation::new(Look { found: Found::Nothing })),
+            look: Slot::talking(Look { error: I2C_STATUS_ERROR }),
             missed: 0,
-            stale: false,
-            ask: Some(Conversation::new(Ask { ready: false })),
+            ask: Slot::talking(Ask),
             rest_ticks: Ticks(0),
             bulk: SensorBulk::new(),
             attached: Attached::default(),
@@ -212,135 +208,117 @@ impl Ldc1612 {
         mcu.assign(oid, sensor)
     }
 
-    /// Whether a sample that counts is being read.
-    fn is_pending(&self) -> bool {
-        self.look.is_none() && !self.stale
-    }
-
     /// Says in the log that the bus fails, if it did not before; or stops the machine.
-    fn note(&mut self, mcu: &mut Mcu, oid: Oid, result: Result<(), BusError>) -> Result<(), Shutdown> {
-        let failed_before = std::mem::replace(&mut self.failing, result.is_err());
-        let Err(error) = result else { return Ok(()) };
-        let trouble = i2c_shutdown(mcu, error);
-        if mcu.serves(HOMES_ITSELF) {
-            return mcu.device_failed(oid, self.kind(), trouble);
+    fn note(failing: &mut bool, turn: &mut Turn, failure: Option<&BusError>) -> Result<(), Shutdown> {
+        let failed_before = std::mem::replace(failing, failure.is_some());
+        let Some(error) = failure else { return Ok(()) };
+        let stops = turn.serves(HOMES_ITSELF);
+        if failed_before && !stops {
+            return Ok(());
         }
-        if !failed_before {
-            mcu.warn(oid, self.kind(), trouble);
+        let trouble = i2c_shutdown(turn, error.clone());
+        if stops {
+            return turn.device_failed(KIND, trouble);
         }
+        turn.warn(KIND, trouble);
         Ok(())
     }
 
     /// Has the sensor read, if it may have a sample.
-    fn turn(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn look(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         if self.intb.as_ref().map_or(Ok(false), |intb| intb.read())? {
             return Ok(());
         }
-        let Some(look) = self.look.take() else { return Ok(()) };
-        mcu.converse(self.i2c, Ticket { oid, tag: LOOK }, look)
+        self.look.converse(turn, self.i2c)
     }
 
     /// Makes up for the turns that came while the sensor was read, as in the firmware, whose timer waits for
     /// the bus: the first one is taken now, each further one says that samples may be lost.
-    fn make_up(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn make_up(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         let missed = std::mem::take(&mut self.missed);
         if missed == 0 {
             return Ok(());
         }
-        self.turn(mcu, oid)?;
-        if self.is_pending() {
+        self.look(turn)?;
+        if self.look.is_pending() {
             self.bulk.count_overflows(missed - 1);
         }
         Ok(())
     }
 
-    fn looked(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let read_at = done.ended;
-        let Some(mut look) = done.errand::<Conversation<Look>>() else { return Ok(()) };
-        let result = std::mem::replace(&mut look.result, Ok(()));
-        let found = look.talk.found;
-        self.look = Some(look);
-        self.note(mcu, oid, result)?;
-        if std::mem::take(&mut self.stale) {
-            return Ok(());
-        }
-        let found = match found {
-            Found::Sample(words) if looks_like_an_error(words) && !mcu.serves(HOMES_ITSELF) => {
-                Found::Error(INVALID_READ_DATA)
-            }
-            found => found,
+    /// Takes in a sample: both words of channel 0, or an error.
+    fn add(&mut self, turn: &mut Turn, words: Result<u32, u8>, read_at: Clock) -> Result<(), Shutdown> {
+        let sample = match words {
+            Ok(words) if looks_like_an_error(words) && !turn.serves(HOMES_ITSELF) => Err(INVALID_READ_DATA),
+            words => words,
         };
-        let sample = match found {
-            Found::Nothing => return Ok(()),
-            Found::Error(error) => {
-                self.attached.note_error(mcu, error)?;
+        let sample = match sample {
+            Err(error) => {
+                self.attached.note_error(turn, error)?;
                 [0xff, 0xff, 0, error]
             }
-            Found::Sample(words) => {
+            Ok(words) => {
                 match words & ERROR_FLAGS {
-                    0 => self.attached.update(mcu, (words & DATA) as i32, read_at)?,
-                    _ => self.attached.note_error(mcu, SENSOR_REPORTS_ERROR)?,
+                    0 => self.attached.update(turn, (words & DATA) as i32, read_at)?,
+                    _ => self.attached.note_error(turn, SENSOR_REPORTS_ERROR)?,
                 }
-                self.homing.update(mcu, words, read_at)?;
+                self.homing.update(turn, words, read_at)?;
                 words.to_be_bytes()
             }
         };
-        self.bulk.add(mcu, oid, &sample);
+        self.bulk.add(turn, &sample);
         Ok(())
     }
 
-    /// The chip says whether it has a sample. Without an answer klippy asks again.
-    fn asked(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let asked = (done.began, done.ended);
-        let Some(mut ask) = done.errand::<Conversation<Ask>>() else { return Ok(()) };
-        let result = std::mem::replace(&mut ask.result, Ok(()));
-        if result.is_ok() {
-            self.bulk.send_status(mcu, oid, asked, if ask.talk.ready { SAMPLE_BYTES } else { 0 });
-        }
-        self.ask = Some(ask);
-        self.note(mcu, oid, result)
-    }
-
-    fn query_status(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn query_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         let Some(intb) = &self.intb else {
-            // Commands wait for each other, so it is here, unless the machine was stopped meanwhile.
-            let Some(ask) = self.ask.take() else { return Ok(()) };
-            return mcu.converse(self.i2c, Ticket { oid, tag: ASK }, ask);
+            return self.ask.converse(turn, self.i2c);
         };
-        let now = mcu.now();
+        let now = turn.now();
         // One that is being read counts as one in the chip.
-        let ready = self.is_pending() || !intb.read()?;
-        self.bulk.send_status(mcu, oid, (now, now), if ready { SAMPLE_BYTES } else { 0 });
+        let ready = self.look.is_pending() || !intb.read()?;
+        self.bulk.send_status(turn, (now, now), if ready { SAMPLE_BYTES } else { 0 });
         Ok(())
     }
 }
 
 impl Object for Ldc1612 {
     fn kind(&self) -> &'static str {
-        "LDC1612"
+        KIND
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
-        match self.look {
-            Some(_) => self.turn(mcu, oid)?,
-            None => self.missed = self.missed.saturating_add(1),
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        if self.look.is_here() {
+            self.look(turn)?;
+        } else {
+            self.missed = self.missed.saturating_add(1);
         }
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        match done.tag {
-            LOOK => {
-                self.looked(mcu, oid, done)?;
-                self.make_up(mcu, oid)
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        if let Some(Back { result, counts, ended, .. }) = self.look.back(done) {
+            let read = result.ok();
+            Self::note(&mut self.failing, turn, result.err())?;
+            let words = match read {
+                Some(words) => words.map(Ok),
+                None => self.look.here().map(|look| Err(look.talk.error)),
+            };
+            if let (true, Some(words)) = (counts, words) {
+                self.add(turn, words, ended)?;
             }
-            _ => self.asked(mcu, oid, done),
+            return self.make_up(turn);
         }
+        // Without an answer klippy asks again.
+        let Some(Back { result, began, ended, .. }) = self.ask.back(done) else { return Ok(()) };
+        if let Ok(ready) = result {
+            self.bulk.send_status(turn, (began, ended), if ready { SAMPLE_BYTES } else { 0 });
+        }
+        Self::note(&mut self.failing, turn, result.err())
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
-        self.stale = self.look.is_none();
+    fn shutdown(&mut self, _turn: &mut Turn) {
+        self.look.drop_pending();
         self.missed = 0;
     }
 }
@@ -358,7 +336,7 @@ const CONFIG_LDC1612_WITH_INTB: Command =
 
 const LDC1612_ATTACH_TRIGGER_ANALOG: Command =
     command!("ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
-        mcu.with::<Ldc1612, _>(oid, |sensor, mcu| sensor.attached.attach(mcu, trigger_analog_oid))
+        mcu.with::<Ldc1612, _>(oid, |sensor, turn| sensor.attached.attach(turn, trigger_analog_oid))
     })
     .of(since(Master));
 
@@ -366,12 +344,12 @@ const LDC1612_SETUP_HOME: Command = command!(
     "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",
     |mcu, oid: Oid, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
         let clock = mcu.instant(clock);
-        mcu.with::<Ldc1612, _>(oid, |sensor, mcu| {
+        mcu.with::<Ldc1612, _>(oid, |sensor, turn| {
             if threshold == 0 {
                 sensor.homing.trsync = None;
                 return Ok(());
             }
-            mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
+            turn.require::<Trsync>(trsync_oid)?;
             let trsync = Some(trsync_oid);
             sensor.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
             Ok(())
@@ -381,33 +359,32 @@ const LDC1612_SETUP_HOME: Command = command!(
 .of(HOMES_ITSELF);
 
 const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Ldc1612, _>(oid, |sensor, mcu| {
+    mcu.with::<Ldc1612, _>(oid, |sensor, turn| {
         let homing = &sensor.homing;
-        mcu.send(HomeState { oid, homing: homing.trsync.is_some(), trigger_clock: homing.clock });
+        turn.send(HomeState { oid: turn.oid(), homing: homing.trsync.is_some(), trigger_clock: homing.clock });
         Ok(())
     })
 })
 .of(HOMES_ITSELF);
 
 const QUERY_LDC1612: Command = command!("query_ldc1612 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-    mcu.with::<Ldc1612, _>(oid, |sensor, mcu| {
-        let timer = TimerId::sampling(oid, 0);
-        mcu.cancel(timer);
-        sensor.stale = sensor.look.is_none();
+    mcu.with::<Ldc1612, _>(oid, |sensor, turn| {
+        turn.cancel(TIMER);
+        sensor.look.drop_pending();
         sensor.missed = 0;
         if rest_ticks == Ticks(0) {
             return Ok(());
         }
         sensor.rest_ticks = rest_ticks;
         sensor.bulk.reset();
-        let at = mcu.now() + rest_ticks;
-        mcu.schedule(timer, at)
+        let at = turn.now() + rest_ticks;
+        turn.schedule(TIMER, at)
     })
 })
 .of(since(V0_13));
 
 const QUERY_STATUS_LDC1612: Command = command!("query_status_ldc1612 oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Ldc1612, _>(oid, |sensor, mcu| sensor.query_status(mcu, oid))
+    mcu.with::<Ldc1612, _>(oid, |sensor, turn| sensor.query_status(turn))
 })
 .of(since(V0_13));
 

@@ -8,15 +8,14 @@
 
 use crate::board::{BusDevice, BusError};
 use crate::mcu::{
-    Command, Enumeration, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, only,
-    response, since,
+    Command, Enumeration, Feature, Generation::V0_12, Generation::V0_13, Oid, Response, WireClock, command, only, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
-use crate::time::{Clock, Ticks};
+use crate::time::Ticks;
 
 use super::fifo_sensor::{BLOCK_BYTES, BusType, FifoChip, Fill, Reading, configure, query, query_at, query_status};
 use super::named;
-use super::sensor_bulk::{BulkData, Status, Words};
+use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "lis2dw",
@@ -32,43 +31,23 @@ shutdowns! {
     INVALID_MODEL = "model type invalid";
 }
 
-response! {
-    /// Samples.
-    "lis2dw_data oid=%c sequence=%hu data=%*s" => only(V0_12);
-    pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
-}
-
-response! {
-    /// How many samples there were, of them `fifo` in the chip.
+own_words! {
+    "lis2dw_data oid=%c sequence=%hu data=%*s",
     "lis2dw_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%c fifo=%c limit_count=%hu" => only(V0_12);
-    pub(super) struct OwnStatus {
-        oid: Oid,
-        clock: Clock,
-        query_ticks: u32,
-        next_sequence: u16,
-        buffered: u8,
-        fifo: u8,
-        limit_count: u16
-    }
+    data_max: BLOCK_BYTES, sample_bytes: SAMPLE_BYTES, fifo: u8
 }
 
-const OWN_WORDS: Words = Words {
-    data_max: BLOCK_BYTES,
-    data: |mcu, BulkData { oid, sequence, data }| mcu.send(OwnData { oid, sequence, data }),
-    status: |mcu, Status { oid, clock, query_ticks, next_sequence, in_message, in_sensor, possible_overflows }| {
-        let fifo = (in_sensor / SAMPLE_BYTES as u32) as u8;
-        let (buffered, limit_count) = (in_message, possible_overflows);
-        mcu.send(OwnStatus { oid, clock, query_ticks, next_sequence, buffered, fifo, limit_count });
-    },
-};
+#[derive(Clone, Copy)]
+enum Register {
+    /// The first of the six data registers, which the FIFO is read through.
+    OutXL = 0x28,
+    FifoCtrl = 0x2e,
+    /// FIFO_SAMPLES of the LIS2DW, FIFO_SRC_REG of the LIS3DH.
+    FifoStatus = 0x2f,
+}
 
-const FIFO_CTRL: u8 = 0x2e;
 /// Continuous mode, of FIFO_CTRL; 0 switches the FIFO off and empties it.
 const CONTINUOUS: u8 = 0xc0;
-/// OUT_X_L, the first of the six data registers, which the FIFO is read through.
-const OUT_X_L: u8 = 0x28;
-/// FIFO_SAMPLES of the LIS2DW, FIFO_SRC_REG of the LIS3DH.
-const FIFO_STATUS: u8 = 0x2f;
 const SAMPLE_BYTES: usize = 6;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -115,16 +94,17 @@ impl Lis2dw {
     /// The number of the first data register, with what the LIS3DH wants in it to go on to the next
     /// ones; the LIS2DW does so by itself.
     fn data_registers(self) -> u8 {
-        match (self.model, self.bus_type) {
-            (Model::Lis2dw, _) => OUT_X_L,
-            (Model::Lis3dh, BusType::Spi) => OUT_X_L | 0x40,
-            (Model::Lis3dh, BusType::I2c) => OUT_X_L | 0x80,
-        }
+        let goes_on = match (self.model, self.bus_type) {
+            (Model::Lis2dw, _) => 0,
+            (Model::Lis3dh, BusType::Spi) => 0x40,
+            (Model::Lis3dh, BusType::I2c) => 0x80,
+        };
+        Register::OutXL as u8 | goes_on
     }
 
     fn ask_fill(self, chip: &mut dyn BusDevice) -> Result<Fill, BusError> {
         let mut status = [0];
-        self.bus_type.read(chip, FIFO_STATUS, &mut status)?;
+        self.bus_type.read_register(chip, Register::FifoStatus as u8, &mut status)?;
         Ok(self.model.fill(status[0]))
     }
 }
@@ -135,11 +115,11 @@ impl FifoChip for Lis2dw {
     const OWN_WORDS: Option<&'static Words> = Some(&OWN_WORDS);
 
     fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.send(&[FIFO_CTRL, CONTINUOUS])
+        chip.send(&[Register::FifoCtrl as u8, CONTINUOUS])
     }
 
     fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        chip.send(&[FIFO_CTRL, 0])
+        chip.send(&[Register::FifoCtrl as u8, 0])
     }
 
     fn bus_type(self) -> BusType {
@@ -147,7 +127,8 @@ impl FifoChip for Lis2dw {
     }
 
     fn read(self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError> {
-        let read = |chip: &mut dyn BusDevice, block: &mut [u8]| self.bus_type.read(chip, self.data_registers(), block);
+        let read =
+            |chip: &mut dyn BusDevice, block: &mut [u8]| self.bus_type.read_once(chip, self.data_registers(), block);
         reading.block(chip, |chip| self.ask_fill(chip), read)
     }
 

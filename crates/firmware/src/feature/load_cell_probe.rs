@@ -7,7 +7,7 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response,
+    Command, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock, command, response,
     since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
@@ -48,6 +48,8 @@ const TRIGGER_GRAMS_MAX: u32 = u16::MAX as u32;
 const SAFETY_RANGE: u8 = 0;
 const OVERFLOW: u8 = 1;
 const WATCHDOG: u8 = 2;
+
+const TIMER: Timer = Timer::exact(0);
 
 /// What the host sets of the sensor.
 #[derive(Default)]
@@ -124,8 +126,7 @@ impl Homing {
     }
 
     fn pull(&self, mcu: &mut Mcu, reason: u8) -> Result<(), Shutdown> {
-        let trsync = self.trsync;
-        mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, reason))
+        mcu.with::<Trsync, _>(self.trsync, |trsync, turn| trsync.trigger(turn, reason))
     }
 }
 
@@ -135,10 +136,10 @@ impl Object for LoadCellProbe {
     }
 
     /// Looks whether the sensor is silent.
-    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = self.homing.as_mut().filter(|_| self.triggered.is_none()) else { return Ok(Next::Done) };
         if homing.watchdog_count > homing.watchdog_max {
-            homing.fail(mcu, WATCHDOG)?;
+            homing.fail(turn, WATCHDOG)?;
         }
         homing.watchdog_count = homing.watchdog_count.wrapping_add(1);
         Ok(Next::At(at + homing.rest_ticks))
@@ -147,7 +148,7 @@ impl Object for LoadCellProbe {
 
 const CONFIG_LOAD_CELL_PROBE: Command =
     command!("config_load_cell_probe oid=%c sos_filter_oid=%c", |mcu, oid: Oid, sos_filter_oid: Oid| {
-        mcu.with::<SosFilter, _>(sos_filter_oid, |_, _| Ok(()))?;
+        mcu.require::<SosFilter>(sos_filter_oid)?;
         let limits = Limits::default();
         mcu.assign(oid, LoadCellProbe { filter: sos_filter_oid, limits, homing: None, triggered: None })
     })
@@ -197,14 +198,14 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
      rest_ticks: Ticks,
      timeout: u32| {
         let begin = mcu.instant(clock);
-        mcu.with::<LoadCellProbe, _>(oid, |probe, mcu| {
-            mcu.cancel(TimerId::new(oid, 0));
+        mcu.with::<LoadCellProbe, _>(oid, |probe, turn| {
+            turn.cancel(TIMER);
             (probe.homing, probe.triggered) = (None, None);
             // That is how the host ends it.
             if error_reason == 0 {
                 return Ok(());
             }
-            mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
+            turn.require::<Trsync>(trsync_oid)?;
             probe.homing = Some(Homing {
                 trsync: trsync_oid,
                 trigger_reason,
@@ -216,16 +217,16 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
                 watchdog_max: timeout as u8,
                 watchdog_count: 0,
             });
-            mcu.schedule(TimerId::new(oid, 0), begin)
+            turn.schedule(TIMER, begin)
         })
     }
 )
 .of(since(Kalico));
 
 const LOAD_CELL_PROBE_QUERY_STATE: Command = command!("load_cell_probe_query_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<LoadCellProbe, _>(oid, |probe, mcu| {
+    mcu.with::<LoadCellProbe, _>(oid, |probe, turn| {
         let trigger_ticks = probe.triggered.map_or(0, Clock::wire);
-        mcu.send(State { oid, is_homing_trigger: probe.triggered.is_some(), trigger_ticks });
+        turn.send(State { oid: turn.oid(), is_homing_trigger: probe.triggered.is_some(), trigger_ticks });
         Ok(())
     })
 })

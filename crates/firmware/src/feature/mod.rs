@@ -23,7 +23,6 @@ mod fifo_sensor;
 mod hd44780;
 mod hx71x;
 mod i2c;
-mod icm20948;
 mod ldc1612;
 mod lis2dw;
 mod load_cell_probe;
@@ -68,7 +67,7 @@ pub const FEATURES: &[Feature] = &[
     fifo_sensor::FEATURE,
     hd44780::FEATURE,
     hx71x::FEATURE,
-    icm20948::FEATURE,
+    mpu9250::ICM20948,
     ldc1612::FEATURE,
     lis2dw::FEATURE,
     load_cell_probe::FEATURE,

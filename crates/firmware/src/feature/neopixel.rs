@@ -18,7 +18,7 @@
 
 use crate::board::{BusDevice, BusError, Mosi, Pin};
 use crate::mcu::{
-    Bus, Command, Conversation, Done, Feature, Mcu, Object, Oid, Response, Talk, Ticket, command, response,
+    Back, Bus, Command, Conversation, Done, Feature, Object, Oid, Response, Slot, Talk, Turn, command, response,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
@@ -79,6 +79,8 @@ struct Frame {
 }
 
 impl Talk for Frame {
+    type Answer = ();
+
     fn talk(&mut self, line: &mut dyn BusDevice) -> Result<(), BusError> {
         let colours = self.message.iter_mut().skip(self.low_bytes);
         for (wire, byte) in colours.zip(self.data.iter().copied().flat_map(encode)) {
@@ -91,8 +93,7 @@ impl Talk for Frame {
 struct Neopixel {
     bus: Bus,
     data: Vec<u8>,
-    /// Here while the colours are not on their way.
-    frame: Option<Box<Conversation<Frame>>>,
+    frame: Slot<Conversation<Frame>>,
     /// Whether the log knows that sending fails.
     failing: bool,
 }
@@ -110,13 +111,13 @@ impl Neopixel {
         Ok(())
     }
 
-    fn send(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
+    fn send(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         // Commands wait for each other, so it is here.
-        let Some(mut frame) = self.frame.take() else {
+        let Some(frame) = self.frame.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came amid another one"));
         };
         frame.talk.data.copy_from_slice(&self.data);
-        mcu.converse_on(&self.bus, Ticket { oid, tag: 0 }, frame)
+        self.frame.converse_on(turn, &self.bus)
     }
 }
 
@@ -125,15 +126,14 @@ impl Object for Neopixel {
         "neopixel"
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let Some(mut frame) = done.errand::<Conversation<Frame>>() else { return Ok(()) };
-        let result = std::mem::replace(&mut frame.result, Ok(()));
-        self.frame = Some(frame);
-        mcu.send(Sent { oid, success: result.is_ok() });
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.frame.back(done) else { return Ok(()) };
+        turn.send(Sent { oid: turn.oid(), success: result.is_ok() });
         // No colour is worth a print. klippy tries eight times for each change: once is enough in the log.
         let known = std::mem::replace(&mut self.failing, result.is_err());
         if let (Err(error), false) = (result, known) {
-            mcu.warn(oid, self.kind(), spi_shutdown(error));
+            let trouble = spi_shutdown(error.clone());
+            turn.warn(self.kind(), trouble);
         }
         Ok(())
     }
@@ -160,12 +160,7 @@ const CONFIG_NEOPIXEL: Command = command!(
             return Err(Shutdown::because(INVALID_SIZE, detail));
         }
         let frame = Frame { data: vec![0; size], message: vec![0; len], low_bytes };
-        let chain = Neopixel {
-            bus: mcu.bus(line)?,
-            data: vec![0; size],
-            frame: Some(Conversation::new(frame)),
-            failing: false,
-        };
+        let chain = Neopixel { bus: mcu.bus(line)?, data: vec![0; size], frame: Slot::talking(frame), failing: false };
         mcu.assign_on(pin, oid, chain)
     }
 );
@@ -175,9 +170,8 @@ const NEOPIXEL_UPDATE: Command =
         mcu.with::<Neopixel, _>(oid, |chain, _| chain.update(pos, data))
     });
 
-const NEOPIXEL_SEND: Command = command!("neopixel_send oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Neopixel, _>(oid, |chain, mcu| chain.send(mcu, oid))
-});
+const NEOPIXEL_SEND: Command =
+    command!("neopixel_send oid=%c", |mcu, oid: Oid| mcu.with::<Neopixel, _>(oid, |chain, turn| chain.send(turn)));
 
 #[cfg(test)]
 mod tests {

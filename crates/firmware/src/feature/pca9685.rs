@@ -12,8 +12,8 @@ use std::time::Duration;
 
 use crate::board::{BusDevice, BusError, I2cConfig, OnWorker};
 use crate::mcu::{
-    BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Remote, Safe, Settable, Ticket,
-    TimerId, WireClock, command,
+    BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Remote, Safe, Settable, Timer, Turn,
+    WireClock, command,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
@@ -52,11 +52,17 @@ const VALUE_MAX: u16 = 4096;
 const CHANNELS: usize = 16;
 const CHIPS_MAX: usize = 16;
 
-// Registers.
-const MODE1: u8 = 0x00;
-const LED0: u8 = 0x06;
-const ALL_LED: u8 = 0xfa;
-const PRE_SCALE: u8 = 0xfe;
+/// The first registers of each kind.
+#[derive(Clone, Copy)]
+enum Register {
+    Mode1 = 0x00,
+    /// Four for each output.
+    Led0 = 0x06,
+    /// Four for all outputs at once.
+    AllLed = 0xfa,
+    PreScale = 0xfe,
+}
+
 // Bits of MODE1.
 const AUTO_INCREMENT: u8 = 0x20;
 const SLEEP: u8 = 0x10;
@@ -108,11 +114,11 @@ impl Chip {
             return Ok(());
         }
         // The prescaler takes a value in sleep only.
-        self.write(&[MODE1, AUTO_INCREMENT | SLEEP | ALL_CALL])?;
-        self.write(&[PRE_SCALE, self.prescale])?;
-        self.write(&[MODE1, AUTO_INCREMENT | ALL_CALL])?;
+        self.write(&[Register::Mode1 as u8, AUTO_INCREMENT | SLEEP | ALL_CALL])?;
+        self.write(&[Register::PreScale as u8, self.prescale])?;
+        self.write(&[Register::Mode1 as u8, AUTO_INCREMENT | ALL_CALL])?;
         thread::sleep(OSCILLATOR_START);
-        self.write(&message(ALL_LED, 0))?;
+        self.write(&message(Register::AllLed as u8, 0))?;
         self.is_set_up = true;
         Ok(())
     }
@@ -172,13 +178,13 @@ struct Chips {
     chips: Vec<Address>,
     /// Of all the chips together; none before the first.
     calls: Option<Calls>,
-    /// 16 for each chip: an output's place is also the tag of its errands.
+    /// 16 for each chip.
     outputs: Vec<Output>,
 }
 
 impl Chips {
     /// The place of an output; its chip is opened if it is the first of that.
-    fn output(&mut self, mcu: &mut Mcu, wanted: Address, channel: u8) -> Result<u8, Shutdown> {
+    fn output(&mut self, mcu: &mut Mcu, wanted: Address, channel: u8) -> Result<usize, Shutdown> {
         let Address { bus, address, cycle } = wanted;
         let known = self.chips.iter().position(|chip| chip.bus == bus && chip.address == address);
         let chip = match known {
@@ -202,7 +208,7 @@ impl Chips {
                 self.chips.len() - 1
             }
         };
-        Ok((chip * CHANNELS) as u8 + channel)
+        Ok(chip * CHANNELS + usize::from(channel))
     }
 
     fn open(&mut self, mcu: &mut Mcu, address: Address) -> Result<(), Shutdown> {
@@ -216,17 +222,17 @@ impl Chips {
         let chip = Arc::new(Mutex::new(chip));
         self.chips.push(address);
         for channel in 0..CHANNELS as u8 {
-            let channel = Channel { chip: chip.clone(), first_register: LED0 + 4 * channel };
+            let channel = Channel { chip: chip.clone(), first_register: Register::Led0 as u8 + 4 * channel };
             let channel = Remote::new(worker, channel, Setting::SetUp);
             self.outputs.push(Output { channel, shutdown_value: 0, is_used: false, is_pending: false });
         }
         Ok(())
     }
 
-    fn set(&mut self, mcu: &mut Mcu, oid: Oid, place: u8, setting: Setting) -> Result<(), Shutdown> {
-        let output = &mut self.outputs[usize::from(place)];
+    fn set(&mut self, turn: &mut Turn, place: usize, setting: Setting) -> Result<(), Shutdown> {
+        let output = &mut self.outputs[place];
         output.is_used = true;
-        output.channel.set(mcu, Ticket { oid, tag: place }, setting)
+        output.channel.set(turn, setting)
     }
 }
 
@@ -235,16 +241,16 @@ impl Object for Chips {
         "PCA9685"
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let ticket = Ticket { oid, tag: done.tag };
-        let Some(output) = self.outputs.get_mut(usize::from(ticket.tag)) else { return Ok(()) };
-        match output.channel.returned(mcu, ticket, done) {
-            Ok(true) => output.is_pending = false,
-            Ok(false) => {}
-            Err(failure) => return mcu.device_failed(oid, self.kind(), failure),
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let mut outputs = self.outputs.iter_mut();
+        let back = outputs.find_map(|output| output.channel.back(turn, done).map(|written| (output, written)));
+        match back {
+            Some((output, Ok(true))) => output.is_pending = false,
+            Some((_, Err(failure))) => return turn.device_failed(self.kind(), failure),
+            _ => {}
         }
         if !self.outputs.iter().any(|output| output.is_pending) {
-            mcu.is_safe(oid);
+            turn.is_safe();
         }
         Ok(())
     }
@@ -258,11 +264,11 @@ impl Object for Chips {
         false
     }
 
-    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
+    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
         let mut safe = Safe::Now;
-        for (output, tag) in self.outputs.iter_mut().zip(0..=u8::MAX).filter(|(output, _)| output.is_used) {
+        for output in self.outputs.iter_mut().filter(|output| output.is_used) {
             output.is_pending = true;
-            output.channel.set(mcu, Ticket { oid, tag }, Setting::ShutdownValue(output.shutdown_value))?;
+            output.channel.set(turn, Setting::ShutdownValue(output.shutdown_value))?;
             safe = Safe::Later;
         }
         Ok(safe)
@@ -274,16 +280,16 @@ const TEXTS: Texts = Texts { max_duration: MAX_DURATION, missed: MISSED };
 /// An output that the host schedules.
 struct Pca9685 {
     chips: Oid,
-    place: u8,
+    place: usize,
     queue: ValueQueue,
 }
 
 impl Pca9685 {
-    fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
+    fn queue(&mut self, turn: &mut Turn, at: Clock, value: u16) -> Result<(), Shutdown> {
         if value > VALUE_MAX {
             return Err(Shutdown::by_host(INVALID_VALUE, format_args!("value {value} is above {VALUE_MAX}")));
         }
-        if self.queue.push(mcu, at, value)? { self.queue.start(mcu, oid, at) } else { Ok(()) }
+        self.queue.queue(turn, at, value)
     }
 }
 
@@ -292,15 +298,15 @@ impl Object for Pca9685 {
         "PCA9685 output"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let value = self.queue.pop(mcu)?;
-        let (own, place) = (self.chips, self.place);
-        mcu.with::<Chips, _>(own, |chips, mcu| chips.set(mcu, own, place, Setting::Value(value)))?;
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        let value = self.queue.pop(turn)?;
+        let place = self.place;
+        turn.with::<Chips, _>(self.chips, |chips, turn| chips.set(turn, place, Setting::Value(value)))?;
         self.queue.next(value, at)
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
-        self.queue.clear(mcu);
+    fn shutdown(&mut self, turn: &mut Turn) {
+        self.queue.clear(turn);
     }
 }
 
@@ -327,11 +333,11 @@ const CONFIG_PCA9685: Command = command!(
         mcu.vacant(oid)?;
         check(channel, &[value, default_value])?;
         let own = mcu.own::<Chips>();
-        let place = mcu.with::<Chips, _>(own, |chips, mcu| {
-            let place = chips.output(mcu, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
-            chips.outputs[usize::from(place)].shutdown_value = default_value;
+        let place = mcu.with::<Chips, _>(own, |chips, turn| {
+            let place = chips.output(turn, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+            chips.outputs[place].shutdown_value = default_value;
             let setting = if value == 0 { Setting::SetUp } else { Setting::Value(value) };
-            chips.set(mcu, own, place, setting)?;
+            chips.set(turn, place, setting)?;
             Ok(place)
         })?;
         mcu.assign(oid, Pca9685 { chips: own, place, queue: ValueQueue::new(default_value, max_duration, &TEXTS) })
@@ -341,7 +347,7 @@ const CONFIG_PCA9685: Command = command!(
 const QUEUE_PCA9685_OUT: Command =
     command!("queue_pca9685_out oid=%c clock=%u value=%hu", |mcu, oid: Oid, clock: WireClock, value: u16| {
         let at = mcu.instant(clock);
-        mcu.with::<Pca9685, _>(oid, |output, mcu| output.queue(mcu, oid, at, value))
+        mcu.with::<Pca9685, _>(oid, |output, turn| output.queue(turn, at, value))
     });
 
 const SET_PCA9685_OUT: Command = command!(
@@ -349,9 +355,9 @@ const SET_PCA9685_OUT: Command = command!(
     |mcu, bus: u8, addr: u8, channel: u8, cycle_ticks: Ticks, value: u16| {
         check(channel, &[value])?;
         let own = mcu.own::<Chips>();
-        mcu.with::<Chips, _>(own, |chips, mcu| {
-            let place = chips.output(mcu, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
-            chips.set(mcu, own, place, Setting::Value(value))
+        mcu.with::<Chips, _>(own, |chips, turn| {
+            let place = chips.output(turn, Address { bus, address: addr, cycle: cycle_ticks }, channel)?;
+            chips.set(turn, place, Setting::Value(value))
         })
     }
 );
@@ -378,7 +384,7 @@ mod tests {
             (4095, [6, 0, 0, 0xff, 0x0f]),
             (4096, [6, 0, 0x10, 0, 0]),
         ] {
-            assert_eq!(message(LED0, value), expected);
+            assert_eq!(message(Register::Led0 as u8, value), expected);
         }
     }
 }

@@ -7,7 +7,7 @@
 use crate::board::{OnWorker, PWM_MAX, Pin, Pwm, PwmConfig};
 use crate::mcu::{
     BusCounts, Calls, Command, Constant, Done, Feature, Mcu, Next, Object, Oid, Present, Remote, Report, Safe,
-    Settable, Ticket, TimerId, WireClock, command,
+    Settable, Timer, Turn, WireClock, command,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -76,13 +76,9 @@ struct PwmOut {
 }
 
 impl PwmOut {
-    fn write(&mut self, mcu: &mut Mcu, oid: Oid, value: u16) -> Result<(), Shutdown> {
+    fn write(&mut self, turn: &mut Turn, value: u16) -> Result<(), Shutdown> {
         self.value = value;
-        self.channel.set(mcu, Ticket { oid, tag: 0 }, Setting { value, cycle: None })
-    }
-
-    fn queue(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, value: u16) -> Result<(), Shutdown> {
-        if self.queue.push(mcu, at, value)? { self.queue.start(mcu, oid, at) } else { Ok(()) }
+        self.channel.set(turn, Setting { value, cycle: None })
     }
 }
 
@@ -91,20 +87,14 @@ impl Object for PwmOut {
         KIND
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
-        let value = self.queue.pop(mcu)?;
-        self.write(mcu, oid, value)?;
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        let value = self.queue.pop(turn)?;
+        self.write(turn, value)?;
         self.queue.next(value, at)
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        match self.channel.returned(mcu, Ticket { oid, tag: 0 }, done) {
-            Ok(true) => mcu.is_safe(oid),
-            Ok(false) => {}
-            Err(failure) => return mcu.device_failed(oid, KIND, failure),
-        }
-        Ok(())
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        self.channel.settle(turn, KIND, done)
     }
 
     fn report(&self) -> Report {
@@ -115,12 +105,12 @@ impl Object for PwmOut {
         Some(self.calls.counts())
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
-        self.queue.clear(mcu);
+    fn shutdown(&mut self, turn: &mut Turn) {
+        self.queue.clear(turn);
     }
 
-    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
-        self.write(mcu, oid, self.queue.default_value())?;
+    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
+        self.write(turn, self.queue.default_value())?;
         Ok(Safe::Later)
     }
 }
@@ -133,24 +123,24 @@ struct SetChannels(Vec<(Pin, Remote<Channel>)>);
 impl SetChannels {
     /// Sets a channel, and keeps it open from then on. As with `set_digital_out`, a channel that is
     /// open may be set again at any time; a new one is refused after `finalize_config`.
-    fn set(&mut self, mcu: &mut Mcu, oid: Oid, config: PwmConfig) -> Result<(), Shutdown> {
+    fn set(&mut self, turn: &mut Turn, config: PwmConfig) -> Result<(), Shutdown> {
         let PwmConfig { pin, cycle, value, .. } = config;
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
-            Some(place) if mcu.is_finalized() => {
+            Some(place) if turn.is_finalized() => {
                 let setting = Setting { value, cycle: Some(cycle) };
-                self.0[place].1.set(mcu, Ticket { oid, tag: place as u8 }, setting)
+                self.0[place].1.set(turn, setting)
             }
-            _ if mcu.is_finalized() => Err(set_too_late(mcu, reason::PWM_CONFIG, "set_pwm_out", pin)),
+            _ if turn.is_finalized() => Err(set_too_late(turn, reason::PWM_CONFIG, "set_pwm_out", pin)),
             Some(place) => {
-                self.0[place].1 = open(mcu, config)?.0;
+                self.0[place].1 = open(turn, config)?.0;
                 Ok(())
             }
             None if self.0.len() > usize::from(u8::MAX) => {
                 Err(Shutdown::by_host(reason::PWM_CONFIG, "set_pwm_out wants more than 256 channels"))
             }
             None => {
-                self.0.push((pin, open(mcu, config)?.0));
+                self.0.push((pin, open(turn, config)?.0));
                 Ok(())
             }
         }
@@ -162,12 +152,9 @@ impl Object for SetChannels {
         "set_pwm_out"
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let ticket = Ticket { oid, tag: done.tag };
-        match self.0.get_mut(usize::from(done.tag)).map(|(_, channel)| channel.returned(mcu, ticket, done)) {
-            Some(Err(failure)) => mcu.device_failed(oid, self.kind(), failure),
-            _ => Ok(()),
-        }
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let mut channels = self.0.iter_mut();
+        channels.try_for_each(|(_, channel)| channel.settle(turn, "set_pwm_out", done))
     }
 }
 
@@ -185,12 +172,12 @@ const CONFIG_PWM_OUT: Command = command!(
 const QUEUE_PWM_OUT: Command =
     command!("queue_pwm_out oid=%c clock=%u value=%hu", |mcu, oid: Oid, clock: WireClock, value: u16| {
         let at = mcu.instant(clock);
-        mcu.with::<PwmOut, _>(oid, |output, mcu| output.queue(mcu, oid, at, value))
+        mcu.with::<PwmOut, _>(oid, |output, turn| output.queue.queue(turn, at, value))
     });
 
 const SET_PWM_OUT: Command =
     command!("set_pwm_out pin=%u cycle_ticks=%u value=%hu", |mcu, pin: Pin, cycle_ticks: Ticks, value: u16| {
         let oid = mcu.own::<SetChannels>();
         let config = PwmConfig { pin, cycle: cycle_ticks, value, shutdown_value: value };
-        mcu.with::<SetChannels, _>(oid, |channels, mcu| channels.set(mcu, oid, config))
+        mcu.with::<SetChannels, _>(oid, |channels, turn| channels.set(turn, config))
     });

@@ -11,13 +11,15 @@
 use std::sync::Arc;
 
 use crate::board::{Bias, BusDevice, BusError, Direction, Line, Pin};
-use crate::mcu::{Conversation, Done, Errand, Mcu, Next, Object, Oid, Talk, Ticket, TimerId};
+use crate::mcu::{Back, Conversation, Done, Errand, Mcu, Next, Object, Oid, Slot, Talk, Timer, Turn};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
 use super::sensor_bulk::SensorBulk;
-use super::spi::{Spi, spi_shutdown};
+use super::spi::Spi;
 use super::trigger_analog::Attached;
+
+const TIMER: Timer = Timer::sampling(0);
 
 /// What a reading came to.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,35 +55,31 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
     type Reading: Errand;
 
     /// Has a sample read.
-    fn read(&mut self, mcu: &mut Mcu, ticket: Ticket, reading: Box<Self::Reading>) -> Result<(), Shutdown>;
+    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown>;
 
-    /// Whether the chip could be read.
-    fn result(reading: &mut Self::Reading) -> Result<(), Shutdown>;
+    /// The stop for a chip that could not be read.
+    fn stop(failure: &<Self::Reading as Errand>::Failure) -> Shutdown;
 
     /// What a reading that counts came to. `late` says that it was not back when it should have been.
-    fn sample(&mut self, reading: &Self::Reading, late: bool) -> Sample;
+    fn sample(&mut self, answer: <Self::Reading as Errand>::Answer, late: bool) -> Sample;
 
     /// How many values make a sample.
     fn channels(&self) -> usize {
         1
     }
 
-    /// Measurements begin anew, or end. Errands for that have the tag [`SWITCH`].
-    fn switch(&mut self, mcu: &mut Mcu, oid: Oid, on: bool) -> Result<(), Shutdown> {
-        let _ = (mcu, oid, on);
+    /// Measurements begin anew, or end.
+    fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
+        let _ = (turn, on);
         Ok(())
     }
 
-    /// An errand of [`ReadyChip::switch`] is back.
-    fn switched(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let _ = (mcu, oid, done);
+    /// An errand of [`ReadyChip::switch`] may be back.
+    fn switched(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let _ = (turn, done);
         Ok(())
     }
 }
-
-// The errands.
-const READ: u8 = 0;
-pub(super) const SWITCH: u8 = 1;
 
 const VALUE_BYTES: usize = 4;
 
@@ -89,10 +87,7 @@ const VALUE_BYTES: usize = 4;
 pub(super) struct ReadyAdc<C: ReadyChip> {
     chip: C,
     ready: Arc<dyn Line>,
-    /// Here while no reading is under way.
-    reading: Option<Box<C::Reading>>,
-    /// Whether the reading under way is of an earlier query, and counts no more.
-    stale: bool,
+    reading: Slot<C::Reading>,
     /// Whether the reading under way is not back in time.
     late: bool,
     rest_ticks: Ticks,
@@ -102,12 +97,11 @@ pub(super) struct ReadyAdc<C: ReadyChip> {
 
 impl<C: ReadyChip> ReadyAdc<C> {
     /// A sensor whose line `ready` is low while a sample is ready.
-    pub(super) fn new(chip: C, ready: Arc<dyn Line>, reading: Box<C::Reading>) -> ReadyAdc<C> {
+    pub(super) fn new(chip: C, ready: Arc<dyn Line>, reading: Slot<C::Reading>) -> ReadyAdc<C> {
         ReadyAdc {
             chip,
             ready,
-            reading: Some(reading),
-            stale: false,
+            reading,
             late: false,
             rest_ticks: Ticks(0),
             bulk: SensorBulk::new(),
@@ -115,14 +109,9 @@ impl<C: ReadyChip> ReadyAdc<C> {
         }
     }
 
-    /// Whether a sample that counts is being read.
-    fn is_pending(&self) -> bool {
-        self.reading.is_none() && !self.stale
-    }
-
     /// Lets a reading under way count no more.
     fn restart(&mut self) {
-        self.stale = self.reading.is_none();
+        self.reading.drop_pending();
         self.late = false;
     }
 }
@@ -132,17 +121,16 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
         C::NAME
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
-        let rests = if self.is_pending() {
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        let rests = if self.reading.is_pending() {
             self.bulk.count_overflows(1);
             self.late = true;
             4
         } else if self.ready.read()? {
             1
-        } else if let Some(reading) = self.reading.take() {
+        } else if self.reading.is_here() {
             self.late = false;
-            self.chip.read(mcu, Ticket { oid, tag: READ }, reading)?;
+            self.chip.read(turn, &mut self.reading)?;
             8
         } else {
             // The reading of an earlier query is still under way.
@@ -151,17 +139,15 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
         Ok(Next::At(at + Ticks(self.rest_ticks.0.wrapping_mul(rests))))
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        if done.tag == SWITCH {
-            return self.chip.switched(mcu, oid, done);
-        }
-        let read_at = done.ended;
-        let Some(mut reading) = done.errand::<C::Reading>() else { return Ok(()) };
-        let result = C::result(&mut reading);
-        let reading = self.reading.insert(reading);
-        if std::mem::take(&mut self.stale) || result.is_err() {
-            return result.or_else(|failure| mcu.try_shut_down(failure));
-        }
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, counts, ended: read_at, .. }) = self.reading.back(done) else {
+            return self.chip.switched(turn, done);
+        };
+        let answer = match result {
+            Ok(answer) if counts => answer,
+            Ok(_) => return Ok(()),
+            Err(failure) => return turn.try_shut_down(C::stop(failure)),
+        };
         let mut bytes = [0; CHANNELS_MAX * VALUE_BYTES];
         let mut put = |values: &[i32]| {
             for (place, value) in bytes.chunks_exact_mut(VALUE_BYTES).zip(values) {
@@ -169,84 +155,79 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
             }
             values.len() * VALUE_BYTES
         };
-        let len = match self.chip.sample(reading, self.late) {
+        let len = match self.chip.sample(answer, self.late) {
             Sample::Value(value) => {
-                self.attached.update(mcu, value, read_at)?;
+                self.attached.update(turn, value, read_at)?;
                 put(&[value])
             }
             Sample::Error { code, value } => {
                 if let Some(code) = code {
-                    self.attached.note_error(mcu, code)?;
+                    self.attached.note_error(turn, code)?;
                 }
                 put(&[value])
             }
             Sample::Channels { values, count, sum } => {
                 if let Some(sum) = sum {
-                    self.attached.update(mcu, sum, read_at)?;
+                    self.attached.update(turn, sum, read_at)?;
                 }
                 put(&values[..count.min(CHANNELS_MAX)])
             }
         };
-        self.bulk.add(mcu, oid, &bytes[..len]);
+        self.bulk.add(turn, &bytes[..len]);
         Ok(())
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, _turn: &mut Turn) {
         self.restart();
     }
 }
 
 /// Begins measurements, or with `rest_ticks` of 0 ends them.
 pub(super) fn query<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| {
-        let timer = TimerId::sampling(oid, 0);
-        mcu.cancel(timer);
+    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| {
+        turn.cancel(TIMER);
         sensor.restart();
         let on = rest_ticks != Ticks(0);
-        sensor.chip.switch(mcu, oid, on)?;
+        sensor.chip.switch(turn, on)?;
         sensor.rest_ticks = rest_ticks;
         if !on {
             return Ok(());
         }
         sensor.bulk.reset();
-        let at = mcu.now() + rest_ticks;
-        mcu.schedule(timer, at)
+        let at = turn.now() + rest_ticks;
+        turn.schedule(TIMER, at)
     })
 }
 
 /// Tells the host how many samples there are. One that is being read counts as one in the chip.
 pub(super) fn query_status<C: ReadyChip>(mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| {
-        let now = mcu.now();
-        let ready = sensor.is_pending() || !sensor.ready.read()?;
+    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| {
+        let now = turn.now();
+        let ready = sensor.reading.is_pending() || !sensor.ready.read()?;
         let bytes = (sensor.chip.channels() * VALUE_BYTES) as u32;
-        sensor.bulk.send_status(mcu, oid, (now, now), if ready { bytes } else { 0 });
+        sensor.bulk.send_status(turn, (now, now), if ready { bytes } else { 0 });
         Ok(())
     })
 }
 
 /// Lets the samples be homed by.
 pub(super) fn attach<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, trigger_analog: Oid) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| sensor.attached.attach(mcu, trigger_analog))
+    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| sensor.attached.attach(turn, trigger_analog))
 }
 
 /// Lets the samples be probed by.
 pub(super) fn attach_probe<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, probe: Oid) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, mcu| sensor.attached.attach_probe(mcu, probe))
+    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| sensor.attached.attach_probe(turn, probe))
 }
 
 /// Bytes that a chip on SPI sends while it is sent zeros; up to `N`.
+#[derive(Clone, Copy)]
 pub(super) struct Frame<const N: usize> {
     bytes: [u8; N],
     len: usize,
 }
 
 impl<const N: usize> Frame<N> {
-    /// A conversation in which so many bytes come.
-    pub(super) fn new(len: usize) -> Box<Conversation<Frame<N>>> {
-        Conversation::new(Frame { bytes: [0; N], len: len.min(N) })
-    }
-
     /// The bytes that came.
     pub(super) fn received(&self) -> &[u8] {
         &self.bytes[..self.len]
@@ -254,9 +235,12 @@ impl<const N: usize> Frame<N> {
 }
 
 impl<const N: usize> Talk for Frame<N> {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+    type Answer = Frame<N>;
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Frame<N>, BusError> {
         self.bytes = [0; N];
-        chip.exchange(&mut self.bytes[..self.len])
+        chip.exchange(&mut self.bytes[..self.len])?;
+        Ok(*self)
     }
 }
 
@@ -269,14 +253,9 @@ pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<
     len: usize,
 ) -> Result<(), Shutdown> {
     mcu.vacant(oid)?;
-    mcu.with::<Spi, _>(spi, |_, _| Ok(()))?;
+    mcu.require::<Spi>(spi)?;
     let ready = mcu.prompt_line(ready_pin, "data_ready", Direction::Input(Bias::None))?;
-    mcu.assign_on(ready_pin, oid, ReadyAdc::new(chip, ready, Frame::new(len)))
-}
-
-/// Takes the result of a conversation over SPI.
-pub(super) fn spi_result<T: Talk>(conversation: &mut Conversation<T>) -> Result<(), Shutdown> {
-    std::mem::replace(&mut conversation.result, Ok(())).map_err(spi_shutdown)
+    mcu.assign_on(ready_pin, oid, ReadyAdc::new(chip, ready, Slot::talking(Frame { bytes: [0; N], len: len.min(N) })))
 }
 
 /// The number that 24 bits in two's complement stand for, the highest byte first.

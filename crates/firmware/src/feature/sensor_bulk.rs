@@ -12,7 +12,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Feature, Generation::V0_13, Mcu, Oid, Response, response, since};
+use crate::mcu::{Feature, Generation::V0_13, Mcu, Oid, Response, Turn, response, since};
 use crate::time::Clock;
 
 pub(super) const FEATURE: Feature =
@@ -66,6 +66,52 @@ pub(super) struct Status {
     pub(super) possible_overflows: u16,
 }
 
+/// Declares a sensor's own messages up to v0.12 as `OwnData`, `OwnStatus` and `OWN_WORDS`.
+macro_rules! own_words {
+    (
+        $data:literal, $status:literal => $hosts:expr;
+        data_max: $data_max:expr, sample_bytes: $sample_bytes:expr, fifo: $fifo:ty
+    ) => {
+        $crate::response! {
+            /// Samples.
+            $data => $hosts;
+            pub(super) struct OwnData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
+        }
+
+        $crate::response! {
+            /// How many samples there were, of them `fifo` in the chip.
+            $status => $hosts;
+            pub(super) struct OwnStatus {
+                oid: Oid,
+                clock: $crate::time::Clock,
+                query_ticks: u32,
+                next_sequence: u16,
+                buffered: u8,
+                fifo: $fifo,
+                limit_count: u16
+            }
+        }
+
+        const OWN_WORDS: $crate::feature::sensor_bulk::Words = $crate::feature::sensor_bulk::Words {
+            data_max: $data_max,
+            data: |mcu, data| mcu.send(OwnData { oid: data.oid, sequence: data.sequence, data: data.data }),
+            status: |mcu, status| {
+                mcu.send(OwnStatus {
+                    oid: status.oid,
+                    clock: status.clock,
+                    query_ticks: status.query_ticks,
+                    next_sequence: status.next_sequence,
+                    buffered: status.in_message,
+                    fifo: (status.in_sensor / $sample_bytes as u32) as $fifo,
+                    limit_count: status.possible_overflows,
+                });
+            },
+        };
+    };
+}
+
+pub(super) use own_words;
+
 /// Those that all sensors have in common, since v0.13.
 const COMMON: Words = Words {
     data_max: DATA_MAX,
@@ -107,25 +153,26 @@ impl SensorBulk {
     }
 
     /// Appends one sample, and sends the message once another sample of its size has no room.
-    pub(super) fn add(&mut self, mcu: &mut Mcu, oid: Oid, sample: &[u8]) {
+    pub(super) fn add(&mut self, turn: &mut Turn, sample: &[u8]) {
         let end = self.len + sample.len();
         self.data[self.len..end].copy_from_slice(sample);
         self.len = end;
         if self.room() < sample.len() {
-            self.send(mcu, oid);
+            self.send(turn);
         }
     }
 
     /// Sends the samples that wait for more, if there are any: the last message of a measurement, which
     /// hosts up to v0.12 expect.
-    pub(super) fn flush(&mut self, mcu: &mut Mcu, oid: Oid) {
+    pub(super) fn flush(&mut self, turn: &mut Turn) {
         if self.len > 0 {
-            self.send(mcu, oid);
+            self.send(turn);
         }
     }
 
-    fn send(&mut self, mcu: &mut Mcu, oid: Oid) {
-        (self.words.data)(mcu, BulkData { oid, sequence: self.sequence, data: &self.data[..self.len] });
+    fn send(&mut self, turn: &mut Turn) {
+        let oid = turn.oid();
+        (self.words.data)(turn, BulkData { oid, sequence: self.sequence, data: &self.data[..self.len] });
         self.sequence = self.sequence.wrapping_add(1);
         self.len = 0;
     }
@@ -142,9 +189,9 @@ impl SensorBulk {
 
     /// Tells the host how many samples there are: `in_sensor` bytes of them are still in the sensor, as
     /// it said between `began` and `ended`.
-    pub(super) fn send_status(&self, mcu: &mut Mcu, oid: Oid, (began, ended): (Clock, Clock), in_sensor: u32) {
+    pub(super) fn send_status(&self, turn: &mut Turn, (began, ended): (Clock, Clock), in_sensor: u32) {
         let status = Status {
-            oid,
+            oid: turn.oid(),
             clock: began,
             query_ticks: ended.wire().wrapping_sub(began.wire()),
             next_sequence: self.sequence,
@@ -152,6 +199,6 @@ impl SensorBulk {
             in_sensor,
             possible_overflows: self.possible_overflows,
         };
-        (self.words.status)(mcu, status);
+        (self.words.status)(turn, status);
     }
 }

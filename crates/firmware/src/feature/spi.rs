@@ -13,8 +13,8 @@ use std::fmt;
 use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusDevice, BusError, ChipSelect, Pin, SpiConfig};
 use crate::mcu::{
-    Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master, Generation::V0_13,
-    Mcu, Object, Oid, Response, Safe, Talk, Ticket, command, response, since, until,
+    Back, Bus, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::Master,
+    Generation::V0_13, Mcu, Object, Oid, Response, Safe, Slot, Talk, Turn, command, response, since, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{CLOCK_FREQ, Ticks};
@@ -62,8 +62,8 @@ pub(super) struct Transfer {
 
 impl Transfer {
     /// One that is to be loaded.
-    pub(super) fn new() -> Box<Conversation<Transfer>> {
-        Conversation::new(Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true })
+    pub(super) fn slot() -> Slot<Conversation<Transfer>> {
+        Slot::talking(Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true })
     }
 
     /// These bytes are to be exchanged for what comes back.
@@ -85,6 +85,8 @@ impl Transfer {
 }
 
 impl Talk for Transfer {
+    type Answer = ();
+
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
         let bytes = &mut self.bytes[..self.len];
         if self.reads { chip.exchange(bytes) } else { chip.send(bytes) }
@@ -95,17 +97,12 @@ impl Talk for Transfer {
 pub(super) struct Spi {
     bus: Option<Bus>,
     chip_select: Option<ChipSelect>,
-    /// None while a transfer is under way: then the worker has the box.
-    transfer: Option<Box<Conversation<Transfer>>>,
+    transfer: Slot<Conversation<Transfer>>,
 }
-
-// The tags of transfers: for `spi_send`, without an answer, and for `spi_transfer`.
-const SEND: u8 = 0;
-const TRANSFER: u8 = 1;
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
-        Spi { bus: None, chip_select, transfer: Some(Transfer::new()) }
+        Spi { bus: None, chip_select, transfer: Transfer::slot() }
     }
 
     /// Whether it has a chip select line of its own.
@@ -154,33 +151,31 @@ impl Spi {
         Ok(())
     }
 
-    fn transfer(&mut self, mcu: &mut Mcu, oid: Oid, tag: u8, data: &[u8]) -> Result<(), Shutdown> {
+    /// Has a transfer: with an answer, for `spi_transfer`, or without one, for `spi_send`.
+    fn transfer(&mut self, turn: &mut Turn, answers: bool, data: &[u8]) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
             // A device without a bus echoes, as in the firmware.
-            answer(mcu, oid, tag, data);
+            if answers {
+                turn.send(TransferResponse { oid: turn.oid(), response: data });
+            }
             return Ok(());
         };
-        // The box is here, as no command runs while another one's transfer is under way.
-        let Some(mut transfer) = self.transfer.take() else {
+        // It is here, as no command runs while another one's transfer is under way.
+        let Some(transfer) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
         };
-        match tag {
-            TRANSFER => transfer.talk.load(data),
-            _ => transfer.talk.load_to_send(data),
+        if answers {
+            transfer.talk.load(data)
+        } else {
+            transfer.talk.load_to_send(data)
         }
-        mcu.converse_on(bus, Ticket { oid, tag }, transfer)
+        self.transfer.converse_on(turn, bus)
     }
 }
 
 #[cold]
 fn invalid(what: impl fmt::Display) -> Shutdown {
     Shutdown::by_host(INVALID_SPI, what)
-}
-
-fn answer(mcu: &mut Mcu, oid: Oid, tag: u8, response: &[u8]) {
-    if tag == TRANSFER {
-        mcu.send(TransferResponse { oid, response });
-    }
 }
 
 /// The stop for an SPI conversation that failed. Not a conversion of any `BusError`: one of an I2C
@@ -194,15 +189,16 @@ impl Object for Spi {
         "SPI device"
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let tag = done.tag;
-        let Some(mut transfer) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
-        let result = std::mem::replace(&mut transfer.result, Ok(()));
-        if result.is_ok() {
-            answer(mcu, oid, tag, transfer.talk.bytes());
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.transfer.back(done) else { return Ok(()) };
+        if let Err(error) = result {
+            let failure = spi_shutdown(error.clone());
+            return turn.device_failed(self.kind(), failure);
         }
-        self.transfer = Some(transfer);
-        result.or_else(|error| mcu.device_failed(oid, self.kind(), spi_shutdown(error)))
+        if let Some(transfer) = self.transfer.here().filter(|transfer| transfer.talk.reads) {
+            turn.send(TransferResponse { oid: turn.oid(), response: transfer.talk.bytes() });
+        }
+        Ok(())
     }
 
     fn bus(&self) -> Option<&Bus> {
@@ -213,8 +209,7 @@ impl Object for Spi {
 /// The message that a device is sent at a shutdown.
 struct SpiShutdown {
     spi: Oid,
-    /// None while the message is on its way: then the worker has the box.
-    message: Option<Box<Conversation<Transfer>>>,
+    message: Slot<Conversation<Transfer>>,
     bytes: Box<[u8]>,
 }
 
@@ -223,16 +218,17 @@ impl Object for SpiShutdown {
         "SPI shutdown message"
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let Some(mut message) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
-        let result = std::mem::replace(&mut message.result, Ok(()));
-        self.message = Some(message);
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.message.back(done) else { return Ok(()) };
         match result {
             Ok(()) => {
-                mcu.is_safe(oid);
+                turn.is_safe();
                 Ok(())
             }
-            Err(error) => mcu.device_failed(oid, self.kind(), spi_shutdown(error)),
+            Err(error) => {
+                let failure = spi_shutdown(error.clone());
+                turn.device_failed(self.kind(), failure)
+            }
         }
     }
 
@@ -241,14 +237,14 @@ impl Object for SpiShutdown {
         false
     }
 
-    fn make_safe(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Safe, Shutdown> {
-        let has_bus = mcu.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
+    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
+        let has_bus = turn.with::<Spi, _>(self.spi, |spi, _| Ok(spi.bus.is_some()))?;
         if !has_bus {
             return Ok(Safe::Now);
         }
-        if let Some(mut message) = self.message.take() {
+        if let Some(message) = self.message.here() {
             message.talk.load_to_send(&self.bytes);
-            mcu.converse(self.spi, Ticket { oid, tag: 0 }, message)?;
+            self.message.converse(turn, self.spi)?;
         }
         Ok(Safe::Later)
     }
@@ -268,7 +264,7 @@ const CONFIG_SPI_WITHOUT_CS: Command =
 const SPI_SET_BUS: Command =
     command!("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", |mcu, oid: Oid, spi_bus: u32, mode: u32, rate: u32| {
         let mode = u8::try_from(mode).unwrap_or(u8::MAX);
-        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_bus(mcu, spi_bus, mode, rate))
+        mcu.with::<Spi, _>(oid, |spi, turn| spi.set_bus(turn, spi_bus, mode, rate))
     });
 
 const SPI_SET_SOFTWARE_BUS: Command = command!(
@@ -279,7 +275,7 @@ const SPI_SET_SOFTWARE_BUS: Command = command!(
         // The firmware ignored the rate and was as fast as its system calls. Lines that are written
         // through mapped registers would be too fast for a chip.
         let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
-        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_lines(mcu, pins, mode, pulse))
+        mcu.with::<Spi, _>(oid, |spi, turn| spi.set_lines(turn, pins, mode, pulse))
     }
 )
 .of(until(V0_13));
@@ -290,23 +286,23 @@ const SPI_SET_SW_BUS: Command = command!(
         // Of one byte, as in the firmware.
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
-        mcu.with::<Spi, _>(oid, |spi, mcu| spi.set_lines(mcu, pins, mode, pulse_ticks))
+        mcu.with::<Spi, _>(oid, |spi, turn| spi.set_lines(turn, pins, mode, pulse_ticks))
     }
 )
 .of(since(Master).and(Kalico));
 
 const SPI_TRANSFER: Command = command!("spi_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Spi, _>(oid, |spi, mcu| spi.transfer(mcu, oid, TRANSFER, data))
+    mcu.with::<Spi, _>(oid, |spi, turn| spi.transfer(turn, true, data))
 });
 
 const SPI_SEND: Command = command!("spi_send oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Spi, _>(oid, |spi, mcu| spi.transfer(mcu, oid, SEND, data))
+    mcu.with::<Spi, _>(oid, |spi, turn| spi.transfer(turn, false, data))
 });
 
 const CONFIG_SPI_SHUTDOWN: Command = command!(
     "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",
     |mcu, oid: Oid, spi_oid: Oid, shutdown_msg: &[u8]| {
-        mcu.with::<Spi, _>(spi_oid, |_, _| Ok(()))?;
-        mcu.assign(oid, SpiShutdown { spi: spi_oid, message: Some(Transfer::new()), bytes: shutdown_msg.into() })
+        mcu.require::<Spi>(spi_oid)?;
+        mcu.assign(oid, SpiShutdown { spi: spi_oid, message: Transfer::slot(), bytes: shutdown_msg.into() })
     }
 );

@@ -9,8 +9,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::V0_12, Generation::V0_13,
-    Generations, Mcu, Next, Object, Oid, Response, Ticket, TimerId, WireClock, command, response, until,
+    Back, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Generation::V0_12, Generation::V0_13,
+    Generations, Hold, Next, Object, Oid, Response, Slot, Timer, Turn, WireClock, command, response, until,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -80,6 +80,8 @@ const FRAMES_MAX: Ticks = Ticks::from_us((32 * 32 * 1_000_000u64 / 750_000) as u
 const ENTRY_BYTES: usize = 3;
 const MESSAGE_MAX: usize = 10;
 
+const TIMER: Timer = Timer::sampling(0);
+
 /// Why there is no angle, as klippy's log counts it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fault {
@@ -137,10 +139,10 @@ impl Chip {
     /// What has to be said before the message: the end of this transfer is when the sensor latches.
     /// The TLE5012B latches at the end of an empty one, which selects it for 1 us at least; the AS5047D at the end of the one that asks
     /// for the angle (ANGLECOM), which the next one brings.
-    fn preface(self, purpose: Purpose) -> Option<&'static [u8]> {
+    fn preface(self, purpose: &Purpose) -> Option<&'static [u8]> {
         match (self, purpose) {
             (Chip::Tle5012b, _) => Some(&[]),
-            (Chip::As5047d, Purpose::Measurement) => Some(&[0x7f, 0xfe]),
+            (Chip::As5047d, Purpose::Measurement { .. }) => Some(&[0x7f, 0xfe]),
             _ => None,
         }
     }
@@ -163,10 +165,10 @@ impl Chip {
 
     /// Whether what is measured is that of the transfer's end, where it has no preface. (Of the
     /// MT6816 and MT6826S that is so for measurements only.)
-    fn latches_at_end(self, purpose: Purpose) -> bool {
+    fn latches_at_end(self, purpose: &Purpose) -> bool {
         match purpose {
-            Purpose::Measurement => matches!(self, Chip::Mt6816 | Chip::Mt6826s),
-            Purpose::Transfer => self == Chip::As5047d,
+            Purpose::Measurement { .. } => matches!(self, Chip::Mt6816 | Chip::Mt6826s),
+            Purpose::Transfer { .. } => self == Chip::As5047d,
         }
     }
 
@@ -227,17 +229,28 @@ fn entry(measured: Result<Angle, Fault>, late: u32, time_shift: u8) -> [u8; ENTR
 }
 
 /// What a sensor is asked for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Purpose {
-    /// By the timer.
-    Measurement,
-    /// By `spi_angle_transfer`.
-    Transfer,
+    /// A measurement of the timer, which was due then; `None` if it is of an earlier query, and counts no more.
+    Measurement { due: Option<Clock> },
+    /// A transfer of the host, with what commands wait by; `None` once the machine is stopped.
+    Transfer { hold: Option<Hold> },
 }
 
-// The errands.
-const PREFACE: u8 = 0;
-const MESSAGE: u8 = 1;
+/// What is under way with a sensor.
+struct Asking {
+    purpose: Purpose,
+    /// When the preface was over; `None` before, and without one.
+    latched: Option<Clock>,
+}
+
+/// The measurement that comes next.
+struct Upcoming {
+    due: Clock,
+    /// How many before it there was no time for.
+    missed: u16,
+}
+
+const KIND: &str = "angle sensor";
 
 struct SpiAngle {
     chip: Chip,
@@ -245,222 +258,178 @@ struct SpiAngle {
     bulk: SensorBulk,
     rest_ticks: Ticks,
     time_shift: u8,
-    /// What is under way.
-    purpose: Option<Purpose>,
-    /// When the measurement under way was due, and when its preface was over.
-    slot: Clock,
-    latched: Clock,
-    /// Whether it is of an earlier query, and counts no more.
-    stale: bool,
-    /// The measurement that comes next, and how many before it there was no time for.
-    due: Option<Clock>,
-    overflows: u16,
-    /// For measurements, and prefaces of transfers; here while there is none under way.
-    measurement: Option<Box<Conversation<Transfer>>>,
-    /// The host's transfer; here while it is not under way.
-    transfer: Option<Box<Conversation<Transfer>>>,
-    /// Whether it waits for the measurement under way, and commands for it.
-    transfer_waits: bool,
-    holds: bool,
+    /// A sensor is asked one thing at a time.
+    asking: Option<Asking>,
+    upcoming: Option<Upcoming>,
+    /// The host's transfer waits for what is under way, and commands for it.
+    asked: Option<Hold>,
+    /// For measurements, and prefaces of transfers.
+    measurement: Slot<Conversation<Transfer>>,
+    /// The host's.
+    transfer: Slot<Conversation<Transfer>>,
 }
 
 impl SpiAngle {
-    fn add(&mut self, mcu: &mut Mcu, oid: Oid, entry: [u8; ENTRY_BYTES]) {
-        self.bulk.add(mcu, oid, &entry);
-    }
-
-    /// Begins what is due, if nothing is under way.
-    fn go_on(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        if self.purpose.is_some() {
+    /// Begins what comes next, if nothing is under way. The host goes first.
+    fn go_on(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        if self.asking.is_some() {
             return Ok(());
         }
-        if std::mem::take(&mut self.transfer_waits) {
-            return self.begin(mcu, oid, Purpose::Transfer);
-        }
-        let Some(slot) = self.due.take() else { return Ok(()) };
-        self.slot = slot;
-        for _ in 0..std::mem::take(&mut self.overflows) {
-            self.add(mcu, oid, entry(Err(Fault::Overflow), 0, 0));
-        }
-        self.begin(mcu, oid, Purpose::Measurement)
-    }
-
-    fn begin(&mut self, mcu: &mut Mcu, oid: Oid, purpose: Purpose) -> Result<(), Shutdown> {
-        self.purpose = Some(purpose);
-        match self.chip.preface(purpose) {
-            Some(preface) => self.say(mcu, oid, PREFACE, preface),
-            None => self.say_message(mcu, oid, purpose),
-        }
-    }
-
-    fn say_message(&mut self, mcu: &mut Mcu, oid: Oid, purpose: Purpose) -> Result<(), Shutdown> {
-        match (purpose, self.transfer.take()) {
-            (Purpose::Transfer, Some(transfer)) => mcu.converse(self.spi, Ticket { oid, tag: MESSAGE }, transfer),
-            (_, transfer) => {
-                self.transfer = transfer;
-                self.say(mcu, oid, MESSAGE, self.chip.message())
+        let purpose = if let Some(hold) = self.asked.take() {
+            Purpose::Transfer { hold: Some(hold) }
+        } else if let Some(Upcoming { due, missed }) = self.upcoming.take() {
+            for _ in 0..missed {
+                self.bulk.add(turn, &entry(Err(Fault::Overflow), 0, 0));
             }
+            Purpose::Measurement { due: Some(due) }
+        } else {
+            return Ok(());
+        };
+        let preface = self.chip.preface(&purpose);
+        let asking = self.asking.insert(Asking { purpose, latched: None });
+        let begun = match (preface, &asking.purpose) {
+            (Some(preface), _) => self.say(turn, preface),
+            (None, Purpose::Measurement { .. }) => self.say(turn, self.chip.message()),
+            (None, Purpose::Transfer { .. }) => self.transfer.converse(turn, self.spi),
+        };
+        if begun.is_err() {
+            self.over(turn);
         }
+        begun
     }
 
-    fn say(&mut self, mcu: &mut Mcu, oid: Oid, tag: u8, message: &[u8]) -> Result<(), Shutdown> {
+    fn say(&mut self, turn: &mut Turn, message: &[u8]) -> Result<(), Shutdown> {
         // Nothing else is under way, so it is here.
-        let Some(mut measurement) = self.measurement.take() else { return Ok(()) };
-        measurement.talk.load(message);
-        mcu.converse(self.spi, Ticket { oid, tag }, measurement)
+        if let Some(measurement) = self.measurement.here() {
+            measurement.talk.load(message);
+        }
+        self.measurement.converse(turn, self.spi)
     }
 
-    /// Takes in the end of a transfer. True if that is all that was under way.
-    fn take_in(
-        &mut self,
-        mcu: &mut Mcu,
-        oid: Oid,
-        purpose: Purpose,
-        tag: u8,
-        reply: &[u8],
-        (began, ended): (Clock, Clock),
-    ) -> Result<bool, Shutdown> {
+    /// Takes in the end of a conversation. True if that is all that was under way.
+    fn take_in(&mut self, turn: &mut Turn, began: Clock, ended: Clock) -> Result<bool, Shutdown> {
+        let Some(Asking { purpose, latched }) = &mut self.asking else { return Ok(true) };
         let too_slow = ended.since(began) > i64::from(TRANSFER_MAX.0);
-        if tag == PREFACE {
-            self.latched = ended;
-            // The TLE5012B latches at an edge.
-            if self.chip == Chip::As5047d && too_slow {
-                self.measured(mcu, oid, Err(Fault::SpiTime), ended);
-                return Ok(true);
+        let has_preface = self.chip.preface(purpose).is_some();
+        if has_preface && latched.is_none() {
+            *latched = Some(ended);
+            match purpose {
+                // The TLE5012B latches at an edge.
+                Purpose::Measurement { due } if self.chip == Chip::As5047d && too_slow => {
+                    let due = *due;
+                    self.measured(turn, due, Err(Fault::SpiTime), ended);
+                    return Ok(true);
+                }
+                Purpose::Measurement { .. } => self.say(turn, self.chip.message())?,
+                Purpose::Transfer { .. } => self.transfer.converse(turn, self.spi)?,
             }
-            self.say_message(mcu, oid, purpose)?;
             return Ok(false);
         }
-        let has_preface = self.chip.preface(purpose).is_some();
         let too_slow = too_slow && !has_preface;
-        let latched = match () {
-            () if has_preface => self.latched,
-            () if self.chip.latches_at_end(purpose) => ended,
-            () => began,
-        };
-        match purpose {
-            Purpose::Transfer => {
-                let response = if too_slow { &[] } else { reply };
-                mcu.send(TransferResponse { oid, clock: latched, response });
+        let latched = latched.unwrap_or(if self.chip.latches_at_end(purpose) { ended } else { began });
+        match (purpose, self.measurement.here(), self.transfer.here()) {
+            (Purpose::Transfer { .. }, _, Some(transfer)) => {
+                let response = if too_slow { &[] } else { transfer.talk.bytes() };
+                turn.send(TransferResponse { oid: turn.oid(), clock: latched, response });
             }
-            Purpose::Measurement => {
-                let mut message = [0; MESSAGE_MAX];
-                let len = reply.len().min(MESSAGE_MAX);
-                message[..len].copy_from_slice(&reply[..len]);
-                let measured = if too_slow { Err(Fault::SpiTime) } else { self.chip.decode(&message) };
-                self.measured(mcu, oid, measured, latched);
+            (Purpose::Measurement { due }, Some(measurement), _) => {
+                let due = *due;
+                let mut reply = [0; MESSAGE_MAX];
+                reply.iter_mut().zip(measurement.talk.bytes()).for_each(|(to, from)| *to = *from);
+                let measured = if too_slow { Err(Fault::SpiTime) } else { self.chip.decode(&reply) };
+                self.measured(turn, due, measured, latched);
             }
+            _ => {}
         }
         Ok(true)
     }
 
-    fn measured(&mut self, mcu: &mut Mcu, oid: Oid, measured: Result<Angle, Fault>, latched: Clock) {
-        if !self.stale {
-            let late = latched.wire().wrapping_sub(self.slot.wire());
-            self.add(mcu, oid, entry(measured, late, self.time_shift));
+    fn measured(&mut self, turn: &mut Turn, due: Option<Clock>, measured: Result<Angle, Fault>, latched: Clock) {
+        if let Some(due) = due {
+            let late = latched.wire().wrapping_sub(due.wire());
+            self.bulk.add(turn, &entry(measured, late, self.time_shift));
         }
     }
 
     /// Nothing is under way any more.
-    fn over(&mut self, mcu: &mut Mcu) {
-        let was_transfer = self.purpose.take() == Some(Purpose::Transfer);
-        self.stale = false;
-        if was_transfer && std::mem::take(&mut self.holds) {
-            mcu.release();
+    fn over(&mut self, turn: &mut Turn) {
+        if let Some(Asking { purpose: Purpose::Transfer { hold: Some(hold) }, .. }) = self.asking.take() {
+            turn.release(hold);
         }
     }
 
     /// Ends the measurements.
     fn end(&mut self) {
-        self.stale = self.purpose == Some(Purpose::Measurement);
-        self.due = None;
-        self.overflows = 0;
-    }
-
-    fn put_back(&mut self, purpose: Purpose, tag: u8, said: Box<Conversation<Transfer>>) {
-        match (purpose, tag) {
-            (Purpose::Transfer, MESSAGE) => self.transfer = Some(said),
-            _ => self.measurement = Some(said),
+        if let Some(Asking { purpose: Purpose::Measurement { due }, .. }) = &mut self.asking {
+            *due = None;
         }
+        self.upcoming = None;
     }
 
-    fn query(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock, rest_ticks: Ticks, time_shift: u8) -> Result<(), Shutdown> {
-        let timer = TimerId::sampling(oid, 0);
-        mcu.cancel(timer);
+    fn query(&mut self, turn: &mut Turn, at: Clock, rest_ticks: Ticks, time_shift: u8) -> Result<(), Shutdown> {
+        turn.cancel(TIMER);
         self.end();
         if rest_ticks == Ticks(0) {
-            if mcu.speaks::<OwnEnd>() {
-                self.bulk.flush(mcu, oid);
-                let now = mcu.now();
-                self.bulk.send_status(mcu, oid, (now, now), 0);
+            if turn.speaks::<OwnEnd>() {
+                self.bulk.flush(turn);
+                let now = turn.now();
+                self.bulk.send_status(turn, (now, now), 0);
             }
             return Ok(());
         }
         self.rest_ticks = rest_ticks;
         self.time_shift = time_shift;
         self.bulk.reset();
-        mcu.schedule(timer, at)
+        turn.schedule(TIMER, at)
     }
 
-    fn ask(&mut self, mcu: &mut Mcu, oid: Oid, data: &[u8]) -> Result<(), Shutdown> {
+    fn ask(&mut self, turn: &mut Turn, data: &[u8]) -> Result<(), Shutdown> {
         // Commands wait for each other, so it is here; a stopped machine's may be still under way.
-        let Some(transfer) = &mut self.transfer else {
+        let Some(transfer) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came amid another one"));
         };
         transfer.talk.load(data);
-        self.transfer_waits = true;
-        // The measurement under way was begun by a timer: what it sends on does not hold by itself.
-        if self.purpose.is_some() {
-            self.holds = mcu.hold(oid);
-        }
-        self.go_on(mcu, oid)
+        // A timer may have begun what is under way: then what is sent next does not hold by itself.
+        self.asked = Some(turn.hold());
+        self.go_on(turn)
     }
 }
 
 impl Object for SpiAngle {
     fn kind(&self) -> &'static str {
-        "angle sensor"
+        KIND
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        if let Some(oid) = timer.oid() {
-            if self.due.replace(at).is_some() {
-                self.overflows = self.overflows.saturating_add(1);
-            }
-            self.go_on(mcu, oid)?;
-        }
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        let missed = self.upcoming.take().map_or(0, |upcoming| upcoming.missed.saturating_add(1));
+        self.upcoming = Some(Upcoming { due: at, missed });
+        self.go_on(turn)?;
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let (tag, span) = (done.tag, (done.began, done.ended));
-        let Some(mut said) = done.errand::<Conversation<Transfer>>() else { return Ok(()) };
-        let Some(purpose) = self.purpose else { return Ok(()) };
-        let result = std::mem::replace(&mut said.result, Ok(()));
-        let taken_in = match result {
-            Ok(()) => {
-                let reply = said.talk.clone();
-                self.put_back(purpose, tag, said);
-                self.take_in(mcu, oid, purpose, tag, reply.bytes(), span)
-            }
-            Err(error) => {
-                self.put_back(purpose, tag, said);
-                mcu.device_failed(oid, self.kind(), spi_shutdown(error)).map(|()| true)
-            }
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let back = self.measurement.back(done).or_else(|| self.transfer.back(done));
+        let Some(Back { result, began, ended, .. }) = back else { return Ok(()) };
+        let is_over = match result {
+            Ok(()) => self.take_in(turn, began, ended),
+            Err(error) => turn.device_failed(KIND, spi_shutdown(error.clone())).map(|()| true),
         };
-        if !matches!(taken_in, Ok(false)) {
-            self.over(mcu);
+        if !matches!(is_over, Ok(false)) {
+            self.over(turn);
         }
-        taken_in?;
-        self.go_on(mcu, oid)
+        is_over?;
+        self.go_on(turn)
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, turn: &mut Turn) {
         self.end();
-        self.transfer_waits = false;
         // A stopped machine is held by nothing.
-        if std::mem::take(&mut self.holds) {
-            mcu.release();
+        let under_way = match &mut self.asking {
+            Some(Asking { purpose: Purpose::Transfer { hold }, .. }) => hold.take(),
+            _ => None,
+        };
+        for hold in self.asked.take().into_iter().chain(under_way) {
+            turn.release(hold);
         }
     }
 }
@@ -482,16 +451,11 @@ const CONFIG_SPI_ANGLE: Command = command!(
             bulk: SensorBulk::with_own(mcu, &OWN_WORDS),
             rest_ticks: Ticks(0),
             time_shift: 0,
-            purpose: None,
-            slot: Clock::EPOCH,
-            latched: Clock::EPOCH,
-            stale: false,
-            due: None,
-            overflows: 0,
-            measurement: Some(Transfer::new()),
-            transfer: Some(Transfer::new()),
-            transfer_waits: false,
-            holds: false,
+            asking: None,
+            upcoming: None,
+            asked: None,
+            measurement: Transfer::slot(),
+            transfer: Transfer::slot(),
         };
         mcu.assign(oid, sensor)
     }
@@ -502,13 +466,13 @@ const QUERY_SPI_ANGLE: Command = command!(
     "query_spi_angle oid=%c clock=%u rest_ticks=%u time_shift=%c",
     |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, time_shift: u8| {
         let at = mcu.instant(clock);
-        mcu.with::<SpiAngle, _>(oid, |sensor, mcu| sensor.query(mcu, oid, at, rest_ticks, time_shift))
+        mcu.with::<SpiAngle, _>(oid, |sensor, turn| sensor.query(turn, at, rest_ticks, time_shift))
     }
 )
 .of(KNOWN);
 
 const SPI_ANGLE_TRANSFER: Command = command!("spi_angle_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<SpiAngle, _>(oid, |sensor, mcu| sensor.ask(mcu, oid, data))
+    mcu.with::<SpiAngle, _>(oid, |sensor, turn| sensor.ask(turn, data))
 })
 .of(KNOWN);
 

@@ -91,9 +91,9 @@ const CONFIG_ST7920: Command = command!(
 );
 
 const ST7920_SEND_CMDS: Command = command!("st7920_send_cmds oid=%c cmds=%*s", |mcu, oid: Oid, cmds: &[u8]| {
-    mcu.with::<Display<St7920>, _>(oid, |display, mcu| display.write(mcu, oid, Register::Commands, cmds))
+    mcu.with::<Display<St7920>, _>(oid, |display, turn| display.write(turn, Register::Commands, cmds))
 });
 
 const ST7920_SEND_DATA: Command = command!("st7920_send_data oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Display<St7920>, _>(oid, |display, mcu| display.write(mcu, oid, Register::Data, data))
+    mcu.with::<Display<St7920>, _>(oid, |display, turn| display.write(turn, Register::Data, data))
 });

@@ -9,7 +9,7 @@ use std::ops::Range;
 use crate::board::Pin;
 use crate::mcu::{
     Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, Present, PromptLine, Report,
-    Response, SPIN_MAX, Safe, TimerId, WireClock, command, response, since,
+    Response, SPIN_MAX, Safe, Timer, Turn, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -46,6 +46,8 @@ response! {
     "stepper_position oid=%c pos=%i"
     pub(super) struct Position { oid: Oid, pos: i32 }
 }
+
+const TIMER: Timer = Timer::exact(0);
 
 /// `count` steps, the first `interval` ticks after the step before, each interval longer by
 /// `add` than the one before.
@@ -95,14 +97,10 @@ const IN_ORDER: Range<i64> = Ticks::from_us(50).0 as i64..Ticks::from_us(50_000)
 const POSITION_BIAS: u32 = 0x4000_0000;
 
 impl Stepper {
-    fn timer(oid: Oid) -> TimerId {
-        TimerId::new(oid, 0)
-    }
-
     /// Takes the next move. `earliest` is when its first edge may come at the earliest, if the
     /// stepper is running.
-    fn load(&mut self, mcu: &mut Mcu, oid: Oid, earliest: Option<Clock>) -> Result<Next, Shutdown> {
-        let Some(Move { interval, count, add, reverses }) = self.queue.pop(&mut mcu.moves) else {
+    fn load(&mut self, turn: &mut Turn, earliest: Option<Clock>) -> Result<Next, Shutdown> {
+        let Some(Move { interval, count, add, reverses }) = self.queue.pop(&mut turn.moves) else {
             self.edges = 0;
             return Ok(Next::Done);
         };
@@ -114,7 +112,7 @@ impl Stepper {
         let Some(earliest) = earliest else {
             // After a long pause the interval has wrapped, and the step's clock is right.
             let clock = self.next_step.wire().wrapping_add(interval);
-            self.next_step = mcu.instant(WireClock(clock));
+            self.next_step = turn.instant(WireClock(clock));
             // Whatever pulse there was before is over, as for the firmware.
             self.earliest = self.next_step;
             if reverses {
@@ -138,11 +136,11 @@ impl Stepper {
             if self.both_edges {
                 // The last step's pulse must end before the direction changes.
                 self.reverse_pending = true;
-                return Ok(self.edge_at(mcu, oid, self.next_step.min(earliest), earliest));
+                return Ok(self.edge_at(turn, self.next_step.min(earliest), earliest));
             }
-            return self.reverse(mcu, oid);
+            return self.reverse(turn);
         }
-        Ok(self.edge_at(mcu, oid, self.next_step, earliest))
+        Ok(self.edge_at(turn, self.next_step, earliest))
     }
 
     /// Has the next edge come when it is due, or at `earliest`, the end of a pulse that begins now, if that is later.
@@ -153,16 +151,16 @@ impl Stepper {
     /// a while would take every sample of an endstop before the first of the steps between them, and home at a wrong
     /// place. A stepper that nothing stops does not wait: the pulses of several would add up, and none would catch up.
     #[inline]
-    fn edge_at(&mut self, mcu: &mut Mcu, oid: Oid, due: Clock, earliest: Clock) -> Next {
+    fn edge_at(&mut self, turn: &mut Turn, due: Clock, earliest: Clock) -> Next {
         self.earliest = earliest;
         let behind = earliest.since(due) - i64::from(self.pulse_ticks.0);
-        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SPIN_MAX && self.may_be_stopped(mcu, oid);
+        let in_order = IN_ORDER.contains(&behind) && self.pulse_ticks <= SPIN_MAX && self.may_be_stopped(turn);
         Next::At(if in_order { due } else { due.max(earliest) })
     }
 
     /// Whether a trsync waits for a trigger that stops this stepper.
-    fn may_be_stopped(&self, mcu: &mut Mcu, oid: Oid) -> bool {
-        self.stopper.is_some_and(|trsync| Trsync::may_stop(mcu, trsync, oid))
+    fn may_be_stopped(&self, turn: &mut Turn) -> bool {
+        self.stopper.is_some_and(|trsync| Trsync::may_stop(turn, trsync))
     }
 
     /// Moves on to the step after the present one, `interval` later by a clock of 32 bits: what
@@ -173,10 +171,10 @@ impl Stepper {
     }
 
     /// Changes the direction and leaves it its set-up time.
-    fn reverse(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<Next, Shutdown> {
+    fn reverse(&mut self, turn: &mut Turn) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
-        let earliest = mcu.now() + self.pulse_ticks;
-        Ok(self.edge_at(mcu, oid, self.next_step, earliest))
+        let earliest = turn.now() + self.pulse_ticks;
+        Ok(self.edge_at(turn, self.next_step, earliest))
     }
 
     /// The position that the host knows: after the steps that were made.
@@ -206,7 +204,7 @@ impl Stepper {
         dir
     }
 
-    fn queue(&mut self, mcu: &mut Mcu, oid: Oid, mut item: Move) -> Result<(), Shutdown> {
+    fn queue(&mut self, turn: &mut Turn, mut item: Move) -> Result<(), Shutdown> {
         if item.count == 0 {
             return Err(Shutdown::by_host(INVALID_COUNT, "queue_step asks for no steps"));
         }
@@ -215,12 +213,12 @@ impl Stepper {
         }
         item.reverses = self.last_dir != self.next_dir;
         self.last_dir = self.next_dir;
-        self.queue.push(&mut mcu.moves, item)?;
+        self.queue.push(&mut turn.moves, item)?;
         if self.edges > 0 {
             return Ok(());
         }
-        match self.load(mcu, oid, None)? {
-            Next::At(at) => mcu.schedule(Self::timer(oid), at),
+        match self.load(turn, None)? {
+            Next::At(at) => turn.schedule(TIMER, at),
             Next::Done => Ok(()),
         }
     }
@@ -232,38 +230,37 @@ impl Object for Stepper {
     }
 
     #[inline]
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
-        mcu.spin_until(self.earliest);
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
+        turn.spin_until(self.earliest);
         if self.reverse_pending {
             self.reverse_pending = false;
-            return self.reverse(mcu, oid);
+            return self.reverse(turn);
         }
         self.step.toggle()?;
         // Counted from a reading after the edge was written: a write may be slow.
-        let earliest = mcu.now() + self.pulse_ticks;
+        let earliest = turn.now() + self.pulse_ticks;
         let edges = self.edges.saturating_sub(1);
         if edges & 1 != 0 && !self.both_edges {
             self.edges = edges;
-            return Ok(self.edge_at(mcu, oid, (self.next_step + self.pulse_ticks).min(earliest), earliest));
+            return Ok(self.edge_at(turn, (self.next_step + self.pulse_ticks).min(earliest), earliest));
         }
         if edges > 0 {
             self.edges = edges;
             self.advance(self.interval, earliest);
             self.interval = self.interval.wrapping_add_signed(i32::from(self.add));
-            return Ok(self.edge_at(mcu, oid, self.next_step, earliest));
+            return Ok(self.edge_at(turn, self.next_step, earliest));
         }
-        self.load(mcu, oid, Some(earliest))
+        self.load(turn, Some(earliest))
     }
 
-    fn triggered(&mut self, mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-        mcu.cancel(Self::timer(oid));
-        self.stop(mcu);
+    fn triggered(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        turn.cancel(TIMER);
+        self.stop(turn);
         self.idle()
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, _oid: Oid) {
-        self.stop(mcu);
+    fn shutdown(&mut self, turn: &mut Turn) {
+        self.stop(turn);
     }
 
     fn report(&self) -> Report {
@@ -271,7 +268,7 @@ impl Object for Stepper {
         Report { queued: self.queue.len(), value: Some(Present::Steps(position)) }
     }
 
-    fn make_safe(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<Safe, Shutdown> {
+    fn make_safe(&mut self, _turn: &mut Turn) -> Result<Safe, Shutdown> {
         self.idle().map(|()| Safe::Now)
     }
 }
@@ -311,7 +308,7 @@ const QUEUE_STEP: Command = command!(
     "queue_step oid=%c interval=%u count=%hu add=%hi",
     |mcu, oid: Oid, interval: u32, count: u16, add: i16| {
         let item = Move { interval, count, add, reverses: false };
-        mcu.with::<Stepper, _>(oid, |stepper, mcu| stepper.queue(mcu, oid, item))
+        mcu.with::<Stepper, _>(oid, |stepper, turn| stepper.queue(turn, item))
     }
 );
 
@@ -335,16 +332,16 @@ const RESET_STEP_CLOCK: Command = command!("reset_step_clock oid=%c clock=%u", |
 });
 
 const STEPPER_GET_POSITION: Command = command!("stepper_get_position oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Stepper, _>(oid, |stepper, mcu| {
-        mcu.send(Position { oid, pos: stepper.position().wrapping_sub(POSITION_BIAS) as i32 });
+    mcu.with::<Stepper, _>(oid, |stepper, turn| {
+        turn.send(Position { oid: turn.oid(), pos: stepper.position().wrapping_sub(POSITION_BIAS) as i32 });
         Ok(())
     })
 });
 
 const STEPPER_STOP_ON_TRIGGER: Command =
     command!("stepper_stop_on_trigger oid=%c trsync_oid=%c", |mcu, oid: Oid, trsync_oid: Oid| {
-        mcu.with::<Stepper, _>(oid, |stepper, mcu| {
-            Trsync::add_signal(mcu, trsync_oid, oid)?;
+        mcu.with::<Stepper, _>(oid, |stepper, turn| {
+            Trsync::add_signal(turn, trsync_oid)?;
             stepper.stopper = Some(trsync_oid);
             Ok(())
         })

@@ -7,8 +7,8 @@
 
 use crate::board::{Board, BusDevice, BusError, Range};
 use crate::mcu::{
-    Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response, Talk,
-    Ticket, TimerId, WireClock, command, response, since,
+    Back, Command, Conversation, Done, Enumeration, Feature, Generation::Kalico, Mcu, Next, Object, Oid, Response,
+    Slot, Talk, Timer, Turn, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -36,6 +36,8 @@ response! {
     "thermocouple_result oid=%c next_clock=%u value=%u fault=%c"
     pub(super) struct Reading { oid: Oid, next_clock: Clock, value: u32, fault: u8 }
 }
+
+const TIMER: Timer = Timer::sampling(0);
 
 /// A chip; its number on the wire is its place in [`Chip::ALL`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -105,34 +107,31 @@ fn types(_board: &dyn Board) -> Vec<Range> {
 }
 
 /// One look at the chip.
-struct Look {
-    chip: Chip,
-    value: u32,
-    fault: u8,
-}
+struct Look(Chip);
 
 impl Talk for Look {
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        let template = self.chip.word_message();
+    /// The word, and the fault bits.
+    type Answer = (u32, u8);
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(u32, u8), BusError> {
+        let template = self.0.word_message();
         let mut buffer = [0; 4];
         let word = &mut buffer[..template.len()];
         word.copy_from_slice(template);
         chip.exchange(word)?;
         let mut faults = [0; 2];
-        if let Some(register) = self.chip.fault_register() {
+        if let Some(register) = self.0.fault_register() {
             faults[0] = register;
             chip.exchange(&mut faults)?;
         }
-        (self.value, self.fault) = self.chip.decode(word, faults[1]);
-        Ok(())
+        Ok(self.0.decode(word, faults[1]))
     }
 }
 
 struct Thermocouple {
     spi: Oid,
     chip: Chip,
-    /// Here while the chip is not asked.
-    look: Option<Box<Conversation<Look>>>,
+    look: Slot<Conversation<Look>>,
     rest_ticks: Ticks,
     min_value: u32,
     max_value: u32,
@@ -140,8 +139,6 @@ struct Thermocouple {
     invalid_count: u8,
     /// The turn after the one that is being looked for.
     next_clock: Clock,
-    /// Tells answers to an earlier query.
-    tag: u8,
 }
 
 impl Thermocouple {
@@ -178,32 +175,29 @@ impl Object for Thermocouple {
         "thermocouple"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
         // A chip that is still being asked misses this turn.
-        if let (Some(oid), Some(look)) = (timer.oid(), self.look.take()) {
+        if self.look.is_here() {
             self.next_clock = next;
-            mcu.converse(self.spi, Ticket { oid, tag: self.tag }, look)?;
+            self.look.converse(turn, self.spi)?;
         }
         Ok(Next::At(next))
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let tag = done.tag;
-        let Some(mut look) = done.errand::<Conversation<Look>>() else { return Ok(()) };
-        let result = std::mem::replace(&mut look.result, Ok(()));
-        let Look { value, fault, .. } = look.talk;
-        self.look = Some(look);
-        if tag != self.tag {
-            return Ok(());
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, counts: true, .. }) = self.look.back(done) else { return Ok(()) };
+        match result {
+            Ok((value, fault)) => {
+                turn.send(Reading { oid: turn.oid(), next_clock: self.next_clock, value, fault });
+                self.check(turn, value, fault)
+            }
+            Err(error) => turn.try_shut_down(spi_shutdown(error.clone())),
         }
-        result.or_else(|error| mcu.try_shut_down(spi_shutdown(error)))?;
-        mcu.send(Reading { oid, next_clock: self.next_clock, value, fault });
-        self.check(mcu, value, fault)
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
-        self.tag = self.tag.wrapping_add(1);
+    fn shutdown(&mut self, _turn: &mut Turn) {
+        self.look.drop_pending();
     }
 }
 
@@ -214,18 +208,17 @@ const CONFIG_THERMOCOUPLE: Command = command!(
             let what = format_args!("thermocouple_type {thermocouple_type} is none");
             return Err(Shutdown::by_host(INVALID_TYPE, what));
         };
-        mcu.with::<Spi, _>(spi_oid, |_, _| Ok(()))?;
+        mcu.require::<Spi>(spi_oid)?;
         let object = Thermocouple {
             spi: spi_oid,
             chip,
-            look: Some(Conversation::new(Look { chip, value: 0, fault: 0 })),
+            look: Slot::talking(Look(chip)),
             rest_ticks: Ticks(0),
             min_value: 0,
             max_value: 0,
             max_invalid_count: 0,
             invalid_count: 0,
             next_clock: Clock::EPOCH,
-            tag: 0,
         };
         mcu.assign(oid, object)
     }
@@ -235,9 +228,9 @@ const QUERY_THERMOCOUPLE: Command = command!(
     "query_thermocouple oid=%c clock=%u rest_ticks=%u min_value=%u max_value=%u max_invalid_count=%c",
     |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
         let at = mcu.instant(clock);
-        mcu.with::<Thermocouple, _>(oid, |sensor, mcu| {
-            mcu.cancel(TimerId::sampling(oid, 0));
-            sensor.tag = sensor.tag.wrapping_add(1);
+        mcu.with::<Thermocouple, _>(oid, |sensor, turn| {
+            turn.cancel(TIMER);
+            sensor.look.drop_pending();
             if rest_ticks == Ticks(0) {
                 return Ok(());
             }
@@ -246,7 +239,7 @@ const QUERY_THERMOCOUPLE: Command = command!(
             sensor.max_value = max_value;
             sensor.max_invalid_count = max_invalid_count;
             sensor.invalid_count = 0;
-            mcu.schedule(TimerId::sampling(oid, 0), at)
+            turn.schedule(TIMER, at)
         })
     }
 );

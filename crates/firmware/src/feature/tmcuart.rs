@@ -16,7 +16,7 @@ use std::sync::Arc;
 
 use crate::board::{Bias, Direction, Line, Pin};
 use crate::mcu::{
-    Command, Done, Errand, Feature, Mcu, Next, Object, Oid, Response, Safe, Ticket, TimerId, WorkerId, command,
+    Back, Command, Done, Errand, Feature, Next, Object, Oid, Response, Safe, Slot, Timer, Turn, WorkerId, command,
     response,
 };
 use crate::shutdown::{Shutdown, shutdowns};
@@ -68,6 +68,8 @@ const SYNC_MASK: u8 = 0b11_1111;
 /// The bits between the first and the last falling edge of these.
 const SYNC_BITS: usize = 4;
 
+const TIMER: Timer = Timer::exact(0);
+
 /// The two ends of the UART.
 #[derive(Clone)]
 struct Wires {
@@ -106,14 +108,16 @@ struct Exchange {
     replied: bool,
     /// Whether a bit was so late that it may have been taken for another.
     spoilt: bool,
-    result: Result<(), Shutdown>,
 }
 
 impl Errand for Exchange {
-    fn run(&mut self) {
+    type Answer = ();
+    type Failure = Shutdown;
+
+    fn run(&mut self) -> Result<(), Shutdown> {
         self.replied = false;
         let exchanged = self.exchange();
-        self.result = exchanged.and(self.wires.idle());
+        exchanged.and(self.wires.idle())
     }
 }
 
@@ -265,16 +269,15 @@ fn div_round(value: i64, by: i64) -> i64 {
 struct TmcUart {
     worker: WorkerId,
     pace: Pace,
-    /// Here while no message is under way.
-    exchange: Option<Box<Exchange>>,
+    exchange: Slot<Exchange>,
     /// Whether the host is owed an answer.
     asked: bool,
 }
 
 impl TmcUart {
-    fn send(&mut self, mcu: &mut Mcu, oid: Oid, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
+    fn send(&mut self, turn: &mut Turn, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
         // As in the firmware: who is busy does not listen, and the host asks again.
-        let Some(exchange) = self.exchange.as_mut().filter(|_| !self.asked) else { return Ok(()) };
+        let Some(exchange) = self.exchange.here().filter(|_| !self.asked) else { return Ok(()) };
         let read_len = usize::from(read_len);
         if write.len() > DATA_MAX || read_len > DATA_MAX {
             return Err(Shutdown::by_host(
@@ -286,8 +289,8 @@ impl TmcUart {
         exchange.write_len = write.len();
         exchange.read_len = read_len;
         self.asked = true;
-        let at = mcu.now() + QUIET;
-        mcu.go_on(TimerId::new(oid, 0), at);
+        let at = turn.now() + QUIET;
+        turn.go_on(TIMER, at);
         Ok(())
     }
 }
@@ -298,37 +301,37 @@ impl Object for TmcUart {
     }
 
     /// Sends the message from here, so that no command waits for it.
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
-        if let (Some(oid), Some(exchange)) = (timer.oid(), self.exchange.take()) {
-            mcu.dispatch(self.worker, Ticket { oid, tag: 0 }, exchange)?;
-        }
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
+        self.exchange.send(turn, self.worker)?;
         Ok(Next::Done)
     }
 
-    fn returned(&mut self, mcu: &mut Mcu, oid: Oid, done: Done) -> Result<(), Shutdown> {
-        let Some(mut exchange) = done.errand::<Exchange>() else { return Ok(()) };
-        let result = std::mem::replace(&mut exchange.result, Ok(()));
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        let Some(Back { result, .. }) = self.exchange.back(done) else { return Ok(()) };
+        let result = result.map_err(Shutdown::clone);
         self.pace.resume();
-        if std::mem::take(&mut self.asked) && result.is_ok() {
-            mcu.send(UartResponse { oid, read: exchange.reply() });
+        if std::mem::take(&mut self.asked)
+            && result.is_ok()
+            && let Some(exchange) = self.exchange.here()
+        {
+            turn.send(UartResponse { oid: turn.oid(), read: exchange.reply() });
         }
-        self.exchange = Some(exchange);
         match result {
             Ok(()) => {
-                mcu.is_safe(oid);
+                turn.is_safe();
                 Ok(())
             }
-            Err(failure) => mcu.device_failed(oid, self.kind(), failure),
+            Err(failure) => turn.device_failed(self.kind(), failure),
         }
     }
 
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {
+    fn shutdown(&mut self, _turn: &mut Turn) {
         self.asked = false;
     }
 
     /// A message that is under way is broken off, and leaves the line idle.
-    fn make_safe(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<Safe, Shutdown> {
-        match &self.exchange {
+    fn make_safe(&mut self, _turn: &mut Turn) -> Result<Safe, Shutdown> {
+        match self.exchange.here() {
             Some(exchange) => exchange.wires.idle().map(|()| Safe::Now),
             None => {
                 self.pace.stop();
@@ -353,7 +356,7 @@ const CONFIG_TMCUART: Command = command!(
         };
         wires.idle()?;
         let pace = Pace::new(mcu);
-        let exchange = Box::new(Exchange {
+        let exchange = Slot::new(Exchange {
             pace: pace.clone(),
             wires,
             bit: bit_time,
@@ -363,15 +366,14 @@ const CONFIG_TMCUART: Command = command!(
             read_len: 0,
             replied: false,
             spoilt: false,
-            result: Ok(()),
         });
-        mcu.assign_on(tx_pin, oid, TmcUart { worker, pace, exchange: Some(exchange), asked: false })
+        mcu.assign_on(tx_pin, oid, TmcUart { worker, pace, exchange, asked: false })
     }
 );
 
 const TMCUART_SEND: Command =
     command!("tmcuart_send oid=%c write=%*s read=%c", |mcu, oid: Oid, write: &[u8], read: u8| {
-        mcu.with::<TmcUart, _>(oid, |uart, mcu| uart.send(mcu, oid, write, read))
+        mcu.with::<TmcUart, _>(oid, |uart, turn| uart.send(turn, write, read))
     });
 
 #[cfg(test)]
@@ -445,7 +447,6 @@ mod tests {
             read_len: REPLY.len(),
             replied: false,
             spoilt: false,
-            result: Ok(()),
         };
         (wire, exchange)
     }
@@ -460,7 +461,7 @@ mod tests {
             }
         });
         *pace.lock().unwrap() = Some(exchange.pace.clone());
-        exchange.run();
+        exchange.run().unwrap();
         assert!(exchange.reply().is_empty());
         let levels: Vec<bool> = wire.edges.lock().unwrap().iter().map(|(_, level)| *level).collect();
         assert_eq!(levels, [true, false, true, false, true], "and left high");
@@ -477,7 +478,7 @@ mod tests {
             }
         });
         exchange.read_len = 0;
-        exchange.run();
+        exchange.run().unwrap();
         let edges = wire.edges.lock().unwrap()[1..].to_vec();
         let edges: Vec<i64> = edges.iter().map(|(at, _)| at.since(edges[0].0)).collect();
         let bit = i64::from(BIT.0);
@@ -503,7 +504,7 @@ mod tests {
                 }
             });
             exchange.read_len = read_len;
-            exchange.run();
+            exchange.run().unwrap();
             assert_eq!(exchange.reply(), &REPLY[..read_len]);
             let falls = wire.edges.lock().unwrap().windows(2).filter(|pair| pair[0].1 && !pair[1].1).count();
             assert_eq!(falls, messages * EDGES / 2, "{read_len}");
@@ -519,7 +520,7 @@ mod tests {
                 late.set(late.now() + BIT);
             }
         });
-        exchange.run();
+        exchange.run().unwrap();
         let falls = wire.edges.lock().unwrap().windows(2).filter(|pair| pair[0].1 && !pair[1].1).count();
         assert_eq!(falls, 3 * EDGES / 2);
     }

@@ -6,8 +6,8 @@
 #![forbid(unsafe_code)]
 
 use crate::mcu::{
-    Command, Enumeration, Feature, Generation::Master, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command,
-    response, since,
+    Command, Enumeration, Feature, Generation::Master, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock,
+    command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -55,6 +55,8 @@ response! {
     "trigger_analog_state oid=%c homing=%c homing_clock=%u" => since(Master);
     pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
 }
+
+const TIMER: Timer = Timer::exact(0);
 
 /// What pulls the trigger.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -160,7 +162,7 @@ impl TriggerAnalog {
 
     fn pull(&self, mcu: &mut Mcu, reason: u8) -> Result<(), Shutdown> {
         let Some(trsync) = self.trsync else { return Ok(()) };
-        mcu.with::<Trsync, _>(trsync, |object, mcu| object.trigger(mcu, trsync, reason))
+        mcu.with::<Trsync, _>(trsync, |trsync, turn| trsync.trigger(turn, reason))
     }
 }
 
@@ -171,12 +173,12 @@ impl Object for TriggerAnalog {
 
     /// Looks whether the sensor is silent. If it is the trigger is pulled, and samples that come later
     /// are looked at all the same, as in the firmware: a trsync is pulled once.
-    fn event(&mut self, mcu: &mut Mcu, _timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if !self.homing {
             return Ok(Next::Done);
         }
         if self.monitor_count > self.monitor_max {
-            self.pull(mcu, self.error_reason.wrapping_add(MONITOR))?;
+            self.pull(turn, self.error_reason.wrapping_add(MONITOR))?;
             return Ok(Next::Done);
         }
         self.monitor_count = self.monitor_count.wrapping_add(1);
@@ -198,14 +200,14 @@ pub(super) enum Attached {
 impl Attached {
     /// Attaches an analog trigger.
     pub(super) fn attach(&mut self, mcu: &mut Mcu, trigger_analog: Oid) -> Result<(), Shutdown> {
-        mcu.with::<TriggerAnalog, _>(trigger_analog, |_, _| Ok(()))?;
+        mcu.require::<TriggerAnalog>(trigger_analog)?;
         *self = Attached::Trigger(trigger_analog);
         Ok(())
     }
 
     /// Attaches a load cell probe.
     pub(super) fn attach_probe(&mut self, mcu: &mut Mcu, probe: Oid) -> Result<(), Shutdown> {
-        mcu.with::<LoadCellProbe, _>(probe, |_, _| Ok(()))?;
+        mcu.require::<LoadCellProbe>(probe)?;
         *self = Attached::Probe(probe);
         Ok(())
     }
@@ -214,8 +216,10 @@ impl Attached {
     pub(super) fn update(self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
         match self {
             Attached::Nothing => Ok(()),
-            Attached::Trigger(oid) => mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| trigger.update(mcu, sample, at)),
-            Attached::Probe(oid) => mcu.with::<LoadCellProbe, _>(oid, |probe, mcu| probe.update(mcu, sample, at)),
+            Attached::Trigger(oid) => {
+                mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| trigger.update(turn, sample, at))
+            }
+            Attached::Probe(oid) => mcu.with::<LoadCellProbe, _>(oid, |probe, turn| probe.update(turn, sample, at)),
         }
     }
 
@@ -223,13 +227,13 @@ impl Attached {
     /// samples are missing.)
     pub(super) fn note_error(self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
         let Attached::Trigger(oid) = self else { return Ok(()) };
-        mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| trigger.fail(mcu, error.wrapping_add(SENSOR_SPECIFIC)))
+        mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| trigger.fail(turn, error.wrapping_add(SENSOR_SPECIFIC)))
     }
 }
 
 const CONFIG_TRIGGER_ANALOG: Command =
     command!("config_trigger_analog oid=%c sos_filter_oid=%c", |mcu, oid: Oid, sos_filter_oid: Oid| {
-        mcu.with::<SosFilter, _>(sos_filter_oid, |_, _| Ok(()))?;
+        mcu.require::<SosFilter>(sos_filter_oid)?;
         let trigger = TriggerAnalog {
             filter: sos_filter_oid,
             raw_min: 0,
@@ -286,15 +290,14 @@ const TRIGGER_ANALOG_HOME: Command = command!(
      monitor_ticks: Ticks,
      monitor_max: u32| {
         let at = mcu.instant(clock);
-        mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| {
-            let timer = TimerId::new(oid, 0);
-            if monitor_ticks == Ticks(0) {
-                mcu.cancel(timer);
+        mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| {
+                if monitor_ticks == Ticks(0) {
+                turn.cancel(TIMER);
                 (trigger.homing, trigger.trsync) = (false, None);
                 return Ok(());
             }
-            mcu.with::<Trsync, _>(trsync_oid, |_, _| Ok(()))?;
-            mcu.cancel(timer);
+            turn.require::<Trsync>(trsync_oid)?;
+            turn.cancel(TIMER);
             trigger.monitor_ticks = monitor_ticks;
             trigger.trsync = Some(trsync_oid);
             trigger.trigger_reason = trigger_reason;
@@ -306,15 +309,15 @@ const TRIGGER_ANALOG_HOME: Command = command!(
             trigger.homing = true;
             trigger.awaits = true;
             trigger.peak = i32::MIN;
-            mcu.schedule(timer, at)
+            turn.schedule(TIMER, at)
         })
     }
 )
 .of(since(Master));
 
 const TRIGGER_ANALOG_QUERY_STATE: Command = command!("trigger_analog_query_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<TriggerAnalog, _>(oid, |trigger, mcu| {
-        mcu.send(State { oid, homing: trigger.homing, homing_clock: trigger.homing_clock });
+    mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| {
+        turn.send(State { oid: turn.oid(), homing: trigger.homing, homing_clock: trigger.homing_clock });
         Ok(())
     })
 })

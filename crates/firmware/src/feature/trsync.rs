@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Command, Feature, Mcu, Next, Object, Oid, Response, TimerId, WireClock, command, response};
+use crate::mcu::{Command, Feature, Mcu, Next, Object, Oid, Response, Timer, Turn, WireClock, command, response};
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
@@ -39,15 +39,15 @@ pub(super) struct Trsync {
 /// configuration, is always enough.
 const SIGNALS_MAX: usize = 256;
 
-const REPORT: u8 = 0;
-const EXPIRE: u8 = 1;
+const REPORT: Timer = Timer::exact(0);
+const EXPIRE: Timer = Timer::exact(1);
 
 impl Trsync {
     /// Pulls the trigger, unless it was pulled before: tells every object that waits for it, and the
     /// host.
-    pub(super) fn trigger(&mut self, mcu: &mut Mcu, oid: Oid, reason: u8) -> Result<(), Shutdown> {
-        if self.pull(mcu, reason)? {
-            self.report(mcu, oid);
+    pub(super) fn trigger(&mut self, turn: &mut Turn, reason: u8) -> Result<(), Shutdown> {
+        if self.pull(turn, reason)? {
+            self.report(turn);
         }
         Ok(())
     }
@@ -64,35 +64,37 @@ impl Trsync {
         Ok(pulled)
     }
 
-    fn report(&self, mcu: &mut Mcu, oid: Oid) {
-        let clock = mcu.now();
-        mcu.send(State { oid, can_trigger: self.can_trigger, trigger_reason: self.trigger_reason, clock });
+    fn report(&self, turn: &mut Turn) {
+        let clock = turn.now();
+        turn.send(State { oid: turn.oid(), can_trigger: self.can_trigger, trigger_reason: self.trigger_reason, clock });
     }
 
-    /// Adds an object to those that are told of the trigger.
+    /// Adds the object whose turn it is to those that are told of the trigger.
     ///
     /// # Errors
     ///
     /// "Can't add signal that is already active" if it waits for one already, "Invalid oid type".
-    pub(super) fn add_signal(mcu: &mut Mcu, trsync: Oid, waiting: Oid) -> Result<(), Shutdown> {
-        if mcu.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
+    pub(super) fn add_signal(turn: &mut Turn, trsync: Oid) -> Result<(), Shutdown> {
+        let waiting = turn.oid();
+        if turn.any::<Trsync>(|trsync| trsync.signals.contains(&waiting)) {
             return Err(Shutdown::by_host(SIGNAL_ACTIVE, "it already waits for a trigger"));
         }
-        mcu.with::<Trsync, _>(trsync, |trsync, _| {
+        turn.with::<Trsync, _>(trsync, |trsync, _| {
             trsync.signals.push(waiting);
             Ok(())
         })
     }
 
-    /// Whether this trsync still waits for a trigger, of which it then tells `waiting`.
-    pub(super) fn may_stop(mcu: &mut Mcu, trsync: Oid, waiting: Oid) -> bool {
-        let may = |trsync: &mut Trsync, _: &mut Mcu| Ok(trsync.can_trigger && trsync.signals.contains(&waiting));
-        mcu.with::<Trsync, _>(trsync, may).unwrap_or(false)
+    /// Whether this trsync still waits for a trigger, of which it then tells the object whose turn it is.
+    pub(super) fn may_stop(turn: &mut Turn, trsync: Oid) -> bool {
+        let waiting = turn.oid();
+        let may = |trsync: &mut Trsync, _: &mut Turn| Ok(trsync.can_trigger && trsync.signals.contains(&waiting));
+        turn.with::<Trsync, _>(trsync, may).unwrap_or(false)
     }
 
-    fn clear(&mut self, mcu: &mut Mcu, oid: Oid) {
-        mcu.cancel(TimerId::new(oid, REPORT));
-        mcu.cancel(TimerId::new(oid, EXPIRE));
+    fn clear(&mut self, turn: &mut Turn) {
+        turn.cancel(REPORT);
+        turn.cancel(EXPIRE);
         self.signals.clear();
         self.can_trigger = false;
         self.trigger_reason = 0;
@@ -105,18 +107,17 @@ impl Object for Trsync {
         "trsync"
     }
 
-    fn event(&mut self, mcu: &mut Mcu, timer: TimerId, at: Clock) -> Result<Next, Shutdown> {
-        let Some(oid) = timer.oid() else { return Ok(Next::Done) };
-        if timer.which() == EXPIRE {
-            self.trigger(mcu, oid, self.expire_reason)?;
+    fn event(&mut self, turn: &mut Turn, timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        if timer == EXPIRE {
+            self.trigger(turn, self.expire_reason)?;
             return Ok(Next::Done);
         }
-        self.report(mcu, oid);
+        self.report(turn);
         Ok(Next::At(at + self.report_ticks))
     }
 
-    fn shutdown(&mut self, mcu: &mut Mcu, oid: Oid) {
-        self.clear(mcu, oid);
+    fn shutdown(&mut self, turn: &mut Turn) {
+        self.clear(turn);
     }
 }
 
@@ -135,14 +136,14 @@ const TRSYNC_START: Command = command!(
     "trsync_start oid=%c report_clock=%u report_ticks=%u expire_reason=%c",
     |mcu, oid: Oid, report_clock: WireClock, report_ticks: Ticks, expire_reason: u8| {
         let report_at = mcu.instant(report_clock);
-        mcu.with::<Trsync, _>(oid, |trsync, mcu| {
-            trsync.clear(mcu, oid);
+        mcu.with::<Trsync, _>(oid, |trsync, turn| {
+            trsync.clear(turn);
             trsync.can_trigger = true;
             trsync.report_ticks = report_ticks;
             trsync.expire_reason = expire_reason;
             match report_ticks {
                 Ticks(0) => Ok(()),
-                _ => mcu.schedule(TimerId::new(oid, REPORT), report_at),
+                _ => turn.schedule(REPORT, report_at),
             }
         })
     }
@@ -151,24 +152,24 @@ const TRSYNC_START: Command = command!(
 const TRSYNC_SET_TIMEOUT: Command =
     command!("trsync_set_timeout oid=%c clock=%u", |mcu, oid: Oid, clock: WireClock| {
         let expire_at = mcu.instant(clock);
-        mcu.with::<Trsync, _>(oid, |trsync, mcu| {
+        mcu.with::<Trsync, _>(oid, |trsync, turn| {
             if !trsync.can_trigger {
                 return Ok(());
             }
-            mcu.cancel(TimerId::new(oid, EXPIRE));
-            mcu.schedule(TimerId::new(oid, EXPIRE), expire_at)
+            turn.cancel(EXPIRE);
+            turn.schedule(EXPIRE, expire_at)
         })
     });
 
 const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", |mcu, oid: Oid, reason: u8| {
-    mcu.with::<Trsync, _>(oid, |trsync, mcu| {
-        trsync.pull(mcu, reason)?;
-        mcu.cancel(TimerId::new(oid, REPORT));
-        mcu.cancel(TimerId::new(oid, EXPIRE));
+    mcu.with::<Trsync, _>(oid, |trsync, turn| {
+        trsync.pull(turn, reason)?;
+        turn.cancel(REPORT);
+        turn.cancel(EXPIRE);
         let trigger_reason = trsync.trigger_reason;
         // The host itself pulled the trigger and does not need to know when: the clock is 0, as in the
         // firmware.
-        mcu.send(State { oid, can_trigger: false, trigger_reason, clock: Clock::EPOCH });
+        turn.send(State { oid: turn.oid(), can_trigger: false, trigger_reason, clock: Clock::EPOCH });
         Ok(())
     })
 });

@@ -4,11 +4,13 @@
 
 #![forbid(unsafe_code)]
 
-use crate::mcu::{Mcu, MoveQueue, Next, Oid, TimerId};
+use crate::mcu::{Mcu, MoveQueue, Next, Timer, Turn};
 use crate::shutdown::{Shutdown, ShutdownReason};
 use crate::time::{Clock, Ticks};
 
 use super::{changes_too_late, not_refreshed};
+
+const TIMER: Timer = Timer::exact(0);
 
 struct Move {
     at: Clock,
@@ -23,7 +25,7 @@ pub(super) struct Texts {
     pub(super) missed: ShutdownReason,
 }
 
-/// The values that an output is to have. Its timer is the object's timer 0.
+/// The values that an output is to have. The object has no other timer than the queue's.
 pub(super) struct ValueQueue {
     default_value: u16,
     max_duration: Ticks,
@@ -48,21 +50,18 @@ impl ValueQueue {
         self.queue.len()
     }
 
-    /// Appends a value. True if it is the only one: then [`ValueQueue::start`] follows.
-    pub(super) fn push(&mut self, mcu: &mut Mcu, at: Clock, value: u16) -> Result<bool, Shutdown> {
+    /// Appends a value. If it is the only one, the timer of the object takes it at `at`.
+    pub(super) fn queue(&mut self, turn: &mut Turn, at: Clock, value: u16) -> Result<(), Shutdown> {
         let first = self.queue.is_empty();
-        self.queue.push(&mut mcu.moves, Move { at, value })?;
-        Ok(first)
-    }
-
-    /// Has the timer of the object take the only value, which is for `at`.
-    pub(super) fn start(&mut self, mcu: &mut Mcu, oid: Oid, at: Clock) -> Result<(), Shutdown> {
+        self.queue.push(&mut turn.moves, Move { at, value })?;
+        if !first {
+            return Ok(());
+        }
         if self.end.take().is_some_and(|end| end < at) {
             return Err(changes_too_late(self.texts.max_duration, self.max_duration));
         }
-        let timer = TimerId::new(oid, 0);
-        mcu.cancel(timer);
-        mcu.schedule(timer, at)
+        turn.cancel(TIMER);
+        turn.schedule(TIMER, at)
     }
 
     /// Takes the value that is due.

@@ -9,10 +9,10 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use crate::board::{BusDevice, BusError, OnWorker};
+use crate::board::{BusDevice, BusError, BusStatus, OnWorker};
 use crate::shutdown::Shutdown;
 
-use super::{BusCounts, Calls, Errand, Mcu, Oid, Ticket, WorkerId};
+use super::{BusCounts, Calls, Errand, Mcu, Oid, Slot, Turn, WorkerId};
 
 /// A chip that several conversations use in turn. All of them run on the worker of its bus, one
 /// after the other, so the lock is always free. The core never takes it.
@@ -52,36 +52,69 @@ impl BusDevice for Counted {
 
 /// What is said to a chip: plain code that runs on the worker and may block there.
 pub trait Talk: Send + 'static {
-    /// Has the conversation, and keeps what the chip answered.
+    /// What comes of it.
+    type Answer: Copy + Send;
+
+    /// Has the conversation.
     ///
     /// # Errors
     ///
     /// Those of the calls of `chip`.
-    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError>;
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Self::Answer, BusError>;
 }
 
-/// A conversation with a chip: an [`Errand`] that is made once and used again and again.
+/// A conversation with a chip, as an [`Errand`].
 pub struct Conversation<T> {
-    /// What is said, and afterwards also what the chip answered.
+    /// What is said.
     pub talk: T,
-    /// Whether the last conversation succeeded.
-    pub result: Result<(), BusError>,
+    /// Set as it is sent.
     device: Option<SharedDevice>,
 }
 
-impl<T: Talk> Conversation<T> {
-    /// A conversation for [`Mcu::converse`]. It allocates: objects make theirs at configuration.
-    pub fn new(talk: T) -> Box<Conversation<T>> {
-        Box::new(Conversation { talk, result: Ok(()), device: None })
+impl<T: Talk> Errand for Conversation<T> {
+    type Answer = T::Answer;
+    type Failure = BusError;
+
+    fn run(&mut self) -> Result<T::Answer, BusError> {
+        let device = self.device.take().ok_or_else(no_device)?;
+        let mut chip = device.lock().unwrap_or_else(PoisonError::into_inner);
+        self.talk.talk(&mut **chip)
     }
 }
 
-impl<T: Talk> Errand for Conversation<T> {
-    fn run(&mut self) {
-        let Some(device) = self.device.take() else { return };
-        let mut chip = device.lock().unwrap_or_else(PoisonError::into_inner);
-        self.result = self.talk.talk(&mut **chip);
+impl<T: Talk> Slot<Conversation<T>> {
+    /// A slot for conversations. It allocates: objects make theirs at configuration.
+    pub fn talking(talk: T) -> Slot<Conversation<T>> {
+        Slot::new(Conversation { talk, device: None })
     }
+
+    /// Sends the conversation, if it is here, to the chip that object `device` stands for.
+    ///
+    /// # Errors
+    ///
+    /// "Invalid oid type" if the object stands for no chip, "Bus worker queue overflow".
+    pub fn converse(&mut self, turn: &mut Turn, device: Oid) -> Result<(), Shutdown> {
+        let bus = turn.lend(device)?;
+        self.converse_on(turn, &bus)
+    }
+
+    /// The same, for the object that stands for the chip itself.
+    ///
+    /// # Errors
+    ///
+    /// "Bus worker queue overflow".
+    pub fn converse_on(&mut self, turn: &mut Turn, bus: &Bus) -> Result<(), Shutdown> {
+        if let Some(conversation) = self.here() {
+            conversation.device = Some(bus.device.clone());
+        }
+        self.send(turn, bus.worker)
+    }
+}
+
+/// A conversation that was sent without a chip, which [`Slot::converse_on`] does not do.
+#[cold]
+fn no_device() -> BusError {
+    BusError { status: BusStatus::Nack, detail: "it was sent without a chip: please report it".into() }
 }
 
 impl Bus {
@@ -114,36 +147,5 @@ impl Mcu {
     /// That the worker can not be started.
     pub fn software_bus(&mut self, device: Box<dyn BusDevice>) -> Result<Bus, Shutdown> {
         self.bus(OnWorker { bus: SOFTWARE.to_owned(), device })
-    }
-
-    /// Sends a conversation to the chip that object `device` stands for. It comes back to
-    /// [`Object::returned`](super::Object::returned) of the ticket's object.
-    ///
-    /// # Errors
-    ///
-    /// "Invalid oid type" if the object stands for no chip, "Bus worker queue overflow".
-    pub fn converse<T: Talk>(
-        &mut self,
-        device: Oid,
-        ticket: Ticket,
-        conversation: Box<Conversation<T>>,
-    ) -> Result<(), Shutdown> {
-        let bus = self.lend(device)?;
-        self.converse_on(&bus, ticket, conversation)
-    }
-
-    /// The same, for the object that stands for the chip itself.
-    ///
-    /// # Errors
-    ///
-    /// "Bus worker queue overflow".
-    pub fn converse_on<T: Talk>(
-        &mut self,
-        bus: &Bus,
-        ticket: Ticket,
-        mut conversation: Box<Conversation<T>>,
-    ) -> Result<(), Shutdown> {
-        conversation.device = Some(bus.device.clone());
-        self.dispatch(bus.worker, ticket, conversation)
     }
 }

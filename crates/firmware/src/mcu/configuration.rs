@@ -104,7 +104,7 @@ impl Mcu {
         self.schedule.timers.clear();
         self.schedule.timers.remove(TimerId::HOLD);
         self.workers.reset();
-        self.hold.count = 0;
+        self.holds.count = 0;
         self.configuration = Configuration::default();
         self.board.reset();
         self.moves = MovePool::default();

@@ -2,10 +2,9 @@
 //! Work that may block: it travels to the worker of its bus as an [`Errand`], is done there, and
 //! comes back to the object that sent it.
 //!
-//! An errand carries everything that the work needs, and afterwards its result, in a box that the
-//! object makes at configuration and uses again and again. So sending it does not allocate, it may be
-//! of any size, and no object has more errands under way than it has boxes, so that the queue of a bus
-//! can not grow beyond their number.
+//! An object has a [`Slot`](super::Slot) for each errand, made at configuration. The errand carries everything that the
+//! work needs in a box that is used again and again. So sending it does not allocate, it may be of any size, and no
+//! object has more errands under way than it has slots, so that the queue of a bus cannot grow beyond their number.
 //!
 //! Commands wait for errands that a command sent (`hold.rs`).
 
@@ -16,42 +15,53 @@ use std::any::Any;
 use crate::shutdown::Shutdown;
 use crate::time::Clock;
 
-use super::{Mcu, Oid};
-
-#[cfg(doc)]
-use super::Object;
+use super::{Hold, Mcu, Oid, Turn};
 
 /// Work that may block.
-pub trait Errand: Any + Send {
-    /// Does the work, and keeps its result. Runs on a worker.
-    fn run(&mut self);
+pub trait Errand: Send + 'static {
+    /// What comes of it.
+    type Answer: Copy + Send;
+    /// Why nothing comes of it.
+    type Failure: Send;
+
+    /// Does the work. Runs on a worker.
+    ///
+    /// # Errors
+    ///
+    /// Those of the devices that it uses.
+    fn run(&mut self) -> Result<Self::Answer, Self::Failure>;
 }
 
-/// Whose errand it is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Ticket {
-    /// The object that sent it.
-    pub oid: Oid,
-    /// A number by which the object tells its errands apart.
-    pub tag: u8,
+/// An errand of any kind with what came of it, as it travels.
+pub trait Parcel: Any + Send {
+    /// Does the work, and keeps what comes of it. Runs on a worker.
+    fn run(&mut self);
 }
 
 /// An errand on its way to a worker.
 pub struct Job {
-    /// Whose it is.
-    pub ticket: Ticket,
+    /// The object that sent it.
+    pub oid: Oid,
     /// The work.
-    pub errand: Box<dyn Errand>,
+    pub parcel: Box<dyn Parcel>,
     /// Whether commands wait until it is back.
     pub holds: bool,
 }
 
+/// A job that a worker cannot take, and why.
+pub struct Refused {
+    /// The job, for its sender.
+    pub job: Job,
+    /// "Bus worker queue overflow".
+    pub why: Shutdown,
+}
+
 /// An errand that is done, on its way back from its worker.
 pub struct Completion {
-    /// Whose it is.
-    pub ticket: Ticket,
-    /// The work and its result.
-    pub errand: Box<dyn Errand>,
+    /// The object that sent it.
+    pub oid: Oid,
+    /// The work, and what came of it.
+    pub parcel: Box<dyn Parcel>,
     /// Whether commands wait for it.
     pub holds: bool,
     /// When the worker began the work.
@@ -60,24 +70,12 @@ pub struct Completion {
     pub ended: Clock,
 }
 
-/// An errand that is done, as its object gets it back.
+/// An errand that is done and looks for its slot.
 pub struct Done {
-    /// The tag of the object's [`Ticket`].
-    pub tag: u8,
-    /// The work and its result.
-    pub errand: Box<dyn Errand>,
-    /// When the worker began the work.
-    pub began: Clock,
-    /// When the worker had done it.
-    pub ended: Clock,
-}
-
-impl Done {
-    /// The errand as the type `T` that was sent; none if it is of another type.
-    pub fn errand<T: Errand>(self) -> Option<Box<T>> {
-        let any: Box<dyn Any> = self.errand;
-        any.downcast().ok()
-    }
+    /// `None` once its slot has taken it.
+    pub(super) parcel: Option<Box<dyn Parcel>>,
+    pub(super) began: Clock,
+    pub(super) ended: Clock,
 }
 
 /// A worker, as [`Workers::start`] numbered it.
@@ -103,8 +101,8 @@ pub trait Workers: Send {
     ///
     /// # Errors
     ///
-    /// "Bus worker queue overflow".
-    fn submit(&mut self, worker: WorkerId, job: Job) -> Result<(), Shutdown>;
+    /// The job, if the worker cannot take it.
+    fn submit(&mut self, worker: WorkerId, job: Job) -> Result<(), Refused>;
 
     /// The next errand that is done. Those of one bus come in the order in which they were sent.
     fn completion(&mut self) -> Option<Completion>;
@@ -143,28 +141,6 @@ impl Mcu {
         Ok(worker)
     }
 
-    /// Sends an errand, which comes back to [`Object::returned`]. If a command sends it, further
-    /// commands wait until it is back; likewise if an object sends it on the return of an errand for
-    /// which commands wait.
-    ///
-    /// # Errors
-    ///
-    /// "Bus worker queue overflow".
-    pub fn dispatch(&mut self, worker: WorkerId, ticket: Ticket, errand: Box<dyn Errand>) -> Result<(), Shutdown> {
-        let holds = self.hold(ticket.oid);
-        self.hand_over(worker, Job { ticket, errand, holds })
-    }
-
-    /// Sends an errand whose sender has called [`Mcu::hold`] itself; `job.holds` is what that returned.
-    pub(super) fn hand_over(&mut self, worker: WorkerId, job: Job) -> Result<(), Shutdown> {
-        let holds = job.holds;
-        let sent = self.workers.submit(worker, job);
-        if sent.is_err() && holds {
-            self.release();
-        }
-        sent
-    }
-
     /// Whether [`Mcu::run_workers`] has something to do.
     #[inline]
     pub fn has_completion(&self) -> bool {
@@ -181,20 +157,19 @@ impl Mcu {
     }
 
     fn give_back(&mut self, completion: Completion) {
-        let Completion { ticket: Ticket { oid, tag }, errand, holds, began, ended } = completion;
+        let Completion { oid, parcel, holds, began, ended } = completion;
         if let Some(mut object) = self.take(oid) {
             // If a command sent this errand, what the object sends now belongs to the command, too.
-            self.hold.is_commanded = holds;
-            let done = object.returned(self, oid, Done { tag, errand, began, ended });
+            self.holds.is_commanded = holds;
+            let mut done = Done { parcel: Some(parcel), began, ended };
+            let done = object.returned(&mut Turn::new(self, oid), &mut done);
             let done = done.map_err(|stop| self.blame(stop, object.kind(), oid));
-            self.hold.is_commanded = false;
+            self.holds.is_commanded = false;
             self.put_back(oid, object);
             if let Err(shutdown) = done {
                 self.shut_down(shutdown);
             }
         }
-        if holds {
-            self.release();
-        }
+        self.release(Hold(holds));
     }
 }

@@ -12,7 +12,7 @@
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Ticks;
 
-use super::{Mcu, Oid, TimerId};
+use super::{Mcu, Oid, TimerId, Turn};
 
 /// How long commands may wait for an errand before the machine stops. klippy, too, gives up waiting
 /// for an answer after five seconds (`SerialRetryCommand` in serialhdl.py). Without this limit a bus
@@ -22,7 +22,7 @@ const HOLD_LIMIT: Ticks = Ticks::from_us(5_000_000);
 
 /// What commands wait for.
 #[derive(Default)]
-pub(super) struct Hold {
+pub(super) struct Holds {
     /// Whether a command runs, or an errand that a command sent is taken in.
     pub(super) is_commanded: bool,
     /// Conversations that commands wait for.
@@ -31,20 +31,28 @@ pub(super) struct Hold {
     holder: Option<Oid>,
 }
 
-impl Mcu {
-    /// If a command runs now, makes further commands wait for this object, until [`Mcu::release`] was
-    /// called as often as this. Returns whether they wait.
-    pub fn hold(&mut self, oid: Oid) -> bool {
-        if self.hold.is_commanded {
-            if self.hold.count == 0 {
+/// Commands wait until this is [released](Mcu::release). If no command has asked for it, none wait.
+#[must_use]
+pub struct Hold(pub(super) bool);
+
+impl Turn<'_> {
+    /// If a command runs now, makes further commands wait for this object until the hold is
+    /// [released](Mcu::release).
+    pub fn hold(&mut self) -> Hold {
+        let holder = self.oid();
+        let is_commanded = self.holds.is_commanded;
+        if is_commanded {
+            if self.holds.count == 0 {
                 self.limit_hold();
             }
-            self.hold.count += 1;
-            self.hold.holder = Some(oid);
+            self.holds.count += 1;
+            self.holds.holder = Some(holder);
         }
-        self.hold.is_commanded
+        Hold(is_commanded)
     }
+}
 
+impl Mcu {
     /// Has the machine stop if commands still wait in [`HOLD_LIMIT`].
     fn limit_hold(&mut self) {
         self.schedule.timers.remove(TimerId::HOLD);
@@ -52,10 +60,13 @@ impl Mcu {
         self.schedule.timers.insert(limit, TimerId::HOLD);
     }
 
-    /// Takes back one [`Mcu::hold`] that returned true.
-    pub fn release(&mut self) {
-        self.hold.count = self.hold.count.saturating_sub(1);
-        if self.hold.count == 0 {
+    /// Lets commands run again, as far as this hold goes.
+    pub fn release(&mut self, Hold(waits): Hold) {
+        if !waits {
+            return;
+        }
+        self.holds.count = self.holds.count.saturating_sub(1);
+        if self.holds.count == 0 {
             self.schedule.timers.remove(TimerId::HOLD);
         }
     }
@@ -64,12 +75,12 @@ impl Mcu {
     /// `config_reset` waits for the outputs.
     #[inline]
     pub fn is_held(&self) -> bool {
-        self.hold.count > 0 && self.stop.reason.is_none() || self.configuration.reset_due
+        self.holds.count > 0 && self.stop.reason.is_none() || self.configuration.reset_due
     }
 
     /// A stop is over. A conversation from before it holds commands again, and its limit may be over.
     pub(super) fn hold_again(&mut self) {
-        if self.hold.count > 0 {
+        if self.holds.count > 0 {
             self.limit_hold();
         }
     }
@@ -78,7 +89,7 @@ impl Mcu {
     pub(super) fn held_too_long(&mut self) {
         if self.is_held() {
             let holder = self
-                .hold
+                .holds
                 .holder
                 .and_then(|oid| Some((oid, self.configuration.objects.get(oid.index())?.as_ref()?.kind())));
             let what = holder.map_or_else(|| "a device".to_owned(), |(oid, kind)| self.name_object(kind, oid));

@@ -12,10 +12,12 @@ use std::sync::Arc;
 
 use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line, OnWorker, Pin};
 use crate::shutdown::{Shutdown, reason};
-use crate::time::Ticks;
+use crate::time::{Clock, Ticks};
 
 use super::snapshot::Level;
-use super::{Calls, Done, Errand, LineState, Mcu, Remote, Safe, Settable, Ticket, UNREAD_LIMIT, Unread, WorkerId};
+use super::{
+    Back, Calls, Done, Errand, LineState, Mcu, Remote, Safe, Settable, Slot, Turn, UNREAD_LIMIT, Unread, WorkerId,
+};
 
 /// A line in use.
 pub(super) struct Claim {
@@ -150,18 +152,18 @@ enum Driver {
 }
 
 impl OutputLine {
-    /// Drives the line, or has its chip's worker drive it; `ticket` is the object's.
+    /// Drives the line, or has its chip's worker drive it.
     ///
     /// # Errors
     ///
     /// "GPIO line write failed".
     #[inline]
-    pub fn write(&mut self, mcu: &mut Mcu, ticket: Ticket, level: bool) -> Result<(), Shutdown> {
+    pub fn write(&mut self, turn: &mut Turn, level: bool) -> Result<(), Shutdown> {
         self.level = level;
         self.shown.set(level);
         match &mut self.driver {
             Driver::Prompt(line) => line.write(level),
-            Driver::Slow(line) => line.set(mcu, ticket, level),
+            Driver::Slow(line) => line.set(turn, level),
         }
     }
 
@@ -171,8 +173,8 @@ impl OutputLine {
     ///
     /// "GPIO line write failed".
     #[inline]
-    pub fn toggle(&mut self, mcu: &mut Mcu, ticket: Ticket) -> Result<(), Shutdown> {
-        self.write(mcu, ticket, !self.level)
+    pub fn toggle(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        self.write(turn, !self.level)
     }
 
     /// Drives the line of a stopped machine to where it belongs.
@@ -180,37 +182,47 @@ impl OutputLine {
     /// # Errors
     ///
     /// "GPIO line write failed".
-    pub fn make_safe(&mut self, mcu: &mut Mcu, ticket: Ticket, level: bool) -> Result<Safe, Shutdown> {
-        self.write(mcu, ticket, level)?;
+    pub fn make_safe(&mut self, turn: &mut Turn, level: bool) -> Result<Safe, Shutdown> {
+        self.write(turn, level)?;
         Ok(match self.driver {
             Driver::Prompt(_) => Safe::Now,
             Driver::Slow(_) => Safe::Later,
         })
     }
 
-    /// Takes in that the worker has written. True once nothing is left to be written.
+    /// Takes in what the worker has written, if it is this line ([`Remote::settle`]).
     ///
     /// # Errors
     ///
-    /// "GPIO line write failed".
-    pub fn returned(&mut self, mcu: &mut Mcu, ticket: Ticket, done: Done) -> Result<bool, Shutdown> {
+    /// "GPIO line write failed", unless the machine is stopped.
+    pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
         match &mut self.driver {
-            Driver::Prompt(_) => Ok(true),
-            Driver::Slow(line) => line.returned(mcu, ticket, done),
+            Driver::Prompt(_) => Ok(()),
+            Driver::Slow(line) => line.settle(turn, kind, done),
         }
     }
 }
 
 /// A look at an input of a chip that may sleep.
-struct Sampling {
-    line: Repeated,
-    level: Result<bool, Shutdown>,
-}
+struct Sampling(Repeated);
 
 impl Errand for Sampling {
-    fn run(&mut self) {
-        self.level = self.line.read();
+    type Answer = bool;
+    type Failure = Shutdown;
+
+    fn run(&mut self) -> Result<bool, Shutdown> {
+        self.0.read()
     }
+}
+
+/// What a worker saw of an input.
+pub struct Look {
+    /// `None` if it could not look, or the machine is stopped and it failed.
+    pub level: Option<bool>,
+    /// When the worker began to look.
+    pub began: Clock,
+    /// When the worker had looked.
+    pub ended: Clock,
 }
 
 /// An input line of any chip.
@@ -222,12 +234,7 @@ pub struct InputLine {
 
 enum Sensor {
     Prompt(Arc<dyn Line>),
-    Slow {
-        worker: WorkerId,
-        /// Here while no look is under way.
-        sampling: Option<Box<Sampling>>,
-        unread: Unread,
-    },
+    Slow { worker: WorkerId, look: Slot<Sampling>, unread: Unread },
 }
 
 impl InputLine {
@@ -236,85 +243,90 @@ impl InputLine {
         let sensor = match &claim.slow {
             None => Sensor::Prompt(line),
             Some((worker, calls)) => {
-                let line = Repeated { line, calls: calls.clone() };
-                let sampling = Some(Box::new(Sampling { line, level: Ok(false) }));
-                Sensor::Slow { worker: *worker, sampling, unread: Unread::default() }
+                let look = Slot::new(Sampling(Repeated { line, calls: calls.clone() }));
+                Sensor::Slow { worker: *worker, look, unread: Unread::default() }
             }
         };
         InputLine { pin: claim.pin, sensor, shown }
     }
 
-    /// The line's level; none if it comes later, to the object's `returned`, as the chip's worker
+    /// The line's level; `None` if it comes later, to the object's `returned`, as the chip's worker
     /// has to look.
     ///
     /// # Errors
     ///
     /// "GPIO line read failed".
     #[inline]
-    pub fn read(&mut self, mcu: &mut Mcu, ticket: Ticket) -> Result<Option<bool>, Shutdown> {
-        match &mut self.sensor {
+    pub fn read(&mut self, turn: &mut Turn) -> Result<Option<bool>, Shutdown> {
+        if let Sensor::Slow { worker, look, unread } = &mut self.sensor
+            && look.is_here()
+        {
+            unread.asked(turn.now());
+            look.send(turn, *worker)?;
+        }
+        self.prompt_level()
+    }
+
+    /// The line's level; `None` if the chip's worker would have to look.
+    ///
+    /// # Errors
+    ///
+    /// "GPIO line read failed".
+    #[inline]
+    pub fn prompt_level(&self) -> Result<Option<bool>, Shutdown> {
+        match &self.sensor {
             Sensor::Prompt(line) => line.read().inspect(|level| self.shown.set(*level)).map(Some),
-            Sensor::Slow { worker, sampling, unread } => {
-                if let Some(sampling) = sampling.take() {
-                    unread.asked(mcu.now());
-                    mcu.dispatch(*worker, ticket, sampling)?;
-                }
-                Ok(None)
-            }
+            Sensor::Slow { .. } => Ok(None),
         }
     }
 
-    /// The level that the worker saw; none if it could not look, or the machine is stopped and it failed.
-    ///
-    /// # Errors
-    ///
+    /// Whether the chip's worker looks at the line.
+    pub fn is_looking(&self) -> bool {
+        matches!(&self.sensor, Sensor::Slow { look, .. } if !look.is_here())
+    }
+
+    /// Takes in a look that is done, if it was at this line. It fails with
     /// "GPIO line read failed", once nothing was seen for [`UNREAD_LIMIT`].
-    pub fn sampled(&mut self, mcu: &Mcu, done: Done) -> Result<Option<bool>, Shutdown> {
-        self.take_in(mcu, done, false)
+    pub fn sampled(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
+        self.take_in(turn, done, false)
     }
 
-    /// The same where a move depends on it.
-    ///
-    /// # Errors
-    ///
-    /// "GPIO line read failed" at once.
-    pub fn seen(&mut self, mcu: &Mcu, done: Done) -> Result<Option<bool>, Shutdown> {
-        self.take_in(mcu, done, true)
+    /// The same where a move depends on it: a look that failed is a failure at once.
+    pub fn seen(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
+        self.take_in(turn, done, true)
     }
 
-    fn take_in(&mut self, mcu: &Mcu, done: Done, at_once: bool) -> Result<Option<bool>, Shutdown> {
-        let ended = done.ended;
-        let (Sensor::Slow { sampling, unread, .. }, Some(back)) = (&mut self.sensor, done.errand::<Sampling>()) else {
-            return Ok(None);
-        };
-        // What failed stays in the box, as the core would free it.
-        match &sampling.insert(back).level {
+    fn take_in(&mut self, turn: &Turn, done: &mut Done, at_once: bool) -> Option<Result<Look, Shutdown>> {
+        let Sensor::Slow { look, unread, .. } = &mut self.sensor else { return None };
+        let Back { result, began, ended, .. } = look.back(done)?;
+        let level = match result {
             Ok(level) => {
                 unread.read();
-                self.shown.set(*level);
-                Ok(Some(*level))
+                self.shown.set(level);
+                Ok(Some(level))
             }
-            Err(failure) if at_once || unread.is_too_long(ended) => mcu.try_shut_down(failure.clone()).map(|()| None),
+            Err(failure) if at_once || unread.is_too_long(ended) => turn.try_shut_down(failure.clone()).map(|()| None),
             Err(_) => Ok(None),
-        }
+        };
+        Some(level.map(|level| Look { level, began, ended }))
     }
 
-    /// To be called while a look is under way.
+    /// To be called while a look may be under way.
     ///
     /// # Errors
     ///
     /// "GPIO line read failed", once nothing was seen for [`UNREAD_LIMIT`].
-    pub fn awaited(&self, mcu: &mut Mcu) -> Result<(), Shutdown> {
-        let Sensor::Slow { unread, .. } = &self.sensor else { return Ok(()) };
-        if !unread.is_too_long(mcu.now()) {
+    pub fn awaited(&self, turn: &mut Turn) -> Result<(), Shutdown> {
+        let Sensor::Slow { look, unread, .. } = &self.sensor else { return Ok(()) };
+        if look.is_here() || !unread.is_too_long(turn.now()) {
             return Ok(());
         }
         let detail = format!(
             "{} has not answered for {} ms: does its chip or its bus hang? Check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
-            mcu.name(self.pin),
+            turn.name(self.pin),
             UNREAD_LIMIT.0 / Ticks::from_us(1000).0
         );
-        mcu.try_shut_down(Shutdown::because(reason::LINE_READ, detail))
+        turn.try_shut_down(Shutdown::because(reason::LINE_READ, detail))
     }
 }
 

@@ -25,9 +25,9 @@ impl Mcu {
     pub fn execute(&mut self, payload: &mut Reader<'_>) {
         let command = *payload;
         self.schedule.is_behind = false;
-        self.hold.is_commanded = true;
+        self.holds.is_commanded = true;
         let done = self.try_execute(payload);
-        self.hold.is_commanded = false;
+        self.holds.is_commanded = false;
         if let Err(mut shutdown) = done {
             if shutdown.reason == reason::COMMAND_PARSER {
                 shutdown = self.cut_short(command);

@@ -28,34 +28,40 @@ mod outbox;
 mod parameters;
 mod remote;
 mod schedule;
+mod slot;
 mod snapshot;
 mod stats;
 mod stop;
 mod timers;
+mod turn;
 
 pub use crate::{command, response};
 pub use bus::{Bus, Conversation, Talk};
 pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};
 pub use dialect::{Dialect, Firmware};
-pub use errand::{Completion, Done, Errand, Job, Ticket, WorkerId, Workers};
+pub use errand::{Completion, Done, Errand, Job, Parcel, Refused, WorkerId, Workers};
 pub use generation::{DialectName, Generation, Generations, only, since, until};
-pub use lines::{InputLine, OutputLine, PromptLine};
+pub use hold::Hold;
+pub use lines::{InputLine, Look, OutputLine, PromptLine};
 pub use moves::{MOVE_COUNT, MovePool, MoveQueue};
 pub use object::{Next, Object, Safe};
 pub use outbox::{Note, Outbox};
 pub use parameters::{Oid, WireClock};
 pub use remote::{Remote, Settable};
 pub use schedule::SPIN_MAX;
+pub use slot::{Back, Slot};
 pub use snapshot::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Report, Snapshot};
 pub use stop::RETRY_TICKS;
-pub use timers::TimerId;
+pub use timers::Timer;
+pub use turn::Turn;
 
 use configuration::{Configuration, OBJECTS_MAX};
-use hold::Hold;
+use hold::Holds;
 use messages::Spoken;
 use schedule::Schedule;
 use stop::Stop;
+use timers::TimerId;
 
 /// The machine's own responses come first in the list of all.
 const fn response_index(format: &str) -> usize {
@@ -72,7 +78,7 @@ pub struct Mcu {
     outbox: Box<dyn Outbox>,
     spoken: Spoken,
     configuration: Configuration,
-    hold: Hold,
+    holds: Holds,
     stop: Stop,
 }
 
@@ -93,7 +99,7 @@ impl Mcu {
             outbox,
             spoken: Spoken { dialect, next: None },
             configuration: Configuration::default(),
-            hold: Hold::default(),
+            holds: Holds::default(),
             stop: Stop::default(),
         };
         mcu.send(base::Starting {});

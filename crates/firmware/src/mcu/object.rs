@@ -9,7 +9,7 @@ use crate::board::Pin;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
-use super::{Bus, BusCounts, Done, Mcu, Oid, Report, TimerId};
+use super::{Bus, BusCounts, Done, Mcu, Oid, Report, Timer, Turn};
 
 /// What an event answers: what becomes of its timer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -26,7 +26,7 @@ pub enum Next {
 pub enum Safe {
     /// They are.
     Now,
-    /// A worker is to write them. The object calls [`Mcu::is_safe`] once that is done.
+    /// A worker is to write them. The object calls [`Turn::is_safe`] once that is done.
     Later,
 }
 
@@ -37,27 +37,27 @@ pub trait Object: Any + Send {
     fn kind(&self) -> &'static str;
 
     /// A timer of this object runs, which was due at `at`. An error stops the machine.
-    fn event(&mut self, _mcu: &mut Mcu, _timer: TimerId, _at: Clock) -> Result<Next, Shutdown> {
+    fn event(&mut self, _turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         Ok(Next::Done)
     }
 
     /// An errand of this object has come back from its worker. An error stops the machine.
-    fn returned(&mut self, _mcu: &mut Mcu, _oid: Oid, _done: Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, _turn: &mut Turn, _done: &mut Done) -> Result<(), Shutdown> {
         Ok(())
     }
 
     /// The trsync that this object waits for was triggered. An error stops the machine.
-    fn triggered(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<(), Shutdown> {
+    fn triggered(&mut self, _turn: &mut Turn) -> Result<(), Shutdown> {
         Ok(())
     }
 
     /// The machine stops and has removed all timers: the object drops whatever it had queued.
-    fn shutdown(&mut self, _mcu: &mut Mcu, _oid: Oid) {}
+    fn shutdown(&mut self, _turn: &mut Turn) {}
 
     /// Drives the outputs to their shutdown values, after [`Object::shutdown`]. As long as this fails
     /// it is called again every [`super::RETRY_TICKS`]; if it fails for too long, the guardian drives
     /// the outputs and ends the program.
-    fn make_safe(&mut self, _mcu: &mut Mcu, _oid: Oid) -> Result<Safe, Shutdown> {
+    fn make_safe(&mut self, _turn: &mut Turn) -> Result<Safe, Shutdown> {
         Ok(Safe::Now)
     }
 
@@ -96,7 +96,7 @@ impl Mcu {
         }
     }
 
-    /// Lends the object of type `T` under `oid` to `f`.
+    /// Gives the object of type `T` under `oid` a turn: `f` runs with it.
     ///
     /// # Errors
     ///
@@ -105,16 +105,25 @@ impl Mcu {
     pub fn with<T: Object, R>(
         &mut self,
         oid: Oid,
-        f: impl FnOnce(&mut T, &mut Mcu) -> Result<R, Shutdown>,
+        f: impl FnOnce(&mut T, &mut Turn) -> Result<R, Shutdown>,
     ) -> Result<R, Shutdown> {
         let Some(mut object) = self.take(oid) else { return Err(not_configured(oid)) };
         let any: &mut dyn Any = &mut *object;
         let result = match any.downcast_mut::<T>() {
-            Some(inner) => f(inner, self).map_err(|stop| self.blame(stop, object.kind(), oid)),
+            Some(inner) => f(inner, &mut Turn::new(self, oid)).map_err(|stop| self.blame(stop, object.kind(), oid)),
             None => Err(not_configured(oid)),
         };
         self.put_back(oid, object);
         result
+    }
+
+    /// Checks that there is an object of type `T` under `oid`.
+    ///
+    /// # Errors
+    ///
+    /// "Invalid oid type".
+    pub fn require<T: Object>(&mut self, oid: Oid) -> Result<(), Shutdown> {
+        self.with::<T, _>(oid, |_, _| Ok(()))
     }
 
     /// The id of the one object of type `T` that belongs to a feature rather than to an oid of the
@@ -159,7 +168,7 @@ impl Mcu {
     pub fn trigger(&mut self, oid: Oid) -> Result<(), Shutdown> {
         match self.take(oid) {
             Some(mut object) => {
-                let result = object.triggered(self, oid);
+                let result = object.triggered(&mut Turn::new(self, oid));
                 self.put_back(oid, object);
                 result
             }

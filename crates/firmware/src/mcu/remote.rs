@@ -5,8 +5,7 @@
 
 use crate::shutdown::Shutdown;
 
-use super::errand::Job;
-use super::{Done, Errand, Mcu, Ticket, WorkerId};
+use super::{Back, Done, Errand, Hold, Slot, Turn, WorkerId};
 
 /// An output that can be set to a value.
 pub trait Settable: Send + 'static {
@@ -21,16 +20,18 @@ pub trait Settable: Send + 'static {
     fn set(&mut self, value: Self::Value) -> Result<(), Shutdown>;
 }
 
-/// One write. Each output has one box of these, which is used again and again.
+/// One write.
 struct Write<S: Settable> {
     output: S,
     value: S::Value,
-    result: Result<(), Shutdown>,
 }
 
 impl<S: Settable> Errand for Write<S> {
-    fn run(&mut self) {
-        self.result = self.output.set(self.value);
+    type Answer = ();
+    type Failure = Shutdown;
+
+    fn run(&mut self) -> Result<(), Shutdown> {
+        self.output.set(self.value)
     }
 }
 
@@ -38,19 +39,15 @@ impl<S: Settable> Errand for Write<S> {
 /// newest is written next, as the others are out of date by then.
 pub struct Remote<S: Settable> {
     worker: WorkerId,
-    /// None while a write is under way: then the worker has the box.
-    write: Option<Box<Write<S>>>,
-    /// The value to write after the write that is under way.
-    next: Option<S::Value>,
-    /// Whether commands wait until `next` is written.
-    next_holds: bool,
+    write: Slot<Write<S>>,
+    /// The value to write after the write that is under way, and what waits for it.
+    next: Option<(S::Value, Hold)>,
 }
 
 impl<S: Settable> Remote<S> {
     /// An output of this worker, which is at `value` now.
     pub fn new(worker: WorkerId, output: S, value: S::Value) -> Remote<S> {
-        let write = Some(Box::new(Write { output, value, result: Ok(()) }));
-        Remote { worker, write, next: None, next_holds: false }
+        Remote { worker, write: Slot::new(Write { output, value }), next: None }
     }
 
     /// Has the worker set the output to `value`, now or after the write that is under way. If a
@@ -59,50 +56,49 @@ impl<S: Settable> Remote<S> {
     /// # Errors
     ///
     /// "Bus worker queue overflow".
-    pub fn set(&mut self, mcu: &mut Mcu, ticket: Ticket, value: S::Value) -> Result<(), Shutdown> {
-        match self.write.take() {
+    pub fn set(&mut self, turn: &mut Turn, value: S::Value) -> Result<(), Shutdown> {
+        let hold = match self.next.take() {
+            Some((_, hold @ Hold(true))) => hold,
+            _ => turn.hold(),
+        };
+        self.write(turn, value, hold)
+    }
+
+    fn write(&mut self, turn: &mut Turn, value: S::Value, hold: Hold) -> Result<(), Shutdown> {
+        match self.write.here() {
             Some(write) => {
-                let holds = mcu.hold(ticket.oid);
-                self.send(mcu, ticket, write, value, holds)
+                write.value = value;
+                self.write.send_with(turn, self.worker, hold)
             }
             None => {
-                self.next = Some(value);
-                self.next_holds = self.next_holds || mcu.hold(ticket.oid);
+                self.next = Some((value, hold));
                 Ok(())
             }
         }
     }
 
-    /// To be called when the write comes back to the object. True once nothing is left to be written.
+    /// Takes the write that is done, if it is this output's. True once nothing is left to be written.
+    pub fn back(&mut self, turn: &mut Turn, done: &mut Done) -> Option<Result<bool, Shutdown>> {
+        let Back { result, .. } = self.write.back(done)?;
+        let result = result.map_err(Shutdown::clone);
+        Some(match self.next.take() {
+            Some((next, hold)) => self.write(turn, next, hold).and(result.map(|()| false)),
+            None => result.map(|()| true),
+        })
+    }
+
+    /// The same for an output of an object whose outputs are all at their shutdown values once this one is. The object
+    /// is of this kind.
     ///
     /// # Errors
     ///
-    /// That of the write, such as "PWM write failed"; "Bus worker queue overflow".
-    pub fn returned(&mut self, mcu: &mut Mcu, ticket: Ticket, done: Done) -> Result<bool, Shutdown> {
-        let Some(mut write) = done.errand::<Write<S>>() else { return Ok(false) };
-        let result = std::mem::replace(&mut write.result, Ok(()));
-        match self.next.take() {
-            Some(next) => {
-                let holds = std::mem::take(&mut self.next_holds);
-                self.send(mcu, ticket, write, next, holds)?;
-                result.map(|()| false)
-            }
-            None => {
-                self.write = Some(write);
-                result.map(|()| true)
-            }
+    /// That of the write, such as "PWM write failed", unless the machine is stopped.
+    pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
+        match self.back(turn, done) {
+            Some(Ok(true)) => turn.is_safe(),
+            Some(Err(failure)) => return turn.device_failed(kind, failure),
+            _ => {}
         }
-    }
-
-    fn send(
-        &mut self,
-        mcu: &mut Mcu,
-        ticket: Ticket,
-        mut write: Box<Write<S>>,
-        value: S::Value,
-        holds: bool,
-    ) -> Result<(), Shutdown> {
-        write.value = value;
-        mcu.hand_over(self.worker, Job { ticket, errand: write, holds })
+        Ok(())
     }
 }

@@ -11,7 +11,7 @@ use crate::time::{Clock, Ticks, TimeSource, Timing};
 
 use super::stats::Stats;
 use super::timers::Timers;
-use super::{Mcu, Next, Note, OBJECTS_MAX, TimerId, WireClock, base};
+use super::{Mcu, Next, Note, OBJECTS_MAX, TimerId, Turn, WireClock, base};
 
 /// How far a timer may fall behind before the machine stops: 100 ms, as in the firmware.
 const LATE_LIMIT: Ticks = Ticks::from_us(100_000);
@@ -95,7 +95,7 @@ impl Mcu {
     }
 
     /// Starts a timer. One that is the next of all and has passed is too close.
-    pub fn schedule(&mut self, timer: TimerId, at: Clock) -> Result<(), Shutdown> {
+    pub(super) fn schedule(&mut self, timer: TimerId, at: Clock) -> Result<(), Shutdown> {
         // In the firmware the timer that runs still is the first of the queue.
         let first = self.schedule.timing.due.get().or(self.schedule.timers.next());
         self.schedule.timers.insert(at, timer);
@@ -115,12 +115,12 @@ impl Mcu {
     }
 
     /// Goes on with an activity of the machine's own: late is late, but no fault of the host.
-    pub fn go_on(&mut self, timer: TimerId, at: Clock) {
+    pub(super) fn go_on(&mut self, timer: TimerId, at: Clock) {
         self.schedule.timers.insert(at, timer);
     }
 
     /// Stops a timer, if it runs.
-    pub fn cancel(&mut self, timer: TimerId) {
+    pub(super) fn cancel(&mut self, timer: TimerId) {
         self.schedule.timers.remove(timer);
     }
 
@@ -174,7 +174,9 @@ impl Mcu {
         let result = match timer.oid() {
             Some(oid) => match self.take(oid) {
                 Some(mut object) => {
-                    let result = object.event(self, timer, at).map_err(|stop| self.blame(stop, object.kind(), oid));
+                    let result = object
+                        .event(&mut Turn::new(self, oid), timer.timer(), at)
+                        .map_err(|stop| self.blame(stop, object.kind(), oid));
                     self.put_back(oid, object);
                     result
                 }

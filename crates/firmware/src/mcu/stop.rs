@@ -12,7 +12,7 @@
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks};
 
-use super::{Mcu, Note, Oid, Safe, TimerId, base};
+use super::{Mcu, Note, Oid, Safe, TimerId, Turn, base};
 
 #[cfg(doc)]
 use super::Object;
@@ -73,7 +73,7 @@ impl Mcu {
         self.schedule.timers.clear();
         for oid in self.oids() {
             if let Some(mut object) = self.take(oid) {
-                object.shutdown(self, oid);
+                object.shutdown(&mut Turn::new(self, oid));
                 self.put_back(oid, object);
             }
         }
@@ -106,14 +106,8 @@ impl Mcu {
         }
     }
 
-    /// To be called when an output or device of an object has failed. A running machine is stopped by
-    /// the error that this returns. In a stopped one the log is told, and the shutdown value is tried
-    /// again later.
-    ///
-    /// # Errors
-    ///
-    /// The failure, unless the machine is stopped.
-    pub fn device_failed(&mut self, oid: Oid, kind: &str, shutdown: Shutdown) -> Result<(), Shutdown> {
+    /// See [`Turn::device_failed`].
+    pub(super) fn device_failed(&mut self, oid: Oid, kind: &str, shutdown: Shutdown) -> Result<(), Shutdown> {
         if self.stop.reason.is_none() {
             return Err(shutdown);
         }
@@ -128,15 +122,14 @@ impl Mcu {
         Ok(())
     }
 
-    /// Says in the log that something of an object failed which does not stop the machine.
-    pub fn warn(&mut self, oid: Oid, kind: &str, trouble: Shutdown) {
+    /// See [`Turn::warn`].
+    pub(super) fn warn(&mut self, oid: Oid, kind: &str, trouble: Shutdown) {
         let trouble = self.blame(trouble, kind, oid);
         self.outbox.note(Note::Warning(&trouble));
     }
 
-    /// To be called by an object that answered [`Safe::Later`], once its outputs are at their shutdown
-    /// values.
-    pub fn is_safe(&mut self, oid: Oid) {
+    /// See [`Turn::is_safe`].
+    pub(super) fn is_safe(&mut self, oid: Oid) {
         let Some(place) = self.stop.owed.iter().position(|debt| debt.oid == oid) else { return };
         let debt = self.stop.owed.swap_remove(place);
         if debt.failed {
@@ -161,7 +154,7 @@ impl Mcu {
 
     fn make_safe(&mut self, oid: Oid) {
         let Some(mut object) = self.take(oid) else { return };
-        let safe = object.make_safe(self, oid);
+        let safe = object.make_safe(&mut Turn::new(self, oid));
         let (kind, guarded) = (object.kind(), object.is_guarded());
         self.put_back(oid, object);
         if !matches!(safe, Ok(Safe::Now)) && !self.stop.owed.iter().any(|debt| debt.oid == oid) {

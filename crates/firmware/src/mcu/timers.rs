@@ -7,13 +7,32 @@ use crate::time::Clock;
 
 use super::Oid;
 
+/// A timer of an object. Each object has its own, told apart by a number.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Timer {
+    number: u8,
+    is_exact: bool,
+}
+
+impl Timer {
+    /// A timer for which the core is awake when it is due.
+    pub const fn exact(number: u8) -> Timer {
+        Timer { number, is_exact: true }
+    }
+
+    /// A timer that may be late by a wake-up, as it asks for a sample at a steady pace. The core sleeps until it is
+    /// due. For an exact timer it wakes earlier and spins.
+    pub const fn sampling(number: u8) -> Timer {
+        Timer { number, is_exact: false }
+    }
+}
+
 /// Which timer: an object's, or the machine's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct TimerId {
+pub(super) struct TimerId {
     /// The object; the machine's own timers have none.
     oid: Option<Oid>,
-    which: u8,
-    is_exact: bool,
+    timer: Timer,
 }
 
 impl TimerId {
@@ -25,34 +44,28 @@ impl TimerId {
     /// The machine's own timer, which ends the wait for a bus that hangs.
     pub(super) const HOLD: TimerId = TimerId::own(2);
 
-    const fn own(which: u8) -> TimerId {
-        TimerId { oid: None, which, is_exact: false }
+    const fn own(number: u8) -> TimerId {
+        TimerId { oid: None, timer: Timer::sampling(number) }
     }
 
-    /// Timer number `which` of an object.
-    pub const fn new(oid: Oid, which: u8) -> TimerId {
-        TimerId { oid: Some(oid), which, is_exact: true }
-    }
-
-    /// The same, of one that may be late by a wake-up: it asks for a sample at a steady pace. The core sleeps until
-    /// it is due, where for others it is awake earlier and spins.
-    pub const fn sampling(oid: Oid, which: u8) -> TimerId {
-        TimerId { oid: Some(oid), which, is_exact: false }
+    /// A timer of an object.
+    pub(super) const fn of(oid: Oid, timer: Timer) -> TimerId {
+        TimerId { oid: Some(oid), timer }
     }
 
     /// Whether the core is to be awake when it is due.
     pub(super) const fn is_exact(self) -> bool {
-        self.is_exact
+        self.timer.is_exact
     }
 
     /// The object whose timer it is.
-    pub const fn oid(self) -> Option<Oid> {
+    pub(super) const fn oid(self) -> Option<Oid> {
         self.oid
     }
 
-    /// The timer's number within its object.
-    pub const fn which(self) -> u8 {
-        self.which
+    /// Which of the object's timers it is.
+    pub(super) const fn timer(self) -> Timer {
+        self.timer
     }
 }
 
@@ -82,7 +95,7 @@ impl Timers {
     /// The instant of the next that the core is to be awake for.
     #[inline]
     pub(super) fn next_exact(&self) -> Option<Clock> {
-        self.waiting.iter().rev().find(|(_, timer)| timer.is_exact).map(|(at, _)| *at)
+        self.waiting.iter().rev().find(|(_, timer)| timer.is_exact()).map(|(at, _)| *at)
     }
 
     #[inline]
@@ -127,7 +140,7 @@ mod tests {
             let mut expected: Vec<(Clock, TimerId)> = instants
                 .iter()
                 .enumerate()
-                .map(|(i, at)| (Clock::from_ticks(*at), TimerId::new(Oid::new(i as u8), 0)))
+                .map(|(i, at)| (Clock::from_ticks(*at), TimerId::of(Oid::new(i as u8), Timer::exact(0))))
                 .collect();
             for (at, timer) in &expected {
                 timers.insert(*at, *timer);
