@@ -296,6 +296,23 @@ fn a_sensor_needs_an_spi_device() {
     }
 }
 
+/// What cannot be sent stays with its sensor, which is told so each time.
+#[test]
+fn a_sensor_whose_device_has_no_bus_loses_nothing() {
+    let config =
+        ["allocate_oids count=2", "config_spi oid=0 pin=17 cs_active_high=0", "config_adxl345 oid=1 spi_oid=0"];
+    let mut rig = Rig::new();
+    rig.send_all(&config);
+    rig.send("finalize_config crc=7");
+    for query in ["query_adxl345 oid=1 rest_ticks=1000", "query_adxl345_status oid=1", "query_adxl345_status oid=1"] {
+        rig.forget_responses();
+        rig.send(query);
+        rig.run_until(rig.now() + 10_000);
+        assert_eq!(rig.shutdown().as_deref(), Some("Invalid oid type"), "{query}");
+        rig.send("clear_shutdown");
+    }
+}
+
 #[test]
 fn a_slow_chip_delays_nothing_but_itself() {
     let mut rig = Rig::with_workers(
