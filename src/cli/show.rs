@@ -80,6 +80,8 @@ impl Item {
 struct Number {
     value: f64,
     step: f64,
+    /// It stands though it goes up and down by less than this.
+    ripple: f64,
 }
 
 /// All that can be seen now.
@@ -92,7 +94,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
         items.push(Item {
             kind: Kind::Axis,
             name: axis.name.into(),
-            number: Some(Number { value: axis.position_mm, step: 1.0 }),
+            number: Some(Number { value: axis.position_mm, step: 1.0, ripple: 0.0 }),
             text: format!("{mm:.2} mm{lost}"),
         });
     }
@@ -100,7 +102,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
         items.push(Item {
             kind: Kind::Heater,
             name: heater.name.into(),
-            number: Some(Number { value: heater.celsius, step: 1.0 }),
+            number: Some(Number { value: heater.celsius, step: 1.0, ripple: 0.0 }),
             text: format!("{:.1} C", heater.celsius),
         });
     }
@@ -108,7 +110,8 @@ fn look(probe: &SimProbe) -> Vec<Item> {
         items.push(Item {
             kind: Kind::Fan,
             name: fan.name.into(),
-            number: Some(Number { value: fan.rpm, step: 100.0 }),
+            // klippy's cycle of 10 ms has a fan at half speed go up and down by 28 rpm.
+            number: Some(Number { value: fan.rpm, step: 100.0, ripple: 30.0 }),
             text: format!("{:.0} rpm", fan.rpm),
         });
     }
@@ -118,7 +121,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
             percent if percent > 99.0 => "on".into(),
             percent => format!("{percent} %"),
         };
-        let number = Some(Number { value: output.brightness, step: 0.05 });
+        let number = Some(Number { value: output.brightness, step: 0.05, ripple: 0.0 });
         items.push(Item { kind: Kind::Output, name: output.name.into(), number, text });
     }
     for (name, text) in probe.sights() {
@@ -345,7 +348,7 @@ mod tests {
     use proptest::prelude::*;
 
     pub(super) fn item(kind: Kind, name: &str, value: Option<f64>, text: &str) -> Item {
-        let number = value.map(|value| Number { value, step: 1.0 });
+        let number = value.map(|value| Number { value, step: 1.0, ripple: 0.0 });
         Item { kind, name: name.into(), number, text: text.into() }
     }
 

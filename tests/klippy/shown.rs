@@ -185,7 +185,7 @@ fn a_fan_at_half_speed_is_told_where_it_ends_up_and_not_for_each_ripple() {
     printer.gcode("M106 S128\nG4 P8000");
     let rpm = |printer: &Printer| printer.shown("fan").trim_end_matches(" rpm").parse::<f64>().unwrap();
     let first = rpm(&printer);
-    assert!((first - 4500.0 * 128.0 / 255.0).abs() < 40.0, "{first}");
+    assert!((first - 4500.0 * 128.0 / 255.0).abs() < 45.0, "{first}");
     let lines = |printer: &Printer| printer.all_shown().matches("] fan: ").count();
     let before = lines(&printer);
     printer.gcode("G4 P20000");

@@ -31,7 +31,7 @@ struct Told {
 impl Told {
     /// Takes in a look. True if there is news to tell.
     fn is_news(&mut self, item: &Item) -> bool {
-        let Some(Number { value, step }) = item.number else { return item.text != self.text };
+        let Some(Number { value, step, ripple }) = item.number else { return item.text != self.text };
         let last = self.seen.back().map(|(last, _)| *last);
         self.seen.push_back((value, item.text.clone()));
         if self.seen.len() > STANDING_LOOKS {
@@ -41,6 +41,9 @@ impl Told {
             return false;
         }
         let way = (value - self.value).abs();
+        if way < ripple {
+            return false;
+        }
         way >= step || last == Some(value) || self.seen.len() == STANDING_LOOKS && self.stands(value, way, step)
     }
 
@@ -128,6 +131,19 @@ mod tests {
         let last: f64 = told.last().unwrap().strip_suffix(" C").unwrap().parse().unwrap();
         assert!((last - 60.0).abs() <= 0.3, "{told:?}");
         assert!(told.len() < 12, "{told:?}");
+    }
+
+    /// Looks that meet the ripple at one phase for a while see it stand, at another place each time.
+    #[test]
+    fn a_fan_that_is_looked_at_in_step_with_its_ripple_is_told_once() {
+        let mut changes = Changes::default();
+        let lines = (0..200).map(|look| {
+            let rpm = if look / 10 % 2 == 0 { 2248.0 } else { 2270.0 };
+            let number = Some(Number { value: rpm, step: 100.0, ripple: 30.0 });
+            let fan = Item { number, ..item(Kind::Fan, "fan", None, &format!("{rpm} rpm")) };
+            changes.lines(&[fan], Duration::ZERO, false)
+        });
+        assert_eq!(lines.collect::<String>().lines().count(), 1);
     }
 
     #[test]
