@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # `make` alone tells what there is.
 
+# Looked for at each use: system-packages may have installed it just now.
 CARGO ?= $(shell command -v cargo || echo "$$HOME/.cargo/bin/cargo")
 CARGO_TARGET_DIR ?= target
 PINION = $(CARGO_TARGET_DIR)/release/pinion
@@ -24,6 +25,7 @@ FISHDIR ?= $(PREFIX)/share/fish/vendor_completions.d
 # A program that runs here, to ask for the shells' completions: not PINION where that is of another architecture.
 COMPLETER ?= $(PINION)
 DEB_FOLDER ?= $(CARGO_TARGET_DIR)/deb
+RELEASE_FOLDER ?= $(CARGO_TARGET_DIR)/pinion-mcu-release
 
 # A computer of 32 bits.
 SMALL = armv7-unknown-linux-gnueabihf
@@ -31,8 +33,14 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test lab lab-pi lab-system bench check build install install-program install-system uninstall deb clean
-.PHONY: system-packages cargo
+.PHONY: help run demo test lab lab-pi lab-system bench check build install install-program install-system uninstall
+.PHONY: deb release clean
+
+# They install what is missing, Rust too.
+PACKAGES = $(addprefix system-packages-,build lab deb check)
+.PHONY: $(PACKAGES)
+$(PACKAGES): system-packages-%:
+	@CARGO='$(CARGO)' scripts/system-packages $*
 
 help:
 	@echo 'make run      build, home and heat a simulated printer, then serve a real host until Ctrl-C'
@@ -47,6 +55,7 @@ help:
 	@echo 'make install  program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
 	@echo 'make deb      a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf,'
 	@echo '              in $(DEB_FOLDER)/arm64 or $(DEB_FOLDER)/armhf'
+	@echo 'make release  the packages for amd64, arm64 and armhf, checksums and notes in $(RELEASE_FOLDER)'
 	@echo 'make clean    remove what was built'
 
 run: build
@@ -55,11 +64,10 @@ run: build
 demo: build
 	@$(PINION) sim --demo $(REALTIME) $(ARGS)
 
-build: system-packages
+build: system-packages-build
 	@$(CARGO) build --release --locked --quiet --bin pinion
 
-test: cargo
-	@scripts/system-packages lab
+test: system-packages-lab
 	$(CARGO) test --locked
 ifeq ($(shell uname -m),x86_64)
 	$(CARGO) test --locked --test lab
@@ -67,23 +75,19 @@ else
 	@echo 'NOT RUN: the tests in the virtual machine, which need an x86-64 computer' >&2
 endif
 
-lab: cargo
-	@scripts/system-packages lab
+lab: system-packages-lab
 	$(CARGO) test --locked --test lab
 
-lab-pi: cargo
-	@scripts/system-packages build
+lab-pi: system-packages-build
 	$(CARGO) test --locked --test lab_pi
 
-lab-system: cargo
-	@scripts/system-packages lab
-	@scripts/system-packages deb
+lab-system: system-packages-lab system-packages-deb
 	$(CARGO) test --locked --test lab_system
 
-bench: system-packages
+bench: system-packages-build
 	$(CARGO) bench --locked
 
-check: system-packages
+check: system-packages-check
 	$(CARGO) fmt --all --check
 	$(CARGO) clippy --locked --all-targets -- -D warnings
 	@if rustup target list --installed 2>/dev/null | grep -qx $(SMALL); then \
@@ -91,16 +95,9 @@ check: system-packages
 	else echo 'NOT RUN: the check for 32 bits, which needs: rustup target add $(SMALL)' >&2; fi
 	RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links' $(CARGO) doc --locked --no-deps --document-private-items --quiet
 	$(CARGO) build --locked --quiet
+	CARGO='$(CARGO)' scripts/check-dependencies
 	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
-	@scripts/system-packages check
 	scripts/check-deb $(CARGO_TARGET_DIR)/debug/pinion
-
-system-packages: cargo
-	@scripts/system-packages build
-
-cargo:
-	@command -v $(CARGO) >/dev/null || { \
-	    echo 'There is no cargo: install Rust 1.88 or later (rustup), then try again.' >&2; exit 1; }
 
 # Root installs what was built before: no compiler runs as root.
 install: install-program install-system
@@ -161,9 +158,11 @@ endif
 
 ARCH ?=
 # Rust is rustup's, of which dpkg knows nothing: -d leaves the build dependencies to us.
-deb: system-packages
-	@scripts/system-packages deb
+deb: system-packages-deb
 	@scripts/build-deb $(DEB_FOLDER) $(ARCH)
+
+release: system-packages-deb
+	@scripts/release $(RELEASE_FOLDER)
 
 clean:
 	$(CARGO) clean
