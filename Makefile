@@ -37,7 +37,7 @@ export CARGO_TARGET_DIR
 .PHONY: deb release clean
 
 # They install what is missing, Rust too.
-PACKAGES = $(addprefix system-packages-,build lab deb check)
+PACKAGES = $(addprefix system-packages-,build lab deb system check)
 .PHONY: $(PACKAGES)
 $(PACKAGES): system-packages-%:
 	@CARGO='$(CARGO)' scripts/system-packages $*
@@ -81,7 +81,7 @@ lab: system-packages-lab
 lab-pi: system-packages-build
 	$(CARGO) test --locked --test lab_pi
 
-lab-system: system-packages-lab system-packages-deb
+lab-system: system-packages-system
 	$(CARGO) test --locked --test lab_system
 
 bench: system-packages-build
@@ -94,7 +94,8 @@ check: system-packages-check
 	    echo '$(CARGO) check --target $(SMALL)'; $(CARGO) check --locked --all-targets --quiet --target $(SMALL); \
 	else echo 'NOT RUN: the check for 32 bits, which needs: rustup target add $(SMALL)' >&2; fi
 	RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links' $(CARGO) doc --locked --no-deps --document-private-items --quiet
-	$(CARGO) build --locked --quiet
+	@# The program of the tests: one built for itself would have other features of some crates.
+	$(CARGO) test --locked --quiet --no-run
 	CARGO='$(CARGO)' scripts/check-dependencies
 	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
 	scripts/check-deb $(CARGO_TARGET_DIR)/debug/pinion

@@ -12,17 +12,19 @@ tree=$2 initramfs=$3 release=$4 here=$5
 busybox=$tree/bin/busybox
 
 # As apt is told where this machine's packages come from. What the package depends on waits in the machine,
-# in a folder that its apt takes packages from: it has no network. The packages of Python are klippy's.
+# in a folder that its apt takes packages from: it has no network. They are not compressed and dpkg does not sync its
+# files, as the emulated processor would take long for both. The packages of Python are klippy's.
 find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/sources.list*.sources' \
     -o -path '*/sources.list' \) -exec \
     mmdebstrap --quiet --mode=root --variant=minbase \
     --include=sudo,apt-utils \
     --include=systemd,systemd-sysv,udev,dbus,kmod,procps,make,libiio0- \
     --include=python3-cffi,python3-greenlet,python3-jinja2,python3-serial \
-    --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt='path-exclude=/usr/share/doc/*' \
+    --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt='path-exclude=/usr/share/doc/*' \
     --dpkgopt='path-include=/usr/share/doc/pinion-mcu/*' --dpkgopt='path-exclude=/var/lib/dpkg/available' \
     --customize-hook='chroot "$1" apt-get -qq install -d -y --no-install-recommends libiio0' \
     --customize-hook='mkdir "$1/opt/packages" && mv "$1"/var/cache/apt/archives/*.deb "$1/opt/packages"' \
+    --customize-hook='cd "$1/opt/packages" && for deb in *; do dpkg-deb -R "$deb" x && dpkg-deb -Znone -b x "$deb" && rm -r x; done >/dev/null' \
     --customize-hook='cd "$1/opt/packages" && dpkg-scanpackages -m . >Packages 2>/dev/null' \
     --customize-hook='rm -rf "$1"/etc/apt/sources.list*' \
     bookworm root {} +
