@@ -20,7 +20,7 @@ use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::Inventory;
 use pinion_linux::clock::Monotonic;
 
-use super::finding::{self, Finding, Group};
+use super::finding::{self, Finding, Group, Level};
 use super::quietly;
 use super::run::{BoardName, Settings, WATCHDOG, WATCHDOG_REMEDY};
 
@@ -47,10 +47,7 @@ fn board(settings: &Settings) -> Vec<Finding> {
     if settings.board == BoardName::Linux {
         // The board would log these, and serve what is left.
         let problems = Inventory::scan().problems;
-        findings.extend(problems.into_iter().map(|problem| {
-            let (what, remedy) = problem.split_once(": ").unwrap_or((&problem, "look at the kernel's log (dmesg)"));
-            Finding::error("devices", what, remedy)
-        }));
+        findings.extend(problems.iter().map(|problem| Finding::of("devices", Level::Error, problem)));
     }
     // Its problems are among the findings already.
     let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None));
@@ -206,7 +203,6 @@ fn watchdog(device: &Path) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::finding::Level;
 
     #[test]
     fn a_link_can_be_made_where_nothing_else_stands() {

@@ -9,6 +9,8 @@ use std::process::ExitCode;
 use serde::Serialize;
 use serde_json::json;
 
+use pinion_firmware::trouble::Trouble;
+
 use super::failed;
 use super::page::{Page, print};
 
@@ -60,6 +62,12 @@ impl Finding {
     /// It is why something does not work.
     pub(super) fn error(check: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Finding {
         Finding { status: Level::Error, ..Finding::warning(check, found, remedy) }
+    }
+
+    /// A trouble as a finding.
+    pub(super) fn of(check: &'static str, status: Level, trouble: &Trouble) -> Finding {
+        let remedy = trouble.remedy.as_deref().map(str::to_owned);
+        Finding { check, status, found: trouble.found(), remedy }
     }
 
     /// The same with a remedy, for something that is fine but may be wanted otherwise.

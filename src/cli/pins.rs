@@ -230,7 +230,7 @@ impl List {
             spi: vec![],
             i2c: vec![],
             w1: vec![],
-            problems: inventory.problems.clone(),
+            problems: inventory.problems.iter().map(ToString::to_string).collect(),
         };
         if !args.free {
             list.adc = inventory.adcs.iter().map(|device| adc(device, &names, args, reading)).collect();

@@ -380,9 +380,9 @@ impl Link {
     /// time to read why.
     fn lose_guardian(&mut self, why: &str) {
         self.guardian = None;
-        let detail =
-            format!("{why}, and without it a crash would leave heaters on: Pinion ends, to be started anew with one");
-        self.request(Request::Shutdown(Shutdown::because(reason::GUARDIAN_LOST, detail)));
+        let cause = format!("{why}, and without it a crash would leave heaters on");
+        let stop = Shutdown::because(reason::GUARDIAN_LOST, cause);
+        self.request(Request::Shutdown(stop.remedy("Pinion ends, to be started anew with one")));
         self.leave_at = Some(monotonic() + FAREWELL);
     }
 
@@ -429,10 +429,8 @@ impl Link {
         if self.input[filled..] == *FORCE_SHUTDOWN {
             self.input.truncate(filled);
             warn!("FORCE_SHUTDOWN was written to {}", self.pty.device().display());
-            self.request(Request::Shutdown(Shutdown::because(
-                reason::FORCE_SHUTDOWN,
-                "somebody wrote FORCE_SHUTDOWN to the pty; FIRMWARE_RESTART starts anew",
-            )));
+            let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
+            self.request(Request::Shutdown(stop.remedy("FIRMWARE_RESTART starts anew")));
         }
         Ok(())
     }

@@ -25,6 +25,7 @@ use nix::time::{ClockId, clock_gettime};
 
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource};
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys::{self, SHARED_WORDS};
 
@@ -111,17 +112,14 @@ impl Pulse {
         if self.page[PATIENCE_MS].load(Ordering::Relaxed) != RUNNING.as_millis() as u32 {
             return None;
         }
-        let detail = match suspended_ms {
-            0 => format!(
-                "Pinion stood still for {ms} ms: was it stopped, its control group frozen, or the computer paused? \
-                 FIRMWARE_RESTART starts anew"
+        let trouble = match suspended_ms {
+            0 => Trouble::new(format!("Pinion stood still for {ms} ms")).remedy(
+                "was it stopped, its control group frozen, or the computer paused? FIRMWARE_RESTART starts anew",
             ),
-            _ => format!(
-                "the computer was suspended for {suspended_ms} ms with outputs in use: keep it from that \
-                 (systemctl mask sleep.target); FIRMWARE_RESTART starts anew"
-            ),
+            _ => Trouble::new(format!("the computer was suspended for {suspended_ms} ms with outputs in use"))
+                .remedy("keep it from that (systemctl mask sleep.target); FIRMWARE_RESTART starts anew"),
         };
-        Some(Shutdown::because(reason::TIMER_PAST, detail))
+        Some(Shutdown::because(reason::TIMER_PAST, trouble))
     }
 
     fn tell_suspension(&self, suspended: Duration) {
@@ -590,7 +588,7 @@ mod tests {
         assert!(pulse.standstill(at(990)).is_none());
         let shutdown = pulse.standstill(at(1010)).unwrap();
         assert_eq!(shutdown.reason, reason::TIMER_PAST);
-        assert!(shutdown.detail.contains("stood still for 10"), "{}", shutdown.detail);
+        assert!(shutdown.trouble.cause.contains("stood still for 10"), "{shutdown}");
         pulse.beat(at(1010), true);
         assert!(pulse.standstill(at(1011)).is_none());
         // One that is being configured may take its time, and owes nobody an explanation.
@@ -607,7 +605,7 @@ mod tests {
         assert!(pulse.standstill(at(1)).is_none(), "this computer was not suspended meanwhile");
         pulse.tell_suspension(Duration::from_secs(60));
         let shutdown = pulse.standstill(at(3)).unwrap();
-        assert!(shutdown.detail.contains("suspended for 60000 ms"), "{}", shutdown.detail);
+        assert!(shutdown.trouble.cause.contains("suspended for 60000 ms"), "{shutdown}");
         assert!(pulse.standstill(at(4)).is_none());
     }
 

@@ -15,6 +15,7 @@ use rtrb::{Consumer, Producer, PushError, RingBuffer};
 use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Ticks, TimeSource};
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
 use super::lookout::Lookout;
@@ -81,14 +82,18 @@ impl Threads {
                 server.run();
             })
             .map_err(|error| {
-                overflow(bus, &format!("its thread can not be started ({error}): raise TasksMax or ulimit -u"))
+                let trouble = Trouble::new(format!("its thread can not be started ({error})"));
+                overflow(bus, trouble.remedy("raise TasksMax or ulimit -u"))
             })?;
         Ok(Worker { bus: bus.into(), jobs, done, quit, thread, left_behind: false })
     }
 }
 
-fn overflow(bus: &str, why: &str) -> Shutdown {
-    Shutdown::because(reason::WORKER_OVERFLOW, format!("the worker of {bus}: {why}"))
+/// What to do about what cannot be.
+const REPORT: &str = "please report it";
+
+fn overflow(bus: &str, why: impl Into<Trouble>) -> Shutdown {
+    Shutdown::because(reason::WORKER_OVERFLOW, why.into().of(format_args!("the worker of {bus}")))
 }
 
 impl Workers for Threads {
@@ -108,10 +113,12 @@ impl Workers for Threads {
 
     fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
         let Some(worker) = self.workers.get_mut(worker) else {
-            return Err(Refused { job, why: overflow("a bus", "it is not there; please report it") });
+            let why = overflow("a bus", Trouble::new("it is not there").remedy(REPORT));
+            return Err(Refused { job, why });
         };
         if let Err(PushError::Full(job)) = worker.jobs.push(job) {
-            let why = overflow(&worker.bus, "more is asked of it at once than there are devices; please report it");
+            let trouble = Trouble::new("more is asked of it at once than there are devices");
+            let why = overflow(&worker.bus, trouble.remedy(REPORT));
             return Err(Refused { job, why });
         }
         worker.thread.thread().unpark();

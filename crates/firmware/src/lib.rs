@@ -96,5 +96,6 @@ pub mod lateness;
 pub mod mcu;
 pub mod shutdown;
 pub mod time;
+pub mod trouble;
 
 pub use pinion_protocol as protocol;

@@ -5,6 +5,8 @@
 
 use std::fmt;
 
+use crate::trouble::Trouble;
+
 /// A shutdown text of the firmware, as the host sees it. klippy shows it to the user and matches
 /// some of them (`klippy/extras/error_mcu.py`), so the wording is Klipper's own.
 ///
@@ -114,38 +116,46 @@ pub mod reason {
     }
 }
 
-/// A stop of the machine: the reason for the wire, and the detail for the log.
+/// A stop of the machine: the reason for the wire, and the trouble for the log.
 ///
-/// Making the detail allocates. That is allowed, as it is made when the machine stops anyway.
+/// Making one allocates. That is allowed, as it is made when the machine stops anyway.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shutdown {
     /// What goes over the wire.
     pub reason: ShutdownReason,
-    /// What the stop is about, its cause and the remedy, for the log.
-    pub detail: Box<str>,
+    /// What the log says. It is boxed, as every handler returns room for a stop.
+    pub trouble: Box<Trouble>,
 }
 
 impl Shutdown {
-    /// A stop with this reason and detail.
-    pub fn because(reason: ShutdownReason, detail: impl Into<Box<str>>) -> Shutdown {
-        Shutdown { reason, detail: detail.into() }
+    /// A stop with this reason; a text alone is its cause.
+    #[cold]
+    pub fn because(reason: ShutdownReason, trouble: impl Into<Trouble>) -> Shutdown {
+        Shutdown { reason, trouble: Box::new(trouble.into()) }
+    }
+
+    /// The same stop, with what to do about it.
+    #[cold]
+    pub fn remedy(self, remedy: impl Into<Box<str>>) -> Shutdown {
+        Shutdown::because(self.reason, self.trouble.remedy(remedy))
     }
 
     /// A stop for a command that no correct host would send at that point.
     #[cold]
     pub fn by_host(reason: ShutdownReason, what: impl fmt::Display) -> Shutdown {
-        Shutdown::because(reason, format!("{what}: a fault of the host; FIRMWARE_RESTART, and report it with its log"))
+        Shutdown::because(reason, format!("{what}: a fault of the host"))
+            .remedy("FIRMWARE_RESTART, and report it with its log")
     }
 
-    /// The same stop, with the name of the object that it is about in front of its detail.
+    /// The same stop, of this object.
     #[cold]
     pub fn of(self, object: &str) -> Shutdown {
-        Shutdown::because(self.reason, format!("{object}: {}", self.detail))
+        Shutdown::because(self.reason, self.trouble.of(object))
     }
 }
 
 impl fmt::Display for Shutdown {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}: {}", self.reason.text(), self.detail)
+        write!(f, "{}: {}", self.reason.text(), self.trouble)
     }
 }

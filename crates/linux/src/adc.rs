@@ -12,8 +12,10 @@ use std::path::Path;
 
 use industrial_io::{Backend, Context};
 
+use crate::LOOK_AT_LOG;
 use pinion_firmware::board::{self, ADC_MAX};
 use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::trouble::Trouble;
 
 /// The format that the C program assumes for every channel; here for those that do not tell theirs.
 const ASSUMED: Format = Format { bits: 12, signed: false };
@@ -71,7 +73,7 @@ impl fmt::Display for Format {
 }
 
 /// libiio's view of this machine. None without IIO devices: libiio would take memory for nothing.
-pub(super) fn context(devices: &Path) -> Result<Option<Context>, String> {
+pub(super) fn context(devices: &Path) -> Result<Option<Context>, Trouble> {
     let any = fs::read_dir(devices)
         .into_iter()
         .flatten()
@@ -81,7 +83,7 @@ pub(super) fn context(devices: &Path) -> Result<Option<Context>, String> {
         return Ok(None);
     }
     Context::with_backend(Backend::Local).map(Some).map_err(|error| {
-        format!("the IIO devices in {} can not be read: {error}: look at the kernel's log (dmesg)", devices.display())
+        Trouble::new(format!("the IIO devices in {} can not be read: {error}", devices.display())).remedy(LOOK_AT_LOG)
     })
 }
 
@@ -189,17 +191,17 @@ impl board::Adc for ChannelReader {
     }
 }
 
-fn read_failure(subject: &str, error: &str) -> String {
+fn read_failure(subject: &str, error: &str) -> Trouble {
     let remedy = if error.starts_with("EBUSY") {
         "another program has its buffer enabled, stop it"
     } else {
         "check the chip's wiring and supply, and the kernel's log (dmesg)"
     };
-    format!("{subject} can not be read: {error}: {remedy}")
+    Trouble::new(format!("{subject} can not be read: {error}")).remedy(remedy)
 }
 
-/// For the log: a channel is not there, and which are.
-pub(super) fn missing(number: u32, id: &str, adcs: &[IioDevice]) -> String {
+/// Says that a channel is not there, but these.
+pub(super) fn missing(number: u32, id: &str, adcs: &[IioDevice]) -> Trouble {
     let known: Vec<String> = adcs
         .iter()
         .map(|adc| {
@@ -211,10 +213,8 @@ pub(super) fn missing(number: u32, id: &str, adcs: &[IioDevice]) -> String {
         true => "no ADC that the kernel knows of".to_owned(),
         false => known.join(", "),
     };
-    format!(
-        "there is no {id} on iio:device{number}: this machine has {known}: load the driver (a \
-         device tree overlay, as a rule), or choose another pin (pinion pins lists them)"
-    )
+    Trouble::new(format!("there is no {id} on iio:device{number}: this machine has {known}"))
+        .remedy("load the driver (a device tree overlay, as a rule), or choose another pin (pinion pins lists them)")
 }
 
 #[cfg(test)]
@@ -259,7 +259,7 @@ mod tests {
     #[test]
     fn texts() {
         assert_eq!(
-            read_failure("iio:device0 (ads1115) voltage3", "EIO: I/O error"),
+            read_failure("iio:device0 (ads1115) voltage3", "EIO: I/O error").to_string(),
             "iio:device0 (ads1115) voltage3 can not be read: EIO: I/O error: check the chip's \
              wiring and supply, and the kernel's log (dmesg)"
         );
@@ -269,9 +269,9 @@ mod tests {
             label: None,
             channels: ["voltage0", "voltage1"].map(|id| Channel { id: id.into(), format: None }).into(),
         };
-        let text = missing(0, "voltage2", &[adc]);
+        let text = missing(0, "voltage2", &[adc]).cause;
         assert!(text.contains("iio:device1 (mcp3008: voltage0 voltage1)"), "{text}");
-        assert!(missing(0, "voltage2", &[]).contains("no ADC that the kernel knows of"));
+        assert!(missing(0, "voltage2", &[]).cause.contains("no ADC that the kernel knows of"));
     }
 
     proptest! {

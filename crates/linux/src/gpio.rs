@@ -27,11 +27,11 @@ mod edges;
 mod refusal;
 
 pub use chip::{Chip, LineInfo};
-use chip::{look_at, node};
+use chip::{look_at, missing, node};
 pub(super) use chip::{may_sleep, number_behind, scan};
 pub(super) use refusal::not_permitted;
 pub use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
-use refusal::{Subject, cannot_open, errno, missing};
+use refusal::{Subject, cannot_open, errno};
 
 /// The name that the kernel shows as the consumer of our lines.
 const CONSUMER: &str = "pinion";
@@ -264,7 +264,7 @@ impl Subject {
             Direction::Input(bias) => ("an input", bias),
             Direction::OpenDrain => ("an open drain", Bias::PullUp),
         };
-        Shutdown::because(reason, self.refusal(action, code, bias, &look_at(line), &release))
+        Shutdown::because(reason, self.refusal(action, code, bias, look_at(line).consumer.as_deref(), &release))
     }
 }
 

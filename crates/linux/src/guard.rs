@@ -86,6 +86,6 @@ impl SharedGuard {
 }
 
 fn not_taken(name: &str, error: &io::Error) -> Shutdown {
-    let detail = format!("the guardian does not take {name}: {error}: restart Pinion");
-    Shutdown::because(reason::GUARDIAN_LOST, detail)
+    let cause = format!("the guardian does not take {name}: {error}");
+    Shutdown::because(reason::GUARDIAN_LOST, cause).remedy("restart Pinion")
 }

@@ -10,10 +10,11 @@ use std::path::Path;
 use linux_embedded_hal::i2cdev::core::{I2CMessage, I2CTransfer};
 use linux_embedded_hal::i2cdev::linux::{LinuxI2CDevice, LinuxI2CMessage};
 
-use super::gpio::not_permitted;
-use crate::sys;
+use crate::gpio::not_permitted;
+use crate::{LOOK_AT_LOG, sys};
 use pinion_firmware::board::{BusDevice, BusError, BusStatus, I2cConfig, Range};
 use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::trouble::Trouble;
 
 /// Buses with names of the C program, from 0 on.
 const BUSES: u32 = 15;
@@ -56,14 +57,12 @@ impl I2c {
         let I2cConfig { bus, address, .. } = config;
         let path = dev.join(format!("i2c-{bus}"));
         let name = format!("{} address {address:#04x}", path.display());
-        let refused = |error: io::Error| {
-            let detail = cannot_open(&path, &name, &error, &scan(dev));
-            Shutdown::because(reason::I2C_OPEN, detail)
-        };
+        let refused =
+            |error: io::Error| Shutdown::because(reason::I2C_OPEN, cannot_open(&path, &name, &error, &scan(dev)));
         let device = LinuxI2CDevice::new(&path, address.into()).map_err(|error| refused(error.into()))?;
         if !sys::is_plain_i2c(&device).map_err(refused)? {
-            let detail = format!("{} knows SMBus only, not I2C messages: choose another i2c_bus", path.display());
-            return Err(Shutdown::because(reason::I2C_OPEN, detail));
+            let cause = format!("{} knows SMBus only, not I2C messages", path.display());
+            return Err(Shutdown::because(reason::I2C_OPEN, cause).remedy("choose another i2c_bus"));
         }
         Ok(I2c { device, name })
     }
@@ -84,45 +83,36 @@ impl BusDevice for I2c {
 /// What an error number of a transfer means, by Documentation/i2c/fault-codes.rst of the kernel, and
 /// what to do.
 fn failure(name: &str, (written, read): (usize, usize), error: &io::Error) -> BusError {
-    let (status, what) = match error.raw_os_error().unwrap_or_default() {
-        libc::ENXIO => (
-            BusStatus::StartNack,
-            "no chip acknowledges the address: check its wiring, its power and i2c_address".to_owned(),
-        ),
+    const CHECK_CHIP: &str = "check its wiring, its power and i2c_address";
+    let (status, trouble) = match error.raw_os_error().unwrap_or_default() {
+        libc::ENXIO => (BusStatus::StartNack, Trouble::new("no chip acknowledges the address").remedy(CHECK_CHIP)),
         // Drivers that do not tell an address from a byte: i2c-bcm2835, i2c-designware.
-        libc::EREMOTEIO => {
-            (BusStatus::Nack, "the chip does not acknowledge: check its wiring, its power and i2c_address".to_owned())
-        }
+        libc::EREMOTEIO => (BusStatus::Nack, Trouble::new("the chip does not acknowledge").remedy(CHECK_CHIP)),
         libc::ETIMEDOUT | libc::EBUSY => (
             BusStatus::Timeout,
-            "the bus is held for too long: a chip or a short pulls SCL or SDA low: check the wiring, switch \
-             the chip's power off and on"
-                .to_owned(),
+            Trouble::new("the bus is held for too long: a chip or a short pulls SCL or SDA low")
+                .remedy("check the wiring, switch the chip's power off and on"),
         ),
         libc::EAGAIN => (
             BusStatus::Timeout,
-            "the bus was lost to another master, or to noise: shorten its wires, lower its rate (on a \
-             Raspberry Pi \"dtparam=i2c_arm_baudrate=50000\")"
-                .to_owned(),
+            Trouble::new("the bus was lost to another master, or to noise")
+                .remedy("shorten its wires, lower its rate (on a Raspberry Pi \"dtparam=i2c_arm_baudrate=50000\")"),
         ),
         libc::EINVAL | libc::EOPNOTSUPP => (
             BusStatus::Nack,
-            format!(
-                "its adapter refuses a transfer of {written} bytes written and {read} read: choose another i2c_bus"
-            ),
+            Trouble::new(format!("its adapter refuses a transfer of {written} bytes written and {read} read"))
+                .remedy("choose another i2c_bus"),
         ),
         _ => (
             BusStatus::Nack,
-            format!(
-                "a transfer of {written} bytes written and {read} read failed: {error}: check the wiring, and the \
-                 kernel's log (dmesg)"
-            ),
+            Trouble::new(format!("a transfer of {written} bytes written and {read} read failed: {error}"))
+                .remedy("check the wiring, and the kernel's log (dmesg)"),
         ),
     };
-    BusError { status, detail: format!("{name}: {what}").into() }
+    BusError::new(status, trouble).of(name)
 }
 
-fn cannot_open(path: &Path, name: &str, error: &io::Error, buses: &[u32]) -> String {
+fn cannot_open(path: &Path, name: &str, error: &io::Error, buses: &[u32]) -> Trouble {
     match error.raw_os_error().unwrap_or_default() {
         libc::ENOENT => {
             let known: Vec<String> = buses.iter().map(|bus| format!("i2c.{bus}")).collect();
@@ -130,18 +120,15 @@ fn cannot_open(path: &Path, name: &str, error: &io::Error, buses: &[u32]) -> Str
                 true => "this machine has no I2C bus".to_owned(),
                 false => format!("this machine has {}", known.join(", ")),
             };
-            format!(
-                "there is no {}: {known}: enable the bus (on a Raspberry Pi \"dtparam=i2c_arm=on\" in config.txt, \
-                 and \"sudo modprobe i2c-dev\"), or change i2c_bus",
-                path.display()
+            Trouble::new(format!("there is no {}: {known}", path.display())).remedy(
+                "enable the bus (on a Raspberry Pi \"dtparam=i2c_arm=on\" in config.txt, and \"sudo modprobe \
+                 i2c-dev\"), or change i2c_bus",
             )
         }
         libc::EACCES | libc::EPERM => not_permitted(path),
-        libc::EBUSY => format!(
-            "{name} is in use by a driver of the kernel: remove its overlay from the device tree, or choose another \
-             chip"
-        ),
-        _ => format!("{name} can not be opened: {error}: look at the kernel's log (dmesg)"),
+        libc::EBUSY => Trouble::new(format!("{name} is in use by a driver of the kernel"))
+            .remedy("remove its overlay from the device tree, or choose another chip"),
+        _ => Trouble::new(format!("{name} can not be opened: {error}")).remedy(LOOK_AT_LOG),
     }
 }
 
@@ -188,17 +175,16 @@ mod tests {
         ] {
             let error = failure("/dev/i2c-1 address 0x48", (2, 200), &io::Error::from_raw_os_error(code));
             assert_eq!(error.status, status, "{code}");
-            assert!(
-                error.detail.starts_with("/dev/i2c-1 address 0x48: ") && error.detail.contains(remedy),
-                "{error:?}"
-            );
+            let told = error.trouble.to_string();
+            assert!(told.starts_with("/dev/i2c-1 address 0x48: ") && told.contains(remedy), "{told}");
         }
     }
 
     #[test]
     fn a_chip_that_the_kernel_has_and_a_bus_that_is_not_permitted() {
         let text = |code| {
-            cannot_open(Path::new("/dev/i2c-1"), "/dev/i2c-1 address 0x48", &io::Error::from_raw_os_error(code), &[])
+            let error = io::Error::from_raw_os_error(code);
+            cannot_open(Path::new("/dev/i2c-1"), "/dev/i2c-1 address 0x48", &error, &[]).to_string()
         };
         assert!(text(libc::EBUSY).contains("in use by a driver of the kernel: remove"));
         assert!(text(libc::EACCES).contains("may not open /dev/i2c-1"));

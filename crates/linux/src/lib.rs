@@ -17,6 +17,7 @@ use pinion_firmware::board::{
     PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
 };
 use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::trouble::Trouble;
 use pins::{Names, Target};
 
 pub mod adc;
@@ -33,6 +34,8 @@ pub mod sysfs;
 mod w1;
 
 const DEV: &str = "/dev";
+/// The remedy where only the kernel knows more.
+const LOOK_AT_LOG: &str = "look at the kernel's log (dmesg)";
 const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
 const SPI_MASTERS: &str = "/sys/class/spi_master";
@@ -52,8 +55,8 @@ pub struct Inventory {
     pub spi: Vec<spi::Node>,
     /// Numbers of I2C buses.
     pub i2c: Vec<u32>,
-    /// For the log: each thing that is there and can not be used, with its cause and remedy.
-    pub problems: Vec<String>,
+    /// Each thing that is there and can not be used.
+    pub problems: Vec<Trouble>,
     /// libiio's view of this machine; none without IIO devices.
     pub context: Option<Context>,
 }
@@ -173,8 +176,8 @@ impl LinuxBoard {
             Direction::Input(_) => ("an input", reason::NOT_INPUT, reason::INPUT_LINE),
         };
         let Target::Line { chip, offset } = Target::of(pin) else {
-            let detail = format!("{} can not be {wanted}: choose a GPIO pin (pinion pins lists them)", Target::of(pin));
-            return Err(Shutdown::because(no_line, detail));
+            let cause = format!("{} can not be {wanted}", Target::of(pin));
+            return Err(Shutdown::because(no_line, cause).remedy("choose a GPIO pin (pinion pins lists them)"));
         };
         gpio::open(&self.dev, chip, offset, refused)
     }
@@ -193,13 +196,13 @@ impl LinuxBoard {
                 let adc = seen.inventory.adcs.iter().find(|adc| adc.number == device);
                 let channel = adc.and_then(|adc| adc.channels.get(position as usize));
                 channel.map(|channel| (device, channel.id.clone())).ok_or_else(|| {
-                    let detail = adc::missing(device, &format!("channel {position}"), &seen.inventory.adcs);
-                    Shutdown::because(reason::ADC_OPEN, detail)
+                    let channel = format!("channel {position}");
+                    Shutdown::because(reason::ADC_OPEN, adc::missing(device, &channel, &seen.inventory.adcs))
                 })
             }
             other => {
-                let detail = format!("{other} is no ADC channel: choose an analog pin (pinion pins lists them)");
-                Err(Shutdown::because(reason::ADC_OPEN, detail))
+                let stop = Shutdown::because(reason::ADC_OPEN, format!("{other} is no ADC channel"));
+                Err(stop.remedy("choose an analog pin (pinion pins lists them)"))
             }
         }
     }
@@ -304,8 +307,8 @@ impl Board for LinuxBoard {
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
         let Target::Pwm { chip, channel } = Target::of(config.pin) else {
-            let detail = format!("{} has no hardware PWM: choose pwmchipC/pwmN", Target::of(config.pin));
-            return Err(Shutdown::because(reason::PWM_CONFIG, detail));
+            let cause = format!("{} has no hardware PWM", Target::of(config.pin));
+            return Err(Shutdown::because(reason::PWM_CONFIG, cause).remedy("choose pwmchipC/pwmN"));
         };
         let channel = pwm::Channel { chip, channel };
         let device = pwm::Pwm::open(&self.pwm, channel, &config, self.guard.clone())?;
@@ -382,17 +385,20 @@ mod tests {
         let mut board = board(dev.path());
         let error = board.mosi(Pin(17), 3_200_000).err().unwrap();
         assert_eq!(error.reason, reason::NOT_OUTPUT);
-        assert!(error.detail.starts_with("gpiochip0 line 17 can not drive LEDs"), "{error}");
-        assert!(error.detail.contains("\"pin: spidev0.0\""), "{error}");
+        assert!(error.trouble.cause.starts_with("gpiochip0 line 17 can not drive LEDs"), "{error}");
+        assert!(error.to_string().contains("\"pin: spidev0.0\""), "{error}");
         let names = Names::of(&Inventory { spi: vec![spi::Node::of(256), spi::Node::of(257)], ..Inventory::default() });
         let range = names.ranges().into_iter().find(|range| range.name == "spidev1.0").unwrap();
         assert_eq!(range.count, 2);
         // It is named as what it is, and it is no GPIO line.
         let error = board.mosi(Pin(range.first + 1), 3_200_000).err().unwrap();
         assert_eq!(error.reason, reason::SPI_OPEN);
-        assert!(error.detail.contains("spidev1.1"), "{error}");
+        assert!(error.trouble.cause.contains("spidev1.1"), "{error}");
         let error = board.line(Pin(range.first), ON).err().unwrap();
-        assert!(error.detail.starts_with("spidev1.0 (an SPI device's data output) can not be an output"), "{error}");
+        assert!(
+            error.trouble.cause.starts_with("spidev1.0 (an SPI device's data output) can not be an output"),
+            "{error}"
+        );
     }
 
     #[test]

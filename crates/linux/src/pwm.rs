@@ -16,6 +16,7 @@ use super::guard::SharedGuard;
 use pinion_firmware::board::{self, PWM_MAX, PwmConfig};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{NS_PER_TICK, Ticks};
+use pinion_firmware::trouble::Trouble;
 
 /// The files of a newly exported channel belong to root until udev has given them to the group.
 const UDEV_TRIES: u32 = 50;
@@ -58,7 +59,7 @@ impl Pwm {
         guard: SharedGuard,
     ) -> Result<Pwm, Shutdown> {
         let refused = |what: &str, error: io::Error| {
-            Shutdown::because(reason::PWM_CONFIG, format!("{channel}: {what}: {error}{}", remedy(&error)))
+            Shutdown::because(reason::PWM_CONFIG, trouble(&error, format!("{what}: {error}")).of(channel))
         };
         let folder = export(class, channel).map_err(|error| refused("exporting it", error))?;
         let open = |name: &str| {
@@ -95,8 +96,8 @@ impl Pwm {
     }
 
     fn not_configured(&self, error: &io::Error) -> Shutdown {
-        let detail = format!("{}: a period of {} ns: {error}{}", self.channel, self.period_ns, remedy(error));
-        Shutdown::because(reason::PWM_CONFIG, detail)
+        let cause = format!("a period of {} ns: {error}", self.period_ns);
+        Shutdown::because(reason::PWM_CONFIG, trouble(error, cause).of(self.channel))
     }
 
     /// Tells the guardian what to set the channel to if the program dies.
@@ -128,8 +129,8 @@ impl Pwm {
 impl board::Pwm for Pwm {
     fn set(&mut self, value: u16) -> Result<(), Shutdown> {
         self.write(value).map_err(|error| {
-            let detail = format!("{}: {error}: did its driver go away? (ls /sys/class/pwm)", self.channel);
-            Shutdown::because(reason::PWM_WRITE, detail)
+            let trouble = Trouble::new(error.to_string()).remedy("did its driver go away? (ls /sys/class/pwm)");
+            Shutdown::because(reason::PWM_WRITE, trouble.of(self.channel))
         })
     }
 
@@ -162,19 +163,20 @@ fn export(class: &Path, channel: Channel) -> io::Result<PathBuf> {
     Ok(folder)
 }
 
-fn remedy(error: &io::Error) -> &'static str {
+/// What an error means beyond `cause`, and what to do about it.
+fn trouble(error: &io::Error, cause: String) -> Trouble {
     match (error.kind(), error.raw_os_error()) {
-        (io::ErrorKind::NotFound, _) => {
-            ": enable the PWM in the device tree (dtoverlay=pwm); ls /sys/class/pwm lists the chips"
-        }
+        (io::ErrorKind::NotFound, _) => Trouble::new(cause)
+            .remedy("enable the PWM in the device tree (dtoverlay=pwm); ls /sys/class/pwm lists the chips"),
         (io::ErrorKind::PermissionDenied, _) => {
-            ": run Pinion as root, or install its udev rules and join the group gpio"
+            Trouble::new(cause).remedy("run Pinion as root, or install its udev rules and join the group gpio")
         }
-        (_, Some(libc::EBUSY)) => ": a driver of the kernel uses it; choose another channel",
-        (_, Some(libc::EINVAL | libc::ERANGE)) => {
-            ": the chip can not do that; choose another cycle_time or another channel"
+        (_, Some(libc::EBUSY)) => {
+            Trouble::new(format!("{cause}: a driver of the kernel uses it")).remedy("choose another channel")
         }
-        _ => "",
+        (_, Some(libc::EINVAL | libc::ERANGE)) => Trouble::new(format!("{cause}: the chip can not do that"))
+            .remedy("choose another cycle_time or another channel"),
+        _ => Trouble::new(cause),
     }
 }
 

@@ -12,9 +12,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use linux_embedded_hal::spidev::{SpiModeFlags, Spidev, SpidevOptions, SpidevTransfer};
 
-use super::gpio::not_permitted;
+use crate::LOOK_AT_LOG;
+use crate::gpio::not_permitted;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect, Range, SpiConfig};
 use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::trouble::Trouble;
 
 /// How many buses the C program has names for.
 const BUSES: u32 = 8;
@@ -161,16 +163,14 @@ impl Spi {
         let SpiConfig { bus, mode, rate_hz, chip_select } = config;
         let node = Node::of(bus);
         let path = dev.join(node.to_string());
-        let device = Spidev::open(&path).map_err(|error| {
-            let detail = cannot_open(&path, &error, &scan(dev));
-            Shutdown::because(reason::SPI_OPEN, detail)
-        })?;
+        let device = Spidev::open(&path)
+            .map_err(|error| Shutdown::because(reason::SPI_OPEN, cannot_open(&path, &error, &scan(dev))))?;
         let mut spi = Spi { device, node, mode: mode.into(), rate_hz, chip_select, controller };
         spi.device.set_rate(rate_hz).map_err(|error| {
-            let detail = format!("/dev/{node} refuses {rate_hz} Hz: {error}: choose another spi_speed");
-            Shutdown::because(reason::SPI_SPEED, detail)
+            let cause = format!("/dev/{node} refuses {rate_hz} Hz: {error}");
+            Shutdown::because(reason::SPI_SPEED, cause).remedy("choose another spi_speed")
         })?;
-        spi.set_mode().map_err(|detail| Shutdown::because(reason::SPI_MODE, detail))?;
+        spi.set_mode().map_err(|trouble| Shutdown::because(reason::SPI_MODE, trouble))?;
         Ok(spi)
     }
 
@@ -197,27 +197,25 @@ impl<N: SpiNode> Spi<N> {
 
     /// Sets all mode bits of the node, as the C program does. That clears SPI_CS_HIGH, too, but the
     /// kernel itself keeps the polarity of a chip select that the device tree describes.
-    fn set_mode(&mut self) -> Result<(), String> {
+    fn set_mode(&mut self) -> Result<(), Trouble> {
         self.device.set_mode(self.mode).map_err(|error| {
-            format!(
-                "/dev/{} refuses SPI mode {}: {error}: its controller can not serve this chip, choose another bus",
+            Trouble::new(format!(
+                "/dev/{} refuses SPI mode {}: {error}: its controller can not serve this chip",
                 self.node, self.mode
-            )
+            ))
+            .remedy("choose another bus")
         })?;
         self.controller().modes.insert(self.node.select, self.mode);
         Ok(())
     }
 
-    fn transfer(&mut self, bytes: Bytes<'_>) -> Result<(), String> {
+    fn transfer(&mut self, bytes: Bytes<'_>) -> Result<(), Trouble> {
         let count = bytes.len();
         // A transfer that fails may have moved the clock, or not.
         self.controller().idles_high = None;
         self.device.transfer(self.rate_hz, bytes).map_err(|error| {
-            format!(
-                "/dev/{} failed to transfer {count} bytes at {} Hz: {error}: look at the kernel's log (dmesg), try a \
-                 lower spi_speed",
-                self.node, self.rate_hz
-            )
+            Trouble::new(format!("/dev/{} failed to transfer {count} bytes at {} Hz: {error}", self.node, self.rate_hz))
+                .remedy("look at the kernel's log (dmesg), try a lower spi_speed")
         })?;
         self.controller().idles_high = Some(self.mode & CPOL != 0);
         Ok(())
@@ -227,7 +225,7 @@ impl<N: SpiNode> Spi<N> {
     /// driver moves the clock only as a transfer begins (spi-bcm2835: in `prepare_message`), which a chip that is
     /// selected by then would count as an edge. So a byte goes to nobody first. A chip that the controller
     /// selects is the kernel's affair.
-    fn prepare(&mut self) -> Result<(), String> {
+    fn prepare(&mut self) -> Result<(), Trouble> {
         let known = self.controller().modes.get(&self.node.select) == Some(&self.mode);
         if !known {
             self.set_mode()?;
@@ -237,8 +235,8 @@ impl<N: SpiNode> Spi<N> {
     }
 
     /// Drives the line that selects the chip, if there is one.
-    fn drive(&self, how: impl FnOnce(&ChipSelect) -> Result<(), Shutdown>) -> Result<(), String> {
-        self.chip_select.as_ref().map_or(Ok(()), how).map_err(|failure| failure.detail.into())
+    fn drive(&self, how: impl FnOnce(&ChipSelect) -> Result<(), Shutdown>) -> Result<(), Trouble> {
+        self.chip_select.as_ref().map_or(Ok(()), how).map_err(|failure| *failure.trouble)
     }
 
     fn converse(&mut self, bytes: Bytes<'_>) -> Result<(), BusError> {
@@ -251,7 +249,7 @@ impl<N: SpiNode> Spi<N> {
                 transferred.and(deselected)
             }
         });
-        conversed.map_err(|detail| BusError { status: BusStatus::Nack, detail: detail.into() })
+        conversed.map_err(|trouble| BusError::new(BusStatus::Nack, trouble))
     }
 }
 
@@ -273,7 +271,8 @@ pub(super) fn driver_without_dma(masters: &Path, node: Node) -> Option<String> {
     WITHOUT_DMA.contains(&driver).then(|| driver.to_owned())
 }
 
-fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> String {
+fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> Trouble {
+    let shown = path.display();
     match error.kind() {
         io::ErrorKind::NotFound => {
             let known: Vec<String> = nodes.iter().map(Node::to_string).collect();
@@ -281,14 +280,11 @@ fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> String {
                 true => "this machine has no spidev node".to_owned(),
                 false => format!("this machine has {}", known.join(", ")),
             };
-            format!(
-                "there is no {}: {known}: enable the bus (on a Raspberry Pi \"dtparam=spi=on\" in \
-                 config.txt), or change spi_bus",
-                path.display()
-            )
+            Trouble::new(format!("there is no {shown}: {known}"))
+                .remedy("enable the bus (on a Raspberry Pi \"dtparam=spi=on\" in config.txt), or change spi_bus")
         }
         io::ErrorKind::PermissionDenied => not_permitted(path),
-        _ => format!("{} can not be opened: {error}: look at the kernel's log (dmesg)", path.display()),
+        _ => Trouble::new(format!("{shown} can not be opened: {error}")).remedy(LOOK_AT_LOG),
     }
 }
 
@@ -503,7 +499,7 @@ mod tests {
         high.send(&[1, 2]).unwrap();
         assert_eq!(wires.lock().unwrap().seen, [("a", 32), ("b", 32)]);
         let error = low.exchange(&mut [1, 2]).err().unwrap();
-        assert!(error.detail.contains("failed to transfer 2 bytes"), "{error:?}");
+        assert!(error.trouble.cause.contains("failed to transfer 2 bytes"), "{error:?}");
     }
 
     #[test]
@@ -552,7 +548,7 @@ mod tests {
         };
         let error = spi.exchange(&mut [1, 2]).err().unwrap();
         assert_eq!(error.status, BusStatus::Nack);
-        assert!(error.detail.contains("/dev/spidev0.0 failed to transfer 2 bytes"), "{error:?}");
+        assert!(error.trouble.cause.contains("/dev/spidev0.0 failed to transfer 2 bytes"), "{error:?}");
         assert_eq!(*line.0.lock().unwrap(), [false, true]);
     }
 }

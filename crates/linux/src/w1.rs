@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_firmware::trouble::Trouble;
 
 /// The sensors of the family of the DS18B20.
 const FAMILY: &str = "28-";
@@ -43,13 +44,14 @@ impl Ds18b20 {
 }
 
 impl Thermometer for Ds18b20 {
-    fn read(&mut self) -> Result<i32, Box<str>> {
+    fn read(&mut self) -> Result<i32, Trouble> {
         let path = self.file.display();
         // Opened each time: a sensor that was unplugged and is back has a new file.
-        let text = fs::read_to_string(&self.file)
-            .map_err(|error| format!("{path} can not be read: {error}: is the sensor plugged in?"))?;
+        let text = fs::read_to_string(&self.file).map_err(|error| {
+            Trouble::new(format!("{path} can not be read: {error}")).remedy("is the sensor plugged in?")
+        })?;
         parse(&text)
-            .map_err(|what| format!("{path}: {what}: check the wires and the pull-up resistor (4.7 kOhm)").into())
+            .map_err(|what| Trouble::new(what).remedy("check the wires and the pull-up resistor (4.7 kOhm)").of(path))
     }
 }
 
@@ -73,18 +75,18 @@ fn parse(text: &str) -> Result<i32, &'static str> {
     value.ok_or("there is no temperature in the kernel's answer")
 }
 
-fn cannot_open(devices: &Path, file: &Path, error: &io::Error) -> String {
+fn cannot_open(devices: &Path, file: &Path, error: &io::Error) -> Trouble {
     let path = file.display();
-    match error.kind() {
-        io::ErrorKind::NotFound => {
-            let sensors = scan(devices);
-            let there = match sensors.is_empty() {
-                true => "the kernel knows no DS18B20: enable the bus (on a Raspberry Pi \"dtoverlay=w1-gpio\" in config.txt) and check the wires".to_owned(),
-                false => format!("the kernel knows {}: correct serial_no", sensors.join(", ")),
-            };
-            format!("there is no {path}: {there}")
-        }
-        _ => format!("{path} can not be opened: {error}: look at its permissions and at the kernel's log (dmesg)"),
+    if error.kind() != io::ErrorKind::NotFound {
+        return Trouble::new(format!("{path} can not be opened: {error}"))
+            .remedy("look at its permissions and at the kernel's log (dmesg)");
+    }
+    let sensors = scan(devices);
+    match sensors.is_empty() {
+        true => Trouble::new(format!("there is no {path}: the kernel knows no DS18B20"))
+            .remedy("enable the bus (on a Raspberry Pi \"dtoverlay=w1-gpio\" in config.txt) and check the wires"),
+        false => Trouble::new(format!("there is no {path}: the kernel knows {}", sensors.join(", ")))
+            .remedy("correct serial_no"),
     }
 }
 
@@ -123,7 +125,7 @@ mod tests {
         let folder = devices.path().join("28-00000000100f");
         fs::remove_dir_all(&folder).unwrap();
         let error = sensor.read().unwrap_err();
-        assert!(error.contains("28-00000000100f/w1_slave can not be read: No such file"), "{error}");
+        assert!(error.cause.contains("28-00000000100f/w1_slave can not be read: No such file"), "{error}");
         fs::create_dir(&folder).unwrap();
         fs::write(folder.join("w1_slave"), GOOD.replace("3062", "4000")).unwrap();
         assert_eq!(sensor.read(), Ok(4000));
@@ -134,8 +136,8 @@ mod tests {
         let devices = with_sensor();
         let error = Ds18b20::open(devices.path(), b"28-1").unwrap_err();
         assert_eq!(error.reason, reason::DS18B20_OPEN);
-        assert!(error.detail.ends_with("the kernel knows 28-00000000100f: correct serial_no"), "{error}");
+        assert!(error.to_string().ends_with("the kernel knows 28-00000000100f: correct serial_no"), "{error}");
         let error = Ds18b20::open(&devices.path().join("none"), b"28-\xff").unwrap_err();
-        assert!(error.detail.contains("dtoverlay=w1-gpio"), "{error}");
+        assert!(error.to_string().contains("dtoverlay=w1-gpio"), "{error}");
     }
 }

@@ -148,12 +148,9 @@ impl SimBoard {
 
     fn pin(&self, pin: Pin, no_pin: ShutdownReason) -> Result<&WiredPin, Shutdown> {
         usize::try_from(pin.0).ok().and_then(|place| self.pins.get(place)).ok_or_else(|| {
-            let detail = format!(
-                "the simulated printer has no pin {}: name one of its {} pins (pinion sim --print-config shows them)",
-                pin.0,
-                self.pins.len(),
-            );
-            Shutdown::because(no_pin, detail)
+            let count = self.pins.len();
+            Shutdown::because(no_pin, format!("the simulated printer has no pin {}", pin.0))
+                .remedy(format!("name one of its {count} pins (pinion sim --print-config shows them)"))
         })
     }
 }
@@ -176,7 +173,7 @@ fn numbered<'a, T>(
 fn is_missing<'a>(what: &str, names: impl Iterator<Item = &'a str>, reason: ShutdownReason) -> Shutdown {
     let names: Vec<&str> = names.collect();
     let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
-    Shutdown::because(reason, format!("the simulated printer has no {what}: {has}"))
+    Shutdown::because(reason, format!("the simulated printer has no {what}")).remedy(has)
 }
 
 impl Board for SimBoard {

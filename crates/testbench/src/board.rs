@@ -13,6 +13,7 @@ use pinion_firmware::board::{
 use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
+use pinion_firmware::trouble::Trouble;
 
 /// GPIO lines: pins 0 up to this.
 pub const GPIOS: u32 = 300;
@@ -290,8 +291,8 @@ impl Bench {
     /// Claims an ADC or PWM channel.
     fn claim(&self, pin: Pin, known: std::ops::Range<u32>, unknown: ShutdownReason) -> Result<u32, Shutdown> {
         if !known.contains(&pin.0) {
-            let detail = format!("the bench has no pin {}: choose one of {} to {}", pin.0, known.start, known.end - 1);
-            return Err(Shutdown::because(unknown, detail));
+            let remedy = format!("choose one of {} to {}", known.start, known.end - 1);
+            return Err(Shutdown::because(unknown, format!("the bench has no pin {}", pin.0)).remedy(remedy));
         }
         self.state().claimed.insert(pin.0);
         Ok(pin.0)
@@ -313,7 +314,7 @@ impl Bench {
             return Ok(());
         }
         self.pass(takes);
-        Err(Shutdown::because(reason, format!("pin {pin} is gone: plug it in again")))
+        Err(Shutdown::because(reason, format!("pin {pin} is gone")).remedy("plug it in again"))
     }
 }
 
@@ -341,15 +342,15 @@ impl Board for FakeBoard {
     fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown> {
         let Pin(number) = pin;
         if number >= GPIOS {
-            let detail = format!("the bench has no pin {number}: choose one of 0 to {}", GPIOS - 1);
             let unknown = match direction {
                 Direction::Output { .. } | Direction::OpenDrain => reason::NOT_OUTPUT,
                 Direction::Input(_) => reason::NOT_INPUT,
             };
-            return Err(Shutdown::because(unknown, detail));
+            let remedy = format!("choose one of 0 to {}", GPIOS - 1);
+            return Err(Shutdown::because(unknown, format!("the bench has no pin {number}")).remedy(remedy));
         }
         if !self.0.state().held.insert(number) {
-            return Err(Shutdown::because(reason::INPUT_LINE, format!("pin {number} is in use: free it")));
+            return Err(Shutdown::because(reason::INPUT_LINE, format!("pin {number} is in use")).remedy("free it"));
         }
         let line = FakeLine { bench: self.0.clone(), pin: number };
         line.set_direction(direction)?;
@@ -376,8 +377,8 @@ impl Board for FakeBoard {
 
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         if config.bus >= SPI_BUSES {
-            let detail = format!("the bench has no SPI bus {}: choose spi0 or spi1", config.bus);
-            return Err(Shutdown::because(reason::SPI_OPEN, detail));
+            let cause = format!("the bench has no SPI bus {}", config.bus);
+            return Err(Shutdown::because(reason::SPI_OPEN, cause).remedy("choose spi0 or spi1"));
         }
         let bus = format!("spi{}", config.bus);
         Ok(OnWorker { bus, device: Box::new(FakeSpi { bench: self.0.clone(), config }) })
@@ -385,8 +386,8 @@ impl Board for FakeBoard {
 
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
         let Some(bus) = pin.0.checked_sub(MOSI).filter(|bus| *bus < SPI_BUSES) else {
-            let detail = format!("pin {} is no SPI data output: choose spidev0", pin.0);
-            return Err(Shutdown::because(reason::NOT_OUTPUT, detail));
+            let cause = format!("pin {} is no SPI data output", pin.0);
+            return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose spidev0"));
         };
         let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
         Ok(Mosi { line, message_max: MESSAGE_MAX })
@@ -394,8 +395,8 @@ impl Board for FakeBoard {
 
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
         if !self.0.state().thermometers.contains_key(serial) {
-            let detail = format!("the bench has no {}: plug it in", String::from_utf8_lossy(serial));
-            return Err(Shutdown::because(reason::DS18B20_OPEN, detail));
+            let cause = format!("the bench has no {}", String::from_utf8_lossy(serial));
+            return Err(Shutdown::because(reason::DS18B20_OPEN, cause).remedy("plug it in"));
         }
         let device = FakeThermometer { bench: self.0.clone(), serial: serial.into() };
         Ok(OnWorker { bus: "w1".into(), device: Box::new(device) })
@@ -407,8 +408,8 @@ impl Board for FakeBoard {
 
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
         if config.bus >= I2C_BUSES {
-            let detail = format!("the bench has no I2C bus {}: choose i2c.0 or i2c.1", config.bus);
-            return Err(Shutdown::because(reason::I2C_OPEN, detail));
+            let cause = format!("the bench has no I2C bus {}", config.bus);
+            return Err(Shutdown::because(reason::I2C_OPEN, cause).remedy("choose i2c.0 or i2c.1"));
         }
         let bus = format!("i2c{}", config.bus);
         Ok(OnWorker { bus, device: Box::new(FakeI2c { bench: self.0.clone(), config }) })
@@ -434,11 +435,11 @@ struct FakeThermometer {
 }
 
 impl Thermometer for FakeThermometer {
-    fn read(&mut self) -> Result<i32, Box<str>> {
+    fn read(&mut self) -> Result<i32, Trouble> {
         let mut state = self.bench.state();
         let values = state.thermometers.get_mut(&self.serial).unwrap();
         let value = if values.len() > 1 { values.pop_front().unwrap() } else { values[0] };
-        value.ok_or_else(|| "the sensor on the bench has a wrong CRC: check the wires".into())
+        value.ok_or_else(|| Trouble::new("the sensor on the bench has a wrong CRC").remedy("check the wires"))
     }
 }
 
@@ -589,12 +590,14 @@ impl BusDevice for FakeI2c {
         // Not locked while the chip answers: it may look at the bench.
         let chip = self.bench.state().i2c_chips.remove(&(bus, address));
         let Some(mut chip) = chip else {
-            let detail = format!("nothing answers at 0x{address:02x}: check the wiring");
-            return Err(BusError { status: BusStatus::StartNack, detail: detail.into() });
+            let trouble = Trouble::new(format!("nothing answers at 0x{address:02x}")).remedy("check the wiring");
+            return Err(BusError::new(BusStatus::StartNack, trouble));
         };
         let answer = chip(at, write, read);
         self.bench.state().i2c_chips.insert((bus, address), chip);
-        answer.map_err(|status| BusError { status, detail: "the chip on the bench says no: ask it again".into() })
+        answer.map_err(|status| {
+            BusError::new(status, Trouble::new("the chip on the bench says no").remedy("ask it again"))
+        })
     }
 }
 
@@ -606,13 +609,12 @@ struct FakeSpi {
 
 impl FakeSpi {
     fn converse(&mut self, bytes: &mut [u8], read: bool) -> Result<(), BusError> {
-        let failed = |failure: Shutdown| BusError { status: BusStatus::Nack, detail: failure.detail };
         let SpiConfig { bus, mode, rate_hz, .. } = self.config;
         self.bench.gate.pass();
-        self.bench.broken(SPI_CHIPS + bus, reason::LINE_READ).map_err(failed)?;
+        self.bench.broken(SPI_CHIPS + bus, reason::LINE_READ)?;
         match &self.config.chip_select {
-            Some(line) if bytes.is_empty() => line.pulse().map_err(failed)?,
-            Some(line) => line.select(true).map_err(failed)?,
+            Some(line) if bytes.is_empty() => line.pulse()?,
+            Some(line) => line.select(true)?,
             None => {}
         }
         let mut message = ([0; MESSAGE_MAX], bytes.len());
@@ -628,7 +630,7 @@ impl FakeSpi {
             None => bytes.iter_mut().for_each(|byte| *byte = !*byte),
         }
         match &self.config.chip_select {
-            Some(line) if !bytes.is_empty() => line.select(false).map_err(failed),
+            Some(line) if !bytes.is_empty() => line.select(false).map_err(BusError::from),
             _ => Ok(()),
         }
     }

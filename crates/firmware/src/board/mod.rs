@@ -3,11 +3,13 @@
 
 #![forbid(unsafe_code)]
 
+use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
 use crate::shutdown::{Shutdown, reason};
 use crate::time::{Ticks, TimeSource};
+use crate::trouble::Trouble;
 
 pub mod soft_i2c;
 pub mod soft_spi;
@@ -190,8 +192,8 @@ pub trait Thermometer: Send {
     ///
     /// # Errors
     ///
-    /// Subject, cause and remedy for the log; the next reading may be good.
-    fn read(&mut self) -> Result<i32, Box<str>>;
+    /// What the log says; the next reading may be good.
+    fn read(&mut self) -> Result<i32, Trouble>;
 }
 
 /// The data output of an SPI controller, used for itself: the controller's clock times what is sent.
@@ -222,7 +224,7 @@ pub struct BusError {
     /// How the bus answered, for the wire.
     pub status: BusStatus,
     /// Which device failed, why, and what to do about it, for the log.
-    pub detail: Box<str>,
+    pub trouble: Trouble,
 }
 
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
@@ -275,10 +277,27 @@ pub trait BusDevice: Send {
     }
 }
 
+/// A line of the bus failed.
+impl From<Shutdown> for BusError {
+    fn from(failure: Shutdown) -> BusError {
+        BusError { status: BusStatus::Nack, trouble: *failure.trouble }
+    }
+}
+
 impl BusError {
+    /// A failure that the bus answered with this status; a text alone is its cause.
+    pub fn new(status: BusStatus, trouble: impl Into<Trouble>) -> BusError {
+        BusError { status, trouble: trouble.into() }
+    }
+
+    /// The same failure, of this device.
+    pub fn of(self, device: impl fmt::Display) -> BusError {
+        BusError { trouble: self.trouble.of(device), ..self }
+    }
+
     fn other_kind(wanted: &str, is: &str) -> BusError {
-        let detail = format!("{wanted} was asked of {is}: a fault of the host's configuration; correct the bus");
-        BusError { status: BusStatus::Nack, detail: detail.into() }
+        let cause = format!("{wanted} was asked of {is}: a fault of the host's configuration");
+        BusError::new(BusStatus::Nack, Trouble::new(cause).remedy("correct the bus"))
     }
 }
 
@@ -454,8 +473,8 @@ pub trait Board: Send {
     /// "Invalid DS18B20 serial id, could not open for reading".
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
         let serial = String::from_utf8_lossy(serial);
-        let detail = format!("{serial:?}: this board has no one-wire bus: take another sensor");
-        Err(Shutdown::because(reason::DS18B20_OPEN, detail))
+        let trouble = Trouble::new("this board has no one-wire bus").remedy("take another sensor");
+        Err(Shutdown::because(reason::DS18B20_OPEN, trouble.of(format_args!("{serial:?}"))))
     }
 
     /// Forgets all claims. The machine has dropped the lines and devices before.
@@ -464,8 +483,8 @@ pub trait Board: Send {
 
 /// The error of [`Board::mosi`] for a pin that is no SPI data output.
 pub fn not_mosi(name: &str) -> Shutdown {
-    let detail = format!(
-        "{name} can not drive LEDs: their pulses are too short for a program on Linux; connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\" (pinion pins lists them)"
-    );
-    Shutdown::because(reason::NOT_OUTPUT, detail)
+    let cause = format!("{name} can not drive LEDs: their pulses are too short for a program on Linux");
+    Shutdown::because(reason::NOT_OUTPUT, cause).remedy(
+        "connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\" (pinion pins lists them)",
+    )
 }

@@ -11,8 +11,8 @@
 use std::sync::Arc;
 
 use super::{BusDevice, BusError, BusStatus, Line};
-use crate::shutdown::Shutdown;
 use crate::time::{Ticks, TimeSource};
+use crate::trouble::Trouble;
 
 /// How long a chip may hold the clock low in one conversation: 100 ms, as with the kernel's own
 /// (drivers/i2c/busses/i2c-gpio.c).
@@ -37,19 +37,6 @@ pub struct SoftI2c {
     stretch_left: Ticks,
 }
 
-/// Why a conversation ends early.
-enum Trouble {
-    Bus(BusStatus, &'static str),
-    /// A line failed.
-    Line(Shutdown),
-}
-
-impl From<Shutdown> for Trouble {
-    fn from(failure: Shutdown) -> Trouble {
-        Trouble::Line(failure)
-    }
-}
-
 /// A byte was not acknowledged.
 struct NotAcknowledged;
 
@@ -72,7 +59,7 @@ impl SoftI2c {
     }
 
     /// Lets the clock go, and waits until the chip has, too.
-    fn clock_high(&mut self) -> Result<(), Trouble> {
+    fn clock_high(&mut self) -> Result<(), BusError> {
         self.scl.write(true)?;
         if self.scl.read()? {
             return Ok(());
@@ -83,10 +70,8 @@ impl SoftI2c {
             let now = self.clock.now();
             if now >= end {
                 self.stretch_left = Ticks(0);
-                return Err(Trouble::Bus(
-                    BusStatus::Timeout,
-                    "SCL stays low: a chip or a short holds it, or it has no pull-up: check the wiring",
-                ));
+                let cause = "SCL stays low: a chip or a short holds it, or it has no pull-up";
+                return Err(BusError::new(BusStatus::Timeout, Trouble::new(cause).remedy("check the wiring")));
             }
             self.clock.spin_until(now + Ticks::from_us(1));
         }
@@ -96,7 +81,7 @@ impl SoftI2c {
     }
 
     /// One bit: puts it on the wire and tells what the wire says.
-    fn bit(&mut self, bit: bool) -> Result<bool, Trouble> {
+    fn bit(&mut self, bit: bool) -> Result<bool, BusError> {
         self.sda.write(bit)?;
         self.pause();
         self.clock_high()?;
@@ -106,7 +91,7 @@ impl SoftI2c {
         Ok(level)
     }
 
-    fn send(&mut self, byte: u8) -> Result<Result<(), NotAcknowledged>, Trouble> {
+    fn send(&mut self, byte: u8) -> Result<Result<(), NotAcknowledged>, BusError> {
         for bit in (0..8).rev() {
             self.bit(byte >> bit & 1 != 0)?;
         }
@@ -114,7 +99,7 @@ impl SoftI2c {
         Ok(if high { Err(NotAcknowledged) } else { Ok(()) })
     }
 
-    fn receive(&mut self, last: bool) -> Result<u8, Trouble> {
+    fn receive(&mut self, last: bool) -> Result<u8, BusError> {
         let mut byte = 0;
         for _ in 0..8 {
             byte = byte << 1 | u8::from(self.bit(true)?);
@@ -124,7 +109,7 @@ impl SoftI2c {
     }
 
     /// A start, or amid a conversation a repeated one: SDA falls while the clock is high.
-    fn start(&mut self) -> Result<(), Trouble> {
+    fn start(&mut self) -> Result<(), BusError> {
         self.pause();
         self.sda.write(true)?;
         self.pause();
@@ -140,11 +125,9 @@ impl SoftI2c {
             self.pause();
         }
         if !self.sda.read()? {
-            return Err(Trouble::Bus(
-                BusStatus::Timeout,
-                "SDA stays low: a chip or a short holds it, or it has no pull-up: check the wiring, switch the \
-                 chip's power off and on",
-            ));
+            let trouble = Trouble::new("SDA stays low: a chip or a short holds it, or it has no pull-up")
+                .remedy("check the wiring, switch the chip's power off and on");
+            return Err(BusError::new(BusStatus::Timeout, trouble));
         }
         self.sda.write(false)?;
         self.pause();
@@ -153,7 +136,7 @@ impl SoftI2c {
     }
 
     /// SDA rises while the clock is high.
-    fn stop(&mut self) -> Result<(), Trouble> {
+    fn stop(&mut self) -> Result<(), BusError> {
         self.sda.write(false)?;
         self.pause();
         let high = self.clock_high();
@@ -163,17 +146,18 @@ impl SoftI2c {
         high
     }
 
-    fn converse(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), Trouble> {
-        const NOBODY: &str = "no chip acknowledges the address: check its wiring, its power and i2c_address";
+    fn converse(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
+        let nobody = |status| {
+            let trouble = Trouble::new("no chip acknowledges the address");
+            BusError::new(status, trouble.remedy("check its wiring, its power and i2c_address"))
+        };
         if !write.is_empty() || read.is_empty() {
             self.start()?;
-            self.send(self.address)?.map_err(|_| Trouble::Bus(BusStatus::StartNack, NOBODY))?;
+            self.send(self.address)?.map_err(|_| nobody(BusStatus::StartNack))?;
             for byte in write {
                 self.send(*byte)?.map_err(|_| {
-                    Trouble::Bus(
-                        BusStatus::Nack,
-                        "the chip does not acknowledge a byte: is it the chip of this section?",
-                    )
+                    let trouble = Trouble::new("the chip does not acknowledge a byte");
+                    BusError::new(BusStatus::Nack, trouble.remedy("is it the chip of this section?"))
                 })?;
             }
         }
@@ -181,7 +165,7 @@ impl SoftI2c {
             return Ok(());
         }
         self.start()?;
-        self.send(self.address | READ)?.map_err(|_| Trouble::Bus(BusStatus::StartReadNack, NOBODY))?;
+        self.send(self.address | READ)?.map_err(|_| nobody(BusStatus::StartReadNack))?;
         let last = read.len() - 1;
         for (n, byte) in read.iter_mut().enumerate() {
             *byte = self.receive(n == last)?;
@@ -196,13 +180,7 @@ impl BusDevice for SoftI2c {
         let conversed = self.converse(write, read);
         // After a failure too, so that the bus is free.
         let stopped = self.stop();
-        conversed.and(stopped).map_err(|trouble| {
-            let (status, detail) = match trouble {
-                Trouble::Bus(status, what) => (status, what.into()),
-                Trouble::Line(failure) => (BusStatus::Nack, failure.detail),
-            };
-            BusError { status, detail: format!("{}: {detail}", self.name).into() }
-        })
+        conversed.and(stopped).map_err(|error| error.of(&self.name))
     }
 }
 
@@ -210,6 +188,7 @@ impl BusDevice for SoftI2c {
 mod tests {
     use super::*;
     use crate::board::Direction;
+    use crate::shutdown::Shutdown;
     use crate::time::{Clock, VirtualClock};
     use proptest::prelude::*;
     use std::sync::Mutex;
@@ -457,7 +436,7 @@ mod tests {
             wires.lock().unwrap().acknowledges = acknowledges;
             let error = i2c.write_read(&[1], &mut [0]).unwrap_err();
             assert_eq!(error.status, status, "{acknowledges}");
-            assert!(error.detail.starts_with("scl gpio2 sda gpio3 address 0x48: "), "{error:?}");
+            assert!(error.trouble.to_string().starts_with("scl gpio2 sda gpio3 address 0x48: "), "{error:?}");
             let wires = wires.lock().unwrap();
             assert_eq!(wires.log.last(), Some(&"stop"));
             assert_eq!((wires.scl, wires.sda), (true, true), "the bus is free for the next chip");
@@ -475,7 +454,7 @@ mod tests {
             wires.lock().unwrap().hold_ticks = Ticks::from_us(hold_us).0.into();
             let error = i2c.write_read(&[1, 2], &mut []).unwrap_err();
             assert_eq!(error.status, BusStatus::Timeout);
-            assert!(error.detail.contains("SCL stays low"), "{error:?}");
+            assert!(error.trouble.cause.contains("SCL stays low"), "{error:?}");
             let wires = wires.lock().unwrap();
             assert_eq!((wires.scl, wires.sda), (true, true), "we hold nothing");
             let waited = i2c.clock.now().since(Clock::EPOCH) as u64;
@@ -495,6 +474,6 @@ mod tests {
         wires.lock().unwrap().stuck_clocks = 1000;
         let error = i2c.write_read(&[7], &mut []).unwrap_err();
         assert_eq!(error.status, BusStatus::Timeout);
-        assert!(error.detail.contains("SDA stays low"), "{error:?}");
+        assert!(error.trouble.cause.contains("SDA stays low"), "{error:?}");
     }
 }

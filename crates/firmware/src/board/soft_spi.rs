@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use super::{BusDevice, BusError, BusStatus, ChipSelect, Line};
+use super::{BusDevice, BusError, ChipSelect, Line};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
 
@@ -52,7 +52,7 @@ impl SoftSpi {
                 shifted.and(deselected)
             }
         });
-        conversed.map_err(|failure| BusError { status: BusStatus::Nack, detail: failure.detail })
+        conversed.map_err(BusError::from)
     }
 
     /// One byte, and what came back if that is read.

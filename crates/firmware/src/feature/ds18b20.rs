@@ -14,6 +14,7 @@ use crate::mcu::{
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{CLOCK_FREQ, Clock, Ticks};
+use crate::trouble::Trouble;
 
 pub(super) const FEATURE: Feature = Feature {
     name: "ds18b20",
@@ -51,9 +52,9 @@ struct Look(Box<dyn Thermometer>);
 
 impl Errand for Look {
     type Answer = i32;
-    type Failure = Box<str>;
+    type Failure = Trouble;
 
-    fn run(&mut self) -> Result<i32, Box<str>> {
+    fn run(&mut self) -> Result<i32, Trouble> {
         self.0.read()
     }
 }
@@ -108,7 +109,8 @@ impl Object for Ds18b20 {
         } else if at.since(self.asked) > READ_LIMIT {
             turn.try_shut_down(Shutdown::because(
                 TOO_SLOW,
-                "its reading is under way for more than 5 s: does the bus or its driver hang (dmesg), or do too many sensors share it?",
+                Trouble::new("its reading is under way for more than 5 s")
+                    .remedy("does the bus or its driver hang (dmesg), or do too many sensors share it?"),
             ))?;
         }
         Ok(Next::At(next))
@@ -121,12 +123,12 @@ impl Object for Ds18b20 {
                 self.value = value;
                 self.error_count = 0;
             }
-            Err(detail) => {
+            Err(trouble) => {
                 self.error_count = self.error_count.saturating_add(1);
                 if self.error_count > self.max_error_count {
                     let times = self.error_count;
-                    let detail = format!("{detail} ({times} readings in a row failed)");
-                    return turn.try_shut_down(Shutdown::because(READ_FAILED, detail));
+                    let cause = format!("{} ({times} readings in a row failed)", trouble.cause).into();
+                    return turn.try_shut_down(Shutdown::because(READ_FAILED, Trouble { cause, ..trouble }));
                 }
             }
         }
@@ -150,9 +152,8 @@ fn configure(
     mcu.vacant(oid)?;
     if serial.contains(&b'/') {
         let serial = String::from_utf8_lossy(serial);
-        let detail =
-            format!("{serial:?} is no sensor: serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab");
-        return Err(Shutdown::because(INVALID_SERIAL, detail));
+        let remedy = "serial_no is a name in /sys/bus/w1/devices, such as 28-0123456789ab";
+        return Err(Shutdown::because(INVALID_SERIAL, format!("{serial:?} is no sensor")).remedy(remedy));
     }
     let OnWorker { bus, device } = mcu.board()?.ds18b20(serial)?;
     let sensor = Ds18b20 {

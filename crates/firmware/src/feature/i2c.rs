@@ -96,7 +96,7 @@ fn statuses() -> Vec<Range> {
 /// The stop of a machine whose sensor can not be talked to (the firmware's `i2c_shutdown_on_err`).
 pub(super) fn i2c_shutdown(mcu: &Mcu, error: BusError) -> Shutdown {
     let reason = if mcu.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
-    Shutdown::because(reason, error.detail)
+    Shutdown::because(reason, error.trouble)
 }
 
 /// What a transfer is for.
@@ -211,8 +211,8 @@ impl I2c {
                 turn.send(TransferResponse { oid: turn.oid(), i2c_bus_status, response: transfer.response() });
                 return Ok(());
             }
-            let detail = "it has no bus: a fault of the host, which did not send i2c_set_bus".into();
-            return Err(self.failure(turn, matches!(transfer.purpose, Purpose::Write), BusError { status, detail }));
+            let error = BusError::new(status, "it has no bus: a fault of the host, which did not send i2c_set_bus");
+            return Err(self.failure(turn, matches!(transfer.purpose, Purpose::Write), error));
         };
         // Commands wait for each other, so it is here.
         let Some(conversation) = self.transfer.here() else {
@@ -226,8 +226,8 @@ impl I2c {
     fn failure(&self, mcu: &Mcu, writing: bool, error: BusError) -> Shutdown {
         match writing {
             _ if !mcu.serves(until(V0_12)) => i2c_shutdown(mcu, error),
-            _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.detail),
-            true => Shutdown::because(I2C_WRITE_FAILED, error.detail),
+            _ if self.on_lines => Shutdown::because(SOFT_I2C_NACK, error.trouble),
+            true => Shutdown::because(I2C_WRITE_FAILED, error.trouble),
             false => i2c_shutdown(mcu, error),
         }
     }

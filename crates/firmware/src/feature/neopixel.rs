@@ -153,11 +153,11 @@ const CONFIG_NEOPIXEL: Command = command!(
         let low_bytes = low_bytes(reset_min_ticks.max(RESET_MIN));
         let len = low_bytes.saturating_mul(2).saturating_add(size * WIRE_BYTES);
         if len > message_max {
-            let detail = format!(
-                "{}: a chain of {size} bytes makes a message of {len}, and its driver takes {message_max} at once: lower chain_count, or raise the kernel's parameter spidev.bufsiz",
-                mcu.name(pin)
-            );
-            return Err(Shutdown::because(INVALID_SIZE, detail));
+            let cause =
+                format!("a chain of {size} bytes makes a message of {len}, and its driver takes {message_max} at once");
+            return Err(Shutdown::because(INVALID_SIZE, cause)
+                .remedy("lower chain_count, or raise the kernel's parameter spidev.bufsiz")
+                .of(&mcu.name(pin)));
         }
         let frame = Frame { data: vec![0; size], message: vec![0; len], low_bytes };
         let chain = Neopixel { bus: mcu.bus(line)?, data: vec![0; size], frame: Slot::talking(frame), failing: false };

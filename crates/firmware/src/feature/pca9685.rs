@@ -149,10 +149,10 @@ impl Settable for Channel {
             Setting::Value(value) | Setting::ShutdownValue(value) => Some(value),
             Setting::SetUp => None,
         };
-        chip.set_up().map_err(|error| Shutdown::because(NOT_SET_UP, error.detail))?;
+        chip.set_up().map_err(|error| Shutdown::because(NOT_SET_UP, error.trouble))?;
         let Some(value) = value else { return Ok(()) };
         let written = chip.write(&message(self.first_register, value));
-        written.map_err(|error| Shutdown::because(NOT_UPDATED, error.detail))
+        written.map_err(|error| Shutdown::because(NOT_UPDATED, error.trouble))
     }
 }
 
@@ -191,17 +191,17 @@ impl Chips {
             Some(chip) => {
                 let present = self.chips[chip].cycle;
                 if present != cycle {
-                    let detail = format!(
-                        "the chip at i2c.{bus} address {address:#04x} has a cycle of {} ticks, and one of {} is asked \
-                         for: give its channels the same cycle_time",
+                    let cause = format!(
+                        "the chip at i2c.{bus} address {address:#04x} has a cycle of {} ticks, and one of {} is asked for",
                         present.0, cycle.0
                     );
-                    return Err(Shutdown::because(OTHER_CYCLE, detail));
+                    return Err(Shutdown::because(OTHER_CYCLE, cause).remedy("give its channels the same cycle_time"));
                 }
                 chip
             }
             None if self.chips.len() == CHIPS_MAX => {
-                return Err(Shutdown::because(TOO_MANY, "there are 17 PCA9685 chips: 16 are possible, remove one"));
+                let cause = "there are 17 PCA9685 chips: 16 are possible";
+                return Err(Shutdown::because(TOO_MANY, cause).remedy("remove one"));
             }
             None => {
                 self.open(mcu, wanted)?;
@@ -214,7 +214,7 @@ impl Chips {
     fn open(&mut self, mcu: &mut Mcu, address: Address) -> Result<(), Shutdown> {
         let config = I2cConfig { bus: address.bus.into(), address: address.address & 0x7f, rate_hz: RATE_HZ };
         let opened = mcu.board()?.i2c(config);
-        let OnWorker { bus, device } = opened.map_err(|error| Shutdown::because(NOT_SET_UP, error.detail))?;
+        let OnWorker { bus, device } = opened.map_err(|error| Shutdown { reason: NOT_SET_UP, ..error })?;
         let worker = mcu.worker(&bus)?;
         let clock = mcu.clock();
         let calls = self.calls.get_or_insert_with(|| Calls::new(clock)).clone();

@@ -124,10 +124,8 @@ impl SosFilter {
             return Err(Shutdown::by_host(NOT_ACTIVE, "a sample came before sos_filter_set_active"));
         }
         self.filter(scaled).map_err(|Overflow| {
-            Shutdown::because(
-                FILTER_OVERFLOW,
-                "a filtered value does not fit 32 bits: check the load cell's wires, calibration and filter settings",
-            )
+            Shutdown::because(FILTER_OVERFLOW, "a filtered value does not fit 32 bits")
+                .remedy("check the load cell's wires, calibration and filter settings")
         })
     }
 

@@ -181,7 +181,7 @@ fn invalid(what: impl fmt::Display) -> Shutdown {
 /// The stop for an SPI conversation that failed. Not a conversion of any `BusError`: one of an I2C
 /// bus has texts of its own (`i2c_shutdown`).
 pub(super) fn spi_shutdown(error: BusError) -> Shutdown {
-    Shutdown::because(SPI_TRANSFER_FAILED, error.detail)
+    Shutdown::because(SPI_TRANSFER_FAILED, error.trouble)
 }
 
 impl Object for Spi {

@@ -440,10 +440,8 @@ const CONFIG_SPI_ANGLE: Command = command!(
         let chip = Chip::of(spi_angle_type)?;
         mcu.vacant(oid)?;
         if !mcu.with::<Spi, _>(spi_oid, |spi, _| Ok(spi.has_chip_select()))? {
-            return Err(Shutdown::because(
-                NEEDS_CS,
-                "its SPI device has no chip select line of its own: set cs_pin to a GPIO line, not to None",
-            ));
+            let cause = "its SPI device has no chip select line of its own";
+            return Err(Shutdown::because(NEEDS_CS, cause).remedy("set cs_pin to a GPIO line, not to None"));
         }
         let sensor = SpiAngle {
             chip,

@@ -123,14 +123,14 @@ impl Stepper {
         self.advance(interval, earliest);
         let early = earliest.since(self.next_step);
         if early > i64::from(self.late_limit.0) {
-            return Err(Shutdown::because(
-                STEPPER_PAST,
-                format!(
-                    "a step is {} us late: more steps a second are asked for than the step pulse of {} ticks and this machine allow: lower the speed, the microsteps or step_pulse_duration",
-                    early / i64::from(Ticks::from_us(1).0),
-                    self.pulse_ticks.0
-                ),
-            ));
+            let cause = format!(
+                "a step is {} us late: more steps a second are asked for than the step pulse of {} ticks and this machine allow",
+                early / i64::from(Ticks::from_us(1).0),
+                self.pulse_ticks.0
+            );
+            return Err(
+                Shutdown::because(STEPPER_PAST, cause).remedy("lower the speed, the microsteps or step_pulse_duration")
+            );
         }
         if reverses {
             if self.both_edges {

@@ -12,6 +12,7 @@ use crate::mcu::{
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
+use crate::trouble::Trouble;
 
 use super::spi::{Spi, spi_shutdown};
 
@@ -157,16 +158,15 @@ impl Thermocouple {
         }
         let times = std::mem::take(&mut self.invalid_count);
         let name = self.chip.name();
-        let detail = match fault {
-            0 => format!(
+        let trouble = match fault {
+            0 => Trouble::new(format!(
                 "the {name} read 0x{value:x} where 0x{:x} to 0x{:x} is allowed, {times} times in a row: a heater past its limits, or a sensor that is broken or unplugged",
                 self.min_value, self.max_value
-            ),
-            fault => format!(
-                "the {name} reports fault bits 0x{fault:02x}, {times} times in a row: check the sensor and its wires (klippy's log names the fault)"
-            ),
+            )),
+            fault => Trouble::new(format!("the {name} reports fault bits 0x{fault:02x}, {times} times in a row"))
+                .remedy("check the sensor and its wires (klippy's log names the fault)"),
         };
-        mcu.try_shut_down(Shutdown::because(READER_FAULT, detail))
+        mcu.try_shut_down(Shutdown::because(READER_FAULT, trouble))
     }
 }
 

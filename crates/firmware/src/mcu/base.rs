@@ -168,10 +168,9 @@ pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err
 
 /// The stop that `emergency_stop` asks for.
 pub fn emergency() -> Shutdown {
-    Shutdown::because(
-        reason::COMMAND_REQUEST,
-        "the host asked for it, by FIRMWARE_RESTART, M112 or an error of its own (its log tells which): unless it was FIRMWARE_RESTART, deal with the cause, then FIRMWARE_RESTART",
-    )
+    let cause = "the host asked for it, by FIRMWARE_RESTART, M112 or an error of its own (its log tells which)";
+    Shutdown::because(reason::COMMAND_REQUEST, cause)
+        .remedy("unless it was FIRMWARE_RESTART, deal with the cause, then FIRMWARE_RESTART")
 }
 
 const CLEAR_SHUTDOWN: Command = command!("clear_shutdown", |mcu| mcu.clear_shutdown()).allowed_in_shutdown();
@@ -197,8 +196,6 @@ const DEBUG_WRITE: Command = command!("debug_write order=%c addr=%u val=%u", |_m
 .allowed_in_shutdown();
 
 fn debug_refused(command: &str) -> Shutdown {
-    Shutdown::because(
-        reason::DEBUG_MEMORY,
-        format!("the host sent {command}: a process of Linux does not poke memory for a host; remove the command"),
-    )
+    let cause = format!("the host sent {command}: a process of Linux does not poke memory for a host");
+    Shutdown::because(reason::DEBUG_MEMORY, cause).remedy("remove the command")
 }

@@ -10,6 +10,7 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::board::{BusDevice, BusError, BusStatus, OnWorker};
+use crate::trouble::Trouble;
 use crate::shutdown::Shutdown;
 
 use super::{BusCounts, Calls, Errand, Mcu, Oid, Slot, Turn, WorkerId};
@@ -114,7 +115,7 @@ impl<T: Talk> Slot<Conversation<T>> {
 /// A conversation that was sent without a chip, which [`Slot::converse_on`] does not do.
 #[cold]
 fn no_device() -> BusError {
-    BusError { status: BusStatus::Nack, detail: "it was sent without a chip: please report it".into() }
+    BusError::new(BusStatus::Nack, Trouble::new("it was sent without a chip").remedy("please report it"))
 }
 
 impl Bus {

@@ -13,7 +13,7 @@ use pinion_protocol::vlq::{Reader, Writer};
 use super::{Generations, Mcu};
 
 impl From<Malformed> for Shutdown {
-    /// The detail is empty: [`Mcu::execute`] adds which command it was.
+    /// The cause is empty: [`Mcu::execute`] adds which command it was.
     #[cold]
     fn from(_: Malformed) -> Shutdown {
         Shutdown::because(reason::COMMAND_PARSER, "")

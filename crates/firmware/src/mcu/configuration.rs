@@ -49,10 +49,8 @@ impl Mcu {
 
     pub(super) fn allocate_oids(&mut self, count: u8) -> Result<(), Shutdown> {
         if self.is_allocated() {
-            return Err(Shutdown::because(
-                reason::OIDS_ALLOCATED,
-                "allocate_oids came twice: a host before left its configuration unfinished, for a wrong pin or because it was killed: FIRMWARE_RESTART",
-            ));
+            let cause = "allocate_oids came twice: a host before left its configuration unfinished, for a wrong pin or because it was killed";
+            return Err(Shutdown::because(reason::OIDS_ALLOCATED, cause).remedy("FIRMWARE_RESTART"));
         }
         let count = usize::from(count);
         self.configuration.oid_count = Some(count);

@@ -17,6 +17,9 @@ use pinion_protocol::vlq::Reader;
 use super::command::{ConstantValue, Feature, Handler};
 use super::{DialectName, Generation, Generations, base, since};
 
+/// What to do about a host that has another dictionary.
+pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
+
 /// What the machine knows of a command that came by its id.
 pub(super) struct Entry {
     pub(super) format: &'static str,
@@ -280,13 +283,10 @@ impl Dialect {
     pub(super) fn command(&self, id: u32) -> Result<&Entry, Shutdown> {
         match self.commands.get(place(id)) {
             Some(Some(entry)) => Ok(entry),
-            _ => Err(Shutdown::because(
-                reason::INVALID_COMMAND,
-                format!(
-                    "the host sent command {}, which the dictionary does not have: restart the host so that it reads the dictionary anew",
-                    id as i32
-                ),
-            )),
+            _ => {
+                let cause = format!("the host sent command {}, which the dictionary does not have", id as i32);
+                Err(Shutdown::because(reason::INVALID_COMMAND, cause).remedy(READ_ANEW))
+            }
         }
     }
 }

@@ -93,11 +93,9 @@ impl Mcu {
                 .holder
                 .and_then(|oid| Some((oid, self.configuration.objects.get(oid.index())?.as_ref()?.kind())));
             let what = holder.map_or_else(|| "a device".to_owned(), |(oid, kind)| self.name_object(kind, oid));
-            let detail = format!(
-                "{what} has not answered for {} s: does its bus or its driver hang (dmesg)?",
-                HOLD_LIMIT.0 / crate::time::CLOCK_FREQ
-            );
-            self.shut_down(Shutdown::because(reason::BUS_HANGS, detail));
+            let cause = format!("{what} has not answered for {} s", HOLD_LIMIT.0 / crate::time::CLOCK_FREQ);
+            let stop = Shutdown::because(reason::BUS_HANGS, cause);
+            self.shut_down(stop.remedy("does its bus or its driver hang (dmesg)?"));
         }
     }
 }

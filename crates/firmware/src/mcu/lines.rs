@@ -321,12 +321,11 @@ impl InputLine {
         if look.is_here() || !unread.is_too_long(turn.now()) {
             return Ok(());
         }
-        let detail = format!(
-            "{} has not answered for {} ms: does its chip or its bus hang? Check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
-            turn.name(self.pin),
-            UNREAD_LIMIT.0 / Ticks::from_us(1000).0
-        );
-        turn.try_shut_down(Shutdown::because(reason::LINE_READ, detail))
+        let (name, ms) = (turn.name(self.pin), UNREAD_LIMIT.0 / Ticks::from_us(1000).0);
+        let stop = Shutdown::because(reason::LINE_READ, format!("{name} has not answered for {ms} ms"));
+        turn.try_shut_down(stop.remedy(
+            "does its chip or its bus hang? Check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
+        ))
     }
 }
 
@@ -426,12 +425,10 @@ impl Mcu {
                 Direction::Input(_) => reason::INPUT_LINE,
                 _ => reason::OUTPUT_LINE,
             };
-            return Err(Shutdown::because(
-                refused,
-                format!(
-                    "{name} can not be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds: choose a pin of the processor itself"
-                ),
-            ));
+            let cause = format!(
+                "{name} can not be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds"
+            );
+            return Err(Shutdown::because(refused, cause).remedy("choose a pin of the processor itself"));
         }
         let own = self.board.canonical(pin);
         let claimed = self.configuration.claims.iter().find(|claim| claim.pin == own);

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use crate::shutdown::{Shutdown, reason};
 use pinion_protocol::vlq::{Reader, Writer};
 
+use super::dialect::READ_ANEW;
 use super::{Dialect, Generations, Mcu, Response, base};
 
 /// The dialects of the host that configured the MCU, and of one that came since.
@@ -52,12 +53,8 @@ impl Mcu {
     fn cut_short(&self, mut command: Reader<'_>) -> Shutdown {
         let id = command.int().ok();
         let format = id.and_then(|id| self.heard().command(id).ok()).map_or("a command's id", |entry| entry.format);
-        Shutdown::because(
-            reason::COMMAND_PARSER,
-            format!(
-                "a message ends in the middle of \"{format}\": restart the host so that it reads the dictionary anew"
-            ),
-        )
+        Shutdown::because(reason::COMMAND_PARSER, format!("a message ends in the middle of \"{format}\""))
+            .remedy(READ_ANEW)
     }
 
     #[inline]
@@ -73,14 +70,13 @@ impl Mcu {
                 self.send(base::IsShutdown { static_string_id });
                 Ok(())
             }
-            None if is_foreign => Err(Shutdown::because(
-                reason::INVALID_COMMAND,
-                format!(
-                    "the machine is configured by a host of the dialect {}, and the present one speaks {}: FIRMWARE_RESTART",
-                    self.spoken.dialect.name(),
-                    self.heard().name()
-                ),
-            )),
+            None if is_foreign => {
+                let (spoken, heard) = (self.spoken.dialect.name(), self.heard().name());
+                let cause = format!(
+                    "the machine is configured by a host of the dialect {spoken}, and the present one speaks {heard}"
+                );
+                Err(Shutdown::because(reason::INVALID_COMMAND, cause).remedy("FIRMWARE_RESTART"))
+            }
             _ => (command.handler)(self, payload),
         }
     }

@@ -217,7 +217,7 @@ impl Mcu {
         Ok(())
     }
 
-    /// Adds to a stop's detail which object it was about.
+    /// Says which object a stop was about.
     #[cold]
     pub(super) fn blame(&self, stop: Shutdown, kind: &str, oid: Oid) -> Shutdown {
         stop.of(&self.name_object(kind, oid))
@@ -235,11 +235,9 @@ impl Mcu {
 
 #[cold]
 fn not_configured(oid: Oid) -> Shutdown {
-    Shutdown::because(
-        reason::INVALID_OID,
-        format!(
-            "oid {} is not configured, or as something else: the host's configuration is not this machine's; FIRMWARE_RESTART",
-            oid.index()
-        ),
-    )
+    let cause = format!(
+        "oid {} is not configured, or as something else: the host's configuration is not this machine's",
+        oid.index()
+    );
+    Shutdown::because(reason::INVALID_OID, cause).remedy("FIRMWARE_RESTART")
 }

@@ -152,13 +152,12 @@ impl Mcu {
         }
         let late = self.schedule.timers.next().map_or(0, |at| self.now().since(at));
         if late > i64::from(LATE_LIMIT.0) && self.stop.reason.is_none() {
-            self.shut_down(Shutdown::because(
-                reason::TIMER_PAST,
-                format!(
-                    "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running: run Pinion in real time (-r, as the service does), or move more slowly",
-                    late as u64 / u64::from(Ticks::from_us(1000).0)
-                ),
-            ));
+            let cause = format!(
+                "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running",
+                late as u64 / u64::from(Ticks::from_us(1000).0)
+            );
+            let stop = Shutdown::because(reason::TIMER_PAST, cause);
+            self.shut_down(stop.remedy("run Pinion in real time (-r, as the service does), or move more slowly"));
         }
         self.schedule.is_behind = self.schedule.timers.next().is_some_and(|at| at <= self.schedule.last_read);
         self.schedule.is_behind

@@ -6,6 +6,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::fmt::{self, Write as _};
 use std::sync::atomic::{AtomicU8, Ordering};
 
 use crate::board::{Direction, Pin};
@@ -195,10 +196,23 @@ fn append<T>(list: &mut Vec<T>, item: T) {
 }
 
 /// Puts as much of a text as has room.
-fn put(text: &mut String, from: &str) {
+fn put(text: &mut String, from: impl fmt::Display) {
     text.clear();
-    let room = (0..=text.capacity().min(from.len())).rev().find(|end| from.is_char_boundary(*end));
-    text.push_str(&from[..room.unwrap_or(0)]);
+    // The write fails where there is no room left: the text is cut there.
+    let _ = write!(Room(text), "{from}");
+}
+
+/// A text that does not grow beyond what is allocated for it.
+struct Room<'a>(&'a mut String);
+
+impl fmt::Write for Room<'_> {
+    fn write_str(&mut self, from: &str) -> fmt::Result {
+        let room = self.0.capacity() - self.0.len();
+        let end = (0..=room.min(from.len())).rev().find(|end| from.is_char_boundary(*end));
+        let end = end.unwrap_or(0);
+        self.0.push_str(&from[..end]);
+        if end == from.len() { Ok(()) } else { Err(fmt::Error) }
+    }
 }
 
 impl Mcu {
@@ -242,9 +256,13 @@ impl Mcu {
         to.is_configured = self.is_finalized();
         to.oids_allocated = self.is_allocated();
         to.dialect = Some(self.spoken.dialect.name());
-        let (detail, at) = self.stop.last.as_ref().map_or(("", self.schedule.last_read), |(detail, at)| (detail, *at));
+        let last = self.stop.last.as_ref().filter(|_| self.is_shutdown());
+        let at = last.map_or(self.schedule.last_read, |(_, at)| *at);
         to.stopped = self.stop.reason.map(|reason| (reason, at));
-        put(&mut to.detail, if self.is_shutdown() { detail } else { "" });
+        match last {
+            Some((trouble, _)) => put(&mut to.detail, trouble),
+            None => to.detail.clear(),
+        }
         put(&mut to.debtor, self.debtor().unwrap_or_default());
         to.is_held = self.is_held();
         to.moves = self.moves.used();

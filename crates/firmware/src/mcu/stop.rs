@@ -11,6 +11,7 @@
 
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks};
+use crate::trouble::Trouble;
 
 use super::{Mcu, Note, Oid, Safe, TimerId, Turn, base};
 
@@ -29,8 +30,8 @@ const UNGUARDED_LIMIT: Ticks = Ticks::from_us(500_000);
 pub(super) struct Stop {
     /// Why the machine is stopped; none while it is not.
     pub(super) reason: Option<ShutdownReason>,
-    /// The cause and the remedy of the last stop, and when it was.
-    pub(super) last: Option<(Box<str>, Clock)>,
+    /// What the log says of the last stop, and when it was.
+    pub(super) last: Option<(Box<Trouble>, Clock)>,
     /// Whether `shut_down` is running: what fails meanwhile must not start it again.
     under_way: bool,
     owed: Vec<Debt>,
@@ -86,7 +87,7 @@ impl Mcu {
         self.send(base::ShutdownReport { clock, static_string_id });
         if first {
             self.outbox.note(Note::Shutdown(&shutdown));
-            self.stop.last = Some((shutdown.detail, clock));
+            self.stop.last = Some((shutdown.trouble, clock));
         } else if shutdown.reason != reason {
             // The same reason again, such as a second `emergency_stop`, would tell the log nothing new.
             self.outbox.note(Note::Trouble(&shutdown));
@@ -189,12 +190,13 @@ impl Mcu {
         for debt in self.stop.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {
             if now.since(debt.since) >= i64::from(UNGUARDED_LIMIT.0) {
                 debt.given_up = true;
-                let detail = format!(
-                    "{} has not taken its shutdown values for {} ms, and nothing else can write them: its outputs may be on; check its power and wiring, then FIRMWARE_RESTART",
+                let cause = format!(
+                    "{} has not taken its shutdown values for {} ms, and nothing else can write them: its outputs may be on",
                     debt.name,
                     UNGUARDED_LIMIT.0 / Ticks::from_us(1000).0
                 );
-                self.outbox.note(Note::Trouble(&Shutdown::because(reason::BUS_HANGS, detail)));
+                let stop = Shutdown::because(reason::BUS_HANGS, cause);
+                self.outbox.note(Note::Trouble(&stop.remedy("check its power and wiring, then FIRMWARE_RESTART")));
             }
         }
         for place in (0..self.stop.owed.len()).rev() {

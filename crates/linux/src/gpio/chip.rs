@@ -9,6 +9,7 @@ use std::path::{Path, PathBuf};
 use gpio_cdev::LineDirection;
 
 use super::refusal::{cannot_open, errno};
+use pinion_firmware::trouble::Trouble;
 
 /// Subsystems whose drivers send their devices messages and sleep until these are answered.
 const SLEEPING_BUSES: [&str; 7] = ["i2c", "spi", "usb", "hid", "serial", "virtio", "w1"];
@@ -42,11 +43,11 @@ pub struct LineInfo {
     pub consumer: Option<String>,
 }
 
-/// The chips of this machine by number, and a line for the log for each that can not be read.
+/// The chips of this machine by number, and why the others can not be read.
 ///
 /// A node that is a link to another chip's (`/dev/gpiochip4` on a Raspberry Pi 5) is left out, as
 /// its lines are those of the other chip. Pins with its number work all the same.
-pub(crate) fn scan(dev: &Path, devices: &Path) -> (Vec<Chip>, Vec<String>) {
+pub(crate) fn scan(dev: &Path, devices: &Path) -> (Vec<Chip>, Vec<Trouble>) {
     let mut chips = Vec::new();
     let mut problems = Vec::new();
     for number in nodes(dev) {
@@ -66,6 +67,17 @@ pub(crate) fn scan(dev: &Path, devices: &Path) -> (Vec<Chip>, Vec<String>) {
         chips.push(Chip { number, label: chip.label().to_owned(), sleeps, lines });
     }
     (chips, problems)
+}
+
+/// Says that a chip is not there, but these.
+pub(super) fn missing(path: &Path, chips: &[Chip]) -> Trouble {
+    let known: Vec<String> = chips.iter().map(|chip| format!("gpiochip{} ({})", chip.number, chip.label)).collect();
+    let known = match known.is_empty() {
+        true => "no GPIO chip that can be opened".to_owned(),
+        false => known.join(", "),
+    };
+    Trouble::new(format!("there is no {}: this machine has {known}", path.display()))
+        .remedy("write the pin with one of these (pinion pins lists them)")
 }
 
 /// The numbers of the chips in `dev`, in ascending order.
@@ -143,6 +155,18 @@ mod tests {
         symlink(&device, chips.join("gpiochip3")).unwrap();
         assert!(!may_sleep(&chips, "gpiochip4", "another"), "a chip that is not there");
         may_sleep(&chips, "gpiochip3", label)
+    }
+
+    #[test]
+    fn a_missing_chip_lists_those_that_are_there() {
+        let chip = |number, label: &str| Chip { number, label: label.into(), sleeps: false, lines: vec![] };
+        let path = Path::new("/dev/gpiochip5");
+        assert_eq!(
+            missing(path, &[chip(0, "pinctrl-rp1"), chip(10, "gpio-brcmstb@107d508500")]).to_string(),
+            "there is no /dev/gpiochip5: this machine has gpiochip0 (pinctrl-rp1), gpiochip10 \
+             (gpio-brcmstb@107d508500): write the pin with one of these (pinion pins lists them)"
+        );
+        assert!(missing(path, &[]).cause.contains("no GPIO chip"));
     }
 
     #[test]

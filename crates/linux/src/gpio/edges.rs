@@ -10,7 +10,6 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
 
-use super::chip::LineInfo;
 use super::refusal::{Subject, text};
 use super::{CONSUMER, Handle, lacks};
 use crate::sys;
@@ -47,8 +46,7 @@ impl EdgeRequest {
         if flags != self.flags.swap(flags, Ordering::Relaxed) {
             sys::set_line_flags(&self.file, flags).map_err(|error| {
                 let code = error.raw_os_error().unwrap_or_default();
-                let detail = self.subject.refusal("an input", code, Bias::None, &LineInfo::default(), "");
-                Shutdown::because(reason::INPUT_LINE, detail)
+                Shutdown::because(reason::INPUT_LINE, self.subject.refusal("an input", code, Bias::None, None, ""))
             })?;
         }
         Ok(())
@@ -76,7 +74,7 @@ impl Handle {
     /// not be: the line may still be had without.
     pub(crate) fn request_edges(self, dev: &Path, bias: Bias) -> Result<(EdgeLine, LineEdges), Box<str>> {
         if lacks(&self.subject.label, bias) {
-            return Err(self.subject.no_bias(bias).into());
+            return Err(self.subject.no_bias(bias).to_string().into());
         }
         let flags = flag::INPUT | flag::BOTH_EDGES | bias_flag(bias);
         let file = File::open(dev.join(&self.subject.chip))
@@ -118,11 +116,8 @@ impl Line for EdgeLine {
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
         let Direction::Input(bias) = direction else {
-            let detail = format!(
-                "{} counts pulses and can not be an output as well: choose another pin for one of the two",
-                self.0.subject
-            );
-            return Err(Shutdown::because(reason::OUTPUT_LINE, detail));
+            let cause = format!("{} counts pulses and can not be an output as well", self.0.subject);
+            return Err(Shutdown::because(reason::OUTPUT_LINE, cause).remedy("choose another pin for one of the two"));
         };
         self.0.subject.setting(direction)?;
         let before = self.0.flags.load(Ordering::Relaxed);

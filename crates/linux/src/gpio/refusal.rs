@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Why the kernel refuses a chip or a line, in words that tell the remedy.
+//! Why the kernel refuses a chip or a line, and the remedy.
 
 #![forbid(unsafe_code)]
 
@@ -12,8 +12,10 @@ use std::path::Path;
 
 use nix::unistd::{Gid, Group, User, geteuid};
 
-use super::chip::{Chip, LineInfo};
 use pinion_firmware::board::Bias;
+use pinion_firmware::trouble::Trouble;
+
+use crate::LOOK_AT_LOG;
 
 /// What a driver answers if it does not support a request (include/linux/errno.h).
 const ENOTSUPP: i32 = 524;
@@ -38,70 +40,64 @@ impl fmt::Display for Subject {
 }
 
 impl Subject {
-    pub(super) fn beyond(&self, lines: u32) -> String {
+    pub(super) fn beyond(&self, lines: u32) -> Trouble {
+        let Subject { chip, label, offset, .. } = self;
         let last = lines.saturating_sub(1);
-        format!(
-            "{} ({}) has no line {}, its lines are 0 to {last}: choose another pin (pinion pins \
-             lists them)",
-            self.chip, self.label, self.offset
-        )
+        Trouble::new(format!("{chip} ({label}) has no line {offset}, its lines are 0 to {last}"))
+            .remedy("choose another pin (pinion pins lists them)")
     }
 
-    pub(super) fn no_bias(&self, bias: Bias) -> String {
+    pub(super) fn no_bias(&self, bias: Bias) -> Trouble {
         let (pull, sign) = pull(bias);
-        format!(
-            "{self} has no {pull} resistor ({} offers none): solder one and write the pin \
-             without the {sign}, or choose another pin",
-            self.label
-        )
+        Trouble::new(format!("{self} has no {pull} resistor ({} offers none)", self.label))
+            .remedy(format!("solder one and write the pin without the {sign}, or choose another pin"))
     }
 
     /// `what` is "read" or "written"; `sleeping` tells whether the chip is on a bus.
-    pub(super) fn lost(&self, what: &str, code: i32, sleeping: bool) -> String {
-        let why = match sleeping {
-            true => "its chip does not answer, or is gone: check its power and wiring",
-            false => "its chip or driver is gone",
+    pub(super) fn lost(&self, what: &str, code: i32, sleeping: bool) -> Trouble {
+        let (why, remedy) = match sleeping {
+            true => (
+                "its chip does not answer, or is gone",
+                "check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
+            ),
+            false => ("its chip or driver is gone", "look at the kernel's log (dmesg), then FIRMWARE_RESTART"),
         };
-        format!(
-            "{self} can no longer be {what}: {}: {why}, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
-            text(code)
-        )
+        Trouble::new(format!("{self} can no longer be {what}: {}: {why}", text(code))).remedy(remedy)
     }
 
-    pub(super) fn refusal(&self, action: &str, code: i32, bias: Bias, found: &LineInfo, release: &str) -> String {
+    /// `consumer` is who holds the line, as far as the kernel tells.
+    pub(super) fn refusal(
+        &self,
+        action: &str,
+        code: i32,
+        bias: Bias,
+        consumer: Option<&str>,
+        release: &str,
+    ) -> Trouble {
         let (pull, _) = pull(bias);
+        let label = &self.label;
         match code {
             libc::EBUSY => {
-                let holder = match &found.consumer {
-                    Some(consumer) => format!("\"{consumer}\""),
-                    None => "the kernel".to_owned(),
-                };
-                format!(
-                    "{self} is in use by {holder}: free it or choose another pin (pinion pins \
-                     lists them)"
-                )
+                let holder = consumer.map_or_else(|| "the kernel".to_owned(), |consumer| format!("\"{consumer}\""));
+                Trouble::new(format!("{self} is in use by {holder}"))
+                    .remedy("free it or choose another pin (pinion pins lists them)")
             }
-            libc::EINVAL if bias != Bias::None && is_before(release, BIAS_SINCE) => format!(
-                "{self} can not have a {pull} resistor: Linux {} knows none before 5.5: update \
-                 the kernel, or solder one",
+            libc::EINVAL if bias != Bias::None && is_before(release, BIAS_SINCE) => Trouble::new(format!(
+                "{self} can not have a {pull} resistor: Linux {} knows none before 5.5",
                 release.trim_end()
-            ),
+            ))
+            .remedy("update the kernel, or solder one"),
             ENOTSUPP | libc::EOPNOTSUPP | libc::ENOSYS if bias != Bias::None => self.no_bias(bias),
-            libc::EINVAL => format!(
-                "{self} is refused as {action} by the driver of {}: the pin has another function \
-                 or is reserved: free it in the device tree, or choose another pin",
-                self.label
-            ),
-            libc::EIO | libc::EPERM | ENOTSUPP | libc::EOPNOTSUPP => format!(
-                "{self} can not be {action}: {}: the chip {} does not offer it: choose another pin",
-                text(code),
-                self.label
-            ),
-            _ => format!(
-                "{self} can not be had as {action}: {}: look at the kernel's log (dmesg), or \
-                 choose another pin",
-                text(code)
-            ),
+            libc::EINVAL => Trouble::new(format!(
+                "{self} is refused as {action} by the driver of {label}: the pin has another function or is reserved"
+            ))
+            .remedy("free it in the device tree, or choose another pin"),
+            libc::EIO | libc::EPERM | ENOTSUPP | libc::EOPNOTSUPP => {
+                Trouble::new(format!("{self} can not be {action}: {}: the chip {label} does not offer it", text(code)))
+                    .remedy("choose another pin")
+            }
+            _ => Trouble::new(format!("{self} can not be had as {action}: {}", text(code)))
+                .remedy("look at the kernel's log (dmesg), or choose another pin"),
         }
     }
 }
@@ -128,30 +124,20 @@ pub fn is_before(release: &str, version: (u32, u32)) -> bool {
     }
 }
 
-pub(super) fn missing(path: &Path, chips: &[Chip]) -> String {
-    let known: Vec<String> = chips.iter().map(|chip| format!("gpiochip{} ({})", chip.number, chip.label)).collect();
-    let known = match known.is_empty() {
-        true => "no GPIO chip that can be opened".to_owned(),
-        false => known.join(", "),
-    };
-    format!(
-        "there is no {}: this machine has {known}: write the pin with one of these (pinion pins \
-         lists them)",
-        path.display()
-    )
-}
-
-pub(super) fn cannot_open(path: &Path, code: i32) -> String {
+pub(super) fn cannot_open(path: &Path, code: i32) -> Trouble {
+    let shown = path.display();
     match code {
         libc::EACCES | libc::EPERM => not_permitted(path),
-        libc::ENOTTY => format!("{} is not a GPIO chip: remove it and let the kernel make the node", path.display()),
-        _ => format!("{} can not be opened: {}: look at the kernel's log (dmesg)", path.display(), text(code)),
+        libc::ENOTTY => {
+            Trouble::new(format!("{shown} is not a GPIO chip")).remedy("remove it and let the kernel make the node")
+        }
+        _ => Trouble::new(format!("{shown} can not be opened: {}", text(code))).remedy(LOOK_AT_LOG),
     }
 }
 
-/// For the log: to whom a device node belongs, and how to get permission to open it.
-pub fn not_permitted(path: &Path) -> String {
-    permission_text(path, &Opener::of(path))
+/// To whom a device node belongs, and how to get permission to open it.
+pub(crate) fn not_permitted(path: &Path) -> Trouble {
+    forbidden(path, &Opener::of(path))
 }
 
 /// Who asks for a file, and the group whose members may open it, if there is one.
@@ -181,15 +167,16 @@ impl Opener {
     }
 }
 
-fn permission_text(path: &Path, opener: &Opener) -> String {
+fn forbidden(path: &Path, opener: &Opener) -> Trouble {
     let (path, who) = (path.display(), &opener.who);
     match (&opener.group, opener.command()) {
-        (Some(group), Some(command)) => format!(
-            "{who} may not open {path}, which belongs to group {group}: \"{command}\", log in anew and start Pinion again"
-        ),
-        _ => format!(
-            "{who} may not open {path}, which is root's alone: \"sudo udevadm trigger\" or a reboot puts \
-             Pinion's udev rules in force, where they are installed; or run Pinion as root"
+        (Some(group), Some(command)) => {
+            Trouble::new(format!("{who} may not open {path}, which belongs to group {group}"))
+                .remedy(format!("\"{command}\", log in anew and start Pinion again"))
+        }
+        _ => Trouble::new(format!("{who} may not open {path}, which is root's alone")).remedy(
+            "\"sudo udevadm trigger\" or a reboot puts Pinion's udev rules in force, where they are installed; or run \
+             Pinion as root",
         ),
     }
 }
@@ -226,8 +213,7 @@ mod tests {
     }
 
     fn refusal(code: i32, bias: Bias, consumer: Option<&str>, release: &str) -> String {
-        let found = LineInfo { consumer: consumer.map(str::to_owned), ..LineInfo::default() };
-        gpio17().refusal("an input", code, bias, &found, release)
+        gpio17().refusal("an input", code, bias, consumer, release).to_string()
     }
 
     #[test]
@@ -256,9 +242,9 @@ mod tests {
 
     #[test]
     fn a_chip_that_no_longer_answers_says_what_to_look_at() {
-        let own = gpio17().lost("written", libc::ENODEV, false);
+        let own = gpio17().lost("written", libc::ENODEV, false).cause;
         assert!(own.contains("can no longer be written: No such device") && own.contains("its chip or driver is gone"));
-        let expander = gpio17().lost("read", libc::ENXIO, true);
+        let expander = gpio17().lost("read", libc::ENXIO, true).to_string();
         assert!(expander.contains("does not answer") && expander.contains("power and wiring"), "{expander}");
     }
 
@@ -270,22 +256,11 @@ mod tests {
     }
 
     #[test]
-    fn a_missing_chip_lists_those_that_are_there() {
-        let chip = |number, label: &str| Chip { number, label: label.into(), sleeps: false, lines: vec![] };
-        let path = Path::new("/dev/gpiochip5");
-        assert_eq!(
-            missing(path, &[chip(0, "pinctrl-rp1"), chip(10, "gpio-brcmstb@107d508500")]),
-            "there is no /dev/gpiochip5: this machine has gpiochip0 (pinctrl-rp1), gpiochip10 \
-             (gpio-brcmstb@107d508500): write the pin with one of these (pinion pins lists them)"
-        );
-        assert!(missing(path, &[]).contains("no GPIO chip"));
-    }
-
-    #[test]
     fn a_forbidden_node_names_its_group() {
         let path = Path::new("/dev/gpiochip0");
-        let text =
-            |group: Option<&str>| permission_text(path, &Opener { who: "pi".into(), group: group.map(str::to_owned) });
+        let text = |group: Option<&str>| {
+            forbidden(path, &Opener { who: "pi".into(), group: group.map(str::to_owned) }).to_string()
+        };
         assert_eq!(
             text(Some("gpio")),
             "pi may not open /dev/gpiochip0, which belongs to group gpio: \"sudo usermod -aG gpio pi\", log in \
@@ -309,6 +284,6 @@ mod tests {
 
     #[test]
     fn a_line_beyond_the_chip() {
-        assert!(gpio17().beyond(8).contains("no line 17, its lines are 0 to 7"));
+        assert!(gpio17().beyond(8).cause.contains("no line 17, its lines are 0 to 7"));
     }
 }

@@ -9,6 +9,7 @@ use std::time::Duration;
 
 use crate::description::buses::I2cBusConfig;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus};
+use pinion_firmware::trouble::Trouble;
 
 /// A chip as its data sheet describes it. Its calls come in the order of the wires: a start with its
 /// address, bytes, perhaps another start, a stop.
@@ -62,8 +63,8 @@ impl I2cBus {
         let mut sockets = self.sockets.lock().unwrap_or_else(PoisonError::into_inner);
         thread::sleep(self.delay);
         let failed = |status, cause: &str| {
-            let detail = format!("the simulated {} at address {address}: {cause}: name a chip of the bus", self.name);
-            Err(BusError { status, detail: detail.into() })
+            let trouble = Trouble::new(cause).remedy("name a chip of the bus");
+            Err(BusError::new(status, trouble.of(format_args!("the simulated {} at address {address}", self.name))))
         };
         let Some(socket) = sockets.iter_mut().find(|socket| socket.address == address) else {
             return failed(BusStatus::StartNack, "no chip has this address");

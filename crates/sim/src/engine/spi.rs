@@ -19,6 +19,7 @@ use crate::description::buses::SpiBusConfig;
 use crate::description::check::SimError;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect};
 use pinion_firmware::time::Clock;
+use pinion_firmware::trouble::Trouble;
 
 /// A chip as its data sheet describes it. Its calls come in the order of the wires: selected,
 /// bytes, deselected.
@@ -129,9 +130,9 @@ impl Trace {
         }
         line.push('\n');
         // In one write, so that a reader never sees half a line.
-        self.file.write_all(line.as_bytes()).map_err(|error| BusError {
-            status: BusStatus::Nack,
-            detail: format!("{} can not be written: {error}: choose another trace_file", self.path.display()).into(),
+        self.file.write_all(line.as_bytes()).map_err(|error| {
+            let trouble = Trouble::new(format!("{} can not be written: {error}", self.path.display()));
+            BusError::new(BusStatus::Nack, trouble.remedy("choose another trace_file"))
         })
     }
 }
@@ -236,7 +237,7 @@ impl SpiDevice {
     fn select(&self, selected: bool) -> Result<(), BusError> {
         let chip_select = self.chip_select.as_ref();
         let driven = chip_select.map_or(Ok(()), |chip_select| chip_select.select(selected));
-        driven.map_err(|failure| BusError { status: BusStatus::Nack, detail: failure.detail })
+        driven.map_err(BusError::from)
     }
 }
 

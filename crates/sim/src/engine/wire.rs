@@ -105,12 +105,9 @@ impl WiredPin {
             Kind::Pwm => "a hardware PWM channel",
             Kind::Mosi => "an SPI bus's data output",
         };
-        let detail = format!(
-            "pin {} of the simulated printer is {is} ({}), no {wanted}: choose another pin",
-            self.name,
-            self.wire.describe()
-        );
-        Shutdown::because(reason, detail)
+        let (name, wire) = (&self.name, self.wire.describe());
+        Shutdown::because(reason, format!("pin {name} of the simulated printer is {is} ({wire}), no {wanted}"))
+            .remedy("choose another pin")
     }
 }
 

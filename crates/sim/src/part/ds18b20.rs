@@ -18,6 +18,7 @@ use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::TimeSource;
+use pinion_firmware::trouble::Trouble;
 
 /// The thermometer's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -80,7 +81,7 @@ struct Ds18b20 {
 }
 
 impl Thermometer for Ds18b20 {
-    fn read(&mut self) -> Result<i32, Box<str>> {
+    fn read(&mut self) -> Result<i32, Trouble> {
         thread::sleep(self.conversion);
         let sixteenths = (self.heater.at(self.clock.now()).celsius * 16.0).floor() as i32;
         Ok((sixteenths * 1000).div_euclid(16))

@@ -35,7 +35,7 @@ fn each_spi_bus_has_its_worker_and_the_first_one_sends_back_what_it_is_sent() {
     assert_eq!((loopback.bus.as_str(), driver.bus.as_str()), ("spi0", "spi1"));
     let error = bench.spi("spidev7.0", None).err().unwrap();
     assert_eq!(error.reason, reason::SPI_OPEN);
-    assert!(error.detail.contains("use spidev0.0 or spidev1.0"), "{}", error.detail);
+    assert_eq!(error.trouble.remedy.as_deref(), Some("use spidev0.0 or spidev1.0"));
 }
 
 #[test]
@@ -97,11 +97,11 @@ fn the_data_output_of_a_bus_drives_lights_and_nothing_else() {
     let strip = bench.probe.sights().find(|(name, _)| *name == "strip").unwrap();
     assert_eq!(strip.1, "#00ff00 off off off off off off off");
     let error = bench.board.line(pin, Direction::Output { level: false, shutdown_level: false }).err().unwrap();
-    assert!(error.detail.contains("spidev3.0 of the simulated printer is an SPI bus's data output"), "{error}");
+    assert!(error.trouble.cause.contains("spidev3.0 of the simulated printer is an SPI bus's data output"), "{error}");
     let led = bench.pin("led");
     let error = bench.board.mosi(led, 3_200_000).err().unwrap();
     assert_eq!(error.reason, reason::NOT_OUTPUT);
-    assert!(error.detail.starts_with("led can not drive LEDs"), "{error}");
+    assert!(error.trouble.cause.starts_with("led can not drive LEDs"), "{error}");
 }
 
 #[test]
@@ -114,5 +114,5 @@ fn a_thermometer_is_found_by_its_serial_and_reads_in_sixteenths() {
     assert_eq!(thermometer.device.read(), Ok(30_687), "30.6875 C, which the kernel cuts off");
     let error = board.ds18b20(b"28-000000000000").err().unwrap();
     assert_eq!(error.reason, reason::DS18B20_OPEN);
-    assert!(error.detail.contains("28-0316b5f6a2ff"), "{}", error.detail);
+    assert!(error.to_string().contains("28-0316b5f6a2ff"), "{error}");
 }

@@ -1,0 +1,71 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What went wrong, in one shape from the place where it happens to the place where it is printed.
+
+#![forbid(unsafe_code)]
+
+use std::fmt;
+
+/// Something that went wrong. Only [`fmt::Display`] makes a sentence of it: `subject: cause: remedy`.
+///
+/// A text alone is a cause: its subject is added by who knows it, with [`Trouble::of`].
+///
+/// ```
+/// use pinion_firmware::trouble::Trouble;
+/// let trouble = Trouble::new("no chip acknowledges the address").remedy("check its wiring").of("/dev/i2c-1");
+/// assert_eq!(trouble.to_string(), "/dev/i2c-1: no chip acknowledges the address: check its wiring");
+/// assert_eq!(trouble.found(), "/dev/i2c-1: no chip acknowledges the address");
+/// ```
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Trouble {
+    /// The object, device or file that it is about; `None` where the cause names it.
+    pub subject: Option<Box<str>>,
+    /// What happened, and why.
+    pub cause: Box<str>,
+    /// What to do about it.
+    pub remedy: Option<Box<str>>,
+}
+
+impl Trouble {
+    /// A trouble with this cause.
+    pub fn new(cause: impl Into<Box<str>>) -> Trouble {
+        Trouble { subject: None, cause: cause.into(), remedy: None }
+    }
+
+    /// The same with what to do about it.
+    pub fn remedy(self, remedy: impl Into<Box<str>>) -> Trouble {
+        Trouble { remedy: Some(remedy.into()), ..self }
+    }
+
+    /// The same of this subject, in front of the one that it has.
+    pub fn of(self, subject: impl fmt::Display) -> Trouble {
+        let subject = self.subject.map_or_else(|| subject.to_string(), |inner| format!("{subject}: {inner}"));
+        Trouble { subject: Some(subject.into()), ..self }
+    }
+
+    /// All but the remedy, for what prints that apart.
+    pub fn found(&self) -> String {
+        match &self.subject {
+            Some(subject) => format!("{subject}: {}", self.cause),
+            None => self.cause.to_string(),
+        }
+    }
+}
+
+impl<T: Into<Box<str>>> From<T> for Trouble {
+    fn from(cause: T) -> Trouble {
+        Trouble::new(cause)
+    }
+}
+
+impl fmt::Display for Trouble {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if let Some(subject) = &self.subject {
+            write!(f, "{subject}: ")?;
+        }
+        f.write_str(&self.cause)?;
+        match &self.remedy {
+            Some(remedy) => write!(f, ": {remedy}"),
+            None => Ok(()),
+        }
+    }
+}
