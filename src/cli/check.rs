@@ -47,7 +47,7 @@ fn board(settings: &Settings) -> Vec<Finding> {
     if settings.board == BoardName::Linux {
         // The board would log these, and serve what is left.
         let problems = Inventory::scan().problems;
-        findings.extend(problems.iter().map(|problem| Finding::of("devices", Level::Error, problem)));
+        findings.extend(problems.into_iter().map(|problem| Finding::of("devices", Level::Error, problem)));
     }
     // Its problems are among the findings already.
     let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None));
@@ -166,19 +166,12 @@ fn real_time(settings: &Settings) -> Vec<Finding> {
     match (settings.cpu, Processors::new(settings.cpu)) {
         (Some(cpu), Ok(_)) => findings.push(Finding::ok("cpu", format!("the core stays on processor {cpu}"))),
         (None, Ok(_)) => {}
-        (_, Err(error)) => {
-            let error = error.to_string();
-            let (what, remedy) = error.rsplit_once(": ").unwrap_or((&error, "choose another"));
-            findings.push(Finding::error("cpu", what, remedy));
-        }
+        (_, Err(trouble)) => findings.push(Finding::of("cpu", Level::Error, trouble)),
     }
     if settings.realtime {
         findings.push(match realtime::is_permitted() {
             Ok(()) => Finding::ok("realtime", "real time is permitted"),
-            Err(why) => {
-                let (what, remedy) = why.split_once(": ").unwrap_or((&why, "run as root"));
-                Finding::warning("realtime", format!("no real-time scheduling: {what}"), remedy)
-            }
+            Err(why) => Finding::of("realtime", Level::Warning, why.of("no real-time scheduling")),
         });
     }
     findings
@@ -210,15 +203,19 @@ mod tests {
         let path = folder.path().join("tty");
         assert_eq!(link(&path).status, Level::Ok);
         std::os::unix::fs::symlink("/dev/pts/99", &path).unwrap();
-        assert!(link(&path).found.ends_with("is a link, and will be replaced"));
+        assert!(link(&path).told.cause.ends_with("is a link, and will be replaced"));
         fs::remove_file(&path).unwrap();
         fs::write(&path, "").unwrap();
         let refused = link(&path);
-        assert_eq!((refused.status, refused.remedy), (Level::Error, Some(format!("sudo rm {}", path.display()))));
+        assert_eq!(refused.status, Level::Error);
+        assert_eq!(refused.told.remedy.as_deref(), Some(&*format!("sudo rm {}", path.display())));
         let refused = link(folder.path());
-        assert!(refused.remedy.as_ref().is_some_and(|remedy| remedy.starts_with("choose another path")), "{refused:?}");
+        assert!(
+            refused.told.remedy.as_ref().is_some_and(|remedy| remedy.starts_with("choose another path")),
+            "{refused:?}"
+        );
         let refused = link(&folder.path().join("none/tty"));
-        assert!(refused.status == Level::Error && refused.found.contains("there is no folder"), "{refused:?}");
+        assert!(refused.status == Level::Error && refused.told.cause.contains("there is no folder"), "{refused:?}");
     }
 
     #[test]

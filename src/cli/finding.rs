@@ -6,7 +6,7 @@
 
 use std::process::ExitCode;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 use serde_json::json;
 
 use pinion_firmware::trouble::Trouble;
@@ -37,42 +37,46 @@ impl Level {
 }
 
 /// What was found.
-#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Finding {
     /// What was looked at, in one word that stays the same from version to version.
     pub(super) check: &'static str,
     pub(super) status: Level,
-    /// In a sentence.
-    pub(super) found: String,
-    /// The command that mends it, or what else to do.
-    pub(super) remedy: Option<String>,
+    /// What is so, and the command that mends it, or what else to do.
+    pub(super) told: Trouble,
+}
+
+impl Serialize for Finding {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Finding { check, status, told } = self;
+        json!({ "check": check, "status": status, "found": told.found(), "remedy": told.remedy }).serialize(serializer)
+    }
 }
 
 impl Finding {
     /// It is as it should be.
-    pub(super) fn ok(check: &'static str, found: impl Into<String>) -> Finding {
-        Finding { check, status: Level::Ok, found: found.into(), remedy: None }
+    pub(super) fn ok(check: &'static str, told: impl Into<Trouble>) -> Finding {
+        Finding::of(check, Level::Ok, told)
     }
 
     /// It may be a reason why something does not work well.
-    pub(super) fn warning(check: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Finding {
-        Finding { check, status: Level::Warning, found: found.into(), remedy: Some(remedy.into()) }
+    pub(super) fn warning(check: &'static str, told: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
+        Finding::of(check, Level::Warning, told).or(remedy)
     }
 
     /// It is why something does not work.
-    pub(super) fn error(check: &'static str, found: impl Into<String>, remedy: impl Into<String>) -> Finding {
-        Finding { status: Level::Error, ..Finding::warning(check, found, remedy) }
+    pub(super) fn error(check: &'static str, told: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
+        Finding::of(check, Level::Error, told).or(remedy)
     }
 
-    /// A trouble as a finding.
-    pub(super) fn of(check: &'static str, status: Level, trouble: &Trouble) -> Finding {
-        let remedy = trouble.remedy.as_deref().map(str::to_owned);
-        Finding { check, status, found: trouble.found(), remedy }
+    /// So grave, with the remedy that it has.
+    pub(super) fn of(check: &'static str, status: Level, told: impl Into<Trouble>) -> Finding {
+        Finding { check, status, told: told.into() }
     }
 
     /// The same with a remedy, for something that is fine but may be wanted otherwise.
-    pub(super) fn or(self, remedy: impl Into<String>) -> Finding {
-        Finding { remedy: Some(remedy.into()), ..self }
+    pub(super) fn or(self, remedy: impl Into<Box<str>>) -> Finding {
+        Finding { told: self.told.remedy(remedy), ..self }
     }
 }
 
@@ -94,9 +98,9 @@ pub(super) fn text(groups: &[Group]) -> Page {
     let mut page = Page::default();
     for Group { name, findings } in groups.iter().filter(|group| !group.findings.is_empty()) {
         page.line(name);
-        for Finding { status, found, remedy, .. } in findings {
-            page.line(format_args!("  {:<8} {found}", status.name()));
-            if let Some(remedy) = remedy {
+        for Finding { status, told, .. } in findings {
+            page.line(format_args!("  {:<8} {}", status.name(), told.found()));
+            if let Some(remedy) = &told.remedy {
                 page.line(format_args!("           -> {remedy}"));
             }
         }

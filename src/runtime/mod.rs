@@ -103,7 +103,7 @@ pub fn run(
 ) -> io::Result<()> {
     let Helpers { guardian, search } = helpers;
     let pulse = guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse()))?;
-    let processors = Processors::new(options.cpu)?;
+    let processors = Processors::new(options.cpu).map_err(io::Error::other)?;
     // First: who sees the link may send a signal, which must not leave the link behind.
     let signals = Signals::new()?;
     let pty = Pty::open(&options.symlink, &options.access)?;

@@ -10,13 +10,15 @@ use std::io;
 use std::thread;
 
 use log::{debug, info, warn};
+use nix::errno::Errno;
 use nix::sched::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
 use nix::sys::mman::{MlockAllFlags, mlockall};
 use nix::sys::prctl;
 use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit, rlim_t};
 use nix::unistd::Pid;
 
-use pinion_linux::sys;
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::{LOOK_AT_LOG, sys};
 
 use super::budget::Class;
 
@@ -68,19 +70,16 @@ pub fn lock_memory() {
     // no thread could be started any more. So memory is locked only where there is no limit.
     let locked = match limit != RLIM_INFINITY && !has_capability(CAP_IPC_LOCK) {
         true => Err(memory_refusal(limit)),
-        false => mlockall(lock_flags()).map_err(|error| error.to_string()),
+        false => mlockall(lock_flags()).map_err(|error| Trouble::new(error.to_string())),
     };
     if let Err(why) = locked {
         warn!("memory is not locked: {why}; steps may be late when memory is short");
     }
 }
 
-fn memory_refusal(limit: rlim_t) -> String {
-    format!(
-        "the limit is {} KiB: set LimitMEMLOCK=infinity in the service (ulimit -l unlimited in a shell), or grant \
-         CAP_IPC_LOCK",
-        limit / 1024
-    )
+fn memory_refusal(limit: rlim_t) -> Trouble {
+    Trouble::new(format!("the limit is {} KiB", limit / 1024))
+        .remedy("set LimitMEMLOCK=infinity in the service (ulimit -l unlimited in a shell), or grant CAP_IPC_LOCK")
 }
 
 /// How a thread is scheduled.
@@ -127,10 +126,10 @@ pub fn enter(role: Role) -> Scheduling {
 /// # Errors
 ///
 /// What keeps it from that, and the remedy.
-pub fn is_permitted() -> Result<(), String> {
+pub fn is_permitted() -> Result<(), Trouble> {
     // A scheduling class is a thread's own, and this one is gone at once.
     let tried = thread::spawn(|| sys::set_fifo(priority(Role::Core)).map_err(|error| refusal(&error)));
-    tried.join().unwrap_or_else(|_| Err("it could not be tried: look at the kernel's log (dmesg)".into()))
+    tried.join().unwrap_or_else(|_| Err(Trouble::new("it could not be tried").remedy(LOOK_AT_LOG)))
 }
 
 /// Makes the calling thread an ordinary one again.
@@ -163,28 +162,32 @@ fn touch_stack() {
 }
 
 /// For the log: what keeps this process from real-time scheduling, and the remedy.
-fn refusal(error: &io::Error) -> String {
+fn refusal(error: &io::Error) -> Trouble {
     scheduling_refusal(error, limit(Resource::RLIMIT_RTPRIO), has_capability(CAP_SYS_NICE), group_runtime_us())
 }
 
-fn scheduling_refusal(error: &io::Error, limit: rlim_t, capable: bool, group_runtime_us: Option<i64>) -> String {
-    if error.raw_os_error() != Some(libc::EPERM) {
-        return format!("{error}: look at the kernel's log (dmesg)");
-    }
-    if group_runtime_us == Some(0) {
-        return "this process's control group has no real-time budget (CONFIG_RT_GROUP_SCHED, cpu.rt_runtime_us is 0): \
-                write a budget such as 950000 there and into the groups above, or sysctl \
-                kernel.sched_rt_runtime_us=-1"
-            .into();
-    }
+fn scheduling_refusal(error: &io::Error, limit: rlim_t, capable: bool, group_runtime_us: Option<i64>) -> Trouble {
     let wanted = GUARDIAN_PRIORITY as rlim_t;
-    if !capable && limit < wanted {
-        return format!(
-            "the limit of real-time priorities is {limit} and CAP_SYS_NICE is missing: set LimitRTPRIO={wanted} in the \
-             service (rtprio in /etc/security/limits.conf for a shell), or grant CAP_SYS_NICE, or run as root"
-        );
+    if error.raw_os_error() != Some(libc::EPERM) {
+        Trouble::new(error.to_string()).remedy(LOOK_AT_LOG)
+    } else if group_runtime_us == Some(0) {
+        Trouble::new(
+            "this process's control group has no real-time budget (CONFIG_RT_GROUP_SCHED, cpu.rt_runtime_us is 0)",
+        )
+        .remedy(
+            "write a budget such as 950000 there and into the groups above, or sysctl kernel.sched_rt_runtime_us=-1",
+        )
+    } else if !capable && limit < wanted {
+        Trouble::new(format!("the limit of real-time priorities is {limit} and CAP_SYS_NICE is missing")).remedy(
+            format!(
+                "set LimitRTPRIO={wanted} in the service (rtprio in /etc/security/limits.conf for a shell), or grant \
+                 CAP_SYS_NICE, or run as root"
+            ),
+        )
+    } else {
+        Trouble::new(format!("{error}: a container or a security module forbids it"))
+            .remedy("allow sched_setscheduler there (CAP_SYS_NICE)")
     }
-    format!("{error}: a container or a security module forbids it: allow sched_setscheduler there (CAP_SYS_NICE)")
 }
 
 fn limit(resource: Resource) -> rlim_t {
@@ -233,15 +236,17 @@ impl Processors {
     /// # Errors
     ///
     /// The process may not use that processor, or there is none of this number.
-    pub fn new(core: Option<usize>) -> io::Result<Processors> {
-        let processors = Processors { present: sched_getaffinity(MYSELF)?, core };
+    pub fn new(core: Option<usize>) -> Result<Processors, Trouble> {
+        let unknown = |error: Errno| Trouble::new(error.to_string()).of("the processors of this process");
+        let processors = Processors { present: sched_getaffinity(MYSELF).map_err(unknown)?, core };
         let Some(cpu) = core else { return Ok(processors) };
         let tried = processors.confine();
-        sched_setaffinity(MYSELF, &processors.present)?;
+        sched_setaffinity(MYSELF, &processors.present).map_err(unknown)?;
         tried.map(|()| processors).map_err(|_| {
             let known = (0..CpuSet::count()).filter(|cpu| processors.present.is_set(*cpu) == Ok(true));
             let known: Vec<String> = known.map(|cpu| cpu.to_string()).collect();
-            io::Error::other(format!("--cpu {cpu}: there is no such processor: choose one of {}", known.join(", ")))
+            let trouble = Trouble::new("there is no such processor");
+            trouble.remedy(format!("choose one of {}", known.join(", "))).of(format_args!("--cpu {cpu}"))
         })
     }
 
@@ -280,22 +285,22 @@ mod tests {
     #[test]
     fn what_keeps_us_from_real_time() {
         let eperm = io::Error::from_raw_os_error(libc::EPERM);
-        let text = scheduling_refusal(&eperm, 0, false, None);
+        let text = scheduling_refusal(&eperm, 0, false, None).to_string();
         assert!(
             text.starts_with("the limit of real-time priorities is 0 and CAP_SYS_NICE is missing: set LimitRTPRIO=50"),
             "{text}"
         );
         let text = scheduling_refusal(&eperm, 99, true, Some(0));
-        assert!(text.contains("cpu.rt_runtime_us is 0"), "{text}");
+        assert!(text.cause.contains("cpu.rt_runtime_us is 0"), "{text}");
         let text = scheduling_refusal(&eperm, 0, true, Some(950_000));
-        assert!(text.contains("a container or a security module"), "{text}");
+        assert!(text.cause.contains("a container or a security module"), "{text}");
         let einval = io::Error::from_raw_os_error(libc::EINVAL);
-        assert!(scheduling_refusal(&einval, 0, false, None).contains("dmesg"));
+        assert!(scheduling_refusal(&einval, 0, false, None).to_string().contains("dmesg"));
     }
 
     #[test]
     fn what_keeps_memory_from_being_locked() {
-        let text = memory_refusal(8 << 20);
+        let text = memory_refusal(8 << 20).to_string();
         assert!(text.starts_with("the limit is 8192 KiB: set LimitMEMLOCK=infinity"), "{text}");
     }
 

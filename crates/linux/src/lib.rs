@@ -35,7 +35,7 @@ mod w1;
 
 const DEV: &str = "/dev";
 /// The remedy where only the kernel knows more.
-const LOOK_AT_LOG: &str = "look at the kernel's log (dmesg)";
+pub const LOOK_AT_LOG: &str = "look at the kernel's log (dmesg)";
 const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
 const SPI_MASTERS: &str = "/sys/class/spi_master";

@@ -573,7 +573,7 @@ mod tests {
         assert!(told(&presence(&tree.machine()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
         NODES.iter().for_each(|(_, path)| tree.put(path, ""));
         let findings = presence(&tree.machine());
-        assert!(findings.iter().all(|finding| finding.status == Fine && finding.remedy.is_none()), "{findings:?}");
+        assert!(findings.iter().all(|finding| finding.status == Fine && finding.told.remedy.is_none()), "{findings:?}");
         told(&findings, "i2c", Fine, "I2C: /dev/i2c-1");
     }
 

@@ -296,7 +296,7 @@ fn access(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance
     if klippy.unit.is_some() || judged.status == Level::Ok {
         return judged;
     }
-    Finding::warning(CHECK, judged.found, STRANGER)
+    Finding::warning(CHECK, judged.told, STRANGER)
 }
 
 fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {

@@ -292,7 +292,7 @@ mod tests {
         let findings = found(&Tree::new(), None);
         assert_eq!(findings.len(), 4);
         assert!(
-            findings.iter().all(|finding| finding.status == Ok && finding.found.contains("unknown")),
+            findings.iter().all(|finding| finding.status == Ok && finding.told.found().contains("unknown")),
             "{findings:?}"
         );
     }

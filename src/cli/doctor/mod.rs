@@ -181,11 +181,12 @@ mod tests {
     /// Asserts that a check has found something with these words, and returns what mends it.
     #[track_caller]
     pub(super) fn told(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
-        let is_it =
-            |finding: &&Finding| finding.check == check && finding.status == status && finding.found.contains(words);
+        let is_it = |finding: &&Finding| {
+            finding.check == check && finding.status == status && finding.told.found().contains(words)
+        };
         let found = findings.iter().find(is_it);
         assert!(found.is_some(), "no {status:?} of {check} with \"{words}\" in {findings:#?}");
-        found.and_then(|finding| finding.remedy.clone()).unwrap_or_default()
+        found.and_then(|finding| finding.told.remedy.clone()).unwrap_or_default().into()
     }
 
     #[test]
@@ -271,7 +272,7 @@ mod tests {
         };
         assert_eq!(verdict(Fitness::Steppers, None).status, Level::Ok);
         assert_eq!(verdict(Fitness::Steppers, Some("run it as root")).status, Level::Warning);
-        assert_eq!(verdict(Fitness::Nothing, Some("isolate")).remedy.as_deref(), Some("isolate"));
+        assert_eq!(verdict(Fitness::Nothing, Some("isolate")).told.remedy.as_deref(), Some("isolate"));
         assert_eq!(latency(Err("no thread".into())).status, Level::Warning);
     }
 }

@@ -35,7 +35,7 @@ fn each_spi_bus_has_its_worker_and_the_first_one_sends_back_what_it_is_sent() {
     assert_eq!((loopback.bus.as_str(), driver.bus.as_str()), ("spi0", "spi1"));
     let error = bench.spi("spidev7.0", None).err().unwrap();
     assert_eq!(error.reason, reason::SPI_OPEN);
-    assert_eq!(error.trouble.remedy.as_deref(), Some("use spidev0.0 or spidev1.0"));
+    assert!(error.to_string().contains("use spidev0.0 or spidev1.0"), "{error}");
 }
 
 #[test]
