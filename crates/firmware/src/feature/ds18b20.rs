@@ -128,7 +128,7 @@ impl Object for Ds18b20 {
                 if self.error_count > self.max_error_count {
                     let times = self.error_count;
                     let cause = format!("{} ({times} readings in a row failed)", trouble.cause).into();
-                    return turn.try_shut_down(Shutdown::because(READ_FAILED, Trouble { cause, ..trouble }));
+                    return turn.try_shut_down(Shutdown::because(READ_FAILED, Trouble { cause, ..trouble.clone() }));
                 }
             }
         }

@@ -10,8 +10,8 @@
 use std::sync::{Arc, Mutex, PoisonError};
 
 use crate::board::{BusDevice, BusError, BusStatus, OnWorker};
-use crate::trouble::Trouble;
 use crate::shutdown::Shutdown;
+use crate::trouble::Trouble;
 
 use super::{BusCounts, Calls, Errand, Mcu, Oid, Slot, Turn, WorkerId};
 
