@@ -14,7 +14,7 @@ use pinion_protocol::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID}
 use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::Reader;
 
-use super::command::{ConstantValue, Feature, Handler};
+use super::command::{Command, ConstantValue, Feature, Handler};
 use super::{DialectName, Generation, Generations, base, since};
 
 /// What to do about a host that has another dictionary.
@@ -31,6 +31,18 @@ pub(super) struct Entry {
 }
 
 impl Entry {
+    fn new(command: &Command, is_own: bool) -> io::Result<Entry> {
+        let conversions = format::parameters(command.format)
+            .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
+        Ok(Entry {
+            format: command.format,
+            handler: command.handler,
+            in_shutdown: command.in_shutdown,
+            is_own,
+            conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
+        })
+    }
+
     /// Takes the parameters off the reader without running the command.
     pub(super) fn skip(&self, reader: &mut Reader<'_>) -> Result<(), Shutdown> {
         for conversion in &self.conversions {
@@ -121,84 +133,94 @@ pub struct Dialect {
     compressed: Vec<u8>,
 }
 
+/// A dictionary with what it says of the program, and no messages yet.
+fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
+    let hosts = since(Generation::V0_13);
+    let is_told = name.generations().iter().any(|generation| hosts.contains(*generation));
+    let told = |text: &str| if is_told { text.to_owned() } else { String::new() };
+    Dictionary {
+        app: told(firmware.app),
+        build_versions: firmware.build_versions.into(),
+        license: told(firmware.license),
+        version: firmware.version.into(),
+        ..Dictionary::default()
+    }
+}
+
+/// The commands by the [`place`] of their ids, and the ids of the responses in the order of the features.
+type Numbered = (Vec<Option<Entry>>, Vec<Option<u32>>);
+
+/// Gives the messages of a dialect their ids, and publishes them.
+fn number(features: &'static [Feature], name: &DialectName, dictionary: &mut Dictionary) -> io::Result<Numbered> {
+    let mut ids = ids();
+    let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
+    let (mut commands, mut response_ids) = (Vec::new(), Vec::new());
+    let responses = Choice::new(name, all(features, |feature| feature.responses), |form| {
+        (format::name(form.format), form.generations)
+    });
+    let taken = Choice::new(name, all(features, |feature| feature.commands), |command| {
+        (format::name(command.format), command.generations)
+    });
+    // The machine's own messages have the same ids in every dialect: an `emergency_stop` means the
+    // same to a machine that was given another one since its host read the dictionary.
+    let (base, others) = features.split_at(features.len().min(1));
+    for (features, is_own) in [(base, true), (others, false)] {
+        // Responses first: what they carry fills a block to the last byte, so their ids are short.
+        for form in all(features, |feature| feature.responses) {
+            if !responses.has(form) {
+                response_ids.push(None);
+                continue;
+            }
+            let id = match format::name(form.format) {
+                "identify_response" => IDENTIFY_RESPONSE_ID,
+                _ => next_id()?,
+            };
+            response_ids.push(Some(id as u32));
+            dictionary.responses.insert(form.format.into(), json!(id));
+        }
+        for command in all(features, |feature| feature.commands).filter(|command| taken.has(command)) {
+            let id = match format::name(command.format) {
+                "identify" => IDENTIFY_ID,
+                _ => next_id()?,
+            };
+            let place = place(id as u32);
+            if commands.len() <= place {
+                commands.resize_with(place + 1, || None);
+            }
+            commands[place] = Some(Entry::new(command, is_own)?);
+            dictionary.commands.insert(command.format.into(), json!(id));
+        }
+    }
+    Ok((commands, response_ids))
+}
+
+/// Publishes the constants and enumerations of a dialect.
+fn publish_names(features: &'static [Feature], name: &DialectName, board: &dyn Board, dictionary: &mut Dictionary) {
+    let constants = all(features, |feature| feature.constants);
+    let had = Choice::new(name, constants.clone(), |constant| (constant.name, constant.generations));
+    for constant in constants.filter(|constant| had.has(constant)) {
+        let value = match constant.value {
+            ConstantValue::Number(number) => json!(number),
+            ConstantValue::Text(text) => json!(text),
+        };
+        dictionary.config.insert(constant.name.into(), value);
+    }
+    let enumerations = all(features, |feature| feature.enumerations);
+    let had = Choice::new(name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.generations));
+    for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {
+        let values = names((enumeration.values)(board));
+        dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
+    }
+}
+
 impl Dialect {
     /// Numbers the messages of the firmware's features that the hosts of this dialect take, and publishes them with
     /// the board's names.
     pub fn new(firmware: &Firmware, board: &dyn Board, name: DialectName) -> io::Result<Dialect> {
         let features = firmware.features;
-        let serves = |hosts: Generations| name.generations().iter().any(|generation| hosts.contains(*generation));
-        let told = |text: &str| if serves(since(Generation::V0_13)) { text.to_owned() } else { String::new() };
-        let mut dictionary = Dictionary {
-            app: told(firmware.app),
-            build_versions: firmware.build_versions.into(),
-            license: told(firmware.license),
-            version: firmware.version.into(),
-            ..Dictionary::default()
-        };
-        let mut ids = ids();
-        let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
-        let mut response_ids = Vec::new();
-        let mut commands = Vec::new();
-        let responses = Choice::new(&name, all(features, |feature| feature.responses), |form| {
-            (format::name(form.format), form.generations)
-        });
-        let taken = Choice::new(&name, all(features, |feature| feature.commands), |command| {
-            (format::name(command.format), command.generations)
-        });
-        // The machine's own messages have the same ids in every dialect: an `emergency_stop` means the
-        // same to a machine that was given another one since its host read the dictionary.
-        let (base, others) = features.split_at(features.len().min(1));
-        for (features, is_own) in [(base, true), (others, false)] {
-            // Responses first: what they carry fills a block to the last byte, so their ids are short.
-            for form in all(features, |feature| feature.responses) {
-                if !responses.has(form) {
-                    response_ids.push(None);
-                    continue;
-                }
-                let id = match format::name(form.format) {
-                    "identify_response" => IDENTIFY_RESPONSE_ID,
-                    _ => next_id()?,
-                };
-                response_ids.push(Some(id as u32));
-                dictionary.responses.insert(form.format.into(), json!(id));
-            }
-            for command in all(features, |feature| feature.commands).filter(|command| taken.has(command)) {
-                let conversions = format::parameters(command.format)
-                    .ok_or_else(|| io::Error::other(format!("\"{}\" is no format", command.format)))?;
-                let entry = Entry {
-                    format: command.format,
-                    handler: command.handler,
-                    in_shutdown: command.in_shutdown,
-                    is_own,
-                    conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
-                };
-                let id = match format::name(command.format) {
-                    "identify" => IDENTIFY_ID,
-                    _ => next_id()?,
-                };
-                let place = place(id as u32);
-                if commands.len() <= place {
-                    commands.resize_with(place + 1, || None);
-                }
-                commands[place] = Some(entry);
-                dictionary.commands.insert(command.format.into(), json!(id));
-            }
-        }
-        let constants = all(features, |feature| feature.constants);
-        let had = Choice::new(&name, constants.clone(), |constant| (constant.name, constant.generations));
-        for constant in constants.filter(|constant| had.has(constant)) {
-            let value = match constant.value {
-                ConstantValue::Number(number) => json!(number),
-                ConstantValue::Text(text) => json!(text),
-            };
-            dictionary.config.insert(constant.name.into(), value);
-        }
-        let enumerations = all(features, |feature| feature.enumerations);
-        let had = Choice::new(&name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.generations));
-        for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {
-            let values = names((enumeration.values)(board));
-            dictionary.enumerations.insert(enumeration.name.into(), Value::Object(values));
-        }
+        let mut dictionary = head(firmware, &name);
+        let (commands, response_ids) = number(features, &name, &mut dictionary)?;
+        publish_names(features, &name, board, &mut dictionary);
         let shutdowns: Vec<ShutdownReason> = features.iter().flat_map(|feature| feature.shutdowns).copied().collect();
         let texts = shutdowns.iter().zip(0..).map(|(reason, id)| (reason.text().into(), json!(id)));
         dictionary.enumerations.insert("static_string_id".into(), Value::Object(texts.collect()));
