@@ -14,7 +14,7 @@ use crate::mcu::{
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
 
-use super::ready_adc::{Frame, ReadyChip, Sample, attach, attach_probe, configure_spi, query, query_status, signed_24};
+use super::ready_adc::{Frame, ReadyAdc, ReadyChip, Sample, configure_spi, signed_24};
 use super::spi::spi_shutdown;
 use crate::board::BusError;
 
@@ -53,6 +53,8 @@ impl ReadyChip for Ads1220 {
     }
 }
 
+type Sensor = ReadyAdc<Ads1220>;
+
 const CONFIG_ADS1220: Command = command!(
     "config_ads1220 oid=%c spi_oid=%c data_ready_pin=%u",
     |mcu, oid: Oid, spi_oid: Oid, data_ready_pin: Pin| {
@@ -61,25 +63,28 @@ const CONFIG_ADS1220: Command = command!(
 )
 .of(since(V0_13));
 
-const ADS1220_ATTACH_TRIGGER_ANALOG: Command =
-    command!("ads1220_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
-        attach::<Ads1220>(mcu, oid, trigger_analog_oid)
-    })
-    .of(since(Master));
+const ADS1220_ATTACH_TRIGGER_ANALOG: Command = command!(
+    "ads1220_attach_trigger_analog oid=%c trigger_analog_oid=%c",
+    Sensor,
+    |sensor, turn, trigger_analog_oid: Oid| { sensor.attached.attach(turn, trigger_analog_oid) }
+)
+.of(since(Master));
 
 const ADS1220_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads1220_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
-    |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Ads1220>(mcu, oid, load_cell_probe_oid)
+    Sensor,
+    |sensor, turn, load_cell_probe_oid: Oid| sensor.attached.attach_probe(turn, load_cell_probe_oid)
 )
 .of(since(Kalico));
 
-const QUERY_ADS1220: Command = command!("query_ads1220 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-    query::<Ads1220>(mcu, oid, rest_ticks)
-})
-.of(since(V0_13));
+const QUERY_ADS1220: Command =
+    command!("query_ads1220 oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
+        sensor.query(turn, rest_ticks)
+    })
+    .of(since(V0_13));
 
 const QUERY_ADS1220_STATUS: Command =
-    command!("query_ads1220_status oid=%c", |mcu, oid: Oid| query_status::<Ads1220>(mcu, oid)).of(since(V0_13));
+    command!("query_ads1220_status oid=%c", Sensor, |sensor, turn| sensor.query_status(turn)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

@@ -15,9 +15,7 @@ use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
 
 use super::named;
-use super::ready_adc::{
-    CHANNELS_MAX, Frame, ReadyChip, Sample, attach, attach_probe, configure_spi, query, query_status, signed_24,
-};
+use super::ready_adc::{CHANNELS_MAX, Frame, ReadyAdc, ReadyChip, Sample, configure_spi, signed_24};
 use super::spi::spi_shutdown;
 use crate::board::BusError;
 
@@ -184,6 +182,8 @@ impl ReadyChip for Ads131m0x {
     }
 }
 
+type Sensor = ReadyAdc<Ads131m0x>;
+
 const CONFIG_ADS131M0X: Command = command!(
     "config_ads131m0x oid=%c spi_oid=%c channel=%c num_channels=%c data_ready_pin=%u",
     |mcu, oid: Oid, spi_oid: Oid, channel: u8, num_channels: u8, data_ready_pin: Pin| {
@@ -222,25 +222,27 @@ const CONFIG_ADS131M0X_OF_KALICO: Command = command!(
 
 const ADS131M0X_ATTACH_TRIGGER_ANALOG: Command = command!(
     "ads131m0x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
-    |mcu, oid: Oid, trigger_analog_oid: Oid| attach::<Ads131m0x>(mcu, oid, trigger_analog_oid)
+    Sensor,
+    |sensor, turn, trigger_analog_oid: Oid| sensor.attached.attach(turn, trigger_analog_oid)
 )
 .of(since(Master));
 
 const ADS131M0X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "ads131m0x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
-    |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Ads131m0x>(mcu, oid, load_cell_probe_oid)
+    Sensor,
+    |sensor, turn, load_cell_probe_oid: Oid| sensor.attached.attach_probe(turn, load_cell_probe_oid)
 )
 .of(since(Kalico));
 
 const QUERY_ADS131M0X: Command =
-    command!("query_ads131m0x oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-        query::<Ads131m0x>(mcu, oid, rest_ticks)
+    command!("query_ads131m0x oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
+        sensor.query(turn, rest_ticks)
     })
     .of(since(Master).and(Kalico));
 
-const QUERY_ADS131M0X_STATUS: Command =
-    command!("query_ads131m0x_status oid=%c", |mcu, oid: Oid| query_status::<Ads131m0x>(mcu, oid))
-        .of(since(Master).and(Kalico));
+const QUERY_ADS131M0X_STATUS: Command = command!("query_ads131m0x_status oid=%c", Sensor, |sensor, turn| sensor
+    .query_status(turn))
+.of(since(Master).and(Kalico));
 
 #[cfg(test)]
 mod tests {

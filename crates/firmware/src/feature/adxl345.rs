@@ -13,7 +13,7 @@ use crate::mcu::{
 };
 use crate::time::Ticks;
 
-use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_at, query_status};
+use super::fifo_sensor::{BusType, FifoChip, FifoSensor, Fill, Reading, configure};
 use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
@@ -114,23 +114,27 @@ impl FifoChip for Adxl345 {
     }
 }
 
+type Sensor = FifoSensor<Adxl345>;
+
 const CONFIG_ADXL345: Command = command!("config_adxl345 oid=%c spi_oid=%c", |mcu, oid: Oid, spi_oid: Oid| {
     configure(mcu, oid, spi_oid, Adxl345)
 });
 
-const QUERY_ADXL345_AT: Command =
-    command!("query_adxl345 oid=%c clock=%u rest_ticks=%u", |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks| {
-        query_at::<Adxl345>(mcu, oid, clock, rest_ticks)
-    })
-    .of(until(V0_12));
+const QUERY_ADXL345_AT: Command = command!(
+    "query_adxl345 oid=%c clock=%u rest_ticks=%u",
+    Sensor,
+    |sensor, turn, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(turn, clock, rest_ticks) }
+)
+.of(until(V0_12));
 
-const QUERY_ADXL345: Command = command!("query_adxl345 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-    query::<Adxl345>(mcu, oid, rest_ticks)
-})
-.of(since(V0_13));
+const QUERY_ADXL345: Command =
+    command!("query_adxl345 oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
+        sensor.query(turn, rest_ticks)
+    })
+    .of(since(V0_13));
 
 const QUERY_ADXL345_STATUS: Command =
-    command!("query_adxl345_status oid=%c", |mcu, oid: Oid| query_status::<Adxl345>(mcu, oid));
+    command!("query_adxl345_status oid=%c", Sensor, |sensor, turn| sensor.ask_status(turn));
 
 #[cfg(test)]
 mod tests {

@@ -309,8 +309,9 @@ const CONFIG_ANALOG_IN: Command = command!("config_analog_in oid=%c pin=%u", |mc
 
 const QUERY_ANALOG_IN: Command = command!(
     "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u min_value=%hu max_value=%hu range_check_count=%c",
-    |mcu,
-     oid: Oid,
+    AnalogIn,
+    |input,
+     turn,
      clock: WireClock,
      sample_ticks: Ticks,
      sample_count: u8,
@@ -318,19 +319,20 @@ const QUERY_ANALOG_IN: Command = command!(
      min_value: u16,
      max_value: u16,
      range_check_count: u8| {
-        let at = mcu.instant(clock);
+        let at = turn.instant(clock);
         let bytes_per_report = None;
         let query =
             Query { sample_ticks, sample_count, rest_ticks, min_value, max_value, range_check_count, bytes_per_report };
-        mcu.with::<AnalogIn, _>(oid, |input, turn| input.query(turn, at, query))
+        input.query(turn, at, query)
     }
 )
 .of(until(V0_13).and(Kalico));
 
 const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
     "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u bytes_per_report=%c min_value=%hu max_value=%hu range_check_count=%c",
-    |mcu,
-     oid: Oid,
+    AnalogIn,
+    |input,
+     turn,
      clock: WireClock,
      sample_ticks: Ticks,
      sample_count: u8,
@@ -339,28 +341,25 @@ const QUERY_ANALOG_IN_FOR_BATCHES: Command = command!(
      min_value: u16,
      max_value: u16,
      range_check_count: u8| {
-        let at = mcu.instant(clock);
-        mcu.with::<AnalogIn, _>(oid, |input, turn| {
-            let bytes_per_report = Some(BytesPerReport::of(bytes_per_report)?);
-            let query = Query {
-                sample_ticks,
-                sample_count,
-                rest_ticks,
-                min_value,
-                max_value,
-                range_check_count,
-                bytes_per_report,
-            };
-            input.query(turn, at, query)
-        })
+        let at = turn.instant(clock);
+        let bytes_per_report = Some(BytesPerReport::of(bytes_per_report)?);
+        let query = Query {
+            sample_ticks,
+            sample_count,
+            rest_ticks,
+            min_value,
+            max_value,
+            range_check_count,
+            bytes_per_report,
+        };
+        input.query(turn, at, query)
     }
 )
 .of(since(Master));
 
 const ANALOG_IN_ATTACH_TRIGGER_ANALOG: Command = command!(
     "analog_in_attach_trigger_analog oid=%c trigger_analog_oid=%c",
-    |mcu, oid: Oid, trigger_analog_oid: Oid| {
-        mcu.with::<AnalogIn, _>(oid, |input, turn| input.attached.attach(turn, trigger_analog_oid))
-    }
+    AnalogIn,
+    |input, turn, trigger_analog_oid: Oid| input.attached.attach(turn, trigger_analog_oid)
 )
 .of(since(Master));

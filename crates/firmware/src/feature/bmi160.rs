@@ -10,7 +10,7 @@ use crate::board::{BusDevice, BusError};
 use crate::mcu::{Command, Feature, Generation::Master, Oid, command, since};
 use crate::time::Ticks;
 
-use super::fifo_sensor::{BusType, FifoChip, Fill, Reading, configure, query, query_status};
+use super::fifo_sensor::{BusType, FifoChip, FifoSensor, Fill, Reading, configure};
 
 pub(super) const FEATURE: Feature =
     Feature { name: "bmi160", commands: &[CONFIG_BMI160, QUERY_BMI160, QUERY_BMI160_STATUS], ..Feature::EMPTY };
@@ -62,19 +62,22 @@ impl FifoChip for Bmi160 {
     }
 }
 
+type Sensor = FifoSensor<Bmi160>;
+
 const CONFIG_BMI160: Command =
     command!("config_bmi160 oid=%c bus_oid=%c bus_oid_type=%c", |mcu, oid: Oid, bus_oid: Oid, bus_oid_type: u8| {
         configure(mcu, oid, bus_oid, Bmi160 { bus_type: BusType::of(bus_oid_type)? })
     })
     .of(since(Master));
 
-const QUERY_BMI160: Command = command!("query_bmi160 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-    query::<Bmi160>(mcu, oid, rest_ticks)
-})
-.of(since(Master));
+const QUERY_BMI160: Command =
+    command!("query_bmi160 oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
+        sensor.query(turn, rest_ticks)
+    })
+    .of(since(Master));
 
 const QUERY_BMI160_STATUS: Command =
-    command!("query_bmi160_status oid=%c", |mcu, oid: Oid| query_status::<Bmi160>(mcu, oid)).of(since(Master));
+    command!("query_bmi160_status oid=%c", Sensor, |sensor, turn| sensor.ask_status(turn)).of(since(Master));
 
 #[cfg(test)]
 mod tests {

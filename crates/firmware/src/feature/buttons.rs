@@ -222,37 +222,35 @@ const CONFIG_BUTTONS: Command = command!("config_buttons oid=%c button_count=%c"
     mcu.assign(oid, Buttons::new(count))
 });
 
-const BUTTONS_ADD: Command =
-    command!("buttons_add oid=%c pos=%c pin=%u pull_up=%c", |mcu, oid: Oid, pos: u8, pin: Pin, pull_up: i8| {
-        mcu.with::<Buttons, _>(oid, |buttons, turn| buttons.add(turn, pos, pin, pull_up))
-    });
+const BUTTONS_ADD: Command = command!(
+    "buttons_add oid=%c pos=%c pin=%u pull_up=%c",
+    Buttons,
+    |buttons, turn, pos: u8, pin: Pin, pull_up: i8| buttons.add(turn, pos, pin, pull_up)
+);
 
 const BUTTONS_QUERY: Command = command!(
     "buttons_query oid=%c clock=%u rest_ticks=%u retransmit_count=%c invert=%c",
-    |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, retransmit_count: u8, invert: u8| {
-        let at = mcu.instant(clock);
-        mcu.with::<Buttons, _>(oid, |buttons, turn| {
-            let retransmit_count = RetransmitCount::of(retransmit_count)?;
-            turn.cancel(TIMER);
-            buttons.rest_ticks = rest_ticks;
-            buttons.retransmit_count = retransmit_count;
-            buttons.pressed = invert;
-            buttons.last_sample = invert;
-            buttons.counts = false;
-            buttons.ack_count = 0;
-            buttons.report_count = 0;
-            buttons.retransmit = None;
-            if rest_ticks == Ticks(0) {
-                return Ok(());
-            }
-            turn.schedule(TIMER, at)
-        })
+    Buttons,
+    |buttons, turn, clock: WireClock, rest_ticks: Ticks, retransmit_count: u8, invert: u8| {
+        let at = turn.instant(clock);
+        let retransmit_count = RetransmitCount::of(retransmit_count)?;
+        turn.cancel(TIMER);
+        buttons.rest_ticks = rest_ticks;
+        buttons.retransmit_count = retransmit_count;
+        buttons.pressed = invert;
+        buttons.last_sample = invert;
+        buttons.counts = false;
+        buttons.ack_count = 0;
+        buttons.report_count = 0;
+        buttons.retransmit = None;
+        if rest_ticks == Ticks(0) {
+            return Ok(());
+        }
+        turn.schedule(TIMER, at)
     }
 );
 
-const BUTTONS_ACK: Command = command!("buttons_ack oid=%c count=%c", |mcu, oid: Oid, count: u8| {
-    mcu.with::<Buttons, _>(oid, |buttons, _| {
-        buttons.acknowledge(count);
-        Ok(())
-    })
+const BUTTONS_ACK: Command = command!("buttons_ack oid=%c count=%c", Buttons, |buttons, _, count: u8| {
+    buttons.acknowledge(count);
+    Ok(())
 });

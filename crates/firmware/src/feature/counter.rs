@@ -318,19 +318,18 @@ const CONFIG_COUNTER: Command =
 
 const QUERY_COUNTER: Command = command!(
     "query_counter oid=%c clock=%u poll_ticks=%u sample_ticks=%u",
-    |mcu, oid: Oid, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
-        let at = mcu.instant(clock);
-        mcu.with::<Counter, _>(oid, |counter, turn| {
-            turn.cancel(TIMER);
-            counter.poll_ticks = poll_ticks;
-            counter.sample_ticks = sample_ticks;
-            counter.next_sample = at;
-            if counter.count == 0 {
-                counter.count_clock = at;
-            }
-            counter.counts = false;
-            turn.schedule(TIMER, at)
-        })
+    Counter,
+    |counter, turn, clock: WireClock, poll_ticks: Ticks, sample_ticks: Ticks| {
+        let at = turn.instant(clock);
+        turn.cancel(TIMER);
+        counter.poll_ticks = poll_ticks;
+        counter.sample_ticks = sample_ticks;
+        counter.next_sample = at;
+        if counter.count == 0 {
+            counter.count_clock = at;
+        }
+        counter.counts = false;
+        turn.schedule(TIMER, at)
     }
 );
 

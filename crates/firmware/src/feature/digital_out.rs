@@ -268,28 +268,28 @@ const CONFIG_DIGITAL_OUT: Command = command!(
 );
 
 const SET_DIGITAL_OUT_PWM_CYCLE: Command =
-    command!("set_digital_out_pwm_cycle oid=%c cycle_ticks=%u", |mcu, oid: Oid, cycle_ticks: Ticks| {
-        mcu.with::<DigitalOut, _>(oid, |output, _| {
-            if !output.queue.is_empty() {
-                return Err(Shutdown::by_host(
-                    PWM_CYCLE_WITH_QUEUE,
-                    "set_digital_out_pwm_cycle came while changes are queued",
-                ));
-            }
-            output.cycle = cycle_ticks;
-            Ok(())
-        })
+    command!("set_digital_out_pwm_cycle oid=%c cycle_ticks=%u", DigitalOut, |output, _, cycle_ticks: Ticks| {
+        if !output.queue.is_empty() {
+            return Err(Shutdown::by_host(
+                PWM_CYCLE_WITH_QUEUE,
+                "set_digital_out_pwm_cycle came while changes are queued",
+            ));
+        }
+        output.cycle = cycle_ticks;
+        Ok(())
     });
 
-const QUEUE_DIGITAL_OUT: Command =
-    command!("queue_digital_out oid=%c clock=%u on_ticks=%u", |mcu, oid: Oid, clock: WireClock, on_ticks: Ticks| {
-        let at = mcu.instant(clock);
-        mcu.with::<DigitalOut, _>(oid, |output, turn| output.queue(turn, at, on_ticks))
-    });
+const QUEUE_DIGITAL_OUT: Command = command!(
+    "queue_digital_out oid=%c clock=%u on_ticks=%u",
+    DigitalOut,
+    |output, turn, clock: WireClock, on_ticks: Ticks| {
+        let at = turn.instant(clock);
+        output.queue(turn, at, on_ticks)
+    }
+);
 
-const UPDATE_DIGITAL_OUT: Command = command!("update_digital_out oid=%c value=%c", |mcu, oid: Oid, value: bool| {
-    mcu.with::<DigitalOut, _>(oid, |output, turn| output.update(turn, value))
-});
+const UPDATE_DIGITAL_OUT: Command =
+    command!("update_digital_out oid=%c value=%c", DigitalOut, |output, turn, value: bool| output.update(turn, value));
 
 const SET_DIGITAL_OUT: Command = command!("set_digital_out pin=%u value=%c", |mcu, pin: Pin, value: bool| {
     let oid = mcu.own::<SetLines>();

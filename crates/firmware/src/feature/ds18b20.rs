@@ -188,18 +188,17 @@ const CONFIG_DS18B20_OF_KALICO: Command = command!(
 
 const QUERY_DS18B20: Command = command!(
     "query_ds18b20 oid=%c clock=%u rest_ticks=%u min_value=%i max_value=%i",
-    |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
-        let at = mcu.instant(clock);
-        mcu.with::<Ds18b20, _>(oid, |sensor, turn| {
-            turn.cancel(TIMER);
-            sensor.look.drop_pending();
-            if rest_ticks == Ticks(0) {
-                return Ok(());
-            }
-            sensor.rest_ticks = rest_ticks;
-            sensor.min_value = min_value;
-            sensor.max_value = max_value;
-            turn.schedule(TIMER, at)
-        })
+    Ds18b20,
+    |sensor, turn, clock: WireClock, rest_ticks: Ticks, min_value: i32, max_value: i32| {
+        let at = turn.instant(clock);
+        turn.cancel(TIMER);
+        sensor.look.drop_pending();
+        if rest_ticks == Ticks(0) {
+            return Ok(());
+        }
+        sensor.rest_ticks = rest_ticks;
+        sensor.min_value = min_value;
+        sensor.max_value = max_value;
+        turn.schedule(TIMER, at)
     }
 );

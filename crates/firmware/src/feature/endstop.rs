@@ -159,8 +159,9 @@ const CONFIG_ENDSTOP: Command =
 
 const ENDSTOP_HOME: Command = command!(
     "endstop_home oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u pin_value=%c trsync_oid=%c trigger_reason=%c",
-    |mcu,
-     oid: Oid,
+    Endstop,
+    |endstop,
+     turn,
      clock: WireClock,
      sample_ticks: Ticks,
      sample_count: u8,
@@ -168,29 +169,26 @@ const ENDSTOP_HOME: Command = command!(
      pin_value: bool,
      trsync_oid: Oid,
      trigger_reason: u8| {
-        let at = mcu.instant(clock);
-        mcu.with::<Endstop, _>(oid, |endstop, turn| {
-            turn.cancel(TIMER);
-            endstop.homing = None;
-            endstop.due = None;
-            if sample_count == 0 {
-                return Ok(());
-            }
-            turn.require::<Trsync>(trsync_oid)?;
-            endstop.homing = Some(Homing {
-                sample_ticks,
-                sample_count,
-                rest_ticks,
-                pin_value,
-                trsync: trsync_oid,
-                trigger_reason,
-                wanted: sample_count,
-            });
-            turn.schedule(TIMER, at)
-        })
+        let at = turn.instant(clock);
+        turn.cancel(TIMER);
+        endstop.homing = None;
+        endstop.due = None;
+        if sample_count == 0 {
+            return Ok(());
+        }
+        turn.require::<Trsync>(trsync_oid)?;
+        endstop.homing = Some(Homing {
+            sample_ticks,
+            sample_count,
+            rest_ticks,
+            pin_value,
+            trsync: trsync_oid,
+            trigger_reason,
+            wanted: sample_count,
+        });
+        turn.schedule(TIMER, at)
     }
 );
 
-const ENDSTOP_QUERY_STATE: Command = command!("endstop_query_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Endstop, _>(oid, |endstop, turn| endstop.query(turn))
-});
+const ENDSTOP_QUERY_STATE: Command =
+    command!("endstop_query_state oid=%c", Endstop, |endstop, turn| endstop.query(turn));

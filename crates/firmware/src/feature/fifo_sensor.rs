@@ -282,7 +282,7 @@ enum Phase {
 /// How often a FIFO of 32 samples is read after the end, so that one that never gets empty ends, too.
 const LAST_READS: u8 = 33;
 /// A sensor.
-struct FifoSensor<C: FifoChip> {
+pub(super) struct FifoSensor<C: FifoChip> {
     chip: C,
     device: Oid,
     bulk: SensorBulk,
@@ -373,8 +373,13 @@ impl<C: FifoChip> FifoSensor<C> {
         }
     }
 
-    /// Measures from `at` on, for a host that leaves it to the machine to switch the sensor on.
-    fn query_at(&mut self, turn: &mut Turn, at: Clock, rest_ticks: Ticks) -> Result<(), Shutdown> {
+    /// Measures, for a host up to v0.12: from `clock` on, the sensor is switched on and off by the MCU, and its end is
+    /// answered by the number of samples. `rest_ticks` of 0 ends it.
+    pub(super) fn query_at(&mut self, turn: &mut Turn, clock: WireClock, rest_ticks: Ticks) -> Result<(), Shutdown> {
+        if rest_ticks == Ticks(0) {
+            return self.stop(turn);
+        }
+        let at = turn.instant(clock);
         turn.cancel(TIMER);
         self.end();
         self.rest_ticks = rest_ticks;
@@ -426,19 +431,22 @@ impl<C: FifoChip> FifoSensor<C> {
         Ok(())
     }
 
-    fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) {
+    /// Measures, with `rest_ticks` between two looks into the FIFO; 0 ends it.
+    pub(super) fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) -> Result<(), Shutdown> {
         turn.cancel(TIMER);
         self.end();
         if rest_ticks == Ticks(0) {
-            return;
+            return Ok(());
         }
         self.rest_ticks = rest_ticks;
         self.bulk.reset();
         let at = turn.now() + rest_ticks;
         turn.go_on(TIMER, at);
+        Ok(())
     }
 
-    fn ask_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+    /// Asks the sensor how many samples it has.
+    pub(super) fn ask_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         if !C::HAS_OVERFLOW_REGISTER {
             return self.ask_fill(turn);
         }
@@ -532,27 +540,4 @@ pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip:
         overflow: Slot::talking(LookForOverflow(chip)),
     };
     mcu.assign(oid, sensor)
-}
-
-/// Measures, with `rest_ticks` between two looks into the FIFO; none ends it.
-pub(super) fn query<C: FifoChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) -> Result<(), Shutdown> {
-    mcu.with::<FifoSensor<C>, _>(oid, |sensor, turn| {
-        sensor.query(turn, rest_ticks);
-        Ok(())
-    })
-}
-
-/// The same as hosts up to v0.12 ask for it: from `at` on, the sensor is switched on and off by the machine,
-/// and its end is answered by the number of samples.
-pub(super) fn query_at<C: FifoChip>(mcu: &mut Mcu, oid: Oid, at: WireClock, rest_ticks: Ticks) -> Result<(), Shutdown> {
-    let at = mcu.instant(at);
-    mcu.with::<FifoSensor<C>, _>(oid, |sensor, turn| match rest_ticks {
-        Ticks(0) => sensor.stop(turn),
-        _ => sensor.query_at(turn, at, rest_ticks),
-    })
-}
-
-/// Asks the sensor how many samples it has.
-pub(super) fn query_status<C: FifoChip>(mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-    mcu.with::<FifoSensor<C>, _>(oid, |sensor, turn| sensor.ask_status(turn))
 }

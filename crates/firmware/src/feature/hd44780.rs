@@ -77,6 +77,8 @@ impl Panel for Hd44780 {
     }
 }
 
+type Screen = Display<Hd44780>;
+
 const CONFIG_HD44780: Command = command!(
     "config_hd44780 oid=%c rs_pin=%u e_pin=%u d4_pin=%u d5_pin=%u d6_pin=%u d7_pin=%u delay_ticks=%u",
     |mcu, oid: Oid, rs_pin: Pin, e_pin: Pin, d4_pin: Pin, d5_pin: Pin, d6_pin: Pin, d7_pin: Pin, delay_ticks: Ticks| {
@@ -89,10 +91,14 @@ const CONFIG_HD44780: Command = command!(
     }
 );
 
-const HD44780_SEND_CMDS: Command = command!("hd44780_send_cmds oid=%c cmds=%*s", |mcu, oid: Oid, cmds: &[u8]| {
-    mcu.with::<Display<Hd44780>, _>(oid, |display, turn| display.write(turn, Register::Commands, cmds))
-});
+const HD44780_SEND_CMDS: Command = command!(
+    "hd44780_send_cmds oid=%c cmds=%*s",
+    Screen,
+    |display, turn, cmds: &[u8]| display.write(turn, Register::Commands, cmds)
+);
 
-const HD44780_SEND_DATA: Command = command!("hd44780_send_data oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Display<Hd44780>, _>(oid, |display, turn| display.write(turn, Register::Data, data))
-});
+const HD44780_SEND_DATA: Command = command!(
+    "hd44780_send_data oid=%c data=%*s",
+    Screen,
+    |display, turn, data: &[u8]| display.write(turn, Register::Data, data)
+);

@@ -23,7 +23,7 @@ use crate::mcu::{
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Ticks, TimeSource};
 
-use super::ready_adc::{ReadyAdc, ReadyChip, Sample, attach, attach_probe, query, query_status};
+use super::ready_adc::{ReadyAdc, ReadyChip, Sample};
 
 pub(super) const FEATURE: Feature = Feature {
     name: "hx71x",
@@ -205,6 +205,8 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
     mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, dout, Slot::new(shift)))
 }
 
+type Sensor = ReadyAdc<Hx71x>;
+
 const CONFIG_HX71X: Command = command!(
     "config_hx71x oid=%c gain_channel=%c dout_pin=%u sclk_pin=%u",
     |mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin: Pin| {
@@ -213,25 +215,27 @@ const CONFIG_HX71X: Command = command!(
 )
 .of(since(V0_13));
 
-const HX71X_ATTACH_TRIGGER_ANALOG: Command =
-    command!("hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
-        attach::<Hx71x>(mcu, oid, trigger_analog_oid)
-    })
-    .of(since(Master));
+const HX71X_ATTACH_TRIGGER_ANALOG: Command = command!(
+    "hx71x_attach_trigger_analog oid=%c trigger_analog_oid=%c",
+    Sensor,
+    |sensor, turn, trigger_analog_oid: Oid| { sensor.attached.attach(turn, trigger_analog_oid) }
+)
+.of(since(Master));
 
 const HX71X_ATTACH_LOAD_CELL_PROBE: Command = command!(
     "hx71x_attach_load_cell_probe oid=%c load_cell_probe_oid=%c",
-    |mcu, oid: Oid, load_cell_probe_oid: Oid| attach_probe::<Hx71x>(mcu, oid, load_cell_probe_oid)
+    Sensor,
+    |sensor, turn, load_cell_probe_oid: Oid| sensor.attached.attach_probe(turn, load_cell_probe_oid)
 )
 .of(since(Kalico));
 
-const QUERY_HX71X: Command = command!("query_hx71x oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-    query::<Hx71x>(mcu, oid, rest_ticks)
+const QUERY_HX71X: Command = command!("query_hx71x oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
+    sensor.query(turn, rest_ticks)
 })
 .of(since(V0_13));
 
 const QUERY_HX71X_STATUS: Command =
-    command!("query_hx71x_status oid=%c", |mcu, oid: Oid| query_status::<Hx71x>(mcu, oid)).of(since(V0_13));
+    command!("query_hx71x_status oid=%c", Sensor, |sensor, turn| sensor.query_status(turn)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

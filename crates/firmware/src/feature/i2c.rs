@@ -289,9 +289,8 @@ const CONFIG_I2C_WITH_BUS: Command = command!(
 
 const I2C_SET_BUS: Command = command!(
     "i2c_set_bus oid=%c i2c_bus=%u rate=%u address=%u",
-    |mcu, oid: Oid, i2c_bus: u32, rate: u32, address: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.set_bus(turn, i2c_bus, rate, address))
-    }
+    I2c,
+    |i2c, turn, i2c_bus: u32, rate: u32, address: u32| i2c.set_bus(turn, i2c_bus, rate, address)
 )
 .of(since(V0_12));
 
@@ -300,52 +299,53 @@ const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
 
 const I2C_SET_SOFTWARE_BUS: Command = command!(
     "i2c_set_software_bus oid=%c scl_pin=%u sda_pin=%u rate=%u address=%u",
-    |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, rate: u32, address: u32| {
+    I2c,
+    |i2c, turn, scl_pin: Pin, sda_pin: Pin, rate: u32, address: u32| {
         let _ = rate;
-        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.set_lines(turn, [scl_pin, sda_pin], SOFTWARE_PULSE, address))
+        i2c.set_lines(turn, [scl_pin, sda_pin], SOFTWARE_PULSE, address)
     }
 )
 .of(since(V0_12).until(V0_13));
 
 const I2C_SET_SW_BUS: Command = command!(
     "i2c_set_sw_bus oid=%c scl_pin=%u sda_pin=%u pulse_ticks=%u address=%u",
-    |mcu, oid: Oid, scl_pin: Pin, sda_pin: Pin, pulse_ticks: Ticks, address: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.set_lines(turn, [scl_pin, sda_pin], pulse_ticks, address))
-    }
+    I2c,
+    |i2c, turn, scl_pin: Pin, sda_pin: Pin, pulse_ticks: Ticks, address: u32| i2c.set_lines(
+        turn,
+        [scl_pin, sda_pin],
+        pulse_ticks,
+        address
+    )
 )
 .of(since(Master).and(Kalico));
 
-const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<I2c, _>(oid, |i2c, turn| i2c.transfer(turn, Transfer::new(Purpose::Write, data, 0)))
-})
+const I2C_WRITE: Command = command!("i2c_write oid=%c data=%*s", I2c, |i2c, turn, data: &[u8]| i2c
+    .transfer(turn, Transfer::new(Purpose::Write, data, 0)))
 .of(until(V0_13).and(Kalico));
 
 const I2C_READ: Command =
-    command!("i2c_read oid=%c reg=%*s read_len=%u", |mcu, oid: Oid, reg: &[u8], read_len: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, turn| i2c.transfer(turn, Transfer::new(Purpose::Read, reg, one_byte(read_len))))
-    })
+    command!("i2c_read oid=%c reg=%*s read_len=%u", I2c, |i2c, turn, reg: &[u8], read_len: u32| i2c
+        .transfer(turn, Transfer::new(Purpose::Read, reg, one_byte(read_len))))
     .of(until(V0_13).and(Kalico));
 
 const I2C_MODIFY_BITS: Command = command!(
     "i2c_modify_bits oid=%c reg=%*s clear_set_bits=%*s",
-    |mcu, oid: Oid, reg: &[u8], clear_set_bits: &[u8]| {
+    I2c,
+    |i2c, turn, reg: &[u8], clear_set_bits: &[u8]| {
         if clear_set_bits.len() % 2 != 0 {
             let what = format_args!("{} bytes of bits are to be cleared and set", clear_set_bits.len());
             return Err(Shutdown::by_host(ODD_BITS, what));
         }
-        mcu.with::<I2c, _>(oid, |i2c, turn| {
-            let purpose = Purpose::modify(clear_set_bits);
-            i2c.transfer(turn, Transfer::new(purpose, reg, clear_set_bits.len() / 2))
-        })
+
+        let purpose = Purpose::modify(clear_set_bits);
+        i2c.transfer(turn, Transfer::new(purpose, reg, clear_set_bits.len() / 2))
     }
 )
 .of(until(V0_12));
 
 const I2C_TRANSFER: Command =
-    command!("i2c_transfer oid=%c write=%*s read_len=%u", |mcu, oid: Oid, write: &[u8], read_len: u32| {
-        mcu.with::<I2c, _>(oid, |i2c, turn| {
-            i2c.transfer(turn, Transfer::new(Purpose::Transfer, write, one_byte(read_len)))
-        })
+    command!("i2c_transfer oid=%c write=%*s read_len=%u", I2c, |i2c, turn, write: &[u8], read_len: u32| {
+        i2c.transfer(turn, Transfer::new(Purpose::Transfer, write, one_byte(read_len)))
     })
     .of(since(Master));
 

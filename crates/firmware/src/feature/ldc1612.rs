@@ -334,41 +334,39 @@ const CONFIG_LDC1612_WITH_INTB: Command =
     })
     .of(since(V0_13));
 
-const LDC1612_ATTACH_TRIGGER_ANALOG: Command =
-    command!("ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c", |mcu, oid: Oid, trigger_analog_oid: Oid| {
-        mcu.with::<Ldc1612, _>(oid, |sensor, turn| sensor.attached.attach(turn, trigger_analog_oid))
-    })
-    .of(since(Master));
+const LDC1612_ATTACH_TRIGGER_ANALOG: Command = command!(
+    "ldc1612_attach_trigger_analog oid=%c trigger_analog_oid=%c",
+    Ldc1612,
+    |sensor, turn, trigger_analog_oid: Oid| sensor.attached.attach(turn, trigger_analog_oid)
+)
+.of(since(Master));
 
 const LDC1612_SETUP_HOME: Command = command!(
     "ldc1612_setup_home oid=%c clock=%u threshold=%u trsync_oid=%c trigger_reason=%c error_reason=%c",
-    |mcu, oid: Oid, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
-        let clock = mcu.instant(clock);
-        mcu.with::<Ldc1612, _>(oid, |sensor, turn| {
-            if threshold == 0 {
-                sensor.homing.trsync = None;
-                return Ok(());
-            }
-            turn.require::<Trsync>(trsync_oid)?;
-            let trsync = Some(trsync_oid);
-            sensor.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
-            Ok(())
-        })
+    Ldc1612,
+    |sensor, turn, clock: WireClock, threshold: u32, trsync_oid: Oid, trigger_reason: u8, error_reason: u8| {
+        let clock = turn.instant(clock);
+        if threshold == 0 {
+            sensor.homing.trsync = None;
+            return Ok(());
+        }
+        turn.require::<Trsync>(trsync_oid)?;
+        let trsync = Some(trsync_oid);
+        sensor.homing = Homing { trsync, threshold, trigger_reason, error_reason, awaits: true, clock };
+        Ok(())
     }
 )
 .of(HOMES_ITSELF);
 
-const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Ldc1612, _>(oid, |sensor, turn| {
-        let homing = &sensor.homing;
-        turn.send(HomeState { oid: turn.oid(), homing: homing.trsync.is_some(), trigger_clock: homing.clock });
-        Ok(())
-    })
+const QUERY_LDC1612_HOME_STATE: Command = command!("query_ldc1612_home_state oid=%c", Ldc1612, |sensor, turn| {
+    let homing = &sensor.homing;
+    turn.send(HomeState { oid: turn.oid(), homing: homing.trsync.is_some(), trigger_clock: homing.clock });
+    Ok(())
 })
 .of(HOMES_ITSELF);
 
-const QUERY_LDC1612: Command = command!("query_ldc1612 oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-    mcu.with::<Ldc1612, _>(oid, |sensor, turn| {
+const QUERY_LDC1612: Command =
+    command!("query_ldc1612 oid=%c rest_ticks=%u", Ldc1612, |sensor, turn, rest_ticks: Ticks| {
         turn.cancel(TIMER);
         sensor.look.drop_pending();
         sensor.missed = 0;
@@ -380,13 +378,10 @@ const QUERY_LDC1612: Command = command!("query_ldc1612 oid=%c rest_ticks=%u", |m
         let at = turn.now() + rest_ticks;
         turn.schedule(TIMER, at)
     })
-})
-.of(since(V0_13));
+    .of(since(V0_13));
 
-const QUERY_STATUS_LDC1612: Command = command!("query_status_ldc1612 oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Ldc1612, _>(oid, |sensor, turn| sensor.query_status(turn))
-})
-.of(since(V0_13));
+const QUERY_STATUS_LDC1612: Command =
+    command!("query_status_ldc1612 oid=%c", Ldc1612, |sensor, turn| sensor.query_status(turn)).of(since(V0_13));
 
 #[cfg(test)]
 mod tests {

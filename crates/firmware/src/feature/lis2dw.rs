@@ -13,7 +13,7 @@ use crate::mcu::{
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::Ticks;
 
-use super::fifo_sensor::{BLOCK_BYTES, BusType, FifoChip, Fill, Reading, configure, query, query_at, query_status};
+use super::fifo_sensor::{BLOCK_BYTES, BusType, FifoChip, FifoSensor, Fill, Reading, configure};
 use super::named;
 use super::sensor_bulk::{Words, own_words};
 
@@ -137,6 +137,8 @@ impl FifoChip for Lis2dw {
     }
 }
 
+type Sensor = FifoSensor<Lis2dw>;
+
 const CONFIG_LIS2DW_ON_SPI: Command = command!("config_lis2dw oid=%c spi_oid=%c", |mcu, oid: Oid, spi_oid: Oid| {
     configure(mcu, oid, spi_oid, Lis2dw { bus_type: BusType::Spi, model: Model::Lis2dw })
 })
@@ -151,19 +153,21 @@ const CONFIG_LIS2DW: Command = command!(
 )
 .of(since(V0_13));
 
-const QUERY_LIS2DW_AT: Command =
-    command!("query_lis2dw oid=%c clock=%u rest_ticks=%u", |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks| {
-        query_at::<Lis2dw>(mcu, oid, clock, rest_ticks)
-    })
-    .of(only(V0_12));
+const QUERY_LIS2DW_AT: Command = command!(
+    "query_lis2dw oid=%c clock=%u rest_ticks=%u",
+    Sensor,
+    |sensor, turn, clock: WireClock, rest_ticks: Ticks| { sensor.query_at(turn, clock, rest_ticks) }
+)
+.of(only(V0_12));
 
-const QUERY_LIS2DW: Command = command!("query_lis2dw oid=%c rest_ticks=%u", |mcu, oid: Oid, rest_ticks: Ticks| {
-    query::<Lis2dw>(mcu, oid, rest_ticks)
-})
-.of(since(V0_13));
+const QUERY_LIS2DW: Command =
+    command!("query_lis2dw oid=%c rest_ticks=%u", Sensor, |sensor, turn, rest_ticks: Ticks| {
+        sensor.query(turn, rest_ticks)
+    })
+    .of(since(V0_13));
 
 const QUERY_LIS2DW_STATUS: Command =
-    command!("query_lis2dw_status oid=%c", |mcu, oid: Oid| query_status::<Lis2dw>(mcu, oid)).of(since(V0_12));
+    command!("query_lis2dw_status oid=%c", Sensor, |sensor, turn| sensor.ask_status(turn)).of(since(V0_12));
 
 #[cfg(test)]
 mod tests {

@@ -156,8 +156,9 @@ const CONFIG_LOAD_CELL_PROBE: Command =
 
 const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
     "load_cell_probe_set_range oid=%c safety_counts_min=%i safety_counts_max=%i tare_counts=%i trigger_grams=%u grams_per_count=%i",
-    |mcu,
-     oid: Oid,
+    LoadCellProbe,
+    |probe,
+     _,
      safety_counts_min: i32,
      safety_counts_max: i32,
      tare_counts: i32,
@@ -173,64 +174,60 @@ const LOAD_CELL_PROBE_SET_RANGE: Command = command!(
         if !(0..1 << GRAMS_PER_COUNT_FRAC_BITS).contains(&grams_per_count) {
             return refuse(GRAMS_PER_COUNT, format!("{grams_per_count} is no fraction of 2^29"));
         }
-        mcu.with::<LoadCellProbe, _>(oid, |probe, _| {
-            probe.limits = Limits {
-                counts_min: safety_counts_min,
-                counts_max: safety_counts_max,
-                tare_counts,
-                trigger_grams: (trigger_grams << GRAMS_FRAC_BITS) as i32,
-                grams_per_count,
-            };
-            Ok(())
-        })
+        probe.limits = Limits {
+            counts_min: safety_counts_min,
+            counts_max: safety_counts_max,
+            tare_counts,
+            trigger_grams: (trigger_grams << GRAMS_FRAC_BITS) as i32,
+            grams_per_count,
+        };
+        Ok(())
     }
 )
 .of(since(Kalico));
 
 const LOAD_CELL_PROBE_HOME: Command = command!(
     "load_cell_probe_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u rest_ticks=%u timeout=%u",
-    |mcu,
-     oid: Oid,
+    LoadCellProbe,
+    |probe,
+     turn,
      trsync_oid: Oid,
      trigger_reason: u8,
      error_reason: u8,
      clock: WireClock,
      rest_ticks: Ticks,
      timeout: u32| {
-        let begin = mcu.instant(clock);
-        mcu.with::<LoadCellProbe, _>(oid, |probe, turn| {
-            turn.cancel(TIMER);
-            (probe.homing, probe.triggered) = (None, None);
-            // That is how the host ends it.
-            if error_reason == 0 {
-                return Ok(());
-            }
-            turn.require::<Trsync>(trsync_oid)?;
-            probe.homing = Some(Homing {
-                trsync: trsync_oid,
-                trigger_reason,
-                error_reason,
-                awaits: true,
-                begin,
-                rest_ticks,
-                // The firmware keeps its low byte.
-                watchdog_max: timeout as u8,
-                watchdog_count: 0,
-            });
-            turn.schedule(TIMER, begin)
-        })
+        let begin = turn.instant(clock);
+        turn.cancel(TIMER);
+        (probe.homing, probe.triggered) = (None, None);
+        // That is how the host ends it.
+        if error_reason == 0 {
+            return Ok(());
+        }
+        turn.require::<Trsync>(trsync_oid)?;
+        probe.homing = Some(Homing {
+            trsync: trsync_oid,
+            trigger_reason,
+            error_reason,
+            awaits: true,
+            begin,
+            rest_ticks,
+            // The firmware keeps its low byte.
+            watchdog_max: timeout as u8,
+            watchdog_count: 0,
+        });
+        turn.schedule(TIMER, begin)
     }
 )
 .of(since(Kalico));
 
-const LOAD_CELL_PROBE_QUERY_STATE: Command = command!("load_cell_probe_query_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<LoadCellProbe, _>(oid, |probe, turn| {
+const LOAD_CELL_PROBE_QUERY_STATE: Command =
+    command!("load_cell_probe_query_state oid=%c", LoadCellProbe, |probe, turn| {
         let trigger_ticks = probe.triggered.map_or(0, Clock::wire);
         turn.send(State { oid: turn.oid(), is_homing_trigger: probe.triggered.is_some(), trigger_ticks });
         Ok(())
     })
-})
-.of(since(Kalico));
+    .of(since(Kalico));
 
 #[cfg(test)]
 mod tests {

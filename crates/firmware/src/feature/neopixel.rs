@@ -166,12 +166,10 @@ const CONFIG_NEOPIXEL: Command = command!(
 );
 
 const NEOPIXEL_UPDATE: Command =
-    command!("neopixel_update oid=%c pos=%hu data=%*s", |mcu, oid: Oid, pos: u16, data: &[u8]| {
-        mcu.with::<Neopixel, _>(oid, |chain, _| chain.update(pos, data))
-    });
+    command!("neopixel_update oid=%c pos=%hu data=%*s", Neopixel, |chain, _, pos: u16, data: &[u8]| chain
+        .update(pos, data));
 
-const NEOPIXEL_SEND: Command =
-    command!("neopixel_send oid=%c", |mcu, oid: Oid| mcu.with::<Neopixel, _>(oid, |chain, turn| chain.send(turn)));
+const NEOPIXEL_SEND: Command = command!("neopixel_send oid=%c", Neopixel, |chain, turn| chain.send(turn));
 
 #[cfg(test)]
 mod tests {

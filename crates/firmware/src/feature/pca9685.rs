@@ -345,9 +345,9 @@ const CONFIG_PCA9685: Command = command!(
 );
 
 const QUEUE_PCA9685_OUT: Command =
-    command!("queue_pca9685_out oid=%c clock=%u value=%hu", |mcu, oid: Oid, clock: WireClock, value: u16| {
-        let at = mcu.instant(clock);
-        mcu.with::<Pca9685, _>(oid, |output, turn| output.queue(turn, at, value))
+    command!("queue_pca9685_out oid=%c clock=%u value=%hu", Pca9685, |output, turn, clock: WireClock, value: u16| {
+        let at = turn.instant(clock);
+        output.queue(turn, at, value)
     });
 
 const SET_PCA9685_OUT: Command = command!(

@@ -170,9 +170,9 @@ const CONFIG_PWM_OUT: Command = command!(
 );
 
 const QUEUE_PWM_OUT: Command =
-    command!("queue_pwm_out oid=%c clock=%u value=%hu", |mcu, oid: Oid, clock: WireClock, value: u16| {
-        let at = mcu.instant(clock);
-        mcu.with::<PwmOut, _>(oid, |output, turn| output.queue.queue(turn, at, value))
+    command!("queue_pwm_out oid=%c clock=%u value=%hu", PwmOut, |output, turn, clock: WireClock, value: u16| {
+        let at = turn.instant(clock);
+        output.queue.queue(turn, at, value)
     });
 
 const SET_PWM_OUT: Command =

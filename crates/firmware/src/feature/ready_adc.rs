@@ -92,7 +92,8 @@ pub(super) struct ReadyAdc<C: ReadyChip> {
     late: bool,
     rest_ticks: Ticks,
     bulk: SensorBulk,
-    attached: Attached,
+    /// What is homed or probed by its samples.
+    pub(super) attached: Attached,
 }
 
 impl<C: ReadyChip> ReadyAdc<C> {
@@ -113,6 +114,30 @@ impl<C: ReadyChip> ReadyAdc<C> {
     fn restart(&mut self) {
         self.reading.drop_pending();
         self.late = false;
+    }
+
+    /// Begins measurements, or with `rest_ticks` of 0 ends them.
+    pub(super) fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) -> Result<(), Shutdown> {
+        turn.cancel(TIMER);
+        self.restart();
+        let on = rest_ticks != Ticks(0);
+        self.chip.switch(turn, on)?;
+        self.rest_ticks = rest_ticks;
+        if !on {
+            return Ok(());
+        }
+        self.bulk.reset();
+        let at = turn.now() + rest_ticks;
+        turn.schedule(TIMER, at)
+    }
+
+    /// Tells the host how many samples there are. One that is being read counts as one in the chip.
+    pub(super) fn query_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
+        let now = turn.now();
+        let ready = self.reading.is_pending() || !self.ready.read()?;
+        let bytes = (self.chip.channels() * VALUE_BYTES) as u32;
+        self.bulk.send_status(turn, (now, now), if ready { bytes } else { 0 });
+        Ok(())
     }
 }
 
@@ -180,44 +205,6 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
     fn shutdown(&mut self, _turn: &mut Turn) {
         self.restart();
     }
-}
-
-/// Begins measurements, or with `rest_ticks` of 0 ends them.
-pub(super) fn query<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, rest_ticks: Ticks) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| {
-        turn.cancel(TIMER);
-        sensor.restart();
-        let on = rest_ticks != Ticks(0);
-        sensor.chip.switch(turn, on)?;
-        sensor.rest_ticks = rest_ticks;
-        if !on {
-            return Ok(());
-        }
-        sensor.bulk.reset();
-        let at = turn.now() + rest_ticks;
-        turn.schedule(TIMER, at)
-    })
-}
-
-/// Tells the host how many samples there are. One that is being read counts as one in the chip.
-pub(super) fn query_status<C: ReadyChip>(mcu: &mut Mcu, oid: Oid) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| {
-        let now = turn.now();
-        let ready = sensor.reading.is_pending() || !sensor.ready.read()?;
-        let bytes = (sensor.chip.channels() * VALUE_BYTES) as u32;
-        sensor.bulk.send_status(turn, (now, now), if ready { bytes } else { 0 });
-        Ok(())
-    })
-}
-
-/// Lets the samples be homed by.
-pub(super) fn attach<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, trigger_analog: Oid) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| sensor.attached.attach(turn, trigger_analog))
-}
-
-/// Lets the samples be probed by.
-pub(super) fn attach_probe<C: ReadyChip>(mcu: &mut Mcu, oid: Oid, probe: Oid) -> Result<(), Shutdown> {
-    mcu.with::<ReadyAdc<C>, _>(oid, |sensor, turn| sensor.attached.attach_probe(turn, probe))
 }
 
 /// Bytes that a chip on SPI sends while it is sent zeros; up to `N`.

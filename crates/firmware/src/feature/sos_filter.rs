@@ -169,54 +169,51 @@ const CONFIG_SOS_FILTER: Command =
 
 const SOS_FILTER_SET_SECTION: Command = command!(
     "sos_filter_set_section oid=%c section_idx=%c sos0=%i sos1=%i sos2=%i sos3=%i sos4=%i",
-    |mcu, oid: Oid, section_idx: u8, sos0: i32, sos1: i32, sos2: i32, sos3: i32, sos4: i32| {
-        mcu.with::<SosFilter, _>(oid, |filter, _| {
-            filter.section(section_idx)?.coefficients = [sos0, sos1, sos2, sos3, sos4];
-            Ok(())
-        })
+    SosFilter,
+    |filter, _, section_idx: u8, sos0: i32, sos1: i32, sos2: i32, sos3: i32, sos4: i32| {
+        filter.section(section_idx)?.coefficients = [sos0, sos1, sos2, sos3, sos4];
+        Ok(())
     }
 )
 .of(since(Master).and(Kalico));
 
 const SOS_FILTER_SET_STATE: Command = command!(
     "sos_filter_set_state oid=%c section_idx=%c state0=%i state1=%i",
-    |mcu, oid: Oid, section_idx: u8, state0: i32, state1: i32| {
-        mcu.with::<SosFilter, _>(oid, |filter, _| {
-            filter.section(section_idx)?.state = [state0, state1];
-            Ok(())
-        })
+    SosFilter,
+    |filter, _, section_idx: u8, state0: i32, state1: i32| {
+        filter.section(section_idx)?.state = [state0, state1];
+        Ok(())
     }
 )
 .of(since(Master).and(Kalico));
 
 const SOS_FILTER_SET_OFFSET_SCALE: Command = command!(
     "sos_filter_set_offset_scale oid=%c offset=%i scale=%i scale_frac_bits=%c auto_offset=%c",
-    |mcu, oid: Oid, offset: i32, scale: i32, scale_frac_bits: u8, auto_offset: bool| {
-        mcu.with::<SosFilter, _>(oid, |filter, _| {
-            filter.offset = offset;
-            filter.scale = scale;
-            filter.scale_frac_bits = scale_frac_bits & FRAC_BITS_MASK;
-            filter.auto_offset = auto_offset;
-            Ok(())
-        })
+    SosFilter,
+    |filter, _, offset: i32, scale: i32, scale_frac_bits: u8, auto_offset: bool| {
+        filter.offset = offset;
+        filter.scale = scale;
+        filter.scale_frac_bits = scale_frac_bits & FRAC_BITS_MASK;
+        filter.auto_offset = auto_offset;
+        Ok(())
     }
 )
 .of(since(Master));
 
 const SOS_FILTER_SET_ACTIVE: Command = command!(
     "sos_filter_set_active oid=%c n_sections=%c coeff_frac_bits=%c",
-    |mcu, oid: Oid, n_sections: u8, coeff_frac_bits: u8| {
-        mcu.with::<SosFilter, _>(oid, |filter, _| filter.activate(n_sections, coeff_frac_bits))
-    }
+    SosFilter,
+    |filter, _, n_sections: u8, coeff_frac_bits: u8| filter.activate(n_sections, coeff_frac_bits)
 )
 .of(since(Master));
 
 const SOS_FILTER_SET_ACTIVE_OF_KALICO: Command = command!(
     "sos_filter_set_active oid=%c n_sections=%c coeff_int_bits=%c",
-    |mcu, oid: Oid, n_sections: u8, coeff_int_bits: u8| {
+    SosFilter,
+    |filter, _, n_sections: u8, coeff_int_bits: u8| {
         // One bit of the 32 is the sign.
         let coeff_frac_bits = 31u8.wrapping_sub(coeff_int_bits);
-        mcu.with::<SosFilter, _>(oid, |filter, _| filter.activate(n_sections, coeff_frac_bits))
+        filter.activate(n_sections, coeff_frac_bits)
     }
 )
 .of(since(Kalico));

@@ -262,42 +262,42 @@ const CONFIG_SPI_WITHOUT_CS: Command =
     command!("config_spi_without_cs oid=%c", |mcu, oid: Oid| mcu.assign(oid, Spi::new(None)));
 
 const SPI_SET_BUS: Command =
-    command!("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", |mcu, oid: Oid, spi_bus: u32, mode: u32, rate: u32| {
+    command!("spi_set_bus oid=%c spi_bus=%u mode=%u rate=%u", Spi, |spi, turn, spi_bus: u32, mode: u32, rate: u32| {
         let mode = u8::try_from(mode).unwrap_or(u8::MAX);
-        mcu.with::<Spi, _>(oid, |spi, turn| spi.set_bus(turn, spi_bus, mode, rate))
+        spi.set_bus(turn, spi_bus, mode, rate)
     });
 
 const SPI_SET_SOFTWARE_BUS: Command = command!(
     "spi_set_software_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u rate=%u",
-    |mcu, oid: Oid, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
+    Spi,
+    |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
         // The firmware ignored the rate and was as fast as its system calls. Lines that are written
         // through mapped registers would be too fast for a chip.
         let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
-        mcu.with::<Spi, _>(oid, |spi, turn| spi.set_lines(turn, pins, mode, pulse))
+        spi.set_lines(turn, pins, mode, pulse)
     }
 )
 .of(until(V0_13));
 
 const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
-    |mcu, oid: Oid, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
+    Spi,
+    |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
         // Of one byte, as in the firmware.
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
-        mcu.with::<Spi, _>(oid, |spi, turn| spi.set_lines(turn, pins, mode, pulse_ticks))
+        spi.set_lines(turn, pins, mode, pulse_ticks)
     }
 )
 .of(since(Master).and(Kalico));
 
-const SPI_TRANSFER: Command = command!("spi_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Spi, _>(oid, |spi, turn| spi.transfer(turn, true, data))
-});
+const SPI_TRANSFER: Command =
+    command!("spi_transfer oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, true, data));
 
-const SPI_SEND: Command = command!("spi_send oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Spi, _>(oid, |spi, turn| spi.transfer(turn, false, data))
-});
+const SPI_SEND: Command =
+    command!("spi_send oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, false, data));
 
 const CONFIG_SPI_SHUTDOWN: Command = command!(
     "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",

@@ -462,17 +462,17 @@ const CONFIG_SPI_ANGLE: Command = command!(
 
 const QUERY_SPI_ANGLE: Command = command!(
     "query_spi_angle oid=%c clock=%u rest_ticks=%u time_shift=%c",
-    |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, time_shift: u8| {
-        let at = mcu.instant(clock);
-        mcu.with::<SpiAngle, _>(oid, |sensor, turn| sensor.query(turn, at, rest_ticks, time_shift))
+    SpiAngle,
+    |sensor, turn, clock: WireClock, rest_ticks: Ticks, time_shift: u8| {
+        let at = turn.instant(clock);
+        sensor.query(turn, at, rest_ticks, time_shift)
     }
 )
 .of(KNOWN);
 
-const SPI_ANGLE_TRANSFER: Command = command!("spi_angle_transfer oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<SpiAngle, _>(oid, |sensor, turn| sensor.ask(turn, data))
-})
-.of(KNOWN);
+const SPI_ANGLE_TRANSFER: Command =
+    command!("spi_angle_transfer oid=%c data=%*s", SpiAngle, |sensor, turn, data: &[u8]| sensor.ask(turn, data))
+        .of(KNOWN);
 
 #[cfg(test)]
 mod tests {

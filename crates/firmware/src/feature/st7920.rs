@@ -71,6 +71,8 @@ impl Panel for St7920 {
     }
 }
 
+type Screen = Display<St7920>;
+
 const CONFIG_ST7920: Command = command!(
     "config_st7920 oid=%c cs_pin=%u sclk_pin=%u sid_pin=%u sync_delay_ticks=%u cmd_delay_ticks=%u",
     |mcu, oid: Oid, cs_pin: Pin, sclk_pin: Pin, sid_pin: Pin, sync_delay_ticks: Ticks, cmd_delay_ticks: Ticks| {
@@ -90,10 +92,16 @@ const CONFIG_ST7920: Command = command!(
     }
 );
 
-const ST7920_SEND_CMDS: Command = command!("st7920_send_cmds oid=%c cmds=%*s", |mcu, oid: Oid, cmds: &[u8]| {
-    mcu.with::<Display<St7920>, _>(oid, |display, turn| display.write(turn, Register::Commands, cmds))
-});
+const ST7920_SEND_CMDS: Command =
+    command!("st7920_send_cmds oid=%c cmds=%*s", Screen, |display, turn, cmds: &[u8]| display.write(
+        turn,
+        Register::Commands,
+        cmds
+    ));
 
-const ST7920_SEND_DATA: Command = command!("st7920_send_data oid=%c data=%*s", |mcu, oid: Oid, data: &[u8]| {
-    mcu.with::<Display<St7920>, _>(oid, |display, turn| display.write(turn, Register::Data, data))
-});
+const ST7920_SEND_DATA: Command =
+    command!("st7920_send_data oid=%c data=%*s", Screen, |display, turn, data: &[u8]| display.write(
+        turn,
+        Register::Data,
+        data
+    ));

@@ -306,43 +306,37 @@ const CONFIG_STEPPER: Command = command!(
 
 const QUEUE_STEP: Command = command!(
     "queue_step oid=%c interval=%u count=%hu add=%hi",
-    |mcu, oid: Oid, interval: u32, count: u16, add: i16| {
+    Stepper,
+    |stepper, turn, interval: u32, count: u16, add: i16| {
         let item = Move { interval, count, add, reverses: false };
-        mcu.with::<Stepper, _>(oid, |stepper, turn| stepper.queue(turn, item))
+        stepper.queue(turn, item)
     }
 );
 
-const SET_NEXT_STEP_DIR: Command = command!("set_next_step_dir oid=%c dir=%c", |mcu, oid: Oid, dir: bool| {
-    mcu.with::<Stepper, _>(oid, |stepper, _| {
-        stepper.next_dir = dir;
-        Ok(())
-    })
+const SET_NEXT_STEP_DIR: Command = command!("set_next_step_dir oid=%c dir=%c", Stepper, |stepper, _, dir: bool| {
+    stepper.next_dir = dir;
+    Ok(())
 });
 
-const RESET_STEP_CLOCK: Command = command!("reset_step_clock oid=%c clock=%u", |mcu, oid: Oid, clock: WireClock| {
-    let clock = mcu.instant(clock);
-    mcu.with::<Stepper, _>(oid, |stepper, _| {
+const RESET_STEP_CLOCK: Command =
+    command!("reset_step_clock oid=%c clock=%u", Stepper, |stepper, turn, clock: WireClock| {
+        let clock = turn.instant(clock);
         if stepper.edges > 0 {
             return Err(Shutdown::by_host(RESET_WHILE_STEPPING, "reset_step_clock came while steps are queued"));
         }
         stepper.next_step = clock;
         stepper.need_reset = false;
         Ok(())
-    })
-});
+    });
 
-const STEPPER_GET_POSITION: Command = command!("stepper_get_position oid=%c", |mcu, oid: Oid| {
-    mcu.with::<Stepper, _>(oid, |stepper, turn| {
-        turn.send(Position { oid: turn.oid(), pos: stepper.position().wrapping_sub(POSITION_BIAS) as i32 });
-        Ok(())
-    })
+const STEPPER_GET_POSITION: Command = command!("stepper_get_position oid=%c", Stepper, |stepper, turn| {
+    turn.send(Position { oid: turn.oid(), pos: stepper.position().wrapping_sub(POSITION_BIAS) as i32 });
+    Ok(())
 });
 
 const STEPPER_STOP_ON_TRIGGER: Command =
-    command!("stepper_stop_on_trigger oid=%c trsync_oid=%c", |mcu, oid: Oid, trsync_oid: Oid| {
-        mcu.with::<Stepper, _>(oid, |stepper, turn| {
-            Trsync::add_signal(turn, trsync_oid)?;
-            stepper.stopper = Some(trsync_oid);
-            Ok(())
-        })
+    command!("stepper_stop_on_trigger oid=%c trsync_oid=%c", Stepper, |stepper, turn, trsync_oid: Oid| {
+        Trsync::add_signal(turn, trsync_oid)?;
+        stepper.stopper = Some(trsync_oid);
+        Ok(())
     });

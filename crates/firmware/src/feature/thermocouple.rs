@@ -226,21 +226,20 @@ const CONFIG_THERMOCOUPLE: Command = command!(
 
 const QUERY_THERMOCOUPLE: Command = command!(
     "query_thermocouple oid=%c clock=%u rest_ticks=%u min_value=%u max_value=%u max_invalid_count=%c",
-    |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
-        let at = mcu.instant(clock);
-        mcu.with::<Thermocouple, _>(oid, |sensor, turn| {
-            turn.cancel(TIMER);
-            sensor.look.drop_pending();
-            if rest_ticks == Ticks(0) {
-                return Ok(());
-            }
-            sensor.rest_ticks = rest_ticks;
-            sensor.min_value = min_value;
-            sensor.max_value = max_value;
-            sensor.max_invalid_count = max_invalid_count;
-            sensor.invalid_count = 0;
-            turn.schedule(TIMER, at)
-        })
+    Thermocouple,
+    |sensor, turn, clock: WireClock, rest_ticks: Ticks, min_value: u32, max_value: u32, max_invalid_count: u8| {
+        let at = turn.instant(clock);
+        turn.cancel(TIMER);
+        sensor.look.drop_pending();
+        if rest_ticks == Ticks(0) {
+            return Ok(());
+        }
+        sensor.rest_ticks = rest_ticks;
+        sensor.min_value = min_value;
+        sensor.max_value = max_value;
+        sensor.max_invalid_count = max_invalid_count;
+        sensor.invalid_count = 0;
+        turn.schedule(TIMER, at)
     }
 );
 

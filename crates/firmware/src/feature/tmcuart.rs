@@ -372,9 +372,8 @@ const CONFIG_TMCUART: Command = command!(
 );
 
 const TMCUART_SEND: Command =
-    command!("tmcuart_send oid=%c write=%*s read=%c", |mcu, oid: Oid, write: &[u8], read: u8| {
-        mcu.with::<TmcUart, _>(oid, |uart, turn| uart.send(turn, write, read))
-    });
+    command!("tmcuart_send oid=%c write=%*s read=%c", TmcUart, |uart, turn, write: &[u8], read: u8| uart
+        .send(turn, write, read));
 
 #[cfg(test)]
 mod tests {

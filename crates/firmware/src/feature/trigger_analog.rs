@@ -257,68 +257,64 @@ const CONFIG_TRIGGER_ANALOG: Command =
 
 const TRIGGER_ANALOG_SET_RAW_RANGE: Command = command!(
     "trigger_analog_set_raw_range oid=%c raw_min=%i raw_max=%i",
-    |mcu, oid: Oid, raw_min: i32, raw_max: i32| {
-        mcu.with::<TriggerAnalog, _>(oid, |trigger, _| {
-            trigger.raw_min = raw_min;
-            trigger.raw_max = raw_max;
-            Ok(())
-        })
+    TriggerAnalog,
+    |trigger, _, raw_min: i32, raw_max: i32| {
+        trigger.raw_min = raw_min;
+        trigger.raw_max = raw_max;
+        Ok(())
     }
 )
 .of(since(Master));
 
 const TRIGGER_ANALOG_SET_TRIGGER: Command = command!(
     "trigger_analog_set_trigger oid=%c trigger_analog_type=%c trigger_value=%i",
-    |mcu, oid: Oid, trigger_analog_type: u8, trigger_value: i32| {
-        mcu.with::<TriggerAnalog, _>(oid, |trigger, _| {
-            trigger.trigger_type = TriggerType::of(trigger_analog_type)?;
-            trigger.trigger_value = trigger_value;
-            Ok(())
-        })
+    TriggerAnalog,
+    |trigger, _, trigger_analog_type: u8, trigger_value: i32| {
+        trigger.trigger_type = TriggerType::of(trigger_analog_type)?;
+        trigger.trigger_value = trigger_value;
+        Ok(())
     }
 )
 .of(since(Master));
 
 const TRIGGER_ANALOG_HOME: Command = command!(
     "trigger_analog_home oid=%c trsync_oid=%c trigger_reason=%c error_reason=%c clock=%u monitor_ticks=%u monitor_max=%u",
-    |mcu,
-     oid: Oid,
+    TriggerAnalog,
+    |trigger,
+     turn,
      trsync_oid: Oid,
      trigger_reason: u8,
      error_reason: u8,
      clock: WireClock,
      monitor_ticks: Ticks,
      monitor_max: u32| {
-        let at = mcu.instant(clock);
-        mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| {
-                if monitor_ticks == Ticks(0) {
-                turn.cancel(TIMER);
-                (trigger.homing, trigger.trsync) = (false, None);
-                return Ok(());
-            }
-            turn.require::<Trsync>(trsync_oid)?;
+        let at = turn.instant(clock);
+        if monitor_ticks == Ticks(0) {
             turn.cancel(TIMER);
-            trigger.monitor_ticks = monitor_ticks;
-            trigger.trsync = Some(trsync_oid);
-            trigger.trigger_reason = trigger_reason;
-            trigger.error_reason = error_reason;
-            trigger.homing_clock = at;
-            // The firmware keeps its low byte.
-            trigger.monitor_max = monitor_max as u8;
-            trigger.monitor_count = 0;
-            trigger.homing = true;
-            trigger.awaits = true;
-            trigger.peak = i32::MIN;
-            turn.schedule(TIMER, at)
-        })
+            (trigger.homing, trigger.trsync) = (false, None);
+            return Ok(());
+        }
+        turn.require::<Trsync>(trsync_oid)?;
+        turn.cancel(TIMER);
+        trigger.monitor_ticks = monitor_ticks;
+        trigger.trsync = Some(trsync_oid);
+        trigger.trigger_reason = trigger_reason;
+        trigger.error_reason = error_reason;
+        trigger.homing_clock = at;
+        // The firmware keeps its low byte.
+        trigger.monitor_max = monitor_max as u8;
+        trigger.monitor_count = 0;
+        trigger.homing = true;
+        trigger.awaits = true;
+        trigger.peak = i32::MIN;
+        turn.schedule(TIMER, at)
     }
 )
 .of(since(Master));
 
-const TRIGGER_ANALOG_QUERY_STATE: Command = command!("trigger_analog_query_state oid=%c", |mcu, oid: Oid| {
-    mcu.with::<TriggerAnalog, _>(oid, |trigger, turn| {
+const TRIGGER_ANALOG_QUERY_STATE: Command =
+    command!("trigger_analog_query_state oid=%c", TriggerAnalog, |trigger, turn| {
         turn.send(State { oid: turn.oid(), homing: trigger.homing, homing_clock: trigger.homing_clock });
         Ok(())
     })
-})
-.of(since(Master));
+    .of(since(Master));

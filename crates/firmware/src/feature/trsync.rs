@@ -134,42 +134,37 @@ const CONFIG_TRSYNC: Command = command!("config_trsync oid=%c", |mcu, oid: Oid| 
 
 const TRSYNC_START: Command = command!(
     "trsync_start oid=%c report_clock=%u report_ticks=%u expire_reason=%c",
-    |mcu, oid: Oid, report_clock: WireClock, report_ticks: Ticks, expire_reason: u8| {
-        let report_at = mcu.instant(report_clock);
-        mcu.with::<Trsync, _>(oid, |trsync, turn| {
-            trsync.clear(turn);
-            trsync.can_trigger = true;
-            trsync.report_ticks = report_ticks;
-            trsync.expire_reason = expire_reason;
-            match report_ticks {
-                Ticks(0) => Ok(()),
-                _ => turn.schedule(REPORT, report_at),
-            }
-        })
+    Trsync,
+    |trsync, turn, report_clock: WireClock, report_ticks: Ticks, expire_reason: u8| {
+        let report_at = turn.instant(report_clock);
+        trsync.clear(turn);
+        trsync.can_trigger = true;
+        trsync.report_ticks = report_ticks;
+        trsync.expire_reason = expire_reason;
+        match report_ticks {
+            Ticks(0) => Ok(()),
+            _ => turn.schedule(REPORT, report_at),
+        }
     }
 );
 
 const TRSYNC_SET_TIMEOUT: Command =
-    command!("trsync_set_timeout oid=%c clock=%u", |mcu, oid: Oid, clock: WireClock| {
-        let expire_at = mcu.instant(clock);
-        mcu.with::<Trsync, _>(oid, |trsync, turn| {
-            if !trsync.can_trigger {
-                return Ok(());
-            }
-            turn.cancel(EXPIRE);
-            turn.schedule(EXPIRE, expire_at)
-        })
+    command!("trsync_set_timeout oid=%c clock=%u", Trsync, |trsync, turn, clock: WireClock| {
+        let expire_at = turn.instant(clock);
+        if !trsync.can_trigger {
+            return Ok(());
+        }
+        turn.cancel(EXPIRE);
+        turn.schedule(EXPIRE, expire_at)
     });
 
-const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", |mcu, oid: Oid, reason: u8| {
-    mcu.with::<Trsync, _>(oid, |trsync, turn| {
-        trsync.pull(turn, reason)?;
-        turn.cancel(REPORT);
-        turn.cancel(EXPIRE);
-        let trigger_reason = trsync.trigger_reason;
-        // The host itself pulled the trigger and does not need to know when: the clock is 0, as in the
-        // firmware.
-        turn.send(State { oid: turn.oid(), can_trigger: false, trigger_reason, clock: Clock::EPOCH });
-        Ok(())
-    })
+const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", Trsync, |trsync, turn, reason: u8| {
+    trsync.pull(turn, reason)?;
+    turn.cancel(REPORT);
+    turn.cancel(EXPIRE);
+    let trigger_reason = trsync.trigger_reason;
+    // The host itself pulled the trigger and does not need to know when: the clock is 0, as in the
+    // firmware.
+    turn.send(State { oid: turn.oid(), can_trigger: false, trigger_reason, clock: Clock::EPOCH });
+    Ok(())
 });

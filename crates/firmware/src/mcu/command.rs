@@ -36,6 +36,11 @@ pub struct Command {
 }
 
 impl Command {
+    /// A command that all hosts take, while the machine runs. [`command!`](crate::command) declares one.
+    pub const fn new(format: &'static str, handler: Handler) -> Command {
+        Command { format, generations: Generations::ALL, in_shutdown: false, handler }
+    }
+
     /// Lets the command run after a shutdown too (`HF_IN_SHUTDOWN`).
     pub const fn allowed_in_shutdown(mut self) -> Command {
         self.in_shutdown = true;
@@ -150,19 +155,14 @@ impl Feature {
         Feature { name: "", commands: &[], responses: &[], constants: &[], enumerations: &[], shutdowns: &[] };
 }
 
-/// Declares a command: its format, and a closure with the machine and the typed parameters.
+/// Declares a command: its format, and a closure with the MCU and the typed parameters.
+///
+/// A command to an object names the object's type behind the format. Its first parameter is the object's `oid`, and its
+/// closure has the object and its [`Turn`](crate::mcu::Turn) in place of the MCU and the oid.
 #[macro_export]
 macro_rules! command {
     ($format:literal, |$mcu:ident $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
-        const {
-            assert!(
-                $crate::protocol::format::agrees($format, &[$($crate::protocol::format::Spec {
-                    name: stringify!($arg),
-                    conversions: <$t as $crate::protocol::format::Arg>::CONVERSIONS,
-                }),*]),
-                concat!("handler arguments disagree with \"", $format, "\"")
-            )
-        };
+        $crate::command!(@agrees $format $(, $arg: $t)*);
         fn handler(
             $mcu: &mut $crate::mcu::Mcu,
             args: &mut $crate::protocol::vlq::Reader<'_>,
@@ -171,13 +171,31 @@ macro_rules! command {
             let _ = args;
             $body
         }
-        $crate::mcu::Command {
-            format: $format,
-            generations: $crate::mcu::Generations::ALL,
-            in_shutdown: false,
-            handler,
-        }
+        $crate::mcu::Command::new($format, handler)
     }};
+    ($format:literal, $object:ty, |$own:ident, $turn:tt $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
+        $crate::command!(@agrees $format, oid: $crate::mcu::Oid $(, $arg: $t)*);
+        fn handler(
+            mcu: &mut $crate::mcu::Mcu,
+            args: &mut $crate::protocol::vlq::Reader<'_>,
+        ) -> Result<(), $crate::shutdown::Shutdown> {
+            let oid = <$crate::mcu::Oid as $crate::protocol::format::Arg>::decode(args)?;
+            $(let $arg = <$t as $crate::protocol::format::Arg>::decode(args)?;)*
+            mcu.with::<$object, _>(oid, |$own, $turn| $body)
+        }
+        $crate::mcu::Command::new($format, handler)
+    }};
+    (@agrees $format:literal $(, $arg:ident: $t:ty)*) => {
+        const {
+            assert!(
+                $crate::protocol::format::agrees($format, &[$($crate::protocol::format::Spec {
+                    name: stringify!($arg),
+                    conversions: <$t as $crate::protocol::format::Arg>::CONVERSIONS,
+                }),*]),
+                concat!("handler arguments disagree with \"", $format, "\"")
+            )
+        }
+    };
 }
 
 /// Declares a response as a struct. Behind the format stands which hosts take it, such as
