@@ -2,7 +2,8 @@
 //! Checks the form of all pages and their links. Other tests check their content: `tests/lab_system` runs their
 //! commands, and `tests/klippy/readme.rs` gives their configurations to klippy.
 
-use std::path::Path;
+use std::fs;
+use std::path::{Path, PathBuf};
 
 use pinion_testkit::page::{COMMANDS, Page, pages, reason};
 
@@ -122,7 +123,7 @@ fn is_path(text: &str) -> bool {
 fn files_that_pages_name_are_there() {
     let project = Path::new(env!("CARGO_MANIFEST_DIR"));
     let map = "tests/README.md".to_owned();
-    let map = Page { text: std::fs::read_to_string(project.join(&map)).unwrap(), name: map };
+    let map = Page { text: fs::read_to_string(project.join(&map)).unwrap(), name: map };
     let mut count = 0;
     for page in pages().iter().chain([&map]) {
         for (number, line) in prose(page) {
@@ -133,6 +134,37 @@ fn files_that_pages_name_are_there() {
         }
     }
     assert!(count > 20, "only {count} paths were seen");
+}
+
+/// All Rust sources below a folder, without the indentation of their lines.
+fn sources(folder: &Path) -> Vec<String> {
+    let paths = fs::read_dir(folder).unwrap().map(|entry| entry.unwrap().path());
+    let source = |path: PathBuf| match path.extension() {
+        _ if path.is_dir() => sources(&path),
+        Some(extension) if extension == "rs" => vec![without_indentation(&fs::read_to_string(path).unwrap())],
+        _ => Vec::new(),
+    };
+    paths.flat_map(source).collect()
+}
+
+fn without_indentation(text: &str) -> String {
+    text.lines().map(|line| format!("{}\n", line.trim())).collect()
+}
+
+/// So it compiles, and follows the code.
+#[test]
+fn rust_on_a_page_is_part_of_a_source() {
+    let sources = sources(&Path::new(env!("CARGO_MANIFEST_DIR")).join("crates"));
+    let mut count = 0;
+    for page in pages() {
+        for block in page.blocks().iter().filter(|block| block.kind == "rust") {
+            let code = without_indentation(&block.text);
+            let found = sources.iter().any(|source| source.contains(&code));
+            assert!(found, "{}:{}: no source has this code", page.name, block.line);
+            count += 1;
+        }
+    }
+    assert!(count > 4, "only {count} blocks were seen");
 }
 
 #[test]

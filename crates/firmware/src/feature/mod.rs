@@ -19,6 +19,8 @@ mod digital_out;
 mod display;
 mod ds18b20;
 mod endstop;
+#[cfg(test)]
+mod example;
 mod fifo_sensor;
 mod hd44780;
 mod hx71x;

@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Bells: struck at an instant.
+
+#![forbid(unsafe_code)]
+
+use crate::board::Pin;
+use crate::mcu::{
+    Command, Done, Feature, Next, Object, Oid, OutputLine, Response, Safe, Timer, Turn, WireClock, command, response,
+};
+use crate::shutdown::{Shutdown, shutdowns};
+use crate::time::{Clock, Ticks};
+
+pub(super) const FEATURE: Feature = Feature {
+    name: "bell",
+    commands: &[CONFIG_BELL, RING_BELL],
+    responses: &[Rung::FORM],
+    shutdowns: SHUTDOWNS,
+    ..Feature::EMPTY
+};
+
+shutdowns! {
+    /// `ring_bell` while the bell still swings.
+    STILL_SWINGING = "Bell is still swinging";
+}
+
+response! {
+    /// The bell was struck.
+    "bell_rung oid=%c clock=%u"
+    pub(super) struct Rung { oid: Oid, clock: Clock }
+}
+
+const TIMER: Timer = Timer::exact(0);
+/// How long the line is high.
+const STRIKE: Ticks = Ticks::from_us(20_000);
+const KIND: &str = "bell";
+
+struct Bell {
+    line: OutputLine,
+    swinging: bool,
+    struck: bool,
+}
+
+const CONFIG_BELL: Command = command!("config_bell oid=%c pin=%u", |mcu, oid: Oid, pin: Pin| {
+    mcu.vacant(oid)?;
+    let line = mcu.output(pin, false, false)?;
+    mcu.assign_on(pin, oid, Bell { line, swinging: false, struck: false })
+});
+
+const RING_BELL: Command = command!("ring_bell oid=%c clock=%u", |mcu, oid: Oid, clock: WireClock| {
+    let at = mcu.instant(clock);
+    mcu.with::<Bell, _>(oid, |bell, turn| bell.ring(turn, at))
+});
+
+impl Bell {
+    fn ring(&mut self, turn: &mut Turn, at: Clock) -> Result<(), Shutdown> {
+        if self.swinging {
+            return Err(Shutdown::by_host(STILL_SWINGING, "ring_bell came too soon"));
+        }
+        self.swinging = true;
+        turn.schedule(TIMER, at)
+    }
+}
+
+impl Object for Bell {
+    fn kind(&self) -> &'static str {
+        KIND
+    }
+
+    fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
+        self.line.toggle(turn)?;
+        self.struck = !self.struck;
+        if self.struck {
+            turn.send(Rung { oid: turn.oid(), clock: at });
+            return Ok(Next::At(at + STRIKE));
+        }
+        self.swinging = false;
+        Ok(Next::Done)
+    }
+
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        self.line.settle(turn, KIND, done)
+    }
+
+    fn shutdown(&mut self, _turn: &mut Turn) {
+        self.swinging = false;
+        self.struck = false;
+    }
+
+    fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
+        self.line.make_safe(turn, false)
+    }
+}
