@@ -18,8 +18,7 @@ use clap::Args;
 use log::LevelFilter;
 use nix::fcntl::OFlag;
 use nix::sys::signal::{Signal, kill};
-use nix::sys::termios::{SetArg, Termios, tcgetattr, tcsetattr};
-use nix::unistd::{getpid, write};
+use nix::unistd::getpid;
 use rustyline::completion::Completer;
 use rustyline::config::CompletionType;
 use rustyline::error::ReadlineError;
@@ -29,8 +28,8 @@ use rustyline::history::FileHistory;
 use rustyline::validate::Validator;
 use rustyline::{Config, Context, Editor, ExternalPrinter, Helper};
 use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
-use signal_hook::iterator::Signals;
 use signal_hook::low_level::emulate_default_handler;
+use termina::escape::csi::DecPrivateModeCode;
 
 use crate::klippy::process::{Search, Terminal as Device, find};
 use crate::runtime::wakeup::MarginLimits;
@@ -43,6 +42,7 @@ use pinion_sim::SimBoard;
 use super::complete::{SIMULATED, offering};
 use super::page::{Page, print};
 use super::run::{BoardName, sim_config};
+use super::terminal::{Terminal, off};
 use super::{failed, logging, not_permitted};
 
 /// How long a machine has to answer.
@@ -75,9 +75,9 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
             let ready = free(&args.pty).and_then(|()| {
                 let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
                 let signals: Vec<i32> = [SIGQUIT, SIGTERM].into_iter().chain(hang_up).collect();
-                Terminal::remember().give_back_at(&signals)
+                lend_terminal(&signals)
             });
-            ready.and_then(|()| speak(args, &args.pty))
+            ready.and_then(|_terminal| speak(args, &args.pty))
         }
         Some(BoardName::Sim(file)) => simulate(args, file.as_deref()),
         Some(BoardName::Linux) => Err("--board is sim or sim:FILE.toml here; for this machine's pins start pinion run, and name its link to pinion console".into()),
@@ -124,9 +124,8 @@ fn free(pty: &Path) -> Result<(), String> {
 fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     // The one host is this console, which speaks every dialect.
     let helpers = Helpers::default();
-    let terminal = Terminal::remember();
     // The others end the machine in order, which then tells which it was.
-    terminal.clone().give_back_at(&[SIGQUIT])?;
+    let terminal = lend_terminal(&[SIGQUIT])?;
     let signal = Arc::new(AtomicUsize::new(0));
     let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
     for ending in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
@@ -174,7 +173,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     };
     let timing = board.timing();
     let ended = runtime::run(&options, Box::new(board), timing, clock, helpers, ready);
-    terminal.give_back();
+    drop(terminal);
     ended.map_err(|error| error.to_string())?;
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();
     said.unwrap_or_else(|| {
@@ -184,39 +183,15 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     })
 }
 
-/// The terminal as it was before a line editor came, which has it otherwise while somebody writes a line.
-#[derive(Clone)]
-struct Terminal(Option<Termios>);
-
-impl Terminal {
-    fn remember() -> Terminal {
-        Terminal(tcgetattr(io::stdin()).ok())
+/// Lends the terminal, if stdin is one, to the line editor, which has it while somebody writes a line. These signals
+/// give it back.
+fn lend_terminal(signals: &[i32]) -> Result<Option<Terminal>, String> {
+    // The editor asks the terminal to mark what is pasted.
+    let terminal = Terminal::lend(format_args!("{}\r\n", off(DecPrivateModeCode::BracketedPaste)));
+    if let Some(terminal) = &terminal {
+        terminal.give_back_at(signals)?;
     }
-
-    fn give_back(&self) {
-        let (Some(before), Ok(now)) = (&self.0, tcgetattr(io::stdin())) else { return };
-        if now.local_flags != before.local_flags {
-            let _ = tcsetattr(io::stdin(), SetArg::TCSANOW, before);
-            // The editor has asked the terminal to mark what is pasted.
-            let _ = write(io::stdout(), b"\x1b[?2004l\r\n");
-        }
-    }
-
-    /// Has these signals end the program as they do by themselves, with the terminal given back first.
-    fn give_back_at(self, signals: &[i32]) -> Result<(), String> {
-        if self.0.is_none() {
-            return Ok(());
-        }
-        let mut signals = Signals::new(signals).map_err(|error| format!("signals can not be taken in: {error}"))?;
-        let wait = move || {
-            for signal in signals.forever() {
-                self.give_back();
-                let _ = emulate_default_handler(signal);
-            }
-        };
-        let waiting = thread::Builder::new().name("signals".into()).spawn(wait);
-        waiting.map(drop).map_err(|error| format!("no thread can be started: {error}"))
-    }
+    Ok(terminal)
 }
 
 /// Speaks to the machine of a terminal: the lines of a file, of a pipe, or of a person.

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 pub(super) mod heater;
 pub(super) mod picture;
 
+use crate::cli::terminal::ERASE_LINE;
 use crate::foreign::plain;
 use heater::{Goal, Heater, Thermistor, Wiring};
 use pinion_client::config::Config;
@@ -228,7 +229,7 @@ impl<W: Write> Observer for ProgressLines<W> {
             self.next = Some(now + Duration::from_millis(50));
             let full = (part.clamp(0.0, 1.0) * WIDTH as f64).round() as usize;
             let bar = "█".repeat(full) + &"░".repeat(WIDTH - full);
-            self.write("\r\x1b[K", &format!("{what:<10} {bar} {detail}"), "");
+            self.write(&format!("\r{ERASE_LINE}"), &format!("{what:<10} {bar} {detail}"), "");
         } else {
             self.next = Some(now + Duration::from_secs(1));
             self.write("", &format!("{what}: {detail}"), "\n");
@@ -237,9 +238,9 @@ impl<W: Write> Observer for ProgressLines<W> {
 
     fn checked(&mut self, check: &Check) {
         self.next = None;
-        let start = if self.live { "\r\x1b[K" } else { "" };
+        let start = if self.live { format!("\r{ERASE_LINE}") } else { String::new() };
         let mark = if check.passed { "ok    " } else { "WRONG " };
-        self.write(start, &format!("{mark}{}: {}", check.what, check.seen), "\n");
+        self.write(&start, &format!("{mark}{}: {}", check.what, check.seen), "\n");
     }
 }
 
@@ -555,6 +556,9 @@ fn heat(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
+    use proptest::prelude::*;
 
     fn shown(live: bool) -> String {
         let mut out = Vec::new();
@@ -568,8 +572,23 @@ mod tests {
     #[test]
     fn progress_is_lines_elsewhere_and_a_bar_on_a_terminal() {
         assert_eq!(shown(false), "home x: 5 mm\nWRONG x homed: 800 steps\n");
-        let bar = format!("\r\x1b[Khome x     {}{} 5 mm", "█".repeat(12), "░".repeat(12));
-        assert_eq!(shown(true), bar + "\r\x1b[KWRONG x homed: 800 steps\n");
+        let bar = format!("\r\x1b[0Khome x     {}{} 5 mm", "█".repeat(12), "░".repeat(12));
+        assert_eq!(shown(true), bar + "\r\x1b[0KWRONG x homed: 800 steps\n");
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_a_machine_names_stays_in_its_line(name in any_name()) {
+            let shown = |live| {
+                let mut out = Vec::new();
+                let mut lines = ProgressLines::new(&mut out, live);
+                lines.update(&name, 0.5, &name);
+                lines.checked(&Check { what: name.clone(), passed: true, seen: name.clone() });
+                String::from_utf8(out).unwrap()
+            };
+            assert_plain(&shown(false), 2);
+            assert_plain(&shown(true).replace(&format!("\r{ERASE_LINE}"), ""), 1);
+        }
     }
 
     #[test]

@@ -21,7 +21,6 @@ pub mod demo;
 mod dict;
 mod doctor;
 mod finding;
-mod keys;
 pub mod latency;
 mod logging;
 mod page;
@@ -30,6 +29,7 @@ pub mod run;
 mod show;
 pub mod sim;
 mod status;
+mod terminal;
 
 use page::{Page, print};
 

@@ -13,14 +13,20 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::getpid;
+use signal_hook::consts::SIGQUIT;
+use termina::escape::csi::{Csi, DecPrivateModeCode, Sgr};
+use termina::event::KeyCode;
+use termina::style::RgbColor;
 
 use crate::foreign::plain;
 use pinion_linux::clock::monotonic;
-use pinion_linux::sys;
 use pinion_sim::SimProbe;
 
-use super::keys::Keys;
 use super::page::draw;
+use super::terminal::{
+    ERASE_BELOW, ERASE_LINE, Key, Keys, RESTORE_CURSOR, SAVE_CURSOR, Terminal, all_scrolls, off, on, rows, scrolling,
+    to_row,
+};
 use changes::Changes;
 
 mod changes;
@@ -172,7 +178,8 @@ fn name_colours(text: &str) -> String {
 /// Paints each colour as a block.
 fn paint_colours(text: &str) -> String {
     each_colour(text, |written, _, [red, green, blue]| {
-        *written += &format!("\x1b[48;2;{red};{green};{blue}m   \x1b[0m");
+        let background = Csi::Sgr(Sgr::Background(RgbColor::new(red, green, blue).into()));
+        *written += &format!("{background}   {}", Csi::Sgr(Sgr::Reset));
     })
 }
 
@@ -229,31 +236,27 @@ impl Screen {
         if (rows, picture_rows) != (self.rows, self.picture_rows) {
             if self.rows > 0 {
                 let top = self.rows.saturating_sub(self.picture_rows) + 1;
-                out += &format!("\x1b[r\x1b[{top};1H\x1b[J");
+                out += &format!("{}{}{ERASE_BELOW}", scrolling(usize::MAX), to_row(top));
             }
             out += &"\n".repeat(picture_rows);
             let log_rows = rows.saturating_sub(picture_rows).max(1);
-            out += &format!("\x1b[1;{log_rows}r\x1b[{log_rows};1H");
+            out += &format!("{}{}", scrolling(log_rows), to_row(log_rows));
             (self.rows, self.picture_rows) = (rows, picture_rows);
             self.drawn.clear();
         }
         let top = rows.saturating_sub(picture_rows) + 1;
         lines.resize(picture_rows, String::new());
         let changed = |(n, line): (usize, &String)| {
-            (self.drawn.get(n) != Some(line)).then(|| format!("\x1b[{};1H{line}\x1b[K", top + n))
+            (self.drawn.get(n) != Some(line)).then(|| format!("{}{line}{ERASE_LINE}", to_row(top + n)))
         };
         let changed: String = lines.iter().enumerate().filter_map(changed).collect();
         if !changed.is_empty() {
             // Without wrapping, which would reach into the next line; the cursor goes back to the log.
-            out += &format!("\x1b7\x1b[?7l{changed}\x1b[?7h\x1b8");
+            let wrap = DecPrivateModeCode::AutoWrap;
+            out += &format!("{SAVE_CURSOR}{}{changed}{}{RESTORE_CURSOR}", off(wrap), on(wrap));
             self.drawn = lines;
         }
         out
-    }
-
-    /// What gives the terminal back, with the last picture on it.
-    fn leave(&self) -> String {
-        if self.rows == 0 { String::new() } else { format!("\x1b[r\x1b[{};1H\n", self.rows) }
     }
 }
 
@@ -318,21 +321,20 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
     }
     let paint = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let mut screen = Screen::default();
-    let keys = Keys::take();
+    let mut terminal = Terminal::take(Keys::ButSignals);
+    if let Err(error) = terminal.give_back_at(&[SIGQUIT]) {
+        log::warn!("the terminal is not given back if SIGQUIT ends the program: {error}");
+    }
     loop {
         let is_over = is_over(DRAW_PERIOD);
-        if !is_over && keys.as_ref().is_some_and(|keys| keys.has(b'q')) {
+        let quit = Key::Other(KeyCode::Char('q'));
+        if !is_over && terminal.keys(Duration::ZERO).is_ok_and(|keys| keys.contains(&quit)) {
             // SIGTERM to ourselves: the program ends in order, as by Ctrl-C.
             kill(getpid(), Signal::SIGTERM)?;
         }
-        // A terminal that does not tell its size has the VT100's.
-        let rows = sys::terminal_rows(&io::stdout()).unwrap_or(24);
-        let mut drawing = screen.draw(picture(&look(probe), paint), rows);
-        if is_over {
-            drawing += &screen.leave();
-        }
+        let drawing = screen.draw(picture(&look(probe), paint), rows());
         if !drawing.is_empty() {
-            draw(&drawing)?;
+            terminal.change(drawing, all_scrolls())?;
         }
         if is_over {
             return Ok(());
@@ -362,7 +364,7 @@ mod tests {
                 assert_plain(&line, 0);
             }
             for line in picture(&items(), true) {
-                assert_plain(&line.replace("\x1b[48;2;", "").replace("\x1b[0m", ""), 0);
+                assert_plain(&line.replace("\x1b[48;2;", "").replace("\x1b[m", ""), 0);
             }
             let lines = Changes::default().lines(&items(), Duration::ZERO, false);
             assert_plain(&lines, lines.matches('\n').count());
@@ -373,7 +375,7 @@ mod tests {
     fn colours_are_found_in_any_text() {
         assert_eq!(name_colours("#ff0000 off #00ff00+20"), "red#ff0000 off green#00ff00+20");
         assert_eq!(name_colours("# #12 #é12345 #zzzzzz"), "# #12 #é12345 #zzzzzz");
-        assert_eq!(paint_colours("a #0a0b0c"), "a \x1b[48;2;10;11;12m   \x1b[0m");
+        assert_eq!(paint_colours("a #0a0b0c"), "a \x1b[48;2;10;11;12m   \x1b[m");
     }
 
     #[test]
@@ -406,10 +408,10 @@ mod tests {
                     let end = rest.find(|c: char| c.is_ascii_alphabetic()).unwrap();
                     let numbers: Vec<usize> = rest[..end].split(';').filter_map(|n| n.parse().ok()).collect();
                     match (&rest[end..=end], &numbers[..]) {
-                        ("H", [row, 1]) => self.row = row - 1,
+                        ("H", [row, 1]) => self.row = row.min(&10) - 1,
                         ("r", [1, bottom]) => (self.bottom, self.row) = (*bottom, 0),
                         ("r", []) => (self.bottom, self.row) = (10, 0),
-                        ("J", []) => self.screen[self.row..].fill(String::new()),
+                        ("J", [0]) => self.screen[self.row..].fill(String::new()),
                         ("K" | "l" | "h", _) => {}
                         other => panic!("{other:?}"),
                     }
@@ -465,7 +467,7 @@ mod tests {
         let many = screen.draw((0..30).map(|n| n.to_string()).collect(), 10);
         terminal.take(&many);
         assert_eq!(terminal.rows()[8..], ["5", "... and 24 lines more, on a terminal with more rows"]);
-        terminal.take(&screen.leave());
+        terminal.take(&all_scrolls());
         assert_eq!((terminal.bottom, terminal.row), (10, 9), "all of it scrolls again, and below the picture");
     }
 }

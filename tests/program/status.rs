@@ -12,9 +12,10 @@ use std::thread;
 use std::time::Instant;
 
 use nix::pty::{Winsize, openpty};
-use nix::sys::signal::Signal;
+use nix::sys::signal::{Signal, kill};
 use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
 use nix::sys::termios::{LocalFlags, tcgetattr};
+use nix::unistd::Pid;
 use serde_json::{Value, json};
 
 use crate::process::{PATIENCE, Pinion, exists, output};
@@ -293,6 +294,45 @@ fn keys_that_the_kernel_makes_signals_of_leave_no_terminal_behind() {
         assert!(watch.wait().unwrap().success());
         assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
     }
+}
+
+#[test]
+fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.until("the socket", || exists(&socket(&pinion)));
+    let terminal = openpty(None, None).unwrap();
+    let before = tcgetattr(&terminal.slave).unwrap();
+    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
+    let mut watch = watch(&pinion, dup(), dup());
+    let pid = Pid::from_raw(watch.id() as i32);
+    let mut master = File::from(terminal.master);
+    let keys = master.try_clone().unwrap();
+    let (mut shown, mut piece) = (String::new(), [0; 4096]);
+    let mut until = |wanted: &str, times: usize| {
+        while shown.matches(wanted).count() < times {
+            let read = master.read(&mut piece).unwrap();
+            shown += &String::from_utf8_lossy(&piece[..read]);
+        }
+    };
+    until("q ends", 1);
+    let press = |key: &[u8]| (&keys).write_all(key).unwrap();
+    press(b"\x1a");
+    until("\x1b[?1049l", 1);
+    let stat = || fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
+    let is_stopped = || stat().rsplit_once(") ").unwrap().1.starts_with('T');
+    let end = Instant::now() + PATIENCE;
+    while !is_stopped() && Instant::now() < end {
+        thread::sleep(std::time::Duration::from_millis(10));
+    }
+    // In a group that no shell looks after, the kernel does not stop it.
+    if is_stopped() {
+        assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
+    }
+    kill(pid, Signal::SIGCONT).unwrap();
+    until("\x1b[?1049h", 2);
+    press(b"q");
+    assert!(watch.wait().unwrap().success());
+    assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
 }
 
 #[test]

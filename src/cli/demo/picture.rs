@@ -274,6 +274,9 @@ fn escape(text: &str) -> String {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::page::tests::assert_plain;
+    use crate::foreign::tests::any_name;
+    use proptest::prelude::*;
 
     /// Every tag that opens closes, in order, and no bare sign stands in the text.
     fn assert_well_formed(svg: &str) {
@@ -321,6 +324,15 @@ mod tests {
         assert_eq!(svg.matches("<polyline").count(), 4);
         assert_eq!(svg.matches("<circle").count(), 2);
         assert_eq!(svg.matches("<rect").count(), 2);
+    }
+
+    proptest! {
+        #[test]
+        fn whatever_an_axis_is_called_the_picture_is_well_formed(name in any_name()) {
+            let svg = homing(&Report { app: name.clone(), axes: vec![axis(&name, 0.0)], ..Report::default() });
+            assert_well_formed(&svg);
+            assert_plain(&svg, svg.lines().count());
+        }
     }
 
     #[test]

@@ -4,26 +4,27 @@
 #![forbid(unsafe_code)]
 
 use std::io::{self, IsTerminal};
-use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use nix::poll::{PollFd, PollFlags, poll};
 use nix::sys::signal::{Signal, raise};
-use nix::sys::termios::{LocalFlags, SetArg, SpecialCharacterIndices, Termios, tcgetattr, tcsetattr};
 use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
+use termina::escape::csi::DecPrivateModeCode as Code;
+use termina::event::KeyCode;
 
 use crate::cli::page::{Page, draw};
+use crate::cli::terminal::{ERASE_BELOW, ERASE_LINE, Key, Keys, Terminal, off, on, rows, to_row};
 use crate::runtime::hang_up;
-use pinion_linux::sys;
 
 use super::ask::ask;
 use super::{StatusArgs, show};
 
 /// Time between two looks.
 const PERIOD: Duration = Duration::from_secs(1);
+/// Longest wait for a key, after which a signal is looked for.
+const KEY_WAIT: Duration = Duration::from_millis(50);
 
 /// Prints the status each second, until it is asked to end.
 pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
@@ -39,8 +40,7 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
         log::warn!("{notice}");
     }
     let mut first = Some(first);
-    let (stdin, stdout) = (io::stdin(), io::stdout());
-    let mut screen = stdout.is_terminal().then(|| Screen::enter(stdin.as_fd()));
+    let mut screen = io::stdout().is_terminal().then(Screen::enter).transpose().map_err(gone)?;
     loop {
         let page = match first.take().map_or_else(|| ask(args), Ok) {
             Ok(answer) => show(args, &answer.status),
@@ -57,29 +57,33 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
         let next = Instant::now() + PERIOD;
         while Instant::now() < next {
             let wish = match &mut screen {
-                Some(screen) => screen.wish(stdin.as_fd()),
+                Some(screen) => screen.wish(),
                 None => {
-                    thread::sleep(Duration::from_millis(20));
+                    thread::sleep(KEY_WAIT);
                     None
                 }
             };
+            if ended.load(Ordering::Relaxed) || wish == Some(Wish::End) {
+                return Ok(());
+            }
             if let (Some(Wish::Scroll(scroll)), Some(screen)) = (wish, &mut screen)
                 && screen.scroll(scroll).is_err()
             {
-                return Ok(());
-            }
-            if ended.load(Ordering::Relaxed) || wish == Some(Wish::End) {
                 return Ok(());
             }
             if wish == Some(Wish::Stop) {
                 drop(screen.take());
                 // Where nobody could have it go on again, the kernel does not stop it.
                 let _ = raise(Signal::SIGTSTP);
-                screen = Some(Screen::enter(stdin.as_fd()));
+                screen = Some(Screen::enter().map_err(gone)?);
                 break;
             }
         }
     }
+}
+
+fn gone(error: io::Error) -> String {
+    format!("the terminal can not be written: {error}")
 }
 
 /// What a key asks for.
@@ -104,27 +108,20 @@ enum Scroll {
     Bottom,
 }
 
-/// The keys that scroll, as terminals send them.
-const SCROLL_KEYS: [(&[u8], Scroll); 18] = [
-    (b"\x1b[A", Scroll::Lines(-1)),
-    (b"\x1bOA", Scroll::Lines(-1)),
-    (b"k", Scroll::Lines(-1)),
-    (b"\x1b[B", Scroll::Lines(1)),
-    (b"\x1bOB", Scroll::Lines(1)),
-    (b"j", Scroll::Lines(1)),
-    (b"\x1b[5~", Scroll::Screens(-1)),
-    (b"b", Scroll::Screens(-1)),
-    (b"\x1b[6~", Scroll::Screens(1)),
-    (b" ", Scroll::Screens(1)),
-    (b"\x1b[H", Scroll::Top),
-    (b"\x1bOH", Scroll::Top),
-    (b"\x1b[1~", Scroll::Top),
-    (b"g", Scroll::Top),
-    (b"\x1b[F", Scroll::Bottom),
-    (b"\x1bOF", Scroll::Bottom),
-    (b"\x1b[4~", Scroll::Bottom),
-    (b"G", Scroll::Bottom),
-];
+/// What a key asks for.
+fn wish(key: Key) -> Option<Wish> {
+    Some(match key {
+        Key::End | Key::Other(KeyCode::Char('q' | 'Q')) => Wish::End,
+        Key::Stop => Wish::Stop,
+        Key::Other(KeyCode::Up | KeyCode::Char('k')) => Wish::Scroll(Scroll::Lines(-1)),
+        Key::Other(KeyCode::Down | KeyCode::Char('j')) => Wish::Scroll(Scroll::Lines(1)),
+        Key::Other(KeyCode::PageUp | KeyCode::Char('b')) => Wish::Scroll(Scroll::Screens(-1)),
+        Key::Other(KeyCode::PageDown | KeyCode::Char(' ')) => Wish::Scroll(Scroll::Screens(1)),
+        Key::Other(KeyCode::Home | KeyCode::Char('g')) => Wish::Scroll(Scroll::Top),
+        Key::Other(KeyCode::End | KeyCode::Char('G')) => Wish::Scroll(Scroll::Bottom),
+        Key::Other(_) => return None,
+    })
+}
 
 /// The lines of a page that are to be seen.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -164,26 +161,23 @@ impl View {
     }
 }
 
-/// A terminal that is drawn on in place: its alternate screen, without a cursor, long
-/// lines cut off. Dropped, it is as before.
+/// A terminal that is drawn on in place: its alternate screen, without a cursor, long lines cut off. Dropped, it is as
+/// before.
 struct Screen {
-    /// The settings to give back, if keys can be read.
-    before: Option<Termios>,
+    terminal: Terminal,
     page: Page,
     view: View,
 }
 
 impl Screen {
-    fn enter(keys: BorrowedFd<'_>) -> Screen {
-        let before = tcgetattr(keys).ok();
-        if let Some(before) = &before {
-            let mut keyed = before.clone();
-            // Those that make signals are keys, too: the kernel's would leave the terminal as it is here.
-            keyed.local_flags.remove(LocalFlags::ICANON | LocalFlags::ECHO | LocalFlags::ISIG);
-            let _ = tcsetattr(keys, SetArg::TCSANOW, &keyed);
-        }
-        let _ = draw("\x1b[?1049h\x1b[?25l\x1b[?7l");
-        Screen { before, page: Page::default(), view: View::default() }
+    fn enter() -> io::Result<Screen> {
+        let (alternate, cursor, wrap) = (Code::ClearAndEnableAlternateScreen, Code::ShowCursor, Code::AutoWrap);
+        let terminal = Terminal::take(Keys::All);
+        terminal.change(
+            format_args!("{}{}{}", on(alternate), off(cursor), off(wrap)),
+            format_args!("{}{}{}", on(wrap), on(cursor), off(alternate)),
+        )?;
+        Ok(Screen { terminal, page: Page::default(), view: View::default() })
     }
 
     /// Shows a new page, at the place that the last one was seen at.
@@ -199,50 +193,19 @@ impl Screen {
 
     /// Draws as much of the page as the terminal has rows for.
     fn draw(&mut self) -> io::Result<()> {
-        self.view.room = sys::terminal_rows(&io::stdout()).unwrap_or(24).saturating_sub(1);
-        let ends = if self.before.is_some() { "q ends" } else { "Ctrl-C ends" };
+        self.view.room = rows().saturating_sub(1);
+        let ends = if self.terminal.has_keys() { "q ends" } else { "Ctrl-C ends" };
         let (lines, foot) = self.view.of(&self.page, ends);
-        let lines: String = lines.iter().map(|line| format!("{line}\x1b[K\r\n")).collect();
-        draw(&format!("\x1b[H{lines}\x1b[J{foot}"))
+        let lines: String = lines.iter().map(|line| format!("{line}{ERASE_LINE}\r\n")).collect();
+        draw(&format!("{}{lines}{ERASE_BELOW}{foot}", to_row(1)))
     }
 
-    /// What somebody has pressed a key for; waits a little for that.
-    fn wish(&self, keys: BorrowedFd<'_>) -> Option<Wish> {
-        let Some(before) = &self.before else {
-            thread::sleep(Duration::from_millis(20));
-            return None;
-        };
-        let mut fds = [PollFd::new(keys, PollFlags::POLLIN)];
-        if !matches!(poll(&mut fds, 50u16), Ok(1)) {
-            return None;
-        }
-        let mut pressed = [0; 64];
-        match nix::unistd::read(keys, &mut pressed) {
-            Ok(read @ 1..)
-                if let Some((_, scroll)) = SCROLL_KEYS.iter().find(|(key, _)| pressed[..read].starts_with(key)) =>
-            {
-                Some(Wish::Scroll(*scroll))
-            }
-            Ok(read @ 1..) => pressed[..read].iter().find_map(|key| {
-                let is = |special: SpecialCharacterIndices| before.control_chars[special as usize] == *key;
-                match key {
-                    b'q' | b'Q' => Some(Wish::End),
-                    _ if is(SpecialCharacterIndices::VINTR) || is(SpecialCharacterIndices::VQUIT) => Some(Wish::End),
-                    _ => is(SpecialCharacterIndices::VSUSP).then_some(Wish::Stop),
-                }
-            }),
-            Err(nix::errno::Errno::EINTR) => None,
-            // Without a terminal any more there is nobody to show anything.
-            Ok(_) | Err(_) => Some(Wish::End),
-        }
-    }
-}
-
-impl Drop for Screen {
-    fn drop(&mut self) {
-        let _ = draw("\x1b[?7h\x1b[?25h\x1b[?1049l");
-        if let Some(before) = &self.before {
-            let _ = tcsetattr(io::stdin().as_fd(), SetArg::TCSANOW, before);
+    /// What somebody has pressed a key for. Waits a little for that.
+    fn wish(&mut self) -> Option<Wish> {
+        match self.terminal.keys(KEY_WAIT) {
+            Ok(keys) => keys.into_iter().find_map(wish),
+            // Without a terminal there is nobody to show anything.
+            Err(_) => Some(Wish::End),
         }
     }
 }

@@ -87,16 +87,6 @@ pub fn keep_only(capabilities: u32) -> io::Result<()> {
     }
 }
 
-/// The rows of a terminal, if it tells them.
-pub fn terminal_rows(terminal: &impl AsRawFd) -> Option<usize> {
-    let mut size = libc::winsize { ws_row: 0, ws_col: 0, ws_xpixel: 0, ws_ypixel: 0 };
-    // SAFETY: `size` is what this request writes, and lives through the call.
-    match unsafe { libc::ioctl(terminal.as_raw_fd(), libc::TIOCGWINSZ, &mut size) } {
-        0 if size.ws_row > 0 => Some(size.ws_row.into()),
-        _ => None,
-    }
-}
-
 /// Words that stay common to this process and to those that it forks.
 pub const SHARED_WORDS: usize = 1024;
 

@@ -1,0 +1,337 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The terminal: how this program changes it, and that it is as before at the end.
+//!
+//! Three things change it: `pinion status --watch`, `pinion sim --show` and the console's line editor. What
+//! they change is remembered here. It is undone once they are dropped, and if the program panics or is ended
+//! by a signal. The escape sequences and the names of keys are termina's.
+
+#![forbid(unsafe_code)]
+
+use std::fmt::Display;
+use std::io::{self, IsTerminal};
+use std::os::fd::AsFd;
+use std::panic;
+use std::sync::{Mutex, MutexGuard, Once, PoisonError};
+use std::thread;
+use std::time::Duration;
+
+use nix::errno::Errno;
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::termios::{LocalFlags, SetArg, SpecialCharacterIndices, Termios, tcgetattr, tcsetattr};
+use nix::unistd::{getpgrp, read, tcgetpgrp, write};
+use signal_hook::iterator::Signals;
+use signal_hook::low_level::emulate_default_handler;
+use termina::escape::csi::{Csi, Cursor, DecPrivateMode, DecPrivateModeCode, Edit, EraseInDisplay, EraseInLine, Mode};
+use termina::event::{KeyCode, Modifiers};
+use termina::{Event, OneBased, Parser};
+use terminal_size::{Height, terminal_size_of};
+
+use super::page::draw;
+
+/// Rows of a terminal that does not tell its size, which are those of the VT100.
+const ROWS: usize = 24;
+/// Longest wait for a terminal that takes no output, as after Ctrl-S, in milliseconds.
+const FAREWELL_MS: u16 = 1000;
+/// A row below that of any terminal: a terminal takes it for its last one.
+const LAST_ROW: usize = 999;
+const FIRST: OneBased = OneBased::from_zero_based(0);
+
+/// Erases the rest of a line.
+pub(super) const ERASE_LINE: Csi = Csi::Edit(Edit::EraseInLine(EraseInLine::EraseToEndOfLine));
+/// Erases the rest of the screen.
+pub(super) const ERASE_BELOW: Csi = Csi::Edit(Edit::EraseInDisplay(EraseInDisplay::EraseToEndOfDisplay));
+/// Save and restore the cursor. Not all terminals know the sequences that termina has for it.
+pub(super) const SAVE_CURSOR: &str = "\x1b7";
+pub(super) const RESTORE_CURSOR: &str = "\x1b8";
+
+/// Switches something on.
+pub(super) fn on(code: DecPrivateModeCode) -> Csi {
+    Csi::Mode(Mode::SetDecPrivateMode(DecPrivateMode::Code(code)))
+}
+
+/// Switches something off.
+pub(super) fn off(code: DecPrivateModeCode) -> Csi {
+    Csi::Mode(Mode::ResetDecPrivateMode(DecPrivateMode::Code(code)))
+}
+
+/// Moves the cursor to the beginning of a row, counted from 1.
+pub(super) fn to_row(row: usize) -> Csi {
+    Csi::Cursor(Cursor::Position { line: row_number(row), col: FIRST })
+}
+
+/// Has the rows down to this one scroll, and no others.
+pub(super) fn scrolling(bottom: usize) -> Csi {
+    Csi::Cursor(Cursor::SetTopAndBottomMargins { top: FIRST, bottom: row_number(bottom) })
+}
+
+/// Has all rows scroll again, and moves the cursor below all that is shown.
+pub(super) fn all_scrolls() -> String {
+    format!("{}{}\n", scrolling(usize::MAX), to_row(LAST_ROW))
+}
+
+fn row_number(row: usize) -> OneBased {
+    // termina leaves out the largest number, which stands for the last row.
+    OneBased::new(u16::try_from(row).unwrap_or(u16::MAX)).unwrap_or(FIRST)
+}
+
+/// The rows of the terminal on stdout.
+pub(super) fn rows() -> usize {
+    terminal_size_of(io::stdout()).map_or(ROWS, |(_, Height(rows))| rows.into())
+}
+
+/// What undoes the changes.
+struct Before {
+    /// The settings of the terminal on stdin.
+    settings: Option<Termios>,
+    /// What to write on stdout.
+    undo: String,
+    /// Whether somebody else changes it from time to time, and undoes that.
+    is_lent: bool,
+}
+
+/// `None` while the terminal is as before.
+static BEFORE: Mutex<Option<Before>> = Mutex::new(None);
+
+fn before() -> MutexGuard<'static, Option<Before>> {
+    BEFORE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Undoes the changes. It takes no lock that a painter holds while it waits for the terminal.
+fn give_back() {
+    let Some(Before { settings, undo, is_lent }) = before().take() else { return };
+    let stdin = io::stdin();
+    if let Some(settings) = settings {
+        let is_changed = tcgetattr(&stdin).is_ok_and(|now| now.local_flags != settings.local_flags);
+        if is_lent && !is_changed {
+            return;
+        }
+        // Another program's terminal is not ours to set. One that is gone needs nothing back.
+        if is_ours() {
+            let _ = tcsetattr(&stdin, SetArg::TCSANOW, &settings);
+        }
+    }
+    let stdout = io::stdout();
+    if undo.is_empty() || !stdout.is_terminal() {
+        return;
+    }
+    let mut fds = [PollFd::new(stdout.as_fd(), PollFlags::POLLOUT)];
+    if matches!(poll(&mut fds, FAREWELL_MS), Ok(1)) {
+        let _ = write(&stdout, undo.as_bytes());
+    }
+}
+
+/// Has a panic in any thread give the terminal back before it is reported.
+fn give_back_at_panic() {
+    static ONCE: Once = Once::new();
+    ONCE.call_once(|| {
+        let hook = panic::take_hook();
+        panic::set_hook(Box::new(move |panic| {
+            give_back();
+            hook(panic);
+        }));
+    });
+}
+
+/// Whether the shell has this program in the foreground. Without job control nobody says so.
+fn is_ours() -> bool {
+    tcgetpgrp(io::stdin()).map_or(true, |group| group == getpgrp())
+}
+
+/// Which keys come to the program one by one, without Enter.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Keys {
+    /// All.
+    All,
+    /// All but those that the kernel makes signals of, such as Ctrl-C.
+    ButSignals,
+}
+
+/// A key that was pressed.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum Key {
+    /// One whose signal ends a program: Ctrl-C and Ctrl-\.
+    End,
+    /// One whose signal stops a program: Ctrl-Z.
+    Stop,
+    /// Any other.
+    Other(KeyCode),
+}
+
+/// The terminal on stdin and stdout while the program changes it. Dropped, it is as before.
+pub(super) struct Terminal {
+    /// Its settings before; `None` if no keys are read.
+    before: Option<Termios>,
+    parser: Parser,
+}
+
+impl Terminal {
+    /// Takes the terminal. No keys are read if stdin is no terminal, or another program reads from it.
+    pub(super) fn take(keys: Keys) -> Terminal {
+        give_back_at_panic();
+        let stdin = io::stdin();
+        // Taking all keys in the background stops the program until the shell has it in the foreground.
+        let settings = tcgetattr(&stdin).ok().filter(|_| keys == Keys::All || is_ours());
+        *before() = Some(Before { settings: settings.clone(), undo: String::new(), is_lent: false });
+        let keyed = settings.filter(|before| {
+            let mut keyed = before.clone();
+            keyed.local_flags.remove(LocalFlags::ICANON | LocalFlags::ECHO);
+            if keys == Keys::All {
+                keyed.local_flags.remove(LocalFlags::ISIG);
+            }
+            tcsetattr(&stdin, SetArg::TCSANOW, &keyed).is_ok()
+        });
+        Terminal { before: keyed, parser: Parser::default() }
+    }
+
+    /// Lends the terminal to a line editor, which has it while somebody writes a line. `None` if stdin is no
+    /// terminal.
+    pub(super) fn lend(undo: impl Display) -> Option<Terminal> {
+        give_back_at_panic();
+        let settings = tcgetattr(io::stdin()).ok()?;
+        *before() = Some(Before { settings: Some(settings), undo: undo.to_string(), is_lent: true });
+        Some(Terminal { before: None, parser: Parser::default() })
+    }
+
+    /// Has these signals end the program as they do by themselves, with the terminal given back first.
+    pub(super) fn give_back_at(&self, signals: &[i32]) -> Result<(), String> {
+        let mut signals = Signals::new(signals).map_err(|error| format!("signals can not be taken in: {error}"))?;
+        let wait = move || {
+            for signal in signals.forever() {
+                give_back();
+                let _ = emulate_default_handler(signal);
+            }
+        };
+        let waiting = thread::Builder::new().name("signals".into()).spawn(wait);
+        waiting.map(drop).map_err(|error| format!("no thread can be started: {error}"))
+    }
+
+    /// Writes what changes the terminal, to be undone by `undo`.
+    pub(super) fn change(&self, changes: impl Display, undo: impl Display) -> io::Result<()> {
+        if let Some(before) = &mut *before() {
+            before.undo = undo.to_string();
+        }
+        draw(&changes.to_string())
+    }
+
+    /// Whether keys are read.
+    pub(super) fn has_keys(&self) -> bool {
+        self.before.is_some()
+    }
+
+    /// The keys that were pressed, after a wait of up to `patience` for the first.
+    ///
+    /// # Errors
+    ///
+    /// The terminal is gone.
+    pub(super) fn keys(&mut self, patience: Duration) -> io::Result<Vec<Key>> {
+        let Some(before) = self.before.as_ref().filter(|_| is_ours()) else {
+            thread::sleep(patience);
+            return Ok(vec![]);
+        };
+        let stdin = io::stdin();
+        let mut fds = [PollFd::new(stdin.as_fd(), PollFlags::POLLIN)];
+        if !matches!(poll(&mut fds, PollTimeout::try_from(patience).unwrap_or(PollTimeout::MAX)), Ok(1)) {
+            return Ok(vec![]);
+        }
+        let mut bytes = [0; 64];
+        let count = match read(&stdin, &mut bytes) {
+            Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+            Ok(count) => count,
+            Err(Errno::EINTR) => return Ok(vec![]),
+            Err(error) => return Err(error.into()),
+        };
+        let pressed = &bytes[..count];
+        let mut keys: Vec<Key> = pressed.iter().filter_map(|byte| signal_key(before, *byte)).collect();
+        self.parser.parse(pressed, count == bytes.len());
+        while let Some(event) = self.parser.pop() {
+            match event {
+                Event::Key(key) if !key.modifiers.intersects(Modifiers::CONTROL | Modifiers::ALT) => {
+                    keys.push(Key::Other(key.code));
+                }
+                _ => {}
+            }
+        }
+        Ok(keys)
+    }
+}
+
+/// What a byte is that the kernel would make a signal of.
+fn signal_key(settings: &Termios, byte: u8) -> Option<Key> {
+    // 0 says that no key is one.
+    let is = |special: SpecialCharacterIndices| byte != 0 && settings.control_chars[special as usize] == byte;
+    match () {
+        () if is(SpecialCharacterIndices::VINTR) || is(SpecialCharacterIndices::VQUIT) => Some(Key::End),
+        () => is(SpecialCharacterIndices::VSUSP).then_some(Key::Stop),
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        give_back();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nix::pty::openpty;
+    use nix::sys::signal::{Signal, raise};
+    use std::fs::File;
+    use std::io::Read;
+    use std::os::unix::process::ExitStatusExt;
+    use std::process::{Command, Stdio};
+
+    #[test]
+    #[ignore = "started by the other test"]
+    fn taking() {
+        let Ok(end) = std::env::var("PINION_TEST_TERMINAL") else { return };
+        let terminal = Terminal::take(Keys::All);
+        terminal.give_back_at(&[libc::SIGTERM]).unwrap();
+        terminal.change(off(DecPrivateModeCode::ShowCursor), on(DecPrivateModeCode::ShowCursor)).unwrap();
+        assert!(!tcgetattr(io::stdin()).unwrap().local_flags.contains(LocalFlags::ICANON));
+        match end.as_str() {
+            "panic" => {
+                let _ = thread::spawn(|| panic!("in a painter")).join();
+                // Nothing is dropped.
+                std::process::exit(3);
+            }
+            "signal" => {
+                raise(Signal::SIGTERM).unwrap();
+                thread::sleep(Duration::from_secs(20));
+            }
+            _ => drop(terminal),
+        }
+    }
+
+    #[test]
+    fn whatever_ends_the_program_the_terminal_is_as_before() {
+        for (end, code, signal) in [("drop", Some(0), None), ("panic", Some(3), None), ("signal", None, Some(15))] {
+            let pty = openpty(None, None).unwrap();
+            let before = tcgetattr(&pty.slave).unwrap();
+            let dup = || Stdio::from(pty.slave.try_clone().unwrap());
+            let mut child = Command::new(std::env::current_exe().unwrap())
+                .args(["--ignored", "--exact", "--nocapture", "cli::terminal::tests::taking"])
+                .env("PINION_TEST_TERMINAL", end)
+                .stdin(dup())
+                .stdout(dup())
+                .stderr(Stdio::null())
+                .spawn()
+                .unwrap();
+            let (mut master, mut seen, mut piece) = (File::from(pty.master), String::new(), [0; 4096]);
+            while !seen.contains("\x1b[?25h") {
+                let read = master.read(&mut piece).unwrap();
+                seen += &String::from_utf8_lossy(&piece[..read]);
+            }
+            let status = child.wait().unwrap();
+            assert_eq!((status.code(), status.signal()), (code, signal), "{end}: {seen}");
+            assert_eq!(tcgetattr(&pty.slave).unwrap(), before, "{end}");
+            assert!(seen.contains("\x1b[?25l"), "{end}: {seen}");
+        }
+    }
+
+    #[test]
+    fn sequences_are_those_of_the_vt100() {
+        assert_eq!(format!("{}{}", scrolling(7), to_row(3)), "\x1b[1;7r\x1b[3;1H");
+        assert_eq!(all_scrolls(), "\x1b[r\x1b[999;1H\n");
+    }
+}
