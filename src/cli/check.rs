@@ -22,7 +22,7 @@ use pinion_linux::clock::Monotonic;
 
 use super::finding::{self, Finding, Group, Level};
 use super::quietly;
-use super::run::{BoardName, Settings, WATCHDOG, WATCHDOG_REMEDY};
+use super::settings::{BoardName, Settings, WATCHDOG, WATCHDOG_REMEDY};
 
 /// Checks and tells; `file` is the configuration file, which has been read.
 pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {

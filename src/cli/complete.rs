@@ -51,7 +51,7 @@ impl<P: TypedValueParser> TypedValueParser for Offering<P> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::cli::run::{BoardName, Spoken};
+    use crate::cli::settings::{BoardName, Spoken};
     use pinion_firmware::mcu::DialectName;
 
     #[test]

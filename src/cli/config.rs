@@ -14,7 +14,7 @@ use toml::de::{DeTable, DeValue};
 
 use crate::foreign;
 
-use super::run::{Given, MARGIN_MAX_US, mode};
+use super::settings::{Given, MARGIN_MAX_US, mode};
 
 /// The file that the service reads.
 pub(super) const SYSTEM_FILE: &str = "/etc/pinion/pinion.toml";

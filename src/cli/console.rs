@@ -41,7 +41,7 @@ use pinion_sim::SimBoard;
 
 use super::complete::{SIMULATED, offering};
 use super::page::{Page, print};
-use super::run::{BoardName, sim_config};
+use super::settings::{BoardName, sim_config};
 use super::terminal::{Terminal, off};
 use super::{failed, logging, not_permitted};
 

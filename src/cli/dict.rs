@@ -17,7 +17,7 @@ use pinion_linux::clock::Monotonic;
 use super::complete::{BOARDS, DIALECTS, offering};
 use super::failed;
 use super::page::{Page, print};
-use super::run::BoardName;
+use super::settings::BoardName;
 
 /// Options of `pinion dict`.
 #[derive(Args, Clone, Debug)]

@@ -26,6 +26,7 @@ mod logging;
 mod page;
 pub mod pins;
 pub mod run;
+mod settings;
 mod show;
 pub mod sim;
 mod status;

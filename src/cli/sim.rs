@@ -28,7 +28,7 @@ use pinion_linux::clock::Monotonic;
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 
 use super::page::{Page, print};
-use super::run::sim_config;
+use super::settings::sim_config;
 use super::show::Show;
 use super::{failed, logging};
 

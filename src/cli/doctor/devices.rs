@@ -14,7 +14,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use crate::cli::finding::Finding;
-use crate::cli::run::BoardName;
+use crate::cli::settings::BoardName;
 use pinion_linux::gpio::Chip;
 
 use super::instance::Instance;

@@ -10,7 +10,7 @@ use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
 use crate::cli::finding::{Finding, Level};
-use crate::cli::run::BoardName;
+use crate::cli::settings::BoardName;
 use crate::klippy::Checkout;
 use crate::klippy::process::{self, Process, Search};
 use pinion_firmware::feature::FEATURES;

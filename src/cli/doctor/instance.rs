@@ -7,8 +7,8 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::config::{self, SYSTEM_FILE};
 use crate::cli::finding::Finding;
-use crate::cli::run::{Given, Settings};
 use crate::cli::run_args;
+use crate::cli::settings::{Given, Settings};
 
 use super::machine::{Machine, Running, Who};
 use super::units::{self, setting};

@@ -10,7 +10,7 @@ use std::path::{Path, PathBuf};
 
 use nix::unistd::{User, getegid, geteuid, getgroups};
 
-use crate::cli::run::Settings;
+use crate::cli::settings::Settings;
 use crate::cli::{config, run_args};
 use crate::foreign;
 use crate::klippy::process::{self, Process};

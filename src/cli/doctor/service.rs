@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use crate::cli::finding::Finding;
-use crate::cli::run::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
+use crate::cli::settings::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
 
 use super::INSTALL;
 use super::instance::{Instance, is_klipper_s};

@@ -1,0 +1,187 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What `pinion run` runs by: what its command line and its configuration file may say, and the defaults.
+
+#![forbid(unsafe_code)]
+
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+use std::sync::Arc;
+
+use clap::{Args, ValueHint};
+use log::LevelFilter;
+
+use crate::runtime::Access;
+use pinion_firmware::board::Board;
+use pinion_firmware::mcu::DialectName;
+use pinion_firmware::time::{TimeSource, Timing};
+use pinion_linux::{Guard, LinuxBoard};
+use pinion_sim::{SimBoard, SimConfig, SimError};
+
+use super::complete::{BOARDS, SPOKEN, offering};
+
+/// The device of the watchdog that -w feeds.
+pub(super) const WATCHDOG: &str = "/dev/watchdog";
+/// What to do where it is not there.
+pub(super) const WATCHDOG_REMEDY: &str =
+    "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
+/// The longest margin that may be asked for.
+pub(super) const MARGIN_MAX_US: u32 = 10_000;
+
+/// What the command line or the configuration file says, as far as it says anything.
+#[derive(Args, Clone, Debug, Default, PartialEq)]
+pub(super) struct Given {
+    /// Where to put the symbolic link to the pty that the host opens [default: /tmp/klipper_host_mcu]
+    #[arg(short = 'I', value_name = "PATH")]
+    pub(super) symlink: Option<PathBuf>,
+    /// Run in real time: SCHED_FIFO and locked memory
+    #[arg(short = 'r', num_args = 0, default_missing_value = "true")]
+    pub(super) realtime: Option<bool>,
+    /// Run the core on this processor only
+    #[arg(long, value_name = "N", value_hint = ValueHint::Other)]
+    pub(super) cpu: Option<usize>,
+    /// How early, at most, the core may wake for a timer and spin the rest: it learns how early
+    /// it has to. 0 saves power and makes steps late [default: 200]
+    #[arg(long, value_name = "US", value_hint = ValueHint::Other, value_parser = clap::value_parser!(u32).range(0..=i64::from(MARGIN_MAX_US)))]
+    pub(super) margin: Option<u32>,
+    /// Feed the hardware watchdog /dev/watchdog
+    #[arg(short = 'w', num_args = 0, default_missing_value = "true")]
+    pub(super) watchdog: Option<bool>,
+    /// Permission bits of the pty, octal [default: 0660]
+    #[arg(short = 'm', value_name = "MODE", value_hint = ValueHint::Other, value_parser = mode)]
+    pub(super) mode: Option<u32>,
+    /// Group of the pty, by name or number [default: tty, where that is permitted]
+    #[arg(short = 'g', value_name = "GROUP", value_hint = ValueHint::Other)]
+    pub(super) group: Option<String>,
+    /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml [default: linux]
+    #[arg(long, value_name = "BOARD", value_parser = offering::<BoardName>(BOARDS), hide_possible_values = true)]
+    pub(super) board: Option<BoardName>,
+    /// The hosts to serve: auto (whichever comes), v0.11, v0.12, v0.13 or master (of Klipper), kalico,
+    /// or union (of the last three, as far as they agree) [default: auto]
+    #[arg(long, value_name = "NAME", value_parser = offering::<Spoken>(SPOKEN), hide_possible_values = true)]
+    pub(super) dialect: Option<Spoken>,
+    /// Where to put the socket for `pinion status` [default: named for the link, in /run/pinion or beside it]
+    #[arg(long, value_name = "PATH")]
+    pub(super) socket: Option<PathBuf>,
+    /// The command line's is an option of all subcommands.
+    #[arg(skip)]
+    pub(super) log_level: Option<LevelFilter>,
+}
+
+/// What the program runs by.
+#[derive(Clone, Debug)]
+pub(super) struct Settings {
+    pub(super) symlink: PathBuf,
+    pub(super) realtime: bool,
+    pub(super) cpu: Option<usize>,
+    pub(super) margin_us: u32,
+    pub(super) watchdog: bool,
+    pub(super) access: Access,
+    pub(super) board: BoardName,
+    pub(super) dialect: Option<DialectName>,
+    pub(super) socket: Option<PathBuf>,
+    pub(super) log_level: LevelFilter,
+}
+
+impl Given {
+    /// What is said here, and where nothing is, what `other` says.
+    pub(super) fn or(self, other: Given) -> Given {
+        Given {
+            symlink: self.symlink.or(other.symlink),
+            realtime: self.realtime.or(other.realtime),
+            cpu: self.cpu.or(other.cpu),
+            margin: self.margin.or(other.margin),
+            watchdog: self.watchdog.or(other.watchdog),
+            mode: self.mode.or(other.mode),
+            group: self.group.or(other.group),
+            board: self.board.or(other.board),
+            dialect: self.dialect.or(other.dialect),
+            socket: self.socket.or(other.socket),
+            log_level: self.log_level.or(other.log_level),
+        }
+    }
+
+    /// The same with the defaults.
+    pub(super) fn settings(self) -> Settings {
+        Settings {
+            symlink: self.symlink.unwrap_or_else(|| "/tmp/klipper_host_mcu".into()),
+            realtime: self.realtime.unwrap_or(false),
+            cpu: self.cpu,
+            margin_us: self.margin.unwrap_or(200),
+            watchdog: self.watchdog.unwrap_or(false),
+            access: Access { mode: self.mode.unwrap_or(0o660), group: self.group },
+            board: self.board.unwrap_or(BoardName::Linux),
+            dialect: self.dialect.and_then(|Spoken(name)| name),
+            socket: self.socket,
+            log_level: self.log_level.unwrap_or(LevelFilter::Info),
+        }
+    }
+}
+
+/// Permission bits, as the command line writes them.
+pub(super) fn mode(text: &str) -> Result<u32, String> {
+    match u32::from_str_radix(text, 8) {
+        Ok(mode) if mode <= 0o777 => Ok(mode),
+        _ => Err("an octal number up to 0777 is wanted, such as 0660".into()),
+    }
+}
+
+/// Which board, as the command line names it.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum BoardName {
+    /// This machine's pins.
+    Linux,
+    /// The simulated printer: the default one, or that of a TOML file.
+    Sim(Option<PathBuf>),
+}
+
+impl FromStr for BoardName {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<BoardName, String> {
+        match text.split_once(':') {
+            None if text == "linux" => Ok(BoardName::Linux),
+            None if text == "sim" => Ok(BoardName::Sim(None)),
+            Some(("sim", file)) if !file.is_empty() => Ok(BoardName::Sim(Some(file.into()))),
+            _ => Err("there are the boards linux, sim and sim:FILE.toml".into()),
+        }
+    }
+}
+
+/// The dialect that is spoken; none: that of the host that comes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) struct Spoken(Option<DialectName>);
+
+impl FromStr for Spoken {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Spoken, String> {
+        match text {
+            "auto" => Ok(Spoken(None)),
+            name => name.parse().map(|name| Spoken(Some(name))),
+        }
+    }
+}
+
+impl BoardName {
+    /// Opens the board. Its outputs are given to `guard`. The timing is that of its MCU.
+    pub(super) fn open(
+        &self,
+        clock: Arc<dyn TimeSource>,
+        guard: Option<Box<dyn Guard>>,
+    ) -> Result<(Box<dyn Board>, Timing), String> {
+        match self {
+            BoardName::Linux => Ok((Box::new(LinuxBoard::new(guard)), Timing::of(clock))),
+            BoardName::Sim(file) => {
+                let board = sim_config(file.as_deref()).and_then(|config| SimBoard::new(config, clock));
+                let board = board.map_err(|error| error.to_string())?;
+                let timing = board.timing();
+                Ok((Box::new(board), timing))
+            }
+        }
+    }
+}
+
+/// The description of a simulated printer: that of a file, or the default one.
+pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, SimError> {
+    file.map_or_else(|| Ok(SimConfig::default_printer()), SimConfig::load)
+}
