@@ -307,13 +307,13 @@ mod tests {
     fn whatever_ends_the_program_the_terminal_is_as_before() {
         for (end, code, signal) in [("drop", Some(0), None), ("panic", Some(3), None), ("signal", None, Some(15))] {
             let pty = openpty(None, None).unwrap();
-            let before = tcgetattr(&pty.slave).unwrap();
-            let dup = || Stdio::from(pty.slave.try_clone().unwrap());
+            // The master end tells the slave's settings. It fails to be read once no slave end is open.
+            let before = tcgetattr(&pty.master).unwrap();
             let mut child = Command::new(std::env::current_exe().unwrap())
                 .args(["--ignored", "--exact", "--nocapture", "cli::terminal::tests::taking"])
                 .env("PINION_TEST_TERMINAL", end)
-                .stdin(dup())
-                .stdout(dup())
+                .stdin(pty.slave.try_clone().unwrap())
+                .stdout(pty.slave)
                 .stderr(Stdio::null())
                 .spawn()
                 .unwrap();
@@ -324,7 +324,7 @@ mod tests {
             }
             let status = child.wait().unwrap();
             assert_eq!((status.code(), status.signal()), (code, signal), "{end}: {seen}");
-            assert_eq!(tcgetattr(&pty.slave).unwrap(), before, "{end}");
+            assert_eq!(tcgetattr(&master).unwrap(), before, "{end}");
             assert!(seen.contains("\x1b[?25l"), "{end}: {seen}");
         }
     }
