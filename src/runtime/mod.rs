@@ -9,29 +9,32 @@
 #![forbid(unsafe_code)]
 
 use std::io;
-use std::iter;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::thread;
+use std::thread::JoinHandle;
 
-use log::{error, info, warn};
-use rtrb::RingBuffer;
+use log::{error, info};
 
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::{DialectName, Generation, Mcu};
+use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::Timing;
 use pinion_linux::clock::Monotonic;
 
 mod budget;
 mod core;
+mod core_end;
+mod core_thread;
 pub mod guardian;
 pub(crate) mod helpers;
 mod host;
+mod host_end;
+mod introduction;
 mod ledger;
 mod link;
 mod lookout;
 mod notify;
 mod outlet;
+mod oversight;
 mod pty;
 mod pulse;
 pub mod realtime;
@@ -51,23 +54,21 @@ pub use served::{Served, served};
 pub(crate) use signals::hang_up;
 pub use status::socket_paths;
 
-use self::core::{Core, Left, Request};
-use host::HostFinder;
-use link::{End, Link, Parts};
+use self::core::{Left, Request};
+use core_thread::{CoreThread, REQUESTS};
+use host_end::HostEnd;
+use introduction::Introduction;
+use link::{End, Link};
 use notify::Notify;
-use outlet::{LinkWake, Progress};
+use outlet::LinkWake;
+use oversight::Oversight;
 use pty::Pty;
 use pulse::Pulse;
-use realtime::{Processors, Role, Scheduling};
+use realtime::{Processors, Role};
 use signals::Signals;
 use status::{Facts, HostBoard, StatusSocket};
-use survey::Surveyor;
-use wakeup::{MarginLimits, Waiter};
+use wakeup::MarginLimits;
 use watchdog::{Vigil, Watchdog};
-use workers::Threads;
-
-/// Blocks between link and core: four times what a host may have under way.
-const REQUESTS: usize = 256;
 
 /// How the program runs.
 #[derive(Clone, Debug)]
@@ -109,19 +110,8 @@ pub fn run(
     let pty = Pty::open(&options.symlink, &options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
-    // All of them now, as the board's names are needed for them and the board becomes the core's.
-    let names = match options.dialect {
-        Some(name) => vec![name],
-        None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
-    };
-    let dialects = survey::dialects(&*board, &names)?;
-    let clock = timing.clock.clone();
-    let wake = Arc::new(LinkWake::new()?);
-    let host = Arc::new(HostBoard::default());
-    // Before the link is of real time, which its threads would inherit.
-    let search = search.filter(|_| options.dialect.is_none());
-    let finder = search.map(|search| HostFinder::start(search, pty.device(), wake.clone(), host.clone()));
-    let finder = finder.map(started).transpose()?;
+    let (wake, shown) = (Arc::new(LinkWake::new()?), Arc::new(HostBoard::default()));
+    let introduction = Introduction::start(options.dialect, &*board, search, &pty, &wake, &shown)?;
     let (teller, asker) = status::ends();
     let facts = Facts {
         link: options.symlink.clone(),
@@ -132,71 +122,23 @@ pub fn run(
         guardian: guardian.as_ref().map(Guardian::pid),
         requests: REQUESTS,
     };
-    let _status = StatusSocket::start(&options.sockets, facts, host.clone(), asker);
-    let surveyor = board.view().map(|view| started(Surveyor::start(view, names, wake.clone()))).transpose()?;
-    let progress = Arc::new(Progress::default());
-    let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
-    let (requests, inbox) = RingBuffer::new(REQUESTS);
-
-    // Before the core is confined to one of them.
-    let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
+    let _status = StatusSocket::start(&options.sockets, facts, shown.clone(), asker);
     let (realtime, margin) = (options.realtime, options.margin);
     if realtime {
         realtime::lock_memory();
     }
-    let (core_dialect, core_clock) = (dialects[0].clone(), clock.clone());
-    let (core_progress, core_wake) = (progress.clone(), wake.clone());
-    let core = started(thread::Builder::new().name("core".into()).spawn(move || {
-        if let Err(error) = processors.confine() {
-            warn!("--cpu: the core is not bound to its processor: {error}: it runs on any; choose another processor");
-        }
-        let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };
-        let prepare = Arc::new(move || {
-            // A thread inherits the processors of the one that starts it.
-            processors.free();
-            if realtime {
-                realtime::enter(Role::Worker);
-            }
-        });
-        let workers = Box::new(Threads::new(thread::current(), prepare, core_clock.clone(), pulse, may_poll));
-        let mcu = Mcu::new(core_dialect, board, timing, workers, Box::new(outlet));
-        let waiter = Waiter::new(core_clock.clone(), margin, scheduling, processors);
-        Core::new(self::core::Parts {
-            mcu,
-            clock: core_clock,
-            requests: inbox,
-            waiter,
-            pulse,
-            progress: core_progress,
-            wake: core_wake,
-            teller,
-            may_poll,
-        })
-        .run()
-    }))?;
+    let (clock, dialect) = (timing.clock.clone(), introduction.first_dialect());
+    let core = CoreThread { board, timing, dialect, wake, pulse, teller, processors, margin, realtime };
+    let (core, core_end) = core.start()?;
 
     info!("serving on {} ({})", options.symlink.display(), pty.device().display());
-    let mut link = Link::new(Parts {
-        pty,
-        clock,
-        dialects,
-        finder,
-        host,
-        surveyor,
-        requests,
-        core: core.thread().clone(),
-        inlet,
-        progress,
-        wake,
-        signals,
-        guardian: guardian.as_ref().map(Guardian::watch),
-        vigil: Vigil::new(notify, notify::watchdog_interval(), pulse),
-        may_poll,
-    });
+    let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
+    let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil);
+    let mut link = Link::new(HostEnd::new(pty, shown), core_end, introduction, oversight, clock);
     if realtime {
         realtime::enter(Role::Link);
     }
-    // Last of what may fail: once open it resets the machine, unless we end in order.
+    // Last of what may fail: once open it resets the computer, unless we end in order.
     let watched = match &options.watchdog {
         Some(path) => Watchdog::open(path).map(|watchdog| link.feed(watchdog)),
         None => Ok(()),
@@ -206,6 +148,11 @@ pub fn run(
         link.run()
             .inspect_err(|error| error!("the terminal failed: {error}: Pinion ends; look at the kernel's log (dmesg)"))
     });
+    end(link, core, guardian, served)
+}
+
+/// Ends the threads and processes in order. `served` is how the link ended.
+fn end(mut link: Link, core: JoinHandle<Left>, guardian: Option<Guardian>, served: io::Result<End>) -> io::Result<()> {
     link.stopping();
     link.request(Request::Quit);
     let left = core.join();
@@ -227,7 +174,7 @@ pub fn run(
     if matches!(served, Ok(End::Asked)) {
         link.farewell();
     }
-    link.close().end();
+    link.close();
     match served? {
         End::Asked => Ok(()),
         End::GuardianLost => {

@@ -1,0 +1,135 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The link's end of the core: blocks and requests go in, responses and lines for the log come out, and an account of
+//! the blocks is kept.
+
+#![forbid(unsafe_code)]
+
+use std::sync::Arc;
+use std::thread::{self, Thread};
+use std::time::Duration;
+
+use log::log;
+use rtrb::{Producer, PushError};
+
+use pinion_linux::clock::monotonic;
+
+use super::core::{Payload, Request};
+use super::ledger::Ledger;
+use super::outlet::{Inlet, LinkWake, Progress};
+
+/// How long to poll for the core to be done with the blocks that it was handed.
+const AWAIT_CORE: Duration = Duration::from_micros(100);
+/// How long to wait for more once there is something to tell the host: one write is to tell of many blocks.
+const AWAIT_MORE: Duration = Duration::from_micros(20);
+/// How long to wait for a core that has no room for requests.
+pub(super) const STALL: Duration = Duration::from_millis(1);
+/// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
+/// holds the blocks back.
+const REQUESTS_KEPT: usize = 8;
+
+/// The link's end of the core.
+pub(super) struct CoreEnd {
+    pub(super) requests: Producer<Request>,
+    pub(super) thread: Thread,
+    pub(super) inlet: Inlet,
+    pub(super) progress: Arc<Progress>,
+    pub(super) wake: Arc<LinkWake>,
+    pub(super) ledger: Ledger,
+    /// Whether there is a processor beside the core's, to poll on for the core.
+    pub(super) may_poll: bool,
+}
+
+/// What the core had been handed at an instant.
+#[derive(Clone, Copy)]
+pub(super) struct Handed {
+    blocks: u32,
+    stops: u32,
+}
+
+impl CoreEnd {
+    /// Asks the core something. It takes requests in faster than a person or a signal asks.
+    pub(super) fn request(&mut self, request: Request) {
+        if matches!(request, Request::Shutdown(_) | Request::Quit) {
+            self.progress.stop_handed();
+        }
+        let mut request = request;
+        while let Err(PushError::Full(back)) = self.requests.push(request) {
+            request = back;
+            self.thread.unpark();
+            thread::sleep(STALL);
+        }
+        self.thread.unpark();
+    }
+
+    /// Whether there is room for another block.
+    pub(super) fn has_room(&self) -> bool {
+        self.requests.slots() > REQUESTS_KEPT
+    }
+
+    /// Hands a block to the core, where there is room for it. `stops`: it asks for an emergency stop.
+    pub(super) fn hand(&mut self, payload: Payload, stops: bool) {
+        if stops {
+            self.progress.stop_handed();
+        }
+        let _ = self.requests.push(Request::Run(payload));
+        self.ledger.hand();
+    }
+
+    /// What the core has been handed so far.
+    pub(super) fn handed(&self) -> Handed {
+        Handed { blocks: self.ledger.handed(), stops: self.progress.stops_handed() }
+    }
+
+    /// Whether blocks were handed to the core since.
+    pub(super) fn has_more_since(&self, before: Handed) -> bool {
+        self.ledger.handed() != before.blocks
+    }
+
+    /// Wakes the core for the blocks that it was handed since, if it can run one of them: awake, it would keep the link
+    /// waiting.
+    pub(super) fn wake_for(&self, before: Handed) {
+        let stops = self.progress.stops_handed() != before.stops;
+        if self.has_more_since(before) && (stops || !self.progress.is_held()) {
+            self.thread.unpark();
+        }
+    }
+
+    /// Polls for what the core makes of the blocks that it was handed since: to sleep and be woken takes longer.
+    /// If a bus holds the core, the blocks wait for longer still.
+    pub(super) fn await_done(&self, before: Handed) {
+        if !self.may_poll || !self.has_more_since(before) {
+            return;
+        }
+        let handed = self.ledger.handed();
+        let (start, mut done) = (monotonic(), self.progress.done());
+        if self.progress.is_held() {
+            return;
+        }
+        let (mut tells, mut until) = (false, start + AWAIT_CORE);
+        while done != handed {
+            let (now, done_now) = (monotonic(), self.progress.done());
+            let progresses = done_now != done || !tells && self.inlet.has_response();
+            done = done_now;
+            if progresses {
+                tells = true;
+                until = (start + AWAIT_CORE).min(now + AWAIT_MORE);
+            }
+            if now >= until {
+                return;
+            }
+            thread::yield_now();
+        }
+    }
+
+    /// Whether there is something to tell the host.
+    pub(super) fn has_news(&self) -> bool {
+        self.inlet.has_response() || self.ledger.is_behind(self.progress.done())
+    }
+
+    /// Logs the core's lines.
+    pub(super) fn log_lines(&mut self) {
+        while let Some((level, line)) = self.inlet.line() {
+            log!(level, "{line}");
+        }
+    }
+}

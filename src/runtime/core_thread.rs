@@ -1,0 +1,80 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The core's thread: how it is scheduled, and what lies between it and the link.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+
+use log::warn;
+use rtrb::RingBuffer;
+
+use pinion_firmware::board::Board;
+use pinion_firmware::mcu::{Dialect, Mcu};
+use pinion_firmware::time::Timing;
+
+use super::core::{Core, Left, Parts};
+use super::core_end::CoreEnd;
+use super::ledger::Ledger;
+use super::outlet::{self, LinkWake, Progress};
+use super::pulse::Pulse;
+use super::realtime::{self, Processors, Role, Scheduling};
+use super::started;
+use super::status::Teller;
+use super::wakeup::{MarginLimits, Waiter};
+use super::workers::Threads;
+
+/// Blocks between link and core: four times what a host may have under way.
+pub(super) const REQUESTS: usize = 256;
+
+/// What the core's thread is to run.
+pub(super) struct CoreThread {
+    pub(super) board: Box<dyn Board>,
+    pub(super) timing: Timing,
+    /// The dialect that the MCU speaks before a host comes.
+    pub(super) dialect: Arc<Dialect>,
+    pub(super) wake: Arc<LinkWake>,
+    pub(super) pulse: Pulse,
+    pub(super) teller: Teller,
+    pub(super) processors: Processors,
+    pub(super) margin: MarginLimits,
+    pub(super) realtime: bool,
+}
+
+impl CoreThread {
+    /// Starts the thread, and returns the link's end of it.
+    pub(super) fn start(self) -> io::Result<(JoinHandle<Left>, CoreEnd)> {
+        let (wake, progress) = (self.wake.clone(), Arc::new(Progress::default()));
+        let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
+        let (requests, inbox) = RingBuffer::new(REQUESTS);
+        // Before the core is confined to one of them.
+        let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
+        let core_progress = progress.clone();
+        let core = started(thread::Builder::new().name("core".into()).spawn(move || {
+            let CoreThread { board, timing, dialect, wake, pulse, teller, processors, margin, realtime } = self;
+            if let Err(error) = processors.confine() {
+                warn!(
+                    "--cpu: the core is not bound to its processor: {error}: it runs on any; choose another processor"
+                );
+            }
+            let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };
+            let prepare = Arc::new(move || {
+                // A thread inherits the processors of the one that starts it.
+                processors.free();
+                if realtime {
+                    realtime::enter(Role::Worker);
+                }
+            });
+            let clock = timing.clock.clone();
+            let workers = Box::new(Threads::new(thread::current(), prepare, clock.clone(), pulse, may_poll));
+            let mcu = Mcu::new(dialect, board, timing, workers, Box::new(outlet));
+            let waiter = Waiter::new(clock.clone(), margin, scheduling, processors);
+            let (requests, progress) = (inbox, core_progress);
+            Core::new(Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, may_poll }).run()
+        }))?;
+        let thread = core.thread().clone();
+        let ledger = Ledger::default();
+        Ok((core, CoreEnd { requests, thread, inlet, progress, wake, ledger, may_poll }))
+    }
+}

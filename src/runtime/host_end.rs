@@ -1,0 +1,173 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The link's end of the terminal: whether a host is there, its bytes parted into blocks, and what it is to read.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::os::fd::BorrowedFd;
+use std::sync::Arc;
+
+use log::{info, warn};
+
+use pinion_protocol::block::{Received, Receiver, Sequence, frame};
+
+use super::core::Payload;
+use super::pty::Pty;
+use super::status::HostBoard;
+
+/// What a shell writes to the pty to stop the MCU, as in Klipper's service file.
+const FORCE_SHUTDOWN: &[u8] = b"FORCE_SHUTDOWN\n";
+/// Bytes read from the pty and not yet taken in.
+const INPUT_BYTES: usize = 4096;
+/// Bytes for a host that does not read; then responses wait in the ring, then they are lost.
+const OUTPUT_BYTES: usize = 16 * 1024;
+
+/// The terminal, with what was read of it and what is to be written.
+pub(super) struct HostEnd {
+    pty: Pty,
+    receiver: Receiver,
+    input: Vec<u8>,
+    /// Bytes of the input that are taken in.
+    taken: usize,
+    output: Vec<u8>,
+    is_attached: bool,
+    /// Where it says whether a host is there.
+    shown: Arc<HostBoard>,
+}
+
+/// What was read.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(super) struct Read {
+    /// A host has come.
+    pub(super) is_new_host: bool,
+    /// Somebody wrote `FORCE_SHUTDOWN`.
+    pub(super) is_forced: bool,
+}
+
+/// What comes next of the input.
+pub(super) enum Next {
+    /// Nothing whole.
+    Nothing,
+    /// Something damaged.
+    Nak,
+    /// A block.
+    Block(Payload),
+}
+
+impl HostEnd {
+    /// The end of a terminal at which nobody is yet.
+    pub(super) fn new(pty: Pty, shown: Arc<HostBoard>) -> HostEnd {
+        HostEnd {
+            pty,
+            receiver: Receiver::default(),
+            input: Vec::with_capacity(INPUT_BYTES),
+            taken: 0,
+            output: Vec::with_capacity(2 * OUTPUT_BYTES),
+            is_attached: false,
+            shown,
+        }
+    }
+
+    /// What is readable once the host has written, and hangs up once it is gone.
+    pub(super) fn event(&self) -> BorrowedFd<'_> {
+        self.pty.master()
+    }
+
+    pub(super) fn is_attached(&self) -> bool {
+        self.is_attached
+    }
+
+    /// Says to whoever asks whether a host is there; one line for the service manager.
+    pub(super) fn tell(&self) -> String {
+        self.shown.attach(self.is_attached);
+        let host = if self.is_attached { "a host is attached" } else { "no host is attached" };
+        format!("serving on {}, {host}", self.pty.symlink().display())
+    }
+
+    /// Reads what the host has written.
+    pub(super) fn read(&mut self) -> io::Result<Read> {
+        let filled = self.input.len();
+        let mut read = Read::default();
+        if filled == INPUT_BYTES {
+            return Ok(read);
+        }
+        self.input.resize(INPUT_BYTES, 0);
+        let bytes = self.pty.read(&mut self.input[filled..]);
+        self.input.truncate(filled + bytes.as_ref().copied().unwrap_or(0));
+        if bytes? > 0 && !self.is_attached && self.pty.meet_host()? {
+            self.is_attached = true;
+            read.is_new_host = true;
+            info!("host attached");
+        }
+        if self.input[filled..] == *FORCE_SHUTDOWN {
+            self.input.truncate(filled);
+            read.is_forced = true;
+            warn!("FORCE_SHUTDOWN was written to {}", self.pty.device().display());
+        }
+        Ok(read)
+    }
+
+    /// The host is gone.
+    pub(super) fn part(&mut self) -> io::Result<()> {
+        self.pty.part_from_host()?;
+        self.is_attached = false;
+        self.output.clear();
+        info!("host gone");
+        Ok(())
+    }
+
+    /// The next block of the input.
+    pub(super) fn next(&mut self) -> Next {
+        loop {
+            let (bytes, received) = self.receiver.next(&self.input[self.taken..]);
+            self.taken += bytes;
+            match received {
+                Received::Nothing => return Next::Nothing,
+                Received::Skip => {}
+                Received::Nak => return Next::Nak,
+                Received::Payload(payload) => return Next::Block(Payload::new(payload)),
+            }
+        }
+    }
+
+    /// Forgets the input that was taken in. True if some is left.
+    pub(super) fn forget_taken(&mut self) -> bool {
+        self.input.drain(..std::mem::take(&mut self.taken));
+        !self.input.is_empty()
+    }
+
+    /// Whether the host has to read before it gets any more.
+    pub(super) fn is_full(&self) -> bool {
+        self.output.len() >= OUTPUT_BYTES
+    }
+
+    /// Whether the host has been given all that was framed.
+    pub(super) fn is_out(&self) -> bool {
+        self.output.is_empty()
+    }
+
+    /// Frames a response, or with no bytes an acknowledgement, behind the block of this number.
+    pub(super) fn frame(&mut self, payload: &[u8], number: u32) {
+        frame(payload, Sequence::after(number), &mut self.output);
+    }
+
+    /// Writes what the terminal has room for.
+    pub(super) fn write(&mut self) {
+        if !self.is_attached {
+            self.output.clear();
+        }
+        if self.output.is_empty() {
+            return;
+        }
+        match self.pty.write(&self.output) {
+            Ok(written) => drop(self.output.drain(..written)),
+            Err(error) => {
+                warn!(
+                    "{} can not be written: {error}: what the host should have read is lost, and the host asks again or gives up",
+                    self.pty.device().display()
+                );
+                self.output.clear();
+            }
+        }
+    }
+}

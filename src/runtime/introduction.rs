@@ -1,0 +1,152 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Finds out what a host that has come is to be told: which dialect it speaks, and what the board has now. The host's
+//! first bytes wait for that.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::iter;
+use std::sync::Arc;
+use std::time::Duration;
+
+use log::warn;
+
+use pinion_firmware::board::Board;
+use pinion_firmware::mcu::{Dialect, DialectName, Generation};
+use pinion_linux::clock::monotonic;
+
+use super::host::{HostFinder, HostSearch};
+use super::outlet::LinkWake;
+use super::pty::Pty;
+use super::started;
+use super::status::HostBoard;
+use super::survey::{self, Surveyor};
+
+/// How long the host's first bytes wait; after that it gets the union dialect. A card that has just
+/// begun to be read after the computer's start may take longer than a second for the few hundred files; klippy
+/// gives up after five (`_start_session` in serialhdl.py).
+const FIND_LIMIT: Duration = Duration::from_secs(3);
+
+/// What is found out about a host.
+pub(super) struct Introduction {
+    /// Those that a host may speak; the first one is spoken before a host comes.
+    dialects: Vec<Arc<Dialect>>,
+    /// Those before the board changed last, kept until it changes again, so that the core never frees one.
+    outdated: Vec<Arc<Dialect>>,
+    /// `None` if the dialect does not depend on the host.
+    finder: Option<HostFinder>,
+    /// `None` if the board never changes.
+    surveyor: Option<Surveyor>,
+    /// Until when the host's first bytes wait (CLOCK_MONOTONIC); `None` while none wait.
+    until: Option<Duration>,
+    /// Whether they waited for too long, and the answer is still to come.
+    is_overdue: bool,
+}
+
+/// How far an introduction has come.
+pub(super) enum Step {
+    /// The host's bytes wait.
+    Wait,
+    /// This dialect is to be spoken from now on.
+    Speak(Arc<Dialect>),
+    /// There is nothing more to find out.
+    Done,
+}
+
+impl Introduction {
+    /// Starts the threads that find out. To be called before the link gets real-time priority, or they inherit it.
+    /// `only` is the one dialect that is spoken, or `None`.
+    pub(super) fn start(
+        only: Option<DialectName>,
+        board: &dyn Board,
+        search: Option<HostSearch>,
+        pty: &Pty,
+        wake: &Arc<LinkWake>,
+        shown: &Arc<HostBoard>,
+    ) -> io::Result<Introduction> {
+        let names = match only {
+            Some(name) => vec![name],
+            None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
+        };
+        let dialects = survey::dialects(board, &names)?;
+        let search = search.filter(|_| only.is_none());
+        let finder = search.map(|search| HostFinder::start(search, pty.device(), wake.clone(), shown.clone()));
+        let finder = finder.map(started).transpose()?;
+        let surveyor = board.view().map(|view| started(Surveyor::start(view, names, wake.clone()))).transpose()?;
+        Ok(Introduction { dialects, outdated: Vec::new(), finder, surveyor, until: None, is_overdue: false })
+    }
+
+    /// The dialect that is spoken before a host comes.
+    pub(super) fn first_dialect(&self) -> Arc<Dialect> {
+        self.dialects[0].clone()
+    }
+
+    /// A host has come.
+    pub(super) fn begin(&mut self) {
+        if let Some(surveyor) = &mut self.surveyor {
+            surveyor.ask();
+        }
+        if let Some(finder) = &mut self.finder {
+            finder.ask();
+            self.is_overdue = false;
+        }
+        if self.surveyor.is_some() || self.finder.is_some() {
+            self.until = Some(monotonic() + FIND_LIMIT);
+        }
+    }
+
+    /// The host is gone.
+    pub(super) fn end(&mut self) {
+        self.until = None;
+    }
+
+    /// Goes on as far as it can; `spoken` is the dialect that is spoken now. To be called again after [`Step::Speak`].
+    pub(super) fn step(&mut self, spoken: DialectName) -> Step {
+        let Some(until) = self.until else {
+            self.hear_late_answer();
+            return Step::Done;
+        };
+        let is_late = monotonic() >= until;
+        if let Some(surveyor) = &mut self.surveyor {
+            if !surveyor.is_done() && !is_late {
+                return Step::Wait;
+            }
+            if let Some(dialects) = surveyor.take() {
+                self.outdated = std::mem::replace(&mut self.dialects, dialects);
+                return self.speak(spoken);
+            }
+        }
+        let Some(finder) = &self.finder else {
+            self.until = None;
+            return Step::Done;
+        };
+        let name = match finder.answer() {
+            Some(name) => name,
+            None if is_late => {
+                warn!(
+                    "the host's dialect was not found within {FIND_LIMIT:?}: served as Klipper v0.13, master and Kalico"
+                );
+                self.is_overdue = true;
+                DialectName::Union
+            }
+            None => return Step::Wait,
+        };
+        self.until = None;
+        self.speak(name)
+    }
+
+    fn speak(&self, name: DialectName) -> Step {
+        let of_name = self.dialects.iter().find(|dialect| dialect.name() == name);
+        of_name.map_or(Step::Done, |dialect| Step::Speak(dialect.clone()))
+    }
+
+    /// An answer that came after the host had read another dictionary.
+    fn hear_late_answer(&mut self) {
+        let answer = self.finder.as_ref().filter(|_| self.is_overdue).and_then(HostFinder::answer);
+        let Some(name) = answer else { return };
+        self.is_overdue = false;
+        if name != DialectName::Union {
+            warn!("the host's dialect, {name}, was found too late: it is spoken from the host's RESTART on");
+        }
+    }
+}

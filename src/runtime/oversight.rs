@@ -1,0 +1,99 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What may end the program, and what it tells those that watch over it: signals, the guardian, the watchdogs.
+
+#![forbid(unsafe_code)]
+
+use std::os::fd::BorrowedFd;
+use std::time::Duration;
+
+use pinion_linux::clock::monotonic;
+
+use super::guardian::GuardianWatch;
+use super::signals::{Signal, Signals};
+use super::watchdog::{Vigil, Watchdog};
+
+/// How long a host has to read why the program ends.
+pub(super) const FAREWELL: Duration = Duration::from_secs(1);
+
+/// Who watches over the program, and whom it watches.
+pub(super) struct Oversight {
+    signals: Signals,
+    guardian: Option<GuardianWatch>,
+    vigil: Vigil,
+    /// When to end (CLOCK_MONOTONIC), as the guardian is gone.
+    leave_at: Option<Duration>,
+}
+
+impl Oversight {
+    /// `guardian`, if the board has outputs that one guards.
+    pub(super) fn new(signals: Signals, guardian: Option<GuardianWatch>, vigil: Vigil) -> Oversight {
+        Oversight { signals, guardian, vigil, leave_at: None }
+    }
+
+    /// Feeds a hardware watchdog from now on.
+    pub(super) fn feed(&mut self, watchdog: Watchdog) {
+        self.vigil.feed(watchdog);
+    }
+
+    /// Tells the service manager that a host may come.
+    pub(super) fn ready(&mut self) {
+        self.vigil.ready();
+    }
+
+    /// Tells the service manager how the program is.
+    pub(super) fn status(&self, status: &str) {
+        self.vigil.status(status);
+    }
+
+    /// Tells the service manager that the program begins to end.
+    pub(super) fn stopping(&self) {
+        self.vigil.stopping();
+    }
+
+    /// Stops the watchdogs.
+    pub(super) fn end(self) {
+        self.vigil.end();
+    }
+
+    /// When to call [`Oversight::tick`] next, at the latest (CLOCK_MONOTONIC).
+    pub(super) fn due(&self) -> Option<Duration> {
+        let look = self.guardian.as_ref().and_then(GuardianWatch::due);
+        self.leave_at.into_iter().chain(self.vigil.due()).chain(look).min()
+    }
+
+    /// Feeds the watchdogs, and returns why the guardian is of no use any more, if it is not.
+    pub(super) fn tick(&mut self) -> Option<&'static str> {
+        if self.vigil.due().is_some() {
+            self.vigil.tick(monotonic());
+        }
+        let guardian = self.guardian.as_mut()?;
+        let hangs = guardian.due().is_some() && guardian.hangs(monotonic());
+        hangs.then_some("the guardian gives no sign of life: was it stopped? (a restart ends it)")
+    }
+
+    /// A socket that hangs up once the guardian is gone; `None` if there is no guardian.
+    pub(super) fn guardian(&self) -> Option<BorrowedFd<'_>> {
+        self.guardian.as_ref().map(GuardianWatch::socket)
+    }
+
+    /// The guardian is gone, or of no use: the program ends once the host has had time to read why.
+    pub(super) fn lose_guardian(&mut self) {
+        self.guardian = None;
+        self.leave_at = Some(monotonic() + FAREWELL);
+    }
+
+    /// Whether the host has had that time.
+    pub(super) fn is_over(&self) -> bool {
+        self.leave_at.is_some_and(|at| monotonic() >= at)
+    }
+
+    /// What is readable once a signal has come.
+    pub(super) fn signals(&self) -> BorrowedFd<'_> {
+        self.signals.event()
+    }
+
+    /// The next signal that has come.
+    pub(super) fn next_signal(&mut self) -> Option<Signal> {
+        self.signals.next()
+    }
+}
