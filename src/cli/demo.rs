@@ -12,11 +12,12 @@ pub(super) mod picture;
 
 use crate::cli::terminal::ERASE_LINE;
 use crate::foreign::plain;
-use heater::{Goal, Heater, Thermistor, Wiring};
+use heater::{Goal, Heater, Wiring};
 use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, Homed, HomingEnd, MoveQueue, Profile, Sight, Stepper, Watch};
 use pinion_client::{Client, Error};
 use pinion_protocol::clock::Clock;
+use pinion_sim::Thermistor;
 
 /// An axis looks for its endstop over its travel times this.
 const OVERTRAVEL: f64 = 1.2;

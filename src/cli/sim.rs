@@ -18,7 +18,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::getpid;
 use signal_hook::consts::{SIGINT, SIGTERM};
 
-use super::demo::heater::{Goal, Thermistor};
+use super::demo::heater::Goal;
 use super::demo::picture;
 use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
 use crate::runtime::wakeup::MarginLimits;
@@ -253,19 +253,13 @@ fn axis(axis: &AxisConfig) -> Option<AxisPlan> {
     })
 }
 
-/// The plan for a heater; none if the host client does not know its kind of thermistor.
+/// The plan for a heater; none if nothing heats it.
 fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
-    let pullup_ohms = heater.pullup_ohm;
-    let thermistor = match (heater.points_celsius_ohm.as_slice(), heater.beta_k) {
-        ([(at_c, ohms), ..], Some(beta_k)) => Thermistor::Beta { pullup_ohms, at_c: *at_c, ohms: *ohms, beta_k },
-        ([a, b, c], None) => Thermistor::Points { pullup_ohms, points: [*a, *b, *c] },
-        _ => return None,
-    };
     Some(HeaterPlan {
         name: heater.name.clone(),
         heater: pin(heater.pin.as_ref()?),
         sensor: heater.sensor_pin.name.clone(),
-        thermistor,
+        thermistor: heater.thermistor().ok()?,
         min_c: heater.min_celsius,
         max_c: heater.max_celsius,
         // The built-in bed takes half a minute to get there.

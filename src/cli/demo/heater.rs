@@ -10,9 +10,6 @@ use pinion_client::config::Config;
 use pinion_client::{Client, Error, Params};
 use pinion_protocol::clock::Clock;
 
-const KELVIN: f64 = 273.15;
-/// Readings that would mean a higher temperature than this count as this one.
-const HOTTEST_K: f64 = 1000.0;
 /// The output's period, in seconds.
 const CYCLE_S: f64 = 0.1;
 /// The output's `max_duration`, in seconds: after this time without a new value the micro-controller
@@ -27,56 +24,6 @@ const RANGE_CHECKS: u8 = 4;
 const LEAD_S: f64 = 0.25;
 /// How long to wait for a reading.
 const READING_TIMEOUT: Duration = Duration::from_secs(3);
-
-/// A thermistor from a pin to ground, pulled up by a resistor to the reference voltage.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub enum Thermistor {
-    /// By its resistance at one temperature and its beta.
-    Beta {
-        /// The pull-up in ohms.
-        pullup_ohms: f64,
-        /// Where the resistance is known, in degrees Celsius.
-        at_c: f64,
-        /// The resistance there, in ohms.
-        ohms: f64,
-        /// Beta in kelvins.
-        beta_k: f64,
-    },
-    /// By its resistances at three temperatures.
-    Points {
-        /// The pull-up in ohms.
-        pullup_ohms: f64,
-        /// Degrees Celsius and ohms.
-        points: [(f64, f64); 3],
-    },
-}
-
-impl Thermistor {
-    /// The temperature, in degrees Celsius, at which the pin reads `fraction` of its full
-    /// scale.
-    pub fn celsius(&self, fraction: f64) -> f64 {
-        let fraction = fraction.clamp(0.000_01, 0.999_99);
-        let ln_r = |pullup: f64| (pullup * fraction / (1.0 - fraction)).ln();
-        let inverse = match *self {
-            Thermistor::Beta { pullup_ohms, at_c, ohms, beta_k } => {
-                1.0 / (at_c + KELVIN) + (ln_r(pullup_ohms) - ohms.ln()) / beta_k
-            }
-            Thermistor::Points { pullup_ohms, points } => {
-                // Newton's interpolation of 1/T in a + b ln r + c (ln r)^3 (Steinhart and Hart).
-                let [(x1, y1), (x2, y2), (x3, y3)] =
-                    points.map(|(celsius, ohms)| (ohms.ln(), 1.0 / (celsius + KELVIN)));
-                let (s2, s3) = ((y2 - y1) / (x2 - x1), (y3 - y1) / (x3 - x1));
-                let c = (s3 - s2) / ((x3 - x2) * (x1 + x2 + x3));
-                let b = s2 - c * (x1 * x1 + x1 * x2 + x2 * x2);
-                let a = y1 - (b + c * x1 * x1) * x1;
-                let x = ln_r(pullup_ohms);
-                a + b * x + c * x * x * x
-            }
-        };
-        // A short circuit would come out as a negative inverse. It counts as very hot.
-        1.0 / inverse.max(1.0 / HOTTEST_K) - KELVIN
-    }
-}
 
 /// A heater's pins and limits.
 #[derive(Clone, Debug, PartialEq)]
@@ -296,28 +243,6 @@ impl Control {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    /// What a pin reads with this resistance to ground.
-    fn fraction(ohms: f64) -> f64 {
-        ohms / (ohms + 4700.0)
-    }
-
-    #[test]
-    fn a_thermistor_reads_as_its_data_sheet_says() {
-        let beta = Thermistor::Beta { pullup_ohms: 4700.0, at_c: 25.0, ohms: 100_000.0, beta_k: 4092.0 };
-        // EPCOS 100K B57560G104F, the points that klippy is given.
-        let points =
-            Thermistor::Points { pullup_ohms: 4700.0, points: [(25.0, 100_000.0), (150.0, 1641.9), (250.0, 226.15)] };
-        for (celsius, ohms) in [(25.0, 100_000.0), (150.0, 1641.9), (250.0, 226.15)] {
-            assert!((points.celsius(fraction(ohms)) - celsius).abs() < 1e-6);
-        }
-        assert!((beta.celsius(fraction(100_000.0)) - 25.0).abs() < 1e-6);
-        for sensor in [beta, points] {
-            let all: Vec<f64> = (0..=1000).map(|i| sensor.celsius(f64::from(i) / 1000.0)).collect();
-            assert!(all.iter().all(|celsius| celsius.is_finite()));
-            assert!(all.is_sorted_by(|a, b| a >= b));
-        }
-    }
 
     #[test]
     fn the_loop_settles_on_the_target_without_going_far_beyond() {

@@ -105,7 +105,7 @@ impl HeaterConfig {
     /// # Errors
     ///
     /// The key whose values no thermistor has, and a remedy.
-    pub(crate) fn thermistor(&self) -> Result<Thermistor, SimError> {
+    pub fn thermistor(&self) -> Result<Thermistor, SimError> {
         const POINTS: &str = "points_celsius_ohm";
         Thermistor::new(&self.points_celsius_ohm, self.beta_k, self.pullup_ohm).map_err(|why| {
             let (key, cause, remedy) = match why {

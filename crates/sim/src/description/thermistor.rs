@@ -15,10 +15,12 @@ use pinion_firmware::board::ADC_MAX;
 
 /// 0 °C in kelvin.
 pub(crate) const KELVIN: f64 = 273.15;
+/// Highest temperature that a reading stands for: a short circuit counts as this hot.
+const HOTTEST_KELVIN: f64 = 1000.0;
 
 /// The coefficients of a thermistor, and its pull-up resistor.
-#[derive(Clone, Copy, Debug)]
-pub(crate) struct Thermistor {
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Thermistor {
     c1: f64,
     c2: f64,
     c3: f64,
@@ -99,6 +101,15 @@ impl Thermistor {
         1.0 / (1.0 + (self.pullup_ohm.ln() - ln_ohm).exp())
     }
 
+    /// The temperature in °C at which the ADC reads this fraction of its reference.
+    pub fn celsius(&self, fraction: f64) -> f64 {
+        let fraction = fraction.clamp(0.000_01, 0.999_99);
+        let ln_ohm = (self.pullup_ohm * fraction / (1.0 - fraction)).ln();
+        let inverse = self.c1 + self.c2 * ln_ohm + self.c3 * ln_ohm.powi(3);
+        // A short circuit would come out as a negative inverse.
+        1.0 / inverse.max(1.0 / HOTTEST_KELVIN) - KELVIN
+    }
+
     /// What the ADC reads at a temperature: 0 to [`ADC_MAX`] counts, with `noise_counts` added.
     pub(crate) fn counts(&self, celsius: f64, noise_counts: f64) -> u16 {
         let max = f64::from(ADC_MAX);
@@ -138,6 +149,18 @@ mod tests {
                 let expected = ohm / (PULLUP_OHM + ohm);
                 assert!((thermistor.fraction(*celsius) - expected).abs() < 1e-9);
             }
+        }
+    }
+
+    #[test]
+    fn a_reading_stands_for_the_temperature_that_it_was_made_at() {
+        for (points, thermistor) in [HOT_END, BED].into_iter().zip(thermistors()) {
+            for (celsius, ohm) in points {
+                assert!((thermistor.celsius(ohm / (PULLUP_OHM + ohm)) - celsius).abs() < 1e-6);
+            }
+            let all: Vec<f64> = (0..=1000).map(|i| thermistor.celsius(f64::from(i) / 1000.0)).collect();
+            assert!(all.iter().all(|celsius| celsius.is_finite()));
+            assert!(all.is_sorted_by(|a, b| a >= b));
         }
     }
 
