@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The lab: the tests of `tests/lab/guest`, run against real kernel drivers in a
-//! virtual machine, on each kernel flavour. docs/develop/lab.md tells how to use it.
+//! VM, on each kernel flavour. docs/develop/lab.md tells how to use it.
 //!
 //! This is the host's side, a test harness of its own. It builds what the
-//! machines boot, lists the tests that the guest binary holds, shares each flavour's
-//! among a few machines, and prints each test by name as libtest does.
+//! VMs boot, lists the tests that the guest binary holds, shares each flavour's
+//! among a few VMs, and prints each test by name as libtest does.
 
 mod lab {
     pub mod emulator;
@@ -34,13 +34,13 @@ use pinion_testkit::kernel::{Flavour, Kernel, Offers};
 /// A failed run exits as libtest's do.
 const FAILED: u8 = 101;
 
-/// So many at most in one machine. To start one costs as much as some tests; with
-/// more machines than processors none of those is idle while another has half of
+/// So many at most in one VM. To start one costs as much as some tests; with
+/// more VMs than processors none of those is idle while another has half of
 /// the work left.
-const TESTS_AT_A_MACHINE: usize = 32;
+const TESTS_IN_A_VM: usize = 32;
 
 /// Tests whose figures are to be compared with those of another run, or of another program: they
-/// have a machine for themselves, so that they do not depend on what ran there before.
+/// have a VM for themselves, so that they do not depend on what ran there before.
 const FIGURES: &str = "timing::figures::";
 
 fn main() -> ExitCode {
@@ -81,25 +81,25 @@ fn run(options: &Options) -> Result<bool, String> {
     Ok(report.finish())
 }
 
-/// The machines' runs, and how many tests were not selected.
+/// The VMs' runs, and how many tests were not selected.
 fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
     let (figures, others): (Vec<_>, Vec<_>) = tests.into_iter().partition(|test| test.starts_with(FIGURES));
     let mut runs = Vec::new();
     let mut filtered_out = 0;
     for flavour in Flavour::ALL {
-        let mut add = |program, tests: &[String], at_a_machine: usize| {
+        let mut add = |program, tests: &[String], in_a_vm: usize| {
             let whole = Run { flavour, program, tests: tests.to_vec() };
             let (selected, left_out): (Vec<_>, Vec<_>) =
                 tests.iter().partition(|test| options.selects(flavour, &whole.name_of(test)));
             filtered_out += left_out.len();
-            let machines = selected.len().div_ceil(at_a_machine);
+            let vms = selected.len().div_ceil(in_a_vm);
             // By turns: the tests of one file take alike, and may be the longest.
-            runs.extend((0..machines).map(|machine| {
-                let tests = selected.iter().skip(machine).step_by(machines).map(|test| (*test).clone()).collect();
+            runs.extend((0..vms).map(|vm| {
+                let tests = selected.iter().skip(vm).step_by(vms).map(|test| (*test).clone()).collect();
                 Run { flavour, program, tests }
             }));
         };
-        add(None, &others, TESTS_AT_A_MACHINE);
+        add(None, &others, TESTS_IN_A_VM);
         for program in [None].into_iter().chain(options.programs.iter().map(Some)) {
             add(program, &figures, figures.len());
         }
@@ -126,9 +126,9 @@ fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -
     // The slower kernel's first.
     let order: Vec<&Run<'_>> = runs.iter().rev().collect();
     let report = Mutex::new(report);
-    // A machine emulates one processor.
-    let machines = thread::available_parallelism().map_or(1, usize::from);
-    at_once(&order, machines, |run| {
+    // A VM emulates one processor.
+    let vms = thread::available_parallelism().map_or(1, usize::from);
+    at_once(&order, vms, |run| {
         let index = flavours.iter().position(|flavour| *flavour == run.flavour).expect("that of a run");
         run.perform(&snapshots[index], &cache, &report)
     })

@@ -25,10 +25,10 @@ pub struct Emulator {
 }
 
 impl Emulator {
-    /// Runs the command, with what it and the machine say in files of the folder.
-    pub fn start(mut machine: Command, folder: &Path) -> Result<Emulator, String> {
-        machine.arg("-serial").arg(format!("file:{}", folder.join("console").display())).args(["-qmp", "stdio"]);
-        let (qemu, input, output) = process::start_emulator(&mut machine, folder)?;
+    /// Runs the command, with what it and the VM say in files of the folder.
+    pub fn start(mut vm: Command, folder: &Path) -> Result<Emulator, String> {
+        vm.arg("-serial").arg(format!("file:{}", folder.join("console").display())).args(["-qmp", "stdio"]);
+        let (qemu, input, output) = process::start_emulator(&mut vm, folder)?;
         let mut emulator = Emulator { qemu, input, output: BufReader::new(output), folder: folder.to_owned() };
         emulator.ask(json!({"execute": "qmp_capabilities"}))?;
         emulator.settle_order();
@@ -72,7 +72,7 @@ impl Emulator {
         }
     }
 
-    /// Waits until the machine has come to this state, one of QMP's `RunState`.
+    /// Waits until the VM has come to this state, one of QMP's `RunState`.
     pub fn wait_until(&mut self, reached: impl Fn(&str) -> bool) -> Result<(), String> {
         let started = Instant::now();
         loop {
@@ -82,7 +82,7 @@ impl Emulator {
                 return Ok(());
             }
             if started.elapsed() > SILENCE_MAX {
-                return Err(format!("the machine is {status} for too long\n{}", self.said()));
+                return Err(format!("the VM is {status} for too long\n{}", self.said()));
             }
             thread::sleep(POLL_INTERVAL);
         }
@@ -93,12 +93,12 @@ impl Emulator {
         self.qemu.try_wait().map_err(|error| error.to_string())
     }
 
-    /// What the machine has written to its console.
+    /// What the VM has written to its console.
     pub fn console(&self) -> String {
         self.read("console")
     }
 
-    /// All that the machine and the emulator have said.
+    /// All that the VM and the emulator have said.
     pub fn said(&self) -> String {
         format!("--- console\n{}\n--- emulator\n{}", self.console(), self.read("qemu"))
     }

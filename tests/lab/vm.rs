@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One machine under QEMU, from its snapshot to the last result.
+//! One VM under QEMU, from its snapshot to the last result.
 
 use std::fs;
 use std::path::Path;
@@ -42,7 +42,7 @@ const COMMAND_LINE: &str = "console=ttyS0 quiet panic=-1 mitigations=off cryptom
 /// has little chance in it.
 const PROCESSOR: &str = "qemu64,+rdrand";
 
-/// The tests that one machine runs.
+/// The tests that one VM runs.
 pub struct Run<'a> {
     pub flavour: Flavour,
     /// What they measure, if not Pinion.
@@ -74,13 +74,12 @@ impl Run<'_> {
         let program = self.program.map(OtherProgram::command).unwrap_or_default();
         let text: String = self.tests.iter().map(|test| format!("{test} {program}\n")).collect();
         fs::write(&plan, text).map_err(|error| format!("cannot write {}: {error}", plan.display()))?;
-        let mut machine = machine(folder)?;
-        machine
-            .args(TIME)
-            // What `-kernel` put into the machine that was booted.
+        let mut vm = vm(folder)?;
+        vm.args(TIME)
+            // What `-kernel` put into the VM that was booted.
             .args(["-option-rom", "pvh.bin", "-incoming", &snapshot.source(), "-fw_cfg"])
             .arg(format!("name=opt/pinion/plan,file={}", plan.display()));
-        let mut emulator = Emulator::start(machine, folder)?;
+        let mut emulator = Emulator::start(vm, folder)?;
         emulator.wait_until(|status| status != "inmigrate")?;
         emulator.ask(json!({"execute": "cont"}))?;
 
@@ -97,7 +96,7 @@ impl Run<'_> {
                     true => format!("{cause}\n{}", emulator.said()),
                     false => format!("no result: see {}", self.name_of(culprit)),
                 };
-                report.lock().expect("no machine panics").test(self, test, Outcome::Failed, &output);
+                report.lock().expect("no VM panics").test(self, test, Outcome::Failed, &output);
             }
         }
         Ok(())
@@ -118,14 +117,14 @@ impl Run<'_> {
             // A name that the program does not know is a success to libtest.
             let passed = status == "0" && output.contains("test result: ok. 1 passed;");
             let outcome = if passed { Outcome::Passed } else { Outcome::Failed };
-            report.lock().expect("no machine panics").test(self, test, outcome, &output);
+            report.lock().expect("no VM panics").test(self, test, outcome, &output);
             reported += 1;
         }
         Ok(reported)
     }
 }
 
-/// Waits until the machine has ended, and returns how, for the tests of which it left no result.
+/// Waits until the VM has ended, and returns how, for the tests of which it left no result.
 fn follow(emulator: &mut Emulator) -> Result<String, String> {
     let mut said = 0;
     let mut heard = Instant::now();
@@ -133,7 +132,7 @@ fn follow(emulator: &mut Emulator) -> Result<String, String> {
         if let Some(status) = emulator.ended()? {
             return Ok(match status.code() {
                 Some(EXIT_PLAN_DONE) => "the guest ended and left no result".into(),
-                _ => format!("the machine died: {status}"),
+                _ => format!("the VM died: {status}"),
             });
         }
         // The console has each test's name as it begins.
@@ -148,48 +147,46 @@ fn follow(emulator: &mut Emulator) -> Result<String, String> {
     }
 }
 
-/// The machine of which a snapshot is taken.
+/// The VM of which a snapshot is taken.
 pub fn booting(kernel: &Kernel, payload: &[u8], folder: &Path) -> Result<Command, String> {
-    let mut machine = machine(folder)?;
-    machine.args(TIME);
+    let mut vm = vm(folder)?;
+    vm.args(TIME);
     // Every run is to begin, and to go on, with the same numbers.
-    boot(&mut machine, kernel, payload, folder, "nokaslr norandmaps random.trust_cpu=on")?;
-    Ok(machine)
+    boot(&mut vm, kernel, payload, folder, "nokaslr norandmaps random.trust_cpu=on")?;
+    Ok(vm)
 }
 
 /// A shell in the guest, on this terminal.
 pub fn shell(kernel: &Kernel, payload: &[u8], cache: &Cache) -> Result<(), String> {
     let folder = cache.run_folder()?;
     let folder = folder.path();
-    let mut machine = machine(folder)?;
+    let mut vm = vm(folder)?;
     eprintln!("lab: /lab/share in the guest is {}", folder.join("share").display());
-    boot(&mut machine, kernel, payload, folder, "LAB_SHELL=1")?;
-    machine.args(["-smp", "2", "-serial", "mon:stdio"]);
-    machine.status().map(drop).map_err(|error| format!("cannot start the emulator: {error}"))
+    boot(&mut vm, kernel, payload, folder, "LAB_SHELL=1")?;
+    vm.args(["-smp", "2", "-serial", "mon:stdio"]);
+    vm.status().map(drop).map_err(|error| format!("cannot start the emulator: {error}"))
 }
 
-/// The machine that every run has. KVM is left alone even where there is one:
+/// The VM that every run has. KVM is left alone even where there is one:
 /// the lab is to be the same everywhere.
-fn machine(folder: &Path) -> Result<Command, String> {
+fn vm(folder: &Path) -> Result<Command, String> {
     let share = folder.join("share");
     fs::create_dir(&share).map_err(|error| format!("cannot create {}: {error}", share.display()))?;
-    let mut machine = Command::new(EMULATOR);
-    machine
-        .args(["-accel", "tcg", "-cpu", PROCESSOR, "-m", "512", "-nodefaults", "-display", "none", "-no-reboot"])
+    let mut vm = Command::new(EMULATOR);
+    vm.args(["-accel", "tcg", "-cpu", PROCESSOR, "-m", "512", "-nodefaults", "-display", "none", "-no-reboot"])
         .args(["-device", "isa-debug-exit,iobase=0xf4,iosize=0x04", "-device", "pvpanic", "-action", "panic=pause"])
         .arg("-virtfs")
         .arg(format!("local,path={},mount_tag=lab,security_model=none", share.display()));
-    Ok(machine)
+    Ok(vm)
 }
 
-fn boot(machine: &mut Command, kernel: &Kernel, payload: &[u8], folder: &Path, parameters: &str) -> Result<(), String> {
+fn boot(vm: &mut Command, kernel: &Kernel, payload: &[u8], folder: &Path, parameters: &str) -> Result<(), String> {
     let initramfs = folder.join("initramfs");
     let mut archives =
         fs::read(&kernel.initramfs).map_err(|error| format!("cannot read {}: {error}", kernel.initramfs.display()))?;
     archives.extend_from_slice(payload);
     fs::write(&initramfs, archives).map_err(|error| format!("cannot write {}: {error}", initramfs.display()))?;
-    machine
-        .arg("-kernel")
+    vm.arg("-kernel")
         .arg(&kernel.vmlinux)
         .arg("-initrd")
         .arg(&initramfs)

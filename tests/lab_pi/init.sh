@@ -19,7 +19,7 @@ fi
 
 stty raw -echo
 # Keeps the processor from idling, in which time would pass at the host's pace: see TIME
-# in machine.rs. Everything is on one processor; two would take turns of milliseconds.
+# in vm.rs. Everything is on one processor; two would take turns of milliseconds.
 taskset -p 1 $$ >/dev/null
 (while :; do :; done) &
 renice -n 19 -p $!

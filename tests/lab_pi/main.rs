@@ -8,7 +8,7 @@
 mod cross;
 mod debian;
 mod gpio;
-mod machine;
+mod vm;
 
 use std::env;
 use std::process::ExitCode;
@@ -16,9 +16,9 @@ use std::time::Instant;
 
 use cross::Programs;
 use debian::Sysroot;
-use machine::{Machine, News};
 use pinion_testkit::cache::Cache;
 use pinion_testkit::initramfs::Archive;
+use vm::{News, Vm};
 
 const USAGE: &str = "\
 Usage: cargo test --test lab_pi -- [OPTIONS] [FILTERS...]
@@ -89,14 +89,14 @@ fn run(options: &Options) -> Result<bool, String> {
     add_filters(&mut archive, &options.filters);
     let initramfs = archive.finish();
     if options.shell {
-        machine::shell(&sysroot, &initramfs, &cache)?;
+        vm::shell(&sysroot, &initramfs, &cache)?;
         return Ok(true);
     }
     println!("a Raspberry Pi 3 with Linux {}", sysroot.release);
-    let mut machine = Machine::boot(&sysroot, &initramfs, &cache)?;
+    let mut vm = Vm::boot(&sysroot, &initramfs, &cache)?;
     let mut report = Report { started: Instant::now(), planned: Vec::new(), failures: Vec::new(), passed: 0 };
-    let outcome = follow(&mut machine, &mut report, options.show_output);
-    Ok(report.finish(outcome, &machine))
+    let outcome = follow(&mut vm, &mut report, options.show_output);
+    Ok(report.finish(outcome, &vm))
 }
 
 fn add_filters(archive: &mut Archive, filters: &[String]) {
@@ -104,10 +104,10 @@ fn add_filters(archive: &mut Archive, filters: &[String]) {
     archive.file("/lab/filters", lines.as_bytes());
 }
 
-/// Until the last test has ended. An error says what became of the machine.
-fn follow(machine: &mut Machine, report: &mut Report, show_output: bool) -> Result<(), String> {
+/// Until the last test has ended. An error says what became of the VM.
+fn follow(vm: &mut Vm, report: &mut Report, show_output: bool) -> Result<(), String> {
     loop {
-        match machine.next()? {
+        match vm.next()? {
             News::Planned(tests) => report.plan(tests),
             News::Ended { test, status, output } => {
                 // A name that the program does not know is a success to libtest.
@@ -151,7 +151,7 @@ impl Report {
     }
 
     /// Prints the rest. Whether there were tests and all have passed.
-    fn finish(mut self, outcome: Result<(), String>, machine: &Machine) -> bool {
+    fn finish(mut self, outcome: Result<(), String>, vm: &Vm) -> bool {
         let ended = self.passed + self.failures.len();
         let cause = match outcome {
             Err(cause) => Some(cause),
@@ -173,7 +173,7 @@ impl Report {
         }
         let ok = cause.is_none() && self.failures.is_empty();
         if let Some(cause) = cause {
-            println!("{cause}\n{}", machine.console());
+            println!("{cause}\n{}", vm.console());
         }
         if !self.failures.is_empty() {
             println!("\nfailures:");

@@ -21,12 +21,13 @@ use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 use pinion_client::{Client, Error};
 use serde_json::{Value, json};
 
-const PATIENCE: Duration = Duration::from_secs(10);
+/// How long the client waits for Pinion.
+const CLIENT_TIMEOUT: Duration = Duration::from_secs(10);
 /// A heater that is not refreshed for so long shuts the machine down.
 const MAX_DURATION_S: f64 = 3.0;
 const REFRESH: Duration = Duration::from_millis(300);
-/// klippy answers G-code when it has ended; an emulated computer homes slowly.
-const KLIPPYS_PATIENCE: Duration = Duration::from_secs(120);
+/// How long the host takes to answer: it answers G-code when it has ended, and an emulated computer homes slowly.
+const HOST_TIMEOUT: Duration = Duration::from_secs(120);
 
 fn main() -> ExitCode {
     let args: Vec<String> = std::env::args().skip(1).collect();
@@ -50,7 +51,7 @@ fn main() -> ExitCode {
 }
 
 fn connect(link: &str) -> Result<Client, Error> {
-    Client::connect(Path::new(link), PATIENCE)
+    Client::connect(Path::new(link), CLIENT_TIMEOUT)
 }
 
 fn identify(link: &str, pin: Option<&str>) -> Result<(), Error> {
@@ -132,7 +133,7 @@ fn ask(socket: &str, method: &str, params: &str, pointer: &str) -> Result<String
 
 fn request(socket: &str, request: &Value) -> io::Result<Value> {
     let mut api = UnixStream::connect(socket)?;
-    api.set_read_timeout(Some(KLIPPYS_PATIENCE))?;
+    api.set_read_timeout(Some(HOST_TIMEOUT))?;
     api.write_all(format!("{request}\x03").as_bytes())?;
     let mut answer = Vec::new();
     for byte in api.bytes() {

@@ -5,9 +5,9 @@
 //!
 //! This is the computer's side, a test harness of its own.
 
-mod machine;
 mod packages;
 mod pages;
+mod vm;
 
 use std::collections::VecDeque;
 use std::env;
@@ -18,8 +18,8 @@ use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Instant;
 
-use machine::{Machine, Root};
 use pinion_testkit::cache::Cache;
+use vm::{Root, Vm};
 
 const USAGE: &str = "\
 Usage: cargo test --test lab_system -- [OPTIONS] [FILTERS...]
@@ -30,7 +30,7 @@ emulator if it is missing, and downloads a Debian the first time.
 
 Options:
   --nocapture        Show the output of checks that pass, too
-  --run FILE         Run this script in the machine after the checks, and print its output
+  --run FILE         Run this script in the VM after the checks, and print its output
   --list             Name the checks";
 
 /// A check that can not be run ends so, and prints why.
@@ -118,7 +118,7 @@ fn run(options: &Options) -> Result<bool, String> {
     pages::share(&share)?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
 
-    // The checks of pages each make what their page finds. So they are run beside the others by a second machine,
+    // The checks of pages each make what their page finds. So they are run beside the others by a second VM,
     // and by that of the others once those are done.
     let (mut of_pages, mut others): (Vec<_>, Vec<_>) = checks.into_iter().partition(pages::tries_any);
     of_pages.retain(|check| options.chosen(check));
@@ -128,18 +128,15 @@ fn run(options: &Options) -> Result<bool, String> {
         others.clear();
     }
     let of_pages = Mutex::new(VecDeque::from(of_pages));
-    let machines = [("first", others, options.run.as_deref()), ("second", Vec::new(), None)];
+    let vms = [("first", others, options.run.as_deref()), ("second", Vec::new(), None)];
     let run = |(name, checks, then): (&str, Vec<Check>, _)| {
         let folder = folder.path().join(name);
         fs::create_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        in_a_machine(|| Machine::boot(&root, &folder, &share), checks, &of_pages, options, then)
+        in_a_vm(|| Vm::boot(&root, &folder, &share), checks, &of_pages, options, then)
     };
     let tallies: Vec<Result<Tally, String>> = thread::scope(|scope| {
-        let started = machines.map(|machine| scope.spawn(|| run(machine)));
-        started
-            .into_iter()
-            .map(|thread| thread.join().unwrap_or_else(|_| Err("a machine's thread died".into())))
-            .collect()
+        let started = vms.map(|vm| scope.spawn(|| run(vm)));
+        started.into_iter().map(|thread| thread.join().unwrap_or_else(|_| Err("a VM's thread died".into()))).collect()
     });
     let mut all = Tally::default();
     for tally in tallies {
@@ -165,10 +162,10 @@ struct Tally {
     not_run: Vec<String>,
 }
 
-/// Runs the checks in a machine, if there are any, `then` the script that this path names, and of the shared ones
-/// as many as other machines leave.
-fn in_a_machine(
-    boot: impl FnOnce() -> Result<Machine, String>,
+/// Runs the checks in a VM, if there are any, `then` the script that this path names, and of the shared ones
+/// as many as other VMs leave.
+fn in_a_vm(
+    boot: impl FnOnce() -> Result<Vm, String>,
     checks: Vec<Check>,
     shared: &Mutex<VecDeque<Check>>,
     options: &Options,
@@ -183,11 +180,11 @@ fn in_a_machine(
     if own.is_empty() && then.is_none() {
         return Ok(tally);
     }
-    let mut machine = boot()?;
-    println!("booted in {:.1} s", machine.boot_took.as_secs_f64());
+    let mut vm = boot()?;
+    println!("booted in {:.1} s", vm.boot_took.as_secs_f64());
     while let Some(check) = own.pop_front().or_else(next_shared) {
         let began = Instant::now();
-        let (status, output) = machine.run(&check.script)?;
+        let (status, output) = vm.run(&check.script)?;
         if status == NOT_RUN {
             println!("check {} ... NOT RUN: {}", check.name, output.trim());
             tally.not_run.push(check.name.clone());
@@ -199,7 +196,7 @@ fn in_a_machine(
         if status != 0 || options.show_output {
             said.push_str(&output);
         }
-        // At once, as another machine's lines may come between.
+        // At once, as another VM's lines may come between.
         print!("{said}");
         match status {
             0 => tally.passed += 1,
@@ -211,7 +208,7 @@ fn in_a_machine(
     }
     if let Some(file) = then {
         let script = fs::read_to_string(file).map_err(|error| format!("{}: {error}", file.display()))?;
-        let (status, output) = machine.run(&script)?;
+        let (status, output) = vm.run(&script)?;
         println!("{output}\nstatus {status}");
     }
     Ok(tally)

@@ -10,7 +10,8 @@ use pinion_client::Client;
 
 const LINK: &str = "/tmp/tty";
 const LOG: &str = "/tmp/log";
-const PATIENCE: Duration = Duration::from_secs(20);
+/// How long the client waits for Pinion.
+const CLIENT_TIMEOUT: Duration = Duration::from_secs(20);
 
 /// A running `pinion`, ended on drop. What it logged is printed then.
 pub struct Pinion(Child);
@@ -25,7 +26,7 @@ impl Pinion {
     }
 
     pub fn client(&self) -> Client {
-        Client::connect(Path::new(LINK), PATIENCE).expect("a micro-controller")
+        Client::connect(Path::new(LINK), CLIENT_TIMEOUT).expect("a micro-controller")
     }
 
     /// With SIGKILL.

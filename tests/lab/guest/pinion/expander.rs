@@ -115,7 +115,7 @@ fn output(oid: usize, pin: &str) -> String {
 }
 
 /// A heater on a line of the processor's and a fan on the expander, both on.
-struct Machine {
+struct Setup {
     /// First, as it is dropped first.
     expander: Expander,
     sim: GpioSim,
@@ -124,10 +124,10 @@ struct Machine {
     heater: u32,
 }
 
-impl Machine {
-    fn new() -> Machine {
+impl Setup {
+    fn new() -> Setup {
         let sim = GpioSim::new("lab", 8);
-        Machine { heater: sim.kernel_number(0), expander: Expander::new(), sim }
+        Setup { heater: sim.kernel_number(0), expander: Expander::new(), sim }
     }
 
     fn switch_on(&self, client: &mut Client) {
@@ -160,8 +160,8 @@ fn now_us() -> u64 {
 }
 
 /// The name under which the log knows the fan.
-fn fan(machine: &Machine) -> String {
-    format!("digital output oid 1 ({})", machine.expander.pin(3))
+fn fan(setup: &Setup) -> String {
+    format!("digital output oid 1 ({})", setup.expander.pin(3))
 }
 
 #[test]
@@ -257,124 +257,124 @@ fn an_axis_homes_to_an_endstop_on_it() {
 
 #[test]
 fn an_emergency_stop_waits_for_no_chip_that_hangs() {
-    let machine = Machine::new();
+    let setup = Setup::new();
     let mut program = Program::start();
     let client = &mut program.connect();
-    machine.switch_on(client);
+    setup.switch_on(client);
     let trace = Trace::start();
     let guardian = program.guardian();
-    let hangs = machine.expander.slow_down(HANGS_MS);
+    let hangs = setup.expander.slow_down(HANGS_MS);
     let began_us = now_us();
     client.send_line("emergency_stop").expect("a session");
-    let off_us = machine.heater_off_us(&trace);
+    let off_us = setup.heater_off_us(&trace);
     assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
     // Nothing more than the fan's shutdown value is missing, and the guardian sees to that.
-    program.wait_for_line(&["guardian: ", &fan(&machine), "is not at its shutdown value within 1000 ms"]);
+    program.wait_for_line(&["guardian: ", &fan(&setup), "is not at its shutdown value within 1000 ms"]);
     // The second that a shutdown value may take, two for the program's end, two for the chip.
     let acted_us = now_us() - began_us;
     assert!((4_900_000..5_500_000).contains(&acted_us), "{acted_us} us");
-    program.wait_for_line(&["only 1 of 2 outputs", &machine.expander.line(3), "its driver hangs"]);
+    program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
     assert!(!exists(program.pid()), "it is killed while the chip still hangs");
     sysfs::wait_until("the guardian ends", || !exists(guardian));
     assert!(now_us() - began_us < 1000 * HANGS_MS);
     drop(hangs);
     assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
     // The write that hung is done in the end.
-    machine.expander.wait_until_free();
-    assert!(!machine.expander.level(3));
+    setup.expander.wait_until_free();
+    assert!(!setup.expander.level(3));
     drop(trace);
-    machine.assert_starts_anew();
+    setup.assert_starts_anew();
 }
 
 #[test]
 fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
-    let machine = Machine::new();
+    let setup = Setup::new();
     let mut program = Program::start();
     let client = &mut program.connect();
-    machine.switch_on(client);
+    setup.switch_on(client);
     let trace = Trace::start();
     let guardian = program.guardian();
-    let hangs = machine.expander.slow_down(HANGS_MS);
-    // A worker is at it, while the machine runs on.
+    let hangs = setup.expander.slow_down(HANGS_MS);
+    // A worker is at it, while the MCU runs on.
     let at = client.clock_in(0.1).expect("the clock").wire();
     run(client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
     thread::sleep(Duration::from_secs(2));
-    assert!(machine.sim.level(0) && program.is_running());
+    assert!(setup.sim.level(0) && program.is_running());
     let began_us = now_us();
     program.signal(Signal::SIGKILL);
-    let off_us = machine.heater_off_us(&trace);
+    let off_us = setup.heater_off_us(&trace);
     assert!(off_us - began_us < WITHIN_US, "{} us", off_us - began_us);
-    program.wait_for_line(&["guardian: ", "only 1 of 2 outputs", &machine.expander.line(3), "its driver hangs"]);
+    program.wait_for_line(&["guardian: ", "only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
     sysfs::wait_until("the guardian ends", || !exists(guardian));
     assert!(!exists(program.pid()));
     drop(hangs);
     drop(trace);
-    machine.assert_starts_anew();
+    setup.assert_starts_anew();
 }
 
 #[test]
-fn a_chip_that_does_not_acknowledge_stops_the_machine_and_is_tried_again() {
-    let machine = Machine::new();
+fn a_chip_that_does_not_acknowledge_stops_the_mcu_and_is_tried_again() {
+    let setup = Setup::new();
     let mut program = Program::start();
     let client = &mut program.connect();
-    machine.switch_on(client);
-    let silent = machine.expander.fall_silent();
+    setup.switch_on(client);
+    let silent = setup.expander.fall_silent();
     client.send_line("update_digital_out oid=1 value=0").expect("a session");
     assert_eq!(shutdown_of(client), "GPIO line write failed");
-    assert!(!machine.sim.level(0), "the heater is off");
-    let line = machine.expander.line(3);
-    program.wait_for_line(&["shutdown: GPIO line write failed", &fan(&machine), &line, "its chip does not answer"]);
+    assert!(!setup.sim.level(0), "the heater is off");
+    let line = setup.expander.line(3);
+    program.wait_for_line(&["shutdown: GPIO line write failed", &fan(&setup), &line, "its chip does not answer"]);
     thread::sleep(Duration::from_millis(300));
     assert!(!program.log().contains("after all"));
     drop(silent);
-    program.wait_for_line(&[&fan(&machine), "is at its shutdown value after all"]);
-    assert!(!machine.expander.level(3));
+    program.wait_for_line(&[&fan(&setup), "is at its shutdown value after all"]);
+    assert!(!setup.expander.level(3));
     // Nobody had to help.
     thread::sleep(Duration::from_secs(2));
     assert!(program.is_running());
     assert!(!program.log().contains("guardian"), "{}", program.log());
     client.reset().expect("a reset");
-    machine.switch_on(client);
+    setup.switch_on(client);
 }
 
 #[test]
 fn a_chip_that_stays_silent_is_left_to_the_guardian_which_names_it() {
-    let machine = Machine::new();
+    let setup = Setup::new();
     let mut program = Program::start();
     let client = &mut program.connect();
-    machine.switch_on(client);
-    let silent = machine.expander.fall_silent();
+    setup.switch_on(client);
+    let silent = setup.expander.fall_silent();
     let began_us = now_us();
     client.send_line("update_digital_out oid=1 value=0").expect("a session");
     assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
     let killed_us = now_us() - began_us;
     assert!((1_000_000..1_500_000).contains(&killed_us), "{killed_us} us");
-    program.wait_for_line(&["guardian: ", &fan(&machine), "is not at its shutdown value within 1000 ms"]);
-    program.wait_for_line(&["only 1 of 2 outputs", &machine.expander.line(3), "No such device or address"]);
+    program.wait_for_line(&["guardian: ", &fan(&setup), "is not at its shutdown value within 1000 ms"]);
+    program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "No such device or address"]);
     drop(silent);
-    machine.assert_starts_anew();
+    setup.assert_starts_anew();
 }
 
 #[test]
 fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
-    let machine = Machine::new();
+    let setup = Setup::new();
     let mut program = Program::start();
-    machine.switch_on(&mut program.connect());
+    setup.switch_on(&mut program.connect());
     let guardian = program.guardian();
-    let silent = machine.expander.fall_silent();
+    let silent = setup.expander.fall_silent();
     let trace = Trace::start();
     let began_us = now_us();
     program.signal(Signal::SIGTERM);
-    let off_us = machine.heater_off_us(&trace);
+    let off_us = setup.heater_off_us(&trace);
     assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
     assert!(!program.wait().success());
     // The chip is back while the guardian tries.
     drop(silent);
     sysfs::wait_until("the guardian ends", || !exists(guardian));
-    program.wait_for_line(&["guardian: ", &fan(&machine), "all 2 outputs are driven to their shutdown values"]);
-    assert!(!machine.expander.level(3));
+    program.wait_for_line(&["guardian: ", &fan(&setup), "all 2 outputs are driven to their shutdown values"]);
+    assert!(!setup.expander.level(3));
     drop(trace);
-    machine.assert_starts_anew();
+    setup.assert_starts_anew();
 }
 
 #[test]
@@ -464,7 +464,7 @@ fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
 }
 
 #[test]
-fn inputs_that_can_not_be_read_for_100_ms_stop_the_machine() {
+fn inputs_that_can_not_be_read_for_100_ms_stop_the_mcu() {
     let expander = Expander::new();
     let program = Program::start();
     let client = &mut program.connect();

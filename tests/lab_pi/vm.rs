@@ -43,8 +43,8 @@ pub enum News {
     Done,
 }
 
-/// A running machine; it ends when this is dropped.
-pub struct Machine {
+/// A running VM; it ends when this is dropped.
+pub struct Vm {
     qemu: Child,
     gpio: Gpio,
     input: ChildStdin,
@@ -56,8 +56,8 @@ pub struct Machine {
     folder: TempDir,
 }
 
-impl Machine {
-    pub fn boot(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<Machine, String> {
+impl Vm {
+    pub fn boot(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<Vm, String> {
         let folder = cache.run_folder()?;
         let qtest = folder.path().join("qtest");
         let mut command = command(sysroot, initramfs, folder.path(), "")?;
@@ -71,7 +71,7 @@ impl Machine {
         ]);
         let (mut qemu, input, output) = process::start_emulator(&mut command, folder.path())?;
         match Gpio::connect(&qtest) {
-            Ok(gpio) => Ok(Machine {
+            Ok(gpio) => Ok(Vm {
                 qemu,
                 gpio,
                 input,
@@ -90,12 +90,12 @@ impl Machine {
     }
 
     /// Does what the guest asks for until it has news. An error says what became of
-    /// the machine.
+    /// the VM.
     pub fn next(&mut self) -> Result<News, String> {
         loop {
             let line = self.lines.recv_timeout(SILENCE_MAX).map_err(|error| match error {
                 RecvTimeoutError::Timeout => format!("nothing came from it for {} s", SILENCE_MAX.as_secs()),
-                RecvTimeoutError::Disconnected => "the machine ended too early".to_owned(),
+                RecvTimeoutError::Disconnected => "the VM ended too early".to_owned(),
             })?;
             self.console += &line;
             self.console.push('\n');
@@ -162,7 +162,7 @@ impl Machine {
     }
 }
 
-impl Drop for Machine {
+impl Drop for Vm {
     fn drop(&mut self) {
         let _ = self.qemu.kill();
         let _ = self.qemu.wait();
@@ -179,7 +179,7 @@ pub fn shell(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<(), S
     qemu.wait().map(drop).map_err(|error| error.to_string())
 }
 
-/// The machine that every run has, save for its console: the second serial port.
+/// The VM that every run has, save for its console: the second serial port.
 fn command(sysroot: &Sysroot, initramfs: &[u8], folder: &Path, more: &str) -> Result<Command, String> {
     let root = folder.join("initramfs");
     fs::write(&root, initramfs).map_err(|error| format!("cannot write {}: {error}", root.display()))?;

@@ -18,16 +18,16 @@ use pinion_testkit::{process, tools};
 /// takes several seconds for one.
 const SILENCE_MAX: Duration = Duration::from_secs(1800);
 /// The guest's time: while it works, an instruction takes 1 ns; while it sleeps, time is the computer's. On a
-/// busy computer the machine is then slow, and nothing in it is late, which klippy and a watchdog would mind.
+/// busy computer the VM is then slow, and nothing in it is late, which klippy and a watchdog would mind.
 const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];
-/// After a script that ends with this status the agent reboots the machine: the next one waits for it.
+/// After a script that ends with this status the agent reboots the VM: the next one waits for it.
 const REBOOTS: i32 = 77;
 
 /// Program and the Debian package that has it.
 const TOOLS: [(&str, &str); 3] =
     [("mmdebstrap", "mmdebstrap"), ("dpkg-scanpackages", "dpkg-dev"), ("mke2fs", "e2fsprogs")];
 
-/// What the machine boots.
+/// What the VM boots.
 pub struct Root {
     kernel: PathBuf,
     folder: PathBuf,
@@ -78,8 +78,8 @@ fn key(kernel: &Kernel) -> u64 {
     hasher.finish()
 }
 
-/// A running machine; it ends when this is dropped.
-pub struct Machine {
+/// A running VM; it ends when this is dropped.
+pub struct Vm {
     kernel: PathBuf,
     initrd: PathBuf,
     folder: PathBuf,
@@ -90,17 +90,17 @@ pub struct Machine {
     pub boot_took: Duration,
 }
 
-impl Machine {
-    /// Boots a copy of the root, which is put into `folder`. The machine sees `share` as /share.
-    pub fn boot(root: &Root, folder: &Path, share: &Path) -> Result<Machine, String> {
+impl Vm {
+    /// Boots a copy of the root, which is put into `folder`. The VM sees `share` as /share.
+    pub fn boot(root: &Root, folder: &Path, share: &Path) -> Result<Vm, String> {
         // The holes stay holes.
         process::run(Command::new("cp").arg("--sparse=always").arg(root.folder.join("root.img")).arg(folder))?;
         let (kernel, initrd) = (root.kernel.clone(), root.folder.join("initrd"));
         let (qemu, input, lines) = start(&kernel, &initrd, folder, share)?;
         let (folder, share) = (folder.to_owned(), share.to_owned());
-        let mut machine = Machine { kernel, initrd, folder, share, qemu, input, lines, boot_took: Duration::ZERO };
-        machine.wait_until_up()?;
-        Ok(machine)
+        let mut vm = Vm { kernel, initrd, folder, share, qemu, input, lines, boot_took: Duration::ZERO };
+        vm.wait_until_up()?;
+        Ok(vm)
     }
 
     fn wait_until_up(&mut self) -> Result<(), String> {
@@ -110,7 +110,7 @@ impl Machine {
         Ok(())
     }
 
-    /// The exit status and the output of a script that is run by bash in the machine.
+    /// The exit status and the output of a script that is run by bash in the VM.
     pub fn run(&mut self, script: &str) -> Result<(i32, String), String> {
         let line = format!("{}\n", base64(script.as_bytes()));
         self.input.write_all(line.as_bytes()).map_err(|error| self.failed(&error.to_string()))?;
@@ -150,7 +150,7 @@ impl Machine {
     }
 }
 
-impl Drop for Machine {
+impl Drop for Vm {
     fn drop(&mut self) {
         let _ = self.qemu.kill();
         let _ = self.qemu.wait();
