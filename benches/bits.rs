@@ -239,7 +239,7 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
     let mut waiter = Waiter::new(Arc::new(clock), MarginLimits::default(), scheduling, processors);
     let mut core = Core { steps: Lateness::default(), bits: Lateness::default(), messages: [0; 2] };
     let mut good = true;
-    let start = clock.now() + Ticks::from_us(1000);
+    let start = clock.now() + Ticks::from_ms(1);
     // Due at, every, whether a bit.
     let stepper = |n: u32| (start + Ticks::from_us(17 * n), Ticks::from_us(100), false);
     let mut timers: Vec<(Clock, Ticks, bool)> = (0..steppers).map(stepper).collect();

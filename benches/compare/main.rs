@@ -5,7 +5,7 @@
 //! - [`rig`]: a /dev of null devices, the stand-in for their drivers, the program's start
 //! - [`steps`]: step edges at a steady rate: how late, how much CPU, how fast at most
 //! - [`talk`]: round trips, and commands a second
-//! - [`process`]: CPU time and memory, of the program and of the others on this machine
+//! - [`process`]: CPU time and memory, of the program and of the others on this computer
 //! - [`table`]: the figures of all runs
 
 #![forbid(unsafe_code)]
@@ -76,7 +76,7 @@ enum Measure {
     Commands,
     /// The smallest step interval that survives
     Interval,
-    /// CPU time of a configured machine whose host is silent
+    /// CPU time of a configured MCU whose host is silent
     Idle,
     /// Resident and private memory
     Memory,

@@ -77,7 +77,7 @@ pub fn memory(pid: u32) -> Result<Memories, String> {
     Ok(Memories { main: of_process(pid)?, forked })
 }
 
-/// How busy others keep this machine: neither the program nor the bench.
+/// How busy others keep this computer: neither the program nor the bench.
 pub struct Others {
     pid: u32,
     since: Instant,

@@ -88,7 +88,7 @@ pub struct Outcome {
     /// Of each step edge, in nanoseconds, sorted.
     late_ns: Vec<i64>,
     pub cpu_us_per_step: f64,
-    /// Why the machine stopped, if it did.
+    /// Why the MCU stopped, if it did.
     pub shutdown: Option<String>,
     pub lasted_s: f64,
     /// CPUs that others used meanwhile.
@@ -291,10 +291,10 @@ pub struct Smallest {
 
 /// Beyond this nothing is looked for.
 const TICKS_MAX: u32 = 20_000;
-/// So often it must die: once may be the fault of others on this machine.
+/// So often it must die: once may be the fault of others on this computer.
 const DEATHS: u32 = 2;
 
-/// Finds the smallest step interval at which the machine goes on for so many seconds, within
+/// Finds the smallest step interval at which the MCU goes on for so many seconds, within
 /// some 3 %. A driver that steps on both edges: one edge a step.
 pub fn smallest_interval(
     rig: &Rig,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The core: owns the machine; runs due timers, then commands while no timer is near, then
+//! The core: owns the MCU; runs due timers, then commands while no timer is near, then
 //! waits.
 
 #![forbid(unsafe_code)]
@@ -48,19 +48,19 @@ impl Payload {
 pub(super) enum Request {
     /// Run the commands of a block.
     Run(Payload),
-    /// Stop the machine.
+    /// Stop the MCU.
     Shutdown(Shutdown),
     /// Speak this dialect, as another host came. The link keeps a copy, so that the core never frees one.
     Speak(Arc<Dialect>),
     /// Say how late timers were.
     Report,
-    /// Stop the machine and end.
+    /// Stop the MCU and end.
     Quit,
     /// Never come back, for a test.
     Hang,
 }
 
-/// A command takes a microsecond or two: within this span of a timer none is begun.
+/// No command is begun within this span of a timer: it takes a microsecond or two.
 const NEAR: Ticks = Ticks::from_us(5);
 /// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
 const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
@@ -71,15 +71,15 @@ const SOON: Ticks = Ticks::from_us(30);
 /// acknowledge each block costs as much as to run it.
 const FEW: usize = 3;
 /// How long the core polls for the next command before it sleeps: hosts send in bursts, and a wake-up takes as long
-/// (20 to 50 us on the machines measured).
+/// (20 to 50 us on the computers measured).
 const NEXT_COMMAND: Ticks = Ticks::from_us(30);
 /// How long the core polls for the answer of a bus that a command waits for.
 const ANSWER: Ticks = Ticks::from_us(100);
-/// For so long another thread may keep the processor of one that yields (3.5 ms were measured).
+/// How long another thread may keep the processor of one that yields (3.5 ms were measured).
 const SLICE: Ticks = Ticks::from_us(5000);
-/// So often commands give way to a timer that is near, then one gets its turn.
-const PATIENCE: u32 = 20;
-/// For how long a program that ends waits for its outputs to be at their shutdown values. The
+/// A command runs after it has yielded to this many timers.
+const YIELDS_MAX: u32 = 20;
+/// How long a program that ends waits for its outputs to be at their shutdown values. The
 /// guardian acts before.
 const LAST_WRITES: Duration = Duration::from_millis(1500);
 
@@ -93,13 +93,13 @@ pub(super) struct Core {
     wake: Arc<LinkWake>,
     /// The block whose commands are run, and how far they were.
     block: Option<(Payload, usize)>,
-    gave_way: u32,
+    yielded: u32,
     /// Requests to stop that were taken in, of those that the link handed over.
     stops_taken: u32,
     /// Blocks are done that the link was not woken for.
     untold: bool,
     lookout: Lookout,
-    /// What the guardian was told that the machine owes.
+    /// What the guardian was told that the MCU owes.
     debtor: Option<String>,
     teller: Teller,
 }
@@ -148,7 +148,7 @@ impl Core {
             progress,
             wake,
             block: None,
-            gave_way: 0,
+            yielded: 0,
             stops_taken: 0,
             debtor: None,
             teller,
@@ -178,7 +178,7 @@ impl Core {
                 self.stop_ahead();
             }
             let near = self.mcu.next_timer().is_some_and(|next| next < self.mcu.last_read() + NEAR);
-            if behind || !near || self.gave_way >= PATIENCE {
+            if behind || !near || self.yielded >= YIELDS_MAX {
                 match self.run_commands(behind) {
                     Turn::Done => {
                         let span = if self.mcu.is_held() { ANSWER } else { NEXT_COMMAND };
@@ -197,7 +197,7 @@ impl Core {
             let deadline = self.mcu.next_timer();
             let now = self.mcu.now();
             if deadline.is_some_and(|deadline| deadline <= now) {
-                self.gave_way += 1;
+                self.yielded += 1;
                 continue;
             }
             if self.teller.is_asked() && !soon(deadline, now) {
@@ -231,7 +231,7 @@ impl Core {
             let woken = self.waiter.wait(deadline, exact, || !near && calls.any(begun, requests));
             busy_since = self.clock.now();
             if woken == Woken::Due {
-                self.gave_way += 1;
+                self.yielded += 1;
             }
         }
     }
@@ -282,8 +282,8 @@ impl Core {
         self.mcu.next_timer().map_or(i64::MAX, to_go).max(1)
     }
 
-    /// Stops the machine ahead of a block that is held back, as a request to stop waits behind it.
-    /// The requests up to that one are refused then, as in any stopped machine.
+    /// Stops the MCU ahead of a block that is held back, as a request to stop waits behind it.
+    /// The requests up to that one are refused then, as in any stopped MCU.
     #[cold]
     fn stop_ahead(&mut self) {
         let Core { mcu, requests, block, .. } = self;
@@ -316,7 +316,7 @@ impl Core {
     /// Runs the commands of a block that have time, or one, or takes in what the link asks.
     #[inline]
     fn run_commands(&mut self, one: bool) -> Turn {
-        self.gave_way = 0;
+        self.yielded = 0;
         if self.mcu.is_held() {
             return Turn::Idle;
         }
@@ -354,7 +354,7 @@ impl Core {
             self.stops_taken = self.stops_taken.wrapping_add(1);
         }
         self.progress.finish();
-        // The end of the next block will do, if that may begin; but a machine that is being
+        // The end of the next block will do, if that may begin; but an MCU that is being
         // configured takes its time for a block.
         self.untold = !self.requests.is_empty() && self.mcu.is_running();
         if !self.untold {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The core's way to the link: responses for the host and lines for the log. Neither side waits for
 //! the other: what does not fit a ring is dropped. Lines have a ring of their own, so that the line
-//! that says why the machine stopped gets through even if the host does not read its responses.
+//! that says why the MCU stopped gets through even if the host does not read its responses.
 
 #![forbid(unsafe_code)]
 
@@ -28,7 +28,7 @@ const LINE_BYTES: usize = 1024;
 const LINE_HEAD_BYTES: usize = 3;
 /// The size of the ring of lines.
 const LINES_BYTES: usize = 1 << 15;
-/// The part of it that is kept free for the line that says why the machine stopped. That one comes
+/// The part of it that is kept free for the line that says why the MCU stopped. That one comes
 /// last: before it, each object may have logged that it could not be stopped.
 const LINES_SPARE: usize = 2 * (LINE_HEAD_BYTES + LINE_BYTES);
 

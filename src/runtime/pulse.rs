@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Signs of life, in a page of memory that program and guardian share: the core's heartbeat, the
-//! shutdown values that the machine owes, what each worker is at, and the guardian's own sign.
+//! shutdown values that the MCU owes, what each worker is at, and the guardian's own sign.
 //!
 //! A beat is the instant at which it was given, so that a listener knows when silence began and
 //! need not look more often than silence may last. How long that is, the core says with each beat:
-//! about half a second while the machine runs ([`RUNNING`]); half a minute otherwise ([`IDLE`]),
+//! about half a second while the MCU runs ([`RUNNING`]); half a minute otherwise ([`IDLE`]),
 //! as opening a device or ending a worker may take its time, and the outputs are at their start or
 //! shutdown values then.
 //!
 //! At a shutdown some of the outputs are written by workers, and are at their shutdown values only
-//! when those have done it. Until then the machine owes them ([`Pulse::owe`]): meanwhile its beats
+//! when those have done it. Until then the MCU owes them ([`Pulse::owe`]): meanwhile its beats
 //! do not count, and after [`STOPPING`] the guardian takes over, as it does for a core that hangs.
 //!
 //! The guardian in turn leaves a sign each time it listens. [`GuardianEar`] is how the program
@@ -29,9 +29,9 @@ use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys::{self, SHARED_WORDS};
 
-/// How long the core may be silent while the machine runs.
+/// How long the core may be silent while the MCU runs.
 pub(super) const RUNNING: Duration = Duration::from_millis(550);
-/// How long the core may be silent while the machine is being configured or is shut down.
+/// How long the core may be silent while the MCU is being configured or is shut down.
 const IDLE: Duration = Duration::from_secs(30);
 /// How long a shutdown value may be on its way to an output.
 const STOPPING: Duration = Duration::from_secs(1);
@@ -39,7 +39,7 @@ const STOPPING: Duration = Duration::from_secs(1);
 pub(super) const BEAT: Duration = Duration::from_millis(300);
 /// How long the guardian may be silent while it holds outputs. It leaves a sign every [`RUNNING`].
 const GUARDIAN: Duration = Duration::from_secs(2);
-/// A running machine that stood still for so long is stopped. Shorter ones are left to the limits
+/// A running MCU that stood still for so long is stopped. Shorter ones are left to the limits
 /// that the host set (max_duration) and to those of late timers and steps.
 const STANDSTILL: Duration = Duration::from_secs(1);
 
@@ -51,8 +51,8 @@ const STANDSTILL_STAMPS: i32 = (STANDSTILL.as_nanos() / (NS_PER_TICK << STAMP_SH
 /// When the core gave its last beat.
 const BEAT_AT: usize = 0;
 /// How long it may be silent.
-const PATIENCE_MS: usize = 1;
-/// Whether the machine owes a shutdown value.
+const SILENCE_MAX_MS: usize = 1;
+/// Whether the MCU owes a shutdown value.
 const OWES: usize = 2;
 /// When the guardian last listened; 0 while it holds no outputs.
 const LISTENED_AT: usize = 3;
@@ -60,7 +60,7 @@ const LISTENED_AT: usize = 3;
 const UNANSWERED: usize = 4;
 /// For how long the computer was suspended, until the core has seen it.
 const SUSPENDED_MS: usize = 5;
-/// Of what the machine owes a shutdown value: a text.
+/// Of what the MCU owes a shutdown value: a text.
 const SUBJECT: usize = 8;
 /// From here on each worker has its words.
 const WORKERS: usize = 24;
@@ -82,19 +82,19 @@ impl Pulse {
         Ok(pulse)
     }
 
-    /// The core is alive at `now`; `running` is whether its machine is configured and not shut
+    /// The core is alive at `now`; `running` is whether its MCU is configured and not shut
     /// down. Only the core calls this.
     #[inline]
     pub(super) fn beat(&self, now: Clock, running: bool) {
         if self.page[OWES].load(Ordering::Relaxed) == 0 {
             self.page[BEAT_AT].store(stamp(now), Ordering::Relaxed);
         }
-        let patience = if running { RUNNING } else { IDLE };
-        // Release: a listener that reads this patience reads this beat, too, and no older one.
-        self.page[PATIENCE_MS].store(patience.as_millis() as u32, Ordering::Release);
+        let silence_max = if running { RUNNING } else { IDLE };
+        // Release: a listener that reads this limit reads this beat, too, and no older one.
+        self.page[SILENCE_MAX_MS].store(silence_max.as_millis() as u32, Ordering::Release);
     }
 
-    /// Why a running machine has to be stopped if it stood still since the last beat, as its
+    /// Why a running MCU has to be stopped if it stood still since the last beat, as its
     /// control group was frozen or the computer suspended: its outputs stayed as they were, and
     /// nobody knows what became of what they heat or move. The core asks before each beat.
     #[inline]
@@ -109,7 +109,7 @@ impl Pulse {
     fn explain_standstill(&self, now: Clock) -> Option<Shutdown> {
         let suspended_ms = self.page[SUSPENDED_MS].swap(0, Ordering::Relaxed);
         let ms = elapsed(self.page[BEAT_AT].load(Ordering::Relaxed), now).as_millis();
-        if self.page[PATIENCE_MS].load(Ordering::Relaxed) != RUNNING.as_millis() as u32 {
+        if self.page[SILENCE_MAX_MS].load(Ordering::Relaxed) != RUNNING.as_millis() as u32 {
             return None;
         }
         let trouble = match suspended_ms {
@@ -126,7 +126,7 @@ impl Pulse {
         self.page[SUSPENDED_MS].store(suspended.as_millis() as u32, Ordering::Relaxed);
     }
 
-    /// From now on the machine owes a shutdown value of `subject`, such as `pwmchip0/pwm1`. The
+    /// From now on the MCU owes a shutdown value of `subject`, such as `pwmchip0/pwm1`. The
     /// first is a sign of life at `now`: what the core was at until then, such as a device that
     /// took seconds to be opened, does not count. A further one replaces the subject, not the
     /// time. Only the core calls this.
@@ -167,22 +167,22 @@ impl Pulse {
         Clock::from_ticks(since.as_nanos() as u64 / NS_PER_TICK)
     }
 
-    fn patience(&self) -> Duration {
+    fn silence_max(&self) -> Duration {
         if self.owes() {
             return STOPPING;
         }
-        Duration::from_millis(self.page[PATIENCE_MS].load(Ordering::Acquire).into())
+        Duration::from_millis(self.page[SILENCE_MAX_MS].load(Ordering::Acquire).into())
     }
 
     /// Whether the heartbeat is missing at `now`.
     pub(super) fn is_silent(&self, now: Clock) -> bool {
-        let patience = self.patience();
-        elapsed(self.page[BEAT_AT].load(Ordering::Relaxed), now) >= patience
+        let silence_max = self.silence_max();
+        elapsed(self.page[BEAT_AT].load(Ordering::Relaxed), now) >= silence_max
     }
 
     /// What is wrong with a program that gave no sign of life, for the log.
     pub(super) fn diagnosis(&self) -> String {
-        let ms = self.patience().as_millis();
+        let ms = self.silence_max().as_millis();
         match self.owes() {
             false => format!("the core gave no sign of life for {ms} ms"),
             true => format!(
@@ -317,12 +317,12 @@ impl Silence {
     }
 
     /// Takes in that the sign is `sign` at `now`. Returns for how long not to look again, `longest`
-    /// at most; none if the sign has been missing for `patience`.
-    fn listen(&mut self, sign: u32, now: Clock, patience: Duration, longest: Duration) -> Option<Duration> {
+    /// at most; none if the sign has been missing for `silence_max`.
+    fn listen(&mut self, sign: u32, now: Clock, silence_max: Duration, longest: Duration) -> Option<Duration> {
         let slept = Duration::from_nanos(now.since(self.looked).max(0) as u64 * NS_PER_TICK);
         let listened = if slept > self.pause + OVERSLEPT { OVERSLEPT } else { slept };
         self.length = if sign == self.heard { self.length + listened } else { elapsed(sign, now).min(listened) };
-        let left = patience.checked_sub(self.length).filter(|left| !left.is_zero())?;
+        let left = silence_max.checked_sub(self.length).filter(|left| !left.is_zero())?;
         self.pause = left.min(longest);
         (self.heard, self.looked) = (sign, now);
         Some(self.pause)
@@ -350,10 +350,10 @@ impl Ear {
         if let Some(suspended) = self.suspensions.newest() {
             self.pulse.tell_suspension(suspended);
         }
-        let patience = self.pulse.patience();
+        let silence_max = self.pulse.silence_max();
         let beat = self.pulse.page[BEAT_AT].load(Ordering::Relaxed);
-        // No longer than a running machine's patience: by then the core may have begun to run.
-        self.silence.listen(beat, now, patience, RUNNING)
+        // No longer than a running MCU's limit: by then the core may have begun to run.
+        self.silence.listen(beat, now, silence_max, RUNNING)
     }
 }
 
@@ -508,7 +508,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_that_begins_to_run_is_watched_closely_at_once() {
+    fn an_mcu_that_begins_to_run_is_watched_closely_at_once() {
         let pulse = pulse();
         let mut ear = Ear::new(pulse, at(0));
         let pause = ear.listen(at(0)).unwrap();
@@ -534,7 +534,7 @@ mod tests {
         ear.listen(at(0)).unwrap();
         pulse.beat(at(290), true);
         ear.listen(at(550)).unwrap();
-        // The machine stood still for a minute, and the core has yet to be woken.
+        // The computer stood still for a minute, and the core has yet to be woken.
         let pause = ear.listen(at(60_000)).expect("it was not heard");
         assert!(pause >= Duration::from_millis(150), "{pause:?}");
         // A listener that never gets its turn in time still hears a core that hangs.
@@ -565,14 +565,14 @@ mod tests {
         pulse.paid();
         pulse.beat(at(1010), false);
         assert!(ear.listen(at(1010)).is_some());
-        assert_eq!(pulse.patience(), IDLE);
+        assert_eq!(pulse.silence_max(), IDLE);
     }
 
     #[test]
-    fn what_the_core_was_at_before_the_machine_owed_anything_does_not_count() {
+    fn what_the_core_was_at_before_the_mcu_owed_anything_does_not_count() {
         let pulse = pulse();
         let mut ear = Ear::new(pulse, at(0));
-        // The core opens a device, in vain, and the machine stops.
+        // The core opens a device, in vain, and the MCU stops.
         for ms in (0..4000).step_by(500) {
             assert!(ear.listen(at(ms)).is_some());
         }
@@ -582,7 +582,7 @@ mod tests {
     }
 
     #[test]
-    fn a_running_machine_that_stood_still_is_told_so_once() {
+    fn a_running_mcu_that_stood_still_is_told_so_once() {
         let pulse = pulse();
         pulse.beat(at(0), true);
         assert!(pulse.standstill(at(990)).is_none());
@@ -597,7 +597,7 @@ mod tests {
     }
 
     #[test]
-    fn a_running_machine_that_was_suspended_is_told_so_once() {
+    fn a_running_mcu_that_was_suspended_is_told_so_once() {
         let pulse = pulse();
         let mut ear = Ear::new(pulse, at(0));
         pulse.beat(at(0), true);

@@ -25,7 +25,7 @@ use super::budget::Class;
 /// What a thread does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Role {
-    /// Owns the machine.
+    /// Owns the MCU.
     Core,
     /// Talks to the host.
     Link,

@@ -23,7 +23,7 @@ use super::realtime::{self, Processors, Scheduling};
 pub struct MarginLimits {
     /// The least, which keeps the margin alive when wake-ups are quick.
     pub min: Ticks,
-    /// The most: what a wake-up of this machine may cost in spinning.
+    /// The most: what a wake-up of this computer may cost in spinning.
     pub max: Ticks,
 }
 

@@ -42,7 +42,7 @@ struct Worker {
 /// What the thread of each new worker calls first.
 pub(super) type Prepare = Arc<dyn Fn() + Send + Sync>;
 
-/// The workers of a machine. Each is started as the first device of its bus is opened.
+/// The workers of an MCU. Each is started as the first device of its bus is opened.
 pub(super) struct Threads {
     core: Thread,
     prepare: Prepare,

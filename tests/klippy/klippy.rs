@@ -19,8 +19,8 @@ use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// Heating takes real time; a machine under load takes more.
-const PATIENCE: Duration = Duration::from_secs(180);
+/// How long the host takes to answer: heating takes real time, and a computer under load takes more.
+const HOST_TIMEOUT: Duration = Duration::from_secs(180);
 /// klippy starts within seconds.
 const START: Duration = Duration::from_secs(40);
 
@@ -226,7 +226,7 @@ impl Printer {
         self.next_id += 1;
         let request = json!({ "id": self.next_id, "method": method, "params": params });
         let api = self.api.as_mut().unwrap();
-        api.set_read_timeout(Some(PATIENCE)).unwrap();
+        api.set_read_timeout(Some(HOST_TIMEOUT)).unwrap();
         api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
         loop {
             let answer = message(api)?;
@@ -251,7 +251,7 @@ impl Printer {
     pub fn try_gcode(&mut self, script: &str) -> Result<String, String> {
         // Answers come to a connection of their own, before the result.
         let mut api = UnixStream::connect(self.path("api")).map_err(|error| error.to_string())?;
-        api.set_read_timeout(Some(PATIENCE)).unwrap();
+        api.set_read_timeout(Some(HOST_TIMEOUT)).unwrap();
         let mut ask = |id: u32, method: &str, params: Value| {
             let request = json!({ "id": id, "method": method, "params": params });
             api.write_all(format!("{request}\x03").as_bytes()).map_err(|error| error.to_string())?;
@@ -372,7 +372,7 @@ impl Printer {
 
     /// Waits until a heater warms.
     pub fn until_heating(&mut self, heater: &str) {
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + HOST_TIMEOUT;
         while self.object(heater)["temperature"].as_f64().is_none_or(|celsius| celsius < 30.0) {
             assert!(Instant::now() < end, "{heater} stays cold\n{}", self.log());
             thread::sleep(Duration::from_millis(100));
@@ -388,7 +388,7 @@ impl Printer {
     #[track_caller]
     pub fn until_object(&mut self, name: &str, key: &str, wanted: impl Into<Value>) {
         let wanted = wanted.into();
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + HOST_TIMEOUT;
         loop {
             let object = self.object(name);
             if object[key] == wanted {
@@ -446,7 +446,7 @@ impl Printer {
 
     #[track_caller]
     fn until(&mut self, what: &str, done: impl Fn(&Printer) -> bool) {
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + HOST_TIMEOUT;
         while !done(self) {
             assert!(Instant::now() < end, "waited in vain for {what}\n{}", self.log());
             thread::sleep(Duration::from_millis(50));

@@ -7,9 +7,9 @@ use std::time::{Duration, Instant};
 use pinion_client::Client;
 use pinion_protocol::block::Sequence;
 
-use crate::process::{PATIENCE, Pinion};
+use crate::process::{Pinion, WAIT_MAX};
 
-/// Sends the lines to a machine with eight ids; it must stop for `reason` and log each of
+/// Sends the lines to an MCU with eight ids; it must stop for `reason` and log each of
 /// `words` in one line. Then a reset must make it new.
 #[track_caller]
 fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
@@ -22,7 +22,7 @@ fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
         let line = timed(&mut client, line);
         client.send_line(&line).unwrap();
     }
-    let told = client.wait_shutdown(PATIENCE).unwrap();
+    let told = client.wait_shutdown(WAIT_MAX).unwrap();
     assert_eq!(told.as_deref(), Some(reason), "{:?}", lines.last());
     let line = || pinion.logged(&format!("shutdown: {reason}: "));
     pinion.until(&format!("a line with {words:?}"), || words.iter().all(|word| line().contains(word)));
@@ -114,7 +114,7 @@ fn commands_that_are_none_and_commands_cut_short() {
     for (payload, reason) in [(&[0x9f, 0x7f][..], "Invalid command"), (&[0x01, 0x00][..], "Command parser error")] {
         let mut client = pinion.client();
         client.link().send(payload).unwrap();
-        assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some(reason));
+        assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some(reason));
         pinion.logged(&format!("shutdown: {reason}: "));
         restarts(&mut client);
     }
@@ -143,13 +143,13 @@ fn garbage_truncated_and_endless_blocks_are_answered_by_a_nak_and_overcome() {
 fn a_block_out_of_order_is_answered_by_a_nak() {
     let pinion = Pinion::simulated(&[]);
     let mut port = pinion.port();
-    // Nothing was sent before: the machine expects number 0.
+    // Nothing was sent before: the MCU expects number 0.
     port.queue_block(&[], Sequence::default().next());
-    let mut until = Instant::now() + PATIENCE;
+    let mut until = Instant::now() + WAIT_MAX;
     let mut empty = 0;
     while let Some((sequence, payload)) = port.wait_block(until).unwrap() {
         assert_eq!(sequence, Sequence::default());
-        // A machine that was just made says `starting`.
+        // An MCU that was just made says `starting`.
         if payload.is_empty() {
             empty += 1;
             until = Instant::now() + Duration::from_millis(50);

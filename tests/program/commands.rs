@@ -21,7 +21,7 @@ fn quick_printer() -> String {
 }
 
 /// Whether this is what the demonstration says of an axis that was homed as far off as it may have
-/// gone while the machine's timers were so late: without real time a busy computer sees to that.
+/// gone while the MCU's timers were so late: without real time a busy computer sees to that.
 fn comes_of_lateness(wrong: &str, late_us: f64) -> bool {
     // Every axis of the built-in printer homes at 4000 steps a second; each of the two times that
     // are compared may be late.
@@ -33,7 +33,7 @@ fn comes_of_lateness(wrong: &str, late_us: f64) -> bool {
 }
 
 #[test]
-fn only_a_late_machine_may_home_worse_than_allowed() {
+fn only_a_late_mcu_may_home_worse_than_allowed() {
     let wrong =
         "WRONG x homed: endstop after 4820 steps (4800 expected), the second time 6 steps off, at most 3 allowed";
     assert!(comes_of_lateness(wrong, 2200.0) && !comes_of_lateness(wrong, 2100.0));
@@ -49,7 +49,7 @@ fn the_demonstration_is_right_and_draws_its_picture() {
     let args = ["sim", "-r", toml.to_str().unwrap(), "--demo", "--picture", svg.to_str().unwrap()];
     let mut pinion = Pinion::start(&args);
     let mut status = pinion.end();
-    // Where the host itself, which has a quarter of a second, comes too late the machine stops.
+    // Where the host itself, which has a quarter of a second, comes too late the MCU stops.
     for _ in 0..2 {
         if !pinion.log().contains("shutdown: Timer too close: ") {
             break;
@@ -182,7 +182,7 @@ fn each_dictionary_has_what_the_firmware_of_its_hosts_has() {
                 assert_eq!(ours, values, "{dialect} {name}");
                 continue;
             }
-            // The machine's own: at least the firmware's names, with the firmware's numbers. v0.11 had other
+            // The MCU's own: at least the firmware's names, with the firmware's numbers. v0.11 had other
             // numbers for the lines of GPIO chips; to a host they are just numbers.
             let ours = expanded(ours);
             for (entry, value) in expanded(values) {
@@ -283,7 +283,7 @@ fn a_dialect_that_is_none_is_explained() {
 }
 
 #[test]
-fn a_machine_serves_the_dictionary_of_its_dialect() {
+fn an_mcu_serves_the_dictionary_of_its_dialect() {
     let printed = output(&["dict", "--board", "sim", "--dialect", "v0.13"]);
     let pinion = Pinion::simulated(&["--dialect", "v0.13"]);
     assert_eq!(pinion.client().dictionary().json().unwrap(), printed.stdout);
@@ -325,7 +325,7 @@ fn the_latency_is_not_measured_while_a_host_may_print() {
 }
 
 #[test]
-fn latency_judges_the_machine() {
+fn latency_judges_the_computer() {
     let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
     let (_folder, svg) = folder_with("latency.svg", "");
     let measured = output(&["latency", "--seconds", "2", "--svg", svg.to_str().unwrap()]);
@@ -356,7 +356,7 @@ fn a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed() {
         let closed = child.wait_with_output().unwrap();
         let log = String::from_utf8(closed.stderr).unwrap();
         assert!(!log.contains("panicked"), "{args:?}: {log}");
-        // A machine without pins has none to list.
+        // A computer without pins has none to list.
         let expected = if args == ["pins"] { output(args).status.code() } else { Some(0) };
         assert_eq!(closed.status.code(), expected, "{args:?}: {log}");
     }

@@ -16,7 +16,7 @@ use nix::sys::termios::{LocalFlags, tcgetattr};
 use nix::unistd::Pid;
 use pinion_client::config::Config;
 
-use crate::process::{PATIENCE, Pinion, folder_with};
+use crate::process::{Pinion, WAIT_MAX, folder_with};
 
 fn console(args: &[&str], script: &str) -> Output {
     let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
@@ -45,7 +45,7 @@ finalize_config crc=1
 ";
 
 #[test]
-fn a_script_configures_a_simulated_machine_and_sets_an_output() {
+fn a_script_configures_a_simulated_mcu_and_sets_an_output() {
     let script =
         format!("{OUTPUT}update_digital_out oid=0 value=1\nget_clock\nget_config\ndelay 0.1\nquit\nnonsense\n");
     let output = console(&["--board", "sim"], &script);
@@ -54,7 +54,7 @@ fn a_script_configures_a_simulated_machine_and_sets_an_output() {
     assert!(out.contains("> update_digital_out oid=0 value=1\n"), "{out}");
     let clock = out.lines().find(|line| line.contains("] clock clock=")).unwrap();
     let (stamp, ticks) = clock.strip_prefix('[').unwrap().split_once("] clock clock=").unwrap();
-    // The stamp is the machine's own time, in seconds: 50 million ticks each.
+    // The stamp is the MCU's own time, in seconds: 50 million ticks each.
     let apart = stamp.trim().parse::<f64>().unwrap() - ticks.parse::<f64>().unwrap() / 50e6;
     assert!((-0.01..5.0).contains(&apart), "{clock}");
     assert!(out.contains("] config is_config=1 crc=1 is_shutdown=0 move_count=1024\n"), "{out}");
@@ -106,7 +106,7 @@ fn an_output_follows_an_instant_that_is_given_from_now() {
 }
 
 #[test]
-fn a_running_machine_is_spoken_to_and_one_with_a_host_is_not() {
+fn a_running_mcu_is_spoken_to_and_one_with_a_host_is_not() {
     let pinion = Pinion::simulated(&[]);
     let link = pinion.link();
     let link = link.to_str().unwrap();
@@ -180,7 +180,7 @@ impl Person {
     }
 
     fn until(&mut self, what: &str) {
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + WAIT_MAX;
         while !self.text().contains(what) {
             assert!(Instant::now() < end, "waited in vain for {what:?}:\n{}", self.text());
             thread::sleep(Duration::from_millis(10));
@@ -310,7 +310,7 @@ fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
 }
 
 #[test]
-fn what_the_machine_says_meanwhile_is_printed_at_once() {
+fn what_the_mcu_says_meanwhile_is_printed_at_once() {
     let state = tempfile::tempdir().unwrap();
     let mut person = Person::new(&["--board", "sim"], state.path());
     person.until("help tells of them");

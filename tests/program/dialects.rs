@@ -171,17 +171,17 @@ fn read_temperature(pinion: &Pinion, query: &str) -> String {
     let mut config = Config::default();
     let oid = config.oid().unwrap();
     config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
-    // That the machine is configured by another host, klippy finds as this client does: by the check
-    // sum. It then resets the machine.
+    // That the MCU is configured by another host, klippy finds as this client does: by the check
+    // sum. It then resets the MCU.
     config.apply(&mut client).unwrap();
     let clock = client.clock_in(0.05).unwrap();
     client.send_line(&format!("query_analog_in oid={oid} clock={} {query}", clock.wire())).unwrap();
-    let state = client.wait("analog_in_state", Some(oid), std::time::Instant::now() + crate::process::PATIENCE);
+    let state = client.wait("analog_in_state", Some(oid), std::time::Instant::now() + crate::process::WAIT_MAX);
     format!("{:?}", state.unwrap().unwrap())
 }
 
 #[test]
-fn a_host_that_was_updated_is_served_at_its_next_start_though_the_machine_is_configured() {
+fn a_host_that_was_updated_is_served_at_its_next_start_though_the_mcu_is_configured() {
     let pinion = Pinion::simulated(&[]);
     let checkout = Checkout::of("v0.13");
     let host = Host::start(&pinion, &checkout);
@@ -291,7 +291,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
             .spawn();
         let pinion = Host(pinion.unwrap());
         let until = |what: &str| {
-            let end = std::time::Instant::now() + crate::process::PATIENCE;
+            let end = std::time::Instant::now() + crate::process::WAIT_MAX;
             loop {
                 let log = fs::read_to_string(&log).unwrap();
                 if let Some(line) = log.lines().find(|line| line.contains(what)) {
@@ -312,7 +312,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
         let mut host = Host(host.unwrap());
         std::io::Read::read_exact(host.0.stdout.as_mut().unwrap(), &mut [0; 4]).unwrap();
         // The test's own client is root's, and so is hidden, too; it is no klippy.
-        let client = pinion_client::Client::connect(&tty, crate::process::PATIENCE).unwrap();
+        let client = pinion_client::Client::connect(&tty, crate::process::WAIT_MAX).unwrap();
         let has_it = client.dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c");
         assert_eq!(has_it, may_look);
         if may_look {

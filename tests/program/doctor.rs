@@ -173,7 +173,7 @@ fn each_instance_and_each_klippy_is_judged() {
 }
 
 #[test]
-fn this_machine_is_looked_at_whatever_it_is() {
+fn this_computer_is_looked_at_whatever_it_is() {
     let examined = output(&["doctor", "--json"]);
     let (value, names, findings) = parsed(&examined);
     for group in GROUPS.iter().copied().chain(["latency"]) {

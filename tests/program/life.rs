@@ -20,7 +20,7 @@ use pinion_client::config::Config;
 use pinion_client::serial::Received;
 use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
 
-use crate::process::{PATIENCE, Pinion, exists};
+use crate::process::{Pinion, WAIT_MAX, exists};
 
 #[test]
 fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
@@ -120,7 +120,7 @@ fn a_link_that_was_left_is_replaced_though_another_pinion_has_the_terminal_of_it
 fn a_signal_at_the_first_sight_of_the_link_ends_the_program_in_order() {
     for _ in 0..10 {
         let mut pinion = Pinion::start(&["run", "--board", "sim"]);
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + WAIT_MAX;
         while !exists(&pinion.link()) {
             assert!(Instant::now() < end, "no link; the log:\n{}", pinion.log());
             // Without a pause, which would be long enough for the program to be quite ready.
@@ -188,7 +188,7 @@ fn a_user_whom_tty_is_not_open_to_is_served_as_by_the_c_program() {
     }
     command.args(["run", "--board", "sim", "-I"]).arg(&link).stderr(fs::File::create(&log).unwrap());
     let mut pinion = command.spawn().unwrap();
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT_MAX;
     let log = || fs::read_to_string(&log).unwrap();
     while !log().contains("serving on") {
         assert!(Instant::now() < end && pinion.try_wait().unwrap().is_none(), "{}", log());
@@ -199,7 +199,7 @@ fn a_user_whom_tty_is_not_open_to_is_served_as_by_the_c_program() {
 }
 
 #[test]
-fn a_host_that_goes_away_and_comes_back_finds_the_machine_as_it_left_it() {
+fn a_host_that_goes_away_and_comes_back_finds_the_mcu_as_it_left_it() {
     let pinion = Pinion::simulated(&[]);
     let mut client = pinion.client();
     Config::default().apply(&mut client).unwrap();
@@ -210,11 +210,11 @@ fn a_host_that_goes_away_and_comes_back_finds_the_machine_as_it_left_it() {
 }
 
 #[test]
-fn force_shutdown_stops_the_machine_and_a_reset_starts_it_anew() {
+fn force_shutdown_stops_the_mcu_and_a_reset_starts_it_anew() {
     let pinion = Pinion::simulated(&[]);
     let mut client = pinion.client();
     fs::OpenOptions::new().write(true).open(pinion.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
-    let reason = client.wait_shutdown(PATIENCE).unwrap();
+    let reason = client.wait_shutdown(WAIT_MAX).unwrap();
     assert_eq!(reason.as_deref(), Some("Force shutdown command"));
     client.reset().unwrap();
     assert!(!client.status().unwrap().is_shutdown);
@@ -231,7 +231,7 @@ fn sigterm_tells_the_host_and_drives_outputs_to_their_shutdown_values() {
     client.link().settle().unwrap();
     pinion.signal(Signal::SIGTERM);
     // The terminal stays open for as long as the news takes to be read.
-    assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Force shutdown command"));
+    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Force shutdown command"));
     drop(client);
     assert_eq!(pinion.end().code(), Some(0));
 }
@@ -260,7 +260,7 @@ fn a_host_that_was_slow_to_read_still_reads_why_the_program_ended() {
     tty.write_all(&block).unwrap();
     pinion.logged("shutdown: Command request");
     pinion.signal(Signal::SIGTERM);
-    let until = Instant::now() + PATIENCE;
+    let until = Instant::now() + WAIT_MAX;
     let mut last = Vec::new();
     while let Ok(Some((_, payload))) = client.link().port().wait_block(until) {
         last = client.messages().decode(&Received { payload, at: Instant::now() });
@@ -295,7 +295,7 @@ fn sigusr1_tells_how_late_timers_were() {
 }
 
 #[test]
-fn a_host_that_never_reads_neither_blocks_the_machine_nor_makes_it_grow() {
+fn a_host_that_never_reads_neither_blocks_the_mcu_nor_makes_it_grow() {
     // One that the core answers, and two that the link answers by itself.
     for query in ["get_uptime", "get_clock", "identify offset=0 count=40"] {
         let pinion = Pinion::simulated(&[]);
@@ -317,10 +317,10 @@ fn a_host_that_never_reads_neither_blocks_the_machine_nor_makes_it_grow() {
             // The terminal stays open: a host that hangs is no host that is gone.
             std::thread::park();
         });
-        finished.recv_timeout(PATIENCE).expect("the machine takes commands in");
+        finished.recv_timeout(WAIT_MAX).expect("the machine takes commands in");
         let grown = pinion.anonymous_kb().saturating_sub(before);
         assert!(grown < 2048, "{query}: grew by {grown} kB; the log:\n{}", pinion.log());
-        // And why the machine stops is in the log all the same. (It counts only if it is read apart
+        // And why the MCU stops is in the log all the same. (It counts only if it is read apart
         // from the blocks.)
         pinion.until("the reason of the stop in the log", || {
             fs::write(pinion.link(), "FORCE_SHUTDOWN\n").unwrap();
@@ -376,7 +376,7 @@ fn full_pipe() -> (PipeReader, PipeWriter) {
 }
 
 #[test]
-fn a_log_that_nobody_reads_stops_neither_the_machine_nor_its_end() {
+fn a_log_that_nobody_reads_stops_neither_the_mcu_nor_its_end() {
     let (reader, writer) = full_pipe();
     let folder = tempfile::tempdir().unwrap();
     let mut pinion = Pinion::start_to(folder, &["run", "--board", "sim"], Stdio::null(), writer);
@@ -408,7 +408,7 @@ fn a_log_that_is_read_again_tells_how_much_of_it_was_lost() {
         lines.for_each(|line| drop(sender.send(line)));
     });
     let wait_for = |text: &str| {
-        while !lines.recv_timeout(PATIENCE).unwrap_or_else(|_| panic!("no line with {text}")).contains(text) {}
+        while !lines.recv_timeout(WAIT_MAX).unwrap_or_else(|_| panic!("no line with {text}")).contains(text) {}
     };
     wait_for("INFO  serving on ");
     wait_for(" lines of the log were lost, as nobody read it");

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use nix::sys::signal::Signal;
 use pinion_client::{Arg, Client, Error};
 
-use crate::process::{PATIENCE, Pinion, output};
+use crate::process::{Pinion, WAIT_MAX, output};
 
 /// A printer whose buses take so long for a transfer, and the record of its first bus, a loop.
 fn slow_printer(delay_ms: u64) -> (Pinion, PathBuf) {
@@ -126,13 +126,13 @@ fn the_clock_is_told_beside_a_slow_transfer() {
     assert_eq!(answer.bytes("response").unwrap(), [0x2a]);
 }
 
-/// A machine whose bus hangs, with a command that waits for it.
+/// An MCU whose bus hangs, with a command that waits for it.
 fn hanging() -> (Pinion, Client) {
     let (pinion, trace) = slow_printer(60_000);
     let mut client = configured(&pinion);
     client.send_line("spi_transfer oid=0 data=01").unwrap();
     client.send_line("update_digital_out oid=1 value=1").unwrap();
-    // The answer shows that the machine has the transfer, too.
+    // The answer shows that the MCU has the transfer, too.
     client.query("get_clock", &[], "clock", None).unwrap();
     assert_eq!(heard(&trace), []);
     (pinion, client)
@@ -142,8 +142,8 @@ fn hanging() -> (Pinion, Client) {
 fn an_emergency_stop_gets_past_a_bus_that_hangs() {
     let (_pinion, mut client) = hanging();
     client.send_line("emergency_stop").unwrap();
-    assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Command request"));
-    // A stopped machine acknowledges what waited behind the transfer.
+    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Command request"));
+    // A stopped MCU acknowledges what waited behind the transfer.
     client.link().settle().unwrap();
 }
 
@@ -151,7 +151,7 @@ fn an_emergency_stop_gets_past_a_bus_that_hangs() {
 fn a_forced_shutdown_gets_past_a_bus_that_hangs() {
     let (pinion, mut client) = hanging();
     fs::OpenOptions::new().write(true).open(pinion.link()).unwrap().write_all(b"FORCE_SHUTDOWN\n").unwrap();
-    assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Force shutdown command"));
+    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Force shutdown command"));
 }
 
 #[test]
@@ -164,7 +164,7 @@ fn a_signal_gets_past_a_bus_that_hangs() {
 }
 
 #[test]
-fn a_bus_that_hangs_for_ever_stops_the_machine() {
+fn a_bus_that_hangs_for_ever_stops_the_mcu() {
     let (_pinion, mut client) = hanging();
-    assert_eq!(client.wait_shutdown(PATIENCE).unwrap().as_deref(), Some("Bus does not answer"));
+    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Bus does not answer"));
 }

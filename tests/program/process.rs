@@ -15,8 +15,8 @@ use pinion_client::Client;
 use pinion_client::serial::Port;
 use tempfile::TempDir;
 
-/// Long enough for any machine; nothing here measures speed.
-pub const PATIENCE: Duration = Duration::from_secs(30);
+/// How long a test waits for anything: long enough for any computer, as nothing here measures speed.
+pub const WAIT_MAX: Duration = Duration::from_secs(30);
 
 /// A running `pinion`, ended on drop.
 pub struct Pinion {
@@ -114,7 +114,7 @@ impl Pinion {
 
     #[track_caller]
     pub fn until(&self, what: &str, done: impl Fn() -> bool) {
-        let end = Instant::now() + PATIENCE;
+        let end = Instant::now() + WAIT_MAX;
         while !done() {
             assert!(Instant::now() < end, "waited in vain for {what}; the log:\n{}", self.log());
             thread::sleep(Duration::from_millis(10));
@@ -122,7 +122,7 @@ impl Pinion {
     }
 
     pub fn client(&self) -> Client {
-        Client::connect(&self.link(), PATIENCE).unwrap()
+        Client::connect(&self.link(), WAIT_MAX).unwrap()
     }
 
     pub fn port(&self) -> Port {
@@ -135,7 +135,7 @@ impl Pinion {
 
     /// Waits for the program's end.
     pub fn end(&mut self) -> ExitStatus {
-        let end = Instant::now() + 4 * PATIENCE;
+        let end = Instant::now() + 4 * WAIT_MAX;
         loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 return status;

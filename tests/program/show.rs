@@ -14,7 +14,7 @@ use nix::sys::signal::Signal;
 use nix::sys::termios::{LocalFlags, tcgetattr};
 use pinion_client::Client;
 
-use crate::process::{PATIENCE, Pinion, closed_pipe, exists, output};
+use crate::process::{Pinion, WAIT_MAX, closed_pipe, exists, output};
 
 const STRIP: &[&str] = &[
     "allocate_oids count=2",
@@ -131,13 +131,13 @@ fn q_ends_the_program_and_gives_the_keys_back() {
     // Whatever is not read fills the terminal.
     let mut master = File::from(terminal.master.try_clone().unwrap());
     let reader = thread::spawn(move || std::io::copy(&mut master, &mut std::io::sink()));
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT_MAX;
     while keys() {
         assert!(Instant::now() < end, "the program takes no keys");
         thread::sleep(Duration::from_millis(20));
     }
     File::from(terminal.master.try_clone().unwrap()).write_all(b"xq").unwrap();
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT_MAX;
     let status = loop {
         if let Some(status) = pinion.try_wait().unwrap() {
             break status;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion status`: what a running machine tells of itself, and that asking does it no harm.
+//! `pinion status`: what a running MCU tells of itself, and that asking does it no harm.
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -18,7 +18,7 @@ use nix::sys::termios::{LocalFlags, tcgetattr};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
-use crate::process::{PATIENCE, Pinion, exists, output};
+use crate::process::{Pinion, WAIT_MAX, exists, output};
 
 fn socket(pinion: &Pinion) -> PathBuf {
     pinion.link().with_file_name("tty.sock")
@@ -50,7 +50,7 @@ const CONFIGURATION: &[&str] = &[
 ];
 
 #[test]
-fn a_machine_tells_how_it_is_in_each_state() {
+fn an_mcu_tells_how_it_is_in_each_state() {
     let mut pinion = Pinion::simulated(&["--dialect", "master"]);
     let socket = socket(&pinion);
     pinion.until("the socket", || exists(&socket));
@@ -74,7 +74,7 @@ fn a_machine_tells_how_it_is_in_each_state() {
     client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
     client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
     assert!(client.status().unwrap().is_config);
-    assert!(client.wait("analog_in_state", Some(2), Instant::now() + PATIENCE).unwrap().is_some());
+    assert!(client.wait("analog_in_state", Some(2), Instant::now() + WAIT_MAX).unwrap().is_some());
     client.send_line("endstop_query_state oid=1").unwrap();
     client.link().settle().unwrap();
     let configured = status(&pinion);
@@ -350,7 +350,7 @@ fn watching_into_a_pipe_is_a_page_each_second() {
     assert!(!shown.contains('\x1b'));
     // A reader that has gone ends it.
     drop(out);
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT_MAX;
     while watch.try_wait().unwrap().is_none() {
         assert!(Instant::now() < end);
         thread::sleep(std::time::Duration::from_millis(20));

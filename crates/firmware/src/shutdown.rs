@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Why the machine stops: the firmware's short text for the wire, and a long one for the log.
+//! Why the MCU stops: the firmware's short text for the wire, and a long one for the log.
 
 #![forbid(unsafe_code)]
 
@@ -40,7 +40,7 @@ macro_rules! shutdowns {
 
 pub(crate) use shutdowns;
 
-/// The texts of the machine itself and of its boards. Those of a feature stand in its file.
+/// The texts of the MCU itself and of its boards. Those of a feature stand in its file.
 pub mod reason {
     shutdowns! {
         /// `clear_shutdown` while running.
@@ -116,9 +116,9 @@ pub mod reason {
     }
 }
 
-/// A stop of the machine: the reason for the wire, and the trouble for the log.
+/// A stop of the MCU: the reason for the wire, and the trouble for the log.
 ///
-/// Making one allocates. That is allowed, as it is made when the machine stops anyway.
+/// Making one allocates. That is allowed, as it is made when the MCU stops anyway.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Shutdown {
     /// What goes over the wire.

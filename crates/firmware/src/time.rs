@@ -24,6 +24,16 @@ impl Ticks {
     pub const fn from_us(us: u32) -> Ticks {
         Ticks(us * (CLOCK_FREQ / 1_000_000))
     }
+
+    /// The span of `ms` milliseconds.
+    pub const fn from_ms(ms: u32) -> Ticks {
+        Ticks(ms * (CLOCK_FREQ / 1000))
+    }
+
+    /// The span in whole milliseconds.
+    pub const fn as_ms(self) -> u32 {
+        self.0 / Ticks::from_ms(1).0
+    }
 }
 
 impl Add<Ticks> for Clock {
@@ -80,7 +90,7 @@ pub struct Timing {
 impl Timing {
     /// By this clock, with steps that may be 1 ms late, as in the firmware.
     pub fn of(clock: Arc<dyn TimeSource>) -> Timing {
-        Timing { clock, due: Due::default(), step_late_limit: Ticks::from_us(1000) }
+        Timing { clock, due: Due::default(), step_late_limit: Ticks::from_ms(1) }
     }
 }
 
@@ -112,7 +122,7 @@ impl Default for Due {
     }
 }
 
-/// A clock that stands still until it is told to advance: the whole machine runs on it in
+/// A clock that stands still until it is told to advance: the whole MCU runs on it in
 /// tests, the same each time.
 #[derive(Clone, Debug)]
 pub struct VirtualClock(Arc<AtomicU64>);

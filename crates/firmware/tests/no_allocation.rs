@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A whole print allocates nothing in the core once the machine is configured: an allocation
+//! A whole print allocates nothing in the core once the MCU is configured: an allocation
 //! may wait for a lock or for the kernel, and a step would wait with it.
 
 use std::alloc::{GlobalAlloc, Layout, System};
@@ -226,7 +226,7 @@ fn a_status_that_is_told_amid_steps_allocates_nothing() {
         assert_eq!((snapshot.moves.0, stepper.queued), (1, 1), "it steps");
         print.run_until(at + 150_000);
     }
-    // One that says why the machine is stopped.
+    // One that says why the MCU is stopped.
     print.rig.send("emergency_stop");
     snapshot.clear();
     print.counted += allocations(|| while !print.rig.mcu.tell(&mut snapshot) {});

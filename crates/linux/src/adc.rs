@@ -72,7 +72,7 @@ impl fmt::Display for Format {
     }
 }
 
-/// libiio's view of this machine. None without IIO devices: libiio would take memory for nothing.
+/// libiio's view of this computer. None without IIO devices: libiio would take memory for nothing.
 pub(super) fn context(devices: &Path) -> Result<Option<Context>, Trouble> {
     let any = fs::read_dir(devices)
         .into_iter()

@@ -141,9 +141,9 @@ impl HeldLine {
     /// Has the guardian hold the line if it is an output now, and let go of it if it no longer is.
     fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
         match direction {
-            Direction::Output { shutdown_level, .. } => {
+            Direction::Output { shutdown_value, .. } => {
                 let name = self.guarded_name();
-                self.guard.output(&name, self.handle.as_raw_fd(), shutdown_level, self.sleeping.as_deref())?;
+                self.guard.output(&name, self.handle.as_raw_fd(), shutdown_value, self.sleeping.as_deref())?;
                 self.watched.store(true, Ordering::Relaxed);
                 Ok(())
             }

@@ -34,7 +34,7 @@ pub trait Guard: Send {
 }
 
 /// The guard, if there is one, as the board and its workers share it. A call waits for the
-/// guardian's answer. So the core calls it only until the machine is configured, and workers later.
+/// guardian's answer. So the core calls it only until the MCU is configured, and workers later.
 #[derive(Clone)]
 pub(super) struct SharedGuard(Option<Arc<Mutex<Box<dyn Guard>>>>);
 

@@ -44,7 +44,7 @@ const W1: &str = "/sys/bus/w1/devices";
 const EDGE_WORKER: &str = "edges";
 const IIO: &str = "/sys/bus/iio/devices";
 
-/// What this machine has.
+/// What this computer has.
 #[derive(Debug, Default)]
 pub struct Inventory {
     /// GPIO chips.
@@ -57,12 +57,12 @@ pub struct Inventory {
     pub i2c: Vec<u32>,
     /// Each thing that is there and can not be used.
     pub problems: Vec<Trouble>,
-    /// libiio's view of this machine; none without IIO devices.
+    /// libiio's view of this computer; none without IIO devices.
     pub context: Option<Context>,
 }
 
 impl Inventory {
-    /// Looks for chips, ADCs and buses. A machine that has none of them is no error.
+    /// Looks for chips, ADCs and buses. A computer that has none of them is no error.
     pub fn scan() -> Inventory {
         let dev = Path::new(DEV);
         let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
@@ -351,7 +351,7 @@ impl Board for LinuxBoard {
 mod tests {
     use super::*;
 
-    const ON: Direction = Direction::Output { level: true, shutdown_level: false };
+    const ON: Direction = Direction::Output { level: true, shutdown_value: false };
 
     fn board(dev: &Path) -> LinuxBoard {
         LinuxBoard {

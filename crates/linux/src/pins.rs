@@ -10,7 +10,7 @@
 //! | 2^25.. | every other ADC channel: 256 numbers for each device | |
 //! | 2^26.. | the data outputs (MOSI) of SPI devices, which LEDs may be connected to | `spidev0.0` |
 //!
-//! `gpio17` stands for `gpiochip0/gpio17`. The machine's own names are published as well: `GPIO17`
+//! `gpio17` stands for `gpiochip0/gpio17`. The computer's own names are published as well: `GPIO17`
 //! (the name that the device tree gives a line), `pinctrl-rp1/gpio17` (by the chip's label) and
 //! `mcp3208/voltage3`. A name is left out if two things share it, if it looks like one of the numeric
 //! names, or if klippy can not read it from a configuration.
@@ -147,7 +147,7 @@ pub fn pwm_number(chip: u32, channel: u32) -> Option<u32> {
     (chip < PWM_CHIPS && channel < PWM_CHIP_CHANNELS).then_some(PWM + chip * PWM_CHIP_CHANNELS + channel)
 }
 
-/// The names that this machine has beyond those of the C program, each with its number.
+/// The names that this computer has beyond those of the C program, each with its number.
 #[derive(Debug, Default)]
 pub struct Names(Vec<(String, u32)>);
 

@@ -134,7 +134,7 @@ impl board::Pwm for Pwm {
         })
     }
 
-    /// An output of `set_pwm_out` stays as it is when the machine stops. So the guardian is told to
+    /// An output of `set_pwm_out` stays as it is when the MCU stops. So the guardian is told to
     /// set it to this value, too.
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         self.set_period(cycle, value)?;
@@ -188,7 +188,7 @@ mod tests {
     const CHANNEL: Channel = Channel { chip: 0, channel: 1 };
 
     fn config(value: u16) -> PwmConfig {
-        PwmConfig { pin: Pin(65537), cycle: Ticks::from_us(1000), value, shutdown_value: 0 }
+        PwmConfig { pin: Pin(65537), cycle: Ticks::from_ms(1), value, shutdown_value: 0 }
     }
 
     fn class(exported: bool) -> tempfile::TempDir {
@@ -232,7 +232,7 @@ mod tests {
     fn a_value_may_come_with_a_new_period() {
         let class = class(true);
         let mut pwm = open(&class, 8192).unwrap();
-        pwm.set_cycle(Ticks::from_us(2000), 16384).unwrap();
+        pwm.set_cycle(Ticks::from_ms(2), 16384).unwrap();
         assert_eq!((read(&class, "period"), read(&class, "duty_cycle")), ("2000000".into(), "1000000".into()));
     }
 

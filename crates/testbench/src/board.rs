@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A board that records what the machine does to its pins, and lets a test play the rest.
+//! A board that records what the MCU does to its pins, and lets a test play the rest.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -32,7 +32,7 @@ pub const MOSI: u32 = 700;
 /// To break the chips of SPI bus 0 or 1: this number, and the next.
 pub const SPI_CHIPS: u32 = 600;
 /// How long the workers have to end.
-const WORKERS_END: Ticks = Ticks::from_us(2_000_000);
+const WORKERS_END: Ticks = Ticks::from_ms(2000);
 /// The chip of the lines that may sleep.
 const EXPANDER: &str = "gpiochip1";
 
@@ -241,9 +241,9 @@ impl Bench {
     }
 
     /// Where an output belongs if the program dies.
-    pub fn shutdown_level(&self, pin: u32) -> bool {
+    pub fn shutdown_value(&self, pin: u32) -> bool {
         match self.state().directions[&pin] {
-            Direction::Output { shutdown_level, .. } => shutdown_level,
+            Direction::Output { shutdown_value, .. } => shutdown_value,
             input => panic!("pin {pin} is {input:?}"),
         }
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A machine on a bench, in virtual time, spoken to in words.
+//! An MCU on a bench, in virtual time, spoken to in words.
 
 use std::sync::{Arc, Mutex};
 
@@ -20,8 +20,8 @@ pub const FIRMWARE: Firmware =
 /// When a rig's story begins, unless a test says otherwise.
 const ORIGIN: u64 = 10_000_000;
 
-/// The machine's responses stand one after the other in one buffer that is large enough from
-/// the start: what is counted in `crates/firmware/tests/no_allocation.rs` is the machine's alone.
+/// The MCU's responses stand one after the other in one buffer that is large enough from
+/// the start: what is counted in `crates/firmware/tests/no_allocation.rs` is the MCU's alone.
 const RESPONSE_BYTES: usize = 1 << 20;
 
 #[derive(Clone)]
@@ -51,7 +51,7 @@ impl Outbox for FakeOutbox {
     }
 }
 
-/// A machine on a bench. Instants count from its making.
+/// An MCU on a bench. Instants count from its making.
 pub struct Rig {
     /// The MCU.
     pub mcu: Mcu,
@@ -70,22 +70,22 @@ impl Default for Rig {
 }
 
 impl Rig {
-    /// A machine that waits for its configuration.
+    /// An MCU that waits for its configuration.
     pub fn new() -> Rig {
         Rig::at(ORIGIN)
     }
 
-    /// A machine that is made at `start`.
+    /// An MCU that is made at `start`.
     pub fn at(start: u64) -> Rig {
         Rig::on_board(start, FakeBoard)
     }
 
-    /// A machine with another board than the bench's own.
+    /// An MCU with another board than the bench's own.
     pub fn on_board<B: Board + 'static>(start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
         Rig::that_speaks(DialectName::Of(Generation::Master), start, board)
     }
 
-    /// A machine for hosts of this generation.
+    /// An MCU for hosts of this generation.
     pub fn of(generation: Generation) -> Rig {
         Rig::that_speaks(DialectName::Of(generation), ORIGIN, FakeBoard)
     }
@@ -111,7 +111,7 @@ impl Rig {
         rig
     }
 
-    /// A machine with these objects.
+    /// An MCU with these objects.
     pub fn configured(commands: &[&str]) -> Rig {
         let mut rig = Rig::new();
         rig.configure(commands);
@@ -155,7 +155,7 @@ impl Rig {
         Clock::from_ticks(self.origin.ticks() + ticks)
     }
 
-    /// Lets time pass without giving the machine a turn.
+    /// Lets time pass without giving the MCU a turn.
     pub fn stall_until(&mut self, ticks: u64) {
         self.clock.set(self.instant(ticks));
     }
@@ -166,7 +166,7 @@ impl Rig {
         self.clock.set(to);
     }
 
-    /// Runs the machine up to and with the instant `ticks`.
+    /// Runs the MCU up to and with the instant `ticks`.
     pub fn run_until(&mut self, ticks: u64) {
         let end = self.instant(ticks);
         while let Some(next) = self.turn().filter(|next| *next <= end) {
@@ -175,7 +175,7 @@ impl Rig {
         self.clock.set(end);
     }
 
-    /// Lets the machine run what is due; at most so many times, as a host's command may ask
+    /// Lets the MCU run what is due; at most so many times, as a host's command may ask
     /// for an event without end.
     pub fn run_turns(&mut self, turns: u32) {
         for _ in 0..turns {
@@ -263,7 +263,7 @@ impl Rig {
         self.responses().pop().unwrap_or_default()
     }
 
-    /// What the machine said since the last call, `stats` left out, as text:
+    /// What the MCU said since the last call, `stats` left out, as text:
     /// `shutdown clock=@5 static_string_id=Timer too close`.
     pub fn responses(&self) -> Vec<String> {
         let mut responses = self.everything();
@@ -290,12 +290,12 @@ impl Rig {
         buffer.clear();
     }
 
-    /// Forgets what the machine said.
+    /// Forgets what the MCU said.
     pub fn forget_responses(&self) {
         self.outbox.payloads.lock().unwrap().clear();
     }
 
-    /// What the machine said for the log since the last call.
+    /// What the MCU said for the log since the last call.
     pub fn notes(&self) -> Vec<String> {
         std::mem::take(&mut self.outbox.notes.lock().unwrap())
     }
@@ -324,7 +324,7 @@ impl Rig {
         self.mcu.dialect()
     }
 
-    /// Offers the machine the dialect of another generation; whether it takes it.
+    /// Offers the MCU the dialect of another generation; whether it takes it.
     pub fn speak(&mut self, generation: Generation) {
         let dialect = Dialect::new(&FIRMWARE, &FakeBoard(self.bench.clone()), DialectName::Of(generation));
         self.mcu.speak(Arc::new(dialect.unwrap()));

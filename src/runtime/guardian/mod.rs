@@ -9,7 +9,7 @@
 //! - when the program's end of their socket closes without a goodbye, or its pidfd says that it
 //!   is gone: SIGKILL, a crash, the OOM killer;
 //! - when the core leaves no heartbeat in a page that both share (`pulse.rs`), while outputs are
-//!   held: within 600 ms of its last one while the machine runs.
+//!   held: within 600 ms of its last one while the MCU runs.
 //!
 //! Then it drives the outputs, kills the program if that still lives, drives the outputs once more, as
 //! the core may have come back and driven them before it was killed, says so in the log, and ends,
@@ -17,7 +17,7 @@
 //! program to end: a terminal or service manager sends them to both processes, and the guardian must
 //! not end before the program, which says goodbye to it.
 //!
-//! If the guardian itself is killed, stopped or hangs, the link notices. The machine shuts down as
+//! If the guardian itself is killed, stopped or hangs, the link notices. The MCU shuts down as
 //! "Guardian process lost" and the program ends with status 1, so that the service manager starts both
 //! anew. (The program can not fork another guardian, as it has threads by then.)
 //!
@@ -264,7 +264,7 @@ mod tests {
             if beats == 10 {
                 pulse.owe("pwmchip7/pwm0", pulse.now());
             }
-            // As the core of a stopped machine, for which the limit is wider: a busy computer may delay
+            // As the core of a stopped MCU, for which the limit is wider: a busy computer may delay
             // a beat.
             pulse.beat(pulse.now(), false);
             thread::sleep(10 * MS);

@@ -3,7 +3,7 @@
 //!
 //! `cargo test --test lab` runs them; docs/develop/lab.md tells how to add one. Each test
 //! has a process of its own. Those in the modules `timing` and `pinion` run on a
-//! machine whose time counts instructions.
+//! VM whose time counts instructions.
 
 // What tests share.
 mod gpio_sim;

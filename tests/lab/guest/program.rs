@@ -20,8 +20,8 @@ use pinion_client::{Client, Error};
 
 use super::{sysfs, uapi};
 
-/// Far longer than anything takes.
-const PATIENCE: Duration = Duration::from_secs(10);
+/// How long a test waits for anything: far longer than it takes.
+const WAIT_MAX: Duration = Duration::from_secs(10);
 
 /// The running program. It is killed when dropped; the log of one under which a test fails is
 /// shown.
@@ -86,7 +86,7 @@ impl Program {
 
     /// A host on its pty.
     pub fn connect(&self) -> Client {
-        Client::connect(&self.link, PATIENCE).expect("a session")
+        Client::connect(&self.link, WAIT_MAX).expect("a session")
     }
 
     pub fn link(&self) -> &Path {
@@ -171,7 +171,7 @@ impl Drop for Program {
         let guardian = self.find_guardian();
         let _ = self.child.kill();
         let _ = self.child.wait();
-        let until = Instant::now() + PATIENCE;
+        let until = Instant::now() + WAIT_MAX;
         while guardian.is_some_and(exists) && Instant::now() < until {
             thread::sleep(Duration::from_millis(1));
         }
@@ -203,12 +203,12 @@ pub fn config<L: AsRef<str>>(oids: u8, lines: &[L]) -> Config {
     config
 }
 
-/// Configures the machine anew.
+/// Configures the MCU anew.
 pub fn configure<L: AsRef<str>>(client: &mut Client, oids: u8, lines: &[L]) {
     config(oids, lines).apply(client).expect("a configuration that it takes");
 }
 
-/// Configures the machine anew, and returns the text that it stops with.
+/// Configures the MCU anew, and returns the text that it stops with.
 pub fn refusal<L: AsRef<str>>(client: &mut Client, oids: u8, lines: &[L]) -> String {
     match config(oids, lines).apply(client) {
         Err(Error::Shutdown { reason }) => reason,
@@ -217,9 +217,9 @@ pub fn refusal<L: AsRef<str>>(client: &mut Client, oids: u8, lines: &[L]) -> Str
     }
 }
 
-/// Waits until the machine stops by itself, and returns the text on the wire.
+/// Waits until the MCU stops by itself, and returns the text on the wire.
 pub fn shutdown_of(client: &mut Client) -> String {
-    client.wait_shutdown(PATIENCE).expect("a session").expect("a shutdown")
+    client.wait_shutdown(WAIT_MAX).expect("a session").expect("a shutdown")
 }
 
 /// Sends a command and waits until it was run.

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the machine asks of the hardware, and the boards that answer.
+//! What the MCU asks of the hardware, and the boards that answer.
 
 #![forbid(unsafe_code)]
 
@@ -17,6 +17,13 @@ pub mod soft_spi;
 /// A pin's number on the wire.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Pin(pub u32);
+
+impl Pin {
+    /// What the dictionary calls the pin; `names` are those of its enumeration `pin`.
+    pub fn name_in(self, names: &[Range]) -> String {
+        names.iter().find_map(|range| range.name_of(self.0)).unwrap_or_else(|| format!("pin number {}", self.0))
+    }
+}
 
 /// Full scale of an ADC reading (`ADC_MAX` of the dictionary).
 pub const ADC_MAX: u16 = 4095;
@@ -66,8 +73,8 @@ pub enum Direction {
     Output {
         /// The level that it is driven to as it becomes an output.
         level: bool,
-        /// The level that it is driven to when the machine stops or the program dies.
-        shutdown_level: bool,
+        /// The level that it is driven to when the MCU stops or the program dies.
+        shutdown_value: bool,
     },
     /// The line is read. A resistor that the chip does not have is an error.
     Input(Bias),
@@ -178,7 +185,7 @@ pub trait Pwm: Send {
     fn set(&mut self, value: u16) -> Result<(), Shutdown>;
 
     /// Sets a new period, and for how much of it the output is on: 0 to [`PWM_MAX`]. The output
-    /// stays as it is set here when the machine stops or the program dies.
+    /// stays as it is set here when the MCU stops or the program dies.
     ///
     /// # Errors
     ///
@@ -263,7 +270,7 @@ pub trait BusDevice: Send {
         Err(BusError::other_kind("an I2C transfer", "an SPI device"))
     }
 
-    /// Reads from a register on, or with none from wherever the chip stands (I2C). The machine makes such
+    /// Reads from a register on, or with none from wherever the chip stands (I2C). The MCU makes such
     /// a transfer again if it fails (`mcu/calls.rs`).
     ///
     /// For registers that reading or naming does not change. A command, or a FIFO, is
@@ -384,7 +391,7 @@ impl ChipSelect {
     }
 }
 
-/// A computer with pins. Opening and claiming may block and allocate, so the machine does so only
+/// A computer with pins. Opening and claiming may block and allocate, so the MCU does so only
 /// until `finalize_config`.
 pub trait Board: Send {
     /// One line for the log: what the board is and what it has.
@@ -449,9 +456,17 @@ pub trait Board: Send {
     fn i2c_buses(&self) -> Vec<Range>;
 
     /// Opens an I2C device.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open i2c device".
     fn i2c(&mut self, config: I2cConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown>;
 
     /// Opens a hardware PWM channel.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to config pwm device", "PWM write failed", "Guardian process lost".
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;
 
     /// Opens the SPI data output that `pin` names, in mode 0.
@@ -461,9 +476,7 @@ pub trait Board: Send {
     /// "Not an output pin" for any other pin, and those of [`Board::spi`].
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
         let _ = rate_hz;
-        let names = self.pins();
-        let name = names.iter().find_map(|range| range.name_of(pin.0)).unwrap_or(format!("pin number {}", pin.0));
-        Err(not_mosi(&name))
+        Err(not_mosi(&pin.name_in(&self.pins())))
     }
 
     /// Opens the DS18B20 thermometer that the kernel calls `serial`, such as `28-0123456789ab`.
@@ -477,7 +490,7 @@ pub trait Board: Send {
         Err(Shutdown::because(reason::DS18B20_OPEN, trouble.of(format_args!("{serial:?}"))))
     }
 
-    /// Forgets all claims. The machine has dropped the lines and devices before.
+    /// Forgets all claims. The MCU has dropped the lines and devices before.
     fn reset(&mut self);
 }
 

@@ -16,7 +16,7 @@ use crate::trouble::Trouble;
 
 /// How long a chip may hold the clock low in one conversation: 100 ms, as with the kernel's own
 /// (drivers/i2c/busses/i2c-gpio.c).
-const STRETCH_MAX: Ticks = Ticks::from_us(100_000);
+const STRETCH_MAX: Ticks = Ticks::from_ms(100);
 /// The last bit of an address byte: the chip is read from.
 const READ: u8 = 1;
 /// A chip that was left amid a byte lets SDA go after this many clocks (UM10204, 3.1.16).
@@ -447,7 +447,7 @@ mod tests {
     fn a_clock_that_is_held_is_waited_for_but_not_for_ever() {
         let (mut i2c, wires) = chip(ADDRESS, 10);
         // 27 bits of 3 ms.
-        wires.lock().unwrap().hold_ticks = Ticks::from_us(3000).0.into();
+        wires.lock().unwrap().hold_ticks = Ticks::from_ms(3).0.into();
         assert_eq!(i2c.write_read(&[1, 2], &mut []), Ok(()));
         for hold_us in [4000, 1_000_000] {
             let (mut i2c, wires) = chip(ADDRESS, 10);

@@ -190,7 +190,7 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
     }
     let dout = mcu.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // Off, until measurements begin and when the program dies.
-    let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_level: true })?;
+    let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
     let worker = mcu.worker(WORKER)?;
     let shift = Shift {
         sclk: sclk.clone(),

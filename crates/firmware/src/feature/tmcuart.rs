@@ -83,7 +83,7 @@ impl Wires {
     /// Drives the line high, as it is between messages.
     fn idle(&self) -> Result<(), Shutdown> {
         match self.single {
-            Some(_) => self.tx.turn(Direction::Output { level: true, shutdown_level: true }),
+            Some(_) => self.tx.turn(Direction::Output { level: true, shutdown_value: true }),
             None => self.tx.write(true),
         }
     }
@@ -351,7 +351,7 @@ const CONFIG_TMCUART: Command = command!(
         let wires = if rx_pin == tx_pin {
             Wires { tx: rx.clone(), rx, single: Some(bias) }
         } else {
-            let idle = Direction::Output { level: true, shutdown_level: true };
+            let idle = Direction::Output { level: true, shutdown_value: true };
             Wires { tx: mcu.prompt_line(tx_pin, "UART", idle)?, rx, single: None }
         };
         wires.idle()?;

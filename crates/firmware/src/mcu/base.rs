@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The commands that every machine has: identify, clock, configuration, shutdown, debugging.
+//! The commands that every MCU has: identify, clock, configuration, shutdown, debugging.
 
 #![forbid(unsafe_code)]
 
@@ -56,7 +56,7 @@ const RESPONSES: &[Form] = &[
 /// bytes, so that all of them fit in it, and the host never blocks in its write.
 const RECEIVE_WINDOW: u32 = 2048;
 
-/// Whether the response with this place in the list of all is one of the machine's own.
+/// Whether the response with this place in the list of all is one of the MCU's own.
 pub(super) const fn is_own_response(index: usize) -> bool {
     index < RESPONSES.len()
 }
@@ -84,22 +84,22 @@ response! {
     pub(super) struct Uptime { high: u32, clock: Clock }
 }
 response! {
-    /// Whether the machine is configured, and the check sum that the host gave its configuration.
+    /// Whether the MCU is configured, and the check sum that the host gave its configuration.
     "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
     pub struct Config { is_config: bool, crc: u32, is_shutdown: bool, move_count: u16 }
 }
 response! {
-    /// The machine has started and waits for its configuration.
+    /// The MCU has started and waits for its configuration.
     "starting"
     pub struct Starting {}
 }
 response! {
-    /// The machine stops.
+    /// The MCU stops.
     "shutdown clock=%u static_string_id=%hu"
     pub(super) struct ShutdownReport { clock: Clock, static_string_id: u16 }
 }
 response! {
-    /// A command was not run, as the machine is stopped.
+    /// A command was not run, as the MCU is stopped.
     "is_shutdown static_string_id=%hu"
     pub(super) struct IsShutdown { static_string_id: u16 }
 }
@@ -148,7 +148,7 @@ const GET_UPTIME: Command = command!("get_uptime", |mcu| {
 const GET_CONFIG: Command = command!("get_config", |mcu| {
     let config = Config {
         is_config: mcu.is_finalized(),
-        // klippy resets a machine that another configuration has, before it sends it anything.
+        // klippy resets an MCU that another configuration has, before it sends it anything.
         crc: if mcu.spoken.next.is_some() { !mcu.configuration.crc } else { mcu.configuration.crc },
         is_shutdown: mcu.is_shutdown(),
         move_count: mcu.moves.count,

@@ -5,8 +5,8 @@
 //!
 //! - A worker makes a failed call again, at once and up to [`TRIES`] times, if that cannot change what the
 //!   call does: a register or a level that is read, an output that is set.
-//! - An input that is sampled may be [`Unread`] for [`UNREAD_LIMIT`] before the machine stops. An input that
-//!   stops a move has no such time: a failure stops the machine at once.
+//! - An input that is sampled may be [`Unread`] for [`UNREAD_LIMIT`] before the MCU stops. An input that
+//!   stops a move has no such time: a failure stops the MCU at once.
 
 #![forbid(unsafe_code)]
 
@@ -21,9 +21,9 @@ use super::BusCounts;
 const TRIES: u32 = 3;
 /// How long a call may have gone on and still be made again. A driver that waits for longer before it gives
 /// up has waited enough.
-const RETRY_LIMIT: Ticks = Ticks::from_us(20_000);
+const RETRY_LIMIT: Ticks = Ticks::from_ms(20);
 /// How long a sampled input may stay unread, as its device fails or hangs.
-pub const UNREAD_LIMIT: Ticks = Ticks::from_us(100_000);
+pub const UNREAD_LIMIT: Ticks = Ticks::from_ms(100);
 
 /// Makes the calls to one device. Its clones count together.
 #[derive(Clone)]
@@ -99,7 +99,7 @@ impl Unread {
         self.0 = None;
     }
 
-    /// Whether the machine has to stop at `now`.
+    /// Whether the MCU has to stop at `now`.
     pub fn is_too_long(&self, now: Clock) -> bool {
         self.0.is_some_and(|since| now.since(since) >= i64::from(UNREAD_LIMIT.0))
     }

@@ -20,7 +20,7 @@ impl From<Malformed> for Shutdown {
     }
 }
 
-/// Decodes a command's parameters and runs the command. An error stops the machine.
+/// Decodes a command's parameters and runs the command. An error stops the MCU.
 pub type Handler = fn(&mut Mcu, &mut Reader<'_>) -> Result<(), Shutdown>;
 
 /// A command that the host may send.
@@ -36,7 +36,7 @@ pub struct Command {
 }
 
 impl Command {
-    /// A command that all hosts take, while the machine runs. [`command!`](crate::command) declares one.
+    /// A command that all hosts take, while the MCU runs. [`command!`](crate::command) declares one.
     pub const fn new(format: &'static str, handler: Handler) -> Command {
         Command { format, generations: Generations::ALL, in_shutdown: false, handler }
     }

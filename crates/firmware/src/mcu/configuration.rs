@@ -31,7 +31,7 @@ pub(super) struct Configuration {
 }
 
 impl Mcu {
-    /// Whether the machine is configured and not stopped.
+    /// Whether the MCU is configured and not stopped.
     #[inline]
     pub fn is_running(&self) -> bool {
         self.is_finalized() && self.stop.reason.is_none()

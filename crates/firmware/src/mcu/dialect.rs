@@ -20,12 +20,12 @@ use super::{DialectName, Generation, Generations, base, since};
 /// What to do about a host that has another dictionary.
 pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
 
-/// What the machine knows of a command that came by its id.
+/// What the MCU knows of a command that came by its id.
 pub(super) struct Entry {
     pub(super) format: &'static str,
     pub(super) handler: Handler,
     pub(super) in_shutdown: bool,
-    /// Whether it is one of the machine's own, which has the same id in every dialect.
+    /// Whether it is one of the MCU's own, which has the same id in every dialect.
     pub(super) is_own: bool,
     conversions: Box<[Conversion]>,
 }
@@ -117,7 +117,7 @@ pub struct Firmware {
     pub license: &'static str,
 }
 
-/// The messages that a host may exchange with the machine, by their ids.
+/// The messages that a host may exchange with the MCU, by their ids.
 pub struct Dialect {
     name: DialectName,
     /// By the [`place`] of the id.
@@ -161,8 +161,8 @@ fn number(features: &'static [Feature], name: &DialectName, dictionary: &mut Dic
     let taken = Choice::new(name, all(features, |feature| feature.commands), |command| {
         (format::name(command.format), command.generations)
     });
-    // The machine's own messages have the same ids in every dialect: an `emergency_stop` means the
-    // same to a machine that was given another one since its host read the dictionary.
+    // The MCU's own messages have the same ids in every dialect: an `emergency_stop` means the
+    // same to an MCU that was given another one since its host read the dictionary.
     let (base, others) = features.split_at(features.len().min(1));
     for (features, is_own) in [(base, true), (others, false)] {
         // Responses first: what they carry fills a block to the last byte, so their ids are short.
@@ -236,7 +236,7 @@ impl Dialect {
         self.name
     }
 
-    /// Whether the machine is to behave as for these hosts, where the form of a message does not say.
+    /// Whether the MCU is to behave as for these hosts, where the form of a message does not say.
     pub(super) fn serves(&self, hosts: Generations) -> bool {
         self.name.generations().first().is_some_and(|generation| hosts.contains(*generation))
     }
@@ -273,7 +273,7 @@ impl Dialect {
         self.emergency_stop.is_some_and(|id| self.contains(payload, id))
     }
 
-    /// Whether a payload is one of the machine's own responses, which mean the same in every dialect.
+    /// Whether a payload is one of the MCU's own responses, which mean the same in every dialect.
     pub fn is_own_response(&self, payload: &[u8]) -> bool {
         let id = Reader::new(payload).int().ok();
         let mut ids = self.response_ids.iter().enumerate();
@@ -281,7 +281,7 @@ impl Dialect {
     }
 
     /// Whether a block's payload has the command with this id. What follows an unknown command, or one
-    /// that is cut short, does not count, as the machine stops there.
+    /// that is cut short, does not count, as the MCU stops there.
     fn contains(&self, payload: &[u8], id: u32) -> bool {
         // The last byte of the id's encoding must occur somewhere. It mostly does not, and then no
         // command need be decoded.

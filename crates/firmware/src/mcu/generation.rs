@@ -9,7 +9,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-/// A state of klippy that a machine can serve.
+/// A state of klippy that an MCU can serve.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Generation {
     /// Klipper v0.11 (November 2022).
@@ -144,7 +144,7 @@ impl Generations {
     }
 }
 
-/// Which dialect a machine speaks.
+/// Which dialect an MCU speaks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DialectName {
     /// That of hosts of one generation.

@@ -5,7 +5,7 @@
 //! acknowledges a block after its last command; klippy relies on both. So an errand that a
 //! command sends *holds*: until it is back, the core runs no further command and leaves the block
 //! unacknowledged ([`Mcu::is_held`]). Timers go on, and errands that they send hold nothing. A
-//! stopped machine is not held.
+//! stopped MCU is not held.
 
 #![forbid(unsafe_code)]
 
@@ -14,11 +14,11 @@ use crate::time::Ticks;
 
 use super::{Mcu, Oid, TimerId, Turn};
 
-/// How long commands may wait for an errand before the machine stops. klippy, too, gives up waiting
+/// How long commands may wait for an errand before the MCU stops. klippy, too, gives up waiting
 /// for an answer after five seconds (`SerialRetryCommand` in serialhdl.py). Without this limit a bus
-/// that hangs would keep the host from stopping the machine: once its window of unacknowledged blocks
+/// that hangs would keep the host from stopping the MCU: once its window of unacknowledged blocks
 /// is full, it can not even send an `emergency_stop`.
-const HOLD_LIMIT: Ticks = Ticks::from_us(5_000_000);
+const HOLD_LIMIT: Ticks = Ticks::from_ms(5000);
 
 /// What commands wait for.
 #[derive(Default)]
@@ -53,7 +53,7 @@ impl Turn<'_> {
 }
 
 impl Mcu {
-    /// Has the machine stop if commands still wait in [`HOLD_LIMIT`].
+    /// Has the MCU stop if commands still wait in [`HOLD_LIMIT`].
     fn limit_hold(&mut self) {
         self.schedule.timers.remove(TimerId::HOLD);
         let limit = self.now() + HOLD_LIMIT;

@@ -12,7 +12,7 @@ use std::sync::Arc;
 
 use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line, OnWorker, Pin};
 use crate::shutdown::{Shutdown, reason};
-use crate::time::{Clock, Ticks};
+use crate::time::Clock;
 
 use super::snapshot::Level;
 use super::{
@@ -28,7 +28,7 @@ pub(super) struct Claim {
     slow: Option<(WorkerId, Calls)>,
     /// What it was set up as last.
     direction: Direction,
-    /// Its level for whoever asks for the machine's status.
+    /// Its level for whoever asks for the MCU's status.
     shown: Arc<Level>,
 }
 
@@ -177,7 +177,7 @@ impl OutputLine {
         self.write(turn, !self.level)
     }
 
-    /// Drives the line of a stopped machine to where it belongs.
+    /// Drives the line of a stopped MCU to where it belongs.
     ///
     /// # Errors
     ///
@@ -194,7 +194,7 @@ impl OutputLine {
     ///
     /// # Errors
     ///
-    /// "GPIO line write failed", unless the machine is stopped.
+    /// "GPIO line write failed", unless the MCU is stopped.
     pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
         match &mut self.driver {
             Driver::Prompt(_) => Ok(()),
@@ -217,7 +217,7 @@ impl Errand for Sampling {
 
 /// What a worker saw of an input.
 pub struct Look {
-    /// `None` if it could not look, or the machine is stopped and it failed.
+    /// `None` if it could not look, or the MCU is stopped and it failed.
     pub level: Option<bool>,
     /// When the worker began to look.
     pub began: Clock,
@@ -321,7 +321,7 @@ impl InputLine {
         if look.is_here() || !unread.is_too_long(turn.now()) {
             return Ok(());
         }
-        let (name, ms) = (turn.name(self.pin), UNREAD_LIMIT.0 / Ticks::from_us(1000).0);
+        let (name, ms) = (turn.name(self.pin), UNREAD_LIMIT.as_ms());
         let stop = Shutdown::because(reason::LINE_READ, format!("{name} has not answered for {ms} ms"));
         turn.try_shut_down(stop.remedy(
             "does its chip or its bus hang? Check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
@@ -334,7 +334,7 @@ pub type CountedEdges = Result<(WorkerId, Box<dyn Edges>), Box<str>>;
 
 impl Mcu {
     /// The board, to claim something: that opens files and waits for the guardian, so the steps
-    /// of a configured machine would wait, too.
+    /// of a configured MCU would wait, too.
     ///
     /// # Errors
     ///
@@ -346,7 +346,7 @@ impl Mcu {
         Ok(&mut *self.board)
     }
 
-    /// Claims a line for one more use, while the machine is configured.
+    /// Claims a line for one more use, while the MCU is configured.
     fn claim(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
         self.board()?;
         self.claim_at_any_time(pin, direction)
@@ -376,13 +376,13 @@ impl Mcu {
         Ok(&self.configuration.claims[place])
     }
 
-    /// Claims an output, driven to `level`; it belongs to `shutdown_level` when the machine stops.
+    /// Claims an output, driven to `level`; it belongs to `shutdown_value` when the MCU stops.
     ///
     /// # Errors
     ///
     /// Those of the board, such as "Unable to open out GPIO chip line".
-    pub fn output(&mut self, pin: Pin, level: bool, shutdown_level: bool) -> Result<OutputLine, Shutdown> {
-        let claim = self.claim(pin, Direction::Output { level, shutdown_level })?;
+    pub fn output(&mut self, pin: Pin, level: bool, shutdown_value: bool) -> Result<OutputLine, Shutdown> {
+        let claim = self.claim(pin, Direction::Output { level, shutdown_value })?;
         let (line, shown) = (claim.line.clone(), claim.shown.clone());
         let driver = match &claim.slow {
             None => Driver::Prompt(line),
@@ -402,9 +402,9 @@ impl Mcu {
         pin: Pin,
         use_: &str,
         level: bool,
-        shutdown_level: bool,
+        shutdown_value: bool,
     ) -> Result<PromptLine, Shutdown> {
-        let claim = self.prompt_claim(pin, use_, Direction::Output { level, shutdown_level })?;
+        let claim = self.prompt_claim(pin, use_, Direction::Output { level, shutdown_value })?;
         Ok(PromptLine { line: claim.line.clone(), level, shown: claim.shown.clone() })
     }
 
@@ -441,7 +441,7 @@ impl Mcu {
     ///
     /// Those of the board, such as "Unable to open out GPIO chip line".
     pub fn shared_output(&mut self, pin: Pin, level: bool) -> Result<Arc<dyn Line>, Shutdown> {
-        self.claim(pin, Direction::Output { level, shutdown_level: level }).map(Claim::shared)
+        self.claim(pin, Direction::Output { level, shutdown_value: level }).map(Claim::shared)
     }
 
     /// Claims an input that workers read, pulled up where it can be.
@@ -504,6 +504,6 @@ impl Mcu {
 
     /// What the dictionary calls a pin.
     pub fn name(&self, pin: Pin) -> String {
-        self.board.pins().iter().find_map(|range| range.name_of(pin.0)).unwrap_or(format!("pin number {}", pin.0))
+        pin.name_in(&self.board.pins())
     }
 }

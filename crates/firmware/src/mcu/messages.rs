@@ -19,8 +19,8 @@ pub(super) struct Spoken {
 }
 
 impl Mcu {
-    /// Runs one command off the front of a block's payload. If it stops the machine, the rest
-    /// of the block is dropped, as in the firmware. None may run while the machine
+    /// Runs one command off the front of a block's payload. If it stops the MCU, the rest
+    /// of the block is dropped, as in the firmware. None may run while the MCU
     /// [is held](Mcu::is_held).
     #[inline]
     pub fn execute(&mut self, payload: &mut Reader<'_>) {
@@ -43,7 +43,7 @@ impl Mcu {
         self.heard().is_emergency(payload)
     }
 
-    /// The dialect in which the host speaks that is there, which the machine may not be able to serve yet.
+    /// The dialect in which the host speaks that is there, which the MCU may not be able to serve yet.
     pub fn heard(&self) -> &Arc<Dialect> {
         self.spoken.next.as_ref().unwrap_or(&self.spoken.dialect)
     }
@@ -81,8 +81,8 @@ impl Mcu {
         }
     }
 
-    /// Has the machine speak another dialect, for another host: at once, or, if a host has begun to
-    /// configure it, after the reset. Until then only the messages of the machine itself are exchanged, which
+    /// Has the MCU speak another dialect, for another host: at once, or, if a host has begun to
+    /// configure it, after the reset. Until then only the messages of the MCU itself are exchanged, which
     /// have the same ids in every dialect: what the objects say would mean something else to the other host, or
     /// nothing, and klippy's reader ends with the first message that it can not decode. `get_config` tells no
     /// check sum that the other host could take for its own.
@@ -96,7 +96,7 @@ impl Mcu {
         }
     }
 
-    /// The dialect that the machine speaks.
+    /// The dialect that the MCU speaks.
     pub fn dialect(&self) -> &Arc<Dialect> {
         &self.spoken.dialect
     }
@@ -106,7 +106,7 @@ impl Mcu {
         self.spoken.dialect.response_id::<R>().is_some()
     }
 
-    /// Whether the machine is to behave as for hosts of these generations, where no form of a message
+    /// Whether the MCU is to behave as for hosts of these generations, where no form of a message
     /// tells them apart.
     pub fn serves(&self, hosts: Generations) -> bool {
         self.spoken.dialect.serves(hosts)

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The machine: oids, timers, move queue, shutdown.
+//! The MCU: oids, timers, move queue, shutdown.
 //!
 //! It does no I/O of its own: it reads the time from the clock that it is given, calls the
 //! board's traits and leaves responses in an outbox. So all of it runs in virtual time too.
@@ -63,7 +63,7 @@ use schedule::Schedule;
 use stop::Stop;
 use timers::TimerId;
 
-/// The machine's own responses come first in the list of all.
+/// The MCU's own responses come first in the list of all.
 const fn response_index(format: &str) -> usize {
     place_of_response(&[base::FEATURE], format)
 }

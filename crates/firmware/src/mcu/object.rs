@@ -36,22 +36,22 @@ pub trait Object: Any + Send {
     /// What people call such an object, for the log: `stepper`, `digital output`.
     fn kind(&self) -> &'static str;
 
-    /// A timer of this object runs, which was due at `at`. An error stops the machine.
+    /// A timer of this object runs, which was due at `at`. An error stops the MCU.
     fn event(&mut self, _turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         Ok(Next::Done)
     }
 
-    /// An errand of this object has come back from its worker. An error stops the machine.
+    /// An errand of this object has come back from its worker. An error stops the MCU.
     fn returned(&mut self, _turn: &mut Turn, _done: &mut Done) -> Result<(), Shutdown> {
         Ok(())
     }
 
-    /// The trsync that this object waits for was triggered. An error stops the machine.
+    /// The trsync that this object waits for was triggered. An error stops the MCU.
     fn triggered(&mut self, _turn: &mut Turn) -> Result<(), Shutdown> {
         Ok(())
     }
 
-    /// The machine stops and has removed all timers: the object drops whatever it had queued.
+    /// The MCU stops and has removed all timers: the object drops whatever it had queued.
     fn shutdown(&mut self, _turn: &mut Turn) {}
 
     /// Drives the outputs to their shutdown values, after [`Object::shutdown`]. As long as this fails
@@ -76,7 +76,7 @@ pub trait Object: Any + Send {
         self.bus().map(Bus::counts)
     }
 
-    /// What it tells to whoever asks for the machine's status.
+    /// What it tells to whoever asks for the MCU's status.
     fn report(&self) -> Report {
         Report::default()
     }

@@ -92,7 +92,7 @@ impl<S: Settable> Remote<S> {
     ///
     /// # Errors
     ///
-    /// That of the write, such as "PWM write failed", unless the machine is stopped.
+    /// That of the write, such as "PWM write failed", unless the MCU is stopped.
     pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
         match self.back(turn, done) {
             Some(Ok(true)) => turn.is_safe(),

@@ -13,9 +13,9 @@ use super::stats::Stats;
 use super::timers::Timers;
 use super::{Mcu, Next, Note, OBJECTS_MAX, TimerId, Turn, WireClock, base};
 
-/// How far a timer may fall behind before the machine stops: 100 ms, as in the firmware.
-const LATE_LIMIT: Ticks = Ticks::from_us(100_000);
-/// The longest wait within a timer's event. Meanwhile nothing else runs, not even a command that stops the machine.
+/// How far a timer may fall behind before the MCU stops: 100 ms, as in the firmware.
+const LATE_LIMIT: Ticks = Ticks::from_ms(100);
+/// The longest wait within a timer's event. Meanwhile nothing else runs, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
 /// Timers that run before it is looked whether they fall behind, and commands get a turn
 /// (`TIMER_REPEAT_COUNT` of the firmware's linux/timer.c).
@@ -23,8 +23,8 @@ const REPEAT_COUNT: u32 = 20;
 /// The same, where there was no command to run (`TIMER_IDLE_REPEAT_COUNT`).
 const IDLE_REPEAT_COUNT: u32 = 100;
 /// Between two `stats` responses.
-const STATS_TICKS: Ticks = Ticks::from_us(5_000_000);
-/// Two timers for each object and three for the machine.
+const STATS_TICKS: Ticks = Ticks::from_ms(5000);
+/// Two timers for each object and three for the MCU.
 const TIMERS_MAX: usize = 2 * OBJECTS_MAX + 3;
 
 /// The time, and the timers that wait for it.
@@ -114,7 +114,7 @@ impl Mcu {
         Ok(())
     }
 
-    /// Goes on with an activity of the machine's own: late is late, but no fault of the host.
+    /// Goes on with an activity of the MCU's own: late is late, but no fault of the host.
     pub(super) fn go_on(&mut self, timer: TimerId, at: Clock) {
         self.schedule.timers.insert(at, timer);
     }
@@ -140,7 +140,7 @@ impl Mcu {
     /// are more of them: then one command is to have its turn, if there is any.
     ///
     /// The firmware runs 20, looks whether they are 100 ms late, lets commands run, and if there
-    /// are none runs 100 more before it looks again; so does this machine, as where it looks
+    /// are none runs 100 more before it looks again; so does this computer, as where it looks
     /// decides whether it stops.
     pub fn run_timers(&mut self) -> bool {
         for _ in 0..if self.schedule.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
@@ -154,7 +154,7 @@ impl Mcu {
         if late > i64::from(LATE_LIMIT.0) && self.stop.reason.is_none() {
             let cause = format!(
                 "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running",
-                late as u64 / u64::from(Ticks::from_us(1000).0)
+                late as u64 / u64::from(Ticks::from_ms(1).0)
             );
             let stop = Shutdown::because(reason::TIMER_PAST, cause);
             self.shut_down(stop.remedy("run Pinion in real time (-r, as the service does), or move more slowly"));
@@ -213,15 +213,15 @@ impl Mcu {
 
     fn send_stats(&mut self, at: Clock) -> Next {
         let Stats { count, sum, sumsq } = std::mem::take(&mut self.schedule.stats);
-        // klippy divides by it, and a machine that stood still since the last time counted none.
+        // klippy divides by it, and an MCU that stood still since the last time counted none.
         let count = count.max(1);
         self.send(base::Stats { count, sum, sumsq });
-        // A suspended machine owes no statistics of its sleep.
+        // A suspended MCU owes no statistics of its sleep.
         let next = at + STATS_TICKS;
         Next::At(next.max(self.schedule.last_read))
     }
 
-    /// How late a step may be before the machine stops.
+    /// How late a step may be before the MCU stops.
     pub fn step_late_limit(&self) -> Ticks {
         self.schedule.timing.step_late_limit
     }

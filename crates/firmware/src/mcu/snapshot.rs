@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a machine tells of itself when asked: its state, objects, lines and queues.
+//! What an MCU tells of itself when asked: its state, objects, lines and queues.
 //!
 //! The core fills a snapshot in while no timer is near, a few rows at a time. Whoever asks has made room for
 //! all of it, so that the core neither allocates nor waits.
@@ -27,12 +27,12 @@ const NAME_BYTES: usize = 32;
 /// Lines and objects that are told in one go. A row costs some 10 ns, or a miss of the cache or two.
 const ROWS: usize = 16;
 
-/// The machine at an instant.
+/// The MCU at an instant.
 #[derive(Debug)]
 pub struct Snapshot {
     /// When it was begun.
     pub at: Clock,
-    /// Whether the machine is configured.
+    /// Whether the MCU is configured.
     pub is_configured: bool,
     /// Whether a host has begun to configure it.
     pub oids_allocated: bool,
@@ -159,7 +159,7 @@ impl QueueState {
 }
 
 impl Default for Snapshot {
-    /// An empty one, with room for all that a machine may have.
+    /// An empty one, with room for all that an MCU may have.
     fn default() -> Snapshot {
         Snapshot {
             at: Clock::EPOCH,

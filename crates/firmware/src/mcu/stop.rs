@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How the machine stops: timers off, outputs to their shutdown values, the host is told.
+//! How the MCU stops: timers off, outputs to their shutdown values, the host is told.
 //!
 //! An output whose shutdown value can not be written at once, as a worker has to write it or as
 //! writing failed, is *owed*. What failed is tried again every [`RETRY_TICKS`]. Whoever runs the
-//! machine watches [`Mcu::debtor`]: a debt that lasts is for the guardian. What the guardian can not
+//! MCU watches [`Mcu::debtor`]: a debt that lasts is for the guardian. What the guardian can not
 //! write either ([`Object::is_guarded`]) is owed for [`UNGUARDED_LIMIT`] only: to end the program for it
 //! would help nobody. It is still tried until the next configuration.
 
@@ -19,16 +19,16 @@ use super::{Mcu, Note, Oid, Safe, TimerId, Turn, base};
 use super::Object;
 
 /// The pause between two attempts to write a shutdown value.
-pub const RETRY_TICKS: Ticks = Ticks::from_us(50_000);
+pub const RETRY_TICKS: Ticks = Ticks::from_ms(50);
 
-/// How long the machine waits for shutdown values that only it can write: less than the second after which
+/// How long the MCU waits for shutdown values that only it can write: less than the second after which
 /// the guardian takes over.
-const UNGUARDED_LIMIT: Ticks = Ticks::from_us(500_000);
+const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 
-/// What a stopped machine knows of its stop.
+/// What a stopped MCU knows of its stop.
 #[derive(Default)]
 pub(super) struct Stop {
-    /// Why the machine is stopped; none while it is not.
+    /// Why the MCU is stopped; none while it is not.
     pub(super) reason: Option<ShutdownReason>,
     /// What the log says of the last stop, and when it was.
     pub(super) last: Option<(Box<Trouble>, Clock)>,
@@ -52,13 +52,13 @@ struct Debt {
 }
 
 impl Mcu {
-    /// Whether the machine is stopped.
+    /// Whether the MCU is stopped.
     pub fn is_shutdown(&self) -> bool {
         self.stop.reason.is_some()
     }
 
-    /// Stops the machine: removes all timers, drives the outputs to their shutdown values, and tells
-    /// the host. A machine that is stopped already does the same once more, and keeps its first reason.
+    /// Stops the MCU: removes all timers, drives the outputs to their shutdown values, and tells
+    /// the host. An MCU that is stopped already does the same once more, and keeps its first reason.
     pub fn shut_down(&mut self, shutdown: Shutdown) {
         if self.stop.under_way {
             self.outbox.note(Note::Trouble(&shutdown));
@@ -94,12 +94,12 @@ impl Mcu {
         }
     }
 
-    /// The given stop as an error, which then stops the machine; nothing if the machine is stopped
+    /// The given stop as an error, which then stops the MCU; nothing if the MCU is stopped
     /// already (the firmware's `try_shutdown`).
     ///
     /// # Errors
     ///
-    /// `shutdown`, unless the machine is stopped.
+    /// `shutdown`, unless the MCU is stopped.
     pub fn try_shut_down(&self, shutdown: Shutdown) -> Result<(), Shutdown> {
         match self.stop.reason {
             Some(_) => Ok(()),
@@ -167,7 +167,7 @@ impl Mcu {
             Ok(Safe::Now) => self.is_safe(oid),
             Ok(Safe::Later) => {}
             Err(trouble) => {
-                // The machine is stopped, so this notes the failure and returns Ok.
+                // The MCU is stopped, so this notes the failure and returns Ok.
                 let _ = self.device_failed(oid, kind, trouble);
             }
         }
@@ -184,7 +184,7 @@ impl Mcu {
     }
 
     /// Tries again to write the shutdown values that could not be written, and no longer waits for those
-    /// that only this machine could write and could not.
+    /// that only this computer could write and could not.
     pub(super) fn retry(&mut self) {
         let now = self.now();
         for debt in self.stop.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {
@@ -193,7 +193,7 @@ impl Mcu {
                 let cause = format!(
                     "{} has not taken its shutdown values for {} ms, and nothing else can write them: its outputs may be on",
                     debt.name,
-                    UNGUARDED_LIMIT.0 / Ticks::from_us(1000).0
+                    UNGUARDED_LIMIT.as_ms()
                 );
                 let stop = Shutdown::because(reason::BUS_HANGS, cause);
                 self.outbox.note(Note::Trouble(&stop.remedy("check its power and wiring, then FIRMWARE_RESTART")));

@@ -27,21 +27,21 @@ impl Timer {
     }
 }
 
-/// Which timer: an object's, or the machine's own.
+/// Which timer: an object's, or the MCU's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct TimerId {
-    /// The object; the machine's own timers have none.
+    /// The object; the MCU's own timers have none.
     oid: Option<Oid>,
     timer: Timer,
 }
 
 impl TimerId {
-    /// The machine's own timer, which sends `stats`.
+    /// The MCU's own timer, which sends `stats`.
     pub(super) const STATS: TimerId = TimerId::own(0);
 
-    /// The machine's own timer, which tries shutdown values again that could not be written.
+    /// The MCU's own timer, which tries shutdown values again that could not be written.
     pub(super) const RETRY: TimerId = TimerId::own(1);
-    /// The machine's own timer, which ends the wait for a bus that hangs.
+    /// The MCU's own timer, which ends the wait for a bus that hangs.
     pub(super) const HOLD: TimerId = TimerId::own(2);
 
     const fn own(number: u8) -> TimerId {

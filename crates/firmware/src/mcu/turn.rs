@@ -71,12 +71,12 @@ impl<'a> Turn<'a> {
         self.mcu.cancel(TimerId::of(self.oid, timer));
     }
 
-    /// To be called when an output or device of the object has failed. A running machine is stopped by the error that
+    /// To be called when an output or device of the object has failed. A running MCU is stopped by the error that
     /// this returns. In a stopped one the log is told, and the shutdown value is tried again later.
     ///
     /// # Errors
     ///
-    /// The failure, unless the machine is stopped.
+    /// The failure, unless the MCU is stopped.
     pub fn device_failed(&mut self, kind: &str, failure: Shutdown) -> Result<(), Shutdown> {
         self.mcu.device_failed(self.oid, kind, failure)
     }
@@ -85,7 +85,7 @@ impl<'a> Turn<'a> {
         self.mcu.workers.submit(worker, job)
     }
 
-    /// Says in the log that something of the object failed which does not stop the machine.
+    /// Says in the log that something of the object failed which does not stop the MCU.
     pub fn warn(&mut self, kind: &str, trouble: Shutdown) {
         self.mcu.warn(self.oid, kind, trouble);
     }

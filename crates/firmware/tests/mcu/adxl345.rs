@@ -236,7 +236,7 @@ fn rubbish_is_told_as_errors_and_a_status_of_rubbish_is_left_out() {
 }
 
 #[test]
-fn a_bus_that_fails_stops_the_machine_and_the_next_configuration_measures() {
+fn a_bus_that_fails_stops_the_mcu_and_the_next_configuration_measures() {
     for ask in ["", "query_adxl345_status oid=1"] {
         let mut rig = Rig::configured(CONFIG);
         plug(&rig, measuring(1000));

@@ -56,7 +56,7 @@ fn what_was_refused_is_not_kept() {
     rig.send(&query(4, 0, 65535, 1));
     rig.send(&query(255, 0, 65535, 1));
     assert_eq!(rig.shutdown().as_deref(), Some("Invalid analog_in bytes_per_report"));
-    // Sampling goes on in the stopped machine as it was asked for before: the same as in a running one.
+    // Sampling goes on in the stopped MCU as it was asked for before: the same as in a running one.
     rig.run_until(10_000_000);
     let reports = rig.responses();
     assert!(reports.len() > 30, "{reports:?}");
@@ -117,7 +117,7 @@ fn a_query_without_samples_ends_the_reports() {
 }
 
 #[test]
-fn a_query_without_rest_reads_as_fast_as_the_adc_does_until_the_machine_stops() {
+fn a_query_without_rest_reads_as_fast_as_the_adc_does_until_the_mcu_stops() {
     let mut rig = Rig::with_workers(3000, &[SENSOR]);
     rig.bench.script_adc(ANALOG, &[10]);
     rig.send("query_analog_in oid=0 clock=@5000 sample_ticks=0 sample_count=1 rest_ticks=0 bytes_per_report=1 min_value=0 max_value=65535 range_check_count=1");
@@ -133,7 +133,7 @@ fn a_query_without_rest_reads_as_fast_as_the_adc_does_until_the_machine_stops() 
 }
 
 #[test]
-fn reads_that_fail_for_100_ms_stop_the_machine_and_reports_come_once_it_works_again() {
+fn reads_that_fail_for_100_ms_stop_the_mcu_and_reports_come_once_it_works_again() {
     let mut rig = Rig::configured(&[SENSOR]);
     rig.bench.script_adc(ANALOG, &[1]);
     rig.send(&query(1, 0, 65535, 1));

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Whatever a host sends, the machine is there afterwards.
+//! Whatever a host sends, the MCU is there afterwards.
 
 use pinion_firmware::mcu::Generation::{self, Kalico, Master, V0_11, V0_12, V0_13};
 use pinion_protocol::block::PAYLOAD_MAX;
@@ -121,7 +121,7 @@ proptest! {
     #![proptest_config(ProptestConfig { cases: 800, ..ProptestConfig::default() })]
 
     #[test]
-    fn no_bytes_break_the_machine(
+    fn no_bytes_break_the_mcu(
         generation in prop::sample::select(&Generation::ALL[..]),
         answer_ticks in 0u32..50_000,
         actions in vec(action(), 1..60),

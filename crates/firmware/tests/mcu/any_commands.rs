@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Whatever commands a host sends, the machine is there afterwards, with its outputs where they belong.
+//! Whatever commands a host sends, the MCU is there afterwards, with its outputs where they belong.
 //!
 //! The commands are those of the dictionary, so a new feature is covered as soon as it is listed: what arguments
 //! a command accepts is found by trying, once for each generation of hosts ([`Book`]). Each case then sends
@@ -21,7 +21,7 @@ use proptest::test_runner::TestRunner;
 use pinion_testbench::board::{ANALOG, GPIOS, MOSI, PWM, SPI_CHIPS};
 use pinion_testbench::rig::Rig;
 
-/// Commands that never leave a running machine as it was, or not for every host that sends them.
+/// Commands that never leave a running MCU as it was, or not for every host that sends them.
 const STOPS: &[&str] = &[
     "emergency_stop",
     "config_reset",
@@ -158,7 +158,7 @@ struct Book {
     forms: Vec<Form>,
     /// A whole configuration.
     setup: Vec<Call>,
-    /// Arguments that each command accepts while the machine is configured, and once it is.
+    /// Arguments that each command accepts while the MCU is configured, and once it is.
     before: Vec<Vec<Vec<Value>>>,
     after: Vec<Vec<Vec<Value>>>,
     /// What each response has, by its id.
@@ -246,7 +246,7 @@ impl Book {
         None
     }
 
-    /// Tries every command on a machine that is being configured.
+    /// Tries every command on an MCU that is being configured.
     fn find_setup(&mut self, dice: &mut Dice) {
         let mut rig = bench(self.generation);
         rig.send(&format!("allocate_oids count={OIDS}"));
@@ -269,7 +269,7 @@ impl Book {
         }
     }
 
-    /// Tries every command on a configured machine, and puts those that are for its configuration into that.
+    /// Tries every command on a configured MCU, and puts those that are for its configuration into that.
     fn find_calls(&mut self, dice: &mut Dice) {
         const WANTED: usize = 4;
         for (with_buses, tries) in [(false, 30), (true, 100)] {
@@ -300,7 +300,7 @@ impl Book {
         }
     }
 
-    /// Configures a machine, as far as it accepts that.
+    /// Configures an MCU, as far as it accepts that.
     fn set_up(&self, rig: &mut Rig) {
         rig.send(&format!("allocate_oids count={OIDS}"));
         for (form, values) in &self.setup {
@@ -311,7 +311,7 @@ impl Book {
     }
 }
 
-/// A machine among devices that answer.
+/// An MCU among devices that answer.
 fn bench(generation: Generation) -> Rig {
     let rig = Rig::of(generation);
     for (bus, address) in (0..2).flat_map(|bus| (0..128).map(move |address| (bus, address))) {
@@ -336,10 +336,10 @@ fn bench(generation: Generation) -> Rig {
     rig
 }
 
-/// A turn of the machine takes this long at least: events that come faster than that make it late.
+/// A turn of the MCU takes this long at least: events that come faster than that make it late.
 const TURN: Ticks = Ticks::from_us(20);
 
-/// Lets the machine run as long as `goes_on`.
+/// Lets the MCU run as long as `goes_on`.
 fn pass(rig: &mut Rig, mut goes_on: impl FnMut(&Rig) -> bool) {
     while goes_on(rig) {
         let now = rig.mcu.now();
@@ -350,7 +350,7 @@ fn pass(rig: &mut Rig, mut goes_on: impl FnMut(&Rig) -> bool) {
     }
 }
 
-/// Lets the machine run up to `ticks`, or for so many turns.
+/// Lets the MCU run up to `ticks`, or for so many turns.
 fn pass_until(rig: &mut Rig, ticks: u64, turns: u32) {
     let mut left = 2 * turns;
     pass(rig, |rig| {
@@ -379,7 +379,7 @@ fn say(rig: &mut Rig, command: &str) {
     run(rig, &payload);
 }
 
-/// What a command stops the machine with, if it does. Whatever it began is ended.
+/// What a command stops the MCU with, if it does. Whatever it began is ended.
 fn try_out(rig: &mut Rig, form: &Form, values: &[Value]) -> Option<String> {
     let payload = form.encode(rig, values);
     run(rig, &payload);
@@ -427,7 +427,7 @@ enum Change {
     Bytes(u8, usize),
 }
 
-/// What becomes of a machine that has stopped.
+/// What becomes of an MCU that has stopped.
 #[derive(Clone, Copy, Debug)]
 enum Recovery {
     Nothing,
@@ -469,24 +469,24 @@ fn action() -> impl Strategy<Value = (Action, Recovery)> {
     (action, recovery)
 }
 
-/// Commands that were sent to a running machine, and those of them that it accepted.
+/// Commands that were sent to a running MCU, and those of them that it accepted.
 static SENT: AtomicU64 = AtomicU64::new(0);
 static ACCEPTED: AtomicU64 = AtomicU64::new(0);
-/// Outputs that were looked at in a stopped machine.
+/// Outputs that were looked at in a stopped MCU.
 static LOOKED_AT: AtomicU64 = AtomicU64::new(0);
 
-/// A machine under test, and what is known of its outputs.
+/// An MCU under test, and what is known of its outputs.
 struct Trial<'a> {
     book: &'a Book,
     rig: Rig,
     finalized: bool,
     /// Each pin that was named to it, and how often.
     named: HashMap<u32, u32>,
-    /// Digital outputs with the levels of a stopped machine.
+    /// Digital outputs with the levels of a stopped MCU.
     outputs: HashMap<u32, bool>,
-    /// Lines that steppers step by, which rest in a stopped machine.
+    /// Lines that steppers step by, which rest in a stopped MCU.
     step_pins: HashSet<u32>,
-    /// Whether the machine was stopped after the last action, and its outputs were where they belong.
+    /// Whether the MCU was stopped after the last action, and its outputs were where they belong.
     stopped: bool,
     /// What was sent since the last configuration, for a case that fails.
     story: Vec<String>,
@@ -525,12 +525,12 @@ impl<'a> Trial<'a> {
         self.story.clear();
     }
 
-    /// Outputs that fail keep a machine from a reset, until the guardian ends the program.
+    /// Outputs that fail keep an MCU from a reset, until the guardian ends the program.
     fn mend(&mut self) {
         self.rig.bench.state().broken.clear();
     }
 
-    /// Has the machine forget everything.
+    /// Has the MCU forget everything.
     fn reset(&mut self) {
         self.mend();
         let now = self.rig.now();
@@ -547,7 +547,7 @@ impl<'a> Trial<'a> {
         assert!(self.rig.ask("get_config").starts_with("config is_config=0 crc=0 is_shutdown=0 "));
     }
 
-    /// Sends a command. Whether a running machine accepted it; nothing is known of a stopped one.
+    /// Sends a command. Whether a running MCU accepted it; nothing is known of a stopped one.
     fn send(&mut self, form: usize, values: &[Value]) -> Option<bool> {
         let form = &self.book.forms[form];
         self.story.push(format!("@{}: {} {values:?}", self.rig.now(), form.format));
@@ -634,7 +634,7 @@ impl<'a> Trial<'a> {
         }
     }
 
-    /// Looks at the outputs of a machine that is stopped.
+    /// Looks at the outputs of an MCU that is stopped.
     fn look(&mut self) {
         let stopped = self.rig.mcu.is_shutdown();
         let broken = !self.rig.bench.state().broken.is_empty();
@@ -691,7 +691,7 @@ fn arguments_are_found_for_every_command() {
 }
 
 #[test]
-fn no_commands_break_the_machine() {
+fn no_commands_break_the_mcu() {
     let cases = std::env::var("PROPTEST_CASES").ok().and_then(|cases| cases.parse().ok()).unwrap_or(100);
     let config = ProptestConfig { cases, source_file: Some(file!()), ..ProptestConfig::default() };
     let strategy = (0..Generation::ALL.len(), 0u32..50_000, vec(action(), 1..120));

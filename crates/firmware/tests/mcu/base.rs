@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What every machine does: identify, clock, configuration, shutdown, bad input.
+//! What every MCU does: identify, clock, configuration, shutdown, bad input.
 
 use pinion_firmware::mcu::MOVE_COUNT;
 use pinion_protocol::block::PAYLOAD_MAX;
@@ -113,7 +113,7 @@ fn a_crc_of_all_ones_comes_back() {
 }
 
 #[test]
-fn what_is_configured_twice_or_wrongly_stops_the_machine() {
+fn what_is_configured_twice_or_wrongly_stops_the_mcu() {
     for (commands, text) in [
         (&["allocate_oids count=1", "allocate_oids count=1"][..], "oids already allocated"),
         (&["allocate_oids count=0", "allocate_oids count=1"], "oids already allocated"),
@@ -148,7 +148,7 @@ fn a_configuration_that_is_refused_may_be_sent_anew() {
 // ---- shutdown
 
 #[test]
-fn a_stopped_machine_says_so_to_every_command_and_answers_what_it_may() {
+fn a_stopped_mcu_says_so_to_every_command_and_answers_what_it_may() {
     let mut rig = Rig::configured(&[STEPPER]);
     rig.run_until(500);
     rig.send("emergency_stop");
@@ -193,7 +193,7 @@ fn a_shutdown_drops_the_rest_of_its_block() {
 }
 
 #[test]
-fn a_cleared_shutdown_lets_the_machine_go_on() {
+fn a_cleared_shutdown_lets_the_mcu_go_on() {
     let mut rig = Rig::configured(&[STEPPER]);
     rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=1000 count=9 add=0"]);
     rig.run_until(3500);
@@ -210,7 +210,7 @@ fn a_cleared_shutdown_lets_the_machine_go_on() {
 }
 
 #[test]
-fn a_running_machine_does_not_forget_its_configuration() {
+fn a_running_mcu_does_not_forget_its_configuration() {
     let mut rig = Rig::configured(&[STEPPER]);
     rig.send("config_reset");
     expect_shutdown(&rig, "config_reset only available when shutdown");
@@ -267,7 +267,7 @@ fn a_host_does_not_poke_memory() {
 }
 
 #[test]
-fn an_unknown_command_stops_the_machine() {
+fn an_unknown_command_stops_the_mcu() {
     // 1 is identify, 0 a response; 0x9f 0x7f is far above all, and so is the last one, below all.
     for payload in [&[0][..], &[0x9f, 0x7f], &[0xe0, 0x00], &[0x8f, 0xff, 0xff, 0xff, 0x00]] {
         let mut rig = Rig::new();
@@ -277,7 +277,7 @@ fn an_unknown_command_stops_the_machine() {
 }
 
 #[test]
-fn a_command_that_ends_too_early_stops_the_machine() {
+fn a_command_that_ends_too_early_stops_the_mcu() {
     let rig = Rig::configured(&[STEPPER]);
     let whole = rig.encode("queue_step oid=0 interval=100000 count=1000 add=-1000");
     let transfer = rig.encode("spi_transfer oid=0 data=010203");
@@ -343,7 +343,7 @@ fn a_timer_in_the_past_is_too_close_only_if_it_would_be_the_next() {
     rig.send("queue_digital_out oid=1 clock=@10000 on_ticks=0");
     expect_shutdown(&rig, "Timer too close");
 
-    // The machine is behind with a step: as in the firmware, what comes after it just waits.
+    // The MCU is behind with a step: as in the firmware, what comes after it just waits.
     let mut rig = Rig::configured(&[STEPPER, OUTPUT]);
     rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=1000 count=1 add=0"]);
     rig.stall_until(3200);
@@ -354,7 +354,7 @@ fn a_timer_in_the_past_is_too_close_only_if_it_would_be_the_next() {
 }
 
 #[test]
-fn a_machine_that_falls_far_behind_stops_itself() {
+fn an_mcu_that_falls_far_behind_stops_itself() {
     for (behind, ends) in [(4_990_000, false), (5_100_000, true)] {
         let mut rig = Rig::configured(&[
             "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0",
@@ -371,7 +371,7 @@ fn a_machine_that_falls_far_behind_stops_itself() {
 }
 
 #[test]
-fn every_payload_length_fits_what_the_machine_answers() {
+fn every_payload_length_fits_what_the_mcu_answers() {
     assert_eq!(PAYLOAD_MAX, 59);
     let mut rig = Rig::configured(&["config_spi_without_cs oid=19"]);
     let data = "ff".repeat(56);
@@ -383,7 +383,7 @@ fn every_payload_length_fits_what_the_machine_answers() {
 
 /// To claim a pin or to open a device takes as long as it takes.
 #[test]
-fn a_configured_machine_claims_and_opens_nothing() {
+fn a_configured_mcu_claims_and_opens_nothing() {
     for (command, text) in [
         ("config_stepper oid=1 step_pin=30 dir_pin=31 invert_step=0 step_pulse_ticks=100", "Can't assign oid"),
         ("config_endstop oid=1 pin=30 pull_up=0", "Can't assign oid"),

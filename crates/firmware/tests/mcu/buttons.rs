@@ -118,7 +118,7 @@ fn a_query_begins_anew_and_one_without_rest_ends() {
     rig.run_until(5000);
     rig.send("buttons_ack oid=0 count=1");
     rig.responses();
-    // As klippy does when it is restarted while this machine stays configured.
+    // As klippy does when it is restarted while this computer stays configured.
     rig.send_all(&["buttons_add oid=0 pos=0 pin=30 pull_up=1", "buttons_add oid=0 pos=1 pin=31 pull_up=0"]);
     rig.send("buttons_query oid=0 clock=@6000 rest_ticks=1000 retransmit_count=5 invert=0");
     rig.run_until(7000);
@@ -153,7 +153,7 @@ fn resistors_reach_the_board_after_finalize_config() {
 }
 
 #[test]
-fn a_line_that_is_gone_stops_the_machine_and_a_stopped_machine_samples_no_more() {
+fn a_line_that_is_gone_stops_the_mcu_and_a_stopped_mcu_samples_no_more() {
     let mut rig = buttons();
     rig.bench.state().broken.insert(B);
     rig.run_until(10_000);
@@ -217,7 +217,7 @@ fn a_look_under_way_is_not_taken_for_one_of_a_later_query_or_line() {
 const UNREAD_LIMIT: u64 = 5_000_000;
 
 #[test]
-fn an_expander_that_fails_for_100_ms_stops_the_machine() {
+fn an_expander_that_fails_for_100_ms_stops_the_mcu() {
     let mut rig = with_expander();
     rig.bench.state().broken.insert(B);
     rig.bench.script_input(A, &[(8500, 1)]);
@@ -249,7 +249,7 @@ fn a_look_that_fails_is_no_sample_and_changes_nothing() {
 }
 
 #[test]
-fn an_expander_that_hangs_for_100_ms_stops_the_machine() {
+fn an_expander_that_hangs_for_100_ms_stops_the_mcu() {
     let mut rig = with_expander();
     rig.run_until(4000);
     rig.bench.state().answer_ticks = 500_000_000;

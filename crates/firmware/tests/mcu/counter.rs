@@ -55,7 +55,7 @@ fn a_query_goes_on_counting_and_a_shutdown_ends_it() {
 }
 
 #[test]
-fn a_line_that_is_gone_stops_the_machine() {
+fn a_line_that_is_gone_stops_the_mcu() {
     let mut rig = Rig::configured(&[COUNTER]);
     rig.bench.state().broken.insert(TACHO);
     rig.send(QUERY);
@@ -91,7 +91,7 @@ fn an_expander_s_pin_is_looked_at_as_often_as_its_worker_can() {
 }
 
 #[test]
-fn polling_without_rest_stops_the_machine_once_it_is_behind() {
+fn polling_without_rest_stops_the_mcu_once_it_is_behind() {
     let mut rig = Rig::configured(&[COUNTER]);
     rig.send("query_counter oid=0 clock=@1000 poll_ticks=0 sample_ticks=1000");
     rig.run_until(2000);
@@ -100,7 +100,7 @@ fn polling_without_rest_stops_the_machine_once_it_is_behind() {
     assert_eq!(rig.shutdown().as_deref(), Some("Rescheduled timer in the past"));
 }
 
-/// A machine whose counter has interrupts.
+/// An MCU whose counter has interrupts.
 fn counted(answer_ticks: u32) -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().counted.insert(TACHO);
@@ -254,7 +254,7 @@ fn bouncing_contacts_are_no_storm() {
 }
 
 #[test]
-fn a_counted_line_that_is_gone_stops_the_machine() {
+fn a_counted_line_that_is_gone_stops_the_mcu() {
     let mut rig = counted(0);
     rig.bench.state().broken.insert(TACHO);
     rig.send(QUERY);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A machine that is given the dialect of another host.
+//! An MCU that is given the dialect of another host.
 
 use pinion_firmware::mcu::{DialectName, Generation};
 use pinion_protocol::vlq::Writer;
@@ -7,7 +7,7 @@ use pinion_protocol::vlq::Writer;
 use pinion_testbench::rig::{Rig, hex};
 
 #[test]
-fn a_machine_speaks_as_it_is_told_at_once_or_after_its_reset() {
+fn an_mcu_speaks_as_it_is_told_at_once_or_after_its_reset() {
     let mut rig = Rig::of(Generation::Master);
     rig.speak(Generation::V0_12);
     assert_eq!(rig.dialect().name(), DialectName::Of(Generation::V0_12));
@@ -33,7 +33,7 @@ fn a_machine_speaks_as_it_is_told_at_once_or_after_its_reset() {
 }
 
 #[test]
-fn a_configured_machine_does_not_take_the_other_hosts_words_for_its_own() {
+fn a_configured_mcu_does_not_take_the_other_hosts_words_for_its_own() {
     let mut rig = Rig::of(Generation::V0_12);
     rig.configure(&["config_digital_out oid=0 pin=1 value=1 default_value=0 max_duration=0"]);
     rig.speak(Generation::Master);
@@ -47,7 +47,7 @@ fn a_configured_machine_does_not_take_the_other_hosts_words_for_its_own() {
 }
 
 #[test]
-fn a_stopped_machine_reads_the_other_hosts_blocks_to_their_end() {
+fn a_stopped_mcu_reads_the_other_hosts_blocks_to_their_end() {
     let mut rig = Rig::of(Generation::V0_12);
     rig.configure(&["config_digital_out oid=0 pin=1 value=1 default_value=0 max_duration=0"]);
     rig.send("emergency_stop");

@@ -239,7 +239,7 @@ fn a_shutdown_drives_every_output_to_its_default() {
     rig.run_until(100_000);
     assert_eq!([20, 21, 22].map(|pin| rig.bench.level(pin)), [true, false, true]);
     // The guardian knows the same values.
-    assert_eq!([20, 21, 22].map(|pin| rig.bench.shutdown_level(pin)), [true, false, true]);
+    assert_eq!([20, 21, 22].map(|pin| rig.bench.shutdown_value(pin)), [true, false, true]);
 }
 
 #[test]
@@ -255,7 +255,7 @@ fn pulses_go_on_across_the_clocks_wrap() {
 }
 
 #[test]
-fn a_line_that_fails_stops_the_machine_and_the_other_outputs_are_safe() {
+fn a_line_that_fails_stops_the_mcu_and_the_other_outputs_are_safe() {
     let mut rig = Rig::configured(&[FAN, "config_digital_out oid=1 pin=21 value=1 default_value=0 max_duration=0"]);
     rig.send("queue_digital_out oid=0 clock=@1000 on_ticks=1");
     rig.bench.state().broken.insert(PIN);
@@ -280,7 +280,7 @@ fn a_pin_that_is_set_once_stays_and_may_be_set_again() {
     assert_eq!(rig.edges(30), []);
     rig.send("update_digital_out oid=0 value=0");
     assert!(!rig.bench.level(30));
-    // It may even be set while the machine runs, as it is held.
+    // It may even be set while the MCU runs, as it is held.
     rig.send("set_digital_out pin=31 value=0");
     assert_eq!(rig.shutdown(), None);
     assert!(!rig.bench.level(31));
@@ -291,7 +291,7 @@ fn a_pin_that_is_set_once_belongs_where_the_output_that_takes_it_does() {
     let mut rig = Rig::new();
     rig.send("set_digital_out pin=30 value=1");
     rig.configure(&["config_digital_out oid=0 pin=30 value=1 default_value=0 max_duration=0"]);
-    assert!(!rig.bench.shutdown_level(30));
+    assert!(!rig.bench.shutdown_value(30));
     rig.send("emergency_stop");
     assert!(!rig.bench.level(30));
 }

@@ -96,7 +96,7 @@ fn an_hd44780_hears_commands_and_data_with_time_in_between() {
 #[test]
 fn an_st7920_hears_messages_with_time_before_each_byte_is_complete() {
     let mut rig = Rig::configured(&[ST7920]);
-    assert!(rig.bench.level(CS) && rig.bench.shutdown_level(CS));
+    assert!(rig.bench.level(CS) && rig.bench.shutdown_value(CS));
     rig.send("st7920_send_cmds oid=0 cmds=24a5");
     rig.send("st7920_send_data oid=0 data=ff");
     rig.send("st7920_send_data oid=0 data=");
@@ -142,7 +142,7 @@ fn a_shutdown_drives_the_lines_low_and_the_display_starts_anew() {
         assert!(!rig.mcu.owes());
         for pin in &pins {
             assert!(!rig.bench.level(*pin), "pin {pin}");
-            assert!(!rig.bench.shutdown_level(*pin), "pin {pin}");
+            assert!(!rig.bench.shutdown_value(*pin), "pin {pin}");
         }
         rig.responses();
         rig.send("clear_shutdown");
@@ -170,7 +170,7 @@ fn a_display_is_there_for_the_next_configuration() {
 }
 
 #[test]
-fn a_line_that_is_gone_stops_the_machine_and_is_tried_again() {
+fn a_line_that_is_gone_stops_the_mcu_and_is_tried_again() {
     for (config, command, pin) in
         [(HD44780, "hd44780_send_cmds oid=0 cmds=01", E), (ST7920, "st7920_send_cmds oid=0 cmds=01", SCLK)]
     {
@@ -199,7 +199,7 @@ fn a_display_behind_an_expander_works() {
 }
 
 #[test]
-fn a_display_that_takes_forever_stops_the_machine() {
+fn a_display_that_takes_forever_stops_the_mcu() {
     let mut rig = Rig::configured(&[&HD44780.replace("=2000", "=4000000000")]);
     rig.begin("hd44780_send_data oid=0 data=4142");
     rig.run_until(300_000_000);

@@ -63,7 +63,7 @@ fn failures_are_told_with_the_last_temperature_until_there_are_too_many() {
 }
 
 #[test]
-fn a_temperature_out_of_its_range_is_told_and_stops_the_machine() {
+fn a_temperature_out_of_its_range_is_told_and_stops_the_mcu() {
     for (value, ends) in [(4999, true), (5000, false), (30_000, false), (30_001, true)] {
         let mut rig = rig(750, &[Some(value)]);
         rig.send(&query(5000, 30_000));
@@ -78,7 +78,7 @@ fn a_temperature_out_of_its_range_is_told_and_stops_the_machine() {
 }
 
 #[test]
-fn a_sensor_that_does_not_answer_stops_the_machine() {
+fn a_sensor_that_does_not_answer_stops_the_mcu() {
     let mut rig = rig(7000, &[Some(20_000)]);
     rig.send(&query(0, 100_000));
     // Asked at 100, 3100 and 6100 ms.

@@ -56,9 +56,9 @@ fn every_stepper_stops_on_the_tick_of_the_last_sample() {
     assert_eq!(steps(&mut rig), ("stepper_position oid=0 pos=-6".into(), "stepper_position oid=1 pos=-6".into()));
 }
 
-/// The computer keeps the machine from running while 30 steps are due, amid which the axis meets its switch.
+/// The computer keeps the MCU from running while 30 steps are due, amid which the axis meets its switch.
 #[test]
-fn a_machine_that_stood_still_takes_steps_and_samples_in_their_order() {
+fn an_mcu_that_stood_still_takes_steps_and_samples_in_their_order() {
     const STEP_TICKS: u64 = 25_000;
     const REST_TICKS: u64 = 25_000;
     const SWITCH_AT: u64 = 40;
@@ -223,7 +223,7 @@ fn a_stepper_waits_for_one_trigger_at_a_time() {
 }
 
 #[test]
-fn a_search_without_rest_stops_the_machine_once_it_is_behind() {
+fn a_search_without_rest_stops_the_mcu_once_it_is_behind() {
     let mut rig = Rig::configured(OBJECTS);
     rig.send("endstop_home oid=2 clock=@1000 sample_ticks=50 sample_count=4 rest_ticks=0 pin_value=1 trsync_oid=3 trigger_reason=1");
     rig.run_until(2000);
@@ -250,7 +250,7 @@ fn homing_needs_a_trsync() {
 }
 
 #[test]
-fn a_switch_that_is_gone_stops_the_machine() {
+fn a_switch_that_is_gone_stops_the_mcu() {
     let mut rig = homing();
     rig.bench.state().broken.insert(SWITCH);
     rig.run_until(2000);

@@ -293,7 +293,7 @@ fn a_new_query_asks_the_chip_anew() {
 }
 
 #[test]
-fn an_i2c_failure_stops_the_machine_with_the_firmware_s_text() {
+fn an_i2c_failure_stops_the_mcu_with_the_firmware_s_text() {
     for setup in SETUPS.iter().filter(|setup| !setup.spi) {
         for (status, text) in [
             (Some(BusStatus::Nack), "I2C NACK"),
@@ -335,7 +335,7 @@ fn an_i2c_failure_stops_the_machine_with_the_firmware_s_text() {
 }
 
 #[test]
-fn an_spi_failure_stops_the_machine() {
+fn an_spi_failure_stops_the_mcu() {
     for setup in SETUPS.iter().filter(|setup| setup.spi) {
         let mut rig = Rig::configured(&setup.config());
         setup.plug(&rig, 100);
@@ -347,7 +347,7 @@ fn an_spi_failure_stops_the_machine() {
 }
 
 #[test]
-fn rubbish_keeps_the_machine_from_nothing() {
+fn rubbish_keeps_the_mcu_from_nothing() {
     for setup in SETUPS {
         for rubbish in [0x00, 0xff] {
             let mut rig = Rig::new();

@@ -149,7 +149,7 @@ fn gain_and_channel_are_chosen_by_pulses_after_the_sample() {
 #[test]
 fn the_chip_is_off_while_nothing_is_measured() {
     let (mut rig, _chip) = rig(0, 1, 500);
-    assert!(rig.bench.level(SCLK) && rig.bench.shutdown_level(SCLK));
+    assert!(rig.bench.level(SCLK) && rig.bench.shutdown_value(SCLK));
     rig.send(QUERY);
     assert_eq!(rig.edges(SCLK), [(500, 0)], "a command is over before the next one runs");
     rig.run_until(10 * PERIOD);
@@ -293,7 +293,7 @@ fn what_is_wrong_with_it_is_refused() {
 }
 
 #[test]
-fn lines_that_fail_stop_the_machine_and_it_can_be_configured_anew() {
+fn lines_that_fail_stop_the_mcu_and_it_can_be_configured_anew() {
     for (pin, text) in [(DOUT, "GPIO line read failed"), (SCLK, "GPIO line write failed")] {
         let (mut rig, chip) = rig(7, 1, 1000);
         rig.send(QUERY);

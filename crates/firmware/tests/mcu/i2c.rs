@@ -51,7 +51,7 @@ fn a_register_is_written_and_read_as_one_conversation() {
 }
 
 #[test]
-fn each_failure_has_its_status_and_the_machine_goes_on() {
+fn each_failure_has_its_status_and_the_mcu_goes_on() {
     for (status, number) in
         [(BusStatus::Nack, 1), (BusStatus::Timeout, 2), (BusStatus::StartNack, 3), (BusStatus::StartReadNack, 4)]
     {
@@ -184,7 +184,7 @@ fn a_bus_is_set_in_the_configuration_and_has_to_be_there() {
 }
 
 #[test]
-fn a_stopped_machine_ends_what_is_under_way_and_starts_anew() {
+fn a_stopped_mcu_ends_what_is_under_way_and_starts_anew() {
     let mut rig = Rig::with_workers(50_000, DEVICE);
     plug(&rig, &[]);
     rig.begin("i2c_transfer oid=0 write=10 read_len=1");

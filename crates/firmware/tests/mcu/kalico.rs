@@ -27,7 +27,7 @@ fn a_ds18b20_may_ignore_its_limits() {
 }
 
 #[test]
-fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_machine() {
+fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_mcu() {
     for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 1, true), (Master, 0, true)] {
         let mut rig = Rig::of(generation);
         // A fault, and out of range.
@@ -46,7 +46,7 @@ fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_machine() {
 }
 
 #[test]
-fn an_analog_input_without_a_count_of_invalid_readings_never_stops_the_machine() {
+fn an_analog_input_without_a_count_of_invalid_readings_never_stops_the_mcu() {
     for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 2, true), (V0_13, 0, true)] {
         let mut rig = Rig::of(generation);
         rig.configure(&["config_analog_in oid=0 pin=400"]);
@@ -108,7 +108,7 @@ const ADS1220: &str = "config_ads1220 oid=1 spi_oid=0 data_ready_pin=10";
 /// Channels 1 and 3 of four.
 const ADS131M04: &str = "config_ads131m0x oid=1 spi_oid=0 data_ready_pin=10 sensor_channel_count=4 channel_mask=10";
 
-/// A machine with a sensor and a probe: half a gram a count, tared at 100.
+/// An MCU with a sensor and a probe: half a gram a count, tared at 100.
 fn rig(sensor: &str, values: Values) -> (Rig, Arc<Mutex<u8>>) {
     let mut rig = Rig::of(Kalico);
     let status = plug(&rig, sensor == ADS131M04, values);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The machine in virtual time, through its public API: what a host can see of it, to the
+//! The MCU in virtual time, through its public API: what a host can see of it, to the
 //! tick and the same each time.
 
 mod adxl345;

@@ -95,7 +95,7 @@ fn bits_of_registers_are_cleared_and_set() {
 }
 
 #[test]
-fn a_chip_that_does_not_answer_stops_the_machine_in_the_words_of_its_time() {
+fn a_chip_that_does_not_answer_stops_the_mcu_in_the_words_of_its_time() {
     use BusStatus::{Nack, StartNack, StartReadNack, Timeout};
     const WRITE: &str = "i2c_write oid=0 data=1020";
     const READ: &str = "i2c_read oid=0 reg=10 read_len=1";
@@ -416,7 +416,7 @@ fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
 }
 
 #[test]
-fn a_sensor_whose_bus_fails_stops_the_machine_in_the_words_of_its_time() {
+fn a_sensor_whose_bus_fails_stops_the_mcu_in_the_words_of_its_time() {
     for (generation, query, text) in [
         (V0_11, "query_mpu9250 oid=1 clock=@5000 rest_ticks=4000", "Unable to read i2c device"),
         (V0_12, "query_mpu9250 oid=1 clock=@5000 rest_ticks=4000", "Unable to read i2c device"),
@@ -493,7 +493,7 @@ fn a_measurement_may_begin_amid_the_end_of_another() {
 }
 
 #[test]
-fn a_machine_that_stops_amid_a_measurement_measures_no_more() {
+fn an_mcu_that_stops_amid_a_measurement_measures_no_more() {
     for stop_at in (4900..9000).step_by(100) {
         let mut rig = configured(V0_12, ADXL345);
         plug_adxl345(&rig);
@@ -590,7 +590,7 @@ fn an_eddy_current_probe_triggers_above_its_threshold() {
 }
 
 #[test]
-fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_silent_the_machine() {
+fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_silent_the_mcu() {
     for generation in [V0_13, Kalico] {
         let (mut rig, value) = ldc1612(generation);
         rig.send_all(&[

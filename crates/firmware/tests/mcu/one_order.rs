@@ -87,7 +87,7 @@ fn a_reading_that_a_timer_began_holds_nothing() {
 }
 
 #[test]
-fn a_stopped_machine_is_held_by_nothing() {
+fn a_stopped_mcu_is_held_by_nothing() {
     let mut rig = Rig::with_workers(200_000, DISPLAY);
     rig.begin("spi_transfer oid=0 data=01");
     rig.mcu.shut_down(pinion_firmware::shutdown::Shutdown::because(
@@ -101,7 +101,7 @@ fn a_stopped_machine_is_held_by_nothing() {
 }
 
 #[test]
-fn a_bus_that_hangs_stops_the_machine_when_the_host_has_given_up() {
+fn a_bus_that_hangs_stops_the_mcu_when_the_host_has_given_up() {
     let mut rig = Rig::with_workers(4_000_000_000, DISPLAY);
     rig.begin("spi_transfer oid=0 data=01");
     rig.run_until(249_999_999);
@@ -114,7 +114,7 @@ fn a_bus_that_hangs_stops_the_machine_when_the_host_has_given_up() {
 
 /// After a `clear_shutdown` commands wait for that bus again, and no longer than before.
 #[test]
-fn a_bus_that_still_hangs_stops_the_machine_again() {
+fn a_bus_that_still_hangs_stops_the_mcu_again() {
     let mut rig = Rig::with_workers(4_000_000_000, DISPLAY);
     rig.begin("spi_transfer oid=0 data=01");
     rig.run_until(260_000_000);
@@ -137,7 +137,7 @@ fn transfers_that_end_in_time_never_add_up_to_one_that_hangs() {
 }
 
 #[test]
-fn a_transfer_that_fails_stops_the_machine_once_and_the_next_configuration_works() {
+fn a_transfer_that_fails_stops_the_mcu_once_and_the_next_configuration_works() {
     let mut rig = Rig::with_workers(1000, DISPLAY);
     rig.bench.state().broken.insert(SPI_CHIPS);
     rig.send("spi_transfer oid=0 data=01");

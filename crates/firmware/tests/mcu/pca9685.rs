@@ -82,7 +82,7 @@ fn queued_values_go_to_the_chip_at_their_instants() {
 }
 
 #[test]
-fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_machine() {
+fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
     for (commands, text) in [
         (&["queue_pca9685_out oid=0 clock=@1000 value=9"][..], "Missed scheduling of next pca9685 event"),
         (
@@ -166,7 +166,7 @@ fn what_can_not_be_is_refused() {
 }
 
 #[test]
-fn a_chip_that_goes_silent_stops_the_machine_and_is_tried_until_it_answers() {
+fn a_chip_that_goes_silent_stops_the_mcu_and_is_tried_until_it_answers() {
     let (mut rig, _) = rig(1000, &[OUTPUT, FREE]);
     rig.bench.plug_i2c(1, ADDRESS, |_, _, _| Err(BusStatus::Nack));
     let now = rig.now();
@@ -200,7 +200,7 @@ fn a_value_that_is_not_acknowledged_is_written_again() {
 }
 
 #[test]
-fn a_chip_that_stays_silent_does_not_keep_the_machine_from_the_next_configuration() {
+fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() {
     let says_nothing = |_: u64, _: &[u8], _: &mut [u8]| Err(BusStatus::Nack);
     let (mut rig, _) = rig(1000, &[OUTPUT, FREE]);
     rig.bench.plug_i2c(1, ADDRESS, says_nothing);
@@ -222,7 +222,7 @@ fn a_chip_that_stays_silent_does_not_keep_the_machine_from_the_next_configuratio
     assert_eq!(bytes(&chip), [[14, 0, 0, 0, 0x10], [66, 0, 0x10, 0, 0]]);
     assert_eq!(rig.notes(), ["safe: PCA9685"]);
 
-    // Silent again: the machine can be configured, without that chip.
+    // Silent again: the MCU can be configured, without that chip.
     rig.bench.plug_i2c(1, ADDRESS, says_nothing);
     rig.send("config_reset");
     rig.forget_responses();

@@ -53,7 +53,7 @@ fn a_change_beyond_max_duration_is_refused() {
 }
 
 #[test]
-fn a_channel_that_fails_stops_the_machine() {
+fn a_channel_that_fails_stops_the_mcu() {
     let mut rig = Rig::configured(&[HEATER]);
     rig.bench.state().broken.insert(PWM);
     rig.send("queue_pwm_out oid=0 clock=@1000 value=1");
@@ -109,7 +109,7 @@ fn a_channel_that_is_set_once_stays_and_may_be_set_again() {
 }
 
 #[test]
-fn a_channel_that_was_set_and_fails_stops_the_machine() {
+fn a_channel_that_was_set_and_fails_stops_the_mcu() {
     let mut rig = Rig::with_workers(2000, &[SET]);
     rig.bench.state().broken.insert(PWM);
     rig.send(SET);

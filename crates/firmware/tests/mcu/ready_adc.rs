@@ -222,7 +222,7 @@ fn a_frame_that_is_damaged_and_a_chip_that_was_reset_are_errors_that_end_homing(
 }
 
 #[test]
-fn a_bus_that_fails_stops_the_machine_and_it_can_be_configured_anew() {
+fn a_bus_that_fails_stops_the_mcu_and_it_can_be_configured_anew() {
     for (sensor, frame) in [(ADS1220, ads1220 as fn(u64) -> Vec<u8>), (ADS131M02, ads131m02)] {
         let (mut rig, _adc) = rig(sensor, frame, 2000);
         rig.send(&query(sensor));

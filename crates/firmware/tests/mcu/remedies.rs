@@ -183,7 +183,7 @@ fn a_full_move_queue_is_named() {
 }
 
 #[test]
-fn a_machine_that_is_late_says_how_late_and_why() {
+fn an_mcu_that_is_late_says_how_late_and_why() {
     let mut rig = Rig::configured(&[OUTPUT, "set_digital_out_pwm_cycle oid=3 cycle_ticks=100"]);
     rig.send("queue_digital_out oid=3 clock=@1000 on_ticks=50");
     rig.run_until(2000);

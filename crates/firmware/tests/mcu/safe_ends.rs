@@ -84,7 +84,7 @@ fn a_reset_waits_for_no_more_than_the_last_writes() {
 
 /// The firmware looks at the first 20 timers, then at each 100, whether they are 100 ms late.
 #[test]
-fn a_timer_that_repeats_in_the_past_stops_the_machine_where_the_firmware_stops() {
+fn a_timer_that_repeats_in_the_past_stops_the_mcu_where_the_firmware_stops() {
     let pulses = |late_ticks: u64| {
         let mut rig = Rig::new();
         rig.configure(&[

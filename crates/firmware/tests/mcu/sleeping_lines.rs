@@ -8,7 +8,7 @@ const PIN: u32 = 50;
 const FAN: &str = "config_digital_out oid=0 pin=50 value=0 default_value=0 max_duration=0";
 const STEPPER: &str = "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0";
 
-/// A machine whose pins 50 and 51 are an expander's, which takes 20000 ticks (0.4 ms) for a call.
+/// An MCU whose pins 50 and 51 are an expander's, which takes 20000 ticks (0.4 ms) for a call.
 fn rig(objects: &[&str]) -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().sleeping.extend([PIN, PIN + 1]);
@@ -127,7 +127,7 @@ fn a_query_is_answered_with_a_fresh_look_before_the_next_command() {
 }
 
 #[test]
-fn a_chip_that_fails_stops_the_machine_and_is_tried_until_it_answers() {
+fn a_chip_that_fails_stops_the_mcu_and_is_tried_until_it_answers() {
     let mut rig = rig(&[FAN]);
     rig.send("update_digital_out oid=0 value=1");
     rig.bench.state().broken.insert(PIN);
@@ -204,7 +204,7 @@ fn one_failed_look_ends_no_homing_and_three_do_at_once() {
 }
 
 #[test]
-fn a_homing_whose_chip_hangs_stops_the_machine_after_100_ms() {
+fn a_homing_whose_chip_hangs_stops_the_mcu_after_100_ms() {
     let mut rig = rig(HOMING);
     home(&mut rig, 10_000);
     rig.run_until(100_000);
@@ -234,7 +234,7 @@ fn a_query_looks_again_for_100_ms() {
 }
 
 #[test]
-fn an_output_is_written_again_before_that_stops_the_machine() {
+fn an_output_is_written_again_before_that_stops_the_mcu() {
     let mut rig = rig(&[FAN]);
     rig.bench.state().nacks.insert(PIN, 2);
     rig.send("update_digital_out oid=0 value=1");

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the machine tells of itself: levels, queues, what went over a bus, why it stopped.
+//! What the MCU tells of itself: levels, queues, what went over a bus, why it stopped.
 
 use pinion_firmware::board::{BusStatus, Pin};
 use pinion_firmware::mcu::{BusCounts, LineUse, Present, Snapshot};

@@ -86,7 +86,7 @@ fn an_i2c_wire_is_an_open_drain_and_an_empty_bus_acknowledges_nothing() {
 }
 
 #[test]
-fn a_wire_that_stays_low_is_a_timeout_and_the_machine_goes_on() {
+fn a_wire_that_stays_low_is_a_timeout_and_the_mcu_goes_on() {
     for (high, held) in [(SDA, "SCL stays low"), (SCL, "SDA stays low")] {
         let mut rig = Rig::configured(I2C);
         rig.bench.script_input(high, &[(0, 1)]);

@@ -37,7 +37,7 @@ fn the_chip_select_idles_and_is_driven_for_the_transfer() {
             "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
         ]);
         assert_eq!(rig.bench.level(CS), active_high == 0);
-        assert_eq!(rig.bench.shutdown_level(CS), active_high == 0);
+        assert_eq!(rig.bench.shutdown_value(CS), active_high == 0);
         rig.send("spi_send oid=0 data=01");
         assert_eq!(rig.edges(CS), [(0, selected), (0, 1 - selected)]);
     }
@@ -105,7 +105,7 @@ fn a_shutdown_message_needs_a_device() {
 }
 
 #[test]
-fn a_chip_select_that_fails_stops_the_machine() {
+fn a_chip_select_that_fails_stops_the_mcu() {
     let mut rig = Rig::configured(&[
         "config_spi oid=0 pin=40 cs_active_high=0",
         "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",

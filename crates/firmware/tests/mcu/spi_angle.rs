@@ -204,7 +204,7 @@ fn a_transfer_waits_for_the_measurement_under_way() {
 }
 
 #[test]
-fn a_machine_that_stops_amid_everything_is_there_for_the_next_configuration() {
+fn an_mcu_that_stops_amid_everything_is_there_for_the_next_configuration() {
     for chip in [A1333, AS5047D, TLE5012B] {
         for stop_at in (1000..8000).step_by(500) {
             let mut rig = rig(chip, 0, 1500);
@@ -232,7 +232,7 @@ fn a_machine_that_stops_amid_everything_is_there_for_the_next_configuration() {
 }
 
 #[test]
-fn a_bus_that_fails_stops_the_machine() {
+fn a_bus_that_fails_stops_the_mcu() {
     for command in
         ["query_spi_angle oid=1 clock=@1000 rest_ticks=1000 time_shift=0", "spi_angle_transfer oid=1 data=8442"]
     {

@@ -114,7 +114,7 @@ fn a_pulse_is_measured_from_when_the_pin_was_written() {
 }
 
 #[test]
-fn a_step_more_than_a_millisecond_late_stops_the_machine() {
+fn a_step_more_than_a_millisecond_late_stops_the_mcu() {
     for (interval, ends) in [(50_000, false), (0, true)] {
         let mut rig =
             Rig::configured(&["config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=51000"]);
@@ -300,7 +300,7 @@ fn the_step_clock_can_not_be_reset_while_steps_are_queued() {
 }
 
 #[test]
-fn a_move_without_steps_stops_the_machine() {
+fn a_move_without_steps_stops_the_mcu() {
     let mut rig = Rig::configured(&[PULSED]);
     rig.send("queue_step oid=0 interval=1000 count=0 add=0");
     assert_eq!(rig.shutdown().as_deref(), Some("Invalid count parameter"));

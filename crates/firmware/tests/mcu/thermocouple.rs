@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Thermocouple converters: read in intervals, and a machine that stops when they tell nothing good.
+//! Thermocouple converters: read in intervals, and an MCU that stops when they tell nothing good.
 
 use std::sync::{Arc, Mutex};
 
@@ -11,7 +11,7 @@ const MAX31856: u8 = 1;
 const MAX31865: u8 = 2;
 const MAX6675: u8 = 3;
 
-/// Asked every 10000 ticks from 1000 on; three bad values in a row stop the machine.
+/// Asked every 10000 ticks from 1000 on; three bad values in a row stop the MCU.
 const QUERY: &str =
     "query_thermocouple oid=1 clock=@1000 rest_ticks=10000 min_value=100 max_value=4294967040 max_invalid_count=3";
 
@@ -72,7 +72,7 @@ fn with_word(answer_ticks: u32, word: u16) -> (Rig, Arc<Mutex<u16>>) {
 }
 
 #[test]
-fn the_third_bad_value_in_a_row_stops_the_machine() {
+fn the_third_bad_value_in_a_row_stops_the_mcu() {
     // Below the range; a fault bit.
     for (bad, fault) in [(96, 0), (404, 4)] {
         let (mut rig, word) = with_word(0, 400);
@@ -159,7 +159,7 @@ fn a_query_without_rest_ends_it() {
 }
 
 #[test]
-fn a_bus_that_fails_stops_the_machine_and_it_can_be_configured_anew() {
+fn a_bus_that_fails_stops_the_mcu_and_it_can_be_configured_anew() {
     let (mut rig, _) = with_word(500, 400);
     rig.send(QUERY);
     rig.bench.state().broken.insert(SPI_CHIPS);

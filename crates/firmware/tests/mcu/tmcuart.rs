@@ -153,7 +153,7 @@ fn serial_bits_are_klippys() {
 fn a_single_wire_is_driven_but_while_it_listens() {
     let mut rig = Rig::configured(&[ONE_WIRE]);
     let direction = |rig: &Rig| rig.bench.state().directions[&TX];
-    let idle = Direction::Output { level: true, shutdown_level: true };
+    let idle = Direction::Output { level: true, shutdown_value: true };
     assert_eq!(direction(&rig), idle);
     rig.bench.state().turns.clear();
     rig.bench.script_input(TX, &speak(IFCNT, 100_000, 1250.0));
@@ -237,7 +237,7 @@ fn commands_and_steps_do_not_wait_for_a_message() {
 }
 
 #[test]
-fn a_message_too_long_stops_the_machine() {
+fn a_message_too_long_stops_the_mcu() {
     for command in ["tmcuart_send oid=0 write=0102030405060708090a0b read=0", "tmcuart_send oid=0 write=00 read=11"] {
         let mut rig = Rig::configured(&[TWO_WIRES]);
         rig.send(command);
@@ -269,7 +269,7 @@ fn a_shutdown_leaves_the_line_high_and_says_nothing_more() {
 }
 
 #[test]
-fn a_line_that_is_gone_stops_the_machine() {
+fn a_line_that_is_gone_stops_the_mcu() {
     for (pin, reason) in [(TX, "GPIO line write failed"), (RX, "GPIO line read failed")] {
         let mut rig = Rig::configured(&[TWO_WIRES]);
         rig.bench.state().broken.insert(pin);

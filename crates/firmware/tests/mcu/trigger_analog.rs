@@ -35,7 +35,7 @@ fn home(rig: &mut Rig, clock: u64) {
     rig.send(&format!("trigger_analog_home oid=4 trsync_oid=1 trigger_reason=1 error_reason=40 {clock}"));
 }
 
-/// A machine that homes as values come in: those of the ADC less `offset`.
+/// An MCU that homes as values come in: those of the ADC less `offset`.
 fn homing(offset: i32, trigger_type: u8, trigger_value: i32, values: &[u16]) -> Rig {
     let mut rig = Rig::configured(OBJECTS);
     rig.send_all(&[

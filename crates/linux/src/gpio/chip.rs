@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The GPIO chips of a machine, and what the kernel tells of them and their lines.
+//! The GPIO chips of a computer, and what the kernel tells of them and their lines.
 
 #![forbid(unsafe_code)]
 
@@ -43,7 +43,7 @@ pub struct LineInfo {
     pub consumer: Option<String>,
 }
 
-/// The chips of this machine by number, and why the others can not be read.
+/// The chips of this computer by number, and why the others can not be read.
 ///
 /// A node that is a link to another chip's (`/dev/gpiochip4` on a Raspberry Pi 5) is left out, as
 /// its lines are those of the other chip. Pins with its number work all the same.

@@ -318,7 +318,7 @@ pub fn is_plain_i2c(bus: &impl AsRawFd) -> io::Result<bool> {
     Ok(functions & 1 != 0)
 }
 
-/// After how many seconds without food a hardware watchdog resets the machine.
+/// After how many seconds without food a hardware watchdog resets the computer.
 pub fn watchdog_timeout_s(watchdog: BorrowedFd<'_>) -> io::Result<i32> {
     let mut seconds = 0;
     // SAFETY: the request writes an int, which lives through the call.

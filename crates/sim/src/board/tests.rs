@@ -45,7 +45,7 @@ impl Bench {
 
     fn output(&mut self, name: &str, value: bool) -> Arc<dyn Line> {
         let pin = self.pin(name);
-        self.board.line(pin, Direction::Output { level: value, shutdown_level: value }).unwrap().line
+        self.board.line(pin, Direction::Output { level: value, shutdown_value: value }).unwrap().line
     }
 
     fn input(&mut self, name: &str) -> Arc<dyn Line> {
@@ -297,7 +297,7 @@ fn a_wrong_pin_says_which_and_what_to_do() {
     let (step, endstop) = (pin("x_step", board), pin("x_endstop", board));
     let sensor = pin("bed_sensor", board);
     let nowhere = Pin(u32::MAX);
-    let output = Direction::Output { level: false, shutdown_level: false };
+    let output = Direction::Output { level: false, shutdown_value: false };
     let input = Direction::Input(Bias::None);
     let errors = [
         (board.line(nowhere, output).err(), reason::NOT_OUTPUT, "no pin 4294967295"),
@@ -464,13 +464,13 @@ fn use_all(config: SimConfig) {
     let mut lines: Vec<Arc<dyn Line>> = Vec::new();
     for number in 0..bench.board.pins.len() {
         let pin = Pin(number as u32);
-        let output = Direction::Output { level: true, shutdown_level: true };
+        let output = Direction::Output { level: true, shutdown_value: true };
         lines.extend(bench.board.line(pin, output).map(|claimed| claimed.line));
         lines.extend(bench.board.line(pin, Direction::Input(Bias::None)).map(|claimed| claimed.line));
         if let Ok(OnWorker { mut device, .. }) = bench.board.adc(pin) {
             device.read().unwrap();
         }
-        let cycle = Ticks::from_us(1000);
+        let cycle = Ticks::from_ms(1);
         let _ = bench.board.pwm(PwmConfig { pin, cycle, value: 12_345, shutdown_value: 0 });
     }
     let mut noise = Noise::of("bytes", 1);

@@ -17,10 +17,10 @@ pub fn seconds(earlier: Clock, later: Clock) -> f64 {
 
 /// A simulated motor follows at any pace: a computer without real time, as most that try the printer, is
 /// late by milliseconds now and then.
-pub(crate) const STEP_LATE_LIMIT: Ticks = Ticks::from_us(100_000);
+pub(crate) const STEP_LATE_LIMIT: Ticks = Ticks::from_ms(100);
 
 /// How far an errand may be ahead of the clock.
-const AHEAD: Ticks = Ticks::from_us(1000);
+const AHEAD: Ticks = Ticks::from_ms(1);
 
 thread_local! {
     /// The instant of the errand that this thread runs, if it runs one.

@@ -223,7 +223,7 @@ mod tests {
         // 1001 us are 750 of its timer: 23 measurements and 14.
         clock.set(Clock::EPOCH + Ticks::from_us(1001));
         transfer(&mut chip, &[]);
-        clock.set(Clock::EPOCH + Ticks::from_us(5000));
+        clock.set(Clock::EPOCH + Ticks::from_ms(5));
         let read = |chip: &mut Tle5012b| transfer(chip, &[0x84, 0x24, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
         let answer = read(&mut chip);
         assert_eq!(answer[2..4], (0x8000u16 | 0x400a).to_be_bytes());

@@ -81,7 +81,7 @@ fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
 }
 
 #[test]
-fn a_device_that_fails_or_disappears_stops_the_machine_by_name() {
+fn a_device_that_fails_or_disappears_stops_the_mcu_by_name() {
     let device = |name| adc::device(name).file_name().and_then(|name| name.to_str()).expect("a name").to_owned();
     let (first, second) = (device("mock-adc12"), device("mock-adc8"));
     let program = Program::start();

@@ -111,7 +111,7 @@ fn a_fan_of_20_000_rpm_is_measured() {
     }
 }
 
-/// At the slowest `poll_ticks`, so that what the emulated machine takes for a level is no matter.
+/// At the slowest `poll_ticks`, so that what the emulated computer takes for a level is no matter.
 #[test]
 fn glitches_are_not_counted_and_pulses_are_exactly() {
     let sim = GpioSim::new("lab", 8);

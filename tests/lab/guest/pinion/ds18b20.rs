@@ -36,7 +36,7 @@ fn reading(client: &mut Client, oid: u8) -> (i64, i64) {
 }
 
 #[test]
-fn sensors_are_read_by_name_and_one_that_is_taken_away_stops_the_machine() {
+fn sensors_are_read_by_name_and_one_that_is_taken_away_stops_the_mcu() {
     for number in [1, 2] {
         let folder = format!("/sys/bus/w1/devices/{}", sensor(number));
         sysfs::wait_until("the bus was searched", || std::fs::exists(format!("{folder}/w1_slave")).unwrap_or(false));

@@ -140,7 +140,7 @@ impl Heater {
         self.sim.level(0)
     }
 
-    /// The machine is stopped, and the program lives: nobody took it for one that hangs.
+    /// The MCU is stopped, and the program lives: nobody took it for one that hangs.
     fn assert_stopped_in_order(&self, mut program: Program, mut client: pinion_client::Client) {
         assert_eq!(shutdown_of(&mut client), "Rescheduled timer in the past");
         sysfs::wait_until("the heater is off", || !self.is_on());
@@ -156,7 +156,7 @@ impl Heater {
 }
 
 #[test]
-fn a_machine_that_was_stopped_with_its_guardian_stops_when_both_go_on() {
+fn an_mcu_that_was_stopped_with_its_guardian_stops_when_both_go_on() {
     let heater = Heater::new();
     for guardian_first in [true, false] {
         let program = Program::start();
@@ -218,7 +218,7 @@ impl Drop for ControlGroup {
 }
 
 #[test]
-fn a_machine_whose_control_group_was_frozen_stops_when_it_is_thawed() {
+fn an_mcu_whose_control_group_was_frozen_stops_when_it_is_thawed() {
     let heater = Heater::new();
     let program = Program::start();
     let group = ControlGroup::new();

@@ -94,7 +94,7 @@ fn switch_on(client: &mut Client) {
 }
 
 #[test]
-fn a_channel_that_fails_stops_the_machine_and_is_tried_again() {
+fn a_channel_that_fails_stops_the_mcu_and_is_tried_again() {
     let mut program = Program::start();
     let client = &mut program.connect();
     switch_on(client);

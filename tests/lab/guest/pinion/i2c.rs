@@ -54,7 +54,7 @@ fn registers_are_written_and_read_with_one_message_each_way() {
 }
 
 #[test]
-fn what_the_kernel_says_becomes_a_status_and_the_machine_goes_on() {
+fn what_the_kernel_says_becomes_a_status_and_the_mcu_goes_on() {
     let program = Program::start();
     let client = &mut program.connect();
     let bus = bus_name();

@@ -171,7 +171,7 @@ fn pins_that_can_not_be_are_refused_and_the_log_says_why() {
 }
 
 #[test]
-fn a_chip_that_goes_away_stops_the_machine_and_a_restart_starts_anew() {
+fn a_chip_that_goes_away_stops_the_mcu_and_a_restart_starts_anew() {
     let (kept, first, second) =
         (GpioSim::new("kept", 8), GpioSim::builder("first", 8).name(2, "FAN").build(), GpioSim::new("second", 8));
     let mut program = Program::start();
@@ -228,7 +228,7 @@ fn after_a_kill_a_restart_claims_the_lines() {
 
 #[test]
 fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
-    // Only a tenth chip's lines have no names that every machine has.
+    // Only a tenth chip's lines have no names that every computer has.
     let before: Vec<GpioSim> = (0..9).map(|n| GpioSim::new(&format!("before{n}"), 1)).collect();
     let program = Program::start();
     let late = GpioSim::builder("late", 8).name(3, "LAMP").build();

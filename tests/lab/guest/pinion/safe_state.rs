@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Outputs go to their shutdown values however the machine is stopped.
+//! Outputs go to their shutdown values however the MCU is stopped.
 
 use std::fs;
 use std::path::Path;

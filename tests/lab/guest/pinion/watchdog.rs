@@ -12,7 +12,7 @@ use nix::sys::signal::Signal;
 use crate::program::{Program, configure};
 use crate::{sysfs, uapi};
 
-/// Unfed for so long it would reset the machine.
+/// Unfed for so long it would reset the computer.
 const LIMIT_S: u32 = 10;
 /// Time costs nothing here: it jumps while nobody has anything to do.
 const LONGER: Duration = Duration::from_secs(15);
@@ -21,7 +21,7 @@ fn is_active() -> bool {
     sysfs::read("/sys/class/watchdog/watchdog0/state") == "active"
 }
 
-/// Whether it would have reset the machine since this test began.
+/// Whether it would have reset the computer since this test began.
 fn has_fired() -> bool {
     let log = Command::new("dmesg").output().expect("busybox").stdout;
     String::from_utf8_lossy(&log).contains("Triggered - Reboot ignored")

@@ -17,10 +17,10 @@ use crate::program::{self, Program};
 use crate::sysfs;
 use crate::trace::{Calls, Trace};
 
-/// Of the lab's machine: see `TIME` in `tests/lab/vm.rs`.
+/// Of the lab's VM: see `TIME` in `tests/lab/vm.rs`.
 const NS_PER_INSTRUCTION: f64 = 1.0;
 /// The steps of a move last about this long, as klippy's do.
-const MOVE: Ticks = Ticks::from_us(25_000);
+const MOVE: Ticks = Ticks::from_ms(25);
 /// Moves that are queued before the first step, and that the queue is kept ahead by.
 const MOVES_AHEAD: u32 = 20;
 /// From the first moves' sending to the first step.
@@ -124,7 +124,7 @@ impl Session {
     }
 
     /// Runs a load. Of the part in which all steppers move, `look` sees the beginning and the end.
-    /// Returns when the first interval began, or why the machine stopped.
+    /// Returns when the first interval began, or why the MCU stopped.
     fn run(&mut self, load: &Load, look: impl FnMut(&Program)) -> Result<Clock, String> {
         match self.try_run(load, look) {
             Ok(start) => Ok(start),
@@ -208,7 +208,7 @@ impl Session {
     }
 }
 
-/// Prints a figure of every case, or why the machine stopped, which Pinion's may not.
+/// Prints a figure of every case, or why the MCU stopped, which Pinion's may not.
 fn figures(of: &str, transfers: bool, measure: impl Fn(&mut Session, &Load, &str) -> Result<String, String>) {
     for &(thousands, moves, steppers) in CASES {
         let load = Load::steady(thousands, moves, steppers, transfers);

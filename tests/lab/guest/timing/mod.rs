@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Costs and lateness where time counts instructions: 1 ns for each, on every
-//! host. The thresholds leave room for another kernel, not for another machine.
+//! host. The thresholds leave room for another kernel, not for another computer.
 
 mod figures;
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the machine itself costs, in virtual time and with lines that do nothing: decoding and
+//! What the MCU itself costs, in virtual time and with lines that do nothing: decoding and
 //! dispatch of commands, a step's event, the dictionary.
 
 use std::hint::black_box;
@@ -16,7 +16,7 @@ use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_testbench::board::{Bench, FakeBoard};
 use pinion_testbench::rig::{FIRMWARE, Rig};
 
-/// The bench's board with outputs that do nothing: what is left is the machine.
+/// The bench's board with outputs that do nothing: what is left is the MCU.
 struct Quiet(FakeBoard);
 
 struct QuietLine;
