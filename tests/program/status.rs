@@ -320,7 +320,7 @@ fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
     until("\x1b[?1049l", 1);
     let stat = || fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
     let is_stopped = || stat().rsplit_once(") ").unwrap().1.starts_with('T');
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + WAIT_MAX;
     while !is_stopped() && Instant::now() < end {
         thread::sleep(std::time::Duration::from_millis(10));
     }
