@@ -46,9 +46,9 @@ const CONFIG_BELL: Command = command!("config_bell oid=%c pin=%u", |mcu, oid: Oi
     mcu.assign_on(pin, oid, Bell { line, swinging: false, struck: false })
 });
 
-const RING_BELL: Command = command!("ring_bell oid=%c clock=%u", |mcu, oid: Oid, clock: WireClock| {
-    let at = mcu.instant(clock);
-    mcu.with::<Bell, _>(oid, |bell, turn| bell.ring(turn, at))
+const RING_BELL: Command = command!("ring_bell oid=%c clock=%u", Bell, |bell, turn, clock: WireClock| {
+    let at = turn.instant(clock);
+    bell.ring(turn, at)
 });
 
 impl Bell {

@@ -50,12 +50,10 @@ const CONFIG_EAR: Command = command!("config_ear oid=%c spi_oid=%c", |mcu, oid: 
 });
 
 const QUERY_EAR: Command =
-    command!("query_ear oid=%c clock=%u rest_ticks=%u", |mcu, oid: Oid, clock: WireClock, rest_ticks: Ticks| {
-        let at = mcu.instant(clock);
-        mcu.with::<Ear, _>(oid, |ear, turn| {
-            ear.rest_ticks = rest_ticks;
-            turn.schedule(TIMER, at)
-        })
+    command!("query_ear oid=%c clock=%u rest_ticks=%u", Ear, |ear, turn, clock: WireClock, rest_ticks: Ticks| {
+        let at = turn.instant(clock);
+        ear.rest_ticks = rest_ticks;
+        turn.schedule(TIMER, at)
     });
 
 impl Object for Ear {
