@@ -29,6 +29,7 @@ pub(crate) mod helpers;
 mod host;
 mod host_end;
 mod introduction;
+pub(crate) mod latency;
 mod ledger;
 mod link;
 mod lookout;

@@ -7,6 +7,7 @@
 use std::fs;
 use std::hint;
 use std::io;
+use std::path::Path;
 use std::thread;
 
 use log::{debug, info, warn};
@@ -17,6 +18,7 @@ use nix::sys::prctl;
 use nix::sys::resource::{RLIM_INFINITY, Resource, getrlimit, rlim_t};
 use nix::unistd::Pid;
 
+use crate::foreign;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
 
@@ -276,6 +278,21 @@ impl Processors {
                 .and_then(|()| sched_setaffinity(MYSELF, &others))
                 .is_ok()
     }
+}
+
+/// Whether a kernel is PREEMPT_RT; `None` if nothing tells. `root` is the root of its /proc and /sys.
+pub(crate) fn is_preempt_rt(root: &Path) -> Option<bool> {
+    const BYTES_MAX: u64 = 4096;
+    let text = |file: &str| {
+        let bytes = foreign::read(&root.join(file), BYTES_MAX).ok()?;
+        Some(String::from_utf8_lossy(&bytes).trim().to_owned())
+    };
+    // The patches for older kernels tell it in /sys, the kernel itself (since 6.12) in its version only.
+    if text("sys/kernel/realtime").is_some_and(|text| text == "1") {
+        return Some(true);
+    }
+    let version = text("proc/version")?;
+    Some(version.contains("PREEMPT_RT") || version.contains("PREEMPT RT"))
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
+use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
 use std::sync::{Arc, Mutex};
@@ -10,8 +11,9 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::pty::{Winsize, openpty};
-use nix::sys::signal::Signal;
+use nix::sys::signal::{Signal, kill};
 use nix::sys::termios::{LocalFlags, tcgetattr};
+use nix::unistd::Pid;
 use pinion_client::Client;
 
 use crate::process::{Pinion, WAIT_MAX, closed_pipe, exists, output};
@@ -149,6 +151,36 @@ fn q_ends_the_program_and_gives_the_keys_back() {
     assert!(!exists(&folder.path().join("tty")));
     assert!(keys(), "the terminal is as before");
     let _ = reader.join();
+}
+
+/// As a person does who presses Ctrl-\\, or a service manager whose program hangs.
+#[test]
+fn a_signal_that_kills_the_program_gives_the_terminal_back() {
+    let terminal = openpty(None, None).unwrap();
+    let before = tcgetattr(&terminal.master).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let mut pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["sim", "--show", "-I"])
+        .arg(folder.path().join("tty"))
+        .stdin(terminal.slave.try_clone().unwrap())
+        .stdout(terminal.slave)
+        .stderr(Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut master = File::from(terminal.master);
+    let (mut shown, mut piece) = (String::new(), [0; 4096]);
+    let mut until = |wanted: &str| {
+        while !shown.contains(wanted) {
+            let read = master.read(&mut piece).unwrap();
+            shown += &String::from_utf8_lossy(&piece[..read]);
+        }
+    };
+    // The picture has its rows.
+    until("\x1b[1;");
+    kill(Pid::from_raw(pinion.id() as i32), Signal::SIGQUIT).unwrap();
+    until("\x1b[r\x1b[999;1H");
+    assert_eq!(pinion.wait().unwrap().signal(), Some(Signal::SIGQUIT as i32));
+    assert_eq!(tcgetattr(&master).unwrap().local_flags, before.local_flags);
 }
 
 #[test]

@@ -336,6 +336,26 @@ fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
 }
 
 #[test]
+fn a_terminal_that_is_gone_ends_it() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.until("the socket", || exists(&socket(&pinion)));
+    let terminal = openpty(None, None).unwrap();
+    let mut watch = watch(&pinion, Stdio::from(terminal.slave.try_clone().unwrap()), Stdio::from(terminal.slave));
+    let mut master = File::from(terminal.master);
+    let (mut shown, mut piece) = (String::new(), [0; 4096]);
+    while !shown.contains("q ends") {
+        let read = master.read(&mut piece).unwrap();
+        shown += &String::from_utf8_lossy(&piece[..read]);
+    }
+    drop(master);
+    let end = Instant::now() + PATIENCE;
+    while watch.try_wait().unwrap().is_none() {
+        assert!(Instant::now() < end, "it goes on without a terminal");
+        thread::sleep(std::time::Duration::from_millis(20));
+    }
+}
+
+#[test]
 fn watching_into_a_pipe_is_a_page_each_second() {
     let pinion = Pinion::simulated(&[]);
     pinion.until("the socket", || exists(&socket(&pinion)));

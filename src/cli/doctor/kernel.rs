@@ -3,9 +3,8 @@
 
 #![forbid(unsafe_code)]
 
-use std::path::Path;
-
 use crate::cli::finding::Finding;
+use crate::runtime::realtime::is_preempt_rt;
 use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
 
 use super::instance::Instance;
@@ -17,17 +16,6 @@ const OLDEST: (u32, u32) = (4, 13);
 pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     let kernel = [version(machine), preempt_rt(machine), throttle(machine)].into_iter();
     kernel.chain(isolation(machine, instances)).chain(governor(machine)).collect()
-}
-
-/// Whether a kernel is PREEMPT_RT; none if nothing tells. `root` is that of its /proc and /sys.
-pub(in crate::cli) fn is_preempt_rt(root: &Path) -> Option<bool> {
-    let machine = Machine::at(root);
-    // The patches for older kernels tell it in /sys, the kernel itself (since 6.12) in its version only.
-    if machine.text("/sys/kernel/realtime").is_some_and(|text| text == "1") {
-        return Some(true);
-    }
-    let version = machine.text("/proc/version")?;
-    Some(version.contains("PREEMPT_RT") || version.contains("PREEMPT RT"))
 }
 
 /// Whether the kernel has what Pinion asks of it.

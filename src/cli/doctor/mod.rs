@@ -11,10 +11,10 @@ use std::process::ExitCode;
 
 use clap::{Args, ValueHint};
 
+use crate::runtime::latency::{self, Fitness, Verdict};
 use pinion_linux::Inventory;
 
 use super::finding::{self, Finding, Group};
-use super::latency::{self, Fitness, Verdict};
 use super::page::Page;
 use super::{failed, quietly};
 
@@ -28,7 +28,6 @@ mod printer;
 mod service;
 mod units;
 
-pub(super) use kernel::is_preempt_rt;
 use machine::Machine;
 
 /// How the package is had, which no repository of a distribution's has.

@@ -83,7 +83,7 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
 }
 
 fn gone(error: io::Error) -> String {
-    format!("the terminal can not be written: {error}")
+    format!("the terminal cannot be written: {error}")
 }
 
 /// What a key asks for.
