@@ -4,14 +4,15 @@
 use std::fs::{self, File};
 use std::io::{Read, Write};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::{FileTypeExt, PermissionsExt};
+use std::os::unix::fs::{FileTypeExt, OpenOptionsExt, PermissionsExt};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::thread;
 use std::time::Instant;
 
-use nix::pty::{Winsize, openpty};
+use nix::fcntl::OFlag;
+use nix::pty::{Winsize, grantpt, openpty, posix_openpt, ptsname_r, unlockpt};
 use nix::sys::signal::{Signal, kill};
 use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
 use nix::sys::termios::{LocalFlags, tcgetattr};
@@ -339,9 +340,16 @@ fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
 fn a_terminal_that_is_gone_ends_it() {
     let pinion = Pinion::simulated(&[]);
     pinion.until("the socket", || exists(&socket(&pinion)));
-    let terminal = openpty(None, None).unwrap();
-    let mut watch = watch(&pinion, Stdio::from(terminal.slave.try_clone().unwrap()), Stdio::from(terminal.slave));
-    let mut master = File::from(terminal.master);
+    // No child may inherit the master end: it would keep the terminal.
+    let mut master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).unwrap();
+    grantpt(&master).unwrap();
+    unlockpt(&master).unwrap();
+    let slave = || {
+        let mut options = File::options();
+        options.read(true).write(true).custom_flags(OFlag::O_NOCTTY.bits());
+        Stdio::from(options.open(ptsname_r(&master).unwrap()).unwrap())
+    };
+    let mut watch = watch(&pinion, slave(), slave());
     let (mut shown, mut piece) = (String::new(), [0; 4096]);
     while !shown.contains("q ends") {
         let read = master.read(&mut piece).unwrap();
