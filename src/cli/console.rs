@@ -45,8 +45,8 @@ use super::settings::{BoardName, sim_config};
 use super::terminal::{Terminal, off};
 use super::{failed, logging, not_permitted};
 
-/// How long a machine has to answer.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// Longest wait for an answer of the MCU.
+const ANSWER_WAIT_MAX: Duration = Duration::from_secs(2);
 /// How often a console that waits for a line looks for what the machine says.
 const LOOK: Duration = Duration::from_millis(20);
 /// How many lines are remembered.
@@ -196,7 +196,7 @@ fn lend_terminal(signals: &[i32]) -> Result<Option<Terminal>, String> {
 
 /// Speaks to the machine of a terminal: the lines of a file, of a pipe, or of a person.
 fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
-    let client = Client::connect(pty, PATIENCE).map_err(|error| error.to_string())?;
+    let client = Client::connect(pty, ANSWER_WAIT_MAX).map_err(|error| error.to_string())?;
     let console = Console::new(client);
     match &args.file {
         Some(path) => {

@@ -20,7 +20,7 @@ use crate::status::{self, Status};
 use super::StatusArgs;
 
 /// Longest wait for the answer. The server gives its core a second.
-const PATIENCE: Duration = Duration::from_secs(5);
+const ANSWER_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Longest answer that is read.
 const ANSWER_MAX: usize = 4 << 20;
 
@@ -93,7 +93,7 @@ fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
 
 /// The document that is sent at a socket.
 fn document_at(path: &Path) -> io::Result<Vec<u8>> {
-    let until = Instant::now() + PATIENCE;
+    let until = Instant::now() + ANSWER_WAIT_MAX;
     // Others may ask as well: then it takes a while until there is room for one more.
     let mut socket = loop {
         match connect(path) {

@@ -26,7 +26,7 @@ pub(crate) use socket::connect;
 pub use socket::socket_paths;
 
 /// Longest wait for the core's answer. It is longer than the core's longest nap.
-const PATIENCE: Duration = Duration::from_millis(1000);
+const ANSWER_WAIT_MAX: Duration = Duration::from_millis(1000);
 /// Time between two looks for the answer.
 const LOOK: Duration = Duration::from_millis(2);
 
@@ -88,7 +88,7 @@ impl Teller {
 impl Asker {
     /// Asks the core, and waits for the answer. `None` if it does not come in time.
     fn ask(&mut self) -> Option<&Answer> {
-        let until = Instant::now() + PATIENCE;
+        let until = Instant::now() + ANSWER_WAIT_MAX;
         // One that came too late for the last question.
         if let Ok(late) = self.answers.pop() {
             self.spare = Some(late);
