@@ -72,7 +72,7 @@ fn quiet(bench: Bench) -> Quiet {
 }
 
 /// `steppers` steppers whose moves are queued by the caller.
-fn machine(steppers: u8, invert_step: i8) -> Rig {
+fn rig_of(steppers: u8, invert_step: i8) -> Rig {
     let mut rig = Rig::on_board(10_000_000, quiet);
     let objects: Vec<String> = (0..steppers)
         .map(|oid| {
@@ -94,7 +94,7 @@ fn block(rig: &Rig, command: &str) -> (Vec<u8>, usize) {
 fn commands(c: &mut Criterion) {
     let mut group = c.benchmark_group("command");
 
-    let mut rig = machine(1, -1);
+    let mut rig = rig_of(1, -1);
     let (payload, count) = block(&rig, "debug_nop");
     group.throughput(Throughput::Elements(count as u64));
     group.bench_function("debug_nop, a block full", |b| b.iter(|| rig.execute(black_box(&payload))));
@@ -134,7 +134,7 @@ fn steps(c: &mut Criterion) {
         ("three steppers, both edges", 3, -1),
         ("eight steppers, both edges", 8, -1),
     ] {
-        let mut rig = machine(steppers, invert_step);
+        let mut rig = rig_of(steppers, invert_step);
         group.bench_function(name, |b| {
             b.iter_custom(|iterations| {
                 let mut spent = Duration::ZERO;
@@ -171,7 +171,7 @@ fn steps(c: &mut Criterion) {
 /// hundred times a second of their time. The two are measured in turns, so that their ratio holds on a busy computer,
 /// too.
 fn status(c: &mut Criterion) {
-    let mut rig = machine(8, -1);
+    let mut rig = rig_of(8, -1);
     let mut snapshot = Snapshot::default();
     c.bench_function("status, eight steppers", |b| {
         b.iter(|| {

@@ -30,7 +30,7 @@ const LINES_MAX: usize = 512;
 /// How long the program waits at its end until the queue is written.
 const FAREWELL: Duration = Duration::from_secs(1);
 /// How long a line that is written at once may wait for somebody to read, in milliseconds.
-const PATIENCE_MS: u16 = 1000;
+const WRITE_TIMEOUT_MS: u16 = 1000;
 /// How many bytes a pipe takes without blocking once poll(2) says that it can be written (`PIPE_BUF`).
 const PIECE_BYTES: usize = 4096;
 
@@ -172,7 +172,7 @@ impl Log for Stderr {
             self.changed.notify_all();
         } else {
             drop(queue);
-            put(&line, PATIENCE_MS.into());
+            put(&line, WRITE_TIMEOUT_MS.into());
         }
     }
 

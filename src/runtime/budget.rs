@@ -29,10 +29,10 @@ pub(super) enum Class {
 pub(super) struct Budget {
     class: Class,
     /// What is left, in 1/1024 ticks.
-    level: i64,
-    full: i64,
+    level_fine: i64,
+    full_fine: i64,
     /// How much the bucket fills in a tick, in 1/1024 ticks.
-    share: i64,
+    share_fine: i64,
     looked: Clock,
     /// When to look next.
     due: Clock,
@@ -42,8 +42,9 @@ pub(super) struct Budget {
 
 /// How long to wait between two looks at the thread's running time at least. Only the kernel knows it,
 /// as it also counts the way into a sleep and out of it; and to ask the kernel costs a system call.
-const LOOK: Ticks = Ticks::from_us(1000);
+const LOOK: Ticks = Ticks::from_ms(1);
 
+/// Fine units of a bucket in a tick.
 const FINE: i64 = 1024;
 
 /// The kernel's setting of the throttle, in microseconds.
@@ -69,8 +70,16 @@ impl Budget {
     /// kept in reserve, for what the kernel counts and the looks do not see.
     pub(super) fn new(throttle: Throttle, now: Clock, ran: Duration) -> Budget {
         let allowance = i64::from(throttle.runtime_us) * FINE / i64::from(throttle.period_us.max(1));
-        let full = i64::from(throttle.runtime_us) * i64::from(Ticks::from_us(1).0) * FINE / 20;
-        Budget { class: Class::Fifo, level: full, full, share: allowance * 9 / 10, looked: now, due: now + LOOK, ran }
+        let full_fine = i64::from(throttle.runtime_us) * i64::from(Ticks::from_us(1).0) * FINE / 20;
+        Budget {
+            class: Class::Fifo,
+            level_fine: full_fine,
+            full_fine,
+            share_fine: allowance * 9 / 10,
+            looked: now,
+            due: now + LOOK,
+            ran,
+        }
     }
 
     /// Whether the thread is to run as SCHED_FIFO at present.
@@ -81,7 +90,7 @@ impl Budget {
     /// Whether there is more than half of it, so that what is not urgent may use some.
     #[inline]
     pub(super) fn is_ample(&self) -> bool {
-        self.level > self.full / 2
+        self.level_fine > self.full_fine / 2
     }
 
     /// Whether it is time to [`Budget::look`].
@@ -98,13 +107,13 @@ impl Budget {
         self.looked = now;
         self.ran = ran;
         let drain = if self.class == Class::Fifo { spent * FINE } else { 0 };
-        self.level = (self.level + span * self.share - drain).min(self.full);
+        self.level_fine = (self.level_fine + span * self.share_fine - drain).min(self.full_fine);
         // To run for a tick drains no more than a tick, so half of what is left now is left then.
-        let half = if self.class == Class::Fifo { self.level / FINE / 2 } else { 0 };
+        let half = if self.class == Class::Fifo { self.level_fine / FINE / 2 } else { 0 };
         self.due = now + Ticks(half.clamp(i64::from(LOOK.0), i64::from(u32::MAX)) as u32);
         let class = match self.class {
-            Class::Fifo if self.level <= 0 => Class::Other,
-            Class::Other if self.level >= self.full / 2 => Class::Fifo,
+            Class::Fifo if self.level_fine <= 0 => Class::Other,
+            Class::Other if self.level_fine >= self.full_fine / 2 => Class::Fifo,
             _ => return None,
         };
         self.class = class;
@@ -115,7 +124,7 @@ impl Budget {
     /// full: if the thread was there before, it has filled again meanwhile.
     pub(super) fn moved(&mut self) {
         self.class = Class::Fifo;
-        self.level = self.full;
+        self.level_fine = self.full_fine;
     }
 }
 
@@ -194,7 +203,7 @@ mod tests {
                 ran += runs;
                 let change = budget.look(Clock::from_ticks((ms + 1) * 50_000), Duration::from_micros(ran));
                 assert_eq!(change, None, "{works} after {ms} ms");
-                assert!(budget.level > budget.full / 2 - budget.full / 20);
+                assert!(budget.level_fine > budget.full_fine / 2 - budget.full_fine / 20);
             }
             // All that the share leaves is used.
             assert!(polled > (840 - works) * 10_000, "{polled} of {works}");

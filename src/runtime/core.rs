@@ -63,7 +63,7 @@ pub(super) enum Request {
 /// No command is begun within this span of a timer: it takes a microsecond or two.
 const NEAR: Ticks = Ticks::from_us(5);
 /// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
-const FAR: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
+const FAR_TICKS: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
 /// What can wait is done only if no timer is within this span: to wake the link, which takes some microseconds, and to
 /// tell a part of the status, which takes one, or several where nothing of it is in the cache.
 const SOON: Ticks = Ticks::from_us(30);
@@ -76,7 +76,7 @@ const NEXT_COMMAND: Ticks = Ticks::from_us(30);
 /// How long the core polls for the answer of a bus that a command waits for.
 const ANSWER: Ticks = Ticks::from_us(100);
 /// How long another thread may keep the processor of one that yields (3.5 ms were measured).
-const SLICE: Ticks = Ticks::from_us(5000);
+const SLICE: Ticks = Ticks::from_ms(5);
 /// A command runs after it has yielded to this many timers.
 const YIELDS_MAX: u32 = 20;
 /// How long a program that ends waits for its outputs to be at their shutdown values. The
@@ -217,8 +217,8 @@ impl Core {
                 continue;
             }
             self.mcu.account(Ticks(now.since(busy_since) as u32));
-            let to_go = deadline.map_or(2 * FAR, |deadline| deadline.since(now));
-            let Some(deadline) = deadline.filter(|_| to_go <= FAR) else {
+            let to_go = deadline.map_or(2 * FAR_TICKS, |deadline| deadline.since(now));
+            let Some(deadline) = deadline.filter(|_| to_go <= FAR_TICKS) else {
                 // Half the way leaves room for a late wake-up.
                 self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));
                 busy_since = self.clock.now();
@@ -646,9 +646,9 @@ mod tests {
 
     #[test]
     fn the_core_sleeps_until_a_sample_is_due_and_does_not_spin_before_it() {
-        const REST: Ticks = Ticks::from_us(2000);
+        const REST: Ticks = Ticks::from_ms(2);
         let mut rig = Rig::new();
-        let first = (rig.clock.now() + Ticks::from_us(100_000)).wire();
+        let first = (rig.clock.now() + Ticks::from_ms(100)).wire();
         let query = "buttons_query oid=%c clock=%u rest_ticks=%u retransmit_count=%c invert=%c";
         rig.run(query, &[2, first, REST.0, 1, 0]);
         rig.wait_until("it is configured", |rig| rig.progress.done() == CONFIGURATION + 1);
@@ -741,7 +741,7 @@ mod tests {
     #[test]
     fn an_ordinary_thread_does_not_yield_with_a_timer_ahead() {
         let now = Clock::from_ticks(0);
-        let (soon, late) = (now + Ticks::from_us(1000), now + Ticks::from_us(10_000));
+        let (soon, late) = (now + Ticks::from_ms(1), now + Ticks::from_ms(10));
         assert!(!may_yield(false, now, Some(soon)));
         assert!(may_yield(false, now, Some(late)) && may_yield(false, now, None));
         assert!(may_yield(true, now, Some(soon)));

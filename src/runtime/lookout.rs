@@ -11,7 +11,7 @@
 use pinion_firmware::time::{Clock, Ticks};
 
 /// How long a thread may poll at a stretch, after it has not polled for some time.
-const RATION: i64 = Ticks::from_us(100_000).0 as i64;
+const RATION: i64 = Ticks::from_ms(100).0 as i64;
 /// A thread that does not poll earns one part in this many of the time for polling: at most a quarter of all time.
 const EARNS: i64 = 3;
 

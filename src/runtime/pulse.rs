@@ -503,7 +503,7 @@ mod tests {
             let silence = Duration::from_millis(550 + after - beat_ms);
             assert!(silence + FINE >= RUNNING && silence <= RUNNING + FINE, "{silence:?}");
             assert!(looks <= 3, "{looks} looks");
-            assert!(pulse.is_silent(at(550 + after) + Ticks::from_us(2000)));
+            assert!(pulse.is_silent(at(550 + after) + Ticks::from_ms(2)));
         }
     }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Hosts of several generations, each recognised by the sources that it runs from. A shell that is
-//! called as klippy is has the pty open; what klippy would say, our own host client says.
+//! called as klippy is has the pty open; what klippy would say, our own client says.
 
 use std::fs;
 use std::io::Write;

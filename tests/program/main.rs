@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The program from outside, over a real pty, with our own host client.
+//! The program from outside, over a real pty, with our own client.
 
 mod bad_input;
 mod commands;

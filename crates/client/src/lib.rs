@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The other end of the wire: a small host client for the demonstration of `pinion sim`, for the
+//! The other end of the wire: a small client for the demonstration of `pinion sim`, for the
 //! tests over a real pty, for the lab and for the benches.
 //!
 //! - [`serial`]: blocks over a tty, acknowledged and sent again as klippy does
@@ -32,7 +32,7 @@ pub use client::Client;
 pub use messages::{Arg, Params};
 pub use serial::BlockLink;
 
-/// Why the host client could not do something. Each prints as one line with a remedy.
+/// Why the client could not do something. Each prints as one line with a remedy.
 #[derive(Debug)]
 pub enum Error {
     /// The tty refused an operation.

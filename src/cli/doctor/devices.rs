@@ -428,10 +428,10 @@ fn throttled(machine: &Machine, vcgencmd: Option<&Path>) -> Option<u32> {
 
 /// What a program prints; none if it does not end within two seconds.
 fn output(command: &mut Command) -> Option<String> {
-    const PATIENCE: Duration = Duration::from_secs(2);
+    const OUTPUT_TIMEOUT: Duration = Duration::from_secs(2);
     let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
     let mut child = command.spawn().ok()?;
-    let end = Instant::now() + PATIENCE;
+    let end = Instant::now() + OUTPUT_TIMEOUT;
     loop {
         match child.try_wait() {
             Ok(None) if Instant::now() < end => thread::sleep(Duration::from_millis(10)),

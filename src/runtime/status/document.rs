@@ -11,7 +11,7 @@ use std::time::Instant;
 use serde::{Deserialize, Serialize};
 
 use crate::status::{self, Guardian, Host, McuStatus, State, Status};
-use pinion_firmware::board::{ADC_MAX, Board, PWM_MAX, Pin, Range};
+use pinion_firmware::board::{ADC_MAX, Board, PWM_MAX, Range};
 use pinion_firmware::lateness::{Lateness, us};
 use pinion_firmware::mcu::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Snapshot};
 use pinion_firmware::time::{NS_PER_TICK, Ticks};
@@ -120,10 +120,6 @@ fn rounded_us(ticks: Ticks) -> f64 {
     rounded(us(ticks))
 }
 
-fn pin_name(pins: &[Range], pin: Pin) -> String {
-    pins.iter().find_map(|range| range.name_of(pin.0)).unwrap_or_else(|| format!("pin number {}", pin.0))
-}
-
 fn state(mcu: &Snapshot) -> State {
     match (mcu.stopped, mcu.is_configured, mcu.oids_allocated) {
         (Some(_), _, _) => State::Shutdown,
@@ -157,7 +153,7 @@ fn mcu(Answer { mcu, waiting, margin }: &Answer, facts: &Facts) -> McuStatus {
 
 fn line(state: &LineState, pins: &[Range]) -> status::Line {
     status::Line {
-        pin: pin_name(pins, state.pin),
+        pin: state.pin.name_in(pins),
         use_: match state.use_ {
             LineUse::Output => status::Use::Output,
             LineUse::Input => status::Use::Input,
@@ -172,7 +168,7 @@ fn object(state: &ObjectState, pins: &[Range]) -> status::Object {
     status::Object {
         oid: state.oid,
         kind: state.kind.to_owned(),
-        pin: state.pin.map(|pin| pin_name(pins, pin)),
+        pin: state.pin.map(|pin| pin.name_in(pins)),
         queued: state.report.queued,
         value: state.report.value.map(|value| match value {
             Present::Adc(counts) => status::Present::Adc(rounded(f64::from(counts) / f64::from(ADC_MAX))),

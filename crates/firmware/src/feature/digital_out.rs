@@ -50,7 +50,7 @@ const KIND: &str = "digital output";
 
 struct DigitalOut {
     line: OutputLine,
-    default: bool,
+    shutdown_value: bool,
     max_duration: Ticks,
     cycle: Ticks,
     queue: MoveQueue<Move>,
@@ -76,7 +76,7 @@ impl DigitalOut {
         self.line.write(turn, on)?;
         self.on = on;
         self.toggling = on && on_ticks < self.cycle;
-        let limited = self.max_duration.0 != 0 && (self.toggling || on != self.default);
+        let limited = self.max_duration.0 != 0 && (self.toggling || on != self.shutdown_value);
         self.end = limited.then(|| at + self.max_duration);
         if let Some(next) = self.queue.first() {
             if self.end.is_some_and(|end| end < next.at) {
@@ -153,7 +153,7 @@ impl DigitalOut {
         self.on = value;
         self.toggling = false;
         self.end = None;
-        if value != self.default && self.max_duration.0 != 0 {
+        if value != self.shutdown_value && self.max_duration.0 != 0 {
             let end = turn.now() + self.max_duration;
             self.end = Some(end);
             self.phase = Phase::Load;
@@ -185,14 +185,14 @@ impl Object for DigitalOut {
     }
 
     fn shutdown(&mut self, turn: &mut Turn) {
-        self.on = self.default;
+        self.on = self.shutdown_value;
         self.toggling = false;
         self.end = None;
         self.queue.clear(&mut turn.moves);
     }
 
     fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
-        self.line.make_safe(turn, self.default)
+        self.line.make_safe(turn, self.shutdown_value)
     }
 }
 
@@ -251,7 +251,7 @@ const CONFIG_DIGITAL_OUT: Command = command!(
         let line = mcu.output(pin, value, default_value)?;
         let output = DigitalOut {
             line,
-            default: default_value,
+            shutdown_value: default_value,
             max_duration,
             cycle: Ticks(0),
             queue: MoveQueue::default(),

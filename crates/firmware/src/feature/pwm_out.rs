@@ -110,7 +110,7 @@ impl Object for PwmOut {
     }
 
     fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
-        self.write(turn, self.queue.default_value())?;
+        self.write(turn, self.queue.shutdown_value())?;
         Ok(Safe::Later)
     }
 }

@@ -27,7 +27,7 @@ pub(super) struct Texts {
 
 /// The values that an output is to have. The object has no other timer than the queue's.
 pub(super) struct ValueQueue {
-    default_value: u16,
+    shutdown_value: u16,
     max_duration: Ticks,
     texts: &'static Texts,
     queue: MoveQueue<Move>,
@@ -36,13 +36,13 @@ pub(super) struct ValueQueue {
 }
 
 impl ValueQueue {
-    pub(super) fn new(default_value: u16, max_duration: Ticks, texts: &'static Texts) -> ValueQueue {
-        ValueQueue { default_value, max_duration, texts, queue: MoveQueue::default(), end: None }
+    pub(super) fn new(shutdown_value: u16, max_duration: Ticks, texts: &'static Texts) -> ValueQueue {
+        ValueQueue { shutdown_value, max_duration, texts, queue: MoveQueue::default(), end: None }
     }
 
     /// The value of a stopped machine.
-    pub(super) fn default_value(&self) -> u16 {
-        self.default_value
+    pub(super) fn shutdown_value(&self) -> u16 {
+        self.shutdown_value
     }
 
     /// How many values are queued.
@@ -72,7 +72,7 @@ impl ValueQueue {
 
     /// When the timer runs next, now that the output has a value that was due at `at`.
     pub(super) fn next(&mut self, value: u16, at: Clock) -> Result<Next, Shutdown> {
-        let limited = value != self.default_value && self.max_duration.0 != 0;
+        let limited = value != self.shutdown_value && self.max_duration.0 != 0;
         let end = limited.then(|| at + self.max_duration);
         let Some(next) = self.queue.first().map(|next| next.at) else {
             self.end = end;

@@ -31,7 +31,7 @@ pub const FEATURE: Feature = Feature {
     constants: &[
         Constant::number("CLOCK_FREQ", CLOCK_FREQ),
         Constant::text("MCU", "linux"),
-        Constant::number("RECEIVE_WINDOW", RECEIVE_WINDOW),
+        Constant::number("RECEIVE_WINDOW", RECEIVE_WINDOW_BYTES),
         Constant::number("STATS_SUMSQ_BASE", SUMSQ_BASE),
     ],
     enumerations: &[Enumeration::new("pin", |board| board.pins())],
@@ -54,7 +54,7 @@ const RESPONSES: &[Form] = &[
 
 /// How many bytes the host may send before they are acknowledged: half of a pty's buffer of 4096
 /// bytes, so that all of them fit in it, and the host never blocks in its write.
-const RECEIVE_WINDOW: u32 = 2048;
+const RECEIVE_WINDOW_BYTES: u32 = 2048;
 
 /// Whether the response with this place in the list of all is one of the MCU's own.
 pub(super) const fn is_own_response(index: usize) -> bool {
