@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Pinion: a Klipper micro-controller made of a Linux process.
+//! Pinion lets Klipper use this computer's GPIO pins and buses. It is a drop-in replacement for klipper_mcu.
 //!
-//! This crate is the program; what it is made of are crates of their own (docs/develop/architecture.md):
+//! This crate is the program. docs/develop/architecture.md describes the other crates. It contains:
 //!
 //! - [`cli`]: the subcommands
 //! - [`runtime`]: threads, pty, real time, signals

@@ -34,10 +34,9 @@ mod terminal;
 
 use page::{Page, print};
 
-/// A Klipper micro-controller made of a Linux process.
+/// Lets Klipper use this computer's GPIO pins and buses. A drop-in replacement for klipper_mcu.
 ///
-/// Without a subcommand it runs as `pinion run` does: the command line of Klipper's own
-/// klipper_mcu (-r -w -I PATH) works unchanged.
+/// Without a subcommand it does the same as `pinion run`. It has the command line of klipper_mcu: -r -w -I PATH.
 #[derive(Parser, Debug)]
 #[command(name = "pinion", version = env!("PINION_VERSION"), max_term_width = 100, args_conflicts_with_subcommands = true)]
 pub(crate) struct Cli {
