@@ -21,9 +21,15 @@ response! {
     pub(super) struct Heard { oid: Oid, loudness: u8 }
 }
 
-const TIMER: Timer = Timer::exact(0);
+const TIMER: Timer = Timer::sampling(0);
+
+#[derive(Clone, Copy)]
+enum Register {
+    Loudness = 0x01,
+}
+
+/// The bit of a register's number that means reading.
 const READ: u8 = 0x80;
-const REGISTER_LOUDNESS: u8 = 0x01;
 
 struct Listen;
 
@@ -32,7 +38,7 @@ impl Talk for Listen {
     type Answer = u8;
 
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<u8, BusError> {
-        let mut message = [READ | REGISTER_LOUDNESS, 0];
+        let mut message = [READ | Register::Loudness as u8, 0];
         chip.exchange(&mut message)?;
         Ok(message[1])
     }
@@ -52,7 +58,12 @@ const CONFIG_EAR: Command = command!("config_ear oid=%c spi_oid=%c", |mcu, oid: 
 const QUERY_EAR: Command =
     command!("query_ear oid=%c clock=%u rest_ticks=%u", Ear, |ear, turn, clock: WireClock, rest_ticks: Ticks| {
         let at = turn.instant(clock);
+        turn.cancel(TIMER);
+        ear.listen.drop_pending();
         ear.rest_ticks = rest_ticks;
+        if rest_ticks == Ticks(0) {
+            return Ok(());
+        }
         turn.schedule(TIMER, at)
     });
 
