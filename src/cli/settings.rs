@@ -14,8 +14,9 @@ use crate::runtime::Access;
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::{TimeSource, Timing};
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::{Guard, LinuxBoard};
-use pinion_sim::{SimBoard, SimConfig, SimError};
+use pinion_sim::{SimBoard, SimConfig};
 
 use super::complete::{BOARDS, SPOKEN, offering};
 
@@ -168,12 +169,11 @@ impl BoardName {
         &self,
         clock: Arc<dyn TimeSource>,
         guard: Option<Box<dyn Guard>>,
-    ) -> Result<(Box<dyn Board>, Timing), String> {
+    ) -> Result<(Box<dyn Board>, Timing), Trouble> {
         match self {
             BoardName::Linux => Ok((Box::new(LinuxBoard::new(guard)), Timing::of(clock))),
             BoardName::Sim(file) => {
-                let board = sim_config(file.as_deref()).and_then(|config| SimBoard::new(config, clock));
-                let board = board.map_err(|error| error.to_string())?;
+                let board = sim_config(file.as_deref()).and_then(|config| SimBoard::new(config, clock))?;
                 let timing = board.timing();
                 Ok((Box::new(board), timing))
             }
@@ -182,6 +182,6 @@ impl BoardName {
 }
 
 /// The description of a simulated printer: that of a file, or the default one.
-pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, SimError> {
+pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, Trouble> {
     file.map_or_else(|| Ok(SimConfig::default_printer()), SimConfig::load)
 }

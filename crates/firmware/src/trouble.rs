@@ -42,6 +42,14 @@ impl Trouble {
         Trouble { subject: Some(subject.into()), ..self }
     }
 
+    /// The same of a place in a file: `byte` of its `text`. It is told as `file:line:column`, counted from 1.
+    pub fn at(self, file: impl fmt::Display, text: &str, byte: usize) -> Trouble {
+        let before = text.get(..byte).unwrap_or(text);
+        let line = before.matches('\n').count() + 1;
+        let column = before.rsplit('\n').next().unwrap_or_default().chars().count() + 1;
+        self.of(format_args!("{file}:{line}:{column}"))
+    }
+
     /// All but the remedy, for what prints that apart.
     pub fn found(&self) -> String {
         match &self.subject {

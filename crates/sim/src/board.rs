@@ -13,7 +13,7 @@ use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{TimeSource, Timing};
 
 use super::config::SimConfig;
-use super::description::check::SimError;
+use super::description::check::Trouble;
 use super::description::pin::PinName;
 use super::engine::i2c::{I2cBus, I2cDevice};
 use super::engine::led::ColouredLed;
@@ -55,7 +55,7 @@ pub struct SimBoard {
 
 impl SimBoard {
     /// The printer of a description, at rest.
-    pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, SimError> {
+    pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, Trouble> {
         config.validate()?;
         let printer = config.printer();
         let now = clock.now();

@@ -11,7 +11,7 @@ use serde::Deserialize;
 use super::catalog::PartConfig;
 use super::description::axes::{AxisConfig, BedConfig, DeltaConfig, Limits};
 use super::description::buses::{I2cBusConfig, SpiBusConfig};
-use super::description::check::{SimError, UsedPins, no_name, wrong};
+use super::description::check::{Trouble, UsedPins, no_name, wrong};
 use super::description::heater::{FanConfig, HeaterConfig};
 use super::description::outputs::{InputConfig, LedConfig, OutputConfig};
 use super::description::pin::is_word;
@@ -80,26 +80,27 @@ impl SimConfig {
     }
 
     /// Reads a description from a file.
-    pub fn load(path: &Path) -> Result<SimConfig, SimError> {
+    pub fn load(path: &Path) -> Result<SimConfig, Trouble> {
         let file = path.display();
         let text = fs::read_to_string(path).map_err(|error| {
-            SimError(format!(
-                "{file}: {error}: name a readable TOML file, or take `--board sim` for the \
-                 built-in printer"
-            ))
+            let trouble = Trouble::new(error.to_string()).of(&file);
+            trouble.remedy("name a readable TOML file, or take `--board sim` for the built-in printer")
         })?;
         SimConfig::parse(&text, &file.to_string())
     }
 
     /// Reads a description; `origin` is how an error calls it.
-    pub fn parse(text: &str, origin: &str) -> Result<SimConfig, SimError> {
+    pub fn parse(text: &str, origin: &str) -> Result<SimConfig, Trouble> {
         let config: SimConfig = toml::from_str(text).map_err(|error| {
-            let (line, key) = place(text, error.span().map_or(0, |span| span.start));
-            let key = key.map_or_else(String::new, |key| format!(", key `{key}`"));
-            let cause = error.message().replace('\n', " ");
-            SimError(format!("{origin} line {line}{key}: {cause}: correct it"))
+            let byte = error.span().map_or(0, |span| span.start);
+            let trouble = Trouble::new(error.message().replace('\n', " ")).remedy("correct it");
+            match key(text, byte) {
+                Some(key) => trouble.of(format_args!("key `{key}`")),
+                None => trouble,
+            }
+            .at(origin, text, byte)
         })?;
-        config.validate().map_err(|SimError(cause)| SimError(format!("{origin}: {cause}")))?;
+        config.validate().map_err(|trouble| trouble.of(origin))?;
         Ok(config)
     }
 
@@ -126,7 +127,7 @@ impl SimConfig {
     /// # Errors
     ///
     /// The first value that is wrong, with its key and a remedy.
-    pub(super) fn validate(&self) -> Result<(), SimError> {
+    pub(super) fn validate(&self) -> Result<(), Trouble> {
         let printer = self.printer();
         let mut pins = UsedPins::default();
         printer.validate(&mut pins)?;
@@ -134,10 +135,10 @@ impl SimConfig {
     }
 
     /// Checks a part against the rest of the printer, and that its pins are free.
-    fn validate_part(&self, part: &dyn Part, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), SimError> {
+    fn validate_part(&self, part: &dyn Part, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), Trouble> {
         let whose = &format!("part `{}`", part.name());
         if self.parts.iter().filter(|other| other.part().name() == part.name()).count() > 1 {
-            return Err(SimError(format!("{whose}: there are two of it: remove one, or tell them apart")));
+            return Err(Trouble::new("there are two of it").remedy("remove one, or tell them apart").of(whose));
         }
         part.pins().into_iter().try_for_each(|(key, pin)| pins.claim(whose, key, pin))?;
         let socket = part.socket();
@@ -178,21 +179,17 @@ impl SimConfig {
     }
 }
 
-/// The number of the line that has the byte `at` of the text, and the key whose value is there.
-fn place(text: &str, at: usize) -> (usize, Option<&str>) {
-    let before = text.get(..at).unwrap_or(text);
-    let line = before.matches('\n').count() + 1;
-    let key = before.rsplit_once('=').and_then(|(keys, value)| {
-        // If lines lie between the key and that byte, it belongs to the value only if that is a list
-        // which is not closed yet.
-        let open = value.matches('[').count() > value.matches(']').count();
-        let goes_on = value.trim_start().starts_with('[') && open;
-        if value.contains('\n') && !goes_on {
-            return None;
-        }
-        keys.trim_end().rsplit([' ', ',', '{', '\n', '\t']).next().filter(|key| is_word(key))
-    });
-    (line, key)
+/// The key whose value has the byte `at` of the text.
+fn key(text: &str, at: usize) -> Option<&str> {
+    let (keys, value) = text.get(..at)?.rsplit_once('=')?;
+    // If lines lie between the key and that byte, it belongs to the value only if that is a list
+    // which is not closed yet.
+    let open = value.matches('[').count() > value.matches(']').count();
+    let goes_on = value.trim_start().starts_with('[') && open;
+    if value.contains('\n') && !goes_on {
+        return None;
+    }
+    keys.trim_end().rsplit([' ', ',', '{', '\n', '\t']).next().filter(|key| is_word(key))
 }
 
 #[cfg(test)]

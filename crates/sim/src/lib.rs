@@ -24,7 +24,6 @@ pub use catalog::PartConfig;
 pub use config::SimConfig;
 pub use description::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};
 pub use description::buses::{I2cBusConfig, SpiBusConfig};
-pub use description::check::SimError;
 pub use description::heater::{FanConfig, HeaterConfig};
 pub use description::outputs::{InputConfig, LedConfig, OutputConfig};
 pub use description::pin::PinName;

@@ -7,7 +7,7 @@ use std::path::PathBuf;
 
 use serde::Deserialize;
 
-use super::check::{SimError, fault};
+use super::check::{Trouble, fault};
 use super::pin::PinName;
 
 /// An SPI bus.
@@ -45,7 +45,7 @@ impl SpiBusConfig {
     }
 
     /// The error of a `trace_file` that can not be made.
-    pub(crate) fn no_trace_file(&self, error: &std::io::Error) -> SimError {
+    pub(crate) fn no_trace_file(&self, error: &std::io::Error) -> Trouble {
         fault(
             &format!("spi_bus `{}`", self.name),
             "trace_file",

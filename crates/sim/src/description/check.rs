@@ -1,24 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What is checked of any value, and the error of one that is wrong.
+//! What is checked of any value, and the trouble with one that is wrong.
 
 #![forbid(unsafe_code)]
 
 use std::collections::HashSet;
-use std::fmt;
+
+pub(crate) use pinion_firmware::trouble::Trouble;
 
 use super::pin::{PinName, is_word};
-
-/// What is wrong with a description: one line with file, key, cause and remedy.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct SimError(pub(crate) String);
-
-impl fmt::Display for SimError {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::error::Error for SimError {}
 
 /// The range that a number must be in.
 pub(crate) enum Bound {
@@ -33,7 +22,7 @@ pub(crate) struct UsedPins(HashSet<String>);
 
 impl UsedPins {
     /// Uses a pin, if there is one; fails if it has a use already.
-    pub(crate) fn claim(&mut self, whose: &str, key: &str, pin: Option<&PinName>) -> Result<(), SimError> {
+    pub(crate) fn claim(&mut self, whose: &str, key: &str, pin: Option<&PinName>) -> Result<(), Trouble> {
         match pin {
             Some(pin) if !self.0.insert(pin.name.clone()) => {
                 wrong(whose, key, &format!("pin `{}` has a use already", pin.name), "give every pin its own name")
@@ -44,7 +33,7 @@ impl UsedPins {
 }
 
 /// Checks that the parts of a kind have names, and that no two share one.
-pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>) -> Result<(), SimError> {
+pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>) -> Result<(), Trouble> {
     let mut seen = HashSet::new();
     names.try_for_each(|name| {
         if !is_word(name) {
@@ -58,7 +47,7 @@ pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>
 }
 
 /// The error of a name that klippy would not take.
-pub(crate) fn no_name(whose: &str, name: &str) -> Result<(), SimError> {
+pub(crate) fn no_name(whose: &str, name: &str) -> Result<(), Trouble> {
     wrong(whose, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
 }
 
@@ -69,7 +58,7 @@ pub(crate) fn there_is<'a>(
     name: &str,
     mut names: impl Iterator<Item = &'a String>,
     kind: &str,
-) -> Result<(), SimError> {
+) -> Result<(), Trouble> {
     if names.any(|other| other == name) {
         return Ok(());
     }
@@ -77,12 +66,12 @@ pub(crate) fn there_is<'a>(
 }
 
 /// The error of a key.
-pub(crate) fn fault(whose: &str, key: &str, cause: &str, remedy: &str) -> SimError {
-    SimError(format!("{whose}, key `{key}`: {cause}: {remedy}"))
+pub(crate) fn fault(whose: &str, key: &str, cause: &str, remedy: &str) -> Trouble {
+    Trouble::new(cause).remedy(remedy).of(format_args!("{whose}, key `{key}`"))
 }
 
 /// The error of a key, as a result.
-pub(crate) fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), SimError> {
+pub(crate) fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result<(), Trouble> {
     Err(fault(whose, key, cause, remedy))
 }
 
@@ -93,7 +82,7 @@ const MAX_NUMBER: f64 = 1e9;
 const MAX_LIGHTS: u32 = 1000;
 
 /// Checks how many lights a strip has.
-pub(crate) fn check_lights(whose: &str, count: u32) -> Result<(), SimError> {
+pub(crate) fn check_lights(whose: &str, count: u32) -> Result<(), Trouble> {
     check(whose, "count", count.into(), Bound::AboveZero)?;
     if count > MAX_LIGHTS {
         return wrong(whose, "count", &format!("{count} is too many"), &format!("{MAX_LIGHTS} at most"));
@@ -102,7 +91,7 @@ pub(crate) fn check_lights(whose: &str, count: u32) -> Result<(), SimError> {
 }
 
 /// Checks that a number is in its range.
-pub(crate) fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), SimError> {
+pub(crate) fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<(), Trouble> {
     let fault = match bound {
         _ if !(-MAX_NUMBER..=MAX_NUMBER).contains(&value) => "is out of range",
         Bound::NotNegative if value < 0.0 => "is below zero",
@@ -113,7 +102,7 @@ pub(crate) fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<
 }
 
 /// Checks where a probe stands from the nozzle.
-pub(crate) fn check_offsets(whose: &str, offsets_mm: [f64; 3]) -> Result<(), SimError> {
+pub(crate) fn check_offsets(whose: &str, offsets_mm: [f64; 3]) -> Result<(), Trouble> {
     let mut keys = ["x_offset_mm", "y_offset_mm", "z_offset_mm"].into_iter().zip(offsets_mm);
     keys.try_for_each(|(key, mm)| check(whose, key, mm, Bound::Any))
 }

@@ -5,7 +5,7 @@
 
 use serde::Deserialize;
 
-use super::check::{SimError, fault};
+use super::check::{Trouble, fault};
 use super::pin::PinName;
 use super::thermistor::{NoThermistor, Thermistor};
 
@@ -105,7 +105,7 @@ impl HeaterConfig {
     /// # Errors
     ///
     /// The key whose values no thermistor has, and a remedy.
-    pub fn thermistor(&self) -> Result<Thermistor, SimError> {
+    pub fn thermistor(&self) -> Result<Thermistor, Trouble> {
         const POINTS: &str = "points_celsius_ohm";
         Thermistor::new(&self.points_celsius_ohm, self.beta_k, self.pullup_ohm).map_err(|why| {
             let (key, cause, remedy) = match why {

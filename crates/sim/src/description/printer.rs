@@ -5,7 +5,7 @@
 
 use super::axes::{AxisConfig, BedConfig, DeltaConfig, Limits};
 use super::buses::{I2cBusConfig, SpiBusConfig};
-use super::check::{SimError, there_is};
+use super::check::{Trouble, there_is};
 use super::heater::{FanConfig, HeaterConfig};
 use super::outputs::{InputConfig, LedConfig, OutputConfig};
 use super::pin::PinName;
@@ -86,20 +86,20 @@ impl<'a> Printer<'a> {
     }
 
     /// Checks that there is the axis that a part's key `axis` names.
-    pub(crate) fn check_axis(&self, whose: &str, axis: &str) -> Result<(), SimError> {
+    pub(crate) fn check_axis(&self, whose: &str, axis: &str) -> Result<(), Trouble> {
         there_is(whose, "axis", axis, self.axes.iter().map(|axis| &axis.name), "[[axis]]")
     }
 
     /// Checks that there is the heater that a part's key `heater` names.
-    pub(crate) fn check_heater(&self, whose: &str, heater: &str) -> Result<(), SimError> {
+    pub(crate) fn check_heater(&self, whose: &str, heater: &str) -> Result<(), Trouble> {
         there_is(whose, "heater", heater, self.heaters.iter().map(|heater| &heater.name), "[[heater]]")
     }
 
-    pub(crate) fn check_spi_bus(&self, whose: &str, bus: &str) -> Result<(), SimError> {
+    pub(crate) fn check_spi_bus(&self, whose: &str, bus: &str) -> Result<(), Trouble> {
         there_is(whose, "bus", bus, self.spi_buses.iter().map(|bus| &bus.name), "[[spi_bus]]")
     }
 
-    pub(crate) fn check_i2c_bus(&self, whose: &str, bus: &str) -> Result<(), SimError> {
+    pub(crate) fn check_i2c_bus(&self, whose: &str, bus: &str) -> Result<(), Trouble> {
         there_is(whose, "bus", bus, self.i2c_buses.iter().map(|bus| &bus.name), "[[i2c_bus]]")
     }
 }

@@ -5,7 +5,7 @@
 
 use super::axes::{AxisConfig, BedConfig, DeltaConfig, End, Limits};
 use super::buses::{I2cBusConfig, SpiBusConfig};
-use super::check::{Bound, SimError, UsedPins, check, there_is, unique, wrong};
+use super::check::{Bound, Trouble, UsedPins, check, there_is, unique, wrong};
 use super::heater::{FanConfig, HeaterConfig};
 use super::outputs::LedConfig;
 use super::printer::{Kinematics, Printer};
@@ -17,7 +17,7 @@ impl Printer<'_> {
     /// # Errors
     ///
     /// The first value that is wrong, with its key and a remedy.
-    pub(crate) fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+    pub(crate) fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
         self.limits.validate()?;
         unique("[[axis]]", self.axes.iter().map(|axis| &axis.name))?;
         unique("[[heater]]", self.heaters.iter().map(|heater| &heater.name))?;
@@ -50,7 +50,7 @@ impl Printer<'_> {
     }
 
     /// Checks where the motors of the z axis hold what they lift.
-    fn validate_places(&self) -> Result<(), SimError> {
+    fn validate_places(&self) -> Result<(), Trouble> {
         let is_cartesian = self.kinematics() == Kinematics::Cartesian;
         let motors: Vec<&AxisConfig> = self.motors("z").filter(|_| is_cartesian).collect();
         let whose = |axis: &AxisConfig| format!("axis `{}`", axis.name);
@@ -72,7 +72,7 @@ impl Printer<'_> {
 }
 
 impl Limits {
-    fn validate(&self) -> Result<(), SimError> {
+    fn validate(&self) -> Result<(), Trouble> {
         for (key, value) in [
             ("velocity_mm_per_s", self.velocity_mm_per_s),
             ("accel_mm_per_s2", self.accel_mm_per_s2),
@@ -87,7 +87,7 @@ impl Limits {
 
 impl DeltaConfig {
     /// Checks the towers, and that each has its axis.
-    fn validate(&self, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>) -> Result<(), Trouble> {
         const WHOSE: &str = "[delta]";
         check(WHOSE, "radius_mm", self.radius_mm, Bound::AboveZero)?;
         check(WHOSE, "bed_radius_mm", self.bed_radius_mm, Bound::AboveZero)?;
@@ -104,7 +104,8 @@ impl DeltaConfig {
         }
         for tower in DeltaConfig::TOWERS {
             let Some(axis) = printer.axis(tower) else {
-                return Err(SimError(format!("{WHOSE}: there is no axis `{tower}`: add an [[axis]] for each tower")));
+                let trouble = Trouble::new(format!("there is no axis `{tower}`"));
+                return Err(trouble.remedy("add an [[axis]] for each tower").of(WHOSE));
             };
             let whose = &format!("axis `{tower}`");
             if axis.endstop_pin.is_none() || axis.endstop_at != End::Max {
@@ -123,7 +124,7 @@ impl DeltaConfig {
 
 impl LedConfig {
     /// Checks that it has a pin, and that its pins are free.
-    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
         let whose = &format!("led `{}`", self.name);
         if self.pins().into_iter().all(|(_, pin)| pin.is_none()) {
             return wrong(whose, "pin", "it has none", "add it, or `red_pin`, `green_pin` and `blue_pin`");
@@ -134,7 +135,7 @@ impl LedConfig {
 
 impl AxisConfig {
     /// Checks the axis by itself, and that its pins are free.
-    fn validate(&self, pins: &mut UsedPins) -> Result<(), SimError> {
+    fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
         use Bound::{AboveZero, Any, NotNegative};
         let whose = &format!("axis `{}`", self.name);
         pins.claim(whose, "step_pin", Some(&self.step_pin))?;
@@ -175,7 +176,7 @@ impl AxisConfig {
 
 impl FanConfig {
     /// Checks the fan, and that its pins are free.
-    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), Trouble> {
         use Bound::{AboveZero, NotNegative};
         let whose = &format!("fan `{}`", self.name);
         pins.claim(whose, "pin", Some(&self.pin))?;
@@ -201,7 +202,7 @@ impl FanConfig {
 
 impl SpiBusConfig {
     /// Checks the bus, and that the pins to trace are outputs of the printer.
-    fn validate(&self, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>) -> Result<(), Trouble> {
         let whose = &format!("spi_bus `{}`", self.name);
         check(whose, "delay_us", self.delay_us as f64, Bound::NotNegative)?;
         let unknown = self.trace_pins.iter().find(|name| !printer.switched().any(|pin| pin.name == **name));
@@ -213,13 +214,13 @@ impl SpiBusConfig {
 }
 
 impl I2cBusConfig {
-    fn validate(&self) -> Result<(), SimError> {
+    fn validate(&self) -> Result<(), Trouble> {
         check(&format!("i2c_bus `{}`", self.name), "delay_us", self.delay_us as f64, Bound::NotNegative)
     }
 }
 
 impl BedConfig {
-    fn validate(&self) -> Result<(), SimError> {
+    fn validate(&self) -> Result<(), Trouble> {
         for (key, value) in [("x_slope_mm", self.x_slope_mm), ("y_slope_mm", self.y_slope_mm), ("bow_mm", self.bow_mm)]
         {
             check("[bed]", key, value, Bound::Any)?;
@@ -230,7 +231,7 @@ impl BedConfig {
 
 impl HeaterConfig {
     /// Checks the heater with its fan, and that its pins are free.
-    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), SimError> {
+    fn validate(&self, printer: &Printer<'_>, pins: &mut UsedPins) -> Result<(), Trouble> {
         use Bound::{AboveZero, NotNegative};
         let whose = &format!("heater `{}`", self.name);
         pins.claim(whose, "pin", self.pin.as_ref())?;
@@ -264,7 +265,7 @@ impl HeaterConfig {
         Ok(())
     }
 
-    fn validate_temperatures(&self, whose: &str) -> Result<(), SimError> {
+    fn validate_temperatures(&self, whose: &str) -> Result<(), Trouble> {
         let absolute_zero = -KELVIN;
         for (key, celsius) in [
             ("ambient_celsius", self.ambient_celsius),

@@ -16,7 +16,6 @@ use std::time::{Duration, Instant};
 use super::physics::Lamp;
 use super::wire::{Kind, Wire};
 use crate::description::buses::SpiBusConfig;
-use crate::description::check::SimError;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect};
 use pinion_firmware::time::Clock;
 use pinion_firmware::trouble::Trouble;
@@ -158,7 +157,7 @@ impl SpiBus {
     pub(crate) fn new(
         config: &SpiBusConfig,
         lamp: impl Fn(&str) -> Option<(Arc<Lamp>, bool)>,
-    ) -> Result<SpiBus, SimError> {
+    ) -> Result<SpiBus, Trouble> {
         let trace = match &config.trace_file {
             None => None,
             Some(path) => {

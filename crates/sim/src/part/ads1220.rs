@@ -17,7 +17,7 @@ use serde::Deserialize;
 use super::load_cell::{Cell, CellConfig};
 use super::ready::{Conversions, ReadyLine, ReadyPin};
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::SimError;
+use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::spi::SpiChip;
@@ -68,11 +68,11 @@ impl Part for Ads1220Config {
         vec![("drdy_pin", Some(&self.drdy_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         self.cell.validate(whose)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let drdy = ReadyLine::new("data ready of ads1220");
         workshop.wire(Some(&self.drdy_pin), ReadyPin(drdy.clone()));
         let cell = Cell::new(&self.cell, workshop, self);

@@ -22,7 +22,7 @@ use serde::Deserialize;
 
 use super::ring::{Ring, RingConfig};
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::noise::Noise;
@@ -120,7 +120,7 @@ impl Part for Adxl345Config {
         Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
     }
 
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         check(whose, "rate_off_percent", self.rate_off_percent, Bound::Any)?;
         if self.rate_off_percent.abs() > 10.0 {
             return wrong(whose, "rate_off_percent", "no chip is so far off", "stay between -10 and 10");
@@ -138,7 +138,7 @@ impl Part for Adxl345Config {
         Ok(())
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let now = workshop.clock.now();
         let rings = self.rings().map(|(_, ring)| {
             let ring = ring?;

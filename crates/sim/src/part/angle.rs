@@ -30,7 +30,7 @@ use shaft::Shaft;
 use tle5012b::Tle5012b;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::{Bound, SimError, check};
+use crate::description::check::{Bound, Trouble, check};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::klippy::layout::{FULL_STEPS, Layout};
@@ -93,13 +93,13 @@ impl Part for AngleConfig {
         Some(Socket::Spi { bus: &self.bus, select_pin: Some(&self.select_pin) })
     }
 
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         check(whose, "offset_degrees", self.offset_degrees, Bound::Any)?;
         check(whose, "eccentricity_degrees", self.eccentricity_degrees, Bound::NotNegative)?;
         printer.check_axis(whose, &self.axis)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let config = workshop.printer.axis(&self.axis);
         let Some((axis, config)) = workshop.axis(&self.axis).zip(config) else { return Ok(()) };
         let clock = workshop.clock.clone();

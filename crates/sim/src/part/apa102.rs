@@ -15,7 +15,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{SimError, check_lights, wrong};
+use crate::description::check::{Trouble, check_lights, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::colour::{self, Colour};
@@ -55,7 +55,7 @@ impl Part for Apa102Config {
         vec![("data_pin", Some(&self.data_pin)), ("clock_pin", Some(&self.clock_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         check_lights(whose, self.count)?;
         if self.data_pin.inverted || self.clock_pin.inverted {
             return wrong(whose, "data_pin", "klippy's lines to such a strip have no polarity", "remove the `!`");
@@ -63,7 +63,7 @@ impl Part for Apa102Config {
         Ok(())
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let strip = Arc::new(Strip::new(self));
         workshop.wire(Some(&self.data_pin), DataPin(strip.clone()));
         workshop.wire(Some(&self.clock_pin), ClockPin(strip.clone()));

@@ -19,7 +19,7 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{Bound, SimError, check, check_offsets};
+use crate::description::check::{Bound, Trouble, check, check_offsets};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
@@ -86,12 +86,12 @@ impl Part for BltouchConfig {
         vec![("control_pin", Some(&self.control_pin)), ("sensor_pin", Some(&self.sensor_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         check_offsets(whose, [self.x_offset_mm, self.y_offset_mm, self.z_offset_mm])?;
         check(whose, "move_s", self.move_s, Bound::AboveZero)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let probe = Arc::new(Bltouch::new(self, workshop.bed()));
         workshop.wire(Some(&self.control_pin), ControlPin(probe.clone()));
         workshop.wire(Some(&self.sensor_pin), SensorPin(probe.clone()));

@@ -11,14 +11,13 @@ use std::time::Duration;
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::printer::Printer;
 use crate::engine::physics::Heater;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::TimeSource;
-use pinion_firmware::trouble::Trouble;
 
 /// The thermometer's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
@@ -44,7 +43,7 @@ impl Part for Ds18b20Config {
         format!("ds18b20 {}", self.serial)
     }
 
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         let digits = self.serial.strip_prefix("28-").unwrap_or_default();
         if digits.len() != 12 || !digits.chars().all(|c| c.is_ascii_hexdigit()) {
             let cause = format!("`{}` is no serial number", self.serial);
@@ -54,7 +53,7 @@ impl Part for Ds18b20Config {
         printer.check_heater(whose, &self.heater)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         if let Some(heater) = workshop.heater(&self.heater) {
             let conversion = Duration::from_millis(self.conversion_ms);
             let thermometer = Ds18b20 { heater, conversion, clock: workshop.clock.clone() };

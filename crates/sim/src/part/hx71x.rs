@@ -19,7 +19,7 @@ use serde::Deserialize;
 
 use super::load_cell::{Cell, CellConfig};
 use super::workshop::{Part, Workshop};
-use crate::description::check::{SimError, wrong};
+use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::time::seconds;
@@ -96,7 +96,7 @@ impl Part for Hx71xConfig {
         vec![("dout_pin", Some(&self.dout_pin)), ("sclk_pin", Some(&self.sclk_pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         if !self.chip.rates().contains(&self.samples_per_s) {
             let cause = format!("{} is none of the chip's rates", self.samples_per_s);
             return wrong(whose, "samples_per_s", &cause, &format!("give one of {:?}", self.chip.rates()));
@@ -104,7 +104,7 @@ impl Part for Hx71xConfig {
         self.cell.validate(whose)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let cell = Cell::new(&self.cell, workshop, self);
         let chip = Arc::new(Hx71x::new(self.chip, self.samples_per_s, cell));
         workshop.wire(Some(&self.dout_pin), DoutPin(chip.clone()));

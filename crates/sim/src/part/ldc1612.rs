@@ -21,7 +21,7 @@ use serde::Deserialize;
 
 use super::ready::{Conversions, ReadyLine, ReadyPin};
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
@@ -148,7 +148,7 @@ impl Part for Ldc1612Config {
         vec![("intb_pin", self.intb_pin.as_ref())]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         use Bound::{AboveZero, Any, NotNegative};
         for (key, value, bound) in [
             ("x_offset_mm", self.x_offset_mm, Any),
@@ -172,7 +172,7 @@ impl Part for Ldc1612Config {
         Ok(())
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let intb = ReadyLine::new("interrupt of ldc1612");
         workshop.wire(self.intb_pin.as_ref(), ReadyPin(intb.clone()));
         let coil = Coil { config: self.clone(), bed: workshop.bed(), noise: workshop.noise(self) };

@@ -7,7 +7,7 @@
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{Bound, SimError, check};
+use crate::description::check::{Bound, Trouble, check};
 use crate::engine::bed::Bed;
 use crate::engine::noise::Noise;
 use crate::klippy::sections::Sections;
@@ -33,7 +33,7 @@ pub struct CellConfig {
 
 impl CellConfig {
     /// Checks the values.
-    pub(crate) fn validate(&self, whose: &str) -> Result<(), SimError> {
+    pub(crate) fn validate(&self, whose: &str) -> Result<(), Trouble> {
         for (key, value, bound) in [
             ("stiffness_g_per_mm", self.stiffness_g_per_mm, Bound::AboveZero),
             ("counts_per_gram", self.counts_per_gram, Bound::AboveZero),

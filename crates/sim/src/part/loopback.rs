@@ -7,7 +7,7 @@
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::SimError;
+use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::engine::spi::SpiChip;
 
@@ -30,7 +30,7 @@ impl Part for LoopbackConfig {
         Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         workshop.solder_spi(self, Loopback);
         Ok(())
     }

@@ -7,7 +7,7 @@
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{SimError, check_offsets};
+use crate::description::check::{Trouble, check_offsets};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
@@ -41,11 +41,11 @@ impl Part for ProbeConfig {
         vec![("pin", Some(&self.pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         check_offsets(whose, [self.x_offset_mm, self.y_offset_mm, self.z_offset_mm])
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let tip = [self.x_offset_mm, self.y_offset_mm, -self.z_offset_mm];
         let probe = Probe { bed: workshop.bed(), tip };
         workshop.wire(Some(&self.pin), probe);

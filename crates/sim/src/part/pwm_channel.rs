@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU32, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{SimError, wrong};
+use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::wire::{Kind, Wire};
@@ -38,14 +38,14 @@ impl Part for PwmChannelConfig {
         vec![("pin", Some(&self.pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.pin.inverted {
             return wrong(whose, "pin", "a PWM channel has no polarity here", "remove the `!`");
         }
         Ok(())
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let channel = Arc::new(PwmChannel { name: self.name.clone(), value: AtomicU32::new(0) });
         workshop.wire_shared(Some(&self.pin), channel.clone());
         workshop.show(channel);

@@ -13,7 +13,7 @@ use std::sync::atomic::{AtomicU64, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::time::seconds;
@@ -71,7 +71,7 @@ impl Part for ServoConfig {
         vec![("pin", Some(&self.pin))]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         check(whose, "min_pulse_us", self.min_pulse_us, Bound::AboveZero)?;
         check(whose, "max_pulse_us", self.max_pulse_us, Bound::AboveZero)?;
         check(whose, "travel_degrees", self.travel_degrees, Bound::AboveZero)?;
@@ -83,7 +83,7 @@ impl Part for ServoConfig {
         Ok(())
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let servo = Arc::new(Servo::new(self, workshop.clock.now()));
         workshop.wire(Some(&self.pin), PulsePin(servo.clone()));
         workshop.show(servo);

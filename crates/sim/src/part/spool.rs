@@ -14,7 +14,7 @@ use std::sync::atomic::{AtomicI64, Ordering};
 use serde::Deserialize;
 
 use super::workshop::{Part, Workshop};
-use crate::description::check::{Bound, SimError, check};
+use crate::description::check::{Bound, Trouble, check};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
@@ -63,14 +63,14 @@ impl Part for SpoolConfig {
         ]
     }
 
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         printer.check_axis(whose, &self.axis)?;
         check(whose, "length_mm", self.length_mm, Bound::NotNegative)?;
         check(whose, "stuck_after_mm", self.stuck_after_mm.unwrap_or(0.0), Bound::NotNegative)?;
         check(whose, "encoder_mm", self.encoder_mm, Bound::AboveZero)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         if let Some(axis) = workshop.axis(&self.axis) {
             let spool = Arc::new(Spool::new(self, axis));
             workshop.wire(self.switch_pin.as_ref(), SwitchPin(spool.clone()));

@@ -18,7 +18,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::{SimError, wrong};
+use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::i2c::I2cChip;
@@ -75,14 +75,14 @@ impl Part for Ssd1306Config {
         vec![("dc_pin", self.dc_pin.as_ref()), ("reset_pin", self.reset_pin.as_ref())]
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.dc_pin.is_none() && self.select_pin.is_some() {
             return wrong(whose, "select_pin", "a chip on I2C has none", "remove it, or add `dc_pin` for SPI");
         }
         Ok(())
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let panel = Arc::new(Panel::new(&self.name, workshop.noise(self)));
         workshop.wire(self.dc_pin.as_ref(), ModePin(panel.clone()));
         workshop.wire(self.reset_pin.as_ref(), ResetPin(panel.clone()));

@@ -15,7 +15,7 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::{Bound, SimError, check, wrong};
+use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::physics::Heater;
@@ -133,7 +133,7 @@ impl Part for ThermocoupleConfig {
         Some(Socket::Spi { bus: &self.bus, select_pin: self.select_pin.as_ref() })
     }
 
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         printer.check_heater(whose, &self.heater)?;
         if self.fault.is_some_and(|fault| !self.chip.knows(fault)) {
             let cause = format!("what a {} makes of that is not known", self.chip.name());
@@ -144,7 +144,7 @@ impl Part for ThermocoupleConfig {
         check(whose, "reference_ohm", self.reference_ohm, Bound::AboveZero)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         if let Some(heater) = workshop.heater(&self.heater) {
             workshop.solder_spi(self, Chip::new(self.clone(), heater, workshop.clock.clone()));
         }

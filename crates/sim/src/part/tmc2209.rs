@@ -25,7 +25,7 @@ use super::trinamic::{
 };
 use super::uart::{HOST, Role, SYNC, Uart, UartChip, UartPin, WRITE, WRITE_LEN, crc8};
 use super::workshop::{Part, Workshop};
-use crate::description::check::{SimError, wrong};
+use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
@@ -123,7 +123,7 @@ impl Part for Tmc2209Config {
         [("uart_pin", Some(&self.uart_pin))].into_iter().chain(pins).collect()
     }
 
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.address > 3 {
             return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 3");
         }
@@ -135,7 +135,7 @@ impl Part for Tmc2209Config {
         printer.check_axis(whose, &self.axis)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let Some(axis) = workshop.axis(&self.axis) else { return Ok(()) };
         let chip = Tmc2209::new(&self.name(), self.address, axis);
         workshop.wire_shared(self.diag_pin.as_ref(), chip.diag.clone());

@@ -26,7 +26,7 @@ use super::trinamic::{
     offer_sensorless_homing,
 };
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::SimError;
+use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::physics::Axis;
@@ -172,11 +172,11 @@ impl Part for Tmc5160Config {
         vec![("diag1_pin", self.diag1_pin.as_ref())]
     }
 
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         printer.check_axis(whose, &self.axis)
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         if let Some(axis) = workshop.axis(&self.axis) {
             let chip = Tmc5160::new(self.name(), axis, workshop.clock.clone());
             workshop.wire_shared(self.diag1_pin.as_ref(), chip.diag1.clone());

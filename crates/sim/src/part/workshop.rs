@@ -6,7 +6,7 @@
 use std::sync::Arc;
 
 use crate::description::axes::DeltaConfig;
-use crate::description::check::SimError;
+use crate::description::check::Trouble;
 use crate::description::pin::PinName;
 use crate::description::printer::{Kinematics, Printer};
 use crate::engine::bed::{Bed, Delta, Head, Plane};
@@ -47,13 +47,13 @@ pub(crate) trait Part {
     }
 
     /// Checks the values that are its own; `whose` begins an error's line.
-    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         let _ = (whose, printer);
         Ok(())
     }
 
     /// Makes the part and wires it. What `validate` refuses does not come here.
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError>;
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble>;
 
     /// Adds its sections, if klippy has one.
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {

@@ -16,7 +16,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use serde::Deserialize;
 
 use super::workshop::{Part, Socket, Workshop};
-use crate::description::check::{SimError, check_lights, wrong};
+use crate::description::check::{Trouble, check_lights, wrong};
 use crate::description::printer::Printer;
 use crate::engine::colour::{self, Colour};
 use crate::engine::spi::MosiListener;
@@ -63,7 +63,7 @@ impl Part for Ws2812Config {
         Some(Socket::Mosi { bus: &self.bus })
     }
 
-    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), SimError> {
+    fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
         check_lights(whose, self.count)?;
         let mut letters: Vec<char> = self.color_order.chars().collect();
         letters.sort_unstable();
@@ -74,7 +74,7 @@ impl Part for Ws2812Config {
         Ok(())
     }
 
-    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), SimError> {
+    fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let strip = Arc::new(Strip::new(self));
         workshop.listen(self, Input { strip: strip.clone(), clock: workshop.clock.clone() });
         workshop.show(strip);
