@@ -16,6 +16,7 @@
 pub mod cli;
 mod foreign;
 pub mod klippy;
+mod proc;
 pub mod runtime;
 mod status;
 

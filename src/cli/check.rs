@@ -14,8 +14,8 @@ use std::sync::Arc;
 use nix::unistd::{AccessFlags, Gid, Group as UserGroup, access, getegid, geteuid, getgroups};
 
 use crate::FIRMWARE;
-use crate::runtime;
 use crate::runtime::realtime::{self, Processors};
+use crate::runtime::{self, Place};
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::Inventory;
 use pinion_linux::clock::Monotonic;
@@ -54,7 +54,7 @@ fn board(settings: &Settings) -> Vec<Finding> {
     let board = match board {
         Ok((board, _)) => board,
         Err(error) => {
-            findings.push(Finding::error("board", error, "correct the file, or choose another board"));
+            findings.push(Finding::of("board", Level::Error, error));
             return findings;
         }
     };
@@ -91,15 +91,15 @@ fn link(symlink: &Path) -> Finding {
     {
         return Finding::ok("symlink", format!("no other program can serve there meanwhile: {served}"));
     }
+    let place = Place::of(symlink);
+    if let Some(obstacle) = place.obstacle(symlink) {
+        let remedy = match place {
+            Place::Folder => "choose another path, such as one in that folder (symlink)".to_owned(),
+            _ => format!("sudo rm {path}"),
+        };
+        return Finding::error("symlink", obstacle, remedy);
+    }
     match fs::symlink_metadata(symlink) {
-        Ok(there) if there.is_dir() => Finding::error(
-            "symlink",
-            format!("{path} is a folder, and no symbolic link"),
-            "choose another path, such as one in that folder (symlink)",
-        ),
-        Ok(there) if !there.file_type().is_symlink() => {
-            Finding::error("symlink", format!("{path} exists and is no symbolic link"), format!("sudo rm {path}"))
-        }
         Ok(_) if leads_to_ours(symlink) => {
             Finding::ok("symlink", format!("{path} is the service's link, which root puts in place for it"))
         }

@@ -13,6 +13,7 @@ use std::str::FromStr;
 use toml::de::{DeTable, DeValue};
 
 use crate::foreign;
+use pinion_firmware::trouble::Trouble;
 
 use super::settings::{Given, MARGIN_MAX_US, mode};
 
@@ -31,10 +32,15 @@ struct Key {
 }
 
 impl Key {
-    /// How it is to be written.
-    fn form(&self) -> String {
+    /// What is wrong with its value, and how it is to be written.
+    fn wrong(&self, why: Option<String>) -> Trouble {
         let Key { name, example, .. } = self;
-        format!("{name}: write it such as {name} = {example}")
+        let form = format!("write it such as {name} = {example}");
+        match why {
+            Some(why) => Trouble::new(why).remedy(form),
+            None => Trouble::new(form),
+        }
+        .of(name)
     }
 }
 
@@ -115,38 +121,39 @@ fn word<T: FromStr<Err = String>>(value: &DeValue<'_>) -> Result<T, Option<Strin
 ///
 /// # Errors
 ///
-/// One line: the file, the line and column, the key, and what to write.
-pub(super) fn load(path: &Path) -> Result<Given, String> {
-    of_file(path, fs::read(path))
+/// The file, the line and column, the key, and what to write.
+pub(super) fn load(path: &Path) -> Result<Given, Trouble> {
+    of_file(&path.display(), fs::read(path))
 }
 
-/// The same of a file that another process names, which may be anything.
-pub(super) fn load_foreign(path: &Path) -> Result<Given, String> {
-    of_file(path, foreign::read(path, FOREIGN_BYTES_MAX))
+/// The same of a file that another process names as `file`, and which may be anything.
+pub(super) fn load_foreign(path: &Path, file: &str) -> Result<Given, Trouble> {
+    of_file(&file, foreign::read(path, FOREIGN_BYTES_MAX))
 }
 
-fn of_file(path: &Path, bytes: io::Result<Vec<u8>>) -> Result<Given, String> {
-    let file = path.display();
-    let bytes = bytes
-        .map_err(|error| format!("{file}: {error}: name a configuration that can be read, or leave out --config"))?;
+fn of_file(file: &dyn fmt::Display, bytes: io::Result<Vec<u8>>) -> Result<Given, Trouble> {
+    let bytes = bytes.map_err(|error| {
+        let trouble = Trouble::new(error.to_string()).of(file);
+        trouble.remedy("name a configuration that can be read, or leave out --config")
+    })?;
     match std::str::from_utf8(&bytes) {
-        Ok(text) => parse(text, &file),
+        Ok(text) => parse(text, file),
         Err(error) => {
-            let good = String::from_utf8_lossy(&bytes[..error.valid_up_to()]).into_owned();
-            Err(format!("{file}:{}: this is no UTF-8 text: write it anew", Place::of(&good, good.len())))
+            let good = String::from_utf8_lossy(&bytes[..error.valid_up_to()]);
+            Err(Trouble::new("this is no UTF-8 text").remedy("write it anew").at(file, &good, good.len()))
         }
     }
 }
 
 /// Reads the text of a file; `file` is how an error calls it.
-fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, String> {
-    let wrong = |span: Option<Range<usize>>, what: String| {
-        let at = span.map_or(0, |span| span.start);
-        format!("{file}:{}: {what}", Place::of(text, at))
-    };
+fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, Trouble> {
+    let wrong = |span: Option<Range<usize>>, what: Trouble| what.at(file, text, span.map_or(0, |span| span.start));
     let table = DeTable::parse(text)
         .map_err(|error| {
-            let what = key_at(text, error.span()).map_or_else(|| error.message().trim().replace('\n', ": "), Key::form);
+            let what = match key_at(text, error.span()) {
+                Some(key) => key.wrong(None),
+                None => Trouble::new(error.message().trim().replace('\n', ": ")),
+            };
             wrong(error.span(), what)
         })?
         .into_inner();
@@ -158,10 +165,7 @@ fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, String> {
         let Some(key) = KEYS.iter().find(|key| key.name == name.get_ref()) else {
             return Err(wrong(Some(name.span()), unknown(name.get_ref())));
         };
-        (key.set)(&mut given, value.get_ref()).map_err(|why| {
-            let what = why.map_or_else(|| key.form(), |why| key.form().replacen(": ", &format!(": {why}: "), 1));
-            wrong(Some(value.span()), what)
-        })?;
+        (key.set)(&mut given, value.get_ref()).map_err(|why| wrong(Some(value.span()), key.wrong(why)))?;
     }
     Ok(given)
 }
@@ -169,7 +173,7 @@ fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, String> {
 /// How many letters of a name may be wrong for another to be what was meant.
 const LETTERS_WRONG: usize = 3;
 
-fn unknown(name: &str) -> String {
+fn unknown(name: &str) -> Trouble {
     let distance = |key: &Key| match key.name.starts_with(name) && !name.is_empty() {
         true => 1,
         false => strsim::damerau_levenshtein(&name.to_lowercase().replace('-', "_"), key.name),
@@ -180,28 +184,7 @@ fn unknown(name: &str) -> String {
         Some(key) => format!("did you mean {}?", key.name),
         None => format!("there are {}", KEYS.map(|key| key.name).join(", ")),
     };
-    format!("{name}: there is no such key: {meant}")
-}
-
-/// A place in a text, counted from 1.
-struct Place {
-    line: usize,
-    column: usize,
-}
-
-impl Place {
-    /// The place of the byte at `at`.
-    fn of(text: &str, at: usize) -> Place {
-        let before = text.get(..at).unwrap_or(text);
-        let line = before.rsplit('\n').next().unwrap_or_default();
-        Place { line: 1 + before.matches('\n').count(), column: 1 + line.chars().count() }
-    }
-}
-
-impl fmt::Display for Place {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{}:{}", self.line, self.column)
-    }
+    Trouble::new("there is no such key").remedy(meant).of(name)
 }
 
 #[cfg(test)]
@@ -210,7 +193,7 @@ mod tests {
     use proptest::prelude::*;
 
     fn error(text: &str) -> String {
-        parse(text, &"f.toml").unwrap_err()
+        parse(text, &"f.toml").unwrap_err().to_string()
     }
 
     #[test]
@@ -302,18 +285,18 @@ mod tests {
 
     #[test]
     fn a_file_that_is_not_there_or_no_text() {
-        let error = load(Path::new("/nonexistent.toml")).unwrap_err();
+        let error = load(Path::new("/nonexistent.toml")).unwrap_err().to_string();
         assert!(error.starts_with("/nonexistent.toml: No such file"), "{error}");
         let file = tempfile::NamedTempFile::new().unwrap();
         fs::write(file.path(), b"cpu = 3\n#\xff").unwrap();
-        assert!(load(file.path()).unwrap_err().contains(":2:2: this is no UTF-8"));
+        assert!(load(file.path()).unwrap_err().to_string().contains(":2:2: this is no UTF-8"));
     }
 
     proptest! {
         #[test]
         fn any_text_is_a_configuration_or_an_error_of_one_line(text in "[a-z_ =\"0-9\\[\\]\n#.é']{0,60}") {
             if let Err(error) = parse(&text, &"f") {
-                prop_assert!(!error.contains('\n'), "{}", error);
+                prop_assert!(!error.to_string().contains('\n'), "{}", error);
             }
         }
     }

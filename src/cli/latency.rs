@@ -5,7 +5,7 @@
 
 use std::fmt::Write as _;
 use std::fs;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -14,7 +14,8 @@ use clap::Args;
 use crate::runtime::latency::{Fitness, Half, Verdict, judge, measure_both};
 use pinion_firmware::lateness::{Lateness, us};
 
-use super::doctor::print_at_risk;
+use super::computer::Machine;
+use super::computer::running::print_at_risk;
 use super::failed;
 use super::page::{Page, print};
 
@@ -31,7 +32,7 @@ pub(super) struct LatencyArgs {
 
 /// Measures, prints and judges.
 pub(super) fn run(args: &LatencyArgs) -> ExitCode {
-    if let Some(why) = print_at_risk() {
+    if let Some(why) = print_at_risk(&Machine::at(Path::new("/"))) {
         return failed(format!("the latency is not measured: {why}"));
     }
     let span = Duration::from_secs(args.seconds.into()) / 2;

@@ -15,6 +15,7 @@ use pinion_linux::gpio::Opener;
 
 mod check;
 mod complete;
+mod computer;
 mod config;
 mod console;
 pub mod demo;

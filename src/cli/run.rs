@@ -12,6 +12,7 @@ use log::LevelFilter;
 
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Guardian, Helpers, Options};
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
 
 use super::settings::{BoardName, Given, Settings, WATCHDOG};
@@ -59,7 +60,7 @@ impl RunArgs {
     /// # Errors
     ///
     /// One line about the file.
-    fn settings(&self, log_level: Option<LevelFilter>) -> Result<Settings, String> {
+    fn settings(&self, log_level: Option<LevelFilter>) -> Result<Settings, Trouble> {
         let file = self.config.as_deref().map(config::load).transpose()?.unwrap_or_default();
         let given = Given { log_level, ..self.given.clone() };
         Ok(given.or(file).settings())

@@ -24,6 +24,16 @@ const REF_BYTES_MAX: u64 = 4096;
 /// Longest `.git/packed-refs` that is read: a line for each branch and tag, of some 70 bytes.
 const PACKED_REFS_BYTES_MAX: u64 = 1 << 20;
 
+/// How klippy knows a pseudo terminal by its path (klippy/mcu.py).
+pub(crate) const HOST_PATHS: &str = "/tmp/klipper_host_";
+
+/// Whether klippy takes a path for a pseudo terminal's. One that any process may name, and that means more in a
+/// command than a name in that folder, counts as none.
+pub(crate) fn is_host_path(path: &Path) -> bool {
+    let is_plain = |c: char| c.is_ascii_alphanumeric() || "_.-".contains(c);
+    path.to_str().and_then(|path| path.strip_prefix(HOST_PATHS)).is_some_and(|name| name.chars().all(is_plain))
+}
+
 /// A message that a machine knows, and who takes it.
 struct KnownShape {
     shape: Shape,
@@ -206,6 +216,21 @@ pub(crate) mod tests {
         let (_folder, klippy) = checkout(["queue_step oid interval count add".to_owned()]);
         let error = Checkout::read(&klippy, FEATURES).unwrap_err();
         assert_eq!(error.to_string(), "it does not hold klippy's sources");
+    }
+
+    #[test]
+    fn a_path_that_goes_into_a_command_is_a_plain_name() {
+        for (path, is) in [
+            ("/tmp/klipper_host_mcu", true),
+            ("/tmp/klipper_host_b-2.old_one", true),
+            ("/tmp/klipper_host_x/../../etc/passwd", false),
+            ("/tmp/klipper_host_;reboot", false),
+            ("/tmp/klipper_host_$(reboot)", false),
+            ("/tmp/klipper_host_a b", false),
+            ("/dev/ttyACM0", false),
+        ] {
+            assert_eq!(is_host_path(Path::new(path)), is, "{path}");
+        }
     }
 
     #[test]

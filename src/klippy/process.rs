@@ -13,11 +13,14 @@ use std::path::{Component, Path, PathBuf};
 use serde::{Deserialize, Serialize};
 
 use crate::foreign;
+use crate::proc::stat_field;
 
 /// Longest part of a command line that is looked at: a process may have one of megabytes.
 const COMMAND_LINE_BYTES_MAX: u64 = 16 << 10;
 /// Longest part of the other files in /proc/PID that is looked at.
 const PROC_BYTES_MAX: u64 = 4096;
+/// The number of the field of /proc/PID/stat that says when a process was started.
+const STARTTIME: usize = 22;
 /// Most open files of a process that are looked at: klippy has less than a hundred.
 const OPEN_FILES_MAX: usize = 4096;
 
@@ -136,10 +139,7 @@ fn pids(proc: &Path) -> io::Result<impl Iterator<Item = u32>> {
 impl Process {
     fn read(proc: &Path, pid: u32, arguments: Vec<PathBuf>) -> Option<Process> {
         let stat = foreign::read(&proc.join(pid.to_string()).join("stat"), PROC_BYTES_MAX).ok()?;
-        // The second field, the name in parentheses, may hold anything; starttime is the 22nd.
-        let name_ends = stat.iter().rposition(|byte| *byte == b')')?;
-        let fields = std::str::from_utf8(&stat[name_ends + 1..]).ok()?;
-        let started = fields.split_whitespace().nth(19)?.parse().ok()?;
+        let started = stat_field(&stat, STARTTIME)?.parse().ok()?;
         Some(Process { pid, started, arguments })
     }
 

@@ -19,6 +19,7 @@ use nix::unistd::{Gid, Group, chown, geteuid, read, ttyname, write};
 
 use pinion_linux::sys;
 
+use super::place::Place;
 use super::served::served;
 
 /// The group that gets the terminal if the command line names none.
@@ -185,22 +186,12 @@ fn give(device: &Path, name: &str) -> io::Result<()> {
 }
 
 fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
-    match fs::symlink_metadata(symlink) {
-        Ok(found) if !found.file_type().is_symlink() && is_left_over(symlink) => {
-            info!("{} was a file that holds nothing but {FORCE_SHUTDOWN}: removed", symlink.display());
-            said(fs::remove_file(symlink), &format!("removing {}", symlink.display()))?;
-        }
-        Ok(found) if found.is_dir() => {
-            let what = "is a folder: choose another path with -I, such as one in that folder";
-            return Err(io::Error::other(format!("{} {what}", symlink.display())));
-        }
-        Ok(found) if !found.file_type().is_symlink() => {
-            return Err(io::Error::other(format!(
-                "{} exists and is no symbolic link: remove it, or choose another path with -I",
-                symlink.display()
-            )));
-        }
-        _ => {}
+    let place = Place::of(symlink);
+    if place == Place::File && is_left_over(symlink) {
+        info!("{} was a file that holds nothing but {FORCE_SHUTDOWN}: removed", symlink.display());
+        said(fs::remove_file(symlink), &format!("removing {}", symlink.display()))?;
+    } else if let Some(obstacle) = place.obstacle(symlink) {
+        return Err(io::Error::other(obstacle));
     }
     // A rename replaces a stale link in one step, so that a host finds a link at any time.
     let mut fresh = symlink.as_os_str().to_owned();

@@ -22,6 +22,8 @@ use crate::foreign;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
 
+use crate::proc::status_field;
+
 use super::budget::Class;
 
 /// What a thread does.
@@ -202,8 +204,7 @@ fn has_capability(number: u32) -> bool {
 }
 
 fn effective_capabilities(status: &str) -> u64 {
-    let line = status.lines().find_map(|line| line.strip_prefix("CapEff:"));
-    line.and_then(|bits| u64::from_str_radix(bits.trim(), 16).ok()).unwrap_or(0)
+    status_field(status, "CapEff").and_then(|bits| u64::from_str_radix(bits, 16).ok()).unwrap_or(0)
 }
 
 /// The real-time budget of this process's control group in microseconds, if its kernel is built to

@@ -13,6 +13,7 @@ use signal_hook::consts::{SIGHUP, SIGINT, SIGTERM, SIGUSR1, SIGUSR2};
 use signal_hook::iterator::backend::SignalDelivery;
 use signal_hook::iterator::exfiltrator::SignalOnly;
 
+use crate::proc::status_field;
 use pinion_linux::sys;
 
 /// What a signal asks for.
@@ -79,8 +80,7 @@ pub(crate) fn hang_up() -> io::Result<Option<i32>> {
 
 /// `status` is /proc/PID/status.
 fn is_hang_up_ignored_in(status: &str) -> bool {
-    let ignored = status.lines().find_map(|line| line.strip_prefix("SigIgn:"));
-    let ignored = ignored.and_then(|mask| u64::from_str_radix(mask.trim(), 16).ok());
+    let ignored = status_field(status, "SigIgn").and_then(|mask| u64::from_str_radix(mask, 16).ok());
     ignored.is_some_and(|mask| mask & 1 << (SIGHUP - 1) != 0)
 }
 

@@ -13,12 +13,12 @@ use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
+use crate::cli::computer::{Access, Machine, Who};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use pinion_linux::gpio::Chip;
 
 use super::instance::Instance;
-use super::machine::{Access, Machine, Who};
 use super::{INSTALL, REINSTALL};
 
 /// A kind of devices.
@@ -30,7 +30,8 @@ struct Class {
     subsystem: &'static str,
     /// The line of a Raspberry Pi's config.txt, and what begins one that enables it, too.
     enabled_by: Option<(&'static str, &'static [&'static str])>,
-    nodes: fn(&Machine) -> Vec<PathBuf>,
+    /// The files that have to be opened.
+    nodes: &'static str,
 }
 
 const CLASSES: [Class; 6] = [
@@ -40,7 +41,7 @@ const CLASSES: [Class; 6] = [
         access: Access::READ_WRITE,
         subsystem: "gpio",
         enabled_by: None,
-        nodes: |machine| machine.beginning("/dev", "gpiochip"),
+        nodes: "/dev/gpiochip*",
     },
     Class {
         check: "adc",
@@ -48,11 +49,7 @@ const CLASSES: [Class; 6] = [
         access: Access::READ,
         subsystem: "iio",
         enabled_by: None,
-        nodes: |machine| {
-            let devices = machine.beginning("/sys/bus/iio/devices", "iio:device");
-            let channels = devices.iter().flat_map(|device| inside(device, "in_voltage"));
-            channels.filter(|channel| channel.to_string_lossy().ends_with("_raw")).collect()
-        },
+        nodes: "/sys/bus/iio/devices/iio:device*/in_voltage*_raw",
     },
     Class {
         check: "pwm",
@@ -60,10 +57,7 @@ const CLASSES: [Class; 6] = [
         access: Access::WRITE,
         subsystem: "pwm",
         enabled_by: Some(("dtoverlay=pwm-2chan", &["dtoverlay=pwm"])),
-        nodes: |machine| {
-            let chips = machine.beginning("/sys/class/pwm", "pwmchip");
-            chips.into_iter().map(|chip| chip.join("export")).filter(|file| file.exists()).collect()
-        },
+        nodes: "/sys/class/pwm/pwmchip*/export",
     },
     Class {
         check: "spi",
@@ -71,7 +65,7 @@ const CLASSES: [Class; 6] = [
         access: Access::READ_WRITE,
         subsystem: "spidev",
         enabled_by: Some(("dtparam=spi=on", &["dtparam=spi", "dtoverlay=spi"])),
-        nodes: |machine| machine.beginning("/dev", "spidev"),
+        nodes: "/dev/spidev*",
     },
     Class {
         check: "i2c",
@@ -79,7 +73,7 @@ const CLASSES: [Class; 6] = [
         access: Access::READ_WRITE,
         subsystem: "i2c-dev",
         enabled_by: Some(("dtparam=i2c_arm=on", &["dtparam=i2c", "dtoverlay=i2c"])),
-        nodes: |machine| machine.beginning("/dev", "i2c-"),
+        nodes: "/dev/i2c-*",
     },
     Class {
         check: "w1",
@@ -87,18 +81,9 @@ const CLASSES: [Class; 6] = [
         access: Access::READ,
         subsystem: "w1",
         enabled_by: Some(("dtoverlay=w1-gpio", &["dtoverlay=w1-gpio"])),
-        nodes: |machine| {
-            let sensors = machine.beginning("/sys/bus/w1/devices", "28-");
-            sensors.into_iter().map(|sensor| sensor.join("w1_slave")).filter(|file| file.exists()).collect()
-        },
+        nodes: "/sys/bus/w1/devices/28-*/w1_slave",
     },
 ];
-
-fn inside(folder: &Path, beginning: &str) -> Vec<PathBuf> {
-    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
-    let found = entries.filter(|entry| entry.file_name().to_string_lossy().starts_with(beginning));
-    found.map(|entry| entry.path()).collect()
-}
 
 /// Whether the users that Pinion runs as may open what is there; where there is no service, the caller.
 pub(super) fn permissions(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
@@ -127,7 +112,7 @@ fn permissions_of(machine: &Machine, instances: &[&Instance], user: &Who) -> Vec
         [] => "log in anew, and start Pinion anew".to_owned(),
         units => format!("sudo systemctl restart {}", units.join(" ")),
     };
-    let permission = |class: &Class| permission(machine, user, &anew, class, &(class.nodes)(machine));
+    let permission = |class: &Class| permission(machine, user, &anew, class, &machine.matching(class.nodes));
     let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
     if instances.iter().any(|instance| instance.settings.watchdog) {
         const WATCHDOG: Class = Class {
@@ -136,7 +121,7 @@ fn permissions_of(machine: &Machine, instances: &[&Instance], user: &Who) -> Vec
             access: Access::WRITE,
             subsystem: "misc",
             enabled_by: None,
-            nodes: |machine| vec![machine.path("/dev/watchdog")],
+            nodes: "/dev/watchdog",
         };
         findings.extend(permission(&WATCHDOG));
     }
@@ -182,7 +167,7 @@ fn with_others(first: &Path, count: usize) -> String {
 
 fn rules_are_there(machine: &Machine) -> bool {
     let folders = ["/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d"];
-    folders.iter().any(|folder| machine.names(folder).iter().any(|name| name.ends_with("pinion-mcu.rules")))
+    folders.iter().any(|folder| !machine.matching(format!("{folder}/*pinion-mcu.rules")).is_empty())
 }
 
 /// Which pins and buses there are, and how to enable those that there are not.
@@ -192,7 +177,7 @@ pub(super) fn presence(machine: &Machine) -> Vec<Finding> {
 
 fn present(machine: &Machine, class: &Class) -> Finding {
     let Class { check, name, .. } = *class;
-    let nodes = (class.nodes)(machine);
+    let nodes = machine.matching(class.nodes);
     if let Some((node, other)) = nodes.iter().find_map(|node| Some((node, other_subsystem(machine, class, node)?))) {
         let node = machine.name(node);
         let (shown, subsystem) = (node.display(), class.subsystem);
@@ -207,7 +192,7 @@ fn present(machine: &Machine, class: &Class) -> Finding {
         let remedy = "connect an I/O board that the kernel knows, or try pinion run --board sim";
         return Finding::warning(check, "GPIO: this computer has no GPIO chip", remedy);
     }
-    if check == "i2c" && !machine.beginning("/sys/bus/i2c/devices", "i2c-").is_empty() {
+    if check == "i2c" && !machine.matching("/sys/bus/i2c/devices/i2c-*").is_empty() {
         let remedy = "echo i2c-dev | sudo tee /etc/modules-load.d/i2c-dev.conf && sudo modprobe i2c-dev";
         return Finding::warning(check, "I2C: there are buses, and no /dev/i2c-*: i2c-dev is not loaded", remedy);
     }
@@ -414,12 +399,8 @@ pub(super) fn power(machine: &Machine, vcgencmd: Option<&Path>) -> Vec<Finding> 
 /// The firmware's bits, from sysfs or by vcgencmd.
 fn throttled(machine: &Machine, vcgencmd: Option<&Path>) -> Option<u32> {
     let hex = |text: &str| u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok();
-    let file = machine.names("/sys/devices/platform").into_iter().find_map(|folder| {
-        let folder = format!("/sys/devices/platform/{folder}");
-        let firmware = machine.names(&folder).into_iter().find(|name| name.ends_with("firmware"))?;
-        machine.text(format!("{folder}/{firmware}/get_throttled"))
-    });
-    if let Some(bits) = file {
+    let files = machine.matching("/sys/devices/platform/*/*firmware/get_throttled");
+    if let Some(bits) = files.iter().find_map(|file| machine.text(machine.name(file))) {
         return hex(&bits);
     }
     let told = output(Command::new(vcgencmd?).arg("get_throttled"))?;
@@ -451,8 +432,9 @@ fn output(command: &mut Command) -> Option<String> {
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::{Tree, told};
+    use super::super::tests::told;
     use super::*;
+    use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
     use pinion_linux::gpio::LineInfo;
 

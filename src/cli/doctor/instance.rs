@@ -5,28 +5,19 @@
 
 use std::path::{Path, PathBuf};
 
+use crate::cli::computer::running::{Running, named_config};
+use crate::cli::computer::units::{self, setting};
+use crate::cli::computer::{Machine, Who};
 use crate::cli::config::{self, SYSTEM_FILE};
 use crate::cli::finding::Finding;
 use crate::cli::run_args;
 use crate::cli::settings::{Given, Settings};
-
-use super::machine::{Machine, Running, Who};
-use super::units::{self, setting};
+use crate::klippy::{HOST_PATHS, is_host_path};
 
 /// The unit of the instance that there is as a rule.
 const UNIT: &str = "pinion-mcu";
 /// The configuration as the package delivers it.
 const DELIVERED: &str = "/usr/share/pinion-mcu/pinion.toml";
-/// How klippy knows a pseudo terminal by its path (klippy/mcu.py).
-pub(super) const HOST_PATHS: &str = "/tmp/klipper_host_";
-
-/// Whether klippy takes a path for a pseudo terminal's. One that any process may name, and that means more in a
-/// command than a name in that folder, counts as none.
-pub(super) fn is_host_path(path: &Path) -> bool {
-    let is_plain = |c: char| c.is_ascii_alphanumeric() || "_.-".contains(c);
-    path.to_str().and_then(|path| path.strip_prefix(HOST_PATHS)).is_some_and(|name| name.chars().all(is_plain))
-}
-
 /// The unit that makes a link, as [`Files`] tells which link a unit makes.
 pub(super) fn unit_for(link: &Path) -> String {
     match link.to_string_lossy().strip_prefix(HOST_PATHS) {
@@ -184,23 +175,10 @@ fn config_of(machine: &Machine, unit: &str) -> Option<String> {
     }
 }
 
-/// The configuration file that a command line of Pinion's names, of whatever version.
-pub(super) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<String> {
-    while let Some(word) = words.next() {
-        match word.strip_prefix("--config") {
-            Some("") => return words.next().map(str::to_owned),
-            Some(value) => return value.strip_prefix('=').map(str::to_owned),
-            None => {}
-        }
-    }
-    None
-}
-
 /// A link that klippy takes, and that leads to this path.
 fn link_to(machine: &Machine, path: &Path) -> Option<PathBuf> {
-    let (folder, beginning) = HOST_PATHS.rsplit_once('/')?;
-    let links = machine.beginning(folder, beginning).into_iter().map(|link| machine.name(&link));
-    links.into_iter().find(|link| machine.follow(link).is_ok_and(|way| way.contains(&machine.path(path))))
+    let mut links = machine.matching(format!("{HOST_PATHS}*")).into_iter().map(|link| machine.name(&link));
+    links.find(|link| machine.follow(link).is_ok_and(|way| way.contains(&machine.path(path))))
 }
 
 /// What the files of a unit say.
@@ -221,14 +199,14 @@ fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, fin
     let Some(config_name) = config else { return given };
     let file = machine.path(config_name);
     if file.exists() {
-        match config::load_foreign(&file) {
+        match config::load_foreign(&file, config_name) {
             Ok(file) => {
                 findings.push(Finding::ok("config", format!("{config_name} has no mistake")));
                 given = given.or(file);
             }
             Err(error) => {
-                let error = error.replacen(&*file.to_string_lossy(), config_name, 1);
-                findings.push(Finding::error("config", error, format!("sudo nano {config_name}, then {restart}")));
+                let remedy = format!("sudo nano {config_name}, then {restart}");
+                findings.push(Finding::error("config", error.to_string(), remedy));
             }
         }
     } else if units::is_installed(machine, unit) {
@@ -267,25 +245,11 @@ fn options(machine: &Machine, file: &str) -> Result<Given, String> {
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::{Tree, told};
+    use super::super::tests::told;
     use super::*;
+    use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok};
     use std::fs;
-
-    #[test]
-    fn a_path_that_goes_into_a_command_is_a_plain_name() {
-        for (path, is) in [
-            ("/tmp/klipper_host_mcu", true),
-            ("/tmp/klipper_host_b-2.old_one", true),
-            ("/tmp/klipper_host_x/../../etc/passwd", false),
-            ("/tmp/klipper_host_;reboot", false),
-            ("/tmp/klipper_host_$(reboot)", false),
-            ("/tmp/klipper_host_a b", false),
-            ("/dev/ttyACM0", false),
-        ] {
-            assert_eq!(is_host_path(Path::new(path)), is, "{path}");
-        }
-    }
 
     #[test]
     fn what_the_service_runs_by() {

@@ -3,12 +3,12 @@
 
 #![forbid(unsafe_code)]
 
+use crate::cli::computer::Machine;
 use crate::cli::finding::Finding;
 use crate::runtime::realtime::is_preempt_rt;
 use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
 
 use super::instance::Instance;
-use super::machine::Machine;
 
 /// The oldest kernel, which opens a terminal whatever its permissions are (TIOCGPTPEER).
 const OLDEST: (u32, u32) = (4, 13);
@@ -159,10 +159,8 @@ fn first(range: &str) -> &str {
 /// None where processors have one frequency only, as in a virtual machine.
 fn governor(machine: &Machine) -> Option<Finding> {
     const CHECK: &str = "governor";
-    let folders = machine.beginning("/sys/devices/system/cpu", "cpu");
-    let governors =
-        folders.iter().filter_map(|folder| machine.text(machine.name(&folder.join("cpufreq/scaling_governor"))));
-    let mut governors: Vec<String> = governors.collect();
+    let files = machine.matching("/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor");
+    let mut governors: Vec<String> = files.iter().filter_map(|file| machine.text(machine.name(file))).collect();
     governors.sort();
     governors.dedup();
     let slow: Vec<&str> = governors.iter().map(String::as_str).filter(|name| *name != "performance").collect();
@@ -180,8 +178,9 @@ fn governor(machine: &Machine) -> Option<Finding> {
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::{Tree, told};
+    use super::super::tests::told;
     use super::*;
+    use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
 
     fn found(tree: &Tree, cpu: Option<usize>) -> Vec<Finding> {

@@ -14,6 +14,7 @@ use clap::{Args, ValueHint};
 use crate::runtime::latency::{self, Fitness, Verdict};
 use pinion_linux::Inventory;
 
+use super::computer::Machine;
 use super::finding::{self, Finding, Group};
 use super::page::Page;
 use super::{failed, quietly};
@@ -23,12 +24,9 @@ mod host;
 mod instance;
 mod kernel;
 mod klipper;
-mod machine;
 mod printer;
 mod service;
-mod units;
-
-use machine::Machine;
+mod terminal;
 
 /// How the package is had, which no repository of a distribution's has.
 const INSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install ./target/deb/pinion-mcu_*.deb (or sudo make install)";
@@ -88,7 +86,7 @@ fn examine(machine: &Machine) -> Vec<Group> {
         Group::new("kernel", kernel::findings(machine, &instances)),
         Group::new("service", [configurations, service::findings(machine, &instances)].concat()),
         Group::new("watchdog", service::watchdog(machine, &instances)),
-        Group::new("terminal", host::terminals(machine, &instances, &klippys)),
+        Group::new("terminal", terminal::terminals(machine, &instances, &klippys)),
         Group::new("host", host::dialects(machine, &instances, &klippys)),
         Group::new(
             "pins and buses",
@@ -103,11 +101,6 @@ fn examine(machine: &Machine) -> Vec<Group> {
         groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
     }
     groups
-}
-
-/// Why this computer must not be kept busy now.
-pub(super) fn print_at_risk() -> Option<String> {
-    host::print_at_risk(&Machine::at(Path::new("/")))
 }
 
 /// A sample of two seconds proves nothing: what it shows is no error.
@@ -127,55 +120,10 @@ fn latency(sample: Result<Verdict, String>) -> Finding {
 
 #[cfg(test)]
 mod tests {
+    use super::super::computer::tests::Tree;
     use super::super::finding::Level;
     use super::*;
     use std::fs;
-    use std::os::unix::fs::{PermissionsExt, symlink};
-    use tempfile::TempDir;
-
-    /// A machine that a test has made of files.
-    pub(super) struct Tree(TempDir);
-
-    impl Tree {
-        pub(super) fn new() -> Tree {
-            Tree(tempfile::tempdir().unwrap())
-        }
-
-        pub(super) fn machine(&self) -> Machine {
-            Machine::at(self.0.path())
-        }
-
-        pub(super) fn put(&self, path: &str, text: &str) {
-            let path = self.0.path().join(path);
-            fs::create_dir_all(path.parent().unwrap()).unwrap();
-            fs::write(path, text).unwrap();
-        }
-
-        pub(super) fn mode(&self, path: &str, mode: u32) {
-            fs::set_permissions(self.0.path().join(path), fs::Permissions::from_mode(mode)).unwrap();
-        }
-
-        pub(super) fn put_mode(&self, path: &str, text: &str, mode: u32) {
-            self.put(path, text);
-            self.mode(path, mode);
-        }
-
-        pub(super) fn link(&self, path: &str, target: &str) {
-            let path = self.0.path().join(path);
-            fs::create_dir_all(path.parent().unwrap()).unwrap();
-            symlink(target, path).unwrap();
-        }
-
-        /// A process of a user with these further groups.
-        pub(super) fn process(&self, pid: u32, arguments: &[&str], uid: u32, gids: &[u32]) {
-            let gids: Vec<String> = gids.iter().map(u32::to_string).collect();
-            self.put(&format!("proc/{pid}/cmdline"), &(arguments.join("\0") + "\0"));
-            self.put(&format!("proc/{pid}/stat"), &format!("{pid} (x) S {} 0", vec!["1"; 20].join(" ")));
-            let ids = [uid; 4].map(|uid| uid.to_string()).join("\t");
-            let status = format!("Name:\tx\nUid:\t{ids}\nGid:\t{ids}\nGroups:\t{}\n", gids.join(" "));
-            self.put(&format!("proc/{pid}/status"), &status);
-        }
-    }
 
     /// Asserts that a check has found something with these words, and returns what mends it.
     #[track_caller]

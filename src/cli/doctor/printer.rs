@@ -4,9 +4,9 @@
 #![forbid(unsafe_code)]
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::path::{Component, Path, PathBuf};
+use std::path::{Path, PathBuf};
 
-use super::machine::Machine;
+use crate::cli::computer::Machine;
 
 /// No configuration has as many files.
 const FILES_MAX: usize = 500;
@@ -58,8 +58,8 @@ impl Reader<'_> {
                 section = header.trim().to_owned();
                 if let Some(pattern) = section.strip_prefix("include ") {
                     let folder = path.parent().unwrap_or(Path::new("/"));
-                    for file in matching(self.machine, &folder.join(pattern.trim())) {
-                        self.file(&file, within)?;
+                    for file in self.machine.matching(folder.join(pattern.trim())) {
+                        self.file(&self.machine.name(&file), within)?;
                     }
                 }
                 continue;
@@ -86,58 +86,10 @@ fn without_comment(line: &str) -> &str {
     &line[..comment.unwrap_or(line.len())]
 }
 
-/// The files that an absolute pattern of `*` and `?` names, in order; a path without any names itself.
-fn matching(machine: &Machine, pattern: &Path) -> Vec<PathBuf> {
-    let mut paths = vec![PathBuf::from("/")];
-    for part in pattern.components() {
-        let Component::Normal(part) = part else {
-            if part == Component::ParentDir {
-                paths.iter_mut().for_each(|path| path.push(".."));
-            }
-            continue;
-        };
-        let part = part.to_string_lossy();
-        if !part.contains(['*', '?']) {
-            paths.iter_mut().for_each(|path| path.push(&*part));
-            continue;
-        }
-        let found = paths.iter().flat_map(|folder| {
-            let names = machine.names(folder).into_iter();
-            // What is hidden has to be asked for by its dot.
-            let names = names.filter(|name| !name.starts_with('.') || part.starts_with('.'));
-            names.filter(|name| is_match(part.as_bytes(), name.as_bytes())).map(|name| folder.join(name))
-        });
-        // One more than is read: a pattern may name every file that there is.
-        paths = found.take(FILES_MAX + 1).collect();
-    }
-    paths
-}
-
-fn is_match(pattern: &[u8], name: &[u8]) -> bool {
-    let (mut at, mut matched) = (0, 0);
-    // Where to go on behind the last `*`, which takes one byte more each time that the rest does not match.
-    let mut star = None;
-    while matched < name.len() {
-        match pattern.get(at) {
-            Some(b'*') => {
-                at += 1;
-                star = Some((at, matched));
-            }
-            Some(wanted) if *wanted == b'?' || *wanted == name[matched] => (at, matched) = (at + 1, matched + 1),
-            _ => {
-                let Some((behind, taken)) = star else { return false };
-                (at, matched) = (behind, taken + 1);
-                star = Some((behind, matched));
-            }
-        }
-    }
-    pattern[at..].iter().all(|left| *left == b'*')
-}
-
 #[cfg(test)]
 mod tests {
-    use super::super::tests::Tree;
     use super::*;
+    use crate::cli::computer::tests::Tree;
 
     const CONFIG: &str = "/home/pi/config/printer.cfg";
 
@@ -184,25 +136,5 @@ mod tests {
         tree.put("home/pi/config/printer.cfg", "[include a.cfg]\n");
         tree.put("home/pi/config/a.cfg", "[include *.cfg]\n");
         assert_eq!(serials(&tree), None);
-    }
-
-    #[test]
-    fn patterns() {
-        for (pattern, name, is) in [
-            ("*.cfg", "a.cfg", true),
-            ("*.cfg", "a.cfg.bak", false),
-            ("a?c*", "abc", true),
-            ("a?c", "ac", false),
-            ("*a*b", "xaxab", true),
-            ("", "", true),
-            ("*a*a*b", "aaxab", true),
-            ("a*", "a", true),
-            ("?", "", false),
-            // In no time, though there are so many ways to try it.
-            (&"*a".repeat(40), &"a".repeat(200), true),
-            (&("*a".repeat(40) + "b"), &"a".repeat(200), false),
-        ] {
-            assert_eq!(is_match(pattern.as_bytes(), name.as_bytes()), is, "{pattern} {name}");
-        }
     }
 }

@@ -3,14 +3,16 @@
 
 #![forbid(unsafe_code)]
 
+use crate::cli::computer::{Machine, units};
 use crate::cli::finding::Finding;
 use crate::cli::settings::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
+use crate::proc::stat_field;
 
 use super::INSTALL;
 use super::instance::{Instance, is_klipper_s};
-use super::machine::Machine;
-use super::units;
 
+/// The number of the field of /proc/PID/stat that has the scheduling class.
+const POLICY: usize = 41;
 /// SCHED_FIFO (linux/sched.h).
 const SCHED_FIFO: &str = "1";
 
@@ -75,11 +77,10 @@ fn real_time(machine: &Machine, instance: &Instance) -> Option<Finding> {
         let found = format!("Pinion (process {pid}) was not asked to run in real time");
         return Some(Finding::warning(CHECK, found, "use the service, or pinion run -r"));
     }
-    let threads = machine.names(format!("/proc/{pid}/task"));
+    let threads = machine.matching(format!("/proc/{pid}/task/*/stat"));
     let policies = threads.iter().filter_map(|thread| {
-        let stat = machine.text(format!("/proc/{pid}/task/{thread}/stat"))?;
-        // The second field, the name in parentheses, may hold anything; policy is the 41st (proc(5)).
-        Some(stat.rsplit_once(')')?.1.split_whitespace().nth(38)? == SCHED_FIFO)
+        let stat = machine.text(machine.name(thread))?;
+        Some(stat_field(stat.as_bytes(), POLICY)? == SCHED_FIFO)
     });
     let policies: Vec<bool> = policies.collect();
     let log = instance.unit.as_ref().map_or(String::new(), |unit| format!(": journalctl -u {unit}"));
@@ -130,15 +131,12 @@ fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
         findings.push(Finding::warning(CHECK, format!("{file} is still there: {STARTED_BY_FLASH}"), remedy));
     }
     // A script of System V's, as Klipper's documentation had it once.
-    let script = machine.names("/etc").into_iter().filter(|name| name.starts_with("rc")).find_map(|folder| {
-        let names = machine.names(format!("/etc/{folder}")).into_iter();
-        names.into_iter().find(|name| name.starts_with('S') && name.ends_with("klipper_mcu"))
-    });
-    if script.is_none() && is_pinion_enabled && machine.path(SCRIPT).exists() {
+    let is_started_at_boot = !machine.matching("/etc/rc*/S*klipper_mcu").is_empty();
+    if !is_started_at_boot && is_pinion_enabled && machine.path(SCRIPT).exists() {
         let found = format!("{SCRIPT} is still there: {STARTED_BY_FLASH}");
         findings.push(Finding::warning(CHECK, found, format!("sudo mv {SCRIPT} /etc/klipper_mcu.before-pinion")));
     }
-    if script.is_some() {
+    if is_started_at_boot {
         let found = "/etc/init.d/klipper_mcu starts Klipper's own program at boot";
         findings.push(Finding::error(CHECK, found, "sudo update-rc.d -f klipper_mcu remove"));
     }
@@ -173,8 +171,8 @@ pub(super) fn watchdog(machine: &Machine, instances: &[Instance]) -> Vec<Finding
         let remedy = format!("watchdog = false in {}, then {}", second.config(), second.restart());
         return vec![Finding::error(CHECK, found, remedy)];
     }
-    let drop_ins = machine.names("/etc/systemd/system.conf.d").into_iter();
-    let files = drop_ins.map(|name| format!("/etc/systemd/system.conf.d/{name}"));
+    let drop_ins = machine.matching("/etc/systemd/system.conf.d/*.conf").into_iter();
+    let files = drop_ins.map(|file| machine.name(&file).display().to_string());
     let other = std::iter::once("/etc/systemd/system.conf".to_owned()).chain(files).find(|file| {
         let text = machine.text(file).unwrap_or_default();
         let mut values = text.lines().filter_map(|line| line.trim().strip_prefix("RuntimeWatchdogSec="));
@@ -193,8 +191,9 @@ pub(super) fn watchdog(machine: &Machine, instances: &[Instance]) -> Vec<Finding
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
-    use super::super::tests::{Tree, told};
+    use super::super::tests::told;
     use super::*;
+    use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok, Warning};
     use std::fs;
 

@@ -5,24 +5,26 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
-use super::machine::Machine;
+use glob::Pattern;
+
+use super::Machine;
 
 /// Where units stand, those of the administrator first (systemd.unit(5)).
 const FOLDERS: [&str; 4] =
     [ADMINISTRATOR_S, "/usr/local/lib/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"];
-pub(super) const ADMINISTRATOR_S: &str = "/etc/systemd/system";
+pub(in crate::cli) const ADMINISTRATOR_S: &str = "/etc/systemd/system";
 const ENDING: &str = ".service";
 
 /// Whether a unit is installed and not masked; an instance of a template if that is.
-pub(super) fn is_installed(machine: &Machine, unit: &str) -> bool {
+pub(in crate::cli) fn is_installed(machine: &Machine, unit: &str) -> bool {
     let template = unit.split_once('@').map(|(name, _)| format!("{name}@"));
     file(machine, unit).or_else(|| file(machine, &template?)).is_some()
 }
 
 /// The file of a unit that is not masked.
-pub(super) fn file(machine: &Machine, unit: &str) -> Option<String> {
+pub(in crate::cli) fn file(machine: &Machine, unit: &str) -> Option<String> {
     let mut files = FOLDERS.iter().map(|folder| format!("{folder}/{unit}{ENDING}"));
     let file = files.find(|file| fs::symlink_metadata(machine.path(file)).is_ok())?;
     let is_masked = fs::read_link(machine.path(&file)).is_ok_and(|target| target == Path::new("/dev/null"));
@@ -30,48 +32,47 @@ pub(super) fn file(machine: &Machine, unit: &str) -> Option<String> {
 }
 
 /// The units that are started at boot, as some target wants them, in order; of these the ones that are `wanted`.
-pub(super) fn enabled(machine: &Machine, wanted: impl Fn(&str) -> bool) -> Vec<String> {
-    const FOLDER: &str = ADMINISTRATOR_S;
-    let folders = machine.names(FOLDER).into_iter();
-    let folders = folders.filter(|folder| [".wants", ".requires"].iter().any(|kind| folder.ends_with(kind)));
-    let names = folders.flat_map(|folder| machine.names(format!("{FOLDER}/{folder}")));
-    let units: BTreeSet<String> = names.filter_map(|name| Some(name.strip_suffix(ENDING)?.to_owned())).collect();
+pub(in crate::cli) fn enabled(machine: &Machine, wanted: impl Fn(&str) -> bool) -> Vec<String> {
+    let kinds = ["wants", "requires"].into_iter();
+    let units = named(kinds.flat_map(|kind| machine.matching(format!("{ADMINISTRATOR_S}/*.{kind}/*{ENDING}"))));
     units.into_iter().filter(|unit| wanted(unit)).collect()
 }
 
 /// All units that are installed, in order.
-pub(super) fn all(machine: &Machine) -> BTreeSet<String> {
-    let names = FOLDERS.iter().flat_map(|folder| machine.names(folder));
-    names.filter_map(|name| Some(name.strip_suffix(ENDING)?.to_owned())).collect()
+pub(in crate::cli) fn all(machine: &Machine) -> BTreeSet<String> {
+    named(FOLDERS.iter().flat_map(|folder| machine.matching(format!("{folder}/*{ENDING}"))))
+}
+
+/// The units that files are called for.
+fn named(files: impl Iterator<Item = PathBuf>) -> BTreeSet<String> {
+    files.filter_map(|file| Some(file.file_name()?.to_str()?.strip_suffix(ENDING)?.to_owned())).collect()
 }
 
 /// The text of a unit, with that of the files which add to it.
-pub(super) fn text(machine: &Machine, unit: &str) -> Option<String> {
+pub(in crate::cli) fn text(machine: &Machine, unit: &str) -> Option<String> {
     let file = FOLDERS.iter().find_map(|folder| machine.text(format!("{folder}/{unit}{ENDING}")))?;
     // The administrator's come last.
-    let added = FOLDERS.iter().rev().flat_map(|folder| {
-        let folder = format!("{folder}/{unit}{ENDING}.d");
-        let names = machine.names(&folder).into_iter().filter(|name| name.ends_with(".conf"));
-        names.filter_map(|name| machine.text(format!("{folder}/{name}"))).collect::<Vec<_>>()
-    });
+    let unit = Pattern::escape(unit);
+    let added = FOLDERS.iter().rev().flat_map(|folder| machine.matching(format!("{folder}/{unit}{ENDING}.d/*.conf")));
+    let added = added.filter_map(|file| machine.text(machine.name(&file)));
     Some(std::iter::once(file).chain(added).collect::<Vec<_>>().join("\n"))
 }
 
 /// A setting in a unit's text: the last one counts.
-pub(super) fn setting<'a>(text: &'a str, key: &str) -> Option<&'a str> {
+pub(in crate::cli) fn setting<'a>(text: &'a str, key: &str) -> Option<&'a str> {
     let values = text.lines().filter_map(|line| line.trim().strip_prefix(key)?.trim_start().strip_prefix('='));
     values.map(str::trim).rfind(|value| !value.is_empty())
 }
 
 /// Whether this is what a unit of Klipper's own micro-controller program is called.
-pub(super) fn of_klipper_mcu(unit: &str) -> bool {
+pub(in crate::cli) fn of_klipper_mcu(unit: &str) -> bool {
     ["klipper-mcu", "klipper_mcu"].contains(&unit)
 }
 
 #[cfg(test)]
 mod tests {
-    use super::super::tests::Tree;
     use super::*;
+    use crate::cli::computer::tests::Tree;
 
     #[test]
     fn what_is_installed_masked_or_an_instance() {

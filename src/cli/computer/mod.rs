@@ -1,0 +1,296 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The computer that is looked at: its files below a root, and its users. Its units and processes stand in files of
+//! their own, on top of this one.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io;
+use std::os::unix::fs::MetadataExt;
+use std::path::{Component, Path, PathBuf};
+
+use glob::{MatchOptions, Pattern};
+use nix::unistd::{User, getegid, geteuid, getgroups};
+
+use crate::foreign;
+
+pub(super) mod running;
+pub(super) mod units;
+
+/// Nothing that is read here is as long.
+const TEXT_MAX: u64 = 4 << 20;
+/// As many links as the kernel follows (path_resolution(7)).
+const LINKS_MAX: usize = 40;
+/// Most files that a pattern names: one that klippy's configuration has may name every file that there is.
+const MATCHES_MAX: usize = 1000;
+/// As in a shell, what is hidden has to be asked for by its dot.
+const LIKE_A_SHELL: MatchOptions =
+    MatchOptions { case_sensitive: true, require_literal_separator: false, require_literal_leading_dot: true };
+
+/// What the program looks at.
+pub(in crate::cli) struct Machine {
+    root: PathBuf,
+}
+
+/// A user, with all groups.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(in crate::cli) struct Who {
+    pub(in crate::cli) name: String,
+    pub(in crate::cli) uid: u32,
+    pub(in crate::cli) gids: Vec<u32>,
+}
+
+/// Access to a file, as bits of its mode.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(in crate::cli) struct Access(u32);
+
+impl Access {
+    pub(in crate::cli) const READ: Access = Access(4);
+    pub(in crate::cli) const WRITE: Access = Access(2);
+    pub(in crate::cli) const READ_WRITE: Access = Access(6);
+    pub(in crate::cli) const SEARCH: Access = Access(1);
+
+    /// Whether a file gives this to its group.
+    pub(in crate::cli) fn is_given_to_group(self, file: &fs::Metadata) -> bool {
+        file.mode() >> 3 & self.0 == self.0
+    }
+}
+
+impl Who {
+    /// Whether the file's owner and mode let this user in (path_resolution(7)).
+    pub(in crate::cli) fn may(&self, access: Access, file: &fs::Metadata) -> bool {
+        let bits = match () {
+            () if self.uid == 0 => return true,
+            () if file.uid() == self.uid => file.mode() >> 6,
+            () if self.gids.contains(&file.gid()) => file.mode() >> 3,
+            () => file.mode(),
+        };
+        bits & access.0 == access.0
+    }
+}
+
+impl Machine {
+    pub(in crate::cli) fn at(root: &Path) -> Machine {
+        Machine { root: root.to_owned() }
+    }
+
+    /// Whether it is this one, of which the kernel can be asked more than files tell.
+    pub(in crate::cli) fn is_this(&self) -> bool {
+        self.root == Path::new("/")
+    }
+
+    /// Where a file of the machine is.
+    pub(in crate::cli) fn path(&self, path: impl AsRef<Path>) -> PathBuf {
+        let path = path.as_ref();
+        self.root.join(path.strip_prefix("/").unwrap_or(path))
+    }
+
+    /// How the machine itself calls a file.
+    pub(in crate::cli) fn name(&self, path: &Path) -> PathBuf {
+        Path::new("/").join(path.strip_prefix(&self.root).unwrap_or(path))
+    }
+
+    /// A file's text without the white space around it. None if there is none or it can not be read.
+    pub(in crate::cli) fn text(&self, path: impl AsRef<Path>) -> Option<String> {
+        let bytes = foreign::read(&self.path(path), TEXT_MAX).ok()?;
+        Some(String::from_utf8_lossy(&bytes).trim().to_owned())
+    }
+
+    /// The names in a folder, in order; none if there is no such folder.
+    fn names(&self, folder: &Path) -> Vec<String> {
+        let entries = fs::read_dir(self.path(folder)).into_iter().flatten().flatten();
+        let mut names: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
+        names.sort();
+        names
+    }
+
+    /// Where the files are that an absolute pattern of `*`, `?` and `[...]` names, in order. A path without any of
+    /// these names itself, also if there is no such file.
+    pub(in crate::cli) fn matching(&self, pattern: impl AsRef<Path>) -> Vec<PathBuf> {
+        let mut paths = vec![PathBuf::from("/")];
+        let mut is_pattern = false;
+        for part in pattern.as_ref().components() {
+            let part = match part {
+                Component::Normal(part) => part.to_string_lossy(),
+                Component::ParentDir => "..".into(),
+                _ => continue,
+            };
+            match Pattern::new(&part).ok().filter(|_| part.contains(['*', '?', '['])) {
+                Some(pattern) => {
+                    is_pattern = true;
+                    let found = paths.iter().flat_map(|folder| {
+                        let names = self.names(folder).into_iter();
+                        names.filter(|name| pattern.matches_with(name, LIKE_A_SHELL)).map(|name| folder.join(name))
+                    });
+                    paths = found.take(MATCHES_MAX).collect();
+                }
+                None => paths.iter_mut().for_each(|path| path.push(&*part)),
+            }
+        }
+        let paths = paths.into_iter().map(|path| self.path(path));
+        paths.filter(|path| !is_pattern || fs::symlink_metadata(path).is_ok()).collect()
+    }
+
+    /// The first of these files that is there.
+    pub(in crate::cli) fn first<'a>(&self, paths: &[&'a str]) -> Option<&'a str> {
+        paths.iter().find(|path| self.path(path).exists()).copied()
+    }
+
+    /// Follows symbolic links as the machine itself would: all paths on the way, the last of which is no
+    /// link.
+    pub(in crate::cli) fn follow(&self, path: &Path) -> io::Result<Vec<PathBuf>> {
+        let mut way = vec![self.path(path)];
+        for _ in 0..LINKS_MAX {
+            let last = &way[way.len() - 1];
+            if !fs::symlink_metadata(last)?.file_type().is_symlink() {
+                return Ok(way);
+            }
+            let target = fs::read_link(last)?;
+            let next = match target.is_absolute() {
+                true => self.path(target),
+                false => last.parent().unwrap_or(&self.root).join(target),
+            };
+            way.push(next);
+        }
+        Err(io::Error::from_raw_os_error(libc::ELOOP))
+    }
+
+    /// A user by name, from the machine's files.
+    pub(in crate::cli) fn user(&self, name: &str) -> Option<Who> {
+        let passwd = self.text("/etc/passwd")?;
+        let fields: Vec<&str> =
+            passwd.lines().map(|line| line.split(':').collect::<Vec<_>>()).find(|fields| fields[0] == name)?;
+        let (uid, gid) = (fields.get(2)?.parse().ok()?, fields.get(3)?.parse().ok()?);
+        let groups = self.text("/etc/group").unwrap_or_default();
+        let member = |line: &str| {
+            let mut fields = line.split(':').skip(2);
+            let gid = fields.next()?.parse().ok()?;
+            fields.next()?.split(',').any(|member| member == name).then_some(gid)
+        };
+        let gids = std::iter::once(gid).chain(groups.lines().filter_map(member)).collect();
+        Some(Who { name: name.to_owned(), uid, gids })
+    }
+
+    pub(in crate::cli) fn user_name(&self, uid: u32) -> String {
+        self.name_of("/etc/passwd", uid)
+    }
+
+    pub(in crate::cli) fn group_name(&self, gid: u32) -> String {
+        self.name_of("/etc/group", gid)
+    }
+
+    /// The group of a file, if membership of it is no more than a way to such files: root's would be.
+    pub(in crate::cli) fn common_group(&self, file: &fs::Metadata) -> Option<String> {
+        let group = self.group_name(file.gid());
+        (group != "root" && group != "0").then_some(group)
+    }
+
+    /// The number of a group, given by name or number.
+    pub(in crate::cli) fn gid_of(&self, group: &str) -> Option<u32> {
+        let text = self.text("/etc/group").unwrap_or_default();
+        let mut lines = text.lines().map(|line| line.split(':').collect::<Vec<_>>());
+        let line = lines.find(|fields| fields[0] == group);
+        line.map_or_else(|| group.parse().ok(), |fields| fields.get(2)?.parse().ok())
+    }
+
+    /// The name that a number has in /etc/passwd or /etc/group; the number if it has none.
+    fn name_of(&self, file: &str, number: u32) -> String {
+        let text = self.text(file).unwrap_or_default();
+        let has = |line: &&str| line.split(':').nth(2) == Some(&number.to_string());
+        let name = text.lines().find(has).and_then(|line| line.split(':').next());
+        name.map_or_else(|| number.to_string(), str::to_owned)
+    }
+
+    /// How a file's owner, group and mode are written: `root:gpio 0660`.
+    pub(in crate::cli) fn ownership(&self, file: &fs::Metadata) -> String {
+        let (user, group) = (self.user_name(file.uid()), self.group_name(file.gid()));
+        format!("{user}:{group} {:04o}", file.mode() & 0o7777)
+    }
+
+    /// Who has started this program, if this machine is looked at, and it is not root, who may do anything.
+    pub(in crate::cli) fn caller(&self) -> Option<Who> {
+        let uid = geteuid();
+        if uid.is_root() || !self.is_this() {
+            return None;
+        }
+        let name = User::from_uid(uid).ok().flatten().map_or_else(|| uid.to_string(), |user| user.name);
+        let groups = getgroups().unwrap_or_default();
+        let gids = std::iter::once(getegid()).chain(groups).map(nix::unistd::Gid::as_raw).collect();
+        Some(Who { name, uid: uid.as_raw(), gids })
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+    use tempfile::TempDir;
+
+    /// A machine that a test has made of files.
+    pub(in crate::cli) struct Tree(TempDir);
+
+    impl Tree {
+        pub(in crate::cli) fn new() -> Tree {
+            Tree(tempfile::tempdir().unwrap())
+        }
+
+        pub(in crate::cli) fn machine(&self) -> Machine {
+            Machine::at(self.0.path())
+        }
+
+        pub(in crate::cli) fn put(&self, path: &str, text: &str) {
+            let path = self.0.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+
+        pub(in crate::cli) fn mode(&self, path: &str, mode: u32) {
+            fs::set_permissions(self.0.path().join(path), fs::Permissions::from_mode(mode)).unwrap();
+        }
+
+        pub(in crate::cli) fn put_mode(&self, path: &str, text: &str, mode: u32) {
+            self.put(path, text);
+            self.mode(path, mode);
+        }
+
+        pub(in crate::cli) fn link(&self, path: &str, target: &str) {
+            let path = self.0.path().join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            symlink(target, path).unwrap();
+        }
+
+        /// A process of a user with these further groups.
+        pub(in crate::cli) fn process(&self, pid: u32, arguments: &[&str], uid: u32, gids: &[u32]) {
+            let gids: Vec<String> = gids.iter().map(u32::to_string).collect();
+            self.put(&format!("proc/{pid}/cmdline"), &(arguments.join("\0") + "\0"));
+            self.put(&format!("proc/{pid}/stat"), &format!("{pid} (x) S {} 0", vec!["1"; 20].join(" ")));
+            let ids = [uid; 4].map(|uid| uid.to_string()).join("\t");
+            let status = format!("Name:\tx\nUid:\t{ids}\nGid:\t{ids}\nGroups:\t{}\n", gids.join(" "));
+            self.put(&format!("proc/{pid}/status"), &status);
+        }
+    }
+
+    #[test]
+    fn patterns_name_what_is_there() {
+        let tree = Tree::new();
+        for file in ["a/x.cfg", "a/.x.cfg", "b/y.cfg", "b/y.cfg.bak", "b/z1.cfg"] {
+            tree.put(file, "");
+        }
+        let machine = tree.machine();
+        let matching = |pattern: &str| -> Vec<String> {
+            let paths = machine.matching(pattern);
+            paths.iter().map(|path| machine.name(path).display().to_string()).collect()
+        };
+        assert_eq!(matching("/*/*.cfg"), ["/a/x.cfg", "/b/y.cfg", "/b/z1.cfg"]);
+        assert_eq!(matching("/a/.*"), ["/a/.x.cfg"]);
+        assert_eq!(matching("/b/[xz]?.cfg"), ["/b/z1.cfg"]);
+        assert_eq!(matching("/*/x.cfg"), ["/a/x.cfg"], "and not one in the other folder");
+        assert_eq!(matching("/a/../b/*.bak"), ["/a/../b/y.cfg.bak"]);
+        assert_eq!(matching("/none/*").len() + matching("/a/[").len(), 1);
+        assert_eq!(matching("/none"), ["/none"]);
+        // In no time, though there are so many ways to try it.
+        tree.put(&format!("c/{}", "a".repeat(200)), "");
+        assert_eq!(matching(&format!("/c/{}", "*a".repeat(40))).len(), 1);
+        assert!(matching(&format!("/c/{}b", "*a".repeat(40))).is_empty());
+    }
+}

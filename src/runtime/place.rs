@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What stands at a link's place. The program that puts the link there, `pinion run --check` and the doctor judge it
+//! by this.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::path::Path;
+
+use pinion_firmware::trouble::Trouble;
+
+/// What stands at a link's place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Place {
+    /// Nothing, or nothing that can be seen.
+    Free,
+    /// A symbolic link, which another one replaces.
+    Link,
+    /// A folder.
+    Folder,
+    /// Any other file.
+    File,
+}
+
+impl Place {
+    /// What stands at `path`.
+    pub fn of(path: &Path) -> Place {
+        match fs::symlink_metadata(path) {
+            Ok(found) if found.file_type().is_symlink() => Place::Link,
+            Ok(found) if found.is_dir() => Place::Folder,
+            Ok(_) => Place::File,
+            Err(_) => Place::Free,
+        }
+    }
+
+    /// Why no link can be put there, which users know as `link`; none if one can.
+    pub fn obstacle(self, link: &Path) -> Option<Trouble> {
+        let link = link.display();
+        match self {
+            Place::Free | Place::Link => None,
+            Place::Folder => Some(
+                Trouble::new(format!("{link} is a folder"))
+                    .remedy("choose another path with -I, such as one in that folder"),
+            ),
+            Place::File => Some(
+                Trouble::new(format!("{link} exists and is no symbolic link"))
+                    .remedy("remove it, or choose another path with -I"),
+            ),
+        }
+    }
+}
