@@ -123,6 +123,8 @@ pub struct State {
     pub write_ticks: u32,
     /// How long a device on a worker takes to answer; at first none does.
     pub answer_ticks: u32,
+    /// Whether the workers' queues are full, so that they take no errand.
+    pub refuses: bool,
     /// How long each byte takes on a bus. If it does, an errand is run as it is handed over, and its
     /// chip is told the instants at which it will be spoken to.
     pub byte_ticks: u32,
@@ -729,6 +731,9 @@ impl Workers for FakeWorkers {
     }
 
     fn submit(&mut self, WorkerId(worker): WorkerId, mut job: Job) -> Result<(), Refused> {
+        if self.bench.state().refuses {
+            return Err(Refused { job, why: Shutdown::because(reason::WORKER_OVERFLOW, "the bench refuses it") });
+        }
         let takes = Ticks(self.bench.state().answer_ticks);
         let at_once = self.bench.state().byte_ticks != 0;
         let mut shop = self.shop.lock().unwrap();

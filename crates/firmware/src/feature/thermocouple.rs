@@ -49,6 +49,22 @@ enum Chip {
     Max6675,
 }
 
+/// Data sheet 19-7534, register map.
+#[derive(Clone, Copy)]
+enum Max31856 {
+    /// The first of three: LTCBH, LTCBM, LTCBL.
+    LinearizedTemperature = 0x0c,
+    FaultStatus = 0x0f,
+}
+
+/// Data sheet 19-6478, register map.
+#[derive(Clone, Copy)]
+enum Max31865 {
+    /// The first of two, the high byte.
+    Rtd = 0x01,
+    FaultStatus = 0x07,
+}
+
 impl Chip {
     const ALL: [(Chip, &'static str); 4] = [
         (Chip::Max31855, "MAX31855"),
@@ -67,10 +83,8 @@ impl Chip {
             // They have no registers: each transfer is the one word.
             Chip::Max31855 => &[0; 4],
             Chip::Max6675 => &[0; 2],
-            // LTCBH, LTCBM, LTCBL: the linearized temperature (data sheet 19-7534, register map).
-            Chip::Max31856 => &[0x0c, 0, 0, 0],
-            // RTD MSBs and LSBs (data sheet 19-6478, register map).
-            Chip::Max31865 => &[0x01, 0, 0],
+            Chip::Max31856 => &[Max31856::LinearizedTemperature as u8, 0, 0, 0],
+            Chip::Max31865 => &[Max31865::Rtd as u8, 0, 0],
         }
     }
 
@@ -78,8 +92,8 @@ impl Chip {
     fn fault_register(self) -> Option<u8> {
         match self {
             Chip::Max31855 | Chip::Max6675 => None,
-            Chip::Max31856 => Some(0x0f),
-            Chip::Max31865 => Some(0x07),
+            Chip::Max31856 => Some(Max31856::FaultStatus as u8),
+            Chip::Max31865 => Some(Max31865::FaultStatus as u8),
         }
     }
 

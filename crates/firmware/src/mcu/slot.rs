@@ -103,10 +103,8 @@ impl<E: Errand> Slot<E> {
 
     /// The same with a hold that the sender has already.
     pub(super) fn send_with(&mut self, turn: &mut Turn, worker: WorkerId, hold: Hold) -> Result<(), Shutdown> {
-        let away = match &self.0 {
-            Place::Here(packed) => Place::Away { address: address(&**packed), counts: true },
-            Place::Away { .. } => return Ok(()),
-        };
+        let Place::Here(packed) = &self.0 else { return Ok(()) };
+        let away = Place::Away { address: address(&**packed), counts: true };
         let Place::Here(parcel) = mem::replace(&mut self.0, away) else { return Ok(()) };
         match turn.submit(worker, Job { oid: turn.oid(), parcel, holds: hold.0 }) {
             Ok(()) => Ok(()),

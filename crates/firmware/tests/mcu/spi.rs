@@ -29,6 +29,20 @@ fn a_transfer_has_the_devices_mode_and_rate_and_its_answer() {
     assert_eq!(rig.bench.transfers(), expected);
 }
 
+/// What a worker does not take stays with its device, and commands do not wait for it.
+#[test]
+fn a_transfer_that_no_worker_takes_is_not_lost() {
+    let mut rig = Rig::configured(&["config_spi_without_cs oid=0", "spi_set_bus oid=0 spi_bus=1 mode=3 rate=5000000"]);
+    rig.bench.state().refuses = true;
+    rig.send("spi_transfer oid=0 data=00");
+    assert_eq!(rig.shutdown().as_deref(), Some("Bus worker queue overflow"));
+    rig.bench.state().refuses = false;
+    rig.forget_responses();
+    rig.send("clear_shutdown");
+    assert!(!rig.mcu.is_held());
+    assert_eq!(rig.ask("spi_transfer oid=0 data=00ff0f"), "spi_transfer_response oid=0 response=ff00f0");
+}
+
 #[test]
 fn the_chip_select_idles_and_is_driven_for_the_transfer() {
     for (active_high, selected) in [(0, 0), (1, 1)] {
