@@ -87,13 +87,13 @@ pub struct Others {
 
 impl Others {
     pub fn start(pid: u32) -> Others {
-        Others { pid, since: Instant::now(), all: machine(), known: cpu(pid) + own() }
+        Others { pid, since: Instant::now(), all: computer(), known: cpu(pid) + own() }
     }
 
     /// CPUs that others used since the start.
     pub fn cpus(&self) -> f64 {
         let known = (cpu(self.pid) + own()).saturating_sub(self.known);
-        let all = machine().saturating_sub(self.all);
+        let all = computer().saturating_sub(self.all);
         all.saturating_sub(known).as_secs_f64() / self.since.elapsed().as_secs_f64()
     }
 }
@@ -105,7 +105,7 @@ fn own() -> Duration {
 }
 
 /// CPU time of all processes and of the kernel; time that a hypervisor stole included.
-fn machine() -> Duration {
+fn computer() -> Duration {
     let text = fs::read_to_string("/proc/stat").unwrap_or_default();
     let fields = text.lines().next().unwrap_or_default().split_whitespace().skip(1);
     let times: Vec<u64> = fields.filter_map(|field| field.parse().ok()).collect();

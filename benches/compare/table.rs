@@ -122,7 +122,7 @@ impl Table {
         if !self.others.is_empty() {
             let mean = self.others.iter().sum::<f64>() / self.others.len() as f64;
             let max = self.others.iter().copied().fold(0.0, f64::max);
-            let _ = writeln!(text, "Others on this machine used {mean:.2} CPUs in the mean, {max:.2} at most.");
+            let _ = writeln!(text, "Others on this computer used {mean:.2} CPUs in the mean, {max:.2} at most.");
         }
         text
     }

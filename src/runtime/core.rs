@@ -681,7 +681,7 @@ mod tests {
                     rig.stop(Request::Run(payload));
                 }
             }
-            rig.wait_until("the machine stops", Rig::is_stopped);
+            rig.wait_until("the MCU stops", Rig::is_stopped);
             rig.wait_until("the blocks are refused", |rig| rig.progress.done() == blocks);
             assert!(!rig.bench.level(30), "a command that waited has not run");
             rig.bench.hang(false);
@@ -709,7 +709,7 @@ mod tests {
         // One that means something else in the dialect of before.
         let block = blocks.find(|block| !rig.dialect.is_emergency(block.as_slice())).unwrap();
         rig.stop(Request::Run(block));
-        rig.wait_until("the machine stops", Rig::is_stopped);
+        rig.wait_until("the MCU stops", Rig::is_stopped);
         rig.bench.hang(false);
         rig.stop(Request::Quit);
         rig.thread.join().unwrap();
@@ -723,7 +723,7 @@ mod tests {
         let stop = rig.encode("emergency_stop", &[]);
         let block = Payload::new(&[transfer.as_slice(), stop.as_slice()].concat());
         rig.stop(Request::Run(block));
-        rig.wait_until("the machine stops", Rig::is_stopped);
+        rig.wait_until("the MCU stops", Rig::is_stopped);
         assert_eq!(rig.quit(), Left::Safe);
     }
 

@@ -188,7 +188,7 @@ impl std::fmt::Display for Verdict {
     }
 }
 
-/// A step that is late by more than 1 ms stops the machine ("Stepper too far in past"). So for
+/// A step that is late by more than 1 ms stops the MCU ("Stepper too far in past"). So for
 /// steppers no edge may be that late, and 999 of 1000 must stay below a tenth of it. A heater has to be
 /// set again within 5 s, and klippy does so every 300 ms: 50 ms do no harm there.
 const STEPPERS_P999_US: f64 = 100.0;

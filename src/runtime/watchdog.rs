@@ -41,13 +41,13 @@ impl Watchdog {
             Ok(seconds) if seconds > 0 => Duration::from_secs(seconds.unsigned_abs().into()),
             _ => USUAL_LIMIT,
         };
-        info!("{} resets this machine {} s after Pinion hangs", path.display(), limit.as_secs());
+        info!("{} resets this computer {} s after Pinion hangs", path.display(), limit.as_secs());
         Ok(Watchdog { file, limit })
     }
 
     fn feed(&mut self) {
         if let Err(error) = self.file.write_all(b"\0") {
-            warn!("the watchdog can not be fed: {error}: this machine is about to be reset");
+            warn!("the watchdog can not be fed: {error}: this computer is about to be reset");
         }
     }
 
@@ -55,7 +55,7 @@ impl Watchdog {
     /// (Documentation/watchdog/watchdog-api.rst, "magic close").
     fn close(mut self) {
         if let Err(error) = self.file.write_all(b"V") {
-            warn!("the watchdog can not be stopped: {error}: this machine is about to be reset");
+            warn!("the watchdog can not be stopped: {error}: this computer is about to be reset");
         }
     }
 }
@@ -63,7 +63,7 @@ impl Watchdog {
 fn cannot_open(path: &Path, error: &io::Error) -> io::Error {
     let remedy = match error.raw_os_error() {
         Some(libc::ENOENT) => {
-            "this machine has no watchdog, or its driver is not loaded: on a Raspberry Pi set \"dtparam=watchdog=on\" in config.txt, elsewhere modprobe softdog, or leave out -w"
+            "this computer has no watchdog, or its driver is not loaded: on a Raspberry Pi set \"dtparam=watchdog=on\" in config.txt, elsewhere modprobe softdog, or leave out -w"
         }
         Some(libc::EBUSY) => {
             "another program feeds it: unset RuntimeWatchdogSec in /etc/systemd/system.conf or stop the watchdog daemon, or leave out -w"

@@ -192,7 +192,7 @@ impl Printer {
 
     pub fn start_host(&mut self) {
         let _ = fs::remove_file(self.path("api"));
-        // While it homes, klippy is a tenth of a second ahead of the machine: on a computer that builds and tests
+        // While it homes, klippy is a tenth of a second ahead of the MCU: on a computer that builds and tests
         // at once it would often be late without this, which only root may ask for.
         let nice = if geteuid().is_root() { "-15" } else { "0" };
         let host = Command::new("nice")
@@ -488,7 +488,7 @@ pub fn with(config: &str, section: &str, keys: &str) -> String {
     format!("{before}{}\n{keys}\n\n{after}", lines.join("\n"))
 }
 
-/// Has klippy translate G-code with a dictionary, without any machine: what it wrote, or why it did not.
+/// Has klippy translate G-code with a dictionary, without any MCU: what it wrote, or why it did not.
 pub fn batch(checkout: &Path, dictionary: &Path, config: &str, gcode: &str) -> Result<Vec<u8>, String> {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);

@@ -63,7 +63,7 @@ fn klippy_stops_in_an_emergency_and_restarts() {
     let mut printer = Printer::start(&checkout);
     printer.gcode("G28");
     printer.stop("M112");
-    // klippy stops itself first, then asks the machine to.
+    // klippy stops itself first, then asks the MCU to.
     printer.until_logged("shutdown: Command request");
     printer.restart("FIRMWARE_RESTART");
     printer.gcode("G28");
@@ -82,7 +82,7 @@ fn a_klippy_that_is_killed_comes_back() {
     // The heater is not refreshed any more.
     printer.until_logged("Missed scheduling of next digital out event");
     printer.start_host();
-    // A machine that is shut down wants its FIRMWARE_RESTART, as any micro-controller; klippy
+    // An MCU that is shut down wants its FIRMWARE_RESTART, as any micro-controller; klippy
     // gives it by itself where it may.
     if printer.settled() != "ready" {
         printer.restart("FIRMWARE_RESTART");

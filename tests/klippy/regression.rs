@@ -272,7 +272,7 @@ fn klippy_ends_its_regression_cases_as_with_the_firmware_s_dictionary() {
             } else if ours.configuration != theirs.configuration {
                 wrong.lock().unwrap().push(format!("{}: {}", case.name(), difference(&ours, &theirs)));
             } else if !ours.failed && ours.configuration.last().is_none_or(|last| !last.starts_with(LAST)) {
-                wrong.lock().unwrap().push(format!("{} does not configure the machine", case.name()));
+                wrong.lock().unwrap().push(format!("{} does not configure the MCU", case.name()));
             } else if theirs.failed != case.should_fail {
                 neither.lock().unwrap().push(format!("{}:\n{}", case.name(), theirs.log));
             }

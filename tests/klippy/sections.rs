@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The printer.cfg of the built-in printer, and what may be taken out of it: klippy reads it in its batch
-//! mode, without a machine.
+//! mode, without an MCU.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A machine that has booted and loaded its modules, kept in a file: tests go on
+//! A VM that has booted and loaded its modules, kept in a file: tests go on
 //! from there. To boot takes an emulated computer longer than a dozen tests do.
 
 use std::fs::{self, File};
@@ -37,7 +37,7 @@ impl Snapshot {
         File::open(&path).map(Snapshot).map_err(|error| format!("cannot read {}: {error}", path.display()))
     }
 
-    /// Where a machine finds it. A run of another checkout may remove the file's name
+    /// Where a VM finds it. A run of another checkout may remove the file's name
     /// meanwhile, and a path in the emulator's command would want quoting.
     pub fn source(&self) -> String {
         format!("exec:cat {}", name_of(&self.0))
@@ -48,7 +48,7 @@ fn make(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache, path: &Path)
     let folder = cache.run_folder()?;
     let file = File::create(path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
     let mut emulator = Emulator::start(vm::booting(kernel, &program.payload()?, folder.path())?, folder.path())?;
-    // init stops the machine when it is ready for tests.
+    // init stops the VM when it is ready for tests.
     emulator.wait_until(|status| status == "guest-panicked")?;
     emulator.ask(json!({"execute": "migrate-set-parameters", "arguments": {"max-bandwidth": 1_u64 << 40}}))?;
     emulator.ask(json!({"execute": "migrate", "arguments": {"uri": format!("exec:cat >{}", name_of(&file))}}))?;
@@ -61,7 +61,7 @@ fn name_of(file: &File) -> String {
     format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
 }
 
-/// Changes with everything that a booted machine is made of.
+/// Changes with everything that a booted VM is made of.
 fn key(kernel: &Kernel, program: &GuestProgram<'_>) -> Result<u64, String> {
     let mut hasher = DefaultHasher::new();
     process::output(Command::new(vm::EMULATOR).arg("--version"))?.hash(&mut hasher);

@@ -23,7 +23,7 @@ use serde_json::{Value, json};
 
 /// How long the client waits for Pinion.
 const CLIENT_TIMEOUT: Duration = Duration::from_secs(10);
-/// A heater that is not refreshed for so long shuts the machine down.
+/// A heater that is not refreshed for so long shuts the MCU down.
 const MAX_DURATION_S: f64 = 3.0;
 const REFRESH: Duration = Duration::from_millis(300);
 /// How long the host takes to answer: it answers G-code when it has ended, and an emulated computer homes slowly.

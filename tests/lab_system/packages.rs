@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the machine is given: the package of the tree as it stands, a later one, the host, the tree, and klippy.
+//! What the VM is given: the package of the tree as it stands, a later one, the host, the tree, and klippy.
 
 use std::env;
 use std::fs;
@@ -8,7 +8,7 @@ use std::process::Command;
 
 use pinion_testkit::process;
 
-/// Fills the folder that the machine sees as /share.
+/// Fills the folder that the VM sees as /share.
 pub fn share(folder: &Path) -> Result<(), String> {
     fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
     let tree = Path::new(env!("CARGO_MANIFEST_DIR"));

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The commands of the pages, as the machine is given them, and which check tries which page.
+//! The commands of the pages, as the VM is given them, and which check tries which page.
 
 use std::fs;
 use std::path::Path;
@@ -18,7 +18,7 @@ fn with_commands() -> Vec<Page> {
     pages().into_iter().filter(has_commands).collect()
 }
 
-/// Puts each block of commands into a file of its own, in the folder that the machine sees as /share:
+/// Puts each block of commands into a file of its own, in the folder that the VM sees as /share:
 /// `pages/README.md/0042.sh`, or `.not-tried`, for the one that begins at line 42.
 pub fn share(folder: &Path) -> Result<(), String> {
     for page in with_commands() {

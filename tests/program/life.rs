@@ -67,7 +67,7 @@ fn a_link_that_a_running_pinion_serves_is_refused_and_left_alone() {
     fs::set_permissions(&target, fs::Permissions::from_mode(0o666)).unwrap();
     made_an_hour_ago(&pinion.link());
     refused(&["run", "--board", "sim"], false);
-    assert!(client.status().is_ok(), "the host keeps its machine");
+    assert!(client.status().is_ok(), "the host keeps its MCU");
     // What is to be restarted may be checked meanwhile.
     let (status, _) = pinion.beside(&["run", "--board", "sim", "--check"], false);
     assert_eq!(status, Some(0));
@@ -317,7 +317,7 @@ fn a_host_that_never_reads_neither_blocks_the_mcu_nor_makes_it_grow() {
             // The terminal stays open: a host that hangs is no host that is gone.
             std::thread::park();
         });
-        finished.recv_timeout(WAIT_MAX).expect("the machine takes commands in");
+        finished.recv_timeout(WAIT_MAX).expect("the MCU takes commands in");
         let grown = pinion.anonymous_kb().saturating_sub(before);
         assert!(grown < 2048, "{query}: grew by {grown} kB; the log:\n{}", pinion.log());
         // And why the MCU stops is in the log all the same. (It counts only if it is read apart

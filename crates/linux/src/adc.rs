@@ -213,7 +213,7 @@ pub(super) fn missing(number: u32, id: &str, adcs: &[IioDevice]) -> Trouble {
         true => "no ADC that the kernel knows of".to_owned(),
         false => known.join(", "),
     };
-    Trouble::new(format!("there is no {id} on iio:device{number}: this machine has {known}"))
+    Trouble::new(format!("there is no {id} on iio:device{number}: this computer has {known}"))
         .remedy("load the driver (a device tree overlay, as a rule), or choose another pin (pinion pins lists them)")
 }
 

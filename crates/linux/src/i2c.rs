@@ -117,8 +117,8 @@ fn cannot_open(path: &Path, name: &str, error: &io::Error, buses: &[u32]) -> Tro
         libc::ENOENT => {
             let known: Vec<String> = buses.iter().map(|bus| format!("i2c.{bus}")).collect();
             let known = match known.is_empty() {
-                true => "this machine has no I2C bus".to_owned(),
-                false => format!("this machine has {}", known.join(", ")),
+                true => "this computer has no I2C bus".to_owned(),
+                false => format!("this computer has {}", known.join(", ")),
             };
             Trouble::new(format!("there is no {}: {known}", path.display())).remedy(
                 "enable the bus (on a Raspberry Pi \"dtparam=i2c_arm=on\" in config.txt, and \"sudo modprobe \
@@ -156,7 +156,7 @@ mod tests {
         fs::write(dev.path().join("i2c-20"), "").unwrap();
         let error = I2c::open(dev.path(), CONFIG).err().unwrap();
         assert_eq!(error.reason, reason::I2C_OPEN);
-        assert!(error.to_string().contains("this machine has i2c.20: enable the bus"), "{error}");
+        assert!(error.to_string().contains("this computer has i2c.20: enable the bus"), "{error}");
         fs::write(dev.path().join("i2c-1"), "").unwrap();
         let error = I2c::open(dev.path(), CONFIG).err().unwrap();
         assert!(error.to_string().contains("i2c-1 address 0x48 can not be opened: "), "{error}");

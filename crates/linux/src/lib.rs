@@ -407,7 +407,7 @@ mod tests {
         let mut board = board(dev.path());
         let error = board.line(Pin(5 * 288), ON).err().unwrap();
         assert_eq!(error.reason, reason::CHIP_MISSING);
-        assert!(error.to_string().contains("gpiochip5: this machine has no GPIO chip"), "{error}");
+        assert!(error.to_string().contains("gpiochip5: this computer has no GPIO chip"), "{error}");
         assert_eq!(board.pins().len(), 19);
         assert_eq!(board.spi_buses().len(), 8);
         assert_eq!(board.i2c_buses().len(), 1);

@@ -277,8 +277,8 @@ fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> Trouble {
         io::ErrorKind::NotFound => {
             let known: Vec<String> = nodes.iter().map(Node::to_string).collect();
             let known = match known.is_empty() {
-                true => "this machine has no spidev node".to_owned(),
-                false => format!("this machine has {}", known.join(", ")),
+                true => "this computer has no spidev node".to_owned(),
+                false => format!("this computer has {}", known.join(", ")),
             };
             Trouble::new(format!("there is no {shown}: {known}"))
                 .remedy("enable the bus (on a Raspberry Pi \"dtparam=spi=on\" in config.txt), or change spi_bus")
@@ -327,7 +327,7 @@ mod tests {
         fs::write(dev.path().join("spidev1.2"), "").unwrap();
         let error = open(dev.path(), None).err().unwrap();
         assert_eq!(error.reason, reason::SPI_OPEN);
-        assert!(error.to_string().contains("this machine has spidev1.2: enable"), "{error}");
+        assert!(error.to_string().contains("this computer has spidev1.2: enable"), "{error}");
     }
 
     #[test]

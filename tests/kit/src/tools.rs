@@ -26,7 +26,7 @@ pub fn ensure() -> Result<(), String> {
     }
     if !has("apt-get") || !has("dpkg-deb") {
         return Err("the lab takes its kernels out of Debian 12's packages, \
-             and this machine has no apt-get and dpkg-deb"
+             and this computer has no apt-get and dpkg-deb"
             .into());
     }
     install(&TOOLS)

@@ -124,7 +124,7 @@ impl Stepper {
         let early = earliest.since(self.next_step);
         if early > i64::from(self.late_limit.0) {
             let cause = format!(
-                "a step is {} us late: more steps a second are asked for than the step pulse of {} ticks and this machine allow",
+                "a step is {} us late: more steps a second are asked for than the step pulse of {} ticks and this computer allow",
                 early / i64::from(Ticks::from_us(1).0),
                 self.pulse_ticks.0
             );

@@ -73,7 +73,7 @@ impl Mcu {
             None if is_foreign => {
                 let (spoken, heard) = (self.spoken.dialect.name(), self.heard().name());
                 let cause = format!(
-                    "the machine is configured by a host of the dialect {spoken}, and the present one speaks {heard}"
+                    "the MCU is configured by a host of the dialect {spoken}, and the present one speaks {heard}"
                 );
                 Err(Shutdown::because(reason::INVALID_COMMAND, cause).remedy("FIRMWARE_RESTART"))
             }

@@ -236,7 +236,7 @@ impl Mcu {
 #[cold]
 fn not_configured(oid: Oid) -> Shutdown {
     let cause = format!(
-        "oid {} is not configured, or as something else: the host's configuration is not this machine's",
+        "oid {} is not configured, or as something else: the host's configuration is not this MCU's",
         oid.index()
     );
     Shutdown::because(reason::INVALID_OID, cause).remedy("FIRMWARE_RESTART")

@@ -105,7 +105,7 @@ impl Mcu {
                 return Err(Shutdown::because(
                     reason::TIMER_TOO_CLOSE,
                     format!(
-                        "the host asked for an event {} us after its time: the host or this machine is overloaded",
+                        "the host asked for an event {} us after its time: the host or this computer is overloaded",
                         late as u64 / u64::from(Ticks::from_us(1).0)
                     ),
                 ));
@@ -153,7 +153,7 @@ impl Mcu {
         let late = self.schedule.timers.next().map_or(0, |at| self.now().since(at));
         if late > i64::from(LATE_LIMIT.0) && self.stop.reason.is_none() {
             let cause = format!(
-                "events are {} ms late: more steps are asked for than this machine can do, or something kept it from running",
+                "events are {} ms late: more steps are asked for than this computer can do, or something kept it from running",
                 late as u64 / u64::from(Ticks::from_ms(1).0)
             );
             let stop = Shutdown::because(reason::TIMER_PAST, cause);

@@ -210,7 +210,7 @@ impl Mcu {
 
     pub(super) fn clear_shutdown(&mut self) -> Result<(), Shutdown> {
         if self.stop.reason.take().is_none() {
-            let what = "clear_shutdown came while the machine was not stopped";
+            let what = "clear_shutdown came while the MCU was not stopped";
             return Err(Shutdown::by_host(reason::NOT_SHUTDOWN, what));
         }
         self.hold_again();

@@ -76,7 +76,7 @@ pub(super) fn missing(path: &Path, chips: &[Chip]) -> Trouble {
         true => "no GPIO chip that can be opened".to_owned(),
         false => known.join(", "),
     };
-    Trouble::new(format!("there is no {}: this machine has {known}", path.display()))
+    Trouble::new(format!("there is no {}: this computer has {known}", path.display()))
         .remedy("write the pin with one of these (pinion pins lists them)")
 }
 
@@ -163,7 +163,7 @@ mod tests {
         let path = Path::new("/dev/gpiochip5");
         assert_eq!(
             missing(path, &[chip(0, "pinctrl-rp1"), chip(10, "gpio-brcmstb@107d508500")]).to_string(),
-            "there is no /dev/gpiochip5: this machine has gpiochip0 (pinctrl-rp1), gpiochip10 \
+            "there is no /dev/gpiochip5: this computer has gpiochip0 (pinctrl-rp1), gpiochip10 \
              (gpio-brcmstb@107d508500): write the pin with one of these (pinion pins lists them)"
         );
         assert!(missing(path, &[]).cause.contains("no GPIO chip"));

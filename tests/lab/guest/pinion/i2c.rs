@@ -131,7 +131,7 @@ fn a_software_bus_pulls_low_or_lets_go_and_never_drives_high() {
     sim.pull(3, false);
     assert_eq!(transfer(client, 0, &[0x10], 0), ("BUS_TIMEOUT".into(), vec![]));
     program.wait_for_line(&["I2C Timeout", "SCL stays low", "check the wiring"]);
-    assert_eq!(transfer(client, 0, &[0x10], 0).0, "BUS_TIMEOUT", "the machine goes on");
+    assert_eq!(transfer(client, 0, &[0x10], 0).0, "BUS_TIMEOUT", "the MCU goes on");
 }
 
 #[test]

@@ -49,7 +49,7 @@ impl Drop for Watchdog {
 fn it_is_fed_while_the_program_gets_on_and_stopped_when_that_ends() {
     let _watchdog = Watchdog::new();
     let mut program = Program::with(&["-r", "-w"], &[]);
-    program.wait_for_line(&["/dev/watchdog resets this machine 10 s after Pinion hangs"]);
+    program.wait_for_line(&["/dev/watchdog resets this computer 10 s after Pinion hangs"]);
     let client = &mut program.connect();
     configure(client, 1, &["config_spi_without_cs oid=0", "spi_set_bus oid=0 spi_bus=spidev0.0 mode=0 rate=1000000"]);
     thread::sleep(LONGER);
