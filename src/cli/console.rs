@@ -42,7 +42,7 @@ use pinion_sim::SimBoard;
 use super::complete::{SIMULATED, offering};
 use super::page::{Page, print};
 use super::settings::{BoardName, sim_config};
-use super::terminal::{Terminal, off};
+use super::terminal::{Terminal, give_back_at, off};
 use super::{failed, logging, not_permitted};
 
 /// Longest wait for an answer of the MCU.
@@ -188,8 +188,8 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
 fn lend_terminal(signals: &[i32]) -> Result<Option<Terminal>, String> {
     // The editor asks the terminal to mark what is pasted.
     let terminal = Terminal::lend(format_args!("{}\r\n", off(DecPrivateModeCode::BracketedPaste)));
-    if let Some(terminal) = &terminal {
-        terminal.give_back_at(signals)?;
+    if terminal.is_some() {
+        give_back_at(signals, Duration::ZERO)?;
     }
     Ok(terminal)
 }

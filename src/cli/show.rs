@@ -24,8 +24,8 @@ use pinion_sim::SimProbe;
 
 use super::page::draw;
 use super::terminal::{
-    ERASE_BELOW, ERASE_LINE, Key, Keys, RESTORE_CURSOR, SAVE_CURSOR, Terminal, all_scrolls, off, on, rows, scrolling,
-    to_row,
+    ERASE_BELOW, ERASE_LINE, Key, Keys, RESTORE_CURSOR, SAVE_CURSOR, Terminal, all_scrolls, give_back_at, off, on,
+    rows, scrolling, to_row,
 };
 use changes::Changes;
 
@@ -322,7 +322,7 @@ fn show(probe: &SimProbe, stopped: &Receiver<()>) -> io::Result<()> {
     let paint = std::env::var_os("NO_COLOR").is_none_or(|value| value.is_empty());
     let mut screen = Screen::default();
     let mut terminal = Terminal::take(Keys::ButSignals);
-    if let Err(error) = terminal.give_back_at(&[SIGQUIT]) {
+    if let Err(error) = give_back_at(&[SIGQUIT], Duration::ZERO) {
         log::warn!("the terminal is not given back if SIGQUIT ends the program: {error}");
     }
     loop {

@@ -132,6 +132,21 @@ fn give_back_at_panic() {
     });
 }
 
+/// Has these signals end the program as they do by themselves, with the terminal given back first. The program has
+/// until `grace` is over to end in order.
+pub(super) fn give_back_at(signals: &[i32], grace: Duration) -> Result<(), String> {
+    let mut signals = Signals::new(signals).map_err(|error| format!("signals can not be taken in: {error}"))?;
+    let wait = move || {
+        for signal in signals.forever() {
+            thread::sleep(grace);
+            give_back();
+            let _ = emulate_default_handler(signal);
+        }
+    };
+    let waiting = thread::Builder::new().name("signals".into()).spawn(wait);
+    waiting.map(drop).map_err(|error| format!("no thread can be started: {error}"))
+}
+
 /// Whether the shell has this program in the foreground. Without job control nobody says so.
 fn is_ours() -> bool {
     tcgetpgrp(io::stdin()).map_or(true, |group| group == getpgrp())
@@ -190,19 +205,6 @@ impl Terminal {
         let settings = tcgetattr(io::stdin()).ok()?;
         *before() = Some(Before { settings: Some(settings), undo: undo.to_string(), is_lent: true });
         Some(Terminal { before: None, parser: Parser::default() })
-    }
-
-    /// Has these signals end the program as they do by themselves, with the terminal given back first.
-    pub(super) fn give_back_at(&self, signals: &[i32]) -> Result<(), String> {
-        let mut signals = Signals::new(signals).map_err(|error| format!("signals can not be taken in: {error}"))?;
-        let wait = move || {
-            for signal in signals.forever() {
-                give_back();
-                let _ = emulate_default_handler(signal);
-            }
-        };
-        let waiting = thread::Builder::new().name("signals".into()).spawn(wait);
-        waiting.map(drop).map_err(|error| format!("no thread can be started: {error}"))
     }
 
     /// Writes what changes the terminal, to be undone by `undo`.
@@ -286,7 +288,7 @@ mod tests {
     fn taking() {
         let Ok(end) = std::env::var("PINION_TEST_TERMINAL") else { return };
         let terminal = Terminal::take(Keys::All);
-        terminal.give_back_at(&[libc::SIGTERM]).unwrap();
+        give_back_at(&[libc::SIGTERM], Duration::ZERO).unwrap();
         terminal.change(off(DecPrivateModeCode::ShowCursor), on(DecPrivateModeCode::ShowCursor)).unwrap();
         assert!(!tcgetattr(io::stdin()).unwrap().local_flags.contains(LocalFlags::ICANON));
         match end.as_str() {

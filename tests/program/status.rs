@@ -6,6 +6,7 @@ use std::io::{Read, Write};
 use std::os::fd::AsRawFd;
 use std::os::unix::fs::{FileTypeExt, OpenOptionsExt, PermissionsExt};
 use std::os::unix::net::{UnixListener, UnixStream};
+use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
 use std::process::{Child, Command, Stdio};
 use std::thread;
@@ -15,7 +16,7 @@ use nix::fcntl::OFlag;
 use nix::pty::{Winsize, grantpt, openpty, posix_openpt, ptsname_r, unlockpt};
 use nix::sys::signal::{Signal, kill};
 use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
-use nix::sys::termios::{LocalFlags, tcgetattr};
+use nix::sys::termios::{FlowArg, LocalFlags, tcflow, tcgetattr};
 use nix::unistd::Pid;
 use serde_json::{Value, json};
 
@@ -361,6 +362,36 @@ fn a_terminal_that_is_gone_ends_it() {
         assert!(Instant::now() < end, "it goes on without a terminal");
         thread::sleep(std::time::Duration::from_millis(20));
     }
+}
+
+#[test]
+fn a_terminal_that_takes_no_output_does_not_keep_it_from_its_end() {
+    let pinion = Pinion::simulated(&[]);
+    pinion.until("the socket", || exists(&socket(&pinion)));
+    let terminal = openpty(None, None).unwrap();
+    let before = tcgetattr(&terminal.slave).unwrap();
+    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
+    let mut watch = watch(&pinion, dup(), dup());
+    let mut master = File::from(terminal.master);
+    let (mut shown, mut piece) = (String::new(), [0; 4096]);
+    while !shown.contains("q ends") {
+        let read = master.read(&mut piece).unwrap();
+        shown += &String::from_utf8_lossy(&piece[..read]);
+    }
+    // As by Ctrl-S. The next page, a second later, finds no room.
+    tcflow(&terminal.slave, FlowArg::TCOOFF).unwrap();
+    thread::sleep(std::time::Duration::from_millis(1500));
+    kill(Pid::from_raw(watch.id() as i32), Signal::SIGTERM).unwrap();
+    let end = Instant::now() + WAIT_MAX;
+    let status = loop {
+        if let Some(status) = watch.try_wait().unwrap() {
+            break status;
+        }
+        assert!(Instant::now() < end, "it does not end");
+        thread::sleep(std::time::Duration::from_millis(20));
+    };
+    assert_eq!(status.signal(), Some(Signal::SIGTERM as i32));
+    assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
 }
 
 #[test]

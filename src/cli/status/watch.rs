@@ -15,7 +15,7 @@ use termina::escape::csi::DecPrivateModeCode as Code;
 use termina::event::KeyCode;
 
 use crate::cli::page::{Page, draw};
-use crate::cli::terminal::{ERASE_BELOW, ERASE_LINE, Key, Keys, Terminal, off, on, rows, to_row};
+use crate::cli::terminal::{ERASE_BELOW, ERASE_LINE, Key, Keys, Terminal, give_back_at, off, on, rows, to_row};
 use crate::runtime::hang_up;
 
 use super::ask::ask;
@@ -23,6 +23,9 @@ use super::{StatusArgs, show};
 
 /// Time between two looks.
 const PERIOD: Duration = Duration::from_secs(1);
+/// How long a signal gives the loop to end: longer than an answer takes. A terminal that takes no output, as after
+/// Ctrl-S, keeps the loop for ever.
+const GRACE: Duration = Duration::from_secs(6);
 /// Longest wait for a key, after which a signal is looked for.
 const KEY_WAIT: Duration = Duration::from_millis(50);
 
@@ -30,10 +33,12 @@ const KEY_WAIT: Duration = Duration::from_millis(50);
 pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
     let ended = Arc::new(AtomicBool::new(false));
     let hang_up = hang_up().map_err(|error| error.to_string())?;
-    for signal in [SIGINT, SIGQUIT, SIGTERM].into_iter().chain(hang_up) {
-        signal_hook::flag::register(signal, ended.clone())
+    let signals: Vec<i32> = [SIGINT, SIGQUIT, SIGTERM].into_iter().chain(hang_up).collect();
+    for signal in &signals {
+        signal_hook::flag::register(*signal, ended.clone())
             .map_err(|error| format!("signals can not be taken in: {error}"))?;
     }
+    give_back_at(&signals, GRACE)?;
     // An instance that cannot be asked at first is a mistake. Later it is one that is being restarted.
     let first = ask(args)?;
     if let Some(notice) = &first.notice {
