@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # `make` alone tells what there is.
 
-# Looked for at each use: system-packages may have installed it just now.
+# Looked for at each use: scripts/system-packages may have installed it just now.
 CARGO ?= $(shell command -v cargo || echo "$$HOME/.cargo/bin/cargo")
 CARGO_TARGET_DIR ?= target
 PINION = $(CARGO_TARGET_DIR)/release/pinion
@@ -33,30 +33,31 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test lab lab-pi lab-system bench check build install install-program install-system uninstall
-.PHONY: deb release clean
+.PHONY: help run demo test test-kernel test-raspberry-pi test-package bench check build install install-program
+.PHONY: install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
-PACKAGES = $(addprefix system-packages-,build lab deb system check)
+PACKAGES = $(addprefix system-packages-,build vm deb system check)
 .PHONY: $(PACKAGES)
 $(PACKAGES): system-packages-%:
 	@CARGO='$(CARGO)' scripts/system-packages $*
 
 help:
-	@echo 'make run      build, home and heat a simulated printer, then serve a real host until Ctrl-C'
-	@echo 'make demo     the same without serving; fails if anything shown was not right'
-	@echo 'make test     all tests, with those against real kernel drivers in a virtual machine'
-	@echo 'make lab      only the latter'
-	@echo 'make lab-pi   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
-	@echo 'make lab-system  the package installed in a booted Debian 12 with systemd (as root)'
-	@echo 'make bench    the benchmarks'
-	@echo 'make check    formatting, lints, documentation, man pages, what the package has'
-	@echo 'make build    the program: $(PINION)'
-	@echo 'make install  program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
-	@echo 'make deb      a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf,'
-	@echo '              in $(DEB_FOLDER)/arm64 or $(DEB_FOLDER)/armhf'
-	@echo 'make release  the packages for amd64, arm64 and armhf, checksums and notes in $(RELEASE_FOLDER)'
-	@echo 'make clean    remove what was built'
+	@echo 'make run           build, home and heat a simulated printer, then serve a real host until Ctrl-C'
+	@echo 'make demo          the same without serving; fails if anything shown was not right'
+	@echo 'make test          all tests, with those against real kernel drivers in a virtual machine'
+	@echo 'make test-kernel   only the latter'
+	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
+	@echo 'make test-raspberry-pi'
+	@echo '                   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
+	@echo 'make bench         the benchmarks'
+	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
+	@echo 'make build         the program: $(PINION)'
+	@echo 'make install       program, service, udev rules and man pages (PREFIX=$(PREFIX) DESTDIR=)'
+	@echo 'make deb           a Debian package in $(DEB_FOLDER); for a Raspberry Pi: ARCH=arm64 or ARCH=armhf,'
+	@echo '                   in $(DEB_FOLDER)/arm64 or $(DEB_FOLDER)/armhf'
+	@echo 'make release       packages for amd64, arm64 and armhf, checksums and notes in $(RELEASE_FOLDER)'
+	@echo 'make clean         remove what was built'
 
 run: build
 	@$(PINION) sim $(REALTIME) $(ARGS)
@@ -67,22 +68,22 @@ demo: build
 build: system-packages-build
 	@$(CARGO) build --release --locked --quiet --bin pinion
 
-test: system-packages-lab
+test: system-packages-vm
 	$(CARGO) test --locked
 ifeq ($(shell uname -m),x86_64)
-	$(CARGO) test --locked --test lab
+	$(CARGO) test --locked --test kernel
 else
 	@echo 'NOT RUN: the tests in the virtual machine, which need an x86-64 computer' >&2
 endif
 
-lab: system-packages-lab
-	$(CARGO) test --locked --test lab
+test-kernel: system-packages-vm
+	$(CARGO) test --locked --test kernel
 
-lab-pi: system-packages-build
-	$(CARGO) test --locked --test lab_pi
+test-raspberry-pi: system-packages-build
+	$(CARGO) test --locked --test raspberry_pi
 
-lab-system: system-packages-system
-	$(CARGO) test --locked --test lab_system
+test-package: system-packages-system
+	$(CARGO) test --locked --test package
 
 bench: system-packages-build
 	$(CARGO) bench --locked

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Checks the form of all pages and their links. Other tests check their content: `tests/lab_system` runs their
-//! commands, and `tests/klippy/readme.rs` gives their configurations to klippy.
+//! Checks the form of all pages and their links. Other tests check their content: `tests/package` runs their
+//! commands, and `tests/klippy/printer_cfg.rs` gives their configurations to klippy.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use pinion_testkit::page::{COMMANDS, Page, pages, reason};
+use pinion_testkit::markdown::{COMMANDS, Page, pages, reason};
 
 /// What a block may be.
 const KINDS: [&str; 6] = [COMMANDS, "ini", "toml", "text", "diff", "rust"];

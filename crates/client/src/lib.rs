@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The other end of the wire: a small client for the demonstration of `pinion sim`, for the
-//! tests over a real pty, for the lab and for the benches.
+//! tests over a real pty, for those on kernel drivers and for the benches.
 //!
 //! - [`serial`]: blocks over a tty, acknowledged and sent again as klippy does
 //! - [`messages`]: commands and responses by name, as a dictionary has them

@@ -236,7 +236,7 @@ mod tests {
         assert_eq!((read(&class, "period"), read(&class, "duty_cycle")), ("2000000".into(), "1000000".into()));
     }
 
-    /// In which order the files are written the lab shows.
+    /// The tests on kernel drivers show in which order the files are written.
     #[test]
     fn a_shorter_period_may_come_with_any_value() {
         for value in [0, 1, 8192, 32768] {

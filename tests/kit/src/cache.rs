@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use nix::fcntl::{Flock, FlockArg};
 use tempfile::TempDir;
 
-/// `$PINION_LAB_CACHE`, or `lab` in cargo's target folder.
+/// `$PINION_VM_CACHE`, or `vm` in cargo's target folder.
 pub struct Cache {
     root: PathBuf,
 }
@@ -16,9 +16,9 @@ pub struct Cache {
 impl Cache {
     /// Opens the cache, and makes its folder if it is not there.
     pub fn open() -> Result<Cache, String> {
-        let root = match env::var_os("PINION_LAB_CACHE") {
+        let root = match env::var_os("PINION_VM_CACHE") {
             Some(folder) => PathBuf::from(folder),
-            None => target()?.join("lab"),
+            None => target()?.join("vm"),
         };
         let runs = root.join("runs");
         fs::create_dir_all(&runs).map_err(|error| format!("cannot create {}: {error}", runs.display()))?;
@@ -51,5 +51,5 @@ impl Cache {
 fn target() -> Result<PathBuf, String> {
     let harness = env::current_exe().map_err(|error| format!("cannot tell which program this is: {error}"))?;
     let target = harness.ancestors().nth(3).map(Path::to_owned);
-    target.ok_or_else(|| format!("{} is not in cargo's target folder: set PINION_LAB_CACHE", harness.display()))
+    target.ok_or_else(|| format!("{} is not in cargo's target folder: set PINION_VM_CACHE", harness.display()))
 }

@@ -24,7 +24,7 @@ pub struct Archive {
 }
 
 impl Archive {
-    /// What every lab's guest has: folders, busybox, and what its init begins with.
+    /// What every VM has: folders, busybox, and what its init begins with.
     pub fn with_busybox(busybox: &Path) -> Result<Archive, String> {
         let mut archive = Archive::default();
         for folder in ["/dev", "/proc", "/sys", "/tmp", "/run", "/root", "/etc"] {
@@ -32,7 +32,7 @@ impl Archive {
         }
         archive.copy("/bin/busybox", busybox)?;
         archive.symlink("/bin/sh", "busybox");
-        archive.file("/lab/start.sh", include_bytes!("start.sh"));
+        archive.file("/tests/start.sh", include_bytes!("start.sh"));
         Ok(archive)
     }
 

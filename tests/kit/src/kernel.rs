@@ -26,7 +26,7 @@ pub enum Flavour {
 }
 
 impl Flavour {
-    /// Each flavour that the labs run.
+    /// Each flavour that tests run on.
     pub const ALL: [Flavour; 2] = [Flavour::Stock, Flavour::Rt];
 
     /// The name at the beginning of a test.
@@ -86,7 +86,7 @@ const PLAN_READER: &str = "qemu_fw_cfg";
 /// The parts of an image package that hold these modules.
 const IMAGE_PARTS: [&str; 22] = [
     "*/modules.builtin*",
-    // The last ones are for the system that `tests/lab_system` boots from a disk.
+    // The last ones are for the system that `tests/package` boots from a disk.
     "*/drivers/firmware/qemu_fw_cfg.ko",
     "*/drivers/i2c/*",
     "*/drivers/iio/*",
@@ -134,7 +134,7 @@ pub struct Kernel {
     pub release: String,
     /// The uncompressed kernel.
     pub vmlinux: PathBuf,
-    /// Busybox, the modules, and `/lab/modules`, the list in loading order.
+    /// Busybox, the modules, and `/tests/modules`, the list in loading order.
     pub initramfs: PathBuf,
 }
 
@@ -153,7 +153,7 @@ impl Kernel {
         let sources = Path::new(env!("CARGO_MANIFEST_DIR")).join("modules");
         let folder = of_version.join(format!("{}-{:016x}", flavour.name(), key(&sources)?));
         if !folder.exists() {
-            eprintln!("lab: building Linux {release}, version {version}");
+            eprintln!("building Linux {release}, version {version}");
             build(&release, &of_version.join("tree"), &sources, &folder)?;
             remove_others(cache.root(), "linux-", &of_version)?;
             remove_others(&of_version, &format!("{}-", flavour.name()), &folder)?;
@@ -241,7 +241,7 @@ impl Fields {
             .find(|name| name.starts_with(prefix))
             .map(str::to_owned)
             .ok_or_else(|| {
-                format!("no {prefix}*, which the lab knows from Debian 12, among the dependencies of:\n{}", self.0)
+                format!("no {prefix}*, which the tests know from Debian 12, among the dependencies of:\n{}", self.0)
             })
     }
 }
@@ -403,15 +403,15 @@ fn archive_modules(image: &Path, ours: &Path, tree: &Path, to: &Path) -> Result<
     let mut archive = Archive::with_busybox(&tree.join("bin/busybox"))?;
     let plan_reader = loader.find(PLAN_READER)?;
     process::run(Command::new("strip").arg("--strip-debug").arg(&plan_reader))?;
-    archive.copy("/lab/plan.ko", &plan_reader)?;
+    archive.copy("/tests/plan.ko", &plan_reader)?;
     let mut list = String::new();
     for (path, options) in &loader.order {
-        let inside = format!("/lab/modules.d/{}", file_name(path));
+        let inside = format!("/tests/modules.d/{}", file_name(path));
         process::run(Command::new("strip").arg("--strip-debug").arg(path))?;
         archive.copy(&inside, path)?;
         list += &format!("{inside} {options}\n");
     }
-    archive.file("/lab/modules", list.as_bytes());
+    archive.file("/tests/modules", list.as_bytes());
     fs::write(to, archive.finish()).map_err(|error| describe("write", to, &error))
 }
 

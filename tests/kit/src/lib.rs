@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! What several test suites share.
 //!
-//! - [`cache`], [`tools`], [`process`]: where a lab keeps what it downloads, and the programs that it runs
+//! - [`cache`], [`tools`], [`process`]: where a suite keeps its downloads, and the programs that it runs
 //! - [`kernel`], [`initramfs`]: what a virtual machine boots
-//! - [`page`]: the pages for users, and the blocks in them
+//! - [`markdown`]: the pages for users, and the blocks in them
 
 #![forbid(unsafe_code)]
 
 pub mod cache;
 pub mod initramfs;
 pub mod kernel;
-pub mod page;
+pub mod markdown;
 pub mod process;
 pub mod tools;

@@ -48,6 +48,6 @@ pub fn start_emulator(command: &mut Command, folder: &Path) -> Result<(Child, Ch
 /// `$1`, `$2` and so on, and need no quoting.
 pub fn pipeline(script: &str, words: &[&str]) -> Result<(), String> {
     let mut bash = Command::new("bash");
-    bash.args(["-o", "pipefail", "-euc", script, "lab"]).args(words);
+    bash.args(["-o", "pipefail", "-euc", script, "tests"]).args(words);
     run(&mut bash)
 }

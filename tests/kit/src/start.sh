@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-# What the first process of every lab's machine begins with.
+# What the first process of every VM begins with.
 export PATH=/bin HOME=/root TERM=vt100
 /bin/busybox --install -s /bin
 mount -t proc proc /proc
@@ -12,4 +12,4 @@ mount -t tmpfs tmpfs /tmp
 mount -t tmpfs tmpfs /run
 exec </dev/console >/dev/console 2>&1
 # Tests write to hardware as root; they look for this before they do.
-: >/run/pinion-lab
+: >/run/pinion-tests

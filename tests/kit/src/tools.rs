@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The programs that the lab runs on the host.
+//! The programs that VMs take on the computer.
 
 use std::env;
 use std::process::Command;
@@ -21,11 +21,11 @@ const TOOLS: [(&str, &str); 6] = [
 pub fn ensure() -> Result<(), String> {
     if !cfg!(target_arch = "x86_64") {
         return Err("the guest is an x86-64 machine and runs the host's own programs: \
-             build for x86_64 to run the lab"
+             build for x86_64 to run the tests in it"
             .into());
     }
     if !has("apt-get") || !has("dpkg-deb") {
-        return Err("the lab takes its kernels out of Debian 12's packages, \
+        return Err("the tests take their kernels out of Debian 12's packages, \
              and this computer has no apt-get and dpkg-deb"
             .into());
     }
@@ -40,9 +40,9 @@ pub fn install(tools: &[(&str, &str)]) -> Result<(), String> {
     }
     let packages = missing.join(" ");
     if !nix::unistd::geteuid().is_root() {
-        return Err(format!("the lab needs: sudo apt-get install {packages}"));
+        return Err(format!("the tests in VMs need: sudo apt-get install {packages}"));
     }
-    eprintln!("lab: installing {packages}");
+    eprintln!("installing {packages}");
     update_package_lists()?;
     process::run(
         Command::new("apt-get")
@@ -50,7 +50,7 @@ pub fn install(tools: &[(&str, &str)]) -> Result<(), String> {
             .args(missing)
             .env("DEBIAN_FRONTEND", "noninteractive"),
     )
-    .map_err(|cause| format!("the lab needs the packages {packages}: {cause}"))
+    .map_err(|cause| format!("the tests in VMs need the packages {packages}: {cause}"))
 }
 
 /// What apt offers may be older than what its archives still hold.

@@ -1,0 +1,116 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A running QEMU and the conversation with its monitor, QMP.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, ChildStdout, Command, ExitStatus};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+
+use pinion_testkit::process;
+
+/// Longer than a boot, or a test, takes on a busy computer.
+pub const SILENCE_MAX: Duration = Duration::from_secs(180);
+const POLL_INTERVAL: Duration = Duration::from_millis(10);
+
+/// Ends when this is dropped.
+pub struct Emulator {
+    qemu: Child,
+    input: ChildStdin,
+    output: BufReader<ChildStdout>,
+    folder: PathBuf,
+}
+
+impl Emulator {
+    /// Runs the command, with what it and the VM say in files of the folder.
+    pub fn start(mut vm: Command, folder: &Path) -> Result<Emulator, String> {
+        vm.arg("-serial").arg(format!("file:{}", folder.join("console").display())).args(["-qmp", "stdio"]);
+        let (qemu, input, output) = process::start_emulator(&mut vm, folder)?;
+        let mut emulator = Emulator { qemu, input, output: BufReader::new(output), folder: folder.to_owned() };
+        emulator.ask(json!({"execute": "qmp_capabilities"}))?;
+        emulator.settle_order();
+        Ok(emulator)
+    }
+
+    /// Has the emulator's main thread run before the one that is the processor, whenever it has
+    /// something to do: both are on one processor of ours (see `at_once`). The main thread passes
+    /// the time when the guest idles. Should it wake at the moment in which the guest begins to,
+    /// instructions that are not accounted for yet would come on top of the time passed, up to
+    /// microseconds of them, and a run would not be the same twice.
+    fn settle_order(&self) {
+        let mut chrt = Command::new("chrt");
+        // Of this one thread: -R keeps it from those that it begins.
+        chrt.args(["-R", "-f", "-p", "1", &self.qemu.id().to_string()]);
+        if let Err(cause) = process::run(&mut chrt) {
+            eprintln!("figures may differ from one run to the next in the fourth digit: {cause}");
+        }
+    }
+
+    /// Gives the monitor a command, and returns its answer.
+    pub fn ask(&mut self, command: Value) -> Result<Value, String> {
+        let failed = |cause: String, emulator: &Emulator| format!("{command}: {cause}\n{}", emulator.said());
+        // In one piece: the monitor quits at the last brace, before a line's end that comes after.
+        let line = format!("{command}\n");
+        self.input.write_all(line.as_bytes()).map_err(|error| failed(error.to_string(), self))?;
+        loop {
+            let mut line = String::new();
+            self.output.read_line(&mut line).map_err(|error| failed(error.to_string(), self))?;
+            if line.is_empty() {
+                return Err(failed("the emulator ended".into(), self));
+            }
+            let message: Value = serde_json::from_str(&line).map_err(|error| failed(error.to_string(), self))?;
+            if let Some(error) = message.get("error") {
+                return Err(failed(error.to_string(), self));
+            }
+            // A greeting and events come between the answers.
+            if let Some(answer) = message.get("return") {
+                return Ok(answer.clone());
+            }
+        }
+    }
+
+    /// Waits until the VM has come to this state, one of QMP's `RunState`.
+    pub fn wait_until(&mut self, reached: impl Fn(&str) -> bool) -> Result<(), String> {
+        let started = Instant::now();
+        loop {
+            let answer = self.ask(json!({"execute": "query-status"}))?;
+            let status = answer["status"].as_str().unwrap_or_default();
+            if reached(status) {
+                return Ok(());
+            }
+            if started.elapsed() > SILENCE_MAX {
+                return Err(format!("the VM is {status} for too long\n{}", self.said()));
+            }
+            thread::sleep(POLL_INTERVAL);
+        }
+    }
+
+    /// Its status, if it has ended.
+    pub fn ended(&mut self) -> Result<Option<ExitStatus>, String> {
+        self.qemu.try_wait().map_err(|error| error.to_string())
+    }
+
+    /// What the VM has written to its console.
+    pub fn console(&self) -> String {
+        self.read("console")
+    }
+
+    /// All that the VM and the emulator have said.
+    pub fn said(&self) -> String {
+        format!("--- console\n{}\n--- emulator\n{}", self.console(), self.read("qemu"))
+    }
+
+    fn read(&self, name: &str) -> String {
+        String::from_utf8_lossy(&fs::read(self.folder.join(name)).unwrap_or_default()).into_owned()
+    }
+}
+
+impl Drop for Emulator {
+    fn drop(&mut self) {
+        let _ = self.qemu.kill();
+        let _ = self.qemu.wait();
+    }
+}

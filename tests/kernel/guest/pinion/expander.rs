@@ -1,0 +1,533 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Lines of an I/O expander: a chip on I2C, whose driver sleeps while it talks to the chip.
+
+use std::fs;
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+use nix::sys::signal::Signal;
+use pinion_client::Client;
+use pinion_client::config::Config;
+use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
+use pinion_linux::clock::monotonic;
+
+use crate::gpio_sim::GpioSim;
+use crate::mock::i2c;
+use crate::program::{Program, configure, exists, refusal, run, shutdown_of};
+use crate::sysfs;
+use crate::trace::{Trace, Write};
+use crate::uapi;
+
+const MOCK: &str = "/sys/devices/platform/mock-i2c";
+const ADDRESS: u16 = 0x50;
+const LINES: u32 = 8;
+/// The registers of a PCA9554, and what they hold after its reset.
+const INPUT: u8 = 0;
+const OUTPUT: u8 = 1;
+const RESET: [u8; 4] = [0x00, 0xff, 0x00, 0xff];
+/// What the guardian promises.
+const WITHIN_US: u64 = 600_000;
+/// A chip that hangs does so for this long, in milliseconds: far longer than anybody waits for it.
+const HANGS_MS: u64 = 12_000;
+
+/// A PCA9554 on the mocked bus. It goes when dropped.
+struct Expander {
+    adapter: PathBuf,
+    chip_name: String,
+}
+
+impl Expander {
+    fn new() -> Expander {
+        let registers: Vec<u8> = [INPUT].into_iter().chain(RESET).collect();
+        uapi::i2c_transfer(&i2c::bus(), ADDRESS, &registers, 0).expect("a register file");
+        let adapter = sysfs::entry_with("/sys/bus/i2c/devices", "name", "mock-i2c");
+        sysfs::write(adapter.join("new_device"), format!("pca9554 {ADDRESS:#x}"));
+        let bus = adapter.file_name().and_then(|name| name.to_str()).expect("a name").replace("i2c-", "");
+        let device = adapter.join(format!("{bus}-{ADDRESS:04x}"));
+        let chip = fs::read_dir(device).expect("the chip's device").flatten().map(|entry| entry.file_name());
+        let chip = chip.filter_map(|name| name.into_string().ok()).find(|name| name.starts_with("gpiochip"));
+        Expander { adapter, chip_name: chip.expect("a GPIO chip") }
+    }
+
+    fn pin(&self, offset: u32) -> String {
+        format!("{}/gpio{offset}", self.chip_name)
+    }
+
+    fn line(&self, offset: u32) -> String {
+        format!("{} line {offset}", self.chip_name)
+    }
+
+    /// The level that the chip gives the line. Waits for what is under way on the bus.
+    fn level(&self, offset: u32) -> bool {
+        let output = uapi::i2c_transfer(&i2c::bus(), ADDRESS, &[OUTPUT], 1).expect("the output register");
+        output[0] >> offset & 1 != 0
+    }
+
+    /// What is at the chip's inputs from outside.
+    fn set_inputs(&self, levels: u8) {
+        sysfs::write(format!("{MOCK}/change"), format!("{ADDRESS:x} {INPUT:x} {levels:x}"));
+    }
+
+    /// From now on each of its transfers takes so long.
+    fn slow_down(&self, delay_ms: u64) -> sysfs::Setting {
+        sysfs::set(format!("{MOCK}/delay_ms"), delay_ms.to_string(), "0")
+    }
+
+    /// One of its next transfers is not acknowledged.
+    fn miss_one(&self) {
+        sysfs::write(format!("{MOCK}/fail"), format!("{} 1", Errno::ENXIO as i32));
+    }
+
+    /// From now on it does not acknowledge.
+    fn fall_silent(&self) -> sysfs::Setting {
+        sysfs::set(format!("{MOCK}/fail"), format!("{} 1000000", Errno::ENXIO as i32), "0 0")
+    }
+
+    fn is_held(&self) -> bool {
+        let chip = Path::new("/dev").join(&self.chip_name);
+        (0..LINES).any(|offset| !uapi::line_info(&chip, offset).consumer.is_empty())
+    }
+
+    /// Waits until no process is in its driver any more: one that was killed amid a transfer stays
+    /// there until that is over.
+    fn wait_until_free(&self) {
+        let until = Instant::now() + Duration::from_millis(2 * HANGS_MS);
+        while self.is_held() && Instant::now() < until {
+            thread::sleep(Duration::from_millis(10));
+        }
+    }
+}
+
+impl Drop for Expander {
+    fn drop(&mut self) {
+        // The kernel would go on with a chip that is gone.
+        self.wait_until_free();
+        let _ = fs::write(self.adapter.join("delete_device"), format!("{ADDRESS:#x}"));
+    }
+}
+
+fn output(oid: usize, pin: &str) -> String {
+    format!("config_digital_out oid={oid} pin={pin} value=0 default_value=0 max_duration=0")
+}
+
+/// A heater on a line of the processor's and a fan on the expander, both on.
+struct Setup {
+    /// First, as it is dropped first.
+    expander: Expander,
+    sim: GpioSim,
+    /// The kernel's number of the heater's line. It can not be had while the chip hangs: the kernel
+    /// reads every line for it.
+    heater: u32,
+}
+
+impl Setup {
+    fn new() -> Setup {
+        let sim = GpioSim::new("lab", 8);
+        Setup { heater: sim.kernel_number(0), expander: Expander::new(), sim }
+    }
+
+    fn switch_on(&self, client: &mut Client) {
+        configure(client, 2, &[output(0, "lab/gpio0"), output(1, &self.expander.pin(3))]);
+        run(client, "update_digital_out oid=0 value=1");
+        run(client, "update_digital_out oid=1 value=1");
+        assert!(self.sim.level(0) && self.expander.level(3));
+    }
+
+    /// Waits until the heater, which was on, was switched off, and returns when (CLOCK_MONOTONIC,
+    /// microseconds).
+    fn heater_off_us(&self, trace: &Trace) -> u64 {
+        let first = || trace.writes_to(self.heater).first().copied();
+        sysfs::wait_until("the heater is switched off", || first().is_some());
+        let Write { level, at_ns, .. } = first().expect("a write");
+        assert!(!level);
+        at_ns / 1000
+    }
+
+    /// A program that is started anew has it all, once the chip's driver is free.
+    fn assert_starts_anew(&self) {
+        self.expander.wait_until_free();
+        let program = Program::start();
+        self.switch_on(&mut program.connect());
+    }
+}
+
+fn now_us() -> u64 {
+    monotonic().as_micros() as u64
+}
+
+/// The name under which the log knows the fan.
+fn fan(setup: &Setup) -> String {
+    format!("digital output oid 1 ({})", setup.expander.pin(3))
+}
+
+#[test]
+fn steps_beside_a_slow_output_are_in_time() {
+    let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+    let program = Program::start();
+    let client = &mut program.connect();
+    let mut config = Config::default();
+    Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
+    config.oid().expect("few objects");
+    config.add(output(1, &expander.pin(5)));
+    config.apply(client).expect("a configuration that it takes");
+    let step = sim.kernel_number(0);
+    let _slow = expander.slow_down(50);
+    sysfs::write(format!("{MOCK}/sent"), "0");
+    let trace = Trace::start();
+    let start = client.clock_in(0.2).expect("the clock").wire();
+    for line in [
+        format!("reset_step_clock oid=0 clock={start}"),
+        "queue_step oid=0 interval=50000 count=1000 add=0".to_owned(),
+        format!("queue_digital_out oid=1 clock={start} on_ticks=1"),
+        format!("queue_digital_out oid=1 clock={} on_ticks=0", start.wrapping_add(client.ticks(0.3))),
+    ] {
+        run(client, &line);
+    }
+    // A command for which the host waits.
+    thread::sleep(Duration::from_millis(800));
+    let began_us = now_us();
+    run(client, "update_digital_out oid=1 value=1");
+    assert!(now_us() - began_us >= 50_000, "it is acknowledged when it is done");
+    thread::sleep(Duration::from_millis(500));
+    let edges = trace.writes_to(step);
+    let rising: Vec<u64> = edges.iter().filter(|write| write.level).map(|write| write.at_ns / 1000).collect();
+    assert_eq!(rising.len(), 1000);
+    let worst = rising.iter().zip(0..).map(|(at_us, n)| (at_us - rising[0]).abs_diff(1000 * n)).max();
+    println!("steps stray by {worst:?} us");
+    assert!(worst.expect("steps") < 200, "{worst:?} us");
+    let sent = sysfs::read(format!("{MOCK}/sent"));
+    let outputs: Vec<&str> = sent.lines().filter(|line| line.starts_with("50 01 ")).collect();
+    assert_eq!(outputs, ["50 01 ff", "50 01 df", "50 01 ff"]);
+}
+
+#[test]
+fn a_step_pin_on_it_is_refused_with_the_reason() {
+    let (_sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+    let program = Program::start();
+    let client = &mut program.connect();
+    for (step, dir) in [(expander.pin(0), "lab/gpio1".to_owned()), ("lab/gpio0".to_owned(), expander.pin(1))] {
+        let config = format!("config_stepper oid=0 step_pin={step} dir_pin={dir} invert_step=0 step_pulse_ticks=100");
+        assert_eq!(refusal(client, 1, &[config]), "Unable to open out GPIO chip line");
+    }
+    for (pin, what) in [(0, "a step pin"), (1, "a dir pin")] {
+        program.wait_for_line(&[&expander.pin(pin), what, "behind a bus", "choose a pin of the processor itself"]);
+    }
+    configure(client, 1, &[output(0, &expander.pin(0))]);
+}
+
+#[test]
+fn an_axis_homes_to_an_endstop_on_it() {
+    const SWITCH: u32 = 7;
+    let (sim, expander) = (GpioSim::new("lab", 8), Expander::new());
+    let program = Program::start();
+    let client = &mut program.connect();
+    let mut config = Config::default();
+    let stepper = Stepper::configure(&mut config, "lab/gpio0", 0, "lab/gpio1", false, 100).expect("few objects");
+    let endstop = Endstop::configure(&mut config, &expander.pin(SWITCH), 0, false).expect("few objects");
+    let status = config.apply(client).expect("a configuration that it takes");
+    let mut queue = MoveQueue::new(status.move_count);
+    let profile = Profile::trapezoid(3000, 2000.0, 20_000.0, 50e6).expect("a profile");
+    let step = sim.kernel_number(0);
+    let _slow = expander.slow_down(5);
+    assert!(!endstop.triggered(client).expect("a state"));
+    let trace = Trace::start();
+    let mut closed = None;
+    let homed = queue.home(client, stepper, endstop, false, &profile, &mut |sight| {
+        if closed.is_none() && sight.position <= -700 {
+            expander.set_inputs(1 << SWITCH);
+            closed = Some(Instant::now());
+        }
+    });
+    let homed = homed.expect("a homing");
+    assert_eq!(homed.reason, HomingEnd::Endstop);
+    // Dated by the end of the look: one that was due before the switch closed has seen it, too.
+    let dated = client.instant_of(homed.trigger.expect("a trigger"));
+    let after = dated + Duration::from_micros(200) - closed.expect("a switch that closed");
+    println!("dated {after:?} after the switch closed");
+    assert!(after < Duration::from_millis(12), "{after:?}");
+    assert!(endstop.triggered(client).expect("a state"));
+    let rising = trace.writes_to(step).iter().filter(|write| write.level).count();
+    assert_eq!(homed.position, -(rising as i64), "it is where the lines say");
+    assert!((-3000..=-700).contains(&homed.position), "{}", homed.position);
+}
+
+#[test]
+fn an_emergency_stop_waits_for_no_chip_that_hangs() {
+    let setup = Setup::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    setup.switch_on(client);
+    let trace = Trace::start();
+    let guardian = program.guardian();
+    let hangs = setup.expander.slow_down(HANGS_MS);
+    let began_us = now_us();
+    client.send_line("emergency_stop").expect("a session");
+    let off_us = setup.heater_off_us(&trace);
+    assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
+    // Nothing more than the fan's shutdown value is missing, and the guardian sees to that.
+    program.wait_for_line(&["guardian: ", &fan(&setup), "is not at its shutdown value within 1000 ms"]);
+    // The second that a shutdown value may take, two for the program's end, two for the chip.
+    let acted_us = now_us() - began_us;
+    assert!((4_900_000..5_500_000).contains(&acted_us), "{acted_us} us");
+    program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
+    assert!(!exists(program.pid()), "it is killed while the chip still hangs");
+    sysfs::wait_until("the guardian ends", || !exists(guardian));
+    assert!(now_us() - began_us < 1000 * HANGS_MS);
+    drop(hangs);
+    assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
+    // The write that hung is done in the end.
+    setup.expander.wait_until_free();
+    assert!(!setup.expander.level(3));
+    drop(trace);
+    setup.assert_starts_anew();
+}
+
+#[test]
+fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
+    let setup = Setup::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    setup.switch_on(client);
+    let trace = Trace::start();
+    let guardian = program.guardian();
+    let hangs = setup.expander.slow_down(HANGS_MS);
+    // A worker is at it, while the MCU runs on.
+    let at = client.clock_in(0.1).expect("the clock").wire();
+    run(client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
+    thread::sleep(Duration::from_secs(2));
+    assert!(setup.sim.level(0) && program.is_running());
+    let began_us = now_us();
+    program.signal(Signal::SIGKILL);
+    let off_us = setup.heater_off_us(&trace);
+    assert!(off_us - began_us < WITHIN_US, "{} us", off_us - began_us);
+    program.wait_for_line(&["guardian: ", "only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
+    sysfs::wait_until("the guardian ends", || !exists(guardian));
+    assert!(!exists(program.pid()));
+    drop(hangs);
+    drop(trace);
+    setup.assert_starts_anew();
+}
+
+#[test]
+fn a_chip_that_does_not_acknowledge_stops_the_mcu_and_is_tried_again() {
+    let setup = Setup::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    setup.switch_on(client);
+    let silent = setup.expander.fall_silent();
+    client.send_line("update_digital_out oid=1 value=0").expect("a session");
+    assert_eq!(shutdown_of(client), "GPIO line write failed");
+    assert!(!setup.sim.level(0), "the heater is off");
+    let line = setup.expander.line(3);
+    program.wait_for_line(&["shutdown: GPIO line write failed", &fan(&setup), &line, "its chip does not answer"]);
+    thread::sleep(Duration::from_millis(300));
+    assert!(!program.log().contains("after all"));
+    drop(silent);
+    program.wait_for_line(&[&fan(&setup), "is at its shutdown value after all"]);
+    assert!(!setup.expander.level(3));
+    // Nobody had to help.
+    thread::sleep(Duration::from_secs(2));
+    assert!(program.is_running());
+    assert!(!program.log().contains("guardian"), "{}", program.log());
+    client.reset().expect("a reset");
+    setup.switch_on(client);
+}
+
+#[test]
+fn a_chip_that_stays_silent_is_left_to_the_guardian_which_names_it() {
+    let setup = Setup::new();
+    let mut program = Program::start();
+    let client = &mut program.connect();
+    setup.switch_on(client);
+    let silent = setup.expander.fall_silent();
+    let began_us = now_us();
+    client.send_line("update_digital_out oid=1 value=0").expect("a session");
+    assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
+    let killed_us = now_us() - began_us;
+    assert!((1_000_000..1_500_000).contains(&killed_us), "{killed_us} us");
+    program.wait_for_line(&["guardian: ", &fan(&setup), "is not at its shutdown value within 1000 ms"]);
+    program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "No such device or address"]);
+    drop(silent);
+    setup.assert_starts_anew();
+}
+
+#[test]
+fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
+    let setup = Setup::new();
+    let mut program = Program::start();
+    setup.switch_on(&mut program.connect());
+    let guardian = program.guardian();
+    let silent = setup.expander.fall_silent();
+    let trace = Trace::start();
+    let began_us = now_us();
+    program.signal(Signal::SIGTERM);
+    let off_us = setup.heater_off_us(&trace);
+    assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
+    assert!(!program.wait().success());
+    // The chip is back while the guardian tries.
+    drop(silent);
+    sysfs::wait_until("the guardian ends", || !exists(guardian));
+    program.wait_for_line(&["guardian: ", &fan(&setup), "all 2 outputs are driven to their shutdown values"]);
+    assert!(!setup.expander.level(3));
+    drop(trace);
+    setup.assert_starts_anew();
+}
+
+#[test]
+fn pulses_at_an_expander_are_polled() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure(client, 1, &[format!("config_counter oid=0 pin={} pull_up=0", expander.pin(2))]);
+    program.wait_for_line(&["WARN", "its chip is behind a bus, so it is polled"]);
+    let at = client.clock_in(0.02).expect("the clock").wire();
+    // Every 20 ms, told every 0.1 s.
+    run(client, &format!("query_counter oid=0 clock={at} poll_ticks=1000000 sample_ticks=5000000"));
+    let mut count = |expected: i64| {
+        client.drain();
+        let mut told = None;
+        for _ in 0..2 {
+            let until = Instant::now() + Duration::from_secs(10);
+            told = client.wait("counter_state", Some(0), until).expect("a session");
+        }
+        assert_eq!(told.expect("a state").int("count").expect("a count"), expected);
+    };
+    count(0);
+    expander.set_inputs(1 << 2);
+    count(1);
+    expander.set_inputs(0);
+    count(2);
+}
+
+/// Buttons, a homing endstop, a counter and a line of `set_digital_out`.
+fn configure_inputs(client: &mut Client, expander: &Expander) {
+    let pin = |offset| expander.pin(offset);
+    configure(
+        client,
+        4,
+        &[
+            "config_buttons oid=0 button_count=1".to_owned(),
+            format!("config_endstop oid=1 pin={} pull_up=0", pin(1)),
+            "config_trsync oid=2".to_owned(),
+            format!("config_counter oid=3 pin={} pull_up=0", pin(2)),
+            format!("set_digital_out pin={} value=1", pin(3)),
+        ],
+    );
+    run(client, &format!("buttons_add oid=0 pos=0 pin={} pull_up=0", pin(0)));
+    let at = client.clock_in(0.05).expect("the clock").wire();
+    // Each 2 ms.
+    run(client, &format!("buttons_query oid=0 clock={at} rest_ticks=100000 retransmit_count=50 invert=0"));
+    run(client, &format!("query_counter oid=3 clock={at} poll_ticks=100000 sample_ticks=5000000"));
+}
+
+/// Calls of the expander's lines that failed and that were made again.
+fn missed(program: &Program) -> (u64, u64) {
+    let link = program.link().to_str().expect("a path");
+    let told = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
+    let status: serde_json::Value = serde_json::from_slice(&told.stdout).expect("a status");
+    let lines = status["lines"].as_array().expect("lines").iter();
+    let counts: Vec<_> = lines.map(|line| &line["bus"]).filter(|bus| !bus.is_null()).collect();
+    assert_eq!(counts.len(), 4, "{status:#}");
+    let sum = |key: &str| counts.iter().map(|bus| bus[key].as_u64().expect("a count")).sum();
+    (sum("errors"), sum("retries"))
+}
+
+#[test]
+fn a_transfer_that_fails_is_tried_again_and_changes_nothing() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    for _ in 0..10 {
+        expander.miss_one();
+        thread::sleep(Duration::from_millis(20));
+    }
+    for level in [false, true] {
+        expander.miss_one();
+        run(client, &format!("set_digital_out pin={} value={}", expander.pin(3), u8::from(level)));
+        assert_eq!(expander.level(3), level);
+    }
+    expander.miss_one();
+    client.drain();
+    run(client, "endstop_query_state oid=1");
+    expander.set_inputs(1);
+    let until = Instant::now() + Duration::from_secs(5);
+    let state = client.wait("buttons_state", Some(0), until).expect("a session").expect("a state");
+    assert_eq!(state.bytes("state").expect("a state"), [1]);
+    assert!(!client.status().expect("a session").is_shutdown, "{}", program.log());
+    assert_eq!(missed(&program), (13, 13));
+}
+
+#[test]
+fn inputs_that_can_not_be_read_for_100_ms_stop_the_mcu() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    let silent = expander.fall_silent();
+    let began_us = now_us();
+    assert_eq!(shutdown_of(client), "GPIO line read failed");
+    let took_us = now_us() - began_us;
+    println!("stopped after {took_us} us");
+    assert!((95_000..130_000).contains(&took_us), "{took_us} us");
+    program.wait_for_line(&[
+        "shutdown: GPIO line read failed",
+        &expander.chip_name,
+        "its chip does not answer",
+        "check",
+    ]);
+    drop(silent);
+    client.reset().expect("a reset");
+    configure_inputs(client, &expander);
+}
+
+#[test]
+fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    let start = client.clock_in(0.05).expect("the clock").wire();
+    run(client, &format!("trsync_start oid=2 report_clock={start} report_ticks=0 expire_reason=4"));
+    // Each 2 ms.
+    run(
+        client,
+        &format!(
+            "endstop_home oid=1 clock={start} sample_ticks=750 sample_count=4 rest_ticks=100000 pin_value=1 trsync_oid=2 trigger_reason=1"
+        ),
+    );
+    thread::sleep(Duration::from_millis(200));
+    let _silent = expander.fall_silent();
+    let began_us = now_us();
+    assert_eq!(shutdown_of(client), "GPIO line read failed");
+    let took_us = now_us() - began_us;
+    println!("stopped after {took_us} us");
+    assert!(took_us < 20_000, "{took_us} us");
+    program.wait_for_line(&["shutdown: GPIO line read failed: endstop oid 1", "its chip does not answer", "check"]);
+}
+
+#[test]
+fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
+    let expander = Expander::new();
+    let program = Program::start();
+    let client = &mut program.connect();
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    let hangs = expander.slow_down(HANGS_MS);
+    thread::sleep(Duration::from_millis(50));
+    client.reset().expect("a reset");
+    drop(hangs);
+    program.wait_for_line(&[&expander.chip_name, "does not answer"]);
+    assert!(expander.is_held(), "the chip still hangs");
+    expander.wait_until_free();
+    assert!(!expander.is_held());
+    configure_inputs(client, &expander);
+    thread::sleep(Duration::from_millis(200));
+    assert!(!client.status().expect("a session").is_shutdown);
+}

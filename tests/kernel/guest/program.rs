@@ -1,0 +1,229 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion run`, or another micro-controller program, as a child of the test, and what a host
+//! says to it.
+
+use std::env;
+use std::fs::{self, DirEntry, File};
+use std::os::unix::process::ExitStatusExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus};
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::errno::Errno;
+use nix::sys::signal::{Signal, kill};
+use nix::time::{clock_getcpuclockid, clock_gettime};
+use nix::unistd::Pid;
+use pinion_client::config::Config;
+use pinion_client::{Client, Error};
+
+use super::{sysfs, uapi};
+
+/// How long a test waits for anything: far longer than it takes.
+const WAIT_MAX: Duration = Duration::from_secs(10);
+
+/// The running program. It is killed when dropped; the log of one under which a test fails is
+/// shown.
+pub struct Program {
+    child: Child,
+    link: PathBuf,
+    log: PathBuf,
+}
+
+impl Program {
+    /// In real time, as a printer's service starts it.
+    pub fn start() -> Program {
+        Program::with(&["-r"], &[])
+    }
+
+    /// With these arguments to `pinion run`, and this in its environment; returns once a host
+    /// may come.
+    pub fn with(args: &[&str], environment: &[(&str, &str)]) -> Program {
+        let mut command = Command::new("pinion");
+        command.args(["run", "-g", "0"]).args(args).envs(environment.iter().copied());
+        Program::spawn(command)
+    }
+
+    /// As on a kernel that answers an ioctl with this error.
+    pub fn without_ioctl(request: u32, errno: Errno) -> Program {
+        let mut command = Command::new("pinion");
+        command.args(["run", "-g", "0", "-r"]);
+        uapi::without_ioctl(&mut command, request, errno as i32);
+        Program::spawn(command)
+    }
+
+    /// The program that the suite measures, in real time: Pinion, or the one that the host's
+    /// `--program` gave, which takes the options of Klipper's.
+    pub fn measured() -> Program {
+        match other() {
+            Some(words) => {
+                let mut words = words.split_whitespace();
+                let mut command = Command::new(words.next().expect("a program"));
+                command.args(words).arg("-r");
+                Program::spawn(command)
+            }
+            None => Program::start(),
+        }
+    }
+
+    fn spawn(mut command: Command) -> Program {
+        sysfs::assert_in_guest();
+        static COUNT: AtomicUsize = AtomicUsize::new(0);
+        let instance = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
+        let link = PathBuf::from(format!("/tmp/pinion-{instance}"));
+        let log = link.with_extension("log");
+        let child = command
+            .arg("-I")
+            .arg(&link)
+            .stderr(File::create(&log).expect("a log"))
+            .spawn()
+            .unwrap_or_else(|error| panic!("{command:?}: {error}"));
+        let program = Program { child, link, log };
+        sysfs::wait_until("the link to the pty stands", || program.link.exists());
+        program
+    }
+
+    /// A host on its pty.
+    pub fn connect(&self) -> Client {
+        Client::connect(&self.link, WAIT_MAX).expect("a session")
+    }
+
+    pub fn link(&self) -> &Path {
+        &self.link
+    }
+
+    pub fn pid(&self) -> Pid {
+        Pid::from_raw(self.child.id().try_into().expect("a process id"))
+    }
+
+    /// The process that watches over its outputs.
+    pub fn guardian(&self) -> Pid {
+        self.find_guardian().expect("a guardian")
+    }
+
+    fn find_guardian(&self) -> Option<Pid> {
+        let pid = self.pid();
+        let children = fs::read_to_string(format!("/proc/{pid}/task/{pid}/children")).ok()?;
+        let mut pids = children.split_whitespace().filter_map(|pid| pid.parse().ok()).map(Pid::from_raw);
+        pids.find(|pid| fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|name| name == "pinion-guardian\n"))
+    }
+
+    /// It and the process that it forked, if any.
+    fn processes(&self) -> impl Iterator<Item = Pid> {
+        [self.pid()].into_iter().chain(self.find_guardian())
+    }
+
+    /// All of its threads.
+    pub fn threads(&self) -> Vec<Pid> {
+        let threads = |process: Pid| fs::read_dir(format!("/proc/{process}/task")).expect("a running program");
+        let id = |thread: DirEntry| thread.file_name().to_str().and_then(|id| id.parse().ok()).expect("a thread's id");
+        let all = self.processes().flat_map(threads);
+        all.map(|thread| Pid::from_raw(id(thread.expect("a readable folder")))).collect()
+    }
+
+    /// The processor's time that all of its threads had so far.
+    pub fn cpu_time(&self) -> Duration {
+        let of = |process| clock_getcpuclockid(process).and_then(clock_gettime).expect("a running program");
+        self.processes().map(|process| Duration::from(of(process))).sum()
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        kill(self.pid(), signal).expect("a running program");
+    }
+
+    /// What it has logged so far.
+    pub fn log(&self) -> String {
+        fs::read_to_string(&self.log).expect("its log")
+    }
+
+    /// Waits until a line of the log has all of these in it, and returns it.
+    pub fn wait_for_line(&self, parts: &[&str]) -> String {
+        let find = || {
+            let log = self.log();
+            log.lines().find(|line| parts.iter().all(|part| line.contains(part))).map(str::to_owned)
+        };
+        sysfs::wait_until(&format!("the log says {parts:?}"), || find().is_some());
+        find().expect("a line that was there")
+    }
+
+    pub fn is_running(&mut self) -> bool {
+        self.child.try_wait().expect("our child").is_none()
+    }
+
+    /// Waits until it has ended.
+    pub fn wait(&mut self) -> ExitStatus {
+        let pid = self.pid();
+        sysfs::wait_until("the program ends", || !exists(pid));
+        self.child.wait().expect("our child")
+    }
+
+    /// Kills it, as nothing can forbid.
+    pub fn kill(&mut self) {
+        self.signal(Signal::SIGKILL);
+        assert_eq!(self.wait().signal(), Some(Signal::SIGKILL as i32));
+    }
+}
+
+impl Drop for Program {
+    fn drop(&mut self) {
+        // It may have ended, and its guardian, who else holds its lines for a moment more.
+        let guardian = self.find_guardian();
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        let until = Instant::now() + WAIT_MAX;
+        while guardian.is_some_and(exists) && Instant::now() < until {
+            thread::sleep(Duration::from_millis(1));
+        }
+        if thread::panicking() {
+            println!("--- log of the program\n{}---", fs::read_to_string(&self.log).unwrap_or_default());
+        }
+    }
+}
+
+/// The command of the program to be measured instead of Pinion: see `init.sh`.
+pub fn other() -> Option<String> {
+    env::var("MEASURED_PROGRAM").ok().filter(|command| !command.is_empty())
+}
+
+/// Whether the process is there and has not ended.
+pub fn exists(pid: Pid) -> bool {
+    fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| !stat.contains(") Z "))
+}
+
+/// A configuration of so many objects, as commands in klippy's notation.
+pub fn config<L: AsRef<str>>(oids: u8, lines: &[L]) -> Config {
+    let mut config = Config::default();
+    for _ in 0..oids {
+        config.oid().expect("few objects");
+    }
+    for line in lines {
+        config.add(line.as_ref().to_owned());
+    }
+    config
+}
+
+/// Configures the MCU anew.
+pub fn configure<L: AsRef<str>>(client: &mut Client, oids: u8, lines: &[L]) {
+    config(oids, lines).apply(client).expect("a configuration that it takes");
+}
+
+/// Configures the MCU anew, and returns the text that it stops with.
+pub fn refusal<L: AsRef<str>>(client: &mut Client, oids: u8, lines: &[L]) -> String {
+    match config(oids, lines).apply(client) {
+        Err(Error::Shutdown { reason }) => reason,
+        Err(error) => panic!("{error}"),
+        Ok(_) => panic!("it takes a configuration that it should not take"),
+    }
+}
+
+/// Waits until the MCU stops by itself, and returns the text on the wire.
+pub fn shutdown_of(client: &mut Client) -> String {
+    client.wait_shutdown(WAIT_MAX).expect("a session").expect("a shutdown")
+}
+
+/// Sends a command and waits until it was run.
+pub fn run(client: &mut Client, line: &str) {
+    client.send_line(line).expect("a command of the dictionary");
+    client.status().expect("a session");
+}

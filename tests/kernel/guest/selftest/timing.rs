@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Costs and lateness where time counts instructions: 1 ns for each, on every
+//! host. The thresholds leave room for another kernel, not for another computer.
+
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use gpio_cdev::{Chip, LineRequestFlags};
+use nix::sys::time::TimeSpec;
+use nix::time::{ClockId, ClockNanosleepFlags, clock_gettime, clock_nanosleep};
+
+use crate::gpio_sim::GpioSim;
+
+fn spin(rounds: u32) -> Duration {
+    let started = Instant::now();
+    for round in 0..rounds {
+        black_box(round);
+    }
+    started.elapsed()
+}
+
+#[test]
+fn the_clock_counts_instructions() {
+    spin(1000);
+    let (once, tenfold) = (spin(100_000), spin(1_000_000));
+    println!("100,000 rounds {once:?}, 1,000,000 rounds {tenfold:?}");
+    let ratio = tenfold.as_secs_f64() / once.as_secs_f64();
+    assert!((9.5..10.5).contains(&ratio), "time is not that of instructions: {ratio}");
+}
+
+#[test]
+fn a_line_is_written_within_20_us() {
+    const WRITES: u32 = 1000;
+    let sim = GpioSim::new("lab", 8);
+    let line = Chip::new(sim.path()).and_then(|mut chip| chip.get_line(0)).expect("the line");
+    let handle = line.request(LineRequestFlags::OUTPUT, 0, "lab test").expect("a free line");
+    let started = Instant::now();
+    for write in 0..WRITES {
+        handle.set_value(u8::from(write % 2 == 0)).expect("a held line");
+    }
+    let each = started.elapsed() / WRITES;
+    println!("a write takes {each:?}");
+    assert!(each < Duration::from_micros(20), "{each:?}");
+}
+
+#[test]
+fn a_sleeper_wakes_within_200_us() {
+    let mut latest = Duration::ZERO;
+    for _ in 0..100 {
+        let now = Duration::from(clock_gettime(ClockId::CLOCK_MONOTONIC).expect("the clock"));
+        let deadline = now + Duration::from_millis(1);
+        clock_nanosleep(
+            ClockId::CLOCK_MONOTONIC,
+            ClockNanosleepFlags::TIMER_ABSTIME,
+            &TimeSpec::from_duration(deadline),
+        )
+        .expect("a sleep");
+        let woken = Duration::from(clock_gettime(ClockId::CLOCK_MONOTONIC).expect("the clock"));
+        latest = latest.max(woken - deadline);
+    }
+    println!("the latest of 100 wakes {latest:?} late");
+    assert!(latest < Duration::from_micros(200), "{latest:?}");
+}

@@ -1,0 +1,75 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Files of the kernel: sysfs, configfs and tracefs. A test ends where one of
+//! them cannot be read or written, with the file's name.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::thread;
+use std::time::{Duration, Instant};
+
+/// Tests write to whatever hardware they find: in the guest, and nowhere else.
+pub fn assert_in_guest() {
+    assert!(
+        Path::new("/run/pinion-tests").exists(),
+        "this runs in the VM of tests/kernel only: cargo test --test kernel"
+    );
+}
+
+/// The content without the newline at its end.
+pub fn read(path: impl AsRef<Path>) -> String {
+    let path = path.as_ref();
+    let content = fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
+    content.trim_end().to_owned()
+}
+
+pub fn write(path: impl AsRef<Path>, value: impl AsRef<str>) {
+    let (path, value) = (path.as_ref(), value.as_ref());
+    try_write(path, value).unwrap_or_else(|error| panic!("writing {value:?} to {}: {error}", path.display()));
+}
+
+/// For a write that may fail.
+pub fn try_write(path: impl AsRef<Path>, value: impl AsRef<str>) -> io::Result<()> {
+    assert_in_guest();
+    fs::write(path, value.as_ref())
+}
+
+/// A setting of a mock that is in force until this is dropped: the next test is to find it as
+/// it was, whether this one passes or not.
+pub struct Setting {
+    path: PathBuf,
+    before: &'static str,
+}
+
+/// Writes `value`, and in the end `before`.
+pub fn set(path: impl Into<PathBuf>, value: impl AsRef<str>, before: &'static str) -> Setting {
+    let path = path.into();
+    write(&path, value);
+    Setting { path, before }
+}
+
+impl Drop for Setting {
+    fn drop(&mut self) {
+        // Not through helpers that panic: the test may be panicking already.
+        let _ = fs::write(&self.path, self.before);
+    }
+}
+
+/// The entry of the folder whose file `name` says `value`: devices are numbered
+/// in whatever order they came.
+pub fn entry_with(folder: &str, name: &str, value: &str) -> PathBuf {
+    fs::read_dir(folder)
+        .unwrap_or_else(|error| panic!("{folder}: {error}"))
+        .map(|entry| entry.expect("a readable folder").path())
+        .find(|path| fs::read_to_string(path.join(name)).is_ok_and(|it| it.trim_end() == value))
+        .unwrap_or_else(|| panic!("nothing in {folder} has {value:?} in its {name}"))
+}
+
+/// Waits for what another thread or process does.
+pub fn wait_until(what: &str, condition: impl Fn() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(10);
+    while !condition() {
+        assert!(Instant::now() < deadline, "waited in vain until {what}");
+        thread::sleep(Duration::from_millis(5));
+    }
+}

@@ -1,0 +1,149 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The test program that runs in the guest: cargo's test target `kernel_guest`, with
+//! `pinion` itself, other programs to be measured, and the libraries that they need.
+
+use std::env;
+use std::ffi::OsStr;
+use std::fs;
+use std::hash::{Hash, Hasher};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::str::FromStr;
+
+use pinion_testkit::initramfs::Archive;
+use pinion_testkit::process;
+
+/// Programs of the host that busybox has no equivalent of.
+const HOST_PROGRAMS: [&str; 1] = ["/usr/bin/chrt"];
+
+/// A micro-controller program of the host that is measured beside Pinion.
+pub struct OtherProgram {
+    pub name: String,
+    path: PathBuf,
+    arguments: String,
+}
+
+impl OtherProgram {
+    /// Where the guest has it.
+    fn path_inside(&self) -> String {
+        format!("/tests/programs/{}", self.name)
+    }
+
+    /// How the guest starts it, with words between spaces.
+    pub fn command(&self) -> String {
+        format!("{} {}", self.path_inside(), self.arguments)
+    }
+}
+
+impl FromStr for OtherProgram {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<OtherProgram, String> {
+        let (name, path) = text.split_once('=').ok_or_else(|| format!("{text} is not NAME=PATH"))?;
+        if name.is_empty() || name == "pinion" || !name.chars().all(|c| c.is_ascii_alphanumeric() || c == '_') {
+            return Err(format!("{name:?} is no name for a program: letters, digits and _, and not pinion"));
+        }
+        let (path, arguments) = path.split_once(' ').unwrap_or((path, ""));
+        let path = fs::canonicalize(path).map_err(|error| format!("cannot read {path}: {error}"))?;
+        Ok(OtherProgram { name: name.into(), path, arguments: arguments.into() })
+    }
+}
+
+pub struct GuestProgram<'a> {
+    path: PathBuf,
+    others: &'a [OtherProgram],
+}
+
+impl<'a> GuestProgram<'a> {
+    /// Has cargo build it, in the profile that this harness was built in.
+    pub fn build(others: &'a [OtherProgram]) -> Result<GuestProgram<'a>, String> {
+        let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
+        cargo.current_dir(env!("CARGO_MANIFEST_DIR"));
+        cargo.args(["test", "--no-run", "--test", "kernel_guest", "--message-format", "json"]);
+        let profile = pinion().parent().and_then(Path::file_name).and_then(OsStr::to_str);
+        match profile {
+            Some("debug") | None => {}
+            Some(profile) => drop(cargo.args(["--profile", profile])),
+        }
+        let messages = process::output(&mut cargo)?;
+        messages
+            .lines()
+            .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+            .find(|message| message["target"]["name"] == "kernel_guest" && message["executable"].is_string())
+            .and_then(|message| message["executable"].as_str().map(PathBuf::from))
+            .map(|path| GuestProgram { path, others })
+            .ok_or_else(|| "cargo built no test target `kernel_guest`".into())
+    }
+
+    /// The names of its tests, in libtest's order.
+    pub fn tests(&self) -> Result<Vec<String>, String> {
+        let list = process::output(Command::new(&self.path).args(["--list", "--format", "terse"]))?;
+        Ok(list.lines().filter_map(|line| line.strip_suffix(": test")).map(str::to_owned).collect())
+    }
+
+    /// The second part of the guest's root folder: init and the programs, with
+    /// their libraries at the paths where the host's loader looks for them.
+    pub fn payload(&self) -> Result<Vec<u8>, String> {
+        let stripped = tempfile::tempdir().map_err(|error| error.to_string())?;
+        let mut archive = Archive::default();
+        archive.program("/init", include_bytes!("init.sh"));
+        for (name, program) in [("guest", self.path.as_path()), ("pinion", pinion())] {
+            let copy = stripped.path().join(name);
+            process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(&copy).arg(program))?;
+            archive.copy(&format!("/bin/{name}"), &copy)?;
+        }
+        for program in HOST_PROGRAMS.map(Path::new) {
+            let name = program.file_name().unwrap_or_default().to_string_lossy();
+            archive.copy(&format!("/bin/{name}"), program)?;
+        }
+        for other in self.others {
+            archive.copy(&other.path_inside(), &other.path)?;
+        }
+        for library in libraries(&self.programs())? {
+            let content = fs::read(&library).map_err(|error| format!("cannot read {library}: {error}"))?;
+            archive.program(&library, &content);
+        }
+        Ok(archive.finish())
+    }
+
+    /// Changes with everything that the payload is made of.
+    pub fn hash_files(&self, hasher: &mut impl Hasher) -> Result<(), String> {
+        for source in [include_str!("guest_program.rs"), pinion_testkit::initramfs::SOURCE, include_str!("init.sh")] {
+            source.hash(hasher);
+        }
+        let libraries = libraries(&self.programs())?;
+        for path in self.programs().into_iter().chain(libraries.iter().map(Path::new)) {
+            let describe = |error| format!("cannot read {}: {error}", path.display());
+            let metadata = fs::metadata(path).map_err(describe)?;
+            // cargo and dpkg write a file anew: none changes without this.
+            (path, metadata.len(), metadata.modified().map_err(describe)?).hash(hasher);
+        }
+        Ok(())
+    }
+
+    fn programs(&self) -> Vec<&Path> {
+        let others = self.others.iter().map(|other| other.path.as_path());
+        [self.path.as_path(), pinion()].into_iter().chain(HOST_PROGRAMS.map(Path::new)).chain(others).collect()
+    }
+}
+
+fn pinion() -> &'static Path {
+    Path::new(env!("CARGO_BIN_EXE_pinion"))
+}
+
+/// The paths that the loader finds, itself among them.
+fn libraries(programs: &[&Path]) -> Result<Vec<String>, String> {
+    let mut libraries = Vec::new();
+    for program in programs {
+        // "name => /path (address)", or "/path (address)" for the loader.
+        let list = process::output(Command::new("ldd").arg(program))?;
+        let found = list.split_whitespace().filter(|word| word.starts_with('/'));
+        libraries.extend(found.map(str::to_owned));
+        if let Some(line) = list.lines().find(|line| line.contains("not found")) {
+            return Err(format!("{} lacks a library: {line}", program.display()));
+        }
+    }
+    libraries.sort();
+    libraries.dedup();
+    Ok(libraries)
+}

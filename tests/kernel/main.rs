@@ -1,0 +1,191 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The suite on kernel drivers: the tests of `tests/kernel/guest`, run against real kernel drivers in a
+//! VM, on each kernel flavour. docs/develop/test-kernel.md tells how to use it.
+//!
+//! This is the host's side, a test harness of its own. It builds what the
+//! VMs boot, lists the tests that the guest binary holds, shares each flavour's
+//! among a few VMs, and prints each test by name as libtest does.
+
+mod emulator;
+mod guest_program;
+mod options;
+mod report;
+mod snapshot;
+mod table;
+mod vm;
+
+use std::process::ExitCode;
+use std::sync::Mutex;
+use std::thread;
+
+use nix::sched::{CpuSet, sched_getaffinity, sched_setaffinity};
+use nix::unistd::Pid;
+
+use guest_program::GuestProgram;
+use options::Options;
+use pinion_testkit::cache::Cache;
+use pinion_testkit::kernel::{Flavour, Kernel, Offers};
+use report::Report;
+use snapshot::Snapshot;
+use vm::Run;
+
+/// A failed run exits as libtest's do.
+const FAILED: u8 = 101;
+
+/// So many at most in one VM. To start one costs as much as some tests; with
+/// more VMs than processors none of those is idle while another has half of
+/// the work left.
+const TESTS_IN_A_VM: usize = 32;
+
+/// Tests whose figures are to be compared with those of another run, or of another program: they
+/// have a VM for themselves, so that they do not depend on what ran there before.
+const FIGURES: &str = "figures::";
+
+fn main() -> ExitCode {
+    match run(&Options::from_args()) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(FAILED),
+        Err(cause) => {
+            eprintln!("kernel: {cause}");
+            ExitCode::from(FAILED)
+        }
+    }
+}
+
+/// Whether every selected test passed; an error is the suite's own failure.
+fn run(options: &Options) -> Result<bool, String> {
+    let program = GuestProgram::build(&options.programs)?;
+    if options.shell {
+        return shell(options, &program);
+    }
+    let tests = program.tests()?;
+    if tests.is_empty() {
+        return Err("the guest program holds no tests".into());
+    }
+    let (runs, filtered_out) = plan(options, tests);
+    if options.list {
+        for run in &runs {
+            for test in &run.tests {
+                println!("{}: test", run.name_of(test));
+            }
+        }
+        return Ok(true);
+    }
+
+    let mut report = Report::new(&runs, filtered_out, options.show_output);
+    if !runs.is_empty() {
+        boot_all(&runs, &program, &mut report)?;
+    }
+    Ok(report.finish())
+}
+
+/// The VMs' runs, and how many tests were not selected.
+fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
+    let (figures, others): (Vec<_>, Vec<_>) = tests.into_iter().partition(|test| test.starts_with(FIGURES));
+    let mut runs = Vec::new();
+    let mut filtered_out = 0;
+    for flavour in Flavour::ALL {
+        let mut add = |program, tests: &[String], in_a_vm: usize| {
+            let whole = Run { flavour, program, tests: tests.to_vec() };
+            let (selected, left_out): (Vec<_>, Vec<_>) =
+                tests.iter().partition(|test| options.selects(flavour, &whole.name_of(test)));
+            filtered_out += left_out.len();
+            let vms = selected.len().div_ceil(in_a_vm);
+            // By turns: the tests of one file take alike, and may be the longest.
+            runs.extend((0..vms).map(|vm| {
+                let tests = selected.iter().skip(vm).step_by(vms).map(|test| (*test).clone()).collect();
+                Run { flavour, program, tests }
+            }));
+        };
+        add(None, &others, TESTS_IN_A_VM);
+        for program in [None].into_iter().chain(options.programs.iter().map(Some)) {
+            add(program, &figures, figures.len());
+        }
+    }
+    (runs, filtered_out)
+}
+
+fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -> Result<(), String> {
+    pinion_testkit::tools::ensure()?;
+    let cache = Cache::open()?;
+    let offers = Offers::ask()?;
+    let flavours: Vec<Flavour> =
+        Flavour::ALL.into_iter().filter(|flavour| runs.iter().any(|run| run.flavour == *flavour)).collect();
+    let snapshots = {
+        let _lock = cache.lock()?;
+        let mut kernels = Vec::new();
+        for &flavour in &flavours {
+            let kernel = Kernel::prepare(flavour, &offers, &cache)?;
+            println!("{} is Linux {}", flavour.name(), kernel.release);
+            kernels.push(kernel);
+        }
+        at_once(&kernels, kernels.len(), |kernel| Snapshot::prepare(kernel, program, &cache))?
+    };
+    // The slower kernel's first.
+    let order: Vec<&Run<'_>> = runs.iter().rev().collect();
+    let report = Mutex::new(report);
+    // A VM emulates one processor.
+    let vms = thread::available_parallelism().map_or(1, usize::from);
+    at_once(&order, vms, |run| {
+        let index = flavours.iter().position(|flavour| *flavour == run.flavour).expect("that of a run");
+        run.perform(&snapshots[index], &cache, &report)
+    })
+    .map(drop)
+}
+
+/// What the function makes of each item, in their order; so many threads take the next one when
+/// they are done with the one before. Each stays on a processor, and so do the threads of the
+/// emulators that it starts: `Emulator` tells why.
+fn at_once<T: Sync, R: Send>(
+    items: &[T],
+    threads: usize,
+    function: impl Fn(&T) -> Result<R, String> + Sync,
+) -> Result<Vec<R>, String> {
+    let queue = Mutex::new(items.iter().enumerate());
+    let done = Mutex::new(Vec::new());
+    thread::scope(|scope| {
+        let threads: Vec<_> = (0..threads)
+            .map(|number| {
+                let (queue, done, function) = (&queue, &done, &function);
+                scope.spawn(move || -> Result<(), String> {
+                    stay_on_processor(number)?;
+                    loop {
+                        let next = queue.lock().expect("it is not held in a panic").next();
+                        let Some((index, item)) = next else { return Ok(()) };
+                        let result = function(item)?;
+                        done.lock().expect("it is not held in a panic").push((index, result));
+                    }
+                })
+            })
+            .collect();
+        threads.into_iter().try_for_each(|thread| thread.join().expect("no thread panics"))
+    })?;
+    let mut done = done.into_inner().expect("it is not held in a panic");
+    done.sort_by_key(|(index, _)| *index);
+    Ok(done.into_iter().map(|(_, result)| result).collect())
+}
+
+/// Keeps this thread on the n-th of the processors that it may use, or on one of them if there are
+/// fewer.
+fn stay_on_processor(number: usize) -> Result<(), String> {
+    let me = Pid::from_raw(0);
+    let choose = |allowed: CpuSet| {
+        let processors: Vec<usize> = (0..CpuSet::count()).filter(|cpu| allowed.is_set(*cpu) == Ok(true)).collect();
+        let mut one = CpuSet::new();
+        one.set(processors[number % processors.len()])?;
+        sched_setaffinity(me, &one)
+    };
+    sched_getaffinity(me).and_then(choose).map_err(|error| format!("cannot choose a processor: {error}"))
+}
+
+fn shell(options: &Options, program: &GuestProgram<'_>) -> Result<bool, String> {
+    pinion_testkit::tools::ensure()?;
+    let cache = Cache::open()?;
+    let flavour = options.flavour.unwrap_or(Flavour::Stock);
+    let kernel = {
+        let _lock = cache.lock()?;
+        Kernel::prepare(flavour, &Offers::ask()?, &cache)?
+    };
+    vm::shell(&kernel, &program.payload()?, &cache)?;
+    Ok(true)
+}

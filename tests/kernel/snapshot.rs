@@ -1,0 +1,74 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A VM that has booted and loaded its modules, kept in a file: tests go on
+//! from there. To boot takes an emulated computer longer than a dozen tests do.
+
+use std::fs::{self, File};
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::os::fd::AsRawFd;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::json;
+
+use super::emulator::Emulator;
+use super::guest_program::GuestProgram;
+use super::vm;
+use pinion_testkit::cache::Cache;
+use pinion_testkit::kernel::Kernel;
+use pinion_testkit::process;
+
+const PREFIX: &str = "booted-";
+
+pub struct Snapshot(File);
+
+impl Snapshot {
+    /// Boots the kernel with the program unless that was done before. The caller
+    /// has the cache's lock.
+    pub fn prepare(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache) -> Result<Snapshot, String> {
+        let folder = kernel.folder();
+        let path = folder.join(format!("{PREFIX}{:016x}", key(kernel, program)?));
+        if !path.exists() {
+            eprintln!("booting Linux {}", kernel.release);
+            pinion_testkit::kernel::remove_others(folder, PREFIX, &path)?;
+            let partial = path.with_extension("partial");
+            make(kernel, program, cache, &partial)?;
+            fs::rename(&partial, &path).map_err(|error| format!("cannot rename {}: {error}", partial.display()))?;
+        }
+        File::open(&path).map(Snapshot).map_err(|error| format!("cannot read {}: {error}", path.display()))
+    }
+
+    /// Where a VM finds it. A run of another checkout may remove the file's name
+    /// meanwhile, and a path in the emulator's command would want quoting.
+    pub fn source(&self) -> String {
+        format!("exec:cat {}", name_of(&self.0))
+    }
+}
+
+fn make(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache, path: &Path) -> Result<(), String> {
+    let folder = cache.run_folder()?;
+    let file = File::create(path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
+    let mut emulator = Emulator::start(vm::booting(kernel, &program.payload()?, folder.path())?, folder.path())?;
+    // init stops the VM when it is ready for tests.
+    emulator.wait_until(|status| status == "guest-panicked")?;
+    emulator.ask(json!({"execute": "migrate-set-parameters", "arguments": {"max-bandwidth": 1_u64 << 40}}))?;
+    emulator.ask(json!({"execute": "migrate", "arguments": {"uri": format!("exec:cat >{}", name_of(&file))}}))?;
+    emulator.wait_until(|status| status == "postmigrate")?;
+    emulator.ask(json!({"execute": "quit"})).map(drop)
+}
+
+/// The open file, as other programs can name it.
+fn name_of(file: &File) -> String {
+    format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
+}
+
+/// Changes with everything that a booted VM is made of.
+fn key(kernel: &Kernel, program: &GuestProgram<'_>) -> Result<u64, String> {
+    let mut hasher = DefaultHasher::new();
+    process::output(Command::new(vm::EMULATOR).arg("--version"))?.hash(&mut hasher);
+    kernel.folder().hash(&mut hasher);
+    for source in [include_str!("vm.rs"), include_str!("snapshot.rs"), include_str!("emulator.rs")] {
+        source.hash(&mut hasher);
+    }
+    program.hash_files(&mut hasher)?;
+    Ok(hasher.finish())
+}

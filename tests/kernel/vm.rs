@@ -1,0 +1,196 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! One VM under QEMU, from its snapshot to the last result.
+
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+use std::sync::Mutex;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use serde_json::json;
+
+use super::emulator::{Emulator, SILENCE_MAX};
+use super::guest_program::OtherProgram;
+use super::report::{Outcome, Report};
+use super::snapshot::Snapshot;
+use pinion_testkit::cache::Cache;
+use pinion_testkit::kernel::{Flavour, Kernel};
+
+pub const EMULATOR: &str = "qemu-system-x86_64";
+
+const POLL_INTERVAL: Duration = Duration::from_millis(20);
+
+/// What init makes QEMU exit with when every test of the plan has run.
+const EXIT_PLAN_DONE: i32 = 33;
+
+/// What init begins a line of the console with that names the next test.
+const MARK: &str = "test: ";
+
+/// The guest's time: an instruction takes 1 ns. It is the same on every host, to
+/// the nanosecond, and passes at once when the guest has nothing to do. By the
+/// host's clock an emulated processor would be slow, and stop whenever the host does.
+const TIME: [&str; 6] = ["-icount", "shift=0,sleep=off", "-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"];
+
+/// A panic reboots, which ends the emulator. The rest is what an emulated processor would
+/// spend time on and no test is about: guards against the faults of real processors, the
+/// ciphers' self-tests, security modules, auditing, clearing of memory, looking for lockups.
+const COMMAND_LINE: &str = "console=ttyS0 quiet panic=-1 mitigations=off cryptomgr.notests lsm= audit=0 \
+     init_on_alloc=0 nowatchdog psi=0";
+
+/// The plainest is emulated fastest; random numbers must not wait for a boot that
+/// has little chance in it.
+const PROCESSOR: &str = "qemu64,+rdrand";
+
+/// The tests that one VM runs.
+pub struct Run<'a> {
+    pub flavour: Flavour,
+    /// What they measure, if not Pinion.
+    pub program: Option<&'a OtherProgram>,
+    pub tests: Vec<String>,
+}
+
+impl Run<'_> {
+    /// The name under which a test is reported.
+    pub fn name_of(&self, test: &str) -> String {
+        match self.program {
+            Some(program) => format!("{}::{}::{test}", self.flavour.name(), program.name),
+            None => format!("{}::{test}", self.flavour.name()),
+        }
+    }
+
+    /// Whose figures the tests print.
+    pub fn column(&self) -> String {
+        let program = self.program.map_or("pinion", |program| &program.name);
+        format!("{} {program}", self.flavour.name())
+    }
+
+    /// Runs the tests and reports them. An error is a failure of the suite; one of
+    /// the guest is that of the tests it left out.
+    pub fn perform(&self, snapshot: &Snapshot, cache: &Cache, report: &Mutex<&mut Report>) -> Result<(), String> {
+        let folder = cache.run_folder()?;
+        let folder = folder.path();
+        let plan = folder.join("plan");
+        let program = self.program.map(OtherProgram::command).unwrap_or_default();
+        let text: String = self.tests.iter().map(|test| format!("{test} {program}\n")).collect();
+        fs::write(&plan, text).map_err(|error| format!("cannot write {}: {error}", plan.display()))?;
+        let mut vm = vm(folder)?;
+        vm.args(TIME)
+            // What `-kernel` put into the VM that was booted.
+            .args(["-option-rom", "pvh.bin", "-incoming", &snapshot.source(), "-fw_cfg"])
+            .arg(format!("name=opt/pinion/plan,file={}", plan.display()));
+        let mut emulator = Emulator::start(vm, folder)?;
+        emulator.wait_until(|status| status != "inmigrate")?;
+        emulator.ask(json!({"execute": "cont"}))?;
+
+        let cause = follow(&mut emulator)?;
+        let share = folder.join("share");
+        let count = self.report_results(&share, report)?;
+        if count < self.tests.len() {
+            let console = emulator.console();
+            let named = console.lines().rev().find_map(|line| line.strip_prefix(MARK));
+            let last = named.filter(|name| self.tests[count..].iter().any(|test| test == name));
+            let culprit = last.unwrap_or(&self.tests[count]);
+            for test in &self.tests[count..] {
+                let output = match test == culprit {
+                    true => format!("{cause}\n{}", emulator.said()),
+                    false => format!("no result: see {}", self.name_of(culprit)),
+                };
+                report.lock().expect("no VM panics").test(self, test, Outcome::Failed, &output);
+            }
+        }
+        Ok(())
+    }
+
+    /// Reports what the guest left in the folder, and returns of how many tests.
+    fn report_results(&self, share: &Path, report: &Mutex<&mut Report>) -> Result<usize, String> {
+        let results = fs::read_to_string(share.join("results")).unwrap_or_default();
+        let mut reported = 0;
+        // A line without its end was being written.
+        for line in results.split_inclusive('\n').filter_map(|line| line.strip_suffix('\n')) {
+            let (test, status) = line.split_once(' ').unwrap_or((line, ""));
+            if self.tests.get(reported).is_none_or(|planned| planned != test) {
+                return Err(format!("the guest reported {line:?}, which was not its next test"));
+            }
+            let output = fs::read(share.join("output").join(test)).unwrap_or_default();
+            let output = String::from_utf8_lossy(&output);
+            // A name that the program does not know is a success to libtest.
+            let passed = status == "0" && output.contains("test result: ok. 1 passed;");
+            let outcome = if passed { Outcome::Passed } else { Outcome::Failed };
+            report.lock().expect("no VM panics").test(self, test, outcome, &output);
+            reported += 1;
+        }
+        Ok(reported)
+    }
+}
+
+/// Waits until the VM has ended, and returns how, for the tests of which it left no result.
+fn follow(emulator: &mut Emulator) -> Result<String, String> {
+    let mut said = 0;
+    let mut heard = Instant::now();
+    loop {
+        if let Some(status) = emulator.ended()? {
+            return Ok(match status.code() {
+                Some(EXIT_PLAN_DONE) => "the guest ended and left no result".into(),
+                _ => format!("the VM died: {status}"),
+            });
+        }
+        // The console has each test's name as it begins.
+        let length = emulator.console().len();
+        if length != said {
+            (said, heard) = (length, Instant::now());
+        }
+        if heard.elapsed() > SILENCE_MAX {
+            return Ok(format!("no result for {} s: stopped", SILENCE_MAX.as_secs()));
+        }
+        thread::sleep(POLL_INTERVAL);
+    }
+}
+
+/// The VM of which a snapshot is taken.
+pub fn booting(kernel: &Kernel, payload: &[u8], folder: &Path) -> Result<Command, String> {
+    let mut vm = vm(folder)?;
+    vm.args(TIME);
+    // Every run is to begin, and to go on, with the same numbers.
+    boot(&mut vm, kernel, payload, folder, "nokaslr norandmaps random.trust_cpu=on")?;
+    Ok(vm)
+}
+
+/// A shell in the guest, on this terminal.
+pub fn shell(kernel: &Kernel, payload: &[u8], cache: &Cache) -> Result<(), String> {
+    let folder = cache.run_folder()?;
+    let folder = folder.path();
+    let mut vm = vm(folder)?;
+    eprintln!("/tests/share in the guest is {}", folder.join("share").display());
+    boot(&mut vm, kernel, payload, folder, "GUEST_SHELL=1")?;
+    vm.args(["-smp", "2", "-serial", "mon:stdio"]);
+    vm.status().map(drop).map_err(|error| format!("cannot start the emulator: {error}"))
+}
+
+/// The VM that every run has. KVM is left alone even where there is one:
+/// the suite is to be the same everywhere.
+fn vm(folder: &Path) -> Result<Command, String> {
+    let share = folder.join("share");
+    fs::create_dir(&share).map_err(|error| format!("cannot create {}: {error}", share.display()))?;
+    let mut vm = Command::new(EMULATOR);
+    vm.args(["-accel", "tcg", "-cpu", PROCESSOR, "-m", "512", "-nodefaults", "-display", "none", "-no-reboot"])
+        .args(["-device", "isa-debug-exit,iobase=0xf4,iosize=0x04", "-device", "pvpanic", "-action", "panic=pause"])
+        .arg("-virtfs")
+        .arg(format!("local,path={},mount_tag=tests,security_model=none", share.display()));
+    Ok(vm)
+}
+
+fn boot(vm: &mut Command, kernel: &Kernel, payload: &[u8], folder: &Path, parameters: &str) -> Result<(), String> {
+    let initramfs = folder.join("initramfs");
+    let mut archives =
+        fs::read(&kernel.initramfs).map_err(|error| format!("cannot read {}: {error}", kernel.initramfs.display()))?;
+    archives.extend_from_slice(payload);
+    fs::write(&initramfs, archives).map_err(|error| format!("cannot write {}: {error}", initramfs.display()))?;
+    vm.arg("-kernel")
+        .arg(&kernel.vmlinux)
+        .arg("-initrd")
+        .arg(&initramfs)
+        .arg("-append")
+        .arg(format!("{COMMAND_LINE} {parameters}"));
+    Ok(())
+}

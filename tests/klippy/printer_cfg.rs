@@ -1,0 +1,129 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the pages have for `printer.cfg`, as a user copies it, given to klippy in batch mode.
+
+use std::collections::HashSet;
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use serde_json::{Value, json};
+
+use crate::{checkout, klippy::python};
+use pinion_testkit::markdown::{Page, pages};
+
+/// What a printer has beside.
+const PRINTER: &str = "[mcu]\nserial: /dev/null\n[printer]\nkinematics: none\nmax_velocity: 1\nmax_accel: 1\n";
+/// The names that the pages give to pins of a computer, which this one has not got.
+const PINS: [(&str, u32); 15] = [
+    ("GPIO5", 5),
+    ("GPIO6", 6),
+    ("GPIO12", 12),
+    ("GPIO13", 13),
+    ("GPIO16", 16),
+    ("GPIO17", 17),
+    ("GPIO22", 22),
+    ("GPIO23", 23),
+    ("GPIO24", 24),
+    ("GPIO25", 25),
+    ("GPIO26", 26),
+    ("pinctrl-bcm2711/gpio27", 27),
+    ("ads1015/voltage0", 4096),
+    ("mcp3208/voltage0", 4097),
+    ("spidev0.0", 1 << 26),
+];
+
+/// A configuration, and where it stands.
+struct Config {
+    place: String,
+    text: String,
+}
+
+/// Every block that the paragraph before it says to be of `printer.cfg`; of a change, what was there before, too.
+fn configs(page: &Page) -> Vec<Config> {
+    let mut configs = Vec::new();
+    for block in page.blocks() {
+        let place = format!("{}:{}", page.name, block.line);
+        match block.kind.as_str() {
+            "ini" if block.before.contains("`printer.cfg`") => configs.push(Config { place, text: block.text }),
+            "diff" if block.text.contains("[mcu") => {
+                for (sign, when) in [('-', "before"), ('+', "after")] {
+                    let side = block.text.lines().filter(|line| line.is_empty() || line.starts_with([' ', sign]));
+                    let text = side.map(|line| format!("{}\n", line.get(1..).unwrap_or_default())).collect();
+                    configs.push(Config { place: format!("{place}, {when}"), text });
+                }
+            }
+            _ => {}
+        }
+    }
+    configs
+}
+
+/// The names of the host's pins in a configuration.
+fn pins(text: &str) -> HashSet<&str> {
+    let ends = |c: char| c.is_whitespace() || c == ',';
+    text.split("host:").skip(1).filter_map(|rest| rest.split(ends).next()).collect()
+}
+
+fn klippy_takes(checkout: &Path, config: &Config, dictionary: &Value) {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let instance = if config.text.contains("[mcu sim]") { "sim" } else { "host" };
+    let own = if config.text.contains("[mcu ") { "" } else { "[mcu host]\nserial: /tmp/klipper_host_mcu\n" };
+    fs::write(path("printer.cfg"), format!("{PRINTER}{own}{}", config.text)).unwrap();
+    fs::write(path("dict"), dictionary.to_string()).unwrap();
+    let gcode = if config.text.contains("[output_pin light]") { "SET_PIN PIN=light VALUE=1\n" } else { "M115\n" };
+    fs::write(path("g.gcode"), gcode).unwrap();
+    let batch = Command::new(python())
+        .arg(checkout.join("klippy/klippy.py"))
+        .arg(path("printer.cfg"))
+        .arg("-i")
+        .arg(path("g.gcode"))
+        .arg("-o")
+        .arg(path("out"))
+        .arg("-d")
+        .arg(path("dict"))
+        .arg("-d")
+        .arg(format!("{instance}={}", path("dict").display()))
+        .output()
+        .unwrap();
+    let said = format!("{}{}", String::from_utf8_lossy(&batch.stdout), String::from_utf8_lossy(&batch.stderr));
+    assert!(batch.status.success() && !said.contains("Error"), "{}: {said}\n{}", config.place, config.text);
+}
+
+#[test]
+fn klippy_takes_the_configuration_of_the_pages() {
+    let Some(checkout) = checkout("klippy_takes_the_configuration_of_the_pages") else { return };
+    let configs: Vec<Config> = pages().iter().flat_map(configs).collect();
+    for (place, part) in [("README.md", "[temperature_sensor"), ("docs/guide/migrate.md", "adc_voltage")] {
+        let found = configs.iter().any(|config| config.place.starts_with(place) && config.text.contains(part));
+        assert!(found, "{place} has no such configuration any more");
+    }
+    let dictionary = Command::new(env!("CARGO_BIN_EXE_pinion")).arg("dict").output().unwrap().stdout;
+    let mut dictionary: Value = serde_json::from_slice(&dictionary).unwrap();
+    let named: HashSet<&str> = configs.iter().flat_map(|config| pins(&config.text)).collect();
+    for (name, number) in PINS {
+        assert!(named.contains(name), "no page names {name}");
+        dictionary["enumerations"]["pin"][name] = json!(number);
+    }
+    for config in &configs {
+        klippy_takes(&checkout, config, &dictionary);
+    }
+}
+
+/// A voltage of both sides of the change is the same: klippy took the raw reading, of 4095, for a part of
+/// `adc_voltage`, and takes the scaled one for a part of the true full scale.
+#[test]
+fn the_change_for_an_adc_is_right() {
+    let page = pages().into_iter().find(|page| page.name == "docs/guide/migrate.md").unwrap();
+    let voltage = |config: &Config| {
+        let line = config.text.lines().find_map(|line| line.strip_prefix("adc_voltage: ")).unwrap();
+        line.parse::<f64>().unwrap()
+    };
+    let [before, after] = &configs(&page)[..] else { panic!("a change has two sides") };
+    // An ADS1115 has 16 bits with a sign.
+    let raw = 20_000.0;
+    let seen_before = raw / 4095.0 * voltage(before);
+    let seen_after = (raw * 4095.0 / 32767.0_f64).round() / 4095.0 * voltage(after);
+    // One count of 4095 is 1 mV.
+    assert!((seen_before - seen_after).abs() < 0.002, "{seen_before} V, {seen_after} V");
+}

@@ -1,9 +1,0 @@
-// SPDX-License-Identifier: GPL-3.0-or-later
-//! The tests that run on the emulated Raspberry Pi 3, as root, against the driver of
-//! its GPIO chip. `make lab-pi` runs them; docs/develop/lab-pi.md tells more.
-
-mod outside;
-mod program;
-
-mod gpio;
-mod homing;

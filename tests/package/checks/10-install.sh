@@ -1,0 +1,11 @@
+# The package installs, and starts and enables nothing. Its user has its groups, and the devices theirs.
+systemctl is-system-running --wait || true
+until_true 30 test -c /dev/gpiochip0
+until_true 30 is_active test-chips
+not id pinion 2>/dev/null
+stat -c '%U:%G %n' /dev/gpiochip0 /dev/watchdog
+apt-get -qq update
+apt-get install -y /share/pinion-mcu.deb
+is "$(systemctl is-enabled pinion-mcu || true)" disabled
+is "$(systemctl is-active pinion-mcu || true)" inactive
+is "$(id -nG pinion | tr ' ' '\n' | sort | xargs)" "gpio i2c pinion spi tty"

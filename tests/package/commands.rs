@@ -1,0 +1,82 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The commands of the pages, as the VM is given them, and which check tries which page.
+
+use std::fs;
+use std::path::Path;
+
+use super::Check;
+use pinion_testkit::markdown::{COMMANDS, Page, pages};
+
+/// How a check begins the line that has a page tried: `page docs/guide/install.md`.
+const WORD: &str = "page ";
+/// The page of a check that is run once for each page that no other check tries.
+const ANY: &str = "\"$PAGE\"";
+
+/// The pages with commands.
+fn with_commands() -> Vec<Page> {
+    let has_commands = |page: &Page| page.blocks().iter().any(|block| block.kind == COMMANDS);
+    pages().into_iter().filter(has_commands).collect()
+}
+
+/// Puts each block of commands into a file of its own, in the folder that the VM sees as /share:
+/// `pages/README.md/0042.sh`, or `.not-tried`, for the one that begins at line 42.
+pub fn share(folder: &Path) -> Result<(), String> {
+    for page in with_commands() {
+        let folder = folder.join("pages").join(&page.name);
+        fs::create_dir_all(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+        for block in page.blocks().into_iter().filter(|block| block.kind == COMMANDS) {
+            let ending = if block.not_tried.is_some() { "not-tried" } else { "sh" };
+            let path = folder.join(format!("{:04}.{ending}", block.line));
+            fs::write(&path, block.text).map_err(|error| format!("{}: {error}", path.display()))?;
+        }
+    }
+    Ok(())
+}
+
+/// The pages that a check tries.
+fn tried(check: &Check) -> impl Iterator<Item = &str> {
+    check.script.lines().filter_map(|line| line.strip_prefix(WORD))
+}
+
+/// Whether the check tries pages.
+pub fn tries_any(check: &Check) -> bool {
+    tried(check).next().is_some()
+}
+
+/// The checks, with the one for any page repeated for each page that no other one tries.
+///
+/// # Errors
+///
+/// A page with commands that no check would try.
+pub fn each_page(checks: Vec<Check>) -> Result<Vec<Check>, String> {
+    let named: Vec<String> = checks.iter().flat_map(tried).map(str::to_owned).collect();
+    let mut others = with_commands();
+    others.retain(|page| !named.contains(&page.name));
+    let (mut all, mut for_any) = (Vec::new(), false);
+    for check in checks {
+        if !tried(&check).any(|page| page == ANY) {
+            all.push(check);
+            continue;
+        }
+        for_any = true;
+        all.extend(others.iter().map(|page| Check {
+            name: format!("{}-{}", check.name, Path::new(&page.name).file_stem().unwrap_or_default().to_string_lossy()),
+            script: check.script.replace(ANY, &page.name),
+        }));
+    }
+    match others.first() {
+        Some(page) if !for_any => Err(format!("no check tries the commands of {}", page.name)),
+        _ => Ok(all),
+    }
+}
+
+/// A line for each block that is not tried in the pages of this check.
+pub fn not_tried(check: &Check) -> Vec<String> {
+    let mut lines = Vec::new();
+    for page in pages().iter().filter(|page| tried(check).any(|name| name == page.name)) {
+        for block in page.blocks() {
+            lines.extend(block.not_tried.map(|reason| format!("not tried: {}:{}: {reason}", page.name, block.line)));
+        }
+    }
+    lines
+}

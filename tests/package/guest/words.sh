@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+# The words that the checks are written with. A check ends at the first command that fails.
+set -Eeuo pipefail
+trap 'echo "failed: line $LINENO: $BASH_COMMAND"; journalctl -n 25 --no-pager -u "pinion-mcu*" -u klipper-mcu 2>/dev/null' ERR
+export PATH=$PATH:/share
+
+LINK=/tmp/klipper_host_mcu
+CHIP=/sys/devices/platform/gpio-sim.0/gpiochip0
+
+# bash goes on after a "!" command that fails its check, and after an "a && b" whose a fails: neither is used.
+not() { if "$@"; then fail "it succeeded: $*"; fi; }
+fail() { echo "$*"; false; }
+# is VALUE WANTED [OF WHAT]
+is() { [ "$1" = "$2" ] || fail "${3:-} is \"$1\", not \"$2\""; }
+# until_true SECONDS COMMAND...
+until_true() {
+    local end=$((SECONDS + $1)); shift
+    until "$@" >/dev/null 2>&1; do
+        [ $SECONDS -lt $end ] || fail "not within its time: $*"
+        sleep 0.1
+    done
+}
+level() { cat "$CHIP/sim_gpio$1/value"; }
+is_low() { [ "$(level "$1")" = 0 ]; }
+is_high() { [ "$(level "$1")" = 1 ]; }
+pid() { systemctl show -P MainPID pinion-mcu; }
+guardian() { pgrep -P "$(pid)" -x pinion-guardian; }
+klippy() { runuser -u klippy -- "$@"; }
+identifies() { klippy timeout 20 /share/host identify "${1:-$LINK}" ${2:+"$2"}; }
+is_active() { systemctl --quiet is-active "$1"; }
+fresh() { systemctl reset-failed 'pinion-mcu*' 'klipper-mcu*' 2>/dev/null || true; }
+# Starts the service, if it does not run, and a host that lights the heater.
+light() {
+    fresh
+    systemctl start pinion-mcu
+    klippy /share/host light $LINK HEATER >/run/light 2>&1 &
+    until_true 20 grep -q lit /run/light
+    until_true 5 is_high 3
+}
+dark() { pkill -f '/share/host light' || true; }
+# What the journal has of the service, since the mark that `mark` sets.
+# (Not by a cursor: with a filter journalctl --after-cursor leaves out the first line that the filter lets through.)
+mark() { date +@%s.%6N >/run/mark; }
+said() { journalctl --sync; journalctl -q --since="$(cat /run/mark)" -o cat -u "${1:-pinion-mcu}" "${@:2}"; }
+
+# What somebody types who takes whatever is proposed.
+ENTERS=/run/enters
+printf '\n%.0s' {1..200} >$ENTERS
+
+# pi, a new user who may do anything by sudo, with a clone.
+new_user() {
+    if id pi >/dev/null 2>&1; then userdel -rf pi; fi
+    useradd -m -s /bin/bash pi
+    # What any system has, and this one does not: sudo looks its own computer up.
+    mkdir -p /etc/apt/sources.list.d
+    grep -q guest /etc/hosts || echo 127.0.1.1 guest >>/etc/hosts
+    echo 'pi ALL=(ALL) NOPASSWD: ALL' >/etc/sudoers.d/pi
+    cp -r /share/tree /home/pi/pinion
+    chown -R pi: /home/pi/pinion
+}
+# A machine without the package, and a new user.
+bare() {
+    until_true 60 is_active test-chips
+    apt-get -qq update
+    fresh
+    if dpkg -s pinion-mcu >/dev/null 2>&1; then apt-get -qq purge -y pinion-mcu; fi
+    apt-get -qq autoremove -y --purge libiio0
+    new_user
+}
+# What docs/guide/install.md leaves a new user: the package is installed, its service runs, and he is in the group tty.
+installed() {
+    fresh
+    if is_as_delivered; then
+        new_user
+    else
+        bare
+        apt-get -qq install -y /share/pinion-mcu.deb
+    fi
+    usermod -aG tty pi
+    systemctl enable pinion-mcu
+    systemctl restart pinion-mcu
+}
+is_as_delivered() {
+    [ "$(dpkg-query -W -f '${Version}' pinion-mcu 2>/dev/null)" = "$(dpkg-deb -f /share/pinion-mcu.deb Version)" ] &&
+        [ -z "$(dpkg --verify pinion-mcu)" ] && [ ! -e /etc/default/pinion-mcu ] &&
+        cmp -s /etc/pinion/pinion.toml /usr/share/pinion-mcu/pinion.toml
+}
+# page NAME: tries its commands, block by block, each in a session of its own, in the folder of the clone.
+# Whatever asks something, as apt does, is answered by Enter.
+page() {
+    local block status
+    for block in /share/pages/"$1"/*; do
+        echo "--- $1, line $((10#$(basename "${block%.*}")))"
+        case $block in
+        *.not-tried) instead "$(cat "$block")" ;;
+        *.sh)
+            status=0
+            runuser -l pi -c "cd pinion && exec timeout -k 5 240 bash -ev $block" <$ENTERS 2>&1 || status=$?
+            [ $status = 0 ] || fail "status $status"
+            ;;
+        esac
+    done
+}
+# What commands would have left that can not be tried: `make deb` a package, and after `git pull` a later one.
+instead() {
+    local deb=/home/pi/pinion/target/deb
+    case $1 in
+    *'git pull'*)
+        rm -rf "$deb"
+        install -D -m 644 /share/later.deb "$deb/$(deb_name /share/later.deb)"
+        ;;
+    *'make deb'*) install -D -m 644 /share/pinion-mcu.deb "$deb/$(deb_name /share/pinion-mcu.deb)" ;;
+    esac
+}
+deb_name() { dpkg-deb -f "$1" Version | sed "s/.*/pinion-mcu_&_$(dpkg --print-architecture).deb/"; }

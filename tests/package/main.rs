@@ -1,0 +1,226 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The package, installed in a Debian 12 that was booted with systemd in the emulator: the scripts
+//! of `tests/package/checks`, in their order, and in some of them the commands of the pages.
+//! docs/develop/test-package.md tells how to use it.
+//!
+//! This is the computer's side, a test harness of its own.
+
+mod commands;
+mod packages;
+mod vm;
+
+use std::collections::VecDeque;
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::{Mutex, PoisonError};
+use std::thread;
+use std::time::Instant;
+
+use pinion_testkit::cache::Cache;
+use vm::{Root, Vm};
+
+const USAGE: &str = "\
+Usage: cargo test --test package -- [OPTIONS] [FILTERS...]
+
+Installs the package in a booted Debian 12 and runs the checks whose name contains any of the filters,
+as in reboot; before any but those of the pages the first one, which installs it. It takes root, installs the
+emulator if it is missing, and downloads a Debian the first time.
+
+Options:
+  --nocapture        Show the output of checks that pass, too
+  --run FILE         Run this script in the VM after the checks, and print its output
+  --list             Name the checks";
+
+/// A check that can not be run ends so, and prints why.
+const NOT_RUN: i32 = 78;
+/// The first check installs the package for all that follow.
+const INSTALLS: &str = "10-install";
+/// A failed run exits as libtest's do.
+const FAILED: u8 = 101;
+
+#[derive(Default)]
+struct Options {
+    filters: Vec<String>,
+    show_output: bool,
+    list: bool,
+    run: Option<PathBuf>,
+}
+
+impl Options {
+    /// Exits on a mistake, and for `--help`.
+    fn from_args() -> Options {
+        let mut options = Options::default();
+        let mut args = env::args().skip(1);
+        while let Some(arg) = args.next() {
+            match arg.as_str() {
+                "-h" | "--help" => {
+                    println!("{USAGE}");
+                    std::process::exit(0)
+                }
+                "--nocapture" | "--no-capture" | "--show-output" => options.show_output = true,
+                "--list" => options.list = true,
+                "--run" => options.run = args.next().map(PathBuf::from),
+                unknown if unknown.starts_with('-') => {
+                    eprintln!("unknown option {unknown}\n\n{USAGE}");
+                    std::process::exit(2)
+                }
+                _ => options.filters.push(arg),
+            }
+        }
+        options
+    }
+
+    fn chosen(&self, check: &Check) -> bool {
+        self.filters.is_empty() || self.filters.iter().any(|part| check.name.contains(part))
+    }
+}
+
+/// A script, and what those before it leave to it.
+struct Check {
+    name: String,
+    script: String,
+}
+
+/// The scripts in the order of their numbers, each with the words that all of them share before it.
+fn checks() -> Result<Vec<Check>, String> {
+    let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
+    let read = |path: &Path| fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()));
+    let shared = read(&here.join("guest/words.sh"))?;
+    let folder = here.join("checks");
+    let entries = fs::read_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let mut paths: Vec<PathBuf> = entries.filter_map(|entry| Some(entry.ok()?.path())).collect();
+    paths.sort();
+    let check = |path: &PathBuf| {
+        let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
+        Ok(Check { name, script: format!("{shared}\n{}", read(path)?) })
+    };
+    commands::each_page(paths.iter().map(check).collect::<Result<_, String>>()?)
+}
+
+fn run(options: &Options) -> Result<bool, String> {
+    let checks = checks()?;
+    if options.list {
+        checks.iter().for_each(|check| println!("{}: test", check.name));
+        return Ok(true);
+    }
+    if !nix::unistd::geteuid().is_root() {
+        return Err("to make a root folder takes root: sudo -E env PATH=$PATH make test-package".into());
+    }
+    let began = Instant::now();
+    let cache = Cache::open()?;
+    let root = Root::prepare(&cache)?;
+    let folder = cache.run_folder()?;
+    let share = folder.path().join("share");
+    packages::share(&share)?;
+    packages::share_klippy(&share)?;
+    commands::share(&share)?;
+    println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
+
+    // The checks of pages each make what their page finds. So they are run beside the others by a second VM,
+    // and by that of the others once those are done.
+    let (mut of_pages, mut others): (Vec<_>, Vec<_>) = checks.into_iter().partition(commands::tries_any);
+    of_pages.retain(|check| options.chosen(check));
+    if options.run.is_some() || others.iter().any(|check| options.chosen(check)) {
+        others.retain(|check| check.name == INSTALLS || options.chosen(check));
+    } else {
+        others.clear();
+    }
+    let of_pages = Mutex::new(VecDeque::from(of_pages));
+    let vms = [("first", others, options.run.as_deref()), ("second", Vec::new(), None)];
+    let run = |(name, checks, then): (&str, Vec<Check>, _)| {
+        let folder = folder.path().join(name);
+        fs::create_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+        in_a_vm(|| Vm::boot(&root, &folder, &share), checks, &of_pages, options, then)
+    };
+    let tallies: Vec<Result<Tally, String>> = thread::scope(|scope| {
+        let started = vms.map(|vm| scope.spawn(|| run(vm)));
+        started.into_iter().map(|thread| thread.join().unwrap_or_else(|_| Err("a VM's thread died".into()))).collect()
+    });
+    let mut all = Tally::default();
+    for tally in tallies {
+        let tally = tally?;
+        all.passed += tally.passed;
+        all.failed.extend(tally.failed);
+        all.not_run.extend(tally.not_run);
+    }
+    let Tally { passed, failed, not_run } = all;
+    println!(
+        "\n{passed} passed, {} failed {failed:?}, {} not run {not_run:?} in {:.1} s",
+        failed.len(),
+        not_run.len(),
+        began.elapsed().as_secs_f64()
+    );
+    Ok(failed.is_empty())
+}
+
+#[derive(Default)]
+struct Tally {
+    passed: usize,
+    failed: Vec<String>,
+    not_run: Vec<String>,
+}
+
+/// Runs the checks in a VM, if there are any, `then` the script that this path names, and of the shared ones
+/// as many as other VMs leave.
+fn in_a_vm(
+    boot: impl FnOnce() -> Result<Vm, String>,
+    checks: Vec<Check>,
+    shared: &Mutex<VecDeque<Check>>,
+    options: &Options,
+    then: Option<&Path>,
+) -> Result<Tally, String> {
+    let mut tally = Tally::default();
+    let next_shared = || shared.lock().unwrap_or_else(PoisonError::into_inner).pop_front();
+    let mut own = VecDeque::from(checks);
+    if own.is_empty() && then.is_none() {
+        own.extend(next_shared());
+    }
+    if own.is_empty() && then.is_none() {
+        return Ok(tally);
+    }
+    let mut vm = boot()?;
+    println!("booted in {:.1} s", vm.boot_took.as_secs_f64());
+    while let Some(check) = own.pop_front().or_else(next_shared) {
+        let began = Instant::now();
+        let (status, output) = vm.run(&check.script)?;
+        if status == NOT_RUN {
+            println!("check {} ... NOT RUN: {}", check.name, output.trim());
+            tally.not_run.push(check.name.clone());
+            continue;
+        }
+        let verdict = if status == 0 { "ok" } else { "FAILED" };
+        let mut said = format!("check {} ... {verdict} ({:.1} s)\n", check.name, began.elapsed().as_secs_f64());
+        said.extend(commands::not_tried(&check).iter().map(|line| format!("{line}\n")));
+        if status != 0 || options.show_output {
+            said.push_str(&output);
+        }
+        // At once, as another VM's lines may come between.
+        print!("{said}");
+        match status {
+            0 => tally.passed += 1,
+            _ => tally.failed.push(check.name.clone()),
+        }
+        if status != 0 && check.name == INSTALLS {
+            break;
+        }
+    }
+    if let Some(file) = then {
+        let script = fs::read_to_string(file).map_err(|error| format!("{}: {error}", file.display()))?;
+        let (status, output) = vm.run(&script)?;
+        println!("{output}\nstatus {status}");
+    }
+    Ok(tally)
+}
+
+fn main() -> ExitCode {
+    match run(&Options::from_args()) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(FAILED),
+        Err(error) => {
+            eprintln!("package: {error}");
+            ExitCode::from(FAILED)
+        }
+    }
+}

@@ -1,0 +1,79 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the VM is given: the package of the tree as it stands, a later one, the host, the tree, and klippy.
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use pinion_testkit::process;
+
+/// Fills the folder that the VM sees as /share.
+pub fn share(folder: &Path) -> Result<(), String> {
+    fs::create_dir_all(folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+    let tree = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let strip = |program: &Path, name: &str| {
+        process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(folder.join(name)).arg(program))
+    };
+    // The one that cargo has built for all tests.
+    strip(Path::new(env!("CARGO_BIN_EXE_pinion")), "pinion")?;
+    strip(&host(tree)?, "host")?;
+    process::run(
+        Command::new(tree.join("scripts/build-deb"))
+            .arg("--with")
+            .arg(folder.join("pinion"))
+            .arg(folder)
+            // An emulated processor unpacks this in a third of the time.
+            .env("DPKG_DEB_COMPRESSOR_TYPE", "zstd")
+            // dpkg-buildpackage is to run as in a shell of its own, not as in make's.
+            .env_remove("MAKEFLAGS")
+            .env_remove("MAKELEVEL"),
+    )?;
+    // The later package has another unit and another configuration.
+    process::pipeline(
+        r#"cd "$1"
+           mv pinion-mcu_*.deb pinion-mcu.deb
+           dpkg-deb -R pinion-mcu.deb later
+           sed -i 's/^Version: .*/&+later/' later/DEBIAN/control
+           unit=$(find later -name pinion-mcu.service)
+           sed -i 's/^Description=.*/Description=The later unit/' "$unit"
+           echo '# of the later package' >>later/usr/share/pinion-mcu/pinion.toml
+           dpkg-deb --root-owner-group -Zzstd -b later later.deb
+           rm -r later"#,
+        &[&folder.display().to_string()],
+    )?;
+    // What `make install` takes: the program was built before.
+    process::pipeline(
+        r#"cd "$1"; tar -c Makefile systemd udev man | tar -x -C "$2" --one-top-level=tree
+           install -D "$2/pinion" "$2/tree/target/release/pinion""#,
+        &[&tree.display().to_string(), &folder.display().to_string()],
+    )
+}
+
+/// klippy of the checkout that KLIPPER_DIR names, if it names one: for its own checks, see
+/// `guest/klippy.sh`. Its C library is compiled here, by klippy itself: this is a Debian 12 for x86-64, too.
+pub fn share_klippy(folder: &Path) -> Result<(), String> {
+    let words = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package/guest/klippy.sh");
+    process::run(Command::new("cp").arg(words).arg(folder))?;
+    let Some(checkout) = env::var_os("KLIPPER_DIR") else { return Ok(()) };
+    let copy = folder.join("klipper");
+    fs::create_dir(&copy).map_err(|error| format!("{}: {error}", copy.display()))?;
+    for part in ["klippy", "scripts/flash-linux.sh"] {
+        process::run(Command::new("cp").arg("-a").arg(Path::new(&checkout).join(part)).arg(&copy))?;
+    }
+    let python = env::var_os("KLIPPER_PYTHON").unwrap_or("python3".into());
+    process::run(Command::new(python).arg(copy.join("klippy/chelper/__init__.py")))
+}
+
+/// Has cargo build the host, and returns its program.
+fn host(tree: &Path) -> Result<PathBuf, String> {
+    let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
+    cargo.current_dir(tree).args(["build", "--locked", "--message-format", "json", "--test", "package_host"]);
+    let messages = process::output(&mut cargo)?;
+    messages
+        .lines()
+        .filter_map(|line| serde_json::from_str::<serde_json::Value>(line).ok())
+        .filter(|message| message["target"]["name"] == "package_host")
+        .find_map(|message| message["executable"].as_str().map(PathBuf::from))
+        .ok_or_else(|| "cargo built no package_host".into())
+}

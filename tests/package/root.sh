@@ -1,0 +1,82 @@
+#!/bin/sh
+# SPDX-License-Identifier: GPL-3.0-or-later
+# Makes the machine that the package is installed in: a Debian 12 with systemd.
+#
+#   root.sh FOLDER TREE INITRAMFS RELEASE HERE
+#
+# FOLDER gets root.img and initrd. TREE and INITRAMFS are of tests/kit: parts of Debian's kernel package, and
+# the modules that it has built. HERE is the folder of this file.
+set -eu
+cd "$1"
+tree=$2 initramfs=$3 release=$4 here=$5
+busybox=$tree/bin/busybox
+
+# As apt is told where this machine's packages come from. What the package depends on waits in the machine,
+# in a folder that its apt takes packages from: it has no network. Only libiio itself waits there: to install ICU, which it needs
+# by way of libxml2, takes the emulated processor half a minute. The packages of Python are klippy's.
+find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/sources.list*.sources' \
+    -o -path '*/sources.list' \) -exec \
+    mmdebstrap --quiet --mode=root --variant=minbase \
+    --include=sudo,apt-utils \
+    --include=systemd,systemd-sysv,udev,dbus,kmod,procps,make,libiio0- \
+    --include=libavahi-client3,libserialport0,libusb-1.0-0,libxml2 \
+    --include=python3-cffi,python3-greenlet,python3-jinja2,python3-serial \
+    --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt='path-exclude=/usr/share/doc/*' \
+    --dpkgopt='path-include=/usr/share/doc/pinion-mcu/*' --dpkgopt='path-exclude=/var/lib/dpkg/available' \
+    --customize-hook='chroot "$1" apt-get -qq install -d -y --no-install-recommends libiio0' \
+    --customize-hook='mkdir "$1/opt/packages" && mv "$1"/var/cache/apt/archives/*.deb "$1/opt/packages"' \
+    --customize-hook='cd "$1/opt/packages" && dpkg-scanpackages -m . >Packages 2>/dev/null' \
+    --customize-hook='rm -rf "$1"/etc/apt/sources.list*' \
+    bookworm root {} +
+echo 'deb [trusted=yes] file:/opt/packages ./' >root/etc/apt/sources.list
+# klippy's user, who is in the group that the README tells, and somebody else.
+chroot root useradd -m -s /bin/bash -G tty klippy
+chroot root useradd -m -s /bin/bash stranger
+echo guest >root/etc/hostname
+mkdir -p root/var/log/journal
+
+modules=root/usr/lib/modules/$release
+mkdir -p root/usr/lib/modules unpacked
+cp -r "$tree/lib/modules/$release" "$modules"
+mkdir -p "$modules/updates"
+(cd unpacked && "$busybox" cpio -idm <"$initramfs" 2>/dev/null)
+for module in gpio-sim irq_sim mock_adc mock_pwm mock_spi mock_i2c mock_w1; do
+    cp "unpacked/tests/modules.d/$module.ko" "$modules/updates/"
+done
+: >"$modules/modules.order"
+chroot root depmod "$release"
+
+install -m 755 "$here/guest/agent" "$here/guest/chips" root/usr/local/sbin/
+install -m 644 "$here"/guest/*.service root/etc/systemd/system/
+mkdir -p root/etc/systemd/system/multi-user.target.wants
+for unit in "$here"/guest/*.service; do
+    chroot root systemctl --quiet enable "$(basename "$unit")"
+done
+printf 'virtio_console\nconfigfs\n9pnet_virtio\n' >root/etc/modules-load.d/tests.conf
+# It has no console that anybody logs in at, and nothing to tidy up.
+chroot root systemctl --quiet mask getty@tty1.service serial-getty@ttyS0.service apt-daily.timer \
+    apt-daily-upgrade.timer dpkg-db-backup.timer e2scrub_all.timer e2scrub_reap.service \
+    fstrim.timer
+truncate -s 1200M root.img
+mke2fs -q -t ext4 -O '^metadata_csum,^has_journal' -d root root.img
+
+# An initrd that finds the disk.
+mkdir -p first/bin first/modules first/dev first/proc first/root
+cp "$busybox" first/bin/busybox
+for module in virtio_pci virtio_blk ext4 crc32c_generic; do
+    chroot root modprobe -S "$release" --show-depends "$module"
+done | awk '/^insmod/ && !seen[$2]++ { print $2 }' >loads
+while read -r module; do
+    cp "root$module" first/modules/
+    echo "/modules/${module##*/}" >>first/list
+done <loads
+cat >first/init <<'END'
+#!/bin/busybox sh
+/bin/busybox --install -s /bin
+mount -t devtmpfs devtmpfs /dev
+while read -r module; do insmod "$module"; done </list
+mount -t ext4 -o rw /dev/vda /root && mount --move /dev /root/dev && exec switch_root /root /sbin/init
+END
+chmod 755 first/init
+(cd first && find . | "$busybox" cpio -o -H newc 2>/dev/null) >initrd
+rm -rf root unpacked first loads

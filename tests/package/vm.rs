@@ -1,0 +1,219 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A Debian with systemd under QEMU, and the agent in it that runs scripts.
+
+use std::fs;
+use std::hash::{DefaultHasher, Hash, Hasher};
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, ChildStdin, Command};
+use std::sync::mpsc::{Receiver, channel};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use pinion_testkit::cache::Cache;
+use pinion_testkit::kernel::{Flavour, Kernel, Offers, remove_others};
+use pinion_testkit::{process, tools};
+
+/// Longer than the agent lets a script run, which it measures by the guest's clock: on a busy computer that
+/// takes several seconds for one.
+const SILENCE_MAX: Duration = Duration::from_secs(1800);
+/// The guest's time: while it works, an instruction takes 1 ns; while it sleeps, time is the computer's. On a
+/// busy computer the VM is then slow, and nothing in it is late, which klippy and a watchdog would mind.
+const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];
+/// After a script that ends with this status the agent reboots the VM: the next one waits for it.
+const REBOOTS: i32 = 77;
+
+/// Program and the Debian package that has it.
+const TOOLS: [(&str, &str); 3] =
+    [("mmdebstrap", "mmdebstrap"), ("dpkg-scanpackages", "dpkg-dev"), ("mke2fs", "e2fsprogs")];
+
+/// What the VM boots.
+pub struct Root {
+    kernel: PathBuf,
+    folder: PathBuf,
+}
+
+impl Root {
+    /// Makes what the cache does not hold yet.
+    pub fn prepare(cache: &Cache) -> Result<Root, String> {
+        tools::ensure()?;
+        tools::install(&TOOLS)?;
+        let _lock = cache.lock()?;
+        let kernel = Kernel::prepare(Flavour::Stock, &Offers::ask()?, cache)?;
+        let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
+        let folder = cache.root().join(format!("system-{:016x}", key(&kernel)));
+        if !folder.exists() {
+            eprintln!("making a Debian 12 with Linux {}", kernel.release);
+            remove_others(cache.root(), "system-", &folder)?;
+            let partial = folder.with_extension("partial");
+            let _ = fs::remove_dir_all(&partial);
+            fs::create_dir_all(&partial).map_err(|error| format!("{}: {error}", partial.display()))?;
+            let tree = kernel.folder().with_file_name("tree");
+            process::run(
+                Command::new("sh")
+                    .arg(here.join("root.sh"))
+                    .args([&partial, &tree, &kernel.initramfs])
+                    .arg(&kernel.release)
+                    .arg(&here),
+            )?;
+            fs::rename(&partial, &folder).map_err(|error| format!("{}: {error}", folder.display()))?;
+        }
+        Ok(Root { kernel: kernel.vmlinux, folder })
+    }
+}
+
+/// Changes with everything that the root is made of, save the versions of Debian's packages.
+fn key(kernel: &Kernel) -> u64 {
+    let mut hasher = DefaultHasher::new();
+    kernel.vmlinux.hash(&mut hasher);
+    for part in [
+        include_str!("root.sh"),
+        include_str!("guest/agent"),
+        include_str!("guest/chips"),
+        include_str!("guest/test-agent.service"),
+        include_str!("guest/test-chips.service"),
+    ] {
+        part.hash(&mut hasher);
+    }
+    hasher.finish()
+}
+
+/// A running VM; it ends when this is dropped.
+pub struct Vm {
+    kernel: PathBuf,
+    initrd: PathBuf,
+    folder: PathBuf,
+    share: PathBuf,
+    qemu: Child,
+    input: ChildStdin,
+    lines: Receiver<String>,
+    pub boot_took: Duration,
+}
+
+impl Vm {
+    /// Boots a copy of the root, which is put into `folder`. The VM sees `share` as /share.
+    pub fn boot(root: &Root, folder: &Path, share: &Path) -> Result<Vm, String> {
+        // The holes stay holes.
+        process::run(Command::new("cp").arg("--sparse=always").arg(root.folder.join("root.img")).arg(folder))?;
+        let (kernel, initrd) = (root.kernel.clone(), root.folder.join("initrd"));
+        let (qemu, input, lines) = start(&kernel, &initrd, folder, share)?;
+        let (folder, share) = (folder.to_owned(), share.to_owned());
+        let mut vm = Vm { kernel, initrd, folder, share, qemu, input, lines, boot_took: Duration::ZERO };
+        vm.wait_until_up()?;
+        Ok(vm)
+    }
+
+    fn wait_until_up(&mut self) -> Result<(), String> {
+        let began = Instant::now();
+        while self.line()? != "READY" {}
+        self.boot_took = began.elapsed();
+        Ok(())
+    }
+
+    /// The exit status and the output of a script that is run by bash in the VM.
+    pub fn run(&mut self, script: &str) -> Result<(i32, String), String> {
+        let line = format!("{}\n", base64(script.as_bytes()));
+        self.input.write_all(line.as_bytes()).map_err(|error| self.failed(&error.to_string()))?;
+        let (output, status) = loop {
+            if let Some(answer) = self.line()?.strip_prefix('=') {
+                let (output, status) = answer.rsplit_once(' ').unwrap_or((answer, ""));
+                let status: i32 = status.parse().map_err(|_| self.failed("the agent told no status"))?;
+                break (from_base64(output), status);
+            }
+        };
+        if status != REBOOTS {
+            return Ok((status, output));
+        }
+        let began = Instant::now();
+        while self.qemu.try_wait().map_err(|error| error.to_string())?.is_none() {
+            if began.elapsed() > SILENCE_MAX {
+                return Err(self.failed("it does not shut down"));
+            }
+            thread::sleep(Duration::from_millis(100));
+        }
+        (self.qemu, self.input, self.lines) = start(&self.kernel, &self.initrd, &self.folder, &self.share)?;
+        self.wait_until_up()?;
+        Ok((0, output))
+    }
+
+    fn line(&mut self) -> Result<String, String> {
+        self.lines.recv_timeout(SILENCE_MAX).map_err(|error| self.failed(&format!("the agent is silent: {error}")))
+    }
+
+    fn failed(&self, cause: &str) -> String {
+        let said = |name: &str| {
+            let said = fs::read(self.folder.join(name)).unwrap_or_default();
+            let tail = said.len().saturating_sub(4000);
+            String::from_utf8_lossy(&said[tail..]).into_owned()
+        };
+        format!("{cause}\n--- console\n{}\n--- emulator\n{}", said("console"), said("qemu"))
+    }
+}
+
+impl Drop for Vm {
+    fn drop(&mut self) {
+        let _ = self.qemu.kill();
+        let _ = self.qemu.wait();
+    }
+}
+
+fn start(
+    kernel: &Path,
+    initrd: &Path,
+    folder: &Path,
+    share: &Path,
+) -> Result<(Child, ChildStdin, Receiver<String>), String> {
+    let file = |name: &str| folder.join(name).display().to_string();
+    let mut qemu = Command::new("qemu-system-x86_64");
+    qemu.args(["-accel", "tcg", "-cpu", "qemu64,+rdrand", "-m", "768"])
+        .args(TIME)
+        .args(["-nodefaults", "-display", "none", "-no-reboot", "-kernel"])
+        .arg(kernel)
+        .arg("-initrd")
+        .arg(initrd)
+        .args(["-append", "console=ttyS0 quiet mitigations=off cryptomgr.notests lsm= audit=0 panic=-1"])
+        .args(["-drive", &format!("file={},if=virtio,format=raw,cache=unsafe", file("root.img"))])
+        .args(["-virtfs", &format!("local,path={},mount_tag=share,security_model=none,readonly=on", share.display())])
+        .args(["-device", "virtio-serial-pci", "-chardev", "stdio,id=agent,signal=off"])
+        .args(["-device", "virtserialport,chardev=agent,name=agent"])
+        .args(["-serial", &format!("file:{}", file("console"))]);
+    let (child, input, output) = process::start_emulator(&mut qemu, folder)?;
+    let (heard, lines) = channel();
+    thread::spawn(move || {
+        for line in BufReader::new(output).lines().map_while(Result::ok) {
+            if heard.send(line).is_err() {
+                return;
+            }
+        }
+    });
+    Ok((child, input, lines))
+}
+
+const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+
+/// RFC 4648.
+fn base64(bytes: &[u8]) -> String {
+    let mut text = String::new();
+    for group in bytes.chunks(3) {
+        let bits = group.iter().chain(&[0; 2]).take(3).fold(0u32, |bits, byte| bits << 8 | u32::from(*byte));
+        for at in 0..4 {
+            let digit = DIGITS[(bits >> (18 - 6 * at) & 63) as usize];
+            text.push(if at <= group.len() { char::from(digit) } else { '=' });
+        }
+    }
+    text
+}
+
+fn from_base64(text: &str) -> String {
+    let mut bytes = Vec::new();
+    let (mut bits, mut count) = (0u32, 0);
+    for value in text.bytes().filter_map(|digit| DIGITS.iter().position(|known| *known == digit)) {
+        bits = bits << 6 | value as u32;
+        count += 6;
+        if count >= 8 {
+            count -= 8;
+            bytes.push((bits >> count) as u8);
+        }
+    }
+    String::from_utf8_lossy(&bytes).into_owned()
+}

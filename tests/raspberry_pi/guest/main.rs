@@ -1,0 +1,9 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The tests that run on the emulated Raspberry Pi 3, as root, against the driver of
+//! its GPIO chip. `make test-raspberry-pi` runs them; docs/develop/test-raspberry-pi.md tells more.
+
+mod outside;
+mod program;
+
+mod gpio;
+mod homing;

@@ -1,0 +1,191 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Pinion on a Raspberry Pi 3: the tests of `tests/raspberry_pi/guest`, run against the real
+//! driver of its GPIO chip on an emulated Pi. docs/develop/test-raspberry-pi.md tells how to use it.
+//!
+//! This is the host's side, a test harness of its own. It builds for arm64 and plays
+//! the world outside of the pins, as the tests ask for it over the console.
+
+mod cross;
+mod debian;
+mod gpio;
+mod vm;
+
+use std::env;
+use std::process::ExitCode;
+use std::time::Instant;
+
+use cross::Programs;
+use debian::Sysroot;
+use pinion_testkit::cache::Cache;
+use pinion_testkit::initramfs::Archive;
+use vm::{News, Vm};
+
+const USAGE: &str = "\
+Usage: cargo test --test raspberry_pi -- [OPTIONS] [FILTERS...]
+
+Runs the tests whose name, as in gpio::an_output_is_seen_from_outside, contains any
+of the filters, on an emulated Raspberry Pi 3. It installs the emulator and compilers
+if they are missing and you are root, and downloads 120 MB the first time.
+
+Options:
+  --exact            A filter is a whole name
+  --skip FILTER      Leave out the tests whose name contains this
+  --nocapture        Show the output of tests that pass, too
+  --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
+
+/// A failed run exits as libtest's do.
+const FAILED: u8 = 101;
+
+#[derive(Default)]
+struct Options {
+    /// For libtest in the guest.
+    filters: Vec<String>,
+    show_output: bool,
+    shell: bool,
+}
+
+impl Options {
+    /// Exits on a mistake, and for `--help`.
+    fn from_args() -> Options {
+        let mut options = Options::default();
+        let mut args = env::args().skip(1);
+        while let Some(arg) = args.next() {
+            match arg.as_str() {
+                "-h" | "--help" => {
+                    println!("{USAGE}");
+                    std::process::exit(0)
+                }
+                "--nocapture" | "--no-capture" | "--show-output" => options.show_output = true,
+                "--shell" => options.shell = true,
+                "--skip" => options.filters.extend([arg].into_iter().chain(args.next())),
+                unknown if unknown.starts_with('-') && unknown != "--exact" => {
+                    eprintln!("unknown option {unknown}\n\n{USAGE}");
+                    std::process::exit(2)
+                }
+                _ => options.filters.push(arg),
+            }
+        }
+        options
+    }
+}
+
+fn main() -> ExitCode {
+    match run(&Options::from_args()) {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::from(FAILED),
+        Err(cause) => {
+            eprintln!("raspberry_pi: {cause}");
+            ExitCode::from(FAILED)
+        }
+    }
+}
+
+/// Whether every test passed; an error is the suite's own failure.
+fn run(options: &Options) -> Result<bool, String> {
+    let cache = Cache::open()?;
+    let sysroot = Sysroot::prepare(&cache)?;
+    let programs = Programs::build(&sysroot)?;
+    let mut archive = programs.initramfs(&sysroot)?;
+    add_filters(&mut archive, &options.filters);
+    let initramfs = archive.finish();
+    if options.shell {
+        vm::shell(&sysroot, &initramfs, &cache)?;
+        return Ok(true);
+    }
+    println!("a Raspberry Pi 3 with Linux {}", sysroot.release);
+    let mut vm = Vm::boot(&sysroot, &initramfs, &cache)?;
+    let mut report = Report { started: Instant::now(), planned: Vec::new(), failures: Vec::new(), passed: 0 };
+    let outcome = follow(&mut vm, &mut report, options.show_output);
+    Ok(report.finish(outcome, &vm))
+}
+
+fn add_filters(archive: &mut Archive, filters: &[String]) {
+    let lines: String = filters.iter().map(|filter| format!("{filter}\n")).collect();
+    archive.file("/tests/filters", lines.as_bytes());
+}
+
+/// Until the last test has ended. An error says what became of the VM.
+fn follow(vm: &mut Vm, report: &mut Report, show_output: bool) -> Result<(), String> {
+    loop {
+        match vm.next()? {
+            News::Planned(tests) => report.plan(tests),
+            News::Ended { test, status, output } => {
+                // A name that the program does not know is a success to libtest.
+                let passed = status == "0" && output.contains("test result: ok. 1 passed;");
+                report.test(test, passed, &output, show_output)?;
+            }
+            News::Done => return Ok(()),
+        }
+    }
+}
+
+/// What the run prints, in libtest's form.
+struct Report {
+    started: Instant,
+    planned: Vec<String>,
+    passed: usize,
+    /// Name and output.
+    failures: Vec<(String, String)>,
+}
+
+impl Report {
+    fn plan(&mut self, tests: Vec<String>) {
+        println!("\nrunning {} test{}", tests.len(), if tests.len() == 1 { "" } else { "s" });
+        self.planned = tests;
+    }
+
+    fn test(&mut self, test: String, passed: bool, output: &str, show_output: bool) -> Result<(), String> {
+        let ended = self.passed + self.failures.len();
+        if self.planned.get(ended) != Some(&test) {
+            return Err(format!("the guest reported {test}, which was not its next test"));
+        }
+        if show_output {
+            println!("---- {test} ----\n{}", output.trim_end());
+        }
+        println!("test {test} ... {}", if passed { "ok" } else { "FAILED" });
+        match passed {
+            true => self.passed += 1,
+            false => self.failures.push((test, output.to_owned())),
+        }
+        Ok(())
+    }
+
+    /// Prints the rest. Whether there were tests and all have passed.
+    fn finish(mut self, outcome: Result<(), String>, vm: &Vm) -> bool {
+        let ended = self.passed + self.failures.len();
+        let cause = match outcome {
+            Err(cause) => Some(cause),
+            Ok(()) if self.planned.is_empty() => Some("no test ran: none has such a name".to_owned()),
+            Ok(()) if ended < self.planned.len() => Some("the guest left tests out".to_owned()),
+            Ok(()) => None,
+        };
+        let left_out = self.planned.get(ended..).unwrap_or_default().iter();
+        let not_run: Vec<_> = left_out.map(|test| (test.clone(), "it has no result: see below".to_owned())).collect();
+        for (test, _) in &not_run {
+            println!("test {test} ... FAILED");
+        }
+        self.failures.extend(not_run);
+        if !self.failures.is_empty() {
+            println!("\nfailures:\n");
+            for (test, output) in &self.failures {
+                println!("---- {test} ----\n{}\n", output.trim_end());
+            }
+        }
+        let ok = cause.is_none() && self.failures.is_empty();
+        if let Some(cause) = cause {
+            println!("{cause}\n{}", vm.console());
+        }
+        if !self.failures.is_empty() {
+            println!("\nfailures:");
+            self.failures.iter().for_each(|(test, _)| println!("    {test}"));
+        }
+        println!(
+            "\ntest result: {}. {} passed; {} failed; 0 ignored; 0 measured; finished in {:.2}s\n",
+            if ok { "ok" } else { "FAILED" },
+            self.passed,
+            self.failures.len(),
+            self.started.elapsed().as_secs_f64()
+        );
+        ok
+    }
+}

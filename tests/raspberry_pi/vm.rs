@@ -1,0 +1,215 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A Raspberry Pi 3 under QEMU, and the conversation with it over its serial console.
+
+use std::fs;
+use std::io::{self, BufRead, BufReader, Write};
+use std::path::Path;
+use std::process::{Child, ChildStdin, ChildStdout, Command};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::thread;
+use std::time::Duration;
+
+use tempfile::TempDir;
+
+use super::debian::{EMULATOR, Sysroot};
+use super::gpio::{Gpio, LINES, Trigger};
+use pinion_testkit::cache::Cache;
+use pinion_testkit::process;
+
+/// Longer than a test may take, and longer than a boot on a busy computer.
+const SILENCE_MAX: Duration = Duration::from_secs(240);
+
+/// The guest's time: an instruction takes 4 ns, and `init.sh` keeps the guest from idling,
+/// so that nothing else passes the time. When the host stops the emulator, the guest's time
+/// stops, too. By the host's clock, steps would often be too late, and homing would end for
+/// want of news.
+const TIME: [&str; 2] = ["-icount", "shift=2"];
+
+/// What the guest's init and tests write begins with it: see `init.sh` and
+/// `guest/outside.rs`. Everything else on the console is somebody's output.
+const MARK: &str = "raspberry-pi: ";
+
+/// A panic is not followed by silence. The kernel keeps quiet otherwise: its words
+/// would stand in the middle of the tests'.
+const COMMAND_LINE: &str = "console=ttyS1,115200 loglevel=1 panic=-1 cryptomgr.notests";
+
+/// What the guest has come to.
+pub enum News {
+    /// The tests that it is going to run.
+    Planned(Vec<String>),
+    /// A test's exit status, and what it printed.
+    Ended { test: String, status: String, output: String },
+    /// The last test has ended.
+    Done,
+}
+
+/// A running VM; it ends when this is dropped.
+pub struct Vm {
+    qemu: Child,
+    gpio: Gpio,
+    input: ChildStdin,
+    lines: Receiver<String>,
+    /// All that it has printed.
+    console: String,
+    /// Since the test began.
+    output: String,
+    folder: TempDir,
+}
+
+impl Vm {
+    pub fn boot(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<Vm, String> {
+        let folder = cache.run_folder()?;
+        let qtest = folder.path().join("qtest");
+        let mut command = command(sysroot, initramfs, folder.path(), "")?;
+        command.arg("-qtest").arg(format!("unix:{},server=on,wait=off", qtest.display())).args([
+            "-qtest-log",
+            "none",
+            "-serial",
+            "stdio",
+            "-monitor",
+            "none",
+        ]);
+        let (mut qemu, input, output) = process::start_emulator(&mut command, folder.path())?;
+        match Gpio::connect(&qtest) {
+            Ok(gpio) => Ok(Vm {
+                qemu,
+                gpio,
+                input,
+                lines: follow(output),
+                console: String::new(),
+                output: String::new(),
+                folder,
+            }),
+            Err(cause) => {
+                let _ = qemu.kill();
+                let _ = qemu.wait();
+                let said = fs::read_to_string(folder.path().join("qemu")).unwrap_or_default();
+                Err(format!("{cause}\n{said}"))
+            }
+        }
+    }
+
+    /// Does what the guest asks for until it has news. An error says what became of
+    /// the VM.
+    pub fn next(&mut self) -> Result<News, String> {
+        loop {
+            let line = self.lines.recv_timeout(SILENCE_MAX).map_err(|error| match error {
+                RecvTimeoutError::Timeout => format!("nothing came from it for {} s", SILENCE_MAX.as_secs()),
+                RecvTimeoutError::Disconnected => "the VM ended too early".to_owned(),
+            })?;
+            self.console += &line;
+            self.console.push('\n');
+            // A test may have printed something before that ends without a new line.
+            let Some((before, words)) = line.split_once(MARK) else {
+                self.output += &line;
+                self.output.push('\n');
+                continue;
+            };
+            self.output += before;
+            let words: Vec<&str> = words.split_ascii_whitespace().collect();
+            match words[..] {
+                ["plan", ref tests @ ..] => {
+                    return Ok(News::Planned(tests.iter().map(|&test| test.to_owned()).collect()));
+                }
+                ["begin", _] => {
+                    self.output.clear();
+                    self.gpio.clear()?;
+                }
+                ["end", test, status] => {
+                    let output = std::mem::take(&mut self.output);
+                    return Ok(News::Ended { test: test.to_owned(), status: status.to_owned(), output });
+                }
+                ["done"] => return Ok(News::Done),
+                _ => {
+                    let answer = self.obey(&words)?;
+                    writeln!(self.input, "{answer}").map_err(|error| format!("the console takes nothing: {error}"))?;
+                }
+            }
+        }
+    }
+
+    /// All that the guest and the emulator have said.
+    pub fn console(&self) -> String {
+        let emulator = fs::read_to_string(self.folder.path().join("qemu")).unwrap_or_default();
+        format!("--- console\n{}--- emulator\n{emulator}", self.console)
+    }
+
+    /// A wish of a test, and the answer to it.
+    fn obey(&self, words: &[&str]) -> Result<String, String> {
+        let misunderstood = || format!("the guest asked for {words:?}");
+        let number = |word: &str| word.parse::<usize>().map_err(|_| misunderstood());
+        let line =
+            |word: &str| number(word).and_then(|line| if line < LINES { Ok(line) } else { Err(misunderstood()) });
+        let digit = |level: bool| if level { '1' } else { '0' };
+        Ok(match *words {
+            ["level", at] => digit(self.gpio.level(line(at)?)?).to_string(),
+            ["drive", at, level] => {
+                self.gpio.drive(line(at)?, level == "1")?;
+                "ok".to_owned()
+            }
+            ["drive", at, level, "after", count, "rises", "of", watched] => {
+                self.gpio.set_trigger(Trigger {
+                    line: line(at)?,
+                    level: level == "1",
+                    after: number(count)?,
+                    watched: line(watched)?,
+                });
+                "ok".to_owned()
+            }
+            ["edges", at] => self.gpio.edges(line(at)?)?.into_iter().map(digit).collect(),
+            _ => return Err(misunderstood()),
+        })
+    }
+}
+
+impl Drop for Vm {
+    fn drop(&mut self) {
+        let _ = self.qemu.kill();
+        let _ = self.qemu.wait();
+    }
+}
+
+/// A shell in the guest, on this terminal.
+pub fn shell(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<(), String> {
+    let folder = cache.run_folder()?;
+    let mut qemu = command(sysroot, initramfs, folder.path(), "GUEST_SHELL=1")?
+        .args(["-serial", "mon:stdio"])
+        .spawn()
+        .map_err(|error| format!("cannot start the emulator: {error}"))?;
+    qemu.wait().map(drop).map_err(|error| error.to_string())
+}
+
+/// The VM that every run has, save for its console: the second serial port.
+fn command(sysroot: &Sysroot, initramfs: &[u8], folder: &Path, more: &str) -> Result<Command, String> {
+    let root = folder.join("initramfs");
+    fs::write(&root, initramfs).map_err(|error| format!("cannot write {}: {error}", root.display()))?;
+    let mut command = Command::new(EMULATOR);
+    command
+        .args(["-M", "raspi3b", "-m", "1G", "-accel", "tcg", "-display", "none", "-no-reboot", "-serial", "null"])
+        .args(TIME)
+        .arg("-kernel")
+        .arg(sysroot.kernel())
+        .arg("-dtb")
+        .arg(sysroot.device_tree())
+        .arg("-initrd")
+        .arg(root)
+        .arg("-append")
+        .arg(format!("{COMMAND_LINE} {more}"));
+    Ok(command)
+}
+
+/// The console's lines, read as they come.
+fn follow(output: ChildStdout) -> Receiver<String> {
+    let (sender, lines) = channel();
+    thread::spawn(move || -> io::Result<()> {
+        for line in BufReader::new(output).split(b'\n') {
+            let line = line?;
+            let line = String::from_utf8_lossy(&line);
+            if sender.send(line.trim_end_matches('\r').to_owned()).is_err() {
+                break;
+            }
+        }
+        Ok(())
+    });
+    lines
+}
