@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What stands at a link's place. The program that puts the link there, `pinion run --check` and the doctor judge it
-//! by this.
+//! What stands at a link's place: one judgment for the program that puts the link there, for `pinion run --check` and
+//! for `pinion doctor`.
 
 #![forbid(unsafe_code)]
 
@@ -33,7 +33,7 @@ impl Place {
         }
     }
 
-    /// Why no link can be put there, which users know as `link`; none if one can.
+    /// Why no link can be put there; `None` if one can. Users know the link as `link`.
     pub fn obstacle(self, link: &Path) -> Option<Trouble> {
         let link = link.display();
         match self {

@@ -7,7 +7,7 @@ use std::fmt;
 
 /// Something that went wrong. Only [`fmt::Display`] makes a sentence of it: `subject: cause: remedy`.
 ///
-/// A text alone is a cause: its subject is added by who knows it, with [`Trouble::of`].
+/// A text alone is a cause. The caller that knows its subject adds it with [`Trouble::of`].
 ///
 /// ```
 /// use pinion_firmware::trouble::Trouble;
@@ -17,7 +17,7 @@ use std::fmt;
 /// ```
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Trouble {
-    /// The object, device or file that it is about; `None` where the cause names it.
+    /// The object, device or file; `None` if the cause names it.
     pub subject: Option<Box<str>>,
     /// What happened, and why.
     pub cause: Box<str>,
@@ -31,18 +31,18 @@ impl Trouble {
         Trouble { subject: None, cause: cause.into(), remedy: None }
     }
 
-    /// The same with what to do about it.
+    /// The same, with this remedy.
     pub fn remedy(self, remedy: impl Into<Box<str>>) -> Trouble {
         Trouble { remedy: Some(remedy.into()), ..self }
     }
 
-    /// The same of this subject, in front of the one that it has.
+    /// The same, of this subject; it goes in front of the present one.
     pub fn of(self, subject: impl fmt::Display) -> Trouble {
         let subject = self.subject.map_or_else(|| subject.to_string(), |inner| format!("{subject}: {inner}"));
         Trouble { subject: Some(subject.into()), ..self }
     }
 
-    /// The same of a place in a file: `byte` of its `text`. It is told as `file:line:column`, counted from 1.
+    /// The same, of a place in a file: `byte` of its `text`. The subject is `file:line:column`, counted from 1.
     pub fn at(self, file: impl fmt::Display, text: &str, byte: usize) -> Trouble {
         let before = text.get(..byte).unwrap_or(text);
         let line = before.matches('\n').count() + 1;
@@ -50,7 +50,7 @@ impl Trouble {
         self.of(format_args!("{file}:{line}:{column}"))
     }
 
-    /// All but the remedy, for what prints that apart.
+    /// Subject and cause. The caller prints the remedy in a line of its own.
     pub fn found(&self) -> String {
         match &self.subject {
             Some(subject) => format!("{subject}: {}", self.cause),

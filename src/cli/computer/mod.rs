@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The computer that is looked at: its files below a root, and its users. Its units and processes stand in files of
-//! their own, on top of this one.
+//! The computer that `pinion doctor` looks at: its files below a root, and its users. `units.rs` and `running.rs` add its
+//! units and processes.
 
 #![forbid(unsafe_code)]
 
@@ -21,7 +21,7 @@ pub(super) mod units;
 const TEXT_MAX: u64 = 4 << 20;
 /// As many links as the kernel follows (path_resolution(7)).
 const LINKS_MAX: usize = 40;
-/// Most files that a pattern names: one that klippy's configuration has may name every file that there is.
+/// Most files that a pattern finds. A pattern in klippy's configuration may name every file of the computer.
 const MATCHES_MAX: usize = 1000;
 /// As in a shell, what is hidden has to be asked for by its dot.
 const LIKE_A_SHELL: MatchOptions =
@@ -104,8 +104,8 @@ impl Machine {
         names
     }
 
-    /// Where the files are that an absolute pattern of `*`, `?` and `[...]` names, in order. A path without any of
-    /// these names itself, also if there is no such file.
+    /// The files that an absolute pattern of `*`, `?` and `[...]` finds, in order, as paths for this program. A path
+    /// without any of these finds itself, even if there is no such file.
     pub(in crate::cli) fn matching(&self, pattern: impl AsRef<Path>) -> Vec<PathBuf> {
         let mut paths = vec![PathBuf::from("/")];
         let mut is_pattern = false;
