@@ -225,10 +225,10 @@ impl Core {
                 continue;
             };
             let exact = self.mcu.next_exact_timer();
-            let calls = Calls { core: &self.progress, stops_taken: self.stops_taken, mcu: &self.mcu };
-            let (requests, begun) = (&self.requests, self.block.is_some());
+            let Core { waiter, progress, stops_taken, mcu, block, requests, .. } = &mut self;
+            let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
             // Within reach of a timer a call has to wait its turn.
-            let woken = self.waiter.wait(deadline, exact, || !near && calls.any(begun, requests));
+            let woken = waiter.wait(deadline, exact, || !near && calls.any());
             busy_since = self.clock.now();
             if woken == Woken::Due {
                 self.yielded += 1;
@@ -239,8 +239,9 @@ impl Core {
     /// Sleeps for a span in which no timer is due, or until it is called, so that the heartbeat
     /// goes on. Unlike the wait for a timer it ends without spinning.
     fn nap(&mut self, longest: Duration) {
-        let calls = Calls { core: &self.progress, stops_taken: self.stops_taken, mcu: &self.mcu };
-        if !calls.any(self.block.is_some(), &self.requests) {
+        let Core { progress, stops_taken, mcu, block, requests, .. } = &*self;
+        let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
+        if !calls.any() {
             self.waiter.nap(longest);
         }
     }
@@ -318,13 +319,18 @@ impl Core {
     fn run_commands(&mut self, one: bool) -> Turn {
         self.yielded = 0;
         if self.mcu.is_held() {
-            return Turn::Idle;
-        }
-        let (payload, mut at) = match self.block.take() {
-            Some(block) => {
-                self.progress.hold(false);
-                block
+            match next_commands(self.block.as_ref(), &self.requests) {
+                Some(commands) if self.mcu.joins(commands) => {}
+                next => {
+                    // What comes behind it can wait as well.
+                    self.progress.hold(next.is_some());
+                    return Turn::Idle;
+                }
             }
+        }
+        self.progress.hold(false);
+        let (payload, mut at) = match self.block.take() {
+            Some(block) => block,
             None => match self.requests.pop() {
                 Ok(Request::Run(payload)) => {
                     self.progress.begin();
@@ -337,17 +343,15 @@ impl Core {
         let bytes = payload.as_slice();
         let mut reader = Reader::new(&bytes[at..]);
         for _ in 0..if one { 1 } else { self.room() } {
-            if reader.is_empty() || self.mcu.is_held() {
+            if reader.is_empty() || self.mcu.is_held() && !self.mcu.joins(reader.rest()) {
                 break;
             }
             self.mcu.execute(&mut reader);
         }
         at = bytes.len() - reader.rest().len();
-        if at < bytes.len() || self.mcu.is_held() {
+        if at < bytes.len() || self.mcu.keeps_block() {
+            self.progress.hold(self.mcu.is_held());
             self.block = Some((payload, at));
-            if self.mcu.is_held() {
-                self.progress.hold(true);
-            }
             return Turn::Done;
         }
         if self.progress.stops_handed() != self.stops_taken && self.mcu.is_emergency(bytes) {
@@ -389,22 +393,39 @@ fn program_ends() -> Shutdown {
     Shutdown::because(reason::FORCE_SHUTDOWN, "the program ends; the host sees the connection close")
 }
 
+/// The commands that come next: the rest of the block that was begun, or the next block.
+#[inline]
+fn next_commands<'a>(block: Option<&'a (Payload, usize)>, requests: &'a Consumer<Request>) -> Option<&'a [u8]> {
+    match block {
+        Some((payload, at)) => payload.as_slice().get(*at..),
+        None => match requests.peek() {
+            Ok(Request::Run(payload)) => Some(payload.as_slice()),
+            _ => None,
+        },
+    }
+}
+
 /// What the core is called for while it waits.
 struct Calls<'a> {
     core: &'a Progress,
     stops_taken: u32,
     mcu: &'a Mcu,
+    block: Option<&'a (Payload, usize)>,
+    requests: &'a Consumer<Request>,
 }
 
 impl Calls<'_> {
     /// Whether there is something to do: an errand is done, or a command may run, or a request to
-    /// stop waits behind one that may not. `begun` is whether a block is being run.
+    /// stop waits behind one that may not.
     #[inline]
-    fn any(&self, begun: bool, requests: &Consumer<Request>) -> bool {
+    fn any(&self) -> bool {
         self.mcu.has_completion()
             || match self.mcu.is_held() {
-                false => begun || !requests.is_empty(),
-                true => !self.mcu.is_shutdown() && self.core.stops_handed() != self.stops_taken,
+                false => self.block.is_some() || !self.requests.is_empty(),
+                true => {
+                    !self.mcu.is_shutdown() && self.core.stops_handed() != self.stops_taken
+                        || next_commands(self.block, self.requests).is_some_and(|commands| self.mcu.joins(commands))
+                }
             }
     }
 }
@@ -624,6 +645,25 @@ mod tests {
         }
         rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 23);
         assert_eq!(rig.said(RESPONSE).len(), 21);
+        assert_eq!(rig.quit(), Left::Safe);
+    }
+
+    #[test]
+    fn what_is_only_sent_is_acknowledged_at_once_and_other_commands_wait_for_it() {
+        let mut rig = Rig::new();
+        rig.bench.hang(true);
+        for byte in 0..3 {
+            rig.run("spi_send oid=%c data=%*s", &[0, 1, byte]);
+            rig.wait_until("its block is done", |rig| rig.progress.done() == CONFIGURATION + 1 + byte);
+        }
+        rig.run("update_digital_out oid=%c value=%c", &[1, 1]);
+        rig.wait_until("the core has seen the block behind them", |rig| rig.progress.is_held());
+        assert!(!rig.bench.level(30) && rig.progress.done() == CONFIGURATION + 3);
+        rig.bench.hang(false);
+        rig.wait_until("every block is done", |rig| rig.progress.done() == CONFIGURATION + 4);
+        assert!(rig.bench.level(30));
+        let sent: Vec<_> = rig.bench.transfers().into_iter().map(|transfer| transfer.data).collect();
+        assert_eq!(sent, [[0], [1], [2]]);
         assert_eq!(rig.quit(), Left::Safe);
     }
 

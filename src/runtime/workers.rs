@@ -206,7 +206,10 @@ impl Server {
         // This does not fail: no more errands are under way than there are boxes, and the queue back
         // is as long as the one that they came by.
         let _ = self.done.push(Completion { oid, parcel, holds, began, ended });
-        self.core.unpark();
+        // Commands that wait for this job wait for the next one as well: the core is woken for the last of them.
+        if !(holds && self.jobs.peek().is_ok_and(|next| next.holds)) {
+            self.core.unpark();
+        }
         // Samples, which timers ask for, come at their own pace.
         if holds {
             self.lookout.expect(ended, NEXT_JOB);

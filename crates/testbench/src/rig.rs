@@ -244,13 +244,14 @@ impl Rig {
         self.mcu.execute(&mut Reader::new(&payload));
     }
 
-    /// Runs the commands of a block's payload, each to the end of the conversation that it began.
+    /// Runs the commands of a block's payload, each to the end of the conversation that it began, unless the next one
+    /// joins it.
     #[inline]
     pub fn execute(&mut self, payload: &[u8]) {
         let mut reader = Reader::new(payload);
         while !reader.is_empty() {
             self.mcu.execute(&mut reader);
-            while self.mcu.is_held() {
+            while self.mcu.is_held() && !self.mcu.joins(reader.rest()) {
                 let next = self.turn();
                 self.clock.set(next.filter(|_| self.mcu.is_held()).unwrap_or(self.clock.now()));
             }

@@ -4,11 +4,15 @@
 //!
 //! A `spi_send` or `spi_transfer` is over, and answered, before the next command runs. klippy relies
 //! on that: for displays it sets the D/C line by the commands before and after a `spi_send`, and when
-//! the acknowledgement of a query arrives it does not wait for the answer any longer.
+//! the acknowledgement of a query arrives it does not wait for the answer any longer. Only a `spi_send` behind a `spi_send` to
+//! the same device does not wait: the worker does them in their order. Once one fails, or the MCU stops, the rest is
+//! not sent.
 
 #![forbid(unsafe_code)]
 
 use std::fmt;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU32, Ordering};
 
 use crate::board::soft_spi::SoftSpi;
 use crate::board::{BusDevice, BusError, ChipSelect, Pin, SpiConfig};
@@ -61,9 +65,11 @@ pub(super) struct Transfer {
 }
 
 impl Transfer {
+    const EMPTY: Transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true };
+
     /// One that is to be loaded.
     pub(super) fn slot() -> Slot<Conversation<Transfer>> {
-        Slot::talking(Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true })
+        Slot::talking(Transfer::EMPTY)
     }
 
     /// These bytes are to be exchanged for what comes back.
@@ -93,16 +99,58 @@ impl Talk for Transfer {
     }
 }
 
+/// How many messages of one device may be under way: enough that the core is woken for one in several.
+const UNDER_WAY_MAX: usize = 8;
+
+/// Numbers the messages that may be sent together. A failure or a stop takes the next number: what waits then is not sent.
+#[derive(Clone, Default)]
+struct Round(Arc<AtomicU32>);
+
+impl Round {
+    fn number(&self) -> u32 {
+        self.0.load(Ordering::Acquire)
+    }
+
+    fn end(&self) {
+        self.0.fetch_add(1, Ordering::AcqRel);
+    }
+}
+
+/// A transfer that is one of a round.
+struct Message {
+    transfer: Transfer,
+    round: Round,
+    /// The number of its round.
+    number: u32,
+}
+
+impl Talk for Message {
+    type Answer = ();
+
+    fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
+        // The host waits for the answer of one that is read.
+        if self.number != self.round.number() && !self.transfer.reads {
+            return Ok(());
+        }
+        self.transfer.talk(chip).inspect_err(|_| self.round.end())
+    }
+}
+
 /// An SPI device.
 pub(super) struct Spi {
     bus: Option<Bus>,
     chip_select: Option<ChipSelect>,
-    transfer: Slot<Conversation<Transfer>>,
+    messages: [Slot<Conversation<Message>>; UNDER_WAY_MAX],
+    round: Round,
 }
 
 impl Spi {
     fn new(chip_select: Option<ChipSelect>) -> Spi {
-        Spi { bus: None, chip_select, transfer: Transfer::slot() }
+        let round = Round::default();
+        let messages = std::array::from_fn(|_| {
+            Slot::talking(Message { transfer: Transfer::EMPTY, round: round.clone(), number: 0 })
+        });
+        Spi { bus: None, chip_select, messages, round }
     }
 
     /// Whether it has a chip select line of its own.
@@ -160,16 +208,19 @@ impl Spi {
             }
             return Ok(());
         };
-        // It is here, as no command runs while another one's transfer is under way.
-        let Some(transfer) = self.transfer.here() else {
-            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
+        // One is here, unless a bus has hung since before a stop.
+        let Some(slot) = self.messages.iter_mut().find(|slot| slot.is_here()) else {
+            return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "the messages from before the stop are under way"));
         };
-        if answers {
-            transfer.talk.load(data)
-        } else {
-            transfer.talk.load_to_send(data)
+        if let Some(Conversation { talk: message, .. }) = slot.here() {
+            message.number = self.round.number();
+            if answers { message.transfer.load(data) } else { message.transfer.load_to_send(data) }
         }
-        self.transfer.converse_on(turn, bus)
+        slot.converse_on(turn, bus)?;
+        if !answers {
+            turn.let_join(UNDER_WAY_MAX as u32);
+        }
+        Ok(())
     }
 }
 
@@ -190,15 +241,23 @@ impl Object for Spi {
     }
 
     fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        let Some(Back { result, .. }) = self.transfer.back(done) else { return Ok(()) };
-        if let Err(error) = result {
-            let failure = spi_shutdown(error.clone());
-            return turn.device_failed(self.kind(), failure);
-        }
-        if let Some(transfer) = self.transfer.here().filter(|transfer| transfer.talk.reads) {
-            turn.send(TransferResponse { oid: turn.oid(), response: transfer.talk.bytes() });
+        let kind = self.kind();
+        for slot in &mut self.messages {
+            let Some(Back { result, .. }) = slot.back(done) else { continue };
+            if let Err(error) = result {
+                let failure = spi_shutdown(error.clone());
+                return turn.device_failed(kind, failure);
+            }
+            if let Some(Conversation { talk: message, .. }) = slot.here().filter(|here| here.talk.transfer.reads) {
+                turn.send(TransferResponse { oid: turn.oid(), response: message.transfer.bytes() });
+            }
+            return Ok(());
         }
         Ok(())
+    }
+
+    fn shutdown(&mut self, _turn: &mut Turn) {
+        self.round.end();
     }
 
     fn bus(&self) -> Option<&Bus> {
@@ -297,7 +356,7 @@ const SPI_TRANSFER: Command =
     command!("spi_transfer oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, true, data));
 
 const SPI_SEND: Command =
-    command!("spi_send oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, false, data));
+    command!("spi_send oid=%c data=%*s", Spi, |spi, turn, data: &[u8]| spi.transfer(turn, false, data)).joining();
 
 const CONFIG_SPI_SHUTDOWN: Command = command!(
     "config_spi_shutdown oid=%c spi_oid=%c shutdown_msg=%*s",

@@ -31,6 +31,8 @@ pub struct Command {
     pub generations: Generations,
     /// Whether it also runs after a shutdown.
     pub in_shutdown: bool,
+    /// Whether it may join its own kind: see [`Command::joining`].
+    pub joins: bool,
     /// What it does.
     pub handler: Handler,
 }
@@ -38,12 +40,19 @@ pub struct Command {
 impl Command {
     /// A command that all hosts take, while the MCU runs. [`command!`](crate::command) declares one.
     pub const fn new(format: &'static str, handler: Handler) -> Command {
-        Command { format, generations: Generations::ALL, in_shutdown: false, handler }
+        Command { format, generations: Generations::ALL, in_shutdown: false, joins: false, handler }
     }
 
     /// Lets the command run after a shutdown too (`HF_IN_SHUTDOWN`).
     pub const fn allowed_in_shutdown(mut self) -> Command {
         self.in_shutdown = true;
+        self
+    }
+
+    /// Lets the command run while commands wait for the errand of one like it that its object
+    /// [lets others join](super::Turn::let_join). Its first parameter must be the oid.
+    pub const fn joining(mut self) -> Command {
+        self.joins = true;
         self
     }
 

@@ -25,6 +25,7 @@ pub(super) struct Entry {
     pub(super) format: &'static str,
     pub(super) handler: Handler,
     pub(super) in_shutdown: bool,
+    pub(super) joins: bool,
     /// Whether it is one of the MCU's own, which has the same id in every dialect.
     pub(super) is_own: bool,
     conversions: Box<[Conversion]>,
@@ -38,6 +39,7 @@ impl Entry {
             format: command.format,
             handler: command.handler,
             in_shutdown: command.in_shutdown,
+            joins: command.joins,
             is_own,
             conversions: conversions.into_iter().map(|(_, conversion)| conversion).collect(),
         })

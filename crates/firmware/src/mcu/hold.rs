@@ -6,11 +6,17 @@
 //! command sends *holds*: until it is back, the core runs no further command and leaves the block
 //! unacknowledged ([`Mcu::is_held`]). Timers go on, and errands that they send hold nothing. A
 //! stopped MCU is not held.
+//!
+//! A command that answers nothing (`spi_send`) lets others of its object join ([`Mcu::joins`]): their errands
+//! follow its own on the same bus, in their order. Its block is done at once, and whatever else comes waits for the last of
+//! them. So a display costs one wake-up for several messages.
 
 #![forbid(unsafe_code)]
 
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Ticks;
+
+use pinion_protocol::vlq::Reader;
 
 use super::{Mcu, Oid, TimerId, Turn};
 
@@ -29,6 +35,8 @@ pub(super) struct Holds {
     pub(super) count: u32,
     /// Whose the last one is.
     holder: Option<Oid>,
+    /// How many conversations there may be in all, if the holder lets others join.
+    join_limit: u32,
 }
 
 /// Commands wait until this is [released](Mcu::release). If no command has asked for it, none wait.
@@ -42,13 +50,18 @@ impl Turn<'_> {
         let holder = self.oid();
         let is_commanded = self.holds.is_commanded;
         if is_commanded {
-            if self.holds.count == 0 {
-                self.limit_hold();
-            }
+            self.limit_hold();
             self.holds.count += 1;
             self.holds.holder = Some(holder);
+            self.holds.join_limit = 0;
         }
         Hold(is_commanded)
+    }
+
+    /// To be called once the errand of a command was sent: commands of its kind that are for the same object need not wait
+    /// for it, until `limit` errands are under way.
+    pub fn let_join(&mut self, limit: u32) {
+        self.holds.join_limit = limit;
     }
 }
 
@@ -68,6 +81,8 @@ impl Mcu {
         self.holds.count = self.holds.count.saturating_sub(1);
         if self.holds.count == 0 {
             self.schedule.timers.remove(TimerId::HOLD);
+        } else if self.is_held() {
+            self.limit_hold();
         }
     }
 
@@ -76,6 +91,23 @@ impl Mcu {
     #[inline]
     pub fn is_held(&self) -> bool {
         self.holds.count > 0 && self.stop.reason.is_none() || self.configuration.reset_due
+    }
+
+    /// Whether the command that has begun last keeps its block: it is not acknowledged before commands may run again.
+    #[inline]
+    pub fn keeps_block(&self) -> bool {
+        self.is_held() && (self.holds.join_limit == 0 || self.configuration.reset_due)
+    }
+
+    /// Whether a command may run though [others wait](Mcu::is_held): it is the first of this payload.
+    pub fn joins(&self, payload: &[u8]) -> bool {
+        if self.keeps_block() || self.holds.count >= self.holds.join_limit {
+            return false;
+        }
+        let mut reader = Reader::new(payload);
+        let command = reader.int().ok().and_then(|id| self.heard().command(id).ok());
+        command.is_some_and(|command| command.joins)
+            && reader.int().is_ok_and(|oid| self.holds.holder.is_some_and(|holder| holder.index() == oid as usize))
     }
 
     /// A stop is over. A conversation from before it holds commands again, and its limit may be over.

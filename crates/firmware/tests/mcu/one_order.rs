@@ -36,6 +36,77 @@ fn a_display_sees_its_line_and_its_bytes_in_order() {
     }
 }
 
+/// With a second device, and a message for the first one at a stop.
+fn two_devices(answer_ticks: u32) -> Rig {
+    let more = [
+        "config_spi_without_cs oid=2",
+        "spi_set_bus oid=2 spi_bus=0 mode=0 rate=1000000",
+        "config_spi_shutdown oid=3 spi_oid=0 shutdown_msg=ee",
+    ];
+    Rig::with_workers(answer_ticks, &[DISPLAY, &more].concat())
+}
+
+fn sent(rig: &Rig) -> Vec<Vec<u8>> {
+    rig.bench.transfers().into_iter().map(|transfer| transfer.data).collect()
+}
+
+#[test]
+fn what_is_only_sent_does_not_wait_for_what_was_sent_before_to_the_same_device() {
+    let mut rig = two_devices(1000);
+    rig.begin("spi_send oid=0 data=00");
+    assert!(!rig.mcu.keeps_block(), "nobody waits for an answer");
+    for n in 1..8 {
+        assert!(!rig.mcu.joins(&[]));
+        for other in ["spi_send oid=2 data=01", "spi_transfer oid=0 data=01", "update_digital_out oid=1 value=1"] {
+            assert!(rig.mcu.is_held() && !rig.mcu.joins(&rig.encode(other)), "{other}");
+        }
+        let next = format!("spi_send oid=0 data={n:02x}");
+        assert!(rig.mcu.joins(&rig.encode(&next)), "{next}");
+        rig.begin(&next);
+    }
+    let next = rig.encode("spi_send oid=0 data=08");
+    assert!(!rig.mcu.joins(&next), "as many as can be are under way");
+    rig.run_until(1000);
+    assert!(rig.mcu.joins(&next));
+    rig.begin("spi_send oid=0 data=08");
+    rig.run_until(8999);
+    assert!(rig.mcu.is_held());
+    rig.run_until(9000);
+    assert!(!rig.mcu.is_held());
+    assert_eq!(sent(&rig), (0..9).map(|n| vec![n]).collect::<Vec<_>>());
+    // What is answered keeps its block, and nothing joins it.
+    rig.begin("spi_transfer oid=0 data=01");
+    assert!(rig.mcu.keeps_block() && !rig.mcu.joins(&next));
+}
+
+#[test]
+fn a_message_that_fails_is_the_last_one() {
+    let mut rig = two_devices(1000);
+    (0..4).for_each(|n| rig.begin(&format!("spi_send oid=0 data={n:02x}")));
+    rig.run_until(1999);
+    rig.bench.state().broken.insert(SPI_CHIPS);
+    rig.run_until(2000);
+    assert_eq!(rig.shutdown().as_deref(), Some("Unable to issue spi ioctl"));
+    rig.bench.state().broken.remove(&SPI_CHIPS);
+    rig.run_until(50_000);
+    assert_eq!(sent(&rig), [[0], [0xee]], "two were under way, and only the message of the stop comes");
+    rig.send("clear_shutdown");
+    rig.send("spi_send oid=0 data=05");
+    assert_eq!(sent(&rig).last(), Some(&vec![5]));
+}
+
+#[test]
+fn a_stop_ends_what_is_under_way() {
+    let mut rig = two_devices(1000);
+    (0..4).for_each(|n| rig.begin(&format!("spi_send oid=0 data={n:02x}")));
+    rig.run_until(1000);
+    rig.begin("emergency_stop");
+    // Of the round that ended.
+    rig.begin("clear_shutdown");
+    rig.run_until(50_000);
+    assert_eq!(sent(&rig), [[0], [0xee]]);
+}
+
 #[test]
 fn an_answer_is_there_before_the_next_command_runs() {
     let mut rig = Rig::with_workers(200_000, DISPLAY);
