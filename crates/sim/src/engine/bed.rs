@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The bed, and where the head is over it.
 //!
-//! A cartesian printer's nozzle is lifted over the bed by motors that hold a gantry, or the bed, each at its own
-//! place; a delta's hangs on three carriages. Either way the bed feels a distance, which follows from where the
-//! motors stand.
+//! Motors hold a cartesian printer's gantry, or its bed, each at its own place. A delta's nozzle hangs on three
+//! carriages. In both cases the distance to the bed follows from the positions of the motors.
 
 #![forbid(unsafe_code)]
 
@@ -14,12 +13,12 @@ use crate::description::axes::{BedConfig, DeltaConfig};
 
 /// A plane that motors hold up, each at a place: a gantry over the bed, or the bed under it.
 ///
-/// It is stiff. Three motors define it; two leave it level across their line, and one leaves it level. More than
+/// The plane is stiff. Three motors define it. Two leave it level across their line, and one leaves it level. More than
 /// three pull at it like springs, and it settles as near to all of them as it can (least squares).
 pub struct Plane {
     /// The middle of the motors.
     middle: [f64; 2],
-    /// The motors, and how much each one tilts it: per millimetre of it, along x and y.
+    /// The motors, and how much each one tilts the plane along x and y: per millimeter of the motor's position.
     motors: Vec<(Arc<Axis>, [f64; 2])>,
 }
 
@@ -33,7 +32,7 @@ impl Plane {
         let xx = sum(&|at| (at[0] - mx).powi(2));
         let xy = sum(&|at| (at[0] - mx) * (at[1] - my));
         let yy = sum(&|at| (at[1] - my).powi(2));
-        // The inverse of [[xx, xy], [xy, yy]]; where the motors stand in a line, its pseudo-inverse.
+        // The inverse of [[xx, xy], [xy, yy]]; the pseudo-inverse if the motors stand in a line.
         let (trace, determinant) = (xx + yy, xx * yy - xy * xy);
         let [ixx, ixy, iyy] = if trace == 0.0 {
             [0.0; 3]
@@ -49,7 +48,7 @@ impl Plane {
         Plane { middle, motors: motors.into_iter().map(|(axis, at)| (axis, tilt(at))).collect() }
     }
 
-    /// How high it is at a place.
+    /// The height of the plane at a place.
     fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
         let mean = 1.0 / self.motors.len().max(1) as f64;
         let (x_mm, y_mm) = (x_mm - self.middle[0], y_mm - self.middle[1]);
@@ -70,15 +69,15 @@ impl Delta {
         Delta { carriages, towers_mm: config.towers_mm(), arm_mm: config.arm_mm, bed_radius_mm: config.bed_radius_mm }
     }
 
-    /// Where the nozzle is: as far as an arm from each carriage, and below them.
+    /// The nozzle's position: one arm's length from each carriage, and below them.
     fn nozzle_mm(&self) -> [f64; 3] {
         let [a, b, c] = [0, 1, 2].map(|tower| {
             let [x, y] = self.towers_mm[tower];
             let z = self.carriages[tower].position_mm();
             ([x, y, z], x * x + y * y + z * z)
         });
-        // The difference of two spheres is a plane: [x, y, z] · plane = level. Two of them leave x and y as lines
-        // of z: x = x0 + x1 z, y = y0 + y1 z.
+        // The difference of two spheres is a plane: [x, y, z] · plane = level. Two planes leave x and y as lines of z:
+        // x = x0 + x1 z, y = y0 + y1 z.
         let plane = |other: ([f64; 3], f64)| {
             let normal = [0, 1, 2].map(|axis| other.0[axis] - a.0[axis]);
             (normal, (other.1 - a.1) / 2.0)
@@ -91,13 +90,13 @@ impl Delta {
         let square = x1 * x1 + y1 * y1 + 1.0;
         let half = x1 * dx + y1 * dy - az;
         let rest = dx * dx + dy * dy + az * az - self.arm_mm * self.arm_mm;
-        // Carriages that the arms cannot join are taken to stretch them.
+        // If the arms cannot join the carriages, they count as stretched.
         let z = (-half - (half * half - square * rest).max(0.0).sqrt()) / square;
         [x0 + x1 * z, y0 + y1 * z, z]
     }
 }
 
-/// What holds the nozzle over the bed.
+/// The kinematics that hold the nozzle over the bed.
 pub enum Head {
     /// Axes along x and y, and the motors of the z axis.
     Cartesian { x: Option<Arc<Axis>>, y: Option<Arc<Axis>>, z: Plane },
@@ -106,13 +105,13 @@ pub enum Head {
 }
 
 impl Head {
-    /// Where a point of the head is that stands off the nozzle by so much.
+    /// The position of a point at this offset from the nozzle.
     fn point_mm(&self, [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3]) -> [f64; 3] {
         match self {
             Head::Cartesian { x, y, z } => {
                 let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| axis.position_mm());
                 let (x_mm, y_mm) = (position(x) + x_offset_mm, position(y) + y_offset_mm);
-                // The head is tilted as the gantry is; or it is the bed that is.
+                // The head is tilted like the gantry. If the motors hold the bed, the bed is tilted instead.
                 [x_mm, y_mm, z.height_mm(x_mm, y_mm) + z_offset_mm]
             }
             Head::Delta(delta) => {
@@ -122,7 +121,7 @@ impl Head {
         }
     }
 
-    /// The ends of the bed along x and y; none where nothing moves along that.
+    /// The ends of the bed along x and y; `None` if nothing moves along that direction.
     fn ends_mm(&self) -> [Option<(f64, f64)>; 2] {
         match self {
             Head::Cartesian { x, y, .. } => {
@@ -152,7 +151,7 @@ impl Bed {
         Bed::new(shape, Head::Cartesian { x, y, z })
     }
 
-    /// The height of the bed under a place: two slopes and a bow, each 0 in the middle.
+    /// The height of the bed at a place: two slopes and a bow, each 0 in the middle.
     pub fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
         // From -1 at one end of the bed to 1 at the other.
         let place = |ends_mm: Option<(f64, f64)>, mm: f64| match ends_mm {
@@ -164,8 +163,7 @@ impl Bed {
         slopes - self.shape.bow_mm * (u * u + v * v) / 2.0
     }
 
-    /// How far the point that stands off the nozzle by so much is above the bed; negative if it
-    /// presses into it.
+    /// How far the point at this offset from the nozzle is above the bed; negative if it presses into the bed.
     pub fn clearance_mm(&self, offset_mm: [f64; 3]) -> f64 {
         let [x_mm, y_mm, z_mm] = self.head.point_mm(offset_mm);
         z_mm - self.height_mm(x_mm, y_mm)
@@ -205,7 +203,7 @@ mod tests {
             assert_near(two.height_mm(50.0, y_mm), 1.5);
             assert_near(two.height_mm(300.0, y_mm), 4.0);
         }
-        // Without places all of them stand at one.
+        // Without places all motors stand at one place.
         let nowhere = plane(&[([0.0, 0.0], 1.0), ([0.0, 0.0], 3.0)]);
         assert_near(nowhere.height_mm(170.0, 20.0), 2.0);
         assert_near(plane(&[]).height_mm(1.0, 1.0), 0.0);
@@ -221,7 +219,7 @@ mod tests {
     }
 
     proptest! {
-        /// Whatever plane three or four motors agree on is the plane.
+        /// If three or four motors agree on a plane, the result is that plane.
         #[test]
         fn motors_that_agree_define_the_plane(
             level in -5.0..5.0, slopes in prop::array::uniform2(-0.02..0.02), four: bool,
@@ -233,9 +231,9 @@ mod tests {
             assert_near(plane(&motors).height_mm(place[0], place[1]), height(place));
         }
 
-        /// The nozzle of a delta is where klippy's formula for its towers puts the carriages. Only
-        /// places on the bed count: farther out an arm lies flat, and the nozzle moves far with
-        /// the millionth of a millimetre to which a carriage's place is rounded.
+        /// The nozzle of a delta is where klippy's formula for its towers puts the carriages. Only places on the bed
+        /// count. Farther out an arm lies flat. There the nozzle moves far when a carriage's position is rounded to a
+        /// millionth of a millimeter.
         #[test]
         fn a_delta_is_where_its_carriages_put_it(
             away in 0.0..90.0f64, around in 0.0..TAU, z in -1.0..250.0f64, turn in -5.0..5.0f64,

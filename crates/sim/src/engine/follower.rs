@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One who feels a motion: every step of an axis, with its instant.
+//! A follower feels a motion: every step of an axis, with its instant.
 
 #![forbid(unsafe_code)]
 
@@ -9,19 +9,18 @@ use super::physics::Axis;
 use super::track::{KEPT, Recorded};
 use pinion_firmware::time::Clock;
 
-/// One who follows an axis.
+/// Reads the steps of an axis in order.
 #[derive(Debug)]
 pub(crate) struct Follower {
     axis: Arc<Axis>,
     next: u64,
 }
 
-/// What an axis did.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Motion {
-    /// A step at this instant, to this place in mm.
+    /// A step at this instant, to this position in mm.
     Step(Clock, f64),
-    /// More than the track holds; at this instant it stepped to here, in mm.
+    /// The track no longer holds the steps before. At this instant the axis stepped to this position, in mm.
     Lost(Clock, f64),
 }
 
@@ -31,7 +30,7 @@ impl Follower {
         Follower { axis, next: 0 }
     }
 
-    /// What came next, if it was no later than this.
+    /// The next motion, if it was not later than `until`.
     pub(crate) fn next(&mut self, until: Clock) -> Option<Motion> {
         let mut lost = false;
         loop {
@@ -42,7 +41,7 @@ impl Follower {
                     return Some(if lost { Motion::Lost(at, mm) } else { Motion::Step(at, mm) });
                 }
                 Recorded::Step(..) | Recorded::NotYet => return None,
-                // Half of the track is left to go on from, while the writer overwrites the other half.
+                // Continue at half of the track, while the writer overwrites the other half.
                 Recorded::Overwritten => {
                     self.next = self.axis.track().next().saturating_sub(KEPT as u64 / 2);
                     lost = true;
@@ -71,7 +70,7 @@ mod tests {
         };
         let at = Clock::from_ticks;
         steps(1, 10);
-        // No further than asked for.
+        // No step later than the given instant.
         for step in 1..=4 {
             assert_eq!(follower.next(at(4)), Some(Motion::Step(at(step), step as f64 / 100.0)));
         }

@@ -11,20 +11,20 @@ use crate::description::buses::I2cBusConfig;
 use pinion_firmware::board::{BusDevice, BusError, BusStatus};
 use pinion_firmware::trouble::Trouble;
 
-/// A chip as its data sheet describes it. Its calls come in the order of the wires: a start with its
-/// address, bytes, perhaps another start, a stop.
+/// A chip as its data sheet describes it. The calls come in the order of the signals: a start with the address, bytes,
+/// perhaps another start, a stop.
 pub(crate) trait I2cChip: Send {
-    /// A start or a repeated start, to write to the chip or to read from it. Whether it acknowledges
-    /// its address.
+    /// A start or a repeated start, to write to the chip or to read from it. Returns whether the chip acknowledges its
+    /// address.
     fn start(&mut self, read: bool) -> bool {
         let _ = read;
         true
     }
 
-    /// Takes a byte in. Whether it acknowledges it.
+    /// Takes a byte in. Returns whether the chip acknowledges it.
     fn write(&mut self, byte: u8) -> bool;
 
-    /// Gives a byte out.
+    /// Returns the next byte of the chip.
     fn read(&mut self) -> u8;
 
     /// The bus is free again.
@@ -38,12 +38,11 @@ struct Socket {
     chip: Box<dyn I2cChip>,
 }
 
-/// A bus.
 pub(crate) struct I2cBus {
-    /// As the dictionary has it.
+    /// As in the dictionary.
     pub(crate) name: String,
     delay: Duration,
-    /// One transfer at a time, as on any bus; only workers wait here.
+    /// One transfer at a time, as on any bus. Only workers wait here.
     sockets: Mutex<Vec<Socket>>,
 }
 
@@ -90,7 +89,7 @@ impl I2cBus {
     }
 }
 
-/// The host's end: a bus as one device of the machine's uses it.
+/// The MCU's end: one bus device on this bus.
 pub(crate) struct I2cDevice {
     pub(crate) bus: Arc<I2cBus>,
     pub(crate) address: u8,

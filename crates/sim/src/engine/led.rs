@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A light of several colours, each dimmed by a pin of its own.
+//! A light of several colors, each dimmed by its own pin.
 
 #![forbid(unsafe_code)]
 
@@ -10,10 +10,9 @@ use super::physics::Lamp;
 use super::world::Sight;
 use pinion_firmware::time::Clock;
 
-/// The light.
 pub(crate) struct ColouredLed {
     pub(crate) name: String,
-    /// Red, green, blue and white, as far as there are such.
+    /// Red, green, blue and white; `None` for a color that the light does not have.
     pub(crate) lamps: [Option<Arc<Lamp>>; 4],
 }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What any printer is made of: what moves and heats, the wires and buses, the time. It names no part.
+//! The elements of every printer: motion and heat, wires and buses, time. It names no part.
 
 #![forbid(unsafe_code)]
 

@@ -3,26 +3,26 @@
 
 #![forbid(unsafe_code)]
 
-/// Noise of the normal kind, the same for the same seed.
+/// Noise with a normal distribution. The same seed gives the same noise.
 #[derive(Clone, Debug)]
 pub struct Noise(u64);
 
 impl Noise {
-    /// What SplitMix64 adds for each draw.
+    /// SplitMix64 adds this for each draw.
     const STEP: u64 = 0x9e37_79b9_7f4a_7c15;
 
-    /// The noise of one part or pin: with the same seed each has another one.
+    /// The noise of one part or pin. With the same seed each part has different noise.
     pub fn of(whose: &str, seed: u64) -> Noise {
         whose.bytes().fold(Noise(seed), |noise, byte| Noise((noise.0 ^ u64::from(byte)).wrapping_mul(Noise::STEP)))
     }
 
-    /// The draw of this number, for who keeps no noise between two draws.
+    /// The draw with this number, for a caller that keeps no noise between two draws.
     pub fn nth(&self, draw: u64) -> f64 {
         Noise(self.0.wrapping_add(draw.wrapping_mul(Noise::STEP))).draw()
     }
 
-    /// A draw with mean 0 and standard deviation 1: the sum of four uniform ones, which is within
-    /// 3.5 and close to normal. The bits are SplitMix64's (Steele, Lea, Flood, 2014).
+    /// A draw with mean 0 and standard deviation 1: the sum of four uniform draws. It is within 3.5 and close to
+    /// normal. The bits come from SplitMix64 (Steele, Lea, Flood, 2014).
     pub fn draw(&mut self) -> f64 {
         self.0 = self.0.wrapping_add(Noise::STEP);
         let mut bits = self.0;
@@ -30,7 +30,7 @@ impl Noise {
         bits = (bits ^ (bits >> 27)).wrapping_mul(0x94d0_49bb_1331_11eb);
         bits ^= bits >> 31;
         let sum: u64 = (0..4).map(|quarter| (bits >> (16 * quarter)) & 0xffff).sum();
-        // Each uniform draw has variance 1/12, their sum 1/3.
+        // Each uniform draw has variance 1/12, and their sum has 1/3.
         (sum as f64 / 65_536.0 - 2.0) * 3f64.sqrt()
     }
 }

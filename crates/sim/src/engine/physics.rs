@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the pins move, heat and spin.
+//! Everything that the pins move, heat and spin.
 //!
-//! One thread drives a pin, mostly the core; any thread may look. Nothing here locks, blocks or
-//! allocates: a state changes only when a pin does, and what lies between two changes is solved
-//! exactly by whoever asks.
+//! One thread drives a pin, mostly the core. Any thread may read. Nothing here locks, blocks or allocates: a state
+//! changes only when a pin changes. The reader calculates the exact state between two changes.
 
 #![forbid(unsafe_code)]
 
@@ -24,11 +23,11 @@ pub struct Axis {
     pub name: String,
     pub travel_mm: Option<f64>,
     steps_per_mm: f64,
-    /// The steps at which it hits something.
+    /// The lowest and the highest step that it reaches without hitting something.
     hard_limits: Option<(i64, i64)>,
-    /// The endstop's end, and the step from which on it is closed.
+    /// The endstop's end, and the step where it closes.
     endstop: Option<(End, i64)>,
-    /// Whether a falling edge is a step, too.
+    /// Whether a falling edge is also a step.
     both_edges: AtomicBool,
     /// Whether the step line is on.
     stepped: AtomicBool,
@@ -37,27 +36,26 @@ pub struct Axis {
     forward: AtomicBool,
     enabled: AtomicBool,
     position: AtomicI64,
-    /// Steps that its driver was given: those with a low direction line less those with a high one.
+    /// Steps that its driver received: those with a low direction line minus those with a high one.
     turned: AtomicI64,
     lost_steps: AtomicU64,
     track: Track,
-    /// The instant of the last step, the ticks between it and the one before, and how many steps
-    /// in a row were lost until then.
+    /// The instant of the last step, the ticks between it and the step before, and the number of lost steps in a row
+    /// until then.
     stride: Together<3>,
 }
 
-/// How a motor steps.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stride {
     /// Ticks between two steps.
     pub ticks: u64,
-    /// Steps in a row that the motor could not do.
+    /// Steps in a row that the motor could not make.
     pub lost_in_a_row: u64,
 }
 
 impl Axis {
     pub fn new(config: &AxisConfig) -> Axis {
-        // The bounds on the description keep this below 2^63.
+        // The limits of the description keep this below 2^63.
         let steps = |mm: f64| (mm * config.steps_per_mm).round() as i64;
         Axis {
             name: config.name.clone(),
@@ -120,7 +118,7 @@ impl Axis {
         }
     }
 
-    /// One step. False if the motor could not do it, as its axis had hit something.
+    /// One step. False if the motor could not make it, because its axis had hit something.
     fn step(&self, at: Clock) -> bool {
         let turn = if self.is_dir_high() { -1 } else { 1 };
         self.turned.store(self.turned_steps().wrapping_add(turn), Ordering::Relaxed);
@@ -143,8 +141,7 @@ impl Axis {
         true
     }
 
-    /// How it steps at this instant. Since the last step the time to the next one is not known yet, and
-    /// is at least what went by.
+    /// The stride at this instant. The time to the next step is unknown, but at least the time since the last step.
     pub fn stride(&self, now: Clock) -> Stride {
         let [last, ticks, lost_in_a_row] = self.stride.load();
         let since = now.since(Clock::from_ticks(last)).max(0) as u64;
@@ -164,7 +161,7 @@ impl Axis {
         self.turned.load(Ordering::Relaxed)
     }
 
-    /// Where so many steps are.
+    /// The position of this step count, in mm.
     pub fn mm(&self, steps: i64) -> f64 {
         steps as f64 / self.steps_per_mm
     }
@@ -177,7 +174,7 @@ impl Axis {
         self.lost_steps.load(Ordering::Relaxed)
     }
 
-    /// Whether the endstop is closed; none without an endstop.
+    /// Whether the endstop is closed; `None` without an endstop.
     pub fn endstop(&self) -> Option<bool> {
         let position = self.position_steps();
         self.endstop.map(|(end, at)| match end {
@@ -189,9 +186,9 @@ impl Axis {
 
 /// A heater, the mass that it heats, and the sensor in it.
 ///
-/// The mass: `C dT/dt = P - L (T - Ta)` with the power `P` on or off, so from one change to the
-/// next `T(t) = T∞ + (T0 - T∞) exp(-t L/C)` with `T∞ = Ta + P/L`. The sensor follows it:
-/// `τ dS/dt = T - S`, a second exponential. A fan that blows at it adds to `L` while it has power.
+/// The mass follows `C dT/dt = P - L (T - Ta)` with the power `P` on or off. So from one change to the next
+/// `T(t) = T∞ + (T0 - T∞) exp(-t L/C)` with `T∞ = Ta + P/L`. The sensor follows the mass: `τ dS/dt = T - S`, a second
+/// exponential. A fan that blows at the heater adds to `L` while the fan has power.
 #[derive(Debug)]
 pub struct Heater {
     pub name: String,
@@ -200,11 +197,12 @@ pub struct Heater {
     ambient_celsius: f64,
     watts: f64,
     heat_capacity_j_per_k: f64,
-    /// To the surroundings, without its fan; and what that adds.
+    /// Loss to the surroundings without the fan; the next field is the fan's addition.
     loss_w_per_k: f64,
     cooling_w_per_k: f64,
     sensor_lag_s: f64,
-    /// Since when, the mass's and the sensor's temperature then, whether power is on, and whether the fan blows.
+    /// The time of the last change, the temperatures of the mass and the sensor then, whether power is on, and whether
+    /// the fan blows.
     state: Together<5>,
 }
 
@@ -220,7 +218,7 @@ pub struct Heat {
 }
 
 impl Heater {
-    /// The heater, and what a fan takes from it.
+    /// `cooling_w_per_k` is the loss that a fan adds.
     pub fn new(config: &HeaterConfig, thermistor: Thermistor, cooling_w_per_k: f64, now: Clock) -> Heater {
         let start = config.start_celsius().to_bits();
         let always_on = config.pin.is_none();
@@ -238,7 +236,7 @@ impl Heater {
         }
     }
 
-    /// How it is, and whether a fan blows at it.
+    /// The heater's state, and whether a fan blows at it.
     fn state_at(&self, now: Clock) -> (Heat, bool) {
         let [since, celsius, sensor_celsius, on, blown] = self.state.load();
         let (on, blown) = (on != 0, blown != 0);
@@ -250,8 +248,7 @@ impl Heater {
         let decay = (-elapsed_s / time_constant_s).exp();
         let celsius = end + mass_k * decay;
         let sensor_celsius = if self.sensor_lag_s > 0.0 {
-            // The part of the sensor's distance that goes with the mass, and the part that goes
-            // by itself.
+            // One part of the sensor's distance decays with the mass, the other part with the sensor's own lag.
             let slow_k = mass_k * time_constant_s / (time_constant_s - self.sensor_lag_s);
             let fast_k = f64::from_bits(sensor_celsius) - end - slow_k;
             end + slow_k * decay + fast_k * (-elapsed_s / self.sensor_lag_s).exp()
@@ -270,7 +267,7 @@ impl Heater {
         self.store(Heat { on, ..heat }, blown, now);
     }
 
-    /// Its fan has power from now on, or has none any more.
+    /// Its fan has power from now on, or no longer has it.
     fn blow(&self, blown: bool, now: Clock) {
         self.store(self.at(now), blown, now);
     }
@@ -281,21 +278,21 @@ impl Heater {
     }
 }
 
-/// A fan. Its speed follows its power as a heater's temperature does: `n(t) = n∞ + (n0 - n∞)
-/// exp(-t/τ)`; the angle is the integral of that.
+/// A fan. Its speed follows its power as a heater's temperature does: `n(t) = n∞ + (n0 - n∞) exp(-t/τ)`. The angle is
+/// the integral of the speed.
 #[derive(Debug)]
 pub struct Fan {
     pub name: String,
     max_rpm: f64,
     spin_up_s: f64,
     pulses_per_revolution: f64,
-    /// What it blows at.
+    /// The heater that it cools.
     cools: Option<Arc<Heater>>,
-    /// Since when, the speed (rpm) and the angle (revolutions) then, and the [`Switch`]es.
+    /// The time of the last change, the speed (rpm) and the angle (revolutions) then, and the [`Switch`]es.
     state: Together<4>,
 }
 
-/// What must be on for a fan to have power.
+/// All of these must be on for a fan to have power.
 #[derive(Clone, Copy, Debug)]
 pub enum Switch {
     /// Its pin.
@@ -343,7 +340,8 @@ impl Fan {
         (self.at(now).1 * self.pulses_per_revolution).fract() < 0.5
     }
 
-    /// The tachometer's edges so far, and how long ago the last one was at the present speed; none while it stands.
+    /// The tachometer's edges so far, and how long ago the last one was at the present speed; `None` for a fan that
+    /// stands still.
     pub fn edges(&self, now: Clock) -> (u64, Option<f64>) {
         let (rpm, turns, _) = self.at(now);
         let edges = turns * self.pulses_per_revolution * 2.0;
@@ -366,13 +364,14 @@ impl Fan {
 #[derive(Debug)]
 pub struct Lamp {
     pub name: String,
-    /// When it was last switched, and whether on; when it was last switched on; how much of the time it is on.
+    /// The time of the last change, whether it is on, the time when it was last switched on, and the share of time that
+    /// it is on.
     state: Together<4>,
 }
 
 impl Lamp {
-    /// What is switched at least as often as this looks dimmed: as bright as the share of the time that it is on.
-    /// What was not switched for longer is on or off.
+    /// Longest time between two changes for which the lamp looks dimmed. Its brightness is then the share of time that
+    /// it is on. After a longer time without a change it is on or off.
     const STEADY_S: f64 = 0.15;
 
     pub fn new(name: &str) -> Lamp {
@@ -384,7 +383,7 @@ impl Lamp {
         on != 0
     }
 
-    /// How bright an eye takes it for: 0 to 1.
+    /// The brightness that an eye sees, 0 to 1.
     pub fn brightness(&self, now: Clock) -> f64 {
         let [edge, on, _, share] = self.state.load();
         match seconds(Clock::from_ticks(edge), now) > Lamp::STEADY_S {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The simulated printer's SPI buses: chips, the lines that select them, and a record of what was
-//! said, as a logic analyser would make it.
+//! The simulated printer's SPI buses: the chips, their chip selects, and a record of the transfers, as a logic analyzer
+//! would make it.
 
 #![forbid(unsafe_code)]
 
@@ -20,10 +20,9 @@ use pinion_firmware::board::{BusDevice, BusError, BusStatus, ChipSelect};
 use pinion_firmware::time::Clock;
 use pinion_firmware::trouble::Trouble;
 
-/// A chip as its data sheet describes it. Its calls come in the order of the wires: selected,
-/// bytes, deselected.
+/// A chip as its data sheet describes it. The calls come in the order of the signals: selected, bytes, deselected.
 pub(crate) trait SpiChip: Send {
-    /// Whether the chip works in this SPI mode (0 to 3). In another one it is not heard.
+    /// Whether the chip works in this SPI mode (0 to 3). In any other mode the chip does not answer.
     fn knows_mode(&self, mode: u8) -> bool;
 
     /// The chip is selected; the bus's clock has this rate.
@@ -31,18 +30,18 @@ pub(crate) trait SpiChip: Send {
         let _ = rate_hz;
     }
 
-    /// Takes a byte in, and gives the one that leaves the chip meanwhile.
+    /// Takes a byte in, and returns the byte that leaves the chip at the same time.
     fn exchange(&mut self, byte: u8) -> u8;
 
-    /// The chip is no longer selected: many act only now.
+    /// The chip is no longer selected. Many chips act only now.
     fn deselect(&mut self) {}
 }
 
-/// What hangs on a bus's data output (MOSI) alone: without clock and select line it hears whatever is
-/// sent on the bus.
+/// A listener on a bus's data output (MOSI) alone. Without clock and chip select it hears everything that is sent on
+/// the bus.
 pub(crate) trait MosiListener: Send {
-    /// The output sends these bytes, the highest bit first, and so many bits in a second. Then it stays
-    /// at the level of the last one.
+    /// The output sends these bytes, the highest bit first, at this bit rate. Then it stays at the level of the last
+    /// bit.
     fn hear(&mut self, rate_hz: u32, bytes: &[u8]);
 }
 
@@ -62,9 +61,9 @@ impl Wire for MosiPin {
     }
 }
 
-/// A line that selects a chip while it is low.
+/// A line that selects a chip while the line is low.
 pub(crate) struct SelectLine {
-    /// Whose it is.
+    /// The name of the chip.
     chip: String,
     low: AtomicBool,
 }
@@ -93,7 +92,7 @@ impl Wire for SelectLine {
 /// A chip's place on its bus.
 struct Socket {
     name: String,
-    /// None for the only chip of a bus, which is always selected.
+    /// `None` for the only chip of a bus, which is always selected.
     select: Option<Arc<SelectLine>>,
     chip: Box<dyn SpiChip>,
 }
@@ -120,7 +119,7 @@ impl Trace {
         for (key, bytes) in [("sent", sent), ("received", received)] {
             line += &format!(" {key}=");
             for byte in bytes {
-                // A String takes everything that is written to it.
+                // Writing to a String cannot fail.
                 let _ = write!(line, "{byte:02x}");
             }
         }
@@ -136,19 +135,17 @@ impl Trace {
     }
 }
 
-/// What hangs on a bus.
 struct Wires {
     sockets: Vec<Socket>,
     listeners: Vec<Box<dyn MosiListener>>,
     trace: Option<Trace>,
 }
 
-/// A bus.
 pub(crate) struct SpiBus {
-    /// As the dictionary has it.
+    /// As in the dictionary.
     pub(crate) name: String,
     delay: Duration,
-    /// One transfer at a time, as on any bus; only workers wait here.
+    /// One transfer at a time, as on any bus. Only workers wait here.
     wires: Mutex<Wires>,
 }
 
@@ -177,12 +174,12 @@ impl SpiBus {
         wires.sockets.push(Socket { name, select, chip });
     }
 
-    /// Puts something on the data output alone.
+    /// Puts a listener on the data output alone.
     pub(crate) fn listen(&mut self, listener: Box<dyn MosiListener>) {
         self.wires.get_mut().unwrap_or_else(PoisonError::into_inner).listeners.push(listener);
     }
 
-    /// One transfer with whatever is selected.
+    /// One transfer with all selected chips.
     fn transfer(&self, mode: u8, rate_hz: u32, bytes: &mut [u8]) -> Result<(), BusError> {
         let mut wires = self.wires.lock().unwrap_or_else(PoisonError::into_inner);
         let Wires { sockets, listeners, trace } = &mut *wires;
@@ -198,7 +195,7 @@ impl SpiBus {
             for ((_, lamp, inverted), levels) in trace.iter().flat_map(|trace| &trace.pins).zip(&mut levels) {
                 levels.push(if lamp.is_on() != *inverted { '1' } else { '0' });
             }
-            // A wire that nobody drives is pulled up, and a chip that drives it low wins.
+            // An undriven wire is pulled up. A chip that drives it low wins.
             *byte = chips.iter_mut().fold(0xff, |wire, socket| wire & socket.chip.exchange(*byte));
         }
         pace.wait(pace.bytes);
@@ -208,7 +205,7 @@ impl SpiBus {
     }
 }
 
-/// Spreads the bytes of a transfer over the time that it is to take.
+/// Spreads the bytes of a transfer over its time.
 struct Pace {
     start: Instant,
     delay: Duration,
@@ -216,7 +213,7 @@ struct Pace {
 }
 
 impl Pace {
-    /// Waits until so many bytes are over.
+    /// Waits until this number of bytes is over.
     fn wait(&self, over: usize) {
         let share = over as f64 / self.bytes.max(1) as f64;
         let share = if self.bytes == 0 { 1.0 } else { share };
@@ -224,7 +221,7 @@ impl Pace {
     }
 }
 
-/// The host's end: a bus as one device of the machine's uses it.
+/// The MCU's end: one bus device on this bus.
 pub(crate) struct SpiDevice {
     pub(crate) bus: Arc<SpiBus>,
     pub(crate) mode: u8,

@@ -10,29 +10,29 @@ use std::time::Duration;
 
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Due, Ticks, TimeSource};
 
-/// Seconds from `earlier` to `later`; none if they are the other way round.
+/// Seconds from `earlier` to `later`; 0 if they are the other way round.
 pub fn seconds(earlier: Clock, later: Clock) -> f64 {
     later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
 }
 
-/// A simulated motor follows at any pace: a computer without real time, as most that try the printer, is
-/// late by milliseconds now and then.
+/// Longest delay of a step. A simulated motor follows at any pace. Most computers that try the printer have no real
+/// time, and are late by milliseconds now and then.
 pub(crate) const STEP_LATE_LIMIT: Ticks = Ticks::from_ms(100);
 
 /// How far an errand may be ahead of the clock.
 const AHEAD: Ticks = Ticks::from_ms(1);
 
 thread_local! {
-    /// The instant of the errand that this thread runs, if it runs one.
+    /// The instant of the errand that this thread runs; `None` if it runs no errand.
     static ERRAND: Cell<Option<Clock>> = const { Cell::new(None) };
 }
 
-/// The printer's time: the clock, but while the core runs a timer the instant for which that timer was set, and
-/// while a worker runs an errand the instant that this waited for.
+/// The printer's time. While the core runs a timer, it is the timer's due time. While a worker runs an errand, it is
+/// the instant that the errand waited for. Otherwise it is the clock.
 ///
-/// So an edge happens when it was due, and not as late as the computer is: most computers that try
-/// the printer are without real time, and its parts would hear rubbish of whatever is timed by
-/// microseconds (the bits of a UART, the pulses of a servo, the steps that make an axis ring).
+/// So an edge happens at its due time, however late the computer is. Most computers that try the printer have no real
+/// time. Their parts would misread everything that is timed by microseconds: the bits of a UART, the pulses of a servo,
+/// the steps that make an axis ring.
 pub(crate) struct PrinterTime {
     clock: Arc<dyn TimeSource>,
     due: Due,
@@ -43,12 +43,12 @@ impl PrinterTime {
         PrinterTime { clock, due: Due::default() }
     }
 
-    /// What the MCU says of the timer that it runs.
+    /// The MCU sets this to the due time of the timer that it runs.
     pub(crate) fn due(&self) -> Due {
         self.due.clone()
     }
 
-    /// The instant of what this thread does with a line. Workers use lines in errands only.
+    /// The instant of this thread's access to a line. Workers use lines in errands only.
     pub(crate) fn of_the_caller(&self) -> Clock {
         ERRAND.get().or_else(|| self.due.get()).unwrap_or_else(|| self.clock.now())
     }
@@ -59,7 +59,7 @@ impl PrinterTime {
     }
 }
 
-/// The time of an errand stands still but for its waits, so that no bit is longer than it was meant to be.
+/// The time of an errand advances only in its waits, so no bit is longer than intended.
 impl TimeSource for PrinterTime {
     fn now(&self) -> Clock {
         ERRAND.get().unwrap_or_else(|| self.clock.now())
@@ -73,8 +73,8 @@ impl TimeSource for PrinterTime {
         self.clock.duration_of(clock)
     }
 
-    /// As the lines have the errand's time, whatever it is meanwhile, nothing has to spin: between two
-    /// bits is no time to sleep, between a thousand there is.
+    /// Nothing has to spin, because the lines use the errand's time and not the clock. The time between two bits is too
+    /// short for a sleep. After about a thousand bits a sleep is possible.
     fn spin_until(&self, end: Clock) {
         let Some(now) = ERRAND.get() else { return self.clock.spin_until(end) };
         ERRAND.set(Some(now.max(end)));
@@ -83,7 +83,7 @@ impl TimeSource for PrinterTime {
         }
     }
 
-    /// The errand ends when both its own time and the clock have come to its end.
+    /// The errand ends when both its own time and the clock have reached its end.
     fn errand(&self, work: &mut dyn FnMut()) -> Clock {
         ERRAND.set(Some(self.clock.now()));
         work();
@@ -116,7 +116,7 @@ mod tests {
         assert_eq!((time.now(), time.of_the_caller()), (ended, ended));
     }
 
-    /// A clock that goes by itself.
+    /// A clock that advances by itself.
     struct Going(std::time::Instant);
 
     impl TimeSource for Going {
@@ -145,7 +145,7 @@ mod tests {
                 assert!(time.now().since(clock.now()) <= i64::from(AHEAD.0));
             }
         });
-        // Of a microsecond, as sleep is told.
+        // The sleep has a resolution of a microsecond.
         assert!(ended + Ticks::from_us(1) >= end);
     }
 

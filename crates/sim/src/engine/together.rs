@@ -5,15 +5,15 @@
 
 use std::sync::atomic::{AtomicU64, Ordering, fence};
 
-/// A few words that belong together: one thread writes them, any thread reads them whole.
+/// A few words that belong together. One thread writes them, and any thread reads them whole.
 ///
-/// They stand in two places by turns, so that a writer that was stopped amid its work keeps nobody
-/// waiting: the words before are still whole. It may be a worker whose processor the core took, and
-/// then it goes on only after the core is done. A reader reads again only if a whole `store` was done
-/// meanwhile, as the next one writes where it reads.
+/// They alternate between two places. So a writer that was stopped in the middle of a store delays no reader: the words
+/// before are still whole. The writer may be a worker that the core preempted. It continues only when the core is done.
+/// A reader reads again only if a whole `store` happened meanwhile, because the next store writes to the place that it
+/// reads.
 #[derive(Debug)]
 pub struct Together<const N: usize> {
-    /// How many times the words were stored. The place of the last ones is its lowest bit.
+    /// How many times the words were stored. The lowest bit is the place of the last ones.
     stores: AtomicU64,
     places: [[AtomicU64; N]; 2],
 }
@@ -42,7 +42,7 @@ impl<const N: usize> Together<N> {
     /// Only one thread may store.
     pub fn store(&self, words: [u64; N]) {
         let stores = self.stores.load(Ordering::Relaxed).wrapping_add(1);
-        // Who sees a word of these sees that the ones of two stores ago are no longer the last.
+        // A reader that sees one of these words also sees that the words of two stores ago are no longer the last.
         fence(Ordering::Release);
         for (word, value) in self.place(stores).iter().zip(words) {
             word.store(value, Ordering::Relaxed);
@@ -83,7 +83,7 @@ mod tests {
     fn who_reads_while_the_writer_is_stopped_amid_its_work_does_not_wait() {
         let words = Together::new([1; 3]);
         words.store([2; 3]);
-        // The first word of the next ones.
+        // The first word of the next store.
         words.place(2)[0].store(3, Ordering::Relaxed);
         assert_eq!(words.load(), [2; 3]);
     }

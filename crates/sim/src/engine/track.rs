@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The way of an axis: its last steps, each with its instant, for parts that feel a motion and not
-//! only a position.
+//! The track of an axis: its last steps, each with its instant, for parts that feel a motion and not only a position.
 //!
-//! The core writes, without a lock; readers on any thread follow at their own pace, each with a place
-//! of its own. A reader that falls behind by more than the track holds notices, and goes on from
-//! where the axis is.
+//! The core writes without a lock. Readers on any thread follow at their own pace, each with its own place. A reader
+//! that falls behind by more than the track holds notices it. It then continues where the axis is.
 
 #![forbid(unsafe_code)]
 
@@ -12,14 +10,13 @@ use std::sync::atomic::{AtomicU64, Ordering, fence};
 
 use pinion_firmware::time::Clock;
 
-/// Steps that are kept: half a second at 32,000 a second.
+/// Number of steps kept: half a second at 32,000 steps per second.
 pub(crate) const KEPT: usize = 1 << 14;
 
 /// The last steps, in a ring.
 ///
-/// Before the writer changes a place it says so in `begun`, and when it is done in `written`. A
-/// reader looks at `written` first and at `begun` last: if the writer has not begun to change the
-/// place again, what was read is whole.
+/// The writer increments `begun` before it changes a place, and `written` afterwards. A reader reads `written` first
+/// and `begun` last. If the writer has not begun to change the place again, the reader has a whole step.
 #[derive(Debug)]
 pub(crate) struct Track {
     begun: AtomicU64,
@@ -39,7 +36,7 @@ impl Track {
         &self.steps[(step % KEPT as u64) as usize]
     }
 
-    /// Adds a step. Only one thread may.
+    /// Adds a step. Only one thread may push.
     pub(crate) fn push(&self, at: Clock, position: i64) {
         let step = self.written.load(Ordering::Relaxed);
         self.begun.store(step + 1, Ordering::Relaxed);
@@ -70,7 +67,7 @@ impl Track {
     }
 }
 
-/// What a track has of a step.
+/// The track's answer for one step. As far behind as possible, at the place where the writer works.
 pub(crate) enum Recorded {
     Step(Clock, i64),
     NotYet,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the board's pins are wired to, and how the machine drives and senses it.
+//! The wires at the board's pins, and how the MCU drives and senses them.
 
 #![forbid(unsafe_code)]
 
@@ -13,57 +13,54 @@ use pinion_firmware::board::{Adc, Direction, Edge, Edges, Line, Pwm};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 
-/// What the machine may do with a pin.
+/// What the MCU may do with a pin.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Kind {
     /// Drive it.
     Output,
     /// Sense it.
     Input,
-    /// Both by turns: a wire that several drive.
+    /// Drive and sense it by turns: a wire with several drivers.
     Shared,
     /// Measure it.
     Analog,
     /// Dim it, by a hardware PWM channel.
     Pwm,
-    /// Have an SPI controller send on it.
+    /// Send on it with an SPI controller.
     Mosi,
 }
 
-/// A part's end of a pin. "On" is what the description calls so: a high level, unless the pin is
-/// inverted.
+/// A part's end of a pin. "On" has the description's meaning: a high level, unless the pin is inverted.
 ///
-/// The core calls these: none may block, lock or allocate.
+/// The core calls these functions. None may block, lock or allocate.
 pub(crate) trait Wire: Send + Sync {
-    /// What may be done with it.
     fn kind(&self) -> Kind;
 
-    /// What it is and whose, such as `step of axis x`.
+    /// The pin's function and its owner, for example `step of axis x`.
     fn describe(&self) -> String;
 
-    /// The machine begins to drive the pin; the first level is no edge.
+    /// The MCU begins to drive the pin. The first level is not an edge.
     fn settle(&self, on: bool, at: Clock) {
         self.drive(on, at);
     }
 
-    /// The machine drives the pin to another level.
+    /// The MCU drives the pin to another level.
     fn drive(&self, on: bool, at: Clock) {
         let _ = (on, at);
     }
 
-    /// The machine lets go of a shared pin.
+    /// The MCU releases a shared pin.
     fn release(&self, at: Clock) {
         let _ = at;
     }
 
-    /// What the machine senses. `driven` is the level that it drove last.
+    /// The level that the MCU senses. `driven` is the level that it drove last.
     fn sense(&self, driven: bool, at: Clock) -> bool {
         let _ = at;
         driven
     }
 
-    /// The edges of an input so far, and how many seconds ago the last one was; none of an input that its part does
-    /// not count.
+    /// The edges of an input so far, and how many seconds ago the last one was; `None` if the part does not count them.
     fn edges(&self, at: Clock) -> Option<(u64, Option<f64>)> {
         let _ = at;
         None
@@ -74,8 +71,7 @@ pub(crate) trait Wire: Send + Sync {
         let _ = value;
     }
 
-    /// What an ADC reads of an analog pin, in counts. `noise` is a draw of a standard normal
-    /// distribution.
+    /// The counts that an ADC reads at an analog pin. `noise` is a draw from a standard normal distribution.
     fn counts(&self, at: Clock, noise: f64) -> u16 {
         let _ = (at, noise);
         0
@@ -95,7 +91,7 @@ impl WiredPin {
         WiredPin { name: pin.name.clone(), inverted: pin.inverted, wire }
     }
 
-    /// Says that it is no `wanted` kind of pin.
+    /// The error for a pin that is not of the `wanted` kind.
     pub(crate) fn is_no(&self, wanted: &str, reason: ShutdownReason) -> Shutdown {
         let is = match self.wire.kind() {
             Kind::Output => "an output",
@@ -111,10 +107,10 @@ impl WiredPin {
     }
 }
 
-/// A line of the board, claimed.
+/// A claimed line of the board.
 pub(crate) struct SimLine {
     pin: WiredPin,
-    /// Whether it was driven on last.
+    /// Whether it was last driven on.
     on: AtomicBool,
     time: Arc<PrinterTime>,
 }
@@ -189,22 +185,22 @@ impl Pwm for SimPwm {
     }
 }
 
-/// The edges of an input, as a kernel's interrupts would date them.
+/// The edges of an input, with the times that a kernel's interrupts would give them.
 pub(crate) struct SimEdges {
     wire: Arc<dyn Wire>,
     clock: Arc<dyn TimeSource>,
-    /// How many there were when they were last taken, and the level behind the last of them.
+    /// The number of edges when they were last taken; the next field is the level after the last of them.
     taken: u64,
     level: bool,
-    /// When the last of them came, or what is earlier than the next: when the line was claimed.
+    /// The time of the last edge. Before the first edge it is the time when the line was claimed.
     last: Clock,
 }
 
-/// As many edges are kept as by the kernel.
+/// Highest number of edges kept, the same as in the kernel.
 const EDGES_KEPT: u64 = 1024;
 
 impl SimEdges {
-    /// None where the part does not count them. `level` is the line's.
+    /// `None` if the part does not count edges. `level` is the level of the line.
     pub(crate) fn new(wire: Arc<dyn Wire>, clock: Arc<dyn TimeSource>, level: bool) -> Option<SimEdges> {
         let last = clock.now();
         let (taken, _) = wire.edges(last)?;
@@ -217,7 +213,7 @@ fn ticks(seconds: f64) -> u64 {
 }
 
 impl Edges for SimEdges {
-    /// A part knows how many there were and when the last one was. The others came evenly before it.
+    /// A part knows the number of edges and the time of the last one. The others are spread evenly before it.
     fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown> {
         let now = self.clock.now();
         let (edges, ago_s) = self.wire.edges(now).unwrap_or((self.taken, None));
@@ -226,7 +222,7 @@ impl Edges for SimEdges {
             return Ok(());
         }
         let since_s = seconds(self.last, now);
-        // The last one came after those that were taken before.
+        // The last edge came after the edges that were taken before.
         let ago_s = ago_s.unwrap_or(0.0).min(since_s);
         let each_s = (since_s - ago_s) / new as f64;
         let dropped = new.saturating_sub(EDGES_KEPT);
@@ -246,7 +242,7 @@ impl Edges for SimEdges {
     }
 }
 
-/// The step input of an axis' driver.
+/// The step input of an axis's driver.
 pub(crate) struct StepPin(pub(crate) Arc<Axis>);
 
 impl Wire for StepPin {
@@ -258,7 +254,7 @@ impl Wire for StepPin {
         format!("step of axis {}", self.0.name)
     }
 
-    /// The line stands at its first level before the motor looks at it.
+    /// The motor ignores the first level of the line.
     fn settle(&self, _on: bool, _at: Clock) {}
 
     fn drive(&self, on: bool, at: Clock) {
@@ -266,7 +262,7 @@ impl Wire for StepPin {
     }
 }
 
-/// The direction input of an axis' driver.
+/// The direction input of an axis's driver.
 pub(crate) struct DirectionPin(pub(crate) Arc<Axis>);
 
 impl Wire for DirectionPin {
@@ -283,7 +279,7 @@ impl Wire for DirectionPin {
     }
 }
 
-/// The enable input of an axis' driver.
+/// The enable input of an axis's driver.
 pub(crate) struct EnablePin(pub(crate) Arc<Axis>);
 
 impl Wire for EnablePin {
@@ -300,7 +296,7 @@ impl Wire for EnablePin {
     }
 }
 
-/// An axis' endstop.
+/// An axis's endstop.
 pub(crate) struct EndstopPin(pub(crate) Arc<Axis>);
 
 impl Wire for EndstopPin {
@@ -351,7 +347,7 @@ impl Wire for ThermistorPin {
     }
 }
 
-/// A fan's power, or its second switch.
+/// A fan's power switch or its enable switch.
 pub(crate) struct FanPin(pub(crate) Arc<Fan>, pub(crate) Switch);
 
 impl Wire for FanPin {
@@ -392,7 +388,7 @@ impl Wire for TachometerPin {
     }
 }
 
-/// A light's switch, or another output's.
+/// The switch of a light or of another output.
 pub(crate) struct LampPin(pub(crate) Arc<Lamp>);
 
 impl Wire for LampPin {

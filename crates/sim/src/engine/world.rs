@@ -11,18 +11,18 @@ use pinion_firmware::time::Clock;
 
 /// What a person would see of a part.
 pub(crate) trait Sight: Send + Sync {
-    /// Whose sight it is.
+    /// The name of the part.
     fn name(&self) -> &str;
 
-    /// What is to be seen at this instant: a line, or several for a picture. A colour is written as
-    /// `#rrggbb`, and `pinion sim --show` paints it where it can.
+    /// What a person sees at this instant: a line, or several lines for a picture. A color is written as `#rrggbb`, and
+    /// `pinion sim --show` paints it where it can.
     fn look(&self, now: Clock) -> String;
 }
 
 /// Opens a thermometer of the one-wire bus.
 pub(crate) type OpenThermometer = Box<dyn Fn() -> Box<dyn Thermometer> + Send + Sync>;
 
-/// Everything that moves, heats, spins, shines, and can be seen.
+/// Everything that moves, heats, spins or shines, and everything that a person can see.
 #[derive(Default)]
 pub(crate) struct World {
     pub(crate) axes: Vec<Arc<Axis>>,
