@@ -48,15 +48,15 @@ const RESPONSES: &[Form] = &[
     IsShutdown::FORM,
     Stats::FORM,
     Pong::FORM,
-    // Never sent, as `debug_read` is refused; the firmware's dictionary has it.
+    // Never sent, because `debug_read` is refused. The firmware's dictionary has it.
     Form { format: "debug_result val=%u", generations: Generations::ALL },
 ];
 
-/// How many bytes the host may send before they are acknowledged: half of a pty's buffer of 4096
-/// bytes, so that all of them fit in it, and the host never blocks in its write.
+/// How many bytes the host may send before an acknowledgement. It is half of a pty's buffer of 4096 bytes. So the
+/// buffer has room for them, and the host never blocks in its write.
 const RECEIVE_WINDOW_BYTES: u32 = 2048;
 
-/// Whether the response with this place in the list of all is one of the MCU's own.
+/// Whether the response at this place in the list of all responses is the MCU's own.
 pub(super) const fn is_own_response(index: usize) -> bool {
     index < RESPONSES.len()
 }
@@ -67,7 +67,7 @@ response! {
     pub struct IdentifyResponse<'a> { offset: u32, data: &'a [u8] }
 }
 response! {
-    /// The present instant.
+    /// The time now.
     "clock clock=%u"
     pub struct ClockResponse { clock: Clock }
 }
@@ -79,12 +79,12 @@ impl From<Clock> for ClockResponse {
 }
 
 response! {
-    /// The present instant as 64 bits.
+    /// The time now, in 64 bits.
     "uptime high=%u clock=%u"
     pub(super) struct Uptime { high: u32, clock: Clock }
 }
 response! {
-    /// Whether the MCU is configured, and the check sum that the host gave its configuration.
+    /// Whether the MCU is configured, and the checksum of that configuration, as the host gave it.
     "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
     pub struct Config { is_config: bool, crc: u32, is_shutdown: bool, move_count: u16 }
 }
@@ -94,12 +94,12 @@ response! {
     pub struct Starting {}
 }
 response! {
-    /// The MCU stops.
+    /// The MCU has stopped.
     "shutdown clock=%u static_string_id=%hu"
     pub(super) struct ShutdownReport { clock: Clock, static_string_id: u16 }
 }
 response! {
-    /// A command was not run, as the MCU is stopped.
+    /// A command was not run, because the MCU is stopped.
     "is_shutdown static_string_id=%hu"
     pub(super) struct IsShutdown { static_string_id: u16 }
 }
@@ -114,10 +114,10 @@ response! {
     pub(super) struct Pong<'a> { data: &'a [u8] }
 }
 
-/// The answer to `identify`: `count` bytes of the compressed dictionary from `offset` on, or as many
-/// of them as there are and fit a block.
+/// The answer to `identify`: at most `count` bytes of the compressed dictionary, from `offset` on. It has fewer if the
+/// dictionary ends or the block is full.
 pub fn identify_response(dictionary: &[u8], offset: u32, count: u8) -> IdentifyResponse<'_> {
-    // Besides the data, the payload has the id (1 byte), the offset (up to 5) and the length (1).
+    // The payload also has the id (1 byte), the offset (up to 5) and the length (1).
     let count = usize::from(count).min(pinion_protocol::block::PAYLOAD_MAX - 7);
     let start = (offset as usize).min(dictionary.len());
     let end = (start + count).min(dictionary.len());
@@ -148,7 +148,7 @@ const GET_UPTIME: Command = command!("get_uptime", |mcu| {
 const GET_CONFIG: Command = command!("get_config", |mcu| {
     let config = Config {
         is_config: mcu.is_finalized(),
-        // klippy resets an MCU that another configuration has, before it sends it anything.
+        // klippy resets an MCU with another configuration before it sends anything else.
         crc: if mcu.spoken.next.is_some() { !mcu.configuration.crc } else { mcu.configuration.crc },
         is_shutdown: mcu.is_shutdown(),
         move_count: mcu.moves.count,
@@ -166,7 +166,7 @@ const CONFIG_RESET: Command = command!("config_reset", |mcu| mcu.reset()).allowe
 
 pub(super) const EMERGENCY_STOP: Command = command!("emergency_stop", |_mcu| Err(emergency())).allowed_in_shutdown();
 
-/// The stop that `emergency_stop` asks for.
+/// The shutdown that `emergency_stop` causes.
 pub fn emergency() -> Shutdown {
     let cause = "the host asked for it, by FIRMWARE_RESTART, M112 or an error of its own (its log tells which)";
     Shutdown::because(reason::COMMAND_REQUEST, cause)

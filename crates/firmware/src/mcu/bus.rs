@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Conversations with chips on a bus.
 //!
-//! An object such as an SPI device stands for a chip, and lends it to other objects. One that talks
-//! to the chip, such as a sensor, learns the oid of the SPI device at configuration, but borrows the
-//! chip only as it talks: klippy configures the sensor before it sets the bus of the SPI device.
+//! An object, for example an SPI device, represents a chip and lends it to other objects. A sensor that talks to the
+//! chip learns the oid of the SPI device at configuration. It borrows the chip only while it talks, because klippy
+//! configures the sensor before it sets the SPI device's bus.
 
 #![forbid(unsafe_code)]
 
@@ -15,8 +15,8 @@ use crate::trouble::Trouble;
 
 use super::{BusCounts, Calls, Errand, Mcu, Oid, Slot, Turn, WorkerId};
 
-/// A chip that several conversations use in turn. All of them run on the worker of its bus, one
-/// after the other, so the lock is always free. The core never takes it.
+/// A chip that several conversations use in turn. They all run on the worker of its bus, one after the other. So the
+/// lock is always free. The core never takes it.
 type SharedDevice = Arc<Mutex<Box<dyn BusDevice>>>;
 
 /// A chip and the worker of its bus.
@@ -27,7 +27,7 @@ pub struct Bus {
     calls: Calls,
 }
 
-/// A chip whose transfers are counted, and made again where that may be.
+/// A chip that counts its transfers and retries the ones that may be repeated.
 struct Counted {
     device: Box<dyn BusDevice>,
     calls: Calls,
@@ -51,24 +51,24 @@ impl BusDevice for Counted {
     }
 }
 
-/// What is said to a chip: plain code that runs on the worker and may block there.
+/// What to say to a chip. This code runs on the worker and may block there.
 pub trait Talk: Send + 'static {
-    /// What comes of it.
+    /// The result of the conversation.
     type Answer: Copy + Send;
 
     /// Has the conversation.
     ///
     /// # Errors
     ///
-    /// Those of the calls of `chip`.
+    /// The errors of the calls to `chip`.
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<Self::Answer, BusError>;
 }
 
 /// A conversation with a chip, as an [`Errand`].
 pub struct Conversation<T> {
-    /// What is said.
+    /// What to say.
     pub talk: T,
-    /// Set as it is sent.
+    /// Set when the conversation is sent.
     device: Option<SharedDevice>,
 }
 
@@ -84,22 +84,22 @@ impl<T: Talk> Errand for Conversation<T> {
 }
 
 impl<T: Talk> Slot<Conversation<T>> {
-    /// A slot for conversations. It allocates: objects make theirs at configuration.
+    /// Creates a slot for conversations. This allocates, so objects call it at configuration.
     pub fn talking(talk: T) -> Slot<Conversation<T>> {
         Slot::new(Conversation { talk, device: None })
     }
 
-    /// Sends the conversation, if it is here, to the chip that object `device` stands for.
+    /// Sends the conversation, if it is here, to the chip that object `device` represents.
     ///
     /// # Errors
     ///
-    /// "Invalid oid type" if the object stands for no chip, "Bus worker queue overflow".
+    /// "Invalid oid type" if the object represents no chip, "Bus worker queue overflow".
     pub fn converse(&mut self, turn: &mut Turn, device: Oid) -> Result<(), Shutdown> {
         let bus = turn.lend(device)?;
         self.converse_on(turn, &bus)
     }
 
-    /// The same, for the object that stands for the chip itself.
+    /// The same, for the object that represents the chip itself.
     ///
     /// # Errors
     ///
@@ -112,21 +112,21 @@ impl<T: Talk> Slot<Conversation<T>> {
     }
 }
 
-/// A conversation that was sent without a chip, which [`Slot::converse_on`] does not do.
+/// The error for a conversation without a chip. [`Slot::converse_on`] always sets the chip.
 #[cold]
 fn no_device() -> BusError {
     BusError::new(BusStatus::Nack, Trouble::new("it was sent without a chip").remedy("please report it"))
 }
 
 impl Bus {
-    /// What went over the bus to this chip.
+    /// The transfers to and from this chip.
     pub(super) fn counts(&self) -> BusCounts {
         self.calls.counts()
     }
 }
 
-/// The worker of every bus that is made of lines. Such buses may share lines in any way, several
-/// clocks one MISO, say, so one worker runs them all.
+/// The worker of every software bus. These buses may share any lines, for example one MISO with several clocks. So one
+/// worker runs them all.
 const SOFTWARE: &str = "software";
 
 impl Mcu {
@@ -134,18 +134,18 @@ impl Mcu {
     ///
     /// # Errors
     ///
-    /// That the worker can not be started.
+    /// An error if the worker cannot be started.
     pub fn bus(&mut self, OnWorker { bus, device }: OnWorker<dyn BusDevice>) -> Result<Bus, Shutdown> {
         let (worker, calls) = (self.worker(&bus)?, Calls::new(self.clock()));
         let counted = Counted { device, calls: calls.clone() };
         Ok(Bus { worker, device: Arc::new(Mutex::new(Box::new(counted))), calls })
     }
 
-    /// A device on a bus that is made of lines.
+    /// A device on a software bus, made of GPIO lines.
     ///
     /// # Errors
     ///
-    /// That the worker can not be started.
+    /// An error if the worker cannot be started.
     pub fn software_bus(&mut self, device: Box<dyn BusDevice>) -> Result<Bus, Shutdown> {
         self.bus(OnWorker { bus: SOFTWARE.to_owned(), device })
     }

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Calls to devices: the one rule for those that fail, and their count.
+//! Calls to devices: the rule for failed calls, and the counts of calls.
 //!
-//! A bus fails now and then: a spike on a long cable is no reason to stop a print. Two limits decide.
+//! A bus fails now and then. A spike on a long cable is no reason to stop a print. There are two limits:
 //!
-//! - A worker makes a failed call again, at once and up to [`TRIES`] times, if that cannot change what the
-//!   call does: a register or a level that is read, an output that is set.
-//! - An input that is sampled may be [`Unread`] for [`UNREAD_LIMIT`] before the MCU stops. An input that
-//!   stops a move has no such time: a failure stops the MCU at once.
+//! - A worker repeats a failed call at once, up to [`TRIES`] tries in all. It does so only if the repetition cannot
+//!   change what the call does: reading a register or a level, setting an output.
+//! - A sampled input may be [`Unread`] for [`UNREAD_LIMIT`] before the MCU stops. An input that stops a move has no
+//!   such limit: its failure stops the MCU at once.
 
 #![forbid(unsafe_code)]
 
@@ -17,12 +17,12 @@ use crate::time::{Clock, Ticks, TimeSource};
 
 use super::BusCounts;
 
-/// How often a call is made before it counts as failed.
+/// How many times a call is made before it counts as failed.
 const TRIES: u32 = 3;
-/// How long a call may have gone on and still be made again. A driver that waits for longer before it gives
-/// up has waited enough.
+/// How long after the start of the first try a failed call may still be repeated. A driver that waits longer before it
+/// gives up has waited enough.
 const RETRY_LIMIT: Ticks = Ticks::from_ms(20);
-/// How long a sampled input may stay unread, as its device fails or hangs.
+/// Longest time that a sampled input may stay unread, because its device fails or hangs.
 pub const UNREAD_LIMIT: Ticks = Ticks::from_ms(100);
 
 /// Makes the calls to one device. Its clones count together.
@@ -45,11 +45,11 @@ impl Calls {
         Calls { clock, counters: Arc::default() }
     }
 
-    /// Makes a call that must not be made twice, such as a command or the reading of a FIFO.
+    /// Makes a call that must not be repeated, for example a command or a read of a FIFO.
     ///
     /// # Errors
     ///
-    /// Those of the call.
+    /// The errors of the call.
     pub fn once<T, E>(&self, call: impl FnOnce() -> Result<T, E>) -> Result<T, E> {
         let done = call();
         self.counters.calls.fetch_add(1, Ordering::Relaxed);
@@ -57,11 +57,11 @@ impl Calls {
         done
     }
 
-    /// Makes a call that may be made twice, and makes it again if it fails.
+    /// Makes a call that may be repeated, and repeats it if it fails.
     ///
     /// # Errors
     ///
-    /// Those of the last call.
+    /// The error of the last try.
     pub fn repeat<T, E>(&self, mut call: impl FnMut() -> Result<T, E>) -> Result<T, E> {
         let limit = self.clock.now() + RETRY_LIMIT;
         let mut tries = 1;
@@ -76,7 +76,7 @@ impl Calls {
         }
     }
 
-    /// How many there were.
+    /// How many calls, errors and retries there were.
     pub fn counts(&self) -> BusCounts {
         let load = |count: &AtomicU32| count.load(Ordering::Relaxed);
         let Counters { calls, errors, retries } = &*self.counters;
@@ -84,12 +84,12 @@ impl Calls {
     }
 }
 
-/// Since when an input could not be read.
+/// The time since which an input is unread.
 #[derive(Default)]
 pub struct Unread(Option<Clock>);
 
 impl Unread {
-    /// The input is to be read.
+    /// A read of the input was requested.
     pub fn asked(&mut self, at: Clock) {
         self.0.get_or_insert(at);
     }
@@ -99,7 +99,7 @@ impl Unread {
         self.0 = None;
     }
 
-    /// Whether the MCU has to stop at `now`.
+    /// Whether the input is unread for too long, so that the MCU must stop.
     pub fn is_too_long(&self, now: Clock) -> bool {
         self.0.is_some_and(|since| now.since(since) >= i64::from(UNREAD_LIMIT.0))
     }

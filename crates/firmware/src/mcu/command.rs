@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Declarations: a command's or response's format, its typed parameters and its handler stand
-//! together, and a disagreement between them is a build error.
+//! Declarations of commands and responses. A format, its typed parameters and its handler stand together. If they
+//! disagree, the build fails.
 
 #![forbid(unsafe_code)]
 
@@ -13,7 +13,7 @@ use pinion_protocol::vlq::{Reader, Writer};
 use super::{Generations, Mcu};
 
 impl From<Malformed> for Shutdown {
-    /// The cause is empty: [`Mcu::execute`] adds which command it was.
+    /// The cause is empty. [`Mcu::execute`] adds the name of the command.
     #[cold]
     fn from(_: Malformed) -> Shutdown {
         Shutdown::because(reason::COMMAND_PARSER, "")
@@ -27,18 +27,18 @@ pub type Handler = fn(&mut Mcu, &mut Reader<'_>) -> Result<(), Shutdown>;
 pub struct Command {
     /// Name, parameters and their conversions, exactly as klippy looks them up.
     pub format: &'static str,
-    /// The hosts that take it in this form.
+    /// The hosts that use this form.
     pub generations: Generations,
     /// Whether it also runs after a shutdown.
     pub in_shutdown: bool,
-    /// Whether it may join its own kind: see [`Command::joining`].
+    /// Whether it may join a command of the same kind: see [`Command::joining`].
     pub joins: bool,
     /// What it does.
     pub handler: Handler,
 }
 
 impl Command {
-    /// A command that all hosts take, while the MCU runs. [`command!`](crate::command) declares one.
+    /// A command for all hosts that runs while the MCU is not stopped. [`command!`](crate::command) declares one.
     pub const fn new(format: &'static str, handler: Handler) -> Command {
         Command { format, generations: Generations::ALL, in_shutdown: false, joins: false, handler }
     }
@@ -49,34 +49,34 @@ impl Command {
         self
     }
 
-    /// Lets the command run while commands wait for the errand of one like it that its object
-    /// [lets others join](super::Turn::let_join). Its first parameter must be the oid.
+    /// Lets the command run while other commands wait for an errand of the same kind of command. Their object must [let
+    /// others join](super::Turn::let_join). The first parameter must be the oid.
     pub const fn joining(mut self) -> Command {
         self.joins = true;
         self
     }
 
-    /// The hosts that take this form: [`since`](super::since), [`until`](super::until) or
-    /// [`only`](super::only). Without it, all do.
+    /// The hosts that use this form: [`since`](super::since), [`until`](super::until) or [`only`](super::only). Without
+    /// this, all hosts use it.
     pub const fn of(mut self, generations: Generations) -> Command {
         self.generations = generations;
         self
     }
 }
 
-/// A form of a response: what the dictionary has of it.
+/// A form of a response, as the dictionary lists it.
 pub struct Form {
     /// Name, parameters and their conversions.
     pub format: &'static str,
-    /// The hosts that take it in this form.
+    /// The hosts that use this form.
     pub generations: Generations,
 }
 
 /// A message to the host.
 pub trait Response {
-    /// Its format, and the hosts that take it.
+    /// Its format, and the hosts that use it.
     const FORM: Form;
-    /// Its place in the list of the responses of all features.
+    /// Its place in the list of all features' responses.
     const INDEX: usize;
     /// Appends the parameters.
     fn encode(&self, writer: &mut Writer);
@@ -84,15 +84,15 @@ pub trait Response {
 
 /// A constant of the dictionary.
 pub struct Constant {
-    /// Such as `ADC_MAX`.
+    /// Its name, for example `ADC_MAX`.
     pub name: &'static str,
-    /// What it stands for.
+    /// Its value.
     pub value: ConstantValue,
-    /// The hosts that have it.
+    /// The hosts whose dictionary has it.
     pub generations: Generations,
 }
 
-/// What a constant stands for.
+/// The value of a constant.
 pub enum ConstantValue {
     /// A number.
     Number(u32),
@@ -111,7 +111,7 @@ impl Constant {
         Constant { name, value: ConstantValue::Text(text), generations: Generations::ALL }
     }
 
-    /// The hosts that have it; without this, all do.
+    /// The hosts whose dictionary has it. Without this, all do.
     pub const fn of(mut self, generations: Generations) -> Constant {
         self.generations = generations;
         self
@@ -120,11 +120,11 @@ impl Constant {
 
 /// An enumeration of the dictionary. Its names may depend on the board.
 pub struct Enumeration {
-    /// Such as `spi_bus`.
+    /// Its name, for example `spi_bus`.
     pub name: &'static str,
-    /// The names on this board, and the values that they stand for.
+    /// The names on this board, and their values.
     pub values: fn(&dyn Board) -> Vec<Range>,
-    /// The hosts that have it.
+    /// The hosts whose dictionary has it.
     pub generations: Generations,
 }
 
@@ -134,15 +134,14 @@ impl Enumeration {
         Enumeration { name, values, generations: Generations::ALL }
     }
 
-    /// The hosts that have it with these values; without this, all do.
+    /// The hosts whose dictionary has it with these values. Without this, all do.
     pub const fn of(mut self, generations: Generations) -> Enumeration {
         self.generations = generations;
         self
     }
 }
 
-/// What a feature adds to the dictionary. Fields that a feature does not need come from
-/// [`Feature::EMPTY`].
+/// What a feature adds to the dictionary. [`Feature::EMPTY`] provides the fields that a feature does not need.
 pub struct Feature {
     /// Its name.
     pub name: &'static str,
@@ -166,8 +165,8 @@ impl Feature {
 
 /// Declares a command: its format, and a closure with the MCU and the typed parameters.
 ///
-/// A command to an object names the object's type behind the format. Its first parameter is the object's `oid`, and its
-/// closure has the object and its [`Turn`](crate::mcu::Turn) in place of the MCU and the oid.
+/// A command to an object names the object's type after the format. Its first parameter is the object's `oid`. Its
+/// closure gets the object and its [`Turn`](crate::mcu::Turn) in place of the MCU and the oid.
 #[macro_export]
 macro_rules! command {
     ($format:literal, |$mcu:ident $(, $arg:ident: $t:ty)* $(,)?| $body:expr $(,)?) => {{
@@ -207,10 +206,9 @@ macro_rules! command {
     };
 }
 
-/// Declares a response as a struct. Behind the format stands which hosts take it, such as
-/// `=> until(V0_12);`; without it, all do. The module above must have a `response_index`, which finds
-/// its format in the list of responses ([`place_of_response`]); one that is not listed is a
-/// build error.
+/// Declares a response as a struct. The hosts that use it follow the format, for example `=> until(V0_12);`. Without
+/// them, all hosts use it. The parent module must have a `response_index` that finds the format in the list of
+/// responses ([`place_of_response`]). The build fails if the format is not listed.
 #[macro_export]
 macro_rules! response {
     ($(#[$doc:meta])* $format:literal $(=> $generations:expr;)? $vis:vis struct $name:ident $(<$life:lifetime>)? {
@@ -228,7 +226,7 @@ macro_rules! response {
                     }),*]),
                     concat!("fields disagree with \"", $format, "\"")
                 );
-                // What was said, or else all.
+                // The given generations, or else all.
                 let generations = [$($generations,)? $crate::mcu::Generations::ALL][0];
                 $crate::mcu::Form { format: $format, generations }
             };
@@ -241,8 +239,8 @@ macro_rules! response {
     };
 }
 
-/// The place of a response in the list of all that these features send. Evaluated by the compiler, it fails the build
-/// if no feature lists the response.
+/// The place of a response in the list of these features' responses. The compiler evaluates it. The build fails if no
+/// feature lists the response.
 pub const fn place_of_response(features: &[Feature], format: &str) -> usize {
     let mut index = 0;
     let mut feature = 0;

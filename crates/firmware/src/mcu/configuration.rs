@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the host configured, and how it is forgotten.
+//! What the host configured, and how the MCU forgets it.
 
 #![forbid(unsafe_code)]
 
@@ -10,21 +10,21 @@ use super::lines::Claim;
 use super::stop::Stop;
 use super::{Mcu, MovePool, Note, Object, Oid, TimerId};
 
-/// Objects with an oid.
+/// Highest number of objects with an oid.
 pub(super) const OBJECTS_MAX: usize = 256;
 
 /// What the host configured.
 #[derive(Default)]
 pub(super) struct Configuration {
-    /// By oid, and behind those the features' own.
+    /// Indexed by oid; feature-owned objects follow.
     pub(super) objects: Vec<Option<Box<dyn Object>>>,
-    /// What `allocate_oids` said; `None` before it came.
+    /// The count of `allocate_oids`; `None` before that command.
     pub(super) oid_count: Option<usize>,
-    /// The objects that the log knows by a pin.
+    /// The objects that the log names by a pin.
     pub(super) pins: Vec<(Oid, Pin)>,
     /// The GPIO lines in use.
     pub(super) claims: Vec<Claim>,
-    /// The check sum that `finalize_config` gave.
+    /// The checksum of `finalize_config`.
     pub(super) crc: u32,
     /// Whether a `config_reset` waits for outputs to be at their shutdown values.
     pub(super) reset_due: bool,
@@ -67,7 +67,7 @@ impl Mcu {
         }
         self.moves.finalize();
         self.configuration.crc = crc;
-        // From here on the core does not allocate.
+        // The core does not allocate after this.
         self.schedule.reserve();
         let mut kinds: Vec<(&'static str, usize)> = Vec::new();
         for object in self.configuration.objects.iter().flatten() {
@@ -80,8 +80,8 @@ impl Mcu {
         Ok(())
     }
 
-    /// Forgets the configuration, as soon as every output is at its shutdown value: afterwards
-    /// nothing would try to drive it there. No command runs before.
+    /// Forgets the configuration as soon as every output is at its shutdown value. After that, nothing would try to
+    /// drive an output to it. No command runs until then.
     pub(super) fn reset(&mut self) -> Result<(), Shutdown> {
         if !self.is_shutdown() {
             return Err(Shutdown::by_host(

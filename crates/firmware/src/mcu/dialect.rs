@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The ids of all messages, and the dictionary that tells them to the host.
+//! The ids of all messages, and the dictionary that gives them to the host.
 
 #![forbid(unsafe_code)]
 
@@ -17,16 +17,16 @@ use pinion_protocol::vlq::Reader;
 use super::command::{Command, ConstantValue, Feature, Handler};
 use super::{DialectName, Generation, Generations, base, since};
 
-/// What to do about a host that has another dictionary.
+/// The remedy for a host with another dictionary.
 pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
 
-/// What the MCU knows of a command that came by its id.
+/// What the MCU knows about a command, found by the command's id.
 pub(super) struct Entry {
     pub(super) format: &'static str,
     pub(super) handler: Handler,
     pub(super) in_shutdown: bool,
     pub(super) joins: bool,
-    /// Whether it is one of the MCU's own, which has the same id in every dialect.
+    /// Whether it is the MCU's own command, with the same id in every dialect.
     pub(super) is_own: bool,
     conversions: Box<[Conversion]>,
 }
@@ -45,7 +45,7 @@ impl Entry {
         })
     }
 
-    /// Takes the parameters off the reader without running the command.
+    /// Reads past the parameters without running the command.
     pub(super) fn skip(&self, reader: &mut Reader<'_>) -> Result<(), Shutdown> {
         for conversion in &self.conversions {
             conversion.skip(reader)?;
@@ -57,18 +57,17 @@ impl Entry {
 /// The ids that take one byte on the wire (docs/Protocol.md, "Variable length quantities").
 const SHORT_IDS: std::ops::Range<i32> = -32..96;
 
-/// The ids in the order in which they are given: those of one byte first, beginning behind the two
-/// that a host knows beforehand.
+/// The ids in the order in which messages get them. Ids of one byte come first, after the two that every host knows.
 fn ids() -> impl Iterator<Item = i32> {
     (IDENTIFY_ID + 1..SHORT_IDS.end).chain(SHORT_IDS.start..IDENTIFY_RESPONSE_ID).chain(SHORT_IDS.end..)
 }
 
-/// An id's place in the list of all.
+/// An id's place in the list of all ids.
 fn place(id: u32) -> usize {
     (id as i32).wrapping_sub(SHORT_IDS.start) as u32 as usize
 }
 
-/// What all features have of one kind.
+/// All features' entries of one kind.
 fn all<'a, T>(
     features: &'a [Feature],
     of: fn(&'a Feature) -> &'static [T],
@@ -76,11 +75,11 @@ fn all<'a, T>(
     features.iter().flat_map(of)
 }
 
-/// Which forms of one kind a dialect has.
+/// The forms of one kind that a dialect has.
 struct Choice<T: 'static> {
-    /// The name of a form, and who takes it.
+    /// The name of a form, and the hosts that use it.
     facts: fn(&'static T) -> (&'static str, Generations),
-    /// For each name the generation whose form it is.
+    /// Maps each name to the generation whose form the dialect uses.
     chosen: HashMap<&'static str, Generation>,
 }
 
@@ -105,9 +104,9 @@ impl<T> Choice<T> {
     }
 }
 
-/// What an MCU is made of, and what its dictionary says of it.
+/// The features of an MCU, and what its dictionary says about the program.
 pub struct Firmware {
-    /// What it can do; the MCU's own feature comes first.
+    /// What the MCU can do. The MCU's own feature comes first.
     pub features: &'static [Feature],
     /// The program's name.
     pub app: &'static str,
@@ -119,23 +118,23 @@ pub struct Firmware {
     pub license: &'static str,
 }
 
-/// The messages that a host may exchange with the MCU, by their ids.
+/// The messages that a host and the MCU may exchange, by their ids.
 pub struct Dialect {
     name: DialectName,
-    /// By the [`place`] of the id.
+    /// Indexed by the [`place`] of the id.
     commands: Vec<Option<Entry>>,
-    /// By [`super::Response::INDEX`].
+    /// Indexed by [`super::Response::INDEX`].
     response_ids: Vec<Option<u32>>,
-    /// The id of `emergency_stop`, for which each block is searched.
+    /// The id of `emergency_stop`. Each block is searched for it.
     emergency_stop: Option<u32>,
-    /// By their number in the enumeration `static_string_id`.
+    /// Indexed by their number in the enumeration `static_string_id`.
     shutdowns: Vec<ShutdownReason>,
     dictionary: Dictionary,
     /// The dictionary as `identify` serves it.
     compressed: Vec<u8>,
 }
 
-/// A dictionary with what it says of the program, and no messages yet.
+/// A dictionary that describes the program and has no messages yet.
 fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
     let hosts = since(Generation::V0_13);
     let is_told = name.generations().iter().any(|generation| hosts.contains(*generation));
@@ -149,10 +148,10 @@ fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
     }
 }
 
-/// The commands by the [`place`] of their ids, and the ids of the responses in the order of the features.
+/// The commands by the [`place`] of their ids, and the ids of the responses in the features' order.
 type Numbered = (Vec<Option<Entry>>, Vec<Option<u32>>);
 
-/// Gives the messages of a dialect their ids, and publishes them.
+/// Gives ids to the messages of a dialect, and adds them to the dictionary.
 fn number(features: &'static [Feature], name: &DialectName, dictionary: &mut Dictionary) -> io::Result<Numbered> {
     let mut ids = ids();
     let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
@@ -163,11 +162,11 @@ fn number(features: &'static [Feature], name: &DialectName, dictionary: &mut Dic
     let taken = Choice::new(name, all(features, |feature| feature.commands), |command| {
         (format::name(command.format), command.generations)
     });
-    // The MCU's own messages have the same ids in every dialect: an `emergency_stop` means the
-    // same to an MCU that was given another one since its host read the dictionary.
+    // The MCU's own messages have the same ids in every dialect. The MCU may get another dialect after its host has
+    // read the dictionary. That host's `emergency_stop` must still work.
     let (base, others) = features.split_at(features.len().min(1));
     for (features, is_own) in [(base, true), (others, false)] {
-        // Responses first: what they carry fills a block to the last byte, so their ids are short.
+        // Responses first: their data fills a block to the last byte, so their ids must be short.
         for form in all(features, |feature| feature.responses) {
             if !responses.has(form) {
                 response_ids.push(None);
@@ -196,7 +195,7 @@ fn number(features: &'static [Feature], name: &DialectName, dictionary: &mut Dic
     Ok((commands, response_ids))
 }
 
-/// Publishes the constants and enumerations of a dialect.
+/// Adds the constants and enumerations of a dialect to the dictionary.
 fn publish_names(features: &'static [Feature], name: &DialectName, board: &dyn Board, dictionary: &mut Dictionary) {
     let constants = all(features, |feature| feature.constants);
     let had = Choice::new(name, constants.clone(), |constant| (constant.name, constant.generations));
@@ -216,8 +215,7 @@ fn publish_names(features: &'static [Feature], name: &DialectName, board: &dyn B
 }
 
 impl Dialect {
-    /// Numbers the messages of the firmware's features that the hosts of this dialect take, and publishes them with
-    /// the board's names.
+    /// Gives ids to the messages that hosts of this dialect use, and makes the dictionary with the board's names.
     pub fn new(firmware: &Firmware, board: &dyn Board, name: DialectName) -> io::Result<Dialect> {
         let features = firmware.features;
         let mut dictionary = head(firmware, &name);
@@ -238,7 +236,7 @@ impl Dialect {
         self.name
     }
 
-    /// Whether the MCU is to behave as for these hosts, where the form of a message does not say.
+    /// Whether the MCU behaves as these hosts expect, where the form of a message does not say it.
     pub(super) fn serves(&self, hosts: Generations) -> bool {
         self.name.generations().first().is_some_and(|generation| hosts.contains(*generation))
     }
@@ -248,12 +246,12 @@ impl Dialect {
         &self.dictionary
     }
 
-    /// The dictionary, zlib-compressed JSON, as `identify` serves it.
+    /// The dictionary as zlib-compressed JSON, as `identify` serves it.
     pub fn compressed(&self) -> &[u8] {
         &self.compressed
     }
 
-    /// The id of the response of type `R`; none if the hosts of this dialect do not take it.
+    /// The id of the response of type `R`; `None` if the hosts of this dialect do not use it.
     #[inline]
     pub fn response_id<R: super::Response>(&self) -> Option<u32> {
         self.response_ids[R::INDEX]
@@ -261,7 +259,7 @@ impl Dialect {
 
     /// The number of a shutdown text.
     pub(super) fn static_string_id(&self, reason: ShutdownReason) -> u16 {
-        // Every reason is in the list, as `shutdowns!` makes the list along with the constants.
+        // Every reason is in the list: `shutdowns!` makes the list together with the constants.
         self.shutdowns.iter().position(|listed| *listed == reason).unwrap_or(0) as u16
     }
 
@@ -275,18 +273,18 @@ impl Dialect {
         self.emergency_stop.is_some_and(|id| self.contains(payload, id))
     }
 
-    /// Whether a payload is one of the MCU's own responses, which mean the same in every dialect.
+    /// Whether a payload is one of the MCU's own responses. These mean the same in every dialect.
     pub fn is_own_response(&self, payload: &[u8]) -> bool {
         let id = Reader::new(payload).int().ok();
         let mut ids = self.response_ids.iter().enumerate();
         id.is_some() && ids.any(|(index, own)| base::is_own_response(index) && *own == id)
     }
 
-    /// Whether a block's payload has the command with this id. What follows an unknown command, or one
-    /// that is cut short, does not count, as the MCU stops there.
+    /// Whether a block's payload has the command with this id. The search ends at an unknown or incomplete command,
+    /// because the MCU stops there.
     fn contains(&self, payload: &[u8], id: u32) -> bool {
-        // The last byte of the id's encoding must occur somewhere. It mostly does not, and then no
-        // command need be decoded.
+        // The last byte of the id's encoding must occur in the payload. Usually it does not, and no command has to be
+        // decoded.
         if !payload.contains(&(id as u8 & 0x7f)) {
             return false;
         }

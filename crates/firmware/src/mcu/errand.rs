@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Work that may block: it travels to the worker of its bus as an [`Errand`], is done there, and
-//! comes back to the object that sent it.
+//! Work that may block. It travels as an [`Errand`] to the worker of its bus, runs there, and returns to the object
+//! that sent it.
 //!
 //! An object has a [`Slot`](super::Slot) for each errand, made at configuration. The errand carries everything that the
-//! work needs in a box that is used again and again. So sending it does not allocate, it may be of any size, and no
-//! object has more errands under way than it has slots, so that the queue of a bus cannot grow beyond their number.
+//! work needs, in a box that is reused. So sending it does not allocate, and it may have any size. An object never has
+//! more errands on their way than slots. So their number limits the queue of a bus.
 //!
 //! Commands wait for errands that a command sent (`hold.rs`).
 
@@ -19,22 +19,22 @@ use super::{Hold, Mcu, Oid, Turn};
 
 /// Work that may block.
 pub trait Errand: Send + 'static {
-    /// What comes of it.
+    /// The result of the work.
     type Answer: Copy + Send;
-    /// Why nothing comes of it.
+    /// Why the work failed.
     type Failure: Send;
 
     /// Does the work. Runs on a worker.
     ///
     /// # Errors
     ///
-    /// Those of the devices that it uses.
+    /// The errors of the devices that it uses.
     fn run(&mut self) -> Result<Self::Answer, Self::Failure>;
 }
 
-/// An errand of any kind with what came of it, as it travels.
+/// An errand of any kind with its result, as it travels.
 pub trait Parcel: Any + Send {
-    /// Does the work, and keeps what comes of it. Runs on a worker.
+    /// Does the work, and keeps its result. Runs on a worker.
     fn run(&mut self);
 }
 
@@ -44,11 +44,11 @@ pub struct Job {
     pub oid: Oid,
     /// The work.
     pub parcel: Box<dyn Parcel>,
-    /// Whether commands wait until it is back.
+    /// Whether commands wait for its return.
     pub holds: bool,
 }
 
-/// A job that a worker cannot take, and why.
+/// A job that a worker cannot accept, and the reason.
 pub struct Refused {
     /// The job, for its sender.
     pub job: Job,
@@ -60,39 +60,38 @@ pub struct Refused {
 pub struct Completion {
     /// The object that sent it.
     pub oid: Oid,
-    /// The work, and what came of it.
+    /// The work and its result.
     pub parcel: Box<dyn Parcel>,
     /// Whether commands wait for it.
     pub holds: bool,
     /// When the worker began the work.
     pub began: Clock,
-    /// When the worker had done it.
+    /// When the worker finished the work.
     pub ended: Clock,
 }
 
-/// An errand that is done and looks for its slot.
+/// A finished errand on its way to its slot.
 pub struct Done {
-    /// `None` once its slot has taken it.
+    /// `None` after its slot has taken it.
     pub(super) parcel: Option<Box<dyn Parcel>>,
     pub(super) began: Clock,
     pub(super) ended: Clock,
 }
 
-/// A worker, as [`Workers::start`] numbered it.
+/// A worker, by the number that [`Workers::start`] gave it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WorkerId(pub usize);
 
-/// Runs errands, those of one bus one after the other.
+/// Runs errands. Those of one bus run one after the other.
 pub trait Workers: Send {
-    /// The worker of a bus. It is started if the bus has none yet.
+    /// The worker of a bus. Starts one if the bus has none yet.
     ///
     /// # Errors
     ///
-    /// "Bus worker queue overflow" if it can not be started.
+    /// "Bus worker queue overflow" if it cannot be started.
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown>;
 
-    /// Says that a worker's devices need not be free to be opened again: [`Workers::reset`] does not wait
-    /// for what it has under way.
+    /// Marks a worker whose devices need not be free to be opened again. [`Workers::reset`] does not wait for its work.
     fn leave_behind(&mut self, worker: WorkerId) {
         let _ = worker;
     }
@@ -101,40 +100,40 @@ pub trait Workers: Send {
     ///
     /// # Errors
     ///
-    /// The job, if the worker cannot take it.
+    /// The job, if the worker cannot accept it.
     fn submit(&mut self, worker: WorkerId, job: Job) -> Result<(), Refused>;
 
-    /// The next errand that is done. Those of one bus come in the order in which they were sent.
+    /// The next finished errand. The errands of one bus finish in the order in which they were sent.
     fn completion(&mut self) -> Option<Completion>;
 
     /// Whether [`Workers::completion`] has one.
     fn has_completion(&self) -> bool;
 
-    /// Tells of each worker the name of its bus, and how many jobs it has.
+    /// Calls `each` with the name of each worker's bus and its number of jobs.
     fn tell(&self, each: &mut dyn FnMut(&str, usize)) {
         let _ = each;
     }
 
-    /// Ends every worker. After this no completion of an earlier job comes.
+    /// Ends every worker. No completion of an earlier job comes after this.
     fn reset(&mut self);
 }
 
 impl Mcu {
-    /// The worker of a bus. To be called before `finalize_config` only, as it may start a thread.
+    /// The worker of a bus. Call it only before `finalize_config`, because it may start a thread.
     ///
     /// # Errors
     ///
-    /// "Bus worker queue overflow" if it can not be started.
+    /// "Bus worker queue overflow" if it cannot be started.
     pub fn worker(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         self.workers.start(bus)
     }
 
-    /// The worker of a device that is only read, may take its time, and may be opened twice. A
-    /// `config_reset` does not wait for it.
+    /// The worker of a device that is only read, may be slow, and may be opened twice. A `config_reset` does not wait
+    /// for it.
     ///
     /// # Errors
     ///
-    /// "Bus worker queue overflow" if it can not be started.
+    /// "Bus worker queue overflow" if it cannot be started.
     pub fn reader(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
         let worker = self.workers.start(bus)?;
         self.workers.leave_behind(worker);
@@ -147,7 +146,7 @@ impl Mcu {
         self.workers.has_completion()
     }
 
-    /// Gives the errands that are done back to their objects.
+    /// Returns the finished errands to their objects.
     #[inline]
     pub fn run_workers(&mut self) {
         while let Some(completion) = self.workers.completion() {
@@ -159,7 +158,7 @@ impl Mcu {
     fn give_back(&mut self, completion: Completion) {
         let Completion { oid, parcel, holds, began, ended } = completion;
         if let Some(mut object) = self.take(oid) {
-            // If a command sent this errand, what the object sends now belongs to the command, too.
+            // If a command sent this errand, the errands that the object sends now also belong to the command.
             self.holds.is_commanded = holds;
             let mut done = Done { parcel: Some(parcel), began, ended };
             let done = object.returned(&mut Turn::new(self, oid), &mut done);

@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The generations of hosts, and which of them take a message.
+//! The generations of hosts, and the sets of generations that use a message.
 //!
-//! To add a generation, add it here: its name, and the generation that it grew out of, whose messages
-//! it then has. docs/guide/dialects.md goes through the rest.
+//! To add a generation, add it here with its name and its parent. It then has the parent's messages.
+//! docs/guide/dialects.md describes the remaining steps.
 
 #![forbid(unsafe_code)]
 
 use std::fmt;
 use std::str::FromStr;
 
-/// A state of klippy that an MCU can serve.
+/// A version of klippy that an MCU can serve.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Generation {
     /// Klipper v0.11 (November 2022).
@@ -30,7 +30,7 @@ impl Generation {
     /// All of them, the oldest first.
     pub const ALL: [Generation; 5] = [V0_11, V0_12, V0_13, Master, Kalico];
 
-    /// What the command line, the log and the documents call it.
+    /// Its name on the command line, in the log and in the documents.
     pub const fn name(self) -> &'static str {
         match self {
             V0_11 => "v0.11",
@@ -41,14 +41,14 @@ impl Generation {
         }
     }
 
-    /// The generation that this one grew out of.
+    /// The generation that this one developed from.
     const fn parent(self) -> Option<Generation> {
         match self {
             V0_11 => None,
             V0_12 => Some(V0_11),
             V0_13 => Some(V0_12),
             Master => Some(V0_13),
-            // A fork: what Klipper's master has since is Kalico's only where Kalico took it over.
+            // Kalico is a fork. It has a newer message of Klipper's master only if Kalico adopted it.
             Kalico => Some(V0_13),
         }
     }
@@ -58,7 +58,7 @@ impl Generation {
         1 << self as u8
     }
 
-    /// Whether this is `ancestor`, or grew out of it.
+    /// Whether this is `ancestor`, or developed from it.
     const fn grew_out_of(self, ancestor: Generation) -> bool {
         let mut this = Some(self);
         while let Some(generation) = this {
@@ -77,13 +77,13 @@ impl fmt::Display for Generation {
     }
 }
 
-/// A set of generations: those that take a form of a message.
+/// A set of generations: those that use a form of a message.
 ///
-/// A generation that is added is in all the sets that the one is in which it grew out of.
+/// A new generation is in every set that its parent is in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Generations(u8);
 
-/// This generation and all that grew out of it.
+/// This generation and all that developed from it.
 pub const fn since(first: Generation) -> Generations {
     let mut bits = 0;
     let mut at = 0;
@@ -96,7 +96,7 @@ pub const fn since(first: Generation) -> Generations {
     Generations(bits)
 }
 
-/// This generation and all that it grew out of.
+/// This generation and all its ancestors.
 pub const fn until(last: Generation) -> Generations {
     let mut bits = 0;
     let mut at = 0;
@@ -118,22 +118,22 @@ impl Generations {
     /// Every generation.
     pub const ALL: Generations = Generations((1 << Generation::ALL.len()) - 1);
 
-    /// Those of this set that are `first` or grew out of it.
+    /// The members of this set that are `first` or developed from it.
     pub const fn since(self, first: Generation) -> Generations {
         Generations(self.0 & since(first).0)
     }
 
-    /// Those of this set that are `last` or that it grew out of.
+    /// The members of this set that are `last` or its ancestors.
     pub const fn until(self, last: Generation) -> Generations {
         Generations(self.0 & until(last).0)
     }
 
-    /// This set, `first`, and all that grew out of it.
+    /// This set, `first`, and all that developed from `first`.
     pub const fn and(self, first: Generation) -> Generations {
         Generations(self.0 | since(first).0)
     }
 
-    /// This set without `first` and all that grew out of it.
+    /// This set without `first` and all that developed from `first`.
     pub const fn except(self, first: Generation) -> Generations {
         Generations(self.0 & !since(first).0)
     }
@@ -147,11 +147,11 @@ impl Generations {
 /// Which dialect an MCU speaks.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum DialectName {
-    /// That of hosts of one generation.
+    /// The dialect of hosts of one generation.
     Of(Generation),
-    /// What Klipper v0.13, its master and Kalico take, for a host of which nothing is known. A host
-    /// looks a message up by its name alone, so of each name it has one form: that of v0.13, which the
-    /// two others often take as well (docs/guide/dialects.md), or else master's, or else Kalico's.
+    /// The messages of Klipper v0.13, its master and Kalico, for an unknown host. A host finds a message by its name
+    /// alone. So this dialect has one form for each name: v0.13's form, or else master's, or else Kalico's. Master and
+    /// Kalico often use v0.13's form too (docs/guide/dialects.md).
     Union,
 }
 
@@ -161,8 +161,8 @@ impl DialectName {
         Generation::ALL.into_iter().map(DialectName::Of).chain([DialectName::Union])
     }
 
-    /// Whose messages it has; the form of a message is that of the first one that has the message. What
-    /// is not a matter of form is as for the first.
+    /// The generations whose messages it has. The first one that has a message decides its form. Behavior that no form
+    /// decides is the first generation's.
     pub(super) fn generations(&self) -> &[Generation] {
         match self {
             DialectName::Of(generation) => std::slice::from_ref(generation),

@@ -1,15 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! One order: commands wait for the conversations that commands began.
 //!
-//! The firmware runs a command to its end before it looks at the next, and
-//! acknowledges a block after its last command; klippy relies on both. So an errand that a
-//! command sends *holds*: until it is back, the core runs no further command and leaves the block
-//! unacknowledged ([`Mcu::is_held`]). Timers go on, and errands that they send hold nothing. A
-//! stopped MCU is not held.
+//! The firmware runs a command to its end before it looks at the next one. It acknowledges a block after the block's
+//! last command. klippy relies on both. So an errand that a command sends *holds*: the core runs no further command
+//! until the errand is back, and does not acknowledge the block ([`Mcu::is_held`]). Timers go on, and errands that they
+//! send hold nothing. A stopped MCU is not held.
 //!
-//! A command that answers nothing (`spi_send`) lets others of its object join ([`Mcu::joins`]): their errands
-//! follow its own on the same bus, in their order. Its block is done at once, and whatever else comes waits for the last of
-//! them. So a display costs one wake-up for several messages.
+//! A command without an answer (`spi_send`) lets other commands to its object join ([`Mcu::joins`]). Their errands
+//! follow its own on the same bus, in their order. Its block is finished at once. All other commands wait for the last
+//! of these errands. So a display costs one wake-up for several messages.
 
 #![forbid(unsafe_code)]
 
@@ -20,32 +19,32 @@ use pinion_protocol::vlq::Reader;
 
 use super::{Mcu, Oid, TimerId, Turn};
 
-/// How long commands may wait for an errand before the MCU stops. klippy, too, gives up waiting
-/// for an answer after five seconds (`SerialRetryCommand` in serialhdl.py). Without this limit a bus
-/// that hangs would keep the host from stopping the MCU: once its window of unacknowledged blocks
-/// is full, it can not even send an `emergency_stop`.
+/// How long commands may wait for an errand before the MCU stops. klippy also gives up waiting for an answer after five
+/// seconds (`SerialRetryCommand` in serialhdl.py). Without this limit, a bus that hangs would keep the host from
+/// stopping the MCU. Once the host's window of unacknowledged blocks is full, the host cannot even send an
+/// `emergency_stop`.
 const HOLD_LIMIT: Ticks = Ticks::from_ms(5000);
 
 /// What commands wait for.
 #[derive(Default)]
 pub(super) struct Holds {
-    /// Whether a command runs, or an errand that a command sent is taken in.
+    /// Whether a command runs now, or the MCU takes back an errand that a command sent.
     pub(super) is_commanded: bool,
     /// Conversations that commands wait for.
     pub(super) count: u32,
-    /// Whose the last one is.
+    /// The object that began the last conversation.
     holder: Option<Oid>,
-    /// How many conversations there may be in all, if the holder lets others join.
+    /// Highest number of conversations, if the holder lets others join; else 0.
     join_limit: u32,
 }
 
-/// Commands wait until this is [released](Mcu::release). If no command has asked for it, none wait.
+/// Makes commands wait until it is [released](Mcu::release). It has no effect if no command asked for it.
 #[must_use]
 pub struct Hold(pub(super) bool);
 
 impl Turn<'_> {
-    /// If a command runs now, makes further commands wait for this object until the hold is
-    /// [released](Mcu::release).
+    /// Makes further commands wait for this object until the hold is [released](Mcu::release). It has an effect only if
+    /// a command runs now.
     pub fn hold(&mut self) -> Hold {
         let holder = self.oid();
         let is_commanded = self.holds.is_commanded;
@@ -58,22 +57,22 @@ impl Turn<'_> {
         Hold(is_commanded)
     }
 
-    /// To be called once the errand of a command was sent: commands of its kind that are for the same object need not wait
-    /// for it, until `limit` errands are under way.
+    /// Call this after sending a command's errand. Other such commands to the same object then need not wait for it,
+    /// until `limit` errands are on their way.
     pub fn let_join(&mut self, limit: u32) {
         self.holds.join_limit = limit;
     }
 }
 
 impl Mcu {
-    /// Has the MCU stop if commands still wait in [`HOLD_LIMIT`].
+    /// Starts the time of [`HOLD_LIMIT`] again. The MCU stops if commands still wait after it.
     fn limit_hold(&mut self) {
         self.schedule.timers.remove(TimerId::HOLD);
         let limit = self.now() + HOLD_LIMIT;
         self.schedule.timers.insert(limit, TimerId::HOLD);
     }
 
-    /// Lets commands run again, as far as this hold goes.
+    /// Ends this hold. Commands run again if no other hold is left.
     pub fn release(&mut self, Hold(waits): Hold) {
         if !waits {
             return;
@@ -86,20 +85,20 @@ impl Mcu {
         }
     }
 
-    /// Whether no further command may run now, as an errand that a command sent is under way, or a
-    /// `config_reset` waits for the outputs.
+    /// Whether no further command may run now. Either a command's errand is on its way, or a `config_reset` waits for
+    /// the outputs.
     #[inline]
     pub fn is_held(&self) -> bool {
         self.holds.count > 0 && self.stop.reason.is_none() || self.configuration.reset_due
     }
 
-    /// Whether the command that has begun last keeps its block: it is not acknowledged before commands may run again.
+    /// Whether the last command keeps its block unacknowledged until commands may run again.
     #[inline]
     pub fn keeps_block(&self) -> bool {
         self.is_held() && (self.holds.join_limit == 0 || self.configuration.reset_due)
     }
 
-    /// Whether a command may run though [others wait](Mcu::is_held): it is the first of this payload.
+    /// Whether the first command of this payload may run although [others wait](Mcu::is_held).
     pub fn joins(&self, payload: &[u8]) -> bool {
         if self.keeps_block() || self.holds.count >= self.holds.join_limit {
             return false;
@@ -110,14 +109,14 @@ impl Mcu {
             && reader.int().is_ok_and(|oid| self.holds.holder.is_some_and(|holder| holder.index() == oid as usize))
     }
 
-    /// A stop is over. A conversation from before it holds commands again, and its limit may be over.
+    /// Called after a stop. A conversation from before the stop holds commands again, and its limit may have passed.
     pub(super) fn hold_again(&mut self) {
         if self.holds.count > 0 {
             self.limit_hold();
         }
     }
 
-    /// The timer of [`HOLD_LIMIT`]: commands have waited too long for an errand.
+    /// Runs when the timer of [`HOLD_LIMIT`] is due: commands have waited too long for an errand.
     pub(super) fn held_too_long(&mut self) {
         if self.is_held() {
             let holder = self

@@ -1,10 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! GPIO lines: the table of claims, and outputs and inputs as objects use them.
+//! GPIO lines: the table of claims, and the outputs and inputs that objects use.
 //!
-//! Several objects may use one line, as in the firmware, which just sets the line up again: what
-//! `[duplicate_pin_override]` allows in printer.cfg, a line that `set_digital_out` drove before an
-//! object took it, chips that share a clock line. The last set-up decides whether it is an output
-//! or an input.
+//! Several objects may use one line, as in the firmware, which sets the line up again. Examples:
+//!
+//! - `[duplicate_pin_override]` in printer.cfg
+//! - a line that `set_digital_out` drove before an object claimed it
+//! - chips that share a clock line
+//!
+//! The last setup decides if the line is an output or an input.
 
 #![forbid(unsafe_code)]
 
@@ -21,14 +24,14 @@ use super::{
 
 /// A line in use.
 pub(super) struct Claim {
-    /// By the board's own number for it.
+    /// The board's own number for it.
     pin: Pin,
     line: Arc<dyn Line>,
-    /// The worker of its chip, if calls to that may take their time, and the calls that it makes.
+    /// The worker of its chip and the worker's calls, if calls to that chip may be slow.
     slow: Option<(WorkerId, Calls)>,
-    /// What it was set up as last.
+    /// Its last setup.
     direction: Direction,
-    /// Its level for whoever asks for the MCU's status.
+    /// Its level, for the MCU's status.
     shown: Arc<Level>,
 }
 
@@ -38,7 +41,7 @@ impl Claim {
         LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get(), bus }
     }
 
-    /// The line for a user that calls it itself, as errands do.
+    /// The line for a user that calls it directly, for example an errand.
     fn shared(&self) -> Arc<dyn Line> {
         let watched = Arc::new(Watched { line: self.line.clone(), shown: self.shown.clone() });
         match &self.slow {
@@ -48,7 +51,7 @@ impl Claim {
     }
 }
 
-/// A line whose level is shown as an errand drives or sees it.
+/// A line that records its level for the status when an errand drives or reads it.
 struct Watched {
     line: Arc<dyn Line>,
     shown: Arc<Level>,
@@ -75,7 +78,7 @@ impl Line for Watched {
     }
 }
 
-/// A line of a chip that may sleep: each call may be made twice.
+/// A line of a chip that may sleep. Each call may be repeated.
 #[derive(Clone)]
 struct Repeated {
     line: Arc<dyn Line>,
@@ -100,7 +103,7 @@ impl Line for Repeated {
     }
 }
 
-/// An output that the core drives itself: a call takes a microsecond or two.
+/// An output that the core itself drives. A call takes one or two microseconds.
 pub struct PromptLine {
     line: Arc<dyn Line>,
     level: bool,
@@ -152,7 +155,7 @@ enum Driver {
 }
 
 impl OutputLine {
-    /// Drives the line, or has its chip's worker drive it.
+    /// Drives the line, directly or through its chip's worker.
     ///
     /// # Errors
     ///
@@ -177,7 +180,7 @@ impl OutputLine {
         self.write(turn, !self.level)
     }
 
-    /// Drives the line of a stopped MCU to where it belongs.
+    /// Drives the line of a stopped MCU to `level`, its shutdown value.
     ///
     /// # Errors
     ///
@@ -190,7 +193,7 @@ impl OutputLine {
         })
     }
 
-    /// Takes in what the worker has written, if it is this line ([`Remote::settle`]).
+    /// Handles the worker's finished write, if it was to this line ([`Remote::settle`]).
     ///
     /// # Errors
     ///
@@ -203,7 +206,7 @@ impl OutputLine {
     }
 }
 
-/// A look at an input of a chip that may sleep.
+/// Reads an input of a chip that may sleep.
 struct Sampling(Repeated);
 
 impl Errand for Sampling {
@@ -215,13 +218,13 @@ impl Errand for Sampling {
     }
 }
 
-/// What a worker saw of an input.
+/// The result of a worker's look at an input.
 pub struct Look {
-    /// `None` if it could not look, or the MCU is stopped and it failed.
+    /// `None` if the look failed.
     pub level: Option<bool>,
     /// When the worker began to look.
     pub began: Clock,
-    /// When the worker had looked.
+    /// When the worker finished.
     pub ended: Clock,
 }
 
@@ -250,8 +253,8 @@ impl InputLine {
         InputLine { pin: claim.pin, sensor, shown }
     }
 
-    /// The line's level; `None` if it comes later, to the object's `returned`, as the chip's worker
-    /// has to look.
+    /// The line's level. `None` if the chip's worker has to look: the level then comes later, to the object's
+    /// `returned`.
     ///
     /// # Errors
     ///
@@ -280,18 +283,18 @@ impl InputLine {
         }
     }
 
-    /// Whether the chip's worker looks at the line.
+    /// Whether the chip's worker is looking at the line.
     pub fn is_looking(&self) -> bool {
         matches!(&self.sensor, Sensor::Slow { look, .. } if !look.is_here())
     }
 
-    /// Takes in a look that is done, if it was at this line. It fails with
-    /// "GPIO line read failed", once nothing was seen for [`UNREAD_LIMIT`].
+    /// Handles a finished look, if it was at this line. It fails with "GPIO line read failed" when no look has
+    /// succeeded for [`UNREAD_LIMIT`].
     pub fn sampled(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
         self.take_in(turn, done, false)
     }
 
-    /// The same where a move depends on it: a look that failed is a failure at once.
+    /// The same, if a move depends on the input. One failed look is a failure at once.
     pub fn seen(&mut self, turn: &Turn, done: &mut Done) -> Option<Result<Look, Shutdown>> {
         self.take_in(turn, done, true)
     }
@@ -311,11 +314,11 @@ impl InputLine {
         Some(level.map(|level| Look { level, began, ended }))
     }
 
-    /// To be called while a look may be under way.
+    /// Checks a look that may still be on its way. Call this while one may be.
     ///
     /// # Errors
     ///
-    /// "GPIO line read failed", once nothing was seen for [`UNREAD_LIMIT`].
+    /// "GPIO line read failed" when no look has succeeded for [`UNREAD_LIMIT`].
     pub fn awaited(&self, turn: &mut Turn) -> Result<(), Shutdown> {
         let Sensor::Slow { look, unread, .. } = &self.sensor else { return Ok(()) };
         if look.is_here() || !unread.is_too_long(turn.now()) {
@@ -329,12 +332,12 @@ impl InputLine {
     }
 }
 
-/// What counts a line's edges, and the worker that asks it; or why nothing does.
+/// The counter of a line's edges and the worker that reads it, or the reason why there is none.
 pub type CountedEdges = Result<(WorkerId, Box<dyn Edges>), Box<str>>;
 
 impl Mcu {
-    /// The board, to claim something: that opens files and waits for the guardian, so the steps
-    /// of a configured MCU would wait, too.
+    /// The board, to claim a resource. A claim opens files and waits for the guardian. It would delay the steps of a
+    /// configured MCU.
     ///
     /// # Errors
     ///
@@ -346,7 +349,7 @@ impl Mcu {
         Ok(&mut *self.board)
     }
 
-    /// Claims a line for one more use, while the MCU is configured.
+    /// Claims a line for one more use. It fails after `finalize_config`.
     fn claim(&mut self, pin: Pin, direction: Direction) -> Result<&Claim, Shutdown> {
         self.board()?;
         self.claim_at_any_time(pin, direction)
@@ -365,7 +368,7 @@ impl Mcu {
         self.enter(pin, claimed, direction)
     }
 
-    /// Puts a line that the board has handed out into the table.
+    /// Adds a line from the board to the table.
     fn enter(&mut self, pin: Pin, claimed: ClaimedLine, direction: Direction) -> Result<&Claim, Shutdown> {
         let ClaimedLine { line, sleeps_on } = claimed;
         let worker = sleeps_on.map(|chip| self.workers.start(&chip)).transpose()?;
@@ -376,11 +379,11 @@ impl Mcu {
         Ok(&self.configuration.claims[place])
     }
 
-    /// Claims an output, driven to `level`; it belongs to `shutdown_value` when the MCU stops.
+    /// Claims an output and drives it to `level`. It goes to `shutdown_value` when the MCU stops.
     ///
     /// # Errors
     ///
-    /// Those of the board, such as "Unable to open out GPIO chip line".
+    /// The board's errors, for example "Unable to open out GPIO chip line".
     pub fn output(&mut self, pin: Pin, level: bool, shutdown_value: bool) -> Result<OutputLine, Shutdown> {
         let claim = self.claim(pin, Direction::Output { level, shutdown_value })?;
         let (line, shown) = (claim.line.clone(), claim.shown.clone());
@@ -391,12 +394,11 @@ impl Mcu {
         Ok(OutputLine { level, driver, shown })
     }
 
-    /// Claims an output whose every edge has its instant, such as `step`: a chip that may sleep is
-    /// no good for that.
+    /// Claims an output with exact edges, for example `step`. It refuses a chip that may sleep.
     ///
     /// # Errors
     ///
-    /// Those of the board, and "Unable to open out GPIO chip line" for such a chip.
+    /// The board's errors, and "Unable to open out GPIO chip line" for a chip that may sleep.
     pub fn prompt_output(
         &mut self,
         pin: Pin,
@@ -408,12 +410,12 @@ impl Mcu {
         Ok(PromptLine { line: claim.line.clone(), level, shown: claim.shown.clone() })
     }
 
-    /// Claims a line on which every edge has its instant, for an errand that drives or reads it: a
-    /// chip that may sleep is no good for that.
+    /// Claims a line with exact edges, for an errand that drives or reads it. It refuses a chip that may sleep.
     ///
     /// # Errors
     ///
-    /// Those of the board, and "Unable to open out GPIO chip line" or its like for such a chip.
+    /// The board's errors, and "Unable to open out GPIO chip line" or "Unable to open in GPIO chip line" for a chip
+    /// that may sleep.
     pub fn prompt_line(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<Arc<dyn Line>, Shutdown> {
         self.prompt_claim(pin, use_, direction).map(Claim::shared)
     }
@@ -435,30 +437,30 @@ impl Mcu {
         claimed.ok_or_else(|| Shutdown::because(reason::OUTPUT_LINE, "a line that was claimed is in no table"))
     }
 
-    /// Claims an output that workers drive, such as a chip select; it belongs to `level`.
+    /// Claims an output that workers drive, for example a chip select. `level` is also its shutdown value.
     ///
     /// # Errors
     ///
-    /// Those of the board, such as "Unable to open out GPIO chip line".
+    /// The board's errors, for example "Unable to open out GPIO chip line".
     pub fn shared_output(&mut self, pin: Pin, level: bool) -> Result<Arc<dyn Line>, Shutdown> {
         self.claim(pin, Direction::Output { level, shutdown_value: level }).map(Claim::shared)
     }
 
-    /// Claims an input that workers read, pulled up where it can be.
+    /// Claims an input that workers read, with a pull-up if the board allows one.
     ///
     /// # Errors
     ///
-    /// Those of the board, such as "Unable to open in GPIO chip line".
+    /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn shared_input(&mut self, pin: Pin) -> Result<Arc<dyn Line>, Shutdown> {
         let pulled_up = self.claim(pin, Direction::Input(Bias::PullUp)).map(Claim::shared);
         pulled_up.or_else(|_| self.claim(pin, Direction::Input(Bias::None)).map(Claim::shared))
     }
 
-    /// Claims a wire that workers pull low or let go, and read.
+    /// Claims an open-drain wire that workers pull low, release and read.
     ///
     /// # Errors
     ///
-    /// Those of the board, such as "Unable to open out GPIO chip line".
+    /// The board's errors, for example "Unable to open out GPIO chip line".
     pub fn shared_wire(&mut self, pin: Pin) -> Result<Arc<dyn Line>, Shutdown> {
         self.claim(pin, Direction::OpenDrain).map(Claim::shared)
     }
@@ -467,16 +469,16 @@ impl Mcu {
     ///
     /// # Errors
     ///
-    /// Those of the board, such as "Unable to open in GPIO chip line".
+    /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
         self.claim(pin, Direction::Input(bias)).map(InputLine::new)
     }
 
-    /// Claims an input whose edges an interrupt counts, if there is one.
+    /// Claims an input, with edges counted by an interrupt if possible.
     ///
     /// # Errors
     ///
-    /// Those of the board, such as "Unable to open in GPIO chip line".
+    /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn counted_input(&mut self, pin: Pin, bias: Bias) -> Result<(InputLine, CountedEdges), Shutdown> {
         let own = self.board()?.canonical(pin);
         if self.configuration.claims.iter().any(|claim| claim.pin == own) {
@@ -491,18 +493,17 @@ impl Mcu {
         Ok((input, edges))
     }
 
-    /// Claims an input, after `finalize_config` too. That opens a file and may start a thread, for
-    /// which steps would wait: it is for `buttons_add` only, which klippy sends as it connects,
-    /// after `finalize_config` and before any step.
+    /// Claims an input, also after `finalize_config`. This opens a file and may start a thread, which delays steps. So
+    /// it is only for `buttons_add`: klippy sends it when it connects, after `finalize_config` and before any step.
     ///
     /// # Errors
     ///
-    /// Those of the board, such as "Unable to open in GPIO chip line".
+    /// The board's errors, for example "Unable to open in GPIO chip line".
     pub fn late_input(&mut self, pin: Pin, bias: Bias) -> Result<InputLine, Shutdown> {
         self.claim_at_any_time(pin, Direction::Input(bias)).map(InputLine::new)
     }
 
-    /// What the dictionary calls a pin.
+    /// The pin's name in the dictionary.
     pub fn name(&self, pin: Pin) -> String {
         pin.name_in(&self.board.pins())
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What host and MCU say to each other: commands, responses, and the dialect of both.
+//! The messages between host and MCU: commands, responses, and their dialect.
 
 #![forbid(unsafe_code)]
 
@@ -11,17 +11,16 @@ use pinion_protocol::vlq::{Reader, Writer};
 use super::dialect::READ_ANEW;
 use super::{Dialect, Generations, Mcu, Response, base};
 
-/// The dialects of the host that configured the MCU, and of one that came since.
+/// The dialects of the host that configured the MCU, and of a later host.
 pub(super) struct Spoken {
     pub(super) dialect: Arc<Dialect>,
-    /// The dialect of a host that came since the MCU was configured.
+    /// The dialect of a host that came after the MCU was configured.
     pub(super) next: Option<Arc<Dialect>>,
 }
 
 impl Mcu {
-    /// Runs one command off the front of a block's payload. If it stops the MCU, the rest
-    /// of the block is dropped, as in the firmware. None may run while the MCU
-    /// [is held](Mcu::is_held).
+    /// Runs the first command of a block's payload. If it stops the MCU, the rest of the block is dropped, as in the
+    /// firmware. Do not call this while the MCU [is held](Mcu::is_held).
     #[inline]
     pub fn execute(&mut self, payload: &mut Reader<'_>) {
         let command = *payload;
@@ -43,12 +42,12 @@ impl Mcu {
         self.heard().is_emergency(payload)
     }
 
-    /// The dialect in which the host speaks that is there, which the MCU may not be able to serve yet.
+    /// The dialect of the present host. The MCU may not be able to serve it yet.
     pub fn heard(&self) -> &Arc<Dialect> {
         self.spoken.next.as_ref().unwrap_or(&self.spoken.dialect)
     }
 
-    /// Says which command ends before its parameters do.
+    /// The error for a command that ends before its parameters do.
     #[cold]
     fn cut_short(&self, mut command: Reader<'_>) -> Shutdown {
         let id = command.int().ok();
@@ -63,7 +62,7 @@ impl Mcu {
         let command = self.heard().command(id)?;
         let is_foreign = self.spoken.next.is_some() && !command.is_own;
         match self.stop.reason {
-            // Some of another dialect's commands would run here, on objects that are not their host's.
+            // Without this, some commands of another dialect would run here, on objects of another host.
             Some(reason) if is_foreign || !command.in_shutdown => {
                 command.skip(payload)?;
                 let static_string_id = self.spoken.dialect.static_string_id(reason);
@@ -81,12 +80,15 @@ impl Mcu {
         }
     }
 
-    /// Has the MCU speak another dialect, for another host: at once, or, if a host has begun to
-    /// configure it, after the reset. Until then only the messages of the MCU itself are exchanged, which
-    /// have the same ids in every dialect: what the objects say would mean something else to the other host, or
-    /// nothing, and klippy's reader ends with the first message that it can not decode. `get_config` tells no
-    /// check sum that the other host could take for its own.
-    /// The same dialect over a board that has changed differs in its names of pins alone.
+    /// Changes the MCU's dialect, for another host. This happens at once, or after the reset if a host has begun to
+    /// configure the MCU.
+    ///
+    /// Until the reset, host and MCU exchange only the MCU's own messages, which have the same ids in every dialect.
+    /// The objects' messages would mean something else to the other host, or nothing. klippy's reader ends at the first
+    /// message that it cannot decode. `get_config` gives a checksum that the other host cannot take for its own.
+    ///
+    /// If only the board has changed, the dialect is the same and only the names of pins differ. Then the change is
+    /// made at once.
     pub fn speak(&mut self, dialect: Arc<Dialect>) {
         self.spoken.next = None;
         if dialect.name() == self.spoken.dialect.name() || !self.is_allocated() && !self.is_finalized() {
@@ -101,18 +103,17 @@ impl Mcu {
         &self.spoken.dialect
     }
 
-    /// Whether the host takes responses of type `R`.
+    /// Whether the host uses responses of type `R`.
     pub fn speaks<R: Response>(&self) -> bool {
         self.spoken.dialect.response_id::<R>().is_some()
     }
 
-    /// Whether the MCU is to behave as for hosts of these generations, where no form of a message
-    /// tells them apart.
+    /// Whether the MCU behaves as hosts of these generations expect, where no form of a message tells them apart.
     pub fn serves(&self, hosts: Generations) -> bool {
         self.spoken.dialect.serves(hosts)
     }
 
-    /// Sends a response, if the host takes it.
+    /// Sends a response, if the host uses it.
     pub fn send<R: Response>(&mut self, response: R) {
         if self.spoken.next.is_some() && !base::is_own_response(R::INDEX) {
             return;

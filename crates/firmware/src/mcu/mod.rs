@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The MCU: oids, timers, move queue, shutdown.
 //!
-//! It does no I/O of its own: it reads the time from the clock that it is given, calls the
-//! board's traits and leaves responses in an outbox. So all of it runs in virtual time too.
+//! It does no I/O of its own. It reads the time from a given clock and calls the board's traits. It leaves its
+//! responses in an outbox. So all of it also runs in virtual time.
 
 #![forbid(unsafe_code)]
 
@@ -63,14 +63,14 @@ use schedule::Schedule;
 use stop::Stop;
 use timers::TimerId;
 
-/// The MCU's own responses come first in the list of all.
+/// The MCU's own responses come first in the list of all responses.
 const fn response_index(format: &str) -> usize {
     place_of_response(&[base::FEATURE], format)
 }
 
 /// The MCU.
 pub struct Mcu {
-    /// The moves that are free.
+    /// Counts the free moves.
     pub moves: MovePool,
     schedule: Schedule,
     board: Box<dyn Board>,
@@ -83,7 +83,7 @@ pub struct Mcu {
 }
 
 impl Mcu {
-    /// An MCU that waits for its configuration; it says `starting`.
+    /// Creates an MCU that waits for its configuration, and sends `starting`.
     pub fn new(
         dialect: Arc<Dialect>,
         board: Box<dyn Board>,

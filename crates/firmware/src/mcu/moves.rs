@@ -7,10 +7,10 @@ use std::collections::VecDeque;
 
 use crate::shutdown::{Shutdown, reason};
 
-/// How many moves there are (`move_count`), as in the firmware on Linux.
+/// Number of moves (`move_count`), as in the firmware on Linux.
 pub const MOVE_COUNT: u16 = 1024;
 
-/// Counts the moves that are free. None are before `finalize_config`.
+/// Counts the free moves. There are none before `finalize_config`.
 #[derive(Debug, Default)]
 pub struct MovePool {
     free: u16,
@@ -23,14 +23,13 @@ impl MovePool {
         self.free = MOVE_COUNT;
     }
 
-    /// How many moves are queued, and how many there is room for.
+    /// How many moves are queued, and how many there are in all.
     pub(super) fn used(&self) -> (u16, u16) {
         (self.count - self.free, self.count)
     }
 }
 
-/// One object's queued moves. It never holds more than the pool has, so it never allocates
-/// after its making.
+/// One object's queued moves. It never holds more moves than the pool has. So it allocates only when it is created.
 #[derive(Debug)]
 pub struct MoveQueue<T>(VecDeque<T>);
 
@@ -41,7 +40,7 @@ impl<T> Default for MoveQueue<T> {
 }
 
 impl<T> MoveQueue<T> {
-    /// Appends a move, or says that all are taken.
+    /// Appends a move. It fails if no move is free.
     #[inline]
     pub fn push(&mut self, pool: &mut MovePool, item: T) -> Result<(), Shutdown> {
         pool.free = pool.free.checked_sub(1).ok_or_else(|| overflow(pool.count))?;
@@ -62,7 +61,7 @@ impl<T> MoveQueue<T> {
         self.0.front()
     }
 
-    /// How many are queued.
+    /// How many moves are queued.
     pub fn len(&self) -> usize {
         self.0.len()
     }
@@ -72,7 +71,7 @@ impl<T> MoveQueue<T> {
         self.0.is_empty()
     }
 
-    /// Frees every place.
+    /// Removes all moves and frees their places.
     pub fn clear(&mut self, pool: &mut MovePool) {
         pool.free += self.0.len() as u16;
         self.0.clear();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Objects: what the host configures under an oid, and the table of all of them.
+//! Objects: the host configures each under an oid. This file has the trait and the table.
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +11,7 @@ use crate::time::Clock;
 
 use super::{Bus, BusCounts, Done, Mcu, Oid, Report, Timer, Turn};
 
-/// What an event answers: what becomes of its timer.
+/// The result of an event: what happens to its timer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
     /// The timer runs again at this instant.
@@ -26,47 +26,46 @@ pub enum Next {
 pub enum Safe {
     /// They are.
     Now,
-    /// A worker is to write them. The object calls [`Turn::is_safe`] once that is done.
+    /// A worker will write them. The object calls [`Turn::is_safe`] when that is finished.
     Later,
 }
 
-/// An object that the host configured under an oid. Its methods run in the core: once
-/// configured they must not allocate, lock, log or block.
+/// An object that the host configured under an oid. Its methods run in the core. After configuration they must not
+/// allocate, lock, log or block.
 pub trait Object: Any + Send {
-    /// What people call such an object, for the log: `stepper`, `digital output`.
+    /// The name of this kind of object in the log, for example `stepper` or `digital output`.
     fn kind(&self) -> &'static str;
 
-    /// A timer of this object runs, which was due at `at`. An error stops the MCU.
+    /// Runs when a timer of this object, due at `at`, fires. An error stops the MCU.
     fn event(&mut self, _turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         Ok(Next::Done)
     }
 
-    /// An errand of this object has come back from its worker. An error stops the MCU.
+    /// Runs when an errand of this object returns from its worker. An error stops the MCU.
     fn returned(&mut self, _turn: &mut Turn, _done: &mut Done) -> Result<(), Shutdown> {
         Ok(())
     }
 
-    /// The trsync that this object waits for was triggered. An error stops the MCU.
+    /// Runs when the trsync that this object waits for is triggered. An error stops the MCU.
     fn triggered(&mut self, _turn: &mut Turn) -> Result<(), Shutdown> {
         Ok(())
     }
 
-    /// The MCU stops and has removed all timers: the object drops whatever it had queued.
+    /// Runs when the MCU stops, after all timers are removed. The object drops its queue.
     fn shutdown(&mut self, _turn: &mut Turn) {}
 
-    /// Drives the outputs to their shutdown values, after [`Object::shutdown`]. As long as this fails
-    /// it is called again every [`super::RETRY_TICKS`]; if it fails for too long, the guardian drives
-    /// the outputs and ends the program.
+    /// Drives the outputs to their shutdown values. It runs after [`Object::shutdown`]. If it fails, it runs again
+    /// after [`super::RETRY_TICKS`]. If it fails for too long, the guardian drives the outputs and ends the program.
     fn make_safe(&mut self, _turn: &mut Turn) -> Result<Safe, Shutdown> {
         Ok(Safe::Now)
     }
 
-    /// Whether the guardian process, too, can drive the outputs to their shutdown values.
+    /// Whether the guardian process can also drive the outputs to their shutdown values.
     fn is_guarded(&self) -> bool {
         true
     }
 
-    /// The chip that this object stands for, if it is a bus device whose bus is set.
+    /// The chip that this object represents, if it is a bus device and its bus is set.
     fn bus(&self) -> Option<&Bus> {
         None
     }
@@ -76,14 +75,14 @@ pub trait Object: Any + Send {
         self.bus().map(Bus::counts)
     }
 
-    /// What it tells to whoever asks for the MCU's status.
+    /// What this object adds to the MCU's status.
     fn report(&self) -> Report {
         Report::default()
     }
 }
 
 impl Mcu {
-    /// Takes an object out of the table, for as long as one of its methods runs.
+    /// Takes an object out of the table while one of its methods runs.
     #[inline]
     pub(super) fn take(&mut self, oid: Oid) -> Option<Box<dyn Object>> {
         self.configuration.objects.get_mut(oid.index()).and_then(Option::take)
@@ -100,7 +99,7 @@ impl Mcu {
     ///
     /// # Errors
     ///
-    /// "Invalid oid type" if there is no object, or one of another type; whatever `f` returns.
+    /// "Invalid oid type" if there is no object, or an object of another type; any error of `f`.
     #[inline]
     pub fn with<T: Object, R>(
         &mut self,
@@ -126,8 +125,8 @@ impl Mcu {
         self.with::<T, _>(oid, |_, _| Ok(()))
     }
 
-    /// The id of the one object of type `T` that belongs to a feature rather than to an oid of the
-    /// host, such as the lines that `set_digital_out` holds. It is made at its first use.
+    /// The id of a feature's own object of type `T`, for example the lines that `set_digital_out` holds. It has no oid
+    /// of the host. It is created at its first use.
     pub fn own<T: Object + Default>(&mut self) -> Oid {
         let is_it = |object: &Option<Box<dyn Object>>| {
             let any = object.as_ref().map(|object| -> &dyn Any { &**object });
@@ -142,17 +141,17 @@ impl Mcu {
         Oid::at(index)
     }
 
-    /// The chip that an object stands for.
+    /// The chip that an object represents.
     ///
     /// # Errors
     ///
-    /// "Invalid oid type" if it stands for none, or its bus is not set.
+    /// "Invalid oid type" if it represents none, or its bus is not set.
     pub(super) fn lend(&self, oid: Oid) -> Result<Bus, Shutdown> {
         let object = self.configuration.objects.get(oid.index()).and_then(Option::as_ref);
         object.and_then(|object| object.bus()).cloned().ok_or_else(|| not_configured(oid))
     }
 
-    /// Whether `f` holds for any object of type `T`.
+    /// Whether `f` is true for any object of type `T`.
     pub fn any<T: Object>(&self, mut f: impl FnMut(&T) -> bool) -> bool {
         self.configuration.objects.iter().flatten().any(|object| {
             let any: &dyn Any = &**object;
@@ -160,11 +159,11 @@ impl Mcu {
         })
     }
 
-    /// Passes a trsync's trigger on to an object that waits for it.
+    /// Passes a trsync's trigger to an object that waits for it.
     ///
     /// # Errors
     ///
-    /// Whatever [`Object::triggered`] returns.
+    /// Any error of [`Object::triggered`].
     pub fn trigger(&mut self, oid: Oid) -> Result<(), Shutdown> {
         match self.take(oid) {
             Some(mut object) => {
@@ -176,12 +175,12 @@ impl Mcu {
         }
     }
 
-    /// Checks that a new object may be put under `oid`. To be called before its pins are claimed: an
-    /// output that was claimed for no object would not be driven to its shutdown value.
+    /// Checks that a new object may be put under `oid`. Call it before claiming the object's pins. An output that is
+    /// claimed for no object would not be driven to its shutdown value.
     ///
     /// # Errors
     ///
-    /// "Can't assign oid" if it has an object, is out of range, or the configuration is complete.
+    /// "Can't assign oid" if it already has an object, is out of range, or the configuration is complete.
     pub fn vacant(&self, oid: Oid) -> Result<(), Shutdown> {
         let taken =
             |why: &str| Err(Shutdown::by_host(reason::CANNOT_ASSIGN_OID, format_args!("oid {} is {why}", oid.index())));
@@ -206,7 +205,7 @@ impl Mcu {
         Ok(())
     }
 
-    /// Puts a new object under `oid`. The log names it by its pin, too, as a user does not know oids.
+    /// Puts a new object under `oid`. The log also names it by its pin, because a user does not know oids.
     ///
     /// # Errors
     ///
@@ -217,13 +216,13 @@ impl Mcu {
         Ok(())
     }
 
-    /// Says which object a stop was about.
+    /// Adds the object's name to a shutdown.
     #[cold]
     pub(super) fn blame(&self, stop: Shutdown, kind: &str, oid: Oid) -> Shutdown {
         stop.of(&self.name_object(kind, oid))
     }
 
-    /// What the log calls an object.
+    /// The log's name for an object.
     pub(super) fn name_object(&self, kind: &str, oid: Oid) -> String {
         match self.configuration.pins.iter().find(|(of, _)| *of == oid) {
             _ if oid.index() >= Oid::FIRST_OWN => kind.to_owned(),

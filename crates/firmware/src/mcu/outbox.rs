@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The MCU's way out: responses for the host, and notes for the log.
+//! The MCU's output: responses for the host, and notes for the log.
 
 #![forbid(unsafe_code)]
 
@@ -7,11 +7,11 @@ use crate::lateness::Lateness;
 use crate::shutdown::Shutdown;
 use crate::time::Ticks;
 
-/// Where the MCU leaves responses for the host and notes for the log. Its calls run in the core:
-/// they must not allocate or block.
+/// Where the MCU leaves responses for the host and notes for the log. Its methods run in the core. They must not
+/// allocate or block.
 pub trait Outbox: Send {
-    /// Takes a response to the host, the payload of one message block. If the host does not read
-    /// and there is no room left, the response is dropped.
+    /// Takes a response to the host: the payload of one message block. The response is dropped if the host does not
+    /// read and there is no room.
     fn send(&mut self, payload: &[u8]);
 
     /// Takes a note for the log.
@@ -23,17 +23,16 @@ pub trait Outbox: Send {
 pub enum Note<'a> {
     /// The MCU stopped.
     Shutdown(&'a Shutdown),
-    /// Something failed that does not stop the MCU.
+    /// A failure that does not stop the MCU.
     Warning(&'a Shutdown),
-    /// Something else failed while the MCU stopped, or is stopped.
+    /// Another failure while the MCU stops or is stopped.
     Trouble(&'a Shutdown),
-    /// This output is at its shutdown value, after attempts that failed.
+    /// This output is at its shutdown value after failed attempts.
     Safe(&'a str),
     /// The host configured this many objects of each kind.
     Configured(&'a [(&'static str, usize)]),
-    /// How late timers were since the MCU was made, and how long before a timer the core wakes
-    /// at present.
+    /// How late timers were since the MCU was created, and how long before a timer the core wakes now.
     Lateness(&'a Lateness, Ticks),
-    /// The MCU was rebuilt and waits for a configuration.
+    /// The MCU has forgotten its configuration and waits for another.
     Reset,
 }

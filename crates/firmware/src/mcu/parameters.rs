@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The types that parameters of commands and responses may have, beside plain numbers and bytes.
+//! Parameter types of commands and responses, besides plain numbers and bytes.
 
 #![forbid(unsafe_code)]
 
@@ -14,21 +14,20 @@ use pinion_protocol::vlq::{Reader, Writer};
 #[cfg(doc)]
 use super::Mcu;
 
-/// An object's id: the one that the host uses, or that of an object which belongs to a feature
-/// ([`Mcu::own`]).
+/// An object's id. It is the host's oid, or the id of a feature's own object ([`Mcu::own`]).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Oid(u16);
 
 impl Oid {
-    /// Ids below this one are the host's; those from here on are of features' own objects.
+    /// Lower ids are the host's. Ids from here on belong to features' own objects.
     pub(super) const FIRST_OWN: usize = 256;
 
-    /// The id that has this number on the wire.
+    /// The id with this number on the wire.
     pub const fn new(oid: u8) -> Oid {
         Oid(oid as u16)
     }
 
-    /// The id of the object at a place of the table.
+    /// The id of the object at this place in the table.
     pub(super) fn at(index: usize) -> Oid {
         Oid(u16::try_from(index).unwrap_or(u16::MAX))
     }
@@ -71,7 +70,7 @@ impl Arg<'_> for Ticks {
     }
 }
 
-/// An instant as the host sends it: the low 32 bits of a clock. [`Mcu::instant`] makes it whole.
+/// A time as the host sends it: the low 32 bits of a clock. [`Mcu::instant`] completes it.
 #[derive(Clone, Copy, Debug)]
 pub struct WireClock(pub u32);
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Outputs that a worker writes, as writing may block: hardware PWM, lines of expanders.
+//! Outputs that a worker writes, because writing may block: hardware PWM, lines of expanders.
 
 #![forbid(unsafe_code)]
 
@@ -9,14 +9,14 @@ use super::{Back, Done, Errand, Hold, Slot, Turn, WorkerId};
 
 /// An output that can be set to a value.
 pub trait Settable: Send + 'static {
-    /// What it is set to.
+    /// The type of its values.
     type Value: Copy + Send;
 
-    /// Sets it. Runs on a worker, and may block there.
+    /// Sets the output. Runs on a worker, and may block there.
     ///
     /// # Errors
     ///
-    /// Those of the output, such as "PWM write failed".
+    /// The output's errors, for example "PWM write failed".
     fn set(&mut self, value: Self::Value) -> Result<(), Shutdown>;
 }
 
@@ -35,23 +35,23 @@ impl<S: Settable> Errand for Write<S> {
     }
 }
 
-/// An output that is set by a worker. Of the values that come while a write is under way only the
-/// newest is written next, as the others are out of date by then.
+/// An output that a worker sets. If several values come during a write, only the newest is written next. The others are
+/// out of date by then.
 pub struct Remote<S: Settable> {
     worker: WorkerId,
     write: Slot<Write<S>>,
-    /// The value to write after the write that is under way, and what waits for it.
+    /// The value to write after the present write, and its hold on commands.
     next: Option<(S::Value, Hold)>,
 }
 
 impl<S: Settable> Remote<S> {
-    /// An output of this worker, which is at `value` now.
+    /// Creates an output of this worker that is at `value` now.
     pub fn new(worker: WorkerId, output: S, value: S::Value) -> Remote<S> {
         Remote { worker, write: Slot::new(Write { output, value }), next: None }
     }
 
-    /// Has the worker set the output to `value`, now or after the write that is under way. If a
-    /// command asks for it, the commands behind that one wait until it is done.
+    /// Lets the worker set the output to `value`, now or after the present write. If a command calls this, the next
+    /// commands wait until the value is written.
     ///
     /// # Errors
     ///
@@ -77,7 +77,7 @@ impl<S: Settable> Remote<S> {
         }
     }
 
-    /// Takes the write that is done, if it is this output's. True once nothing is left to be written.
+    /// Handles a finished write, if it was to this output. `Ok(true)` means that nothing is left to write.
     pub fn back(&mut self, turn: &mut Turn, done: &mut Done) -> Option<Result<bool, Shutdown>> {
         let Back { result, .. } = self.write.back(done)?;
         let result = result.map_err(Shutdown::clone);
@@ -87,12 +87,11 @@ impl<S: Settable> Remote<S> {
         })
     }
 
-    /// The same for an output of an object whose outputs are all at their shutdown values once this one is. The object
-    /// is of this kind.
+    /// The same, for an object of this kind whose outputs are all safe when this one is at its shutdown value.
     ///
     /// # Errors
     ///
-    /// That of the write, such as "PWM write failed", unless the MCU is stopped.
+    /// The error of the write, for example "PWM write failed", unless the MCU is stopped.
     pub fn settle(&mut self, turn: &mut Turn, kind: &str, done: &mut Done) -> Result<(), Shutdown> {
         match self.back(turn, done) {
             Some(Ok(true)) => turn.is_safe(),

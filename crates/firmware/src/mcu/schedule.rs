@@ -13,16 +13,16 @@ use super::stats::Stats;
 use super::timers::Timers;
 use super::{Mcu, Next, Note, OBJECTS_MAX, TimerId, Turn, WireClock, base};
 
-/// How far a timer may fall behind before the MCU stops: 100 ms, as in the firmware.
+/// Longest delay of a timer before the MCU stops: 100 ms, as in the firmware.
 const LATE_LIMIT: Ticks = Ticks::from_ms(100);
-/// The longest wait within a timer's event. Meanwhile nothing else runs, not even a command that stops the MCU.
+/// Longest wait within a timer's event. Nothing else runs meanwhile, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
-/// Timers that run before it is looked whether they fall behind, and commands get a turn
-/// (`TIMER_REPEAT_COUNT` of the firmware's linux/timer.c).
+/// How many timers run before the MCU checks the delay and commands get a turn (`TIMER_REPEAT_COUNT` of the firmware's
+/// linux/timer.c).
 const REPEAT_COUNT: u32 = 20;
-/// The same, where there was no command to run (`TIMER_IDLE_REPEAT_COUNT`).
+/// The same after a turn without a command to run (`TIMER_IDLE_REPEAT_COUNT`).
 const IDLE_REPEAT_COUNT: u32 = 100;
-/// Between two `stats` responses.
+/// The time between two `stats` responses.
 const STATS_TICKS: Ticks = Ticks::from_ms(5000);
 /// Two timers for each object and three for the MCU.
 const TIMERS_MAX: usize = 2 * OBJECTS_MAX + 3;
@@ -32,7 +32,7 @@ pub(super) struct Schedule {
     timing: Timing,
     pub(super) timers: Timers,
     pub(super) last_read: Clock,
-    /// Whether the last timers that ran left some that were due.
+    /// Whether some timers were still due after the last run.
     pub(super) is_behind: bool,
     /// How late the timers were.
     pub(super) lateness: Lateness,
@@ -41,7 +41,7 @@ pub(super) struct Schedule {
 }
 
 impl Schedule {
-    /// A schedule with nothing but the next `stats`.
+    /// A schedule with only the timer of the next `stats`.
     pub(super) fn new(timing: Timing) -> Schedule {
         let now = timing.clock.now();
         let mut timers = Timers::with_capacity(TIMERS_MAX);
@@ -57,15 +57,15 @@ impl Schedule {
 }
 
 impl Mcu {
-    /// The present instant.
+    /// The time now.
     #[inline]
     pub fn now(&mut self) -> Clock {
         self.schedule.last_read = self.schedule.timing.clock.now();
         self.schedule.last_read
     }
 
-    /// Spins until `end`, for [`SPIN_MAX`] at most. No other timer or command runs meanwhile, so this is for spans as
-    /// short as a step's pulse.
+    /// Spins until `end`, for [`SPIN_MAX`] at most. No other timer or command runs meanwhile. So use it only for spans
+    /// as short as a step's pulse.
     #[inline]
     pub fn spin_until(&mut self, end: Clock) {
         if self.schedule.last_read < end {
@@ -77,26 +77,26 @@ impl Mcu {
         }
     }
 
-    /// The clock, for what a worker paces by it.
+    /// The clock, for pacing on a worker.
     pub fn clock(&self) -> Arc<dyn TimeSource> {
         self.schedule.timing.clock.clone()
     }
 
-    /// The instant that was read last: in the past, by little while timers run.
+    /// The last time that was read. While timers run, it is a short time ago.
     #[inline]
     pub fn last_read(&self) -> Clock {
         self.schedule.last_read
     }
 
-    /// The instant that the host means: the one nearest to now.
+    /// The time that the host means: the one nearest to now.
     pub fn instant(&mut self, clock: WireClock) -> Clock {
         let now = self.now();
         Clock::widen(clock.0, now)
     }
 
-    /// Starts a timer. One that is the next of all and has passed is too close.
+    /// Starts a timer. It is too close if it is the first of all timers and its time has passed.
     pub(super) fn schedule(&mut self, timer: TimerId, at: Clock) -> Result<(), Shutdown> {
-        // In the firmware the timer that runs still is the first of the queue.
+        // In the firmware, the running timer is still the first of the queue.
         let first = self.schedule.timing.due.get().or(self.schedule.timers.next());
         self.schedule.timers.insert(at, timer);
         if first.is_none_or(|first| at < first) && self.stop.reason.is_none() {
@@ -114,7 +114,7 @@ impl Mcu {
         Ok(())
     }
 
-    /// Goes on with an activity of the MCU's own: late is late, but no fault of the host.
+    /// Starts a timer for an activity of the MCU's own. It may be late: that is not the host's fault.
     pub(super) fn go_on(&mut self, timer: TimerId, at: Clock) {
         self.schedule.timers.insert(at, timer);
     }
@@ -124,24 +124,24 @@ impl Mcu {
         self.schedule.timers.remove(timer);
     }
 
-    /// The next timer's instant.
+    /// The time of the next timer.
     #[inline]
     pub fn next_timer(&self) -> Option<Clock> {
         self.schedule.timers.next()
     }
 
-    /// The instant of the next timer that the core is to be awake for.
+    /// The time of the next exact timer. The core must be awake then.
     #[inline]
     pub fn next_exact_timer(&self) -> Option<Clock> {
         self.schedule.timers.next_exact()
     }
 
-    /// Runs the timers that are due, some at most, so that commands get their turn. True if there
-    /// are more of them: then one command is to have its turn, if there is any.
+    /// Runs the due timers, up to a limit, so that commands get their turn. True if more timers are due: then one
+    /// command gets its turn, if there is one.
     ///
-    /// The firmware runs 20, looks whether they are 100 ms late, lets commands run, and if there
-    /// are none runs 100 more before it looks again; so does this computer, as where it looks
-    /// decides whether it stops.
+    /// The firmware runs 20 timers and checks if they are 100 ms late. Then it lets commands run. If there are none, it
+    /// runs 100 more timers before the next check. Pinion does the same, because the place of this check decides if the
+    /// MCU stops.
     pub fn run_timers(&mut self) -> bool {
         for _ in 0..if self.schedule.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
             if self.schedule.timers.next().is_none_or(|at| at > self.schedule.last_read && at > self.now()) {
@@ -206,22 +206,22 @@ impl Mcu {
         self.schedule.stats.add(busy);
     }
 
-    /// Says in the log how late timers were; `margin` is how early whoever runs them wakes.
+    /// Reports in the log how late timers were. `margin` is how long before a timer the core wakes.
     pub fn report_lateness(&mut self, margin: Ticks) {
         self.outbox.note(Note::Lateness(&self.schedule.lateness, margin));
     }
 
     fn send_stats(&mut self, at: Clock) -> Next {
         let Stats { count, sum, sumsq } = std::mem::take(&mut self.schedule.stats);
-        // klippy divides by it, and an MCU that stood still since the last time counted none.
+        // klippy divides by the count. It is 0 if the MCU stood still since the last `stats`.
         let count = count.max(1);
         self.send(base::Stats { count, sum, sumsq });
-        // A suspended MCU owes no statistics of its sleep.
+        // After a suspend, the MCU sends no `stats` for the time of the suspend.
         let next = at + STATS_TICKS;
         Next::At(next.max(self.schedule.last_read))
     }
 
-    /// How late a step may be before the MCU stops.
+    /// Longest delay of a step before the MCU stops.
     pub fn step_late_limit(&self) -> Ticks {
         self.schedule.timing.step_late_limit
     }

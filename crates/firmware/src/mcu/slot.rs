@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Slots: an object's places for its errands.
 //!
-//! What is in a slot cannot be lost. It is here, or a worker has it. If it cannot be sent, it stays here.
+//! An errand in a slot cannot be lost. It is here, or a worker has it. If it cannot be sent, it stays here.
 
 #![forbid(unsafe_code)]
 
@@ -14,20 +14,20 @@ use crate::time::Clock;
 use super::errand::{Job, Parcel, Refused};
 use super::{Done, Errand, Hold, Turn, WorkerId};
 
-/// The place of an errand, which is here or away with a worker.
+/// The place of an errand. The errand is here or with a worker.
 pub struct Slot<E: Errand>(Place<E>);
 
 enum Place<E: Errand> {
     Here(Box<Packed<E>>),
     Away {
-        /// Where the box is in memory: by that its slot knows it again.
+        /// The box's address in memory. The slot recognizes its errand by it.
         address: usize,
-        /// Whether the object still wants what comes of it.
+        /// Whether the object still wants the result.
         counts: bool,
     },
 }
 
-/// An errand in the box in which it travels, with what came of it the last time.
+/// An errand in the box in which it travels, with its last result.
 struct Packed<E: Errand> {
     errand: E,
     outcome: Option<Result<E::Answer, E::Failure>>,
@@ -39,15 +39,15 @@ impl<E: Errand> Parcel for Packed<E> {
     }
 }
 
-/// What came of an errand that is back.
+/// The result of an errand that has returned.
 pub struct Back<'a, E: Errand> {
-    /// The answer. A failure stays in the slot, as the core would free it.
+    /// The answer. A failure stays in the slot, because otherwise the core would have to free its memory.
     pub result: Result<E::Answer, &'a E::Failure>,
-    /// False if the object [has dropped](Slot::drop_pending) it meanwhile.
+    /// False if the object [has dropped](Slot::drop_pending) the result.
     pub counts: bool,
     /// When the worker began the work.
     pub began: Clock,
-    /// When the worker had done it.
+    /// When the worker finished the work.
     pub ended: Clock,
 }
 
@@ -56,12 +56,12 @@ fn address(parcel: &dyn Parcel) -> usize {
 }
 
 impl<E: Errand> Slot<E> {
-    /// A slot with its errand. It allocates: objects make theirs at configuration.
+    /// Creates a slot with its errand. This allocates, so objects call it at configuration.
     pub fn new(errand: E) -> Slot<E> {
         Slot(Place::Here(Box::new(Packed { errand, outcome: None })))
     }
 
-    /// The errand, to be made ready; `None` while it is away.
+    /// The errand, to prepare it; `None` while it is away.
     pub fn here(&mut self) -> Option<&mut E> {
         match &mut self.0 {
             Place::Here(packed) => Some(&mut packed.errand),
@@ -74,21 +74,22 @@ impl<E: Errand> Slot<E> {
         matches!(self.0, Place::Here(_))
     }
 
-    /// Whether the errand is away, and what comes of it counts.
+    /// Whether the errand is away and the object still wants its result.
     pub fn is_pending(&self) -> bool {
         matches!(self.0, Place::Away { counts: true, .. })
     }
 
-    /// Drops what comes of an errand that is away: it counts no more.
+    /// Drops the result of an errand that is away.
     pub fn drop_pending(&mut self) {
         if let Place::Away { counts, .. } = &mut self.0 {
             *counts = false;
         }
     }
 
-    /// Sends the errand to a worker, if it is here. It comes back to [`Object::returned`](super::Object::returned). If
-    /// a command sends it, further commands wait until it is back; likewise if an object sends it on the return of an
-    /// errand for which commands wait.
+    /// Sends the errand to a worker, if it is here. It returns to [`Object::returned`](super::Object::returned).
+    ///
+    /// If a command sends it, further commands wait until it is back. They also wait if an object sends it at the
+    /// return of an errand that held commands.
     ///
     /// # Errors
     ///
@@ -101,7 +102,7 @@ impl<E: Errand> Slot<E> {
         self.send_with(turn, worker, hold)
     }
 
-    /// The same with a hold that the sender has already.
+    /// The same, with a hold that the sender already has.
     pub(super) fn send_with(&mut self, turn: &mut Turn, worker: WorkerId, hold: Hold) -> Result<(), Shutdown> {
         let Place::Here(packed) = &self.0 else { return Ok(()) };
         let away = Place::Away { address: address(&**packed), counts: true };
@@ -116,7 +117,7 @@ impl<E: Errand> Slot<E> {
         }
     }
 
-    /// Takes the errand that is done, if it is this slot's.
+    /// Takes a finished errand, if it is this slot's.
     pub fn back(&mut self, done: &mut Done) -> Option<Back<'_, E>> {
         let Place::Away { address: own, counts } = self.0 else { return None };
         let parcel = done.parcel.take_if(|parcel| address(&**parcel) == own)?;

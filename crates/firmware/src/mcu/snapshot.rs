@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What an MCU tells of itself when asked: its state, objects, lines and queues.
+//! What an MCU reports about itself on request: its state, objects, lines and queues.
 //!
-//! The core fills a snapshot in while no timer is near, a few rows at a time. Whoever asks has made room for
-//! all of it, so that the core neither allocates nor waits.
+//! The core fills a snapshot while no timer is near, a few rows at a time. The caller has reserved memory for all of
+//! it. So the core neither allocates nor waits.
 
 #![forbid(unsafe_code)]
 
@@ -16,21 +16,21 @@ use crate::time::Clock;
 
 use super::{DialectName, Mcu, OBJECTS_MAX, Oid};
 
-/// The most lines that are told of.
+/// Highest number of lines in a snapshot.
 const LINES_MAX: usize = 512;
-/// The most workers that are told of.
+/// Highest number of workers in a snapshot.
 const QUEUES_MAX: usize = 32;
-/// How many bytes of a text are told, such as the detail of a shutdown.
+/// Longest text in a snapshot in bytes, for example the detail of a shutdown.
 const TEXT_BYTES: usize = 1024;
-/// How many bytes of a worker's name are told.
+/// Longest name of a worker in bytes.
 const NAME_BYTES: usize = 32;
-/// Lines and objects that are told in one go. A row costs some 10 ns, or a miss of the cache or two.
+/// How many lines and objects are added in one turn. A row costs about 10 ns, or one or two cache misses.
 const ROWS: usize = 16;
 
-/// The MCU at an instant.
+/// The MCU's state at one moment.
 #[derive(Debug)]
 pub struct Snapshot {
-    /// When it was begun.
+    /// When the snapshot was begun.
     pub at: Clock,
     /// Whether the MCU is configured.
     pub is_configured: bool,
@@ -38,51 +38,51 @@ pub struct Snapshot {
     pub oids_allocated: bool,
     /// The dialect that it speaks.
     pub dialect: Option<DialectName>,
-    /// Why and when it stopped; none while it is not.
+    /// Why and when it stopped; `None` while it is not stopped.
     pub stopped: Option<(ShutdownReason, Clock)>,
-    /// The cause and remedy of the stop, as the log has them.
+    /// The cause and remedy of the stop, as in the log.
     pub detail: String,
-    /// The output that is not at its shutdown value yet; empty if there is none.
+    /// The object that still owes a shutdown value; empty if there is none.
     pub debtor: String,
     /// Whether commands wait for a bus.
     pub is_held: bool,
-    /// Moves that are queued, and that there is room for.
+    /// How many moves are queued, and how many there are in all.
     pub moves: (u16, u16),
     /// How late timers were.
     pub lateness: Lateness,
     /// The GPIO lines in use.
     pub lines: Vec<LineState>,
-    /// The objects, by their oids.
+    /// The objects in the order of their oids.
     pub objects: Vec<ObjectState>,
-    /// The workers with the jobs that they have.
+    /// The workers and their numbers of jobs.
     pub queues: Vec<QueueState>,
-    /// How many lines and objects there were as this was begun.
+    /// How many lines and objects there were when the snapshot was begun.
     shape: (usize, usize),
-    /// Rows that are told already, and one for the head.
+    /// How many rows are filled in, plus one for the head.
     told: usize,
 }
 
 /// A GPIO line in use.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct LineState {
-    /// By the board's own number for it.
+    /// The board's own number for it.
     pub pin: Pin,
-    /// What it was set up as last.
+    /// Its last setup.
     pub use_: LineUse,
-    /// The level that it was driven to or that was seen last; none if it was not looked at yet.
+    /// The level that was last driven or read; `None` if it was never read.
     pub level: Option<bool>,
     /// The calls of its worker, if its chip is an expander.
     pub bus: Option<BusCounts>,
 }
 
-/// What a line is.
+/// How a line is used.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum LineUse {
     /// It is driven.
     Output,
     /// It is read.
     Input,
-    /// It is pulled low or let go.
+    /// It is pulled low or released.
     OpenDrain,
 }
 
@@ -96,22 +96,22 @@ impl From<Direction> for LineUse {
     }
 }
 
-/// An object of the host.
+/// The state of an object.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct ObjectState {
-    /// The host's number for it; none for what belongs to no object, such as the lines of `set_digital_out`.
+    /// The host's number for it; `None` for a feature's own object, for example the lines of `set_digital_out`.
     pub oid: Option<u8>,
-    /// What people call it.
+    /// The log's name for this kind of object.
     pub kind: &'static str,
-    /// The pin that the log names it by.
+    /// The pin by which the log names it.
     pub pin: Option<Pin>,
-    /// What it says of itself.
+    /// What it reports about itself.
     pub report: Report,
     /// The calls to its device, if a worker makes them.
     pub bus: Option<BusCounts>,
 }
 
-/// What an object says of itself.
+/// What an object reports about itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Report {
     /// How many changes or moves it has queued.
@@ -125,20 +125,20 @@ pub struct Report {
 pub enum Present {
     /// A sample of an ADC, 0 to [`crate::board::ADC_MAX`].
     Adc(u16),
-    /// For how much of each period an output is on, 0 to [`crate::board::PWM_MAX`].
+    /// The part of each period in which an output is on, 0 to [`crate::board::PWM_MAX`].
     Pwm(u16),
     /// A stepper's position in steps.
     Steps(i32),
 }
 
-/// Calls to a device since it was configured. The counts wrap around.
+/// Counts of calls to a device since its configuration. They wrap around.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct BusCounts {
-    /// Calls, those that failed among them.
+    /// All calls, also the failed ones.
     pub transfers: u32,
-    /// Calls that failed.
+    /// Failed calls.
     pub errors: u32,
-    /// Of these, those that were made again.
+    /// Failed calls that were repeated.
     pub retries: u32,
 }
 
@@ -146,7 +146,7 @@ pub struct BusCounts {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct QueueState {
     name: [u8; NAME_BYTES],
-    /// Jobs that wait for it.
+    /// Jobs that wait for this worker.
     pub waiting: usize,
 }
 
@@ -159,7 +159,7 @@ impl QueueState {
 }
 
 impl Default for Snapshot {
-    /// An empty one, with room for all that an MCU may have.
+    /// An empty snapshot with memory for all rows of an MCU.
     fn default() -> Snapshot {
         Snapshot {
             at: Clock::EPOCH,
@@ -182,27 +182,27 @@ impl Default for Snapshot {
 }
 
 impl Snapshot {
-    /// To be called before it is filled in anew.
+    /// Call this before the snapshot is filled again.
     pub fn clear(&mut self) {
         self.told = 0;
     }
 }
 
-/// Appends to a list that has room for it.
+/// Appends an item if the list has room for it.
 fn append<T>(list: &mut Vec<T>, item: T) {
     if list.len() < list.capacity() {
         list.push(item);
     }
 }
 
-/// Puts as much of a text as has room.
+/// Writes as much of a text as there is room for.
 fn put(text: &mut String, from: impl fmt::Display) {
     text.clear();
-    // The write fails where there is no room left: the text is cut there.
+    // The write fails when there is no room left. The text ends there.
     let _ = write!(Room(text), "{from}");
 }
 
-/// A text that does not grow beyond what is allocated for it.
+/// A text that does not grow beyond its allocated memory.
 struct Room<'a>(&'a mut String);
 
 impl fmt::Write for Room<'_> {
@@ -216,8 +216,8 @@ impl fmt::Write for Room<'_> {
 }
 
 impl Mcu {
-    /// Tells the next part of a snapshot: the head first, then a few lines or objects. True once it is whole. It
-    /// begins anew if lines or objects came or went meanwhile. Does not allocate.
+    /// Fills in the next part of a snapshot: the head first, then a few lines or objects. True when it is complete. It
+    /// begins again if lines or objects came or went meanwhile. It does not allocate.
     pub fn tell(&self, to: &mut Snapshot) -> bool {
         let shape = (self.configuration.claims.len(), self.configuration.objects.len());
         if to.told == 0 || to.shape != shape {
@@ -284,7 +284,7 @@ impl Mcu {
     }
 }
 
-/// The level of a line as it was driven or seen last. Its writer, the core or a worker, stores a byte.
+/// The level of a line when it was last driven or read. The core or a worker writes this byte.
 #[derive(Debug)]
 pub(super) struct Level(AtomicU8);
 
@@ -297,7 +297,7 @@ impl Level {
         level
     }
 
-    /// The line is set up.
+    /// Called when the line is set up.
     pub(super) fn begin(&self, direction: Direction) {
         match direction {
             Direction::Output { level, .. } => self.set(level),

@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How busy the core is: the sums that klippy's statistics are made from.
+//! How busy the core is: the sums for klippy's statistics.
 
 #![forbid(unsafe_code)]
 
 use crate::time::Ticks;
 
-/// What squares of ticks are divided by (`STATS_SUMSQ_BASE`).
+/// The divisor of squares of ticks (`STATS_SUMSQ_BASE`).
 pub(super) const SUMSQ_BASE: u32 = 256;
 
-/// The spans in which the core was busy since the last `stats` response: how many, the sum of their
-/// ticks, and the sum of the squares of these over [`SUMSQ_BASE`].
+/// The core's busy spans since the last `stats` response: their number, the sum of their ticks, and the sum of their
+/// squares divided by [`SUMSQ_BASE`].
 #[derive(Debug, Default)]
 pub(super) struct Stats {
     pub(super) count: u32,
@@ -18,7 +18,7 @@ pub(super) struct Stats {
 }
 
 impl Stats {
-    /// Adds a busy span. The sum of the squares saturates, as in the firmware.
+    /// Adds a busy span. The sum of squares saturates, as in the firmware.
     pub(super) fn add(&mut self, busy: Ticks) {
         let square = u64::from(busy.0) * u64::from(busy.0);
         let square = square.div_ceil(u64::from(SUMSQ_BASE));

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How the MCU stops: timers off, outputs to their shutdown values, the host is told.
+//! How the MCU stops. It removes timers, drives outputs to their shutdown values and informs the host.
 //!
-//! An output whose shutdown value can not be written at once, as a worker has to write it or as
-//! writing failed, is *owed*. What failed is tried again every [`RETRY_TICKS`]. Whoever runs the
-//! MCU watches [`Mcu::debtor`]: a debt that lasts is for the guardian. What the guardian can not
-//! write either ([`Object::is_guarded`]) is owed for [`UNGUARDED_LIMIT`] only: to end the program for it
-//! would help nobody. It is still tried until the next configuration.
+//! A shutdown value that cannot be written at once is *owed*: a worker has to write it, or the write failed. A failed
+//! write is retried every [`RETRY_TICKS`]. The program watches [`Mcu::debtor`]: the guardian handles a debt that lasts.
+//!
+//! The guardian cannot write some outputs ([`Object::is_guarded`]). Their debt ends after [`UNGUARDED_LIMIT`], because
+//! ending the program for it would help nobody. The MCU still retries them until the next configuration.
 
 #![forbid(unsafe_code)]
 
@@ -18,21 +18,21 @@ use super::{Mcu, Note, Oid, Safe, TimerId, Turn, base};
 #[cfg(doc)]
 use super::Object;
 
-/// The pause between two attempts to write a shutdown value.
+/// The time between two attempts to write a shutdown value.
 pub const RETRY_TICKS: Ticks = Ticks::from_ms(50);
 
-/// How long the MCU waits for shutdown values that only it can write: less than the second after which
-/// the guardian takes over.
+/// How long the MCU waits for shutdown values that only it can write. It is less than the second after which the
+/// guardian takes over.
 const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 
-/// What a stopped MCU knows of its stop.
+/// What a stopped MCU knows about its stop.
 #[derive(Default)]
 pub(super) struct Stop {
-    /// Why the MCU is stopped; none while it is not.
+    /// Why the MCU is stopped; `None` while it is not.
     pub(super) reason: Option<ShutdownReason>,
-    /// What the log says of the last stop, and when it was.
+    /// The log's text for the last stop, and the time of that stop.
     pub(super) last: Option<(Box<Trouble>, Clock)>,
-    /// Whether `shut_down` is running: what fails meanwhile must not start it again.
+    /// Whether `shut_down` is running. A failure meanwhile must not start it again.
     under_way: bool,
     owed: Vec<Debt>,
 }
@@ -40,14 +40,14 @@ pub(super) struct Stop {
 /// An object that owes a shutdown value.
 struct Debt {
     oid: Oid,
-    /// What the log calls it.
+    /// The log's name for it.
     name: String,
     /// Whether writing failed.
     failed: bool,
-    /// Whether the guardian holds the output, too.
+    /// Whether the guardian also holds the output.
     guarded: bool,
     since: Clock,
-    /// Whether nobody waits for it any more.
+    /// Whether the MCU no longer waits for it.
     given_up: bool,
 }
 
@@ -57,8 +57,8 @@ impl Mcu {
         self.stop.reason.is_some()
     }
 
-    /// Stops the MCU: removes all timers, drives the outputs to their shutdown values, and tells
-    /// the host. An MCU that is stopped already does the same once more, and keeps its first reason.
+    /// Stops the MCU. It removes all timers, drives the outputs to their shutdown values, and informs the host. An MCU
+    /// that is already stopped does this again and keeps its first reason.
     pub fn shut_down(&mut self, shutdown: Shutdown) {
         if self.stop.under_way {
             self.outbox.note(Note::Trouble(&shutdown));
@@ -89,13 +89,13 @@ impl Mcu {
             self.outbox.note(Note::Shutdown(&shutdown));
             self.stop.last = Some((shutdown.trouble, clock));
         } else if shutdown.reason != reason {
-            // The same reason again, such as a second `emergency_stop`, would tell the log nothing new.
+            // The same reason again, for example a second `emergency_stop`, gives the log nothing new.
             self.outbox.note(Note::Trouble(&shutdown));
         }
     }
 
-    /// The given stop as an error, which then stops the MCU; nothing if the MCU is stopped
-    /// already (the firmware's `try_shutdown`).
+    /// Returns the given shutdown as an error, which then stops the MCU. Returns `Ok` if the MCU is already stopped
+    /// (the firmware's `try_shutdown`).
     ///
     /// # Errors
     ///
@@ -114,7 +114,7 @@ impl Mcu {
         }
         let known = self.stop.owed.iter_mut().find(|debt| debt.oid == oid);
         let again = known.is_some_and(|debt| std::mem::replace(&mut debt.failed, true));
-        // What is tried twenty times a second is told once.
+        // It is retried twenty times a second, but logged once.
         if !again {
             let trouble = self.blame(shutdown, kind, oid);
             self.outbox.note(Note::Trouble(&trouble));
@@ -138,7 +138,7 @@ impl Mcu {
         }
     }
 
-    /// The name of an object that owes its shutdown value, for the log; none if nothing is owed.
+    /// The log's name of an object that owes its shutdown value; `None` if nothing is owed.
     pub fn debtor(&self) -> Option<&str> {
         self.stop.owed.iter().find(|debt| !debt.given_up).map(|debt| debt.name.as_str())
     }
@@ -167,14 +167,14 @@ impl Mcu {
             Ok(Safe::Now) => self.is_safe(oid),
             Ok(Safe::Later) => {}
             Err(trouble) => {
-                // The MCU is stopped, so this notes the failure and returns Ok.
+                // The MCU is stopped, so this logs the failure and returns `Ok`.
                 let _ = self.device_failed(oid, kind, trouble);
             }
         }
     }
 
-    /// Starts the timer of the next attempt, if any shutdown value could not be written, or will be given
-    /// up.
+    /// Starts the timer of the next attempt. It is needed if a shutdown value could not be written, or if the MCU will
+    /// stop waiting for one.
     fn retry_later(&mut self) {
         if self.stop.owed.iter().any(|debt| debt.failed || !debt.guarded && !debt.given_up) {
             self.schedule.timers.remove(TimerId::RETRY);
@@ -183,8 +183,8 @@ impl Mcu {
         }
     }
 
-    /// Tries again to write the shutdown values that could not be written, and no longer waits for those
-    /// that only this computer could write and could not.
+    /// Retries the shutdown values that could not be written. It stops waiting for overdue ones that the guardian
+    /// cannot write.
     pub(super) fn retry(&mut self) {
         let now = self.now();
         for debt in self.stop.owed.iter_mut().filter(|debt| !debt.guarded && !debt.given_up) {

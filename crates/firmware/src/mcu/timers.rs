@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The timers that wait: an ordered queue keyed by instant and insertion order.
+//! The waiting timers: a queue ordered by due time, then by insertion order.
 
 #![forbid(unsafe_code)]
 
@@ -7,7 +7,7 @@ use crate::time::Clock;
 
 use super::Oid;
 
-/// A timer of an object. Each object has its own, told apart by a number.
+/// A timer of an object. A number tells the timers of one object apart.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Timer {
     number: u8,
@@ -15,33 +15,33 @@ pub struct Timer {
 }
 
 impl Timer {
-    /// A timer for which the core is awake when it is due.
+    /// A timer that finds the core awake when it is due.
     pub const fn exact(number: u8) -> Timer {
         Timer { number, is_exact: true }
     }
 
-    /// A timer that may be late by a wake-up, as it asks for a sample at a steady pace. The core sleeps until it is
-    /// due. For an exact timer it wakes earlier and spins.
+    /// A timer that may be late by the time of a wake-up, because it takes samples at a steady pace. The core sleeps
+    /// until it is due. Before an exact timer the core wakes earlier and spins.
     pub const fn sampling(number: u8) -> Timer {
         Timer { number, is_exact: false }
     }
 }
 
-/// Which timer: an object's, or the MCU's own.
+/// Identifies a timer of an object, or the MCU's own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct TimerId {
-    /// The object; the MCU's own timers have none.
+    /// The object; `None` for the MCU's own timers.
     oid: Option<Oid>,
     timer: Timer,
 }
 
 impl TimerId {
-    /// The MCU's own timer, which sends `stats`.
+    /// The MCU's own timer that sends `stats`.
     pub(super) const STATS: TimerId = TimerId::own(0);
 
-    /// The MCU's own timer, which tries shutdown values again that could not be written.
+    /// The MCU's own timer that retries failed shutdown values.
     pub(super) const RETRY: TimerId = TimerId::own(1);
-    /// The MCU's own timer, which ends the wait for a bus that hangs.
+    /// The MCU's own timer that ends the wait for a bus that hangs.
     pub(super) const HOLD: TimerId = TimerId::own(2);
 
     const fn own(number: u8) -> TimerId {
@@ -53,7 +53,7 @@ impl TimerId {
         TimerId { oid: Some(oid), timer }
     }
 
-    /// Whether the core is to be awake when it is due.
+    /// Whether the core must be awake when it is due.
     pub(super) const fn is_exact(self) -> bool {
         self.timer.is_exact
     }
@@ -69,15 +69,15 @@ impl TimerId {
     }
 }
 
-/// Few timers run at once (a few dozen), so a sorted array beats cleverer queues.
+/// Only a few dozen timers run at once, so a sorted array is faster than a more complex queue.
 #[derive(Debug)]
 pub(super) struct Timers {
-    /// The next timer is the last: taking it moves nothing.
+    /// The next timer is at the end, so taking it moves nothing.
     waiting: Vec<(Clock, TimerId)>,
 }
 
 impl Timers {
-    /// A queue that takes `capacity` timers without allocating.
+    /// A queue for `capacity` timers without allocation.
     pub(super) fn with_capacity(capacity: usize) -> Timers {
         Timers { waiting: Vec::with_capacity(capacity) }
     }
@@ -86,13 +86,13 @@ impl Timers {
         self.waiting.reserve(capacity.saturating_sub(self.waiting.len()));
     }
 
-    /// The next timer's instant.
+    /// The due time of the next timer.
     #[inline]
     pub(super) fn next(&self) -> Option<Clock> {
         self.waiting.last().map(|(at, _)| *at)
     }
 
-    /// The instant of the next that the core is to be awake for.
+    /// The due time of the next exact timer.
     #[inline]
     pub(super) fn next_exact(&self) -> Option<Clock> {
         self.waiting.iter().rev().find(|(_, timer)| timer.is_exact()).map(|(at, _)| *at)
@@ -103,14 +103,14 @@ impl Timers {
         self.waiting.pop()
     }
 
-    /// Inserts a timer behind those of the same instant. A timer waits once, so that there are never more than the
-    /// objects have.
+    /// Inserts a timer after those with the same due time. A timer is in the queue at most once. So there are never
+    /// more entries than the objects have timers.
     #[inline]
     pub(super) fn insert(&mut self, at: Clock, timer: TimerId) {
         debug_assert!(!self.waiting.iter().any(|(_, waiting)| *waiting == timer), "{timer:?} waits already");
         let mut place = self.waiting.len();
         self.waiting.push((at, timer));
-        // It mostly belongs near the end: to move one after the other beats a call of memmove.
+        // Its place is usually near the end, so moving entries one by one is faster than memmove.
         while place > 0 && self.waiting[place - 1].0 <= at {
             self.waiting[place] = self.waiting[place - 1];
             place -= 1;
@@ -122,7 +122,7 @@ impl Timers {
         self.waiting.retain(|(_, waiting)| *waiting != timer);
     }
 
-    /// Drops the timers of objects.
+    /// Removes the timers of objects.
     pub(super) fn clear(&mut self) {
         self.waiting.retain(|(_, timer)| timer.oid.is_none());
     }

@@ -11,8 +11,8 @@ use crate::time::Clock;
 use super::errand::{Job, Refused};
 use super::{Mcu, Oid, Response, Timer, TimerId, WorkerId};
 
-/// An object's turn in the core: the MCU, and which object it is. What an object starts in its turn (timers, errands,
-/// holds) is its own.
+/// An object's turn in the core: the MCU and the object's id. The timers, errands and holds that an object starts in
+/// its turn are its own.
 pub struct Turn<'a> {
     mcu: &'a mut Mcu,
     oid: Oid,
@@ -46,7 +46,7 @@ impl<'a> Turn<'a> {
         self.oid
     }
 
-    /// Sends a response, if the host takes it.
+    /// Sends a response, if the host uses it.
     pub fn send<R: Response>(&mut self, response: R) {
         self.mcu.send(response);
     }
@@ -55,13 +55,13 @@ impl<'a> Turn<'a> {
     ///
     /// # Errors
     ///
-    /// "Timer too close" if it is the next of all and its instant has passed.
+    /// "Timer too close" if it is the first of all timers and its time has passed.
     #[inline]
     pub fn schedule(&mut self, timer: Timer, at: Clock) -> Result<(), Shutdown> {
         self.mcu.schedule(TimerId::of(self.oid, timer), at)
     }
 
-    /// Starts a timer of the object for an activity of its own: late is late, but no fault of the host.
+    /// Starts a timer for an activity of the object's own. It may be late: that is not the host's fault.
     pub fn go_on(&mut self, timer: Timer, at: Clock) {
         self.mcu.go_on(TimerId::of(self.oid, timer), at);
     }
@@ -71,8 +71,8 @@ impl<'a> Turn<'a> {
         self.mcu.cancel(TimerId::of(self.oid, timer));
     }
 
-    /// To be called when an output or device of the object has failed. A running MCU is stopped by the error that
-    /// this returns. In a stopped one the log is told, and the shutdown value is tried again later.
+    /// Call this when an output or device of the object has failed. The returned error stops a running MCU. If the MCU
+    /// is already stopped, the failure is logged and the shutdown value is retried later.
     ///
     /// # Errors
     ///
@@ -85,13 +85,13 @@ impl<'a> Turn<'a> {
         self.mcu.workers.submit(worker, job)
     }
 
-    /// Says in the log that something of the object failed which does not stop the MCU.
+    /// Logs a failure of the object that does not stop the MCU.
     pub fn warn(&mut self, kind: &str, trouble: Shutdown) {
         self.mcu.warn(self.oid, kind, trouble);
     }
 
-    /// To be called by an object that answered [`Safe::Later`](super::Safe::Later), once its outputs are at their
-    /// shutdown values.
+    /// Call this after answering [`Safe::Later`](super::Safe::Later), when the object's outputs are at their shutdown
+    /// values.
     pub fn is_safe(&mut self) {
         self.mcu.is_safe(self.oid);
     }
