@@ -210,7 +210,7 @@ impl SetLines {
     ///
     /// # Errors
     ///
-    /// "Unable to open out GPIO chip line" for such a line, or the 257th; those of [`Mcu::output`];
+    /// "Unable to open out GPIO chip line" for such a line, or the 257th; those of [`Mcu::output`](crate::mcu::Mcu::output);
     /// "GPIO line write failed".
     fn set(&mut self, turn: &mut Turn, pin: Pin, value: bool) -> Result<(), Shutdown> {
         let known = self.0.iter().position(|(held, _)| *held == pin);
