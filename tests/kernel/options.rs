@@ -20,7 +20,7 @@ Options:
   --nocapture        Show the output of tests that pass, too
   --flavour NAME     Only this kernel: stock or rt
   --program 'NAME=PATH [ARGUMENTS]'
-                     Have the tests of timing::figures measure this program of the
+                     Have the tests of figures measure this program of the
                      host, too: one that takes the options of Klipper's linux MCU
   --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
 
