@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The load cell ADC ADS1220 on SPI (Texas Instruments SBAS501, "SPI Programming").
 //!
-//! DRDY goes low when a conversion is over. The next 24 clocks shift it out, the highest bit first,
-//! whatever is sent meanwhile; what is sent are commands, which read and write the four registers.
+//! DRDY goes low when a conversion is over. The next 24 clocks shift it out, the highest bit first, independent of the
+//! sent bytes. The sent bytes are commands, which read and write the four registers.
 //!
-//! Simulated: the commands, the rates of all modes, single conversions, gains, the cell between AIN0 and
-//! AIN1 either way round. What is shifted out is what the cell bears at the first clock. Not simulated:
-//! other inputs (they read 0), the temperature sensor, the current sources, the filter of 50 and 60 Hz.
+//! Simulated: the commands, the rates of all modes, single conversions, gains, the cell between AIN0 and AIN1 either
+//! way round. The chip shifts out the cell's load at the first clock. Not simulated: other inputs (they read 0), the
+//! temperature sensor, the current sources, the filter of 50 and 60 Hz.
 
 #![forbid(unsafe_code)]
 
@@ -27,7 +27,7 @@ use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// CPOL is 0 and CPHA is 1.
 const MODE: u8 = 1;
-/// What klippy sets up: enough for a weight, and little to do for a busy computer.
+/// The rate in klippy's configuration: enough for a weight, and little work for a busy computer.
 const RATE: u32 = 45;
 
 /// By DR: samples a second in normal mode, in duty cycle mode, in turbo mode.
@@ -47,11 +47,11 @@ const RATES: [[f64; 3]; 7] = [
 pub struct Ads1220Config {
     /// Its SPI bus.
     pub bus: String,
-    /// Low selects it; without it, it is the only chip on its bus.
+    /// Low selects the chip. Without this pin it is the only chip on its bus.
     pub select_pin: Option<PinName>,
     /// Low while a conversion waits.
     pub drdy_pin: PinName,
-    /// The load cell; its counts are those at a gain of 128.
+    /// The load cell. Its counts are valid for a gain of 128.
     pub cell: CellConfig,
 }
 
@@ -90,16 +90,15 @@ impl Part for Ads1220Config {
     }
 }
 
-/// What the bytes that come belong to.
+/// The meaning of the next bytes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Talk {
     Command,
-    /// So many registers from this one are sent, or taken in.
+    /// The register to start from, and the number of registers to send or to take in.
     Read(usize, u8),
     Write(usize, u8),
 }
 
-/// The chip.
 struct Ads1220 {
     cell: Cell,
     clock: Arc<dyn TimeSource>,
@@ -107,10 +106,10 @@ struct Ads1220 {
     conversions: Conversions,
     registers: [u8; 4],
     talk: Talk,
-    /// What is left of the conversion that is being shifted out.
+    /// The conversion that is being shifted out; the next field counts its remaining bytes.
     data: [u8; 3],
     left: usize,
-    /// Readings so far.
+    /// Number of readings so far.
     readings: u64,
 }
 
@@ -129,7 +128,7 @@ impl Ads1220 {
         }
     }
 
-    /// Conversions begin.
+    /// Starts the conversions.
     fn begin(&mut self) {
         let [_, second, ..] = self.registers;
         let mode = usize::from(second >> 3 & 3).min(2);
@@ -144,14 +143,14 @@ impl Ads1220 {
         self.drdy.tell(conversions);
     }
 
-    /// A single conversion, if the chip is not to go on, counts as one.
+    /// Number of finished conversions. In single-shot mode it is at most one.
     fn over(&self) -> u64 {
         let over = self.conversions.over(self.clock.now());
         let goes_on = self.registers[1] & 4 != 0;
         if goes_on { over } else { over.min(1) }
     }
 
-    /// Takes up the conversion that waits.
+    /// Latches the waiting conversion.
     fn latch(&mut self) {
         let over = self.over();
         if over <= self.conversions.seen {
@@ -168,7 +167,7 @@ impl Ads1220 {
         let [_, data @ ..] = counts.to_be_bytes();
         self.data = data;
         self.left = 3;
-        // The line tells of a single one once.
+        // The line reports a single conversion once.
         let told = self.registers[1] & 4 != 0;
         self.set(Conversions { seen: over, told, ..self.conversions });
     }
@@ -186,7 +185,7 @@ impl Ads1220 {
             0 if byte >> 1 == 4 => self.begin(),
             2 => self.talk = Talk::Read(first, count),
             4 => self.talk = Talk::Write(first, count),
-            // RDATA asks for the data, which comes in any case.
+            // RDATA requests the data, which comes in any case.
             _ => {}
         }
     }
@@ -214,7 +213,7 @@ impl SpiChip for Ads1220 {
             }
             Talk::Command => self.command(byte),
         }
-        // What is shifted out stands beside the commands. Then the line is high.
+        // The data is shifted out at the same time as commands come in. After the data the line is high.
         if self.left == 0 {
             return 0xff;
         }
@@ -288,7 +287,7 @@ mod tests {
         let mut bench = Bench::new();
         bench.wait_us(1_000_000);
         assert!(!bench.is_ready(), "it was not started");
-        // Turbo mode, 180 a second, on and on; a gain of 128.
+        // Turbo mode, 180 per second, continuous; a gain of 128.
         bench.transfer(&[0x43, 0x0e, 2 << 5 | 2 << 3 | 4, 0, 0]);
         bench.transfer(&[0x08]);
         bench.wait_us(5_555);

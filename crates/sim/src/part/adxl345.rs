@@ -2,16 +2,16 @@
 //! The accelerometer ADXL345 on SPI, after its data sheet (Analog Devices, rev. G: "Serial
 //! Communications", "FIFO", "Interrupts", "Register Map"), on a head that rings.
 //!
-//! Each axis of the chip feels a mass on a spring, whose other end a motor moves step by step:
-//! `x'' = w^2 (u - x) - 2 d w x'` with the motor's place `u`, `w` the resonance as an angular frequency and
-//! `d` the damping ratio. Between two steps `u` stands, so that the solution is exact. A sample is the mean
-//! acceleration since the sample before, the difference of two speeds: so the chip's own low-pass is
-//! simulated, without which the steps, far above the sampling rate, would be heard as beats.
+//! Each axis of the chip feels a mass on a spring. A motor moves the other end of the spring step by step:
+//! `x'' = w^2 (u - x) - 2 d w x'` with the motor's position `u`, the resonance `w` as an angular frequency and the
+//! damping ratio `d`. Between two steps `u` is constant, so the solution is exact. A sample is the mean acceleration
+//! since the sample before, which is the difference of two speeds. This simulates the chip's own low-pass. Without it
+//! the steps, far above the sampling rate, would appear as beats.
 //!
-//! Simulated: all registers; rates by a clock of the chip's own, ranges, full resolution and justification,
-//! offsets, noise; the FIFO in its modes with watermark and overrun, and how it is read. Not
-//! simulated: taps, activity and free fall, sleep and self test, the trigger mode (which works as
-//! the stream mode) and the interrupt pins (what they would tell is in INT_SOURCE).
+//! Simulated: all registers; rates by the chip's own clock, ranges, full resolution and justification, offsets, noise;
+//! the FIFO in its modes with watermark and overrun, and how it is read. Not simulated: taps, activity and free fall,
+//! sleep and self test, the trigger mode (it works like the stream mode) and the interrupt pins (INT_SOURCE has the
+//! same bits).
 
 #![forbid(unsafe_code)]
 
@@ -67,20 +67,20 @@ const OVERRUN: u8 = 0x01;
 const FIFO: usize = 32;
 /// The highest rate, of code 15; each code below halves it.
 const TOP_RATE_HZ: f64 = 3200.0;
-/// From measuring on, and a period more, until the first sample.
+/// The first sample comes this time and one period after the start of the measurement.
 const TURN_ON_S: f64 = 0.0011;
-/// LSB for each g in full resolution, at a supply of 3.3 V: its x and y axes differ from the 256 at 2.5 V.
+/// LSB per g in full resolution, at a supply of 3.3 V. There the x and y axes differ from the 256 at 2.5 V.
 const LSB_PER_G: [f64; 3] = [265.0, 265.0, 256.0];
 /// An offset's LSB is 15.6 mg, a sample's 3.9 mg.
 const LSB_PER_OFFSET: f64 = 4.0;
-/// The noise of the z axis is that of the others times this (1.1 to 0.75 LSB).
+/// The noise of the z axis is this many times the noise of the others (1.1 to 0.75 LSB).
 const Z_NOISE: f64 = 1.1 / 0.75;
-/// The rate for which the noise is told; it grows with the root of the bandwidth.
+/// The rate at which `noise_lsb` is specified. The noise grows with the square root of the bandwidth.
 const NOISE_RATE_HZ: f64 = 100.0;
 const G_MM_PER_S2: f64 = 9806.65;
 
-/// How long after a step the chip feels it: as late as the computer may make one. So each is felt as if
-/// it had come when it was due.
+/// How long after a step the chip feels it: the longest delay of a step by the computer. So the chip feels each step as
+/// if it had come at its due time.
 const DELAY_TICKS: u64 = STEP_LATE_LIMIT.0 as u64;
 
 /// The chip's description.
@@ -89,19 +89,19 @@ const DELAY_TICKS: u64 = STEP_LATE_LIMIT.0 as u64;
 pub struct Adxl345Config {
     /// Its SPI bus.
     pub bus: String,
-    /// Low selects it; without it, it is the only chip on its bus.
+    /// Low selects the chip. Without this pin it is the only chip on its bus.
     pub select_pin: Option<PinName>,
-    /// How much faster its clock goes than it should.
+    /// How much faster its clock runs than it should.
     #[serde(default)]
     pub rate_off_percent: f64,
     /// Standard deviation of x and y at 100 samples a second, in LSB of 3.9 mg.
     #[serde(default)]
     pub noise_lsb: f64,
-    /// What it feels along x.
+    /// The motion that it feels along x.
     pub x: Option<RingConfig>,
-    /// What it feels along y.
+    /// The motion that it feels along y.
     pub y: Option<RingConfig>,
-    /// What it feels along z, beside gravity.
+    /// The motion that it feels along z, in addition to gravity.
     pub z: Option<RingConfig>,
 }
 
@@ -155,7 +155,7 @@ impl Part for Adxl345Config {
         if !layout.has_head() {
             return;
         }
-        // klippy shakes the head there.
+        // klippy shakes the head at this place.
         let [x_mm, y_mm] = layout.place_mm(0.5, 0.5);
         let z_mm = (layout.height_mm() / 2.0).min(20.0);
         cfg.section("resonance_tester");
@@ -171,48 +171,46 @@ struct Sampling {
     /// When the first period began.
     start: Clock,
     period_ticks: f64,
-    /// Samples that were taken.
+    /// Number of samples taken.
     taken: u64,
 }
 
 impl Sampling {
-    /// The instant of a sample.
     fn instant(&self, sample: u64) -> Clock {
         // A few years at most, far below 2^53 ticks.
         Clock::from_ticks(self.start.ticks() + (sample as f64 * self.period_ticks) as u64)
     }
 }
 
-/// Where a transfer is.
+/// The state of a transfer.
 #[derive(Clone, Copy, PartialEq)]
 enum Transfer {
-    /// The first byte is to come.
+    /// Waits for the first byte.
     Start,
     Read(u8),
     Write(u8),
 }
 
-/// The chip.
 struct Adxl345 {
     clock: Arc<dyn TimeSource>,
     rings: [Option<Ring>; 3],
     noise: Noise,
     noise_lsb: f64,
     rate_off: f64,
-    /// By address, those that hold what is written.
+    /// By address; only the registers that hold what is written.
     registers: [u8; 0x40],
     sampling: Option<Sampling>,
-    /// The speeds at the sample before.
+    /// The speeds at the previous sample.
     speeds: [f64; 3],
-    /// Samples that were not read, the oldest first, and the last one that was.
+    /// Unread samples, the oldest first; the next field is the last sample that was read.
     samples: VecDeque<[i16; 3]>,
     shown: [i16; 3],
     overrun: bool,
     transfer: Transfer,
     many: bool,
-    /// Whether a data register was read: the sample leaves as the read goes on beyond them or ends.
+    /// Whether a data register was read. The sample leaves when the read moves beyond the data registers or ends.
     data_read: bool,
-    /// FIFO_STATUS stands still for 5 us after that, which is longer than the rest of the transfer.
+    /// FIFO_STATUS. It does not change for 5 us after a data read, which is longer than the rest of the transfer.
     status: u8,
 }
 
@@ -248,7 +246,7 @@ impl Adxl345 {
         TOP_RATE_HZ / f64::from(1u32 << (15 - (self.get(BW_RATE) & 0x0f)))
     }
 
-    /// How many samples there is room for, and whether a newer one takes the oldest one's place.
+    /// Number of samples that fit, and whether a new sample replaces the oldest.
     fn room(&self) -> (usize, bool) {
         match self.get(FIFO_CTL) >> 6 {
             0 => (1, true),
@@ -257,7 +255,7 @@ impl Adxl345 {
         }
     }
 
-    /// Starts or ends to measure, as the registers say.
+    /// Starts or stops the measurement according to the registers.
     fn restart(&mut self) {
         let now = self.clock.now();
         let ticks = f64::from(CLOCK_FREQ);
@@ -278,7 +276,7 @@ impl Adxl345 {
         }
     }
 
-    /// Takes the samples that were due until now.
+    /// Takes the samples that have become due.
     fn catch_up(&mut self) {
         let now = self.clock.now();
         let Some(mut sampling) = self.sampling.take() else { return };
@@ -286,7 +284,7 @@ impl Adxl345 {
         let due = (elapsed / sampling.period_ticks) as u64;
         let (room, replaces) = self.room();
         if due - sampling.taken > 2 * room as u64 && replaces {
-            // Those that nobody will see.
+            // Skip the samples that nobody will see.
             sampling.taken = due - room as u64 - 1;
             self.overrun = true;
             self.feel(sampling.instant(sampling.taken));
@@ -301,7 +299,7 @@ impl Adxl345 {
             if self.samples.len() == room {
                 self.overrun = true;
                 if !replaces {
-                    // Nor is there room for the others, however many those are.
+                    // The later samples do not fit either.
                     sampling.taken = due;
                     self.feel(sampling.instant(due));
                     break;
@@ -313,7 +311,7 @@ impl Adxl345 {
         self.sampling = Some(sampling);
     }
 
-    /// What the registers would hold of so many g.
+    /// The register values for an acceleration in g.
     fn digitize(&mut self, [x, y, z]: [f64; 3]) -> [i16; 3] {
         let format = self.get(DATA_FORMAT);
         let range = format & RANGE;
@@ -440,7 +438,7 @@ mod tests {
     }
 
     impl Bench {
-        /// A chip without noise whose x rings.
+        /// A chip without noise. Its x axis rings.
         fn new(rate_off_percent: f64) -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(1_000_000_000));
             let axis = Arc::new(Axis::new(&DefaultPrinter::read().axes[0]));
@@ -481,7 +479,7 @@ mod tests {
             self.exchange([register, value]);
         }
 
-        /// The sample that is next, and FIFO_STATUS as read with it.
+        /// The next sample, and the FIFO_STATUS read with it.
         fn sample(&mut self) -> ([i16; 3], u8) {
             let [_, x0, x1, y0, y1, z0, z1, _, status] =
                 self.exchange([DATAX0 | READ | MULTIPLE_BYTES, 0, 0, 0, 0, 0, 0, 0, 0]);
@@ -514,10 +512,10 @@ mod tests {
             let kept = matches!(register, BW_RATE | POWER_CTL);
             assert_eq!(bench.read(register) == 0x55, kept, "{register:#04x}");
         }
-        // Several in one go: THRESH_TAP and the offsets.
+        // Several registers in one transfer: THRESH_TAP and the offsets.
         bench.exchange([THRESH_TAP | MULTIPLE_BYTES, 1, 2, 3, 4]);
         assert_eq!(bench.exchange([THRESH_TAP | READ | MULTIPLE_BYTES, 0, 0, 0, 0]), [0, 1, 2, 3, 4]);
-        // Without that bit the register is the same.
+        // Without that bit the register stays the same.
         assert_eq!(bench.exchange([OFSX | READ, 0, 0]), [0, 2, 2]);
     }
 
@@ -529,7 +527,7 @@ mod tests {
         let mut samples = 0u32;
         for ms in 0..10_000 {
             bench.wait(0.001);
-            // Between the beats, so that rounding decides nothing.
+            // Between two samples, so that rounding decides nothing.
             while bench.read(FIFO_STATUS) != 0 {
                 let (_, filled) = bench.sample();
                 assert!(filled <= 5, "{filled} after {ms} ms");
@@ -545,7 +543,7 @@ mod tests {
         for (fifo_ctl, first) in [(0x80 | 8, 200 - 33 + 1), (0x40 | 8, 1)] {
             let mut bench = Bench::new(0.0);
             bench.measure(fifo_ctl);
-            // From the first sample on each has its number in the offset's register, of four LSB.
+            // From the first sample on, the offset's register marks each sample with its number, four LSB each.
             bench.wait(TURN_ON_S + 0.5 / 3200.0);
             for n in 1..=200u8 {
                 bench.write(OFSX + 1, n);
@@ -563,10 +561,10 @@ mod tests {
                 assert_eq!(bench.read(INT_SOURCE) & OVERRUN, 0);
             }
             assert_eq!(bench.read(FIFO_STATUS), 0);
-            // What is read once more is the last one.
+            // A further read returns the last sample again.
             let last = bench.sample();
             assert_eq!(last, bench.sample());
-            // A read of a single data register takes a sample out, too.
+            // A read of a single data register also takes a sample out.
             bench.wait(3.0 / 3200.0);
             bench.read(DATAX0);
             assert_eq!(bench.read(FIFO_STATUS), 2);
@@ -578,7 +576,7 @@ mod tests {
     #[test]
     fn gravity_is_on_z_in_each_format() {
         for (format, z) in [
-            // Ten bits: 256 LSB for each g at 2 g, half as many at each doubling of the range.
+            // Ten bits: 256 LSB per g at 2 g, half of that at each doubling of the range.
             (0x00, 256),
             (0x01, 128),
             (0x02, 64),
@@ -607,7 +605,7 @@ mod tests {
         // Twenty steps at the pace of 4000 a second, a rest, and back.
         let steps: Vec<f64> = (0..40).map(|n| f64::from(n) / 4000.0 + if n < 20 { 0.01 } else { 0.1 }).collect();
         let delay_s = DELAY_TICKS as f64 / f64::from(CLOCK_FREQ);
-        // Euler's method in small steps; the mean acceleration of each period is that of the speeds.
+        // Euler's method in small steps. The mean acceleration of each period is the difference of the speeds.
         let (mut x, mut v, mut before, mut u) = (0.0, 0.0, 0.0, 0.0);
         let omega = TAU * X_HZ;
         let (dt, each) = (1.0 / 3200.0 / 400.0, 400);
@@ -648,7 +646,7 @@ mod tests {
             bench.wait(0.0002);
             bench.step();
         }
-        // Ten seconds, of which the axis' track has only the last; the motion goes on evenly.
+        // Ten seconds: the axis's track has only the last part of them. The motion continues evenly.
         let drag_lsb = 40;
         for _ in 0..33 {
             let ([x, _, z], _) = bench.sample();
@@ -657,7 +655,7 @@ mod tests {
         bench.write(POWER_CTL, 0);
         bench.wait(10.0);
         assert_eq!(bench.read(FIFO_STATUS), 0);
-        // Nor does a read take long after weeks.
+        // A read after weeks does not take long either.
         bench.measure(0x40);
         bench.wait(1e6);
         assert_eq!(bench.read(FIFO_STATUS), 32);

@@ -3,13 +3,13 @@
 //! AS5047D (ams, v1-10, "SPI Interface"), TLE5012B (Infineon, V2.1 and its user's manual, "SSC Data
 //! Transfer"), MT6816 (MagnTek, rev. 1.3, "SPI Interface"), MT6826S (MagnTek, rev. 1.1, "SPI Interface").
 //!
-//! The magnet turns with the axis' motor. It is not quite in the middle, which makes an error once in a
-//! turn, and stands at any angle to the motor.
+//! The magnet turns with the axis's motor. It is slightly off-center, which makes an error once per turn. Its angle to
+//! the motor is arbitrary.
 //!
-//! Simulated: the frames with their parities and check sums, the registers of the angle and of what a
-//! host sets up, errors of frames where the chip has them, the TLE5012B's own clock and what it latches,
-//! the MT6826S' calibration as far as it tells of it. Not simulated: noise, the sensors' own delays and
-//! filters, faults of the magnet, other outputs than SPI.
+//! Simulated: the frames with their parities and checksums, the registers of the angle and of the host's configuration,
+//! frame errors where the chip has them, the TLE5012B's own clock and its latched values, the visible part of the
+//! MT6826S's calibration. Not simulated: noise, the sensors' own delays and filters, faults of the magnet, outputs
+//! other than SPI.
 
 #![forbid(unsafe_code)]
 
@@ -36,19 +36,19 @@ use crate::description::printer::Printer;
 use crate::klippy::layout::{FULL_STEPS, Layout};
 use crate::klippy::sections::Sections;
 
-/// Which of the sensors it is.
+/// The sensor's type.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum AngleChip {
-    /// Allegro's, with 15 bits.
+    /// Allegro, with 15 bits.
     A1333,
-    /// Of ams, with 14 bits.
+    /// ams, with 14 bits.
     As5047d,
-    /// Infineon's, with 15 bits and a clock of its own.
+    /// Infineon, with 15 bits and its own clock.
     Tle5012b,
-    /// MagnTek's, with 14 bits.
+    /// MagnTek, with 14 bits.
     Mt6816,
-    /// MagnTek's, with 15 bits and a calibration of its own.
+    /// MagnTek, with 15 bits and its own calibration.
     Mt6826s,
 }
 
@@ -68,18 +68,18 @@ impl AngleChip {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AngleConfig {
-    /// Which one it is.
+    /// The sensor's type.
     pub chip: AngleChip,
     /// Its SPI bus.
     pub bus: String,
-    /// Low selects it. klippy wants one for these sensors.
+    /// Low selects the chip. klippy requires this pin for these sensors.
     pub select_pin: PinName,
-    /// The axis on whose motor it sits.
+    /// The axis with the motor that the sensor is on.
     pub axis: String,
     /// The angle that it measures at 0 mm.
     #[serde(default)]
     pub offset_degrees: f64,
-    /// By how much the angle is wrong at most, as the magnet is not in the middle.
+    /// Highest error of the angle, because the magnet is off-center.
     #[serde(default)]
     pub eccentricity_degrees: f64,
 }
@@ -139,7 +139,7 @@ mod tests {
     use pinion_firmware::time::{Clock, Ticks, VirtualClock};
     use std::sync::Arc;
 
-    /// A shaft at this many 3200th of a turn: 60 mm are one turn and a half.
+    /// A shaft at this many 3200ths of a turn. 60 mm are one and a half turns.
     fn shaft(steps: i64) -> Shaft {
         let mut config = DefaultPrinter::read();
         config.axes[0].start_mm = 60.0 + steps as f64 / 80.0;
@@ -157,7 +157,7 @@ mod tests {
     #[test]
     fn a_magnet_that_is_not_in_the_middle_errs_once_in_a_turn() {
         let shaft = |steps| Shaft { offset: 0.25, eccentricity: 0.01, ..shaft(steps) };
-        // 1.5 turns and the offset are 0.75 of a turn, where the sine is -1.
+        // 1.5 turns plus the offset are 0.75 of a turn, where the sine is -1.
         assert_eq!(shaft(0).angle(14), (0.74f64 * 16384.0) as u16);
         assert_eq!(shaft(-800).angle(14), 8192, "and 0 at half a turn");
         assert_eq!(shaft(-1600).angle(14), (0.26f64 * 16384.0) as u16);
@@ -181,10 +181,10 @@ mod tests {
             u16::from_be_bytes(answer.try_into().unwrap())
         };
         ask(0xffff);
-        // Half a turn and 10.24 of 16384: three ones and the parity.
+        // Half a turn and 10.24 of 16384, with three ones and the parity.
         assert_eq!(ask(0x7ffe), 0xa00a);
         assert_eq!(ask(0x7fff), 0xa00a, "the one of the frame before");
-        // That had a wrong parity.
+        // That frame had a wrong parity.
         assert_eq!(ask(0x4001), 0x4000 | 0x8000);
         assert_eq!(ask(0xc000), 0x4004, "which was told, and is cleared");
         assert_eq!(ask(0xc000), 0x0000);
@@ -208,13 +208,13 @@ mod tests {
         let clock = VirtualClock::at(Clock::EPOCH);
         let mut chip = Tle5012b::new(shaft(1), Arc::new(clock.clone()));
         let crc = |bytes: &[u8]| !crc8(0x1d, 0xff, bytes);
-        // STAT tells of the reset, once.
+        // STAT reports the reset once.
         let answer = transfer(&mut chip, &[0x80, 0x01, 0, 0, 0, 0]);
         assert_eq!(answer[..4], [0x80, 0x01, 0x80, 0x01]);
         let answer = transfer(&mut chip, &[0x80, 0x01, 0, 0, 0, 0]);
         assert_eq!(answer[2..5], [0x80, 0x00, 0xfe]);
         assert_eq!(answer[5], crc(&answer[..4]));
-        // MOD1 is written with the lock code only, and what comes back is what was said.
+        // MOD1 can only be written with the lock code. The answer repeats the sent words.
         transfer(&mut chip, &[0x00, 0x61, 0x80, 0x00, 0, 0]);
         assert_eq!(transfer(&mut chip, &[0xd0, 0x61, 0, 0, 0, 0])[2..4], [0x40, 0x01]);
         let answer = transfer(&mut chip, &[0x50, 0x61, 0x40, 0x00, 0, 0]);

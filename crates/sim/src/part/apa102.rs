@@ -2,10 +2,9 @@
 //! A strip of APA102 lights ("dotstars") on two lines, clock and data, after their data sheet (Shiji
 //! APA102: "Series data structure").
 //!
-//! The strip takes a bit at each rising edge of the clock. A start frame is 32 zeros; a light's frame
-//! is three ones, 5 bits of brightness, and blue, green, red of 8 bits each. Not simulated: that each
-//! light passes data on half a clock later, for which a host sends ones at the end; here the last light
-//! has its colour with its last bit.
+//! The strip takes a bit at each rising edge of the clock. A start frame is 32 zeros. A light's frame is three ones, 5
+//! bits of brightness, and blue, green, red with 8 bits each. Not simulated: each light passes data on half a clock
+//! later, so a host sends ones at the end. Here the last light gets its color with its last bit.
 
 #![forbid(unsafe_code)]
 
@@ -25,9 +24,9 @@ use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
-/// The bits of a frame.
+/// Bits of a frame.
 const FRAME: u32 = 32;
-/// What a light's frame begins with.
+/// The first bits of a light's frame.
 const MARK: u32 = 0xe000_0000;
 /// Full brightness.
 const BRIGHTEST: u32 = 31;
@@ -36,7 +35,7 @@ const BRIGHTEST: u32 = 31;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Apa102Config {
-    /// Such as `dots`.
+    /// For example `dots`.
     pub name: String,
     /// The data line.
     pub data_pin: PinName,
@@ -79,15 +78,15 @@ impl Part for Apa102Config {
     }
 }
 
-/// The lights and their shift register. One thread drives the lines; any may look.
+/// The lights and their shift register. One thread drives the lines. Any thread may read.
 struct Strip {
     name: String,
     data: AtomicBool,
     clocked: AtomicBool,
-    /// The last 32 bits, and how many of them belong to a light's frame.
+    /// The last 32 bits; the next field counts the bits that belong to a light's frame.
     shift: AtomicU32,
     bits: AtomicU32,
-    /// The light whose frame is next; none before the first start frame.
+    /// The light of the next frame; no light before the first start frame.
     next: AtomicU32,
     /// Each light's last frame.
     lights: Vec<AtomicU32>,
@@ -115,7 +114,7 @@ impl Strip {
         let (next, bits) = match shift {
             // A start frame, however long.
             0 => (0, 0),
-            // A light's frame begins with a one: what is before is the start frame's, too.
+            // A light's frame begins with a one. The zeros before it still belong to the start frame.
             _ if bits == 1 && shift & 1 == 0 => (load(&self.next), 0),
             _ if bits == FRAME => {
                 let next = load(&self.next);
@@ -145,7 +144,7 @@ impl Sight for Strip {
     }
 }
 
-/// The data line. klippy names it as its input, too, on which nobody answers.
+/// The data line. klippy also names it as its input, where nothing answers.
 struct DataPin(Arc<Strip>);
 
 impl Wire for DataPin {
@@ -208,7 +207,7 @@ mod tests {
         let look = || strip.look(Clock::from_ticks(0));
         send(&strip, &[0xff03_0201, 0, 0xff03_0201, 0xff00_0000, 0xf0ff_00ff, 0xff44_4444, u32::MAX]);
         assert_eq!(look(), "#010203 off #830083", "the last one at 16 of 31, and a fourth that is not there");
-        // Black at the least brightness is no start frame, and a frame without its mark is none.
+        // Black at the lowest brightness is not a start frame. A frame without its mark is not a light's frame.
         send(&strip, &[0, 0xe000_0000, 0x9fff_ffff, 0xffff_ffff, u32::MAX]);
         assert_eq!(look(), "off off #ffffff");
     }

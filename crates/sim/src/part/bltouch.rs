@@ -1,16 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The probe BLTouch Smart V3 (ANTCLABS, "BLTouch Smart V3.1" manual): a push-pin that goes down when it
-//! is told to, and goes up by itself as it touches the bed.
+//! The probe BLTouch Smart V3 (ANTCLABS, "BLTouch Smart V3.1" manual). On command it lowers a push-pin. The pin
+//! retracts by itself when it touches the bed.
 //!
-//! A servo's pulses on the control line give the commands, by their widths; the same pulse again is the
-//! same command. The sensor line gives a pulse of 10 ms at a touch. In touch mode it follows the pin
-//! instead: high while that is up. A pin that can not get where it was told to ends in the alarm, in
-//! which the line is high until a command releases it.
+//! Servo pulses on the control line give the commands by their widths. Repeated pulses of one width are one command.
+//! The sensor line gives a pulse of 10 ms at a touch. In touch mode it follows the pin instead: it is high while the
+//! pin is up. A pin that cannot reach its target raises the alarm. In the alarm the line is high until a command
+//! releases it.
 //!
-//! Simulated: pin down, touch mode, pin up, self-test, reset, the pin's time to move, the touch, the
-//! alarm. Not simulated: the modes of the output's voltage, the heat of a pin that is held for long,
-//! the lights. A touch is noticed when somebody looks at the sensor line, as a host does at each step
-//! of a probing move.
+//! Simulated: pin down, touch mode, pin up, self-test, reset, the pin's time to move, the touch, the alarm. Not
+//! simulated: the modes of the output's voltage, the heat of a pin that is held for long, the lights. A touch is
+//! noticed only when the sensor line is read, as a host does at each step of a probing move.
 
 #![forbid(unsafe_code)]
 
@@ -33,25 +32,26 @@ use pinion_firmware::time::Clock;
 
 /// How long the sensor line is high after a touch.
 const TOUCH_PULSE_S: f64 = 0.010;
-/// How far a pulse may be from a command's width: less than half of what lies between the closest two.
+/// How far a pulse may be from a command's width: less than half of the distance between the two closest widths.
 const WIDTH_TOLERANCE_US: f64 = 45.0;
-/// The pulses of a servo come every 20 ms. After a longer pause the same pulse is a new command.
+/// Longest time between two pulses of one command. A servo's pulses come every 20 ms. The same pulse after a longer
+/// pause is a new command.
 const TRAIN_S: f64 = 0.050;
-/// The self-test: the pin goes down and up so many times.
+/// How many times the pin goes down and up in the self-test.
 const SELF_TEST_ROUNDS: f64 = 10.0;
 
 /// The probe's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct BltouchConfig {
-    /// Takes the servo's pulses.
+    /// The input for the servo's pulses.
     pub control_pin: PinName,
-    /// Tells of a touch.
+    /// Reports a touch.
     pub sensor_pin: PinName,
-    /// How far it stands from the nozzle along the x axis.
+    /// How far the probe is from the nozzle along the x axis.
     #[serde(default)]
     pub x_offset_mm: f64,
-    /// How far it stands from the nozzle along the y axis.
+    /// How far the probe is from the nozzle along the y axis.
     #[serde(default)]
     pub y_offset_mm: f64,
     /// How far below the nozzle the pin touches the bed.
@@ -59,7 +59,7 @@ pub struct BltouchConfig {
     /// How long the pin takes to go down or up.
     #[serde(default = "default_move_s")]
     pub move_s: f64,
-    /// Where the pin is stuck, if it is.
+    /// Where the pin is stuck, if it is stuck.
     pub jams: Option<Jam>,
 }
 
@@ -67,13 +67,13 @@ fn default_move_s() -> f64 {
     0.3
 }
 
-/// Where a pin is stuck.
+/// The place where a pin is stuck.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Jam {
-    /// It does not go down.
+    /// The pin does not go down.
     Up,
-    /// It does not go up.
+    /// The pin does not go up.
     Down,
 }
 
@@ -117,9 +117,9 @@ enum Command {
     TouchMode,
     PinUp,
     SelfTest,
-    /// Voltage of the output and the memory for it: nothing is to be seen of them here.
+    /// The voltage of the output and its memory. They have no visible effect here.
     OutputMode,
-    /// Releases the alarm, and takes the pin up.
+    /// Releases the alarm, and raises the pin.
     Reset,
 }
 
@@ -135,7 +135,7 @@ const COMMANDS: [(f64, Command); 8] = [
     (2190.0, Command::Reset),
 ];
 
-/// Where the pin is going, or is.
+/// The pin's target.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Way {
     Up,
@@ -143,11 +143,11 @@ enum Way {
     SelfTest,
 }
 
-/// All that the probe remembers.
+/// The probe's whole state.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct State {
     way: Way,
-    /// When the pin set out.
+    /// When the pin started to move.
     since: Clock,
     touch_mode: bool,
     alarm: bool,
@@ -155,7 +155,7 @@ struct State {
     touched: Option<Clock>,
     /// When the control line's pulse began.
     rise: Clock,
-    /// The place of the last command in [`COMMANDS`], and when it was last given.
+    /// The last command's index in [`COMMANDS`]; the next field is when it was last given.
     command: Option<usize>,
     commanded: Clock,
 }
@@ -189,10 +189,9 @@ impl State {
     }
 }
 
-/// The probe.
 struct Bltouch {
     bed: Bed,
-    /// Where the pin touches while it is down, from the nozzle.
+    /// The point where the lowered pin touches, relative to the nozzle.
     tip: [f64; 3],
     move_s: f64,
     jams: Option<Jam>,
@@ -225,7 +224,7 @@ impl Bltouch {
         self.bed.clearance_mm(self.tip) <= 0.0
     }
 
-    /// How things stand by now.
+    /// The state at this time.
     fn at(&self, now: Clock) -> State {
         let mut state = State::of(self.state.load());
         let elapsed_s = seconds(state.since, now);
@@ -299,7 +298,7 @@ impl Bltouch {
             _ => {}
         }
         state.touch_mode = false;
-        // While it is in the alarm, the pin does not go.
+        // The pin does not move during the alarm.
         if state.alarm {
             return;
         }
@@ -312,7 +311,7 @@ impl Bltouch {
             state.way = way;
             state.since = at;
         }
-        // A pin that is against the bed finds no room to go down.
+        // A pin against the bed has no room to go down.
         state.alarm = way == Way::Down && self.is_against_the_bed();
         if state.alarm {
             state.way = Way::Up;
@@ -332,7 +331,7 @@ impl Sight for Bltouch {
     }
 }
 
-/// The line that takes the servo's pulses.
+/// The control line, which takes the servo's pulses.
 struct ControlPin(Arc<Bltouch>);
 
 impl Wire for ControlPin {
@@ -349,7 +348,7 @@ impl Wire for ControlPin {
     }
 }
 
-/// The line that tells of a touch.
+/// The sensor line, which reports a touch.
 struct SensorPin(Arc<Bltouch>);
 
 impl Wire for SensorPin {
@@ -409,7 +408,7 @@ mod tests {
             self
         }
 
-        /// Ten pulses of a servo, a second in all.
+        /// Ten pulses of a servo, in one second.
         fn send(&mut self, width_us: f64) {
             let control = ControlPin(self.probe.clone());
             for _ in 0..10 {
@@ -453,7 +452,7 @@ mod tests {
         assert!(!bench.sensor(), "a pulse");
         bench.wait(0.3);
         assert_eq!((bench.sensor(), bench.seen().as_str()), (false, "pin up"));
-        // No touch without the pin.
+        // Without the pin there is no touch.
         bench.move_z(-1.0);
         assert!(!bench.sensor());
     }
@@ -467,7 +466,7 @@ mod tests {
             bench.send(width_us);
             assert_eq!(bench.seen(), seen, "{width_us}");
         }
-        // Modes of the output's voltage move nothing.
+        // The modes of the output's voltage move nothing.
         bench.send(650.0);
         for width_us in [1884.0, 1988.0, 2091.0] {
             bench.send(width_us);
@@ -541,7 +540,7 @@ mod tests {
             was_up = is_up;
             bench.wait(0.01);
         }
-        // The first time is over when the command is.
+        // The first time is over when the command ends.
         assert_eq!(went_down, 9);
         assert_eq!((bench.sensor(), was_up), (false, true));
     }

@@ -23,11 +23,11 @@ use pinion_firmware::time::TimeSource;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ds18b20Config {
-    /// As klippy calls it.
+    /// Its name in klippy.
     pub name: String,
-    /// As the kernel calls it, such as `28-0123456789ab`.
+    /// Its name in the kernel, for example `28-0123456789ab`.
     pub serial: String,
-    /// The heater that it is at.
+    /// The heater that it measures.
     pub heater: String,
     /// How long a reading takes.
     #[serde(default = "default_conversion_ms")]
@@ -71,7 +71,6 @@ impl Part for Ds18b20Config {
     }
 }
 
-/// The thermometer.
 #[derive(Clone)]
 struct Ds18b20 {
     heater: Arc<Heater>,

@@ -2,14 +2,13 @@
 //! The load cell ADCs HX711 and HX717 (Avia Semiconductor's data sheets, "Serial Interface" and "Reset and
 //! Power-Down Sequence").
 //!
-//! The data line goes low when a conversion is ready. 24 pulses of the clock shift its bits out, the
-//! highest first; one to four more take the data line high and choose channel and gain of what follows. A
-//! clock that is high for over 60 us switches the chip off; as it falls, the chip begins anew, with
-//! channel A and its highest gain, and is ready when it has settled for four conversions.
+//! The data line goes low when a conversion is ready. 24 pulses of the clock shift out its bits, the highest first. One
+//! to four more pulses set the data line high and choose channel and gain of the next conversion. If the clock is high
+//! for more than 60 us, the chip powers down. When the clock falls, the chip starts again with channel A and its
+//! highest gain. It is ready after it has settled for four conversions.
 //!
-//! Simulated: all of that, by the clock. What is shifted out is what the cell bears at the first pulse,
-//! not at the end of the conversion just before. Channel B is connected to nothing and reads noise. The
-//! settling after a change of the gain is left out.
+//! Simulated: all of this, by the clock. The chip shifts out the cell's load at the first pulse, not at the end of the
+//! conversion before. Channel B is not connected and reads noise. The settling after a change of the gain is omitted.
 
 #![forbid(unsafe_code)]
 
@@ -29,10 +28,10 @@ use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::Clock;
 
-/// So long the clock may be high before the chip switches itself off.
+/// Longest high pulse of the clock before the chip powers down.
 const POWER_DOWN_S: f64 = 60e-6;
 const SAMPLE_BITS: u64 = 24;
-/// The conversions that it takes to settle after a start.
+/// Number of conversions that the chip needs to settle after a start.
 const SETTLING: u64 = 4;
 
 /// The chip's description.
@@ -51,7 +50,7 @@ pub struct Hx71xConfig {
     pub cell: CellConfig,
 }
 
-/// The chips of this kind.
+/// The two chips.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum Hx71xChip {
@@ -76,8 +75,7 @@ impl Hx71xChip {
         }
     }
 
-    /// What so many pulses beyond the sample's choose: the gain as a share of the highest one; 0 for
-    /// channel B.
+    /// The gain that this number of extra pulses chooses, relative to the highest gain; 0 for channel B.
     fn gain(self, pulses: u64) -> f64 {
         match (self, pulses) {
             (_, 3) => 0.5,
@@ -131,19 +129,19 @@ impl Part for Hx71xConfig {
     }
 }
 
-/// What the clock line has done to the chip. Only the thread that drives it changes this.
+/// The state that the clock line has set. Only the thread that drives the line changes it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 struct State {
     /// Whether the clock is high, and since when.
     high: bool,
     rise: Clock,
-    /// The chip converts since then.
+    /// When the chip started to convert.
     start: Clock,
-    /// Conversions that were read or passed over.
+    /// Number of conversions that were read or skipped.
     taken: u64,
-    /// Pulses since the last sample was begun; 0 after a start.
+    /// Pulses since the start of the last sample; 0 after a power-up.
     pulses: u64,
-    /// The pulses that chose the gain of the sample: 1 to 4.
+    /// The number of extra pulses that chose the gain of the sample: 1 to 4.
     gain: u64,
     sample: u32,
 }
@@ -167,7 +165,6 @@ impl State {
     }
 }
 
-/// The chip.
 struct Hx71x {
     chip: Hx71xChip,
     samples_per_s: f64,
@@ -182,7 +179,7 @@ impl Hx71x {
         Hx71x { chip, samples_per_s: samples_per_s.into(), cell, state: Together::new(state.words()) }
     }
 
-    /// The conversions since the start that are over and were not taken.
+    /// Number of finished conversions since the start that were not taken.
     fn waiting(&self, state: &State, at: Clock) -> u64 {
         let conversions = (seconds(state.start, at) * self.samples_per_s) as u64;
         conversions.saturating_sub(SETTLING - 1).saturating_sub(state.taken)
@@ -192,7 +189,7 @@ impl Hx71x {
         state.high && seconds(state.rise, at) > POWER_DOWN_S
     }
 
-    /// The clock line has a level.
+    /// The clock line gets a level.
     fn clock(&self, high: bool, at: Clock) {
         let mut state = State::of(self.state.load());
         if high == state.high {
@@ -220,10 +217,10 @@ impl Hx71x {
             let gain = self.chip.gain(state.gain);
             state.sample = self.cell.counts(gain, state.start.ticks().wrapping_add(state.taken)) as u32;
         } else if state.pulses == 0 {
-            // There is nothing to shift out.
+            // No conversion is ready to shift out.
             return;
         }
-        // Beyond the last that has a meaning they only keep the line high.
+        // Further pulses only keep the line high.
         state.pulses = (state.pulses + 1).min(SAMPLE_BITS + 4);
     }
 
@@ -311,7 +308,7 @@ mod tests {
             !self.chip.data(self.now)
         }
 
-        /// The bits that come with so many pulses, the last one lowest.
+        /// The bits that these pulses shift out, the last one lowest.
         fn shift(&mut self, pulses: u32) -> u32 {
             (0..pulses).fold(0, |bits, _| {
                 self.chip.clock(true, self.now);
@@ -323,7 +320,7 @@ mod tests {
             })
         }
 
-        /// The next sample, read with 24 and so many further pulses.
+        /// The next sample, read with 24 pulses and `further` more.
         fn sample(&mut self, further: u32) -> i32 {
             while !self.is_ready() {
                 self.wait(1e-4);
@@ -348,7 +345,7 @@ mod tests {
         assert!(!bench.is_ready());
         bench.wait(0.0005);
         assert!(bench.is_ready());
-        // One that nobody reads gives way to the next.
+        // The next sample replaces an unread one.
         bench.wait(0.1);
         bench.sample(1);
         assert!(!bench.is_ready());
@@ -394,7 +391,7 @@ mod tests {
         bench.wait(0.0002);
         assert!(bench.is_ready());
         assert_eq!(bench.sample(1), -5000, "the highest gain again");
-        // Amid a sample.
+        // In the middle of a sample.
         while !bench.is_ready() {
             bench.wait(1e-4);
         }

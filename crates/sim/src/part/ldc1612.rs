@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The inductance converter LDC1612 on I2C with a coil beside the nozzle (Texas Instruments SNOSCY9,
-//! "Register Maps", "Functional Description"): the closer the metal of the bed, the less inductance the
-//! coil has, and the higher is the frequency at which it swings.
+//! The inductance converter LDC1612 on I2C with a coil beside the nozzle (Texas Instruments SNOSCY9, "Register Maps",
+//! "Functional Description"). Closer metal of the bed gives the coil less inductance, and a higher frequency of
+//! oscillation.
 //!
-//! A conversion takes 16 RCOUNT0 + 4 clocks, the first one after a start 16 SETTLECOUNT0 more. It gives
-//! `f / FIN_DIVIDER0 / fREF * 2^28`, less the offset. Reading STATUS clears its flags and takes INTB high;
-//! reading the data of channel 0 clears UNREADCONV0.
+//! A conversion takes 16 RCOUNT0 + 4 clocks. The first one after a start takes 16 SETTLECOUNT0 more. The result is
+//! `f / FIN_DIVIDER0 / fREF * 2^28`, minus the offset. Reading STATUS clears its flags and sets INTB high. Reading the
+//! data of channel 0 clears UNREADCONV0.
 //!
-//! Simulated: these registers, channel 0 by the clock, sleep, reset, the errors (frequency too high,
-//! amplitude, no swing), the drive current that the chip finds by itself, INTB. The swing has an amplitude
-//! in proportion to the drive current. A conversion tells the frequency as it is read, not as it was in
-//! the conversion just before. Not simulated: channel 1 and the sequence of channels, the filter of the
-//! input (its register keeps what is written), the time that the search for the drive current takes.
+//! Simulated: these registers, channel 0 by the clock, sleep, reset, the errors (frequency too high, amplitude, no
+//! oscillation), the drive current that the chip finds by itself, INTB. The amplitude is proportional to the drive
+//! current. A conversion gives the frequency at the time of the read, not during the conversion before. Not simulated:
+//! channel 1 and the sequence of channels, the filter of the input (its register keeps what is written), the time of
+//! the search for the drive current.
 
 #![forbid(unsafe_code)]
 
@@ -31,11 +31,11 @@ use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
-/// What is connected to CLKIN, as klippy takes for granted.
+/// The clock at CLKIN, as klippy assumes.
 const EXTERNAL_CLOCK_HZ: f64 = 12e6;
 const INTERNAL_CLOCK_HZ: f64 = 43.3e6;
 
-/// The highest of IDRIVE0, which has five bits.
+/// Highest value of IDRIVE0, which has five bits.
 const MAX_CURRENT: u16 = 31;
 
 const DATA0_MSB: u8 = 0x00;
@@ -66,13 +66,13 @@ const STATUS_UNREADCONV0: u16 = 1 << 3;
 const ERR_OR: u32 = 1 << 30;
 const ERR_WD: u32 = 1 << 29;
 const ERR_AE: u32 = 1 << 28;
-/// The bits of ERROR_CONFIG that let these into DATA0.
+/// The bits of ERROR_CONFIG that let these flags into DATA0.
 const OR_ERR2OUT: u16 = 1 << 14;
 const WD_ERR2OUT: u16 = 1 << 13;
 const AH_ERR2OUT: u16 = 1 << 12;
 const AL_ERR2OUT: u16 = 1 << 11;
 
-/// The registers with the bits that can be written, and their values at power-up.
+/// The registers with their writable bits and their values at power-up.
 const REGISTERS: &[(u8, u16, u16)] = &[
     (RCOUNT0, 0xffff, 0x0080),
     (0x09, 0xffff, 0x0080), // RCOUNT1
@@ -101,7 +101,7 @@ pub struct Ldc1612Config {
     /// Its address: 42 or 43, by its ADDR pin.
     #[serde(default = "default_address")]
     pub address: u8,
-    /// Low while a conversion waits to be read.
+    /// Low while an unread conversion waits.
     pub intb_pin: Option<PinName>,
     /// How far the coil stands from the nozzle along the x axis.
     #[serde(default)]
@@ -113,16 +113,16 @@ pub struct Ldc1612Config {
     pub coil_mm: f64,
     /// The frequency far from any metal.
     pub far_hz: f64,
-    /// By how much more it swings right at the metal.
+    /// How much higher the frequency is right at the metal.
     pub near_hz: f64,
-    /// The distance over which that fades to a share of 1/e.
+    /// The distance over which the increase falls to 1/e.
     pub fade_mm: f64,
     /// Standard deviation of a conversion.
     #[serde(default)]
     pub noise_hz: f64,
     /// The drive current (0 to 31) that suits the coil.
     pub drive_current: u16,
-    /// How much of the way that a nozzle goes on after it has touched the bed the bed gives way.
+    /// How far the bed gives way, as a share of the nozzle's further travel after contact.
     #[serde(default = "default_yielding")]
     pub yielding: f64,
 }
@@ -203,10 +203,10 @@ struct Coil {
 }
 
 impl Coil {
-    /// The frequency that it swings at, with a noise of its own.
+    /// The frequency of oscillation, with noise.
     fn hz(&mut self) -> f64 {
         let Ldc1612Config { x_offset_mm, y_offset_mm, coil_mm, far_hz, near_hz, fade_mm, .. } = self.config;
-        // The nozzle pushes the bed before it.
+        // The nozzle pushes the bed in front of it.
         let depth_mm = (-self.bed.clearance_mm([0.0; 3])).max(0.0);
         let distance_mm = self.bed.clearance_mm([x_offset_mm, y_offset_mm, coil_mm]) + self.config.yielding * depth_mm;
         let near_hz = near_hz * (-distance_mm.max(0.0) / fade_mm).exp();
@@ -214,21 +214,20 @@ impl Coil {
     }
 }
 
-/// The chip.
 struct Ldc1612 {
     coil: Coil,
     clock: Arc<dyn TimeSource>,
     intb: Arc<ReadyLine>,
     conversions: Conversions,
-    /// Conversions whose data was read.
+    /// Number of conversions whose data was read.
     read: u64,
     /// By address.
     registers: [u16; 128],
     /// DATA0_LSB belongs to the last DATA0_MSB that was read.
     lsb: u16,
-    /// The register that is spoken of.
+    /// The addressed register.
     pointer: u8,
-    /// What was written of it, or is to be read, and how many bytes of it are over.
+    /// The bytes written to it or to read from it; the next field counts the finished bytes.
     word: u16,
     bytes: usize,
 }
@@ -269,7 +268,7 @@ impl Ldc1612 {
         if external { EXTERNAL_CLOCK_HZ / f64::from(divider) } else { INTERNAL_CLOCK_HZ / f64::from(divider) }
     }
 
-    /// Conversions begin anew, or end.
+    /// Conversions start again, or stop.
     fn begin(&mut self) {
         let ticks = |clocks: f64| clocks / self.reference_hz() * f64::from(CLOCK_FREQ);
         let conversion = ticks(16.0 * f64::from(self.get(RCOUNT0)) + 4.0);
@@ -285,20 +284,20 @@ impl Ldc1612 {
         self.read = 0;
         self.intb.tell(self.conversions);
         if !asleep && self.get(CONFIG) & AUTO_AMP_DIS == 0 {
-            // INIT_IDRIVE: what the chip found.
+            // INIT_IDRIVE: the current that the chip found.
             let found = self.coil.config.drive_current << 6;
             let current = &mut self.registers[usize::from(DRIVE_CURRENT0)];
             *current = *current & 0xf800 | found;
         }
     }
 
-    /// DATA0 of a conversion that is over by now.
+    /// DATA0 of a finished conversion.
     fn convert(&mut self) -> u32 {
         let errors = self.get(ERROR_CONFIG);
         let suits = self.coil.config.drive_current;
         let current = if self.get(CONFIG) & RP_OVERRIDE_EN != 0 { self.get(DRIVE_CURRENT0) >> 11 } else { suits };
         let let_out = |flag: u32, bits: u16| if errors & bits != 0 { flag } else { 0 };
-        // Without a current it does not swing. The coil is content with half and with twice of what suits it.
+        // Without a current the coil does not oscillate. Half to twice the suitable current is enough for it.
         if current == 0 {
             return let_out(ERR_WD, WD_ERR2OUT);
         }
@@ -311,7 +310,7 @@ impl Ldc1612 {
         }
         let divider = (self.get(CLOCK_DIVIDERS0) >> 12).max(1);
         let share = self.coil.hz() / f64::from(divider) / self.reference_hz();
-        // The input is to be below a quarter of the reference.
+        // The input must be below a quarter of the reference.
         if share >= 0.25 {
             flags |= let_out(ERR_OR, OR_ERR2OUT);
         }
@@ -320,7 +319,7 @@ impl Ldc1612 {
         flags | data as u32
     }
 
-    /// What a host reads.
+    /// The value that a host reads.
     fn fetch(&mut self, address: u8) -> u16 {
         let over = self.conversions.over(self.clock.now());
         match address {
@@ -429,7 +428,7 @@ mod tests {
             Bench { z, clock, intb, chip }
         }
 
-        /// The set-up for 400 conversions a second, at half the coil's frequency.
+        /// The configuration for 400 conversions a second, at half the coil's frequency.
         fn set_up() -> Bench {
             let mut bench = Bench::new();
             for (address, value) in [
@@ -545,7 +544,7 @@ mod tests {
         bench.move_z(-0.1);
         let pressed = bench.hz();
         assert!((pressed - expected(1.99)).abs() < 0.1, "{pressed}");
-        // DATA0_LSB stays that of the DATA0_MSB before it.
+        // DATA0_LSB still belongs to the DATA0_MSB before it.
         let high = bench.read(DATA0_MSB);
         bench.move_z(5.0);
         let data = u32::from(high) << 16 | u32::from(bench.read(DATA0_LSB));

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A load cell under the hot end: the nozzle that presses into the bed bends it, and so does a weight that
-//! hangs on it. The chips that measure it are parts of their own.
+//! A load cell under the hot end. It bends when the nozzle presses into the bed, or when a weight hangs on it. The
+//! chips that measure it are separate parts.
 
 #![forbid(unsafe_code)]
 
@@ -16,11 +16,11 @@ use crate::klippy::sections::Sections;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct CellConfig {
-    /// The force for each millimetre that the nozzle is below the bed's surface.
+    /// The force for each millimeter that the nozzle is below the bed's surface.
     pub stiffness_g_per_mm: f64,
-    /// What the chip counts for each gram.
+    /// The chip's counts per gram.
     pub counts_per_gram: f64,
-    /// What the chip counts without any force.
+    /// The chip's counts without any force.
     #[serde(default)]
     pub zero_counts: f64,
     /// A weight that hangs on it.
@@ -54,7 +54,6 @@ impl CellConfig {
     }
 }
 
-/// The cell.
 pub(crate) struct Cell {
     config: CellConfig,
     bed: Bed,
@@ -72,18 +71,18 @@ impl Cell {
         Cell { config, bed, noise: Noise::of("cell", 0) }
     }
 
-    /// What it bears at this moment.
+    /// The present load.
     fn grams(&self) -> f64 {
         let depth_mm = (-self.bed.clearance_mm([0.0; 3])).max(0.0);
         self.config.weight_g + self.config.stiffness_g_per_mm * depth_mm
     }
 
-    /// The reading of this number, of a chip of 24 bits whose gain is this share of the description's.
+    /// The reading with this number from a 24-bit chip. `gain` is relative to the gain in the description.
     pub(crate) fn counts(&self, gain: f64, reading: u64) -> i32 {
         const MAX: f64 = 0x7f_ffff as f64;
         let noise = self.noise.nth(reading) * self.config.noise_counts;
         let signal = self.config.zero_counts + self.config.counts_per_gram * self.grams();
-        // A chip that is driven beyond its range stays at its end.
+        // A chip beyond its range stays at the limit.
         (signal * gain + noise).round().clamp(-MAX - 1.0, MAX) as i32
     }
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A wire from the bus's output (MOSI) to its input (MISO): every byte comes back. klippy has no
-//! section for a wire; a test's own commands talk to it.
+//! A wire from the bus's output (MOSI) to its input (MISO): every byte comes back. klippy has no section for a wire.
+//! Tests use their own commands for it.
 
 #![forbid(unsafe_code)]
 
@@ -17,7 +17,7 @@ use crate::engine::spi::SpiChip;
 pub struct LoopbackConfig {
     /// Its SPI bus.
     pub bus: String,
-    /// Low selects it; without it, it is the only chip on its bus.
+    /// Low selects the chip. Without this pin it is the only chip on its bus.
     pub select_pin: Option<PinName>,
 }
 
@@ -36,7 +36,6 @@ impl Part for LoopbackConfig {
     }
 }
 
-/// The wire.
 struct Loopback;
 
 impl SpiChip for Loopback {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The parts: each is a file of its own with its description, its wires, its behaviour and its sections of
-//! printer.cfg. A part knows the engine and the words of descriptions; it knows no other part.
+//! The parts. Each is a file with its description, its wires, its behavior and its sections of printer.cfg. A part uses
+//! the engine and the types of descriptions. It uses no other part.
 
 #![forbid(unsafe_code)]
 

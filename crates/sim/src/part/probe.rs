@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A switch beside the nozzle that closes as the bed touches it: an inductive probe, a Klicky, a
-//! microswitch. It has no noise and no hysteresis.
+//! A switch beside the nozzle that closes when it touches the bed: an inductive probe, a Klicky, a microswitch. It has
+//! no noise and no hysteresis.
 
 #![forbid(unsafe_code)]
 
@@ -20,15 +20,15 @@ use pinion_firmware::time::Clock;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ProbeConfig {
-    /// High while it touches the bed.
+    /// High while the probe touches the bed.
     pub pin: PinName,
-    /// How far it stands from the nozzle along the x axis.
+    /// How far the probe is from the nozzle along the x axis.
     #[serde(default)]
     pub x_offset_mm: f64,
-    /// How far it stands from the nozzle along the y axis.
+    /// How far the probe is from the nozzle along the y axis.
     #[serde(default)]
     pub y_offset_mm: f64,
-    /// How far below the nozzle it touches the bed.
+    /// How far below the nozzle the probe touches the bed.
     pub z_offset_mm: f64,
 }
 
@@ -65,10 +65,9 @@ impl Part for ProbeConfig {
     }
 }
 
-/// The switch.
 struct Probe {
     bed: Bed,
-    /// Where it touches, from the nozzle.
+    /// The point of contact, relative to the nozzle.
     tip: [f64; 3],
 }
 
@@ -102,7 +101,7 @@ mod tests {
         }
         let bed = || Bed::under(printer.bed.clone(), Some(x.clone()), Some(y.clone()), Some(z.clone()));
         let probe = Probe { bed: bed(), tip: [-30.0, 10.0, -2.5] };
-        // The nozzle stands at 60, 45 and 12 mm.
+        // The nozzle is at 60, 45 and 12 mm.
         let height = bed().height_mm(60.0 - 30.0, 45.0 + 10.0);
         let at_nozzle = bed().height_mm(60.0, 45.0);
         assert!((height - at_nozzle).abs() > 0.02, "{height} {at_nozzle}: the offset would not show");

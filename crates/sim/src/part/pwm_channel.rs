@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A hardware PWM channel, with something on it that is dimmed.
+//! A hardware PWM channel, with an output that it dims.
 
 #![forbid(unsafe_code)]
 
@@ -23,7 +23,7 @@ use pinion_firmware::time::Clock;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PwmChannelConfig {
-    /// Such as `laser`.
+    /// For example `laser`.
     pub name: String,
     /// The channel.
     pub pin: PinName,
@@ -61,7 +61,6 @@ impl Part for PwmChannelConfig {
     }
 }
 
-/// The channel.
 struct PwmChannel {
     name: String,
     /// 0 to [`PWM_MAX`].
@@ -101,7 +100,7 @@ mod tests {
     fn a_channel_shows_the_percent_that_klippy_was_told() {
         let channel = PwmChannel { name: "laser".into(), value: AtomicU32::new(0) };
         for percent in 0..=100 {
-            // As klippy computes it (klippy/mcu.py).
+            // The value that klippy computes (klippy/mcu.py).
             channel.dim((f64::from(percent) / 100.0 * f64::from(PWM_MAX) + 0.5) as u16);
             assert_eq!(channel.look(Clock::EPOCH), format!("{percent} %"));
         }

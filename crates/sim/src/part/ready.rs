@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A chip that converts by its own clock, and its line that is low while a conversion waits.
+//! A chip that converts by its own clock, and its line, which is low while a conversion waits.
 
 #![forbid(unsafe_code)]
 
@@ -9,16 +9,16 @@ use crate::engine::together::Together;
 use crate::engine::wire::{Kind, Wire};
 use pinion_firmware::time::Clock;
 
-/// The conversions of a chip, as its clock makes them.
+/// The timing of a chip's conversions.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) struct Conversions {
-    /// The first one ends here.
+    /// The end of the first conversion.
     pub(crate) first: Clock,
-    /// Ticks of 20 ns from one end to the next; 0 while the chip makes none.
+    /// Ticks of 20 ns from one end to the next; 0 while the chip does not convert.
     pub(crate) period: f64,
-    /// Those that wait no more.
+    /// Number of conversions that no longer wait.
     pub(crate) seen: u64,
-    /// Whether the line tells of them.
+    /// Whether the line reports them.
     pub(crate) told: bool,
 }
 
@@ -33,16 +33,16 @@ impl Conversions {
         Conversions { first: Clock::from_ticks(first), period: f64::from_bits(period), seen, told: told != 0 }
     }
 
-    /// How many are over.
+    /// Number of finished conversions.
     pub(crate) fn over(&self, now: Clock) -> u64 {
         let since = now.since(self.first);
         if self.period == 0.0 || since < 0 { 0 } else { (since as f64 / self.period) as u64 + 1 }
     }
 }
 
-/// What a chip and its line share. The chip, which hears its bus's worker alone, writes it.
+/// The state that a chip and its line share. Only the chip writes it, from its bus's worker.
 pub(crate) struct ReadyLine {
-    /// Such as `interrupt of ldc1612`.
+    /// For example `interrupt of ldc1612`.
     name: &'static str,
     conversions: Together<4>,
 }
@@ -63,7 +63,6 @@ impl ReadyLine {
     }
 }
 
-/// The line's pin.
 pub(crate) struct ReadyPin(pub(crate) Arc<ReadyLine>);
 
 impl Wire for ReadyPin {

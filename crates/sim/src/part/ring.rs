@@ -12,7 +12,6 @@ use crate::engine::follower::{Follower, Motion};
 use crate::engine::physics::Axis;
 use pinion_firmware::time::{CLOCK_FREQ, Clock};
 
-/// An axis that rings.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct RingConfig {
@@ -20,19 +19,19 @@ pub struct RingConfig {
     pub axis: String,
     /// Its resonance, without damping.
     pub hz: f64,
-    /// 0 would ring for ever, 1 not at all.
+    /// At 0 it would ring forever, and at 1 not at all.
     pub damping_ratio: f64,
 }
 
-/// A mass on a spring, whose other end an axis moves.
+/// A mass on a spring. An axis moves the other end of the spring.
 pub(crate) struct Ring {
     follower: Follower,
-    /// Angular frequency in rad/s, and how it fades, in 1/s.
+    /// Angular frequency in rad/s; the next field is the decay rate in 1/s.
     omega: f64,
     fade: f64,
-    /// Until when it is solved.
+    /// The time up to which the motion is solved.
     now: Clock,
-    /// Where the axis is, how far the mass is ahead of it, and how fast it goes.
+    /// The axis's position, how far the mass is ahead of it, and the speed of the mass.
     axis_mm: f64,
     ahead_mm: f64,
     mm_per_s: f64,
@@ -52,7 +51,7 @@ impl Ring {
         }
     }
 
-    /// Goes on to an instant, step by step, and gives the speed there.
+    /// Continues to an instant, step by step, and returns the speed there.
     pub(crate) fn speed_at(&mut self, until: Clock) -> f64 {
         while let Some(motion) = self.follower.next(until) {
             let (Motion::Step(at, mm) | Motion::Lost(at, mm)) = motion;
@@ -60,7 +59,7 @@ impl Ring {
             self.ahead_mm -= mm - self.axis_mm;
             self.axis_mm = mm;
             if matches!(motion, Motion::Lost(..)) {
-                // What it did meanwhile nobody knows: it starts from rest.
+                // The motion between is unknown, so the mass starts from rest.
                 (self.ahead_mm, self.mm_per_s) = (0.0, 0.0);
             }
         }
@@ -68,9 +67,9 @@ impl Ring {
         self.mm_per_s
     }
 
-    /// The damped oscillation while the axis stands: with the damped frequency `n`,
+    /// The damped oscillation while the axis stands still. With the damped frequency `n` it is
     /// `y = e^-ft (y0 cos nt + (v0 + f y0)/n sin nt)`, `v = e^-ft (v0 cos nt - (w^2 y0 + f v0)/n sin nt)`.
-    /// A step that comes out of order happens now.
+    /// A step that comes out of order counts as happening now.
     fn swing(&mut self, until: Clock) {
         let ticks = until.since(self.now).max(0);
         self.now = self.now.max(until);

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A hobby servo: the width of its pulses tells the angle to which it turns.
+//! A hobby servo. The width of its pulses sets its angle.
 //!
-//! Simulated: the widths between the edges' instants, the stops at both ends, the pace at which it
-//! turns. A servo without pulses stays where it is. Not simulated: the load, and a refresh rate that is too low or
-//! too high.
+//! Simulated: the pulse widths, measured between the instants of the edges, the stops at both ends, the speed of the
+//! turn. A servo without pulses stays where it is. Not simulated: the load, and a refresh rate that is too low or too
+//! high.
 
 #![forbid(unsafe_code)]
 
@@ -28,7 +28,7 @@ use pinion_firmware::time::Clock;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ServoConfig {
-    /// Such as `arm`.
+    /// For example `arm`.
     pub name: String,
     /// High during a pulse.
     pub pin: PinName,
@@ -38,10 +38,10 @@ pub struct ServoConfig {
     /// The pulse for the other stop.
     #[serde(default = "default_max_pulse_us")]
     pub max_pulse_us: f64,
-    /// Where the other stop is.
+    /// The angle of the other stop.
     #[serde(default = "default_travel_degrees")]
     pub travel_degrees: f64,
-    /// How fast it turns.
+    /// Its speed.
     #[serde(default = "default_degrees_per_s")]
     pub degrees_per_s: f64,
 }
@@ -99,21 +99,20 @@ impl Part for ServoConfig {
     }
 }
 
-/// No pulse is under way.
+/// Means that there is no pulse now.
 const NO_PULSE: u64 = u64::MAX;
 
-/// The servo.
 struct Servo {
     config: ServoConfig,
     name: String,
-    /// When the pulse began that is under way.
+    /// When the current pulse began.
     pulse: AtomicU64,
-    /// Since when it turns, from which angle and to which one.
+    /// The start of the turn, its first angle and its target.
     turn: Together<3>,
 }
 
 impl Servo {
-    /// At its first stop.
+    /// A servo at its first stop.
     fn new(config: &ServoConfig, now: Clock) -> Servo {
         let stop = 0f64.to_bits();
         Servo {
@@ -138,7 +137,7 @@ impl Servo {
         }
         let width_us = seconds(Clock::from_ticks(began), at) * 1e6;
         let ServoConfig { min_pulse_us, max_pulse_us, travel_degrees, .. } = self.config;
-        // What is shorter or longer by far is no pulse for it.
+        // The servo ignores a pulse that is much too short or too long.
         if (min_pulse_us / 2.0..=max_pulse_us * 1.5).contains(&width_us) {
             let share = (width_us - min_pulse_us) / (max_pulse_us - min_pulse_us);
             let to = share.clamp(0.0, 1.0) * travel_degrees;
@@ -200,7 +199,7 @@ mod tests {
             }
             at(f64::from(first + 50) * 20_000.0)
         };
-        // The level at which a line is set up is no pulse.
+        // The first level of a line is not a pulse.
         pin.settle(false, Clock::EPOCH);
         assert_eq!(servo.look(at(1e6)), "0.0 degrees");
         let now = pulses(50, 1500.0);
@@ -208,11 +207,11 @@ mod tests {
         assert_eq!(servo.degrees(at(50.0 * 20_000.0 + 1500.0 + 100_000.0)), 90.0, "there long ago");
         let now = pulses(100, 2500.0);
         assert_eq!(servo.degrees(now), 180.0);
-        // Beyond its stop it can not go, and what is no pulse moves nothing.
+        // It cannot turn beyond its stop. Wrong widths move nothing.
         assert_eq!(servo.degrees(pulses(150, 2700.0)), 180.0);
         assert_eq!(servo.degrees(pulses(200, 5000.0)), 180.0);
         assert_eq!(servo.degrees(pulses(250, 100.0)), 180.0);
-        // A single pulse turns it all the way, at its pace.
+        // A single pulse turns it all the way, at its speed.
         pin.drive(true, at(300.0 * 20_000.0));
         let end_us = 300.0 * 20_000.0 + 500.0;
         pin.drive(false, at(end_us));

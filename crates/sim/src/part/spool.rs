@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A spool of filament, the switch that the filament closes and the encoder that it turns, both right
-//! before the extruder.
+//! A spool of filament. The filament closes a switch and turns an encoder, both directly before the extruder.
 //!
-//! Simulated: a filament that goes with the extruder's axis, forwards and back, ends after a length, and
-//! can be stuck from a length on, so that the extruder grinds it. A pin stands for the person who puts in a new
-//! spool.
+//! Simulated: a filament that moves with the extruder's axis, forward and backward. It ends after a length. It can be
+//! stuck from a length on, so that the extruder grinds it. A pin stands for the person who inserts a new spool.
 
 #![forbid(unsafe_code)]
 
@@ -27,21 +25,21 @@ use pinion_firmware::time::Clock;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpoolConfig {
-    /// Such as `filament`.
+    /// For example `filament`.
     pub name: String,
     /// The axis that pulls the filament.
     pub axis: String,
-    /// How much there is.
+    /// Length of the filament.
     pub length_mm: f64,
-    /// From here on the spool holds the filament fast.
+    /// The length after which the spool holds the filament.
     pub stuck_after_mm: Option<f64>,
     /// High while there is filament.
     pub switch_pin: Option<PinName>,
     /// Changes its level as the filament moves.
     pub encoder_pin: Option<PinName>,
-    /// A new spool is put in as this goes high.
+    /// Inserts a new spool when it goes high.
     pub refill_pin: Option<PinName>,
-    /// Filament from one change of the encoder to the next.
+    /// Length of filament between two changes of the encoder.
     #[serde(default = "default_encoder_mm")]
     pub encoder_mm: f64,
 }
@@ -105,11 +103,10 @@ impl Part for SpoolConfig {
     }
 }
 
-/// The spool.
 struct Spool {
     name: String,
     axis: Arc<Axis>,
-    /// Where the axis was, in steps, as the spool was put in.
+    /// The axis's position in steps when the spool was inserted.
     start: AtomicI64,
     length_mm: f64,
     stuck_after_mm: Option<f64>,
@@ -128,20 +125,19 @@ impl Spool {
         }
     }
 
-    /// How far the filament has moved: what is stuck stays, and so does what has run out.
+    /// How far the filament has moved. Stuck filament does not move, nor does filament that has run out.
     fn moved_mm(&self) -> f64 {
         let end_mm = self.stuck_after_mm.map_or(self.length_mm, |stuck_mm| self.length_mm.min(stuck_mm));
         let steps = self.axis.position_steps().wrapping_sub(self.start.load(Ordering::Relaxed));
         self.axis.mm(steps).min(end_mm)
     }
 
-    /// A new spool is put in.
+    /// Inserts a new spool.
     fn refill(&self) {
         self.start.store(self.axis.position_steps(), Ordering::Relaxed);
     }
 }
 
-/// The switch.
 struct SwitchPin(Arc<Spool>);
 
 impl Wire for SwitchPin {
@@ -158,7 +154,6 @@ impl Wire for SwitchPin {
     }
 }
 
-/// The encoder.
 struct EncoderPin(Arc<Spool>);
 
 impl Wire for EncoderPin {
@@ -175,7 +170,7 @@ impl Wire for EncoderPin {
     }
 }
 
-/// The hand that puts in a new spool.
+/// The person who inserts a new spool.
 struct RefillPin(Arc<Spool>);
 
 impl Wire for RefillPin {
@@ -187,7 +182,7 @@ impl Wire for RefillPin {
         format!("refill of spool {}", self.0.name)
     }
 
-    /// A pin that is high from the start puts in nothing.
+    /// A pin that is high from the start inserts nothing.
     fn settle(&self, _on: bool, _at: Clock) {}
 
     fn drive(&self, on: bool, _at: Clock) {
@@ -202,7 +197,7 @@ mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
 
-    /// A spool of 50 mm, and what pulls it.
+    /// A spool of 50 mm, and the axis that pulls it.
     struct Bench {
         axis: Arc<Axis>,
         spool: Arc<Spool>,
@@ -225,7 +220,7 @@ mod tests {
             Bench { spool: Arc::new(Spool::new(&config, axis.clone())), axis }
         }
 
-        /// The switch and the changes of the encoder, after each move in mm of 100 steps.
+        /// The switch and the number of encoder changes after each move. A move is in mm, with 100 steps per mm.
         fn feed(&self, moves: &[i32]) -> Vec<(bool, u32)> {
             let (switch, encoder) = (SwitchPin(self.spool.clone()), EncoderPin(self.spool.clone()));
             let now = Clock::EPOCH;
@@ -246,7 +241,7 @@ mod tests {
 
     #[test]
     fn filament_runs_out_after_its_length_and_can_be_drawn_back_to_the_switch() {
-        // 5 mm have two edges, at 2 and 4 mm; the way back crosses them again.
+        // 5 mm have two edges, at 2 and 4 mm. The way back crosses them again.
         assert_eq!(Bench::new(None).feed(&[5, -5, 49]), [(true, 2), (true, 2), (true, 24)]);
         assert_eq!(Bench::new(None).feed(&[49, 1, 20, -21]), [(true, 24), (false, 1), (false, 0), (true, 1)]);
     }
@@ -265,7 +260,7 @@ mod tests {
         refill.drive(false, Clock::EPOCH);
         assert_eq!(bench.feed(&[1]), [(false, 0)], "only the rising edge puts it in");
         refill.drive(true, Clock::EPOCH);
-        // The encoder begins anew.
+        // The encoder starts again.
         assert_eq!(bench.feed(&[49, 1]), [(true, 24), (false, 1)]);
     }
 }

@@ -2,13 +2,13 @@
 //! The display controller SSD1306 with a panel of 128 x 64, on I2C or SPI, after its data sheet (Solomon
 //! Systech SSD1306, rev. 1.1: "MCU Interface", "Command Table", "Graphic Display Data RAM").
 //!
-//! The panel is mounted as on the usual modules: the picture stands upright with the segments remapped
-//! (A1) and the COM outputs scanned downwards (C8), which are wired alternately (DA 12).
+//! The panel is mounted as on the usual modules. The picture is upright if the segments are remapped (A1) and the COM
+//! outputs are scanned downward (C8). The COM outputs are wired alternately (DA 12).
 //!
-//! Simulated: every command with its arguments, the three addressing modes, the mapping of the memory to
-//! segments and COM outputs, offset, start line, multiplex ratio, inversion, all pixels on, display and
-//! charge pump off, the reset line, the status byte. Not simulated: scrolling, contrast, oscillator and
-//! voltages, other wirings of the COM outputs. The memory is noise at first, as in a real chip.
+//! Simulated: every command with its arguments, the three addressing modes, the mapping of the memory to segments and
+//! COM outputs, offset, start line, multiplex ratio, inversion, all pixels on, display and charge pump off, the reset
+//! line, the status byte. Not simulated: scrolling, contrast, oscillator and voltages, other wirings of the COM
+//! outputs. The memory starts as noise, as in a real chip.
 
 #![forbid(unsafe_code)]
 
@@ -33,23 +33,23 @@ use pinion_firmware::time::Clock;
 const COLUMNS: u8 = 128;
 const PAGES: u8 = 8;
 const ROWS: u8 = 64;
-/// Of a module whose SA0 is low.
+/// The address of a module with SA0 low.
 const ADDRESS: u8 = 0x3c;
 
 /// The display's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ssd1306Config {
-    /// Such as `display`.
+    /// For example `display`.
     pub name: String,
     /// Its bus: I2C, or SPI if it has a `dc_pin`.
     pub bus: String,
     /// Its address on I2C.
     #[serde(default = "default_address")]
     pub address: u8,
-    /// High while data is sent by SPI, low while commands are.
+    /// High while SPI sends data, low while it sends commands.
     pub dc_pin: Option<PinName>,
-    /// Low selects it on SPI; without it, it is the only chip on its bus.
+    /// Low selects the chip on SPI. Without this pin it is the only chip on its bus.
     pub select_pin: Option<PinName>,
     /// Low resets it.
     pub reset_pin: Option<PinName>,
@@ -95,7 +95,7 @@ impl Part for Ssd1306Config {
     }
 
     fn printer_cfg(&self, cfg: &mut Sections, _layout: &Layout<'_>) {
-        // `display` is klippy's own word for the first one.
+        // klippy uses the word `display` for the first one.
         match self.name.as_str() {
             "display" => cfg.section("display"),
             name => cfg.section(format_args!("display {name}")),
@@ -115,18 +115,17 @@ impl Part for Ssd1306Config {
     }
 }
 
-/// The chip and its panel.
 struct Panel {
     name: String,
     chip: Mutex<Chip>,
-    /// What the core drives, without a lock: D/C, the reset line, and whether that was low since the
-    /// chip was last looked at.
+    /// The core drives these without a lock: D/C, the reset line, and whether the reset line was low since the last
+    /// access to the chip.
     is_data: AtomicBool,
     held: AtomicBool,
     was_reset: AtomicBool,
 }
 
-/// Where a byte of data goes, and where the next one.
+/// How the place of the next byte follows from the place of this one.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Addressing {
     Horizontal,
@@ -139,11 +138,11 @@ struct Chip {
     /// By page and segment; bit 0 is the page's topmost row.
     memory: [[u8; COLUMNS as usize]; PAGES as usize],
     settings: Settings,
-    /// A command whose arguments are not complete.
+    /// A command with incomplete arguments.
     command: Vec<u8>,
 }
 
-/// What a reset sets.
+/// The settings that a reset changes.
 #[derive(Clone)]
 struct Settings {
     addressing: Addressing,
@@ -155,7 +154,7 @@ struct Settings {
     com_downwards: bool,
     start_line: u8,
     offset: u8,
-    /// Rows that are driven.
+    /// Number of driven rows.
     multiplex: u8,
     inverted: bool,
     all_on: bool,
@@ -263,15 +262,15 @@ impl Chip {
         }
     }
 
-    /// Whether anything can light up.
+    /// Whether any pixel can light up.
     fn is_lit(&self) -> bool {
         self.settings.on && self.settings.charge_pump
     }
 
-    /// Whether a place of the panel is bright, from its upper left corner.
+    /// Whether the pixel at this place is bright; the origin is the panel's upper left corner.
     fn pixel(&self, x: u8, y: u8) -> bool {
         let is = &self.settings;
-        // The panel's left column is the last segment, its first row the last COM output.
+        // The panel's left column is the last segment. Its first row is the last COM output.
         let (segment, com) = (COLUMNS - 1 - x, ROWS - 1 - y);
         let shifted = (com + is.offset) % ROWS;
         if shifted >= is.multiplex {
@@ -296,7 +295,7 @@ impl Panel {
         }
     }
 
-    /// The chip as it is; only workers and those who look wait here.
+    /// The chip's present state. Only workers and viewers wait here.
     fn chip(&self) -> MutexGuard<'_, Chip> {
         let mut chip = self.chip.lock().unwrap_or_else(PoisonError::into_inner);
         if self.was_reset.swap(false, Ordering::Relaxed) || self.held.load(Ordering::Relaxed) {
@@ -306,7 +305,7 @@ impl Panel {
         chip
     }
 
-    /// What a byte does, unless the chip is held in its reset.
+    /// Executes a byte, unless the chip is held in reset.
     fn take(&self, is_data: bool, byte: u8) {
         let mut chip = self.chip();
         if self.held.load(Ordering::Relaxed) {
@@ -316,8 +315,8 @@ impl Panel {
     }
 }
 
-/// The dots of a Braille character by column and row, as bits of its code point from U+2800 on (Unicode,
-/// "Braille Patterns").
+/// The dots of a Braille character by column and row, as bits of its code point from U+2800 on (Unicode, "Braille
+/// Patterns").
 const DOTS: [[u32; 4]; 2] = [[0x01, 0x02, 0x04, 0x40], [0x08, 0x10, 0x20, 0x80]];
 
 impl Sight for Panel {
@@ -325,9 +324,9 @@ impl Sight for Panel {
         &self.name
     }
 
-    /// The picture, of 2 x 4 pixels in a character.
+    /// The picture, with 2 x 4 pixels in a character.
     fn look(&self, _now: Clock) -> String {
-        // A copy: who draws may lose the processor at any time, and the bus must not wait for that.
+        // A copy: the drawing thread may lose the processor at any time, and the bus must not wait for it.
         let chip = self.chip().clone();
         if !chip.is_lit() {
             return "dark".into();
@@ -343,10 +342,10 @@ impl Sight for Panel {
     }
 }
 
-/// The chip on I2C: a control byte tells what the following ones are.
+/// The chip on I2C. A control byte says whether commands or data follow.
 struct OnI2c {
     panel: Arc<Panel>,
-    /// Whether what comes is data, and whether that holds for one byte only. None: a control byte comes.
+    /// Whether the next byte is data, and whether that is valid for one byte only. `None`: a control byte comes next.
     control: Option<(bool, bool)>,
 }
 
@@ -370,13 +369,13 @@ impl I2cChip for OnI2c {
         true
     }
 
-    /// The status: bit 6 tells that the display is off.
+    /// The status: bit 6 is set while the display is off.
     fn read(&mut self) -> u8 {
         u8::from(!self.panel.chip().settings.on) << 6
     }
 }
 
-/// The chip on SPI with four wires, which it never answers.
+/// The chip on SPI with four wires. It never answers.
 struct OnSpi(Arc<Panel>);
 
 impl SpiChip for OnSpi {
@@ -436,7 +435,7 @@ mod tests {
         i2c: OnI2c,
     }
 
-    /// What a module's maker has a host send first.
+    /// The first commands that a module's maker recommends.
     const START: &[u8] =
         &[0x00, 0xae, 0xa8, 0x3f, 0xd3, 0, 0x40, 0x8d, 0x14, 0x20, 0, 0xa1, 0xc8, 0xda, 0x12, 0xa4, 0xa6, 0xaf];
 
@@ -446,7 +445,7 @@ mod tests {
             Bench { i2c: OnI2c { panel: panel.clone(), control: None }, panel }
         }
 
-        /// Set up, cleared, the pointer at the start.
+        /// Configured and cleared, with the pointer at the start.
         fn started() -> Bench {
             let mut bench = Bench::new();
             bench.write(START);
@@ -490,7 +489,7 @@ mod tests {
         let look = bench.look();
         let characters: Vec<char> = look.chars().collect();
         assert_eq!((characters[0], characters[65]), ('\u{2801}', '\u{2880}'));
-        // COM outputs the other way round act at once; segments only on what is written then.
+        // A reversed scan of the COM outputs acts at once. Remapped segments affect only data written afterwards.
         bench.write(&[0x00, 0xc0, 0xa0]);
         assert_eq!(bench.bright(), [(1, 56), (0, 63)]);
         bench.write(&[0x00, 0xc8]);
@@ -501,7 +500,7 @@ mod tests {
     #[test]
     fn addressing_modes_and_windows() {
         let mut bench = Bench::started();
-        // Horizontal, in a window of two columns and two pages, which it fills and begins anew.
+        // Horizontal, in a window of two columns and two pages. The data fills it and wraps around.
         bench.write(&[0x00, 0x21, 10, 11, 0x22, 2, 3]);
         bench.write(&[0x40, 1, 1, 1, 1, 2]);
         assert_eq!(bench.bright(), [(11, 16), (10, 17), (10, 24), (11, 24)]);
@@ -509,7 +508,7 @@ mod tests {
         bench.write(&[0x00, 0x20, 1, 0x21, 10, 11, 0x22, 2, 3]);
         bench.write(&[0x40, 1, 2, 4]);
         assert_eq!(bench.bright(), [(10, 16), (11, 18), (10, 25)]);
-        // By pages: column 0x7f, and from there to the column's start in the same page.
+        // By pages: column 0x7f, and from there to the first column of the same page.
         let mut bench = Bench::started();
         bench.write(&[0x00, 0x20, 2, 0xb5, 0x0f, 0x17]);
         bench.write(&[0x40, 1, 2]);
@@ -539,7 +538,7 @@ mod tests {
         assert_eq!(bench.bright().len(), 128 * 64 - 1);
         bench.write(&[0x00, 0xa6, 0xa5]);
         assert_eq!(bench.bright().len(), 128 * 64);
-        // A scroll's arguments are none of these commands.
+        // The arguments of a scroll are not commands.
         bench.write(&[0x00, 0xa4, 0x26, 0xae, 0xae, 0xae, 0xae, 0xae, 0xae, 0x2e]);
         assert_eq!(bench.bright(), [(0, 0)]);
     }

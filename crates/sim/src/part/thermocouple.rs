@@ -1,12 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Converters of thermocouples and of a platinum resistor on SPI, whose sensor is in a heater: MAX31855
-//! (data sheet 19-5793), MAX6675 (19-2235), MAX31856 (19-7534), MAX31865 (19-6478).
+//! SPI converters for thermocouples and for a platinum resistor. The sensor is in a heater. The chips are the MAX31855
+//! (data sheet 19-5793), MAX6675 (19-2235), MAX31856 (19-7534) and MAX31865 (19-6478).
 //!
-//! Simulated: words and registers with their resolution and range, how long a conversion takes and what
-//! starts it, the faults that wires can have and what each chip notices of them. A thermocouple is as
-//! linear as the chips take it for; a platinum resistor follows the equation of Callendar and Van Dusen
-//! (IEC 60751). Not simulated: noise, averaging, the cold junction's limits and offset, the
-//! MAX31865's fault detection cycle.
+//! Simulated: words and registers with their resolution and range, the duration and the start of a conversion, faults
+//! of the wires and what each chip notices of them. A thermocouple is as linear as the chips assume. A platinum
+//! resistor follows the equation of Callendar and Van Dusen (IEC 60751). Not simulated: noise, averaging, the cold
+//! junction's limits and offset, the MAX31865's fault detection cycle.
 
 #![forbid(unsafe_code)]
 
@@ -28,25 +27,25 @@ use pinion_firmware::time::{Clock, Ticks, TimeSource};
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ThermocoupleConfig {
-    /// Such as `nozzle`.
+    /// For example `nozzle`.
     pub name: String,
     /// Which chip it is.
     pub chip: Converter,
     /// Its SPI bus.
     pub bus: String,
-    /// Low selects it; without it, it is the only chip on its bus.
+    /// Low selects the chip. Without this pin it is the only chip on its bus.
     pub select_pin: Option<PinName>,
     /// The heater that its sensor is in.
     pub heater: String,
     /// Temperature of the chip itself.
     #[serde(default = "default_chip_celsius")]
     pub chip_celsius: f64,
-    /// What is wrong with the sensor.
+    /// The fault of the sensor, if it has one.
     pub fault: Option<SensorFault>,
     /// The platinum resistor's resistance at 0 °C (MAX31865).
     #[serde(default = "default_rtd_ohm")]
     pub rtd_ohm: f64,
-    /// The resistor that it is compared with (MAX31865).
+    /// The reference resistor (MAX31865).
     #[serde(default = "default_reference_ohm")]
     pub reference_ohm: f64,
 }
@@ -77,7 +76,7 @@ pub enum Converter {
     Max31865,
 }
 
-/// What can be wrong with a sensor's wires.
+/// The faults that a sensor's wires can have.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SensorFault {
@@ -104,7 +103,7 @@ impl Converter {
         }
     }
 
-    /// The longest conversion; of those with a filter for the mains, at 60 Hz.
+    /// The longest conversion. For chips with a mains filter, at 60 Hz.
     fn conversion(self) -> Ticks {
         Ticks::from_us(match self {
             Max31855 => 100_000,
@@ -114,7 +113,7 @@ impl Converter {
         })
     }
 
-    /// Whether a fault is one that the chip's data sheet speaks of.
+    /// Whether the chip's data sheet mentions this fault.
     fn knows(self, fault: SensorFault) -> bool {
         match self {
             Max31855 => true,
@@ -195,7 +194,6 @@ const LOW_THRESHOLD: usize = 0x05;
 const FAULT_STATUS: usize = 0x07;
 const MAX31865_REGISTERS: [u8; 16] = [0, 0, 0, 0xff, 0xff, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0];
 
-/// The chip.
 struct Chip {
     config: ThermocoupleConfig,
     heater: Arc<Heater>,
@@ -203,9 +201,9 @@ struct Chip {
     registers: [u8; 16],
     /// The word of a chip without registers.
     word: [u8; 4],
-    /// Since when it converts, if it does.
+    /// Since when it converts; `None` if it does not.
     since: Option<Clock>,
-    /// Bytes since it was selected, and the address that the first one named.
+    /// Bytes since the chip was selected; the next field is the address from the first byte.
     bytes: usize,
     address: u8,
 }
@@ -224,8 +222,8 @@ impl Chip {
         self.config.fault == Some(fault)
     }
 
-    /// What a thermocouple makes of the heater's temperature: without a voltage, as where its wires
-    /// touch, it reads as the chip's own.
+    /// The temperature that a thermocouple measures. Without a voltage, for example if its wires touch, it is the
+    /// temperature of the chip.
     fn celsius(&self, now: Clock) -> f64 {
         match self.config.fault {
             None => self.heater.at(now).celsius,
@@ -233,7 +231,7 @@ impl Chip {
         }
     }
 
-    /// Ends the conversion under way if it has had its time.
+    /// Ends the current conversion if its time is over.
     fn convert(&mut self, now: Clock) {
         let done = self.since.is_some_and(|since| now.since(since) >= i64::from(self.config.chip.conversion().0));
         if !done {
@@ -247,7 +245,8 @@ impl Chip {
         }
     }
 
-    /// The word: 14 bits of 0.25 C, any fault, 12 bits of 0.0625 C of the chip's own, faults (table 2).
+    /// The word: 14 bits of 0.25 C, any fault, 12 bits of 0.0625 C for the chip's own temperature, the faults (table
+    /// 2).
     fn max31855(&self, now: Clock) -> u32 {
         let faults = u32::from(self.has(SensorFault::Open))
             | u32::from(self.has(SensorFault::ShortToGround)) << 1
@@ -275,8 +274,7 @@ impl Chip {
         let over = self.has(SensorFault::ShortToSupply);
         let celsius = self.celsius(now);
         let sixteenths = (celsius * 16.0).round() as i32;
-        // 19 bits of 1/128 C and 14 bits of 1/64 C, both to the left. An input beyond the supply stops
-        // the conversions.
+        // 19 bits of 1/128 C and 14 bits of 1/64 C, both left-aligned. An input above the supply stops the conversions.
         if !over {
             let [_, linearized @ ..] = (counts(celsius, 128.0, -0x40000, 0x3ffff) << 5).to_be_bytes();
             self.registers[LINEARIZED..LINEARIZED + 3].copy_from_slice(&linearized);
@@ -333,13 +331,12 @@ impl Chip {
     }
 }
 
-/// A temperature in counts of which so many make a kelvin, kept within the converter's range, in two's
-/// complement.
+/// Converts degrees Celsius to counts, clamped to the converter's range, in two's complement.
 fn counts(celsius: f64, per_kelvin: f64, min: i32, max: i32) -> u32 {
     ((celsius * per_kelvin).round() as i32).clamp(min, max) as u32 & (max as u32 * 2 + 1)
 }
 
-/// A platinum resistor's resistance, as a multiple of that at 0 °C.
+/// A platinum resistor's resistance relative to its resistance at 0 °C.
 fn relative_resistance(celsius: f64) -> f64 {
     const A: f64 = 3.9083e-3;
     const B: f64 = -5.775e-7;
@@ -352,7 +349,7 @@ impl SpiChip for Chip {
     fn knows_mode(&self, mode: u8) -> bool {
         match self.config.chip {
             Max31855 | Max6675 => mode == 0,
-            // CPHA is 1, and the chip looks which level the clock rests at.
+            // CPHA is 1. The chip detects the clock's idle level.
             Max31856 | Max31865 => mode == 1 || mode == 3,
         }
     }
@@ -372,7 +369,7 @@ impl SpiChip for Chip {
             self.address = byte;
             return 0xff;
         }
-        // The address goes on by itself.
+        // The address increments by itself.
         let at = (usize::from(self.address & 0x7f) + n - 1) % self.registers.len();
         if self.address & 0x80 != 0 {
             self.write(at, byte, self.clock.now());
@@ -381,7 +378,7 @@ impl SpiChip for Chip {
         self.registers[at]
     }
 
-    /// Those without registers stop converting while they are selected, and begin anew.
+    /// Chips without registers stop converting while they are selected, and start again here.
     fn deselect(&mut self) {
         if matches!(self.config.chip, Max31855 | Max6675) {
             self.since = Some(self.clock.now());
@@ -401,7 +398,7 @@ mod tests {
     }
 
     impl Bench {
-        /// A chip whose sensor is in a mass of this temperature.
+        /// A chip with its sensor in a mass of this temperature.
         fn new(chip: Converter, celsius: f64, fault: Option<SensorFault>) -> Bench {
             let clock = VirtualClock::at(Clock::from_ticks(1_000_000));
             let mut printer = DefaultPrinter::read();
@@ -482,7 +479,7 @@ mod tests {
         assert_eq!(bench.transfer(&[0x0c, 0, 0, 0])[1..], [0, 0, 0]);
         bench.wait_ms(100);
         assert_eq!(bench.transfer(&[0x0a, 0, 0, 0, 0, 0, 0])[1..], [0x19, 0, 0x06, 0x48, 0, 0]);
-        // A limit of 100 C, and what is not to be written.
+        // A limit of 100 C, and registers that are read-only.
         bench.transfer(&[0x85, 0x06, 0x40]);
         bench.transfer(&[0x8c, 1, 1, 1, 1]);
         assert_eq!(bench.transfer(&[0x0c, 0, 0, 0, 0])[1..], [0x06, 0x48, 0, 0x08]);
@@ -512,7 +509,7 @@ mod tests {
         bench.wait_ms(20);
         assert_eq!(bench.transfer(&[0x00, 0, 0, 0])[1..], [0xc0, 0x58, 0xa4]);
         assert_eq!(bench.transfer(&[0x07, 0])[1], 0);
-        // A high threshold just at the code.
+        // A high threshold exactly at the code.
         bench.transfer(&[0x83, 0x58, 0xa4]);
         assert_eq!(bench.transfer(&[0x01, 0, 0])[1..], [0x58, 0xa5]);
         bench.transfer(&[0x83, 0xff, 0xff]);

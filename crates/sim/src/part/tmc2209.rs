@@ -2,16 +2,14 @@
 //! The stepper driver TMC2209 on its UART, after its data sheet (Trinamic, TMC2209, rev. 1.09: "UART
 //! Single Wire Interface", "Register Map", "StallGuard4 Load Measurement").
 //!
-//! A message begins with a sync nibble, by which the chip measures the length of a bit, and has the
-//! chip's address, a register, with bit 7 set to write 32 bits to it, and a check sum. To a read the chip
-//! answers after the bit times of SENDDELAY; what was written it counts (IFCNT). It does not hear a
-//! message that is for another address, or not whole.
+//! A message begins with a sync nibble, from which the chip measures the length of a bit. It then has the chip's
+//! address, a register (with bit 7 set to write 32 bits to it), and a checksum. The chip answers a read after the bit
+//! times of SENDDELAY. It counts the writes (IFCNT). It ignores a message that is for another address, or incomplete.
 //!
-//! Simulated: the UART by its edges; every register with its access and its reset value, the microstep
-//! counter and its currents, standstill and the time between steps, the inputs, StallGuard and DIAG
-//! (`trinamic.rs`). The motor turns as that of a TMC5160 (`tmc5160.rs`). Not simulated: CoolStep,
-//! temperatures and faults, the automatic tuning of StealthChop, the pulse generator (VACTUAL), INDEX,
-//! and what the OTP memory changes.
+//! Simulated: the UART by its edges; every register with its access and its reset value, the microstep counter and its
+//! currents, standstill and the time between steps, the inputs, StallGuard and DIAG (`trinamic.rs`). The motor turns as
+//! with a TMC5160 (`tmc5160.rs`). Not simulated: CoolStep, temperatures and faults, the automatic tuning of
+//! StealthChop, the pulse generator (VACTUAL), INDEX, and the effects of the OTP memory.
 
 #![forbid(unsafe_code)]
 
@@ -63,12 +61,12 @@ const CHOPCONF_DEDGE: u32 = 1 << 29;
 
 /// SG_RESULT of a free motor; the full load makes it 0. The data sheet gives no formula.
 const SG_FREE: u32 = 250;
-/// SGTHRS with which a fifth of the full load counts as a stall.
+/// The SGTHRS at which a fifth of the full load counts as a stall.
 const SGTHRS_FOR_HOMING: u32 = 100;
 
 use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
 
-/// What is at no address here reads as zero.
+/// An address without a register reads as zero.
 const REGISTERS: &[Register] = &[
     Register(GCONF, RW, 10, 0x0000_0101),
     Register(GSTAT, C, 3, 0x0000_0001),
@@ -100,7 +98,7 @@ const REGISTERS: &[Register] = &[
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Tmc2209Config {
-    /// PDN_UART, the wire both ways; with `tx_pin` the board's receiving end.
+    /// PDN_UART, the wire for both directions; with `tx_pin` it is the board's receiving end.
     pub uart_pin: PinName,
     /// The board's sending end, joined to the wire by a resistor.
     pub tx_pin: Option<PinName>,
@@ -166,13 +164,12 @@ impl Part for Tmc2209Config {
     }
 }
 
-/// The chip behind its UART.
 struct Tmc2209 {
     address: u8,
     motor: Motor,
     diag: Arc<StallOutput>,
     registers: Registers,
-    /// Messages that wrote a register.
+    /// Number of messages that wrote a register.
     written: u8,
 }
 
@@ -186,7 +183,7 @@ impl Tmc2209 {
         chip
     }
 
-    /// Follows the registers.
+    /// Applies the registers.
     fn set_up(&mut self) {
         let mres = if self.registers.is_set(GCONF, GCONF_MSTEP_REG_SELECT) {
             self.registers.get(CHOPCONF) >> 24 & 0xf
@@ -198,7 +195,7 @@ impl Tmc2209 {
         self.diag.set(stall_rule(&self.registers, self.motor.mres()));
     }
 
-    /// What a host reads at this instant.
+    /// The value that a host reads at this instant.
     fn read(&self, address: u8, now: Clock) -> u32 {
         let stands = self.motor.tstep(now) == STANDSTILL;
         match address {
@@ -254,13 +251,13 @@ impl UartChip for Tmc2209 {
     }
 
     fn send_delay(&self) -> u64 {
-        // 8, 24, 40 ... 120 by pairs of values.
+        // 8, 24, 40 ... 120, one for each pair of values.
         8 * u64::from(self.registers.get(SLAVECONF) >> 8 & 0xf | 1)
     }
 }
 
-/// When DIAG tells of a stall: SG_RESULT is not above twice SGTHRS, at velocities from TCOOLTHRS on up to
-/// where SpreadCycle begins.
+/// When DIAG reports a stall: SG_RESULT is at most twice SGTHRS, and the velocity is from TCOOLTHRS up to the start of
+/// SpreadCycle.
 fn stall_rule(registers: &Registers, mres: u32) -> StallRule {
     let fall = SG_FREE.saturating_sub(2 * registers.get(SGTHRS));
     let stealth = !registers.is_set(GCONF, GCONF_EN_SPREADCYCLE);
@@ -303,7 +300,7 @@ mod tests {
             self.now = Clock::from_ticks(self.now.ticks() + bits * self.bit);
         }
 
-        /// Sends bytes, and lets go of the wire.
+        /// Sends bytes, and then releases the wire.
         fn send(&mut self, bytes: &[u8]) {
             let mut level = true;
             for byte in bytes {
@@ -319,7 +316,7 @@ mod tests {
             self.pin.release(self.now);
         }
 
-        /// What comes back, and after how many bit times.
+        /// The answer, and the number of bit times before it.
         fn receive(&mut self) -> Option<(u64, Vec<u8>)> {
             let silent = (0..200).find(|_| {
                 let low = !self.pin.sense(true, self.now);
@@ -357,7 +354,7 @@ mod tests {
             self.wait(12);
         }
 
-        /// Pulses of the step pin, one each 250 us.
+        /// Pulses of the step pin, one every 250 us.
         fn steps(&mut self, count: u32) {
             self.axis.set_enabled(true);
             for _ in 0..count {
@@ -368,7 +365,7 @@ mod tests {
         }
     }
 
-    /// The example that the data sheet's CRC and klippy agree on: a read of IFCNT.
+    /// The data sheet's CRC and klippy agree on this example: a read of IFCNT.
     #[test]
     fn the_check_sum_is_crc8_atm() {
         assert_eq!(crc8(&[0x05, 0x00, 0x02]), 0x8f);
@@ -437,13 +434,13 @@ mod tests {
         assert_eq!(bench.read(GSTAT), 1);
     }
 
-    /// The chip takes the length of a bit from the sync nibble: what is sent 4 % too slowly all the way
-    /// is heard as well as what is not.
+    /// The chip takes the length of a bit from the sync nibble. So it also understands a message that is 4 % too slow
+    /// throughout.
     #[test]
     fn bits_are_read_in_their_middle() {
         let mut bench = Bench::new(2);
         let whole = [0xf5, 2, IFCNT, crc8(&[0xf5, 2, IFCNT])];
-        // Each edge as late or early as 40 % of a bit, as a fixed pattern has it; not those of the sync nibble.
+        // Each edge is up to 40 % of a bit late or early, in a fixed pattern. The edges of the sync nibble are exact.
         let mut level = true;
         let mut edges = 0u64;
         let begin = bench.now.ticks();
@@ -451,7 +448,7 @@ mod tests {
             let next = (u32::from(whole[(place / 10) as usize]) << 1 | 0x200) >> (place % 10) & 1 != 0;
             if next != level {
                 edges += 1;
-                // A start bit sets the clock anew: no edge of a byte may be farther off than from that one.
+                // A start bit sets the clock anew. Each edge of a byte is at most this far off relative to it.
                 let off = if place < 5 || place % 10 == 0 { 0 } else { [40i64, -40, 20][(edges % 3) as usize] };
                 let at = (begin + place * BIT).wrapping_add_signed(off * BIT as i64 / 100);
                 bench.pin.drive(next, Clock::from_ticks(at));
@@ -476,11 +473,11 @@ mod tests {
         // 3000 clocks and 16 microsteps of 1/256. The message itself takes 80 us.
         assert_eq!(bench.read(TSTEP), 187);
         assert_eq!(bench.read(SG_RESULT), SG_FREE);
-        // The direction line of this axis is high for back.
+        // The direction line of this axis is high for backward.
         assert_eq!(bench.read(MSCNT), 1024 - 160);
         assert_eq!(bench.read(DRV_STATUS) >> 30, 1);
         assert_eq!(bench.read(IOIN) & 1 << 4, 0);
-        // To its end at -2 mm, and 3 of 16 microsteps on.
+        // To its end at -2 mm, and 3 of 16 microsteps further.
         bench.steps(47 * 80 - 10 + 3);
         assert_eq!(bench.read(SG_RESULT), SG_FREE - 46);
         assert_eq!(bench.read(IOIN) & 1 << 4, 0);

@@ -1,19 +1,18 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The stepper driver TMC5160 in its step and direction mode, after its data sheet (Trinamic,
-//! TMC5160A, rev. 1.14: "SPI Interface", "Register Mapping", "Sine-Wave Look-up Table").
+//! The stepper driver TMC5160 in its step and direction mode, after its data sheet (Trinamic, TMC5160A, rev. 1.14: "SPI
+//! Interface", "Register Mapping", "Sine-Wave Look-up Table").
 //!
-//! A datagram has 40 bits: an address, with bit 7 set to write, and 32 bits of data. What comes
-//! back is a status byte, and what the datagram *before* this one asked for. The chip keeps what it
-//! was told until its power is off, whatever the machine is reset.
+//! A datagram has 40 bits: an address, with bit 7 set to write, and 32 bits of data. The answer is a status byte and
+//! the data that the *previous* datagram asked for. The chip keeps its settings until its power is off, even if the MCU
+//! is reset.
 //!
-//! Simulated: every register with its access and its reset value, the microstep counter and the
-//! currents of the wave table, standstill and the time between steps, the inputs, StallGuard and DIAG1
-//! (`trinamic.rs`). The motor is
-//! simulated by its [`Axis`], which turns whether the chip's power stage is on or not and however
-//! many microsteps the chip is told to make, so that a host may do without the chip; of the set-up
-//! only the edges that are steps (DEDGE) are the axis's, too. Not simulated: DIAG0, CoolStep, temperatures
-//! and faults, the automatic tuning of StealthChop, and the ramp generator and encoder (their
-//! registers keep what is written).
+//! Simulated: every register with its access and its reset value, the microstep counter and the currents of the wave
+//! table, standstill and the time between steps, the inputs, StallGuard and DIAG1 (`trinamic.rs`). The [`Axis`]
+//! simulates the motor. It turns whether or not the chip's power stage is on, and for any microstep setting. So a host
+//! can omit the chip's section. Only one setting affects the axis: which edges are steps (DEDGE).
+//!
+//! Not simulated: DIAG0, CoolStep, temperatures and faults, the automatic tuning of StealthChop, and the ramp generator
+//! and encoder (their registers keep what is written).
 
 #![forbid(unsafe_code)]
 
@@ -60,7 +59,7 @@ const PWM_AUTO: u8 = 0x72;
 
 /// FCLKTRIM as the factory wrote it to the chip.
 const OTP: u32 = 0x0f;
-/// IOIN: VERSION, and SD_MODE, which is wired high for steps and directions.
+/// IOIN: VERSION, and SD_MODE, which is wired high for the step and direction mode.
 const VERSION: u32 = 0x30 << 24;
 const SD_MODE: u32 = 1 << 6;
 const GCONF_EN_PWM_MODE: u32 = 1 << 2;
@@ -71,15 +70,15 @@ const GSTAT_DRV_ERR: u32 = 1 << 1;
 const CHOPCONF_DEDGE: u32 = 1 << 29;
 const DRV_STATUS_STALLGUARD: u32 = 1 << 24;
 
-/// SG_RESULT of a free motor with SGT at 0, what it falls by up to the full load, and what it rises by with
-/// each step of SGT: values of a common motor. The data sheet gives no formula.
+/// SG_RESULT of a free motor with SGT at 0, its decrease at full load, and its increase with each step of SGT. These
+/// are values of a common motor: the data sheet gives no formula.
 const SG_FREE: i32 = 200;
 const SG_FALL: i32 = 300;
 const SG_PER_SGT: i32 = 10;
 
 use Access::{Read as R, ReadClear as C, ReadWrite as RW, Write as W};
 
-/// What is at no address here reads as zero.
+/// An address without a register reads as zero.
 const REGISTERS: &[Register] = &[
     Register(GCONF, RW, 18, 0x0000_0008),
     Register(GSTAT, C, 3, 0x0000_0001),
@@ -151,7 +150,7 @@ const REGISTERS: &[Register] = &[
 pub struct Tmc5160Config {
     /// Its SPI bus.
     pub bus: String,
-    /// Low selects it; without it, it is the only chip on its bus.
+    /// Low selects the chip. Without this pin it is the only chip on its bus.
     pub select_pin: Option<PinName>,
     /// The axis whose motor it drives.
     pub axis: String,
@@ -192,7 +191,7 @@ impl Part for Tmc5160Config {
         cfg.key("run_current", 0.8);
         cfg.key("sense_resistor", 0.075);
         if let Some(pin) = &self.diag1_pin {
-            // An open drain: a low level tells of a stall.
+            // An open drain: a low level reports a stall.
             let inverted = if pin.inverted { "" } else { "!" };
             cfg.key("diag1_pin", format_args!("^{inverted}{}", pin.name));
             offer_sensorless_homing(cfg, layout, "tmc5160", &self.axis, ("driver_SGT", 0));
@@ -200,16 +199,15 @@ impl Part for Tmc5160Config {
     }
 }
 
-/// The chip.
 struct Tmc5160 {
     motor: Motor,
     time: Arc<dyn TimeSource>,
     diag1: Arc<StallOutput>,
     registers: Registers,
-    /// The shift register of 40 bits, and the bytes that came in since the chip was selected.
+    /// The shift register of 40 bits; the next field counts the bytes since the chip was selected.
     shift: u64,
     bytes: usize,
-    /// What the next datagram brings back.
+    /// The data that the next datagram returns.
     reply: u32,
 }
 
@@ -229,7 +227,7 @@ impl Tmc5160 {
         self.motor.set_up(self.registers.get(CHOPCONF) >> 24 & 0xf, reversed);
     }
 
-    /// What a host reads.
+    /// The value that a host reads.
     fn read(&self, address: u8) -> u32 {
         let now = self.time.now();
         match address {
@@ -268,7 +266,7 @@ impl Tmc5160 {
         let stealth = self.registers.is_set(GCONF, GCONF_EN_PWM_MODE) && tstep >= self.registers.get(TPWMTHRS);
         let current = self.registers.get(IHOLD_IRUN) >> if stands { 0 } else { 8 } & 0x1f;
         let mut status = u32::from(stands) << 31 | current << 16 | u32::from(stealth) << 14;
-        // The measurement is SpreadCycle's.
+        // Only SpreadCycle measures the load.
         if !stealth && !stands {
             let fall = SG_FALL * self.motor.load(now) as i32 / FULL_LOAD as i32;
             let result = (SG_FREE + SG_PER_SGT * sgt(&self.registers) - fall).clamp(0, 0x3ff) as u32;
@@ -287,16 +285,16 @@ impl Tmc5160 {
     }
 }
 
-/// SGT of COOLCONF, which has a sign.
+/// SGT of COOLCONF, a signed number.
 fn sgt(registers: &Registers) -> i32 {
     let bits = (registers.get(COOLCONF) >> 16 & 0x7f) as i32;
     if bits < 0x40 { bits } else { bits - 0x80 }
 }
 
-/// When DIAG1 tells of a stall: SG_RESULT is 0, at velocities from TCOOLTHRS on, and in SpreadCycle.
+/// When DIAG1 reports a stall: SG_RESULT is 0, the velocity is at least TCOOLTHRS, and SpreadCycle is in use.
 fn stall_rule(registers: &Registers) -> StallRule {
     let is_set = |bit| registers.is_set(GCONF, bit);
-    // The load from which on SG_RESULT is 0.
+    // The lowest load at which SG_RESULT is 0.
     let load = (SG_FREE + SG_PER_SGT * sgt(registers)) * FULL_LOAD as i32;
     let load = (load.max(0) as u32).div_ceil(SG_FALL as u32);
     let stealth_from = if is_set(GCONF_EN_PWM_MODE) { registers.get(TPWMTHRS) } else { STANDSTILL };
@@ -326,8 +324,8 @@ impl SpiChip for Tmc5160 {
         out
     }
 
-    /// Of a longer datagram the last 40 bits count (the others are those of chips behind this one
-    /// in a chain); a shorter one is none.
+    /// Only the last 40 bits of a longer datagram count. The others belong to chips behind this one in a chain. A
+    /// shorter datagram has no effect.
     fn deselect(&mut self) {
         if self.bytes < DATAGRAM_BYTES {
             return;
@@ -389,7 +387,7 @@ mod tests {
             self.clock.set(Clock::from_ticks(self.clock.now().ticks() + ms * u64::from(CLOCK_FREQ) / 1000));
         }
 
-        /// Pulses of the step pin, one in so many milliseconds.
+        /// Pulses of the step pin, one every `ms` milliseconds.
         fn steps(&self, count: u32, ms: u64) {
             self.axis.set_enabled(true);
             for _ in 0..count {
@@ -454,7 +452,7 @@ mod tests {
         assert_eq!(bench.read(DRV_STATUS), 0x001f_00c8);
         assert_eq!(bench.read(IOIN), 0x3000_0042);
         assert_eq!(bench.read(MSCNT), 1024 - 160, "DIR is high");
-        // The counter goes on from there in steps of another size, and backwards.
+        // The counter continues in steps of another size, and backwards.
         bench.write(CHOPCONF, 0x1041_0150 | 8 << 24);
         bench.steps(3, 1);
         bench.write(GCONF, GCONF_SHAFT);
@@ -478,13 +476,13 @@ mod tests {
         assert_eq!(bench.axis.position_steps(), start + 9);
     }
 
-    /// Half a full step against the end of the axis is half of the full load.
+    /// Half a full step against the end of the axis gives half of the full load.
     #[test]
     fn a_load_makes_sg_result_fall_and_sgt_makes_it_rise() {
         let mut bench = Bench::new();
         bench.write(CHOPCONF, 0x1041_0150 | 4 << 24);
         bench.axis.set_forward(false);
-        // It stands at 12 mm and goes 2 mm beyond its end.
+        // It stands at 12 mm and moves 2 mm beyond its end.
         bench.steps(14 * 400 + 8, 1);
         assert_eq!(bench.read(DRV_STATUS) & 0x3ff, 50);
         assert_eq!(bench.datagram(DRV_STATUS, 0).0 & 4, 0);
@@ -498,7 +496,7 @@ mod tests {
         assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, DRV_STATUS_STALLGUARD);
         assert_eq!(bench.datagram(DRV_STATUS, 0).0 & 4, 4);
         assert!(bench.chip.diag1.is_stalled(bench.clock.now()));
-        // In StealthChop there is no StallGuard.
+        // StealthChop has no StallGuard.
         bench.write(GCONF, GCONF_DIAG1_STALL | GCONF_EN_PWM_MODE);
         assert_eq!(bench.read(DRV_STATUS) & 0x0100_03ff, 0);
         assert!(!bench.chip.diag1.is_stalled(bench.clock.now()));

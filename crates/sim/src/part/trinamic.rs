@@ -1,11 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What Trinamic's stepper drivers have in common: registers, the microstep counter and its wave, the
-//! time between steps, and StallGuard's output.
+//! The common part of Trinamic's stepper drivers: registers, the microstep counter and its wave, the time between
+//! steps, and StallGuard's output.
 //!
-//! StallGuard measures how far the load turns the rotor back from the field. Here a motor that is free has
-//! no load, and one that drives against the end of its axis one that grows with each lost step, up to its
-//! full torque at a full step. So the measured value follows each step; the chips' own does with each full
-//! step only.
+//! StallGuard measures how far the load turns the rotor back from the field. Here a free motor has no load. A motor
+//! that drives against the end of its axis has a load that grows with each lost step. It reaches the full torque after
+//! a full step. So the measured value follows each step. In the real chips it follows each full step only.
 
 #![forbid(unsafe_code)]
 
@@ -21,28 +20,28 @@ use pinion_firmware::time::{CLOCK_FREQ, Clock};
 
 /// The internal clock.
 const CLOCK_HZ: u64 = 12_000_000;
-/// TSTEP at standstill; also the clocks without a step after which the motor stands still.
+/// TSTEP at standstill. After this many clocks without a step the motor counts as standing still.
 pub(crate) const STANDSTILL: u32 = 0xf_ffff;
-/// Of the wave table, in a full step.
+/// Places of the wave table in a full step.
 const FULL_STEP: u64 = 256;
-/// The load of a motor that is stalled.
+/// The load of a stalled motor.
 pub(crate) const FULL_LOAD: u32 = 1000;
 
-/// What the host may do with a register.
+/// The host's access to a register.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum Access {
     /// It reads as zero.
     Write,
     Read,
     ReadWrite,
-    /// Ones that are written clear their bits.
+    /// A written one clears its bit.
     ReadClear,
 }
 
-/// A register: its address, access, the bits that it has, and its value at power-up.
+/// A register: its address, access, bits, and value at power-up.
 pub(crate) struct Register(pub(crate) u8, pub(crate) Access, pub(crate) u32, pub(crate) u32);
 
-/// A chip's registers, as the host has set them. What is at no address of the table reads as zero.
+/// A chip's registers, as the host has set them. An address that is not in the table reads as zero.
 pub(crate) struct Registers {
     table: &'static [Register],
     values: [u32; 128],
@@ -69,7 +68,7 @@ impl Registers {
         self.table.iter().find(|register| register.0 == address)
     }
 
-    /// What the host reads, where that is what is written.
+    /// The value that the host reads, if it is the stored value.
     pub(crate) fn read(&self, address: u8) -> u32 {
         match self.find(address) {
             None | Some(Register(_, Access::Write, ..)) => 0,
@@ -88,14 +87,13 @@ impl Registers {
     }
 }
 
-/// Tells of a driver's section that klippy does without it.
+/// Says in a driver's section that klippy can run without the section.
 pub(crate) fn may_be_left_out(cfg: &mut Sections) {
     cfg.comment("The motor turns without this section, too. When you take it out, start Pinion anew: the chip");
     cfg.comment("keeps what it was told, and then takes each pulse for two steps.");
 }
 
-/// Offers the sections with which an axis that has an endstop homes by its driver instead, to where it hits
-/// something.
+/// Offers the sections for homing by the driver instead of the endstop: the axis then moves until it hits its end.
 pub(crate) fn offer_sensorless_homing(
     cfg: &mut Sections,
     layout: &Layout<'_>,
@@ -127,9 +125,9 @@ pub(crate) struct Motor {
     pub(crate) axis: Arc<Axis>,
     /// The size of a step as a power of two of 256th full steps (MRES).
     mres: u32,
-    /// Whether the counter goes the other way (SHAFT).
+    /// Whether the counter runs backward (SHAFT).
     reversed: bool,
-    /// Steps of the motor and the microstep counter when one of these was set up.
+    /// The motor's steps and the microstep counter when one of these settings last changed.
     origin: (i64, u32),
 }
 
@@ -139,14 +137,14 @@ impl Motor {
         Motor { axis, mres: 8, reversed: false, origin }
     }
 
-    /// From here on a step is of this size.
+    /// Sets the size and the direction of the following steps.
     pub(crate) fn set_up(&mut self, mres: u32, reversed: bool) {
         self.origin = (self.axis.turned_steps(), self.mscnt());
         self.mres = mres.min(8);
         self.reversed = reversed;
     }
 
-    /// The place in the wave table, 1024 to four full steps: it goes up while DIR is low.
+    /// The place in the wave table, 1024 for four full steps. It rises while DIR is low.
     pub(crate) fn mscnt(&self) -> u32 {
         let (step, mscnt) = self.origin;
         let went = self.axis.turned_steps().wrapping_sub(step) << self.mres;
@@ -188,8 +186,8 @@ fn load(axis: &Axis, mres: u32, now: Clock) -> u32 {
     back as u32 * FULL_LOAD / FULL_STEP as u32
 }
 
-/// A sine as increments from each place of its first quarter to the next, in four segments of their own
-/// widths ("Sine-Wave Look-up Table").
+/// A sine as increments between the places of its first quarter. It has four segments with their own widths ("Sine-Wave
+/// Look-up Table").
 pub(crate) struct Wave {
     /// MSLUT: a bit for each increment.
     pub(crate) increments: [u32; 8],
@@ -200,7 +198,7 @@ pub(crate) struct Wave {
 }
 
 impl Wave {
-    /// The one of power-up, which drivers without such registers have for good.
+    /// The wave at power-up. Drivers without wave registers always use it.
     pub(crate) const DEFAULT: Wave = Wave {
         increments: [
             0xaaaa_b554,
@@ -235,27 +233,27 @@ impl Wave {
     }
 }
 
-/// When a driver says that its motor is stalled.
+/// When a driver reports that its motor is stalled.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) struct StallRule {
-    /// None if it never does.
+    /// `None` if it never reports a stall.
     pub(crate) least_load: Option<u32>,
-    /// The range of TSTEP in which it looks.
+    /// The range of TSTEP in which the driver checks.
     pub(crate) fastest: u32,
     pub(crate) slowest: u32,
     pub(crate) mres: u32,
-    /// Whether the pin is driven high for a stall; otherwise it is an open drain, and low.
+    /// Whether the pin is driven high for a stall. Otherwise it is an open drain, and low for a stall.
     pub(crate) push_pull: bool,
 }
 
-/// A driver's output for a stall (DIAG). The core senses it, so the rule is one word.
+/// A driver's output for a stall (DIAG). The core reads it, so the rule is one word.
 pub(crate) struct StallOutput {
     name: String,
     axis: Arc<Axis>,
     rule: AtomicU64,
 }
 
-/// Stands for no least load: no motor has it.
+/// Means "no least load". No motor has this load.
 const NO_LOAD: u32 = 0x3ff;
 
 impl StallOutput {
@@ -285,7 +283,7 @@ impl StallOutput {
         }
     }
 
-    /// Whether the motor is stalled, as the driver sees it.
+    /// Whether the driver sees the motor as stalled.
     pub(crate) fn is_stalled(&self, now: Clock) -> bool {
         let StallRule { least_load, fastest, slowest, mres, .. } = self.rule();
         let tstep = tstep(&self.axis, mres, now);

@@ -9,20 +9,20 @@ use std::sync::{Arc, Mutex, TryLockError};
 use crate::engine::wire::{Kind, Wire};
 use pinion_firmware::time::Clock;
 
-/// The low nibble of a message's first byte; the high one may be anything.
+/// The low nibble of a message's first byte. The high nibble may have any value.
 pub(crate) const SYNC: u8 = 0x05;
-/// The address in an answer: the host's.
+/// The address in an answer: the host.
 pub(crate) const HOST: u8 = 0xff;
 pub(crate) const WRITE: u8 = 0x80;
 const READ_LEN: usize = 4;
 pub(crate) const WRITE_LEN: usize = 8;
-/// A byte with its start and its stop bit.
+/// Bits of a byte with its start and its stop bit.
 const FRAME_BITS: u64 = 10;
-/// After a pause of so many bit times between two start bits, or after a fault and so many of silence, a
-/// message begins anew.
+/// A new message begins after a pause of `PAUSE_BITS` bit times between two start bits. After a fault it begins after
+/// `RECOVERY_BITS` bit times of silence.
 const PAUSE_BITS: u64 = 63;
 const RECOVERY_BITS: u64 = 12;
-/// The baud rates that the chip hears: 9000 to its clock / 16.
+/// The longest bit that the chip understands: its baud rates are 9000 to its clock / 16.
 const LONGEST_BIT: u64 = pinion_firmware::time::CLOCK_FREQ as u64 / 9000;
 
 /// CRC8-ATM, each byte from its lowest bit on ("CRC Calculation").
@@ -35,40 +35,40 @@ pub(crate) fn crc8(bytes: &[u8]) -> u8 {
     })
 }
 
-/// What the chip's receiver waits for.
+/// The event that the chip's receiver waits for.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Expects {
     /// The start bit of a message.
     Message,
-    /// The edges of the sync nibble after the first one, of which so many came.
+    /// The next edges of the sync nibble; this many have come after the first one.
     Sync(u32),
     /// The middle of this bit of a byte (0 is the start bit).
     Bit(u64),
     /// The start bit of the next byte.
     Byte,
-    /// Silence, as what came was no message.
+    /// Silence, because the bits so far were no message.
     Silence,
 }
 
-/// A chip that a UART talks to.
+/// A chip with a UART.
 pub(crate) trait UartChip: Send {
-    /// Takes a message in; what it answers.
+    /// Takes a message in and returns the answer.
     fn hear(&mut self, message: &[u8], now: Clock) -> Option<[u8; WRITE_LEN]>;
 
     /// Bit times from a message to its answer.
     fn send_delay(&self) -> u64;
 }
 
-/// The chip's UART on its wire, which is high when nobody drives it low.
+/// The chip's UART on its wire. The wire is high when nothing drives it low.
 pub(crate) struct Uart {
     chip: Box<dyn UartChip>,
     expects: Expects,
-    /// The wire's level as the machine drives it, and since when.
+    /// The wire's level as the MCU drives it; the next field is since when.
     high: bool,
     since: Clock,
     /// Ticks of a bit; 0 before the first sync nibble.
     bit: u64,
-    /// The start bit of the byte that comes, or came last.
+    /// The start bit of the current or the last byte.
     start: Clock,
     bytes: [u8; WRITE_LEN],
     len: usize,
@@ -111,7 +111,7 @@ impl Uart {
         }
     }
 
-    /// The machine drives the wire, or lets go of it, which pulls it up.
+    /// The MCU drives the wire, or releases it. A released wire is pulled up.
     fn set(&mut self, high: bool, at: Clock) {
         self.look(at);
         if high == self.high {
@@ -137,8 +137,8 @@ impl Uart {
         }
     }
 
-    /// An edge of the sync nibble, 1010, which takes the chip as long as four bits from the falling edge
-    /// of the start bit to the last falling one.
+    /// An edge of the sync nibble, 1010. The chip measures four bits, from the falling edge of the start bit to the
+    /// last falling edge.
     fn sync(&mut self, edges: u32, at: Clock) {
         let edges = edges + 1;
         self.expects = Expects::Sync(edges);
@@ -153,12 +153,12 @@ impl Uart {
         }
     }
 
-    /// The middle of a bit of the byte that comes.
+    /// The middle of a bit of the current byte.
     fn middle(&self, bit: u64) -> Clock {
         Clock::from_ticks(self.start.ticks() + bit * self.bit + self.bit / 2)
     }
 
-    /// Takes in what went by until now, while the wire stood as it stands.
+    /// Reads the bits until now. The wire kept its level during this time.
     fn look(&mut self, now: Clock) {
         while let Expects::Bit(bit) = self.expects {
             let middle = self.middle(bit);
@@ -178,7 +178,7 @@ impl Uart {
         }
     }
 
-    /// A byte is whole, in the middle of its stop bit.
+    /// A byte is complete, in the middle of its stop bit.
     fn byte(&mut self, now: Clock) {
         self.len += 1;
         self.expects = Expects::Byte;
@@ -198,14 +198,14 @@ impl Uart {
         self.answer = bytes.map(|bytes| Answer { at: Clock::from_ticks(end), bit: self.bit, bytes });
     }
 
-    /// The level of the wire when the machine does not drive it.
+    /// The level of the wire when the MCU does not drive it.
     fn level(&mut self, now: Clock) -> bool {
         self.look(now);
         self.answer.is_none_or(|answer| answer.level(now))
     }
 }
 
-/// What an end of the UART does.
+/// The role of one end of the UART.
 #[derive(Clone, Copy, PartialEq)]
 pub(crate) enum Role {
     /// Sends and receives, by turns.
@@ -214,7 +214,7 @@ pub(crate) enum Role {
     Receiver,
 }
 
-/// The board's end of the wire, or one of two.
+/// The board's end of the wire, or one of its two ends.
 pub(crate) struct UartPin {
     pub(crate) name: String,
     pub(crate) role: Role,
@@ -222,8 +222,8 @@ pub(crate) struct UartPin {
 }
 
 impl UartPin {
-    /// Something happens on the wire. One thread at a time drives it; should another come in between, the
-    /// chip does not hear it.
+    /// An access to the wire. One thread at a time drives it. The chip does not hear an access of another thread at the
+    /// same time.
     fn on_wire<T>(&self, happens: impl FnOnce(&mut Uart) -> T) -> Option<T> {
         match self.uart.try_lock() {
             Ok(mut uart) => Some(happens(&mut uart)),
@@ -254,7 +254,7 @@ impl Wire for UartPin {
         self.on_wire(|uart| uart.set(true, at));
     }
 
-    /// The machine's own low level is on the wire, too.
+    /// The MCU's own low level is also on the wire.
     fn sense(&self, _driven: bool, at: Clock) -> bool {
         self.on_wire(|uart| uart.level(at) && uart.high).unwrap_or(true)
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What each part of the printer does for the rest of it, and where the printer is put together.
+//! The interface between a part and the rest of the printer, and the place where the printer is assembled.
 
 #![forbid(unsafe_code)]
 
@@ -20,20 +20,20 @@ use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::TimeSource;
 
-/// Where a part hangs on a bus.
+/// A part's connection to a bus.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Socket<'a> {
-    /// A chip on an SPI bus: low on the pin selects it; without a pin it is the only chip there.
+    /// A chip on an SPI bus. Low on the pin selects it. Without a pin it is the only chip there.
     Spi { bus: &'a str, select_pin: Option<&'a PinName> },
     /// A chip on an I2C bus.
     I2c { bus: &'a str, address: u8 },
-    /// Something on the data output of an SPI bus alone.
+    /// A listener on the data output of an SPI bus alone.
     Mosi { bus: &'a str },
 }
 
 /// A part's description.
 pub(crate) trait Part {
-    /// Its name for people, which no other part has.
+    /// Its name for people. No other part has this name.
     fn name(&self) -> String;
 
     /// Its bus, if it is a chip on one.
@@ -41,27 +41,27 @@ pub(crate) trait Part {
         None
     }
 
-    /// The pins that it is wired to by their keys, but for the one that selects it on its bus.
+    /// The pins of its wires by their keys, without the pin that selects it on its bus.
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
         Vec::new()
     }
 
-    /// Checks the values that are its own; `whose` begins an error's line.
+    /// Checks the part's own values. `whose` begins an error's line.
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         let _ = (whose, printer);
         Ok(())
     }
 
-    /// Makes the part and wires it. What `validate` refuses does not come here.
+    /// Makes the part and wires it. It is called only after `validate` has accepted the part.
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble>;
 
-    /// Adds its sections, if klippy has one.
+    /// Adds its sections, if klippy has sections for it.
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         let _ = (cfg, layout);
     }
 }
 
-/// Where a printer is put together.
+/// The place where a printer is assembled.
 pub(crate) struct Workshop<'a> {
     pub(crate) printer: Printer<'a>,
     pub(crate) clock: Arc<dyn TimeSource>,
@@ -72,12 +72,12 @@ pub(crate) struct Workshop<'a> {
 }
 
 impl Workshop<'_> {
-    /// An axis by its name, if there is one.
+    /// An axis by its name; `None` if there is no such axis.
     pub(crate) fn axis(&self, name: &str) -> Option<Arc<Axis>> {
         self.world.axes.iter().find(|axis| axis.name == name).cloned()
     }
 
-    /// A heater by its name, if there is one.
+    /// A heater by its name; `None` if there is no such heater.
     pub(crate) fn heater(&self, name: &str) -> Option<Arc<Heater>> {
         self.world.heaters.iter().find(|heater| heater.name == name).cloned()
     }
@@ -113,7 +113,7 @@ impl Workshop<'_> {
         self.wire_shared(pin, Arc::new(wire));
     }
 
-    /// Wires a pin, if the part has it, to what the part itself looks at, too.
+    /// Wires a pin, if the part has it, to an object that the part itself also reads.
     pub(crate) fn wire_shared(&mut self, pin: Option<&PinName>, wire: Arc<dyn Wire>) {
         self.pins.extend(pin.map(|pin| WiredPin::new(pin, wire)));
     }
@@ -146,7 +146,7 @@ impl Workshop<'_> {
         }
     }
 
-    /// Lets a person see the part.
+    /// Shows the part to a person.
     pub(crate) fn show(&mut self, sight: Arc<dyn Sight>) {
         self.world.sights.push(sight);
     }

@@ -2,12 +2,12 @@
 //! A strip of WS2812B lights ("neopixels") on the data output (MOSI) of an SPI bus, after their data
 //! sheet (Worldsemi WS2812B: "Data transfer time", "Sequence chart", "Cascade method").
 //!
-//! A bit is a pulse: 0.4 us high for 0, 0.8 us for 1, each 0.15 us more or less. Each light takes the
-//! first bits that it gets for itself and passes on what follows; all show what they took once the line
-//! is low for 50 us. The strip hears whatever is sent on its bus, at the bus's rate, meant for it or not.
+//! A bit is a pulse: 0.4 us high for 0, 0.8 us for 1, each within 0.15 us. Each light keeps the first bits that it
+//! receives and passes on the rest. When the line has been low for 50 us, all lights show their bits. The strip hears
+//! everything on its bus, at the bus's rate, even transfers for other devices.
 //!
-//! Pulses that no data sheet has are taken for what they are nearer to, and are told of with the colours:
-//! real strips differ in what they make of them.
+//! A pulse outside the data sheet's tolerance counts as the nearer value. The display of the colors mentions these
+//! pulses, because real strips differ in how they read them.
 
 #![forbid(unsafe_code)]
 
@@ -29,23 +29,23 @@ use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 const ZERO_HIGH_NS: f64 = 400.0;
 const ONE_HIGH_NS: f64 = 800.0;
 const TOLERANCE_NS: f64 = 150.0;
-/// The least low times after a 0 and after a 1 (T0L, T1L). A longer one is a pause.
+/// Shortest low times after a 0 and after a 1 (T0L, T1L). A longer one is a pause.
 const ZERO_LOW_NS: f64 = 850.0 - TOLERANCE_NS;
 const ONE_LOW_NS: f64 = 450.0 - TOLERANCE_NS;
-/// A line that is low for so long has the lights show what they took (RES).
+/// How long the line must be low before the lights show their bits (RES).
 const RESET_NS: f64 = 50_000.0;
 
 /// A strip's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Ws2812Config {
-    /// Such as `strip`.
+    /// For example `strip`.
     pub name: String,
-    /// The SPI bus whose data output it is on.
+    /// The SPI bus with the data output for this strip.
     pub bus: String,
     /// How many lights it has.
     pub count: u32,
-    /// The order in which a light takes its colours: letters of `RGB` or `RGBW`.
+    /// The order in which a light receives its colors: letters of `RGB` or `RGBW`.
     #[serde(default = "default_color_order")]
     pub color_order: String,
 }
@@ -89,7 +89,7 @@ impl Part for Ws2812Config {
     }
 }
 
-/// The lights, and what they see of the line.
+/// The lights, and their view of the line.
 struct Strip {
     name: String,
     color_order: Vec<u8>,
@@ -98,15 +98,15 @@ struct Strip {
 
 struct State {
     lights: Vec<Colour>,
-    /// Pulses of the colours that are shown which no data sheet has.
+    /// Number of pulses outside the data sheet's tolerance in the colors that are shown.
     odd_pulses: u32,
-    /// The line's level, since how long, and until when that is known.
+    /// The line's level, how long it has lasted, and the time up to which that is known.
     high: bool,
     level_ns: f64,
     until: Clock,
     /// The last pulse was a 1.
     one: bool,
-    /// What was taken since the last reset, and how much of it by bits.
+    /// The bits received since the last reset; the next field counts them.
     taken: Vec<u8>,
     bits: usize,
     odd: u32,
@@ -114,7 +114,7 @@ struct State {
 
 impl Strip {
     fn new(config: &Ws2812Config) -> Strip {
-        // The bounds on the description keep this small.
+        // The limits of the description keep this small.
         let count = config.count as usize;
         let state = State {
             lights: vec![Colour::default(); count],
@@ -134,10 +134,10 @@ impl Strip {
         }
     }
 
-    /// What the lights are at this instant: only workers and those who look wait here.
+    /// The lights at this instant. Only workers and viewers wait here.
     fn at(&self, now: Clock) -> MutexGuard<'_, State> {
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
-        // An output that rests stays at the level of its last bit.
+        // An idle output stays at the level of its last bit.
         let rest = now.since(state.until).max(0) as f64;
         if rest > 0.0 {
             state.level_ns += rest * 1e9 / f64::from(CLOCK_FREQ);
@@ -147,7 +147,7 @@ impl Strip {
         state
     }
 
-    /// The line has a level for so long.
+    /// The line has a level for this time.
     fn level(&self, state: &mut State, high: bool, ns: f64) {
         if state.high == high {
             state.level_ns += ns;
@@ -173,14 +173,14 @@ impl State {
         let off = |nominal_ns: f64| (self.level_ns - nominal_ns).abs();
         self.one = off(ONE_HIGH_NS) < off(ZERO_HIGH_NS);
         self.odd += u32::from(off(ZERO_HIGH_NS).min(off(ONE_HIGH_NS)) > TOLERANCE_NS);
-        // What is too much leaves the strip at its end.
+        // Surplus bits leave the strip at its end.
         if let Some(byte) = self.taken.get_mut(self.bits / 8) {
             *byte = *byte << 1 | u8::from(self.one);
             self.bits += 1;
         }
     }
 
-    /// Has the lights that took all of their bits show them, if the line is low for long enough.
+    /// If the line has been low for long enough, the lights with all of their bits show them.
     fn take_over(&mut self, color_order: &[u8]) {
         if self.high || self.level_ns < RESET_NS || self.bits == 0 {
             return;
@@ -206,7 +206,7 @@ impl Sight for Strip {
     }
 
     fn look(&self, now: Clock) -> String {
-        // The bus must not wait for what is done with it.
+        // The bus must not wait for the formatting.
         let (lights, odd_pulses) = {
             let state = self.at(now);
             (state.lights.clone(), state.odd_pulses)
@@ -232,7 +232,7 @@ impl MosiListener for Input {
         for bit in bytes.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 != 0)) {
             self.strip.level(&mut state, bit, bit_ns);
         }
-        // The simulated bus needs no time for its bits, a real one does.
+        // The simulated bus needs no time for its bits, but a real one does.
         let took = bytes.len() as f64 * 8.0 * bit_ns * f64::from(CLOCK_FREQ) / 1e9;
         state.until = Clock::from_ticks(state.until.ticks().saturating_add(took as u64));
     }
@@ -257,7 +257,7 @@ mod tests {
             Bench { input: Input { strip, clock: Arc::new(clock.clone()) }, clock }
         }
 
-        /// Sends pulses at 20 MHz: of each the high and the low time by 50 ns.
+        /// Sends pulses at 20 MHz. Each has a high and a low time in units of 50 ns.
         fn pulses(&mut self, pulses: impl Iterator<Item = (usize, usize)>) {
             let bits: Vec<u8> = pulses.flat_map(|(high, low)| [vec![1; high], vec![0; low]].concat()).collect();
             let bytes: Vec<u8> = bits
@@ -267,7 +267,7 @@ mod tests {
             self.input.hear(20_000_000, &bytes);
         }
 
-        /// Sends bytes by the data sheet's times.
+        /// Sends bytes with the data sheet's timing.
         fn send(&mut self, bytes: &[u8]) {
             let bits = bytes.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 != 0));
             self.pulses(bits.map(|one| if one { (16, 9) } else { (8, 17) }));
@@ -292,7 +292,7 @@ mod tests {
         assert_eq!(bench.look(), "off off");
         bench.wait_us(6);
         assert_eq!(bench.look(), "#102030 #010203");
-        // A message for the first one only.
+        // A message for the first light only.
         bench.send(&[0, 0xff, 0]);
         bench.wait_us(500);
         assert_eq!(bench.look(), "#ff0000 #010203");
@@ -312,7 +312,7 @@ mod tests {
     fn a_white_part_and_a_reset_within_one_message() {
         let mut bench = Bench::new(1, "RGBW");
         bench.send(&[1, 2, 3, 4]);
-        // 60 us low, and other colours, not shown yet.
+        // 60 us low, and then other colors, which are not shown yet.
         bench.pulses([(0, 1200)].into_iter());
         bench.send(&[5, 6, 7, 8]);
         assert_eq!(bench.look(), "#010203+04");
@@ -327,7 +327,7 @@ mod tests {
             ((19, 6), true, 0),
             ((4, 20), false, 24),
             ((20, 12), true, 24),
-            // A low time that is too short before the next pulse, of which there are 23.
+            // A low time before the next pulse that is too short. There are 23 of them.
             ((8, 13), false, 23),
             ((16, 5), true, 23),
         ] {

@@ -6,12 +6,12 @@
 use super::shaft::{Frame, Shaft, even_parity};
 use crate::engine::spi::SpiChip;
 
-/// A frame has a zero, whether to write, six bits of address and eight of data. What is read comes with the
-/// next frame, as it is when that begins.
+/// A frame has a zero, a write bit, six bits of address and eight of data. The next frame returns the value that the
+/// register has when that frame begins.
 pub(super) struct A1333 {
     pub(super) shaft: Shaft,
     frame: Frame,
-    /// What is read.
+    /// The address of the last read.
     address: u8,
 }
 
@@ -31,7 +31,7 @@ impl A1333 {
                 let angle = self.shaft.angle(12);
                 angle | (even_parity(angle) ^ 1) << 12
             }
-            // Its identifier, and nothing to report.
+            // The chip's identifier, and nothing to report.
             A1333::STA => 0x8000,
             A1333::ANG15 => self.shaft.angle(15),
             _ => 0,
@@ -53,7 +53,7 @@ impl SpiChip for A1333 {
     }
 
     fn deselect(&mut self) {
-        // To write needs a code that no host here has.
+        // A write needs a code that no host has here.
         if let Some(frame) = self.frame.whole().filter(|frame| frame & 0x4000 == 0) {
             self.address = (frame >> 8 & 0x3f) as u8;
         }

@@ -6,13 +6,13 @@
 use super::shaft::{Frame, Shaft, even_parity};
 use crate::engine::spi::SpiChip;
 
-/// A frame has its even parity, whether to read, and 14 bits of address; an answer its parity, whether an error
-/// is to be told, and 14 bits of data. What is read is latched as the frame ends, and comes with the next.
+/// A frame has its even parity, a read bit, and 14 bits of address. An answer has its parity, an error bit, and 14 bits
+/// of data. The value is latched when the frame ends, and comes with the next frame.
 pub(super) struct As5047d {
     pub(super) shaft: Shaft,
     frame: Frame,
     answer: u16,
-    /// Where the next frame's data goes.
+    /// The address for the next frame's data.
     writes: Option<u16>,
     errors: u16,
     /// SETTINGS1 and SETTINGS2.
@@ -29,15 +29,15 @@ impl As5047d {
         As5047d { shaft, frame: Frame::default(), answer: 0, writes: None, errors: 0, settings: [0x01, 0] }
     }
 
-    /// What is at an address; none if there is no such register.
+    /// The value at an address; `None` if there is no such register.
     fn register(&mut self, address: u16) -> Option<u16> {
         match address {
             0x0000 | 0x0003 | 0x0016 | 0x0017 => Some(0),
             0x0001 => Some(std::mem::take(&mut self.errors)),
             0x0018 | 0x0019 => Some(self.settings[usize::from(address & 1)]),
-            // DIAAGC: the loop of the offset is finished, gain in the middle.
+            // DIAAGC: the offset loop is finished, and the gain is in the middle.
             0x3ffc => Some(0x0180),
-            // MAG: of a magnet that fits.
+            // MAG: the magnet fits.
             0x3ffd => Some(0x1200),
             // ANGLEUNC and ANGLECOM, which differ while the motor turns fast.
             0x3ffe | 0x3fff => Some(self.shaft.angle(14)),
@@ -80,7 +80,7 @@ impl SpiChip for As5047d {
     }
 
     fn deselect(&mut self) {
-        // Reading the error flags clears them: the answer tells of those before.
+        // Reading the error flags clears them: the answer reports the earlier errors.
         let had_errors = self.errors != 0;
         let data = match self.frame.whole() {
             Some(frame) => self.take_in(frame),

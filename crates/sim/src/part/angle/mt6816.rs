@@ -6,12 +6,12 @@
 use super::shaft::{Shaft, even_parity};
 use crate::engine::spi::SpiChip;
 
-/// A byte with the address and whether to read, then as many registers as the host clocks out. The angle is
-/// latched as the chip is selected.
+/// A byte with the address and a read bit, then as many registers as the host clocks out. The angle is latched when the
+/// chip is selected.
 pub(super) struct Mt6816 {
     pub(super) shaft: Shaft,
     latched: u16,
-    /// Of the register that goes out next; none until the address came.
+    /// The next register to send; `None` before the address.
     place: Option<u8>,
     address: u8,
 }
@@ -35,7 +35,7 @@ impl SpiChip for Mt6816 {
     fn exchange(&mut self, byte: u8) -> u8 {
         let Some(place) = self.place else {
             self.address = byte & 0x7f;
-            // What is written programs the chip, which is done in a factory.
+            // A write programs the chip. That is done in a factory.
             self.place = (byte & 0x80 != 0).then_some(self.address);
             return 0xff;
         };

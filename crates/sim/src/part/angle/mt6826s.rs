@@ -6,15 +6,15 @@
 use super::shaft::{Shaft, crc8};
 use crate::engine::spi::SpiChip;
 
-/// Four bits of command and twelve of address, then data: to read as many registers as the host clocks out.
-/// The angle is latched as the chip is selected.
+/// Four bits of command and twelve of address, then data. A read returns as many registers as the host clocks out. The
+/// angle is latched when the chip is selected.
 pub(super) struct Mt6826s {
     pub(super) shaft: Shaft,
     latched: u16,
     head: u16,
     bytes: usize,
     registers: [u8; 0x156],
-    /// Where the motor stood as a calibration began.
+    /// The motor's turns at the start of a calibration.
     calibrates_from: Option<f64>,
 }
 
@@ -27,19 +27,19 @@ impl Mt6826s {
     const AUTOCAL_STATUS: usize = 0x113;
     const AUTOCAL_KEY: usize = 0x155;
     const AUTOCAL_START: u8 = 0x5e;
-    /// Turns that its calibration takes.
+    /// Number of turns that a calibration takes.
     const AUTOCAL_TURNS: f64 = 16.0;
 
     pub(super) fn new(shaft: Shaft) -> Mt6826s {
         let mut registers = [0; 0x156];
-        // To be calibrated at 100 to 200 turns in a minute.
+        // Calibration at 100 to 200 turns per minute.
         registers[Mt6826s::AUTOCAL_FREQ] = 5 << 4;
         Mt6826s { shaft, latched: 0, head: 0, bytes: 0, registers, calibrates_from: None }
     }
 
     fn register(&self, address: usize) -> u8 {
         let [high, low] = (self.latched << 1).to_be_bytes();
-        // The magnet and the supply are well.
+        // The magnet and the supply have no faults.
         let angle = [high, low, 0];
         match address {
             Mt6826s::ANGLE..Mt6826s::CRC => angle[address - Mt6826s::ANGLE],

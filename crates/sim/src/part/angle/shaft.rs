@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A motor's shaft with a magnet, and what the frames of several sensors share.
+//! A motor's shaft with a magnet, and the common parts of several sensors' frames.
 
 #![forbid(unsafe_code)]
 
@@ -8,7 +8,7 @@ use std::sync::Arc;
 
 use crate::engine::physics::Axis;
 
-/// What a sensor measures.
+/// The shaft that a sensor measures.
 pub(super) struct Shaft {
     pub(super) axis: Arc<Axis>,
     pub(super) steps_per_turn: f64,
@@ -23,17 +23,17 @@ impl Shaft {
         self.axis.position_steps() as f64 / self.steps_per_turn
     }
 
-    /// The angle that the sensor finds: of so many bits.
+    /// The angle that the sensor measures, with this number of bits.
     pub(super) fn angle(&self, bits: u32) -> u16 {
         let angle = (self.turns() + self.offset).rem_euclid(1.0);
         let measured = angle + self.eccentricity * (TAU * angle).sin();
         let steps = f64::from(1u32 << bits);
-        // One turn is none.
+        // A full turn wraps to zero.
         (measured.rem_euclid(1.0) * steps) as u16 & ((1u32 << bits) - 1) as u16
     }
 }
 
-/// 1 where that makes the number of ones even.
+/// The bit that makes the number of ones even.
 pub(super) fn even_parity(word: u16) -> u16 {
     (word.count_ones() & 1) as u16
 }

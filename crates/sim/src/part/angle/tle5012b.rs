@@ -9,18 +9,17 @@ use super::shaft::{Shaft, crc8};
 use crate::engine::spi::SpiChip;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
-/// One wire both ways: a command word (read, lock, whether to read what was latched, address, count), so many
-/// data words, and the chip's safety word with a check sum. An empty selection latches angle, revolutions and
-/// clock.
+/// One wire both ways: a command word (read, lock, whether to read the latched values, address, count), data words, and
+/// the chip's safety word with a checksum. An empty selection latches angle, revolutions and clock.
 pub(super) struct Tle5012b {
     pub(super) shaft: Shaft,
     time: Arc<dyn TimeSource>,
     registers: [u16; 0x40],
-    /// AVAL to FSYNC as they were latched.
+    /// The latched values of AVAL to FSYNC.
     latched: [u16; 4],
-    /// The frame whose angle was read.
+    /// The frame of the last angle that was read.
     read_frame: Option<u64>,
-    /// Since power-up nobody has read STAT.
+    /// STAT has not been read since power-up.
     was_reset: bool,
     /// The bytes of the command and the data.
     said: Vec<u8>,
@@ -32,17 +31,17 @@ impl Tle5012b {
     const AVAL: usize = 0x02;
     const FSYNC: usize = 0x05;
     const MOD1: usize = 0x06;
-    /// Registers that need the lock code to be written.
+    /// Registers that need the lock code for a write.
     const LOCKED: std::ops::RangeInclusive<usize> = 0x05..=0x11;
     const LOCK: u16 = 0b1010;
-    /// Of its timer.
+    /// Frequency of its timer.
     const TIMER_HZ: u64 = 750_000;
-    /// TEMPER at 25 degrees: 2.776 for each degree from -152 at 0 on.
+    /// TEMPER at 25 degrees: -152 at 0 degrees, and 2.776 for each degree.
     const TEMPER: i16 = -83;
 
     pub(super) fn new(shaft: Shaft, time: Arc<dyn TimeSource>) -> Tle5012b {
         let mut registers = [0; 0x40];
-        // MOD1 with updates each 42.7 us, MOD2 with the range of 360 degrees, MOD4.
+        // MOD1 with updates every 42.7 us, MOD2 with the range of 360 degrees, MOD4.
         registers[Tle5012b::MOD1] = 0x4001;
         registers[0x08] = 0x0801;
         registers[0x0e] = 0x0080;
@@ -58,7 +57,7 @@ impl Tle5012b {
         }
     }
 
-    /// Ticks of its timer since power-up, and those from one measurement to the next.
+    /// Ticks of its timer since power-up; then the ticks between two measurements.
     fn timer(&self) -> (u64, u64) {
         let ticks = self.time.now().since(Clock::EPOCH).max(0) as u64;
         let timer = u128::from(ticks) * u128::from(Tle5012b::TIMER_HZ) / u128::from(CLOCK_FREQ);
@@ -85,12 +84,12 @@ impl Tle5012b {
         Some(u16::from_be_bytes(self.said.get(..2)?.try_into().ok()?))
     }
 
-    /// The word of a read at this place behind the command.
+    /// The word that a read returns at this place after the command.
     fn word(&mut self, command: u16, place: usize) -> u16 {
         let address = (usize::from(command >> 4 & 0x3f) + place) & 0x3f;
         match address {
             Tle5012b::STAT => {
-                // Bit 0 tells of a reset, bit 15 that this is new.
+                // Bit 0 reports a reset. Bit 15 says that this is new.
                 0x8000 | u16::from(std::mem::take(&mut self.was_reset))
             }
             Tle5012b::AVAL..=Tle5012b::FSYNC => {
@@ -106,7 +105,7 @@ impl Tle5012b {
     }
 
     fn safety(&self) -> [u8; 2] {
-        // All is well but for a reset; and which sensor answers: the first.
+        // No fault except a reset. The first sensor answers.
         let status = if self.was_reset { 0x7e } else { 0xfe };
         [status, !crc8(0x1d, 0xff, &self.said)]
     }
