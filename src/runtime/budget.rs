@@ -1,12 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Keeps the core from being stopped by the kernel's real-time throttle.
 //!
-//! The kernel stops a SCHED_FIFO thread that has run for `sched_rt_runtime_us` of a
-//! `sched_rt_period_us` until that period is over (Documentation/scheduler/sched-rt-group.rst). By
-//! default that is for 50 ms in every second, which ends a print. The kernel counts for each processor
-//! apart. So the core watches its own running time, as the kernel counts it, and moves to another
-//! processor before its time on the present one is used up. If it has no other, it runs as
-//! SCHED_OTHER, which is never throttled, for a small part of a busy second.
+//! The kernel lets a SCHED_FIFO thread run for `sched_rt_runtime_us` of each `sched_rt_period_us`. After that it stops
+//! the thread until the period is over (Documentation/scheduler/sched-rt-group.rst). By default that is 50 ms in
+//! every second, which ends a print. The kernel counts each processor separately. So the core watches its own
+//! running time, as the kernel counts it. It moves to another processor before its time on the present one is used up.
+//! If there is no other, it runs as SCHED_OTHER for a small part of a busy second. SCHED_OTHER is never throttled.
 
 #![forbid(unsafe_code)]
 
@@ -15,20 +14,20 @@ use std::time::Duration;
 
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
 
-/// The scheduling class that the core is to run in.
+/// The core's scheduling class.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Class {
     Fifo,
     Other,
 }
 
-/// The running time as SCHED_FIFO that the core has left on a processor, kept as a bucket: it fills at
-/// a share of real time, and drains while the core runs as SCHED_FIFO. So in any period of the kernel,
-/// wherever it begins, the core runs for at most that share and one full bucket.
+/// The SCHED_FIFO running time that the core has left on a processor, kept as a bucket. It fills at a share of real
+/// time, and drains while the core runs as SCHED_FIFO. So in any period of the kernel the core runs for at most that
+/// share and one full bucket, wherever the period begins.
 #[derive(Debug)]
 pub(super) struct Budget {
     class: Class,
-    /// What is left, in 1/1024 ticks.
+    /// The running time left, in 1/1024 ticks.
     level_fine: i64,
     full_fine: i64,
     /// How much the bucket fills in a tick, in 1/1024 ticks.
@@ -40,8 +39,8 @@ pub(super) struct Budget {
     ran: Duration,
 }
 
-/// How long to wait between two looks at the thread's running time at least. Only the kernel knows it,
-/// as it also counts the way into a sleep and out of it; and to ask the kernel costs a system call.
+/// Shortest time between two looks at the thread's running time. Only the kernel knows it, because it also counts the
+/// way into a sleep and out of it. To ask the kernel costs a system call.
 const LOOK: Ticks = Ticks::from_ms(1);
 
 /// Fine units of a bucket in a tick.
@@ -55,7 +54,7 @@ pub(super) struct Throttle {
 }
 
 impl Throttle {
-    /// The throttle in force; none if it is switched off or the kernel has none.
+    /// The throttle in force. `None` if it is off, or if the kernel has none.
     pub(super) fn read() -> Option<Throttle> {
         let read = |name: &str| fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse().ok();
         // A runtime of -1 switches the throttle off. It does not parse as a u32, so this returns none.
@@ -65,9 +64,9 @@ impl Throttle {
 }
 
 impl Budget {
-    /// A full budget for a thread that runs as SCHED_FIFO and has run for `ran` so far. Of what the
-    /// kernel allows, nine tenths are the share, and a twentieth the bucket; the last twentieth is
-    /// kept in reserve, for what the kernel counts and the looks do not see.
+    /// A full budget for a thread that runs as SCHED_FIFO and has run for `ran` so far. Nine tenths of the kernel's
+    /// allowance are the share, and a twentieth is the bucket. The last twentieth is a reserve for time that the kernel
+    /// counts and the looks do not see.
     pub(super) fn new(throttle: Throttle, now: Clock, ran: Duration) -> Budget {
         let allowance = i64::from(throttle.runtime_us) * FINE / i64::from(throttle.period_us.max(1));
         let full_fine = i64::from(throttle.runtime_us) * i64::from(Ticks::from_us(1).0) * FINE / 20;
@@ -82,12 +81,12 @@ impl Budget {
         }
     }
 
-    /// Whether the thread is to run as SCHED_FIFO at present.
+    /// Whether the thread should run as SCHED_FIFO now.
     pub(super) fn is_fifo(&self) -> bool {
         self.class == Class::Fifo
     }
 
-    /// Whether there is more than half of it, so that what is not urgent may use some.
+    /// Whether more than half of the bucket is left. Then work that is not urgent may use some.
     #[inline]
     pub(super) fn is_ample(&self) -> bool {
         self.level_fine > self.full_fine / 2
@@ -99,8 +98,7 @@ impl Budget {
         now >= self.due
     }
 
-    /// Takes in that the thread has run for `ran` in its life so far. The class that it is to change
-    /// to, if it is to change.
+    /// Takes in the thread's total running time, `ran`. Returns the new class if the thread has to change it.
     pub(super) fn look(&mut self, now: Clock, ran: Duration) -> Option<Class> {
         let span = now.since(self.looked).clamp(0, 1 << 40);
         let spent = ran.saturating_sub(self.ran).as_nanos() as i64 / NS_PER_TICK as i64;
@@ -108,7 +106,7 @@ impl Budget {
         self.ran = ran;
         let drain = if self.class == Class::Fifo { spent * FINE } else { 0 };
         self.level_fine = (self.level_fine + span * self.share_fine - drain).min(self.full_fine);
-        // To run for a tick drains no more than a tick, so half of what is left now is left then.
+        // Running for a tick drains at most a tick. So half of the present level is left then.
         let half = if self.class == Class::Fifo { self.level_fine / FINE / 2 } else { 0 };
         self.due = now + Ticks(half.clamp(i64::from(LOOK.0), i64::from(u32::MAX)) as u32);
         let class = match self.class {
@@ -120,8 +118,8 @@ impl Budget {
         Some(class)
     }
 
-    /// The thread has moved to another processor and goes on as SCHED_FIFO. The bucket of that one is
-    /// full: if the thread was there before, it has filled again meanwhile.
+    /// The thread has moved to another processor and continues as SCHED_FIFO. The bucket of that processor is full. If
+    /// the thread was there before, the bucket has filled again meanwhile.
     pub(super) fn moved(&mut self) {
         self.class = Class::Fifo;
         self.level_fine = self.full_fine;
@@ -136,8 +134,7 @@ mod tests {
     const THROTTLE: Throttle = Throttle { runtime_us: 950_000, period_us: 1_000_000 };
     const SECOND: u64 = 50_000_000;
 
-    /// The spans in which a core with these running and sleeping spans runs as SCHED_FIFO, on
-    /// each of so many processors.
+    /// When a core with these running and sleeping spans runs as SCHED_FIFO, for each processor.
     fn fifo_spans(spans: &[(u64, u64)], seconds: u64, processors: usize) -> Vec<Vec<(u64, u64)>> {
         let mut budget = Budget::new(THROTTLE, Clock::from_ticks(0), Duration::ZERO);
         let (mut now, mut ran, mut class) = (0, 0, Class::Fifo);
@@ -197,7 +194,7 @@ mod tests {
             let mut budget = Budget::new(THROTTLE, Clock::from_ticks(0), Duration::ZERO);
             let (mut polled, mut ran) = (0, 0);
             for ms in 0..10_000 {
-                // A part of each millisecond is work; the rest is polled away where that may be.
+                // A part of each millisecond is work. Polling takes the rest, if it may.
                 let runs = if budget.is_ample() { 1000 } else { works };
                 polled += runs - works;
                 ran += runs;
@@ -205,7 +202,7 @@ mod tests {
                 assert_eq!(change, None, "{works} after {ms} ms");
                 assert!(budget.level_fine > budget.full_fine / 2 - budget.full_fine / 20);
             }
-            // All that the share leaves is used.
+            // Polling uses all that the share leaves.
             assert!(polled > (840 - works) * 10_000, "{polled} of {works}");
         }
     }

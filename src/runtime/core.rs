@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The core: owns the MCU; runs due timers, then commands while no timer is near, then
-//! waits.
+//! The core owns the MCU. It runs due timers first, then commands while no timer is near. Otherwise it waits.
 
 #![forbid(unsafe_code)]
 
@@ -31,7 +30,7 @@ pub(super) struct Payload {
 }
 
 impl Payload {
-    /// A copy of `payload`, which is that of a block.
+    /// A copy of `payload`, the payload of one block.
     pub(super) fn new(payload: &[u8]) -> Payload {
         let len = payload.len().min(PAYLOAD_MAX);
         let mut bytes = [0; PAYLOAD_MAX];
@@ -44,43 +43,42 @@ impl Payload {
     }
 }
 
-/// What the link asks of the core.
+/// A request of the link to the core.
 pub(super) enum Request {
     /// Run the commands of a block.
     Run(Payload),
     /// Stop the MCU.
     Shutdown(Shutdown),
-    /// Speak this dialect, as another host came. The link keeps a copy, so that the core never frees one.
+    /// Speak this dialect: another host came. The link keeps a copy, so that the core never frees one.
     Speak(Arc<Dialect>),
-    /// Say how late timers were.
+    /// Report how late timers were.
     Report,
     /// Stop the MCU and end.
     Quit,
-    /// Never come back, for a test.
+    /// Hang forever, for a test.
     Hang,
 }
 
-/// No command is begun within this span of a timer: it takes a microsecond or two.
+/// No command starts if a timer is due within this span. A command takes one or two microseconds.
 const NEAR: Ticks = Ticks::from_us(5);
-/// A timer beyond this leaves time for a nap; for a nearer one there is no heartbeat in between.
+/// Before a timer farther away than this, the core naps. Before a nearer one it needs no heartbeat.
 const FAR_TICKS: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
-/// What can wait is done only if no timer is within this span: to wake the link, which takes some microseconds, and to
-/// tell a part of the status, which takes one, or several where nothing of it is in the cache.
+/// Work that can wait is done only if no timer is due within this span. To wake the link takes some microseconds. To
+/// tell a part of the status takes one, or several if nothing of it is in the cache.
 const SOON: Ticks = Ticks::from_us(30);
-/// A core that waits for a bus has the blocks before acknowledged, if there are no more than these to go on with. To
+/// A core that waits for a bus wakes the link for the finished blocks only if at most this many requests wait. To
 /// acknowledge each block costs as much as to run it.
 const FEW: usize = 3;
-/// How long the core polls for the next command before it sleeps: hosts send in bursts, and a wake-up takes as long
-/// (20 to 50 us on the computers measured).
+/// How long the core polls for the next command before it sleeps. Hosts send in bursts. A wake-up takes as long: 20 to
+/// 50 us on the computers measured.
 const NEXT_COMMAND: Ticks = Ticks::from_us(30);
 /// How long the core polls for the answer of a bus that a command waits for.
 const ANSWER: Ticks = Ticks::from_us(100);
-/// How long another thread may keep the processor of one that yields (3.5 ms were measured).
+/// Longest time that another thread keeps the processor after a yield. 3.5 ms were measured.
 const SLICE: Ticks = Ticks::from_ms(5);
 /// A command runs after it has yielded to this many timers.
 const YIELDS_MAX: u32 = 20;
-/// How long a program that ends waits for its outputs to be at their shutdown values. The
-/// guardian acts before.
+/// How long an ending program waits until its outputs have their shutdown values. The guardian acts earlier.
 const LAST_WRITES: Duration = Duration::from_millis(1500);
 
 pub(super) struct Core {
@@ -91,20 +89,20 @@ pub(super) struct Core {
     pulse: Pulse,
     progress: Arc<Progress>,
     wake: Arc<LinkWake>,
-    /// The block whose commands are run, and how far they were.
+    /// The present block, and the offset of its next command.
     block: Option<(Payload, usize)>,
     yielded: u32,
-    /// Requests to stop that were taken in, of those that the link handed over.
+    /// How many of the link's stop requests the core has taken.
     stops_taken: u32,
-    /// Blocks are done that the link was not woken for.
+    /// The link was not yet woken for some finished blocks.
     untold: bool,
     lookout: Lookout,
-    /// What the guardian was told that the MCU owes.
+    /// The output that the guardian knows to be owed its shutdown value.
     debtor: Option<String>,
     teller: Teller,
 }
 
-/// What the core is made of.
+/// The parts of the core.
 pub(super) struct Parts {
     pub(super) mcu: Mcu,
     pub(super) clock: Arc<dyn TimeSource>,
@@ -114,23 +112,23 @@ pub(super) struct Parts {
     pub(super) progress: Arc<Progress>,
     pub(super) wake: Arc<LinkWake>,
     pub(super) teller: Teller,
-    /// There are processors to poll on.
+    /// There is a second processor, so that the core may poll.
     pub(super) may_poll: bool,
 }
 
-/// What a turn for commands came to.
+/// The result of a turn for commands.
 enum Turn {
     Done,
     Idle,
     Quit,
 }
 
-/// How a program that was asked to end has left its outputs.
+/// The state of the outputs after the program was asked to end.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum Left {
     /// At their shutdown values.
     Safe,
-    /// This one is not there, as far as is known.
+    /// This output is not at its shutdown value, as far as is known.
     Owing(String),
 }
 
@@ -219,7 +217,7 @@ impl Core {
             self.mcu.account(Ticks(now.since(busy_since) as u32));
             let to_go = deadline.map_or(2 * FAR_TICKS, |deadline| deadline.since(now));
             let Some(deadline) = deadline.filter(|_| to_go <= FAR_TICKS) else {
-                // Half the way leaves room for a late wake-up.
+                // Sleep half the way: this leaves room for a late wake-up.
                 self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));
                 busy_since = self.clock.now();
                 continue;
@@ -227,7 +225,7 @@ impl Core {
             let exact = self.mcu.next_exact_timer();
             let Core { waiter, progress, stops_taken, mcu, block, requests, .. } = &mut self;
             let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
-            // Within reach of a timer a call has to wait its turn.
+            // Near a timer, calls have to wait.
             let woken = waiter.wait(deadline, exact, || !near && calls.any());
             busy_since = self.clock.now();
             if woken == Woken::Due {
@@ -236,8 +234,8 @@ impl Core {
         }
     }
 
-    /// Sleeps for a span in which no timer is due, or until it is called, so that the heartbeat
-    /// goes on. Unlike the wait for a timer it ends without spinning.
+    /// Sleeps while no timer is due, or until the core is woken, so that the heartbeat continues. Unlike the wait for a
+    /// timer, it ends without spinning.
     fn nap(&mut self, longest: Duration) {
         let Core { progress, stops_taken, mcu, block, requests, .. } = &*self;
         let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
@@ -246,7 +244,7 @@ impl Core {
         }
     }
 
-    /// Lets the guardian know what owes its shutdown value.
+    /// Tells the guardian which output is owed its shutdown value.
     fn tell_debts(&mut self) {
         if !self.mcu.owes() {
             if self.debtor.take().is_some() {
@@ -261,7 +259,7 @@ impl Core {
         }
     }
 
-    /// Waits until the outputs are where they belong.
+    /// Waits until the outputs have their shutdown values.
     fn end(mut self) -> Left {
         let deadline = monotonic() + LAST_WRITES;
         while self.mcu.owes() && monotonic() < deadline {
@@ -272,19 +270,19 @@ impl Core {
             thread::park_timeout(Duration::from_millis(1));
         }
         let left = self.mcu.debtor().map_or(Left::Safe, |debtor| Left::Owing(debtor.to_owned()));
-        // Workers and devices may take their time to end.
+        // This beat gives workers and devices time to end.
         self.pulse.beat(self.mcu.now(), false);
         left
     }
 
-    /// How many commands have time before the next timer, if each takes as long as is near.
+    /// How many commands fit before the next timer, if each takes [`NEAR`]. At least one.
     fn room(&self) -> i64 {
         let to_go = |next: Clock| next.since(self.mcu.last_read()) / i64::from(NEAR.0);
         self.mcu.next_timer().map_or(i64::MAX, to_go).max(1)
     }
 
-    /// Stops the MCU ahead of a block that is held back, as a request to stop waits behind it.
-    /// The requests up to that one are refused then, as in any stopped MCU.
+    /// Stops the MCU ahead of a held block, because a stop request waits behind it. The MCU then refuses the requests
+    /// before the stop request, as any stopped MCU does.
     #[cold]
     fn stop_ahead(&mut self) {
         let Core { mcu, requests, block, .. } = self;
@@ -308,13 +306,14 @@ impl Core {
                 })
             }
         };
-        // It may be on its way into the ring still.
+        // Without one, it is still on its way into the ring.
         if let Some(stop) = stop {
             self.mcu.shut_down(stop);
         }
     }
 
-    /// Runs the commands of a block that have time, or one, or takes in what the link asks.
+    /// Runs one command of a block, or as many as there is time for. If the next request is no block, it serves that
+    /// request.
     #[inline]
     fn run_commands(&mut self, one: bool) -> Turn {
         self.yielded = 0;
@@ -322,7 +321,7 @@ impl Core {
             match next_commands(self.block.as_ref(), &self.requests) {
                 Some(commands) if self.mcu.joins(commands) => {}
                 next => {
-                    // What comes behind it can wait as well.
+                    // The blocks behind it can wait as well.
                     self.progress.hold(next.is_some());
                     return Turn::Idle;
                 }
@@ -358,8 +357,8 @@ impl Core {
             self.stops_taken = self.stops_taken.wrapping_add(1);
         }
         self.progress.finish();
-        // The end of the next block will do, if that may begin; but an MCU that is being
-        // configured takes its time for a block.
+        // The end of the next block is early enough, if that block may begin. But an MCU that is being configured takes
+        // its time for a block.
         self.untold = !self.requests.is_empty() && self.mcu.is_running();
         if !self.untold {
             self.wake.wake();
@@ -367,7 +366,7 @@ impl Core {
         Turn::Done
     }
 
-    /// Does what the link asks, other than to run a block.
+    /// Serves a request other than a block.
     fn serve(&mut self, request: Request) -> Turn {
         match request {
             Request::Shutdown(shutdown) => {
@@ -405,7 +404,7 @@ fn next_commands<'a>(block: Option<&'a (Payload, usize)>, requests: &'a Consumer
     }
 }
 
-/// What the core is called for while it waits.
+/// Reasons to end the core's wait.
 struct Calls<'a> {
     core: &'a Progress,
     stops_taken: u32,
@@ -415,8 +414,8 @@ struct Calls<'a> {
 }
 
 impl Calls<'_> {
-    /// Whether there is something to do: an errand is done, or a command may run, or a request to
-    /// stop waits behind one that may not.
+    /// Whether there is work: an errand is finished, or a command may run. A stop request behind a command that may not
+    /// run is work too.
     #[inline]
     fn any(&self) -> bool {
         self.mcu.has_completion()
@@ -430,13 +429,13 @@ impl Calls<'_> {
     }
 }
 
-/// Whether a timer leaves no time for what can wait.
+/// Whether a timer is too near for work that can wait.
 fn soon(deadline: Option<Clock>, now: Clock) -> bool {
     deadline.is_some_and(|deadline| deadline <= now + SOON)
 }
 
-/// Whether to yield does not cost a timer its time: an ordinary thread may then be without a
-/// processor for as long as others' slices take, where one that wakes up is given its turn.
+/// Whether a yield cannot delay a timer. After a yield, an ordinary thread may be without a processor for the slices of
+/// other threads. A thread that wakes up gets its turn.
 fn may_yield(realtime: bool, now: Clock, deadline: Option<Clock>) -> bool {
     realtime || deadline.is_none_or(|deadline| deadline > now + SLICE)
 }
@@ -473,7 +472,7 @@ mod tests {
         fn note(&mut self, _note: Note<'_>) {}
     }
 
-    /// A clock that counts how often it is read, which the core does in each turn.
+    /// A clock that counts its readings. The core reads it in each turn.
     struct Counting(Monotonic, AtomicUsize);
 
     impl TimeSource for Counting {
@@ -491,7 +490,7 @@ mod tests {
         }
     }
 
-    /// A core at work with an SPI device and a digital output, and what stands for its link.
+    /// A working core with an SPI device and a digital output, and a stand-in for its link.
     struct Rig {
         thread: JoinHandle<Left>,
         dialect: Arc<Dialect>,
@@ -550,7 +549,7 @@ mod tests {
             rig
         }
 
-        /// The same amid a transfer on a bus that hangs, with a command behind it.
+        /// The same during a transfer on a hanging bus, with a command behind it.
         fn held() -> Rig {
             let mut rig = Rig::new();
             rig.bench.hang(true);
@@ -581,7 +580,7 @@ mod tests {
             self.thread.thread().unpark();
         }
 
-        /// As the link asks for a stop.
+        /// Asks for a stop as the link does.
         fn stop(&mut self, request: Request) {
             self.progress.stop_handed();
             self.request(request);
@@ -593,7 +592,7 @@ mod tests {
             self.thread.join().unwrap()
         }
 
-        /// The parameters of what the core said so far in responses of this format.
+        /// The parameters of all responses of this format so far.
         fn said(&self, format: &str) -> Vec<Vec<u8>> {
             let id = self.dialect.dictionary().responses[format].as_i64().unwrap();
             let heard = self.heard.0.lock().unwrap();
@@ -627,7 +626,7 @@ mod tests {
         assert_eq!(rig.progress.done(), CONFIGURATION, "it is not acknowledged");
         assert!(!rig.bench.level(30), "what is behind it has not run");
 
-        // The core is not woken for what it cannot run yet.
+        // The core is not woken for a block that it cannot run yet.
         assert!(rig.progress.is_held());
         let payload = rig.encode("update_digital_out oid=%c value=%c", &[1, 1]);
         rig.requests.push(Request::Run(payload)).ok().unwrap();
@@ -696,7 +695,7 @@ mod tests {
         let turns = rig.clock.1.load(Ordering::Relaxed);
         thread::sleep(Duration::from_millis(100));
         let turns = rig.clock.1.load(Ordering::Relaxed) - turns;
-        // 50 samples; to be awake 200 us before each would take thousands of looks at the clock.
+        // There are 50 samples. A core awake 200 us before each would read the clock thousands of times.
         assert!(turns < 10_000, "the clock was read {turns} times");
         assert_eq!(rig.quit(), Left::Safe);
     }
@@ -714,7 +713,7 @@ mod tests {
                     blocks += 1;
                     let mut payload = rig.encode("emergency_stop", &[]);
                     if which == 3 {
-                        // Amid others of its block.
+                        // Among other commands of its block.
                         let get = rig.encode("get_config", &[]);
                         payload = Payload::new(&[get.as_slice(), payload.as_slice(), get.as_slice()].concat());
                     }
@@ -746,7 +745,7 @@ mod tests {
             format.matches('%').for_each(|_| writer.int(1));
             Payload::new(&[writer.payload().unwrap(), stop.as_slice()].concat())
         });
-        // One that means something else in the dialect of before.
+        // A block that means something else in the earlier dialect.
         let block = blocks.find(|block| !rig.dialect.is_emergency(block.as_slice())).unwrap();
         rig.stop(Request::Run(block));
         rig.wait_until("the MCU stops", Rig::is_stopped);

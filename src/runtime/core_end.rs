@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The link's end of the core: blocks and requests go in, responses and lines for the log come out, and an account of
-//! the blocks is kept.
+//! The link's end of the core. Blocks and requests go in. Responses and log lines come out. It keeps an account of the
+//! blocks.
 
 #![forbid(unsafe_code)]
 
@@ -17,14 +17,14 @@ use super::core::{Payload, Request};
 use super::ledger::Ledger;
 use super::outlet::{Inlet, LinkWake, Progress};
 
-/// How long to poll for the core to be done with the blocks that it was handed.
+/// How long to poll until the core has finished the blocks that it was handed.
 const AWAIT_CORE: Duration = Duration::from_micros(100);
-/// How long to wait for more once there is something to tell the host: one write is to tell of many blocks.
+/// How long to wait for more once there is news for the host: one write covers many blocks.
 const AWAIT_MORE: Duration = Duration::from_micros(20);
 /// How long to wait for a core that has no room for requests.
 pub(super) const STALL: Duration = Duration::from_millis(1);
-/// Room in the core's ring that blocks leave to requests: one to stop must find it where a slow bus
-/// holds the blocks back.
+/// Room in the core's ring that blocks leave to requests. A stop request must find room while a slow bus holds the
+/// blocks back.
 const REQUESTS_KEPT: usize = 8;
 
 /// The link's end of the core.
@@ -35,11 +35,11 @@ pub(super) struct CoreEnd {
     pub(super) progress: Arc<Progress>,
     pub(super) wake: Arc<LinkWake>,
     pub(super) ledger: Ledger,
-    /// Whether there is a processor beside the core's, to poll on for the core.
+    /// There is a processor beside the core's, on which the link may poll for the core.
     pub(super) may_poll: bool,
 }
 
-/// What the core had been handed at an instant.
+/// Counts of what the core was handed up to an instant.
 #[derive(Clone, Copy)]
 pub(super) struct Handed {
     blocks: u32,
@@ -47,7 +47,7 @@ pub(super) struct Handed {
 }
 
 impl CoreEnd {
-    /// Asks the core something. It takes requests in faster than a person or a signal asks.
+    /// Passes a request to the core. The core takes requests faster than a person or a signal makes them.
     pub(super) fn request(&mut self, request: Request) {
         if matches!(request, Request::Shutdown(_) | Request::Quit) {
             self.progress.stop_handed();
@@ -66,7 +66,7 @@ impl CoreEnd {
         self.requests.slots() > REQUESTS_KEPT
     }
 
-    /// Hands a block to the core, where there is room for it. `stops`: it asks for an emergency stop.
+    /// Hands a block to the core, if there is room. `stops`: the block asks for an emergency stop.
     pub(super) fn hand(&mut self, payload: Payload, stops: bool) {
         if stops {
             self.progress.stop_handed();
@@ -80,13 +80,13 @@ impl CoreEnd {
         Handed { blocks: self.ledger.handed(), stops: self.progress.stops_handed() }
     }
 
-    /// Whether blocks were handed to the core since.
+    /// Whether blocks were handed to the core since `before`.
     pub(super) fn has_more_since(&self, before: Handed) -> bool {
         self.ledger.handed() != before.blocks
     }
 
-    /// Wakes the core for the blocks that it was handed since, if it can run one of them: awake, it would keep the link
-    /// waiting.
+    /// Wakes the core for the blocks that it was handed since `before`, if it can run one of them. A core that is woken
+    /// without need keeps the link waiting.
     pub(super) fn wake_for(&self, before: Handed) {
         let stops = self.progress.stops_handed() != before.stops;
         if self.has_more_since(before) && (stops || !self.progress.is_held()) {
@@ -94,8 +94,8 @@ impl CoreEnd {
         }
     }
 
-    /// Polls for what the core makes of the blocks that it was handed since: to sleep and be woken takes longer.
-    /// If a bus holds the core, the blocks wait for longer still.
+    /// Polls until the core has finished the blocks that it was handed since `before`. To sleep and be woken takes
+    /// longer. If a bus holds the core, it does not poll: these blocks take longer still.
     pub(super) fn await_done(&self, before: Handed) {
         if !self.may_poll || !self.has_more_since(before) {
             return;
@@ -121,7 +121,7 @@ impl CoreEnd {
         }
     }
 
-    /// Whether there is something to tell the host.
+    /// Whether there is news for the host: responses or acknowledgements.
     pub(super) fn has_news(&self) -> bool {
         self.inlet.has_response() || self.ledger.is_behind(self.progress.done())
     }

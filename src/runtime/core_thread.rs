@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The core's thread: how it is scheduled, and what lies between it and the link.
+//! The core's thread: its scheduling, and its rings to the link.
 
 #![forbid(unsafe_code)]
 
@@ -25,10 +25,10 @@ use super::status::Teller;
 use super::wakeup::{MarginLimits, Waiter};
 use super::workers::Threads;
 
-/// Blocks between link and core: four times what a host may have under way.
+/// Highest number of blocks between link and core: four times the blocks that a host may have under way.
 pub(super) const REQUESTS: usize = 256;
 
-/// What the core's thread is to run.
+/// Everything that the core's thread needs.
 pub(super) struct CoreThread {
     pub(super) board: Box<dyn Board>,
     pub(super) timing: Timing,
@@ -48,7 +48,7 @@ impl CoreThread {
         let (wake, progress) = (self.wake.clone(), Arc::new(Progress::default()));
         let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);
-        // Before the core is confined to one of them.
+        // Count the processors before the core is confined to one.
         let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
         let core_progress = progress.clone();
         let core = started(thread::Builder::new().name("core".into()).spawn(move || {
@@ -60,7 +60,7 @@ impl CoreThread {
             }
             let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };
             let prepare = Arc::new(move || {
-                // A thread inherits the processors of the one that starts it.
+                // A thread inherits the processors of the thread that starts it.
                 processors.free();
                 if realtime {
                     realtime::enter(Role::Worker);

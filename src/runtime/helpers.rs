@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The program's other processes: the guardian, and the search for the host. Both are forked before the program has
-//! threads, as a process with threads can not be.
+//! threads, because a process with threads cannot be forked.
 
 #![forbid(unsafe_code)]
 
@@ -19,30 +19,30 @@ use pinion_linux::sys;
 use super::guardian::{self, Guardian};
 use super::host::{self, HostSearch};
 
-/// What the kernel calls their processes, whose command lines are the program's.
+/// The kernel's names of these processes. Their command lines are the program's.
 pub(crate) const NAMES: [&CStr; 2] = [guardian::NAME, host::NAME];
 
-/// Most threads the program may have when it forks them; a test has that of its harness, too.
+/// Highest number of threads when the program forks them. A test also has its harness's thread.
 pub(super) const THREADS_MAX: usize = if cfg!(test) { 2 } else { 1 };
 
-/// The processes that a program has.
+/// The program's helper processes.
 #[derive(Default)]
 pub struct Helpers {
-    /// That of the board's outputs.
+    /// It guards the board's outputs.
     pub guardian: Option<Guardian>,
-    /// Without it every host is served in the dialect that most hosts take.
+    /// Without it every host is served in the dialect that most hosts accept.
     pub search: Option<HostSearch>,
 }
 
 impl Helpers {
-    /// Forks them, and then gives up what this process does not need itself. To be called before any thread is
-    /// started. `guarded`, if outputs are to be guarded, has the core's clock and whether it runs in real time.
+    /// Forks them, then gives up the rights that this process does not need. Call it before any thread starts.
+    /// `guarded` asks for a guardian. It has the core's clock and whether the core runs in real time.
     ///
     /// # Errors
     ///
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
     pub fn start(guarded: Option<(Monotonic, bool)>, searches: bool) -> io::Result<Helpers> {
-        // The search comes first: it is to share nothing with the guardian.
+        // The search comes first, because it must share nothing with the guardian.
         let search = searches.then(HostSearch::start).transpose()?;
         let guardian = guarded.map(|(clock, realtime)| Guardian::start(clock, realtime)).transpose()?;
         if let Err(error) = sys::keep_only(sys::SERVE) {
@@ -54,10 +54,11 @@ impl Helpers {
     }
 }
 
-/// Gives a new process its name and its session, and leaves it no descriptors but these. It has the signals that ask a
-/// program to end ignored: a terminal and a service manager send them to all processes, and these end with the program.
+/// Gives a new process its name and its session, and closes all descriptors except `kept`. The process ignores the
+/// signals that ask a program to end. A terminal and a service manager send them to all processes, and these processes
+/// end with the program.
 pub(super) fn settle(name: &CStr, kept: &[RawFd]) {
-    // Failures are ignored here: without any of these the process can still do its work.
+    // A failure is ignored: the process can work without any of these.
     let _ = prctl::set_name(name);
     let _ = setsid();
     let _ = chdir("/");

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The link's end of the terminal: whether a host is there, its bytes parted into blocks, and what it is to read.
+//! The link's end of the terminal: whether a host is there, the blocks of its input, and the output for it.
 
 #![forbid(unsafe_code)]
 
@@ -17,25 +17,25 @@ use super::status::HostBoard;
 
 /// What a shell writes to the pty to stop the MCU, as in Klipper's service file.
 const FORCE_SHUTDOWN: &[u8] = b"FORCE_SHUTDOWN\n";
-/// Bytes read from the pty and not yet taken in.
+/// Highest number of bytes read from the pty and not yet taken in.
 const INPUT_BYTES: usize = 4096;
-/// Bytes for a host that does not read; then responses wait in the ring, then they are lost.
+/// Highest number of bytes for a host that does not read. After that, responses wait in the ring; then they are lost.
 const OUTPUT_BYTES: usize = 16 * 1024;
 
-/// The terminal, with what was read of it and what is to be written.
+/// The terminal, with its input and its output.
 pub(super) struct HostEnd {
     pty: Pty,
     receiver: Receiver,
     input: Vec<u8>,
-    /// Bytes of the input that are taken in.
+    /// How many bytes of the input are taken in.
     taken: usize,
     output: Vec<u8>,
     is_attached: bool,
-    /// Where it says whether a host is there.
+    /// Shows whether a host is there.
     shown: Arc<HostBoard>,
 }
 
-/// What was read.
+/// The result of a read.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub(super) struct Read {
     /// A host has come.
@@ -44,18 +44,18 @@ pub(super) struct Read {
     pub(super) is_forced: bool,
 }
 
-/// What comes next of the input.
+/// The next item of the input.
 pub(super) enum Next {
-    /// Nothing whole.
+    /// No complete block.
     Nothing,
-    /// Something damaged.
+    /// Damaged bytes.
     Nak,
     /// A block.
     Block(Payload),
 }
 
 impl HostEnd {
-    /// The end of a terminal at which nobody is yet.
+    /// The end of a terminal without a host.
     pub(super) fn new(pty: Pty, shown: Arc<HostBoard>) -> HostEnd {
         HostEnd {
             pty,
@@ -68,7 +68,7 @@ impl HostEnd {
         }
     }
 
-    /// What is readable once the host has written, and hangs up once it is gone.
+    /// A descriptor: readable when the host has written, and hung up when the host is gone.
     pub(super) fn event(&self) -> BorrowedFd<'_> {
         self.pty.master()
     }
@@ -77,14 +77,14 @@ impl HostEnd {
         self.is_attached
     }
 
-    /// Says to whoever asks whether a host is there; one line for the service manager.
+    /// Shows whether a host is there, and returns a line about it for the service manager.
     pub(super) fn tell(&self) -> String {
         self.shown.attach(self.is_attached);
         let host = if self.is_attached { "a host is attached" } else { "no host is attached" };
         format!("serving on {}, {host}", self.pty.symlink().display())
     }
 
-    /// Reads what the host has written.
+    /// Reads the host's bytes.
     pub(super) fn read(&mut self) -> io::Result<Read> {
         let filled = self.input.len();
         let mut read = Read::default();
@@ -130,28 +130,28 @@ impl HostEnd {
         }
     }
 
-    /// Forgets the input that was taken in. True if some is left.
+    /// Drops the input that was taken in. True if some input is left.
     pub(super) fn forget_taken(&mut self) -> bool {
         self.input.drain(..std::mem::take(&mut self.taken));
         !self.input.is_empty()
     }
 
-    /// Whether the host has to read before it gets any more.
+    /// Whether the host has to read before it gets more.
     pub(super) fn is_full(&self) -> bool {
         self.output.len() >= OUTPUT_BYTES
     }
 
-    /// Whether the host has been given all that was framed.
+    /// Whether the terminal has taken all framed bytes.
     pub(super) fn is_out(&self) -> bool {
         self.output.is_empty()
     }
 
-    /// Frames a response, or with no bytes an acknowledgement, behind the block of this number.
+    /// Frames a response with the sequence number after block `number`. An empty payload is an acknowledgement.
     pub(super) fn frame(&mut self, payload: &[u8], number: u32) {
         frame(payload, Sequence::after(number), &mut self.output);
     }
 
-    /// Writes what the terminal has room for.
+    /// Writes as much as the terminal has room for.
     pub(super) fn write(&mut self) {
         if !self.is_attached {
             self.output.clear();

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds out what a host that has come is to be told: which dialect it speaks, and what the board has now. The host's
-//! first bytes wait for that.
+//! Finds out what to tell a new host: its dialect, and what the board has now. The host's first bytes wait for that.
 
 #![forbid(unsafe_code)]
 
@@ -22,40 +21,41 @@ use super::started;
 use super::status::HostBoard;
 use super::survey::{self, Surveyor};
 
-/// How long the host's first bytes wait; after that it gets the union dialect. A card that has just
-/// begun to be read after the computer's start may take longer than a second for the few hundred files; klippy
-/// gives up after five (`_start_session` in serialhdl.py).
+/// How long the host's first bytes wait. After that the host gets the union dialect. Shortly after the computer's
+/// start, a card may take more than a second to read the few hundred files. klippy gives up after five seconds
+/// (`_start_session` in serialhdl.py).
 const FIND_LIMIT: Duration = Duration::from_secs(3);
 
-/// What is found out about a host.
+/// Finds the facts about a host.
 pub(super) struct Introduction {
-    /// Those that a host may speak; the first one is spoken before a host comes.
+    /// The dialects that a host may speak. The first one is spoken before a host comes.
     dialects: Vec<Arc<Dialect>>,
-    /// Those before the board changed last, kept until it changes again, so that the core never frees one.
+    /// The dialects before the last change of the board. They stay until the next change, so that the core never frees
+    /// one.
     outdated: Vec<Arc<Dialect>>,
     /// `None` if the dialect does not depend on the host.
     finder: Option<HostFinder>,
     /// `None` if the board never changes.
     surveyor: Option<Surveyor>,
-    /// Until when the host's first bytes wait (CLOCK_MONOTONIC); `None` while none wait.
+    /// The end of the wait of the host's first bytes (CLOCK_MONOTONIC). `None` while none wait.
     until: Option<Duration>,
-    /// Whether they waited for too long, and the answer is still to come.
+    /// The bytes have waited too long, and the answer is still missing.
     is_overdue: bool,
 }
 
-/// How far an introduction has come.
+/// The state of an introduction.
 pub(super) enum Step {
-    /// The host's bytes wait.
+    /// The host's bytes have to wait.
     Wait,
-    /// This dialect is to be spoken from now on.
+    /// This dialect is spoken from now on.
     Speak(Arc<Dialect>),
-    /// There is nothing more to find out.
+    /// Everything is found.
     Done,
 }
 
 impl Introduction {
-    /// Starts the threads that find out. To be called before the link gets real-time priority, or they inherit it.
-    /// `only` is the one dialect that is spoken, or `None`.
+    /// Starts the threads that search. Call it before the link gets real-time priority, or they inherit it. `only` is
+    /// the one dialect that is spoken, or `None`.
     pub(super) fn start(
         only: Option<DialectName>,
         board: &dyn Board,
@@ -100,7 +100,7 @@ impl Introduction {
         self.until = None;
     }
 
-    /// Goes on as far as it can; `spoken` is the dialect that is spoken now. To be called again after [`Step::Speak`].
+    /// Goes on as far as it can. `spoken` is the present dialect. Call it again after [`Step::Speak`].
     pub(super) fn step(&mut self, spoken: DialectName) -> Step {
         let Some(until) = self.until else {
             self.hear_late_answer();
@@ -140,7 +140,7 @@ impl Introduction {
         of_name.map_or(Step::Done, |dialect| Step::Speak(dialect.clone()))
     }
 
-    /// An answer that came after the host had read another dictionary.
+    /// Hears an answer that came after the host had read another dictionary.
     fn hear_late_answer(&mut self) {
         let answer = self.finder.as_ref().filter(|_| self.is_overdue).and_then(HostFinder::answer);
         let Some(name) = answer else { return };

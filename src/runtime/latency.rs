@@ -20,18 +20,18 @@ use super::wakeup::{MarginLimits, Waiter};
 /// The time between two events: 1,000 a second, so that the program really sleeps in between.
 const PERIOD: Ticks = Ticks::from_us(1000);
 
-/// What was measured in one half.
+/// The measurements of one half: idle, or under load.
 pub(crate) struct Half {
     pub(crate) name: &'static str,
     /// How late sleeps ended.
     pub(crate) wakeup: Lateness,
-    /// How late events were, with the program's own way of waiting: it wakes early and spins the rest.
+    /// How late events were with the program's own waiting: it wakes early and spins the rest.
     pub(crate) edge: Lateness,
-    /// How early the program woke at last.
+    /// How early the program woke at the end.
     pub(crate) margin: Ticks,
 }
 
-/// Measures for `span` idle and for as long under load.
+/// Measures for `span` while idle, then as long under load.
 pub(crate) fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), String> {
     let processors = Processors::new(None).map_err(|error| format!("the processors can not be told: {error}"))?;
     in_thread(move || {
@@ -46,8 +46,8 @@ pub(crate) fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), St
     })
 }
 
-/// Measures for `span` while Pinion serves a host: below it, and without load or spinning, so that it
-/// does not make it late.
+/// Measures for `span` while Pinion serves a host. It runs below Pinion's priority, without load or spinning. So it
+/// does not delay Pinion.
 fn measure_beside(span: Duration) -> Result<(Scheduling, Half), String> {
     let processors = Processors::new(None).map_err(|error| format!("the processors can not be told: {error}"))?;
     in_thread(move || {
@@ -61,7 +61,7 @@ fn measure_beside(span: Duration) -> Result<(Scheduling, Half), String> {
     })
 }
 
-/// Runs this in a thread of its own, which may change its scheduling.
+/// Runs `work` in a thread of its own, because `work` may change the scheduling of its thread.
 fn in_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Result<T, String> {
     let thread = thread::Builder::new().name("core".into()).spawn(work);
     match thread.map(thread::JoinHandle::join) {
@@ -70,7 +70,7 @@ fn in_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Re
     }
 }
 
-/// A look at the latency that takes two seconds; a gentle one where Pinion serves a host.
+/// Measures the latency for two seconds. While Pinion serves a host, it measures gently.
 pub(crate) fn sample(is_serving: bool) -> Result<Verdict, String> {
     const SPAN: Duration = Duration::from_secs(2);
     if is_serving {
@@ -133,7 +133,7 @@ impl Load {
                 }
             }
         };
-        // The threads inherit the scheduling class of this one, which must not be SCHED_FIFO for them.
+        // The threads inherit this thread's scheduling class. They must not run as SCHED_FIFO.
         let threads = (0..count).map(|_| {
             let work = work(end.clone());
             thread::spawn(move || {
@@ -154,7 +154,7 @@ impl Drop for Load {
     }
 }
 
-/// For which outputs the computer is good enough.
+/// The outputs for which the computer is good enough.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Fitness {
     Steppers,
@@ -188,9 +188,9 @@ impl std::fmt::Display for Verdict {
     }
 }
 
-/// A step that is late by more than 1 ms stops the MCU ("Stepper too far in past"). So for
-/// steppers no edge may be that late, and 999 of 1000 must stay below a tenth of it. A heater has to be
-/// set again within 5 s, and klippy does so every 300 ms: 50 ms do no harm there.
+/// A step that is more than 1 ms late stops the MCU ("Stepper too far in past"). So for steppers no edge may be that
+/// late, and 999 of 1000 must stay below a tenth of it. A heater has to be set again within 5 s, and klippy does so
+/// every 300 ms. So 50 ms do no harm there.
 const STEPPERS_P999_US: f64 = 100.0;
 const STEPPERS_MAX_US: f64 = 1000.0;
 const SLOW_MAX_US: f64 = 50_000.0;

@@ -1,43 +1,40 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The sequence numbers of the blocks that go to the host: each says how many of the host's blocks
-//! were received and are done.
+//! The sequence numbers of the blocks to the host. Each says how many of the host's blocks were received and are done.
 //!
-//! A number acknowledges all blocks before it. So a block counts only once all blocks before it are
-//! done, too. That matters for those that the link answers at once, while the core is still busy with
-//! blocks that came before.
+//! A number acknowledges all blocks before it. So a block counts only when all blocks before it are done too. This
+//! matters for blocks that the link answers at once, while the core is still busy with earlier blocks.
 
 #![forbid(unsafe_code)]
 
 use std::collections::VecDeque;
 
-/// How many blocks the link may have answered that do not count yet. klippy sends at most 12 blocks
-/// before it waits for an acknowledgement (`MAX_PENDING_BLOCKS` in chelper/serialqueue.c).
+/// Highest number of blocks that the link has answered and that do not count yet. klippy sends at most 12 blocks before
+/// it waits for an acknowledgement (`MAX_PENDING_BLOCKS` in chelper/serialqueue.c).
 const EARLY_MAX: usize = 32;
 
-/// The account of the blocks that came from the host. All numbers count blocks since the start and
-/// wrap around.
+/// The account of the host's blocks. All numbers count blocks since the start and wrap around.
 #[derive(Debug, Default)]
 pub(super) struct Ledger {
     /// Blocks handed to the core.
     handed: u32,
-    /// How many of those the core was done with when the link last looked.
+    /// How many of those blocks the core had finished when the link last looked.
     core_done: u32,
-    /// The blocks that the link has answered and that do not count yet: for each, how many blocks had
-    /// been handed to the core before it.
+    /// The blocks that the link has answered and that do not count yet. For each: how many blocks had been handed to
+    /// the core before it.
     early: VecDeque<u32>,
-    /// How many blocks that the link has answered count.
+    /// How many of the blocks that the link has answered count.
     settled: u32,
-    /// The highest number that was sent. No lower one may follow: klippy would take it for an error
-    /// on the line and drop the block.
+    /// The highest number that was sent. No lower one may follow: klippy would treat it as a line error and drop the
+    /// block.
     said: u32,
     /// The number of the last empty block that was sent.
     acknowledged: u32,
-    /// Whether the host is still to be told that a block was refused.
+    /// The host has yet to be told that a block was refused.
     nak_owed: bool,
 }
 
 impl Ledger {
-    /// Takes in that a block is handed to the core.
+    /// Notes that a block is handed to the core.
     pub(super) fn hand(&mut self) {
         self.handed = self.handed.wrapping_add(1);
     }
@@ -47,16 +44,16 @@ impl Ledger {
         self.handed
     }
 
-    /// Takes in that a block was refused, as it came out of order, or that garbage came.
+    /// Notes that a block was refused because it was out of order, or that garbage came.
     pub(super) fn refuse(&mut self) {
         self.nak_owed = true;
     }
 
-    /// Takes in that the link answers a block itself, and returns the number of its answer. None if
-    /// too many such blocks do not count yet: then this one has to go to the core, too.
+    /// Notes that the link answers a block itself, and returns the number of its answer. `None` if too many of these
+    /// blocks do not count yet. Then this block has to go to the core too.
     ///
-    /// `core_done` is how many blocks the core is done with. Its responses to these must all have gone
-    /// through [`Ledger::respond`] before, as they would get too high a number afterwards.
+    /// `core_done` is how many blocks the core has finished. All responses to them must have gone through
+    /// [`Ledger::respond`] before. Otherwise they would get too high a number.
     pub(super) fn answer(&mut self, core_done: u32) -> Option<u32> {
         self.settle(core_done);
         if self.early.len() >= EARLY_MAX {
@@ -67,24 +64,24 @@ impl Ledger {
         Some(self.say(self.done()))
     }
 
-    /// The number of a response of the core, which had begun `core_begun` blocks when it sent that: the
-    /// number just after the block that it was running.
+    /// The number of a response of the core. The core had begun `core_begun` blocks when it sent the response. The
+    /// number is the one just after the block that it was running.
     pub(super) fn respond(&mut self, core_begun: u32) -> u32 {
         self.settle(core_begun.wrapping_sub(1));
         self.say(core_begun.wrapping_add(self.settled))
     }
 
-    /// The numbers of the empty blocks that are to be sent now that the core is done with `core_done`
-    /// blocks (for which the same holds as in [`Ledger::answer`]).
+    /// The numbers of the empty blocks to send now. The core has finished `core_done` blocks; the condition in
+    /// [`Ledger::answer`] holds here too.
     ///
-    /// The first acknowledges what was done since the last such block. The second is a NAK, for the
-    /// host takes an empty block that repeats the last number for one. So it is sent only if a block
-    /// was refused, and once all blocks before that one are done.
+    /// The first number acknowledges the blocks that were finished since the last empty block. The second is a NAK: the
+    /// host takes an empty block that repeats the last number as a NAK. So it is sent only if a block was refused, and
+    /// only when all blocks before that one are done.
     pub(super) fn acknowledge(&mut self, core_done: u32) -> [Option<u32>; 2] {
         self.settle(core_done);
         let done = self.done();
-        // No acknowledgement is needed if a response to the block that the core is running has
-        // carried a higher number already.
+        // A response to the block that the core is running may have carried a higher number already. Then no
+        // acknowledgement is needed.
         let news = done != self.acknowledged && !is_after(self.said, done);
         self.acknowledged = done;
         let all_done = self.core_done == self.handed;
@@ -97,13 +94,13 @@ impl Ledger {
         is_after(core_done, self.core_done) || self.done() != self.acknowledged
     }
 
-    /// How many blocks count: all of them are done, and all before them.
+    /// How many blocks count: these blocks and all before them are done.
     fn done(&self) -> u32 {
         self.core_done.wrapping_add(self.settled)
     }
 
-    /// Takes in how many blocks the core is done with, and counts the blocks that the link has answered
-    /// as far as all blocks before them are done.
+    /// Notes how many blocks the core has finished. It counts the blocks that the link has answered, as far as all
+    /// blocks before them are done.
     fn settle(&mut self, core_done: u32) {
         if is_after(core_done, self.core_done) {
             self.core_done = core_done;
@@ -141,15 +138,15 @@ mod tests {
         Query,
         /// A block is refused.
         Refused,
-        /// The core takes up a block, or goes on with the one that it has.
+        /// The core begins a block, or continues its present one.
         Begin,
-        /// The core says something, of its block or by a timer.
+        /// The core sends a response, for its block or from a timer.
         Respond,
         /// The core is done with its block.
         Finish,
         /// The link looks how far the core is.
         Look,
-        /// The link frames what the core said, and acknowledges what it saw.
+        /// The link frames the core's responses, and acknowledges the finished blocks that it saw.
         GiveOut,
     }
 
@@ -158,10 +155,10 @@ mod tests {
     struct Model {
         /// Whether each block was answered by the link.
         blocks: Vec<bool>,
-        /// Blocks that the core has begun and done.
+        /// How many blocks the core has begun, and how many it has finished.
         begun: usize,
         done: usize,
-        /// What the core said, by the blocks begun.
+        /// The core's responses, each as the number of blocks begun at that time.
         responses: VecDeque<usize>,
         /// How many blocks the link saw done.
         seen: usize,
@@ -174,7 +171,7 @@ mod tests {
             self.blocks.iter().filter(|early| !**early).count()
         }
 
-        /// How many leading blocks are done, when the core is done with so many of its own.
+        /// How many leading blocks are done when the core has finished `core_done` of its own.
         fn leading(&self, mut core_done: usize) -> usize {
             let is_done = |early: &&bool| {
                 let done = **early || core_done > 0;
@@ -184,7 +181,7 @@ mod tests {
             self.blocks.iter().take_while(is_done).count()
         }
 
-        /// The number just after the core's block of this number, counted from 1.
+        /// The number just after block `core_begun` of the core, counted from 1.
         fn just_after(&self, core_begun: usize) -> usize {
             let mut own = (1..).zip(&self.blocks).filter(|(_, early)| !**early);
             core_begun.checked_sub(1).map_or(0, |before| own.nth(before).unwrap().0)
@@ -205,7 +202,7 @@ mod tests {
         proptest::collection::vec(event, 0..300)
     }
 
-    /// The core's counters as they are after `start` blocks.
+    /// A counter of the core that began at `start`, after `count` blocks.
     fn after(start: u32, count: usize) -> u32 {
         start.wrapping_add(count as u32)
     }
@@ -216,8 +213,8 @@ mod tests {
             let own = model.just_after(begun);
             model.seen = model.seen.max(begun.saturating_sub(1));
             prop_assert_eq!(number, own.max(model.sent));
-            // If the number had to be raised above that, all blocks in between were answered by the
-            // link: so it acknowledges no block that the core still has.
+            // If the number had to be raised above that, the link answered all blocks in between. So the number
+            // acknowledges no block that the core still has.
             prop_assert!(model.blocks[own..number].iter().all(|early| *early));
             model.sent = number;
         }

@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The link: takes blocks from the host to the core, and responses from the core to the host.
 //!
-//! It answers `identify` and `get_clock` by itself when they come alone in a block: they need
-//! no core, and the host's clock synchronisation sees the shortest round trip, also while a bus
-//! holds the blocks before them back.
+//! The link itself answers `identify` and `get_clock` when they come alone in a block: they need no core. So the host's
+//! clock synchronization sees the shortest round trip, even while a bus holds earlier blocks back.
 
 #![forbid(unsafe_code)]
 
@@ -31,7 +30,7 @@ use super::oversight::{FAREWELL, Oversight};
 use super::signals::Signal;
 use super::watchdog::Watchdog;
 
-/// The messages that the link knows by itself.
+/// The messages that the link answers itself.
 struct Known {
     dialect: Arc<Dialect>,
     get_clock: Option<u32>,
@@ -47,7 +46,7 @@ impl Known {
         }
     }
 
-    /// The answer to a block that holds nothing but one of these commands.
+    /// The answer to a block that holds only one of these commands.
     fn answer(&self, payload: &[u8], now: impl FnOnce() -> Clock) -> Option<Writer> {
         let mut reader = Reader::new(payload);
         let id = Some(reader.int().ok()?);
@@ -81,13 +80,12 @@ pub(super) struct Link {
     oversight: Oversight,
     clock: Arc<dyn TimeSource>,
     known: Known,
-    /// How many blocks the core had been given when the host's dialect changed, until it begins the next one. What
-    /// it says before that may be in the words of the host that was there before.
+    /// How many blocks the core had been handed when the host's dialect changed. It is kept until the core begins the
+    /// next block. Earlier responses may be in the dialect of the previous host.
     changed_at: Option<u32>,
 }
 
-/// What ended the link's sleep: it looks only where there is something, as each look is a system
-/// call.
+/// What ended the link's sleep. The link looks only there, because each look is a system call.
 #[derive(Clone, Copy, Debug)]
 struct Woken {
     by_signal: bool,
@@ -101,7 +99,7 @@ struct Woken {
 pub(super) enum End {
     /// A signal asked for it.
     Asked,
-    /// The guardian is gone: the program has to be started anew.
+    /// The guardian is gone. The program has to be started again.
     GuardianLost,
 }
 
@@ -158,21 +156,21 @@ impl Link {
         }
     }
 
-    /// Passes on what the core said last.
+    /// Passes on the core's last responses and log lines.
     pub(super) fn finish(&mut self) {
         self.give_out();
     }
 
-    /// Leaves a host the time to read why the program ends: what is unread when the terminal closes is lost,
-    /// and klippy then tells of a lost communication, seconds later.
+    /// Gives a host time to read why the program ends. Unread bytes are lost when the terminal closes. Then klippy
+    /// reports a lost communication, seconds later.
     pub(super) fn farewell(&mut self) {
         let end = monotonic() + FAREWELL;
         while self.host.is_attached() && monotonic() < end {
-            // What the terminal had no room for goes out as the host reads.
+            // Bytes without room in the terminal go out as the host reads.
             let is_out = self.host.is_out() && !self.core.inlet.has_response();
             let events = if is_out { PollFlags::empty() } else { PollFlags::POLLOUT };
             let mut fds = [PollFd::new(self.host.event(), events)];
-            // A host that hangs up has read it; a further signal cuts it short.
+            // A host that hangs up has read it. A further signal ends the wait.
             if poll(&mut fds, in_ms(end.saturating_sub(monotonic()))) != Ok(1)
                 || fds[0].revents() != Some(PollFlags::POLLOUT)
             {
@@ -189,12 +187,12 @@ impl Link {
         oversight.end();
     }
 
-    /// The program begins to end.
+    /// Tells the service manager that the program begins to end.
     pub(super) fn stopping(&self) {
         self.oversight.stopping();
     }
 
-    /// Asks the core something.
+    /// Passes a request to the core.
     pub(super) fn request(&mut self, request: Request) {
         self.core.request(request);
     }
@@ -217,7 +215,7 @@ impl Link {
         if !self.host.is_out() {
             events |= PollFlags::POLLOUT;
         }
-        // Without a guardian any other descriptor stands in.
+        // Without a guardian any other descriptor takes its place.
         let guardian = self.oversight.guardian();
         let mut fds = [
             PollFd::new(self.host.event(), events),
@@ -248,8 +246,7 @@ impl Link {
         stalled.then_some(STALL).into_iter().chain(due).min().map_or(PollTimeout::NONE, in_ms)
     }
 
-    /// The guardian is gone, or of no use: stops the MCU, and has the program end once the host has had
-    /// time to read why.
+    /// The guardian is gone or of no use. This stops the MCU. The program ends when the host has had time to read why.
     fn lose_guardian(&mut self, why: &str) {
         let cause = format!("{why}, and without it a crash would leave heaters on");
         let stop = Shutdown::because(reason::GUARDIAN_LOST, cause);
@@ -270,7 +267,7 @@ impl Link {
         Ok(())
     }
 
-    /// Whether it is not known yet what the host is to be told: what the board has, in which dialect.
+    /// Whether the link still has to find out the host's dialect, or what the board has.
     fn is_finding(&mut self) -> bool {
         loop {
             match self.introduction.step(self.known.dialect.name()) {
@@ -293,8 +290,8 @@ impl Link {
         self.request(Request::Speak(dialect));
     }
 
-    /// Takes in the blocks that were read. True if they have to wait: for the host's dialect, or
-    /// because the core has no room for all of them.
+    /// Takes in the blocks that were read. True if they have to wait for the host's dialect, or because the core has no
+    /// room for all of them.
     fn take_in(&mut self) -> bool {
         if self.is_finding() {
             return true;
@@ -319,8 +316,8 @@ impl Link {
         self.host.forget_taken() && stalled
     }
 
-    /// Answers a block here, if that can be done. A host that does not read gets its answers, like
-    /// any others, from the core, which drops what finds no room.
+    /// Answers a block here, if that is possible. A host that does not read gets its answers from the core, like all
+    /// others. The core drops answers that find no room.
     fn answer(&mut self, payload: &Payload) -> bool {
         let Some(answer) = self.known.answer(payload.as_slice(), || self.clock.now()) else { return false };
         let core_done = self.core.progress.done();
@@ -335,7 +332,7 @@ impl Link {
         true
     }
 
-    /// Frames what the core said, as long as the host reads.
+    /// Frames the core's responses, as long as the host reads.
     fn frame_responses(&mut self) {
         while !self.host.is_full() {
             let Some((payload, core_begun)) = self.core.inlet.response() else { return };
@@ -347,11 +344,11 @@ impl Link {
         }
     }
 
-    /// Frames what the core said and writes what the pty has room for.
+    /// Frames the core's responses and acknowledgements, and writes as much as the pty has room for.
     fn give_out(&mut self) {
         self.core.log_lines();
-        // In this order: what the core said of the blocks that are done is in the ring already, and
-        // all of it is framed before they are acknowledged.
+        // The order matters. The responses to finished blocks are already in the ring, and all are framed before these
+        // blocks are acknowledged.
         let core_done = self.core.progress.done();
         self.frame_responses();
         if !self.host.is_full() {

@@ -1,21 +1,22 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! How long a thread polls for the next step of a conversation before it sleeps.
 //!
-//! A wake-up takes 20 to 50 us on the computers measured, which is longer than most answers of a bus. So the core polls
-//! for an answer, and a worker for the next question. A computer with a single processor needs that processor for the
-//! thread that is waited for: nothing polls there. Polling is rationed, so that an endless conversation does not take
-//! a processor from the host, and does not use up what the kernel allows real-time threads.
+//! A wake-up takes 20 to 50 us on the computers measured. Most answers of a bus take less. So the core polls for an
+//! answer, and a worker polls for the next question. With a single processor nothing polls, because the other thread
+//! needs that processor. Polling is rationed. So an endless conversation takes no processor from the host, and does not
+//! use up the time that the kernel allows real-time threads.
 
 #![forbid(unsafe_code)]
 
 use pinion_firmware::time::{Clock, Ticks};
 
-/// How long a thread may poll at a stretch, after it has not polled for some time.
+/// Longest time that a thread may poll without a break, after it has not polled for some time.
 const RATION: i64 = Ticks::from_ms(100).0 as i64;
-/// A thread that does not poll earns one part in this many of the time for polling: at most a quarter of all time.
+/// A thread that does not poll earns one part in this many of the time for polling. So it polls for at most a quarter
+/// of all time.
 const EARNS: i64 = 3;
 
-/// Says of one thread whether it polls.
+/// Decides for one thread whether it polls.
 #[derive(Debug)]
 pub(super) struct Lookout {
     may_poll: bool,
@@ -26,7 +27,7 @@ pub(super) struct Lookout {
 }
 
 impl Lookout {
-    /// Nothing is polled for yet; nothing ever will be unless `may_poll`.
+    /// Nothing is expected yet. Without `may_poll` the thread never polls.
     pub(super) fn new(may_poll: bool, now: Clock) -> Lookout {
         Lookout { may_poll, until: now, looked: now, ration: RATION }
     }
@@ -77,7 +78,7 @@ mod tests {
         assert!(!lookout.goes_on(at(2_050)) && !lookout.goes_on(at(9_000)));
         lookout.expect(at(9_000), SPAN);
         assert!(lookout.goes_on(at(9_020)));
-        // What came while it polled begins another span.
+        // An event during the polling begins another span.
         lookout.expect(at(9_040), SPAN);
         assert!(lookout.goes_on(at(9_089)) && !lookout.goes_on(at(9_090)));
     }
@@ -91,7 +92,7 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
-        /// Whatever the conversation is like, in any second it polls for a quarter of the time and one ration.
+        /// In any second, it polls for at most a quarter of the time and one ration, whatever the conversation is like.
         #[test]
         fn polling_is_rationed(turns in proptest::collection::vec((0u64..20_000, 1u64..20_000), 1..20)) {
             let mut lookout = Lookout::new(true, Clock::from_ticks(0));
@@ -111,7 +112,7 @@ mod tests {
             }
             for from in (0..3 * SECOND).step_by(SECOND as usize / 10) {
                 let within = polled.iter().filter(|at| (from..from + SECOND).contains(*at)).count() as u64 * 25;
-                // Of each turn a look more than the ration has is possible.
+                // Each turn may have one look more than the ration allows.
                 prop_assert!(within <= SECOND / 4 + RATION as u64 + SECOND / 50, "{} from {}", within, from);
             }
         }

@@ -76,7 +76,7 @@ use watchdog::{Vigil, Watchdog};
 /// How the program runs.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Where the symbolic link to the pty stands.
+    /// Path of the symbolic link to the pty.
     pub symlink: PathBuf,
     /// Who may open the pty.
     pub access: Access,
@@ -84,18 +84,18 @@ pub struct Options {
     pub realtime: bool,
     /// How early the core may wake for a timer.
     pub margin: MarginLimits,
-    /// The dialect to speak; none: that of the host that comes.
+    /// The dialect to speak. `None`: the dialect of the host that comes.
     pub dialect: Option<DialectName>,
     /// The hardware watchdog to feed.
     pub watchdog: Option<PathBuf>,
-    /// The processor that the core runs on, and nowhere else.
+    /// The only processor that the core runs on.
     pub cpu: Option<usize>,
-    /// Where the socket for the status stands: the first of these paths where that can be; without any there is none.
+    /// Possible paths of the status socket: the first one that works is used. Without any there is no socket.
     pub sockets: Vec<PathBuf>,
 }
 
-/// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP; calls `ready` once a host may come.
-/// The MCU drives `board` by `timing`, whose instants are those of `clock`. `helpers` has the guardian of the board's
+/// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP. It calls `ready` once a host may come. The MCU drives
+/// `board` by `timing`, and the instants of `timing` are those of `clock`. `helpers` has the guardian of the board's
 /// outputs.
 pub fn run(
     options: &Options,
@@ -108,7 +108,7 @@ pub fn run(
     let Helpers { guardian, search } = helpers;
     let pulse = guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse()))?;
     let processors = Processors::new(options.cpu).map_err(io::Error::other)?;
-    // First: who sees the link may send a signal, which must not leave the link behind.
+    // This comes first: a process that sees the link may send a signal, and the signal must not leave the link behind.
     let signals = Signals::new()?;
     let pty = Pty::open(&options.symlink, &options.access)?;
     let notify = Notify::from_env()?;
@@ -141,7 +141,8 @@ pub fn run(
     if realtime {
         realtime::enter(Role::Link);
     }
-    // Last of what may fail: once open it resets the computer, unless we end in order.
+    // This comes last of all steps that may fail. Once open, the watchdog resets the computer unless Pinion ends in
+    // order.
     let watched = match &options.watchdog {
         Some(path) => Watchdog::open(path).map(|watchdog| link.feed(watchdog)),
         None => Ok(()),
@@ -173,7 +174,7 @@ fn end(mut link: Link, core: JoinHandle<Left>, guardian: Option<Guardian>, serve
     if let Some(guardian) = guardian {
         guardian.goodbye();
     }
-    // With its guardian lost it has taken leave already.
+    // After the loss of its guardian the link has already given the host time to read why.
     if matches!(served, Ok(End::Asked)) {
         link.farewell();
     }
@@ -186,7 +187,7 @@ fn end(mut link: Link, core: JoinHandle<Left>, guardian: Option<Guardian>, serve
     }
 }
 
-/// Says of a thread that can not be started what would permit one more.
+/// Adds the remedy to the error of a thread that cannot be started.
 fn started<T>(thread: io::Result<T>) -> io::Result<T> {
     thread.map_err(|error| {
         io::Error::new(error.kind(), format!("no thread can be started: {error}: raise TasksMax or ulimit -u"))

@@ -32,7 +32,7 @@ impl Notify {
                 _ => SocketAddr::from_pathname(name)?,
             };
             let socket = UnixDatagram::unbound()?;
-            // The link sends these messages: it must not block on a service manager that is busy.
+            // The link sends these messages. It must not block on a busy service manager.
             socket.set_nonblocking(true)?;
             socket.connect_addr(&address)?;
             Ok(Notify(Some(socket)))
@@ -43,10 +43,10 @@ impl Notify {
         })
     }
 
-    /// Sends assignments such as `READY=1`, one on each line.
+    /// Sends assignments such as `READY=1`, one per line.
     pub(super) fn send(&self, assignments: &str) {
         if let Some(socket) = &self.0 {
-            // A message that is lost does no harm: state and watchdog messages are sent again and again.
+            // A lost message does no harm: state and watchdog messages are sent again and again.
             let _ = socket.send(assignments.as_bytes());
         }
     }
@@ -58,8 +58,8 @@ impl Notify {
     }
 }
 
-/// How often to tell the service manager that the program is alive: at half of the limit that it sets
-/// (`WatchdogSec=`); none if it sets none.
+/// How often to tell the service manager that the program is alive: at half of its limit (`WatchdogSec=`). `None` if it
+/// sets no limit.
 pub(super) fn watchdog_interval() -> Option<Duration> {
     let variable = |name| env::var(name).ok();
     interval(variable("WATCHDOG_USEC"), variable("WATCHDOG_PID"), std::process::id())

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The core's way to the link: responses for the host and lines for the log. Neither side waits for
-//! the other: what does not fit a ring is dropped. Lines have a ring of their own, so that the line
-//! that says why the MCU stopped gets through even if the host does not read its responses.
+//! The core's way to the link: responses for the host and lines for the log. Neither side waits for the other: a record
+//! that does not fit its ring is dropped. Lines have a ring of their own. So the line with the reason of a stop gets
+//! through even if the host does not read its responses.
 
 #![forbid(unsafe_code)]
 
@@ -18,18 +18,18 @@ use pinion_firmware::lateness::us;
 use pinion_firmware::mcu::{Note, Outbox};
 use pinion_firmware::shutdown::{Shutdown, reason};
 
-/// The size of the ring of responses, of which some 1,000 fit.
+/// Size of the ring of responses. Some 1,000 responses fit.
 const RING_BYTES: usize = 1 << 16;
-/// What stands before a response in the ring: its length, and how many blocks the core had begun.
+/// Size of the head of a response in the ring: its length, and how many blocks the core had begun.
 const HEAD_BYTES: usize = 6;
-/// The longest line for the log. One that is longer is cut.
+/// Longest line for the log. A longer one is cut.
 const LINE_BYTES: usize = 1024;
-/// What stands before a line in the ring: its level and its length.
+/// Size of the head of a line in the ring: its level and its length.
 const LINE_HEAD_BYTES: usize = 3;
-/// The size of the ring of lines.
+/// Size of the ring of lines.
 const LINES_BYTES: usize = 1 << 15;
-/// The part of it that is kept free for the line that says why the MCU stopped. That one comes
-/// last: before it, each object may have logged that it could not be stopped.
+/// The part of that ring that is kept free for the line with the reason of a stop. That line comes last. Before it,
+/// each object may have logged that it could not be stopped.
 const LINES_SPARE: usize = 2 * (LINE_HEAD_BYTES + LINE_BYTES);
 
 /// Wakes the link. Costs a system call only if the link sleeps.
@@ -44,7 +44,7 @@ impl LinkWake {
         Ok(LinkWake { asleep: AtomicBool::new(false), event })
     }
 
-    /// To be called by the core after it has put something into a ring.
+    /// The core calls this after it has put something into a ring.
     pub(super) fn wake(&self) {
         if self.asleep.swap(false, Ordering::SeqCst) {
             // The write can fail only if the counter is full of wake-ups, and then the link wakes, too.
@@ -52,18 +52,18 @@ impl LinkWake {
         }
     }
 
-    /// To be called by the link before it sleeps. After this it must look at the rings once more.
+    /// The link calls this before it sleeps. After this it must look at the rings once more.
     ///
-    /// Then no wake-up is lost. Either this swap comes first: the core's swap in [`LinkWake::wake`]
-    /// finds the link asleep and wakes it. Or the core's swap comes first: this one reads the value
-    /// that it left, and so the look that follows sees all that the core wrote before it. A plain
-    /// store would read nothing, so the second case would not hold: the link could look before the
-    /// core's response becomes visible to it, and go to sleep although the core found it awake.
+    /// Then no wake-up is lost. If this swap comes first, the core's swap in [`LinkWake::wake`] finds the link asleep
+    /// and wakes it. If the core's swap comes first, this swap reads the value that it left. So the look that follows
+    /// sees all that the core wrote before its swap. A plain store would read nothing, and the second case would not
+    /// hold. The link could then look before the core's response becomes visible, and go to sleep although the core
+    /// found it awake.
     pub(super) fn sleeping(&self) {
         self.asleep.swap(true, Ordering::SeqCst);
     }
 
-    /// To be called by the link after its sleep; `called` tells whether its event was readable.
+    /// The link calls this after its sleep. `called`: its event was readable.
     pub(super) fn awake(&self, called: bool) {
         self.asleep.store(false, Ordering::SeqCst);
         if called {
@@ -76,13 +76,12 @@ impl LinkWake {
     }
 }
 
-/// How many of the host's blocks the core has begun and done, and how many requests to stop the link
-/// has handed to it. The counts wrap around.
+/// How many of the host's blocks the core has begun and finished, and how many stop requests the link has handed to it.
+/// The counts wrap around.
 ///
-/// By them a response gets the sequence number of the block that it answers. klippy takes a response
-/// for the answer to a query only if its number says that the query had been received (`#sent_time`
-/// in serialhdl.py). If numbers ran ahead of the core, a late answer to an earlier query of the same
-/// name would pass for the answer to the present one.
+/// They give a response the sequence number of the block that it answers. klippy takes a response for the answer to a
+/// query only if its number says that the query had been received (`#sent_time` in serialhdl.py). If numbers ran ahead
+/// of the core, a late answer to an earlier query of the same name would pass for the present answer.
 #[derive(Debug, Default)]
 pub(super) struct Progress {
     begun: AtomicU32,
@@ -97,7 +96,7 @@ impl Progress {
         self.begun.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// The core is done with the block, and has said all that it had to say of it.
+    /// The core has finished the block, and has sent all its responses to it.
     pub(super) fn finish(&self) {
         self.done.fetch_add(1, Ordering::Release);
     }
@@ -107,29 +106,29 @@ impl Progress {
         self.done.load(Ordering::Acquire)
     }
 
-    /// Says whether a bus holds the core's block back from now on. Before the core sleeps after that it looks for
-    /// further blocks.
+    /// Notes whether a bus holds the core's block back from now on. After this the core looks for further blocks before
+    /// it sleeps.
     pub(super) fn hold(&self, held: bool) {
         self.held.store(held, Ordering::Relaxed);
         fence(Ordering::SeqCst);
     }
 
     /// Whether a bus holds the core's block back. Then the core need not be unparked for a block that it was handed
-    /// before: of the two fences one comes first, so either this sees that the core is held no longer, or the core
+    /// before. One of the two fences comes first. So either this call sees that the core is no longer held, or the core
     /// sees the block.
     pub(super) fn is_held(&self) -> bool {
         fence(Ordering::SeqCst);
         self.held.load(Ordering::Relaxed)
     }
 
-    /// The link is about to hand the core a request to stop: a block with `emergency_stop`,
-    /// `Request::Shutdown` or `Request::Quit`.
+    /// The link is about to hand the core a stop request: a block with `emergency_stop`, `Request::Shutdown` or
+    /// `Request::Quit`.
     pub(super) fn stop_handed(&self) {
         self.stops_handed.fetch_add(1, Ordering::Release);
     }
 
-    /// How many requests to stop the link has handed to the core, or is about to. The core counts
-    /// those that it has taken out of its ring: as long as these are fewer, one is still to come.
+    /// How many stop requests the link has handed to the core, or is about to. The core counts those that it has taken
+    /// out of its ring. While its count is lower, one is still to come.
     pub(super) fn stops_handed(&self) -> u32 {
         self.stops_handed.load(Ordering::Acquire)
     }
@@ -165,7 +164,7 @@ fn push(ring: &mut Producer<u8>, head: &[u8], bytes: &[u8]) {
     }
 }
 
-/// Takes as many bytes out of a ring as `to` has room for, if there are that many.
+/// Fills `to` from a ring, if the ring has enough bytes.
 fn pop<'a>(ring: &mut Consumer<u8>, to: &'a mut [u8]) -> Option<&'a [u8]> {
     let chunk = ring.read_chunk(to.len()).ok()?;
     for (to, from) in to.iter_mut().zip(chunk) {
@@ -175,11 +174,11 @@ fn pop<'a>(ring: &mut Consumer<u8>, to: &'a mut [u8]) -> Option<&'a [u8]> {
 }
 
 impl Outlet {
-    /// Puts a line into its ring, or drops it if that would leave fewer than `spare` bytes free.
+    /// Puts a line into its ring, or drops it if fewer than `spare` bytes would stay free.
     fn line(&mut self, level: Level, spare: usize, line: std::fmt::Arguments<'_>) {
         let mut text = [0; LINE_BYTES];
         let mut rest = &mut text[..];
-        // The write fails where the text is full: the line is cut there.
+        // The write fails when the text is full. The line is cut there.
         let _ = rest.write_fmt(line);
         let len = LINE_BYTES - rest.len();
         if self.lines.slots() >= LINE_HEAD_BYTES + len + spare {
@@ -227,8 +226,8 @@ impl Outbox for Outlet {
     }
 }
 
-/// The level at which a stop is logged: as information if somebody has asked for it (M112 and
-/// FIRMWARE_RESTART; SIGTERM; FORCE_SHUTDOWN, for which the link logs a warning itself).
+/// The level at which a stop is logged. It is information if somebody asked for the stop: M112, FIRMWARE_RESTART,
+/// SIGTERM or FORCE_SHUTDOWN. For FORCE_SHUTDOWN the link logs a warning itself.
 fn gravity(shutdown: &Shutdown) -> Level {
     match shutdown.reason {
         reason::COMMAND_REQUEST | reason::FORCE_SHUTDOWN => Level::Info,
@@ -253,7 +252,7 @@ impl std::fmt::Display for Kinds<'_> {
 }
 
 impl Inlet {
-    /// The payload of the next response, and how many blocks the core had begun when it sent that.
+    /// The payload of the next response, and how many blocks the core had begun when it sent the response.
     pub(super) fn response(&mut self) -> Option<(&[u8], u32)> {
         let mut head = [0; HEAD_BYTES];
         pop(&mut self.responses, &mut head)?;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What may end the program, and what it tells those that watch over it: signals, the guardian, the watchdogs.
+//! Everything that may end the program or watches over it: signals, the guardian, the watchdogs.
 
 #![forbid(unsafe_code)]
 
@@ -15,17 +15,17 @@ use super::watchdog::{Vigil, Watchdog};
 /// How long a host has to read why the program ends.
 pub(super) const FAREWELL: Duration = Duration::from_secs(1);
 
-/// Who watches over the program, and whom it watches.
+/// Watches over the program: signals, the guardian and the watchdogs.
 pub(super) struct Oversight {
     signals: Signals,
     guardian: Option<GuardianWatch>,
     vigil: Vigil,
-    /// When to end (CLOCK_MONOTONIC), as the guardian is gone.
+    /// When to end (CLOCK_MONOTONIC), because the guardian is gone.
     leave_at: Option<Duration>,
 }
 
 impl Oversight {
-    /// `guardian`, if the board has outputs that one guards.
+    /// `guardian` is `None` if the board has no outputs to guard.
     pub(super) fn new(signals: Signals, guardian: Option<GuardianWatch>, vigil: Vigil) -> Oversight {
         Oversight { signals, guardian, vigil, leave_at: None }
     }
@@ -40,7 +40,7 @@ impl Oversight {
         self.vigil.ready();
     }
 
-    /// Tells the service manager how the program is.
+    /// Tells the service manager the program's state.
     pub(super) fn status(&self, status: &str) {
         self.vigil.status(status);
     }
@@ -61,7 +61,7 @@ impl Oversight {
         self.leave_at.into_iter().chain(self.vigil.due()).chain(look).min()
     }
 
-    /// Feeds the watchdogs, and returns why the guardian is of no use any more, if it is not.
+    /// Feeds the watchdogs. If the guardian is of no use any more, it returns the reason.
     pub(super) fn tick(&mut self) -> Option<&'static str> {
         if self.vigil.due().is_some() {
             self.vigil.tick(monotonic());
@@ -76,7 +76,7 @@ impl Oversight {
         self.guardian.as_ref().map(GuardianWatch::socket)
     }
 
-    /// The guardian is gone, or of no use: the program ends once the host has had time to read why.
+    /// The guardian is gone or of no use. The program ends when the host has had time to read why.
     pub(super) fn lose_guardian(&mut self) {
         self.guardian = None;
         self.leave_at = Some(monotonic() + FAREWELL);
@@ -87,7 +87,7 @@ impl Oversight {
         self.leave_at.is_some_and(|at| monotonic() >= at)
     }
 
-    /// What is readable once a signal has come.
+    /// A descriptor that is readable when a signal has come.
     pub(super) fn signals(&self) -> BorrowedFd<'_> {
         self.signals.event()
     }

@@ -22,19 +22,18 @@ use pinion_linux::sys;
 use super::place::Place;
 use super::served::served;
 
-/// The group that gets the terminal if the command line names none.
+/// The terminal's group, if the command line names none.
 const USUAL_GROUP: &str = "tty";
-/// Where others leave files in the link's place.
+/// The folder where others leave files in the link's place.
 const TMP: &str = "/tmp";
-/// What the stop command of Klipper's own service writes to the link's path, whether a program serves
-/// there or not.
+/// The stop command of Klipper's own service writes this to the link's path, even if no program serves there.
 const FORCE_SHUTDOWN: &str = "FORCE_SHUTDOWN";
 
 /// A terminal that a host finds by a symbolic link.
 ///
-/// The kernel tells when the host has gone: once the last process has closed the slave end, the master
-/// hangs up. For that our own slave end must be closed while a host is there. It is open while none
-/// is, as otherwise the master would be hung up all that time.
+/// The kernel reports that the host has gone: the master hangs up when the last process has closed the slave end. So
+/// our own slave end must be closed while a host is there. It is open while no host is there, or the master would be
+/// hung up all that time.
 pub(super) struct Pty {
     master: OwnedFd,
     /// Our own slave end, open while no host is there.
@@ -48,8 +47,8 @@ pub(super) struct Pty {
 pub struct Access {
     /// Permission bits.
     pub mode: u32,
-    /// Name or number of the group. Without one it is `tty`, or, if that is not permitted, the group
-    /// that the system has given the terminal.
+    /// Name or number of the group. `None` means `tty`. If that is not permitted, the terminal keeps the group that the
+    /// system has given it.
     pub group: Option<String>,
 }
 
@@ -94,11 +93,11 @@ impl Pty {
         &self.symlink
     }
 
-    /// Reads what the host wrote, and returns how many bytes; 0 if there is nothing.
+    /// Reads the host's bytes, and returns how many; 0 if there are none.
     pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
         match read(&self.master, buffer) {
             Ok(len) => Ok(len),
-            // The kernel answers EIO once the host has gone and all that it wrote has been read.
+            // The kernel answers EIO when the host has gone and all its bytes have been read.
             Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(0),
             Err(error) => Err(error.into()),
         }
@@ -113,8 +112,8 @@ impl Pty {
         }
     }
 
-    /// To be called when bytes came while no host was there: closes our slave end, so that the master
-    /// hangs up when the host goes. Returns false if it has gone already, as `echo` in a shell does.
+    /// Call this when bytes came while no host was there. It closes our slave end, so that the master hangs up when the
+    /// host goes. It returns false if the host has gone already, as `echo` in a shell does.
     pub(super) fn meet_host(&mut self) -> io::Result<bool> {
         self.slave = None;
         let mut fds = [PollFd::new(self.master.as_fd(), PollFlags::empty())];
@@ -126,12 +125,11 @@ impl Pty {
         Ok(is_there)
     }
 
-    /// To be called when the master has hung up, as the host has gone: opens our slave end again, and
-    /// drops what the host did not read.
+    /// Call this when the master has hung up because the host has gone. It opens our slave end again, and drops the
+    /// bytes that the host did not read.
     pub(super) fn part_from_host(&mut self) -> io::Result<()> {
         let slave = said(sys::pty_slave(self.master.as_fd()), "opening the terminal anew")?;
-        // Should this fail, the next host reads some blocks that were meant for this one, and skips
-        // them.
+        // If this fails, the next host reads some blocks that were meant for this one, and skips them.
         let _ = tcflush(&slave, FlushArg::TCIFLUSH);
         self.slave = Some(slave);
         Ok(())
@@ -144,7 +142,7 @@ impl Pty {
 
 impl Drop for Pty {
     fn drop(&mut self) {
-        // Another program may have put its own link there since: that one must stay.
+        // Another program may have put its own link there since. That link must stay.
         if fs::read_link(&self.symlink).is_ok_and(|target| target == self.device) {
             let _ = fs::remove_file(&self.symlink);
         }
@@ -156,8 +154,8 @@ fn grant(device: &Path, access: &Access) -> io::Result<()> {
     said(fs::set_permissions(device, fs::Permissions::from_mode(access.mode)), &about("the mode"))?;
     match &access.group {
         Some(name) => give(device, name),
-        // The user has not asked for this group, so the program runs without it: only root or a member
-        // may give a file to `tty`. (The C program leaves the group as it is.)
+        // The user has not asked for this group, so the program runs without it. Only root or a member may give a file
+        // to `tty`. (The C program leaves the group as it is.)
         None => give(device, USUAL_GROUP).or_else(|error| {
             let gid = fs::metadata(device)?.gid();
             warn!("{error}: it stays with group {gid}; a klippy of another user can not open it");
@@ -193,7 +191,7 @@ fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
     } else if let Some(obstacle) = place.obstacle(symlink) {
         return Err(io::Error::other(obstacle));
     }
-    // A rename replaces a stale link in one step, so that a host finds a link at any time.
+    // A rename replaces a stale link in one step. So a host finds a link at any time.
     let mut fresh = symlink.as_os_str().to_owned();
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
@@ -203,11 +201,11 @@ fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
     said(fs::rename(&fresh, symlink), &what).inspect_err(|_| drop(fs::remove_file(&fresh)))
 }
 
-/// Whether this is a file that a service's stop command has left in /tmp, when it wrote where no link
-/// was: root's or our own, with nothing else in it. (The C program removes whatever is there.)
+/// Whether a service's stop command left this file in /tmp because there was no link. The file is root's or our own,
+/// with nothing else in it. (The C program removes any file.)
 fn is_left_over(path: &Path) -> bool {
     let read = || -> io::Result<(fs::Metadata, String)> {
-        // Neither another's link nor a pipe that nobody writes to, should one come in its place now.
+        // Another file may take its place now. Do not follow another user's link, and do not wait for a pipe's writer.
         let flags = OFlag::O_NOFOLLOW | OFlag::O_NONBLOCK;
         let file = OpenOptions::new().read(true).custom_flags(flags.bits()).open(path)?;
         let mut content = String::new();

@@ -1,19 +1,18 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Signs of life, in a page of memory that program and guardian share: the core's heartbeat, the
-//! shutdown values that the MCU owes, what each worker is at, and the guardian's own sign.
+//! Signs of life, in a page of memory that the program and the guardian share. The page has the core's heartbeat, the
+//! shutdown values that the MCU owes, each worker's present job, and the guardian's own sign.
 //!
-//! A beat is the instant at which it was given, so that a listener knows when silence began and
-//! need not look more often than silence may last. How long that is, the core says with each beat:
-//! about half a second while the MCU runs ([`RUNNING`]); half a minute otherwise ([`IDLE`]),
-//! as opening a device or ending a worker may take its time, and the outputs are at their start or
-//! shutdown values then.
+//! A beat is the instant at which it was given. So a listener knows when silence began, and need not look more often
+//! than silence may last. The core sets that limit with each beat. It is about half a second while the MCU runs
+//! ([`RUNNING`]), and half a minute otherwise ([`IDLE`]). Then opening a device or ending a worker may take its time,
+//! and the outputs are at their start or shutdown values.
 //!
-//! At a shutdown some of the outputs are written by workers, and are at their shutdown values only
-//! when those have done it. Until then the MCU owes them ([`Pulse::owe`]): meanwhile its beats
-//! do not count, and after [`STOPPING`] the guardian takes over, as it does for a core that hangs.
+//! At a shutdown, workers write some of the outputs. Until they have done so, the MCU owes these shutdown values
+//! ([`Pulse::owe`]). Meanwhile its beats do not count. After [`STOPPING`] the guardian takes over, as it does for a
+//! core that hangs.
 //!
-//! The guardian in turn leaves a sign each time it listens. [`GuardianEar`] is how the program
-//! notices a guardian that is stopped or hangs.
+//! The guardian in turn leaves a sign each time it listens. With [`GuardianEar`] the program notices a guardian that is
+//! stopped or hangs.
 
 #![forbid(unsafe_code)]
 
@@ -35,12 +34,12 @@ pub(super) const RUNNING: Duration = Duration::from_millis(550);
 const IDLE: Duration = Duration::from_secs(30);
 /// How long a shutdown value may be on its way to an output.
 const STOPPING: Duration = Duration::from_secs(1);
-/// A core with nothing to do beats this often: it may be late by what is left of [`RUNNING`].
+/// How often an idle core beats. A beat may be late by the rest of [`RUNNING`].
 pub(super) const BEAT: Duration = Duration::from_millis(300);
 /// How long the guardian may be silent while it holds outputs. It leaves a sign every [`RUNNING`].
 const GUARDIAN: Duration = Duration::from_secs(2);
-/// A running MCU that stood still for so long is stopped. Shorter ones are left to the limits
-/// that the host set (max_duration) and to those of late timers and steps.
+/// Shortest standstill after which a running MCU is stopped. Shorter ones are left to the limits that the host set
+/// (max_duration) and to the limits of late timers and steps.
 const STANDSTILL: Duration = Duration::from_secs(1);
 
 /// Instants in the page are counted in 2^16 ticks, 1.3 ms: they wrap after 65 days.
@@ -50,7 +49,7 @@ const STANDSTILL_STAMPS: i32 = (STANDSTILL.as_nanos() / (NS_PER_TICK << STAMP_SH
 // The page's words.
 /// When the core gave its last beat.
 const BEAT_AT: usize = 0;
-/// How long it may be silent.
+/// How long the core may be silent.
 const SILENCE_MAX_MS: usize = 1;
 /// Whether the MCU owes a shutdown value.
 const OWES: usize = 2;
@@ -58,13 +57,13 @@ const OWES: usize = 2;
 const LISTENED_AT: usize = 3;
 /// Whether the guardian did not answer.
 const UNANSWERED: usize = 4;
-/// For how long the computer was suspended, until the core has seen it.
+/// How long the computer was suspended. The core clears it when it has seen it.
 const SUSPENDED_MS: usize = 5;
-/// Of what the MCU owes a shutdown value: a text.
+/// The name of the output that is owed its shutdown value: a text.
 const SUBJECT: usize = 8;
-/// From here on each worker has its words.
+/// The first word of the workers.
 const WORKERS: usize = 24;
-/// A worker's words: since when it is at its present job (0 without one), and its bus's name.
+/// How many words a worker has: the start of its present job (0 without one), and the name of its bus.
 const SLOT_WORDS: usize = 8;
 
 /// The core's heartbeat, and the page itself.
@@ -75,28 +74,27 @@ pub(super) struct Pulse {
 }
 
 impl Pulse {
-    /// A heart that beats now. `clock` is the core's.
+    /// Gives a first beat now. `clock` is the core's.
     pub(super) fn new(clock: Monotonic) -> io::Result<Pulse> {
         let pulse = Pulse { page: sys::shared_words()?, clock };
         pulse.beat(clock.now(), false);
         Ok(pulse)
     }
 
-    /// The core is alive at `now`; `running` is whether its MCU is configured and not shut
-    /// down. Only the core calls this.
+    /// The core is alive at `now`. `running`: its MCU is configured and not shut down. Only the core calls this.
     #[inline]
     pub(super) fn beat(&self, now: Clock, running: bool) {
         if self.page[OWES].load(Ordering::Relaxed) == 0 {
             self.page[BEAT_AT].store(stamp(now), Ordering::Relaxed);
         }
         let silence_max = if running { RUNNING } else { IDLE };
-        // Release: a listener that reads this limit reads this beat, too, and no older one.
+        // Release: a listener that reads this limit also reads this beat, and no older one.
         self.page[SILENCE_MAX_MS].store(silence_max.as_millis() as u32, Ordering::Release);
     }
 
-    /// Why a running MCU has to be stopped if it stood still since the last beat, as its
-    /// control group was frozen or the computer suspended: its outputs stayed as they were, and
-    /// nobody knows what became of what they heat or move. The core asks before each beat.
+    /// Why a running MCU has to be stopped, if it stood still since the last beat. Its control group was frozen, or the
+    /// computer was suspended. Its outputs stayed as they were, and nobody knows the state of the parts that they heat
+    /// or move. The core asks before each beat.
     #[inline]
     pub(super) fn standstill(&self, now: Clock) -> Option<Shutdown> {
         let stamps = stamp(now).wrapping_sub(self.page[BEAT_AT].load(Ordering::Relaxed)) as i32;
@@ -126,10 +124,9 @@ impl Pulse {
         self.page[SUSPENDED_MS].store(suspended.as_millis() as u32, Ordering::Relaxed);
     }
 
-    /// From now on the MCU owes a shutdown value of `subject`, such as `pwmchip0/pwm1`. The
-    /// first is a sign of life at `now`: what the core was at until then, such as a device that
-    /// took seconds to be opened, does not count. A further one replaces the subject, not the
-    /// time. Only the core calls this.
+    /// From now on the MCU owes the shutdown value of `subject`, such as `pwmchip0/pwm1`. The first call is a sign of
+    /// life at `now`. So earlier work of the core does not count, such as opening a device for seconds. A further call
+    /// replaces the subject, not the time. Only the core calls this.
     pub(super) fn owe(&self, subject: &str, now: Clock) {
         if self.page[OWES].load(Ordering::Relaxed) == 0 {
             self.page[BEAT_AT].store(stamp(now), Ordering::Relaxed);
@@ -161,7 +158,7 @@ impl Pulse {
         self.clock.now()
     }
 
-    /// The core's instant of a time since the kernel's start.
+    /// Converts a time since the kernel's start to an instant of the core's clock.
     pub(super) fn at(&self, time: Duration) -> Clock {
         let since = time.saturating_sub(self.clock.duration_of(Clock::EPOCH));
         Clock::from_ticks(since.as_nanos() as u64 / NS_PER_TICK)
@@ -180,7 +177,7 @@ impl Pulse {
         elapsed(self.page[BEAT_AT].load(Ordering::Relaxed), now) >= silence_max
     }
 
-    /// What is wrong with a program that gave no sign of life, for the log.
+    /// For the log: the fault of a program that gave no sign of life.
     pub(super) fn diagnosis(&self) -> String {
         let ms = self.silence_max().as_millis();
         match self.owes() {
@@ -192,14 +189,14 @@ impl Pulse {
         }
     }
 
-    /// Words for a new worker; none if there are no more. Only the core calls this.
+    /// Words for a new worker. `None` if no words are left. Only the core calls this.
     pub(super) fn worker(&self, bus: &str) -> Option<JobClock> {
         let slot = self.slots().find(|slot| !slot.name().is_set())?;
         slot.name().set(bus);
         Some(JobClock { slot, pulse: *self })
     }
 
-    /// The bus of a worker that has been at one job for longer than `limit` at `now`.
+    /// The bus of a worker whose present job takes longer than `limit` at `now`.
     pub(super) fn stuck(&self, now: Clock, limit: Duration) -> Option<String> {
         let mut workers = self.slots().filter(|slot| slot.name().is_set());
         workers.find(|slot| slot.busy_for(now) > limit).map(|slot| slot.name().get())
@@ -214,13 +211,13 @@ fn stamp(now: Clock) -> u32 {
     (now.ticks() >> STAMP_SHIFT) as u32
 }
 
-/// The time from a stamp until `now`; a stamp set meanwhile may lie behind it.
+/// The time from a stamp until `now`. Zero if the stamp was set meanwhile and is later than `now`.
 fn elapsed(since: u32, now: Clock) -> Duration {
     let stamps = (stamp(now).wrapping_sub(since) as i32).max(0);
     Duration::from_nanos(((stamps as u64) << STAMP_SHIFT) * NS_PER_TICK)
 }
 
-/// Words that hold a text, or as much of it as has room.
+/// Words that hold a text, or as much of it as fits.
 #[derive(Clone, Copy)]
 struct Text(&'static [AtomicU32]);
 
@@ -237,7 +234,7 @@ impl Text {
         for place in &self.0[1..] {
             place.store(word(), Ordering::Relaxed);
         }
-        // The first word last, as it is what `is_set` looks at: who sees it sees the others.
+        // The first word is written last, because `is_set` looks at it. A reader that sees it also sees the others.
         self.0[0].store(first, Ordering::Release);
     }
 
@@ -270,7 +267,7 @@ impl Slot {
     }
 }
 
-/// Since when a worker is at its present job, for others to see.
+/// Shows others since when a worker is at its present job.
 pub(super) struct JobClock {
     slot: Slot,
     pulse: Pulse,
@@ -282,7 +279,7 @@ impl JobClock {
         self.slot.since().store(stamp(self.pulse.now()).max(1), Ordering::Relaxed);
     }
 
-    /// It is done.
+    /// The job ends.
     pub(super) fn end(&self) {
         self.slot.since().store(0, Ordering::Relaxed);
     }
@@ -295,29 +292,28 @@ impl Drop for JobClock {
     }
 }
 
-/// A listener that sleeps longer than it meant to by more than this has heard no more of it.
+/// Longest oversleep that counts as listening. After a longer one, only this much of the sleep counts.
 const OVERSLEPT: Duration = Duration::from_millis(100);
 
-/// For how long a sign of life is missing. Silence counts only as far as the listener itself was
-/// awake to hear it: where both processes stood still, as in a frozen control group, neither takes
-/// the other for one that hangs.
+/// How long a sign of life is missing. Silence counts only while the listener itself was awake. Both processes may
+/// stand still together, as in a frozen control group. Then neither one believes that the other hangs.
 struct Silence {
     /// The last sign that was heard.
     heard: u32,
     length: Duration,
     looked: Clock,
-    /// For how long the listener meant to sleep then.
+    /// How long the listener meant to sleep then.
     pause: Duration,
 }
 
 impl Silence {
-    /// None so far; the sign is `sign` at `now`.
+    /// No silence so far. The sign is `sign` at `now`.
     fn new(sign: u32, now: Clock) -> Silence {
         Silence { heard: sign, length: Duration::ZERO, looked: now, pause: Duration::ZERO }
     }
 
-    /// Takes in that the sign is `sign` at `now`. Returns for how long not to look again, `longest`
-    /// at most; none if the sign has been missing for `silence_max`.
+    /// Takes in that the sign is `sign` at `now`. Returns how long not to look again, at most `longest`. `None` if the
+    /// sign has been missing for `silence_max`.
     fn listen(&mut self, sign: u32, now: Clock, silence_max: Duration, longest: Duration) -> Option<Duration> {
         let slept = Duration::from_nanos(now.since(self.looked).max(0) as u64 * NS_PER_TICK);
         let listened = if slept > self.pause + OVERSLEPT { OVERSLEPT } else { slept };
@@ -329,8 +325,8 @@ impl Silence {
     }
 }
 
-/// The guardian's: listens to the heartbeat, and leaves a sign of its own each time. It lives as
-/// long as the guardian holds outputs.
+/// The guardian's ear. It listens to the heartbeat, and leaves a sign of its own each time. It lives as long as the
+/// guardian holds outputs.
 pub(super) struct Ear {
     pulse: Pulse,
     silence: Silence,
@@ -344,7 +340,7 @@ impl Ear {
         Ear { pulse, silence: Silence::new(beat, now), suspensions: Suspensions::new() }
     }
 
-    /// For how long not to look again; none if the heartbeat is missing at `now`.
+    /// How long not to look again. `None` if the heartbeat is missing at `now`.
     pub(super) fn listen(&mut self, now: Clock) -> Option<Duration> {
         self.pulse.page[LISTENED_AT].store(stamp(now).max(1), Ordering::Relaxed);
         if let Some(suspended) = self.suspensions.newest() {
@@ -352,7 +348,7 @@ impl Ear {
         }
         let silence_max = self.pulse.silence_max();
         let beat = self.pulse.page[BEAT_AT].load(Ordering::Relaxed);
-        // No longer than a running MCU's limit: by then the core may have begun to run.
+        // No longer than the limit of a running MCU: by then the core may have begun to run.
         self.silence.listen(beat, now, silence_max, RUNNING)
     }
 }
@@ -363,26 +359,25 @@ impl Drop for Ear {
     }
 }
 
-/// Notices that the computer was suspended: CLOCK_BOOTTIME counts that time, CLOCK_MONOTONIC, by
-/// which everything else here goes, does not.
+/// Notices that the computer was suspended. CLOCK_BOOTTIME counts that time. CLOCK_MONOTONIC does not, and everything
+/// else here uses it.
 struct Suspensions {
-    /// By how much the former is ahead, or a little less.
+    /// How far CLOCK_BOOTTIME is ahead, as measured.
     ahead: Duration,
 }
 
-/// What the clocks' resolution may add up to.
+/// Highest difference that the clocks' resolution may cause.
 const SUSPENSION_MIN: Duration = Duration::from_millis(1);
 
 impl Suspensions {
     fn new() -> Suspensions {
-        // Whoever is kept from running between two readings takes the second clock for later. Here
-        // that makes the difference too large, below too small: neither tells of a suspension that
-        // was none.
+        // A process that is kept from running between two readings reads the second clock too late. That makes the
+        // difference too large here, and too small below. So neither looks like a suspension.
         let before = monotonic();
         Suspensions { ahead: boottime().saturating_sub(before) }
     }
 
-    /// For how long it was suspended since the last call.
+    /// How long the computer was suspended since the last call.
     fn newest(&mut self) -> Option<Duration> {
         let boottime = boottime();
         self.grown_to(boottime.saturating_sub(monotonic()))
@@ -400,7 +395,7 @@ fn boottime() -> Duration {
     clock_gettime(ClockId::CLOCK_BOOTTIME).map_or(Duration::ZERO, Duration::from)
 }
 
-/// The program's: listens to the guardian's sign of life while that holds outputs.
+/// The program's ear. It listens to the guardian's sign of life while the guardian holds outputs.
 pub(super) struct GuardianEar {
     pulse: Pulse,
     silence: Option<Silence>,
@@ -412,7 +407,7 @@ impl GuardianEar {
         GuardianEar { pulse, silence: None, due: Duration::ZERO }
     }
 
-    /// When to look next (CLOCK_MONOTONIC); none while the guardian holds nothing.
+    /// When to look next (CLOCK_MONOTONIC). `None` while the guardian holds nothing.
     pub(super) fn due(&self) -> Option<Duration> {
         let is_set = |word: usize| self.pulse.page[word].load(Ordering::Relaxed) != 0;
         if is_set(UNANSWERED) {
@@ -444,7 +439,7 @@ mod tests {
     use super::*;
     use pinion_firmware::time::{CLOCK_FREQ, Ticks};
 
-    /// What the stamps' resolution may add or take.
+    /// Highest difference that the stamps' resolution may cause.
     const FINE: Duration = Duration::from_millis(2);
 
     fn at(ms: u64) -> Clock {
@@ -457,8 +452,7 @@ mod tests {
         pulse
     }
 
-    /// After how many milliseconds a listener that sleeps as it means to hears that the
-    /// heartbeat is missing, and how often it looked.
+    /// After how many milliseconds a punctual listener hears that the heartbeat is missing, and how often it looked.
     fn silent_after(ear: &mut Ear, from_ms: u64) -> (u64, u32) {
         let (mut ms, mut looks) = (from_ms, 0);
         while let Some(pause) = ear.listen(at(ms)) {
@@ -534,7 +528,7 @@ mod tests {
         ear.listen(at(0)).unwrap();
         pulse.beat(at(290), true);
         ear.listen(at(550)).unwrap();
-        // The computer stood still for a minute, and the core has yet to be woken.
+        // The computer stood still for a minute, and the core is not awake yet.
         let pause = ear.listen(at(60_000)).expect("it was not heard");
         assert!(pause >= Duration::from_millis(150), "{pause:?}");
         // A listener that never gets its turn in time still hears a core that hangs.
@@ -550,11 +544,11 @@ mod tests {
         ear.listen(at(0)).unwrap();
         pulse.owe("spi0", at(0));
         for ms in (0..=900).step_by(100) {
-            // The core itself gets on.
+            // The core itself continues.
             pulse.beat(at(ms), false);
             assert!(ear.listen(at(ms)).is_some(), "{ms} ms");
         }
-        // The first is where it belongs, and there is another: the time goes on.
+        // The first output has its value, and another has not: the time goes on.
         pulse.owe("pwmchip10/pwm1", at(950));
         pulse.beat(at(1000), false);
         let (after, _) = silent_after(&mut ear, 901);
@@ -572,7 +566,7 @@ mod tests {
     fn what_the_core_was_at_before_the_mcu_owed_anything_does_not_count() {
         let pulse = pulse();
         let mut ear = Ear::new(pulse, at(0));
-        // The core opens a device, in vain, and the MCU stops.
+        // The core fails to open a device, and the MCU stops.
         for ms in (0..4000).step_by(500) {
             assert!(ear.listen(at(ms)).is_some());
         }
@@ -591,7 +585,7 @@ mod tests {
         assert!(shutdown.trouble.cause.contains("stood still for 10"), "{shutdown}");
         pulse.beat(at(1010), true);
         assert!(pulse.standstill(at(1011)).is_none());
-        // One that is being configured may take its time, and owes nobody an explanation.
+        // An MCU that is being configured may take its time, and reports nothing.
         pulse.beat(at(1010), false);
         assert!(pulse.standstill(at(9000)).is_none());
     }
@@ -614,7 +608,7 @@ mod tests {
         let s = Duration::from_secs;
         let mut suspensions = Suspensions { ahead: s(10) };
         assert_eq!(suspensions.grown_to(s(10)), None);
-        // Kept from running between two readings.
+        // The process did not run between two readings.
         assert_eq!(suspensions.grown_to(s(8)), None);
         assert_eq!(suspensions.grown_to(s(15)), Some(s(5)));
         assert_eq!(suspensions.grown_to(s(15)), None);
@@ -625,7 +619,7 @@ mod tests {
         pulse.clock.duration_of(at(ms))
     }
 
-    /// What the guardian does while it gets on, at each instant of `ms`.
+    /// The core's beat and the guardian's look, at each instant of `ms`.
     fn listen_at(ear: &mut Ear, ms: impl IntoIterator<Item = u64>) {
         for ms in ms {
             ear.pulse.beat(at(ms), true);
@@ -641,7 +635,7 @@ mod tests {
         let mut guardian = Ear::new(pulse, at(0));
         listen_at(&mut guardian, [0]);
         let (mut ms, mut looks) = (0, 0);
-        // It listens until the tenth second, and is stopped then.
+        // It listens until the tenth second, then it is stopped.
         let lost_at = loop {
             assert!(ms < 20_000, "it is not missed");
             if ms % 500 == 0 && ms <= 10_000 {
@@ -668,7 +662,7 @@ mod tests {
         let mut guardian = Ear::new(pulse, at(0));
         listen_at(&mut guardian, (0..=5000).step_by(500));
         assert!(!program.is_lost(time(pulse, 5100)));
-        // Both are frozen for a minute, and the program is the first to go on.
+        // Both are frozen for a minute, and the program continues first.
         assert!(!program.is_lost(time(pulse, 65_000)));
         assert!(program.due().unwrap() > time(pulse, 66_000));
         listen_at(&mut guardian, [65_010]);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Real time: scheduling class, locked memory, timer slack, processor. What the kernel does not permit
-//! is left out; the log then names the limit and the remedy.
+//! Real time: scheduling class, locked memory, timer slack, processor. Steps that the kernel does not permit are left
+//! out. The log then names the limit and the remedy.
 
 #![forbid(unsafe_code)]
 
@@ -37,8 +37,8 @@ pub enum Role {
     Worker,
 }
 
-/// The SCHED_FIFO priority of a thread. The core has half of the highest one, as the C program does,
-/// and the other threads have less.
+/// The SCHED_FIFO priority of a thread. The core has half of the highest one, as in the C program. The other threads
+/// have less.
 fn priority(role: Role) -> i32 {
     match role {
         Role::Core => 49,
@@ -47,16 +47,16 @@ fn priority(role: Role) -> i32 {
     }
 }
 
-/// The core's nice value while it runs as SCHED_OTHER: the most favourable that there is.
+/// The core's nice value while it runs as SCHED_OTHER: the most favorable one.
 const NICE: i32 = -20;
 /// The guardian stands above the core, so that it still runs if the core takes all of the processor.
 const GUARDIAN_PRIORITY: i32 = 50;
-/// MCL_ONFAULT (linux/mman.h): pages are locked once they are touched. Without it all pages of the
-/// libraries that libiio needs would be locked, which are 40 MB.
+/// MCL_ONFAULT (linux/mman.h): pages are locked when they are touched. Without it all pages of the libraries that
+/// libiio needs would be locked, which are 40 MB.
 const MCL_ONFAULT: i32 = 4;
-/// More than any thread of ours uses of its stack.
+/// How much stack is touched: more than any of our threads uses.
 const STACK_BYTES: usize = 256 * 1024;
-/// What the scheduling calls take for the calling thread.
+/// The calling thread, for the scheduling calls.
 const MYSELF: Pid = Pid::from_raw(0);
 /// Numbers of capabilities (linux/capability.h).
 const CAP_IPC_LOCK: u32 = 14;
@@ -66,12 +66,11 @@ fn lock_flags() -> MlockAllFlags {
     MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE | MlockAllFlags::from_bits_retain(MCL_ONFAULT)
 }
 
-/// Locks every page that is touched from now on, or was, in memory. If that is not permitted, the log
-/// says so.
+/// Locks every page in memory that was touched, or is touched from now on. If that is not permitted, the log says so.
 pub fn lock_memory() {
     let limit = limit(Resource::RLIMIT_MEMLOCK);
-    // With a limit, locking may succeed now, but later mappings would fail once the limit is reached:
-    // no thread could be started any more. So memory is locked only where there is no limit.
+    // With a limit, locking may succeed now. But later mappings would fail at the limit, and no thread could be started
+    // any more. So memory is locked only where there is no limit.
     let locked = match limit != RLIM_INFINITY && !has_capability(CAP_IPC_LOCK) {
         true => Err(memory_refusal(limit)),
         false => mlockall(lock_flags()).map_err(|error| Trouble::new(error.to_string())),
@@ -95,12 +94,11 @@ pub enum Scheduling {
     Ordinary,
 }
 
-/// Gives the calling thread its real-time priority, if that is permitted. Returns how it is scheduled
-/// now.
+/// Gives the calling thread its real-time priority, if that is permitted. Returns how the thread is scheduled now.
 pub fn enter(role: Role) -> Scheduling {
     touch_stack();
-    // Before Linux 6.13 a futex wait ends up to 50 us late (the default timer slack) even under
-    // SCHED_FIFO, unless the slack is set.
+    // Before Linux 6.13 a futex wait ends up to 50 us late (the default timer slack), even under SCHED_FIFO. Setting
+    // the slack prevents that.
     if let Err(error) = prctl::set_timerslack(1) {
         warn!("the timer slack can not be set: {error}; steps may be late by 50 us, before Linux 6.13");
     }
@@ -108,7 +106,7 @@ pub fn enter(role: Role) -> Scheduling {
         Ok(()) => {
             if role == Role::Core {
                 info!("real time: SCHED_FIFO, priority {}", priority(role));
-                // It counts while the budget has the core run as SCHED_OTHER.
+                // It counts while the budget makes the core run as SCHED_OTHER.
                 if let Err(error) = sys::set_nice(NICE) {
                     debug!("nice {NICE}: {error}");
                 }
@@ -129,21 +127,21 @@ pub fn enter(role: Role) -> Scheduling {
 ///
 /// # Errors
 ///
-/// What keeps it from that, and the remedy.
+/// The obstacle, and the remedy.
 pub fn is_permitted() -> Result<(), Trouble> {
-    // A scheduling class is a thread's own, and this one is gone at once.
+    // A scheduling class belongs to one thread, and this thread ends at once.
     let tried = thread::spawn(|| sys::set_fifo(priority(Role::Core)).map_err(|error| refusal(&error)));
     tried.join().unwrap_or_else(|_| Err(Trouble::new("it could not be tried").remedy(LOOK_AT_LOG)))
 }
 
 /// Makes the calling thread an ordinary one again.
 pub fn leave() {
-    // These can not fail: a thread may always give up a priority.
+    // These cannot fail: a thread may always give up a priority.
     let _ = sys::set_other().and_then(|()| sys::set_nice(0));
 }
 
-/// Changes the scheduling class of the calling thread, which is the core. It was permitted at the
-/// start; should it no longer be, the core goes on in its present class.
+/// Changes the scheduling class of the calling thread, the core. It was permitted at the start. If it no longer is, the
+/// core continues in its present class.
 pub(super) fn change(class: Class) {
     let _ = match class {
         Class::Fifo => sys::set_fifo(priority(Role::Core)),
@@ -151,8 +149,8 @@ pub(super) fn change(class: Class) {
     };
 }
 
-/// Locks the memory of the calling process, which is the guardian, and puts it above the core. It does
-/// not log what is refused: the core is refused the same, and the program logs that.
+/// Locks the memory of the calling process, the guardian, and puts it above the core. It does not log refusals: the
+/// core meets the same ones, and the program logs those.
 pub(super) fn enter_guardian() {
     touch_stack();
     let _ = mlockall(lock_flags());
@@ -165,7 +163,7 @@ fn touch_stack() {
     hint::black_box(&mut [0u8; STACK_BYTES]);
 }
 
-/// For the log: what keeps this process from real-time scheduling, and the remedy.
+/// For the log: the obstacle to real-time scheduling, and the remedy.
 fn refusal(error: &io::Error) -> Trouble {
     scheduling_refusal(error, limit(Resource::RLIMIT_RTPRIO), has_capability(CAP_SYS_NICE), group_runtime_us())
 }
@@ -207,8 +205,8 @@ fn effective_capabilities(status: &str) -> u64 {
     status_field(status, "CapEff").and_then(|bits| u64::from_str_radix(bits, 16).ok()).unwrap_or(0)
 }
 
-/// The real-time budget of this process's control group in microseconds, if its kernel is built to
-/// have them (CONFIG_RT_GROUP_SCHED).
+/// The real-time budget of this process's control group in microseconds. `None` if the kernel is built without these
+/// budgets (CONFIG_RT_GROUP_SCHED).
 fn group_runtime_us() -> Option<i64> {
     let groups = fs::read_to_string("/proc/self/cgroup").ok()?;
     let group = cpu_group(&groups)?;
@@ -226,7 +224,7 @@ fn cpu_group(groups: &str) -> Option<&str> {
     })
 }
 
-/// The processors that this process may use, and the one that the core is to stay on, if any.
+/// The processors that this process may use, and the core's fixed processor, if any.
 #[derive(Clone, Copy)]
 pub struct Processors {
     present: CpuSet,
@@ -234,7 +232,7 @@ pub struct Processors {
 }
 
 impl Processors {
-    /// The processors of the calling thread. `core` is the one that the core is to stay on.
+    /// The processors of the calling thread. `core` is the core's fixed processor.
     ///
     /// # Errors
     ///
@@ -253,7 +251,7 @@ impl Processors {
         })
     }
 
-    /// Binds the calling thread, which is the core, to its processor, if it is to stay on one.
+    /// Binds the calling thread, the core, to its fixed processor, if there is one.
     pub(super) fn confine(&self) -> io::Result<()> {
         let Some(cpu) = self.core else { return Ok(()) };
         let mut cpus = CpuSet::new();
@@ -261,18 +259,17 @@ impl Processors {
         Ok(sched_setaffinity(MYSELF, &cpus)?)
     }
 
-    /// Lets the calling thread run on any processor. The core has started it, so it has inherited the
-    /// core's binding.
+    /// Lets the calling thread run on any processor. The core has started it, so it has inherited the core's binding.
     pub(super) fn free(&self) {
-        // Should this fail, the thread just shares the core's processor.
+        // If this fails, the thread only shares the core's processor.
         let _ = sched_setaffinity(MYSELF, &self.present);
     }
 
-    /// Moves the calling thread, which is the core, to another processor. False if there is no other,
-    /// or the core is to stay on one.
+    /// Moves the calling thread, the core, to another processor. False if there is no other, or if the core has a fixed
+    /// one.
     pub(super) fn change(&self) -> bool {
         let mut others = self.present;
-        // With one processor only, the set of the others is empty, and the kernel refuses it.
+        // With only one processor, the set of the others is empty, and the kernel refuses it.
         self.core.is_none()
             && sched_getcpu()
                 .and_then(|cpu| others.unset(cpu))
@@ -281,14 +278,14 @@ impl Processors {
     }
 }
 
-/// Whether a kernel is PREEMPT_RT; `None` if nothing tells. `root` is the root of its /proc and /sys.
+/// Whether a kernel is PREEMPT_RT; `None` if that is unknown. `root` is the root of its /proc and /sys.
 pub(crate) fn is_preempt_rt(root: &Path) -> Option<bool> {
     const BYTES_MAX: u64 = 4096;
     let text = |file: &str| {
         let bytes = foreign::read(&root.join(file), BYTES_MAX).ok()?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
     };
-    // The patches for older kernels tell it in /sys, the kernel itself (since 6.12) in its version only.
+    // Patched older kernels say it in /sys. The kernel itself (since 6.12) says it only in its version.
     if text("sys/kernel/realtime").is_some_and(|text| text == "1") {
         return Some(true);
     }

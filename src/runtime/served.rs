@@ -16,14 +16,14 @@ use crate::klippy::process::{self, Process, server};
 
 /// The major numbers of pseudo terminals (admin-guide/devices.txt).
 const PTS_MAJORS: std::ops::RangeInclusive<u64> = 136..=143;
-/// The longest way of links that the kernel follows (path_resolution(7)).
+/// Highest number of links that the kernel follows (path_resolution(7)).
 const LINKS_MAX: usize = 40;
 /// Longest part of /proc/PID/cgroup that is looked at.
 const GROUPS_BYTES_MAX: u64 = 4096;
 /// How much younger than its link a served terminal may be. Klipper's own program changes the mode after it makes the
 /// link.
 const YOUNGER_MAX_S: i64 = 1;
-/// The programs that serve hosts, and what people call them.
+/// The programs that serve hosts, each with its name for people.
 const PROGRAMS: [(&str, &str); 2] = [("pinion", "Pinion"), ("klipper_mcu", "Klipper's own klipper_mcu")];
 
 /// A terminal that a running program serves.
@@ -31,7 +31,7 @@ const PROGRAMS: [(&str, &str); 2] = [("pinion", "Pinion"), ("klipper_mcu", "Klip
 pub struct Served {
     link: PathBuf,
     device: PathBuf,
-    /// What people call the program.
+    /// The program's name for people.
     program: &'static str,
     pid: Option<u32>,
     unit: Option<String>,
@@ -39,8 +39,8 @@ pub struct Served {
 
 /// The terminal behind a link, if a running program serves it.
 ///
-/// The kernel removes a terminal when its program ends, and gives the number to whoever opens a terminal next, such as a
-/// login. So a terminal that is younger than the link to it is none of ours. (`systemd/link` has the same rule.)
+/// The kernel removes a terminal when its program ends. The next terminal, such as a login's, gets the same number. So
+/// a terminal that is younger than the link to it is not ours. (`systemd/link` has the same rule.)
 pub fn served(link: &Path) -> Option<Served> {
     let way = follow(link);
     let [.., last_link, device] = &way[..] else { return None };
@@ -67,13 +67,13 @@ pub fn served(link: &Path) -> Option<Served> {
         device: device.clone(),
         program: server.as_ref().and_then(known).unwrap_or("another program"),
         pid: server.map(|process| process.pid),
-        // One of cron's, for instance, is started by cron's unit.
+        // A program that cron started, for example, belongs to cron's unit.
         unit: unit.filter(|unit| unit.contains("pinion") || unit.contains("klipper")).map(str::to_owned),
     })
 }
 
-/// The path and those that its links lead through, one after the other. (The kernel itself does not follow another
-/// user's link in /tmp.)
+/// The path, and the paths that its links lead through, in order. (The kernel itself does not follow another user's
+/// link in /tmp.)
 fn follow(link: &Path) -> Vec<PathBuf> {
     let mut way = vec![link.to_owned()];
     while way.len() <= LINKS_MAX
@@ -86,27 +86,27 @@ fn follow(link: &Path) -> Vec<PathBuf> {
     way
 }
 
-/// Whether the program was told to serve the terminal at another link. Then the one here was left behind by a program
-/// that had a terminal of the same number before.
+/// Whether the program was told to serve the terminal at another link. Then an earlier program, whose terminal had the
+/// same number, left this link behind.
 fn has_another_link(proc: &Path, server: &Process, way: &[PathBuf]) -> bool {
     let Some(link) = server.arguments.iter().skip_while(|argument| *argument != Path::new("-I")).nth(1) else {
         return false;
     };
     let Ok(folder) = fs::read_link(proc.join(server.pid.to_string()).join("cwd")) else { return false };
     let link = folder.join(link);
-    // Not by their names: a link has more than one.
+    // Do not compare names: a link has more than one.
     let identity = |path: &Path| fs::symlink_metadata(path).ok().map(|about| (about.dev(), about.ino()));
-    // It may have its terminal, and not have made its link yet.
+    // The program may have its terminal, but not its link yet.
     let theirs = identity(&link);
     theirs.is_none() || way.iter().all(|path| identity(path) != theirs)
 }
 
-/// Whether the terminal was made after the link. What it is changed by later, such as its mode, makes it younger, too.
+/// Whether the terminal was made after the link. A later change, such as a new mode, makes it younger too.
 fn is_younger(terminal: &Metadata, link: &Metadata) -> bool {
     (terminal.ctime() - YOUNGER_MAX_S, terminal.ctime_nsec()) > (link.mtime(), link.mtime_nsec())
 }
 
-/// What people call a program that serves hosts.
+/// The name for people of a program that serves hosts.
 fn known(process: &Process) -> Option<&'static str> {
     PROGRAMS
         .iter()
@@ -114,8 +114,9 @@ fn known(process: &Process) -> Option<&'static str> {
         .map(|(_, called)| *called)
 }
 
-/// The program that likely serves the terminal, among those of other users: one of the terminal's owner, first of all
-/// one whose command line names a link on the way to it. Its guardian was started later.
+/// The program of another user that likely serves the terminal. It is one of the terminal's owner. A program whose
+/// command line names a link on the way to the terminal comes first. The oldest comes next, because a guardian was
+/// started after its program.
 fn hidden_server(proc: &Path, way: &[PathBuf], terminal: &Metadata) -> Option<Process> {
     let is_owner = |process: &Process| {
         fs::metadata(proc.join(process.pid.to_string())).is_ok_and(|about| about.uid() == terminal.uid())
@@ -164,12 +165,12 @@ mod tests {
         let pty = openpty(None, None).unwrap();
         let device = ttyname(&pty.slave).unwrap();
         symlink(&device, &own).unwrap();
-        // As Klipper's own program does.
+        // Klipper's own program does this.
         fs::set_permissions(&device, fs::Permissions::from_mode(0o660)).unwrap();
         let found = served(&link).unwrap().to_string();
         let expected = format!("{} leads to {}, which another program serves", link.display(), device.display());
         assert!(found.starts_with(&expected), "{found}");
-        // The link of a program that has ended, and a terminal that has its number since.
+        // The link of an ended program, and a new terminal with the same number.
         let hour_ago = TimeSpec::seconds(fs::symlink_metadata(&own).unwrap().mtime() - 3600);
         utimensat(AT_FDCWD, &own, &hour_ago, &hour_ago, UtimensatFlags::NoFollowSymlink).unwrap();
         assert!(served(&link).is_none(), "it is another's terminal");

@@ -16,32 +16,32 @@ use signal_hook::iterator::exfiltrator::SignalOnly;
 use crate::proc::status_field;
 use pinion_linux::sys;
 
-/// What a signal asks for.
+/// The request of a signal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Signal {
-    /// SIGTERM, SIGINT, SIGHUP: to end the program in order.
+    /// SIGTERM, SIGINT, SIGHUP: end the program in order.
     End,
-    /// SIGUSR1: to log how late timers were.
+    /// SIGUSR1: log how late timers were.
     Report,
-    /// SIGUSR2, in tests only: to have the core hang.
+    /// SIGUSR2, in tests only: let the core hang.
     Hang,
 }
 
-/// The signals that have come and were not asked for yet.
+/// The signals that have come and were not read yet.
 pub(super) struct Signals(SignalDelivery<UnixStream, SignalOnly>);
 
 impl Signals {
-    /// Has the signals that the program knows come here instead of ending it.
+    /// Catches the signals that the program knows, so that they do not end it.
     pub(super) fn new() -> io::Result<Signals> {
-        // These would stop the program and leave heaters as they are: Ctrl-Z, or a program in the
-        // background that reads from its terminal or writes a log line to one that allows none.
+        // These would stop the program and leave heaters as they are. Ctrl-Z does that. So does a background program
+        // that reads from its terminal, or writes a log line to a terminal that allows none.
         for stop in [SIGTSTP, SIGTTIN, SIGTTOU] {
             sys::ignore(stop)?;
         }
         let (read, write) = UnixStream::pair()?;
         let mut known = vec![SIGTERM, SIGINT, SIGUSR1];
-        // SIGHUP, as a terminal closes, ends the program in order. (It kills the C program, which leaves its pins
-        // as they are.)
+        // SIGHUP comes when a terminal closes, and ends the program in order. (It kills the C program, which leaves its
+        // pins as they are.)
         known.extend(hang_up()?);
         if std::env::var_os("PINION_TEST_HANG").is_some() {
             known.push(SIGUSR2);
@@ -49,7 +49,7 @@ impl Signals {
         SignalDelivery::with_pipe(read, write, SignalOnly, known).map(Signals)
     }
 
-    /// Readable once a signal has come.
+    /// A descriptor that is readable when a signal has come.
     pub(super) fn event(&self) -> BorrowedFd<'_> {
         self.0.get_read().as_fd()
     }
@@ -65,12 +65,12 @@ impl Signals {
     }
 }
 
-/// SIGHUP, unless the program was started with it ignored, as by nohup(1), and as long as nobody has registered it
-/// since: who registers it would be ended by it.
+/// SIGHUP, unless the program was started with it ignored, as by nohup(1). A program that registers it anyway would be
+/// ended by it. This is true only while nobody has registered it since the start.
 ///
 /// # Errors
 ///
-/// Those of reading /proc/self/status.
+/// /proc/self/status cannot be read.
 pub(crate) fn hang_up() -> io::Result<Option<i32>> {
     const STATUS: &str = "/proc/self/status";
     let status =

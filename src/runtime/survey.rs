@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Looks around again whenever a host comes: a chip may have appeared since the program started, as its
-//! driver was loaded late at boot or somebody has plugged it in. The host then reads the names that are true.
+//! Looks at the board again when a host comes. A chip may have appeared since the program started: its driver was
+//! loaded late at boot, or somebody has plugged it in. So the host reads the names that are true now.
 
 #![forbid(unsafe_code)]
 
@@ -17,12 +17,12 @@ use pinion_firmware::mcu::{Dialect, DialectName};
 
 use super::outlet::LinkWake;
 
-/// The dialects of these names, over what the board has.
+/// The dialects of these names, for the board as it is now.
 pub(super) fn dialects(board: &dyn Board, names: &[DialectName]) -> io::Result<Vec<Arc<Dialect>>> {
     names.iter().map(|name| Dialect::new(&FIRMWARE, board, *name).map(Arc::new)).collect()
 }
 
-/// The thread that looks around: it opens devices, which the link must not wait for without an end.
+/// The thread that looks at the board. It opens devices, and the link must not wait for them without an end.
 pub(super) struct Surveyor {
     asks: Sender<()>,
     answers: Receiver<Option<Vec<Arc<Dialect>>>>,
@@ -77,7 +77,7 @@ impl Surveyor {
         self.pending == 0
     }
 
-    /// The dialects over what the board has now, if that has changed.
+    /// The dialects for the board as it is now, if it has changed.
     pub(super) fn take(&mut self) -> Option<Vec<Arc<Dialect>>> {
         self.found.take()
     }

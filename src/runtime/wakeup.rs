@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How the core waits: asleep until a learned margin before the instant, then spinning.
+//! How the core waits: it sleeps until a learned margin before the instant, then it spins.
 //!
-//! The margin follows the upper quantile of the wake-ups' lateness, so that most wake-ups come
-//! before the instant and an edge is late by the clock's own reading only.
+//! The margin follows the upper quantile of the wake-ups' lateness. So most wake-ups come before the instant, and an
+//! edge is late only by the clock's own reading.
 
 #![forbid(unsafe_code)]
 
@@ -21,9 +21,9 @@ use super::realtime::{self, Processors, Scheduling};
 /// The margin's bounds.
 #[derive(Clone, Copy, Debug)]
 pub struct MarginLimits {
-    /// The least, which keeps the margin alive when wake-ups are quick.
+    /// Lowest margin. It keeps the margin alive when wake-ups are quick.
     pub min: Ticks,
-    /// The most: what a wake-up of this computer may cost in spinning.
+    /// Highest margin: the time that a wake-up of this computer may cost in spinning.
     pub max: Ticks,
 }
 
@@ -34,7 +34,7 @@ impl Default for MarginLimits {
 }
 
 impl MarginLimits {
-    /// At most `us` microseconds; less than 5 only if that is asked for.
+    /// Bounds of 5 and `us` microseconds. Both are `us` if that is less than 5.
     pub const fn up_to_us(us: u32) -> MarginLimits {
         MarginLimits { min: Ticks::from_us(if us < 5 { us } else { 5 }), max: Ticks::from_us(us) }
     }
@@ -50,21 +50,21 @@ pub struct Margin {
     unslept: u32,
 }
 
-/// After so many waits too short to sleep a smaller margin is tried.
+/// After this many waits that were too short to sleep, a smaller margin is tried.
 const UNSLEPT_MAX: u32 = 500;
-/// A shorter sleep is late by what the way into it and out of it takes: it saves nothing, and would
-/// have the margin grow.
+/// Longest wait without a sleep. A shorter sleep is late by the time that going into it and out of it takes. It saves
+/// nothing, and would make the margin grow.
 const NAP_MIN: i64 = Ticks::from_us(1).0 as i64;
 /// One wake-up in this many may come after the instant.
 const LATE_SHARE: i64 = 50;
-/// Sleeps that are tried at the start, and how long each is.
+/// How many sleeps are tried at the start, and how long each is.
 const TRIALS: usize = 16;
 const TRIAL: Duration = Duration::from_micros(100);
 const FINE: i64 = 256;
 
 impl Margin {
-    /// A margin that covers a wake-up that comes `late` after it was asked for, and a quarter more:
-    /// what it does not cover it learns from edges that are late.
+    /// A margin that covers a wake-up that comes `late` after its time, and a quarter more. It learns the rest from
+    /// late edges.
     pub fn new(limits: MarginLimits, late: i64) -> Margin {
         let mut margin = Margin { limits, fine: 0, unslept: 0 };
         margin.displace(late.clamp(0, i64::from(u32::MAX)) * FINE * 5 / 4);
@@ -76,18 +76,17 @@ impl Margin {
         Ticks((self.fine / FINE) as u32)
     }
 
-    /// Learns from a wake-up that came `late` after it was asked for: up by a step if the
-    /// margin did not cover it, down by a fiftieth of one if it did, which balances where one
-    /// wake-up in fifty is later.
+    /// Learns from a wake-up that came `late` after its time. The margin grows by a step if it did not cover the
+    /// wake-up, and shrinks by a fiftieth of a step if it did. The two balance where one wake-up in fifty is later.
     pub fn learn(&mut self, late: i64) {
         let present = self.fine / FINE;
-        // Steps in proportion: quick to follow a load, fine when there is none.
+        // Steps are in proportion to the margin: quick to follow a load, fine without one.
         let step = present.max(64) * FINE / 24;
         self.displace(if late > present { step } else { -step / LATE_SHARE });
     }
 
-    /// A wait was too short to sleep, so that nothing was learned. A margin above the step
-    /// interval would else stay there, and the core would never sleep.
+    /// A wait was too short to sleep, so nothing was learned. Otherwise a margin above the step interval would stay
+    /// there, and the core would never sleep.
     fn unslept(&mut self) {
         self.unslept += 1;
         if self.unslept >= UNSLEPT_MAX {
@@ -101,14 +100,13 @@ impl Margin {
     }
 }
 
-/// How long the calling thread ran so far, as the kernel counts it.
+/// How long the calling thread has run, as the kernel counts it.
 fn running_time() -> Duration {
     // clock_gettime(2) fails for an unknown clock or a bad pointer only.
     clock_gettime(ClockId::CLOCK_THREAD_CPUTIME_ID).map_or(Duration::ZERO, Duration::from)
 }
 
-/// How late the calling thread wakes from short sleeps: the second latest of a few, as the latest
-/// may be due to something else.
+/// How late the calling thread wakes from short sleeps: the second latest of a few. The latest may have another cause.
 fn try_wake_ups(clock: &dyn TimeSource) -> i64 {
     let mut late = [0; TRIALS];
     for late in &mut late {
@@ -125,7 +123,7 @@ fn try_wake_ups(clock: &dyn TimeSource) -> i64 {
 pub enum Woken {
     /// The instant came.
     Due,
-    /// Something else is to be done.
+    /// There is something else to do.
     Called,
 }
 
@@ -135,13 +133,13 @@ pub struct Waiter {
     margin: Margin,
     processors: Processors,
     scheduling: Scheduling,
-    /// Of a thread that runs as SCHED_FIFO under a throttle.
+    /// For a thread that runs as SCHED_FIFO under a throttle.
     budget: Option<Budget>,
 }
 
 impl Waiter {
-    /// A waiter for the calling thread, which runs as `scheduling` says on `processors`. It sleeps a
-    /// few times, two milliseconds in all, to learn how late it wakes.
+    /// A waiter for the calling thread, which has this `scheduling` and these `processors`. It sleeps a few times, two
+    /// milliseconds in all, to learn how late it wakes.
     pub fn new(
         clock: Arc<dyn TimeSource>,
         limits: MarginLimits,
@@ -154,7 +152,7 @@ impl Waiter {
         Waiter { clock, margin, processors, scheduling, budget }
     }
 
-    /// The margin as it was learned.
+    /// The learned margin.
     pub fn margin(&self) -> Ticks {
         self.margin.get()
     }
@@ -164,14 +162,13 @@ impl Waiter {
         self.scheduling == Scheduling::RealTime && self.budget.as_ref().is_none_or(Budget::is_fifo)
     }
 
-    /// Whether to poll leaves the thread enough running time for what is due.
+    /// Whether polling leaves the thread enough running time for due work.
     #[inline]
     pub(super) fn has_time_to_spare(&self) -> bool {
         self.budget.as_ref().is_none_or(Budget::is_ample)
     }
 
-    /// The thread ran until now. Past its budget it goes on on another processor, or as
-    /// SCHED_OTHER.
+    /// The thread ran until now. Past its budget it continues on another processor, or as SCHED_OTHER.
     #[inline]
     pub fn ran(&mut self, now: Clock) {
         let Some(budget) = self.budget.as_mut().filter(|budget| budget.is_due(now)) else { return };
@@ -182,15 +179,15 @@ impl Waiter {
         }
     }
 
-    /// Sleeps for that long or until the thread is unparked, without spinning.
+    /// Sleeps for `span` or until the thread is unparked, without spinning.
     pub fn nap(&mut self, span: Duration) {
         self.ran(self.clock.now());
         thread::park_timeout(span);
     }
 
-    /// Waits for `deadline`, or until `called` says that there is something to do; whoever
-    /// changes what it looks at unparks this thread. It sleeps until a margin before `exact`, which is the deadline or
-    /// a later one, so that it is awake then; from there on it spins.
+    /// Waits for `deadline`, or until `called` says that there is something to do. A thread that changes what `called`
+    /// looks at unparks this thread. `exact` is the deadline or a later one. This thread sleeps until a margin before
+    /// `exact`, so that it is awake then. From there on it spins.
     pub fn wait(&mut self, deadline: Clock, exact: Option<Clock>, mut called: impl FnMut() -> bool) -> Woken {
         let mut now = self.clock.now();
         let mut slept = deadline.since(now) < i64::from(self.margin.limits.min.0);
@@ -208,7 +205,7 @@ impl Waiter {
             thread::park_timeout(Duration::from_nanos(asleep as u64 * NS_PER_TICK));
             now = self.clock.now();
             let late = now.since(wake_at);
-            // Woken before its time: by a call, which says nothing of the margin.
+            // A call woke the thread before its time. That says nothing about the margin.
             if late >= 0 {
                 self.margin.learn(late);
             }
@@ -226,7 +223,7 @@ impl Waiter {
     }
 }
 
-/// When to end the sleep before `deadline` for a thread that is to be awake a margin before `exact`.
+/// When to end the sleep before `deadline`, for a thread that must be awake a margin before `exact`.
 fn wake_at(deadline: Clock, exact: Option<Clock>, margin: Ticks) -> Clock {
     exact.map_or(deadline, |exact| (exact - margin).min(deadline))
 }
@@ -292,7 +289,7 @@ mod tests {
         let meagre = Throttle { runtime_us: 100, period_us: 1_000_000 };
         waiter.budget = Some(Budget::new(meagre, clock.now(), running_time()));
         let before = sched_getaffinity(Pid::from_raw(0)).unwrap();
-        // A quota of processor time, which the number of threads to use follows, changes nothing.
+        // A quota of processor time changes nothing here. It only changes the number of threads to use.
         let several = (0..CpuSet::count()).filter(|cpu| before.is_set(*cpu) == Ok(true)).count() > 1;
         let start = running_time();
         while running_time() < start + Duration::from_millis(2) {

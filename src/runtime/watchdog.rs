@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Watchdogs: the hardware's, which resets the computer (`-w`), and the service manager's, which
-//! restarts the program. Both are fed only while neither the core, nor the link, nor a worker hangs.
+//! Watchdogs: the hardware's resets the computer (`-w`), and the service manager's restarts the program. Both are fed
+//! only while neither the core, nor the link, nor a worker hangs.
 //!
-//! The link feeds them, so if it hangs, they are not fed. The core hangs if its heartbeat fails to
-//! come for as long as the guardian allows. A worker hangs if one job takes longer than [`JOB_LIMIT`].
+//! The link feeds them, so a link that hangs does not feed them. The core hangs if its heartbeat is missing for as long
+//! as the guardian allows. A worker hangs if one job takes longer than [`JOB_LIMIT`].
 
 #![forbid(unsafe_code)]
 
@@ -21,13 +21,12 @@ use pinion_linux::sys;
 use super::notify::Notify;
 use super::pulse::{BEAT, Pulse};
 
-/// The longest that one job of a worker may take.
+/// Longest time that one job of a worker may take.
 const JOB_LIMIT: Duration = Duration::from_secs(10);
-/// The limit that is assumed for a hardware watchdog that does not tell its own.
+/// Limit that is assumed for a hardware watchdog that does not report its own.
 const USUAL_LIMIT: Duration = Duration::from_secs(10);
 
-/// A hardware watchdog. If it is dropped without [`Watchdog::close`], it goes on running and resets
-/// the computer.
+/// A hardware watchdog. If it is dropped without [`Watchdog::close`], it continues to run and resets the computer.
 pub(super) struct Watchdog {
     file: File,
     limit: Duration,
@@ -51,7 +50,7 @@ impl Watchdog {
         }
     }
 
-    /// Stops the watchdog, as the program ends in order. "V" is what its driver wants for that
+    /// Stops the watchdog, because the program ends in order. Its driver wants a "V" for that
     /// (Documentation/watchdog/watchdog-api.rst, "magic close").
     fn close(mut self) {
         if let Err(error) = self.file.write_all(b"V") {
@@ -80,7 +79,7 @@ fn cannot_open(path: &Path, error: &io::Error) -> io::Error {
 pub(super) struct Vigil {
     watchdog: Option<Watchdog>,
     notify: Notify,
-    /// How often the watchdogs are fed; none if there are none.
+    /// How often the watchdogs are fed. `None` if there are none.
     interval: Option<Duration>,
     due: Duration,
     pulse: Pulse,
@@ -90,12 +89,12 @@ pub(super) struct Vigil {
 impl Vigil {
     /// `notify_interval` is how often the service manager wants to be fed, if at all.
     pub(super) fn new(notify: Notify, notify_interval: Option<Duration>, pulse: Pulse) -> Vigil {
-        // Between two heartbeats of the core nothing new is known, so feeding more often is of no use.
+        // Between two heartbeats of the core nothing new is known. So feeding more often is of no use.
         let interval = notify_interval.map(|interval| interval.max(BEAT));
         Vigil { watchdog: None, notify, interval, due: monotonic(), pulse, starving: false }
     }
 
-    /// Has a hardware watchdog fed as well.
+    /// Feeds a hardware watchdog as well.
     pub(super) fn feed(&mut self, watchdog: Watchdog) {
         let interval = (watchdog.limit / 3).max(BEAT);
         self.interval = Some(self.interval.map_or(interval, |present| present.min(interval)));
@@ -107,7 +106,7 @@ impl Vigil {
         self.interval.map(|_| self.due)
     }
 
-    /// Feeds the watchdogs if it is time to, at `now` (CLOCK_MONOTONIC).
+    /// Feeds the watchdogs if it is time at `now` (CLOCK_MONOTONIC).
     pub(super) fn tick(&mut self, now: Duration) {
         let Some(interval) = self.interval.filter(|_| now >= self.due) else { return };
         self.due = now + interval;
@@ -150,7 +149,7 @@ impl Vigil {
         self.notify.send("STOPPING=1\nSTATUS=shutting down");
     }
 
-    /// Stops the hardware watchdog, as the program has ended in order.
+    /// Stops the hardware watchdog, because the program has ended in order.
     pub(super) fn end(self) {
         if let Some(watchdog) = self.watchdog {
             watchdog.close();
@@ -214,7 +213,7 @@ mod tests {
             vigil.tick(now);
         };
         (0..5).for_each(&mut tick);
-        // At 0, 3.3, 6.7 and 10 seconds, less what passed before the job began.
+        // At 0, 3.3, 6.7 and 10 seconds, less the time before the job began.
         assert!(["...", "...."].contains(&food(file.path()).as_str()));
         clock.end();
         let before = food(file.path()).len();

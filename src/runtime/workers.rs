@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Workers: one thread for each bus runs the errands to the bus's devices, one after the other, so
-//! that the core never waits for a device.
+//! Workers: each bus has a thread that runs the errands to the bus's devices, one after the other. So the core never
+//! waits for a device.
 
 #![forbid(unsafe_code)]
 
@@ -21,12 +21,12 @@ use pinion_linux::clock::monotonic;
 use super::lookout::Lookout;
 use super::pulse::{JobClock, Pulse};
 
-/// How many errands may wait for one bus. There are at most 256 objects, with one or two errands each.
+/// Highest number of errands that may wait for one bus. There are at most 256 objects, with one or two errands each.
 const QUEUE_JOBS: usize = 1024;
-/// How long a worker polls for the next job after one that a command waited for: the core runs the next command
+/// How long a worker polls for the next job after a job that a command waited for. The core runs the next command
 /// within microseconds, if the host has sent it already.
 const NEXT_JOB: Ticks = Ticks::from_us(50);
-/// How long to wait for workers to end: most drivers give up a chip that is silent within this time.
+/// How long to wait for workers to end. Most drivers give up a silent chip within this time.
 const END_LIMIT: Duration = Duration::from_secs(2);
 
 struct Worker {
@@ -35,14 +35,14 @@ struct Worker {
     done: Consumer<Completion>,
     quit: Arc<AtomicBool>,
     thread: JoinHandle<()>,
-    /// Whether nobody waits for its end.
+    /// Nobody waits for its end.
     left_behind: bool,
 }
 
-/// What the thread of each new worker calls first.
+/// The thread of each new worker calls this first.
 pub(super) type Prepare = Arc<dyn Fn() + Send + Sync>;
 
-/// The workers of an MCU. Each is started as the first device of its bus is opened.
+/// The workers of an MCU. Each one starts when the first device of its bus is opened.
 pub(super) struct Threads {
     core: Thread,
     prepare: Prepare,
@@ -53,8 +53,8 @@ pub(super) struct Threads {
 }
 
 impl Threads {
-    /// No workers yet. Those to come unpark `core` when an errand is done, and note in `pulse` since
-    /// when they run it. They pace themselves by the clock. `may_poll`: there are processors to poll on.
+    /// No workers yet. A worker unparks `core` when an errand is done, and notes in `pulse` since when it runs the
+    /// errand. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
     pub(super) fn new(
         core: Thread,
         prepare: Prepare,
@@ -89,7 +89,7 @@ impl Threads {
     }
 }
 
-/// What to do about what cannot be.
+/// The remedy for an error that should not be possible.
 const REPORT: &str = "please report it";
 
 fn overflow(bus: &str, why: impl Into<Trouble>) -> Shutdown {
@@ -137,8 +137,8 @@ impl Workers for Threads {
         self.workers.iter().for_each(|worker| each(&worker.bus, QUEUE_JOBS - worker.jobs.slots()));
     }
 
-    /// Waits until the workers have done what was submitted, for up to two seconds: only then are their
-    /// devices free to be opened again. A worker that hangs is left behind, with its devices.
+    /// Waits up to two seconds until the workers have done the submitted jobs. Only then are their devices free to be
+    /// opened again. A worker that hangs is left behind, with its devices.
     fn reset(&mut self) {
         for worker in &self.workers {
             worker.quit.store(true, Ordering::Release);
@@ -181,10 +181,10 @@ struct Server {
 impl Server {
     fn run(mut self) {
         loop {
-            // This must be read before the queue. A job that was submitted before `quit` was set is
-            // then seen, and is still done: it may switch an output off.
+            // Read this before the queue. Then a job that was submitted before `quit` was set is seen and still done.
+            // It may switch an output off.
             let ending = self.quit.load(Ordering::Acquire);
-            // It was left behind: what it was to do is another worker's now, and what it holds is wanted.
+            // This worker was left behind. Another worker has its jobs now, and its devices are wanted.
             if self.jobs.is_abandoned() {
                 return;
             }
@@ -203,10 +203,9 @@ impl Server {
         let began = self.clock.now();
         let ended = self.clock.errand(&mut || parcel.run());
         self.shown.end();
-        // This does not fail: no more errands are under way than there are boxes, and the queue back
-        // is as long as the one that they came by.
+        // This does not fail: there are no more errands under way than boxes, and both queues have the same length.
         let _ = self.done.push(Completion { oid, parcel, holds, began, ended });
-        // Commands that wait for this job wait for the next one as well: the core is woken for the last of them.
+        // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
         if !(holds && self.jobs.peek().is_ok_and(|next| next.holds)) {
             self.core.unpark();
         }
@@ -226,7 +225,7 @@ mod tests {
     use std::sync::atomic::AtomicU64;
     use std::sync::mpsc::{self, Receiver, Sender};
 
-    /// Waits to be let go on, then says which one it is.
+    /// Waits until it may continue, then reports its number.
     struct Slow {
         go_on: Arc<std::sync::Mutex<Receiver<()>>>,
         number: u8,
@@ -269,13 +268,13 @@ mod tests {
         assert!(taken.is_ok());
     }
 
-    /// How often a worker looks at its clock after it was given a job, until it sleeps.
+    /// How often a worker reads its clock after it got a job, until it sleeps.
     fn looks_after_a_job(holds: bool, may_poll: bool) -> u64 {
         let clock = Arc::new(Looks::default());
         let pulse = Pulse::new(Monotonic::start()).unwrap();
         let mut threads = Threads::new(thread::current(), Arc::new(|| ()), clock.clone(), pulse, may_poll);
         let worker = threads.start("spi0").unwrap();
-        // It looks once as it falls asleep.
+        // It reads the clock once when it falls asleep.
         let asleep = || {
             let mut before = 0;
             loop {
@@ -297,7 +296,7 @@ mod tests {
 
     #[test]
     fn a_worker_polls_for_the_next_job_of_a_conversation_only() {
-        // When the job began and ended, and one look before it sleeps.
+        // One look when the job begins, one when it ends, and one before the worker sleeps.
         assert_eq!(looks_after_a_job(false, true), 3);
         assert_eq!(looks_after_a_job(true, false), 3);
         assert_eq!(looks_after_a_job(true, true), 2 + u64::from(NEXT_JOB.0 / Ticks::from_us(1).0));
@@ -343,7 +342,7 @@ mod tests {
         // Another one takes its place.
         threads.start("i2c1").unwrap();
         drop(release);
-        // This ends as both errands are dropped; the second one is not begun.
+        // This ends when both errands are dropped. The second one is not begun.
         assert_eq!(heard.iter().collect::<Vec<_>>(), [0]);
     }
 
@@ -357,7 +356,7 @@ mod tests {
         threads.leave_behind(worker);
         let waiting = |threads: &Threads| QUEUE_JOBS - threads.workers[0].jobs.slots();
         submit(&mut threads, worker, Box::new(Slow { go_on, number: 7, said }), false);
-        // What is not under way yet is dropped.
+        // A job that is not under way yet would be dropped.
         while waiting(&threads) > 0 {
             thread::sleep(Duration::from_millis(1));
         }
@@ -365,7 +364,7 @@ mod tests {
         threads.reset();
         assert!(monotonic() - began < END_LIMIT, "it was waited for");
         assert!(heard.try_recv().is_err());
-        // It goes on, and what it says is nobody's.
+        // It continues, and nobody gets its result.
         threads.start("w1 28-1").unwrap();
         drop(release);
         assert_eq!(heard.recv(), Ok(7));

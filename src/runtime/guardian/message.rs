@@ -1,18 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The messages between program and guardian. Their socket (SOCK_SEQPACKET) keeps each in one piece.
 //!
-//! A message begins with a byte that tells which [`Message`] it is. One about a line or a file comes
-//! with its descriptor. The guardian answers each with [`TAKEN`] or [`REFUSED`], except for
-//! [`Message::Goodbye`].
+//! The first byte of a message tells which [`Message`] it is. A message about a line or a file comes with its
+//! descriptor. The guardian answers each with [`TAKEN`] or [`REFUSED`], except for [`Message::Goodbye`].
 
 #![forbid(unsafe_code)]
 
-/// The length of the longest message.
+/// Longest message.
 pub(super) const MESSAGE_BYTES: usize = 256;
 
-/// The guardian's answer if it has done what the message says.
+/// The guardian's answer if it has carried out the message.
 pub(super) const TAKEN: u8 = b'+';
-/// The guardian's answer if it has not.
+/// The guardian's answer if it has not carried out the message.
 pub(super) const REFUSED: u8 = b'-';
 
 const LINE: u8 = 1;
@@ -31,18 +30,18 @@ pub(super) enum Message<'a> {
         name: &'a str,
         /// The level to drive it to.
         shutdown_value: bool,
-        /// The name of its chip, if calls to that may block.
+        /// The name of its chip, if calls to the chip may block.
         sleeping: Option<&'a str>,
     },
-    /// A file of an output that has several, and what is to be written to it. The last file follows in
+    /// A file of an output that has several, and the bytes to write to it. The last file follows in
     /// [`Message::LastFile`].
     File(&'a [u8]),
-    /// Hold an output of files: this is its last or only one. As nothing is held before this message,
-    /// no output is ever held with only some of its files.
+    /// Hold an output of files: this is its last or only file. Nothing is held before this message. So no output is
+    /// ever held with only some of its files.
     LastFile {
         /// The output's name.
         name: &'a str,
-        /// What is to be written.
+        /// The bytes to write.
         bytes: &'a [u8],
     },
     /// Drop a line that is no output any more.
@@ -57,7 +56,7 @@ pub(super) enum Message<'a> {
 }
 
 impl<'a> Message<'a> {
-    /// The message as bytes; none if they are more than [`MESSAGE_BYTES`].
+    /// The message as bytes. `None` if they are more than [`MESSAGE_BYTES`].
     pub(super) fn encode(&self) -> Option<Vec<u8>> {
         let message = match *self {
             Message::Line { name, shutdown_value, sleeping } => {
@@ -72,7 +71,7 @@ impl<'a> Message<'a> {
         (message.len() <= MESSAGE_BYTES).then_some(message)
     }
 
-    /// The message in these bytes, if they are one.
+    /// The message in these bytes, if they are a message.
     pub(super) fn decode(message: &'a [u8]) -> Option<Message<'a>> {
         let (kind, rest) = message.split_first()?;
         Some(match (*kind, rest) {
@@ -97,13 +96,13 @@ impl<'a> Message<'a> {
     }
 }
 
-/// A text that is followed by something: a byte with its length, and the text.
+/// A text that is followed by something: one byte with its length, then the text.
 fn text(text: &str) -> Option<Vec<u8>> {
     let length = u8::try_from(text.len()).ok()?;
     Some([&[length], text.as_bytes()].concat())
 }
 
-/// Splits what [`text`] has made from what follows it.
+/// Splits a result of [`text`] from the bytes that follow it.
 fn split_text(bytes: &[u8]) -> Option<(&str, &[u8])> {
     let (length, rest) = bytes.split_first()?;
     let (text, rest) = rest.split_at_checked((*length).into())?;

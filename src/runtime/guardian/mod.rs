@@ -1,28 +1,27 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The guardian: a second process that drives the outputs to their shutdown values if the
-//! program dies or its core hangs.
+//! The guardian is a second process. It drives the outputs to their shutdown values if the program dies or its core
+//! hangs.
 //!
-//! It is forked before any thread starts, and is given a copy of every output's descriptor with
-//! the shutdown value. As long as it has the descriptor of a line open, the kernel keeps that line's
-//! level. It acts
+//! It is forked before any thread starts. It gets a copy of every output's descriptor, with the shutdown value. While
+//! it has the descriptor of a line open, the kernel keeps that line's level. It acts
 //!
-//! - when the program's end of their socket closes without a goodbye, or its pidfd says that it
-//!   is gone: SIGKILL, a crash, the OOM killer;
-//! - when the core leaves no heartbeat in a page that both share (`pulse.rs`), while outputs are
-//!   held: within 600 ms of its last one while the MCU runs.
+//! - when the program's end of their socket closes without a goodbye, or its pidfd says that it is gone: SIGKILL, a
+//!   crash, the OOM killer;
+//! - when the core leaves no heartbeat in a page that both share (`pulse.rs`), while outputs are held: within 600 ms of
+//!   the last heartbeat while the MCU runs.
 //!
-//! Then it drives the outputs, kills the program if that still lives, drives the outputs once more, as
-//! the core may have come back and driven them before it was killed, says so in the log, and ends,
-//! which frees the lines for a restart. It has a session of its own and ignores the signals that ask a
-//! program to end: a terminal or service manager sends them to both processes, and the guardian must
-//! not end before the program, which says goodbye to it.
+//! Then it drives the outputs, and kills the program if it still lives. It drives the outputs once more: the core may
+//! have come back and driven them before it was killed. It logs the result and ends, which frees the lines for a
+//! restart.
 //!
-//! If the guardian itself is killed, stopped or hangs, the link notices. The MCU shuts down as
-//! "Guardian process lost" and the program ends with status 1, so that the service manager starts both
-//! anew. (The program can not fork another guardian, as it has threads by then.)
+//! It has a session of its own and ignores the signals that ask a program to end. A terminal or service manager sends
+//! them to both processes. The guardian must not end before the program, which says goodbye to it.
 //!
-//! This file is the program's side, `watcher.rs` the second process, and `message.rs` what they say
-//! to each other.
+//! If the guardian itself is killed, stopped or hangs, the link notices. The MCU shuts down as "Guardian process lost".
+//! The program ends with status 1, so that the service manager starts both again. (The program cannot fork another
+//! guardian, because it has threads by then.)
+//!
+//! This file is the program's side. `watcher.rs` is the second process. `message.rs` has the messages between them.
 //!
 //! For tests: with `PINION_TEST_HANG` in the environment SIGUSR2 makes the core hang.
 
@@ -59,7 +58,7 @@ use super::pulse::{GuardianEar, Pulse};
 use message::{Message, TAKEN};
 use watcher::{Program, Watcher};
 
-/// What the kernel calls the guardian's process (proc_pid_comm(5)): its command line is the program's.
+/// The kernel's name of the guardian's process (proc_pid_comm(5)). Its command line is the program's.
 pub(crate) const NAME: &CStr = c"pinion-guardian";
 /// How long the program waits for the guardian's answer, in seconds.
 const ANSWER_S: i64 = 5;
@@ -75,8 +74,8 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Forks the guardian. To be called before any thread is started. `clock` is the core's. With
-    /// `realtime` the guardian's priority is above the core's.
+    /// Forks the guardian. Call it before any thread starts. `clock` is the core's. With `realtime` the guardian's
+    /// priority is above the core's.
     ///
     /// # Errors
     ///
@@ -101,7 +100,7 @@ impl Guardian {
         Ok(Guardian { socket: Arc::new(socket), pid, pulse })
     }
 
-    /// What a board is to give its outputs to.
+    /// The board gives its outputs to this.
     pub fn guard(&self) -> Box<dyn Guard> {
         Box::new(Lifeline { socket: self.socket.clone(), pulse: self.pulse, lost: false })
     }
@@ -115,7 +114,7 @@ impl Guardian {
         self.pid.as_raw().unsigned_abs()
     }
 
-    /// What the link watches to notice that the guardian is lost.
+    /// The link watches this to notice that the guardian is lost.
     pub(super) fn watch(&self) -> GuardianWatch {
         GuardianWatch { socket: self.socket.clone(), ear: GuardianEar::new(self.pulse) }
     }
@@ -132,8 +131,8 @@ impl Guardian {
                     "the guardian (process {}) is stopped or hangs: it is killed, as it would keep the lines",
                     self.pid
                 );
-                // The guardian is our child and was not waited for yet, so the kernel can not have
-                // given its process number to another.
+                // The guardian is our child and was not waited for yet. So the kernel cannot have given its process
+                // number to another process.
                 let _ = kill(self.pid, Signal::SIGKILL);
                 return;
             }
@@ -160,7 +159,7 @@ impl GuardianWatch {
         self.socket.as_fd()
     }
 
-    /// When to call [`GuardianWatch::hangs`] next (CLOCK_MONOTONIC); none while no outputs are held.
+    /// When to call [`GuardianWatch::hangs`] next (CLOCK_MONOTONIC). `None` while no outputs are held.
     pub(super) fn due(&self) -> Option<Duration> {
         self.ear.due()
     }
@@ -175,8 +174,8 @@ impl GuardianWatch {
 struct Lifeline {
     socket: Arc<OwnedFd>,
     pulse: Pulse,
-    /// Whether an answer has failed to come. Nothing is asked any more then, as a late answer would
-    /// pass for the answer to the next message.
+    /// An answer has failed to come. Then nothing is asked any more: a late answer would pass for the answer to the
+    /// next message.
     lost: bool,
 }
 
@@ -192,8 +191,8 @@ impl Lifeline {
         Err(io::Error::other("it has no room for another descriptor (raise LimitNOFILE)"))
     }
 
-    /// Sends a message, and returns whether the guardian has done what it says. Without an answer the
-    /// guardian counts as lost.
+    /// Sends a message, and returns whether the guardian has carried it out. Without an answer the guardian counts as
+    /// lost.
     fn converse(&mut self, message: &[u8], descriptor: Option<RawFd>) -> io::Result<bool> {
         let fds: Vec<RawFd> = descriptor.into_iter().collect();
         let rights = [ControlMessage::ScmRights(&fds)];
@@ -258,20 +257,19 @@ mod tests {
 
     const MS: Duration = Duration::from_millis(1);
 
-    /// A core that runs on, but owes a shutdown value for ever.
+    /// A core that continues to run, but owes a shutdown value forever.
     fn stop_and_owe(pulse: Pulse) {
         for beats in 0.. {
             if beats == 10 {
                 pulse.owe("pwmchip7/pwm0", pulse.now());
             }
-            // As the core of a stopped MCU, for which the limit is wider: a busy computer may delay
-            // a beat.
+            // This is the beat of a stopped MCU, which has a wider limit: a busy computer may delay a beat.
             pulse.beat(pulse.now(), false);
             thread::sleep(10 * MS);
         }
     }
 
-    /// A guarded program, which is killed with a test that fails.
+    /// A guarded program. It is killed when its test fails.
     struct Guarded(Child);
 
     impl Drop for Guarded {
@@ -281,7 +279,7 @@ mod tests {
         }
     }
 
-    /// This test program itself, as a program that is guarded.
+    /// Starts this test program itself as a guarded program.
     fn start(script: &str, file: &Path) -> (Guarded, u32) {
         fs::write(file, "on ").unwrap();
         let mut child = Command::new(std::env::current_exe().unwrap())
@@ -323,7 +321,7 @@ mod tests {
         if script == "release" {
             guard.release().unwrap();
         }
-        // Before a beat that may be the last.
+        // This comes before a beat that may be the last.
         println!("\nguardian {}", guardian.pid);
         pulse.beat(pulse.now(), script == "hang");
         match script.as_str() {
@@ -353,7 +351,7 @@ mod tests {
         fs::read_to_string(file).unwrap()
     }
 
-    /// A file, in a folder that goes with it.
+    /// A file, in a folder of its own.
     fn file() -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("output");

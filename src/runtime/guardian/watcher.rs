@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The guardian process: watches the program, and drives the outputs when the program can not.
+//! The guardian process. It watches the program, and drives the outputs when the program cannot.
 
 #![forbid(unsafe_code)]
 
@@ -27,17 +27,16 @@ use super::super::realtime;
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
 use super::{END_LIMIT, in_ms};
 
-/// For how long to try again to drive an output that can not be driven, and to wait for a driver that
-/// hangs.
+/// How long to retry an output that cannot be driven, and how long to wait for a driver that hangs.
 const TRY_FOR: Duration = Duration::from_secs(2);
-/// The pause between two attempts to drive such an output.
+/// Pause between two attempts to drive an output.
 const TRY_EVERY: Duration = Duration::from_millis(50);
 /// How long writing to the log may take, in seconds.
 const LOG_S: u32 = 2;
 
 /// Gives the new process its name, session, signals, rights and priority.
 pub(super) fn settle(realtime: bool, socket: &OwnedFd, program: &Program) {
-    // Not the program's ends of its sockets: the guardian and the search would not notice that it closes them.
+    // The program's ends of its sockets are not kept: the guardian and the search would not notice that it closes them.
     let kept = [0, 1, 2, socket.as_raw_fd()].into_iter().chain(program.pidfd.as_ref().map(AsRawFd::as_raw_fd));
     helpers::settle(super::NAME, &kept.collect::<Vec<_>>());
     // Failures are ignored here: without any of these the guardian can still do its work.
@@ -47,8 +46,8 @@ pub(super) fn settle(realtime: bool, socket: &OwnedFd, program: &Program) {
     if realtime {
         realtime::enter_guardian();
     }
-    // A first call, without outputs, reads the code from the disk, and so it is locked in memory, too.
-    // When it is needed, the disk might hang.
+    // A first call, without outputs, reads the code from the disk, and so the code is locked in memory too. When it is
+    // needed, the disk might hang.
     drive(&mut []);
 }
 
@@ -58,7 +57,7 @@ type Drive = Box<dyn Fn() -> io::Result<()> + Send>;
 /// Whether an output could be driven.
 struct Outcome {
     name: String,
-    /// The result of the last attempt; none as long as the first one has not returned.
+    /// The result of the last attempt. `None` until the first attempt has returned.
     result: Option<io::Result<()>>,
 }
 
@@ -67,7 +66,7 @@ impl Outcome {
         matches!(self.result, Some(Ok(())))
     }
 
-    /// For the log: the output's name and what is wrong with it.
+    /// For the log: the output's name and its fault.
     fn complaint(&self) -> String {
         match &self.result {
             Some(Err(error)) => format!("{}: {error}", self.name),
@@ -91,13 +90,12 @@ impl Output {
         Output::new(name, Box::new(move || sys::set_line(&line, value)))
     }
 
-    /// A line of a chip that may sleep. It is driven in a way that tells whether the chip has answered.
+    /// A line of a chip that may sleep. It is driven in a way that reports whether the chip has answered.
     fn sleeping_line(name: &str, line: OwnedFd, value: bool) -> Output {
         Output::new(name, Box::new(move || sys::set_line_checked(&line, sys::OUTPUT, value)))
     }
 
-    /// An output that is set by files, such as a PWM, with what is to be written at the beginning of
-    /// each.
+    /// An output that is set by files, such as a PWM. Each file has the bytes to write at its beginning.
     fn files(name: &str, files: Vec<(OwnedFd, Box<[u8]>)>) -> Output {
         let drive = move || {
             files.iter().try_for_each(|(file, bytes)| match pwrite(file, bytes, 0)? {
@@ -116,7 +114,7 @@ fn drive(outputs: &mut [Output]) {
     }
 }
 
-/// Outputs that are driven by one thread: those of a chip whose driver may sleep, or a PWM.
+/// Outputs that one thread drives: a PWM, or the lines of a chip whose driver may sleep.
 struct Group {
     chip: String,
     outputs: Vec<Output>,
@@ -135,8 +133,8 @@ impl HeldOutputs {
         self.native.is_empty() && self.apart.is_empty()
     }
 
-    /// Holds an output, in place of the one that was held by its name. With `chip` it is driven by that
-    /// chip's thread, without one with the native lines.
+    /// Holds an output, in place of one with the same name. With `chip` that chip's thread drives it. Without a chip it
+    /// is driven with the native lines.
     fn hold(&mut self, chip: Option<&str>, output: Output) {
         self.forget(&output.outcome.name);
         match chip {
@@ -168,7 +166,7 @@ pub(super) struct Program {
 impl Program {
     /// The process `pid`, which must be our parent.
     pub(super) fn new(pid: Pid) -> Program {
-        // Linux before 5.3 has no pidfd. There the socket alone tells that the program has ended.
+        // Linux before 5.3 has no pidfd. There only the socket shows that the program has ended.
         Program { pid, pidfd: sys::pidfd(pid).ok() }
     }
 
@@ -180,7 +178,7 @@ impl Program {
     }
 
     fn kill(&self) {
-        // As long as it is our parent, its process number has not been given to another.
+        // While it is our parent, its process number has not been given to another process.
         if getppid() == self.pid {
             let _ = kill(self.pid, Signal::SIGKILL);
         }
@@ -200,9 +198,9 @@ enum Cause {
     Hangs,
 }
 
-/// What came over the socket.
+/// The result of reading the socket.
 enum Incoming {
-    /// A message, which was answered.
+    /// A message. It was answered.
     Message,
     Goodbye,
     /// Nothing: the program has closed its end.
@@ -215,7 +213,7 @@ pub(super) struct Watcher {
     program: Program,
     pulse: Pulse,
     held: HeldOutputs,
-    /// The files that have come so far of an output whose last file is still to come.
+    /// The files so far of an output whose last file has not come yet.
     files: Vec<(OwnedFd, Box<[u8]>)>,
 }
 
@@ -224,11 +222,11 @@ impl Watcher {
         Watcher { socket, program, pulse, held: HeldOutputs::default(), files: Vec::new() }
     }
 
-    /// Tells the program that it is ready, and watches until the program says goodbye, dies or hangs;
-    /// in the last two cases it drives the outputs.
+    /// Reports to the program that it is ready. It watches until the program says goodbye, dies or hangs. In the last
+    /// two cases it drives the outputs.
     pub(super) fn watch(mut self) {
         self.answer(TAKEN);
-        // Listens to the core's heartbeat. There is one only while outputs are held.
+        // This listens to the core's heartbeat. It exists only while outputs are held.
         let mut ear: Option<Ear> = None;
         let cause = loop {
             let pause = match &mut ear {
@@ -288,7 +286,7 @@ impl Watcher {
         Incoming::Message
     }
 
-    /// Does what a message says. False if it makes no sense, such as one that lacks its descriptor.
+    /// Carries out a message. False if it makes no sense, for example because it lacks its descriptor.
     fn take(&mut self, message: Message<'_>, descriptor: Option<OwnedFd>) -> bool {
         match (message, descriptor) {
             (Message::Release, _) => {
@@ -312,14 +310,14 @@ impl Watcher {
     }
 
     fn answer(&self, answer: u8) {
-        // If this fails, the program is dead, and the next poll tells so.
+        // If this fails, the program is dead, and the next poll shows it.
         let _ = send(self.socket.as_raw_fd(), &[answer], MsgFlags::MSG_NOSIGNAL);
     }
 
-    /// Drives all outputs, kills the program, and logs what could be driven and what could not.
+    /// Drives all outputs, kills the program, and logs which outputs could be driven and which could not.
     fn rescue(self, cause: &Cause) {
         let Watcher { program, pulse, held: HeldOutputs { mut native, apart }, .. } = self;
-        // Native lines come first, as writing to them never blocks.
+        // Native lines come first, because writing to them never blocks.
         drive(&mut native);
         let diagnosis = pulse.diagnosis();
         let program = Arc::new(program);
@@ -336,8 +334,8 @@ impl Watcher {
         }
         let (driven, failed): (Vec<_>, Vec<_>) = native.into_iter().partition(|output| output.outcome.is_driven());
         crew.employ(failed, None, TRY_FOR);
-        // If nobody reads the log, writing to it blocks, and this process would keep the lines in use
-        // for ever. The alarm ends it then (SIGALRM).
+        // If nobody reads the log, writing to it blocks, and this process would keep the lines in use forever. Then the
+        // alarm ends it (SIGALRM).
         alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
         let of_crew = crew.wait(TRY_FOR, |outcome| {
             let seconds = TRY_FOR.as_secs();
@@ -354,7 +352,7 @@ impl Watcher {
     }
 }
 
-/// For the log: how many outputs could be driven, and what is wrong with the others.
+/// For the log: how many outputs could be driven, and the faults of the others.
 fn summary(outcomes: &[&Outcome]) -> String {
     let all = outcomes.len();
     let complaints: Vec<_> =
@@ -372,14 +370,13 @@ fn summary(outcomes: &[&Outcome]) -> String {
 /// What a thread reports after each attempt to drive an output: the output's number, and the result.
 type Attempt = (usize, io::Result<()>);
 
-/// Threads that each drive a group of outputs, so that a driver that hangs delays neither the other
-/// groups nor this process.
+/// Threads that each drive a group of outputs. So a driver that hangs delays neither the other groups nor this process.
 struct Crew {
     tell: Sender<Attempt>,
     told: Receiver<Attempt>,
-    /// By the outputs' numbers.
+    /// Indexed by the outputs' numbers.
     outcomes: Vec<Outcome>,
-    /// Work for which no thread could be started, as memory is short.
+    /// Work without a thread: none could be started because memory is short.
     left: Vec<Work>,
 }
 
@@ -391,17 +388,16 @@ impl Default for Crew {
 }
 
 impl Crew {
-    /// Has a thread drive these outputs, and try again those that fail until `try_for` is over. If
-    /// `survivor` is given, the program still lives and may drive them, too: they are driven at once,
-    /// and again when it has ended.
+    /// Starts a thread that drives these outputs, and retries those that fail until `try_for` is over. With `survivor`,
+    /// the program still lives and may drive them too. Then they are driven at once, and again when it has ended.
     fn employ(&mut self, outputs: Vec<Output>, survivor: Option<Arc<Program>>, try_for: Duration) {
         let mut drives = Vec::new();
         for Output { drive, outcome } in outputs {
             drives.push((self.outcomes.len(), drive));
             self.outcomes.push(Outcome { result: None, ..outcome });
         }
-        // If the thread can not be started, its closure is dropped with all that it owns. So it owns
-        // the work together with this function, which can then take the work back.
+        // If the thread cannot be started, its closure is dropped with all that it owns. So it shares the work with
+        // this function, which can then take the work back.
         let work = Arc::new(Mutex::new(Some(Work { drives, survivor, try_for })));
         let (theirs, tell) = (work.clone(), self.tell.clone());
         let run = move || {
@@ -415,8 +411,8 @@ impl Crew {
         }
     }
 
-    /// Waits until all outputs are driven, or `limit` is over, and returns how it went. Calls
-    /// `complain` once for each output whose first attempt fails.
+    /// Waits until all outputs are driven, or `limit` is over, and returns the outcomes. It calls `complain` once for
+    /// each output whose first attempt fails.
     fn wait(self, limit: Duration, mut complain: impl FnMut(&Outcome)) -> Vec<Outcome> {
         let Crew { tell, told, mut outcomes, left } = self;
         // Without this sender the channel closes when the last thread is done, and ends the wait.
@@ -433,7 +429,7 @@ impl Crew {
         while let Ok(report) = told.recv_timeout(until.saturating_sub(monotonic())) {
             note(report);
         }
-        // This comes last, as a driver that hangs would block this thread.
+        // This comes last, because a driver that hangs would block this thread.
         for work in left {
             work.run(&mut note);
         }
@@ -445,7 +441,7 @@ fn take<T>(from: &Mutex<Option<T>>) -> Option<T> {
     from.lock().unwrap_or_else(PoisonError::into_inner).take()
 }
 
-/// What one thread is to do: see [`Crew::employ`].
+/// The work of one thread: see [`Crew::employ`].
 struct Work {
     drives: Vec<(usize, Drive)>,
     survivor: Option<Arc<Program>>,
@@ -494,7 +490,7 @@ mod tests {
     const LONG: Duration = Duration::from_secs(60);
 
     thread_local! {
-        /// Dropped when the thread ends, and so after it has told what its drives came to.
+        /// Dropped when the thread ends, and so after it has reported its results.
         static ALIVE: Cell<Option<Sender<()>>> = const { Cell::new(None) };
     }
 

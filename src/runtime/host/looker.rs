@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The process that looks: it answers question after question until the program is gone.
+//! The search's process. It answers one question after the other until the program is gone.
 
 #![forbid(unsafe_code)]
 
@@ -29,17 +29,17 @@ use super::super::status::FoundHost;
 use super::message::{Answer, Hello, Line, MESSAGE_BYTES_MAX, Question};
 
 const PROC: &str = "/proc";
-/// Most memory that it may write to. It takes 3 MB for klippy's sources.
+/// Highest number of bytes of memory that it may write to. klippy's sources take 3 MB.
 const MEMORY_BYTES_MAX: rlim_t = 64 << 20;
-/// When memory is short, the kernel kills it before the program, which does not need it to go on.
+/// When memory is short, the kernel kills it before the program. The program does not need it to continue.
 const OOM_SCORE: &str = "500";
-/// Longest part of /proc/stat that is read; it has a number for each interrupt.
+/// Longest part of /proc/stat that is read. It has a number for each interrupt.
 const STAT_BYTES_MAX: u64 = 1 << 20;
 
-/// How many forms of messages that Pinion does not know are named in the log.
+/// Highest number of unknown forms of messages that the log names.
 const UNKNOWN_SHOWN: usize = 10;
 
-/// What to do about a host that can not be looked into.
+/// The remedy for a host that cannot be looked into.
 const REMEDY: &str = "for an older one name its --dialect, or give Pinion the capabilities CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them";
 
 /// Looks for hosts until the program closes its end of the socket.
@@ -71,20 +71,21 @@ fn say(socket: &OwnedFd, message: &impl Serialize) -> bool {
     send(socket.as_raw_fd(), &message, MsgFlags::MSG_NOSIGNAL).is_ok()
 }
 
-/// Makes the new process one that reads and answers, and does nothing else.
+/// Leaves the new process only what it needs to read and to answer.
 ///
 /// # Errors
 ///
-/// What keeps it from giving up the rest.
+/// Why it cannot give up the rest.
 fn settle(socket: &OwnedFd) -> io::Result<()> {
     let _ = fs::write("/proc/self/oom_score_adj", OOM_SCORE);
     let _ = setrlimit(Resource::RLIMIT_DATA, MEMORY_BYTES_MAX, MEMORY_BYTES_MAX);
     let _ = setrlimit(Resource::RLIMIT_CORE, 0, 0);
-    // Should the program have been started in real time.
+    // The program may have been started in real time.
     let _ = sys::set_other();
     helpers::settle(super::NAME, &[socket.as_raw_fd()]);
     sys::keep_only(sys::LOOK_INTO_OTHERS)?;
-    // It ends with the program's first thread, which lives as long as the program, whatever it waits for then.
+    // The process ends with the program's first thread, whatever it waits for then. That thread lives as long as the
+    // program.
     prctl::set_pdeathsig(Signal::SIGKILL)?;
     sys::allow_only_reading()
 }
@@ -106,10 +107,10 @@ impl Say {
 /// Looks at hosts, one after the other.
 #[derive(Default)]
 struct Looker {
-    /// The host that was seen last. A process goes on with the sources that it has loaded, whatever becomes
-    /// of the files: klippy's RESTART keeps the process. One whose sources could not be read is looked at anew.
+    /// The host that was seen last. A process continues with the sources that it has loaded, even if the files change.
+    /// klippy's RESTART keeps the process. A host whose sources could not be read is looked at again.
     last: Option<(Process, DialectName)>,
-    /// The same for whoever asks.
+    /// The same host, for the status.
     host: Option<FoundHost>,
     say: Say,
 }
@@ -121,7 +122,7 @@ impl Looker {
         let say = &mut self.say;
         let (process, is_sure) = match find(Path::new(PROC), terminal) {
             Ok(Search::Found(process)) => (process, true),
-            // Whichever of these it is, it runs from those sources.
+            // The host is one of these, and all of them run from the same sources.
             Ok(Search::Hidden(mut processes)) if same_folder(&processes) => (processes.remove(0), false),
             Ok(Search::Hidden(processes)) => {
                 let pids: Vec<String> = processes.iter().map(|process| process.pid.to_string()).collect();
@@ -155,20 +156,20 @@ impl Looker {
     }
 }
 
-/// Whether there are processes, all of which run from one folder.
+/// Whether there are processes, and all of them run from one folder.
 fn same_folder(processes: &[Process]) -> bool {
     let folders: Vec<_> = processes.iter().map(|process| process.klippy_folder(Path::new(PROC))).collect();
     folders.first().is_some_and(|first| first.is_some() && folders.iter().all(|folder| folder == first))
 }
 
-/// Says that the host gets the union, and what else may be done.
+/// For the log: the host gets the union, and what else the user can do.
 fn union(remedy: &str) -> String {
     let stop = if remedy.is_empty() { "" } else { "; " };
     format!("it is served as Klipper v0.13, master and Kalico{stop}{remedy}")
 }
 
-/// The dialect of a process, none if it can not be told, and a line in the log that says why. Adds to
-/// `host` where it runs from.
+/// The dialect of a process, or `None` if it is unknown. It logs a line that says why, and notes in `host` where the
+/// process runs from.
 fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) -> Option<DialectName> {
     let pid = process.pid;
     let Some(folder) = process.klippy_folder(Path::new(PROC)) else {
@@ -218,11 +219,11 @@ fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) 
     Some(DialectName::Of(best.generation))
 }
 
-/// When a process was started, by the clock on the wall.
+/// When a process was started, in wall-clock time.
 fn started(process: &Process) -> Option<SystemTime> {
     let stat = String::from_utf8(foreign::read(&Path::new(PROC).join("stat"), STAT_BYTES_MAX).ok()?).ok()?;
     let boot_s: u64 = stat.lines().find_map(|line| line.strip_prefix("btime "))?.trim().parse().ok()?;
     let per_s = u64::try_from(sysconf(SysconfVar::CLK_TCK).ok()??).ok()?;
-    // One second for the rounding of the time of the boot.
+    // One second is for the rounding of the boot time.
     Some(SystemTime::UNIX_EPOCH + Duration::from_secs(boot_s + process.started / per_s.max(1) + 1))
 }

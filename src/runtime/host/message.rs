@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the program and the search for the host say to each other. Their socket (SOCK_SEQPACKET) keeps each message in
-//! one piece; each is JSON.
+//! The messages between the program and the search for the host. Their socket (SOCK_SEQPACKET) keeps each message in
+//! one piece. Each is JSON.
 //!
-//! The search reads what a host has written, so the program believes none of what it says: [`Answer::decode`] takes
-//! nothing that is too long or no answer.
+//! The search reads files that a host has written. So the program trusts none of its messages: [`Answer::decode`] takes
+//! nothing that is too long or not an answer.
 
 #![forbid(unsafe_code)]
 
@@ -15,9 +15,9 @@ use pinion_firmware::mcu::DialectName;
 
 use super::super::status::FoundHost;
 
-/// Longest message of either. The longest texts of an answer fit.
+/// Longest message in either direction. The longest texts of an answer fit.
 pub(super) const MESSAGE_BYTES_MAX: usize = 64 * 1024;
-/// Most lines of an answer, and longest text of one; longest path.
+/// Highest number of lines in an answer, longest text of a line, and longest path.
 const LINES_MAX: usize = 6;
 const LINE_CHARS_MAX: usize = 1000;
 const PATH_CHARS_MAX: usize = 1000;
@@ -25,15 +25,15 @@ const PATH_CHARS_MAX: usize = 1000;
 /// The program's question: who has this terminal open?
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Question {
-    /// The answer has the same.
+    /// The answer has the same number.
     pub(super) number: u32,
     pub(super) terminal: Terminal,
 }
 
-/// What the search says first.
+/// The first message of the search.
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Hello {
-    /// Why the kernel does not confine it, if it does not.
+    /// Why the kernel does not confine the search, if it does not.
     pub(super) unconfined: Option<String>,
 }
 
@@ -48,13 +48,13 @@ pub(super) struct Line {
 #[derive(Debug, Serialize, Deserialize)]
 pub(super) struct Answer {
     pub(super) number: u32,
-    /// As [`DialectName`] is written.
+    /// Written as [`DialectName`] writes it.
     dialect: String,
     pub(super) host: Option<FoundHost>,
     pub(super) lines: Vec<Line>,
 }
 
-/// A text without control characters and not too long for the log.
+/// A text without control characters that is not too long for the log.
 fn bounded(text: &str, chars_max: usize) -> String {
     let text = plain(text);
     match text.chars().count() <= chars_max {
@@ -68,12 +68,12 @@ impl Answer {
         Answer { number, dialect: dialect.to_string(), host, lines }.bounded()
     }
 
-    /// The dialect; that which most hosts take, if it is none that this program knows.
+    /// The dialect. It is the union, which most hosts accept, if this program does not know it.
     pub(super) fn dialect(&self) -> DialectName {
         self.dialect.parse().unwrap_or(DialectName::Union)
     }
 
-    /// The same with nothing in it that is too long or may not be shown.
+    /// The same answer without anything that is too long or may not be shown.
     fn bounded(mut self) -> Answer {
         self.lines.truncate(LINES_MAX);
         for line in &mut self.lines {
@@ -108,7 +108,7 @@ mod tests {
             let line = || Line { is_warning: is_sure, text: text.clone() };
             let lines = (0..lines).map(|_| line()).collect();
             let told = Answer { number: pid, dialect: name.clone(), host: Some(host), lines };
-            // Whatever comes over the socket.
+            // Anything may come over the socket.
             let heard = Answer::decode(&serde_json::to_vec(&told).unwrap()).unwrap();
             prop_assert_eq!(heard.dialect(), DialectName::Union);
             prop_assert!(heard.lines.len() <= LINES_MAX);

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds out which dialect the host speaks: from the process that has the pty open, and the sources that it runs from.
+//! Finds the dialect that the host speaks, from the process that has the pty open and the sources that it runs from.
 //!
-//! That takes capabilities which open every file and every process of the computer, and it reads what a host has
-//! written. So a process of its own does it. It is forked before the program has threads, keeps these capabilities alone
-//! and gives up everything else: its only descriptor is the socket to the program, and the kernel lets it read files and
-//! nothing more (`sys/filter.rs`). It gets a terminal's number, and answers a dialect, whom it found, and lines for the log.
-//! The program keeps none of those capabilities, and takes no answer on trust.
+//! That takes capabilities that open every file and every process of the computer, and it reads files that a host has
+//! written. So a process of its own does it, forked before the program has threads. That process keeps only these
+//! capabilities. Its only descriptor is the socket to the program. The kernel lets it read files and nothing more
+//! (`sys/filter.rs`). It gets a terminal's number. It answers with a dialect, the host that it found, and lines for the
+//! log. The program keeps none of those capabilities, and trusts no answer.
 //!
-//! This file is the program's side, `looker.rs` the process, and `message.rs` what they say to each other.
+//! This file is the program's side. `looker.rs` is the process. `message.rs` has the messages between them.
 
 #![forbid(unsafe_code)]
 
@@ -36,16 +36,16 @@ use super::outlet::LinkWake;
 use super::status::HostBoard;
 use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
 
-/// What the kernel calls its process (proc_pid_comm(5)): its command line is the program's.
+/// The kernel's name of its process (proc_pid_comm(5)). Its command line is the program's.
 pub(crate) const NAME: &CStr = c"pinion-search";
-/// How long the new process has until it is ready, in seconds.
+/// How long the new process may take to be ready, in seconds.
 const START_S: i64 = 5;
 
-/// The search, before it is asked anything.
+/// The search, before its first question.
 pub struct HostSearch(OwnedFd);
 
 impl HostSearch {
-    /// Forks the process. To be called before any thread is started.
+    /// Forks the process. Call it before any thread starts.
     pub(super) fn start() -> io::Result<HostSearch> {
         let started = HostSearch::try_start();
         started.map_err(|error| {
@@ -88,7 +88,7 @@ fn receive<'a>(socket: &OwnedFd, message: &'a mut [u8]) -> nix::Result<&'a [u8]>
     }
 }
 
-/// The link's way to the search. A thread hears the answers.
+/// The link's way to the search. A thread receives the answers.
 pub(super) struct HostFinder {
     socket: Arc<OwnedFd>,
     terminal: Terminal,
@@ -99,8 +99,8 @@ pub(super) struct HostFinder {
 }
 
 impl HostFinder {
-    /// Has the search look for the host on the terminal `device`. The link is woken with each answer, and `board` shows
-    /// whom it found.
+    /// Lets the search look for the host on the terminal `device`. Each answer wakes the link, and `board` shows the
+    /// host that was found.
     pub(super) fn start(
         search: HostSearch,
         device: &Path,
@@ -113,7 +113,7 @@ impl HostFinder {
         let (ear, shown) = (socket.clone(), board.clone());
         thread::Builder::new().name("host".into()).spawn(move || {
             let mut message = vec![0; MESSAGE_BYTES_MAX];
-            // Until nobody asks any more.
+            // This ends when nobody asks any more.
             while let Ok(bytes) = receive(&ear, &mut message) {
                 let Some(answer) = Answer::decode(bytes) else { break };
                 for line in &answer.lines {
@@ -134,17 +134,17 @@ impl HostFinder {
         Ok(HostFinder { socket, terminal, board, answers, asked: 0 })
     }
 
-    /// Asks which dialect the host speaks that came just now.
+    /// Asks for the dialect of the host that came just now.
     pub(super) fn ask(&mut self) {
         self.asked = self.asked.wrapping_add(1);
         self.board.found(None);
         let question = Question { number: self.asked, terminal: self.terminal };
-        // One that hangs has the link wait for as long as for an answer, and one that is gone gives none.
+        // If the search hangs, the link waits as long as for an answer. If the search is gone, it gives no answer.
         let flags = MsgFlags::MSG_NOSIGNAL | MsgFlags::MSG_DONTWAIT;
         let _ = send(self.socket.as_raw_fd(), &serde_json::to_vec(&question).unwrap_or_default(), flags);
     }
 
-    /// The answer to the last question, once it is there.
+    /// The answer to the last question, if it has come.
     pub(super) fn answer(&self) -> Option<DialectName> {
         loop {
             match self.answers.try_recv() {

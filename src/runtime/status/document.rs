@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Makes the status of what the core, the search for the host and the program's start tell.
+//! Makes the status from the core's answer, the search for the host and the facts of the program's start.
 
 #![forbid(unsafe_code)]
 
@@ -18,7 +18,7 @@ use pinion_firmware::time::{NS_PER_TICK, Ticks};
 
 use super::{Answer, Asker};
 
-/// What is known of the host, as the threads that find it out leave it.
+/// Facts about the host, as the threads that find them leave them.
 #[derive(Default)]
 pub(in crate::runtime) struct HostBoard {
     /// Whether a host has the terminal open. The link says so.
@@ -59,7 +59,7 @@ impl HostBoard {
     }
 }
 
-/// What the program knows from its start.
+/// Facts that the program knows from its start.
 pub(in crate::runtime) struct Facts {
     pub(in crate::runtime) link: PathBuf,
     pub(in crate::runtime) device: PathBuf,
@@ -67,7 +67,7 @@ pub(in crate::runtime) struct Facts {
     pub(in crate::runtime) board: String,
     /// Names of its pins.
     pub(in crate::runtime) pins: Vec<Range>,
-    /// Where to ask for both again, as chips come and go; `None` if nothing does.
+    /// Where to ask for both again, because chips come and go. `None` if the board never changes.
     pub(in crate::runtime) view: Option<Box<dyn Board>>,
     /// The guardian's process.
     pub(in crate::runtime) guardian: Option<u32>,
@@ -88,7 +88,7 @@ impl Reporter {
         Reporter { asker, facts, host, started: Instant::now() }
     }
 
-    /// The status now. It asks the core, and waits for it.
+    /// The status now. It asks the core, and waits for the answer.
     pub(super) fn status(&mut self) -> Status {
         let answer = self.asker.ask();
         let facts = &mut self.facts;
@@ -105,7 +105,7 @@ impl Reporter {
             board: facts.board.clone(),
             state: answer.map_or(State::Unknown, |answer| state(&answer.mcu)),
             host: self.host.host(),
-            // Where it is lost the program ends.
+            // If the guardian is lost, the program ends.
             guardian: Guardian { present: facts.guardian.is_some(), pid: facts.guardian },
             mcu: answer.map(|answer| mcu(answer, facts)),
         }

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Answers `pinion status` on a socket in the file system.
 //!
-//! A thread of its own serves the socket (`socket.rs`). It sends one JSON document (`crate::status`) to each
-//! client and reads nothing. For the MCU's part it sends the core an empty [`Snapshot`] through a ring, and
-//! looks for its return every few milliseconds. The core is not woken: it fills the snapshot in when it next
-//! passes by with no timer near. So an answer may take as long as the core's nap, and costs the core a look
-//! at the ring each time that it is idle anyway.
+//! A thread of its own serves the socket (`socket.rs`). It sends one JSON document (`crate::status`) to each client and
+//! reads nothing. For the MCU's part it sends the core an empty [`Snapshot`] through a ring, and looks for its return
+//! every few milliseconds. The core is not woken. It fills in the snapshot when it next passes by with no timer near.
+//! So an answer may take as long as the core's nap. It costs the core one look at the ring each time that it is idle
+//! anyway.
 
 #![forbid(unsafe_code)]
 
@@ -36,7 +36,7 @@ struct Answer {
     mcu: Snapshot,
     /// Requests that wait for the core.
     waiting: usize,
-    /// How early it wakes for a timer.
+    /// How early the core wakes for a timer.
     margin: Ticks,
 }
 
@@ -44,11 +44,11 @@ struct Answer {
 pub(super) struct Teller {
     asked: Consumer<Box<Answer>>,
     told: Producer<Box<Answer>>,
-    /// The one that is being filled in.
+    /// The answer that is being filled in.
     at_work: Option<Box<Answer>>,
 }
 
-/// The other end.
+/// The status thread's end.
 pub(super) struct Asker {
     ask: Producer<Box<Answer>>,
     answers: Consumer<Box<Answer>>,
@@ -70,14 +70,14 @@ impl Teller {
         self.at_work.is_some() || !self.asked.is_empty()
     }
 
-    /// Fills in the next part of the answer. Call it while no timer is near. `waiting` requests wait for the
-    /// core, which wakes `margin` before a timer.
+    /// Fills in the next part of the answer. Call it while no timer is near. `waiting` is how many requests wait for
+    /// the core. `margin` is how early the core wakes for a timer.
     #[cold]
     pub(super) fn tell(&mut self, mcu: &Mcu, waiting: usize, margin: Ticks) {
         let Some(mut answer) = self.at_work.take().or_else(|| self.asked.pop().ok()) else { return };
         if mcu.tell(&mut answer.mcu) {
             (answer.waiting, answer.margin) = (waiting, margin);
-            // There is room: no more than this one is ever under way.
+            // There is room: at most one answer is under way.
             let _ = self.told.push(answer);
         } else {
             self.at_work = Some(answer);
@@ -89,7 +89,7 @@ impl Asker {
     /// Asks the core, and waits for the answer. `None` if it does not come in time.
     fn ask(&mut self) -> Option<&Answer> {
         let until = Instant::now() + ANSWER_WAIT_MAX;
-        // One that came too late for the last question.
+        // This answer came too late for the last question.
         if let Ok(late) = self.answers.pop() {
             self.spare = Some(late);
         }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The socket of the status: where it stands, and the thread that serves it.
+//! The socket of the status: its path, and the thread that serves it.
 
 #![forbid(unsafe_code)]
 
@@ -24,20 +24,20 @@ use super::document::{Facts, HostBoard, Reporter};
 
 /// Shortest time between two questions to the core, however many clients ask.
 const PAUSE: Duration = Duration::from_millis(50);
-/// Most clients that are answered at once. Others wait in the kernel's queue.
+/// Highest number of clients that are answered at once. Others wait in the kernel's queue.
 const CLIENTS_MAX: usize = 32;
 
-/// The socket in the file system. Dropped, it is removed and its thread ends.
+/// The socket in the file system. When this is dropped, the socket is removed and its thread ends.
 pub(in crate::runtime) struct StatusSocket {
     path: PathBuf,
-    /// Device and inode by which ours is known.
+    /// Device and inode of our own socket.
     id: (u64, u64),
     _thread: PipeWriter,
 }
 
 impl StatusSocket {
-    /// Opens the socket of the first of these paths where that can be done, and serves it. Who may open the
-    /// terminal may ask: the socket gets its group. A path where another instance answers is not taken over.
+    /// Opens the socket at the first of these paths where that is possible, and serves it. Users who may open the
+    /// terminal may ask: the socket gets the terminal's group. A path where another instance answers is not taken over.
     pub(in crate::runtime) fn start(
         paths: &[PathBuf],
         facts: Facts,
@@ -72,12 +72,11 @@ impl Drop for StatusSocket {
     }
 }
 
-/// The paths where the socket of the instance with this link is looked for, the best first.
+/// The possible paths of the socket of the instance with this link, the best first.
 ///
-/// It is named for the link: the file's name without `klipper_host_`, and `.sock`. For a link in `/tmp` or
-/// `/run/pinion` it stands in `/run/pinion`, which is the service's, or, where that is not there or another
-/// user's, as `pinion-NAME.sock` in `$XDG_RUNTIME_DIR` or else `/tmp`. For a link anywhere else it stands beside
-/// the link.
+/// The socket is named after the link: the file's name without `klipper_host_`, and `.sock`. For a link in `/tmp` or
+/// `/run/pinion` it stands in `/run/pinion`, the service's folder. If that folder is missing or another user's, it is
+/// `pinion-NAME.sock` in `$XDG_RUNTIME_DIR`, or else in `/tmp`. For a link anywhere else it stands beside the link.
 pub fn socket_paths(link: &Path) -> Vec<PathBuf> {
     let file = link.file_name().unwrap_or_default().to_string_lossy();
     let name = file.strip_prefix("klipper_host_").unwrap_or(&file);
@@ -90,7 +89,7 @@ pub fn socket_paths(link: &Path) -> Vec<PathBuf> {
     vec![Path::new("/run/pinion").join(format!("{name}.sock")), own.join(format!("pinion-{name}.sock"))]
 }
 
-/// Opens the socket at a path, and returns by which device and inode it is known.
+/// Opens the socket at a path, and returns it with its device and inode.
 fn open(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
     match fs::symlink_metadata(path) {
         Ok(found) if !found.file_type().is_socket() => {
@@ -98,7 +97,7 @@ fn open(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
         }
         Ok(_) => match connect(path) {
             Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => {}
-            // One whose queue is full is alive, too.
+            // A socket whose queue is full is alive too.
             Err(error) if error.kind() != io::ErrorKind::WouldBlock => return Err(error),
             _ => {
                 let live = "another Pinion answers there: choose another -I, or --socket";
@@ -107,7 +106,7 @@ fn open(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
         },
         Err(_) => {}
     }
-    // A rename puts it in place with its permissions, and replaces a stale one, in one step.
+    // A rename puts the socket in place with its permissions, and replaces a stale one, in one step.
     let mut fresh = path.as_os_str().to_owned();
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
@@ -116,7 +115,7 @@ fn open(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
     let placed = (|| {
         listener.set_nonblocking(true)?;
         let gid = fs::metadata(device)?.gid();
-        // Only root and the group's members may. Without it only our own user asks, and root.
+        // Only root and the group's members may do this. Without it only our own user and root may ask.
         let _ = chown(&fresh, None, Some(gid));
         fs::set_permissions(&fresh, fs::Permissions::from_mode(0o660))?;
         let ours = fs::symlink_metadata(&fresh)?;
@@ -126,7 +125,7 @@ fn open(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
     placed.map(|id| (listener, id)).inspect_err(|_: &io::Error| drop(fs::remove_file(&fresh)))
 }
 
-/// Connects to the socket of an instance, without waiting for one that hangs.
+/// Connects to the socket of an instance. It does not wait for an instance that hangs.
 pub(crate) fn connect(path: &Path) -> io::Result<UnixStream> {
     let flags = SockFlag::SOCK_CLOEXEC | SockFlag::SOCK_NONBLOCK;
     let socket = socket(AddressFamily::Unix, SockType::Stream, flags, None)?;
@@ -134,7 +133,7 @@ pub(crate) fn connect(path: &Path) -> io::Result<UnixStream> {
     Ok(UnixStream::from(socket))
 }
 
-/// Starts the thread. It ends once what this returns is dropped.
+/// Starts the thread. It ends when the returned value is dropped.
 fn serve_on(listener: UnixListener, mut reporter: Reporter) -> io::Result<PipeWriter> {
     let (end, alive) = io::pipe()?;
     thread::Builder::new().name("status".into()).spawn(move || serve(&listener, &end, &mut reporter))?;
@@ -165,7 +164,7 @@ fn serve(listener: &UnixListener, end: &PipeReader, reporter: &mut Reporter) {
     }
 }
 
-/// Sends the document, or as much of it as a client that does not read has room for.
+/// Sends the document. A client that does not read gets as much of it as there is room for.
 fn give(mut client: UnixStream, mut document: &[u8]) {
     if client.set_nonblocking(true).is_err() {
         return;
@@ -232,12 +231,12 @@ mod tests {
         assert!(start().is_none());
         assert_eq!(fs::read(&path).unwrap(), b"mine");
         fs::remove_file(&path).unwrap();
-        // What a program leaves that was killed.
+        // A killed program leaves this.
         drop(UnixListener::bind(&path).unwrap());
         let first = start().unwrap();
         assert!(start().is_none());
         assert_eq!(fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o660);
-        // One that another program has put there since is not ours to remove.
+        // A socket that another program has put there since is not ours to remove.
         fs::remove_file(&path).unwrap();
         let _other = UnixListener::bind(&path).unwrap();
         drop(first);
