@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What others write: files that may be anything, and names that may hold anything.
+//! Data of others: files that may be anything, and names that may contain anything.
 //!
-//! A host, its checkout, other processes and devices name things as they like. Their files are read with
-//! [`read`], and their names leave the program only after [`plain`] or [`plain_json`].
+//! A host, its checkout, other processes and devices choose their own names. Their files are read with [`read`]. Their
+//! names leave the program only after [`plain`] or [`plain_json`].
 
 #![forbid(unsafe_code)]
 
@@ -19,10 +19,10 @@ use nix::fcntl::OFlag;
 ///
 /// # Errors
 ///
-/// Those of opening it. [`io::ErrorKind::InvalidInput`]: it is something else.
+/// It cannot be opened. [`io::ErrorKind::InvalidInput`]: it is not a regular file.
 pub(crate) fn open(path: &Path) -> io::Result<(File, Metadata)> {
-    // With O_PATH nothing is opened yet: a FIFO cannot block, and no device notices (a watchdog starts
-    // when it is opened). The second open is of that very file, whatever the path leads to by then.
+    // With O_PATH nothing is opened yet: a FIFO cannot block, and no device notices (a watchdog starts when it is
+    // opened). The second open is of that very file, even if the path leads elsewhere by then.
     let place = OpenOptions::new().read(true).custom_flags(OFlag::O_PATH.bits()).open(path)?;
     let about = place.metadata()?;
     if !about.is_file() {
@@ -33,27 +33,27 @@ pub(crate) fn open(path: &Path) -> io::Result<(File, Metadata)> {
     Ok((OpenOptions::new().read(true).custom_flags(flags).open(same)?, about))
 }
 
-/// Reads the first `bytes_max` of a regular file.
+/// Reads the first `bytes_max` bytes of a regular file.
 ///
 /// # Errors
 ///
-/// Those of [`open`] and of reading.
+/// The errors of [`open`] and of reading.
 pub(crate) fn read(path: &Path, bytes_max: u64) -> io::Result<Vec<u8>> {
     let mut bytes = Vec::new();
     open(path)?.0.take(bytes_max).read_to_end(&mut bytes)?;
     Ok(bytes)
 }
 
-/// A text as part of one line for a terminal or a log: each control character is replaced.
+/// A text as part of one line for a terminal or a log. Each control character is replaced.
 ///
-/// The C0 and C1 controls and DEL have meanings to terminals, and a line feed would begin a line that
-/// passes for one of ours.
+/// The C0 and C1 controls and DEL have meanings to terminals. A line feed would begin a line that passes for one of
+/// ours.
 pub(crate) fn plain(text: &str) -> Cow<'_, str> {
     if text.contains(char::is_control) { text.replace(char::is_control, "?").into() } else { text.into() }
 }
 
-/// The same for JSON: line feeds stand between its lines. Inside its strings they are escaped already, as
-/// are other characters below 0x20; the remaining control characters are escaped here.
+/// The same for JSON, whose lines are separated by line feeds. Inside its strings, line feeds and other characters
+/// below 0x20 are escaped already. The remaining control characters are escaped here.
 pub(crate) fn plain_json(json: &str) -> String {
     let mut plain = String::with_capacity(json.len());
     for c in json.chars() {
@@ -94,7 +94,7 @@ pub(crate) mod tests {
         fs::remove_file(&path).unwrap();
         fs::write(&path, "0123456789abc").unwrap();
         assert_eq!(read(&path, 10).unwrap(), b"0123456789");
-        // Those of /proc have no length.
+        // Files in /proc have no length.
         assert!(!read(Path::new("/proc/self/stat"), 4096).unwrap().is_empty());
     }
 

@@ -5,11 +5,11 @@
 //!
 //! - [`cli`]: the subcommands
 //! - [`runtime`]: threads, pty, real time, signals
-//! - [`klippy`]: what can be known of a host from outside
-//! - `foreign`: what others write: files that may be anything, and names that may hold anything
-//! - `status`: what a running Pinion tells, as `pinion status` prints it
+//! - [`klippy`]: facts about a host, found from outside
+//! - `foreign`: data of others: files that may be anything, and names that may contain anything
+//! - `status`: the status of a running Pinion, as `pinion status` prints it
 
-// Printing panics when nobody reads, these when something is not as was thought: tests may.
+// Printing panics when nobody reads. The others panic when an assumption is wrong. Tests may use all of them.
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]
 #![cfg_attr(not(test), warn(clippy::unwrap_used, clippy::expect_used, clippy::todo))]
 
@@ -23,7 +23,7 @@ mod status;
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::Firmware;
 
-/// What the program is as an MCU.
+/// The program's description as an MCU.
 pub const FIRMWARE: Firmware = Firmware {
     features: FEATURES,
     app: "Pinion",

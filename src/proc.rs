@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Fields of the texts in /proc (proc(5)). Why not the crate `procfs`: docs/develop/architecture.md, "Data of others".
+//! Fields of the texts in /proc (proc(5)). docs/develop/architecture.md, "Data of others", says why not the crate
+//! `procfs`.
 
 #![forbid(unsafe_code)]
 

@@ -14,7 +14,7 @@ use serde_json::Value;
 /// Version of the document's form. A new field does not change it.
 pub(crate) const FORM: u32 = 1;
 
-/// What a running Pinion tells.
+/// The status of a running Pinion.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct Status {
     /// [`FORM`].
@@ -33,7 +33,7 @@ pub(crate) struct Status {
     pub(crate) state: State,
     pub(crate) host: Host,
     pub(crate) guardian: Guardian,
-    /// `None` if the core has not answered in time: `state` is then [`State::Unknown`].
+    /// `None` if the core has not answered in time. Then `state` is [`State::Unknown`].
     #[serde(flatten)]
     pub(crate) mcu: Option<McuStatus>,
 }
@@ -93,7 +93,7 @@ pub(crate) struct Guardian {
     pub(crate) pid: Option<u32>,
 }
 
-/// What the core tells of the MCU.
+/// The MCU's part, from the core.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 pub(crate) struct McuStatus {
     /// Present in [`State::Shutdown`].
@@ -131,7 +131,7 @@ pub(crate) struct Line {
     pub(crate) bus: Option<BusCounts>,
 }
 
-/// What a line is used as.
+/// The use of a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub(crate) enum Use {
@@ -160,7 +160,7 @@ impl Use {
 pub(crate) struct Object {
     /// The host's number for it; `None` for lines that belong to no object.
     pub(crate) oid: Option<u8>,
-    /// What people call it.
+    /// Its name for people.
     pub(crate) kind: String,
     /// Name of its pin.
     pub(crate) pin: Option<String>,
@@ -188,9 +188,9 @@ pub(crate) enum Present {
 pub(crate) struct BusCounts {
     /// All transfers.
     pub(crate) transfers: u32,
-    /// Those that failed.
+    /// Failed transfers.
     pub(crate) errors: u32,
-    /// Failed transfers that were tried again.
+    /// Failed transfers that were retried.
     pub(crate) retries: u32,
 }
 
@@ -209,7 +209,7 @@ pub(crate) struct Lateness {
     pub(crate) buckets_us: Vec<(f64, u64)>,
 }
 
-/// What waits.
+/// The queues.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub(crate) struct Queues {
     pub(crate) moves: MoveQueue,
@@ -250,7 +250,7 @@ pub(crate) fn read(document: &[u8]) -> serde_json::Result<(Status, Vec<String>)>
     let sent: Value = serde_json::from_slice(document)?;
     let status = Status::deserialize(&sent)?;
     if status.mcu.is_none() && status.state != State::Unknown {
-        // serde makes `None` of a flattened struct that it cannot read. This tells why.
+        // serde makes `None` of a flattened struct that it cannot read. This gives the reason.
         McuStatus::deserialize(&sent)?;
     }
     let mut unknown = Vec::new();
@@ -270,7 +270,7 @@ fn list_unknown(sent: &Value, known: &Value, path: &str, unknown: &mut Vec<Strin
                 }
             }
         }
-        // The elements of a list are alike: each field is told once.
+        // The elements of a list are alike: each field is listed once.
         (Value::Array(sent), Value::Array(known)) => {
             let before = unknown.len();
             sent.iter().zip(known).for_each(|(sent, known)| list_unknown(sent, known, path, unknown));
@@ -288,7 +288,7 @@ pub(crate) mod tests {
     use super::*;
     use serde_json::json;
 
-    /// What a Pinion 0.1.0 said, before the status was a type.
+    /// The status of a Pinion 0.1.0, recorded before the status was a type.
     const RECORDED: &str = include_str!("status/recorded.json");
 
     pub(crate) fn recorded() -> Status {

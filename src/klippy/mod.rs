@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What can be known of a Klipper host from outside: which process it is, which messages its sources
-//! look up, and so which dialect it speaks.
+//! Facts about a Klipper host, found from outside: its process, the messages that its sources look up, and so the
+//! dialect that it speaks.
 
 #![forbid(unsafe_code)]
 
@@ -17,30 +17,31 @@ pub mod sources;
 
 use sources::{Shape, Sources};
 
-/// A klippy looks up more than 80 of our messages; what looks up fewer than these is something else.
+/// Lowest number of our messages that klippy's sources look up. klippy looks up more than 80. A folder with fewer than
+/// this is something else.
 const SHAPES_MIN: usize = 20;
 /// Longest `.git/HEAD` and single reference that is read.
 const REF_BYTES_MAX: u64 = 4096;
 /// Longest `.git/packed-refs` that is read: a line for each branch and tag, of some 70 bytes.
 const PACKED_REFS_BYTES_MAX: u64 = 1 << 20;
 
-/// How klippy knows a pseudo terminal by its path (klippy/mcu.py).
+/// klippy takes paths that begin like this for pseudo terminals (klippy/mcu.py).
 pub(crate) const HOST_PATHS: &str = "/tmp/klipper_host_";
 
-/// Whether klippy takes a path for a pseudo terminal's. One that any process may name, and that means more in a
-/// command than a name in that folder, counts as none.
+/// Whether klippy takes a path for a pseudo terminal. Any process may name a path. One that means more in a command
+/// than a name in that folder does not count.
 pub(crate) fn is_host_path(path: &Path) -> bool {
     let is_plain = |c: char| c.is_ascii_alphanumeric() || "_.-".contains(c);
     path.to_str().and_then(|path| path.strip_prefix(HOST_PATHS)).is_some_and(|name| name.chars().all(is_plain))
 }
 
-/// A message that a machine knows, and who takes it.
+/// A message that an MCU knows, and the generations that have it.
 struct KnownShape {
     shape: Shape,
     generations: Generations,
 }
 
-/// What a checkout says of the host that runs from it.
+/// Facts about the host that runs from a checkout.
 #[derive(Debug)]
 pub struct Checkout {
     /// The folder, such as `/home/pi/klipper`.
@@ -49,33 +50,32 @@ pub struct Checkout {
     pub commit: Option<String>,
     /// When the newest of its sources was written.
     pub newest: SystemTime,
-    /// What could not be read of it, if anything.
+    /// The first part that could not be read, if any.
     pub unread: Option<String>,
-    /// Every message that it looks up.
+    /// Every message that the host looks up.
     pub shapes: BTreeSet<Shape>,
-    /// What each generation makes of it, in the order of [`Generation::ALL`].
+    /// The verdict on each generation, in the order of [`Generation::ALL`].
     pub verdicts: Vec<Verdict>,
 }
 
 /// How a generation's dialect suits a host.
 #[derive(Debug)]
 pub struct Verdict {
-    /// Which one.
+    /// The generation.
     pub generation: Generation,
     /// Messages in the form that the dialect has.
     pub served: BTreeSet<Shape>,
-    /// Messages in a form that the dialect does not have, and another generation's may. A host often
-    /// looks up several forms of one message, and takes the one that there is.
+    /// Messages in a form that the dialect does not have. Another generation's dialect may have it. A host often looks
+    /// up several forms of one message, and takes the one that exists.
     pub other: BTreeSet<Shape>,
 }
 
 impl Checkout {
-    /// Reads the sources in klippy's folder, that of `klippy.py`, and compares them with the messages of
-    /// `features`.
+    /// Reads the sources in klippy's folder, which holds `klippy.py`. Compares them with the messages of `features`.
     ///
     /// # Errors
     ///
-    /// Those of reading, and that the folder is none of klippy's.
+    /// The sources cannot be read, or the folder is not klippy's.
     pub fn read(klippy: &Path, features: &[Feature]) -> io::Result<Checkout> {
         let Sources { shapes, newest, unread, .. } = Sources::read(klippy)?;
         let known = known(features);
@@ -102,7 +102,7 @@ impl Checkout {
         })
     }
 
-    /// The dialect that has most of what the host looks up; of several the newest.
+    /// The dialect that has most of the messages that the host looks up. Of several it is the newest.
     pub fn best(&self) -> &Verdict {
         let best = self.verdicts.iter().rev().min_by_key(|verdict| verdict.other.len());
         match best {
@@ -111,15 +111,15 @@ impl Checkout {
         }
     }
 
-    /// Messages that no generation has in this form though it knows their names: the host is newer than
-    /// all that this program knows, and they will not be served.
+    /// Messages that no generation has in this form, though it knows their names. The host is newer than all that this
+    /// program knows, and these messages will not be served.
     pub fn unknown(&self) -> impl Iterator<Item = &Shape> {
         let everywhere = |shape: &&Shape| self.verdicts.iter().all(|verdict| verdict.other.contains(*shape));
         self.best().other.iter().filter(everywhere)
     }
 }
 
-/// The messages that have parameters. Those without are no more than a word in a host's sources.
+/// The messages that have parameters. A message without parameters is only a word in a host's sources.
 fn known(features: &[Feature]) -> Vec<KnownShape> {
     let commands = features.iter().flat_map(|feature| feature.commands);
     let commands = commands.map(|command| (command.format, command.generations));
@@ -171,7 +171,7 @@ pub(crate) mod tests {
         (folder, klippy)
     }
 
-    /// What a generation's machines know.
+    /// The messages that a generation's MCUs know.
     pub(crate) fn forms(generation: Generation) -> Vec<String> {
         let known = known(FEATURES).into_iter().filter(|known| known.generations.contains(generation));
         known.map(|known| known.shape.as_str().to_owned()).collect()

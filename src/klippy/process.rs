@@ -15,13 +15,13 @@ use serde::{Deserialize, Serialize};
 use crate::foreign;
 use crate::proc::stat_field;
 
-/// Longest part of a command line that is looked at: a process may have one of megabytes.
+/// Longest part of a command line that is looked at. A process may have one of megabytes.
 const COMMAND_LINE_BYTES_MAX: u64 = 16 << 10;
 /// Longest part of the other files in /proc/PID that is looked at.
 const PROC_BYTES_MAX: u64 = 4096;
-/// The number of the field of /proc/PID/stat that says when a process was started.
+/// Number of the field in /proc/PID/stat that says when a process was started.
 const STARTTIME: usize = 22;
-/// Most open files of a process that are looked at: klippy has less than a hundred.
+/// Highest number of open files of a process that are looked at. klippy has less than a hundred.
 const OPEN_FILES_MAX: usize = 4096;
 
 /// A process that may be a host.
@@ -29,26 +29,26 @@ const OPEN_FILES_MAX: usize = 4096;
 pub struct Process {
     /// Its number.
     pub pid: u32,
-    /// When it was started, in clock ticks since the computer was: a number is used anew, the two
-    /// together are not.
+    /// When it was started, in clock ticks since the computer's start. A process number is used again, but never with
+    /// the same start.
     pub started: u64,
     /// Its command line.
     pub arguments: Vec<PathBuf>,
 }
 
-/// Who has the terminal open.
+/// The process that has the terminal open.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Search {
     /// This process.
     Found(Process),
-    /// Nobody whom this program may look into, but these processes of klippy's may not be looked into.
+    /// No process that this program may look into. It may not look into these processes of klippy.
     Hidden(Vec<Process>),
     /// Nobody.
     Nobody,
 }
 
-/// A terminal by its numbers: its own, and that of the devpts that it is on. Containers have terminals of the same
-/// numbers, on devices of their own.
+/// A terminal by its numbers: its own, and the number of the devpts that it is on. Containers have terminals of the
+/// same numbers, on devices of their own.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Terminal {
     number: u64,
@@ -56,11 +56,11 @@ pub struct Terminal {
 }
 
 impl Terminal {
-    /// That of a device, such as `/dev/pts/3`.
+    /// The terminal of a device, such as `/dev/pts/3`.
     ///
     /// # Errors
     ///
-    /// Those of looking at it.
+    /// The device cannot be looked at.
     pub fn of(device: &Path) -> io::Result<Terminal> {
         fs::metadata(device).map(|about| Terminal { number: about.rdev(), devpts: about.dev() })
     }
@@ -70,11 +70,11 @@ impl Terminal {
     }
 }
 
-/// Finds the process that has a terminal open, another than this one. `proc` is /proc.
+/// Finds the process that has a terminal open, other than this one. `proc` is /proc.
 ///
 /// # Errors
 ///
-/// Those of looking at `proc` itself.
+/// `proc` itself cannot be looked at.
 pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
     let mut klippys = Vec::new();
     let mut others = Vec::new();
@@ -86,15 +86,15 @@ pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
             others.push(pid);
         }
     }
-    // A look into a process costs a call for each of its files, so the likely ones come first; of a
-    // process and its children the parent.
+    // A look into a process costs a call for each of its files. So the likely processes come first, and a parent comes
+    // before its children.
     klippys.sort_by_key(|process| process.started);
     let mut hidden = Vec::new();
     for process in klippys {
         match has_open(proc, process.pid, terminal) {
             Ok(true) if !serves(proc, process.pid, terminal) => return Ok(Search::Found(process)),
             Err(error) if error.kind() == io::ErrorKind::PermissionDenied => hidden.push(process),
-            // One that ended meanwhile.
+            // It is not the host, or it ended meanwhile.
             Ok(_) | Err(_) => {}
         }
     }
@@ -109,28 +109,28 @@ pub fn find(proc: &Path, terminal: Terminal) -> io::Result<Search> {
     Ok(if hidden.is_empty() { Search::Nobody } else { Search::Hidden(hidden) })
 }
 
-/// The process that serves the terminal `device`, which is not its own: it has the master end open. None if there is
-/// none that this program may look into.
+/// The process, other than this one, that serves the terminal `device`: it has the master end open. `None` if this
+/// program may look into no process that does.
 ///
 /// # Errors
 ///
-/// Those of looking at the terminal or at `proc` itself.
+/// The terminal or `proc` itself cannot be looked at.
 pub fn server(proc: &Path, device: &Path) -> io::Result<Option<Process>> {
     let terminal = Terminal::of(device)?;
     let pid = pids(proc)?.find(|pid| serves(proc, *pid, terminal));
     Ok(pid.and_then(|pid| Process::read(proc, pid, arguments(proc, pid))))
 }
 
-/// All processes but this one.
+/// All processes except this one.
 ///
 /// # Errors
 ///
-/// Those of looking at `proc` itself.
+/// `proc` itself cannot be looked at.
 pub fn all(proc: &Path) -> io::Result<Vec<Process>> {
     Ok(pids(proc)?.filter_map(|pid| Process::read(proc, pid, arguments(proc, pid))).collect())
 }
 
-/// The numbers of all processes but this one.
+/// The numbers of all processes except this one.
 fn pids(proc: &Path) -> io::Result<impl Iterator<Item = u32>> {
     let pids = fs::read_dir(proc)?.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok());
     Ok(pids.filter(|pid| *pid != std::process::id()))
@@ -148,28 +148,28 @@ impl Process {
         self.arguments.first()?.file_name()
     }
 
-    /// Whether its open files can not be told, as it is another user's.
+    /// Whether its open files are unknown, because it is another user's.
     pub fn is_hidden(&self, proc: &Path) -> bool {
         fs::read_dir(proc.join(self.pid.to_string()).join("fdinfo")).is_err()
     }
 
-    /// Whether it was started as klippy is.
+    /// Whether it was started like klippy.
     pub fn is_klippy(&self) -> bool {
         klippy(&self.arguments).is_some()
     }
 
-    /// klippy's folder as this program can reach it, should the process be klippy.
+    /// klippy's folder as this program can reach it. `None` if the process is not klippy.
     pub fn klippy_folder(&self, proc: &Path) -> Option<PathBuf> {
         self.reach(proc, klippy(&self.arguments)?)
     }
 
-    /// The configuration that klippy has, as this program can reach it, should the process be klippy.
+    /// klippy's configuration as this program can reach it. `None` if the process is not klippy.
     pub fn klippy_config(&self, proc: &Path) -> Option<PathBuf> {
         self.reach(proc, klippy_config(&self.arguments)?)
     }
 
-    /// A path of the process as this program can reach it: through the process's own root (a container's), or,
-    /// where that is not permitted, as if both had the same.
+    /// A path of the process as this program can reach it. It leads through the process's own root (a container's). If
+    /// that is not permitted, both are taken to have the same root.
     fn reach(&self, proc: &Path, path: &Path) -> Option<PathBuf> {
         let folder = proc.join(self.pid.to_string());
         let mut path = path.to_owned();
@@ -181,7 +181,7 @@ impl Process {
     }
 }
 
-/// The unit of systemd that a text of /proc/PID/cgroup names, without `.service` (systemd.resource-control(5)). None if
+/// The systemd unit that a text of /proc/PID/cgroup names, without `.service` (systemd.resource-control(5)). `None` if
 /// the process was started from a user's session or manager, which `sudo systemctl` does not reach.
 pub(crate) fn unit(groups: &str) -> Option<&str> {
     let is_user = |name: &str| name.starts_with("user@") || name.starts_with("user-");
@@ -191,7 +191,7 @@ pub(crate) fn unit(groups: &str) -> Option<&str> {
     groups.lines().find_map(|line| line.rsplit('/').next()?.strip_suffix(".service"))
 }
 
-/// The command line of a process; it is empty for the kernel's threads.
+/// The command line of a process. It is empty for the kernel's threads.
 fn arguments(proc: &Path, pid: u32) -> Vec<PathBuf> {
     let file = proc.join(pid.to_string()).join("cmdline");
     let line = foreign::read(&file, COMMAND_LINE_BYTES_MAX).unwrap_or_default();
@@ -199,8 +199,8 @@ fn arguments(proc: &Path, pid: u32) -> Vec<PathBuf> {
     arguments.map(|argument| PathBuf::from(OsStr::from_bytes(argument))).collect()
 }
 
-/// Where in a command line klippy stands, if it is klippy's, and klippy's folder: that of `klippy.py`, or what
-/// `-m klippy` names.
+/// The place of klippy in its command line, and klippy's folder: the folder of `klippy.py`, or the one that `-m klippy`
+/// names.
 fn program(arguments: &[PathBuf]) -> Option<(usize, &Path)> {
     let is_script = |argument: &PathBuf| argument.file_name().is_some_and(|name| name == "klippy.py");
     let is_module = |pair: &[PathBuf]| {
@@ -217,9 +217,9 @@ pub(crate) fn klippy(arguments: &[PathBuf]) -> Option<&Path> {
     program(arguments).map(|(_, folder)| folder)
 }
 
-/// The configuration that a command line of klippy's names.
+/// The configuration that klippy's command line names.
 pub(crate) fn klippy_config(arguments: &[PathBuf]) -> Option<&Path> {
-    // Those of klippy/klippy.py, and of Kalico's klippy/printer.py, which take a value.
+    // These options of klippy/klippy.py, and of Kalico's klippy/printer.py, take a value.
     const WITH_VALUE: [&str; 15] = [
         "-i",
         "--debuginput",
@@ -249,12 +249,12 @@ pub(crate) fn klippy_config(arguments: &[PathBuf]) -> Option<&Path> {
     None
 }
 
-/// As many links as the kernel follows in a path.
+/// Highest number of links that the kernel follows in a path.
 const LINKS_MAX: usize = 40;
 
-/// The file that has the absolute `path` for a process whose root is `root`. A link that begins at the root
-/// would lead to this program's own files, if the kernel followed it: to another container's, or to a home
-/// that the service can not see.
+/// The file that has the absolute `path` for a process whose root is `root`. If the kernel followed a link that begins
+/// at the root, it would lead to this program's own files. They may be another container's, or a home that the service
+/// cannot see.
 fn inside(root: &Path, path: &Path) -> PathBuf {
     let mut links = 0;
     let mut reached = PathBuf::new();
@@ -284,8 +284,8 @@ fn inside(root: &Path, path: &Path) -> PathBuf {
     root.join(reached)
 }
 
-/// Whether a process has the master end of the terminal open, as Pinion itself. Which terminal a master belongs to
-/// is the `tty-index` of its fdinfo (proc_pid_fdinfo(5)).
+/// Whether a process has the master end of the terminal open, as Pinion itself. The `tty-index` in the fdinfo of a
+/// master names its terminal (proc_pid_fdinfo(5)).
 fn serves(proc: &Path, pid: u32, terminal: Terminal) -> bool {
     let index = format!("tty-index:\t{}", nix::sys::stat::minor(terminal.number));
     let Ok(files) = fs::read_dir(proc.join(pid.to_string()).join("fdinfo")) else { return false };
@@ -298,7 +298,7 @@ fn serves(proc: &Path, pid: u32, terminal: Terminal) -> bool {
 fn has_open(proc: &Path, pid: u32, terminal: Terminal) -> io::Result<bool> {
     for entry in fs::read_dir(proc.join(pid.to_string()).join("fd"))?.take(OPEN_FILES_MAX) {
         let file = match fs::metadata(entry?.path()) {
-            // It was closed meanwhile.
+            // The file was closed meanwhile.
             Err(error) if error.kind() == io::ErrorKind::NotFound => continue,
             file => file?,
         };
@@ -317,7 +317,7 @@ mod tests {
     use nix::unistd::ttyname;
     use std::process::{Child, Command, Stdio};
 
-    /// A terminal whose ends no process of another test inherits.
+    /// A terminal whose ends no other test's process inherits.
     fn terminal() -> (OpenptyResult, PathBuf) {
         let pty = openpty(None, None).unwrap();
         for end in [&pty.master, &pty.slave] {
@@ -331,10 +331,10 @@ mod tests {
         find(Path::new("/proc"), Terminal::of(device)?)
     }
 
-    /// A process that has the terminal open as its input, called as klippy is.
+    /// A process that has the terminal open as its input, called like klippy.
     fn host(device: &Path, script: &Path) -> Child {
         let terminal = fs::File::open(device).unwrap();
-        // A shell ignores what follows its script.
+        // A shell ignores the arguments after its script.
         let host = Command::new("/bin/sh")
             .args(["-c", "read line", "sh"])
             .arg(script)
@@ -371,7 +371,7 @@ mod tests {
     #[test]
     fn who_serves_the_terminal_is_no_host() {
         let (pty, device) = terminal();
-        // A program that has both ends open, as Pinion has while no host is there.
+        // This program has both ends open, as Pinion has while no host is there.
         let mut server = Command::new("/bin/sh")
             .args(["-c", "read line"])
             .stdin(Stdio::from(pty.slave.try_clone().unwrap()))
@@ -393,7 +393,7 @@ mod tests {
     fn a_terminal_of_the_same_number_elsewhere_is_another() {
         let (_pty, device) = terminal();
         let mut host = host(&device, Path::new("klippy.py"));
-        // A file is on another device than the terminal, whatever it is.
+        // A file is always on another device than the terminal.
         let file = tempfile::NamedTempFile::new().unwrap();
         assert_eq!(look(file.path()).unwrap(), Search::Nobody);
         host.kill().unwrap();

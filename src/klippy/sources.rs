@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Which messages a checkout of klippy looks up, from the strings in its sources.
+//! Finds the messages that a checkout of klippy looks up, from the strings in its sources.
 //!
-//! klippy writes each message that it exchanges with a micro-controller as a string with the
-//! message's name and its parameters, often in pieces:
+//! klippy writes each message that it exchanges with an MCU as a string. The string has the message's name and its
+//! parameters, often in pieces:
 //!
 //! ```python
 //! self.query_cmd = mcu.lookup_command("query_adxl345 oid=%c"
@@ -19,24 +19,24 @@ use std::time::SystemTime;
 
 use crate::foreign;
 
-/// Most that is read of a checkout: names in its folders, files, bytes of one and of all of them, messages.
-/// klippy's own come first: further ones, of a plugin that brings much along, are left out.
+/// Highest numbers that are read of a checkout: names in its folders, files, bytes of one file and of all files,
+/// messages. klippy's own come first. Further ones, of a plugin that brings much along, are left out.
 const NAMES_MAX: usize = 20_000;
 const FILES_MAX: usize = 2000;
 const FILE_BYTES_MAX: u64 = 1 << 20;
 const BYTES_MAX: u64 = 32 << 20;
 const SHAPES_MAX: usize = 10_000;
-/// klippy's own folder, `extras`, and packages in there.
+/// Highest depth of folders: klippy's own folder, `extras`, and packages in there.
 const DEPTH_MAX: usize = 3;
 
-/// A message as a host looks it up: its name and those of its parameters, in order, such as
-/// `query_adxl345 oid rest_ticks`. The conversions are left out, as klippy writes the parameters of
-/// `config_` commands with conversions of Python's.
+/// A message as a host looks it up: its name and its parameters' names, in order, such as `query_adxl345 oid
+/// rest_ticks`. The conversions are left out, because klippy writes the parameters of `config_` commands with Python's
+/// conversions.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Shape(String);
 
 impl Shape {
-    /// The shape of a format; none of a text that is no format with parameters.
+    /// The shape of a format. `None` for a text that is not a format with parameters.
     pub fn of(format: &str) -> Option<Shape> {
         let (name, parameters) = format.split_once(' ')?;
         let is_word = |word: &str| {
@@ -69,24 +69,24 @@ impl Shape {
     }
 }
 
-/// What klippy's folder holds.
+/// The contents of klippy's folder.
 #[derive(Debug)]
 pub struct Sources {
     /// The shapes of all messages.
     pub shapes: BTreeSet<Shape>,
     /// When the newest file was written.
     pub newest: SystemTime,
-    /// What could not be read, if anything: the first of it.
+    /// The first part that could not be read, if any.
     pub unread: Option<String>,
     bytes: u64,
 }
 
 impl Sources {
-    /// Reads klippy's folder, that of `klippy.py`.
+    /// Reads klippy's folder, which holds `klippy.py`.
     ///
     /// # Errors
     ///
-    /// Those of reading the folder itself. What can not be read in it is left out: it may be a plugin's.
+    /// The folder itself cannot be read. Files in it that cannot be read are left out: they may be a plugin's.
     pub fn read(klippy: &Path) -> io::Result<Sources> {
         let mut sources = Sources { shapes: BTreeSet::new(), newest: SystemTime::UNIX_EPOCH, unread: None, bytes: 0 };
         let (mut names, mut files) = (0, 0);
@@ -121,8 +121,8 @@ impl Sources {
 
     fn add(&mut self, path: &Path) -> io::Result<()> {
         let (file, metadata) = match foreign::open(path) {
-            // A link that leads nowhere is a plugin that was removed, and nothing that klippy loads. Nor
-            // does klippy load what is no file, such as a FIFO.
+            // A link that leads nowhere is a removed plugin, and klippy does not load it. klippy also does not load
+            // things that are not files, such as a FIFO.
             Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::InvalidInput) => {
                 return Ok(());
             }
@@ -151,7 +151,7 @@ impl Sources {
     }
 }
 
-/// Tells each string of a Python source, adjacent literals as one string.
+/// Passes each string of a Python source to `tell`. Adjacent literals are one string.
 fn strings(source: &[u8], mut tell: impl FnMut(&str)) {
     let mut at = 0;
     // The bytes of the literals so far, if the last token was one.
@@ -259,7 +259,8 @@ mod tests {
         let sources = Sources::read(folder.path()).unwrap();
         let shapes: Vec<&str> = sources.shapes.iter().map(Shape::as_str).collect();
         assert_eq!(shapes, ["hd44780_send_cmds oid cmds", "i2c_write oid data", "trsync_start oid report_clock"]);
-        // What can not be read (here a link that leads to itself; root may read any file) loses nothing else.
+        // A file that cannot be read loses nothing else. Here it is a link that leads to itself: root may read any
+        // file.
         let unread = sources.unread.unwrap();
         assert!(unread.contains("extras/self.py: "), "{unread}");
         assert!(Sources::read(&folder.path().join("none")).is_err());
