@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A simulated printer, put together and driven as a board.
+//! A simulated printer, assembled and driven as a board.
 
 #![forbid(unsafe_code)]
 
@@ -29,13 +29,13 @@ use super::engine::world::World;
 use super::part::workshop::Workshop;
 use super::view::SimProbe;
 
-/// The worker of the thermistors.
+/// The worker for the thermistors.
 const ADC_WORKER: &str = "adc";
-/// The worker that takes edges.
+/// The worker for the edges.
 const EDGES_WORKER: &str = "edges";
-/// The worker of the PWM channels.
+/// The worker for the PWM channels.
 const PWM_WORKER: &str = "pwm";
-/// Bytes that an SPI bus sends without a pause: as many as by the kernel's default `spidev.bufsiz`.
+/// Highest number of bytes that an SPI bus sends without a pause, as with the kernel's default `spidev.bufsiz`.
 const MESSAGE_MAX: usize = 4096;
 
 /// A simulated printer.
@@ -54,7 +54,7 @@ pub struct SimBoard {
 }
 
 impl SimBoard {
-    /// The printer of a description, at rest.
+    /// The printer of a description, in its initial state.
     pub fn new(config: SimConfig, clock: Arc<dyn TimeSource>) -> Result<SimBoard, Trouble> {
         config.validate()?;
         let printer = config.printer();
@@ -155,7 +155,7 @@ impl SimBoard {
     }
 }
 
-/// The bus with a number, or why there is none.
+/// The bus with this number, or an error.
 fn numbered<'a, T>(
     buses: &'a [Arc<T>],
     number: u32,
@@ -169,7 +169,7 @@ fn numbered<'a, T>(
         .ok_or_else(|| is_missing(&format!("{kind} bus {number}"), buses.iter().map(|bus| name(bus)), reason))
 }
 
-/// Says that there is no such thing, but these.
+/// The error for a missing bus or pin, with the names that exist.
 fn is_missing<'a>(what: &str, names: impl Iterator<Item = &'a str>, reason: ShutdownReason) -> Shutdown {
     let names: Vec<&str> = names.collect();
     let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
@@ -274,7 +274,7 @@ impl Board for SimBoard {
         Ok(Mosi { line, message_max: MESSAGE_MAX })
     }
 
-    /// Nothing is claimed for good: the parts are there whoever drives them.
+    /// No claim is permanent: the parts exist independent of the MCU.
     fn reset(&mut self) {}
 }
 

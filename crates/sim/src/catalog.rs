@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! All parts that a description may have.
+//! All parts that a description may contain.
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +11,7 @@ use super::part::{
     ssd1306, thermocouple, tmc2209, tmc5160, ws2812,
 };
 
-/// A part as the description has it: a `[[part]]`, whose key `kind` tells which of these it is.
+/// A part in the description: a `[[part]]`. Its key `kind` selects one of these.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(tag = "kind", rename_all = "lowercase")]
 pub enum PartConfig {
@@ -22,7 +22,7 @@ pub enum PartConfig {
     /// A hardware PWM channel.
     #[serde(rename = "pwm_channel")]
     PwmChannel(pwm_channel::PwmChannelConfig),
-    /// Sends back what it is sent.
+    /// Sends every byte back.
     Loopback(loopback::LoopbackConfig),
     /// A servo.
     Servo(servo::ServoConfig),
@@ -41,7 +41,7 @@ pub enum PartConfig {
     Apa102(apa102::Apa102Config),
     /// A display.
     Ssd1306(ssd1306::Ssd1306Config),
-    /// A thermocouple's or a platinum resistor's converter.
+    /// A converter for a thermocouple or a platinum resistor.
     Thermocouple(thermocouple::ThermocoupleConfig),
     /// A switch beside the nozzle.
     Probe(probe::ProbeConfig),
@@ -56,7 +56,7 @@ pub enum PartConfig {
 }
 
 impl PartConfig {
-    /// What all of them can do.
+    /// The common interface of all parts.
     pub(crate) fn part(&self) -> &dyn Part {
         match self {
             PartConfig::Adxl345(config) => config,

@@ -28,10 +28,10 @@ pub struct SimConfig {
     /// The limits of the motion in printer.cfg.
     #[serde(default)]
     pub limits: Limits,
-    /// The axes; `x`, `y`, `z` and `extruder` are those of a cartesian printer.
+    /// The axes; `x`, `y`, `z` and `extruder` make a cartesian printer.
     #[serde(default, rename = "axis")]
     pub axes: Vec<AxisConfig>,
-    /// The towers, if it is a delta printer.
+    /// The towers of a delta printer.
     pub delta: Option<DeltaConfig>,
     /// The heaters with their sensors.
     #[serde(default, rename = "heater")]
@@ -39,10 +39,10 @@ pub struct SimConfig {
     /// The fans.
     #[serde(default, rename = "fan")]
     pub fans: Vec<FanConfig>,
-    /// Lights, which the host may dim.
+    /// Lights that the host may dim.
     #[serde(default, rename = "led")]
     pub leds: Vec<LedConfig>,
-    /// Outputs that switch something that needs no simulation.
+    /// Outputs for things that need no simulation.
     #[serde(default, rename = "output")]
     pub outputs: Vec<OutputConfig>,
     /// Inputs that stay at one level: buttons, a door.
@@ -57,7 +57,7 @@ pub struct SimConfig {
     /// I2C buses.
     #[serde(default, rename = "i2c_bus")]
     pub i2c_buses: Vec<I2cBusConfig>,
-    /// Chips, probes and whatever else.
+    /// Chips, probes and other parts.
     #[serde(default, rename = "part")]
     pub parts: Vec<PartConfig>,
 }
@@ -66,7 +66,7 @@ pub struct SimConfig {
 const DEFAULT: &str = include_str!("default.toml");
 
 impl SimConfig {
-    /// The description of [`SimConfig::default_printer`], with comments: a start for one's own.
+    /// The description of [`SimConfig::default_printer`], with comments: a start for a description of your own.
     pub const fn default_toml() -> &'static str {
         DEFAULT
     }
@@ -89,7 +89,7 @@ impl SimConfig {
         SimConfig::parse(&text, &file.to_string())
     }
 
-    /// Reads a description; `origin` is how an error calls it.
+    /// Reads a description; `origin` is its name in an error.
     pub fn parse(text: &str, origin: &str) -> Result<SimConfig, Trouble> {
         let config: SimConfig = toml::from_str(text).map_err(|error| {
             let byte = error.span().map_or(0, |span| span.start);
@@ -104,7 +104,7 @@ impl SimConfig {
         Ok(config)
     }
 
-    /// What it has besides the parts.
+    /// The description without its parts.
     pub(super) fn printer(&self) -> Printer<'_> {
         Printer {
             seed: self.seed,
@@ -126,7 +126,7 @@ impl SimConfig {
     ///
     /// # Errors
     ///
-    /// The first value that is wrong, with its key and a remedy.
+    /// The first wrong value, with its key and a remedy.
     pub(super) fn validate(&self) -> Result<(), Trouble> {
         let printer = self.printer();
         let mut pins = UsedPins::default();
@@ -170,7 +170,7 @@ impl SimConfig {
             None => {}
         }
         part.validate(whose, printer)?;
-        // What stands behind the kind was named by the description, and names a section of printer.cfg.
+        // The description chose the text after the kind. It names a section of printer.cfg.
         let name = part.name();
         match name.split_once(' ') {
             Some((_, own)) if !is_word(own) => no_name(whose, own),
@@ -179,11 +179,10 @@ impl SimConfig {
     }
 }
 
-/// The key whose value has the byte `at` of the text.
+/// The key with the value that contains the byte `at` of the text.
 fn key(text: &str, at: usize) -> Option<&str> {
     let (keys, value) = text.get(..at)?.rsplit_once('=')?;
-    // If lines lie between the key and that byte, it belongs to the value only if that is a list
-    // which is not closed yet.
+    // If there are lines between the key and that byte, the byte belongs to the value only in an unclosed list.
     let open = value.matches('[').count() > value.matches(']').count();
     let goes_on = value.trim_start().starts_with('[') && open;
     if value.contains('\n') && !goes_on {

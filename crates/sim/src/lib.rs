@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The simulated printer: axes that count steps and close endstops, heaters with a mass and a
-//! thermistor, fans with a tachometer, lights, all of it described in TOML.
+//! The simulated printer, described in TOML: axes that count steps and close endstops, heaters with a mass and a
+//! thermistor, fans with a tachometer, lights.
 //!
-//! It runs under a real host in real time, and in tests in virtual time: whatever happens
-//! between two writes is solved exactly from the clock.
+//! It runs under a real host in real time, and in tests in virtual time. The state between two writes is calculated
+//! exactly from the clock.
 
 #![forbid(unsafe_code)]
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]

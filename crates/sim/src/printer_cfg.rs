@@ -15,12 +15,11 @@ mod software;
 #[cfg(test)]
 mod tests;
 
-/// The printer.cfg that matches a board, for a klippy of today's Klipper with `pty` as its serial
-/// port.
+/// The printer.cfg that matches a board, for a klippy of the current Klipper with `pty` as its serial port.
 ///
-/// The axes `x`, `y` and `z` with endstops make a cartesian printer, `z1` is one more motor of its z axis,
-/// a heater `extruder` and an axis `extruder` make its hot end; what has other names becomes a
-/// `manual_stepper`, a `heater_generic`, a `fan_generic`.
+/// The axes `x`, `y` and `z` with endstops make a cartesian printer. `z1` is another motor of its z axis. A heater
+/// `extruder` and an axis `extruder` make its hot end. Other names become a `manual_stepper`, a `heater_generic` or a
+/// `fan_generic`.
 pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
     let mut cfg = Sections::default();
     cfg.comment("Printed by Pinion for its simulated printer: every number is the simulation's.");
@@ -62,7 +61,7 @@ pub fn printer_cfg(config: &SimConfig, pty: &str) -> String {
 }
 
 impl Sections {
-    /// `[printer]`, and a section for each axis but the hot ends'.
+    /// `[printer]`, and a section for each axis except the hot ends' axes.
     fn motion(&mut self, layout: &Layout<'_>) {
         let limits = &layout.printer.limits;
         self.section("printer");
@@ -123,11 +122,11 @@ impl Sections {
             _ if layout.is_homed(name) => {
                 self.rail(axis);
                 if name == "z" {
-                    // A nozzle that is a probe goes below the endstop.
+                    // A nozzle that is a probe moves below the endstop.
                     self.key("position_min", -axis.overtravel_mm);
                 }
             }
-            // One more motor of an axis, which has the axis' other keys.
+            // Another motor of an axis. The axis has the other keys.
             _ => {}
         }
     }
@@ -142,17 +141,17 @@ impl Sections {
         self.key("angle", delta.angles_degrees[tower]);
     }
 
-    /// What levels the gantry, or the bed, by the motors of the z axis.
+    /// The section that levels the gantry, or the bed, with the motors of the z axis.
     fn leveling(&mut self, layout: &Layout<'_>) {
         let at_mm: Vec<[f64; 2]> = layout.printer.motors("z").filter_map(|motor| motor.at_mm).collect();
         if at_mm.len() < 2 {
             return;
         }
-        // As near to each motor as a probe beside the nozzle reaches.
+        // As near to each motor as a probe beside the nozzle can reach.
         let [low, high] = [1.0 - WITHIN_REACH, WITHIN_REACH].map(|share| layout.place_mm(share, share));
         let near = |at: &[f64; 2]| [0, 1].map(|axis| at[axis].clamp(low[axis], high[axis].max(low[axis])));
         match at_mm[..] {
-            // From the front left on clockwise, as klippy wants them.
+            // Clockwise from the front left, in klippy's order.
             [[x0, y0], [x1, y1], [x2, y2], [x3, y3]]
                 if x0 == x1 && x2 == x3 && x0 < x2 && y0 == y3 && y1 == y2 && y0 < y1 =>
             {
@@ -176,8 +175,8 @@ impl Sections {
         self.key("dir_pin", &axis.dir_pin);
         self.key_if("enable_pin", axis.enable_pin.as_ref());
         self.key("microsteps", axis.microsteps);
-        // klippy steps on both edges only for a driver that it sets up itself. For any other it makes a
-        // pulse, which has two edges and so is two steps of this motor.
+        // klippy steps on both edges only for a driver that it configures itself. For any other driver it makes a
+        // pulse. A pulse has two edges, so it is two steps of this motor.
         let pulses_per_mm = axis.steps_per_mm / if axis.step_both_edges { 2.0 } else { 1.0 };
         let rotation_distance = FULL_STEPS * f64::from(axis.microsteps) / pulses_per_mm;
         self.key("rotation_distance", rotation_distance);
@@ -206,7 +205,7 @@ impl Sections {
     fn heater(&mut self, heater: &HeaterConfig, layout: &Layout<'_>) {
         let fan = layout.printer.fan_of(&heater.name);
         if heater.pin.is_none() && fan.is_some() {
-            // The fan's section has its keys.
+            // The fan's section has the heater's keys.
             return;
         }
         self.section(layout.heater(heater));
@@ -285,23 +284,23 @@ impl Sections {
     }
 }
 
-/// klippy's PID parameters. 255 of each stand for full power.
+/// klippy's PID parameters. 255 means full power.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Gains {
-    /// Power for each kelvin that the heater is too cold.
+    /// Power for each kelvin below the target.
     pub(super) kp: f64,
-    /// Power for each kelvin too cold and each second that this has lasted.
+    /// Power for each kelvin below the target and each second of this deviation.
     pub(super) ki: f64,
-    /// Power for each kelvin a second at which the temperature falls.
+    /// Power for each kelvin per second by which the temperature falls.
     pub(super) kd: f64,
 }
 
 impl Gains {
-    /// The gains for a heater by the SIMC rules (Skogestad, 2003), which make the loop as quick as
-    /// its delay allows. That delay is klippy's 0.5 s and the sensor's lag: a reading is 0.15 s old on
-    /// average (klippy takes one in 0.3 s), its answer takes effect 0.3 s later, and the soft PWM's cycle
-    /// of 0.1 s adds half of that. The derivative term cancels half of the delay. Full power is reached no closer
-    /// than 2 K below the target, as a stronger gain would make power follow the sensor's noise.
+    /// The gains for a heater by the SIMC rules (Skogestad, 2003). They make the loop as quick as its delay allows. The
+    /// delay is klippy's 0.5 s and the sensor's lag. klippy's part has three terms. A reading is 0.15 s old on average
+    /// (klippy takes one every 0.3 s). klippy's answer takes effect 0.3 s later. The soft PWM's cycle of 0.1 s adds
+    /// half of that. The derivative term cancels half of the delay. Full power is reached no closer than 2 K below the
+    /// target: with a stronger gain the power would follow the sensor's noise.
     pub(super) fn of(heater: &HeaterConfig) -> Gains {
         const PID_PARAM_BASE: f64 = 255.0;
         const FINEST_BAND_K: f64 = 2.0;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a person would see of a simulated printer.
+//! A person's view of a simulated printer.
 
 #![forbid(unsafe_code)]
 
@@ -15,27 +15,27 @@ pub struct SimProbe {
     pub(super) clock: Arc<dyn TimeSource>,
 }
 
-/// An axis as it stands.
+/// The present state of an axis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AxisView<'a> {
-    /// Such as `x`.
+    /// For example `x`.
     pub name: &'a str,
-    /// Where it stands.
+    /// Its position.
     pub position_mm: f64,
-    /// It goes from 0 to here, if it ends.
+    /// The end of its travel from 0; `None` for an axis without an end.
     pub travel_mm: Option<f64>,
     /// Whether its motor is held.
     pub enabled: bool,
-    /// Whether its endstop is closed; none if it has none.
+    /// Whether its endstop is closed; `None` without an endstop.
     pub endstop: Option<bool>,
-    /// Steps that it could not go since the start.
+    /// Steps since the start that it could not make.
     pub lost_steps: u64,
 }
 
-/// A heater as it is.
+/// The present state of a heater.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeaterView<'a> {
-    /// Such as `heater_bed`.
+    /// For example `heater_bed`.
     pub name: &'a str,
     /// Temperature of the heated mass.
     pub celsius: f64,
@@ -45,28 +45,28 @@ pub struct HeaterView<'a> {
     pub on: bool,
 }
 
-/// A fan as it turns.
+/// The present state of a fan.
 #[derive(Clone, Debug, PartialEq)]
 pub struct FanView<'a> {
-    /// Such as `fan`.
+    /// For example `fan`.
     pub name: &'a str,
-    /// Revolutions in a minute.
+    /// Revolutions per minute.
     pub rpm: f64,
 }
 
 /// A light, or another output that is on or off.
 #[derive(Clone, Debug, PartialEq)]
 pub struct OutputView<'a> {
-    /// Such as `light`.
+    /// For example `light`.
     pub name: &'a str,
     /// Whether it is on.
     pub on: bool,
-    /// How bright an eye takes it for, 0 to 1: half if it is switched on and off quickly.
+    /// The brightness that an eye sees, 0 to 1. It is half if the output is switched on and off quickly.
     pub brightness: f64,
 }
 
 impl SimProbe {
-    /// The instant of the printer's clock.
+    /// The present instant of the printer's clock.
     pub fn now(&self) -> Clock {
         self.clock.now()
     }
@@ -105,8 +105,7 @@ impl SimProbe {
         lamps.map(move |lamp| OutputView { name: &lamp.name, on: lamp.is_on(), brightness: lamp.brightness(now) })
     }
 
-    /// What a person would see of the other parts at this instant: the part's name, and a line or a
-    /// picture of several lines.
+    /// A person's view of the other parts at this instant: the part's name, and a line or a picture of several lines.
     pub fn sights(&self) -> impl Iterator<Item = (&str, String)> {
         let now = self.now();
         self.world.sights.iter().map(move |sight| (sight.name(), sight.look(now)))

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The simulated board in virtual time: what its pins do to axes, heaters and fans.
+//! The simulated board in virtual time: the effect of its pins on axes, heaters and fans.
 
 #![forbid(unsafe_code)]
 
@@ -100,7 +100,7 @@ fn homing_closes_the_endstop_at_the_exact_step() {
     assert!(endstop.read().unwrap());
     assert_eq!(bench.axis("x").position_mm, 0.0);
     assert_eq!(bench.axis("x").endstop, Some(true));
-    // Back off: open at the first step.
+    // Moving back: open at the first step.
     dir.write(true).unwrap();
     pulse(&*step);
     assert!(!endstop.read().unwrap());
@@ -132,7 +132,7 @@ fn an_axis_stays_at_its_hard_limit_and_counts_lost_steps() {
     let step = bench.output("z_step", false);
     let dir = bench.output("z_dir", false);
     let _enable = bench.output("z_enable", false);
-    // From 12 mm to the end 2 mm below zero, and 7 steps more.
+    // From 12 mm to the end at 2 mm below zero, and 7 steps more.
     for _ in 0..14 * 400 + 7 {
         pulse(&*step);
     }
@@ -164,7 +164,7 @@ fn both_edges_step_if_the_description_says_so() {
     config.axes[0].step_both_edges = true;
     config.axes[1].dir_pin.inverted = true;
     let mut bench = Bench::new(config);
-    // The claim of a line is no edge, whatever its level.
+    // The claim of a line is not an edge, whatever the level of the line.
     let x_step = bench.output("x_step", true);
     let y_step = bench.output("y_step", false);
     let _enable = [bench.output("x_enable", false), bench.output("y_enable", false)];
@@ -190,7 +190,7 @@ fn a_heater_follows_the_analytic_curve() {
     let warm = |t: f64| ambient + p / l * (1.0 - (-l * t / c).exp());
     for t in 1..=90 {
         bench.advance(1.0);
-        // Looking and writing the same value change nothing.
+        // Reading, or writing the same value, changes nothing.
         power.write(true).unwrap();
         let celsius = bench.probe.heater("heater_bed").unwrap().celsius;
         assert!((celsius - warm(f64::from(t))).abs() < 1e-9, "{t} s: {celsius}");
@@ -324,7 +324,7 @@ fn a_fan_spins_up_and_its_tachometer_counts_the_turns() {
     let rpm = bench.probe.fan("fan").unwrap().rpm;
     assert!((rpm - 4500.0 * (1.0 - (-1f64).exp())).abs() < 1e-6);
     bench.advance(10.0);
-    // 4500 rpm are 75 turns, 150 pulses, 300 edges a second; klippy polls each 1.5 ms.
+    // 4500 rpm are 75 turns, 150 pulses and 300 edges a second. klippy polls every 1.5 ms.
     let mut edges = 0;
     let mut last = tachometer.read().unwrap();
     for _ in 0..20_000 {
@@ -334,7 +334,7 @@ fn a_fan_spins_up_and_its_tachometer_counts_the_turns() {
         last = level;
     }
     assert!(edges.abs_diff(300 * 30) <= 1, "{edges}");
-    // Not where a whole number of turns would leave it on an edge.
+    // Avoid a time at which a whole number of turns ends on an edge.
     bench.advance(0.001);
     fan.write(false).unwrap();
     bench.advance(10.0);
@@ -378,7 +378,7 @@ fn every_pin_has_its_own_name_and_number_and_stands_in_printer_cfg() {
     let config = SimConfig::default_printer();
     let cfg = printer_cfg(&config, "/tmp/klipper_host_mcu");
     assert!(cfg.contains("serial: /tmp/klipper_host_mcu\n"));
-    // The data output of a bus is a pin, too.
+    // The data output of a bus is also a pin.
     let buses: Vec<String> = config.spi_buses.iter().map(|bus| bus.name.clone()).collect();
     let bench = Bench::new(config);
     let pins = bench.board.pins();
@@ -396,7 +396,7 @@ fn printer_cfg_moves_as_far_as_the_board() {
     let mut config = SimConfig::default_printer();
     config.axes[1].step_both_edges = true;
     let cfg = printer_cfg(&config, "/tmp/pty");
-    // 200 full steps of 16 microsteps a turn, 80 or 400 steps a millimetre.
+    // 200 full steps of 16 microsteps per turn, 80 or 400 steps per millimeter.
     for (section, expected) in [("x", "40"), ("y", "80"), ("z", "8")] {
         let section = cfg.split(&format!("[stepper_{section}]\n")).nth(1).unwrap();
         let section = section.split("\n\n").next().unwrap();
@@ -405,8 +405,8 @@ fn printer_cfg_moves_as_far_as_the_board() {
     }
 }
 
-/// klippy's heater loop (`klippy/extras/heaters.py`: `ControlPID`, the soft PWM, its delays)
-/// around the board, with the parameters that printer.cfg has.
+/// klippy's heater loop (`klippy/extras/heaters.py`: `ControlPID`, the soft PWM, its delays) around the board, with the
+/// parameters in printer.cfg.
 #[test]
 fn klippy_holds_the_targets_and_finds_no_fault_with_the_heaters() {
     for (index, pin, sensor, target, seconds) in
@@ -433,7 +433,7 @@ fn klippy_holds_the_targets_and_finds_no_fault_with_the_heaters() {
             if (0.0..=1.0).contains(&output) {
                 integral = next_integral;
             }
-            // What klippy decides now is in force 0.3 s later.
+            // klippy's decision takes effect 0.3 s later.
             let in_force = std::mem::replace(&mut duty, output.clamp(0.0, 1.0));
             for _ in 0..3 {
                 power.write(in_force > 0.0).unwrap();
@@ -457,7 +457,7 @@ fn klippy_holds_the_targets_and_finds_no_fault_with_the_heaters() {
     }
 }
 
-/// Uses all that a printer has, with bytes that no host would send, too.
+/// Uses everything in a printer, also with bytes that no host would send.
 fn use_all(config: SimConfig) {
     let _ = printer_cfg(&config, "/tmp/pty");
     let mut bench = Bench::new(config);
@@ -482,7 +482,7 @@ fn use_all(config: SimConfig) {
                 line.read().unwrap();
             }
         }
-        // Whatever a low line selects is selected.
+        // Every chip with a low select line is selected.
         for (bus, mode) in (0..bench.board.spi_buses.len()).flat_map(|bus| [(bus, 0), (bus, 1), (bus, 3)]) {
             let config = SpiConfig { bus: bus as u32, mode, rate_hz: 1_000_000, chip_select: None };
             let OnWorker { mut device, .. } = bench.board.spi(config).unwrap();
@@ -494,9 +494,9 @@ fn use_all(config: SimConfig) {
         let addresses: &[u8] = if bench.board.i2c_buses.is_empty() { &[] } else { &[42, 60] };
         for address in addresses.iter().copied() {
             let OnWorker { mut device, .. } = bench.board.i2c(I2cConfig { bus: 0, address, rate_hz: 400_000 }).unwrap();
-            // What the coil's chip measured since it was woken, with a drive current that was told; then anything.
+            // The measurement of the coil's chip since its wake-up, with a given drive current; then anything.
             for message in [&[0x00][..], &[0x1e, 0x80, 0x00], &[0x1a, 0x16, 0x01], &[0x7f, 0xff, 0xff, 0xff], &[]] {
-                // Where the address is the number that was changed, nobody answers.
+                // If the changed number is the address, no chip answers.
                 let _ = device.write_read(message, &mut [0; 3]);
                 let _ = device.write_read(message, &mut []);
             }
@@ -517,7 +517,7 @@ fn no_number_of_a_description_makes_it_panic() {
     assert!(used > 30, "{used}");
 }
 
-/// Uses a printer with other values for each of its numbers, behind this text. Tells how many printers that were.
+/// Uses a printer with other values for each number after this text. Returns the number of printers.
 fn use_with_each_number(toml: &str, behind: &str) -> u32 {
     let lines: Vec<&str> = toml.lines().collect();
     let first = lines.iter().position(|line| line.contains(behind)).unwrap();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The description: what is refused, and how; and that its documentation is complete.
+//! The description: the refused values and their errors, and whether its documentation is complete.
 
 #![forbid(unsafe_code)]
 
@@ -17,7 +17,7 @@ fn error_of(from: &str, to: &str) -> String {
 
 const DOCUMENTATION: &str = include_str!("../../../../docs/guide/simulator.md");
 
-/// An example of the documentation: by itself, or appended to the built-in description as it says.
+/// An example of the documentation: alone, or appended to the built-in description as the example says.
 pub(crate) fn example(heading: &str) -> String {
     let (_, section) = DOCUMENTATION.split_once(&format!("\n### {heading}\n")).unwrap();
     let (_, example) = section.split_once("\n```toml\n").unwrap();
@@ -131,7 +131,7 @@ fn what_the_examples_have_is_checked_as_well() {
     }
 }
 
-/// The words that an error offers for one that nobody knows.
+/// The words that an error offers instead of an unknown word.
 fn offered(toml: &str) -> Vec<String> {
     let Err(error) = SimConfig::parse(toml, "my.toml") else { panic!("accepted {toml}") };
     let error = error.to_string();
@@ -173,7 +173,7 @@ fn the_documentation_has_every_kind_and_every_key() {
     assert!(kinds.len() > 10, "{kinds:?}");
     for kind in kinds {
         let keys = offered(&format!("[[part]]\nkind = \"{kind}\"\nnobody = 1"));
-        // Of a chip's place on its bus the chapter's head tells.
+        // The head of the chapter describes the keys for a chip's bus.
         let own = keys.iter().filter(|key| !["bus", "select_pin"].contains(&key.as_str()));
         own.for_each(|key| has(&format!("### {kind}"), key));
     }

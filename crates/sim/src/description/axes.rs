@@ -7,7 +7,7 @@ use serde::Deserialize;
 
 use super::pin::PinName;
 
-/// The end of an axis at which its endstop sits.
+/// The end of an axis with its endstop.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
 #[serde(rename_all = "lowercase")]
 pub enum End {
@@ -17,43 +17,43 @@ pub enum End {
     Max,
 }
 
-/// A stepper motor and what it moves.
+/// A stepper motor and its axis.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct AxisConfig {
-    /// Such as `x`.
+    /// For example `x`.
     pub name: String,
     /// The step pin. Each rising edge is a step.
     pub step_pin: PinName,
     /// The direction pin. While it is high, steps count up.
     pub dir_pin: PinName,
-    /// The motor is held, and steps, only while this is high. Without this pin it always is.
+    /// The motor is held, and steps, only while this pin is high. Without this pin it is always held.
     pub enable_pin: Option<PinName>,
-    /// Whether the falling edge of the step pin is a step too.
+    /// Whether the falling edge of the step pin is also a step.
     #[serde(default)]
     pub step_both_edges: bool,
-    /// Steps in a millimetre.
+    /// Steps per millimeter.
     pub steps_per_mm: f64,
-    /// Microsteps in a full step, for printer.cfg. The motor has 200 full steps in a turn.
+    /// Microsteps per full step, for printer.cfg. The motor has 200 full steps per turn.
     #[serde(default = "default_microsteps")]
     pub microsteps: u32,
-    /// The axis goes from 0 to here. Without this it has no end.
+    /// The axis moves from 0 to this position. Without this key it has no end.
     pub travel_mm: Option<f64>,
-    /// How far beyond either end of its travel the axis goes before it hits something and loses steps.
+    /// How far beyond either end of its travel the axis moves before it hits something and loses steps.
     #[serde(default = "default_overtravel_mm")]
     pub overtravel_mm: f64,
-    /// The position of the axis at first.
+    /// The initial position of the axis.
     #[serde(default)]
     pub start_mm: f64,
     /// The endstop's pin. It is high while the axis is at that end of its travel or beyond.
     pub endstop_pin: Option<PinName>,
-    /// The end of the travel at which the endstop sits.
+    /// The end of the travel with the endstop.
     #[serde(default = "default_end")]
     pub endstop_at: End,
     /// Speed of homing, for printer.cfg.
     #[serde(default = "default_homing_mm_per_s")]
     pub homing_mm_per_s: f64,
-    /// Where on the bed a motor of the z axis holds the gantry, or the bed: x and y.
+    /// The place on the bed where a motor of the z axis holds the gantry, or the bed: x and y.
     pub at_mm: Option<[f64; 2]>,
 }
 
@@ -73,18 +73,18 @@ fn default_homing_mm_per_s() -> f64 {
     5.0
 }
 
-/// A delta printer: three towers around the bed, whose carriages hold the nozzle by arms. The carriages
-/// are the axes `a`, `b` and `c`, at 0 where the arms would lie flat on the bed.
+/// A delta printer: three towers around the bed. Their carriages hold the nozzle by arms. The carriages are the axes
+/// `a`, `b` and `c`. A carriage is at 0 where the arms would lie flat on the bed.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct DeltaConfig {
-    /// What the arms span, seen from above, while the nozzle is in the middle of the bed.
+    /// Horizontal length of the arms while the nozzle is in the middle of the bed.
     pub radius_mm: f64,
     /// The length of the arms.
     pub arm_mm: f64,
     /// From the middle of the bed to its edge.
     pub bed_radius_mm: f64,
-    /// The directions in which the towers a, b and c stand, counted from the x axis towards the y axis.
+    /// The directions of the towers a, b and c, counted from the x axis toward the y axis.
     #[serde(default = "default_angles_degrees")]
     pub angles_degrees: [f64; 3],
 }
@@ -97,12 +97,12 @@ impl DeltaConfig {
     /// The axes of the carriages.
     pub(crate) const TOWERS: [&'static str; 3] = ["a", "b", "c"];
 
-    /// How high the carriages are while the nozzle is on the bed's middle.
+    /// The height of the carriages while the nozzle is on the middle of the bed.
     pub(crate) fn lowest_mm(&self) -> f64 {
         (self.arm_mm * self.arm_mm - self.radius_mm * self.radius_mm).max(0.0).sqrt()
     }
 
-    /// Where the towers stand: x and y.
+    /// The positions of the towers: x and y.
     pub(crate) fn towers_mm(&self) -> [[f64; 2]; 3] {
         self.angles_degrees.map(|degrees| {
             let (sine, cosine) = degrees.to_radians().sin_cos();
@@ -136,14 +136,14 @@ impl Default for Limits {
     }
 }
 
-/// The shape of the bed; its middle is at 0.
+/// The shape of the bed. Its middle is at 0.
 #[derive(Clone, Debug, Default, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields, default)]
 pub struct BedConfig {
-    /// How much higher it is at the end of the x axis than at its start.
+    /// How much higher the bed is at the end of the x axis than at its start.
     pub x_slope_mm: f64,
-    /// How much higher it is at the end of the y axis than at its start.
+    /// How much higher the bed is at the end of the y axis than at its start.
     pub y_slope_mm: f64,
-    /// How much lower it is at the corners than in the middle.
+    /// How much lower the bed is at the corners than in the middle.
     pub bow_mm: f64,
 }

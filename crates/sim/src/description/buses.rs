@@ -14,15 +14,15 @@ use super::pin::PinName;
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SpiBusConfig {
-    /// The name that the board publishes, such as `spidev0.0`.
+    /// The name that the board publishes, for example `spidev0.0`.
     pub name: String,
     /// How long each transfer takes.
     #[serde(default)]
     pub delay_us: u64,
-    /// A file that gets a line for each transfer: the chips that were selected, the bytes both
-    /// ways, the levels of `trace_pins` at each byte.
+    /// A file for the trace, with one line per transfer: the selected chips, the bytes in both directions, the levels
+    /// of `trace_pins` at each byte.
     pub trace_file: Option<PathBuf>,
-    /// The pins of `[[led]]` and `[[output]]` whose levels are to be in the trace.
+    /// The pins of `[[led]]` and `[[output]]` with levels in the trace.
     #[serde(default)]
     pub trace_pins: Vec<String>,
 }
@@ -31,7 +31,7 @@ pub struct SpiBusConfig {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct I2cBusConfig {
-    /// The name that the board publishes, such as `i2c.1`.
+    /// The name that the board publishes, for example `i2c.1`.
     pub name: String,
     /// How long each transfer takes.
     #[serde(default)]
@@ -39,12 +39,12 @@ pub struct I2cBusConfig {
 }
 
 impl SpiBusConfig {
-    /// Its data output as a pin, which has the bus's own name, as on a Linux board.
+    /// Its data output as a pin. The pin has the bus's name, as on a Linux board.
     pub(crate) fn mosi_pin(&self) -> PinName {
         PinName { name: self.name.clone(), inverted: false }
     }
 
-    /// The error of a `trace_file` that can not be made.
+    /// The error for a `trace_file` that cannot be created.
     pub(crate) fn no_trace_file(&self, error: &std::io::Error) -> Trouble {
         fault(
             &format!("spi_bus `{}`", self.name),

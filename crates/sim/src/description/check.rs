@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What is checked of any value, and the trouble with one that is wrong.
+//! The checks for any value, and the error for a wrong value.
 
 #![forbid(unsafe_code)]
 
@@ -9,19 +9,19 @@ pub(crate) use pinion_firmware::trouble::Trouble;
 
 use super::pin::{PinName, is_word};
 
-/// The range that a number must be in.
+/// The allowed range of a number.
 pub(crate) enum Bound {
     Any,
     NotNegative,
     AboveZero,
 }
 
-/// The pins that have a use already, by name.
+/// The pins that are already in use, by name.
 #[derive(Default)]
 pub(crate) struct UsedPins(HashSet<String>);
 
 impl UsedPins {
-    /// Uses a pin, if there is one; fails if it has a use already.
+    /// Marks a pin as used, if there is one. Fails if the pin is already in use.
     pub(crate) fn claim(&mut self, whose: &str, key: &str, pin: Option<&PinName>) -> Result<(), Trouble> {
         match pin {
             Some(pin) if !self.0.insert(pin.name.clone()) => {
@@ -32,7 +32,7 @@ impl UsedPins {
     }
 }
 
-/// Checks that the parts of a kind have names, and that no two share one.
+/// Checks that all parts of a kind have names, and that the names are unique.
 pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>) -> Result<(), Trouble> {
     let mut seen = HashSet::new();
     names.try_for_each(|name| {
@@ -46,12 +46,12 @@ pub(crate) fn unique<'a>(kind: &str, mut names: impl Iterator<Item = &'a String>
     })
 }
 
-/// The error of a name that klippy would not take.
+/// The error for a name that klippy would not accept.
 pub(crate) fn no_name(whose: &str, name: &str) -> Result<(), Trouble> {
     wrong(whose, "name", &format!("`{name}` is no name"), "use letters, digits, `_`, `-`, `.` and `/`")
 }
 
-/// Checks that something of this name is in the description; `kind` is its table.
+/// Checks that the description has an entry with this name; `kind` is its table.
 pub(crate) fn there_is<'a>(
     whose: &str,
     key: &str,
@@ -75,13 +75,13 @@ pub(crate) fn wrong(whose: &str, key: &str, cause: &str, remedy: &str) -> Result
     Err(fault(whose, key, cause, remedy))
 }
 
-/// Larger numbers describe no printer, and could overflow a position or a time.
+/// Highest number in a description. A larger number describes no printer, and could overflow a position or a time.
 const MAX_NUMBER: f64 = 1e9;
 
-/// The lights of the longest strip.
+/// Highest number of lights in a strip.
 const MAX_LIGHTS: u32 = 1000;
 
-/// Checks how many lights a strip has.
+/// Checks the number of lights of a strip.
 pub(crate) fn check_lights(whose: &str, count: u32) -> Result<(), Trouble> {
     check(whose, "count", count.into(), Bound::AboveZero)?;
     if count > MAX_LIGHTS {
@@ -101,7 +101,7 @@ pub(crate) fn check(whose: &str, key: &str, value: f64, bound: Bound) -> Result<
     wrong(whose, key, &format!("{value} {fault}"), "set a value of the printer's")
 }
 
-/// Checks where a probe stands from the nozzle.
+/// Checks a probe's offsets from the nozzle.
 pub(crate) fn check_offsets(whose: &str, offsets_mm: [f64; 3]) -> Result<(), Trouble> {
     let mut keys = ["x_offset_mm", "y_offset_mm", "z_offset_mm"].into_iter().zip(offsets_mm);
     keys.try_for_each(|(key, mm)| check(whose, key, mm, Bound::Any))

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The default printer without its parts, for the tests of what a part is made of.
+//! The default printer without its parts, for the tests of the engine and of the parts.
 
 #![forbid(unsafe_code)]
 

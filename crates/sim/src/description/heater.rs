@@ -13,9 +13,9 @@ use super::thermistor::{NoThermistor, Thermistor};
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct HeaterConfig {
-    /// Such as `extruder` or `heater_bed`.
+    /// For example `extruder` or `heater_bed`.
     pub name: String,
-    /// Power is on while this is high; always, if left out.
+    /// Power is on while this pin is high. Without this pin it is always on.
     pub pin: Option<PinName>,
     /// The ADC channel of the thermistor.
     pub sensor_pin: PinName,
@@ -23,7 +23,7 @@ pub struct HeaterConfig {
     pub heater_watts: f64,
     /// Heat capacity of the heated mass.
     pub heat_capacity_j_per_k: f64,
-    /// Heat lost to the surroundings for each kelvin above them.
+    /// Heat loss to the surroundings for each kelvin above them.
     pub loss_w_per_k: f64,
     /// Time constant with which the sensor follows the heated mass; 0 means at once.
     #[serde(default)]
@@ -31,17 +31,17 @@ pub struct HeaterConfig {
     /// Temperature of the surroundings.
     #[serde(default = "default_ambient_celsius")]
     pub ambient_celsius: f64,
-    /// Temperature at first. Without this it is that of the surroundings.
+    /// Initial temperature. Without this key it is the temperature of the surroundings.
     pub start_celsius: Option<f64>,
-    /// `min_temp` in printer.cfg: below this the host stops.
+    /// `min_temp` in printer.cfg: the host stops below this temperature.
     #[serde(default)]
     pub min_celsius: f64,
-    /// `max_temp` in printer.cfg: above this the host stops.
+    /// `max_temp` in printer.cfg: the host stops above this temperature.
     pub max_celsius: f64,
     /// Standard deviation of a reading, in counts of the ADC.
     #[serde(default)]
     pub noise_counts: f64,
-    /// Resistor from the ADC's input to its reference.
+    /// The pull-up resistor from the ADC's input to its reference.
     #[serde(default = "default_pullup_ohm")]
     pub pullup_ohm: f64,
     /// The thermistor's resistance at one temperature (with `beta_k`) or at three.
@@ -58,19 +58,19 @@ fn default_pullup_ohm() -> f64 {
     4700.0
 }
 
-/// A fan that takes its time to spin up and down.
+/// A fan that needs time to spin up and down.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct FanConfig {
-    /// Such as `fan`, which is the part's cooling fan.
+    /// For example `fan`, which is the part cooling fan.
     pub name: String,
-    /// Power is on while this is high.
+    /// Power is on while this pin is high.
     pub pin: PinName,
-    /// A second pin that must be high, too, for the fan to have power.
+    /// A second pin that must also be high for the fan to have power.
     pub enable_pin: Option<PinName>,
     /// An input that is high for the first half of each pulse of the tachometer.
     pub tachometer_pin: Option<PinName>,
-    /// Pulses of the tachometer in a revolution.
+    /// Pulses of the tachometer per revolution.
     #[serde(default = "default_pulses_per_revolution")]
     pub pulses_per_revolution: u32,
     /// Speed at full power.
@@ -78,10 +78,9 @@ pub struct FanConfig {
     /// Time constant with which the speed follows the power.
     #[serde(default = "default_spin_up_s")]
     pub spin_up_s: f64,
-    /// The heater that it blows at.
+    /// The heater that the fan cools.
     pub cools: Option<String>,
-    /// What that loses while the fan has power, for each kelvin above the surroundings and beyond what it
-    /// loses without.
+    /// Additional heat loss of that heater while the fan has power, for each kelvin above the surroundings.
     #[serde(default)]
     pub cooling_w_per_k: f64,
 }
@@ -95,7 +94,7 @@ fn default_spin_up_s() -> f64 {
 }
 
 impl HeaterConfig {
-    /// The temperature at first, in °C.
+    /// The initial temperature, in °C.
     pub(crate) fn start_celsius(&self) -> f64 {
         self.start_celsius.unwrap_or(self.ambient_celsius)
     }
@@ -104,7 +103,7 @@ impl HeaterConfig {
     ///
     /// # Errors
     ///
-    /// The key whose values no thermistor has, and a remedy.
+    /// The key with values that no thermistor has, and a remedy.
     pub fn thermistor(&self) -> Result<Thermistor, Trouble> {
         const POINTS: &str = "points_celsius_ohm";
         Thermistor::new(&self.points_celsius_ohm, self.beta_k, self.pullup_ohm).map_err(|why| {

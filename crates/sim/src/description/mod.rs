@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The words of descriptions, and what is checked of them. It names neither the engine nor a part.
+//! The types of descriptions, and their checks. It names neither the engine nor a part.
 
 #![forbid(unsafe_code)]
 

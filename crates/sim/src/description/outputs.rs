@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The lights of a description, and whatever else is on or off.
+//! The lights of a description, and the other outputs that are on or off.
 
 #![forbid(unsafe_code)]
 
@@ -7,13 +7,13 @@ use serde::Deserialize;
 
 use super::pin::PinName;
 
-/// A light of one to four colours.
+/// A light of one to four colors.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct LedConfig {
-    /// Such as `light`.
+    /// For example `light`.
     pub name: String,
-    /// A light that is on while high; of one with colours, its white part.
+    /// A light that is on while this pin is high; the white part of a light with colors.
     pub pin: Option<PinName>,
     /// Its red part.
     pub red_pin: Option<PinName>,
@@ -35,11 +35,11 @@ impl LedConfig {
     }
 }
 
-/// An output that switches something that needs no simulation.
+/// An output for something that needs no simulation.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct OutputConfig {
-    /// Such as `light`.
+    /// For example `light`.
     pub name: String,
     /// On while high.
     pub pin: PinName,
@@ -49,7 +49,7 @@ pub struct OutputConfig {
 #[derive(Clone, Debug, PartialEq, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct InputConfig {
-    /// Such as `door`.
+    /// For example `door`.
     pub name: String,
     /// The input.
     pub pin: PinName,

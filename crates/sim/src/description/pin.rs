@@ -7,7 +7,7 @@ use std::fmt;
 
 use serde::Deserialize;
 
-/// A pin as the description names it: `x_step`, or `!x_step` for an inverted one.
+/// A pin's name in the description: `x_step`, or `!x_step` for an inverted pin.
 #[derive(Clone, Debug, PartialEq, Eq, Deserialize)]
 #[serde(try_from = "String")]
 pub struct PinName {
@@ -42,7 +42,7 @@ impl fmt::Display for PinName {
     }
 }
 
-/// Whether klippy takes `text` as the name of a pin or of a section.
+/// Whether klippy accepts `text` as the name of a pin or of a section.
 pub(crate) fn is_word(text: &str) -> bool {
     !text.is_empty() && text.chars().all(|c| c.is_ascii_alphanumeric() || "_-./".contains(c))
 }

@@ -10,7 +10,7 @@ use super::heater::{FanConfig, HeaterConfig};
 use super::outputs::{InputConfig, LedConfig, OutputConfig};
 use super::pin::PinName;
 
-/// What a description has besides the parts: all that a part may know of its printer.
+/// A description without its parts: everything that a part may know of its printer.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Printer<'a> {
     pub(crate) seed: u64,
@@ -30,11 +30,11 @@ pub(crate) struct Printer<'a> {
 /// How the axes move the head.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Kinematics<'a> {
-    /// `x`, `y` and `z` with endstops, each for itself.
+    /// `x`, `y` and `z` with endstops, each independent.
     Cartesian,
     /// `a`, `b` and `c` together.
     Delta(&'a DeltaConfig),
-    /// Each is a motor, and no more.
+    /// Each axis is only a motor.
     None,
 }
 
@@ -64,7 +64,7 @@ impl<'a> Printer<'a> {
         }
     }
 
-    /// The motors of a rail, such as `z`, `z1` and `z2`.
+    /// The motors of a rail, for example `z`, `z1` and `z2`.
     pub(crate) fn motors(&self, rail: &str) -> impl Iterator<Item = &'a AxisConfig> {
         in_a_row(rail, |name| self.axis(name))
     }
@@ -80,17 +80,17 @@ impl<'a> Printer<'a> {
         leds.chain(self.outputs.iter().map(|output| &output.pin))
     }
 
-    /// The fan that cools a heater, if there is one.
+    /// The fan that cools a heater; `None` if there is no such fan.
     pub(crate) fn fan_of(&self, heater: &str) -> Option<&'a FanConfig> {
         self.fans.iter().find(|fan| fan.cools.as_deref() == Some(heater))
     }
 
-    /// Checks that there is the axis that a part's key `axis` names.
+    /// Checks that the axis in a part's key `axis` exists.
     pub(crate) fn check_axis(&self, whose: &str, axis: &str) -> Result<(), Trouble> {
         there_is(whose, "axis", axis, self.axes.iter().map(|axis| &axis.name), "[[axis]]")
     }
 
-    /// Checks that there is the heater that a part's key `heater` names.
+    /// Checks that the heater in a part's key `heater` exists.
     pub(crate) fn check_heater(&self, whose: &str, heater: &str) -> Result<(), Trouble> {
         there_is(whose, "heater", heater, self.heaters.iter().map(|heater| &heater.name), "[[heater]]")
     }
@@ -104,7 +104,8 @@ impl<'a> Printer<'a> {
     }
 }
 
-/// What is called `first`, and the same with 1, 2 and so on behind it until one is missing, as klippy looks for it.
+/// The element called `first`, then the same name with 1, 2 and so on until one is missing. klippy searches in this
+/// way.
 fn in_a_row<T>(first: &str, find: impl Fn(&str) -> Option<T>) -> impl Iterator<Item = T> {
     let name = move |n| if n == 0 { first.to_owned() } else { format!("{first}{n}") };
     (0..).map_while(move |n| find(&name(n)))

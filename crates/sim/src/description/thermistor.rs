@@ -1,11 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A thermistor below a pull-up resistor, read by a 12-bit ADC.
 //!
-//! The equations are klippy's (`klippy/extras/thermistor.py`), so that the host reads back the
-//! temperature that was put in:
+//! The equations are klippy's (`klippy/extras/thermistor.py`), so the host reads back the simulated temperature:
 //!
-//! - Steinhart and Hart, 1968: `1/T = c1 + c2 ln R + c3 (ln R)^3`; a beta is `c3 = 0`,
-//!   `c2 = 1/beta`
+//! - Steinhart and Hart, 1968: `1/T = c1 + c2 ln R + c3 (ln R)^3`; a beta means `c3 = 0`, `c2 = 1/beta`
 //! - its inverse by Cardano's formula
 //! - the divider: `R / (pull-up + R)` of the reference
 
@@ -15,7 +13,7 @@ use pinion_firmware::board::ADC_MAX;
 
 /// 0 °C in kelvin.
 pub(crate) const KELVIN: f64 = 273.15;
-/// Highest temperature that a reading stands for: a short circuit counts as this hot.
+/// Highest temperature of a reading. A short circuit counts as this hot.
 const HOTTEST_KELVIN: f64 = 1000.0;
 
 /// The coefficients of a thermistor, and its pull-up resistor.
@@ -27,25 +25,25 @@ pub struct Thermistor {
     pullup_ohm: f64,
 }
 
-/// Why points and a beta describe no thermistor.
+/// Why points and a beta do not describe a thermistor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum NoThermistor {
     /// A point is at or below 0 K or 0 ohm, or not a finite number.
     PointOutOfRange,
     /// The beta is at or below 0 K, or not a finite number.
     BetaOutOfRange,
-    /// One point, and no beta.
+    /// One point without a beta.
     BetaMissing,
-    /// A beta, and another number of points than one.
+    /// A beta with any number of points except one.
     PointsBesideBeta,
-    /// No beta, and another number of points than three.
+    /// No beta, and any number of points except three.
     PointCount,
-    /// No curve of a thermistor passes through these three points.
+    /// No thermistor's curve passes through these three points.
     PointsOnNoCurve,
 }
 
 impl Thermistor {
-    /// A thermistor by its resistance at three temperatures, or at one and its beta.
+    /// A thermistor from its resistance at three temperatures, or at one temperature with its beta.
     ///
     /// `points_celsius_ohm` are pairs of a temperature in °C and a resistance in ohm; `beta_k` is in
     /// kelvin.
@@ -106,14 +104,14 @@ impl Thermistor {
         let fraction = fraction.clamp(0.000_01, 0.999_99);
         let ln_ohm = (self.pullup_ohm * fraction / (1.0 - fraction)).ln();
         let inverse = self.c1 + self.c2 * ln_ohm + self.c3 * ln_ohm.powi(3);
-        // A short circuit would come out as a negative inverse.
+        // Without the limit a short circuit would give a negative inverse.
         1.0 / inverse.max(1.0 / HOTTEST_KELVIN) - KELVIN
     }
 
-    /// What the ADC reads at a temperature: 0 to [`ADC_MAX`] counts, with `noise_counts` added.
+    /// The ADC's reading at a temperature: 0 to [`ADC_MAX`] counts, with `noise_counts` added.
     pub(crate) fn counts(&self, celsius: f64, noise_counts: f64) -> u16 {
         let max = f64::from(ADC_MAX);
-        // The clamp keeps the value within what a u16 holds, so the cast loses nothing.
+        // The clamp keeps the value in the range of a u16, so the cast loses nothing.
         (self.fraction(celsius) * max + noise_counts).round().clamp(0.0, max) as u16
     }
 }
@@ -122,7 +120,7 @@ impl Thermistor {
 mod tests {
     use super::*;
 
-    /// klippy's `calc_temp`, for the way back.
+    /// klippy's `calc_temp`, for the conversion back.
     fn calc_temp(thermistor: &Thermistor, counts: f64) -> f64 {
         let adc = counts / f64::from(ADC_MAX);
         let ln_r = (thermistor.pullup_ohm * adc / (1.0 - adc)).ln();
@@ -130,9 +128,9 @@ mod tests {
         1.0 / inv_t - KELVIN
     }
 
-    /// A hot end's thermistor, by three points.
+    /// A hot end's thermistor, defined by three points.
     const HOT_END: &[(f64, f64)] = &[(25.0, 100_000.0), (150.0, 1641.9), (250.0, 226.15)];
-    /// A bed's thermistor, by one point and this beta.
+    /// A bed's thermistor, defined by one point and this beta.
     const BED: &[(f64, f64)] = &[(25.0, 100_000.0)];
     const BED_BETA_K: f64 = 3950.0;
     const PULLUP_OHM: f64 = 4700.0;

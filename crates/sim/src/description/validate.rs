@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Whether the values of a description make a printer. An error names the first one that is wrong, and a remedy.
+//! Checks that the values of a description make a printer. An error names the first wrong value and a remedy.
 
 #![forbid(unsafe_code)]
 
@@ -16,7 +16,7 @@ impl Printer<'_> {
     ///
     /// # Errors
     ///
-    /// The first value that is wrong, with its key and a remedy.
+    /// The first wrong value, with its key and a remedy.
     pub(crate) fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
         self.limits.validate()?;
         unique("[[axis]]", self.axes.iter().map(|axis| &axis.name))?;
@@ -49,7 +49,7 @@ impl Printer<'_> {
         self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)
     }
 
-    /// Checks where the motors of the z axis hold what they lift.
+    /// Checks the places where the motors of the z axis hold the gantry or the bed.
     fn validate_places(&self) -> Result<(), Trouble> {
         let is_cartesian = self.kinematics() == Kinematics::Cartesian;
         let motors: Vec<&AxisConfig> = self.motors("z").filter(|_| is_cartesian).collect();
@@ -134,7 +134,7 @@ impl LedConfig {
 }
 
 impl AxisConfig {
-    /// Checks the axis by itself, and that its pins are free.
+    /// Checks the axis alone, and that its pins are free.
     fn validate(&self, pins: &mut UsedPins) -> Result<(), Trouble> {
         use Bound::{AboveZero, Any, NotNegative};
         let whose = &format!("axis `{}`", self.name);
@@ -201,7 +201,7 @@ impl FanConfig {
 }
 
 impl SpiBusConfig {
-    /// Checks the bus, and that the pins to trace are outputs of the printer.
+    /// Checks the bus, and that the trace pins are outputs of the printer.
     fn validate(&self, printer: &Printer<'_>) -> Result<(), Trouble> {
         let whose = &format!("spi_bus `{}`", self.name);
         check(whose, "delay_us", self.delay_us as f64, Bound::NotNegative)?;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Which of klippy's sections a printer has, and where its bed is for klippy.
+//! The printer's sections in klippy, and the place of its bed for klippy.
 
 #![forbid(unsafe_code)]
 
@@ -8,13 +8,13 @@ use std::fmt::{self, Display};
 use crate::description::heater::HeaterConfig;
 use crate::description::printer::{Kinematics, Printer};
 
-/// Full steps in a turn of the usual stepper motor.
+/// Full steps per turn of the usual stepper motor.
 pub(crate) const FULL_STEPS: f64 = 200.0;
 
 /// The second carriage of the x axis.
 pub(crate) const DUAL_CARRIAGE: &str = "dual_carriage";
 
-/// Which of klippy's sections the axes belong to.
+/// Maps the axes to klippy's sections.
 pub(crate) struct Layout<'a> {
     pub(crate) printer: Printer<'a>,
     pub(crate) kinematics: Kinematics<'a>,
@@ -30,7 +30,7 @@ impl<'a> Layout<'a> {
         self.kinematics != Kinematics::None
     }
 
-    /// Whether an axis has klippy's keys of an axis that is homed.
+    /// Whether an axis has klippy's keys for a homed axis.
     pub(crate) fn is_homed(&self, axis: &str) -> bool {
         self.kinematics == Kinematics::Cartesian
             && (self.kinematics.rails().contains(&axis) || self.is_dual_carriage(axis))
@@ -41,12 +41,12 @@ impl<'a> Layout<'a> {
         self.kinematics == Kinematics::Cartesian && config.is_some_and(|axis| axis.endstop_pin.is_some())
     }
 
-    /// Whether there is a hot end of this name: klippy has its heater and its stepper in one section.
+    /// Whether there is a hot end with this name. klippy has its heater and its stepper in one section.
     pub(crate) fn is_hot_end(&self, name: &str) -> bool {
         self.printer.hot_ends().any(|heater| heater.name == name)
     }
 
-    /// The section of an axis' stepper.
+    /// The section of an axis's stepper.
     pub(crate) fn stepper(&self, axis: &str) -> String {
         let is_of = |rail: &&str| self.printer.motors(rail).any(|motor| motor.name == axis);
         if self.kinematics.rails().iter().any(is_of) {
@@ -58,7 +58,7 @@ impl<'a> Layout<'a> {
         }
     }
 
-    /// The section of a heater, or of the sensor in what nobody switches.
+    /// The section of a heater. For a heater without a pin it is the section of a sensor.
     pub(crate) fn heater(&self, heater: &HeaterConfig) -> String {
         match heater.name.as_str() {
             "heater_bed" => "heater_bed".to_owned(),
@@ -68,17 +68,17 @@ impl<'a> Layout<'a> {
         }
     }
 
-    /// A place on the bed: 0 is where x and y start, 1 is where they end.
+    /// A place on the bed: 0 is the start of x and y, 1 is the end.
     pub(crate) fn place_mm(&self, x: f64, y: f64) -> [f64; 2] {
         let travel_mm = |name| self.printer.axis(name).and_then(|axis| axis.travel_mm).unwrap_or(0.0);
         match self.kinematics {
-            // The square in the circle.
+            // The inscribed square of the circle.
             Kinematics::Delta(delta) => [x, y].map(|share| (2.0 * share - 1.0) * delta.bed_radius_mm / 2f64.sqrt()),
             _ => [x * travel_mm("x"), y * travel_mm("y")],
         }
     }
 
-    /// The highest that the nozzle goes.
+    /// The highest position of the nozzle.
     pub(crate) fn height_mm(&self) -> f64 {
         let travel_mm = |name| self.printer.axis(name).and_then(|axis| axis.travel_mm).unwrap_or(0.0);
         match self.kinematics {
@@ -88,17 +88,17 @@ impl<'a> Layout<'a> {
     }
 }
 
-/// What a probe beside the nozzle reaches: up to this share of the bed, and from the rest of it on.
+/// The reach of a probe beside the nozzle: up to this share of the bed, and from the remaining share on.
 pub(crate) const WITHIN_REACH: f64 = 0.8;
-/// Above the bed by so much no probe touches it.
+/// A height above the bed at which no probe touches it.
 pub(crate) const CLEAR_MM: f64 = 5.0;
 
-/// To a micrometre, without what a fraction of two adds.
+/// Rounds to a micrometer, without the rest of a binary fraction.
 pub(crate) fn rounded(mm: f64) -> f64 {
     (mm * 1000.0).round() / 1000.0 + 0.0
 }
 
-/// A place on the bed, as klippy reads it.
+/// A place on the bed, in klippy's format.
 pub(crate) struct Place(pub(crate) [f64; 2]);
 
 impl Display for Place {

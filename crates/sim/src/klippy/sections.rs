@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A printer.cfg as it is written.
+//! A printer.cfg while it is written.
 
 #![forbid(unsafe_code)]
 
@@ -9,33 +9,32 @@ use super::layout::{CLEAR_MM, Layout, Place, WITHIN_REACH, rounded};
 use crate::description::pin::PinName;
 use crate::description::printer::Kinematics;
 
-/// A printer.cfg as it grows.
+/// A printer.cfg that grows.
 #[derive(Default)]
 pub(crate) struct Sections {
     pub(crate) text: String,
-    /// Whether what comes is only offered: a `#` stands before each line.
+    /// Whether the next lines are only offered: each of them begins with `#`.
     offered: bool,
-    /// Whether there is a section of a probe, of which klippy takes one.
+    /// Whether there is a section of a probe already. klippy accepts one.
     pub(crate) has_probe: bool,
 }
 
 impl Sections {
-    /// Adds a line. Writing to a String does not fail.
+    /// Adds a line. Writing to a String cannot fail.
     pub(crate) fn line(&mut self, line: fmt::Arguments<'_>) {
         let mark = if self.offered { "#" } else { "" };
         let written = self.text.write_fmt(format_args!("{mark}{line}\n"));
         debug_assert!(written.is_ok());
     }
 
-    /// Adds sections that take the place of others: a `#` before each of their lines keeps them out
-    /// of use.
+    /// Adds sections that replace others. A `#` before each of their lines keeps them out of use.
     pub(crate) fn offer(&mut self, sections: impl FnOnce(&mut Sections)) {
         self.offered = true;
         sections(self);
         self.offered = false;
     }
 
-    /// Adds the section of a probe: klippy takes one, so the first is in use, and the others are offered.
+    /// Adds the section of a probe. klippy accepts one, so the first is in use, and the others are offered.
     pub(crate) fn probe(&mut self, layout: &Layout<'_>, section: impl FnOnce(&mut Sections)) {
         if !layout.has_head() {
             return;
@@ -62,7 +61,7 @@ impl Sections {
         self.key("speed", layout.printer.limits.velocity_mm_per_s);
     }
 
-    /// The keys of a probe that stands off the nozzle by so much.
+    /// The keys of a probe with these offsets from the nozzle.
     pub(crate) fn offsets(&mut self, [x_mm, y_mm, z_mm]: [f64; 3]) {
         self.key("x_offset", x_mm);
         self.key("y_offset", y_mm);
@@ -84,7 +83,7 @@ impl Sections {
         self.line(format_args!("#{}{text}", if text.is_empty() { "" } else { " " }));
     }
 
-    /// Tells that klippy takes this section only beside another one.
+    /// Says that klippy accepts this section only together with another one.
     pub(crate) fn needs(&mut self, section: impl Display) {
         self.comment(format_args!("Needs [{section}]."));
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Sections that need no hardware of their own, offered for whoever wants to try their G-codes.
+//! Sections without hardware of their own, offered for trying their G-codes.
 
 #![forbid(unsafe_code)]
 
@@ -7,7 +7,7 @@ use crate::description::printer::Kinematics;
 use crate::klippy::layout::{CLEAR_MM, Layout, Place, WITHIN_REACH, rounded};
 use crate::klippy::sections::Sections;
 
-/// Those that any printer takes, with their keys.
+/// Sections that any printer accepts, with their keys.
 const ANYWHERE: [(&str, &[(&str, &str)]); 10] = [
     ("gcode_arcs", &[("resolution", "0.1")]),
     (
@@ -29,7 +29,7 @@ const ANYWHERE: [(&str, &[(&str, &str)]); 10] = [
     ("save_variables", &[("filename", "~/pinion_variables.cfg")]),
 ];
 
-/// The corners of the bed, counted from the front left clockwise.
+/// The corners of the bed, clockwise from the front left.
 const CORNERS: [(&str, [f64; 2]); 4] = [
     ("front left", [1.0 - WITHIN_REACH, 1.0 - WITHIN_REACH]),
     ("rear left", [1.0 - WITHIN_REACH, WITHIN_REACH]),
@@ -55,7 +55,7 @@ impl Sections {
         });
     }
 
-    /// Those for the bed of a cartesian printer.
+    /// The sections for the bed of a cartesian printer.
     fn screws(&mut self, layout: &Layout<'_>) {
         let corners = CORNERS.map(|(name, [x, y])| (name, layout.place_mm(x, y)));
         for section in ["bed_screws", "screws_tilt_adjust"] {

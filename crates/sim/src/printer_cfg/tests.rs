@@ -38,7 +38,7 @@ fn several_motors_of_the_z_axis_are_leveled() {
     let corners = ["gantry_corners:", "  -30, -10", "  250, 230"];
     let points = ["points:", "  44, 44", "  44, 176", "  176, 176", "  176, 44"];
     assert_eq!(level[..8], [&corners[..], &points[..]].concat());
-    // Three of them, and their drivers.
+    // Three motors, and their drivers.
     let three = example("Four Z motors").split("\n[[axis]]\nname = \"z3\"").next().unwrap().to_owned();
     let driver = "\n[[part]]\nkind = \"tmc2209\"\naxis = \"z2\"\nuart_pin = \"z2_uart\"\naddress = 1\n";
     let cfg = printer_cfg(&SimConfig::parse(&(three + driver), "three").unwrap(), "/tmp/pty");
@@ -66,7 +66,7 @@ fn a_second_extruder_and_a_second_carriage_have_sections_of_their_own() {
     let cfg = printed("A second extruder");
     assert_has(&cfg, "extruder1", &["step_pin: e1_step", "heater_pin: hotend1_heater", "nozzle_diameter: 0.4"]);
     assert_has(&cfg, "dual_carriage", &["axis: x", "endstop_pin: u_endstop", "position_endstop: 220"]);
-    // Without its heater it is no hot end's, and without its endstop no carriage.
+    // Without its heater it is not a hot end's axis, and without its endstop it is not a carriage.
     let text = example("A second extruder").replace("name = \"extruder1\"\npin", "name = \"oven\"\npin");
     let text = text.replace("endstop_pin = \"u_endstop\"\n", "");
     let cfg = printer_cfg(&SimConfig::parse(&text, "other").unwrap(), "/tmp/pty");

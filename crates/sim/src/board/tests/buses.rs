@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The simulated board's buses in virtual time: who hears what, and who answers.
+//! The simulated board's buses in virtual time: which chips listen, and which answer.
 
 #![forbid(unsafe_code)]
 
@@ -90,7 +90,7 @@ fn the_data_output_of_a_bus_drives_lights_and_nothing_else() {
     let pin = bench.pin("spidev3.0");
     let mut mosi = bench.board.mosi(pin, 3_200_000).unwrap();
     assert_eq!(mosi.line.bus, "spi2");
-    // Green, as `neopixel` encodes it, and 50 us low.
+    // Green, in the encoding of `neopixel`, and 50 us low.
     let mut message = [[0xee; 4], [0x88; 4], [0x88; 4]].concat();
     message.extend([0; 20]);
     mosi.line.device.exchange(&mut message).unwrap();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the documentation's examples do, in virtual time; lights and the edges of a tachometer.
+//! The documentation's examples in virtual time; lights and the edges of a tachometer.
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +11,7 @@ fn bench(heading: &str) -> Bench {
     Bench::new(SimConfig::parse(&example(heading), heading).unwrap())
 }
 
-/// Steps an axis towards its start by so much, or away from it.
+/// Moves an axis by this number of steps, toward its start or away from it.
 fn travel(bench: &mut Bench, axis: &str, steps: i32) {
     let step = bench.output(&format!("{axis}_step"), false);
     let _dir = bench.output(&format!("{axis}_dir"), steps > 0);
@@ -23,7 +23,7 @@ fn travel(bench: &mut Bench, axis: &str, steps: i32) {
 fn the_probe_feels_how_a_gantry_hangs_on_its_motors() {
     let mut bench = bench("Four Z motors");
     let probe = bench.input("probe");
-    // The nozzle stands at 60 and 45 mm, the probe beside it at 84 and 37 mm, 1.5 mm deeper.
+    // The nozzle is at 60 and 45 mm. The probe beside it is at 84 and 37 mm, 1.5 mm deeper.
     let height = |[z, z1, z2, z3]: [f64; 4]| {
         let (left, right) = ((z + z1) / 2.0, (z2 + z3) / 2.0);
         let (front, rear) = ((z + z3) / 2.0, (z1 + z2) / 2.0);
@@ -52,7 +52,7 @@ fn the_probe_feels_how_a_gantry_hangs_on_its_motors() {
 fn the_probe_of_a_delta_feels_the_bed() {
     let mut bench = bench("A delta printer");
     let probe = bench.input("probe");
-    // In the middle the nozzle is as high as the carriages, less the arms' height.
+    // In the middle the nozzle is as high as the carriages, minus the arms' height.
     let arms = (215.0f64 * 215.0 - 105.0 * 105.0).sqrt();
     let down = ((380.0 - arms - 1.5) * 100.0) as i32;
     for axis in ["a", "b", "c"] {
@@ -75,7 +75,7 @@ fn a_chamber_is_warm_by_itself_and_its_fan_cools_it() {
     assert!((celsius(&bench) - (85.0 - 40.0 * (-1.0f64).exp())).abs() < 0.01, "{warm} {}", celsius(&bench));
     bench.advance(1e5);
     assert!((celsius(&bench) - 85.0).abs() < 0.01);
-    // And 5 W/K, in steps as a dimmed fan takes them.
+    // 5 W/K more, in the steps of a dimmed fan.
     let fan = bench.output("exhaust_fan", false);
     let from = celsius(&bench);
     for _ in 0..3000 {
@@ -109,7 +109,7 @@ fn a_light_of_four_colours_mixes_them() {
         bench.advance(0.008);
         seen.extend((cycle > 30).then(|| shown(&bench)));
     }
-    // It does not flicker.
+    // The light does not flicker.
     assert!(seen.iter().all(|shown| shown == "#330000+ff"), "{seen:?}");
     assert!(bench.probe.output("shelf").is_none() && bench.probe.output("light").is_some());
 }
@@ -131,7 +131,7 @@ fn a_light_that_is_switched_quickly_looks_dimmed() {
     led.write(true).unwrap();
     bench.advance(0.2);
     assert_eq!(brightness(&bench), 1.0);
-    // Off for a moment, after it was on for long.
+    // Off for a moment, after a long time on.
     led.write(false).unwrap();
     bench.advance(0.001);
     led.write(true).unwrap();
@@ -159,14 +159,14 @@ fn the_edges_of_a_tachometer_are_counted_and_dated() {
     assert_eq!(seen.len(), levels as usize);
     assert_eq!(seen.last().unwrap().level, level);
     assert!(seen.windows(2).all(|pair| pair[0].level != pair[1].level && pair[0].at <= pair[1].at));
-    // 75 turns a second, and so 300 edges, each 1/300 s after the one before.
+    // 75 turns a second give 300 edges, each 1/300 s after the one before.
     bench.advance(1.0);
     seen.clear();
     edges.take(&mut |edge| seen.push(edge)).unwrap();
     assert!((299..=301).contains(&seen.len()), "{}", seen.len());
     let gaps = seen.windows(2).map(|pair| (pair[1].at - pair[0].at).as_secs_f64());
     assert!(gaps.into_iter().all(|gap| (gap - 1.0 / 300.0).abs() < 5e-5), "{seen:?}");
-    // A fan that stands has no more of them. What nobody took in time is dropped.
+    // A fan that stands still has no more edges. Edges that were not taken in time are dropped.
     fan.write(false).unwrap();
     bench.advance(20.0);
     seen.clear();
