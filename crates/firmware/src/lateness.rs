@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Distributions of how late things happened. To record a sample does not allocate.
+//! Distributions of delays. Recording a sample does not allocate.
 
 #![forbid(unsafe_code)]
 
@@ -7,10 +7,10 @@ use std::fmt;
 
 use crate::time::{CLOCK_FREQ, Ticks};
 
-/// Into how many buckets each octave (from a power of two to the next) is parted. So a bucket is at
-/// most as wide as an eighth of its values.
+/// Number of buckets in each octave (from a power of two to the next). So a bucket is at most as wide as an eighth of
+/// its values.
 const PARTS: usize = 8;
-/// Enough buckets for 2^32 ticks (86 s). What is later counts as that late.
+/// Enough buckets for 2^32 ticks (86 s). Longer delays count as 2^32 ticks.
 const BUCKETS: usize = 30 * PARTS + PARTS;
 
 /// Counts samples by how late they were.
@@ -27,8 +27,8 @@ impl Default for Lateness {
     }
 }
 
-/// The bucket of a value in ticks. Values below 16 have a bucket each; larger ones share the eight
-/// buckets of their octave.
+/// The bucket of a value in ticks. Values below 16 have a bucket each. Larger values share the eight buckets of their
+/// octave.
 fn bucket(late: u32) -> usize {
     if late < PARTS as u32 {
         return late as usize;
@@ -48,7 +48,7 @@ fn upper(bucket: usize) -> u32 {
 }
 
 impl Lateness {
-    /// Takes a sample in ticks. One that came early, below zero, counts as not late.
+    /// Records a sample in ticks. An early sample, below zero, counts as not late.
     #[inline]
     pub fn record(&mut self, late: i64) {
         let late = late.clamp(0, i64::from(u32::MAX)) as u32;
@@ -62,13 +62,13 @@ impl Lateness {
         self.samples
     }
 
-    /// The latest sample.
+    /// The longest delay.
     pub fn max(&self) -> Ticks {
         Ticks(self.max)
     }
 
-    /// How late at most the share `q` (0 to 1) of the samples was. It is up to an eighth too high, as
-    /// it is the upper end of a bucket.
+    /// The longest delay of the best share `q` (0 to 1) of the samples. It is up to an eighth too high, because it is
+    /// the upper end of a bucket.
     pub fn quantile(&self, q: f64) -> Ticks {
         let wanted = (q * self.samples as f64).ceil() as u64;
         let mut seen = 0;
@@ -81,7 +81,7 @@ impl Lateness {
         self.max()
     }
 
-    /// The buckets that hold samples: the largest value that belongs to each, and how many it holds.
+    /// The buckets with samples: the largest value of each, and its number of samples.
     pub fn buckets(&self) -> impl Iterator<Item = (Ticks, u64)> + '_ {
         let filled = self.counts.iter().enumerate().filter(|(_, count)| **count > 0);
         filled.map(|(bucket, count)| (Ticks(upper(bucket)), *count))

@@ -1,19 +1,19 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A Klipper micro-controller without I/O: its scheduler, its objects and its features.
 //!
-//! The MCU reads the time from the clock that it is given, asks a [`Board`](board::Board) for pins and buses, hands
-//! what takes time to [`Workers`](mcu::Workers), and leaves what it says in an [`Outbox`](mcu::Outbox). So a whole MCU
-//! runs in a test, in virtual time and the same each time.
+//! The MCU reads the time from a given clock and asks a [`Board`](board::Board) for pins and buses. It passes slow work
+//! to [`Workers`](mcu::Workers) and leaves its responses in an [`Outbox`](mcu::Outbox). So a whole MCU runs in a test,
+//! in virtual time and with the same result each time.
 //!
 //! - [`feature`]: one file per Klipper feature, and the list of them all
 //! - [`mcu`]: the MCU: oids, timers, move queue, shutdown
-//! - [`board`]: what the MCU asks of the hardware, and buses made of bare lines
-//! - [`time`], [`shutdown`], [`lateness`]: the words that all of these share
+//! - [`board`]: the MCU's requests to the hardware, and buses made of GPIO lines
+//! - [`time`], [`shutdown`], [`lateness`]: types that the others share
 //!
 //! # An MCU with one feature of its own, in virtual time
 //!
-//! The feature answers `echo` with the number that it was sent, and the instant. The board is that of the crate
-//! `pinion-testbench`, which records what an MCU does to its pins.
+//! The feature answers `echo` with the number that it received and the time. The board is from the crate
+//! `pinion-testbench`. It records what an MCU does to its pins.
 //!
 //! ```
 //! use std::sync::{Arc, Mutex};

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Instants and spans in ticks of 20 ns, and what an MCU times itself by.
+//! Times and spans in ticks of 20 ns, and the clocks of an MCU.
 
 #![forbid(unsafe_code)]
 
@@ -10,7 +10,7 @@ use std::time::Duration;
 
 pub use pinion_protocol::clock::Clock;
 
-/// Ticks in a second, as the linux MCU of Klipper has it (`CLOCK_FREQ`).
+/// Ticks in a second, as in Klipper's Linux MCU (`CLOCK_FREQ`).
 pub const CLOCK_FREQ: u32 = 50_000_000;
 /// Nanoseconds in a tick.
 pub const NS_PER_TICK: u64 = 1_000_000_000 / CLOCK_FREQ as u64;
@@ -50,25 +50,25 @@ impl Sub<Ticks> for Clock {
     }
 }
 
-/// Where an MCU reads the time.
+/// The clock of an MCU.
 pub trait TimeSource: Send + Sync {
-    /// The present instant; never earlier than an instant that it told before.
+    /// The time now; never earlier than a time that it returned before.
     fn now(&self) -> Clock;
 
-    /// Runs the work of an errand on this thread, and tells when it ended. A clock that is not of this world gives
-    /// the work a time of its own.
+    /// Runs the work of an errand on this thread, and returns when the work ended. A clock other than the real one
+    /// gives the work a time of its own.
     fn errand(&self, work: &mut dyn FnMut()) -> Clock {
         work();
         self.now()
     }
 
-    /// The instant that CLOCK_MONOTONIC tells as `monotonic`: the kernel dates by that clock.
+    /// Converts a time of CLOCK_MONOTONIC, which the kernel uses for its events.
     fn instant_of(&self, monotonic: Duration) -> Clock;
 
-    /// What CLOCK_MONOTONIC tells at this instant.
+    /// Converts a time to CLOCK_MONOTONIC.
     fn duration_of(&self, clock: Clock) -> Duration;
 
-    /// Waits until `end` without sleeping: for the pulses of a bus, which are shorter than a sleep.
+    /// Waits until `end` without sleeping. The pulses of a bus are shorter than a sleep.
     fn spin_until(&self, end: Clock) {
         while self.now() < end {
             std::hint::spin_loop();
@@ -76,40 +76,40 @@ pub trait TimeSource: Send + Sync {
     }
 }
 
-/// What an MCU times itself by.
+/// The clock and the time limits of an MCU.
 #[derive(Clone)]
 pub struct Timing {
-    /// The clock of the core, and of the errands on its workers.
+    /// The clock of the core and of the workers' errands.
     pub clock: Arc<dyn TimeSource>,
-    /// What the MCU tells of the timer that runs.
+    /// The due time of the running timer, which the MCU stores here.
     pub due: Due,
-    /// How late a step may be before the MCU stops: a motor that is stepped too late loses steps.
+    /// Longest delay of a step before the MCU stops. A motor that is stepped too late loses steps.
     pub step_late_limit: Ticks,
 }
 
 impl Timing {
-    /// By this clock, with steps that may be 1 ms late, as in the firmware.
+    /// Timing by this clock, with steps at most 1 ms late, as in the firmware.
     pub fn of(clock: Arc<dyn TimeSource>) -> Timing {
         Timing { clock, due: Due::default(), step_late_limit: Ticks::from_ms(1) }
     }
 }
 
-/// The instant for which the timer that runs was set. The core sets it; a simulated printer reads it, whose parts are
-/// not to feel how late the computer is.
+/// The due time of the running timer. The core sets it. A simulated printer reads it, so that a late computer does not
+/// affect its parts.
 #[derive(Clone, Debug)]
 pub struct Due(Arc<AtomicU64>);
 
 impl Due {
-    /// No timer runs. No instant has these bits: they lie 11,000 years ahead.
+    /// The value while no timer runs. No time has these bits: they are 11,000 years ahead.
     const NO_TIMER: u64 = u64::MAX;
 
-    /// A timer runs that was due at this instant; `None`: no timer runs.
+    /// Sets the due time of the running timer; `None` if no timer runs.
     #[inline]
     pub fn set(&self, due: Option<Clock>) {
         self.0.store(due.map_or(Due::NO_TIMER, Clock::to_bits), Ordering::Relaxed);
     }
 
-    /// When the timer that runs was due; `None` if no timer runs.
+    /// The due time of the running timer; `None` if no timer runs.
     #[inline]
     pub fn get(&self) -> Option<Clock> {
         Some(self.0.load(Ordering::Relaxed)).filter(|bits| *bits != Due::NO_TIMER).map(Clock::from_bits)
@@ -122,8 +122,7 @@ impl Default for Due {
     }
 }
 
-/// A clock that stands still until it is told to advance: the whole MCU runs on it in
-/// tests, the same each time.
+/// A clock that stands still until it is advanced. In tests, the whole MCU runs on it with the same result each time.
 #[derive(Clone, Debug)]
 pub struct VirtualClock(Arc<AtomicU64>);
 
@@ -133,7 +132,7 @@ impl VirtualClock {
         VirtualClock(Arc::new(AtomicU64::new(now.ticks())))
     }
 
-    /// Moves the clock to `now`; never back.
+    /// Moves the clock forward to `now`. It never goes back.
     pub fn set(&self, now: Clock) {
         self.0.fetch_max(now.ticks(), Ordering::SeqCst);
     }
@@ -144,7 +143,7 @@ impl TimeSource for VirtualClock {
         Clock::from_ticks(self.0.load(Ordering::SeqCst))
     }
 
-    /// Its tick 0 is that clock's zero.
+    /// Tick 0 is the zero of CLOCK_MONOTONIC.
     fn instant_of(&self, monotonic: Duration) -> Clock {
         let s = monotonic.as_secs();
         Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
@@ -158,7 +157,7 @@ impl TimeSource for VirtualClock {
         self.set(end);
     }
 
-    /// The work has a time of its own that begins now, as on another thread. The clock itself stands where it stood.
+    /// The work has its own time, which begins now, as on another thread. The clock itself does not advance.
     fn errand(&self, work: &mut dyn FnMut()) -> Clock {
         let now = self.now();
         work();

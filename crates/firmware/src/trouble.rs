@@ -36,13 +36,14 @@ impl Trouble {
         Trouble { remedy: Some(remedy.into()), ..self }
     }
 
-    /// The same, of this subject; it goes in front of the present one.
+    /// The same, with this subject in front of the present one.
     pub fn of(self, subject: impl fmt::Display) -> Trouble {
         let subject = self.subject.map_or_else(|| subject.to_string(), |inner| format!("{subject}: {inner}"));
         Trouble { subject: Some(subject.into()), ..self }
     }
 
-    /// The same, of a place in a file: `byte` of its `text`. The subject is `file:line:column`, counted from 1.
+    /// The same, with a place in a file as its subject: `byte` of the file's `text`. The subject is `file:line:column`,
+    /// counted from 1.
     pub fn at(self, file: impl fmt::Display, text: &str, byte: usize) -> Trouble {
         let before = text.get(..byte).unwrap_or(text);
         let line = before.matches('\n').count() + 1;
@@ -50,7 +51,7 @@ impl Trouble {
         self.of(format_args!("{file}:{line}:{column}"))
     }
 
-    /// Subject and cause. The caller prints the remedy in a line of its own.
+    /// Subject and cause. The caller prints the remedy in a separate line.
     pub fn found(&self) -> String {
         match &self.subject {
             Some(subject) => format!("{subject}: {}", self.cause),

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the MCU asks of the hardware, and the boards that answer.
+//! The MCU's requests to the hardware, and the interface of boards.
 
 #![forbid(unsafe_code)]
 
@@ -19,7 +19,7 @@ pub mod soft_spi;
 pub struct Pin(pub u32);
 
 impl Pin {
-    /// What the dictionary calls the pin; `names` are those of its enumeration `pin`.
+    /// The pin's name in the dictionary. `names` is the enumeration `pin`.
     pub fn name_in(self, names: &[Range]) -> String {
         names.iter().find_map(|range| range.name_of(self.0)).unwrap_or_else(|| format!("pin number {}", self.0))
     }
@@ -30,20 +30,20 @@ pub const ADC_MAX: u16 = 4095;
 /// Full scale of a PWM value (`PWM_MAX` of the dictionary).
 pub const PWM_MAX: u16 = 32768;
 
-/// A published name of the dictionary's enumerations: `count` names from `name` on (its number
-/// counts up) stand for the values from `first` on.
+/// A published name of the dictionary's enumerations. The `count` names from `name` on (its number counts up) have the
+/// values from `first` on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Range {
-    /// The first name, such as `gpiochip1/gpio0`.
+    /// The first name, for example `gpiochip1/gpio0`.
     pub name: String,
     /// The value of the first name.
     pub first: u32,
-    /// How many; 1 publishes the plain name.
+    /// Number of names; 1 publishes the plain name.
     pub count: u32,
 }
 
 impl Range {
-    /// The name that stands for `value`, if it is one of these.
+    /// The name of `value`, if it is in this range.
     pub fn name_of(&self, value: u32) -> Option<String> {
         let at = value.checked_sub(self.first).filter(|at| *at < self.count)?;
         if at == 0 {
@@ -58,7 +58,7 @@ impl Range {
 /// The resistor that the chip puts on an input.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Bias {
-    /// None: the level is what the wiring makes it.
+    /// None: the wiring determines the level.
     None,
     /// To the supply.
     PullUp,
@@ -66,30 +66,31 @@ pub enum Bias {
     PullDown,
 }
 
-/// Whether a claimed GPIO line is an output or an input, and how it is set up.
+/// Whether a claimed GPIO line is an output or an input, and its setup.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Direction {
     /// The line is driven.
     Output {
-        /// The level that it is driven to as it becomes an output.
+        /// The level when it becomes an output.
         level: bool,
-        /// The level that it is driven to when the MCU stops or the program dies.
+        /// The level when the MCU stops or the program dies.
         shutdown_value: bool,
     },
-    /// The line is read. A resistor that the chip does not have is an error.
+    /// The line is read. It is an error if the chip does not have this resistor.
     Input(Bias),
-    /// It pulls low or lets go, and is read in either case: a wire that several drive. It begins let
-    /// go, and has a pull-up where the chip is not known to have none. The guardian has no part in it.
+    /// An open drain, for a wire that several chips drive: it pulls low or releases the wire, and is read in both
+    /// states. It begins released. It has a pull-up, except on chips known to have none. The guardian does not handle
+    /// it.
     OpenDrain,
 }
 
 /// A claimed GPIO line. The objects and workers that share a line all hold this one value.
 ///
-/// No call may allocate or log. Nor may one block, unless the board said that the line
-/// [sleeps](ClaimedLine::sleeps_on): then only a worker calls it.
+/// No call may allocate or log. No call may block, unless the board said that the line
+/// [sleeps](ClaimedLine::sleeps_on). Then only a worker calls it.
 pub trait Line: Send + Sync {
-    /// Drives an output to a level, or lets an open drain go (`true`, high) or pulls it low. A line that
-    /// another user has made an input since is left as it is.
+    /// Drives an output to a level. Releases an open drain (`true`, high) or pulls it low. Does nothing if another user
+    /// has made the line an input.
     ///
     /// # Errors
     ///
@@ -103,29 +104,28 @@ pub trait Line: Send + Sync {
     /// "GPIO line read failed".
     fn read(&self) -> Result<bool, Shutdown>;
 
-    /// Makes the line an output or an input for all who share it. As in the firmware, the last
-    /// set-up of a line replaces the ones before.
+    /// Makes the line an output or an input for all users. As in the firmware, the last setup of a line replaces the
+    /// earlier ones.
     ///
     /// # Errors
     ///
-    /// "Unable to open out GPIO chip line" or "Unable to open in GPIO chip line", and on the
-    /// simulated printer "Not an output pin" or "Not an input pin".
+    /// "Unable to open out GPIO chip line" or "Unable to open in GPIO chip line". The simulated printer also has "Not
+    /// an output pin" and "Not an input pin".
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
 
-    /// The same amid a conversation on this line (single-wire UART, open-drain I2C): as cheap as a
-    /// write, since the guardian is not told. Claim the line as an input, so that the guardian never
-    /// drives it.
+    /// The same during a conversation on this line (single-wire UART, open-drain I2C). It is as fast as a write,
+    /// because the guardian is not informed. Claim the line as an input, so that the guardian never drives it.
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.set_direction(direction)
     }
 }
 
-/// A line as the board hands it out.
+/// A line from the board.
 pub struct ClaimedLine {
     /// The line.
     pub line: Arc<dyn Line>,
-    /// The name of the worker of the line's chip, if calls to that chip may block, as it is an
-    /// expander on I2C, SPI or USB. The core must not call such a line.
+    /// The name of the worker of the line's chip, if calls to that chip may block. Examples are expanders on I2C, SPI
+    /// or USB. The core must not call this line.
     pub sleeps_on: Option<String>,
 }
 
@@ -134,15 +134,15 @@ pub struct ClaimedLine {
 pub struct Edge {
     /// When it came, in CLOCK_MONOTONIC.
     pub at: Duration,
-    /// The level that the interrupt found. It equals the level before where a pulse was over by then.
+    /// The level that the interrupt read. It equals the previous level if the pulse was already over.
     pub level: bool,
-    /// Edges before this one that were dropped, as nobody took them in time.
+    /// How many earlier edges were dropped because nobody read them in time.
     pub dropped: u32,
 }
 
-/// The edges of a line, which an interrupt dates. A worker makes these calls.
+/// The edges of a line, with times from an interrupt. A worker makes these calls.
 pub trait Edges: Send {
-    /// Shows the edges since the last call, the oldest first.
+    /// Passes the edges since the last call to `see`, the oldest first.
     ///
     /// # Errors
     ///
@@ -157,11 +157,11 @@ pub trait Edges: Send {
     fn end(&mut self) -> Result<(), Shutdown>;
 }
 
-/// An input whose edges are to be counted, as the board hands it out.
+/// An input with counted edges, from the board.
 pub struct CountedLine {
-    /// The line, to be read and to be shared.
+    /// The line, for reading and sharing.
     pub line: ClaimedLine,
-    /// Its edges; or for the log why no interrupt counts them.
+    /// Its edges, or for the log why no interrupt counts them.
     pub edges: Result<OnWorker<dyn Edges>, Box<str>>,
 }
 
@@ -177,15 +177,15 @@ pub trait Adc: Send {
 
 /// A hardware PWM channel. Its calls may block.
 pub trait Pwm: Send {
-    /// Sets for how much of each period the output is on: 0 to [`PWM_MAX`].
+    /// Sets the part of each period in which the output is on: 0 to [`PWM_MAX`].
     ///
     /// # Errors
     ///
     /// "PWM write failed".
     fn set(&mut self, value: u16) -> Result<(), Shutdown>;
 
-    /// Sets a new period, and for how much of it the output is on: 0 to [`PWM_MAX`]. The output
-    /// stays as it is set here when the MCU stops or the program dies.
+    /// Sets a new period, and the part of it in which the output is on: 0 to [`PWM_MAX`]. The output keeps this setting
+    /// when the MCU stops or the program dies.
     ///
     /// # Errors
     ///
@@ -193,35 +193,35 @@ pub trait Pwm: Send {
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown>;
 }
 
-/// A thermometer whose reading takes its time.
+/// A thermometer with slow readings.
 pub trait Thermometer: Send {
     /// The temperature in thousandths of a degree Celsius.
     ///
     /// # Errors
     ///
-    /// What the log says; the next reading may be good.
+    /// The text for the log. The next reading may succeed.
     fn read(&mut self) -> Result<i32, Trouble>;
 }
 
-/// The data output of an SPI controller, used for itself: the controller's clock times what is sent.
+/// The data output of an SPI controller without a chip. The controller's clock times the data.
 pub struct Mosi {
-    /// The output; nobody answers there.
+    /// The output. Nothing answers there.
     pub line: OnWorker<dyn BusDevice>,
-    /// Bytes that are sent at once.
+    /// Highest number of bytes in one transfer.
     pub message_max: usize,
 }
 
 /// How a bus answered, in the words of the dictionary's `i2c_bus_status`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum BusStatus {
-    /// The chip did not acknowledge a byte, or the driver failed in another way than these; SPI has
-    /// no other status.
+    /// The chip did not acknowledge a byte, or the driver failed for a reason not listed here. SPI has only this
+    /// status.
     Nack,
-    /// The bus was not free, or the chip held the clock, for too long.
+    /// The bus was busy for too long, or the chip held the clock for too long.
     Timeout,
     /// No chip acknowledged the address.
     StartNack,
-    /// No chip acknowledged the address when it was addressed again to be read from.
+    /// No chip acknowledged the address after the repeated start of a read.
     StartReadNack,
 }
 
@@ -230,61 +230,60 @@ pub enum BusStatus {
 pub struct BusError {
     /// How the bus answered, for the wire.
     pub status: BusStatus,
-    /// Which device failed, why, and what to do about it, for the log.
+    /// For the log: the device that failed, why, and the remedy.
     pub trouble: Trouble,
 }
 
 /// One addressed chip on its bus. A worker uses it, one conversation at a time.
 ///
-/// A chip is on an SPI or an I2C bus, and has the conversations of the other kind fail.
+/// A chip is on an SPI or an I2C bus. Conversations of the other kind fail.
 pub trait BusDevice: Send {
-    /// Sends the bytes and replaces each by the one that came back meanwhile (SPI). With no bytes the chip
-    /// is only [selected for a moment](ChipSelect::pulse).
+    /// Sends the bytes and replaces each by the received byte (SPI). Without bytes, the chip is only
+    /// [selected for a moment](ChipSelect::pulse).
     ///
     /// # Errors
     ///
-    /// What the bus said.
+    /// The error of the bus.
     fn exchange(&mut self, bytes: &mut [u8]) -> Result<(), BusError> {
         let _ = bytes;
         Err(BusError::other_kind("an SPI transfer", "an I2C device"))
     }
 
-    /// Sends the bytes, and leaves what comes back meanwhile alone (SPI): a controller with one data line
-    /// cannot do both.
+    /// Sends the bytes and ignores the received bytes (SPI). A controller with one data line cannot do both.
     ///
     /// # Errors
     ///
-    /// What the bus said.
+    /// The error of the bus.
     fn send(&mut self, bytes: &[u8]) -> Result<(), BusError> {
         self.exchange(&mut bytes.to_vec())
     }
 
-    /// Writes bytes and reads bytes, with a repeated start between the two (I2C). Nothing to read is
-    /// a plain write, nothing to write a plain read.
+    /// Writes bytes and then reads bytes, with a repeated start between the two (I2C). It is a plain write if there is
+    /// nothing to read, and a plain read if there is nothing to write.
     ///
     /// # Errors
     ///
-    /// What the bus said.
+    /// The error of the bus.
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         let _ = (write, read);
         Err(BusError::other_kind("an I2C transfer", "an SPI device"))
     }
 
-    /// Reads from a register on, or with none from wherever the chip stands (I2C). The MCU makes such
-    /// a transfer again if it fails (`mcu/calls.rs`).
+    /// Reads from this register on, or without a register from the chip's present position (I2C). The MCU retries this
+    /// transfer if it fails (`mcu/calls.rs`).
     ///
-    /// For registers that reading or naming does not change. A command, or a FIFO, is
-    /// [`BusDevice::write_read`]'s: asked for twice it might be carried out twice.
+    /// Use it only for registers that do not change when they are selected or read. For a command or a FIFO, use
+    /// [`BusDevice::write_read`], because a retry might run the command twice.
     ///
     /// # Errors
     ///
-    /// What the bus said at last.
+    /// The error of the last try.
     fn read_register(&mut self, register: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         self.write_read(register, read)
     }
 }
 
-/// A line of the bus failed.
+/// For a failure of a GPIO line of the bus.
 impl From<Shutdown> for BusError {
     fn from(failure: Shutdown) -> BusError {
         BusError { status: BusStatus::Nack, trouble: *failure.trouble }
@@ -292,12 +291,12 @@ impl From<Shutdown> for BusError {
 }
 
 impl BusError {
-    /// A failure that the bus answered with this status; a text alone is its cause.
+    /// A failure with this status of the bus. A text alone is its cause.
     pub fn new(status: BusStatus, trouble: impl Into<Trouble>) -> BusError {
         BusError { status, trouble: trouble.into() }
     }
 
-    /// The same failure, of this device.
+    /// The same failure, with this device as its subject.
     pub fn of(self, device: impl fmt::Display) -> BusError {
         BusError { trouble: self.trouble.of(device), ..self }
     }
@@ -308,10 +307,10 @@ impl BusError {
     }
 }
 
-/// A device whose calls may block, and the name of the worker that is to make them.
+/// A device whose calls may block, and the name of the worker that makes them.
 pub struct OnWorker<T: ?Sized> {
-    /// The name of the worker, such as `spi0` or `iio:device1`. Devices on one bus carry the same
-    /// name, so that one worker makes all their calls, one after the other.
+    /// The name of the worker, for example `spi0` or `iio:device1`. Devices on one bus have the same name. So one
+    /// worker makes all their calls, one after the other.
     pub bus: String,
     /// The device.
     pub device: Box<T>,
@@ -324,9 +323,9 @@ pub struct PwmConfig {
     pub pin: Pin,
     /// The period.
     pub cycle: Ticks,
-    /// The value from the beginning.
+    /// The first value.
     pub value: u16,
-    /// The value that the output is set to if the program dies.
+    /// The value when the program dies.
     pub shutdown_value: u16,
 }
 
@@ -336,9 +335,9 @@ pub struct SpiConfig {
     pub bus: u32,
     /// 0 to 3: clock polarity in bit 1, clock phase in bit 0.
     pub mode: u8,
-    /// The bus's clock rate while it speaks to this chip.
+    /// The bus's clock rate for this chip.
     pub rate_hz: u32,
-    /// The GPIO line that selects the chip; none if the bus's controller selects it, or nothing.
+    /// The GPIO line that selects the chip; `None` if the bus's controller selects it, or nothing does.
     pub chip_select: Option<ChipSelect>,
 }
 
@@ -349,7 +348,7 @@ pub struct I2cConfig {
     pub bus: u32,
     /// The chip's address, 7 bits.
     pub address: u8,
-    /// Clock rate that the host asks for; on Linux the driver has its own.
+    /// The host's clock rate. On Linux the driver uses its own.
     pub rate_hz: u32,
 }
 
@@ -358,18 +357,18 @@ pub struct I2cConfig {
 pub struct ChipSelect {
     /// The line, an output.
     pub line: Arc<dyn Line>,
-    /// Whether a high level selects the chip, rather than a low one.
+    /// Whether a high level selects the chip, instead of a low one.
     pub active_high: bool,
-    /// What a pulse is timed by.
+    /// The clock that times a pulse.
     pub clock: Arc<dyn TimeSource>,
 }
 
-/// Shortest pulse on a line that selects a chip. The TLE5012B latches at the end of one of 1 us (Infineon,
-/// TLE5012B E1000 user manual, "SSC timing": t_CSupdate).
+/// Shortest pulse on a chip select. The TLE5012B latches at the end of a pulse of 1 us (Infineon, TLE5012B E1000 user
+/// manual, "SSC timing": t_CSupdate).
 const SELECT_MIN: Ticks = Ticks::from_us(1);
 
 impl ChipSelect {
-    /// Drives the line so that the chip is selected, or not.
+    /// Selects or deselects the chip.
     ///
     /// # Errors
     ///
@@ -378,7 +377,7 @@ impl ChipSelect {
         self.line.write(selected == self.active_high)
     }
 
-    /// Selects the chip for 1 us at least, with no clock meanwhile.
+    /// Selects the chip for at least 1 us, without clock edges meanwhile.
     ///
     /// # Errors
     ///
@@ -391,8 +390,7 @@ impl ChipSelect {
     }
 }
 
-/// A computer with pins. Opening and claiming may block and allocate, so the MCU does so only
-/// until `finalize_config`.
+/// A computer with pins. Opening and claiming may block and allocate. So the MCU does it only until `finalize_config`.
 pub trait Board: Send {
     /// One line for the log: what the board is and what it has.
     fn describe(&self) -> String;
@@ -403,23 +401,23 @@ pub trait Board: Send {
     /// The names of the dictionary's enumeration `spi_bus`.
     fn spi_buses(&self) -> Vec<Range>;
 
-    /// Another view of the same hardware, for a thread that [looks again](Board::look_again): what it
-    /// then finds, this board has, too. None if nothing comes and goes.
+    /// Another view of the same hardware, for a thread that [looks again](Board::look_again). This board then also has
+    /// what the view finds. `None` if nothing comes or goes.
     fn view(&self) -> Option<Box<dyn Board>> {
         None
     }
 
-    /// Looks for what has come and gone, which may block. True if something has.
+    /// Looks for devices that have come or gone, which may block. True if there are any.
     fn look_again(&mut self) -> bool {
         false
     }
 
-    /// One and the same number for all the pins that lead to one line.
+    /// The one number for all pins that lead to the same line.
     fn canonical(&self, pin: Pin) -> Pin {
         pin
     }
 
-    /// Claims a line that nobody has claimed yet.
+    /// Claims a line that is not claimed yet.
     ///
     /// # Errors
     ///
@@ -428,11 +426,11 @@ pub trait Board: Send {
     /// "Guardian process lost".
     fn line(&mut self, pin: Pin, direction: Direction) -> Result<ClaimedLine, Shutdown>;
 
-    /// Claims an input that nobody has claimed yet, and has its edges counted where that can be.
+    /// Claims an input that is not claimed yet, with counted edges if possible.
     ///
     /// # Errors
     ///
-    /// Those of [`Board::line`].
+    /// The errors of [`Board::line`].
     fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
         let line = self.line(pin, Direction::Input(bias))?;
         Ok(CountedLine { line, edges: Err("this board has no edge events".into()) })
@@ -469,17 +467,17 @@ pub trait Board: Send {
     /// "Unable to config pwm device", "PWM write failed", "Guardian process lost".
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;
 
-    /// Opens the SPI data output that `pin` names, in mode 0.
+    /// Opens the SPI data output with the name `pin`, in mode 0.
     ///
     /// # Errors
     ///
-    /// "Not an output pin" for any other pin, and those of [`Board::spi`].
+    /// "Not an output pin" for any other pin, and the errors of [`Board::spi`].
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
         let _ = rate_hz;
         Err(not_mosi(&pin.name_in(&self.pins())))
     }
 
-    /// Opens the DS18B20 thermometer that the kernel calls `serial`, such as `28-0123456789ab`.
+    /// Opens the DS18B20 thermometer that the kernel names `serial`, for example `28-0123456789ab`.
     ///
     /// # Errors
     ///
@@ -490,11 +488,11 @@ pub trait Board: Send {
         Err(Shutdown::because(reason::DS18B20_OPEN, trouble.of(format_args!("{serial:?}"))))
     }
 
-    /// Forgets all claims. The MCU has dropped the lines and devices before.
+    /// Forgets all claims. The MCU has dropped the lines and devices before this.
     fn reset(&mut self);
 }
 
-/// The error of [`Board::mosi`] for a pin that is no SPI data output.
+/// The error of [`Board::mosi`] for a pin that is not an SPI data output.
 pub fn not_mosi(name: &str) -> Shutdown {
     let cause = format!("{name} can not drive LEDs: their pulses are too short for a program on Linux");
     Shutdown::because(reason::NOT_OUTPUT, cause).remedy(

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! I2C by GPIO lines, bit for bit (UM10204, "I2C-bus specification and user manual").
+//! I2C on GPIO lines, bit by bit (UM10204, "I2C-bus specification and user manual").
 //!
-//! Nothing is ever driven high: the lines are open drains ([`Direction::OpenDrain`]), which pull-ups
-//! take high when everyone has let go.
+//! Nothing is ever driven high. The lines are open drains ([`Direction::OpenDrain`]). Pull-ups take them high when all
+//! chips have released them.
 //!
 //! [`Direction::OpenDrain`]: super::Direction::OpenDrain
 
@@ -14,12 +14,12 @@ use super::{BusDevice, BusError, BusStatus, Line};
 use crate::time::{Ticks, TimeSource};
 use crate::trouble::Trouble;
 
-/// How long a chip may hold the clock low in one conversation: 100 ms, as with the kernel's own
+/// How long a chip may hold the clock low in one conversation: 100 ms, as in the kernel's driver
 /// (drivers/i2c/busses/i2c-gpio.c).
 const STRETCH_MAX: Ticks = Ticks::from_ms(100);
-/// The last bit of an address byte: the chip is read from.
+/// The last bit of an address byte, set for a read.
 const READ: u8 = 1;
-/// A chip that was left amid a byte lets SDA go after this many clocks (UM10204, 3.1.16).
+/// A chip that was interrupted within a byte releases SDA after this many clocks (UM10204, 3.1.16).
 const CLEAR_CLOCKS: u32 = 9;
 
 /// A chip on lines that other chips may share.
@@ -28,10 +28,10 @@ pub struct SoftI2c {
     sda: Arc<dyn Line>,
     /// The address byte of a write.
     address: u8,
-    /// Between two changes of the lines: half a bit.
+    /// The time between two changes of the lines: half a bit.
     pulse: Ticks,
     clock: Arc<dyn TimeSource>,
-    /// What the log calls it.
+    /// The log's name for it.
     name: String,
     /// How long the chip may still hold the clock.
     stretch_left: Ticks,
@@ -41,8 +41,8 @@ pub struct SoftI2c {
 struct NotAcknowledged;
 
 impl SoftI2c {
-    /// A chip of this address (7 bits). Between two changes of the lines, which are open drains, lies
-    /// a `pulse` at least.
+    /// A chip with this 7-bit address. At least one `pulse` passes between two changes of the lines. The lines must be
+    /// open drains.
     pub fn new(
         scl: Arc<dyn Line>,
         sda: Arc<dyn Line>,
@@ -58,7 +58,7 @@ impl SoftI2c {
         self.clock.spin_until(self.clock.now() + self.pulse);
     }
 
-    /// Lets the clock go, and waits until the chip has, too.
+    /// Releases the clock, and waits until the chip has released it too.
     fn clock_high(&mut self) -> Result<(), BusError> {
         self.scl.write(true)?;
         if self.scl.read()? {
@@ -80,7 +80,7 @@ impl SoftI2c {
         Ok(())
     }
 
-    /// One bit: puts it on the wire and tells what the wire says.
+    /// Sends one bit and returns the level of the wire.
     fn bit(&mut self, bit: bool) -> Result<bool, BusError> {
         self.sda.write(bit)?;
         self.pause();
@@ -108,7 +108,7 @@ impl SoftI2c {
         Ok(byte)
     }
 
-    /// A start, or amid a conversation a repeated one: SDA falls while the clock is high.
+    /// A start, or a repeated start within a conversation: SDA falls while the clock is high.
     fn start(&mut self) -> Result<(), BusError> {
         self.pause();
         self.sda.write(true)?;
@@ -135,13 +135,13 @@ impl SoftI2c {
         Ok(())
     }
 
-    /// SDA rises while the clock is high.
+    /// A stop: SDA rises while the clock is high.
     fn stop(&mut self) -> Result<(), BusError> {
         self.sda.write(false)?;
         self.pause();
         let high = self.clock_high();
         self.pause();
-        // Whatever became of the clock.
+        // Release SDA even if the clock stays low.
         self.sda.write(true)?;
         high
     }
@@ -178,7 +178,7 @@ impl BusDevice for SoftI2c {
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         self.stretch_left = STRETCH_MAX;
         let conversed = self.converse(write, read);
-        // After a failure too, so that the bus is free.
+        // Stop after a failure too, so that the bus is free.
         let stopped = self.stop();
         conversed.and(stopped).map_err(|error| error.of(&self.name))
     }
@@ -195,26 +195,26 @@ mod tests {
 
     const ADDRESS: u8 = 0x48;
 
-    /// A chip on the two wires that does what UM10204 says: 256 registers, the first byte written sets
-    /// the register. It writes down what it sees.
+    /// A chip on the two wires as UM10204 describes it. It has 256 registers, and the first written byte selects the
+    /// register. It logs what happens.
     #[derive(Default)]
     struct Wires {
-        /// What we let go or pull low.
+        /// What [`SoftI2c`] releases or pulls low.
         scl: bool,
         sda: bool,
-        /// What the chip does.
+        /// What the chip does to SDA.
         chip_sda_low: bool,
-        /// Until when it holds the clock, once it falls.
+        /// How long it holds the clock after each falling edge.
         hold_ticks: u64,
         held_until: u64,
         acknowledges: usize,
-        /// Bits of the present byte, and whether the chip is the one that sends.
+        /// Bits of the present byte.
         bits: Vec<bool>,
         state: State,
         register: u8,
         registers: Vec<u8>,
         writes: Vec<u8>,
-        /// Clocks that it takes until SDA is let go at the beginning.
+        /// Clocks until it releases SDA at the beginning.
         stuck_clocks: u32,
         log: Vec<&'static str>,
         /// When lines changed.
@@ -278,7 +278,7 @@ mod tests {
                 }
                 State::Read if count == 9 => {
                     self.register = self.register.wrapping_add(1);
-                    // The master did not acknowledge: it was the last byte.
+                    // The master did not acknowledge, so it was the last byte.
                     if self.bits[8] {
                         self.state = State::Idle;
                         return;
@@ -402,7 +402,7 @@ mod tests {
         let (mut i2c, wires) = chip(ADDRESS, 250);
         i2c.write_read(&[0x55], &mut [0]).unwrap();
         let changes = &wires.lock().unwrap().changes;
-        // The clock falls and data changes at one instant; every other change has its distance.
+        // The clock falls and the data changes at the same time. All other changes are at least a pulse apart.
         let distinct: Vec<u64> = changes.iter().copied().fold(Vec::new(), |mut distinct, at| {
             if distinct.last() != Some(&at) {
                 distinct.push(at);
@@ -410,7 +410,7 @@ mod tests {
             distinct
         });
         assert!(distinct.windows(2).all(|pair| pair[1] - pair[0] >= 250), "{distinct:?}");
-        // 29 bits of two halves are the least that this conversation can take.
+        // This conversation takes at least 29 bits of two halves each.
         assert!(distinct.last().unwrap() - distinct.first().unwrap() >= 29 * 2 * 250);
     }
 
@@ -446,7 +446,7 @@ mod tests {
     #[test]
     fn a_clock_that_is_held_is_waited_for_but_not_for_ever() {
         let (mut i2c, wires) = chip(ADDRESS, 10);
-        // 27 bits of 3 ms.
+        // 27 bits of 3 ms each.
         wires.lock().unwrap().hold_ticks = Ticks::from_ms(3).0.into();
         assert_eq!(i2c.write_read(&[1, 2], &mut []), Ok(()));
         for hold_us in [4000, 1_000_000] {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! SPI by GPIO lines, bit for bit.
+//! SPI on GPIO lines, bit by bit.
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +11,7 @@ use crate::time::{Clock, Ticks, TimeSource};
 
 /// A chip on lines that other chips may share.
 pub struct SoftSpi {
-    /// From the chip. May be the same line as `mosi`, where nothing comes back.
+    /// From the chip. It may be the same line as `mosi` if nothing comes back.
     pub miso: Arc<dyn Line>,
     /// To the chip.
     pub mosi: Arc<dyn Line>,
@@ -19,11 +19,11 @@ pub struct SoftSpi {
     pub sclk: Arc<dyn Line>,
     /// 0 to 3: clock polarity in bit 1, clock phase in bit 0.
     pub mode: u8,
-    /// One bit takes this long, and longer by what it takes to drive the lines.
+    /// Shortest time for one bit. Driving the lines adds to it.
     pub pulse: Ticks,
     /// A line that selects the chip.
     pub chip_select: Option<ChipSelect>,
-    /// What the bits are paced by.
+    /// The clock that paces the bits.
     pub clock: Arc<dyn TimeSource>,
 }
 
@@ -32,14 +32,14 @@ impl SoftSpi {
         self.mode & 2 != 0
     }
 
-    /// Takes the clock to its idle level: a chip of another polarity may have left it.
+    /// Sets the clock to its idle level. A chip with another polarity may have used it before.
     fn prepare(&self) -> Result<(), Shutdown> {
         self.sclk.write(self.idles_high())?;
         self.clock.spin_until(self.clock.now() + self.pulse);
         Ok(())
     }
 
-    /// Has the chip selected while `shift` sends so many bytes, from the instant on that it is given.
+    /// Selects the chip while `shift` sends `count` bytes, beginning at the time that `shift` receives.
     fn converse(&self, count: usize, shift: impl FnOnce(Clock) -> Result<(), Shutdown>) -> Result<(), BusError> {
         let select = |selected| self.chip_select.as_ref().map_or(Ok(()), |line| line.select(selected));
         let begin = || self.clock.now() + Ticks(self.pulse.0 / 2);
@@ -47,7 +47,7 @@ impl SoftSpi {
             0 => self.chip_select.as_ref().map_or(Ok(()), ChipSelect::pulse),
             _ => {
                 let shifted = select(true).and_then(|()| shift(begin()));
-                // After a failure too.
+                // Deselect after a failure too.
                 let deselected = select(false);
                 shifted.and(deselected)
             }
@@ -55,7 +55,7 @@ impl SoftSpi {
         conversed.map_err(BusError::from)
     }
 
-    /// One byte, and what came back if that is read.
+    /// Sends one byte, and returns the received byte if `read`.
     fn byte(&self, sent: u8, read: bool, end: &mut Clock) -> Result<u8, Shutdown> {
         (0..8).rev().try_fold(0, |received, bit| {
             let bit = self.bit(sent >> bit & 1 != 0, read, end)?;
@@ -63,14 +63,14 @@ impl SoftSpi {
         })
     }
 
-    /// One bit, whose first half begins at `end`; sets `end` to where the next one's does.
+    /// Sends one bit. Its first half begins at `end`. Sets `end` to the beginning of the next bit.
     fn bit(&self, sent: bool, read: bool, end: &mut Clock) -> Result<bool, Shutdown> {
         let first_half = Ticks(self.pulse.0 / 2);
         let second_half = Ticks(self.pulse.0 - first_half.0);
         let active = !self.idles_high();
         self.clock.spin_until(*end);
         let received = if self.mode & 1 != 0 {
-            // Data changes at the edge away from idle, and is taken at the one back.
+            // Data changes at the clock edge away from idle, and is read at the edge back to idle.
             self.sclk.write(active)?;
             self.mosi.write(sent)?;
             self.clock.spin_until(self.clock.now() + second_half);
@@ -111,8 +111,8 @@ mod tests {
     use proptest::prelude::*;
     use std::sync::Mutex;
 
-    /// A shift register on the wires, as an oscilloscope and a data sheet see it: it takes data at one
-    /// edge of the clock and shifts it out at the other one.
+    /// A shift register on the wires, as a data sheet describes it. It reads data at one edge of the clock and shifts
+    /// data out at the other edge.
     #[derive(Default)]
     struct Wires {
         mode: u8,
@@ -120,7 +120,7 @@ mod tests {
         mosi: bool,
         miso: bool,
         selected: bool,
-        /// Bits that the chip still has to send, the next one last.
+        /// Bits that the chip still has to send. The next one is the last.
         to_send: Vec<bool>,
         taken: Vec<bool>,
         /// When the clock changed while the chip was selected.
@@ -200,7 +200,7 @@ mod tests {
         bytes.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 != 0)).collect()
     }
 
-    /// A chip of this mode, and its wires.
+    /// A chip with this mode, and its wires.
     fn chip(mode: u8, pulse: Ticks, answer: &[u8], loop_back: bool) -> (SoftSpi, Arc<Mutex<Wires>>) {
         let clock = VirtualClock::at(Clock::EPOCH);
         let to_send = bits(answer).into_iter().rev().collect();
@@ -238,7 +238,7 @@ mod tests {
             prop_assert_eq!(&wires.taken, &bits(&sent));
             prop_assert!(!wires.selected);
             prop_assert_eq!(wires.edges.len(), sent.len() * 16);
-            // Both halves of a bit are as long as they have to be.
+            // Both halves of a bit are long enough.
             let half = u64::from(pulse / 2);
             prop_assert!(wires.edges.windows(2).all(|pair| pair[1] - pair[0] >= half));
             prop_assert!(wires.edges.windows(3).all(|three| three[2] - three[0] >= u64::from(pulse)));
@@ -271,7 +271,7 @@ mod tests {
         let clock = spi.clock.clone();
         let began = clock.now();
         spi.exchange(&mut []).unwrap();
-        // 10 ticks for the idle clock, and 1 us.
+        // 10 ticks for the idle clock, then 1 us.
         assert_eq!(clock.now().since(began), 60);
         let wires = wires.lock().unwrap();
         assert!(wires.edges.is_empty() && !wires.selected);
