@@ -35,8 +35,7 @@ impl Sequence {
     }
 }
 
-/// Appends a block with `payload` to `out`. A payload over [`PAYLOAD_MAX`] bytes does not fit
-/// a block and is left out.
+/// Appends a block with `payload` to `out`. It appends nothing for a payload over [`PAYLOAD_MAX`] bytes.
 pub fn frame(payload: &[u8], sequence: Sequence, out: &mut Vec<u8>) {
     if payload.len() > PAYLOAD_MAX {
         return;
@@ -50,7 +49,7 @@ pub fn frame(payload: &[u8], sequence: Sequence, out: &mut Vec<u8>) {
     out.push(SYNC);
 }
 
-/// What stands at the front of some bytes.
+/// What some bytes begin with.
 #[derive(Debug, PartialEq, Eq)]
 enum Front<'a> {
     Incomplete,
@@ -84,14 +83,14 @@ pub enum Found<'a> {
     Nothing,
     /// An intact block.
     Block(Sequence, &'a [u8]),
-    /// Bytes that belong to no block. `first` tells a run of them once.
+    /// Bytes that belong to no block. A run of them has `first` only once.
     Garbage {
         /// Whether an intact block came since the last garbage.
         first: bool,
     },
 }
 
-/// Finds blocks in a stream and its way back to them after garbage.
+/// Finds blocks in a stream, also after garbage.
 #[derive(Debug, Default)]
 pub struct Resync {
     need_sync: bool,
@@ -99,7 +98,7 @@ pub struct Resync {
 }
 
 impl Resync {
-    /// How many bytes to take off the front of `bytes`, and what they were.
+    /// How many bytes to remove from the front of `bytes`, and what they were.
     pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Found<'a>) {
         if !self.need_sync {
             match front(bytes) {
@@ -108,7 +107,7 @@ impl Resync {
                     self.need_valid = false;
                     return (payload.len() + BLOCK_MIN, Found::Block(sequence, payload));
                 }
-                // Sync bytes between blocks say nothing of a loss.
+                // Sync bytes between blocks do not mean that bytes were lost.
                 Front::Garbage if bytes[0] == SYNC => return (1, Found::Garbage { first: false }),
                 Front::Garbage => self.need_sync = true,
             }
@@ -128,21 +127,21 @@ impl Resync {
     }
 }
 
-/// What the micro-controller makes of the bytes it received.
+/// How the micro-controller answers the bytes that it received.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Received<'a> {
     /// The bytes end before a block does.
     Nothing,
-    /// The expected block's payload, to be run and acknowledged.
+    /// The expected block's payload. Run and acknowledge it.
     Payload(&'a [u8]),
-    /// A block out of order or a first sign of garbage, to be answered by a NAK: an empty
-    /// block that repeats the expected sequence number.
+    /// A block out of order, or the first garbage. Answer with a NAK: an empty block that repeats the expected sequence
+    /// number.
     Nak,
     /// Nothing to answer.
     Skip,
 }
 
-/// The micro-controller's end of the wire: takes blocks in order only.
+/// The micro-controller's end of the wire. It accepts blocks in order only.
 #[derive(Debug, Default)]
 pub struct Receiver {
     resync: Resync,
@@ -150,7 +149,7 @@ pub struct Receiver {
 }
 
 impl Receiver {
-    /// How many bytes to take off the front of `bytes`, and what is to be done about them.
+    /// How many bytes to remove from the front of `bytes`, and how to answer them.
     pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Received<'a>) {
         let (taken, found) = self.resync.next(bytes);
         let received = match found {
@@ -165,8 +164,8 @@ impl Receiver {
         (taken, received)
     }
 
-    /// The sequence number that the next block must have. Every block sent carries it, which
-    /// acknowledges all blocks before.
+    /// The sequence number that the next block must have. Every block to the host carries it and so acknowledges all
+    /// blocks before it.
     pub fn expected(&self) -> Sequence {
         self.expected
     }

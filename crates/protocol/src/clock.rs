@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Instants of a micro-controller's clock.
+//! Times of a micro-controller's clock.
 //!
-//! Inside, an instant is a `u64` that never wraps. It becomes 32 bits only on the wire, and a
-//! 32-bit clock from the other end is widened to the instant nearest to a reference.
+//! In a program, a time is a `u64` that never wraps. It has 32 bits only on the wire. A 32-bit clock from the other end
+//! is widened to the time nearest to a reference.
 
 #![forbid(unsafe_code)]
 
 use std::fmt;
 
-/// An instant in ticks. Tick 0 of the wire is [`Clock::EPOCH`], a whole turn of the 32-bit
-/// clock above zero, so that an instant before it can still be told.
+/// A time in ticks. Tick 0 of the wire is [`Clock::EPOCH`], 2^32 ticks above zero. So times before tick 0 can also be
+/// represented.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Clock(u64);
 
@@ -17,22 +17,22 @@ impl Clock {
     /// Tick 0.
     pub const EPOCH: Clock = Clock(1 << 32);
 
-    /// The instant `ticks` after tick 0.
+    /// The time `ticks` after tick 0.
     pub const fn from_ticks(ticks: u64) -> Clock {
         Clock(Clock::EPOCH.0 + ticks)
     }
 
-    /// Ticks since tick 0; an instant before it counts as tick 0.
+    /// Ticks since tick 0; 0 for an earlier time.
     pub const fn ticks(self) -> u64 {
         self.0.saturating_sub(Clock::EPOCH.0)
     }
 
-    /// The instant as [`Clock::to_bits`] gave it.
+    /// The time that [`Clock::to_bits`] converted.
     pub const fn from_bits(bits: u64) -> Clock {
         Clock(bits)
     }
 
-    /// The instant as a number that an atomic can hold.
+    /// The time as a number, for an atomic.
     pub const fn to_bits(self) -> u64 {
         self.0
     }
@@ -42,28 +42,28 @@ impl Clock {
         self.0 as u32
     }
 
-    /// The instant nearest to `near` whose 32 bits are `wire`.
+    /// The time nearest to `near` whose low 32 bits are `wire`.
     pub const fn widen(wire: u32, near: Clock) -> Clock {
         near.displaced(wire.wrapping_sub(near.wire()))
     }
 
-    /// This instant displaced by a span that wraps as the firmware's 32-bit clocks do: from
-    /// 2^31 ticks on it lies in the past.
+    /// This time displaced by a span that wraps as in the firmware's 32-bit clocks. A span of 2^31 ticks or more leads
+    /// into the past.
     pub const fn displaced(self, ticks: u32) -> Clock {
         Clock(self.0.wrapping_add_signed(ticks as i32 as i64))
     }
 
-    /// Ticks from `earlier` to this instant, negative if this one is before it.
+    /// Ticks from `earlier` to this time; negative if this time is before it.
     pub const fn since(self, earlier: Clock) -> i64 {
         self.0.wrapping_sub(earlier.0) as i64
     }
 
-    /// The instant `ticks` after this one.
+    /// The time `ticks` after this one.
     pub const fn later(self, ticks: u64) -> Clock {
         Clock(self.0 + ticks)
     }
 
-    /// The instant `ticks` before this one.
+    /// The time `ticks` before this one.
     pub const fn earlier(self, ticks: u64) -> Clock {
         Clock(self.0.wrapping_sub(ticks))
     }

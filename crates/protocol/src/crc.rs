@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The check sum of a message block: CRC-16/MCRF4XX (polynomial 0x1021 reflected, initial
-//! value 0xffff), which Klipper calls `crc16_ccitt`.
+//! The checksum of a message block: CRC-16/MCRF4XX (polynomial 0x1021 reflected, initial value 0xffff). Klipper calls
+//! it `crc16_ccitt`.
 
 #![forbid(unsafe_code)]
 
@@ -20,7 +20,7 @@ const TABLE: [u16; 256] = {
     table
 };
 
-/// The check sum of `bytes`.
+/// The checksum of `bytes`.
 pub(crate) fn crc16_ccitt(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0xffff, |crc, byte| (crc >> 8) ^ TABLE[usize::from((crc ^ u16::from(*byte)) & 0xff)])
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Message formats such as `queue_step oid=%c interval=%u count=%hu add=%hi`: their parsing,
-//! and the Rust types that may stand for their parameters.
+//! Message formats, for example `queue_step oid=%c interval=%u count=%hu add=%hi`: how to parse them, and the Rust
+//! types for their parameters.
 
 #![forbid(unsafe_code)]
 
@@ -39,7 +39,7 @@ impl Conversion {
         })
     }
 
-    /// Takes a value of this kind off the reader.
+    /// Reads past a value of this kind.
     pub fn skip(self, reader: &mut Reader<'_>) -> Result<(), Malformed> {
         match self {
             Conversion::Bytes => reader.bytes().map(drop),
@@ -53,7 +53,7 @@ pub fn name(format: &str) -> &str {
     format.split(' ').next().unwrap_or(format)
 }
 
-/// The parameters of a message, `None` if the format is none.
+/// The parameters of a message; `None` if the format is not valid.
 pub fn parameters(format: &str) -> Option<Vec<(&str, Conversion)>> {
     format
         .split(' ')
@@ -65,17 +65,17 @@ pub fn parameters(format: &str) -> Option<Vec<(&str, Conversion)>> {
         .collect()
 }
 
-/// A Rust type that can stand for a command's parameter.
+/// A Rust type for a command's parameter.
 pub trait Arg<'m>: Sized {
-    /// The conversions that this type may appear under.
+    /// The conversions that this type may have.
     const CONVERSIONS: &'static [&'static str];
-    /// Takes a value off the reader.
+    /// Reads a value.
     fn decode(reader: &mut Reader<'m>) -> Result<Self, Malformed>;
 }
 
-/// A Rust type that can stand for a response's parameter.
+/// A Rust type for a response's parameter.
 pub trait Field {
-    /// The conversions that this type may appear under.
+    /// The conversions that this type may have.
     const CONVERSIONS: &'static [&'static str];
     /// Appends the value.
     fn encode(&self, writer: &mut Writer);
@@ -83,7 +83,7 @@ pub trait Field {
 
 macro_rules! integers {
     ($($t:ty: $($conversion:literal)|+;)*) => {$(
-        // The firmware takes an integer's low bits, whatever its conversion.
+        // The firmware uses an integer's low bits, for every conversion.
         impl Arg<'_> for $t {
             const CONVERSIONS: &'static [&'static str] = &[$($conversion),+];
             #[inline]
@@ -137,7 +137,7 @@ impl Field for &[u8] {
     }
 }
 
-/// The low 32 bits.
+/// Writes the low 32 bits.
 impl Field for Clock {
     const CONVERSIONS: &'static [&'static str] = &["%u"];
     fn encode(&self, writer: &mut Writer) {
@@ -145,16 +145,16 @@ impl Field for Clock {
     }
 }
 
-/// A parameter as a handler declares it: its name and the conversions of its type.
+/// A parameter as a handler declares it: its name and its type's conversions.
 pub struct Spec {
     /// The parameter's name.
     pub name: &'static str,
-    /// What its type may stand for.
+    /// The conversions of its type.
     pub conversions: &'static [&'static str],
 }
 
-/// Does `format` name exactly these parameters, in order, under conversions that their types
-/// accept? Evaluated by the compiler.
+/// Whether `format` has exactly these parameters, in this order, with conversions that their types accept. The compiler
+/// evaluates it.
 pub const fn agrees(format: &str, specs: &[Spec]) -> bool {
     let format = format.as_bytes();
     let mut at = 0;
@@ -191,7 +191,7 @@ pub const fn agrees(format: &str, specs: &[Spec]) -> bool {
     at == format.len()
 }
 
-/// Are the two texts the same? (`==` is not for the compiler yet.)
+/// Whether the two texts are equal. (`==` does not work in a `const fn` yet.)
 pub const fn same(a: &str, b: &str) -> bool {
     a.len() == b.len() && starts(a.as_bytes(), 0, b.as_bytes())
 }

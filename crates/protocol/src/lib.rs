@@ -1,15 +1,16 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The bytes of Klipper's micro-controller protocol, as in its docs/Protocol.md. No I/O, and no state of an MCU.
+//! The bytes of Klipper's micro-controller protocol, as in its docs/Protocol.md. There is no I/O and no state of an
+//! MCU.
 //!
 //! - [`vlq`]: integers and byte strings of a message
-//! - [`mod@format`]: a message's format, such as `get_clock` or `clock clock=%u`
-//! - [`block`]: messages travel in blocks, which are numbered and checked
-//! - [`dictionary`]: what an MCU tells of itself: its messages, constants and names
-//! - [`clock`]: instants of an MCU's clock, 32 bits of which go over the wire
+//! - [`mod@format`]: a message's format, for example `get_clock` or `clock clock=%u`
+//! - [`block`]: the numbered and checked blocks that carry messages
+//! - [`dictionary`]: the description of an MCU: its messages, constants and names
+//! - [`clock`]: times of an MCU's clock; 32 bits of a time go over the wire
 //!
 //! # A client that talks to any Klipper MCU
 //!
-//! It reads the MCU's dictionary and asks for the time. (It asks once. A real one asks again when a block was lost.)
+//! It reads the MCU's dictionary and asks for the time. (It asks once. A real client asks again if a block was lost.)
 //!
 //! ```no_run
 //! use std::fs::File;

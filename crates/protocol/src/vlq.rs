@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Variable length quantities: seven bits a byte, high bits first, the top bit set on all but
-//! the last byte; the first byte's bits 5 and 6 both set mean a negative number.
+//! Variable length quantities: seven bits a byte, high bits first. The top bit is set on all bytes except the last. A
+//! number is negative if bits 5 and 6 of the first byte are both set.
 
 #![forbid(unsafe_code)]
 
 use super::Malformed;
 
-/// The longest encoding that a writer makes.
+/// Longest encoding that a writer makes, in bytes.
 pub const MAX_BYTES: usize = 5;
 
-/// Reads a message's values off the front of its bytes.
+/// Reads a message's values from the front of its bytes.
 #[derive(Clone, Copy, Debug)]
 pub struct Reader<'a>(&'a [u8]);
 
@@ -19,7 +19,7 @@ impl<'a> Reader<'a> {
         Reader(bytes)
     }
 
-    /// Whether everything was read.
+    /// Whether all bytes are read.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
     }
@@ -29,7 +29,7 @@ impl<'a> Reader<'a> {
         self.0
     }
 
-    /// The next integer, modulo 2^32: a longer encoding wraps, as in the firmware.
+    /// The next integer, modulo 2^32. A longer encoding wraps, as in the firmware.
     #[inline]
     pub fn int(&mut self) -> Result<u32, Malformed> {
         let mut byte = self.byte()?;
@@ -80,7 +80,7 @@ impl Writer {
     pub fn int(&mut self, value: u32) {
         let signed = value as i32;
         for shift in [28, 21, 14, 7] {
-            // One byte less holds values from -2^(shift-2) to 3 * 2^(shift-2) - 1.
+            // One byte less has room for values from -2^(shift-2) to 3 * 2^(shift-2) - 1.
             let reach = 1i32 << (shift - 2);
             if signed < -reach || i64::from(signed) >= 3 * i64::from(reach) {
                 self.byte((value >> shift) as u8 & 0x7f | 0x80);
@@ -100,7 +100,7 @@ impl Writer {
         }
     }
 
-    /// The payload, if all of it fitted.
+    /// The payload, or `None` if the values did not fit.
     pub fn payload(&self) -> Option<&[u8]> {
         (!self.overflow).then(|| &self.bytes[..self.len])
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A board that records what the MCU does to its pins, and lets a test play the rest.
+//! A board that records what the MCU does to its pins. A test plays the devices.
 
 use std::collections::{HashMap, HashSet, VecDeque};
 use std::sync::atomic::{AtomicU32, Ordering};
@@ -15,7 +15,7 @@ use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
 
-/// GPIO lines: pins 0 up to this.
+/// Number of GPIO lines. Their pins begin at 0.
 pub const GPIOS: u32 = 300;
 /// ADC channels: this pin and the seven after it.
 pub const ANALOG: u32 = 400;
@@ -23,32 +23,32 @@ const ANALOGS: u32 = 8;
 /// Hardware PWM channels: this pin and the one after it.
 pub const PWM: u32 = 500;
 const PWMS: u32 = 2;
-/// SPI buses: 0 up to this.
+/// Number of SPI buses. Their numbers begin at 0.
 const SPI_BUSES: u32 = 2;
-/// I2C buses: 0 up to this.
+/// Number of I2C buses. Their numbers begin at 0.
 const I2C_BUSES: u32 = 2;
-/// The data output of SPI bus 0, and of 1.
+/// The pin of the data output of SPI bus 0; the next pin is the one of bus 1.
 pub const MOSI: u32 = 700;
-/// To break the chips of SPI bus 0 or 1: this number, and the next.
+/// A number for [`State::broken`] and [`State::nacks`]: the chips of SPI bus 0; the next number is for bus 1.
 pub const SPI_CHIPS: u32 = 600;
-/// How long the workers have to end.
+/// How long a reset waits for the workers.
 const WORKERS_END: Ticks = Ticks::from_ms(2000);
-/// The chip of the lines that may sleep.
+/// The chip that has the lines that may sleep.
 const EXPANDER: &str = "gpiochip1";
 
-/// A pin's level from an instant on, in ticks.
+/// The time in ticks from which a pin has a level, and the level.
 pub type Edge = (u64, u8);
 
-/// Bytes that an SPI bus takes at once.
+/// Longest message on an SPI bus, in bytes.
 pub const MESSAGE_MAX: usize = 512;
 
-/// Kept without an allocation.
+/// Bytes and their number, kept without an allocation.
 type Message = ([u8; MESSAGE_MAX], usize);
 
 /// A conversation with an SPI chip.
 #[derive(Debug, PartialEq, Eq)]
 pub struct Transfer {
-    /// The instant, in ticks.
+    /// When it began, in ticks.
     pub at: u64,
     /// The number of the bus.
     pub bus: u32,
@@ -58,40 +58,38 @@ pub struct Transfer {
     pub rate_hz: u32,
     /// What the MCU sent.
     pub data: Vec<u8>,
-    /// Whether what came back was read.
+    /// Whether the MCU read the received bytes.
     pub read: bool,
 }
 
-/// A chip on an SPI bus: it is told the instant in ticks, and replaces the bytes that it gets by those
-/// that it sends.
+/// A chip on an SPI bus. It gets the time in ticks, and replaces the bytes that it receives by the bytes that it sends.
 pub type SpiChip = Box<dyn FnMut(u64, &mut [u8]) + Send>;
 
-/// A chip at an I2C address: it is told the instant in ticks and what is written, and fills in what is
-/// read.
+/// A chip at an I2C address. It gets the time in ticks and the written bytes, and fills in the bytes to read.
 pub type I2cChip = Box<dyn FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus> + Send>;
 
-/// A chip behind an input: it is told the instant in ticks, and either which output now has which
-/// level, or nothing as its input is read, and tells the input's level.
+/// A chip behind an input. It gets the time in ticks. It also gets an output and its new level, or `None` when its
+/// input is read. It returns the input's level.
 pub type LineChip = Box<dyn FnMut(u64, Option<(u32, bool)>) -> bool + Send>;
 
 #[derive(Default)]
-/// What a test sets and sees of the board.
+/// What a test sets and reads on the board.
 pub struct State {
-    /// By the input that they drive.
+    /// By the input that the chip drives.
     line_chips: HashMap<u32, LineChip>,
     /// By bus.
     spi_chips: HashMap<u32, SpiChip>,
     /// By bus and address.
     i2c_chips: HashMap<(u32, u8), I2cChip>,
-    /// What each claimed pin was made last.
+    /// The last direction of each claimed pin.
     pub directions: HashMap<u32, Direction>,
-    /// What each pin was made amid a conversation, in order.
+    /// The changes of direction during conversations, in order.
     pub turns: Vec<(u32, Direction)>,
-    /// Inputs whose edges an interrupt counts.
+    /// Inputs with edges that an interrupt counts.
     pub counted: HashSet<u32>,
     /// Pins of chips that may sleep.
     pub sleeping: HashSet<u32>,
-    /// Whether an errand is being run: only then may the line of such a chip be called.
+    /// Whether an errand is running. Only then may lines that sleep be called.
     on_worker: bool,
     /// ADC and PWM channels in use.
     pub claimed: HashSet<u32>,
@@ -99,55 +97,55 @@ pub struct State {
     pub levels: HashMap<u32, bool>,
     /// Every change of an output, in order.
     pub edges: Vec<(u32, Edge)>,
-    /// Levels of inputs from instants on.
+    /// Levels of inputs, with the times from which they hold.
     inputs: HashMap<u32, Vec<Edge>>,
-    /// Readings to come; the last one stays.
+    /// Next readings. The last one stays.
     readings: HashMap<u32, VecDeque<u16>>,
-    /// What each DS18B20 reads, in thousandths of a degree; the last one stays. None fails.
+    /// Readings of each DS18B20 in thousandths of a degree. The last one stays. `None` is a failure.
     thermometers: HashMap<Vec<u8>, VecDeque<Option<i32>>>,
-    /// Pins that can not be written or read any more, ADC channels too.
+    /// Pins that can no longer be written or read, also ADC channels.
     pub broken: HashSet<u32>,
     /// How many of a pin's next calls fail.
     pub nacks: HashMap<u32, u32>,
-    /// How long a call that fails takes.
+    /// How long a failing call takes.
     pub fail_ticks: u32,
-    /// Lines that somebody holds.
+    /// Lines that are claimed.
     pub held: HashSet<u32>,
-    /// Every SPI transfer, and when it began.
+    /// Every SPI transfer, with its time.
     transfers: Vec<(u64, u32, u8, u32, Message, bool)>,
-    /// Every value of a PWM channel: pin, instant, value.
+    /// Every value of a PWM channel: pin, time, value.
     pub pwm_values: Vec<(u32, u64, u16)>,
     /// The period of each PWM channel.
     pub pwm_cycles: HashMap<u32, u32>,
-    /// How long writing a line takes.
+    /// How long a write to a line takes.
     pub write_ticks: u32,
-    /// How long a device on a worker takes to answer; at first none does.
+    /// How long a device on a worker takes to answer; 0 by default.
     pub answer_ticks: u32,
-    /// Whether the workers' queues are full, so that they take no errand.
+    /// Whether the workers' queues are full and refuse errands.
     pub refuses: bool,
-    /// How long each byte takes on a bus. If it does, an errand is run as it is handed over, and its
-    /// chip is told the instants at which it will be spoken to.
+    /// How long each byte takes on a bus. If it is not 0, an errand runs as soon as it is submitted. Its chip gets the
+    /// times at which its transfers will begin.
     pub byte_ticks: u32,
-    /// How far the errand that is run has come, then.
+    /// The time that the running errand has reached, if [`State::byte_ticks`] is not 0.
     bus_now: Option<Clock>,
 }
 
-/// What the board, its lines, its devices and the test share.
+/// Shared by the board, its lines, its devices and the test.
 #[derive(Clone)]
 pub struct Bench {
     state: Arc<Mutex<State>>,
     gate: Arc<Gate>,
     clock: VirtualClock,
-    /// How many ticks ago the worker did what the errand that is run does: the core may have stood still since.
+    /// How many ticks ago the worker ran the present errand. The core may have stood still since then.
     ago: Arc<AtomicU32>,
-    /// Instants that a test reads and writes count from here.
+    /// A test's times count from here.
     origin: Clock,
 }
 
-/// Lets the SPI chips hang, in the tests that run in real time.
+/// Lets the SPI chips hang, in tests in real time.
 #[derive(Default)]
 struct Gate {
-    /// Whether it is closed, and whether somebody waits there.
+    /// Whether it is closed, and whether a conversation waits at it.
     state: Mutex<(bool, bool)>,
     changed: Condvar,
 }
@@ -162,7 +160,7 @@ impl Gate {
 }
 
 impl Bench {
-    /// Lets the SPI chips hang, or lets them go on.
+    /// Lets the SPI chips hang, or ends that.
     pub fn hang(&self, hang: bool) {
         self.gate.state.lock().unwrap().0 = hang;
         self.gate.changed.notify_all();
@@ -175,7 +173,7 @@ impl Bench {
 
     /// A bench on this clock, whose ticks count from `origin`.
     pub fn new(clock: VirtualClock, origin: Clock) -> Bench {
-        // Room enough: the bench does not allocate later, see tests/no_allocation.rs.
+        // Reserve enough memory: the bench must not allocate later (tests/no_allocation.rs).
         let state = State {
             edges: Vec::with_capacity(1 << 16),
             transfers: Vec::with_capacity(256),
@@ -191,12 +189,12 @@ impl Bench {
         now.since(self.origin) as u64
     }
 
-    /// A device takes its time.
+    /// Advances the clock by the time that a device needs.
     pub fn pass(&self, ticks: Ticks) {
         self.clock.set(self.clock.now() + ticks);
     }
 
-    /// When a conversation of so many bytes begins.
+    /// When a conversation of `bytes` bytes begins.
     fn bus_ticks(&self, bytes: usize) -> u64 {
         let mut state = self.state();
         let takes = Ticks(state.byte_ticks * bytes as u32);
@@ -206,7 +204,7 @@ impl Bench {
         at.since(self.origin) as u64
     }
 
-    /// What a test sets and sees.
+    /// What a test sets and reads.
     pub fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap()
     }
@@ -242,7 +240,7 @@ impl Bench {
         self.state().levels[&pin]
     }
 
-    /// Where an output belongs if the program dies.
+    /// The level of an output if the program dies.
     pub fn shutdown_value(&self, pin: u32) -> bool {
         match self.state().directions[&pin] {
             Direction::Output { shutdown_value, .. } => shutdown_value,
@@ -275,17 +273,17 @@ impl Bench {
         self.state().line_chips.insert(pin, Box::new(chip));
     }
 
-    /// Lets an input change at instants in the future.
+    /// Lets an input change at these future times.
     pub fn script_input(&self, pin: u32, levels: &[Edge]) {
         self.state().inputs.entry(pin).or_default().extend(levels);
     }
 
-    /// Lets an ADC channel read these values and then stay at the last.
+    /// Sets the next readings of an ADC channel. The last one stays.
     pub fn script_adc(&self, pin: u32, values: &[u16]) {
         self.state().readings.insert(pin, values.iter().copied().collect());
     }
 
-    /// Plugs a DS18B20 in, which reads these values and then stays at the last; none fails.
+    /// Adds a DS18B20 with these next readings. The last one stays. `None` is a failure.
     pub fn script_ds18b20(&self, serial: &str, values: &[Option<i32>]) {
         self.state().thermometers.insert(serial.into(), values.iter().copied().collect());
     }
@@ -300,7 +298,7 @@ impl Bench {
         Ok(pin.0)
     }
 
-    /// The core never waits for a chip that may sleep.
+    /// Checks that the core does not call a line that may sleep.
     fn may_call(&self, pin: u32) {
         let state = self.state();
         assert!(state.on_worker || !state.sleeping.contains(&pin), "the core itself calls pin {pin}");
@@ -320,7 +318,7 @@ impl Bench {
     }
 }
 
-/// The board itself; the bench is its other side.
+/// The board. The bench is the test's side of it.
 pub struct FakeBoard(pub Bench);
 
 impl Board for FakeBoard {
@@ -471,7 +469,7 @@ struct FakeLine {
 
 impl Drop for FakeLine {
     fn drop(&mut self) {
-        // Amid a panic of a test, too.
+        // This also runs when a test panics.
         self.bench.state.lock().unwrap_or_else(PoisonError::into_inner).held.remove(&self.pin);
     }
 }
@@ -535,7 +533,7 @@ impl Line for FakeLine {
 struct FakeEdges {
     bench: Bench,
     pin: u32,
-    /// How many of them were taken.
+    /// How many changes were read.
     taken: usize,
 }
 
@@ -577,7 +575,7 @@ impl Adc for FakeAdc {
     }
 }
 
-/// What stands at an I2C address: a chip that a test plugged in, or nothing.
+/// The device at an I2C address: a chip from a test, or nothing.
 struct FakeI2c {
     bench: Bench,
     config: I2cConfig,
@@ -586,10 +584,10 @@ struct FakeI2c {
 impl BusDevice for FakeI2c {
     fn write_read(&mut self, write: &[u8], read: &mut [u8]) -> Result<(), BusError> {
         let I2cConfig { bus, address, .. } = self.config;
-        // The address goes before what is written, and before what is read.
+        // An address byte precedes the written bytes, and another precedes the bytes to read.
         let addresses = usize::from(!write.is_empty()) + usize::from(!read.is_empty());
         let at = self.bench.bus_ticks(write.len() + read.len() + addresses);
-        // Not locked while the chip answers: it may look at the bench.
+        // The state is not locked while the chip answers, because the chip may read the bench.
         let chip = self.bench.state().i2c_chips.remove(&(bus, address));
         let Some(mut chip) = chip else {
             let trouble = Trouble::new(format!("nothing answers at 0x{address:02x}")).remedy("check the wiring");
@@ -603,7 +601,7 @@ impl BusDevice for FakeI2c {
     }
 }
 
-/// A chip that sends back the complement of what it gets, or one that a test plugged in.
+/// A chip from a test, or one that returns the complement of each byte.
 struct FakeSpi {
     bench: Bench,
     config: SpiConfig,
@@ -651,7 +649,7 @@ impl BusDevice for FakeSpi {
     }
 }
 
-/// Workers in virtual time: one errand of a bus after the other, each takes its time.
+/// Workers in virtual time. The errands of one bus run one after the other, and each takes its time.
 #[derive(Clone)]
 pub struct FakeWorkers {
     bench: Bench,
@@ -661,9 +659,9 @@ pub struct FakeWorkers {
 struct Shop {
     /// Each bus, and when it is free again.
     buses: Vec<(String, Clock)>,
-    /// In the order of their ends.
+    /// In the order of their end times.
     under_way: VecDeque<UnderWay>,
-    /// What hung when the workers were reset.
+    /// Errands that hung when the workers were reset.
     left_behind: Vec<UnderWay>,
 }
 
@@ -681,7 +679,7 @@ enum Work {
 }
 
 impl Shop {
-    /// Room for more errands than a test sends: the bench does not allocate later.
+    /// Reserves memory for more errands than a test sends, because the bench must not allocate later.
     fn new() -> Shop {
         Shop { buses: Vec::new(), under_way: VecDeque::with_capacity(256), left_behind: Vec::new() }
     }
@@ -691,7 +689,7 @@ impl Shop {
         self.under_way.insert(place, new);
     }
 
-    /// An errand of this worker took its own time as well: those behind it wait for it.
+    /// Delays the errands after one that ran for a time of its own on this worker.
     fn delay(&mut self, worker: usize, ended: Clock, by: Ticks) {
         self.buses[worker].1 = self.buses[worker].1.max(ended);
         for other in self.under_way.iter_mut().filter(|other| other.worker == worker) {
@@ -709,12 +707,12 @@ impl FakeWorkers {
         FakeWorkers { bench, shop: Arc::new(Mutex::new(Shop::new())) }
     }
 
-    /// How many errands are under way.
+    /// How many errands are on their way.
     pub fn under_way(&self) -> usize {
         self.shop.lock().unwrap().under_way.len()
     }
 
-    /// When the next errand is done.
+    /// When the next errand ends.
     pub fn next_end(&self) -> Option<Clock> {
         self.shop.lock().unwrap().under_way.front().map(|next| next.end)
     }
@@ -754,8 +752,8 @@ impl Workers for FakeWorkers {
         Ok(())
     }
 
-    /// What an errand does to its device it does at its end, unless bytes take their time. One that
-    /// keeps time itself goes on from there in a time of its own, and is done when that has come.
+    /// An errand calls its device at its own end, unless bytes take time. An errand that keeps time itself goes on from
+    /// there in a time of its own. It is finished when that time has come.
     fn completion(&mut self) -> Option<Completion> {
         while self.has_completion() {
             let UnderWay { worker, begin: began, end, work } = self.shop.lock().unwrap().under_way.pop_front()?;
@@ -783,14 +781,14 @@ impl Workers for FakeWorkers {
     fn has_completion(&self) -> bool {
         let now = self.bench.clock.now();
         let mut shop = self.shop.lock().unwrap();
-        // A worker that hung comes back, and ends.
+        // A worker that hung returns and ends.
         let back: Vec<UnderWay> = shop.left_behind.extract_if(.., |hung| hung.end <= now).collect();
         drop(shop);
         drop(back);
         self.next_end().is_some_and(|end| end <= now)
     }
 
-    /// What takes longer than the two seconds that the program waits is left behind.
+    /// The program waits two seconds. Longer work is left behind.
     fn reset(&mut self) {
         let waits_until = self.bench.clock.now() + WORKERS_END;
         let mut shop = self.shop.lock().unwrap();

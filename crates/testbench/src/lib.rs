@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A micro-controller in virtual time, for tests and benches.
 //!
-//! - [`board`]: a board that records what the MCU does to its pins, and lets a test play the rest
+//! - [`board`]: a board that records what the MCU does to its pins; a test plays the devices
 //! - [`rig`]: an MCU on that board, and the host's side of its wire
 
 #![forbid(unsafe_code)]

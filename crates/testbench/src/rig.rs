@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! An MCU on a bench, in virtual time, spoken to in words.
+//! An MCU on a bench in virtual time. Tests send commands and read responses as text.
 
 use std::sync::{Arc, Mutex};
 
@@ -13,15 +13,15 @@ use pinion_protocol::vlq::{Reader, Writer};
 
 use crate::board::{Bench, Edge, FakeBoard, FakeWorkers};
 
-/// What a rig's MCU is.
+/// The firmware of a rig's MCU.
 pub const FIRMWARE: Firmware =
     Firmware { features: FEATURES, app: "Rig", version: "test", build_versions: "", license: "" };
 
-/// When a rig's story begins, unless a test says otherwise.
+/// The tick at which a rig is created, unless a test sets another.
 const ORIGIN: u64 = 10_000_000;
 
-/// The MCU's responses stand one after the other in one buffer that is large enough from
-/// the start: what is counted in `crates/firmware/tests/no_allocation.rs` is the MCU's alone.
+/// Size of the buffer for all responses. It never grows, so `crates/firmware/tests/no_allocation.rs` counts only the
+/// MCU's own allocations.
 const RESPONSE_BYTES: usize = 1 << 20;
 
 #[derive(Clone)]
@@ -51,7 +51,7 @@ impl Outbox for FakeOutbox {
     }
 }
 
-/// An MCU on a bench. Instants count from its making.
+/// An MCU on a bench. Times count from the rig's creation.
 pub struct Rig {
     /// The MCU.
     pub mcu: Mcu,
@@ -75,7 +75,7 @@ impl Rig {
         Rig::at(ORIGIN)
     }
 
-    /// An MCU that is made at `start`.
+    /// An MCU that is created at `start`.
     pub fn at(start: u64) -> Rig {
         Rig::on_board(start, FakeBoard)
     }
@@ -111,14 +111,14 @@ impl Rig {
         rig
     }
 
-    /// An MCU with these objects.
+    /// An MCU configured with these commands.
     pub fn configured(commands: &[&str]) -> Rig {
         let mut rig = Rig::new();
         rig.configure(commands);
         rig
     }
 
-    /// As [`Rig::configured`], with devices that take `answer_ticks` on a worker.
+    /// As [`Rig::configured`], with devices that need `answer_ticks` on a worker.
     pub fn with_workers(answer_ticks: u32, commands: &[&str]) -> Rig {
         let mut rig = Rig::new();
         rig.bench.state().answer_ticks = answer_ticks;
@@ -136,17 +136,17 @@ impl Rig {
 
     // ---- time
 
-    /// Ticks since the rig was made.
+    /// Ticks since the rig's creation.
     pub fn now(&self) -> u64 {
         self.clock.now().since(self.origin) as u64
     }
 
-    /// The present instant as it goes over the wire.
+    /// The time now, as it goes over the wire.
     pub fn wire_clock(&self) -> u32 {
         self.clock.now().wire()
     }
 
-    /// How many errands are under way.
+    /// How many errands are on their way.
     pub fn errands(&self) -> usize {
         self.workers.under_way()
     }
@@ -160,13 +160,13 @@ impl Rig {
         self.clock.set(self.instant(ticks));
     }
 
-    /// Jumps to an instant.
+    /// Jumps to a time.
     #[inline]
     pub fn jump(&self, to: Clock) {
         self.clock.set(to);
     }
 
-    /// Runs the MCU up to and with the instant `ticks`.
+    /// Runs the MCU up to the time `ticks`, inclusive.
     pub fn run_until(&mut self, ticks: u64) {
         let end = self.instant(ticks);
         while let Some(next) = self.turn().filter(|next| *next <= end) {
@@ -175,8 +175,7 @@ impl Rig {
         self.clock.set(end);
     }
 
-    /// Lets the MCU run what is due; at most so many times, as a host's command may ask
-    /// for an event without end.
+    /// Lets the MCU run what is due, for at most this many turns. A command may ask for events without end.
     pub fn run_turns(&mut self, turns: u32) {
         for _ in 0..turns {
             if let Some(next) = self.turn() {
@@ -185,20 +184,20 @@ impl Rig {
         }
     }
 
-    /// Runs what is due, and tells when there is more to do.
+    /// Runs what is due, and returns the time of the next event.
     #[inline]
     pub fn turn(&mut self) -> Option<Clock> {
         self.mcu.run_timers();
         self.mcu.run_workers();
         let next = [self.mcu.next_timer(), self.workers.next_end()].into_iter().flatten().min()?;
-        // An event that asks to run again in the past takes its time like any other.
+        // An event that asks to run again in the past also takes some time.
         Some(if next <= self.mcu.last_read() { self.mcu.now() + Ticks::from_us(1) } else { next })
     }
 
     // ---- words
 
-    /// Encodes a command such as `queue_step oid=0 interval=1000 count=5 add=-3`; bytes are
-    /// written in hex, `clock=@1000` is 1000 ticks after the rig was made.
+    /// Encodes a command, for example `queue_step oid=0 interval=1000 count=5 add=-3`. Bytes are in hexadecimal.
+    /// `clock=@1000` is 1000 ticks after the rig's creation.
     pub fn encode(&self, command: &str) -> Vec<u8> {
         let mut words = command.split(' ');
         let name = words.next().unwrap();
@@ -238,14 +237,14 @@ impl Rig {
         commands.iter().for_each(|command| self.send(command));
     }
 
-    /// Runs one command, and returns before the conversation that it may have begun is over.
+    /// Runs one command, and does not wait for the end of its conversation.
     pub fn begin(&mut self, command: &str) {
         let payload = self.encode(command);
         self.mcu.execute(&mut Reader::new(&payload));
     }
 
-    /// Runs the commands of a block's payload, each to the end of the conversation that it began, unless the next one
-    /// joins it.
+    /// Runs the commands of a block's payload. It waits for the end of each command's conversation, unless the next
+    /// command joins it.
     #[inline]
     pub fn execute(&mut self, payload: &[u8]) {
         let mut reader = Reader::new(payload);
@@ -258,13 +257,13 @@ impl Rig {
         }
     }
 
-    /// Sends a command and takes its answer, which comes last.
+    /// Sends a command and returns its answer, the last response.
     pub fn ask(&mut self, command: &str) -> String {
         self.send(command);
         self.responses().pop().unwrap_or_default()
     }
 
-    /// What the MCU said since the last call, `stats` left out, as text:
+    /// The responses since the last call as text, without `stats`, for example
     /// `shutdown clock=@5 static_string_id=Timer too close`.
     pub fn responses(&self) -> Vec<String> {
         let mut responses = self.everything();
@@ -279,7 +278,7 @@ impl Rig {
         responses
     }
 
-    /// Looks at each response since the last call as it goes over the wire.
+    /// Passes each response since the last call to `look`, as bytes of the wire.
     pub fn each_response(&self, mut look: impl FnMut(&[u8])) {
         let mut buffer = self.outbox.payloads.lock().unwrap();
         let mut payloads = &buffer[..];
@@ -291,18 +290,17 @@ impl Rig {
         buffer.clear();
     }
 
-    /// Forgets what the MCU said.
+    /// Forgets the responses so far.
     pub fn forget_responses(&self) {
         self.outbox.payloads.lock().unwrap().clear();
     }
 
-    /// What the MCU said for the log since the last call.
+    /// The MCU's notes for the log since the last call.
     pub fn notes(&self) -> Vec<String> {
         std::mem::take(&mut self.outbox.notes.lock().unwrap())
     }
 
-    /// The text of the shutdown since the last call, if there was one; more than one is a
-    /// fault of its own.
+    /// The text of the shutdown since the last call, if there was one. It panics if there were several.
     pub fn shutdown(&self) -> Option<String> {
         let mut responses = self.responses();
         responses.retain(|response| response.starts_with("shutdown "));
@@ -315,7 +313,7 @@ impl Rig {
         self.bench.edges(pin)
     }
 
-    /// What the MCU tells a host of itself.
+    /// The MCU's dictionary.
     pub fn dictionary(&self) -> &Dictionary {
         self.dialect().dictionary()
     }
@@ -325,7 +323,7 @@ impl Rig {
         self.mcu.dialect()
     }
 
-    /// Offers the MCU the dialect of another generation; whether it takes it.
+    /// Gives the MCU the dialect of another generation. It may not use it before a reset.
     pub fn speak(&mut self, generation: Generation) {
         let dialect = Dialect::new(&FIRMWARE, &FakeBoard(self.bench.clone()), DialectName::Of(generation));
         self.mcu.speak(Arc::new(dialect.unwrap()));
@@ -360,7 +358,7 @@ impl Rig {
     }
 }
 
-/// Bytes in hexadecimal, as the commands of a rig have them.
+/// Bytes in hexadecimal, as in a rig's commands.
 pub fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
