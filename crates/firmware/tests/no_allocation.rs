@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A whole print allocates nothing in the core once the MCU is configured: an allocation
-//! may wait for a lock or for the kernel, and a step would wait with it.
+//! After configuration, the core allocates nothing in a whole print. An allocation may wait for a lock or for the
+//! kernel, and a step would wait with it.
 
 use std::alloc::{GlobalAlloc, Layout, System};
 use std::cell::Cell;
@@ -10,7 +10,7 @@ use pinion_firmware::mcu::Snapshot;
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::rig::Rig;
 
-/// The system's allocator, which counts for the thread that asks it to.
+/// The system's allocator. It counts allocations of a thread that sets `COUNTS`.
 struct Counting;
 
 thread_local! {
@@ -24,8 +24,8 @@ fn count() {
     }
 }
 
-// SAFETY: every call goes to the system's allocator as it came. The counters are plain cells of
-// the thread, made without an allocation and without a destructor.
+// SAFETY: every call goes unchanged to the system's allocator. The counters are plain cells of the thread. They need no
+// allocation and have no destructor.
 #[allow(unsafe_code)]
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
@@ -50,7 +50,7 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
 
-/// Runs `core` and counts what it allocates and frees.
+/// Runs `core` and counts its allocations and frees.
 fn allocations(core: impl FnOnce()) -> u64 {
     ALLOCATIONS.set(0);
     COUNTS.set(true);
@@ -59,7 +59,7 @@ fn allocations(core: impl FnOnce()) -> u64 {
     ALLOCATIONS.get()
 }
 
-/// Commands at instants, as a host sends them: ahead of their time.
+/// Sends commands ahead of their time, as a host does.
 struct Print {
     rig: Rig,
     counted: u64,
@@ -73,7 +73,7 @@ impl Print {
 
     fn run_until(&mut self, ticks: u64) {
         self.counted += allocations(|| self.rig.run_until(ticks));
-        // The bench's own records have their limits.
+        // The bench has room for a limited number of edges.
         self.rig.bench.forget_edges();
     }
 }
@@ -103,7 +103,7 @@ const OBJECTS: &[&str] = &[
     "config_neopixel oid=13 pin=701 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
 ];
 
-/// What klippy sends after the configuration, before anything moves.
+/// klippy's commands after the configuration, before anything moves.
 const BEGINNINGS: &[&str] = &[
     "buttons_add oid=9 pos=0 pin=10 pull_up=1",
     "buttons_add oid=9 pos=1 pin=11 pull_up=1",
@@ -124,7 +124,7 @@ fn print(rig: Rig) -> Print {
     print.rig.bench.script_input(13, &[(50_000_000, 1), (60_000_000, 0)]);
     print.rig.send_all(BEGINNINGS);
     print.send("query_analog_in oid=6 clock=@100000 sample_ticks=50000 sample_count=8 rest_ticks=15000000 bytes_per_report=48 min_value=0 max_value=65535 range_check_count=4");
-    // The bench has room for a few hundred transfers.
+    // The bench has room for only 256 transfers.
     print.send("query_adxl345 oid=14 rest_ticks=20000000");
     print.home(5_000_000);
     assert_eq!(print.rig.ask("endstop_query_state oid=3").split(' ').nth(2), Some("homing=1"));
@@ -199,7 +199,7 @@ fn a_print_allocates_nothing_once_configured() {
     }
 }
 
-/// Whoever asks for the status brings the room for the answer.
+/// The caller provides the memory for the status.
 #[test]
 fn a_status_that_is_told_amid_steps_allocates_nothing() {
     let mut rig = Rig::new();
@@ -220,13 +220,13 @@ fn a_status_that_is_told_amid_steps_allocates_nothing() {
                 parts += 1;
             }
         });
-        // The head, and 16 lines or objects at a time.
+        // The head is one part, and each further part has up to 16 lines or objects.
         assert!(parts > 2 && snapshot.lines.len() > 10 && snapshot.objects.len() > 15);
         let stepper = snapshot.objects[0].report;
         assert_eq!((snapshot.moves.0, stepper.queued), (1, 1), "it steps");
         print.run_until(at + 150_000);
     }
-    // One that says why the MCU is stopped.
+    // A status that contains the reason of the shutdown.
     print.rig.send("emergency_stop");
     snapshot.clear();
     print.counted += allocations(|| while !print.rig.mcu.tell(&mut snapshot) {});
@@ -234,7 +234,7 @@ fn a_status_that_is_told_amid_steps_allocates_nothing() {
     assert_eq!(print.counted, 0);
 }
 
-/// A probe by each kind of sensor, whose lines and chips are left to answer what they will.
+/// Probes with each kind of sensor. Their lines and chips answer anything.
 #[test]
 fn probing_allocates_nothing_once_configured() {
     let objects = [
@@ -272,7 +272,7 @@ fn probing_allocates_nothing_once_configured() {
                 reports.iter().any(|it| it.starts_with("sensor_bulk_data") || it.starts_with("analog_in_state")),
                 "{name}"
             );
-            // The bench's records have their limits.
+            // The bench has room for a limited number of transfers.
             if name != "analog_in" {
                 print.send(&format!("query_{name} {oid} rest_ticks=0"));
             }
@@ -281,7 +281,7 @@ fn probing_allocates_nothing_once_configured() {
     }
 }
 
-/// What hosts before master ask for in other words.
+/// Covers the forms of commands that only hosts before master use.
 #[test]
 fn older_hosts_cost_no_allocation_either() {
     let sensors = [
@@ -312,7 +312,7 @@ fn older_hosts_cost_no_allocation_either() {
         print.send("i2c_write oid=1 data=1020");
         print.send("i2c_read oid=1 reg=10 read_len=6");
         print.send("i2c_modify_bits oid=1 reg=10 clear_set_bits=0102");
-        // The bench has room for a few hundred transfers.
+        // The bench has room for only 256 transfers.
         print.run_until(2_000_000);
         for sensor in ["adxl345 oid=3", "lis2dw oid=4", "mpu9250 oid=5"] {
             let (name, oid) = sensor.split_once(' ').unwrap();
@@ -368,6 +368,6 @@ fn a_probe_of_kalico_allocates_nothing_once_configured() {
 
 #[test]
 fn the_counter_counts() {
-    // Out of the optimiser's sight, which would leave the pair out.
+    // `black_box` keeps the optimizer from removing the pair.
     assert_eq!(allocations(|| drop(std::hint::black_box(Box::new(1)))), 2);
 }

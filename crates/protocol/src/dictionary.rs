@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The data dictionary (docs/Protocol.md, "Data dictionary"). klippy reads it through `identify`. Its batch mode reads it
-//! from a file (`-d`).
+//! The data dictionary (docs/Protocol.md, "Data dictionary"). klippy reads it through `identify`. Its batch mode reads
+//! it from a file (`-d`).
 
 #![forbid(unsafe_code)]
 

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The accelerometer ADXL345: samples in order and complete, statuses that fit them, and what
-//! becomes of a chip that is not there.
+//! The accelerometer ADXL345: complete samples in order, statuses that match them, and the effect of a missing chip.
 
 use std::sync::{Arc, Mutex};
 
@@ -13,26 +12,25 @@ const CONFIG: &[&str] = &[
     "spi_set_bus oid=0 spi_bus=0 mode=3 rate=5000000",
 ];
 
-/// Ticks of a sample at 3200 Hz.
+/// Ticks per sample at 3200 Hz.
 const SAMPLE_TICKS: u64 = 15_625;
-/// klippy's: four samples.
+/// The value of klippy: four samples.
 const REST_TICKS: u64 = 4 * SAMPLE_TICKS;
 
-/// The chip: it measures from an instant on, and each sample is its number.
+/// The chip measures from `start` on. The value of each sample is its number.
 #[derive(Default)]
 struct Chip {
     period: u64,
     start: u64,
-    /// Samples that were read, and those that the full FIFO dropped.
+    /// Samples that were read, and samples that the full FIFO dropped.
     taken: u64,
     dropped: u64,
-    /// Instead of an answer.
+    /// If set, the chip sends this byte instead of an answer.
     rubbish: Option<u8>,
 }
 
 impl Chip {
-    /// Samples that are there to be read, after the data sheet 32 of the FIFO and one in the output
-    /// registers.
+    /// Samples ready to be read. According to the data sheet, the FIFO holds 32 and the output registers hold one.
     fn available(&mut self, at: u64) -> u64 {
         let made = (at.saturating_sub(self.start) / self.period).min(1 << 40);
         let available = made - self.taken - self.dropped;
@@ -76,7 +74,7 @@ fn field<'a>(response: &'a str, name: &str) -> &'a str {
     words.find(|(key, _)| *key == name).unwrap_or_else(|| panic!("{response}")).1
 }
 
-/// The samples' numbers in a message; none for an error.
+/// The samples' numbers in a message; `None` for an error.
 fn samples(response: &str) -> Vec<Option<u64>> {
     let data = field(response, "data");
     let bytes: Vec<u8> =
@@ -118,7 +116,7 @@ fn the_fifo_is_looked_at_after_its_rest_and_read_until_one_is_left() {
     assert_eq!(at, [3000, 3000, 3000, 6000, 6000, 6000]);
 }
 
-/// At 10 us a byte a sample takes 90 us of the 312 us that it has. A minute, as klippy measures.
+/// A measurement of a minute, as klippy makes it. At 10 us a byte, a sample takes 90 us of its 312 us.
 #[test]
 fn no_sample_is_lost_at_3200_hz_beside_steppers_and_steps_are_on_their_ticks() {
     const SECONDS: u64 = 60;
@@ -145,7 +143,7 @@ fn no_sample_is_lost_at_3200_hz_beside_steppers_and_steps_are_on_their_ticks() {
     let mut messages = 0u16;
     let mut steps = 0;
     for tenth in 1..=10 * SECONDS {
-        // klippy asks ten times a second, at any moment.
+        // klippy asks ten times a second, at any time.
         let until = tenth * 5_000_000 - tenth * 7_919 % 100_000;
         rig.run_until(until);
         rig.send("query_adxl345_status oid=1");
@@ -172,7 +170,7 @@ fn no_sample_is_lost_at_3200_hz_beside_steppers_and_steps_are_on_their_ticks() {
     assert_eq!(chip.lock().unwrap().dropped, 0);
 }
 
-/// What klippy computes a sample's time from: so many samples at that instant, and not one more.
+/// klippy computes a sample's time from the status. It must have the exact number of samples at its time.
 #[test]
 fn a_status_counts_the_samples_of_its_instant() {
     let mut rig = Rig::new();
@@ -181,7 +179,7 @@ fn a_status_counts_the_samples_of_its_instant() {
     plug(&rig, measuring(SAMPLE_TICKS));
     rig.send(&format!("query_adxl345 oid=1 rest_ticks={REST_TICKS}"));
     for n in 0..500u64 {
-        // At any moment, amid readings too.
+        // At any time, also during a reading.
         rig.run_until(n * 23_456);
         rig.send("query_adxl345_status oid=1");
         let responses = rig.responses();
@@ -199,7 +197,7 @@ fn a_status_is_that_of_the_question_and_not_of_the_wait_for_the_bus() {
     plug(&rig, measuring(SAMPLE_TICKS));
     rig.begin("spi_transfer oid=0 data=f20000000000000000");
     rig.run_until(1500);
-    // Behind the transfer that takes until 2000.
+    // After the transfer, which takes until 2000.
     rig.send("query_adxl345_status oid=1");
     assert_eq!(
         rig.responses().pop().unwrap(),
@@ -267,7 +265,7 @@ fn an_ended_query_says_nothing_more_and_the_next_begins_at_zero() {
     let mut rig = Rig::with_workers(5000, CONFIG);
     plug(&rig, measuring(500));
     rig.send("query_adxl345 oid=1 rest_ticks=20000");
-    // Amid a reading.
+    // During a reading.
     rig.run_until(22_000);
     rig.send("query_adxl345 oid=1 rest_ticks=0");
     rig.run_until(100_000);
@@ -277,7 +275,7 @@ fn an_ended_query_says_nothing_more_and_the_next_begins_at_zero() {
     rig.send("query_adxl345 oid=1 rest_ticks=20000");
     rig.run_until(160_000);
     assert!(field(rig.responses().last().unwrap(), "sequence") != "0");
-    // Anew amid a reading, and due before that is over.
+    // Started again during a reading, and due before that reading ends.
     rig.run_until(162_000);
     rig.forget_responses();
     rig.send("query_adxl345 oid=1 rest_ticks=100");
@@ -296,7 +294,7 @@ fn a_sensor_needs_an_spi_device() {
     }
 }
 
-/// What cannot be sent stays with its sensor, which is told so each time.
+/// An errand that cannot be sent stays with its sensor. The sensor gets an error each time.
 #[test]
 fn a_sensor_whose_device_has_no_bus_loses_nothing() {
     let config =

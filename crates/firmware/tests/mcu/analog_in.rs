@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Analog inputs, with an ADC that answers at once and with one that takes its time.
+//! Analog inputs, with an ADC that answers at once and with a slow ADC.
 
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::rig::Rig;
 
 const SENSOR: &str = "config_analog_in oid=0 pin=400";
 
-/// Asks for sums of four samples 1000 ticks apart, every 100000 ticks from tick 5000 on.
+/// Requests sums of four samples 1000 ticks apart, every 100000 ticks from tick 5000 on.
 fn query(bytes_per_report: u8, min_value: u16, max_value: u16, range_check_count: u8) -> String {
     format!(
         "query_analog_in oid=0 clock=@5000 sample_ticks=1000 sample_count=4 rest_ticks=100000 \
@@ -56,7 +56,7 @@ fn what_was_refused_is_not_kept() {
     rig.send(&query(4, 0, 65535, 1));
     rig.send(&query(255, 0, 65535, 1));
     assert_eq!(rig.shutdown().as_deref(), Some("Invalid analog_in bytes_per_report"));
-    // Sampling goes on in the stopped MCU as it was asked for before: the same as in a running one.
+    // The stopped MCU goes on sampling with the earlier settings, the same as a running one.
     rig.run_until(10_000_000);
     let reports = rig.responses();
     assert!(reports.len() > 30, "{reports:?}");
@@ -66,7 +66,7 @@ fn what_was_refused_is_not_kept() {
 #[test]
 fn so_many_readings_in_a_row_may_be_out_of_range() {
     let mut rig = Rig::configured(&[SENSOR]);
-    // Sums of 0, 0, 400, 0, 0, 0.
+    // The sums are 0, 0, 400, 0, 0, 0.
     rig.bench.script_adc(ANALOG, &[0, 0, 0, 0, 0, 0, 0, 0, 100, 100, 100, 100, 0]);
     rig.send(&query(1, 100, 1000, 3));
     rig.run_until(500_000);
@@ -138,7 +138,7 @@ fn reads_that_fail_for_100_ms_stop_the_mcu_and_reports_come_once_it_works_again(
     rig.bench.script_adc(ANALOG, &[1]);
     rig.send(&query(1, 0, 65535, 1));
     rig.bench.state().broken.insert(ANALOG);
-    // Sums of which nothing could be read are due every 100000 ticks from 5000 on.
+    // Sums without any reading are due every 100000 ticks from 5000 on.
     rig.run_until(5_004_999);
     assert_eq!(rig.responses(), [""; 0]);
     rig.run_until(5_005_000);
@@ -161,7 +161,7 @@ fn a_read_that_fails_is_tried_again_and_then_its_sum_is_left_out() {
     rig.bench.state().nacks.insert(ANALOG, 3);
     rig.run_until(250_000);
     assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@305000 values=0400"]);
-    // One more, long after: it is the first in its row.
+    // One more failure, long after: it is the first of a new row.
     rig.run_until(6_000_000);
     rig.bench.state().nacks.insert(ANALOG, 3);
     rig.run_until(12_000_000);
@@ -170,7 +170,7 @@ fn a_read_that_fails_is_tried_again_and_then_its_sum_is_left_out() {
 
 #[test]
 fn an_adc_that_takes_its_time_delays_samples_and_nothing_else() {
-    // 3000 ticks for a reading: the four samples take 12000 instead of 3000.
+    // A reading takes 3000 ticks. So the four samples take 12000 ticks instead of 3000.
     let mut rig = Rig::with_workers(
         3000,
         &[SENSOR, "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0"],
@@ -190,7 +190,7 @@ fn an_adc_that_takes_its_time_delays_samples_and_nothing_else() {
 
 #[test]
 fn an_adc_that_is_slower_than_the_reports_loses_some_and_no_step() {
-    // 60000 ticks for a reading, 240000 for a report that is wanted every 100000.
+    // A reading takes 60000 ticks. A report takes 240000 and is requested every 100000.
     let mut rig = Rig::with_workers(
         60_000,
         &[SENSOR, "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0"],
@@ -200,7 +200,7 @@ fn an_adc_that_is_slower_than_the_reports_loses_some_and_no_step() {
     rig.send_all(&["reset_step_clock oid=1 clock=@0", "queue_step oid=1 interval=1000 count=5000 add=0"]);
     rig.run_until(5_000_000);
     let reports = rig.responses();
-    // Every third place in time is taken: 5000, 305000, ...
+    // Every third time slot is used: 5000, 305000, ...
     let expected: Vec<String> = (0..reports.len() as u64)
         .map(|n| format!("analog_in_state oid=0 next_clock=@{} values=2800", 305_000 + 300_000 * n))
         .collect();

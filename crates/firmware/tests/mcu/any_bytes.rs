@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Whatever a host sends, the MCU is there afterwards.
+//! No bytes from a host can break the MCU.
 
 use pinion_firmware::mcu::Generation::{self, Kalico, Master, V0_11, V0_12, V0_13};
 use pinion_protocol::block::PAYLOAD_MAX;
@@ -36,7 +36,7 @@ const OBJECTS: &[&str] = &[
     "config_neopixel oid=17 pin=701 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
 ];
 
-/// The same objects for a host of another generation, in its forms; some that only it has besides.
+/// The same objects for a host of another generation, in its forms, and some objects that only it has.
 fn objects(generation: Generation) -> Vec<&'static str> {
     let mut objects = OBJECTS.to_vec();
     let mut replace = |name: &str, by: &[&'static str]| {
@@ -69,7 +69,7 @@ fn objects(generation: Generation) -> Vec<&'static str> {
 
 #[derive(Clone, Debug)]
 enum Action {
-    /// Any bytes at all.
+    /// Random bytes.
     Bytes(Vec<u8>),
     /// A command of the dictionary with these values.
     Command(usize, Vec<u32>, Vec<u8>),
@@ -77,12 +77,12 @@ enum Action {
     Stall(u64),
 }
 
-/// Values at which something might break, and those that make sense.
+/// Values at which something might break, and valid values.
 fn value() -> impl Strategy<Value = u32> {
     prop_oneof![
         4 => 0u32..8,
         1 => prop::sample::select(vec![255, 256, 1000, 65535, 65536, 1 << 31, (1 << 31) - 1, u32::MAX, u32::MAX - 1]),
-        // Clocks around the rig's beginning.
+        // Clocks near the rig's creation.
         2 => 10_000_000u32..10_500_000,
         1 => any::<u32>(),
     ]
@@ -107,9 +107,9 @@ fn command(rig: &Rig, which: usize, values: &[u32], bytes: &[u8]) -> Vec<u8> {
     let strings = parameters.iter().filter(|(_, conversion)| *conversion == Conversion::Bytes).count();
     for ((name, conversion), value) in parameters.iter().zip(values) {
         match conversion {
-            // All of them together fit a block.
+            // All strings together fit a block.
             Conversion::Bytes => writer.string(&bytes[..bytes.len() / strings]),
-            // Mostly of an object that there is.
+            // Most of these oids have an object.
             _ if name.ends_with("oid") => writer.int(value % 21),
             _ => writer.int(*value),
         }
@@ -143,7 +143,7 @@ proptest! {
                 Action::Turns(turns) => rig.run_turns(*turns),
                 Action::Stall(ticks) => rig.stall_until(rig.now() + ticks),
             }
-            // Every response has the form that the dictionary says.
+            // This checks that every response has the form of the dictionary.
             rig.everything();
         }
         prop_assert!(rig.ask("get_config").starts_with("config is_config="));
@@ -151,7 +151,7 @@ proptest! {
         rig.everything();
         rig.configure(&objects(generation));
         prop_assert_eq!(rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024");
-        // And it works: a step comes on its tick.
+        // The MCU still works: a step comes on its tick.
         rig.edges(1);
         let now = rig.now();
         rig.send(&format!("reset_step_clock oid=0 clock=@{now}"));

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Whatever commands a host sends, the MCU is there afterwards, with its outputs where they belong.
+//! No commands from a host can break the MCU. Its outputs are at their shutdown values when it stops.
 //!
-//! The commands are those of the dictionary, so a new feature is covered as soon as it is listed: what arguments
-//! a command accepts is found by trying, once for each generation of hosts ([`Book`]). Each case then sends
-//! accepted arguments with some of them changed.
+//! The commands come from the dictionary, so a new feature is covered as soon as it is listed. The test tries each
+//! command to find arguments that the command accepts, once for each generation of hosts ([`Book`]). Each case then
+//! sends accepted arguments and changes some of them.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::LazyLock;
@@ -21,7 +21,7 @@ use proptest::test_runner::TestRunner;
 use pinion_testbench::board::{ANALOG, GPIOS, MOSI, PWM, SPI_CHIPS};
 use pinion_testbench::rig::Rig;
 
-/// Commands that never leave a running MCU as it was, or not for every host that sends them.
+/// Commands that always stop a running MCU, for all hosts or for some.
 const STOPS: &[&str] = &[
     "emergency_stop",
     "config_reset",
@@ -38,15 +38,15 @@ const EXTREMES: &[u32] = &[
     0, 1, u32::MAX, 2, 7, 8, 15, 16, 48, 49, 63, 64, 127, 128, 255, 256, 4096, 4097, 32767, 32768, 65535, 65536,
     (1 << 31) - 1, 1 << 31, (1 << 31) + 1, u32::MAX - 1,
 ];
-/// Pins of every kind, those of an expander among them, and what may break besides.
+/// Pins of every kind, also of an expander, and numbers that might break something.
 #[rustfmt::skip]
 const PINS: &[u32] = &[
     0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, 19, 20, 21, 22, 23, 24,
     EXPANDED, EXPANDED + 1, EXPANDED + 2, EXPANDED + 3, ANALOG, ANALOG + 1, ANALOG + 2, PWM, PWM + 1, MOSI, MOSI + 1,
     SPI_CHIPS, SPI_CHIPS + 1, 300, 255, u32::MAX,
 ];
-/// Spans that a worker waits for between two edges. The bench runs an errand to its end at once and can not break it
-/// off, as a stop does, so these are short there.
+/// Spans that a worker waits for between two edges. They are short here: the bench runs an errand to its end at once
+/// and cannot interrupt it, as a stop does.
 const PACED: &[&str] = &["delay_ticks", "sync_delay_ticks", "cmd_delay_ticks", "pulse_ticks", "bit_time"];
 const PACED_TICKS: u32 = 500;
 /// The first line of the expander.
@@ -54,15 +54,15 @@ const EXPANDED: u32 = 280;
 const EXPANDED_LINES: u32 = 8;
 /// A thermometer on the bench.
 const SERIAL: &[u8] = b"28";
-/// Oids that a configuration has room for.
+/// Number of oids in a configuration.
 const OIDS: u8 = 100;
-/// Objects of each command that makes one.
+/// Number of objects for each command that creates one.
 const OBJECTS_OF_A_KIND: usize = 3;
-/// Errands that may be under way: no object has more boxes for them than 32, but for PCA9685, which has one for each
-/// output.
+/// Highest number of errands on their way. No object has more than 32 boxes for them, except PCA9685, which has one for
+/// each output.
 const ERRANDS_MAX: usize = 1024;
 
-/// A small generator of numbers, the same each time.
+/// A small generator of numbers, with the same sequence each time.
 struct Dice(u64);
 
 impl Dice {
@@ -80,11 +80,11 @@ impl Dice {
     }
 }
 
-/// An argument as it can be sent at any time.
+/// An argument that can be sent at any time.
 #[derive(Clone, Debug)]
 enum Value {
     Number(u32),
-    /// An instant, in ticks from now.
+    /// A time, in ticks from now.
     Soon(u32),
     Bytes(Vec<u8>),
 }
@@ -105,11 +105,11 @@ impl Form {
         self.name().starts_with("config_") && self.name() != "config_reset"
     }
 
-    /// The message; bytes that have no room are left out.
+    /// The message, without the bytes that do not fit.
     fn encode(&self, rig: &Rig, values: &[Value]) -> Vec<u8> {
         let mut writer = Writer::default();
         writer.int(self.id);
-        // An integer takes five bytes at most, the length of a string one.
+        // An integer takes at most five bytes, the length of a string one.
         let sizes = self.parameters.iter().map(|(_, conversion)| if *conversion == Conversion::Bytes { 1 } else { 5 });
         let mut room = PAYLOAD_MAX - 2 - sizes.sum::<usize>().min(PAYLOAD_MAX - 2);
         for (value, (name, _)) in values.iter().zip(&self.parameters) {
@@ -128,7 +128,7 @@ impl Form {
         writer.payload().unwrap().to_vec()
     }
 
-    /// The pins that it names.
+    /// The pins in its arguments.
     fn pins<'a>(&'a self, values: &'a [Value]) -> impl Iterator<Item = u32> + 'a {
         self.parameters.iter().zip(values).filter_map(|((name, _), value)| match value {
             Value::Number(number) if is_pin(name) => Some(*number),
@@ -152,18 +152,18 @@ fn is_pin(parameter: &str) -> bool {
 /// A command with its arguments.
 type Call = (usize, Vec<Value>);
 
-/// What the hosts of a generation may send.
+/// The commands of a generation's hosts.
 struct Book {
     generation: Generation,
     forms: Vec<Form>,
-    /// A whole configuration.
+    /// The commands of a whole configuration.
     setup: Vec<Call>,
-    /// Arguments that each command accepts while the MCU is configured, and once it is.
+    /// Arguments that each command accepts during configuration (`before`) and after it (`after`).
     before: Vec<Vec<Vec<Value>>>,
     after: Vec<Vec<Vec<Value>>>,
-    /// What each response has, by its id.
+    /// The parameters of each response, by its id.
     responses: HashMap<u32, Vec<Conversion>>,
-    /// Objects that are not of a command's kind.
+    /// Pairs of a command and an oid whose object has another kind.
     wrong: HashSet<(usize, u32)>,
 }
 
@@ -190,7 +190,7 @@ impl Book {
         book
     }
 
-    /// The oids of the objects that commands with such a word in their names configure; all if there are none.
+    /// The oids of objects that commands with `word` in their names configure; all oids if there are none.
     fn oids(&self, word: &str) -> Vec<u32> {
         let oid = |(form, values): &Call| self.forms[*form].argument(values, "oid");
         let named = |(form, _): &&Call| self.forms[*form].name().contains(word);
@@ -223,7 +223,7 @@ impl Book {
         form.parameters.iter().map(guess).collect()
     }
 
-    /// Tries a command, until it was refused so many times: with arguments that it accepts, if there are any.
+    /// Tries a command with random arguments, until it accepts them or has refused `tries` times.
     fn find(
         &mut self,
         dice: &mut Dice,
@@ -237,7 +237,7 @@ impl Book {
             let refused = try_out(rig, &self.forms[form], &values);
             let Some(refused) = refused else { return Some(values) };
             tries -= 1;
-            // Once the objects of its kind are known, only these are tried.
+            // An oid of another kind is not tried again, and the attempt does not count.
             if let (Some(oid), true) = (self.forms[form].argument(&values, "oid"), refused.contains("Invalid oid type"))
             {
                 tries += u32::from(self.wrong.insert((form, oid)));
@@ -246,12 +246,12 @@ impl Book {
         None
     }
 
-    /// Tries every command on an MCU that is being configured.
+    /// Tries every command during the configuration of an MCU.
     fn find_setup(&mut self, dice: &mut Dice) {
         let mut rig = bench(self.generation);
         rig.send(&format!("allocate_oids count={OIDS}"));
         let mut new_oid = 0;
-        // Sensors come behind their buses in the second round.
+        // Sensors need their buses, so they succeed in the second round.
         for _ in 0..OBJECTS_OF_A_KIND {
             for form in 0..self.forms.len() {
                 if STOPS.contains(&self.forms[form].name()) {
@@ -269,7 +269,7 @@ impl Book {
         }
     }
 
-    /// Tries every command on a configured MCU, and puts those that are for its configuration into that.
+    /// Tries every command on a configured MCU. Commands that belong to its configuration are added to `setup`.
     fn find_calls(&mut self, dice: &mut Dice) {
         const WANTED: usize = 4;
         for (with_buses, tries) in [(false, 30), (true, 100)] {
@@ -293,14 +293,14 @@ impl Book {
                         calls.extend(values.iter().map(|values| (form, values.clone())));
                     }
                 }
-                // Buses on lines come first: no I2C chip answers there.
+                // Buses on GPIO lines come first, because no I2C chip answers there.
                 calls.sort_by_key(|(form, values)| self.forms[*form].pins(values).next().is_none());
                 self.setup.extend(calls);
             }
         }
     }
 
-    /// Configures an MCU, as far as it accepts that.
+    /// Configures an MCU, as far as it accepts the commands.
     fn set_up(&self, rig: &mut Rig) {
         rig.send(&format!("allocate_oids count={OIDS}"));
         for (form, values) in &self.setup {
@@ -311,7 +311,7 @@ impl Book {
     }
 }
 
-/// An MCU among devices that answer.
+/// An MCU with devices that answer.
 fn bench(generation: Generation) -> Rig {
     let rig = Rig::of(generation);
     for (bus, address) in (0..2).flat_map(|bus| (0..128).map(move |address| (bus, address))) {
@@ -336,10 +336,10 @@ fn bench(generation: Generation) -> Rig {
     rig
 }
 
-/// A turn of the MCU takes this long at least: events that come faster than that make it late.
+/// Shortest turn of the MCU: events that come faster make it late.
 const TURN: Ticks = Ticks::from_us(20);
 
-/// Lets the MCU run as long as `goes_on`.
+/// Lets the MCU run while `goes_on` is true.
 fn pass(rig: &mut Rig, mut goes_on: impl FnMut(&Rig) -> bool) {
     while goes_on(rig) {
         let now = rig.mcu.now();
@@ -350,7 +350,7 @@ fn pass(rig: &mut Rig, mut goes_on: impl FnMut(&Rig) -> bool) {
     }
 }
 
-/// Lets the MCU run up to `ticks`, or for so many turns.
+/// Lets the MCU run up to `ticks`, or for `turns` turns.
 fn pass_until(rig: &mut Rig, ticks: u64, turns: u32) {
     let mut left = 2 * turns;
     pass(rig, |rig| {
@@ -359,12 +359,12 @@ fn pass_until(rig: &mut Rig, ticks: u64, turns: u32) {
     });
 }
 
-/// Runs a command to the end of what it began.
+/// Runs a command to the end of its conversation.
 fn run(rig: &mut Rig, payload: &[u8]) {
     let mut reader = Reader::new(payload);
     while !reader.is_empty() {
         rig.mcu.execute(&mut reader);
-        // Commands wait for a bus for five seconds at most.
+        // Commands wait for a bus for at most five seconds.
         let limit = rig.now() + 6 * u64::from(CLOCK_FREQ);
         pass(rig, |rig| {
             assert!(rig.now() < limit, "commands are held for too long");
@@ -373,13 +373,13 @@ fn run(rig: &mut Rig, payload: &[u8]) {
     }
 }
 
-/// The same for a command in words.
+/// The same for a command as text.
 fn say(rig: &mut Rig, command: &str) {
     let payload = rig.encode(command);
     run(rig, &payload);
 }
 
-/// What a command stops the MCU with, if it does. Whatever it began is ended.
+/// The shutdown text if the command stops the MCU, else `None`. It ends all activity that the command began.
 fn try_out(rig: &mut Rig, form: &Form, values: &[Value]) -> Option<String> {
     let payload = form.encode(rig, values);
     run(rig, &payload);
@@ -397,7 +397,7 @@ fn try_out(rig: &mut Rig, form: &Form, values: &[Value]) -> Option<String> {
     refused
 }
 
-/// Waits until the outputs are where they belong.
+/// Waits until the outputs are at their shutdown values.
 fn settle(rig: &mut Rig) {
     let limit = rig.now() + u64::from(CLOCK_FREQ);
     pass(rig, |rig| {
@@ -408,12 +408,12 @@ fn settle(rig: &mut Rig) {
 
 #[derive(Clone, Debug)]
 enum Action {
-    /// A command: which, which of the arguments that it accepts, and what is changed of these.
+    /// A command: its index, the index of arguments that it accepts, and the changes to them.
     Send(usize, usize, Vec<Option<Change>>),
     Turns(u32),
     Stall(u64),
     Stop,
-    /// A pin or the chips of a bus fail, until all are mended.
+    /// A pin or the chips of a bus fail until everything is repaired.
     Break(usize),
     Mend,
 }
@@ -427,12 +427,12 @@ enum Change {
     Bytes(u8, usize),
 }
 
-/// What becomes of an MCU that has stopped.
+/// The next step after the MCU has stopped.
 #[derive(Clone, Copy, Debug)]
 enum Recovery {
     Nothing,
     Clear,
-    /// A reset, and what comes next configures it.
+    /// A reset; the next commands configure the MCU.
     Reset,
     Configure,
 }
@@ -469,26 +469,26 @@ fn action() -> impl Strategy<Value = (Action, Recovery)> {
     (action, recovery)
 }
 
-/// Commands that were sent to a running MCU, and those of them that it accepted.
+/// Commands that were sent to a running MCU, and the number that it accepted.
 static SENT: AtomicU64 = AtomicU64::new(0);
 static ACCEPTED: AtomicU64 = AtomicU64::new(0);
-/// Outputs that were looked at in a stopped MCU.
+/// How many outputs of a stopped MCU were checked.
 static LOOKED_AT: AtomicU64 = AtomicU64::new(0);
 
-/// An MCU under test, and what is known of its outputs.
+/// An MCU under test, and the known facts about its outputs.
 struct Trial<'a> {
     book: &'a Book,
     rig: Rig,
     finalized: bool,
-    /// Each pin that was named to it, and how often.
+    /// How often each pin was in an argument.
     named: HashMap<u32, u32>,
-    /// Digital outputs with the levels of a stopped MCU.
+    /// Digital outputs with their levels in a stopped MCU.
     outputs: HashMap<u32, bool>,
-    /// Lines that steppers step by, which rest in a stopped MCU.
+    /// Step lines of steppers. They do not change in a stopped MCU.
     step_pins: HashSet<u32>,
-    /// Whether the MCU was stopped after the last action, and its outputs were where they belong.
+    /// Whether the MCU was stopped after the last action, with its outputs at their shutdown values.
     stopped: bool,
-    /// What was sent since the last configuration, for a case that fails.
+    /// The commands since the last configuration, to print if a case fails.
     story: Vec<String>,
 }
 
@@ -525,12 +525,12 @@ impl<'a> Trial<'a> {
         self.story.clear();
     }
 
-    /// Outputs that fail keep an MCU from a reset, until the guardian ends the program.
+    /// Repairs all pins. Failing outputs prevent a reset of the MCU until the guardian ends the program.
     fn mend(&mut self) {
         self.rig.bench.state().broken.clear();
     }
 
-    /// Has the MCU forget everything.
+    /// Makes the MCU forget everything.
     fn reset(&mut self) {
         self.mend();
         let now = self.rig.now();
@@ -547,7 +547,7 @@ impl<'a> Trial<'a> {
         assert!(self.rig.ask("get_config").starts_with("config is_config=0 crc=0 is_shutdown=0 "));
     }
 
-    /// Sends a command. Whether a running MCU accepted it; nothing is known of a stopped one.
+    /// Sends a command. Returns whether a running MCU accepted it; `None` for a stopped MCU.
     fn send(&mut self, form: usize, values: &[Value]) -> Option<bool> {
         let form = &self.book.forms[form];
         self.story.push(format!("@{}: {} {values:?}", self.rig.now(), form.format));
@@ -612,7 +612,7 @@ impl<'a> Trial<'a> {
         match action {
             Action::Send(which, call, changes) => {
                 let calls = if self.finalized { &self.book.after } else { &self.book.before };
-                // Mostly a command that is accepted now.
+                // Seven times out of eight, a command that is accepted now.
                 let known: Vec<usize> = (0..calls.len()).filter(|form| !calls[*form].is_empty()).collect();
                 let form = if call % 8 == 0 { which % calls.len() } else { known[which % known.len()] };
                 let calls = if calls[form].is_empty() { &self.book.before[form] } else { &calls[form] };
@@ -634,7 +634,7 @@ impl<'a> Trial<'a> {
         }
     }
 
-    /// Looks at the outputs of an MCU that is stopped.
+    /// Checks the outputs of a stopped MCU.
     fn look(&mut self) {
         let stopped = self.rig.mcu.is_shutdown();
         let broken = !self.rig.bench.state().broken.is_empty();
@@ -643,7 +643,7 @@ impl<'a> Trial<'a> {
                 settle(&mut self.rig);
                 self.rig.bench.forget_edges();
             }
-            // A line with several users belongs to the last one.
+            // The last user of a shared line decides its level, so only lines with one user are checked.
             let alone = |pin: &u32| self.named.get(pin) == Some(&1);
             for (pin, default) in self.outputs.iter().filter(|(pin, _)| alone(pin)) {
                 assert_eq!(self.rig.bench.level(*pin), *default, "pin {pin} of a stopped machine");
@@ -654,7 +654,7 @@ impl<'a> Trial<'a> {
             }
         }
         self.stopped = stopped && !broken;
-        // Every response has the form that the dictionary says.
+        // Every response has the form of the dictionary.
         self.rig.each_response(|payload| {
             let mut reader = Reader::new(payload);
             let conversions = &self.book.responses[&reader.int().unwrap()];

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What every MCU does: identify, clock, configuration, shutdown, bad input.
+//! Behavior of every MCU: identify, clock, configuration, shutdown, bad input.
 
 use pinion_firmware::mcu::MOVE_COUNT;
 use pinion_protocol::block::PAYLOAD_MAX;
@@ -164,7 +164,7 @@ fn a_stopped_mcu_says_so_to_every_command_and_answers_what_it_may() {
     }
     assert_eq!(rig.ask("get_clock"), "clock clock=@500");
     assert_eq!(rig.ask("debug_ping data=01"), "pong data=01");
-    // Commands that may not run are skipped whole: those after them in the block do run.
+    // Commands that may not run are skipped completely. The commands after them in the block do run.
     let block = [rig.encode("spi_transfer oid=0 data=0102"), rig.encode("get_clock")].concat();
     rig.execute(&block);
     assert_eq!(rig.responses(), ["is_shutdown static_string_id=Command request", "clock clock=@500"]);
@@ -241,7 +241,7 @@ fn after_config_reset_everything_is_free() {
             "queue_step oid=0 interval=1000 count=65535 add=0",
             "spi_transfer oid=5 data=00",
         ]);
-        // In the middle of a step, a reading and a transfer.
+        // During a step, a reading and a transfer.
         rig.run_until(now + 1050);
         assert_eq!(rig.ask("stepper_get_position oid=0"), "stepper_position oid=0 pos=-1", "round {round}");
         rig.send_all(&["emergency_stop", "config_reset"]);
@@ -268,7 +268,7 @@ fn a_host_does_not_poke_memory() {
 
 #[test]
 fn an_unknown_command_stops_the_mcu() {
-    // 1 is identify, 0 a response; 0x9f 0x7f is far above all, and so is the last one, below all.
+    // 1 is identify, 0 is a response. 0x9f 0x7f is far above all ids, and the last one is below all ids.
     for payload in [&[0][..], &[0x9f, 0x7f], &[0xe0, 0x00], &[0x8f, 0xff, 0xff, 0xff, 0x00]] {
         let mut rig = Rig::new();
         rig.execute(payload);
@@ -286,7 +286,7 @@ fn a_command_that_ends_too_early_stops_the_mcu() {
             let mut rig = Rig::configured(&[STEPPER]);
             rig.execute(&whole[..len]);
             assert_eq!(rig.shutdown().as_deref(), Some("Command parser error"), "{:?}", &whole[..len]);
-            // And a stopped one neither hangs nor runs it.
+            // A stopped MCU neither hangs nor runs it.
             rig.execute(&whole[..len]);
             assert_eq!(rig.shutdown().as_deref(), Some("Command parser error"));
         }
@@ -296,7 +296,7 @@ fn a_command_that_ends_too_early_stops_the_mcu() {
 #[test]
 fn integers_wrap_as_the_firmwares_do() {
     let mut rig = Rig::new();
-    // oid 256 + 3 is oid 3, a count of 65536 + 2 is 2.
+    // oid 256 + 3 is oid 3, and a count of 65536 + 2 is 2.
     rig.send_all(&["allocate_oids count=10", "config_trsync oid=259", "finalize_config crc=1"]);
     assert!(rig.ask("trsync_trigger oid=3 reason=257").starts_with("trsync_state oid=3 can_trigger=0"));
     let mut rig = Rig::configured(&[STEPPER]);
@@ -309,7 +309,7 @@ fn integers_wrap_as_the_firmwares_do() {
 fn the_move_queue_takes_what_it_promises_and_no_more() {
     let mut rig = Rig::configured(&[STEPPER, "config_digital_out oid=1 pin=5 value=0 default_value=0 max_duration=0"]);
     rig.send("reset_step_clock oid=0 clock=@0");
-    // The first move is taken off the queue at once.
+    // The first move leaves the queue at once.
     for _ in 0..MOVE_COUNT {
         rig.send("queue_step oid=0 interval=1000 count=1 add=0");
     }
@@ -317,14 +317,14 @@ fn the_move_queue_takes_what_it_promises_and_no_more() {
     assert_eq!(rig.shutdown(), None);
     rig.send("queue_digital_out oid=1 clock=@600000 on_ticks=0");
     expect_shutdown(&rig, "Move queue overflow");
-    // A shutdown gives every place back.
+    // A shutdown frees all moves.
     rig.send("clear_shutdown");
     rig.run_until(1000);
     for n in 0..MOVE_COUNT {
         rig.send(&format!("queue_digital_out oid=1 clock=@{} on_ticks=1", 5000 + u32::from(n)));
     }
     assert_eq!(rig.shutdown(), None);
-    // And so does the end of a move.
+    // The end of a move also frees it.
     rig.run_until(1_000_000);
     for n in 0..MOVE_COUNT {
         rig.send(&format!("queue_digital_out oid=1 clock=@{} on_ticks=1", 1_005_000 + u32::from(n)));
@@ -343,7 +343,7 @@ fn a_timer_in_the_past_is_too_close_only_if_it_would_be_the_next() {
     rig.send("queue_digital_out oid=1 clock=@10000 on_ticks=0");
     expect_shutdown(&rig, "Timer too close");
 
-    // The MCU is behind with a step: as in the firmware, what comes after it just waits.
+    // The MCU is late with a step. As in the firmware, later events wait.
     let mut rig = Rig::configured(&[STEPPER, OUTPUT]);
     rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=1000 count=1 add=0"]);
     rig.stall_until(3200);
@@ -364,7 +364,7 @@ fn an_mcu_that_falls_far_behind_stops_itself() {
         rig.send("queue_digital_out oid=1 clock=@1000 on_ticks=500");
         rig.run_until(100_000);
         rig.stall_until(100_000 + behind);
-        // Caught up within the second, unless it was 100 ms.
+        // The MCU catches up within a second, unless it is 100 ms late.
         rig.run_until(10_000_000);
         assert_eq!(rig.shutdown().is_some(), ends, "{behind} ticks behind");
     }
@@ -381,7 +381,7 @@ fn every_payload_length_fits_what_the_mcu_answers() {
     );
 }
 
-/// To claim a pin or to open a device takes as long as it takes.
+/// Claiming a pin or opening a device takes time, so it is refused after `finalize_config`.
 #[test]
 fn a_configured_mcu_claims_and_opens_nothing() {
     for (command, text) in [

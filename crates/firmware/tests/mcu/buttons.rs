@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Buttons: debounced, told until they are acknowledged, those of expanders too.
+//! Buttons: debounced, reported until they are acknowledged, also on expanders.
 
 use pinion_firmware::board::{Bias, Direction};
 
@@ -8,7 +8,7 @@ use pinion_testbench::rig::Rig;
 const A: u32 = 30;
 const B: u32 = 31;
 
-/// klippy adds the pins and asks only after `finalize_config`.
+/// klippy adds the pins and starts the query only after `finalize_config`.
 fn start(rig: &mut Rig, retransmit_count: u8, invert: u8) {
     rig.send_all(&["buttons_add oid=0 pos=0 pin=30 pull_up=1", "buttons_add oid=0 pos=1 pin=31 pull_up=0"]);
     rig.send(&format!(
@@ -25,7 +25,7 @@ fn buttons() -> Rig {
 #[test]
 fn a_level_counts_once_two_samples_in_a_row_have_it() {
     let mut rig = buttons();
-    // One sample long, at 3000; then from the sample at 6000 on.
+    // One sample is high, at 3000. From 6000 on all samples are high.
     rig.bench.script_input(A, &[(2500, 1), (3500, 0), (5500, 1)]);
     rig.run_until(6999);
     assert_eq!(rig.responses(), [""; 0]);
@@ -62,7 +62,7 @@ fn what_is_not_acknowledged_is_told_again() {
         let mut rig = Rig::configured(&["config_buttons oid=0 button_count=2"]);
         rig.bench.script_input(A, &[(500, 1)]);
         start(&mut rig, count, 0);
-        // Seen at 1000 and 2000; told again so many samples later, and one.
+        // The samples at 1000 and 2000 are high. The report is repeated `count` + 1 samples later.
         let again = 2000 + 1000 * (u64::from(count) + 1);
         rig.run_until(again - 1);
         assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
@@ -84,12 +84,12 @@ fn reports_pile_up_in_order_and_leave_as_they_are_acknowledged() {
         ["01", "0100", "010002"].iter().map(|s| format!("buttons_state oid=0 ack_count=0 state={s}")).collect();
     assert_eq!(rig.responses(), reports);
     rig.send("buttons_ack oid=0 count=1");
-    // The last was told at 11000: the rest comes 51 samples later.
+    // The last report was at 11000. The rest comes 51 samples later.
     rig.run_until(11_000 + 51_000 - 1);
     assert_eq!(rig.responses(), [""; 0]);
     rig.run_until(11_000 + 51_000);
     assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=1 state=0002"]);
-    // More than there are: klippy's count is the one that is kept.
+    // This acknowledges more than there are. The MCU keeps klippy's count.
     rig.send("buttons_ack oid=0 count=255");
     rig.bench.script_input(B, &[(70_500, 0)]);
     rig.run_until(80_000);
@@ -118,7 +118,7 @@ fn a_query_begins_anew_and_one_without_rest_ends() {
     rig.run_until(5000);
     rig.send("buttons_ack oid=0 count=1");
     rig.responses();
-    // As klippy does when it is restarted while this computer stays configured.
+    // A restarted klippy sends this while the MCU stays configured.
     rig.send_all(&["buttons_add oid=0 pos=0 pin=30 pull_up=1", "buttons_add oid=0 pos=1 pin=31 pull_up=0"]);
     rig.send("buttons_query oid=0 clock=@6000 rest_ticks=1000 retransmit_count=5 invert=0");
     rig.run_until(7000);
@@ -162,7 +162,7 @@ fn a_line_that_is_gone_stops_the_mcu_and_a_stopped_mcu_samples_no_more() {
     rig.bench.script_input(A, &[(11_000, 1)]);
     rig.run_until(100_000);
     assert_eq!(rig.responses(), [""; 0]);
-    // Configured anew it works.
+    // It works after a new configuration.
     rig.send("config_reset");
     rig.configure(&["config_buttons oid=0 button_count=2"]);
     rig.send("buttons_add oid=0 pos=0 pin=30 pull_up=0");
@@ -171,7 +171,7 @@ fn a_line_that_is_gone_stops_the_mcu_and_a_stopped_mcu_samples_no_more() {
     assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"]);
 }
 
-/// Button B is an expander's, which takes 1500 ticks for a look.
+/// Button B is on an expander that needs 1500 ticks for a look.
 fn with_expander() -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().sleeping.insert(B);
@@ -186,7 +186,7 @@ fn an_expander_s_button_is_sampled_as_often_as_its_worker_looks() {
     let mut rig = with_expander();
     rig.bench.script_input(A, &[(2500, 1)]);
     rig.bench.script_input(B, &[(4000, 1)]);
-    // Samples at 1000, 3000, 5000, 7000, each complete 1500 later.
+    // The samples at 1000, 3000, 5000 and 7000 are each complete 1500 later.
     rig.run_until(6499);
     assert_eq!(rig.responses(), [""; 0]);
     rig.run_until(6500);
@@ -201,7 +201,7 @@ fn a_look_under_way_is_not_taken_for_one_of_a_later_query_or_line() {
     let mut rig = with_expander();
     rig.bench.script_input(B, &[(0, 1)]);
     rig.run_until(3000);
-    // One sample is in, the second one under way.
+    // One sample is complete, and the second is on its way.
     rig.send_all(&[
         "buttons_add oid=0 pos=1 pin=30 pull_up=0",
         "buttons_query oid=0 clock=@3500 rest_ticks=1000 retransmit_count=50 invert=0",
@@ -224,7 +224,7 @@ fn an_expander_that_fails_for_100_ms_stops_the_mcu() {
     rig.run_until(20_000);
     assert_eq!(rig.responses(), ["buttons_state oid=0 ack_count=0 state=01"], "others go on");
     rig.send("buttons_ack oid=0 count=1");
-    // The first sample that could not be read is of 1000; each is complete 1500 later.
+    // The first sample that fails is at 1000. Each sample is complete 1500 later.
     rig.run_until(1000 + UNREAD_LIMIT - 1);
     assert_eq!(rig.responses(), [""; 0]);
     rig.run_until(1000 + UNREAD_LIMIT + 2000);
@@ -235,12 +235,12 @@ fn an_expander_that_fails_for_100_ms_stops_the_mcu() {
 fn a_look_that_fails_is_no_sample_and_changes_nothing() {
     let mut rig = with_expander();
     rig.bench.script_input(B, &[(2600, 1), (6000, 0)]);
-    // Samples at 1000, 3000, 5000, 7000: high at 3000, which nothing confirms, as the look at 5000 fails.
+    // Samples at 1000, 3000, 5000, 7000. It is high at 3000, but nothing confirms it because the look at 5000 fails.
     rig.run_until(5000);
     rig.bench.state().nacks.insert(B, 3);
     rig.run_until(100_000);
     assert_eq!(rig.responses(), [""; 0]);
-    // High from then on: with one try that fails it is told as with none.
+    // It is high from then on. A look with failed tries is reported like one without.
     rig.bench.script_input(B, &[(100_600, 1)]);
     rig.run_until(102_000);
     rig.bench.state().nacks.insert(B, 2);

@@ -10,7 +10,7 @@ const QUERY: &str = "query_counter oid=0 clock=@10000 poll_ticks=1000 sample_tic
 #[test]
 fn edges_are_counted_and_told_in_intervals() {
     let mut rig = Rig::configured(&[COUNTER]);
-    // High for 2500 ticks, low for 2500.
+    // High for 2500 ticks, then low for 2500.
     let edges: Vec<(u64, u8)> = (0..100).map(|n| (12_500 + 2500 * n, (n % 2 == 0).into())).collect();
     rig.bench.script_input(TACHO, &edges);
     rig.send(QUERY);
@@ -20,9 +20,9 @@ fn edges_are_counted_and_told_in_intervals() {
     assert_eq!(
         rig.responses(),
         [
-            // The first after the second look, as in the firmware.
+            // The first report comes after the second look, as in the firmware.
             "counter_state oid=0 next_clock=@12000 count=0 count_clock=@10000",
-            // Edges at 12500, 15000, ..., 30000: eight.
+            // Eight edges at 12500, 15000, ..., 30000.
             "counter_state oid=0 next_clock=@33000 count=8 count_clock=@30000",
             "counter_state oid=0 next_clock=@54000 count=17 count_clock=@53000",
         ]
@@ -76,12 +76,12 @@ fn an_expander_s_pin_is_looked_at_as_often_as_its_worker_can() {
     assert_eq!(
         rig.responses(),
         [
-            // By the ends of the looks.
+            // The times are the ends of the looks.
             "counter_state oid=0 next_clock=@12500 count=0 count_clock=@10000",
             "counter_state oid=0 next_clock=@34500 count=1 count_clock=@15500",
         ]
     );
-    // Looks that fail see the last level for 100 ms.
+    // While looks fail, the last level counts for 100 ms.
     rig.bench.state().broken.insert(TACHO);
     rig.run_until(40_000 + 5_000_000 - 1);
     let told = told(&rig);
@@ -100,7 +100,7 @@ fn polling_without_rest_stops_the_mcu_once_it_is_behind() {
     assert_eq!(rig.shutdown().as_deref(), Some("Rescheduled timer in the past"));
 }
 
-/// An MCU whose counter has interrupts.
+/// An MCU with a counter that has interrupts.
 fn counted(answer_ticks: u32) -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().counted.insert(TACHO);
@@ -114,7 +114,7 @@ fn every(ticks: u64, count: u64) -> Vec<(u64, u8)> {
     (1..=count).map(|n| (n * ticks, (n % 2 == 1).into())).collect()
 }
 
-/// Count and its instant of each `counter_state`.
+/// The count and time of each `counter_state`.
 fn told(rig: &Rig) -> Vec<(u32, i64)> {
     let number = |text: &str, name: &str| -> i64 {
         let rest = text.split_once(&format!(" {name}=")).unwrap().1;
@@ -133,16 +133,16 @@ fn the_kernel_s_count_is_told_with_the_instant_of_its_last_edge() {
         rig.responses(),
         [
             "counter_state oid=0 next_clock=@11000 count=0 count_clock=@10000",
-            // The first two are closer than polling would have seen.
+            // Polling would have missed the first two, because they are too close.
             "counter_state oid=0 next_clock=@31000 count=3 count_clock=@22500",
         ]
     );
 }
 
-/// klippy's FrequencyCounter: what `[fan]` with a `tachometer_pin` makes of these.
+/// Computes the frequency like klippy's FrequencyCounter, for a `[fan]` with a `tachometer_pin`.
 #[test]
 fn a_fan_of_20_000_rpm_is_measured_to_a_part_in_a_hundred_thousand() {
-    // Two pulses, four edges, a turn: 37,500 ticks from one to the next. Samples of 1 s, at 1.5 ms.
+    // Two pulses per turn, so four edges: 37,500 ticks between edges. Samples of 1 s, polled every 1.5 ms.
     let mut rig = counted(3000);
     rig.bench.script_input(TACHO, &every(37_500, 20_000));
     rig.send("query_counter oid=0 clock=@1000000 poll_ticks=75000 sample_ticks=50000000");
@@ -158,7 +158,7 @@ fn a_fan_of_20_000_rpm_is_measured_to_a_part_in_a_hundred_thousand() {
 
 #[test]
 fn a_count_is_no_older_than_its_last_edge() {
-    // A worker that is late by 0.1 s sees edges from after the timer.
+    // A worker that is 0.1 s late sees edges from after the timer.
     let mut rig = counted(5_000_000);
     rig.bench.script_input(TACHO, &every(37_500, 2000));
     rig.send("query_counter oid=0 clock=@1000000 poll_ticks=75000 sample_ticks=50000000");
@@ -172,7 +172,7 @@ fn a_worker_that_is_slower_than_the_interval_misses_turns() {
     let mut rig = counted(30_000);
     rig.bench.script_input(TACHO, &[(12_000, 1), (45_000, 0)]);
     rig.send(QUERY);
-    // Asked at 10000, not at 30000, at 50000.
+    // The worker looks at 10000 and 50000, but not at 30000.
     rig.run_until(85_000);
     assert_eq!(told(&rig), [(1, 12_000), (2, 45_000)]);
 }
@@ -195,20 +195,20 @@ fn a_pin_that_storms_is_polled_from_then_on() {
     // 25,000 edges a second, for 3 s.
     rig.bench.script_input(TACHO, &every(2000, 75_000));
     rig.send("query_counter oid=0 clock=@1000000 poll_ticks=75000 sample_ticks=50000000");
-    // What was before the first look is over too short a time to tell.
+    // The time before the first look is too short to judge.
     rig.run_until(5_999_999);
     assert!(rig.bench.state().counted.contains(&TACHO));
     rig.run_until(10_000_000);
     assert!(!rig.bench.state().counted.contains(&TACHO), "the interrupts were not ended");
     rig.run_until(250_000_000);
-    // No level lasted, and then there is what polling sees.
+    // No level lasted long enough to count. After that, polling counts.
     let told = told(&rig);
     assert_eq!(told[0], (0, 1_000_000));
     assert!(told.len() > 2 && told.last().unwrap().0 > 0, "{told:?}");
     assert!(rig.shutdown().is_none());
 }
 
-/// Looks in between do not tell anything.
+/// The looks between reports send nothing.
 #[test]
 fn it_is_told_once_in_each_sample_ticks() {
     let mut rig = counted(3000);
@@ -221,8 +221,8 @@ fn it_is_told_once_in_each_sample_ticks() {
 #[test]
 fn glitches_are_not_counted_and_pulses_are_exactly() {
     let mut rig = counted(3000);
-    // 10,000 rpm: levels of 1.5 ms, the longest poll_ticks that klippy's documentation allows for it. A
-    // spike of 3 us before each edge, one of 300 us in each level, and edges that ring for 20 us.
+    // 10,000 rpm: levels of 1.5 ms, the longest poll_ticks that klippy's documentation allows for it. There is a spike
+    // of 3 us before each edge and one of 300 us in each level. Edges ring for 20 us.
     let mut edges = Vec::new();
     for n in 1..=4000 {
         let (at, before, after) = (75_000 * n, ((n + 1) % 2) as u8, (n % 2) as u8);
@@ -236,7 +236,7 @@ fn glitches_are_not_counted_and_pulses_are_exactly() {
     let told = told(&rig);
     assert_eq!(told.len(), 6);
     for (n, (count, at)) in (0..).zip(&told) {
-        // A level that lasts 0.375 ms counts, from when its edge had rung.
+        // A level of 0.375 ms counts, from the end of its edge's ringing.
         let edges = (1_043_000 + n * 50_000_000 - 18_750) / 75_000;
         assert_eq!((i64::from(*count), *at), (edges, edges * 75_000), "{told:?}");
     }
@@ -245,7 +245,7 @@ fn glitches_are_not_counted_and_pulses_are_exactly() {
 #[test]
 fn bouncing_contacts_are_no_storm() {
     let mut rig = counted(0);
-    // A burst of 200 edges in 2 ms, and then quiet, with samples every 5 ms.
+    // A burst of 200 edges in 2 ms, then quiet, with samples every 5 ms.
     rig.bench.script_input(TACHO, &every(500, 200));
     rig.send("query_counter oid=0 clock=@100000 poll_ticks=75000 sample_ticks=250000");
     rig.run_until(50_000_000);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! An MCU that is given the dialect of another host.
+//! An MCU that gets the dialect of another host.
 
 use pinion_firmware::mcu::{DialectName, Generation};
 use pinion_protocol::vlq::Writer;
@@ -11,7 +11,7 @@ fn an_mcu_speaks_as_it_is_told_at_once_or_after_its_reset() {
     let mut rig = Rig::of(Generation::Master);
     rig.speak(Generation::V0_12);
     assert_eq!(rig.dialect().name(), DialectName::Of(Generation::V0_12));
-    // What identify serves is the new dictionary.
+    // identify serves the new dictionary.
     let served = hex(&rig.dialect().compressed()[..40]);
     assert_eq!(rig.ask("identify offset=0 count=40"), format!("identify_response offset=0 data={served}"));
     rig.configure(&[]);
@@ -53,7 +53,7 @@ fn a_stopped_mcu_reads_the_other_hosts_blocks_to_their_end() {
     rig.send("emergency_stop");
     rig.responses();
     rig.speak(Generation::Master);
-    // Their ids mean something else in the dialect of before, and are longer or shorter.
+    // In the earlier dialect, their ids mean something else and have other lengths.
     let commands = ["query_adxl345 oid=0 rest_ticks=0", "i2c_transfer oid=0 write=0011 read_len=2", "config_reset"];
     let block = commands.map(|command| rig.encode(command)).concat();
     assert!(rig.mcu.is_emergency(&[rig.encode(commands[1]), rig.encode("emergency_stop")].concat()));

@@ -5,9 +5,9 @@ use pinion_testbench::rig::Rig;
 
 const PIN: u32 = 20;
 
-/// A heater: off by default, to be refreshed every 100000 ticks.
+/// A heater: off by default, with a refresh at least every 100000 ticks.
 const HEATER: &str = "config_digital_out oid=0 pin=20 value=0 default_value=0 max_duration=100000";
-/// A fan: nothing to be refreshed.
+/// A fan: it needs no refresh.
 const FAN: &str = "config_digital_out oid=0 pin=20 value=0 default_value=0 max_duration=0";
 /// An enable pin that is high when the motor is off.
 const ENABLE: &str = "config_digital_out oid=0 pin=20 value=0 default_value=1 max_duration=0";
@@ -70,7 +70,7 @@ fn software_pwm_changes_in_the_middle_of_a_cycle() {
     let mut rig = Rig::configured(&[FAN, CYCLE]);
     rig.send("queue_digital_out oid=0 clock=@1000 on_ticks=5000");
     rig.run_until(12_000);
-    // On since 11000; a change at 14000 comes before the pulse's own end.
+    // On since 11000. The change at 14000 comes before the end of the pulse.
     rig.send("queue_digital_out oid=0 clock=@14000 on_ticks=2000");
     rig.run_until(30_000);
     assert_eq!(rig.edges(PIN), [(1000, 1), (6000, 0), (11_000, 1), (16_000, 0), (24_000, 1), (26_000, 0)]);
@@ -155,7 +155,7 @@ fn an_output_that_is_on_by_default_is_refreshed_while_it_is_off() {
 
 #[test]
 fn a_change_past_max_duration_is_refused_at_once() {
-    // While the output is on, and while it is queued to be.
+    // While the output is on, and while a change to on is queued.
     let mut rig = Rig::configured(&[HEATER]);
     rig.send("queue_digital_out oid=0 clock=@1000 on_ticks=1");
     rig.run_until(2000);
@@ -238,7 +238,7 @@ fn a_shutdown_drives_every_output_to_its_default() {
     assert_eq!([20, 21, 22].map(|pin| rig.bench.level(pin)), [true, false, true]);
     rig.run_until(100_000);
     assert_eq!([20, 21, 22].map(|pin| rig.bench.level(pin)), [true, false, true]);
-    // The guardian knows the same values.
+    // The guardian has the same values.
     assert_eq!([20, 21, 22].map(|pin| rig.bench.shutdown_value(pin)), [true, false, true]);
 }
 
@@ -274,13 +274,13 @@ fn a_pin_that_is_set_once_stays_and_may_be_set_again() {
     ]);
     assert_eq!(rig.shutdown(), None);
     assert!(rig.bench.level(30) && rig.bench.level(31));
-    // An output takes it over without a gap.
+    // An output takes over the line without a gap.
     rig.edges(30);
     rig.configure(&["config_digital_out oid=0 pin=30 value=1 default_value=1 max_duration=0"]);
     assert_eq!(rig.edges(30), []);
     rig.send("update_digital_out oid=0 value=0");
     assert!(!rig.bench.level(30));
-    // It may even be set while the MCU runs, as it is held.
+    // The line can also be set while the MCU runs, because it is claimed already.
     rig.send("set_digital_out pin=31 value=0");
     assert_eq!(rig.shutdown(), None);
     assert!(!rig.bench.level(31));

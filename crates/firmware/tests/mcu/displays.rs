@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Displays on bare lines, with chips that hear what their data sheets say.
+//! Displays on GPIO lines, with chips that read as their data sheets say.
 
 use pinion_testbench::rig::{Rig, hex};
 
@@ -10,13 +10,13 @@ const CS: u32 = 20;
 const SCLK: u32 = 21;
 const SID: u32 = 22;
 
-/// 40 us after each byte, as klippy has it.
+/// 40 us after each byte, as in klippy.
 const HD44780: &str =
     "config_hd44780 oid=0 rs_pin=10 e_pin=11 d4_pin=12 d5_pin=13 d6_pin=14 d7_pin=15 delay_ticks=2000";
-/// 45 and 20 us.
+/// Delays of 45 us and 20 us.
 const ST7920: &str = "config_st7920 oid=0 cs_pin=20 sclk_pin=21 sid_pin=22 sync_delay_ticks=2250 cmd_delay_ticks=1000";
 
-/// Levels of lines as their edges come, from all of them low.
+/// The levels of lines after their edges so far. All begin low.
 #[derive(Default)]
 struct Levels(std::collections::HashMap<u32, (u64, bool)>);
 
@@ -30,7 +30,7 @@ impl Levels {
     }
 }
 
-/// What an HD44780 on four lines takes in: when, whether it is data, four bits.
+/// What an HD44780 on four lines reads: the time, whether it is data, and four bits.
 fn hear_hd44780(rig: &Rig) -> Vec<(u64, bool, u8)> {
     let mut levels = Levels::default();
     let mut heard = Vec::new();
@@ -49,7 +49,7 @@ fn hear_hd44780(rig: &Rig) -> Vec<(u64, bool, u8)> {
     heard
 }
 
-/// What an ST7920 takes in: when each byte ended, and the byte.
+/// What an ST7920 reads: the end of each byte, and the byte.
 fn hear_st7920(rig: &Rig) -> Vec<(u64, u8)> {
     let mut levels = Levels::default();
     let mut heard = Vec::new();
@@ -72,7 +72,7 @@ fn hear_st7920(rig: &Rig) -> Vec<(u64, u8)> {
     heard
 }
 
-/// Bytes of pairs of nibbles, and when each was complete.
+/// Joins pairs of nibbles to bytes, with the time when each is complete.
 fn bytes(nibbles: &[(u64, bool, u8)]) -> Vec<(u64, bool, u8)> {
     let byte = |pair: &[(u64, bool, u8)]| (pair[1].0, pair[0].1, pair[0].2 << 4 | pair[1].2);
     nibbles.chunks(2).map(byte).collect()
@@ -87,7 +87,7 @@ fn an_hd44780_hears_commands_and_data_with_time_in_between() {
     let said: Vec<(bool, u8)> = heard.iter().map(|(_, data, byte)| (*data, *byte)).collect();
     let expected = [0x28, 0x28, 0x0c].map(|byte| (false, byte)).into_iter();
     assert_eq!(said, expected.chain(b"Hallo\xff\x00".map(|byte| (true, byte))).collect::<Vec<_>>());
-    // Its first nibble takes 26 ticks more than the second.
+    // The first nibble takes 26 ticks longer than the second.
     for pair in heard.windows(2) {
         assert!((2000..2060).contains(&(pair[1].0 - pair[0].0)), "{heard:?}");
     }
@@ -103,7 +103,7 @@ fn an_st7920_hears_messages_with_time_before_each_byte_is_complete() {
     let heard = hear_st7920(&rig);
     let said: Vec<u8> = heard.iter().map(|(_, byte)| *byte).collect();
     assert_eq!(hex(&said), "f8204 0a050 faf0f0 fa".replace(' ', ""));
-    // A byte takes 160 ticks; between the ends of two there are the host's delay and half a byte.
+    // A byte takes 160 ticks. The host's delay and half a byte are between the ends of two bytes.
     let ends: Vec<u64> = heard.iter().map(|(at, _)| *at).collect();
     assert_eq!(ends[4] - ends[2], 1000 + 160, "{ends:?}");
     assert_eq!(ends[7] - ends[4], 2250 + 160, "{ends:?}");

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! DS18B20 thermometers, which take 750 ms for a reading.
+//! DS18B20 thermometers, with readings of 750 ms.
 
 use pinion_testbench::rig::{Rig, hex};
 
 const SERIAL: &str = "28-00000000100f";
 const MS: u64 = 50_000;
 
-/// A sensor that reads these; four failures in a row are let pass, as klippy asks for.
+/// A sensor with these readings. It ignores four failures in a row, as klippy configures it.
 fn rig(answer_ms: u64, values: &[Option<i32>]) -> Rig {
     let mut rig = Rig::new();
     rig.bench.script_ds18b20(SERIAL, values);
@@ -19,7 +19,7 @@ fn config(serial: &str) -> String {
     format!("config_ds18b20 oid=0 serial={} max_error_count=4", hex(serial.as_bytes()))
 }
 
-/// From 100 ms on, every three seconds.
+/// Queries from 100 ms on, every three seconds.
 fn query(min_value: i32, max_value: i32) -> String {
     format!(
         "query_ds18b20 oid=0 clock=@{} rest_ticks={} min_value={min_value} max_value={max_value}",
@@ -81,7 +81,7 @@ fn a_temperature_out_of_its_range_is_told_and_stops_the_mcu() {
 fn a_sensor_that_does_not_answer_stops_the_mcu() {
     let mut rig = rig(7000, &[Some(20_000)]);
     rig.send(&query(0, 100_000));
-    // Asked at 100, 3100 and 6100 ms.
+    // Queries at 100, 3100 and 6100 ms.
     rig.run_until(6099 * MS);
     assert_eq!(rig.shutdown(), None);
     rig.run_until(6100 * MS);

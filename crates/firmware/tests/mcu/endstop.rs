@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Homing: an endstop is sampled, a trsync is triggered, steppers stop.
+//! Homing: the MCU samples an endstop and triggers a trsync, and steppers stop.
 
 use pinion_firmware::board::{Bias, Direction};
 
@@ -15,8 +15,7 @@ const OBJECTS: &[&str] = &[
     "config_trsync oid=4",
 ];
 
-/// Two steppers that step every 1000 ticks, stopped by the switch, which is asked for four
-/// samples 50 ticks apart every 700 ticks.
+/// Two steppers step every 1000 ticks. The switch stops them. It needs four samples 50 ticks apart, every 700 ticks.
 fn homing() -> Rig {
     let mut rig = Rig::configured(OBJECTS);
     rig.send_all(&[
@@ -40,8 +39,8 @@ fn steps(rig: &mut Rig) -> (String, String) {
 #[test]
 fn every_stepper_stops_on_the_tick_of_the_last_sample() {
     let mut rig = homing();
-    // Samples at 1000, 1700, ..., 5900: the switch closes before 5900 and is sampled at 5900,
-    // 5950, 6000 and 6050.
+    // Samples at 1000, 1700, ..., 5900. The switch closes before 5900. The samples at 5900, 5950, 6000 and 6050 are
+    // closed.
     rig.bench.script_input(SWITCH, &[(5500, 1)]);
     rig.run_until(6049);
     assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=1 trigger_reason=0 clock=@3000"]);
@@ -50,19 +49,19 @@ fn every_stepper_stops_on_the_tick_of_the_last_sample() {
     let query = rig.ask("endstop_query_state oid=2");
     assert_eq!(query, "endstop_state oid=2 homing=1 next_clock=@6600 pin_value=1");
     rig.run_until(100_000);
-    // The step of 6000 was made, its pulse of 100 ticks cut short.
+    // The step at 6000 was made, and its pulse of 100 ticks was cut short.
     assert_eq!(rig.edges(1).last(), Some(&(6050, 0)));
     assert_eq!(rig.edges(3).last(), Some(&(6000, 0)));
     assert_eq!(steps(&mut rig), ("stepper_position oid=0 pos=-6".into(), "stepper_position oid=1 pos=-6".into()));
 }
 
-/// The computer keeps the MCU from running while 30 steps are due, amid which the axis meets its switch.
+/// The MCU stands still while 30 steps are due. During these steps the axis meets its switch.
 #[test]
 fn an_mcu_that_stood_still_takes_steps_and_samples_in_their_order() {
     const STEP_TICKS: u64 = 25_000;
     const REST_TICKS: u64 = 25_000;
     const SWITCH_AT: u64 = 40;
-    // A step is a pulse, or an edge.
+    // A step is a pulse or an edge.
     for (oid, step, both_edges) in [(0, 1, false), (1, 3, true)] {
         let mut rig = Rig::configured(OBJECTS);
         let mut steps = 0;
@@ -80,7 +79,7 @@ fn an_mcu_that_stood_still_takes_steps_and_samples_in_their_order() {
         rig.run_until(30 * STEP_TICKS);
         rig.stall_until(60 * STEP_TICKS);
         rig.run_until(120 * STEP_TICKS);
-        // klippy computes from the sample's clock how many steps had been made by then.
+        // From the sample's clock, klippy computes the number of steps made by then.
         let state = rig.ask("endstop_query_state oid=2");
         let next_clock: u64 = state.split(['@', ' ']).find_map(|word| word.parse().ok()).unwrap();
         assert_eq!((next_clock - REST_TICKS) / STEP_TICKS, SWITCH_AT, "{state}");
@@ -103,7 +102,7 @@ fn reports_go_on_after_a_trigger_until_the_host_ends_them() {
             "trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@13000",
         ]
     );
-    // Whatever reason it gives, the first one stays.
+    // The first reason stays, also after another trigger.
     assert!(rig.ask("trsync_trigger oid=3 reason=2").starts_with("trsync_state oid=3 can_trigger=0 trigger_reason=1 "));
     rig.run_until(100_000);
     assert_eq!(rig.responses(), [""; 0]);
@@ -111,7 +110,7 @@ fn reports_go_on_after_a_trigger_until_the_host_ends_them() {
 
 #[test]
 fn a_bounce_at_any_sample_starts_the_search_anew_a_rest_after_the_first_match() {
-    // Closed at 1700, open again before the sample that the bounce hits.
+    // Closed at 1700, and open again before the sample that the bounce affects.
     for (sample, open) in [(2, 1740), (3, 1790), (4, 1840)] {
         let mut rig = homing();
         rig.bench.script_input(SWITCH, &[(1700, 1), (open, 0), (open + 100, 1)]);
@@ -155,7 +154,7 @@ fn a_trsync_expires_for_its_own_reason() {
     rig.run_until(20_000);
     assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=4 clock=@20000"]);
     rig.run_until(22_000);
-    // The step of tick 20000 came first or not at all, and both steppers agree.
+    // The step of tick 20000 came before the trigger or not at all. Both steppers agree.
     let (a, b) = steps(&mut rig);
     assert_eq!(a.strip_prefix("stepper_position oid=0"), b.strip_prefix("stepper_position oid=1"));
 }
@@ -171,7 +170,7 @@ fn a_timeout_that_is_set_anew_in_time_does_not_expire() {
     assert!(rig.responses().iter().all(|report| report.contains("can_trigger=1")));
     rig.run_until(65_000);
     assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=4 clock=@65000"]);
-    // After the trigger there is nothing to expire.
+    // After the trigger, nothing expires.
     rig.send("trsync_set_timeout oid=3 clock=@66000");
     rig.run_until(67_999);
     assert_eq!(rig.responses(), [""; 0]);
@@ -209,7 +208,7 @@ fn a_stepper_waits_for_one_trigger_at_a_time() {
         rig.send(&format!("stepper_stop_on_trigger oid=0 trsync_oid={trsync}"));
         assert_eq!(rig.shutdown().as_deref(), Some("Can't add signal that is already active"));
     }
-    // Starting a trsync anew lets go of those that waited.
+    // A new start of a trsync removes the steppers that waited for it.
     let mut rig = homing();
     rig.send_all(&[
         "trsync_start oid=3 report_clock=@0 report_ticks=0 expire_reason=4",
@@ -217,7 +216,7 @@ fn a_stepper_waits_for_one_trigger_at_a_time() {
         "stepper_stop_on_trigger oid=0 trsync_oid=4",
     ]);
     assert_eq!(rig.shutdown(), None);
-    // So does a trigger.
+    // A trigger does the same.
     rig.send_all(&["trsync_trigger oid=4 reason=1", "stepper_stop_on_trigger oid=0 trsync_oid=3"]);
     assert_eq!(rig.shutdown(), None);
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The accelerometers whose FIFO is read in blocks (LIS2DW, LIS3DH, MPU9250, ICM20948, BMI160), on
-//! SPI and on I2C: what ADXL345's tests do not tell already.
+//! The accelerometers with a FIFO that is read in blocks (LIS2DW, LIS3DH, MPU9250, ICM20948, BMI160), on SPI and on
+//! I2C. These tests cover what ADXL345's tests do not.
 
 use std::sync::{Arc, Mutex};
 
@@ -66,11 +66,11 @@ impl Setup {
             (Bmi160, true) => "config_bmi160 oid=1 bus_oid=0 bus_oid_type=0",
             (Bmi160, false) => "config_bmi160 oid=1 bus_oid=0 bus_oid_type=1",
         };
-        // As klippy has it: the sensor first, its bus afterwards.
+        // klippy configures the sensor first and its bus afterwards.
         vec![bus[0], sensor, bus[1]]
     }
 
-    /// Ticks of a sample at the rate that klippy asks for.
+    /// Ticks per sample at the rate that klippy sets.
     fn period(self) -> u64 {
         50_000_000
             / match self.model {
@@ -81,7 +81,7 @@ impl Setup {
             }
     }
 
-    /// Samples that the FIFO holds.
+    /// Number of samples that the FIFO holds.
     fn depth(self) -> u64 {
         match self.model {
             Lis2dw | Lis3dh => 32,
@@ -120,11 +120,11 @@ impl Setup {
     }
 }
 
-/// A chip that measures from the beginning on; each sample is its number, six bytes, high ones first.
+/// A chip that measures from tick 0 on. The value of each sample is its number in six bytes, high bytes first.
 struct Chip {
     setup: Setup,
     period: u64,
-    /// Samples that were read, and those that the full FIFO dropped.
+    /// Samples that were read, and samples that the full FIFO dropped.
     taken: u64,
     dropped: u64,
     overflowed: bool,
@@ -156,7 +156,7 @@ impl Chip {
             (Mpu9250, _, 0x3a) => into[0] = u8::from(std::mem::take(&mut self.overflowed)) << 4,
             (Icm20948, _, 0x1b) => into[0] = u8::from(std::mem::take(&mut self.overflowed)),
             (Bmi160, true, 0xa2) | (Bmi160, false, 0x22) => into.copy_from_slice(&(6 * kept as u16).to_le_bytes()),
-            // The data: the LIS3DH wants a bit for the next register, another one on I2C than on SPI.
+            // The data. The LIS3DH needs a bit to advance to the next register, and I2C has another bit than SPI.
             (Lis2dw, true, 0xa8)
             | (Lis2dw, false, 0x28)
             | (Lis3dh, true, 0xe8)
@@ -190,7 +190,7 @@ fn number(response: &str, name: &str) -> u64 {
 fn at_full_rate_no_sample_is_lost_and_a_status_counts_those_of_its_instant() {
     for setup in SETUPS {
         let mut rig = Rig::new();
-        // 10 us a byte on SPI, 400 kHz on I2C.
+        // 10 us per byte on SPI, 400 kHz on I2C.
         rig.bench.state().byte_ticks = if setup.spi { 500 } else { 1125 };
         rig.configure(&setup.config());
         let period = setup.period();
@@ -229,7 +229,7 @@ fn at_full_rate_no_sample_is_lost_and_a_status_counts_those_of_its_instant() {
 #[test]
 fn samples_that_the_chip_drops_are_told() {
     for setup in SETUPS {
-        // The BMI160's count just stands at its end.
+        // The BMI160's count just stays at its maximum.
         if setup.model == Bmi160 {
             continue;
         }
@@ -260,7 +260,7 @@ fn nothing_is_read_until_there_is_a_block_and_all_blocks_at_once() {
         assert_eq!(rig.responses().len(), 1);
         rig.stall_until(49_000);
         rig.run_until(49_000);
-        // 33 samples wait, of which the LIS3DH can tell 31 only.
+        // 33 samples wait. The LIS3DH can report only 31.
         assert_eq!(rig.responses().len(), if setup.model == Lis3dh { 3 } else { 4 }, "{setup:?}");
         assert!(chip.lock().unwrap().taken % 8 == 0);
     }
@@ -269,14 +269,14 @@ fn nothing_is_read_until_there_is_a_block_and_all_blocks_at_once() {
 #[test]
 fn a_new_query_asks_the_chip_anew() {
     for setup in SETUPS {
-        // Amid a reading, and between two.
+        // During a reading, and between two readings.
         for answer_ticks in [0, 400] {
             let mut rig = Rig::with_workers(answer_ticks, &setup.config());
             let chip = setup.plug(&rig, 100);
             rig.send(&setup.query(2900));
             rig.run_until(3100);
             rig.send(&setup.query(0));
-            // What klippy does then: the FIFO is emptied.
+            // klippy empties the FIFO here.
             rig.run_until(5000);
             {
                 let mut chip = chip.lock().unwrap();
@@ -300,7 +300,7 @@ fn an_i2c_failure_stops_the_mcu_with_the_firmware_s_text() {
             (Some(BusStatus::Timeout), "I2C Timeout"),
             (Some(BusStatus::StartNack), "I2C START NACK"),
             (Some(BusStatus::StartReadNack), "I2C START READ NACK"),
-            // Unplugged.
+            // The chip is unplugged.
             (None, "I2C START NACK"),
         ] {
             for by_status in [false, true] {
@@ -367,7 +367,7 @@ fn rubbish_keeps_the_mcu_from_nothing() {
     }
 }
 
-/// 63 samples, whose bytes the firmware keeps in one byte.
+/// 63 samples. The firmware counts their bytes in a `u8`.
 #[test]
 fn a_lis2dw_that_does_not_answer_takes_the_bus_for_two_blocks() {
     for setup in SETUPS.iter().filter(|setup| setup.model == Lis2dw) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Load cells on an HX711: a model of the chip after its data sheet, at 80 samples a second.
+//! Load cells on an HX711: a model of the chip from its data sheet, at 80 samples a second.
 
 use std::sync::{Arc, Mutex};
 
@@ -8,29 +8,29 @@ use pinion_testbench::rig::Rig;
 
 const DOUT: u32 = 10;
 const SCLK: u32 = 11;
-/// Between two samples of the chip.
+/// Ticks between two samples of the chip.
 const PERIOD: u64 = 625_000;
-/// As klippy asks for: a tenth of it.
+/// As klippy configures it: a tenth of `PERIOD`.
 const QUERY: &str = "query_hx71x oid=0 rest_ticks=62500";
 const END: &str = "query_hx71x oid=0 rest_ticks=0";
 const STATUS: &str = "query_hx71x_status oid=0";
-/// From the first to the last of them the data line tells the bits.
+/// Clock pulses for which the data line carries a bit.
 const BITS: u32 = 24;
-/// The clock's longest high time in ticks: 60 us.
+/// Longest high time of the clock in ticks: 60 us.
 const HIGH_MAX: u64 = 3000;
 
 #[derive(Default)]
 struct Hx711 {
-    /// What it measures: this value, and one more with each sample.
+    /// The next value; it counts up with each sample.
     value: i32,
     measured: u32,
-    /// When the next sample is there; none while it is off.
+    /// When the next sample is ready; `None` while the chip is off.
     next: Option<u64>,
     ready: bool,
     pulses: u32,
     rose: u64,
     high: bool,
-    /// Pulses of each reading.
+    /// The number of pulses of each reading.
     counts: Vec<u32>,
     stuck_low: bool,
 }
@@ -58,7 +58,7 @@ impl Hx711 {
             self.rose = at;
             self.pulses += u32::from(self.next.is_some());
         } else if self.next.is_none() {
-            // Reset: four samples are needed to settle.
+            // A reset. The chip needs four samples to settle.
             (self.next, self.pulses) = (Some(at + 4 * PERIOD), 0);
         }
     }
@@ -109,7 +109,7 @@ fn rig(value: i32, gain_channel: u8, answer_ticks: u32) -> (Rig, Arc<Mutex<Hx711
     (rig, chip)
 }
 
-/// The samples in the `sensor_bulk_data` messages, whose sequence counts up from `first`.
+/// The samples in the `sensor_bulk_data` messages. Their sequence must count up from `first`.
 fn samples(rig: &Rig, first: u16) -> Vec<i32> {
     let mut samples = Vec::new();
     let responses = rig.responses();
@@ -166,7 +166,7 @@ fn the_chip_is_off_while_nothing_is_measured() {
 fn a_status_counts_what_was_read_what_is_being_read_and_what_is_in_the_chip() {
     let (mut rig, _chip) = rig(0, 1, 1000);
     rig.send(QUERY);
-    // The chip is woken at 1000, has its first sample four periods later, and the timer looks every 62500.
+    // The chip wakes at 1000 and has its first sample four periods later. The timer looks every 62500 ticks.
     let first = 1000 + 4 * PERIOD;
     let look = 41 * 62_500;
     let status = |at: u64, buffered: u32| {
@@ -211,7 +211,7 @@ fn a_chip_that_does_not_answer_as_it_should_sends_errors_until_it_is_asked_anew(
 
 #[test]
 fn a_reading_that_is_not_back_in_time_is_an_error_and_counted() {
-    // Back after 10 looks instead of 8.
+    // It is back after 10 looks instead of 8.
     let (mut rig, _chip) = rig(7, 1, 600_000);
     rig.send(QUERY);
     rig.run_until(40 * PERIOD);
@@ -254,7 +254,7 @@ fn a_probe_triggers_at_its_sample_and_not_at_errors() {
         rig.run_until(20 * PERIOD);
         let reports = rig.responses();
         let report = reports.iter().find(|report| report.starts_with("trsync_state")).unwrap();
-        // An error is no sample, so the monitor finds the sensor silent.
+        // An error does not count as a sample, so the monitor finds the sensor silent.
         let reason = if stuck_low { 42 } else { 1 };
         assert!(report.contains(&format!("trigger_reason={reason} ")), "{report}");
     }
@@ -264,7 +264,7 @@ fn a_probe_triggers_at_its_sample_and_not_at_errors() {
 fn measurements_that_begin_anew_amid_a_reading_have_none_of_it() {
     let (mut rig, chip) = rig(7, 1, 30_000);
     rig.send(QUERY);
-    // The clock falls at 30000, and the first look that finds a sample is at 2562500.
+    // The clock falls at 30000. The first look that finds a sample is at 2562500.
     rig.run_until(2_580_000);
     assert_eq!(chip.lock().unwrap().pulses, 0, "the reading is on its way");
     rig.send(QUERY);
@@ -306,7 +306,7 @@ fn lines_that_fail_stop_the_mcu_and_it_can_be_configured_anew() {
         rig.bench.state().broken.clear();
         rig.send("config_reset");
         rig.configure(&objects(1).each_ref().map(String::as_str));
-        // Long enough for the chip to switch itself off.
+        // Long enough for the chip to power down.
         rig.run_until(9 * PERIOD);
         rig.send(QUERY);
         let (from, value) = (rig.now(), chip.lock().unwrap().value);

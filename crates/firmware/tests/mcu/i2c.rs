@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! I2C devices: what is said to a chip, how its silence is told, and what waits for it.
+//! I2C devices: transfers to a chip, the report of a missing answer, and what waits for the answer.
 
 use std::sync::{Arc, Mutex};
 
@@ -10,11 +10,11 @@ use pinion_testbench::rig::Rig;
 
 const DEVICE: &[&str] = &["config_i2c oid=0", "i2c_set_bus oid=0 i2c_bus=1 rate=400000 address=72"];
 
-/// What a chip heard: bytes written, and how many were read after them.
+/// The transfers to a chip: the written bytes, and the number of bytes read after them.
 type Heard = Arc<Mutex<Vec<(Vec<u8>, usize)>>>;
 
-/// A chip at 0x48 of bus 1 that counts up from the first byte written to it, and acknowledges as these
-/// say, then always.
+/// A chip at 0x48 of bus 1. Its data counts up from the first written byte. Its first transfers fail with these
+/// statuses, all later ones succeed.
 fn plug(rig: &Rig, statuses: &[BusStatus]) -> Heard {
     let heard = Heard::default();
     let log = heard.clone();
@@ -79,9 +79,9 @@ fn only_a_plain_read_is_tried_again_and_not_for_ever() {
     for (command, statuses, tries, status) in [
         ("write= read_len=2", &[Nack, StartReadNack][..], 3, 0),
         ("write= read_len=2", &[Nack, Nack, Nack], 3, 1),
-        // Noise that takes a bus from its master is over at once.
+        // Noise that takes a bus from its master ends at once.
         ("write= read_len=2", &[Timeout], 2, 0),
-        // klippy decides: a command would be given twice.
+        // The MCU does not retry, because a command would run twice. klippy decides.
         ("write=10 read_len=2", &[Nack], 1, 1),
         ("write= read_len=0", &[Nack], 1, 1),
     ] {
@@ -139,7 +139,7 @@ fn the_next_command_waits_for_a_slow_chip_and_steps_do_not() {
     );
     plug(&rig, &[]);
     rig.send_all(&["reset_step_clock oid=1 clock=@0", "queue_step oid=1 interval=1000 count=6000 add=0"]);
-    // 100 ms.
+    // This takes 100 ms.
     rig.begin("i2c_transfer oid=0 write=10 read_len=1");
     assert!(rig.mcu.is_held());
     rig.run_until(4_999_000);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What Kalico has of its own: limits that are ignored, probing by load cells.
+//! Features that only Kalico has: ignored limits, and probing by load cells.
 
 use std::sync::{Arc, Mutex};
 
@@ -30,7 +30,7 @@ fn a_ds18b20_may_ignore_its_limits() {
 fn a_thermocouple_without_a_count_of_invalid_values_never_stops_the_mcu() {
     for (generation, count, ends) in [(Kalico, 0, false), (Kalico, 1, true), (Master, 0, true)] {
         let mut rig = Rig::of(generation);
-        // A fault, and out of range.
+        // The chip reports a fault, and the value is out of range.
         rig.bench.plug_spi(0, |_, bytes| bytes.fill(0xff));
         rig.configure(&[
             "config_spi_without_cs oid=0",
@@ -66,10 +66,10 @@ fn an_analog_input_without_a_count_of_invalid_readings_never_stops_the_mcu() {
 // ---- load cells
 
 const READY: u32 = 10;
-/// Between two samples; the line is looked at ten times as often.
+/// Ticks between two samples. The line is checked ten times as often.
 const PERIOD: u64 = 100_000;
 
-/// The channels of a sample by its number, for an ADS131M04 (four) or an ADS1220 (one).
+/// The channels of the sample with this number. An ADS131M04 has four, an ADS1220 one.
 type Values = fn(u64) -> Vec<i32>;
 
 fn crc(words: &[u8]) -> u16 {
@@ -81,8 +81,8 @@ fn crc(words: &[u8]) -> u16 {
     })
 }
 
-/// A chip that has a sample every [`PERIOD`]; `status` is the first byte of an ADS131M04's frame, and
-/// `is_ads131` says that it is one.
+/// Adds an ADS131M04 (`is_ads131`) or an ADS1220 with a sample every [`PERIOD`]. The returned `status` is the first
+/// byte of an ADS131M04's frame.
 fn plug(rig: &Rig, is_ads131: bool, values: Values) -> Arc<Mutex<u8>> {
     let status = Arc::new(Mutex::new(0));
     let (read, told) = (Arc::new(Mutex::new(0)), status.clone());
@@ -105,10 +105,10 @@ fn plug(rig: &Rig, is_ads131: bool, values: Values) -> Arc<Mutex<u8>> {
 }
 
 const ADS1220: &str = "config_ads1220 oid=1 spi_oid=0 data_ready_pin=10";
-/// Channels 1 and 3 of four.
+/// Channels 1 and 3 of the four.
 const ADS131M04: &str = "config_ads131m0x oid=1 spi_oid=0 data_ready_pin=10 sensor_channel_count=4 channel_mask=10";
 
-/// An MCU with a sensor and a probe: half a gram a count, tared at 100.
+/// An MCU with a sensor and a probe: half a gram per count, tared at 100.
 fn rig(sensor: &str, values: Values) -> (Rig, Arc<Mutex<u8>>) {
     let mut rig = Rig::of(Kalico);
     let status = plug(&rig, sensor == ADS131M04, values);
@@ -137,7 +137,7 @@ fn set_range(min: i32, max: i32, trigger_grams: u32, grams_per_count: i32) -> St
     )
 }
 
-/// Homes from the fifth sample on: reason 1 for a trigger, 40 and what follows for errors.
+/// Homes from the fifth sample on. Reason 1 is a trigger; 40 and above are errors.
 fn home(rig: &mut Rig) {
     rig.send_all(&[
         "trsync_start oid=4 report_clock=@0 report_ticks=0 expire_reason=2",
@@ -145,7 +145,7 @@ fn home(rig: &mut Rig) {
     ]);
 }
 
-/// The reason and the instant of the trigger by the thirtieth sample, if it came.
+/// The reason and the time of the trigger, if it came by the thirtieth sample.
 fn triggered(rig: &mut Rig) -> Option<(u32, u64)> {
     rig.run_until(30 * PERIOD);
     let responses = rig.responses();
@@ -158,7 +158,8 @@ const STATE: &str = "load_cell_probe_query_state oid=3";
 
 #[test]
 fn a_probe_triggers_at_its_force_either_way_once_homing_has_begun() {
-    // 200 counts from the tare are 100 g, more than the 50; before the fifth sample that does not count.
+    // 200 counts from the tare are 100 g, more than the 50 g of the trigger. Before the fifth sample that does not
+    // count.
     let cases: [(Values, Option<u64>); 4] = [
         (|n| vec![if !(5..8).contains(&n) { 200 } else { 199 }], Some(8)),
         (|n| vec![if n >= 8 { 0 } else { 1 }], Some(8)),
@@ -182,7 +183,7 @@ fn a_probe_triggers_at_its_force_either_way_once_homing_has_begun() {
 
 #[test]
 fn what_goes_wrong_has_its_reason() {
-    // Out of the safe range, whose ends do not belong to it; grams that overflow.
+    // Out of the safe range, which excludes its limits. Then grams that overflow.
     let (mut rig_, _) = rig(ADS1220, |n| vec![if n == 7 { 10_000 } else { 100 }]);
     home(&mut rig_);
     assert_eq!(triggered(&mut rig_).map(|(reason, at)| (reason, at / PERIOD)), Some((40, 7)));
@@ -190,7 +191,8 @@ fn what_goes_wrong_has_its_reason() {
     rig_.send(&set_range(-8_388_608, 8_388_607, 50, 1 << 28));
     home(&mut rig_);
     assert_eq!(triggered(&mut rig_).map(|(reason, at)| (reason, at / PERIOD)), Some((41, 7)));
-    // A sensor that falls silent: at its fifth turn, as three without a sample are allowed.
+    // A sensor that becomes silent. The error comes at its fifth turn, because three turns without a sample are
+    // allowed.
     let (mut rig_, _) = rig(ADS1220, |_| vec![100]);
     home(&mut rig_);
     rig_.run_until(700_000);
@@ -216,12 +218,12 @@ fn a_filter_must_be_active_and_must_not_overflow() {
     home(&mut inactive);
     inactive.run_until(10 * PERIOD);
     assert_eq!(inactive.shutdown().as_deref(), Some("sos_filter not property initialized"));
-    // Twice each value, with 29 fractional bits.
+    // This doubles each value, with 29 fractional bits.
     let doubling = [
         "sos_filter_set_section oid=2 section_idx=0 sos0=1073741824 sos1=0 sos2=0 sos3=0 sos4=0",
         "sos_filter_set_active oid=2 n_sections=1 coeff_int_bits=2",
     ];
-    // 26 g become 52; 24 become 48, below the trigger's 50.
+    // 26 g become 52 g. 24 g become 48 g, below the trigger's 50 g.
     for (counts, reason) in [(152, Some(1)), (148, None)] {
         let values: Values = if counts == 152 { |_| vec![152] } else { |_| vec![148] };
         let (mut rig, _) = rig(ADS1220, values);
@@ -255,7 +257,7 @@ fn ranges_that_make_no_sense_are_refused() {
 fn an_ads131m04_sends_the_channels_of_its_mask_and_is_probed_by_their_sum() {
     let (mut rig, status) = rig(ADS131M04, |n| vec![7_000_000, 15 * n as i32, 7_000_000, 20 * n as i32]);
     home(&mut rig);
-    // The sum of the two is 35 n: 200, which are 50 g, are passed with the sixth sample.
+    // The sum of the two is 35 n. The sixth sample passes 200, which is 50 g.
     rig.run_until(6 * PERIOD + PERIOD / 2);
     let responses = rig.responses();
     let triggered = |it: &String| it.starts_with("trsync_state oid=4 can_trigger=0 trigger_reason=1 clock=@6");
@@ -265,7 +267,7 @@ fn an_ads131m04_sends_the_channels_of_its_mask_and_is_probed_by_their_sum() {
     assert_eq!(data, [&format!("sensor_bulk_data oid=1 sequence=0 data={expected}")]);
     let pending = rig.ask("query_ads131m0x_status oid=1");
     assert!(pending.contains(" next_sequence=1 buffered=0 "), "{pending}");
-    // A reset is told in each channel's place until the measurements begin anew.
+    // A reset of the chip is reported in each channel's place, until the measurements start again.
     *status.lock().unwrap() = 4;
     rig.run_until(7 * PERIOD + PERIOD / 2);
     *status.lock().unwrap() = 0;

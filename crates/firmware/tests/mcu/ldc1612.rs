@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! An eddy current probe: LDC1612 with its INTB line and without, after its data sheet.
+//! An eddy current probe: LDC1612 with and without its INTB line, from its data sheet.
 
 use std::sync::{Arc, Mutex};
 
@@ -10,7 +10,7 @@ use pinion_testbench::rig::Rig;
 
 const INTB: u32 = 10;
 const ADDRESS: u8 = 0x2a;
-/// Between two samples: 400 a second.
+/// Ticks between two samples: 400 samples a second.
 const PERIOD: u64 = 125_000;
 const QUERY: &str = "query_ldc1612 oid=1 rest_ticks=62500";
 const STATUS: &str = "query_status_ldc1612 oid=1";
@@ -18,12 +18,12 @@ const WITHOUT: &str = "config_ldc1612 oid=1 i2c_oid=0";
 const WITH_INTB: &str = "config_ldc1612_with_intb oid=1 i2c_oid=0 intb_pin=10";
 
 struct Ldc {
-    /// The sample by its number.
+    /// Returns the sample with this number.
     words: fn(u64) -> u32,
-    /// The last sample that was read, and the last of which STATUS told.
+    /// The last sample that was read, and the last sample that STATUS reported.
     read: u64,
     told: u64,
-    /// Which registers fail, how often still.
+    /// Registers that fail, with the number of failures left.
     nacks: Vec<(u8, u32)>,
 }
 
@@ -86,7 +86,7 @@ fn samples(rig: &Rig) -> Vec<u32> {
     samples_from(rig, 0)
 }
 
-/// Those of the messages from this number on.
+/// The samples of the messages, whose sequence counts up from `first`.
 fn samples_from(rig: &Rig, first: usize) -> Vec<u32> {
     let mut samples = Vec::new();
     for (message, sequence) in rig.responses().iter().filter(|it| it.starts_with("sensor_bulk_data")).zip(first..) {
@@ -118,7 +118,7 @@ fn a_status_tells_the_instants_and_counts_every_sample_once() {
         for at in (5000..11 * PERIOD).step_by(7777) {
             rig.run_until(at);
             let answer = rig.ask(STATUS);
-            // A reading that is under way comes first.
+            // If a reading is on its way, it ends first.
             let began = answer.split_once("clock=@").unwrap().1.split(' ').next().unwrap().parse::<u64>().unwrap();
             assert!((at..=at + takes).contains(&began), "{at}: {answer}");
             assert!(answer.contains(&format!(" query_ticks={takes} ")), "{at}: {answer}");
@@ -145,8 +145,8 @@ fn a_bus_that_is_too_slow_is_counted() {
     }
 }
 
-/// Three registers in 1.7 ms, as at 100 kHz on a busy controller, and a turn every 1.25 ms: a turn that comes amid a
-/// reading follows it, and no sample is lost or doubted.
+/// Three registers take 1.7 ms, as at 100 kHz on a busy controller. A turn comes every 1.25 ms. If a turn comes during
+/// a reading, it follows that reading. No sample is lost, and no overflow is reported.
 #[test]
 fn a_reading_that_is_longer_than_a_turn_loses_nothing() {
     for sensor in [WITHOUT, WITH_INTB] {
@@ -167,7 +167,7 @@ fn a_reading_that_is_longer_than_a_turn_loses_nothing() {
     }
 }
 
-/// Homes, and tells the reason of the trigger and its instant.
+/// Homes, and returns the reports with the trigger's reason and time.
 fn home(rig: &mut Rig) -> Vec<String> {
     let home = format!(
         "trigger_analog_home oid=3 trsync_oid=4 trigger_reason=1 error_reason=40 clock=@{} monitor_ticks=125000 monitor_max=3",
@@ -203,7 +203,7 @@ fn errors_stand_in_a_samples_place_and_end_homing() {
     assert_eq!(numbers, expected);
     let flagged: fn(u64) -> u32 = |n| if n == 2 { 0x8000_0001 } else { good(n) };
     let rubbish: fn(u64) -> u32 = |n| if n == 2 { 0xffff_ffff } else { good(n) };
-    // An amplitude out of its best range is told, and homed by.
+    // An amplitude outside its best range is reported, and homing uses the sample.
     let amplitude: fn(u64) -> u32 = |n| good(n) | 0x1000_0000;
     for (words, nack, code, sample) in [
         (flagged, None, Some(0), 0x8000_0001),
@@ -216,7 +216,7 @@ fn errors_stand_in_a_samples_place_and_end_homing() {
         let (mut rig, ldc) = rig(WITHOUT, words, 0);
         rig.send(QUERY);
         rig.run_until(PERIOD + 1);
-        // It is asked three times before that is an error.
+        // The MCU tries three times before it reports an error.
         ldc.lock().unwrap().nacks.extend(nack.map(|register| (register, 3)));
         rig.notes();
         let reports = home(&mut rig);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The MCU in virtual time, through its public API: what a host can see of it, to the
-//! tick and the same each time.
+//! The MCU in virtual time, through its public API. The tests check what a host can see, to the tick. The result is the
+//! same each time.
 
 mod adxl345;
 mod analog_in;
