@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A session with a micro-controller: its dictionary, what it says, and its clock.
+//! A session with an MCU: its dictionary, its messages, and its clock.
 
 #![forbid(unsafe_code)]
 
@@ -15,25 +15,25 @@ use super::serial::{BlockLink, Received};
 use pinion_protocol::clock::Clock;
 use pinion_protocol::dictionary::{Dictionary, IDENTIFY_ID, IDENTIFY_RESPONSE_ID};
 
-/// How long after its acknowledgement a query without an answer is sent again. The pause doubles each
-/// time, and there are as many of them as klippy makes (SerialRetryCommand in serialhdl.py).
+/// How long after its acknowledgement a query without an answer is sent again. The pause doubles each time. The number
+/// of retries is klippy's (SerialRetryCommand in serialhdl.py).
 const RETRY_DELAY: Duration = Duration::from_millis(10);
 const RETRIES: u32 = 5;
-/// How long reading the dictionary may take in all.
+/// Timeout for reading the whole dictionary.
 const IDENTIFY_TIMEOUT: Duration = Duration::from_secs(15);
 const IDENTIFY_CHUNK: u8 = 40;
-/// The longest compressed dictionary that is read. A real one has a few kilobytes.
+/// Largest compressed dictionary that is read. A real one has a few kilobytes.
 const IDENTIFY_MAX: usize = 128 * 1024;
-/// How many responses are kept until somebody asks for them. The oldest are dropped first.
+/// Highest number of responses kept until they are requested. The oldest are dropped first.
 const INBOX_MAX: usize = 65_536;
-/// The age from which on the estimate of the micro-controller's clock is renewed.
+/// The age at which the estimate of the MCU's clock is renewed.
 const CLOCK_AGE: Duration = Duration::from_millis(500);
 
-/// A session with a micro-controller.
+/// A session with an MCU.
 #[derive(Debug)]
 pub struct Client {
     link: BlockLink,
-    /// The path by which to open the tty again after a reset that closed it; none over a descriptor.
+    /// The path for opening the tty again after a reset that closed it; `None` for a descriptor.
     path: Option<PathBuf>,
     dictionary: Dictionary,
     messages: Messages,
@@ -45,8 +45,8 @@ pub struct Client {
 }
 
 impl Client {
-    /// Opens a tty, identifies the micro-controller and estimates its clock. Tries again until
-    /// `timeout` is over, as the program at the other end may still be starting.
+    /// Opens a tty, identifies the MCU and estimates its clock. Retries until `timeout`, because the program at the
+    /// other end may still be starting.
     pub fn connect(path: &Path, timeout: Duration) -> Result<Client, Error> {
         let until = Instant::now() + timeout;
         loop {
@@ -64,7 +64,7 @@ impl Client {
         }
     }
 
-    /// Identifies the micro-controller at the other end of a link and finds out its clock.
+    /// Identifies the MCU at the other end of a link and estimates its clock.
     pub fn new(link: BlockLink) -> Result<Client, Error> {
         Client::start(link, None)
     }
@@ -142,7 +142,7 @@ impl Client {
         &self.messages
     }
 
-    /// A constant of the dictionary that is a number. Fails if there is none.
+    /// A numeric constant of the dictionary. Fails if there is no such constant.
     pub fn constant(&self, name: &str) -> Result<f64, Error> {
         let value = self.dictionary.config.get(name);
         value
@@ -150,7 +150,7 @@ impl Client {
             .ok_or_else(|| Error::Dictionary { why: format!("it has no number {name}") })
     }
 
-    /// Ticks of the micro-controller's clock in a second.
+    /// Ticks per second of the MCU's clock.
     pub fn frequency_hz(&self) -> f64 {
         self.frequency_hz
     }
@@ -160,7 +160,7 @@ impl Client {
         (seconds * self.frequency_hz).round() as u32
     }
 
-    /// The link beneath.
+    /// The underlying link.
     pub fn link(&mut self) -> &mut BlockLink {
         &mut self.link
     }
@@ -178,7 +178,7 @@ impl Client {
         self.link.send(&payload)
     }
 
-    /// Sends encoded commands in order, as many to a block as fit.
+    /// Sends encoded commands in order, in as few blocks as possible.
     pub fn send_encoded(&mut self, commands: &[Vec<u8>]) -> Result<(), Error> {
         let mut block = Vec::new();
         for command in commands {
@@ -194,17 +194,16 @@ impl Client {
         self.link.send(&block)
     }
 
-    /// Sends a command and takes its response, of this `oid` if one is given.
+    /// Sends a command and returns its response, with this `oid` if one is given.
     ///
-    /// As in klippy, the answer must have come when the acknowledgement comes. Otherwise the command
-    /// is sent again after 10 ms, even if the answer comes in that time. So a micro-controller that
-    /// acknowledges before it answers gets the command twice, and its second answer may pass for the
-    /// answer to the next query.
+    /// As in klippy, the answer must have arrived when the acknowledgement arrives. Otherwise the command is sent again
+    /// after 10 ms, even if the answer arrives in that time. So an MCU that acknowledges before it answers gets the
+    /// command twice. Its second answer may then count as the answer to the next query.
     ///
     /// # Errors
     ///
-    /// [`Error::Shutdown`] if the micro-controller shuts down, or refuses the command as it is shut
-    /// down; [`Error::Timeout`] if the last repetition has no answer, either.
+    /// [`Error::Shutdown`] if the MCU shuts down, or if it refuses the command because it is shut down.
+    /// [`Error::Timeout`] if the last retry has no answer either.
     pub fn query(
         &mut self,
         command: &str,
@@ -246,9 +245,8 @@ impl Client {
         Ok(None)
     }
 
-    /// The oldest response of this name, and of this `oid` if one is given; waits for one,
-    /// `None` if none comes in time. Fails with [`Error::Shutdown`] if the micro-controller
-    /// is shut down.
+    /// Waits for the oldest response with this name, and with this `oid` if one is given; `None` if none arrives in
+    /// time. Fails with [`Error::Shutdown`] if the MCU is shut down.
     pub fn wait(&mut self, response: &str, oid: Option<u8>, until: Instant) -> Result<Option<Params>, Error> {
         loop {
             if let Some(params) = self.take(response, oid) {
@@ -256,7 +254,7 @@ impl Client {
             }
             self.check()?;
             match self.link.receive(until)? {
-                // Checked for each response, so that a flood of others can not prolong the wait.
+                // Checked for each response, so that a flood of others cannot prolong the wait.
                 Some(received) => self.file(&received),
                 None => return Ok(None),
             }
@@ -266,15 +264,14 @@ impl Client {
         }
     }
 
-    /// The oldest response of this name, and of this `oid` if one is given, among those that
-    /// came in; waits for nothing.
+    /// The oldest response with this name, and with this `oid` if one is given, among those that have arrived. Does not
+    /// wait.
     pub fn take(&mut self, response: &str, oid: Option<u8>) -> Option<Params> {
         let at = self.inbox.iter().position(|p| p.is(response, oid))?;
         self.inbox.remove(at)
     }
 
-    /// Reads what comes in until then, for a later [`Client::take`]. Fails with
-    /// [`Error::Shutdown`] if the micro-controller is shut down.
+    /// Reads until this instant, for a later [`Client::take`]. Fails with [`Error::Shutdown`] if the MCU is shut down.
     pub fn listen(&mut self, until: Instant) -> Result<(), Error> {
         while let Some(received) = self.link.receive(until)? {
             self.file(&received);
@@ -285,8 +282,8 @@ impl Client {
         self.check()
     }
 
-    /// Waits until then, or for nothing if that is past, and takes all responses that came in. A shutdown is one of
-    /// them.
+    /// Waits until this instant, or not at all if it is past, and takes all responses that have arrived. A shutdown is
+    /// one of them.
     pub(super) fn hear(&mut self, until: Instant) -> Result<Vec<Params>, Error> {
         for _ in 0..INBOX_MAX {
             match self.link.receive(until)? {
@@ -297,12 +294,12 @@ impl Client {
         Ok(self.drain())
     }
 
-    /// All responses that came in and that nobody took.
+    /// All responses that have arrived and were not taken.
     pub fn drain(&mut self) -> Vec<Params> {
         self.inbox.drain(..).collect()
     }
 
-    /// Fails with [`Error::Shutdown`] if the micro-controller said that it is shut down.
+    /// Fails with [`Error::Shutdown`] if the MCU reported a shutdown.
     pub fn check(&self) -> Result<(), Error> {
         match &self.shutdown {
             Some(reason) => Err(Error::Shutdown { reason: reason.clone() }),
@@ -310,8 +307,7 @@ impl Client {
         }
     }
 
-    /// Waits until the micro-controller says that it is shut down, and why; `None` if it does
-    /// not in time.
+    /// Waits until the MCU reports a shutdown, and returns the reason; `None` if no report arrives in time.
     pub fn wait_shutdown(&mut self, timeout: Duration) -> Result<Option<String>, Error> {
         let until = Instant::now() + timeout;
         while self.shutdown.is_none() {
@@ -326,13 +322,13 @@ impl Client {
         Ok(self.shutdown.clone())
     }
 
-    /// Forgets a shutdown that the micro-controller reported.
+    /// Forgets a shutdown that the MCU reported.
     pub(super) fn forget_shutdown(&mut self) {
         self.shutdown = None;
     }
 
-    /// Opens the tty again and starts a new session. Over a descriptor, which can not be opened again,
-    /// only reads the dictionary and the clock again.
+    /// Opens the tty again and starts a new session. A descriptor cannot be opened again: then it only reads the
+    /// dictionary and the clock again.
     pub(super) fn reconnect(&mut self, timeout: Duration) -> Result<(), Error> {
         match self.path.clone() {
             Some(path) => *self = Client::connect(&path, timeout)?,
@@ -360,7 +356,7 @@ impl Client {
         }
     }
 
-    /// Renews the estimate of the clock by the shortest of several round trips.
+    /// Renews the estimate of the clock from the shortest of several round trips.
     pub fn estimate_clock(&mut self, round_trips: u32) -> Result<(), Error> {
         let mut best: Option<(Duration, Instant, u32)> = None;
         for _ in 0..round_trips.max(1) {
@@ -378,7 +374,7 @@ impl Client {
         Ok(())
     }
 
-    /// The micro-controller's clock at an instant of ours, as estimated.
+    /// The estimated clock of the MCU at an instant of this computer.
     pub fn clock_at_instant(&self, at: Instant) -> Clock {
         let ticks = |span: Duration| (span.as_secs_f64() * self.frequency_hz) as i64;
         let since = match at.checked_duration_since(self.clock_at) {
@@ -388,7 +384,7 @@ impl Client {
         Clock::from_ticks(self.clock.ticks().saturating_add_signed(since))
     }
 
-    /// Our instant at which the micro-controller's clock shows `clock`, as estimated.
+    /// The estimated instant of this computer at which the MCU's clock shows `clock`.
     pub fn instant_of(&self, clock: Clock) -> Instant {
         let seconds = clock.since(self.clock) as f64 / self.frequency_hz;
         let span = Duration::try_from_secs_f64(seconds.abs()).unwrap_or_default();
@@ -396,7 +392,7 @@ impl Client {
         instant.unwrap_or(self.clock_at)
     }
 
-    /// The micro-controller's clock so many seconds from now. Renews an old estimate.
+    /// The MCU's clock this many seconds from now. Renews an old estimate.
     pub fn clock_in(&mut self, seconds: f64) -> Result<Clock, Error> {
         if self.clock_at.elapsed() > CLOCK_AGE {
             self.estimate_clock(2)?;
@@ -406,13 +402,13 @@ impl Client {
         Ok(Clock::from_ticks(now.saturating_add_signed(ahead)))
     }
 
-    /// The instant nearest to the present whose 32 bits are `wire`.
+    /// The instant nearest to the present with these low 32 bits.
     pub fn widen(&self, wire: u32) -> Clock {
         Clock::widen(wire, self.clock_at_instant(Instant::now()))
     }
 }
 
-/// The two messages that a host knows before it has read a dictionary.
+/// The two messages that a host knows before it reads a dictionary.
 fn before_identify() -> Dictionary {
     let entry = |format: &str, id: i32| Map::from_iter([(format.to_owned(), Json::from(id))]);
     Dictionary {
@@ -438,14 +434,14 @@ mod tests {
         let state = client.query("endstop_query_state", &args, "endstop_state", Some(7)).unwrap();
         assert_eq!(state.int("pin_value").unwrap(), 1);
         assert!(state.int("nothing").is_err());
-        // The fake clock stands at 2^32 + 5.
+        // The fake clock is at 2^32 + 5.
         assert_eq!(client.widen(5).ticks() & 0xffff_ffff, 5);
         assert!(client.clock_in(0.0).unwrap().ticks() >= 1 << 32);
         drop(client);
         peer.join().unwrap();
     }
 
-    /// A micro-controller that keeps its answers until the next block.
+    /// An MCU that keeps its answers until the next block.
     fn late() -> (std::thread::JoinHandle<Vec<Vec<u8>>>, Client) {
         let mut held = Vec::new();
         let (peer, link) = Peer::start(0, &[], move |payload| {
@@ -463,7 +459,7 @@ mod tests {
     fn an_answer_that_comes_after_the_acknowledgement_is_asked_for_again() {
         let (peer, mut client) = late();
         for asked in [7u8, 8] {
-            // The answers are always those of the block before.
+            // The answers always belong to the block before.
             let state = client.query("endstop_query_state", &[("oid", asked.into())], "endstop_state", Some(asked));
             assert_eq!(state.unwrap().int("oid").unwrap(), i64::from(asked));
         }

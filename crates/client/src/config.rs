@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Configuring a micro-controller as klippy does: oids, config commands, their check sum; and
-//! making one that is configured or shut down new again.
+//! Configures an MCU as klippy does: oids, config commands, their checksum. It also resets an MCU that is configured or
+//! shut down.
 
 #![forbid(unsafe_code)]
 
@@ -10,25 +10,25 @@ use flate2::Crc;
 
 use super::{Client, Error};
 
-/// How long a reset may take.
+/// Timeout for a reset.
 const RESET_TIMEOUT: Duration = Duration::from_secs(10);
-/// The pause that klippy makes between the steps of a reset.
+/// klippy's pause between the steps of a reset.
 const RESET_PAUSE: Duration = Duration::from_millis(15);
 
-/// A configuration in the making: commands in klippy's notation, without `allocate_oids` and
-/// `finalize_config`, which are added at the end.
+/// A configuration in preparation: commands in klippy's notation, without `allocate_oids` and `finalize_config`. Those
+/// two are added at the end.
 #[derive(Clone, Debug, Default)]
 pub struct Config {
     oids: u8,
     commands: Vec<String>,
 }
 
-/// What `get_config` tells.
+/// The answer to `get_config`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Status {
     /// Whether it is configured.
     pub is_config: bool,
-    /// The check sum of its configuration.
+    /// The checksum of its configuration.
     pub crc: u32,
     /// Whether it is shut down.
     pub is_shutdown: bool,
@@ -52,22 +52,22 @@ impl Config {
         self.commands.push(command);
     }
 
-    /// All commands but the last, `finalize_config`, in order.
+    /// All commands except the last, `finalize_config`, in order.
     pub fn lines(&self) -> Vec<String> {
         let mut lines = vec![format!("allocate_oids count={}", self.oids)];
         lines.extend_from_slice(&self.commands);
         lines
     }
 
-    /// The check sum: CRC-32 of the lines.
+    /// The checksum: CRC-32 of the lines.
     pub fn crc(&self) -> u32 {
         let mut crc = Crc::new();
         crc.update(self.lines().join("\n").as_bytes());
         crc.sum()
     }
 
-    /// Configures a micro-controller; one that is configured already or shut down is reset
-    /// first. Fails if it shuts down over a command (a pin in use, say).
+    /// Configures an MCU. Resets it first if it is configured or shut down. Fails if it shuts down because of a command
+    /// (for example for a pin in use).
     pub fn apply(&self, client: &mut Client) -> Result<Status, Error> {
         let status = client.status()?;
         if status.is_config || status.is_shutdown {
@@ -91,11 +91,11 @@ impl Config {
 }
 
 impl Client {
-    /// Asks for the state of the configuration.
+    /// Queries the state of the configuration.
     pub fn status(&mut self) -> Result<Status, Error> {
         let config = match self.query("get_config", &[], "config", None) {
-            // The query fails if the report of a shutdown comes in during it. A stopped machine answers
-            // get_config all the same, so this asks once more.
+            // The query fails if the report of a shutdown arrives during it. A stopped MCU still answers get_config, so
+            // ask once more.
             Err(Error::Shutdown { .. }) => self.query("get_config", &[], "config", None)?,
             other => other?,
         };
@@ -107,15 +107,14 @@ impl Client {
         })
     }
 
-    /// Shuts the micro-controller down. The text that it gives as the reason, `None` if it
-    /// gives none within a second.
+    /// Shuts the MCU down. Returns its reason; `None` if it gives none within a second.
     pub fn emergency_stop(&mut self) -> Result<Option<String>, Error> {
         self.send("emergency_stop", &[])?;
         self.wait_shutdown(Duration::from_secs(1))
     }
 
-    /// Makes the micro-controller new, as klippy's FIRMWARE_RESTART does: `emergency_stop`,
-    /// `config_reset`, a new session. (`reset` where there is no `config_reset`.)
+    /// Resets the MCU as klippy's FIRMWARE_RESTART does: `emergency_stop`, `config_reset`, a new session. (`reset` if
+    /// there is no `config_reset`.)
     pub fn reset(&mut self) -> Result<(), Error> {
         let command =
             ["config_reset", "reset"].into_iter().find(|name| self.messages().has_command(name)).ok_or_else(|| {
@@ -129,7 +128,7 @@ impl Client {
         std::thread::sleep(RESET_PAUSE);
         self.send(command, &[])?;
         std::thread::sleep(RESET_PAUSE);
-        // The C program restarts itself and closes the tty. What it sends until then is dropped.
+        // The C program restarts itself and closes the tty. Its output before that is dropped.
         loop {
             let rest = until.saturating_duration_since(Instant::now());
             let attempt = self.reconnect(rest).and_then(|()| self.status());

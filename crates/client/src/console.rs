@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A host to be spoken to in words: lines of commands in, responses out (`pinion console`).
+//! A host with a text interface: lines of commands in, responses out (`pinion console`).
 
 #![forbid(unsafe_code)]
 
@@ -14,12 +14,12 @@ use pinion_protocol::format::{self, Conversion};
 
 /// How often responses are printed during a `delay`.
 const PRINT_PERIOD: Duration = Duration::from_millis(50);
-/// The longest `delay`, in seconds.
+/// Longest `delay`, in seconds.
 const DELAY_MAX_S: f64 = 86_400.0;
-/// How many names of an enumeration `help` prints.
+/// Highest number of names of an enumeration that `help` prints.
 const NAMES_SHOWN: usize = 40;
 
-/// What the console itself understands, with what help says of it.
+/// The console's own commands, with their help texts.
 const OWN: &[(&str, &str)] = &[
     ("help", "help [COMMAND]: what there is, or the parameters of a command"),
     ("delay", "delay SECONDS: wait, and print what comes meanwhile"),
@@ -28,27 +28,27 @@ const OWN: &[(&str, &str)] = &[
     ("quit", "quit: end (also Ctrl-D)"),
 ];
 
-/// What the values of a command may be besides what the dictionary says.
+/// The forms of a command's values in addition to those of the dictionary.
 const VALUES: &str = "\
 A number may be decimal, 0x hexadecimal, a name that the parameter takes, a time in ticks as 0.5s, 10ms or 20us,
 or an instant as clock, clock+0.5s or clock-1ms, counted from now. Bytes are hexadecimal digits: data=00ff.";
 
-/// Whether the console goes on after a line.
+/// Whether the console continues after a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
-    /// It does.
+    /// It continues.
     Line,
-    /// It was asked to end.
+    /// The line ended it.
     End,
 }
 
-/// A session in words.
+/// A console session.
 #[derive(Debug)]
 pub struct Console {
     client: Client,
     vocabulary: Vocabulary,
     shows_stats: bool,
-    /// Whether the machine has closed its terminal.
+    /// Whether the MCU has closed its terminal.
     gone: bool,
 }
 
@@ -62,7 +62,7 @@ pub struct Vocabulary {
 }
 
 impl Console {
-    /// A console for a machine.
+    /// A console for an MCU.
     pub fn new(client: Client) -> Console {
         Console {
             vocabulary: Vocabulary::new(client.dictionary(), client.messages()),
@@ -72,17 +72,17 @@ impl Console {
         }
     }
 
-    /// The words that the machine understands.
+    /// The words that the MCU understands.
     pub fn vocabulary(&self) -> &Vocabulary {
         &self.vocabulary
     }
 
-    /// Whether the machine has closed its terminal.
+    /// Whether the MCU has closed its terminal.
     pub fn is_gone(&self) -> bool {
         self.gone
     }
 
-    /// One line about the machine.
+    /// One line about the MCU.
     pub fn greeting(&self) -> String {
         let dictionary = self.client.dictionary();
         format!(
@@ -93,13 +93,13 @@ impl Console {
         )
     }
 
-    /// Carries a line out, and prints line by line what the machine says to it. Nothing is done for an empty line, or one that
-    /// begins with `#`.
+    /// Executes a line, and prints the MCU's responses line by line. An empty line, or a line that begins with `#`,
+    /// does nothing.
     ///
     /// # Errors
     ///
-    /// What is wrong with the line; that the machine shut down or refused the command as it is shut down; that it
-    /// does not answer any more.
+    /// An error in the line, a shutdown of the MCU, a command that the MCU refuses because it is shut down, or an MCU
+    /// that no longer answers.
     pub fn line(&mut self, line: &str, print: &mut dyn FnMut(&str)) -> Result<Next, String> {
         let line = line.trim();
         let mut words = line.split_ascii_whitespace();
@@ -151,11 +151,11 @@ impl Console {
         }
     }
 
-    /// Prints what the machine says in this time.
+    /// Prints the MCU's responses in this time.
     ///
     /// # Errors
     ///
-    /// That it shut down, or that it is gone.
+    /// The MCU shut down, or is gone.
     pub fn listen(&mut self, span: Duration, print: &mut dyn FnMut(&str)) -> Result<(), String> {
         let until = Instant::now() + span;
         loop {
@@ -169,13 +169,13 @@ impl Console {
         }
     }
 
-    /// Prints what comes in until then; returns what a shutdown said, if there was one.
+    /// Prints the responses until this instant. Returns the text of a shutdown, if there was one.
     fn print_heard(&mut self, until: Instant, print: &mut dyn FnMut(&str)) -> Result<Option<String>, String> {
         let heard = self.client.hear(until).map_err(|error| {
             self.gone = matches!(error, Error::Closed { .. } | Error::Io { .. });
             told(error)
         })?;
-        // Queries, such as those for the clock, are answered by a stopped machine, too.
+        // A stopped MCU also answers queries, for example for the clock.
         self.client.forget_shutdown();
         let mut stopped = None;
         for response in heard {
@@ -194,12 +194,12 @@ impl Console {
         Ok(stopped)
     }
 
-    /// A response with the machine's time, in seconds, at which it came.
+    /// A response with the time of its arrival on the MCU's clock, in seconds.
     fn show(&self, response: &Params) -> String {
         let at = self.client.clock_at_instant(response.at).since(Clock::EPOCH) as f64 / self.client.frequency_hz();
         let mut text = format!("[{at:12.6}] {}", response.name);
         for (name, value) in response.fields() {
-            // A String takes everything that is written to it.
+            // Writing to a String cannot fail.
             let _ = match value {
                 Value::Int(value) => write!(text, " {name}={value}"),
                 Value::Name(value) => write!(text, " {name}={value}"),
@@ -212,7 +212,7 @@ impl Console {
         text
     }
 
-    /// A word of a command with times and instants in ticks.
+    /// A word of a command, with times and instants converted to ticks.
     fn resolve(&mut self, format: &str, word: &str) -> Result<String, String> {
         let Some((name, value)) = word.split_once('=') else { return Ok(word.to_owned()) };
         let is_number = format::parameters(format)
@@ -319,13 +319,13 @@ impl Vocabulary {
         Ok(lines)
     }
 
-    /// What is wrong with a command that there is not, and which may have been meant.
+    /// The error for an unknown command, with the nearest name.
     fn unknown(&self, name: &str) -> String {
         let meant = nearest(name, self.names()).map_or(String::new(), |meant| format!("; did you mean {meant}?"));
         format!("there is no command {name}{meant}{}", if meant.is_empty() { "; help lists them" } else { "" })
     }
 
-    /// Which name may have been meant by a value that is none, if there is such a one.
+    /// The nearest name for a wrong parameter or value; empty if none is near.
     fn hint(&self, command: &str, words: &[&str]) -> String {
         let parameters = self.command(command).and_then(format::parameters).unwrap_or_default();
         let mut pairs = words.iter().filter_map(|word| word.split_once('='));
@@ -340,7 +340,7 @@ impl Vocabulary {
         meant.map_or(String::new(), |meant| format!("; did you mean {meant}?"))
     }
 
-    /// Where the last word of `line` begins, and what it may be completed to.
+    /// The start of the last word of `line`, and its completions.
     pub fn complete(&self, line: &str) -> (usize, Vec<String>) {
         let start = line.rfind(' ').map_or(0, |space| space + 1);
         let (before, word) = line.split_at(start);
@@ -367,7 +367,7 @@ impl Vocabulary {
         }
     }
 
-    /// A command's name, with a space if something is to follow it.
+    /// A command's name, with a space if parameters follow it.
     fn whole(&self, name: &str) -> String {
         let takes = match self.command(name) {
             Some(format) => format.contains('='),
@@ -377,13 +377,13 @@ impl Vocabulary {
     }
 }
 
-/// The word that is the most like this one, if any is like it.
+/// The most similar word, if any word is similar.
 fn nearest<'a>(word: &str, among: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let allowed = (word.chars().count() / 3).max(1);
     among.map(|other| (distance(word, other), other)).filter(|(far, _)| *far <= allowed).min().map(|(_, other)| other)
 }
 
-/// How many characters have to be put in, left out or replaced to make one of the other (Levenshtein).
+/// How many characters must be inserted, deleted or replaced to turn one word into the other (Levenshtein).
 fn distance(a: &str, b: &str) -> usize {
     let b: Vec<char> = b.chars().collect();
     let mut row: Vec<usize> = (0..=b.len()).collect();
@@ -471,7 +471,7 @@ mod tests {
         let (peer, mut console) = console();
         let said = say(&mut console, "emergency_stop").unwrap();
         assert!(said[0].ends_with("static_string_id=Command request"), "{said:?}");
-        // The clock is still to be had.
+        // The clock is still available.
         console.client.clock_in(0.0).unwrap();
         drop(console);
         peer.join().unwrap();

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The other end of the wire for tests: a peer over a socket that loses and mangles the blocks that
-//! the test names, and a micro-controller that knows a handful of commands.
+//! The other end of the wire for tests: a peer over a socket, and an MCU with a few commands. The peer loses and
+//! corrupts the blocks that the test names.
 
 #![forbid(unsafe_code)]
 
@@ -16,26 +16,26 @@ use pinion_protocol::block::{Found, Received, Receiver, Resync, Sequence, frame}
 use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::vlq::{Reader, Writer};
 
-/// What goes wrong with a block on its way.
+/// The fault of a block on its way.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Fault {
-    /// It is lost.
+    /// The block is lost.
     Drop,
-    /// A bit of it is flipped.
+    /// One bit of the block is flipped.
     Corrupt,
-    /// It arrives, its acknowledgement does not.
+    /// The block arrives, but its acknowledgement does not.
     MuteAck,
     /// Its acknowledgement arrives twice.
     DoubleAck,
 }
 
-/// A peer that acknowledges blocks, and answers them by a function of the test.
+/// A peer that acknowledges blocks, and answers them with a function of the test.
 pub(super) struct Peer;
 
 impl Peer {
-    /// Starts a peer that has received `before` blocks from an earlier host, and mangles the
-    /// blocks of these numbers (counted as sent, not as received). It ends when the link is
-    /// dropped, and tells the payloads that it took.
+    /// Starts a peer that has received `before` blocks from an earlier host. It applies the faults to the blocks with
+    /// these numbers (counted as sent, not as received). It ends when the link is dropped, and returns the payloads
+    /// that it took.
     pub(super) fn start(
         before: u8,
         faults: &[(u64, Fault)],
@@ -80,7 +80,7 @@ fn serve(
             let Some((sequence, payload)) = block else {
                 continue;
             };
-            // The empty block with which a session begins has no number.
+            // The empty block at the start of a session has no number.
             let number = (!payload.is_empty()).then(|| {
                 count += 1;
                 count - 1
@@ -112,8 +112,8 @@ fn serve(
     }
 }
 
-/// Takes a block in as a micro-controller does: `answer` gives the responses to its payload, and each
-/// payload is acknowledged so many times.
+/// Takes a block in as an MCU does. `answer` gives the responses to its payload. Each payload is acknowledged
+/// `acknowledgements` times.
 fn receive(
     receiver: &mut Receiver,
     mut block: Vec<u8>,
@@ -144,7 +144,7 @@ fn acknowledge(expected: Sequence, output: &mut Vec<u8>) {
     frame(&[], expected, output);
 }
 
-/// The dictionary of the fake micro-controller.
+/// The dictionary of the fake MCU.
 pub(super) fn dictionary() -> Dictionary {
     let map = |json: serde_json::Value| json.as_object().unwrap().clone();
     Dictionary {
@@ -182,7 +182,7 @@ pub(super) fn dictionary() -> Dictionary {
     }
 }
 
-/// A micro-controller that can be identified, configured, shut down and reset.
+/// An MCU that can be identified, configured, shut down and reset.
 pub(super) struct FakeMcu {
     identify: Vec<u8>,
     crc: Option<u32>,
@@ -196,7 +196,7 @@ impl Default for FakeMcu {
 }
 
 impl FakeMcu {
-    /// A micro-controller whose `identify` serves these bytes as its compressed dictionary.
+    /// An MCU that serves these bytes as its compressed dictionary in `identify`.
     pub(super) fn identifying(identify: Vec<u8>) -> FakeMcu {
         FakeMcu { identify, ..FakeMcu::default() }
     }

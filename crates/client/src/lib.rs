@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The other end of the wire: a small client for the demonstration of `pinion sim`, for the
-//! tests over a real pty, for those on kernel drivers and for the benches.
+//! The host's end of the wire: a small client for the demonstration of `pinion sim`, for the tests over a real pty, for
+//! the tests on kernel drivers and for the benches.
 //!
-//! - [`serial`]: blocks over a tty, acknowledged and sent again as klippy does
-//! - [`messages`]: commands and responses by name, as a dictionary has them
+//! - [`serial`]: blocks over a tty, acknowledged and sent again as in klippy
+//! - [`messages`]: commands and responses by their names in a dictionary
 //! - [`client`]: a session: the dictionary, commands and responses, the MCU's clock
-//! - [`config`]: oids, config commands, their check sum; resetting a machine in use
+//! - [`config`]: oids, config commands, their checksum; resetting an MCU in use
 //! - [`motion`]: step sequences, pacing them into the move queue, homing
-//! - [`console`]: a session in words
+//! - [`console`]: a session with a text interface
 //!
 //! There is one thread: a call that waits also reads, acknowledges and sends blocks again.
 
@@ -32,19 +32,19 @@ pub use client::Client;
 pub use messages::{Arg, Params};
 pub use serial::BlockLink;
 
-/// Why the client could not do something. Each prints as one line with a remedy.
+/// Why an operation of the client failed. Each error prints as one line with a remedy.
 #[derive(Debug)]
 pub enum Error {
     /// The tty refused an operation.
     Io {
-        /// What was being done.
+        /// The operation.
         doing: &'static str,
         /// The tty's name.
         port: String,
         /// The kernel's answer.
         source: io::Error,
     },
-    /// The path leads to something else, to which nothing was written.
+    /// The path is not a terminal. Nothing was written to it.
     NoTerminal {
         /// The path.
         port: String,
@@ -54,35 +54,35 @@ pub enum Error {
         /// The tty's name.
         port: String,
     },
-    /// Nothing came in time.
+    /// Nothing arrived in time.
     Timeout {
-        /// What was waited for.
+        /// The expected event.
         waiting_for: String,
-        /// How long.
+        /// The length of the wait.
         after: Duration,
     },
-    /// The micro-controller shut down.
+    /// The MCU shut down.
     Shutdown {
         /// The firmware's text.
         reason: String,
     },
-    /// The data dictionary is not one.
+    /// The data dictionary is invalid.
     Dictionary {
-        /// What is wrong with it.
+        /// The fault.
         why: String,
     },
     /// A message that does not fit the dictionary.
     Message {
         /// The command or response.
         message: String,
-        /// What is wrong with it.
+        /// The fault.
         why: String,
     },
     /// A plan that cannot be carried out.
     Plan {
         /// The axis, heater or value.
         subject: String,
-        /// What is wrong with it, and what would be right.
+        /// The fault, and the remedy.
         why: String,
     },
 }

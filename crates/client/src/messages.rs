@@ -15,10 +15,10 @@ use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::{Reader, Writer};
 
-/// How many names of a run are listed.
+/// Highest number of names of a run that are listed.
 const NAMES_MAX: u32 = 4096;
 
-/// A value given for a command's parameter.
+/// An argument for a command's parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Arg<'a> {
     /// A number, -2^31 to 2^32 - 1.
@@ -58,7 +58,7 @@ impl<'a> From<&'a [u8]> for Arg<'a> {
     }
 }
 
-/// A value that came in a response.
+/// A value in a response.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Value {
     /// A number.
@@ -72,7 +72,7 @@ pub enum Value {
 /// A response: its name and parameters.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Params {
-    /// The response's name; `#unknown` for one that the dictionary does not have.
+    /// The response's name; `#unknown` for a response that is not in the dictionary.
     pub name: String,
     /// When it was read.
     pub at: Instant,
@@ -80,7 +80,7 @@ pub struct Params {
 }
 
 impl Params {
-    /// The parameter's value, if there is such a parameter.
+    /// The parameter's value; `None` if there is no such parameter.
     pub fn get(&self, parameter: &str) -> Option<&Value> {
         self.fields.iter().find_map(|(name, value)| (name == parameter).then_some(value))
     }
@@ -98,12 +98,12 @@ impl Params {
         }
     }
 
-    /// A 32-bit number, such as a clock. Fails if the response has no such number.
+    /// A 32-bit number, for example a clock. Fails if the response has no such number.
     pub fn u32(&self, parameter: &str) -> Result<u32, Error> {
         Ok(self.int(parameter)? as u32)
     }
 
-    /// A number that stands for true or false. Fails if the response has no such number.
+    /// A number that means true or false. Fails if the response has no such number.
     pub fn flag(&self, parameter: &str) -> Result<bool, Error> {
         Ok(self.int(parameter)? != 0)
     }
@@ -116,7 +116,7 @@ impl Params {
         }
     }
 
-    /// A name of an enumeration; a number that has none reads `?N`.
+    /// A name of an enumeration; `?N` for a number without a name.
     pub fn text(&self, parameter: &str) -> Result<String, Error> {
         match self.get(parameter) {
             Some(Value::Name(value)) => Ok(value.clone()),
@@ -138,7 +138,7 @@ impl Params {
 struct Parameter {
     name: String,
     conversion: Conversion,
-    /// The enumeration that names the parameter's values, if there is one.
+    /// The enumeration with names for the parameter's values, if there is one.
     enumeration: Option<usize>,
 }
 
@@ -193,7 +193,7 @@ impl Enumeration {
         })
     }
 
-    /// Every name, sorted. Of a run that is absurdly long the beginning.
+    /// All names, sorted. A very long run is cut at `NAMES_MAX` names.
     fn all(&self) -> Vec<String> {
         let runs = self.runs.iter().flat_map(|(root, start, _, count)| {
             (0..(*count).min(NAMES_MAX)).map(move |at| format!("{root}{}", u64::from(*start) + u64::from(at)))
@@ -223,7 +223,7 @@ pub struct Messages {
 }
 
 impl Messages {
-    /// Prepares a dictionary. Messages whose format can not be parsed are left out.
+    /// Prepares a dictionary. Messages with an invalid format are omitted.
     pub fn new(dictionary: &Dictionary) -> Messages {
         let enumerations: Vec<_> = dictionary
             .enumerations
@@ -255,19 +255,19 @@ impl Messages {
         self.commands.contains_key(name)
     }
 
-    /// Whether there is such a command with such a parameter.
+    /// Whether there is a command with this name and this parameter.
     pub fn has_parameter(&self, command: &str, parameter: &str) -> bool {
         self.commands.get(command).is_some_and(|m| m.parameters.iter().any(|p| p.name == parameter))
     }
 
-    /// The names that a parameter takes, sorted; none if it takes no names.
+    /// The names that a parameter accepts, sorted; empty if it accepts no names.
     pub(super) fn names(&self, parameter: &str) -> Vec<String> {
         let enumeration = self.enumerations.iter().find(|enumeration| names_values_of(&enumeration.name, parameter));
         enumeration.map_or_else(Vec::new, Enumeration::all)
     }
 
-    /// The bytes of a command. Fails if the dictionary has no such command, if the parameters
-    /// are not exactly its own, or if a value does not fit.
+    /// The bytes of a command. Fails if the dictionary has no such command, if the parameters are not exactly the
+    /// command's own, or if a value does not fit.
     pub fn encode(&self, command: &str, args: &[(&str, Arg<'_>)]) -> Result<Vec<u8>, Error> {
         let wrong = |why: String| Error::Message { message: command.to_owned(), why };
         let message = self.commands.get(command).ok_or_else(|| wrong("the MCU has no such command".to_owned()))?;
@@ -312,8 +312,8 @@ impl Messages {
         }
     }
 
-    /// The bytes of a command in klippy's notation, `config_stepper oid=0 step_pin=gpio17 ...`;
-    /// byte strings stand as hexadecimal digits. Fails as [`Messages::encode`] does.
+    /// The bytes of a command in klippy's notation, `config_stepper oid=0 step_pin=gpio17 ...`. Byte strings are
+    /// hexadecimal digits. Fails as [`Messages::encode`] does.
     pub fn encode_line(&self, line: &str) -> Result<Vec<u8>, Error> {
         let mut words = line.split_ascii_whitespace();
         let command = words.next().unwrap_or_default();
@@ -335,8 +335,8 @@ impl Messages {
         self.encode(command, &pairs)
     }
 
-    /// Takes the responses out of a payload. What the dictionary does not know becomes one
-    /// response `#unknown` with the rest of the payload as `data`.
+    /// Takes the responses from a payload. From the first unknown response on, the rest of the payload becomes one
+    /// response `#unknown` with the rest as `data`.
     pub fn decode(&self, received: &Received) -> Vec<Params> {
         let mut reader = Reader::new(&received.payload);
         let mut responses = Vec::new();
@@ -378,7 +378,7 @@ impl Messages {
     }
 }
 
-/// Whether an enumeration names the values of a parameter: `pin` does for `pin` and for `step_pin`.
+/// Whether an enumeration names the values of a parameter: `pin` names those of `pin` and of `step_pin`.
 fn names_values_of(enumeration: &str, parameter: &str) -> bool {
     parameter.strip_suffix(enumeration).is_some_and(|front| front.is_empty() || front.ends_with('_'))
 }
@@ -417,7 +417,7 @@ mod tests {
             messages
                 .encode("config_endstop", &[("oid", 0.into()), ("pin", pin.into()), ("pull_up", (-1i8 as i32).into())])
         };
-        // config_endstop has the id 5; -1 is one byte.
+        // config_endstop has the id 5. -1 is one byte.
         assert_eq!(encode("gpio17").unwrap(), [5, 0, 17, 0x7f]);
         assert_eq!(encode("gpiochip1/gpio2").unwrap(), [5, 0, 0x82, 0x22, 0x7f]);
         assert_eq!(encode("GPIO17").unwrap(), [5, 0, 17, 0x7f]);

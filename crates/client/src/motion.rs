@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Moves as step sequences, paced into the micro-controller's move queue; homing against an
-//! endstop, in the words that klippy uses for it.
+//! Moves as step sequences, paced into the MCU's move queue, and homing against an endstop with klippy's commands.
 
 #![forbid(unsafe_code)]
 
@@ -12,50 +11,50 @@ use super::config::Config;
 use super::{Client, Error};
 use pinion_protocol::clock::Clock;
 
-/// How long before they are due steps are sent, in seconds.
+/// How long before its due time a step is sent, in seconds.
 const LOOKAHEAD_S: f64 = 1.0;
-/// How long after the present a move starts, in seconds: time to send its first steps.
+/// How long after the present a move starts, in seconds. This leaves time to send its first steps.
 const LEAD_S: f64 = 0.25;
-/// How often position and endstop are looked at during a move.
+/// How often position and endstop are queried during a move.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
-/// How many times they are looked at after homing, with the axis at rest.
+/// How many times they are queried after homing, with the axis at rest.
 const LOOKS_AT_REST: u32 = 5;
-/// How long to wait for a response at most before looking whether more steps are to be sent.
+/// Longest wait for a response before the next check for steps to send.
 const FEED_EVERY: Duration = Duration::from_millis(5);
-/// By how much of itself the interval may shrink within one chord of a ramp. A tenth keeps the chord
-/// within half a hundredth of the curve.
+/// Highest share by which the interval may shrink within one chord of a ramp. A tenth keeps the chord within half a
+/// hundredth of the curve.
 const CHORD: f64 = 0.1;
-/// The same where intervals shrink by fewer than [`ADD_COARSE`] ticks a step: `add` is a whole number
-/// of ticks, so its rounding matters there.
+/// The same limit where intervals shrink by fewer than [`ADD_COARSE`] ticks per step. `add` is a whole number of ticks,
+/// so its rounding matters there.
 const CHORD_FINE: f64 = 0.02;
 const ADD_COARSE: i64 = -8;
-/// The longest interval between two steps, in ticks. With a much longer one, the 32-bit clock of the
-/// next step would be taken for one in the past.
+/// Longest interval between two steps, in ticks. With a much longer interval, the MCU would take the 32-bit clock of
+/// the next step for a past one.
 const INTERVAL_MAX: f64 = (1u32 << 30) as f64;
 
-/// How many entries of the move queue are left to heaters and other outputs.
+/// Number of entries of the move queue that are left for heaters and other outputs.
 const RESERVED_MOVES: usize = 16;
 
-/// After this many seconds without a message from the host the micro-controller ends homing by itself.
-/// It is klippy's value for a printer with one micro-controller.
+/// The MCU ends homing by itself after this many seconds without a message from the host. It is klippy's value for a
+/// printer with one MCU.
 const TRSYNC_TIMEOUT_S: f64 = 5.0;
-/// How long after the end of the move the report of the trsync may come.
+/// How long after the end of the move the trsync's report may come.
 const NEWS_TIMEOUT: Duration = Duration::from_secs(6);
 const ENDSTOP_SAMPLE_S: f64 = 0.000_015;
 const ENDSTOP_SAMPLES: u8 = 4;
 
-/// Why homing ended, as klippy numbers it.
+/// The reason for the end of homing, with klippy's numbers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum HomingEnd {
     /// The endstop closed.
     Endstop,
     /// The host gave up.
     Host,
-    /// The move was over.
+    /// The move ended.
     PastEnd,
-    /// The micro-controller did not hear from the host in time.
+    /// The MCU received no message from the host in time.
     Silence,
-    /// A reason that klippy does not have.
+    /// A reason that klippy does not define.
     Other(i64),
 }
 
@@ -78,20 +77,20 @@ impl HomingEnd {
     }
 }
 
-/// `count` steps, the first `interval` ticks after the step before, each further one after an
-/// interval longer by `add`: what one `queue_step` says.
+/// The content of one `queue_step`: `count` steps. The first is `interval` ticks after the step before. Each later
+/// interval is longer by `add`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Run {
     /// Ticks to the first step.
     pub interval: u32,
-    /// Steps, at least one.
+    /// Number of steps, at least one.
     pub count: u16,
     /// Ticks by which each interval is longer than the one before.
     pub add: i16,
 }
 
 impl Run {
-    /// Ticks from the step before to the last step.
+    /// Ticks from the step before the run to its last step.
     pub fn ticks(&self) -> u64 {
         let count = i64::from(self.count);
         let ramp = i64::from(self.add) * (count * (count - 1) / 2);
@@ -109,21 +108,21 @@ impl Run {
     }
 }
 
-/// A move of one stepper: it speeds up, keeps its speed, and slows down.
+/// A move of one stepper. It accelerates, keeps its speed, and decelerates.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Profile {
     /// The move, in order.
     pub runs: Vec<Run>,
-    /// Steps of all runs.
+    /// Number of steps of all runs.
     pub steps: u32,
     /// Ticks from the start to the last step.
     pub ticks: u64,
 }
 
 impl Profile {
-    /// A move of `steps` steps at up to `speed` steps/s with `acceleration` steps/s² (infinity
-    /// for none), on a clock of `frequency_hz`. Fails if a number is not positive or the speed
-    /// is below a step in some 20 seconds or above a step in a tick.
+    /// A move of `steps` steps at up to `speed` steps/s with `acceleration` steps/s² (infinity for no limit), on a
+    /// clock of `frequency_hz`. Fails if a number is not positive. Also fails if the speed is below a step in about 20
+    /// seconds or above a step per tick.
     pub fn trapezoid(steps: u32, speed: f64, acceleration: f64, frequency_hz: f64) -> Result<Profile, Error> {
         let cruise = (frequency_hz / speed).ceil();
         let positive = speed > 0.0 && acceleration > 0.0 && frequency_hz > 0.0;
@@ -145,7 +144,7 @@ impl Profile {
         let ramp_steps = (speed * speed / (2.0 * acceleration)).min(f64::from(steps / 2)) as u32;
         let ramp = ramp(ramp_steps, interval);
         let peak = ramp.last().map_or(cruise, |run| run.last_interval());
-        // A short move does not reach the wanted speed. Its middle keeps the highest one it reaches.
+        // A short move does not reach `speed`. Its middle keeps the highest speed that it reaches.
         let even = if ramp_steps < steps / 2 { cruise } else { peak };
         let mut runs = ramp.clone();
         let mut rest = steps - 2 * ramp_steps;
@@ -160,15 +159,15 @@ impl Profile {
     }
 }
 
-/// Approximates the intervals of the steps `0..steps`, which shrink ever more slowly, by runs whose
-/// intervals change evenly (chords of the curve). `add` is rounded towards zero, so that no run ends
-/// with a shorter interval than the next one begins with.
+/// Approximates the intervals of the steps `0..steps` by runs with evenly changing intervals (chords of the curve). The
+/// intervals shrink ever more slowly. `add` is rounded toward zero, so no run ends with a shorter interval than the
+/// next one begins with.
 fn ramp(steps: u32, interval: impl Fn(u32) -> u32) -> Vec<Run> {
     let mut runs = Vec::new();
     let mut at = 0;
     while at < steps {
         let first = interval(at);
-        // The end of the longest chord whose intervals shrink by no more than `part`, by bisection.
+        // The end of the longest chord with intervals that shrink by at most `part`, found by bisection.
         let chord = |part: f64| {
             let least = f64::from(first) * (1.0 - part);
             let (mut count, mut beyond) = (1, (steps - at).min(u32::from(u16::MAX)) + 1);
@@ -197,7 +196,7 @@ fn ramp(steps: u32, interval: impl Fn(u32) -> u32) -> Vec<Run> {
     runs
 }
 
-/// A stepper as configured.
+/// A configured stepper.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Stepper {
     /// Its oid.
@@ -207,8 +206,8 @@ pub struct Stepper {
 }
 
 impl Stepper {
-    /// Adds a stepper to a configuration: its pins by name, `invert_step` (-1: step on both
-    /// edges), and the width of a step pulse in ticks. Fails if there are too many objects.
+    /// Adds a stepper to a configuration: its pins by name, `invert_step` (-1: step on both edges), and the width of a
+    /// step pulse in ticks. Fails if there are too many objects.
     pub fn configure(
         config: &mut Config,
         step_pin: &str,
@@ -225,7 +224,7 @@ impl Stepper {
         Ok(Stepper { oid, invert_dir })
     }
 
-    /// Asks where it is, in steps from where it was configured.
+    /// Queries its position, in steps from its position at configuration.
     pub fn position(&self, client: &mut Client) -> Result<i64, Error> {
         let args = [("oid", self.oid.into())];
         let state = client.query("stepper_get_position", &args, "stepper_position", Some(self.oid))?;
@@ -234,7 +233,7 @@ impl Stepper {
     }
 }
 
-/// An endstop and the trsync that it triggers, as configured.
+/// A configured endstop, and the trsync that it triggers.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Endstop {
     /// The endstop's oid.
@@ -256,13 +255,13 @@ impl Endstop {
         Ok(Endstop { oid, trsync, invert })
     }
 
-    /// Asks whether it is triggered.
+    /// Queries whether it is triggered.
     pub fn triggered(&self, client: &mut Client) -> Result<bool, Error> {
         Ok(self.state(client)?.0)
     }
 
-    /// Has the micro-controller look at the pin from `start` on, each `rest_ticks`, and pull the
-    /// trigger once several samples in a row, `sample_ticks` apart, see it triggered.
+    /// Makes the MCU sample the pin from `start` on, every `rest_ticks`. The endstop triggers after several triggered
+    /// samples in a row, `sample_ticks` apart.
     fn search(&self, client: &mut Client, start: Clock, sample_ticks: u32, rest_ticks: u32) -> Result<(), Error> {
         client.send(
             "endstop_home",
@@ -279,7 +278,7 @@ impl Endstop {
         )
     }
 
-    /// Whether it is triggered, and the clock of the sample after the one that ended homing.
+    /// Whether it is triggered, and the clock of the sample after the last sample of homing.
     fn state(&self, client: &mut Client) -> Result<(bool, Clock), Error> {
         let args = [("oid", self.oid.into())];
         let state = client.query("endstop_query_state", &args, "endstop_state", Some(self.oid))?;
@@ -288,10 +287,10 @@ impl Endstop {
     }
 }
 
-/// What was seen at an instant of a move.
+/// The state at an instant of a move.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Sight {
-    /// When.
+    /// The instant.
     pub clock: Clock,
     /// The stepper's position in steps.
     pub position: i64,
@@ -299,56 +298,55 @@ pub struct Sight {
     pub triggered: bool,
 }
 
-/// What is watched during a move.
+/// The watcher of a move.
 pub struct Watch<'a> {
-    /// The endstop to look at.
+    /// The endstop to query.
     pub endstop: Endstop,
-    /// Is told what was seen, some fifty times a second.
+    /// Receives the state about fifty times a second.
     pub seen: &'a mut dyn FnMut(Sight),
 }
 
-/// How homing ended.
+/// The result of homing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Homed {
     /// Why it ended.
     pub reason: HomingEnd,
     /// When the move began.
     pub start: Clock,
-    /// When the endstop was first seen triggered, if it was.
+    /// When the endstop was first seen triggered; `None` if it was not.
     pub trigger: Option<Clock>,
-    /// The position at which the stepper stopped, in steps.
+    /// The position where the stepper stopped, in steps.
     pub position: i64,
-    /// How many steps the stepper may have made after the endstop closed, until the samples of the
-    /// endstop have shown it.
+    /// Highest number of steps after the endstop closed, before its samples showed the trigger.
     pub slack_steps: u32,
 }
 
-/// Paces moves into the micro-controller's move queue: keeps account of its entries in use.
+/// Paces moves into the MCU's move queue, and counts its used entries.
 #[derive(Debug)]
 pub struct MoveQueue {
     room: usize,
-    /// When each entry in use becomes free again.
+    /// When each used entry becomes free again.
     releases: BinaryHeap<Reverse<Clock>>,
 }
 
-/// A move on its way into the queue.
+/// A move that is being sent to the queue.
 #[derive(Debug)]
 struct Moving {
     oid: u8,
     start: Clock,
     end: Clock,
-    /// When the step before the next run is due.
+    /// The due time of the step before the next run.
     next: Clock,
     runs: VecDeque<Run>,
 }
 
 impl MoveQueue {
-    /// A queue of so many entries, as `get_config` tells; a few are left for other outputs.
+    /// A queue with the number of entries from `get_config`. A few entries are left for other outputs.
     pub fn new(move_count: u16) -> MoveQueue {
         MoveQueue { room: usize::from(move_count).saturating_sub(RESERVED_MOVES).max(1), releases: BinaryHeap::new() }
     }
 
-    /// Moves a stepper, and returns when it has arrived. Fails if the stepper does not.
+    /// Moves a stepper, and returns when it has arrived. Fails if the stepper does not arrive.
     pub fn run(
         &mut self,
         client: &mut Client,
@@ -361,7 +359,7 @@ impl MoveQueue {
         let start = client.clock_in(LEAD_S)?;
         let mut moving = self.begin(client, stepper, positive, profile, start)?;
         let mut look_at = Instant::now();
-        // Waits 10 ms longer, as the last step may be a little late.
+        // Wait 10 ms longer, because the last step may be a little late.
         let arrived = moving.end.displaced(client.ticks(0.01));
         while client.clock_in(0.0)? <= arrived {
             self.feed(client, &mut moving)?;
@@ -378,7 +376,7 @@ impl MoveQueue {
         Ok(())
     }
 
-    /// Moves a stepper towards an endstop, and returns when it was stopped or the move is over.
+    /// Moves a stepper toward an endstop. Returns when the stepper was stopped or the move is over.
     pub fn home(
         &mut self,
         client: &mut Client,
@@ -450,7 +448,7 @@ impl MoveQueue {
         let mut args = vec![("oid", endstop.oid.into())];
         args.extend(nothing.map(|name| (name, 0u8.into())));
         client.send("endstop_home", &args)?;
-        // The last report may still be on its way. It has come once all that was sent is acknowledged.
+        // The last report may still be on its way. It has arrived when everything sent is acknowledged.
         client.link().settle()?;
         let mut state = client.query(
             "trsync_trigger",
@@ -497,7 +495,7 @@ impl MoveQueue {
         Ok(moving)
     }
 
-    /// Sends the runs that are due soon and that the queue has room for.
+    /// Sends the runs that are due soon, as far as the queue has room.
     fn feed(&mut self, client: &mut Client, moving: &mut Moving) -> Result<(), Error> {
         let now = client.clock_in(0.0)?;
         let horizon = client.clock_in(LOOKAHEAD_S)?.max(moving.start);
@@ -518,7 +516,7 @@ impl MoveQueue {
                     ("add", run.add.into()),
                 ],
             )?);
-            // The micro-controller takes a run out of its queue when the run before it is over.
+            // The MCU removes a run from its queue when the run before it is over.
             self.releases.push(Reverse(moving.next));
             moving.next = Clock::from_ticks(moving.next.ticks() + run.ticks());
         }
@@ -530,8 +528,8 @@ fn no_news() -> Error {
     Error::Timeout { waiting_for: "report `trsync_state` on homing".to_owned(), after: NEWS_TIMEOUT }
 }
 
-/// Starts a trsync that stops a stepper when it is triggered. It reports from `start` on, each
-/// `report_ticks`, and triggers by itself at `expire` unless that is set anew.
+/// Starts a trsync that stops a stepper when it is triggered. It reports every `report_ticks` from `start` on. It
+/// triggers by itself at `expire`, unless the host sets `expire` anew.
 fn arm(
     client: &mut Client,
     stepper: Stepper,
@@ -583,7 +581,7 @@ mod tests {
 
     const FREQUENCY_HZ: f64 = 50e6;
 
-    /// The clocks of all steps, as the firmware computes them: with integers only.
+    /// The clocks of all steps, calculated with integers only, as in the firmware.
     fn step_clocks(profile: &Profile) -> Vec<u64> {
         let (mut clock, mut clocks) = (0u64, Vec::new());
         for run in &profile.runs {
@@ -618,7 +616,7 @@ mod tests {
             prop_assert_eq!(intervals.iter().sum::<u64>(), profile.ticks);
             let fastest = (FREQUENCY_HZ / speed) as u64;
             prop_assert!(intervals.iter().all(|interval| *interval >= fastest));
-            // The intervals shrink, then grow, and are the same from either end.
+            // The intervals shrink, then grow, and are symmetric.
             let lowest = intervals.iter().min().unwrap();
             let bottom = intervals.iter().position(|i| i == lowest).unwrap();
             prop_assert!(intervals[..=bottom].is_sorted_by(|a, b| a >= b));

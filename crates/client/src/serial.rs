@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Blocks over a tty: a [`Port`] carries bytes and finds blocks in them, a [`BlockLink`] delivers
-//! payloads in order, each once.
+//! Blocks over a tty. A [`Port`] carries bytes and finds blocks in them. A [`BlockLink`] delivers payloads in order,
+//! each once.
 //!
-//! Blocks are sent again by klippy's rules (chelper/serialqueue.c). At most [`WINDOW`] blocks are
-//! sent without being acknowledged. After the retransmission time, or at once after a NAK, all of them
-//! are sent again, behind a sync byte. An empty block that repeats the last acknowledgement is a NAK.
+//! Blocks are sent again by klippy's rules (chelper/serialqueue.c). At most [`WINDOW`] blocks are sent without an
+//! acknowledgement. After the retransmission timeout, or at once after a NAK, all of them are sent again, after a sync
+//! byte. An empty block that repeats the last acknowledgement is a NAK.
 
 #![forbid(unsafe_code)]
 
@@ -25,19 +25,19 @@ use nix::sys::time::TimeSpec;
 use super::Error;
 use pinion_protocol::block::{BLOCK_MAX, BLOCK_MIN, Found, PAYLOAD_MAX, Resync, Sequence, frame};
 
-/// How many blocks may be sent without being acknowledged.
+/// Highest number of blocks without an acknowledgement.
 pub const WINDOW: usize = 12;
 /// How long to wait for any acknowledgement before sending fails.
 pub const SILENCE: Duration = Duration::from_secs(5);
 
-/// How many payloads are kept until they are received. The oldest are dropped first.
+/// Highest number of payloads kept until they are received. The oldest are dropped first.
 const RECEIVED_MAX: usize = 65_536;
 const SYNC: u8 = 0x7e;
 const RTO_MIN: Duration = Duration::from_millis(25);
 const RTO_MAX: Duration = Duration::from_secs(5);
 
-/// Carries bytes over a tty, pty, socket or anything else that can be polled, and finds the blocks in
-/// what comes in, in whatever order. Tests send bytes through it that a [`BlockLink`] would never send.
+/// Carries bytes over a tty, pty, socket or any other pollable file, and finds the blocks in the input, in any order.
+/// Tests send bytes through it that a [`BlockLink`] would never send.
 #[derive(Debug)]
 pub struct Port {
     file: File,
@@ -45,12 +45,12 @@ pub struct Port {
     resync: Resync,
     input: Vec<u8>,
     output: Vec<u8>,
-    /// Bytes that belonged to no intact block.
+    /// Number of bytes outside intact blocks.
     garbage: u64,
 }
 
 impl Port {
-    /// Opens a tty, makes it raw and throws away what an earlier session left in it.
+    /// Opens a tty, makes it raw and discards the remains of an earlier session.
     pub fn open(path: &Path) -> Result<Port, Error> {
         let name = path.display().to_string();
         let file = OpenOptions::new()
@@ -59,14 +59,14 @@ impl Port {
             .custom_flags((OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits())
             .open(path)
             .map_err(|source| Error::Io { doing: "open", port: name.clone(), source })?;
-        // What is written to a file would stay in it.
+        // Bytes written to a regular file would stay in it.
         if !file.is_terminal() {
             return Err(Error::NoTerminal { port: name });
         }
         Port::new(file, name)
     }
 
-    /// Takes over an open descriptor. A tty is made raw. Errors call it `name`.
+    /// Takes over an open descriptor. A tty is made raw. Errors use `name` for it.
     pub fn from_fd(fd: OwnedFd, name: &str) -> Result<Port, Error> {
         Port::new(File::from(fd), name.to_owned())
     }
@@ -98,18 +98,17 @@ impl Port {
         &self.name
     }
 
-    /// Appends bytes, just as they are, to those that wait to be written.
+    /// Appends bytes, unchanged, to the output buffer.
     pub fn queue(&mut self, bytes: &[u8]) {
         self.output.extend_from_slice(bytes);
     }
 
-    /// Appends an intact block with this sequence number to the bytes that wait to be written.
+    /// Appends an intact block with this sequence number to the output buffer.
     pub fn queue_block(&mut self, payload: &[u8], sequence: Sequence) {
         frame(payload, sequence, &mut self.output);
     }
 
-    /// Writes what waits to be written, and reads until something comes in or the time is over. Returns
-    /// whether bytes came in.
+    /// Writes the output buffer, and reads until bytes arrive or the time is over. Returns whether bytes arrived.
     pub fn exchange(&mut self, until: Instant) -> Result<bool, Error> {
         self.write_some()?;
         let wait = until.saturating_duration_since(Instant::now());
@@ -152,7 +151,7 @@ impl Port {
         }
     }
 
-    /// The next intact block, `None` if none comes in time.
+    /// The next intact block; `None` if none arrives in time.
     pub fn wait_block(&mut self, until: Instant) -> Result<Option<(Sequence, Vec<u8>)>, Error> {
         loop {
             if let Some(block) = self.next_block() {
@@ -198,7 +197,7 @@ impl Port {
     }
 }
 
-/// A payload that came in.
+/// A payload that arrived.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Received {
     /// The payload, not empty.
@@ -207,18 +206,18 @@ pub struct Received {
     pub at: Instant,
 }
 
-/// What went over a link so far.
+/// The traffic of a link so far.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Traffic {
-    /// Blocks sent, each counted once.
+    /// Number of blocks sent, each counted once.
     pub blocks_sent: u64,
-    /// Blocks sent again.
+    /// Number of blocks sent again.
     pub blocks_again: u64,
-    /// Blocks received, acknowledgements included.
+    /// Number of blocks received, including acknowledgements.
     pub blocks_received: u64,
-    /// NAKs among them.
+    /// Number of NAKs among them.
     pub naks: u64,
-    /// Received bytes that belonged to no intact block.
+    /// Number of received bytes outside intact blocks.
     pub garbage_bytes: u64,
 }
 
@@ -230,7 +229,7 @@ struct Sent {
 
 /// Delivers payloads in order, each once.
 ///
-/// Numbers count blocks from the session's start; the wire carries them modulo 16.
+/// Numbers count blocks from the session's start. The wire carries them modulo 16.
 #[derive(Debug)]
 pub struct BlockLink {
     port: Port,
@@ -238,7 +237,7 @@ pub struct BlockLink {
     synchronised: bool,
     /// The number of the next new block.
     send: u64,
-    /// The number of the oldest block that is not acknowledged.
+    /// The number of the oldest block without an acknowledgement.
     receive: u64,
     last_ack: u64,
     /// NAKs up to this number are ignored: they answer blocks that have been sent again since.
@@ -254,10 +253,10 @@ pub struct BlockLink {
     retransmit_at: Instant,
     heard_at: Instant,
     received: VecDeque<Received>,
-    /// How many payloads have come in, and how many of them were received or dropped.
+    /// Number of payloads that arrived; the next field counts those that were received or dropped.
     arrived: u64,
     taken: u64,
-    /// What `arrived` was when the last block that was sent was acknowledged.
+    /// The value of `arrived` when the last sent block was acknowledged.
     settled: Option<u64>,
     traffic: Traffic,
 }
@@ -268,7 +267,7 @@ impl BlockLink {
         BlockLink::new(Port::open(path)?, timeout)
     }
 
-    /// Makes a link of a port: finds out which block the other end expects next.
+    /// Makes a link from a port, and finds out which block the other end expects next.
     pub fn new(port: Port, timeout: Duration) -> Result<BlockLink, Error> {
         let now = Instant::now();
         let mut sequences = [Sequence::default(); 16];
@@ -302,9 +301,9 @@ impl BlockLink {
         Ok(link)
     }
 
-    /// Finds out which block the other end expects next, by sending an empty one: the answer tells it
-    /// whether the number of the empty block was right or not. The sync bytes before it end a block
-    /// that an earlier host may have left incomplete.
+    /// Finds out which block the other end expects next. It sends an empty block. The answer has the expected number,
+    /// whether or not the number of the empty block was right. The sync bytes before it end a block that an earlier
+    /// host may have left incomplete.
     fn synchronise(&mut self, timeout: Duration) -> Result<(), Error> {
         let until = Instant::now() + timeout;
         while !self.synchronised {
@@ -324,16 +323,15 @@ impl BlockLink {
         Ok(())
     }
 
-    /// Limits the bytes that are sent without being acknowledged to what the other end can buffer: its
-    /// constant `RECEIVE_WINDOW`.
+    /// Limits the unacknowledged bytes to the other end's buffer size, its constant `RECEIVE_WINDOW`.
     pub(super) fn set_window_bytes(&mut self, bytes: usize) {
         self.window_bytes = bytes.max(BLOCK_MAX);
     }
 
-    /// Sends a payload as one block; waits while the window is full.
+    /// Sends a payload as one block. Waits while the window is full.
     ///
-    /// Fails if the payload does not fit a block, the other end closes, or acknowledges
-    /// nothing for [`SILENCE`].
+    /// Fails if the payload does not fit into a block, if the other end closes, or if it acknowledges nothing for
+    /// [`SILENCE`].
     pub fn send(&mut self, payload: &[u8]) -> Result<(), Error> {
         if payload.len() > PAYLOAD_MAX {
             return Err(Error::Message {
@@ -359,12 +357,12 @@ impl BlockLink {
         self.port.write_some()
     }
 
-    /// Waits until all that was sent is acknowledged.
+    /// Waits until everything sent is acknowledged.
     pub fn settle(&mut self) -> Result<(), Error> {
         self.wait_while(|link| !link.sent.is_empty())
     }
 
-    /// The next payload that came in; waits for one, `None` if none comes in time.
+    /// Waits for the next payload; `None` if none arrives in time.
     pub fn receive(&mut self, until: Instant) -> Result<Option<Received>, Error> {
         loop {
             if let Some(received) = self.next_received() {
@@ -377,8 +375,8 @@ impl BlockLink {
         }
     }
 
-    /// The next of the payloads that come in before all that was sent is acknowledged, or together with
-    /// that. Waits for one; `None` once there are no more.
+    /// The next payload that arrives before, or together with, the acknowledgement of everything sent. Waits for one;
+    /// `None` when there are no more.
     pub(super) fn receive_unsettled(&mut self) -> Result<Option<Received>, Error> {
         self.wait_while(|link| link.received.is_empty() && link.settled.is_none())?;
         match self.settled {
@@ -393,17 +391,17 @@ impl BlockLink {
         received
     }
 
-    /// How many blocks are sent and not acknowledged.
+    /// Number of sent blocks without an acknowledgement.
     pub fn unacknowledged(&self) -> usize {
         self.sent.len()
     }
 
-    /// What went over the link so far.
+    /// The traffic of the link so far.
     pub fn traffic(&self) -> Traffic {
         Traffic { garbage_bytes: self.port.garbage, ..self.traffic }
     }
 
-    /// The port beneath, to send bytes that a link would never send.
+    /// The underlying port, for sending bytes that a link would never send.
     pub fn port(&mut self) -> &mut Port {
         &mut self.port
     }
@@ -425,7 +423,7 @@ impl BlockLink {
     /// One round of writing, waiting, reading, acknowledging and sending again.
     fn exchange(&mut self, until: Instant) -> Result<(), Error> {
         self.port.write_some()?;
-        // The retransmission time runs only once everything has been written.
+        // The retransmission timeout starts only after everything has been written.
         let timed = !self.sent.is_empty() && self.port.output.is_empty();
         let until = if timed { until.min(self.retransmit_at) } else { until };
         if self.port.exchange(until)? {
@@ -475,7 +473,7 @@ impl BlockLink {
         } else if self.receive > self.ignore_nak && !self.sent.is_empty() {
             self.traffic.naks += 1;
             self.ignore_nak = if self.receive < self.retransmitted {
-                // It is the second NAK since the blocks were sent again. Further ones are ignored.
+                // This is the second NAK since the blocks were sent again. Further ones are ignored.
                 self.retransmitted
             } else {
                 self.receive
@@ -504,7 +502,7 @@ impl BlockLink {
         self.retransmit_at = at + self.rto;
     }
 
-    /// Adapts the retransmission time to a round trip, after RFC 6298.
+    /// Adapts the retransmission timeout to a round trip, after RFC 6298.
     fn measure(&mut self, sample: Duration) {
         let (smooth, variation) = match self.round_trip {
             None => (sample * 10, sample / 2),

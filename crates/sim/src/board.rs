@@ -169,7 +169,7 @@ fn numbered<'a, T>(
         .ok_or_else(|| is_missing(&format!("{kind} bus {number}"), buses.iter().map(|bus| name(bus)), reason))
 }
 
-/// The error for a missing bus or pin, with the names that exist.
+/// The error for a missing bus or thermometer, with the names that exist.
 fn is_missing<'a>(what: &str, names: impl Iterator<Item = &'a str>, reason: ShutdownReason) -> Shutdown {
     let names: Vec<&str> = names.collect();
     let has = if names.is_empty() { "it has none".to_owned() } else { format!("use {}", names.join(" or ")) };
