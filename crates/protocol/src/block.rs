@@ -49,7 +49,7 @@ pub fn frame(payload: &[u8], sequence: Sequence, out: &mut Vec<u8>) {
     out.push(SYNC);
 }
 
-/// What some bytes begin with.
+/// The beginning of some bytes.
 #[derive(Debug, PartialEq, Eq)]
 enum Front<'a> {
     Incomplete,
@@ -76,7 +76,7 @@ fn front(bytes: &[u8]) -> Front<'_> {
     Front::Block(Sequence(bytes[1] & SEQUENCE_MASK), &checked[HEADER_BYTES..])
 }
 
-/// What a [`Resync`] found at the front of its bytes.
+/// The result of [`Resync::next`].
 #[derive(Debug, PartialEq, Eq)]
 pub enum Found<'a> {
     /// The bytes end before a block does.
@@ -98,7 +98,7 @@ pub struct Resync {
 }
 
 impl Resync {
-    /// How many bytes to remove from the front of `bytes`, and what they were.
+    /// How many bytes to remove from the front of `bytes`, and their content.
     pub fn next<'a>(&mut self, bytes: &'a [u8]) -> (usize, Found<'a>) {
         if !self.need_sync {
             match front(bytes) {

@@ -56,7 +56,7 @@ pub struct Transfer {
     pub mode: u8,
     /// The clock rate.
     pub rate_hz: u32,
-    /// What the MCU sent.
+    /// The bytes from the MCU.
     pub data: Vec<u8>,
     /// Whether the MCU read the received bytes.
     pub read: bool,
@@ -73,7 +73,7 @@ pub type I2cChip = Box<dyn FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus>
 pub type LineChip = Box<dyn FnMut(u64, Option<(u32, bool)>) -> bool + Send>;
 
 #[derive(Default)]
-/// What a test sets and reads on the board.
+/// The settings and records of the board, for a test.
 pub struct State {
     /// By the input that the chip drives.
     line_chips: HashMap<u32, LineChip>,
@@ -204,7 +204,7 @@ impl Bench {
         at.since(self.origin) as u64
     }
 
-    /// What a test sets and reads.
+    /// The settings and records, for a test.
     pub fn state(&self) -> MutexGuard<'_, State> {
         self.state.lock().unwrap()
     }

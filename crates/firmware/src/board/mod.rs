@@ -258,8 +258,8 @@ pub trait BusDevice: Send {
         self.exchange(&mut bytes.to_vec())
     }
 
-    /// Writes bytes and then reads bytes, with a repeated start between the two (I2C). It is a plain write if there is
-    /// nothing to read, and a plain read if there is nothing to write.
+    /// Writes bytes and then reads bytes, with a repeated start between the two (I2C). It only
+    /// writes if there is nothing to read, and only reads if there is nothing to write.
     ///
     /// # Errors
     ///
@@ -392,7 +392,7 @@ impl ChipSelect {
 
 /// A computer with pins. Opening and claiming may block and allocate. So the MCU does it only until `finalize_config`.
 pub trait Board: Send {
-    /// One line for the log: what the board is and what it has.
+    /// One line for the log that describes the board and its devices.
     fn describe(&self) -> String;
 
     /// The names of the dictionary's enumeration `pin`.

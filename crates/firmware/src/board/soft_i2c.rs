@@ -199,10 +199,10 @@ mod tests {
     /// register. It logs what happens.
     #[derive(Default)]
     struct Wires {
-        /// What [`SoftI2c`] releases or pulls low.
+        /// The levels from [`SoftI2c`]: released or low.
         scl: bool,
         sda: bool,
-        /// What the chip does to SDA.
+        /// Whether the chip pulls SDA low.
         chip_sda_low: bool,
         /// How long it holds the clock after each falling edge.
         hold_ticks: u64,

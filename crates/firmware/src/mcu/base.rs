@@ -9,7 +9,7 @@ use crate::time::{CLOCK_FREQ, Clock};
 use super::stats::SUMSQ_BASE;
 use super::{Command, Constant, Enumeration, Feature, Form, Generations, Response, command, response};
 
-/// What this file adds to the dictionary.
+/// This file's entries in the dictionary.
 pub const FEATURE: Feature = Feature {
     name: "base",
     commands: &[

@@ -51,12 +51,12 @@ impl BusDevice for Counted {
     }
 }
 
-/// What to say to a chip. This code runs on the worker and may block there.
+/// The code of a conversation with a chip. It runs on the worker and may block there.
 pub trait Talk: Send + 'static {
     /// The result of the conversation.
     type Answer: Copy + Send;
 
-    /// Has the conversation.
+    /// Runs the conversation.
     ///
     /// # Errors
     ///
@@ -66,7 +66,7 @@ pub trait Talk: Send + 'static {
 
 /// A conversation with a chip, as an [`Errand`].
 pub struct Conversation<T> {
-    /// What to say.
+    /// The code of the conversation.
     pub talk: T,
     /// Set when the conversation is sent.
     device: Option<SharedDevice>,

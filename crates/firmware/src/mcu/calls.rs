@@ -5,8 +5,8 @@
 //!
 //! - A worker repeats a failed call at once, up to [`TRIES`] tries in all. It does so only if the repetition cannot
 //!   change what the call does: reading a register or a level, setting an output.
-//! - A sampled input may be [`Unread`] for [`UNREAD_LIMIT`] before the MCU stops. An input that stops a move has no
-//!   such limit: its failure stops the MCU at once.
+//! - A sampled input may be [`Unread`] for [`UNREAD_LIMIT`] before the MCU stops. An input that stops a move has
+//!   no limit: its failure stops the MCU at once.
 
 #![forbid(unsafe_code)]
 

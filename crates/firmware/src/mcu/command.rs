@@ -33,7 +33,7 @@ pub struct Command {
     pub in_shutdown: bool,
     /// Whether it may join a command of the same kind: see [`Command::joining`].
     pub joins: bool,
-    /// What it does.
+    /// Decodes the parameters and runs the command.
     pub handler: Handler,
 }
 
@@ -141,7 +141,7 @@ impl Enumeration {
     }
 }
 
-/// What a feature adds to the dictionary. [`Feature::EMPTY`] provides the fields that a feature does not need.
+/// A feature's entries in the dictionary. [`Feature::EMPTY`] provides the fields that a feature does not need.
 pub struct Feature {
     /// Its name.
     pub name: &'static str,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the host configured, and how the MCU forgets it.
+//! The host's configuration, and how the MCU forgets it.
 
 #![forbid(unsafe_code)]
 
@@ -13,7 +13,7 @@ use super::{Mcu, MovePool, Note, Object, Oid, TimerId};
 /// Highest number of objects with an oid.
 pub(super) const OBJECTS_MAX: usize = 256;
 
-/// What the host configured.
+/// The host's configuration.
 #[derive(Default)]
 pub(super) struct Configuration {
     /// Indexed by oid; feature-owned objects follow.

@@ -112,7 +112,7 @@ pub struct Firmware {
     pub app: &'static str,
     /// The program's version.
     pub version: &'static str,
-    /// What the program was built with.
+    /// The tools that built the program.
     pub build_versions: &'static str,
     /// The program's license.
     pub license: &'static str,

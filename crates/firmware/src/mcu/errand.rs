@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Work that may block. It travels as an [`Errand`] to the worker of its bus, runs there, and returns to the object
+//! Work that may block. It travels as an [`Errand`] to the worker of its bus and runs there. It returns to the object
 //! that sent it.
 //!
 //! An object has a [`Slot`](super::Slot) for each errand, made at configuration. The errand carries everything that the
@@ -82,7 +82,7 @@ pub struct Done {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct WorkerId(pub usize);
 
-/// Runs errands. Those of one bus run one after the other.
+/// Runs errands. The errands of one bus run one after the other.
 pub trait Workers: Send {
     /// The worker of a bus. Starts one if the bus has none yet.
     ///

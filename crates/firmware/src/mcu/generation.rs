@@ -77,7 +77,7 @@ impl fmt::Display for Generation {
     }
 }
 
-/// A set of generations: those that use a form of a message.
+/// A set of generations: the ones that use a form of a message.
 ///
 /// A new generation is in every set that its parent is in.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -25,7 +25,7 @@ use super::{Mcu, Oid, TimerId, Turn};
 /// `emergency_stop`.
 const HOLD_LIMIT: Ticks = Ticks::from_ms(5000);
 
-/// What commands wait for.
+/// The holds that make commands wait.
 #[derive(Default)]
 pub(super) struct Holds {
     /// Whether a command runs now, or the MCU takes back an errand that a command sent.
@@ -57,7 +57,7 @@ impl Turn<'_> {
         Hold(is_commanded)
     }
 
-    /// Call this after sending a command's errand. Other such commands to the same object then need not wait for it,
+    /// Call this after sending a command's errand. Other commands of this kind to the same object need not wait,
     /// until `limit` errands are on their way.
     pub fn let_join(&mut self, limit: u32) {
         self.holds.join_limit = limit;

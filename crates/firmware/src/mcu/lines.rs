@@ -414,8 +414,8 @@ impl Mcu {
     ///
     /// # Errors
     ///
-    /// The board's errors, and "Unable to open out GPIO chip line" or "Unable to open in GPIO chip line" for a chip
-    /// that may sleep.
+    /// The board's errors. For a chip that may sleep it is "Unable to open out GPIO chip line", or for an input "Unable
+    /// to open in GPIO chip line".
     pub fn prompt_line(&mut self, pin: Pin, use_: &str, direction: Direction) -> Result<Arc<dyn Line>, Shutdown> {
         self.prompt_claim(pin, use_, direction).map(Claim::shared)
     }

@@ -14,7 +14,7 @@ use super::{Bus, BusCounts, Done, Mcu, Oid, Report, Timer, Turn};
 /// The result of an event: what happens to its timer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Next {
-    /// The timer runs again at this instant.
+    /// The timer runs again at this time.
     At(Clock),
     /// The timer stops.
     Done,
@@ -75,7 +75,7 @@ pub trait Object: Any + Send {
         self.bus().map(Bus::counts)
     }
 
-    /// What this object adds to the MCU's status.
+    /// This object's part of the MCU's status.
     fn report(&self) -> Report {
         Report::default()
     }

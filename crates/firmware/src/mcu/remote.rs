@@ -87,7 +87,7 @@ impl<S: Settable> Remote<S> {
         })
     }
 
-    /// The same, for an object of this kind whose outputs are all safe when this one is at its shutdown value.
+    /// The same, for an object of this kind. All its outputs are safe when this one is at its shutdown value.
     ///
     /// # Errors
     ///

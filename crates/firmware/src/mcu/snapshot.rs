@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What an MCU reports about itself on request: its state, objects, lines and queues.
+//! The report of an MCU about itself, on request: its state, objects, lines and queues.
 //!
 //! The core fills a snapshot while no timer is near, a few rows at a time. The caller has reserved memory for all of
 //! it. So the core neither allocates nor waits.
@@ -105,13 +105,13 @@ pub struct ObjectState {
     pub kind: &'static str,
     /// The pin by which the log names it.
     pub pin: Option<Pin>,
-    /// What it reports about itself.
+    /// Its report about itself.
     pub report: Report,
     /// The calls to its device, if a worker makes them.
     pub bus: Option<BusCounts>,
 }
 
-/// What an object reports about itself.
+/// An object's report about itself.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Report {
     /// How many changes or moves it has queued.
@@ -151,7 +151,7 @@ pub struct QueueState {
 }
 
 impl QueueState {
-    /// Its name, such as `spi0`.
+    /// Its name, for example `spi0`.
     pub fn name(&self) -> String {
         let name: Vec<u8> = self.name.iter().copied().take_while(|byte| *byte != 0).collect();
         String::from_utf8_lossy(&name).into_owned()

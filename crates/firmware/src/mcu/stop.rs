@@ -25,7 +25,7 @@ pub const RETRY_TICKS: Ticks = Ticks::from_ms(50);
 /// guardian takes over.
 const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 
-/// What a stopped MCU knows about its stop.
+/// The reason of a stop, and the shutdown values that are still owed.
 #[derive(Default)]
 pub(super) struct Stop {
     /// Why the MCU is stopped; `None` while it is not.

@@ -30,7 +30,7 @@ impl Levels {
     }
 }
 
-/// What an HD44780 on four lines reads: the time, whether it is data, and four bits.
+/// Reads like an HD44780 on four lines: the time, whether it is data, and four bits.
 fn hear_hd44780(rig: &Rig) -> Vec<(u64, bool, u8)> {
     let mut levels = Levels::default();
     let mut heard = Vec::new();
@@ -49,7 +49,7 @@ fn hear_hd44780(rig: &Rig) -> Vec<(u64, bool, u8)> {
     heard
 }
 
-/// What an ST7920 reads: the end of each byte, and the byte.
+/// Reads like an ST7920: the end time of each byte, and the byte.
 fn hear_st7920(rig: &Rig) -> Vec<(u64, u8)> {
     let mut levels = Levels::default();
     let mut heard = Vec::new();
