@@ -7,7 +7,7 @@ use std::f64::consts::TAU;
 use crate::checkout;
 use crate::klippy::Printer;
 
-/// The registers of a driver by name, as klippy dumps them.
+/// The registers of a driver by name, from klippy's dump.
 fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
     let said = printer.answer(&format!("DUMP_TMC STEPPER={stepper}"));
     let registers = said.lines().filter_map(|line| {
@@ -18,7 +18,7 @@ fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
     registers.collect()
 }
 
-/// The steps that klippy has had a stepper do, by its own count.
+/// The steps of a stepper, by klippy's own count.
 fn steps(printer: &mut Printer, stepper: &str) -> i64 {
     let said = printer.answer("GET_POSITION");
     let (_, counts) = said.split_once("mcu: ").unwrap();
@@ -27,8 +27,8 @@ fn steps(printer: &mut Printer, stepper: &str) -> i64 {
     words.next().unwrap().parse().unwrap()
 }
 
-/// The registers that klippy reads of a TMC2209 after it set it up, with the values of its defaults
-/// (klippy/extras/tmc2209.py), at standstill.
+/// The registers that klippy reads from a configured TMC2209 at standstill, with the default values of
+/// klippy/extras/tmc2209.py.
 const TMC2209: [(&str, u32); 12] = [
     // PDN_DISABLE, MSTEP_REG_SELECT, MULTISTEP_FILT, and SpreadCycle.
     ("GCONF", 0x0000_01c4),
@@ -60,7 +60,7 @@ fn klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two() {
         for (name, value) in TMC2209 {
             assert_eq!(dumped[name], value, "{name}: {:08x}", dumped[name]);
         }
-        // The power stage is off; MS1 and MS2 are the address.
+        // The power stage is off. MS1 and MS2 are the address.
         assert_eq!(dumped["IOIN"] & 0xff00_005d, 0x2100_0041 | if two { 3 << 2 } else { 0 });
         assert_eq!(dumped["GSTAT"], 1, "it was switched on");
         assert_eq!(dumped["IHOLD_IRUN"], 0x0008_1919);
@@ -75,13 +75,13 @@ fn klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two() {
         assert_eq!(dumped["IFCNT"], (count + 1) & 0xff);
         printer.gcode("INIT_TMC STEPPER=stepper_y");
 
-        // At the first enable klippy tells of the reset, and clears it.
+        // At the first enable klippy reports the reset, and clears it.
         printer.gcode("G28 Y\nG1 Y50 F6000\nM400");
         let log = printer.host_log("TMC 'stepper_y' reports GSTAT:      00000001 reset=1(Reset)", 1);
         assert!(!log.contains("phase change") && !log.contains("Unable to"), "{log}");
         let dumped = dump(&mut printer, "stepper_y");
         assert_eq!(dumped["GSTAT"], 0);
-        // 16 microsteps to a full step: klippy knows by its own count where the driver's wave stands.
+        // 16 microsteps per full step. klippy knows the position of the driver's wave from its own count.
         let status = printer.object("tmc2209 stepper_y");
         let offset = status["mcu_phase_offset"].as_i64().unwrap();
         let position = steps(&mut printer, "stepper_y");
@@ -100,12 +100,12 @@ fn klippy_tells_of_a_driver_that_is_not_there() {
     printer.host_log("TMC stepper_y failed to init: Unable to read tmc uart 'stepper_y' register IFCNT", 1);
     let error = printer.refused("DUMP_TMC STEPPER=stepper_y");
     assert!(error.contains("Unable to read tmc uart 'stepper_y' register"), "{error}");
-    // The others are not disturbed.
+    // The other drivers still work.
     printer.gcode("G28 X");
     printer.stop("G28 Y");
 }
 
-/// Puts into use what printer.cfg offers for homing by the load.
+/// Enables the sections that printer.cfg offers for homing by the load.
 fn without_endstops(config: String) -> String {
     let mut offered = false;
     let mut changed = String::new();
@@ -132,7 +132,7 @@ fn klippy_homes_by_the_load_at_the_end_of_an_axis() {
             let stands_mm = printer.probe().axis(axis).unwrap().position_mm;
             assert_eq!(stands_mm, -2.0, "{axis} stands at its hard end");
             let thinks_mm = position(&mut printer, number);
-            // It stalls a step or two after it lost what makes the load: 4 steps (y) or 11 (z).
+            // It stalls a step or two after the lost steps that make the load: 4 steps (y) or 11 (z).
             let off = (thinks_mm - stands_mm) / step_mm;
             assert!((-1.0..=2.0).contains(&off), "{axis}: klippy is off by {off} steps");
         }
@@ -142,14 +142,14 @@ fn klippy_homes_by_the_load_at_the_end_of_an_axis() {
             assert!((-20.0..=20.0).contains(&off), "{axis} is off by {off} steps");
         }
     }
-    // What homing set up is as before.
+    // The registers that homing changes have their former values.
     let dumped = dump(&mut printer, "stepper_y");
     assert_eq!((dumped["GCONF"], dumped["TCOOLTHRS"], dumped["SGTHRS"]), (0x1c4, 0, 100));
     let dumped = dump(&mut printer, "stepper_z");
     assert_eq!((dumped["GCONF"] & 0x100, dumped["TCOOLTHRS"]), (0, 0));
 }
 
-/// Another sensor on the built-in printer's shaft.
+/// Puts another sensor on the built-in printer's shaft.
 fn with_sensor(chip: &'static str) -> impl Fn(String, &std::path::Path) -> String {
     move |board, _| {
         let changed = board.replace("chip = \"tle5012b\"", &format!("chip = \"{chip}\""));
@@ -158,7 +158,7 @@ fn with_sensor(chip: &'static str) -> impl Fn(String, &std::path::Path) -> Strin
     }
 }
 
-/// Lets klippy calibrate the sensor against its stepper.
+/// Makes klippy calibrate the sensor against its stepper.
 fn with_stepper(config: String) -> String {
     let changed = config.replace("#stepper: stepper_y", "stepper: stepper_y");
     assert_ne!(config, changed);
@@ -175,7 +175,7 @@ fn klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft() {
     let pending = printer.object("configfile")["save_config_pending_items"]["angle y"]["calibrate"].clone();
     let table = pending.as_str().unwrap().replace('\n', "");
     let angles: Vec<f64> = table.split(',').map(|angle| angle.trim().parse().unwrap()).collect();
-    // One for each full step, with the error of the magnet: 0.6 degrees of 65536.
+    // One angle for each full step, with the error of the magnet: 0.6 degrees of 65536.
     assert_eq!(angles.len(), 200);
     let even = |n: usize| (angles[n] - angles[0] - n as f64 * 65536.0 / 200.0 + 32768.0).rem_euclid(65536.0) - 32768.0;
     let even: Vec<f64> = (0..200).map(even).collect();
@@ -185,18 +185,18 @@ fn klippy_calibrates_an_angle_sensor_on_a_motor_s_shaft() {
     printer.configure(|config| with_stepper(config).replace("[angle y]", &format!("[angle y]\ncalibrate: {table}")));
     printer.restart("RESTART");
     printer.gcode("G28 Y\nG1 Y100 F6000\nM400");
-    // Each batch has the angle, and where klippy believes the axis to be by it.
+    // Each batch has the angle, and klippy's position of the axis from it.
     let mut errors_mm = Vec::new();
     for place_mm in [100, 103, 107, 112, 120, 131, 150] {
         printer.gcode(&format!("G1 Y{place_mm}\nM400\nG4 P300"));
         let batch = printer.angles("y");
         let offset_mm = batch["position_offset"].as_f64().unwrap();
         let (_, angle) = batch["data"].as_array().unwrap().last().map(|sample| (&sample[0], &sample[1])).unwrap();
-        // 40 mm are a turn, whichever way round.
+        // 40 mm are one turn, in either direction.
         let turn_mm = angle.as_f64().unwrap() * 40.0 / 65536.0;
         errors_mm.push(turn_mm + offset_mm - f64::from(place_mm));
     }
-    // Uncalibrated they would differ by 0.13 mm.
+    // Without the calibration they would differ by 0.13 mm.
     let (least, most) = errors_mm.iter().fold((f64::MAX, f64::MIN), |(l, m), error| (l.min(*error), m.max(*error)));
     assert!(most - least < 0.005, "{errors_mm:?}");
 }
@@ -208,7 +208,7 @@ fn klippy_reads_each_kind_of_angle_sensor() {
         let mut printer = Printer::start_here(&checkout, with_sensor(chip), with_stepper);
         let batch = printer.angles("y");
         let measured = batch["data"].as_array().unwrap().last().unwrap()[1].as_f64().unwrap();
-        // It stands at 45 mm, of 40 in a turn; the magnet errs once in a turn.
+        // It is at 45 mm, with 40 mm per turn. The magnet's error repeats once per turn.
         let angle = 77.0 / 360.0 + 45.0 / 40.0 - 1.0;
         let expected = (angle + 0.6 / 360.0 * (TAU * angle).sin()) * 65536.0;
         assert!((measured - expected + 32768.0).rem_euclid(65536.0) - 32768.0 < 1.0, "{chip}: {measured} {expected}");
@@ -229,7 +229,7 @@ fn klippy_reads_each_kind_of_angle_sensor() {
 #[test]
 fn klippy_has_an_angle_sensor_calibrate_itself() {
     let Some(checkout) = checkout("klippy_has_an_angle_sensor_calibrate_itself") else { return };
-    // 22 turns and more have no room on an axis that ends.
+    // 22 turns and more have no room on an axis with an end.
     let long = |board: String, path: &std::path::Path| {
         let (before, y) = board.split_once("name = \"y\"\n").unwrap();
         with_sensor("mt6826s")(format!("{before}name = \"y\"\n{}", y.replacen("220.0", "9000.0", 1)), path)

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Filament that runs out or is stuck amid a print.
+//! Filament that runs out or gets stuck during a print.
 
 use std::path::Path;
 
 use super::checkout;
 use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, rest};
 
-/// A print of so many moves of 5 mm of filament each, by a cold hot end.
+/// A print of `moves` moves of 5 mm of filament each, with a cold hot end.
 fn start_print(checkout: &Path, moves: usize, spool: &str) -> Printer {
     let describe = |board: String, _: &Path| {
         let changed = board.replace("length_mm = 330000.0\n", spool);
@@ -51,7 +51,7 @@ fn a_print_pauses_as_the_filament_runs_out() {
         "filament not detected"
     );
     assert_eq!(printer.object("print_stats")["state"], "paused");
-    // What klippy had read of the file by then is still printed: not the rest of 200 mm.
+    // klippy still prints the moves that it has read, but not the rest of 200 mm.
     let extruder = printer.probe().axis("extruder").unwrap().position_mm;
     assert!((42.0..150.0).contains(&extruder), "{extruder}");
     printer.gcode("CANCEL_PRINT");
@@ -65,7 +65,7 @@ fn a_print_pauses_as_the_filament_is_stuck() {
     printer.gcode("M400");
     assert!(!detects(&mut printer, MOTION));
     assert!(detects(&mut printer, SWITCH));
-    // No sooner than the length that klippy waits for an edge of the encoder.
+    // Not before the length that klippy waits for an edge of the encoder.
     let extruder = printer.probe().axis("extruder").unwrap().position_mm;
     assert!((42.0 + 7.0 - 1.44..150.0).contains(&extruder), "{extruder}");
     printer.gcode("CANCEL_PRINT");
@@ -80,7 +80,7 @@ fn a_print_with_enough_filament_goes_on_to_its_end() {
     assert_eq!(printer.object("pause_resume")["is_paused"], false);
     assert!(detects(&mut printer, SWITCH) && detects(&mut printer, MOTION));
     assert_eq!(printer.probe().axis("extruder").unwrap().position_mm, 60.0);
-    // One step more, and it has run out.
+    // After one step more the filament has run out.
     printer.gcode("G1 E0.01 F60\nM400");
     printer.until_object(SWITCH, "filament_detected", false);
 }

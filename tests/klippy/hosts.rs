@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Every generation of hosts on the whole simulated printer, each from its own checkout:
-//! `KLIPPER_DIR_V0_11`, `_V0_12`, `_V0_13`, `_MASTER` and `_KALICO`.
+//! Hosts of every generation on the whole simulated printer. Each has its own checkout: `KLIPPER_DIR_V0_11`, `_V0_12`,
+//! `_V0_13`, `_MASTER` and `_KALICO`.
 
 use std::io::Write;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use pinion_firmware::mcu::Generation;
 
 use super::klippy::{Printer, rest};
 
-/// The checkout of a generation, if there is one.
+/// The checkout of a generation; `None` if there is none.
 pub fn checkout(generation: Generation) -> Option<PathBuf> {
     let variable = format!("KLIPPER_DIR_{}", generation.name().to_uppercase().replace('.', "_"));
     let folder = std::env::var_os(&variable).map(PathBuf::from);
@@ -21,15 +21,15 @@ pub fn checkout(generation: Generation) -> Option<PathBuf> {
     folder
 }
 
-/// A button that is pressed, beside what the built-in printer has.
+/// Adds a pressed button to the built-in printer.
 fn with_button(board: String, _trace: &Path) -> String {
     board + "\n[[input]]\nname = \"knob\"\npin = \"knob\"\nlevel = true\n"
 }
 
 fn with_sections(config: String, generation: Generation) -> String {
-    // At the 3200 samples a second of klippy's default a busy computer is late now and then.
+    // At klippy's default of 3200 samples a second, a busy computer is late now and then.
     let config = config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n");
-    // Load cells came with v0.13, the ADS1220 in this form with master; Kalico's firmware for Linux has no angle
+    // Load cells came with v0.13, and this form of the ADS1220 with master. Kalico's firmware for Linux has no angle
     // sensors.
     let unknown = |section: &str| match generation {
         Generation::Master => false,
@@ -77,7 +77,7 @@ fn use_everything(printer: &mut Printer, generation: Generation) {
         assert!((from..to).contains(&celsius), "{generation}: {sensor} is at {celsius} C");
     }
     assert_eq!(printer.object("gcode_button knob")["state"], "PRESSED", "{generation}");
-    // Gravity, in the words that each generation has for it.
+    // Gravity, in each generation's wording.
     let answer = printer.answer("ACCELEROMETER_QUERY");
     let felt = rest(&answer, "accelerometer values (x, y, z): ");
     let z: f64 = felt.rsplit(", ").next().unwrap().parse().unwrap();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A simulated printer with a klippy, spoken to over klippy's API socket.
+//! A simulated printer with a klippy. The tests use klippy's API socket.
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -19,9 +19,9 @@ use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-/// How long the host takes to answer: heating takes real time, and a computer under load takes more.
+/// Timeout for an answer of the host. Heating takes real time, and a computer under load takes more.
 const HOST_TIMEOUT: Duration = Duration::from_secs(180);
-/// klippy starts within seconds.
+/// Timeout for klippy's start, which takes seconds.
 const START: Duration = Duration::from_secs(40);
 
 /// The Python that runs klippy.
@@ -29,21 +29,21 @@ pub fn python() -> String {
     std::env::var("KLIPPER_PYTHON").unwrap_or_else(|_| "python3".into())
 }
 
-/// What lets klippy move without homing. For a test that is not about homing: there klippy is never more
-/// than 0.1 s ahead of the motion, and a busy computer stops it.
+/// Lets klippy move without homing, for tests of other things. During homing klippy is at most 0.1 s ahead of the
+/// motion, so a busy computer stops it.
 pub const UNHOMED: &str = "\n[force_move]\nenable_force_move: True\n";
-/// Where the built-in printer stands at first.
+/// The initial position of the built-in printer.
 pub const WHERE_IT_STANDS: &str = "SET_KINEMATIC_POSITION X=60 Y=45 Z=12";
 
-/// Who serves klippy.
+/// The MCU that serves klippy.
 enum Server {
     /// The program.
     Program(Child),
-    /// This process, which can look at its simulated printer.
+    /// This process, which can read its simulated printer.
     Here { running: Option<JoinHandle<()>>, probe: SimProbe, _alone: MutexGuard<'static, ()> },
 }
 
-/// This process serves one printer at a time: the signal that ends it would end all.
+/// This process serves one printer at a time: the signal that ends one printer would end all.
 static HERE: Mutex<()> = Mutex::new(());
 
 pub struct Printer {
@@ -56,19 +56,19 @@ pub struct Printer {
 }
 
 impl Printer {
-    /// A printer whose klippy is ready.
+    /// A printer with a ready klippy.
     pub fn start(checkout: &Path) -> Printer {
         let mut printer = Printer::start_with(checkout, |config| config);
         printer.until_state("ready");
         printer
     }
 
-    /// A printer whose configuration was changed.
+    /// A printer with a changed configuration.
     pub fn start_with(checkout: &Path, change: impl FnOnce(String) -> String) -> Printer {
         Printer::start_on(checkout, |board, _| board, change)
     }
 
-    /// The same, of another description; its change is told the path of a file of its own.
+    /// The same with another description. `describe` also gets the path of a file for its use.
     pub fn start_on(
         checkout: &Path,
         describe: impl FnOnce(String, &Path) -> String,
@@ -86,7 +86,7 @@ impl Printer {
         })
     }
 
-    /// The same, by `pinion sim --show`.
+    /// The same, with `pinion sim --show`.
     pub fn start_shown(
         checkout: &Path,
         describe: impl FnOnce(String, &Path) -> String,
@@ -105,15 +105,15 @@ impl Printer {
         })
     }
 
-    /// A printer that can be looked at: it is simulated by this process. Its log goes to stderr with RUST_LOG=info.
+    /// A printer that this process simulates, so tests can read its state. Its log goes to stderr with RUST_LOG=info.
     pub fn start_here(
         checkout: &Path,
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
-        // Another test may have started it.
+        // Another test may have started the logger.
         let _ = env_logger::try_init();
-        // Poisoned by a test that failed.
+        // A failed test poisons the lock.
         let alone = HERE.lock().unwrap_or_else(PoisonError::into_inner);
         let mut printer = Printer::serve(checkout, describe, change, |folder| {
             let clock = Monotonic::start();
@@ -144,7 +144,7 @@ impl Printer {
         change: impl FnOnce(String) -> String,
         serve: impl FnOnce(&Path) -> Server,
     ) -> Printer {
-        // klippy knows a pseudo terminal by the beginning of its path.
+        // klippy recognizes a pseudo terminal by the start of its path.
         let folder = tempfile::Builder::new().prefix("klipper_host_").tempdir_in("/tmp").unwrap();
         let printed = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["sim", "--print-board"]).output().unwrap();
         let board = describe(String::from_utf8(printed.stdout).unwrap(), &folder.path().join("trace"));
@@ -166,7 +166,7 @@ impl Printer {
         }
     }
 
-    /// Writes a file into the printer's folder, and tells where it is.
+    /// Writes a file into the printer's folder, and returns its path.
     pub fn write(&self, name: &str, text: &str) -> PathBuf {
         let path = self.path(name);
         fs::write(&path, text).unwrap();
@@ -177,7 +177,7 @@ impl Printer {
         self.folder.path().join(name)
     }
 
-    /// Writes the printer's configuration, changed.
+    /// Writes the changed configuration of the printer.
     pub fn configure(&mut self, change: impl FnOnce(String) -> String) {
         let printed = Command::new(env!("CARGO_BIN_EXE_pinion"))
             .arg("sim")
@@ -192,8 +192,8 @@ impl Printer {
 
     pub fn start_host(&mut self) {
         let _ = fs::remove_file(self.path("api"));
-        // While it homes, klippy is a tenth of a second ahead of the MCU: on a computer that builds and tests
-        // at once it would often be late without this, which only root may ask for.
+        // While it homes, klippy is a tenth of a second ahead of the MCU. On a computer that builds and tests at the
+        // same time it would often be late without this. Only root may request it.
         let nice = if geteuid().is_root() { "-15" } else { "0" };
         let host = Command::new("nice")
             .args(["-n", nice])
@@ -247,9 +247,9 @@ impl Printer {
         }
     }
 
-    /// Runs G-code to its end, and gives what it answers, or why klippy refuses it.
+    /// Runs G-code to its end. Returns its answer, or klippy's reason for a refusal.
     pub fn try_gcode(&mut self, script: &str) -> Result<String, String> {
-        // Answers come to a connection of their own, before the result.
+        // Answers come on a separate connection, before the result.
         let mut api = UnixStream::connect(self.path("api")).map_err(|error| error.to_string())?;
         api.set_read_timeout(Some(HOST_TIMEOUT)).unwrap();
         let mut ask = |id: u32, method: &str, params: Value| {
@@ -272,13 +272,13 @@ impl Printer {
         ask(2, "gcode/script", json!({ "script": script }))
     }
 
-    /// Runs G-code to its end, and gives what it answers.
+    /// Runs G-code to its end, and returns its answer.
     #[track_caller]
     pub fn answer(&mut self, script: &str) -> String {
         self.try_gcode(script).unwrap_or_else(|error| panic!("{script}: {error}\n{}", self.log()))
     }
 
-    /// Runs G-code that klippy refuses, and gives what it says.
+    /// Runs G-code that klippy refuses, and returns the error.
     #[track_caller]
     pub fn refused(&mut self, script: &str) -> String {
         match self.try_gcode(script) {
@@ -287,13 +287,13 @@ impl Printer {
         }
     }
 
-    /// A batch of what an angle sensor measures now.
+    /// A batch of an angle sensor's present measurements.
     #[track_caller]
     pub fn angles(&mut self, sensor: &str) -> Value {
         let template = json!({ "batch": sensor });
         self.call("angle/dump_angle", json!({ "sensor": sensor, "response_template": template })).unwrap();
         let api = self.api.as_mut().unwrap();
-        // What else klippy says on this connection is of no use any more.
+        // Other messages of klippy on this connection are no longer needed.
         let batch = loop {
             let message = message(api).unwrap();
             let has_data = message["params"]["data"].as_array().is_some_and(|data| !data.is_empty());
@@ -301,14 +301,14 @@ impl Printer {
                 break message["params"].clone();
             }
         };
-        // klippy ends the measurements when nobody listens.
+        // klippy stops the measurements when the connection is closed.
         self.api = Some(UnixStream::connect(self.path("api")).unwrap());
         batch
     }
 
     /// Runs G-code that stops the printer.
     pub fn stop(&mut self, script: &str) {
-        // klippy answers or not, as it is stopped.
+        // klippy may or may not answer, because it is stopped.
         let _ = self.call("gcode/script", json!({ "script": script }));
         self.until_state("shutdown");
     }
@@ -317,7 +317,7 @@ impl Printer {
     #[track_caller]
     pub fn restart(&mut self, command: &str) {
         let _ = self.call("gcode/script", json!({ "script": command }));
-        // It goes away first.
+        // klippy disconnects first.
         thread::sleep(Duration::from_millis(500));
         self.until_state("ready");
     }
@@ -333,7 +333,7 @@ impl Printer {
         "startup".into()
     }
 
-    /// The state in which klippy's start ends.
+    /// The final state of klippy's start.
     pub fn settled(&mut self) -> String {
         let end = Instant::now() + START;
         loop {
@@ -345,7 +345,7 @@ impl Printer {
         }
     }
 
-    /// What klippy says of its state.
+    /// klippy's message about its state.
     fn why(&mut self) -> String {
         let info = self.call("info", json!({})).unwrap_or_default();
         info["state_message"].as_str().unwrap_or_default().to_owned()
@@ -370,7 +370,7 @@ impl Printer {
         answer["status"][name].clone()
     }
 
-    /// Waits until a heater warms.
+    /// Waits until a heater is warm.
     pub fn until_heating(&mut self, heater: &str) {
         let end = Instant::now() + HOST_TIMEOUT;
         while self.object(heater)["temperature"].as_f64().is_none_or(|celsius| celsius < 30.0) {
@@ -400,8 +400,8 @@ impl Printer {
         }
     }
 
-    /// klippy's log, once it has this text so many times: what no command was answered. A thread of klippy's
-    /// writes it.
+    /// klippy's log, once it contains this text `times` times. Use it for text that is in no command's answer: a thread
+    /// of klippy writes the log.
     #[track_caller]
     pub fn host_log(&mut self, text: &str, times: usize) -> String {
         let log = |printer: &Printer| fs::read_to_string(printer.path("klippy.log")).unwrap();
@@ -409,15 +409,15 @@ impl Printer {
         log(self)
     }
 
-    /// All that `--show` showed.
+    /// Everything that `--show` has shown.
     pub fn all_shown(&self) -> String {
         fs::read_to_string(self.path("shown")).unwrap()
     }
 
-    /// What `--show` showed of a thing last: the rest of its line, or the lines below it.
+    /// The last output of `--show` for a part: the rest of its line, or the lines below it.
     pub fn shown(&self, name: &str) -> String {
         let shown = self.all_shown();
-        // A block that is still being written counts for nothing.
+        // An incomplete block is ignored.
         let whole = shown.rsplit_once('\n').map_or("", |(whole, _)| whole);
         let head = format!("] {name}:");
         let Some((_, last)) = whole.rsplit_once(&head) else { return String::new() };
@@ -434,7 +434,7 @@ impl Printer {
         }
     }
 
-    /// What the description's own file holds.
+    /// The content of the description's own file.
     pub fn trace(&self) -> String {
         fs::read_to_string(self.path("trace")).unwrap()
     }
@@ -454,7 +454,7 @@ impl Printer {
     }
 }
 
-/// An example of docs/guide/simulator.md: by itself, or appended to the built-in description as it says.
+/// An example of docs/guide/simulator.md: alone, or appended to the built-in description as the example says.
 pub fn example(built_in: &str, heading: &str) -> String {
     const PAGE: &str = include_str!("../../docs/guide/simulator.md");
     let (_, section) = PAGE.split_once(&format!("\n### {heading}\n")).unwrap();
@@ -478,7 +478,7 @@ pub fn without(config: &str, section: &str) -> String {
     format!("{before}{}", after.split_once("\n\n").map_or("", |(_, after)| after))
 }
 
-/// The configuration with a section in use that is only offered, with more keys.
+/// The configuration with an offered section in use, with more keys.
 pub fn with(config: &str, section: &str, keys: &str) -> String {
     let head = format!("#[{section}]\n");
     let at = config.find(&head).unwrap_or_else(|| panic!("no #[{section}] in\n{config}"));
@@ -488,7 +488,7 @@ pub fn with(config: &str, section: &str, keys: &str) -> String {
     format!("{before}{}\n{keys}\n\n{after}", lines.join("\n"))
 }
 
-/// Has klippy translate G-code with a dictionary, without any MCU: what it wrote, or why it did not.
+/// Runs klippy's batch mode with a dictionary, without an MCU. Returns the output, or the reason for a failure.
 pub fn batch(checkout: &Path, dictionary: &Path, config: &str, gcode: &str) -> Result<Vec<u8>, String> {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
@@ -505,7 +505,7 @@ pub fn batch(checkout: &Path, dictionary: &Path, config: &str, gcode: &str) -> R
         .arg(dictionary)
         .arg("-l")
         .arg(path("log"))
-        // Whatever it keeps there.
+        // The home folder for anything that it stores there.
         .env("HOME", folder.path())
         .output()
         .unwrap();
@@ -542,7 +542,7 @@ impl Drop for Printer {
         self.host.iter_mut().for_each(end);
         match &mut self.server {
             Server::Program(pinion) => end(pinion),
-            // It handles the signal, which ends it and not this process.
+            // It handles the signal. The signal ends the printer and not this process.
             Server::Here { running, .. } => {
                 let _ = raise(Signal::SIGTERM);
                 let _ = running.take().map(JoinHandle::join);
@@ -551,7 +551,7 @@ impl Drop for Printer {
     }
 }
 
-/// The rest of the line of klippy's answer that begins like this.
+/// The rest of the line with this start in klippy's answer.
 #[track_caller]
 pub fn rest<'a>(answer: &'a str, start: &str) -> &'a str {
     let found = answer.lines().find_map(|line| line.trim_start_matches("// ").strip_prefix(start));

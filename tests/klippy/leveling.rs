@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Gantries on several motors, and a delta printer: klippy levels and calibrates them by the probe.
+//! Gantries on several motors, and a delta printer. klippy levels and calibrates them with the probe.
 
 use std::path::Path;
 
@@ -13,7 +13,7 @@ fn motors(printer: &Printer) -> Vec<f64> {
     axes.map(|axis| axis.position_mm).collect()
 }
 
-/// Where the probe finds the bed, at places of the nozzle.
+/// The bed's heights by the probe, with the nozzle at these places.
 fn heights<const N: usize>(printer: &mut Printer, places: [[f64; 2]; N]) -> [f64; N] {
     places.map(|[x, y]| {
         printer.gcode(&format!("G1 Z5 F600\nG1 X{x} Y{y} F9000"));
@@ -26,7 +26,7 @@ fn range(values: &[f64]) -> f64 {
     high - low
 }
 
-/// Homes a gantry that hangs askew, and has it leveled.
+/// Homes a gantry that hangs askew, and levels it.
 fn level(checkout: &Path, change: fn(String) -> String, command: &str, corners: &[[f64; 2]; 4]) {
     let describe = |board: String, _: &Path| change(example(&board, "Four Z motors"));
     let mut printer = Printer::start_here(checkout, describe, |config| config);
@@ -58,7 +58,7 @@ fn klippy_levels_a_bed_on_three_motors() {
 #[test]
 fn klippy_levels_a_gantry_on_two_motors() {
     let Some(checkout) = checkout("klippy_levels_a_gantry_on_two_motors") else { return };
-    // In the middle of the left and of the right side.
+    // In the middle of the left and the right side.
     let two = |board: String| {
         let board = board.split("\n[[axis]]\nname = \"z2\"").next().unwrap().to_owned();
         board.replace("[-30.0, -10.0]", "[-30.0, 110.0]").replace("[-30.0, 230.0]", "[250.0, 110.0]")
@@ -67,8 +67,8 @@ fn klippy_levels_a_gantry_on_two_motors() {
     level(&checkout, two, "Z_TILT_ADJUST RETRIES=4", &[left, right, left, right]);
 }
 
-/// The bed of the delta of the example: by `[bed]` 0.1 mm along x, and 0.05 mm lower at the ends of both ways than
-/// in the middle.
+/// The bed of the example's delta. By `[bed]` it rises 0.1 mm along x. It is 0.05 mm lower at the ends of both
+/// directions than in the middle.
 fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
     let (u, v) = (x_mm / 90.0, y_mm / 90.0);
     0.05 * u - 0.025 * (u * u + v * v)
@@ -90,7 +90,7 @@ fn klippy_probes_the_bed_of_a_delta_printer() {
 #[test]
 fn klippy_calibrates_a_delta_printer() {
     let Some(checkout) = checkout("klippy_calibrates_a_delta_printer") else { return };
-    // A flat bed, and a printer.cfg that is wrong of the radius and of where the towers end.
+    // A flat bed, and a printer.cfg with a wrong radius and wrong ends of the towers.
     let describe = |board: String, _: &Path| {
         example(&board, "A delta printer").replace("[bed]\nx_slope_mm = 0.1\nbow_mm = 0.05\n", "")
     };
@@ -112,7 +112,7 @@ fn klippy_calibrates_a_delta_printer() {
     let number = |section: &str, key: &str| saved[section][key].as_str().unwrap().parse::<f64>().unwrap();
     let radius = number("printer", "delta_radius");
     assert!((radius - 105.0).abs() < 0.05, "{radius}");
-    // The arms' height differs by the radius that was found.
+    // The arms' height depends on the radius that was found.
     let arms = |radius: f64| (215.0f64 * 215.0 - radius * radius).sqrt();
     for tower in ["a", "b", "c"] {
         let endstop = number(&format!("stepper_{tower}"), "position_endstop") + arms(radius);

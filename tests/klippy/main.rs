@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A real klippy on the simulated printer: what a user's host does with the program.
+//! A real klippy on the simulated printer: the program with a user's host.
 //!
-//! Needs a checkout of Klipper in `KLIPPER_DIR` and, in `KLIPPER_PYTHON` (python3 if unset), a
-//! Python with klippy's requirements (scripts/klippy-requirements.txt there). Without the
-//! former every test here is skipped, and says so.
+//! Needs a checkout of Klipper in `KLIPPER_DIR`. Also needs, in `KLIPPER_PYTHON` (python3 if unset), a Python with
+//! klippy's requirements (scripts/klippy-requirements.txt there). Without the checkout every test here is skipped, and
+//! says so.
 
 mod drivers;
 mod filament;
@@ -25,7 +25,7 @@ use std::path::PathBuf;
 
 use klippy::{Printer, without};
 
-/// The checkout, or a loud skip: written past the test harness, which keeps what a test prints.
+/// The checkout, or a visible skip. It bypasses the test harness, which captures the output of tests.
 fn checkout(test: &str) -> Option<PathBuf> {
     let folder = std::env::var_os("KLIPPER_DIR").map(PathBuf::from);
     if folder.is_none() {
@@ -46,7 +46,7 @@ fn klippy_homes_heats_and_moves() {
     let toolhead = printer.object("toolhead");
     assert_eq!(toolhead["homed_axes"], "xyz");
     assert_eq!(toolhead["position"][0], 50.0);
-    // The bed in the background, the hot end to its target: verify_heater watches both.
+    // The bed heats in the background, and the hot end to its target. verify_heater watches both.
     printer.gcode("M140 S45\nM109 S180");
     let extruder = printer.object("extruder")["temperature"].as_f64().unwrap();
     assert!((extruder - 180.0).abs() < 5.0, "{extruder}");
@@ -63,7 +63,7 @@ fn klippy_stops_in_an_emergency_and_restarts() {
     let mut printer = Printer::start(&checkout);
     printer.gcode("G28");
     printer.stop("M112");
-    // klippy stops itself first, then asks the MCU to.
+    // klippy stops itself first, and then the MCU.
     printer.until_logged("shutdown: Command request");
     printer.restart("FIRMWARE_RESTART");
     printer.gcode("G28");
@@ -79,11 +79,10 @@ fn a_klippy_that_is_killed_comes_back() {
     printer.gcode("M104 S200");
     printer.until_heating("extruder");
     printer.kill_host();
-    // The heater is not refreshed any more.
+    // Nobody refreshes the heater any more.
     printer.until_logged("Missed scheduling of next digital out event");
     printer.start_host();
-    // An MCU that is shut down wants its FIRMWARE_RESTART, as any micro-controller; klippy
-    // gives it by itself where it may.
+    // An MCU that is shut down needs its FIRMWARE_RESTART, like any MCU. klippy sends it by itself where it may.
     if printer.settled() != "ready" {
         printer.restart("FIRMWARE_RESTART");
     }
@@ -102,10 +101,9 @@ fn klippy_tells_a_wrong_pin_and_goes_on_after_it_was_mended() {
     printer.gcode("G28");
 }
 
-/// What DUMP_TMC reads of a TMC5160 (klippy/extras/tmc5160.py), and the values that klippy does not
-/// write, of a chip whose motor stands and never moved. DRV_STATUS is standstill at the holding
-/// current that klippy sets; IOIN is the version, step and direction mode, and a power stage that is
-/// switched off.
+/// The registers of a TMC5160 that DUMP_TMC reads (klippy/extras/tmc5160.py). The values are those that klippy does not
+/// write, for a motor that has never moved. DRV_STATUS is standstill at klippy's holding current. IOIN is the version,
+/// step and direction mode, and a power stage that is off.
 const DUMPED: [(&str, u8, Option<u32>); 13] = [
     ("GCONF", 0x00, None),
     ("CHOPCONF", 0x6c, None),
@@ -122,7 +120,7 @@ const DUMPED: [(&str, u8, Option<u32>); 13] = [
     ("TSTEP", 0x12, Some(0x000f_ffff)),
 ];
 
-/// The last value that a host wrote to a register of the chip.
+/// The last value that the host wrote to a register of the chip.
 fn written(sent: &[u64], register: u8) -> Option<u32> {
     let is_it = |datagram: &&u64| (**datagram >> 32) as u8 == register | 0x80;
     sent.iter().rfind(is_it).map(|datagram| *datagram as u32)
@@ -142,13 +140,12 @@ fn klippy_reads_the_registers_of_a_driver_on_a_slow_bus_each_once() {
     printer.until_state("ready");
     let sent = |printer: &Printer| -> Vec<u64> {
         let trace = printer.trace();
-        // Another chip is on this bus, too.
+        // Another chip is also on this bus.
         let driver = trace.lines().filter(|line| line.starts_with("chips=tmc5160 z "));
         let sent = driver.map(|line| line.split_once(" sent=").unwrap().1.split_once(' ').unwrap().0);
         sent.map(|sent| u64::from_str_radix(sent, 16).unwrap()).collect()
     };
-    // klippy sets up each register, with a datagram that fetches what was written, then asks where
-    // the motor stands.
+    // klippy writes each register, with a datagram that reads the value back. Then it queries the motor's position.
     let before = sent(&printer);
     let (set_up, position) = before.split_at(before.len() - 2);
     assert_eq!(position, [0x6a << 32; 2]);
@@ -188,7 +185,7 @@ fn klippy_homes_and_moves_an_axis_with_and_without_its_driver() {
         printer.until_state("ready");
         printer.gcode("G28\nG1 Z7 F600\nM400\nG28 Z\nGET_POSITION");
         let log = printer.host_log("\nmcu: stepper_x:", 1);
-        // The axis stood at 12 mm, of 400 steps each.
+        // The axis was at 12 mm, with 400 steps per mm.
         let (_, position) = log.split_once("\nmcu: stepper_x:").unwrap();
         let steps = position.lines().next().unwrap().rsplit_once(" stepper_z:").unwrap().1.parse::<i32>().unwrap();
         assert!((-4900..=-4790).contains(&steps), "{steps}");

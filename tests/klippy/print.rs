@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A print from the virtual SD card, with what slicers use.
+//! A print from the virtual SD card, with the G-code of slicers.
 
 use super::checkout;
 use super::klippy::Printer;
 
-/// What a user who prints so has in his printer.cfg, and an extruder that works cold.
+/// The printer.cfg of a user who prints in this way, with an extruder that works cold.
 fn configure(config: String) -> String {
     let tty = config.lines().find_map(|line| line.strip_prefix("serial: ")).unwrap().to_owned();
     let cold = config.replace("min_extrude_temp: 170", "min_extrude_temp: 0\npressure_advance: 0.03");
@@ -17,18 +17,18 @@ fn configure(config: String) -> String {
     )
 }
 
-/// The bed's diagonals AC and BD and its side AD, as measured of a printed square: askew by 0.6 degrees.
+/// The bed's diagonals AC and BD and its side AD, measured on a printed square that is askew by 0.6 degrees.
 const SKEW: [f64; 3] = [140.7, 142.1, 100.0];
 
-/// How far x is to give way for each mm of y (`calc_skew_factor` of extras/skew_correction.py): the
-/// cotangent of the angle between AD and AB, by the law of cosines.
+/// How far x must move for each mm of y (`calc_skew_factor` of extras/skew_correction.py): the cotangent of the angle
+/// between AD and AB, by the law of cosines.
 fn skew_factor([ac, bd, ad]: [f64; 3]) -> f64 {
     let ab = (2.0 * ac * ac + 2.0 * bd * bd - 4.0 * ad * ad).sqrt() / 2.0;
     let cosine = (ac * ac - ab * ab - ad * ad) / (2.0 * ab * ad);
     cosine.asin().tan()
 }
 
-/// A square of 20 mm at a place: four lines of 0.7 mm of filament each.
+/// A square of 20 mm at a place: four lines with 0.7 mm of filament each.
 fn square(x: f64, y: f64) -> String {
     let corner = |dx: f64, dy: f64| format!("G1 X{} Y{} E0.7 F4800\n", x + dx, y + dy);
     format!("G0 X{x} Y{y} F9000\nG11\n")
@@ -39,7 +39,7 @@ fn square(x: f64, y: f64) -> String {
         + "G10\n"
 }
 
-/// A full circle, of two arcs each way round.
+/// A full circle, with two arcs in each direction.
 fn circle(x: f64, y: f64) -> String {
     let right = x + 20.0;
     format!(
@@ -49,7 +49,7 @@ fn circle(x: f64, y: f64) -> String {
 }
 
 const LAYERS: usize = 3;
-/// The pause comes within this layer, after the square.
+/// The layer with the pause, which comes after the square.
 const PAUSED_IN: usize = 1;
 
 #[test]
@@ -81,7 +81,7 @@ fn a_print_from_the_virtual_sd_card_ends_at_the_exact_place() {
 
     printer.until_object("pause_resume", "is_paused", true);
     assert_eq!(printer.object("print_stats")["state"], "paused");
-    // A look at the nozzle, and the tower is given up.
+    // The user looks at the nozzle and gives up the tower.
     printer.gcode("G90\nG1 Z30 F900\nG1 X10 Y200 F9000\nG1 E-2 F1200\nG1 E2 F1200\nM400");
     printer.gcode("EXCLUDE_OBJECT NAME=TOWER");
     assert_eq!(printer.probe().axis("z").unwrap().position_mm, 30.0);
@@ -93,8 +93,9 @@ fn a_print_from_the_virtual_sd_card_ends_at_the_exact_place() {
     assert_eq!(excluded, serde_json::json!(["TOWER"]));
     let x = 180.0 - 123.0 * skew_factor(SKEW);
     assert!((180.0 - x).abs() > 1.0, "there is no skew to be seen");
-    // Two squares and a circle in each layer, the tower in the first one; each outline is drawn back
-    // to and given out 0.1 mm more by G11 (once at the end, for the first G10), but for the tower's others.
+    // Each layer has two squares and a circle; the first layer also has the tower. G11 returns each outline's filament
+    // with
+    // 0.1 mm more (also once at the end, for the first G10). The tower's other outlines are omitted.
     let outlines = 3 * LAYERS + 1;
     let filament = LAYERS as f64 * (8.0 * 0.7 + 4.0 * 1.1) + 4.0 * 0.7 + 0.1 * (outlines + 1) as f64;
     for (name, mm, step_mm) in
@@ -104,7 +105,7 @@ fn a_print_from_the_virtual_sd_card_ends_at_the_exact_place() {
         assert!((axis.position_mm - mm).abs() <= step_mm, "{name}: {} mm, not {mm}", axis.position_mm);
         assert_eq!(axis.lost_steps, 0, "{name}");
     }
-    // The endstops agree: the place at which they close is the one from which the print was counted.
+    // The endstops agree: they close at the place from which the print was counted.
     printer.gcode("SET_SKEW CLEAR=1\nG28\nG1 X40 Y40 Z10 F6000\nM400");
     for (name, mm, step_mm) in [("x", 40.0, 0.0125), ("y", 40.0, 0.0125), ("z", 10.0, 0.0025)] {
         let position_mm = printer.probe().axis(name).unwrap().position_mm;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the pages have for `printer.cfg`, as a user copies it, given to klippy in batch mode.
+//! The pages' blocks for `printer.cfg`, given to klippy in batch mode as a user copies them.
 
 use std::collections::HashSet;
 use std::fs;
@@ -11,9 +11,9 @@ use serde_json::{Value, json};
 use crate::{checkout, klippy::python};
 use pinion_testkit::markdown::{Page, pages};
 
-/// What a printer has beside.
+/// The other sections that a printer needs.
 const PRINTER: &str = "[mcu]\nserial: /dev/null\n[printer]\nkinematics: none\nmax_velocity: 1\nmax_accel: 1\n";
-/// The names that the pages give to pins of a computer, which this one has not got.
+/// The pages' names of a computer's pins. This computer does not have them.
 const PINS: [(&str, u32); 15] = [
     ("GPIO5", 5),
     ("GPIO6", 6),
@@ -32,13 +32,13 @@ const PINS: [(&str, u32); 15] = [
     ("spidev0.0", 1 << 26),
 ];
 
-/// A configuration, and where it stands.
+/// A configuration and its place in the pages.
 struct Config {
     place: String,
     text: String,
 }
 
-/// Every block that the paragraph before it says to be of `printer.cfg`; of a change, what was there before, too.
+/// Every block for `printer.cfg`, as the paragraph before it says. Of a change, the old side is included too.
 fn configs(page: &Page) -> Vec<Config> {
     let mut configs = Vec::new();
     for block in page.blocks() {
@@ -110,8 +110,8 @@ fn klippy_takes_the_configuration_of_the_pages() {
     }
 }
 
-/// A voltage of both sides of the change is the same: klippy took the raw reading, of 4095, for a part of
-/// `adc_voltage`, and takes the scaled one for a part of the true full scale.
+/// The voltage is the same on both sides of the change. klippy took the raw reading, of 4095, as a part of
+/// `adc_voltage`. Now it takes the scaled reading as a part of the true full scale.
 #[test]
 fn the_change_for_an_adc_is_right() {
     let page = pages().into_iter().find(|page| page.name == "docs/guide/migrate.md").unwrap();
@@ -120,7 +120,7 @@ fn the_change_for_an_adc_is_right() {
         line.parse::<f64>().unwrap()
     };
     let [before, after] = &configs(&page)[..] else { panic!("a change has two sides") };
-    // An ADS1115 has 16 bits with a sign.
+    // An ADS1115 has 16 bits, signed.
     let raw = 20_000.0;
     let seen_before = raw / 4095.0 * voltage(before);
     let seen_after = (raw * 4095.0 / 32767.0_f64).round() / 4095.0 * voltage(after);

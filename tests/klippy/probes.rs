@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The probes of the simulated printer as a user has them: homing, probing, the mesh of the bed.
+//! A user's probes on the simulated printer: homing, probing, the mesh of the bed.
 
 use serde_json::Value;
 
 use super::checkout;
 use super::klippy::{Printer, with, without};
 
-/// A step of the z axis.
+/// Length of a step of the z axis.
 pub const STEP_MM: f64 = 1.0 / 400.0;
 /// The travel of the x and y axis.
 const TRAVEL_MM: f64 = 220.0;
 
-/// The height of the default printer's bed: by `[bed]` 0.12 mm along x, -0.08 mm along y, and 0.1 mm lower
-/// at the corners than in the middle, which is at 0.
+/// The height of the default printer's bed. By `[bed]` it changes by 0.12 mm along x and by -0.08 mm along y. It is 0.1
+/// mm lower at the corners than in the middle, which is at 0.
 pub fn bed_mm(x_mm: f64, y_mm: f64) -> f64 {
     let (u, v) = (x_mm / TRAVEL_MM - 0.5, y_mm / TRAVEL_MM - 0.5);
     0.12 * u - 0.08 * v - 0.2 * (u * u + v * v)
@@ -26,8 +26,7 @@ fn homed_by_probe(config: &str) -> String {
     format!("{before}[stepper_z]\n{z}\n[safe_z_home]\nhome_xy_position: 110, 110\nz_hop: 10\n")
 }
 
-/// Homes, and does what else there is to do. Again where klippy came too late with its moves, as on a busy
-/// computer it does.
+/// Homes, and then runs `then`. Retries if klippy sent its moves too late, as happens on a busy computer.
 #[track_caller]
 pub fn home(printer: &mut Printer, then: &str) {
     for _ in 0..5 {
@@ -41,22 +40,22 @@ pub fn home(printer: &mut Printer, then: &str) {
     panic!("klippy comes too late, five times\n{}", printer.log());
 }
 
-/// The number behind a text.
+/// The number after a text.
 fn number(said: &str, before: &str) -> f64 {
     let (_, after) = said.split_once(before).unwrap_or_else(|| panic!("no `{before}` in\n{said}"));
     let end = after.find(|c: char| !(c.is_ascii_digit() || ".-".contains(c))).unwrap_or(after.len());
     after[..end].parse().unwrap_or_else(|_| panic!("no number behind `{before}` in\n{said}"))
 }
 
-/// Where a PROBE of the bed ended: place and height.
+/// The result of a PROBE of the bed: place and height.
 pub fn probed(printer: &mut Printer, probe: &str) -> [f64; 3] {
     printer.gcode(probe);
     let position = printer.object("probe")["last_probe_position"].clone();
-    // klippy computes them from steps.
+    // klippy calculates them from steps.
     [0, 1, 2].map(|axis| (position[axis].as_f64().unwrap() * 1e6).round() / 1e6)
 }
 
-/// The greatest distance of the points of the probed mesh from the bed.
+/// The largest distance between the points of the probed mesh and the bed.
 fn mesh_fault_mm(printer: &mut Printer) -> f64 {
     let mesh = printer.object("bed_mesh");
     let corner = |key: &str| [0, 1].map(|axis| mesh[key][axis].as_f64().unwrap());
@@ -101,7 +100,7 @@ fn klippy_homes_the_z_axis_by_the_probe() {
     let mut printer = Printer::start_with(&checkout, |config| homed_by_probe(&config));
     printer.until_state("ready");
     home(&mut printer, "G1 Z8 F600");
-    // The height is 0 where it homed, so each other height is by so much off.
+    // The height is 0 at the place of homing, so all other heights have this offset.
     let datum = bed_mm(110.0 + 24.0, 110.0 - 8.0);
     printer.gcode("G1 X20 Y180 F9000");
     let [x, y, z] = probed(&mut printer, "PROBE");
@@ -149,14 +148,14 @@ fn klippy_tells_a_bltouch_whose_pin_is_stuck() {
     }
 }
 
-/// What the default printer's load cell counts for a gram.
+/// The counts of the default printer's load cell per gram.
 const COUNTS_PER_GRAM: f64 = 420.0;
-/// What it counts without the nozzle on the bed: -21000, and 85 g of the hot end.
+/// Its counts without the nozzle on the bed: -21000, and 85 g for the hot end.
 const TARE_COUNTS: f64 = -21_000.0 + 85.0 * COUNTS_PER_GRAM;
-/// The force of the nozzle in the bed.
+/// The force of the nozzle in the bed, per millimeter.
 const GRAMS_PER_MM: f64 = 4000.0;
 
-/// Runs what reads a sensor, again where this computer was too slow to read it in time.
+/// Runs a command that reads a sensor. Retries if this computer was too slow to read the sensor in time.
 #[track_caller]
 fn read_in_time(printer: &mut Printer, script: &str) -> String {
     const SLOW: [&str; 4] = ["Sensor reported", "sensor reported errors", "timed out", "Trigger analog error"];
@@ -169,8 +168,8 @@ fn read_in_time(printer: &mut Printer, script: &str) -> String {
     panic!("{script}: this computer is too slow, ten times\n{}", printer.log())
 }
 
-/// LOAD_CELL_DIAGNOSTIC, which takes ten seconds: how often klippy began the measurements anew, and what
-/// it says. Again where it had to.
+/// LOAD_CELL_DIAGNOSTIC, which takes ten seconds: how many times klippy restarted the measurements, and its answer.
+/// Retries if there was a restart.
 fn diagnostic(printer: &mut Printer) -> (usize, String) {
     let restarts = |printer: &mut Printer| printer.host_log("", 0).matches("Forced sensor restart").count();
     let mut last = (0, String::new());
@@ -188,7 +187,7 @@ fn diagnostic(printer: &mut Printer) -> (usize, String) {
 #[test]
 fn klippy_calibrates_a_load_cell() {
     let Some(checkout) = checkout("klippy_calibrates_a_load_cell") else { return };
-    // Nothing of the calibration is known to klippy.
+    // klippy does not know the calibration.
     let mut printer = Printer::start_with(&checkout, |config| {
         let lines = config
             .lines()
@@ -198,12 +197,12 @@ fn klippy_calibrates_a_load_cell() {
     printer.until_state("ready");
     let (restarts, said) = diagnostic(&mut printer);
     let rate = number(&said, "Measured samples per second: ");
-    // klippy begins anew, and loses a part of a second, where this computer was late amid a sample.
+    // klippy restarts, and loses a part of a second, if this computer was late in the middle of a sample.
     let least = if restarts == 0 { 79.0 } else { 20.0 };
     assert!((least..81.0).contains(&rate), "{restarts} restarts: {said}");
     assert!(said.contains("Saturated samples: 0"), "{said}");
     assert!(number(&said, "Unique values: ") > 100.0, "{said}");
-    // The other one, on SPI: no line of its is timed by the computer.
+    // The other ADC, on SPI: the computer times none of its lines.
     let said = printer.answer("LOAD_CELL_DIAGNOSTIC LOAD_CELL=ads1220");
     let rate = number(&said, "Measured samples per second: ");
     assert!((40.0..46.0).contains(&rate) && said.contains("reported no errors"), "{said}");
@@ -212,7 +211,7 @@ fn klippy_calibrates_a_load_cell() {
     home(&mut printer, "G1 X110 Y110 Z5 F6000\nM400\nLOAD_CELL_CALIBRATE");
     let tare = number(&read_in_time(&mut printer, "TARE"), "% (");
     assert!((tare - TARE_COUNTS).abs() < 60.0, "{tare}");
-    // The weight of a kilogram: the nozzle, a quarter of a millimetre deep in the bed.
+    // A kilogram of force: the nozzle is a quarter of a millimeter deep in the bed.
     let depth_mm = 0.25;
     let z = bed_mm(110.0, 110.0) - depth_mm;
     printer.gcode(&format!("G1 Z{z} F60\nM400"));
@@ -220,7 +219,7 @@ fn klippy_calibrates_a_load_cell() {
     printer.gcode("ACCEPT");
     let cell = printer.object("load_cell");
     let counts_per_gram = cell["counts_per_gram"].as_f64().unwrap();
-    // The depth is right to two steps of the z axis: one by which homing may be off, and one of the move.
+    // The depth is correct to two steps of the z axis: one for homing, and one for the move.
     assert!((counts_per_gram / COUNTS_PER_GRAM - 1.0).abs() < 2.0 * STEP_MM / depth_mm, "{counts_per_gram}");
     let read = |printer: &mut Printer| {
         let said = read_in_time(printer, "LOAD_CELL_READ");
@@ -247,8 +246,8 @@ fn klippy_probes_by_a_tap_of_the_nozzle_on_the_load_cell() {
         read_in_time(&mut printer, "PROBE PROBE_SPEED=1");
         let position = printer.object("probe")["last_probe_position"].clone();
         let z = position[2].as_f64().unwrap();
-        // The trigger is at 75 g, 0.019 mm deep; at 1 mm/s there is a sample for each 0.0125 mm, and it is
-        // noticed late where this computer is busy.
+        // The trigger is at 75 g, 0.019 mm deep. At 1 mm/s there is a sample for each 0.0125 mm. A busy computer
+        // notices it late.
         let depth_mm = bed_mm(x, y) - z;
         assert!((0.010..0.060).contains(&depth_mm), "{depth_mm}");
     }
@@ -263,15 +262,15 @@ fn klippy_calibrates_an_eddy_current_probe_and_probes_with_it() {
     home(&mut printer, "G1 X110 Y110 Z10 F6000\nM400");
     let said = printer.answer("LDC_CALIBRATE_DRIVE_CURRENT CHIP=coil");
     assert_eq!(number(&said, "reg_drive_current: "), 16.0);
-    // A person lowers the nozzle until it grips a sheet of paper; here by what is known of the bed.
+    // A person lowers the nozzle until it grips a sheet of paper. The test uses the known height of the bed.
     let down = bed_mm(110.0, 110.0) - 1.0;
     let calibrate = |printer: &mut Printer| {
         printer.gcode("G1 X110 Y110 Z1 F600\nPROBE_EDDY_CURRENT_CALIBRATE CHIP=coil");
         printer.gcode(&format!("TESTZ Z={down}"));
         printer.try_gcode("ACCEPT").unwrap_or_else(|error| error)
     };
-    // klippy tells the time of a conversion by their count: where this computer lost some, it takes those
-    // of another height.
+    // klippy derives the time of a conversion from their count. If this computer lost some, klippy uses conversions of
+    // another height.
     let faults = ["Frequency stops", "too noisy", "Failed calibration"];
     let is_right = |said: &str| !faults.iter().any(|fault| said.contains(fault));
     let mut said = calibrate(&mut printer);
@@ -290,7 +289,7 @@ fn klippy_calibrates_an_eddy_current_probe_and_probes_with_it() {
         .collect();
     assert!(pairs.len() > 90, "{table}");
     assert!(pairs.windows(2).all(|pair| pair[0][0] < pair[1][0] && pair[0][1] > pair[1][1]), "{table}");
-    // The coil stands 2.5 mm above the nozzle, and beside it, where the bed has another height.
+    // The coil is 2.5 mm above the nozzle, and beside it, where the bed has another height.
     for [mm, hz] in &pairs {
         let distance = mm + 2.5;
         let expected = 2_900_000.0 + 400_000.0 * (-distance / 2.5).exp();
@@ -315,7 +314,7 @@ fn klippy_calibrates_an_eddy_current_probe_and_probes_with_it() {
         let expected = bed_mm(at_x, at_y) - datum;
         assert!((z - expected).abs() < 0.02, "{x} {y}: {z} {expected}");
     }
-    // By a tap: the bed gives way to the nozzle, and the frequency rises no further.
+    // By a tap: the bed yields to the nozzle, and the frequency stops rising.
     for (x, y) in [(110.0, 110.0), (40.0, 150.0)] {
         printer.gcode(&format!("G1 X{x} Y{y} Z4 F6000\nM400"));
         read_in_time(&mut printer, "PROBE METHOD=tap TAP_THRESHOLD=20000");

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Klipper's own regression cases (`test/klippy/*.test` of the checkout, run as scripts/test_klippy.py
-//! runs them) with our dictionary, and beside it with the firmware's.
+//! Klipper's own regression cases (`test/klippy/*.test` of the checkout, run as by scripts/test_klippy.py). Each runs
+//! with our dictionary and with the firmware's.
 //!
-//! In these cases klippy has no micro-controller: it takes a dictionary and writes what it would send to
-//! a file. All but one of the cases are for printers with other micro-controllers, whose pins and buses
-//! the linux process has not got. Both dictionaries get them added here, under the same numbers. What
-//! remains is each command, constant and enumeration that any of these configurations and their G-code count
-//! on: klippy has to end the same with both, and to configure each micro-controller by the same messages.
-//! (What it sends later depends on real time: how much of its queues is out when the file ends, what a
+//! In these cases klippy has no MCU: it takes a dictionary and writes its messages to a file. All cases except one are
+//! for printers with other MCUs. The linux process does not have the pins and buses of those MCUs. They are added to
+//! both dictionaries here, with the same numbers. What remains is each command, constant and enumeration that any of
+//! these configurations and their G-code need. klippy must end in the same way with both dictionaries. It must also
+//! configure each MCU with the same messages. (Its later messages depend on real time: how much of its queues is sent
+//! when the file ends, and what a display shows.)
 //! display shows.)
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -27,11 +27,11 @@ use crate::{checkout, klippy::python};
 
 /// The dictionary of Klipper's own linux process.
 const FIRMWARE: &str = include_str!("../dictionaries/klipper-master.json");
-/// What klippy sends meanwhile, as real time goes by.
+/// Messages that klippy sends as real time passes.
 const BY_REAL_TIME: [&str; 2] = ["get_clock", "get_uptime"];
-/// The end of a configuration.
+/// The last message of a configuration.
 const LAST: &str = "finalize_config";
-/// Numbers of what is added, far from those of the linux process.
+/// First number for additions, far from the numbers of the linux process.
 const FOREIGN: u32 = 1_000_000;
 
 /// One run of klippy.
@@ -39,7 +39,7 @@ struct Case {
     file: PathBuf,
     config: PathBuf,
     gcode: Gcode,
-    /// The names of its micro-controllers; the main one's is empty.
+    /// The names of its MCUs. The main one's name is empty.
     mcus: Vec<String>,
     should_fail: bool,
 }
@@ -56,8 +56,8 @@ impl Case {
     }
 }
 
-/// The cases of a `.test` file: one for each CONFIG, with the dictionaries that stand before it, or in a
-/// file of one case anywhere.
+/// The cases of a `.test` file: one for each CONFIG, with the dictionaries that precede it. In a file with one case the
+/// dictionaries may be anywhere.
 fn cases(file: &Path) -> Vec<Case> {
     let folder = file.parent().unwrap();
     let text = fs::read_to_string(file).unwrap();
@@ -95,7 +95,7 @@ fn all_cases(checkout: &Path) -> Vec<Case> {
     files.iter().flat_map(|file| cases(file)).collect()
 }
 
-/// The buses that the configurations name, by the enumeration that they belong to.
+/// The buses that the configurations name, by their enumeration.
 fn named_buses(cases: &[Case]) -> BTreeMap<&'static str, BTreeSet<String>> {
     let mut buses: BTreeMap<&str, BTreeSet<String>> = BTreeMap::new();
     let configs: BTreeSet<&Path> = cases.iter().map(|case| &*case.config).collect();
@@ -110,7 +110,7 @@ fn named_buses(cases: &[Case]) -> BTreeMap<&'static str, BTreeSet<String>> {
     buses
 }
 
-/// Adds pins and buses as other micro-controllers name theirs.
+/// Adds pins and buses with the names of other MCUs.
 fn add_foreign(dictionary: &mut Value, buses: &BTreeMap<&str, BTreeSet<String>>) {
     let mut next = FOREIGN;
     let letters = ('A'..='L').map(|port| format!("P{port}0"));
@@ -128,8 +128,8 @@ fn add_foreign(dictionary: &mut Value, buses: &BTreeMap<&str, BTreeSet<String>>)
     }
 }
 
-/// The firmware's dictionary; the messages that ours has, too, get the same ids, so that what klippy
-/// sends can be compared byte by byte.
+/// The firmware's dictionary. Messages that are also in our dictionary get the same ids, so that klippy's output can be
+/// compared byte by byte.
 fn firmware(ours: &Value) -> Value {
     let firmware: Value = serde_json::from_str(FIRMWARE).unwrap();
     let ids: Vec<&Map<String, Value>> =
@@ -157,15 +157,15 @@ fn firmware(ours: &Value) -> Value {
     })
 }
 
-/// How a run ended: whether it failed, the end of its log, and the messages that configured its
-/// micro-controllers, with their parameters in bytes.
+/// The end of a run: whether it failed, the end of its log, and the messages that configured its MCUs, with their
+/// parameters in bytes.
 struct End {
     failed: bool,
     log: String,
     configuration: Vec<String>,
 }
 
-/// Runs a case with a dictionary for each of its micro-controllers.
+/// Runs a case with a dictionary for each of its MCUs.
 fn run(checkout: &Path, folder: &Path, case: &Case, dictionary: &Path, formats: &BTreeMap<u32, String>) -> End {
     fs::create_dir_all(folder).unwrap();
     let gcode = match &case.gcode {
@@ -196,7 +196,7 @@ fn run(checkout: &Path, folder: &Path, case: &Case, dictionary: &Path, formats: 
     End { failed: !status.success(), log, configuration }
 }
 
-/// The messages by which klippy configured a micro-controller, out of all that it sent.
+/// The messages that configured an MCU, from everything that klippy sent.
 fn configured(sent: &[u8], formats: &BTreeMap<u32, String>) -> Vec<String> {
     let (mut resync, mut rest, mut messages) = (Resync::default(), sent, Vec::new());
     loop {
@@ -259,7 +259,7 @@ fn klippy_ends_its_regression_cases_as_with_the_firmware_s_dictionary() {
         while let Some((at, case)) =
             Some(next.fetch_add(1, Ordering::Relaxed)).and_then(|at| Some((at, cases.get(at)?)))
         {
-            // A case of the linux process needs nothing that is not its own.
+            // A case for the linux process needs no additions.
             let kind = if case.file.ends_with("linuxtest.test") { ".plain" } else { "" };
             let end = |name: &str| {
                 let dictionary = folder.path().join(format!("{name}{kind}"));
@@ -285,6 +285,6 @@ fn klippy_ends_its_regression_cases_as_with_the_firmware_s_dictionary() {
     let counts = format!("{} cases, {} go with neither dictionary", cases.len(), neither.len());
     println!("{counts}:\n{}", neither.join("\n"));
     assert!(wrong.is_empty(), "{counts}, {} differ:\n{}", wrong.len(), wrong.join("\n"));
-    // A Python without SciPy can not run the load cell's; more of them would mean that nothing was tested.
+    // A Python without SciPy cannot run the load cell's cases. If more cases failed, nothing would have been tested.
     assert!(cases.len() > 200 && neither.len() < 5, "{counts}:\n{}", neither.join("\n"));
 }

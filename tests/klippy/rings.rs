@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! An accelerometer on a head that rings, and klippy's search for its resonances.
+//! An accelerometer on a ringing head, and klippy's search for its resonances.
 
 use std::path::{Path, PathBuf};
 use std::process;
@@ -11,12 +11,12 @@ use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, rest};
 
 /// The resonances of the built-in printer.
 const RESONANCES_HZ: [(&str, f64); 2] = [("x", 57.0), ("y", 43.5)];
-/// The chip's own pace, of 400 samples a second and 0.4 % more.
+/// The chip's own sample rate: 400 samples a second and 0.4 % more.
 const RATE_HZ: f64 = 400.0 * 1.004;
 const G: f64 = 9806.65;
 
-/// A printer whose chip takes 400 samples a second, far more than the resonances need: at klippy's 3200
-/// its FIFO lasts for 10 ms, and a computer that tests much at once is late by more now and then.
+/// A printer with a chip that takes 400 samples a second, far more than the resonances need. At klippy's 3200 the
+/// chip's FIFO lasts 10 ms. A computer that runs many tests at once is sometimes later than that.
 fn start(checkout: &Path) -> Printer {
     let change = |config: String| config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n") + UNHOMED;
     let mut printer = Printer::start_with(checkout, change);
@@ -24,15 +24,15 @@ fn start(checkout: &Path) -> Printer {
     printer
 }
 
-/// A name for klippy's files, which it writes to /tmp: nobody else's.
+/// A unique name for klippy's files, which it writes to /tmp.
 fn name(what: &str) -> String {
     format!("pinion_{what}_{}", process::id())
 }
 
-/// A file of klippy's, taken away from /tmp: the names of its columns, and its lines.
+/// A file of klippy's, moved away from /tmp: the names of its columns, and its lines.
 fn table(file: String) -> (Vec<String>, Vec<Vec<f64>>) {
     let path = PathBuf::from(file);
-    // It is written by a process of its own: whole once it does not grow.
+    // A separate process writes it. It is complete when it stops growing.
     let end = Instant::now() + Duration::from_secs(30);
     let (mut text, mut before) = (String::new(), usize::MAX);
     while text.len() != before || text.is_empty() {
@@ -48,7 +48,7 @@ fn table(file: String) -> (Vec<String>, Vec<Vec<f64>>) {
     (columns, lines.map(numbers).collect())
 }
 
-/// Where a column of a spectrum is highest: between the bins, by the parabola through the three of them.
+/// The maximum of a column of a spectrum: between the bins, on the parabola through three of them.
 fn peak(file: String, column: &str) -> f64 {
     let (columns, lines) = table(file);
     let column = columns.iter().position(|name| name == column).unwrap();
@@ -59,7 +59,7 @@ fn peak(file: String, column: &str) -> f64 {
     lines[top][0] + bin_hz * (left - right) / (left - 2.0 * middle + right) / 2.0
 }
 
-/// The G-code of a test around a resonance, 12 Hz to either side of it: twelve seconds.
+/// The G-code of a test around a resonance, 12 Hz to either side of it. It takes twelve seconds.
 fn sweep(hz: f64) -> String {
     format!("FREQ_START={} FREQ_END={} HZ_PER_SEC=2", hz - 12.0, hz + 12.0)
 }
@@ -72,7 +72,7 @@ fn an_accelerometer_is_asked_and_measures_without_a_gap() {
     let answer = printer.answer("ACCELEROMETER_QUERY");
     let said = rest(&answer, "accelerometer values (x, y, z): ");
     let values: Vec<f64> = said.split(", ").map(|value| value.parse().unwrap()).collect();
-    // The noise of a sample is 60 to 90 mm/s^2, and never more than three and a half times that.
+    // The noise of a sample is 60 to 90 mm/s^2, and at most three and a half times that.
     let expected = [0.0, 0.0, G];
     assert!(values.iter().zip(expected).all(|(value, g)| (value - g).abs() < 320.0), "{said}");
 
@@ -85,7 +85,7 @@ fn an_accelerometer_is_asked_and_measures_without_a_gap() {
     let times: Vec<f64> = samples.iter().map(|sample| sample[0]).collect();
     let seconds = times[times.len() - 1] - times[0];
     assert!(seconds >= SECONDS - 0.1, "{seconds}");
-    // klippy finds the chip's own pace; a sample that is lost would slow it down.
+    // klippy measures the chip's own sample rate. A lost sample would lower it.
     let rate_hz = (times.len() - 1) as f64 / seconds;
     assert!((rate_hz / RATE_HZ - 1.0).abs() < 0.001, "{rate_hz}");
     let widest = times.windows(2).map(|pair| pair[1] - pair[0]).fold(0.0, f64::max);
@@ -115,16 +115,16 @@ fn klippy_calibrates_its_input_shaper_for_the_resonances() {
     for (axis, hz) in RESONANCES_HZ {
         let name = name("calibrate");
         let said = printer.answer(&format!("SHAPER_CALIBRATE AXIS={axis} NAME={name} {}", sweep(hz)));
-        // The frequency of a shaper is that of the resonance for which it is made (extras/shaper_defs.py); of those
-        // that klippy fits, "mzv" has one notch and stands on the resonance, while those with several notches
-        // have theirs to its sides.
+        // The frequency of a shaper is the resonance for which it is made (extras/shaper_defs.py). Of klippy's fitted
+        // shapers, "mzv" has one notch, which is on the resonance. Shapers with several notches have them beside the
+        // resonance.
         let fitted = rest(&said, "Fitted shaper 'mzv' frequency = ");
         let fitted_hz: f64 = fitted.split(' ').next().unwrap().parse().unwrap();
         let found_hz = peak(format!("/tmp/calibration_data_{axis}_{name}.csv"), &format!("psd_{axis}"));
         let recommended = rest(&said, &format!("Recommended shaper_type_{axis} = "));
         assert!((found_hz - hz).abs() < 1.0, "{axis}: {found_hz} Hz, not {hz}");
         assert!((fitted_hz - hz).abs() < 1.0, "{axis}: {fitted_hz} Hz, not {hz}");
-        // klippy uses what it recommends.
+        // klippy uses its recommendation.
         let (shaper, shaper_hz) = recommended.split_once(&format!(", shaper_freq_{axis} = ")).unwrap();
         let shaper_hz: f64 = shaper_hz.trim_end_matches(" Hz").parse().unwrap();
         let in_use = printer.answer("SET_INPUT_SHAPER");

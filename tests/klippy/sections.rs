@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The printer.cfg of the built-in printer, and what may be taken out of it: klippy reads it in its batch
-//! mode, without an MCU.
+//! The printer.cfg of the built-in printer, and the sections that a user may remove. klippy reads it in its batch mode,
+//! without an MCU.
 
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -13,7 +13,7 @@ use super::checkout;
 use super::hosts;
 use super::klippy::{batch, example, without};
 
-/// What klippy does not do without.
+/// The sections that klippy cannot omit.
 const ALWAYS: [&str; 5] = ["mcu", "printer", "stepper_x", "stepper_y", "stepper_z"];
 const MOVES: &str = "G28\nG1 X10 Y20 Z5 F3000\nG1 X100 Y100\n";
 
@@ -28,20 +28,20 @@ fn sections(config: &str) -> Vec<&str> {
     config.lines().filter_map(|line| line.strip_prefix('[')?.strip_suffix(']')).collect()
 }
 
-/// The sections that say that they need this one.
+/// The sections that declare that they need this one.
 fn in_need<'a>(config: &'a str, section: &str) -> Vec<&'a str> {
     let blocks = config.split("\n\n").filter(|block| block.contains(&format!("\n# Needs [{section}].")));
     blocks.filter_map(|block| sections(block).pop()).collect()
 }
 
-/// The configuration without a section and those that need it.
+/// The configuration without a section and without the sections that need it.
 fn without_it(config: &str, section: &str) -> String {
     in_need(config, section).into_iter().fold(without(config, section), |rest, other| {
         if sections(&rest).contains(&other) { without_it(&rest, other) } else { rest }
     })
 }
 
-/// Has each item worked on, several at a time.
+/// Processes each item, several at a time.
 fn for_each<T: Sync>(items: &[T], work: impl Fn(&T) + Sync) {
     let next = AtomicUsize::new(0);
     let work = || {
@@ -54,8 +54,8 @@ fn for_each<T: Sync>(items: &[T], work: impl Fn(&T) + Sync) {
     });
 }
 
-/// Takes each section out of a configuration that the host takes whole. `keep` are those that this host
-/// does not do without.
+/// Removes each section from a configuration that the host accepts whole. `keep` are the sections that this host cannot
+/// omit.
 fn take_out_each(checkout: &Path, generation: Generation, config: &str, keep: &[&str]) {
     let folder = tempfile::tempdir().unwrap();
     let dictionary = folder.path().join("dict");
@@ -89,14 +89,14 @@ fn klippy_does_without_any_section_of_printer_cfg() {
 fn kalico_does_without_any_section_of_printer_cfg() {
     let Some(checkout): Option<PathBuf> = hosts::checkout(Generation::Kalico) else { return };
     let config = built_in();
-    // As the section says.
+    // The section says so.
     let angle = config.split("\n\n").find(|block| block.starts_with("[angle y]")).unwrap();
     assert!(angle.contains("Kalico"), "{angle}");
     take_out_each(&checkout, Generation::Kalico, &without(&config, "angle y"), &["virtual_sdcard"]);
 }
 
-/// The sections without hardware that a configuration offers, in use: each one's name, its lines, and the section
-/// whose place it takes.
+/// The sections without hardware that a configuration offers, in use: each one's name, its lines, and the section that
+/// it replaces.
 fn offered(config: &str) -> Vec<(String, String, Option<String>)> {
     let (_, offers) = config.split_once("\n# Sections without hardware.").unwrap();
     let blocks = offers.split("\n\n").filter(|block| block.starts_with("#["));
@@ -109,12 +109,12 @@ fn offered(config: &str) -> Vec<(String, String, Option<String>)> {
     told.collect()
 }
 
-/// What needs the sections that are offered.
+/// G-code that needs the offered sections.
 const THEIR_MOVES: &str = "G28\nG1 X50 Y50 Z5 F3000\nG2 X70 Y50 I10 J0\nG11\nG10\nRESPOND MSG=hello\nM117 hello\n\
                            SET_SKEW XY=141,141,100\nFORCE_MOVE STEPPER=stepper_x DISTANCE=1 VELOCITY=10\nPAUSE\n\
                            RESUME\nEXCLUDE_OBJECT_DEFINE NAME=PART\nSAVE_VARIABLE VARIABLE=one VALUE=1\n";
 
-/// Takes each section that is offered into use, by itself and then all that go together.
+/// Enables each offered section alone, and then all compatible ones together.
 fn take_in_each(checkout: &Path, generation: Generation, config: &str, moves: &str) {
     let folder = tempfile::tempdir().unwrap();
     let dictionary = folder.path().join("dict");
@@ -141,11 +141,11 @@ fn klippy_takes_each_section_without_hardware_that_is_offered() {
 #[test]
 fn kalico_takes_each_section_without_hardware_that_is_offered() {
     let Some(checkout): Option<PathBuf> = hosts::checkout(Generation::Kalico) else { return };
-    // Its [firmware_retraction] is not ready yet in the batch mode.
+    // Its [firmware_retraction] is not ready yet in batch mode.
     take_in_each(&checkout, Generation::Kalico, &without(&built_in(), "angle y"), MOVES);
 }
 
-/// Has a host read what is printed for each example of the documentation.
+/// Makes a host read the printed configuration for each example of the documentation.
 fn take_the_examples(checkout: &Path, generation: Generation) {
     let built_in = String::from_utf8(pinion(&["sim", "--print-board"])).unwrap();
     let examples: [(&str, &[&str]); 5] = [

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What turns beside the head: a servo, and a stepper of its own.
+//! Parts that move independent of the head: a servo, and a stepper of its own.
 
 use std::path::Path;
 use std::time::{Duration, Instant};
@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 use super::checkout;
 use super::klippy::Printer;
 
-/// Where the servo stands, once it turns no more.
+/// The servo's angle, after it has stopped turning.
 fn servo_degrees(printer: &Printer) -> f64 {
     let look = || {
         let sight = printer.probe().sights().find(|(name, _)| *name == "servo arm").unwrap().1;
@@ -34,13 +34,13 @@ fn a_servo_turns_to_its_angle() {
         ("ANGLE=120", 120.0),
         ("WIDTH=0.0015", 90.0),
         ("WIDTH=0.002", 180.0),
-        // No pulse: it stays.
+        // Without a pulse it stays.
         ("WIDTH=0", 180.0),
         ("ANGLE=0", 0.0),
     ] {
         printer.gcode(&format!("SET_SERVO SERVO=arm {command}\nM400"));
         let found = servo_degrees(&printer);
-        // A pulse of a millisecond is 50,000 ticks, so exact to the last digit.
+        // A pulse of a millisecond is 50,000 ticks, so the angle is exact to the last digit.
         assert!((found - degrees).abs() < 0.11, "{command}: {found}");
     }
 }
@@ -56,7 +56,7 @@ fn a_manual_stepper_homes_and_moves() {
     let position = |printer: &Printer| printer.probe().axis("lift").unwrap().position_mm;
     printer.gcode("MANUAL_STEPPER STEPPER=lift ENABLE=1 SET_POSITION=30 MOVE=33.5 SPEED=20 SYNC=1\nM400");
     assert_eq!(position(&printer), 20.5);
-    // To its endstop, which stops it a few steps behind the one at which it closed.
+    // To its endstop. It stops a few steps after the endstop closed.
     printer.gcode("MANUAL_STEPPER STEPPER=lift MOVE=-10 STOP_ON_ENDSTOP=home\nM400");
     let stopped = position(&printer);
     assert!((-0.5..=0.0).contains(&stopped), "{stopped}");

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a person sees of the simulated printer while a real klippy drives it: lights, the display,
-//! temperatures.
+//! A person's view of the simulated printer while a real klippy drives it: lights, the display, temperatures.
 
 use std::path::Path;
 use std::process::Command;
@@ -14,7 +13,7 @@ fn pixels(picture: &str) -> Vec<Vec<bool>> {
     const DOTS: [[u32; 4]; 2] = [[0, 1, 2, 6], [3, 4, 5, 7]];
     let row = |y: usize| -> Option<Vec<bool>> {
         let line = picture.lines().nth(y / 4)?.chars();
-        // A display that is dark has no picture.
+        // A dark display has no picture.
         let line: Vec<u32> = line.map(|c| (c as u32).checked_sub(0x2800)).collect::<Option<_>>()?;
         Some((0..128).map(|x| line[x / 2] >> DOTS[x % 2][y % 4] & 1 != 0).collect())
     };
@@ -35,7 +34,7 @@ fn font(checkout: &Path) -> Vec<Vec<u8>> {
     hex.lines().map(|line| (0..16).map(|n| byte(line, n)).collect()).collect()
 }
 
-/// The text of a display, by rows of 16 characters; what is no printable character is `?`.
+/// The text of a display, in rows of 16 characters. A shape that is not a printable character is `?`.
 fn text(picture: &str, font: &[Vec<u8>]) -> Vec<String> {
     let pixels = pixels(picture);
     let glyph = |row: usize, column: usize| -> Vec<u8> {
@@ -74,7 +73,7 @@ fn lights_have_the_colours_that_klippy_gives_them() {
     printer.until_shown("strip", |strip| strip == ["white#ffffff"; 8].join(" "));
     printer.gcode("SET_LED_TEMPLATE LED=strip TEMPLATE=glow param_red=0.4 INDEX=3");
     printer.until_shown("strip", |strip| strip.split(' ').nth(2) == Some("magenta#660080"));
-    // Over lines that klippy drives bit by bit, in messages of 20 bytes.
+    // klippy drives these lines bit by bit, in messages of 20 bytes.
     printer.gcode("SET_LED LED=dots RED=0.2 INDEX=1\nSET_LED LED=dots BLUE=1 INDEX=4");
     printer.until_shown("dots", |dots| dots == "red#330000 off off blue#0000ff");
     printer.gcode("SET_LED LED=light WHITE=0.5\nG4 P500");
@@ -99,7 +98,7 @@ fn the_display_shows_what_klippy_writes() {
     );
     printer.until_state("ready");
     printer.until_shown("display", |picture| last_row(picture, &font) == "Ready");
-    // Icons, which are no text, and beside them what they stand for.
+    // Icons, which are not text, with their values beside them.
     let status = ["?? 25?    ??  0%", "?? 25?    ??100%", "?????????? 00:00", "Ready           "];
     printer.until_shown("display", |picture| text(picture, &font) == status);
     printer.gcode("M117 Pinion: 42 <ok>");
@@ -108,18 +107,18 @@ fn the_display_shows_what_klippy_writes() {
     printer.until_shown("display", |picture| {
         text(picture, &font).iter().map(|row| row.trim_end()).eq(["", "   2250.0", "", ""])
     });
-    // The axis stood at 60 mm.
+    // The axis was at 60 mm.
     printer.gcode("FORCE_MOVE STEPPER=stepper_x DISTANCE=-22.5 VELOCITY=50");
     printer.until_shown("x", |x| x == "37.50 mm");
     printer.gcode("M117 there\nSET_DISPLAY_GROUP GROUP=_default_16x4");
     printer.until_shown("display", |picture| last_row(picture, &font) == "there");
-    // A restart resets nothing of the display, and klippy writes all of it anew.
+    // A restart does not reset the display. klippy writes all of it again.
     printer.restart("FIRMWARE_RESTART");
     printer.gcode("M117 again");
     printer.until_shown("display", |picture| last_row(picture, &font) == "again");
 }
 
-/// A converter in the bed, beside those that are there.
+/// Adds a converter in the bed to the existing ones.
 fn with_converter(board: String, chip: &str, fault: &str) -> String {
     let part = format!("[[part]]\nkind = \"thermocouple\"\nname = \"{chip}\"\nchip = \"{chip}\"\n{fault}");
     format!("{board}\n{part}bus = \"spidev1.0\"\nselect_pin = \"{chip}_cs\"\nheater = \"heater_bed\"\n")
@@ -145,11 +144,11 @@ fn converters_read_what_the_heater_has() {
         last = bed;
         for chip in CHIPS {
             let read = printer.object(&format!("temperature_sensor {chip}"))["temperature"].as_f64().unwrap();
-            // What is shown goes by degrees, and klippy smoothes over a second.
+            // The display shows whole degrees, and klippy smooths over a second.
             assert!((read - bed).abs() < 1.5, "{chip}: {read} of {bed}");
         }
     }
-    // The hot end, cold.
+    // The hot end is cold.
     let nozzle = printer.object("temperature_sensor nozzle")["temperature"].as_f64().unwrap();
     assert_eq!(nozzle, 25.0);
 }
@@ -181,7 +180,7 @@ fn a_fan_at_half_speed_is_told_where_it_ends_up_and_not_for_each_ripple() {
     };
     let mut printer = Printer::start_shown(&checkout, |board, _| board, |config| config);
     printer.until_state("ready");
-    // klippy's cycle of 10 ms, and a fan that takes 0.4 s to follow.
+    // klippy's PWM cycle is 10 ms. The fan needs 0.4 s to follow.
     printer.gcode("M106 S128\nG4 P8000");
     let rpm = |printer: &Printer| printer.shown("fan").trim_end_matches(" rpm").parse::<f64>().unwrap();
     let first = rpm(&printer);

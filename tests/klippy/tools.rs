@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A second extruder on a second carriage, fans that follow a temperature, a light of four colours.
+//! A second extruder on a second carriage, fans that follow a temperature, a light of four colors.
 
 use std::path::Path;
 
@@ -49,13 +49,13 @@ fn klippy_cools_a_chamber_by_its_fan() {
     assert!(celsius(&printer) < warmer, "{} {warmer}", celsius(&printer));
     let read = printer.object("temperature_fan exhaust")["temperature"].as_f64().unwrap();
     assert!((read - celsius(&printer)).abs() < 1.0, "{read}");
-    // The heat sink's fan goes with the hot end.
+    // The heat sink's fan follows the hot end.
     assert_eq!(rpm(&printer, "heat_sink"), 0.0);
     printer.gcode("M104 S60");
     printer.until_object("heater_fan heat_sink", "speed", 1.0);
     printer.gcode("G4 P3000");
     assert!(rpm(&printer, "heat_sink") > 5000.0);
-    // Nothing was said of the fan whose tachometer is read.
+    // No command was given to the fan yet, but klippy reads its tachometer.
     assert!(printer.object("fan")["rpm"].is_number());
     printer.gcode("M106 S255\nG4 P5000");
     let read = printer.object("fan")["rpm"].as_f64().unwrap();
