@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The ADC ADS1220 on SPI, for load cells (Texas Instruments SBAS501).
 //!
-//! 24 clocks after DRDY went low shift out a sample: 24 bits in two's complement, the highest first
-//! ("Data Format"). klippy sets the chip up by itself.
+//! After DRDY goes low, 24 clocks shift out a sample: 24 bits in two's complement, the highest bit first ("Data
+//! Format"). klippy itself sets up the chip.
 
 #![forbid(unsafe_code)]
 

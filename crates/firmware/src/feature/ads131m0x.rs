@@ -38,17 +38,17 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A number of channels that no chip has, or a channel beyond them.
+    /// No chip has this number of channels, or the channel is not one of them.
     INVALID_CHANNELS = "Invalid ads131m0x channels configuration";
-    /// Kalico: a number of channels that no chip has.
+    /// Kalico: no chip has this number of channels.
     INVALID_CHANNEL_COUNT = "ads131m0x invalid sensor_channel_count";
-    /// Kalico: no channel, or one that the chip does not have.
+    /// Kalico: the mask selects no channel, or one that the chip does not have.
     INVALID_CHANNEL_MASK = "ads131m0x invalid channel_mask";
 }
 
-/// The frame's CRC does not fit its words.
+/// The frame's CRC does not match its words.
 const ERROR_CRC: u8 = 1;
-/// The chip was reset since the measurements began, and with it what klippy had set.
+/// The chip was reset after the measurements began, and lost klippy's settings.
 const ERROR_RESET: u8 = 2;
 
 const WORD_BYTES: usize = 3;
@@ -61,14 +61,14 @@ const fn frame_bytes(channels: u8) -> usize {
     (1 + channels as usize + 1) * WORD_BYTES
 }
 
-/// CRC-16/CCITT: polynomial 0x1021, from 0xffff on ("CRC" in "SPI Communication Frames").
+/// CRC-16/CCITT: polynomial 0x1021, initial value 0xffff ("CRC" in "SPI Communication Frames").
 fn crc16(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0xffff, |crc, byte| {
         (0..8).fold(crc ^ u16::from(*byte) << 8, |crc, _| crc << 1 ^ if crc & 0x8000 != 0 { 0x1021 } else { 0 })
     })
 }
 
-/// What a frame says.
+/// A decoded frame.
 #[derive(Debug, PartialEq, Eq)]
 enum Content {
     BadCrc {
@@ -97,30 +97,30 @@ fn decode(frame: &[u8]) -> Content {
     Content::Good { reset, values }
 }
 
-/// Which channels are sampled, and how the host is told of errors.
+/// The sampled channels. They also decide how errors are reported.
 #[derive(Clone, Copy)]
 enum Channels {
-    /// One.
+    /// One channel, for Klipper.
     One(u8),
-    /// Those whose bits are set, each with its own value: Kalico's.
+    /// Every channel with its bit set, each with its own value, for Kalico.
     Mask(u8),
 }
 
-/// What Kalico knows errors by.
+/// Kalico recognizes errors by these values.
 const KALICO_ERROR_CRC: i32 = i32::MIN;
 const KALICO_ERROR_RESET: i32 = 1 << 30;
 
 struct Ads131m0x {
     spi: Oid,
     channels: Channels,
-    /// Whether it was reset since the measurements began: that is for the host to mend.
+    /// Whether the chip was reset after the measurements began. Only the host can set it up again.
     was_reset: bool,
 }
 
 impl Ads131m0x {
     fn judge(&mut self, content: Content) -> Sample {
         self.was_reset |= match (self.channels, &content) {
-            // Kalico takes the bit also of a frame that is damaged: a bus that floats is a reset to it.
+            // Kalico also takes this bit from a damaged frame. So it sees a floating bus as a reset.
             (Channels::Mask(_), Content::BadCrc { reset }) | (_, Content::Good { reset, .. }) => *reset,
             (Channels::One(_), Content::BadCrc { .. }) => false,
         };
@@ -251,7 +251,7 @@ mod tests {
 
     const BAD: Content = Content::BadCrc { reset: false };
 
-    /// The check value of CRC-16/CCITT-FALSE (also CRC-16/IBM-3740) in the catalogue of CRCs.
+    /// The check value of CRC-16/CCITT-FALSE (also CRC-16/IBM-3740) in the catalog of CRCs.
     #[test]
     fn the_crc_is_the_one_of_the_data_sheet() {
         assert_eq!(crc16(b"123456789"), 0x29b1);
@@ -310,7 +310,7 @@ mod tests {
         assert_eq!(chip.judge(good(false)), both([6, -8, 0, 0], Some(-2)));
         assert_eq!(chip.judge(BAD), both([i32::MIN; 4], None));
         assert_eq!(chip.judge(Content::BadCrc { reset: true }), both([1 << 30; 4], None));
-        // A reset counts for more than a check sum.
+        // A reset takes precedence over a CRC error.
         assert_eq!(chip.judge(BAD), both([1 << 30; 4], None));
     }
 }

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The accelerometer ADXL345 on SPI.
 //!
-//! Registers after its data sheet (Analog Devices, rev. G: "FIFO", "Register Map"). A sample is read
-//! together with the two registers behind it: FIFO_CTL, which must hold what klippy wrote there, and
-//! FIFO_STATUS. So a glitch on the wires is noticed, and nothing is to be asked beforehand.
+//! Registers from its data sheet (Analog Devices, rev. G: "FIFO", "Register Map"). A sample is read together with the
+//! next two registers, FIFO_CTL and FIFO_STATUS. FIFO_CTL must still hold klippy's value: this shows glitches on the
+//! wires. FIFO_STATUS has the number of samples, so no separate query comes first.
 
 #![forbid(unsafe_code)]
 
@@ -38,16 +38,16 @@ enum Register {
     FifoStatus = 0x39,
 }
 
-/// Measure, of POWER_CTL.
+/// The Measure bit of POWER_CTL.
 const MEASURE: u8 = 0x08;
-/// Bits of the first byte.
+/// Bits of a message's first byte.
 const READ: u8 = 0x80;
 const MULTIPLE_BYTES: u8 = 0x40;
 /// FIFO_CTL as klippy sets it (`SET_FIFO_CTL`): stream mode.
 const STREAM: u8 = 0x90;
-/// Samples in the FIFO and the output registers.
+/// Highest number of samples, in the FIFO and the output registers.
 const FIFO_MAX: u8 = 32;
-/// From so many on some may have been dropped.
+/// With this many samples, the chip may have dropped some.
 const FULL: u8 = 31;
 const SAMPLE_BYTES: usize = 5;
 
@@ -56,9 +56,8 @@ fn entries(fifo_status: u8) -> u8 {
     fifo_status & 0x7f
 }
 
-/// One sample as klippy wants it, 13 bits of each axis in five bytes, and how many samples the FIFO
-/// held with it. A sample that can not be one has all bits set, where bit 7 of the last byte tells
-/// klippy of an error.
+/// Returns one sample in klippy's format, and the number of samples in the FIFO. The format has 13 bits of each axis in
+/// five bytes. An invalid sample has all bits set. Bit 7 of its last byte reports the error to klippy.
 fn decode(message: &[u8; 9]) -> ([u8; SAMPLE_BYTES], u8) {
     let [_, x_low, x_high, y_low, y_high, z_low, z_high, fifo_ctl, fifo_status] = *message;
     let extends_sign = |high: u8| matches!(high & 0xf0, 0x00 | 0xf0);
@@ -141,7 +140,7 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    /// What klippy makes of a sample (`_convert_samples` of extras/adxl345.py).
+    /// klippy's conversion of a sample (`_convert_samples` of extras/adxl345.py).
     fn accelerations([x_low, y_low, z_low, xz_high, yz_high]: [u8; SAMPLE_BYTES]) -> Option<[i16; 3]> {
         let signed = |value: u16| ((value << 3) as i16) >> 3;
         let x = u16::from(x_low) | u16::from(xz_high & 0x1f) << 8;
@@ -171,7 +170,7 @@ mod tests {
         for (message, filled) in [
             (message(good, STREAM, 0), Some(0)),
             (message(good, STREAM, 32), Some(32)),
-            // Bit 7 of FIFO_STATUS is the trigger's.
+            // Bit 7 of FIFO_STATUS is the trigger bit.
             (message(good, STREAM, 0x80 | 3), Some(3)),
             (message(good, STREAM, 33), None),
             (message(good, 0x00, 3), None),

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Analog inputs: oversampling, range check, reports of several readings, homing by their values.
 //!
-//! A worker takes the readings, as each may block for a while. If the ADC is slower than the host
-//! wants, samples are left out; timers and steps do not wait for it. A reading that fails leaves its sum out.
+//! A worker takes the readings, because each may block. If the ADC is slower than the host wants, samples are skipped.
+//! Timers and steps do not wait for it. A failed reading drops its sum.
 
 #![forbid(unsafe_code)]
 
@@ -29,7 +29,7 @@ pub(super) const FEATURE: Feature = Feature {
 shutdowns! {
     /// `bytes_per_report` above 48.
     INVALID_BYTES_PER_REPORT = "Invalid analog_in bytes_per_report";
-    /// A reading outside its range, `range_check_count` times in a row.
+    /// A value was outside its range, `range_check_count` times in a row.
     ADC_RANGE = "ADC out of range";
 }
 
@@ -45,7 +45,7 @@ response! {
     pub(super) struct Batch<'a> { oid: Oid, next_clock: Clock, values: &'a [u8] }
 }
 
-/// How many bytes of readings a report holds at most.
+/// Highest number of bytes of readings in a report.
 const REPORT_BYTES: usize = 48;
 const SAMPLE_BYTES: usize = 2;
 
@@ -90,7 +90,7 @@ impl BytesPerReport {
     }
 }
 
-/// What the host asks for.
+/// The host's settings for the samples.
 #[derive(Clone, Copy, Default)]
 struct Query {
     sample_ticks: Ticks,
@@ -99,7 +99,7 @@ struct Query {
     min_value: u16,
     max_value: u16,
     range_check_count: u8,
-    /// Of a batch; none if each sum is a report of its own.
+    /// `None`: each sum is its own report.
     bytes_per_report: Option<BytesPerReport>,
 }
 
@@ -108,18 +108,18 @@ struct AnalogIn {
     reading: Slot<Reading>,
     calls: Calls,
     unread: Unread,
-    /// Whether a sample waits until the ADC is done with one of an earlier query.
+    /// Whether a sample waits until the ADC has finished a reading of an earlier query.
     waiting: bool,
     query: Query,
     /// When the first sample of the next sum is due.
     next_begin: Clock,
-    /// When the present sample was due.
+    /// When the current sample was due.
     sample_at: Clock,
-    /// How many samples the present sum has.
+    /// How many samples the current sum has.
     taken: u8,
     /// The sum of the samples. It wraps around, as the firmware's does.
     sum: u16,
-    /// The sample that was taken last.
+    /// The last sample.
     last: Option<u16>,
     invalid_count: u8,
     report: [u8; REPORT_BYTES],
@@ -135,7 +135,7 @@ impl AnalogIn {
         self.reading.drop_pending();
     }
 
-    /// Has the worker read the ADC, or remembers to once the reading under way is back.
+    /// Makes the worker read the ADC. If a reading is still under way, the next one follows when it returns.
     fn sample(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         if !self.reading.is_here() {
             self.waiting = true;
@@ -145,8 +145,8 @@ impl AnalogIn {
         self.reading.send(turn, self.worker)
     }
 
-    /// Moves `next_begin` on by `rest_ticks`, or by as many of them as it takes to lie in the future:
-    /// what was due before is left out, as the ADC was too slow for it.
+    /// Moves `next_begin` ahead by one `rest_ticks`, or by as many as it takes to reach the future. Sums that were due
+    /// before are skipped, because the ADC was too slow for them.
     fn skip_missed(&mut self, now: Clock) {
         self.next_begin = self.next_begin + self.query.rest_ticks;
         let behind = now.since(self.next_begin);
@@ -154,14 +154,14 @@ impl AnalogIn {
             return;
         }
         self.next_begin = match u64::from(self.query.rest_ticks.0) {
-            // Without a pause the next sum just begins now.
+            // Without a pause the next sum begins now.
             0 => now,
             rest => Clock::from_ticks(self.next_begin.ticks() + (behind as u64 / rest + 1) * rest),
         };
     }
 
     fn check_range(&mut self, mcu: &Mcu) -> Result<(), Shutdown> {
-        // So Kalico has limits ignored (`temp_ignore_limits`).
+        // Kalico ignores limits this way (`temp_ignore_limits`).
         if self.query.range_check_count == 0 && mcu.serves(since(Kalico)) {
             return Ok(());
         }
@@ -231,12 +231,12 @@ impl Object for AnalogIn {
         let sample = match result {
             Ok(sample) => sample,
             Err(failure) => {
-                // A move may depend on it.
+                // A move may depend on an attached input.
                 let at_once = !matches!(self.attached, Attached::Nothing);
                 if at_once || self.unread.is_too_long(read_at) {
                     turn.try_shut_down(failure.clone())?;
                 }
-                // This sum is given up, and the next one begins in its turn.
+                // Drop this sum. The next one begins at its own time.
                 self.restart();
                 self.skip_missed(turn.now());
                 turn.go_on(TIMER, self.next_begin);
@@ -269,15 +269,14 @@ impl Object for AnalogIn {
     }
 
     fn shutdown(&mut self, turn: &mut Turn) {
-        // A reading that is under way does not count any more.
+        // A reading under way no longer counts.
         self.restart();
         self.attached = Attached::default();
-        // Without a pause between sums a stopped machine would be busy with them for ever.
+        // Without a pause between sums, sampling would keep a stopped MCU busy forever.
         if self.query.sample_count == 0 || self.query.rest_ticks == Ticks(0) {
             return;
         }
-        // Sampling goes on, as in the firmware, so that the host sees the temperatures of a stopped
-        // machine, too.
+        // Sampling continues, as in the firmware, so that the host also sees the temperatures of a stopped MCU.
         self.skip_missed(turn.now());
         turn.go_on(TIMER, self.next_begin);
     }

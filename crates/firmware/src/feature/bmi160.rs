@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The accelerometer BMI160, on SPI or I2C.
 //!
-//! Registers after its data sheet (Bosch, BST-BMI160-DS000: "Register (0x22-0x23) FIFO_LENGTH",
-//! "Register (0x24) FIFO_DATA"); klippy has it put bare samples of the accelerometer in the FIFO.
+//! Registers from its data sheet (Bosch, BST-BMI160-DS000: "Register (0x22-0x23) FIFO_LENGTH", "Register (0x24)
+//! FIFO_DATA"). klippy configures the FIFO for bare samples of the accelerometer.
 
 #![forbid(unsafe_code)]
 
@@ -21,10 +21,10 @@ enum Register {
     FifoData = 0x24,
 }
 
-/// Bytes that the FIFO holds.
+/// Size of the FIFO in bytes.
 const FIFO_BYTES: u16 = 1024;
 
-/// What FIFO_LENGTH says, low byte first.
+/// Decodes FIFO_LENGTH, low byte first.
 fn fill(length: [u8; 2]) -> Fill {
     let bytes = u16::from_le_bytes(length);
     Fill { bytes, overflowed: bytes > FIFO_BYTES }

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Buttons: up to eight inputs, sampled together and debounced; each change is told until the host
-//! has acknowledged it.
+//! Buttons: up to eight inputs, sampled together and debounced. Each change is reported until the host acknowledges it.
 
 #![forbid(unsafe_code)]
 
@@ -22,31 +21,30 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// `config_buttons` with more than 8.
+    /// `config_buttons` with more than 8 buttons.
     MAX_BUTTONS = "Max of 8 buttons";
-    /// `buttons_add` at a place that `config_buttons` did not count.
+    /// `buttons_add` with a position beyond the count of `config_buttons`.
     PAST_COUNT = "Set button past maximum button count";
     /// `buttons_query` with a `retransmit_count` above 127.
     INVALID_RETRANSMIT = "Invalid buttons retransmit count";
 }
 
 response! {
-    /// The states that the host has not acknowledged, the oldest first; `ack_count` is how many it
-    /// has, modulo 256.
+    /// The unacknowledged states, the oldest first. `ack_count` counts the acknowledged ones, modulo 256.
     "buttons_state oid=%c ack_count=%c state=%*s"
     pub(super) struct State<'a> { oid: Oid, ack_count: u8, state: &'a [u8] }
 }
 
-/// Buttons of one object, a bit of a state each.
+/// Highest number of buttons of one object: a state has one bit for each.
 const BUTTONS: usize = 8;
-/// States that wait for the host; later changes are dropped.
+/// Highest number of states that wait for the host. Later changes are dropped.
 const REPORTS: usize = 8;
-/// The largest `retransmit_count`, as in the firmware.
+/// Highest `retransmit_count`, as in the firmware.
 const RETRANSMIT_MAX: u8 = 0x7f;
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// How many samples there are between two tellings of the same reports.
+/// How many samples pass before the same states are reported again.
 #[derive(Clone, Copy, Default)]
 struct RetransmitCount(u8);
 
@@ -66,11 +64,11 @@ impl RetransmitCount {
 struct Buttons {
     buttons: Vec<Option<InputLine>>,
     rest_ticks: Ticks,
-    /// The levels of the sample that is being taken.
+    /// The levels of the current sample.
     sample: u8,
-    /// The buttons, a bit each, at which workers of expanders could not look for it.
+    /// Buttons that workers of expanders could not read for this sample, one bit each.
     unread: u8,
-    /// Whether the sample that is being taken counts: not one of an earlier query.
+    /// Whether the current sample counts. A sample of an earlier query does not.
     counts: bool,
     last_sample: u8,
     /// The debounced state.
@@ -79,7 +77,7 @@ struct Buttons {
     report_count: usize,
     ack_count: u8,
     retransmit_count: RetransmitCount,
-    /// Samples until the reports are sent once more; none if the host has them all.
+    /// Samples until the states are sent again. `None`: the host has acknowledged all of them.
     retransmit: Option<u8>,
 }
 
@@ -112,7 +110,7 @@ impl Buttons {
         Ok(())
     }
 
-    /// Looks at each button. A button that was not added reads low.
+    /// Reads each button. A button that was not added reads low.
     fn take_sample(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         (self.sample, self.unread) = (0, 0);
         self.counts = true;
@@ -125,9 +123,8 @@ impl Buttons {
         Ok(())
     }
 
-    /// Debounces a sample that is complete: a level counts if the sample before had it too. A button that
-    /// could not be looked at keeps its last level, which that does not confirm. True if there is something
-    /// new to tell.
+    /// Debounces a complete sample. A level counts if the sample before had it too. A button that could not be read
+    /// keeps its last level, which confirms nothing. Returns true if there is a new state to report.
     fn debounce(&mut self) -> bool {
         let read = !self.unread;
         let steady = !(self.sample ^ self.last_sample) & read;
@@ -143,12 +140,12 @@ impl Buttons {
         true
     }
 
-    /// Whether expanders still look for the last sample.
+    /// Whether workers of expanders are still reading the last sample.
     fn is_awaited(&self) -> bool {
         self.buttons.iter().flatten().any(InputLine::is_looking)
     }
 
-    /// Takes in a complete sample, and tells what is new.
+    /// Debounces a complete sample, and reports a new state.
     fn sampled(&mut self, turn: &mut Turn) -> bool {
         let news = !self.is_awaited() && std::mem::take(&mut self.counts) && self.debounce();
         if news {
@@ -179,7 +176,7 @@ impl Object for Buttons {
     }
 
     fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        // Expanders that still look for the last sample miss this one.
+        // Expanders that are still being read for the last sample miss this one.
         let news = if self.is_awaited() {
             self.buttons.iter().flatten().try_for_each(|button| button.awaited(turn))?;
             false
@@ -195,9 +192,9 @@ impl Object for Buttons {
         Ok(Next::At(at + self.rest_ticks))
     }
 
-    /// An expander's worker has looked.
+    /// A worker has read a line of an expander.
     fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
-        // Not if another line took its place meanwhile: that has a look of its own.
+        // A line that was replaced in the meantime does not count: the new line has its own look.
         for (place, button) in self.buttons.iter_mut().enumerate() {
             let Some(look) = button.as_mut().and_then(|button| button.sampled(turn, done)) else { continue };
             match look?.level {

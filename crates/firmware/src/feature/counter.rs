@@ -1,14 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Counters of a pin's edges, such as a fan's tachometer.
+//! Counters of a pin's edges, for example of a fan's tachometer.
 //!
-//! The firmware polls the pin, and so do we where nothing else can be had. Where the board has
-//! interrupts, the kernel dates the edges and a worker takes them: the core has 20 timers in a second to
-//! run instead of a thousand.
+//! The firmware polls the pin. Pinion polls it only where nothing better is available. If the board has interrupts, the
+//! kernel timestamps the edges and a worker reads them. The core then runs 20 timers per second instead of a thousand.
 //!
-//! Polling hardly ever sees a pulse much shorter than `poll_ticks`, such as noise on a fan's wire. An
-//! interrupt sees each, so a level counts here only once it has lasted a part of that time. The kernel
-//! can debounce a line, too, but most often by a timer in jiffies of 1 to 10 ms: a fan of 10,000 rpm
-//! has levels of 1.5 ms.
+//! Polling rarely sees a pulse much shorter than `poll_ticks`, for example noise on a fan's wire. An interrupt sees
+//! each one. So a level counts only after it has lasted a part of that time. The kernel can debounce a line too. But it
+//! mostly uses a timer in jiffies of 1 to 10 ms. A fan at 10,000 rpm has levels of 1.5 ms.
 
 #![forbid(unsafe_code)]
 
@@ -34,39 +32,38 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 response! {
-    /// The edges so far, and the instants of the next look and of the last edge. klippy takes the
-    /// count for that of one `poll_ticks` before `next_clock`.
+    /// The edges so far, the time of the next look, and the time of the last edge. klippy assumes that the count was
+    /// taken one `poll_ticks` before `next_clock`.
     "counter_state oid=%c next_clock=%u count=%u count_clock=%u"
     pub(super) struct State { oid: Oid, next_clock: Clock, count: u32, count_clock: Clock }
 }
 
-/// More interrupts than these are none of a tachometer (20,000 rpm with two pulses are 1333 edges a
-/// second), but of a pin that floats or oscillates. Each costs the kernel 10 us and more, and whatever
-/// else this computer does comes after them.
+/// Highest rate of interrupts that is accepted as a tachometer. 20,000 rpm with two pulses are 1333 edges per second. A
+/// pin with a higher rate floats or oscillates. Each interrupt costs the kernel 10 us or more, and delays everything
+/// else on this computer.
 const EDGES_PER_S_MAX: u32 = 20_000;
-/// The time over which they are counted, at least: a contact that bounces is no such pin.
+/// Shortest time over which this rate is measured, so that a bouncing contact does not exceed it.
 const STORM_TICKS: Ticks = Ticks::from_us(100_000);
 
-/// How often the edges are taken. The kernel keeps 1024, and [`EDGES_PER_S_MAX`] are 1000 in this time.
+/// How often the worker reads the edges. The kernel keeps 1024, and [`EDGES_PER_S_MAX`] makes 1000 in this time.
 const TAKE_TICKS: Ticks = Ticks::from_us(50_000);
-/// A level counts if it lasts `poll_ticks` divided by this. klippy's documentation wants a
-/// `tachometer_poll_interval` below the time of one level at the highest speed. So all pulses count at
-/// that speed if the shorter level takes an eighth of a pulse or more, and at twice the speed if it takes
-/// a quarter.
+/// A level counts if it lasts `poll_ticks` divided by this. klippy's documentation wants a `tachometer_poll_interval`
+/// below the time of one level at the highest speed. So at that speed all pulses count if the shorter level takes an
+/// eighth of a pulse or more. At twice the speed they count if it takes a quarter or more.
 const SETTLE_DIVISOR: u32 = 4;
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// Counts the edges of a line, but for those of glitches.
+/// Counts the edges of a line, and ignores glitches.
 #[derive(Debug)]
 struct Settling {
-    /// The level that lasted last.
+    /// The last level that lasted long enough.
     level: bool,
-    /// Since when the line has had the other one.
+    /// Since when the line has had the other level.
     left: Option<Clock>,
     /// Edges, modulo 2^32.
     count: u32,
-    /// When the last one was.
+    /// The time of the last counted edge.
     last: Option<Clock>,
 }
 
@@ -75,21 +72,21 @@ impl Settling {
         Settling { level, left: None, count: 0, last: None }
     }
 
-    /// Takes in an edge, after which the line was at `level`.
+    /// Processes an edge. The line was at `level` after it.
     fn see(&mut self, at: Clock, level: bool, settle: Ticks) {
         self.pass(at, settle);
         self.left = (level != self.level).then_some(at);
     }
 
-    /// Takes in that edges were dropped, before one after which the line was at `level`. Nothing is known of
-    /// them, nor how long the level before them lasted: so all count.
+    /// Processes dropped edges. The line was at `level` after the next edge. Nothing is known about the dropped edges,
+    /// nor how long the level before them lasted. So all of them count.
     fn lose(&mut self, edges: u32, level: bool) {
         self.last = self.left.or(self.last);
         self.count = self.count.wrapping_add(edges).wrapping_add(self.left.take().is_some().into());
         self.level = !level;
     }
 
-    /// Takes in that no edge came until now.
+    /// Processes the time until `now`, without an edge.
     fn pass(&mut self, now: Clock, settle: Ticks) {
         if let Some(at) = self.left.filter(|at| now.since(*at) >= i64::from(settle.0)) {
             self.level = !self.level;
@@ -100,30 +97,30 @@ impl Settling {
     }
 }
 
-/// A worker's look at the edges that the kernel has dated.
+/// Reads the edges that the kernel has timestamped, on a worker.
 struct Reading {
     edges: Box<dyn Edges>,
     clock: Arc<dyn TimeSource>,
-    /// What the log calls the pin.
+    /// The pin's name in the log.
     name: String,
     settling: Settling,
     /// How long a level must last to count.
     settle: Ticks,
-    /// Since when edges are counted in order to see whether there are too many.
+    /// When the count in `interrupts` began. A count that is too high ends the interrupts.
     since: Clock,
-    /// How many there were since then, glitches too.
+    /// How many edges came since then, including glitches.
     interrupts: u32,
-    /// Whether there were, so that there are no more interrupts.
+    /// Whether there were too many, so that the interrupts are switched off.
     given_up: bool,
 }
 
 impl Errand for Reading {
-    /// How many edges there were, and when the last one was.
+    /// The number of edges, and the time of the last one.
     type Answer = (u32, Option<Clock>);
     type Failure = Shutdown;
 
     fn run(&mut self) -> Result<(u32, Option<Clock>), Shutdown> {
-        // The kernel has all edges up to now.
+        // Take the time first. The kernel already has all edges up to it.
         let now = self.clock.now();
         let Reading { edges, clock, settling, settle, interrupts, .. } = self;
         edges.take(&mut |Edge { at, level, dropped }| {
@@ -148,19 +145,19 @@ impl Errand for Reading {
     }
 }
 
-/// For the log: a pin has so many edges in a second that its interrupts were given up.
+/// For the log: a pin has `per_s` edges per second, so its interrupts were switched off.
 fn too_many(name: &str, per_s: u64) -> String {
     format!(
         "counter ({name}): {per_s} edges a second are none of a fan, and their interrupts slow this computer down: it is polled from now on; does the pin float? Connect it, or give it a pull-up (^)"
     )
 }
 
-/// For the log: nothing counts a pin's edges.
+/// For the log: nothing else counts a pin's edges, so it is polled.
 fn polled(name: &str, why: &str) -> String {
     format!("counter ({name}): {why}, so it is polled: pulses shorter than its poll_interval are missed")
 }
 
-/// The edges that the kernel dates, and who takes them.
+/// The errand that reads the kernel's edges, and its worker.
 struct Counted {
     worker: WorkerId,
     reading: Slot<Reading>,
@@ -168,23 +165,24 @@ struct Counted {
 
 struct Counter {
     pin: InputLine,
-    /// None where the pin is polled.
+    /// `None`: the pin is polled.
     counted: Option<Counted>,
     poll_ticks: Ticks,
     sample_ticks: Ticks,
-    /// The count is told at the first look after this, or of a worker's looks at the first from this on.
+    /// When the next report is due. A polled pin reports at the first look after this time. A worker's read reports at
+    /// this time or later.
     next_sample: Clock,
-    /// Edges, modulo 2^32. While the pin is polled it is odd as long as that is high.
+    /// Edges, modulo 2^32. While the pin is polled, the count is odd if the pin is high.
     count: u32,
-    /// When the last edge was seen; before the first one, when counting began (the firmware says 0,
-    /// which klippy takes for some instant that may lie ahead).
+    /// When the last edge was seen. Before the first edge: when counting began. The firmware reports 0 there, and
+    /// klippy takes 0 for some time that may lie in the future.
     count_clock: Clock,
-    /// Whether what a worker does is for the present query.
+    /// Whether the worker's result is for the current query.
     counts: bool,
 }
 
 impl Counter {
-    /// Takes in the level at an instant.
+    /// Processes the level at a given time.
     fn look(&mut self, turn: &mut Turn, level: bool, at: Clock) {
         if level != (self.count % 2 == 1) {
             self.count = self.count.wrapping_add(1);
@@ -196,13 +194,13 @@ impl Counter {
         }
     }
 
-    /// Tells the count that was right at an instant.
+    /// Reports the count as it was at a given time.
     fn tell(&mut self, turn: &mut Turn, at: Clock) {
         let next_clock = at + self.poll_ticks;
         turn.send(State { oid: turn.oid(), next_clock, count: self.count, count_clock: self.count_clock });
     }
 
-    /// Takes in what the worker has seen of the edges.
+    /// Processes the edges that the worker has read.
     fn has_read(
         &mut self,
         turn: &mut Turn,
@@ -237,14 +235,14 @@ impl Object for Counter {
                 self.next_sample = at + self.sample_ticks.max(self.poll_ticks);
                 self.counts = true;
             }
-            // A worker that still reads misses this turn.
+            // A worker that is still reading misses this turn.
             if let Some(ready) = reading.here() {
                 ready.settle = Ticks(self.poll_ticks.0 / SETTLE_DIVISOR);
                 reading.send(turn, *worker)?;
             }
             return Ok(Next::At(self.next_sample.min(at + TAKE_TICKS)));
         }
-        // So does an expander that still looks.
+        // An expander that is still being read also misses it.
         if self.pin.is_looking() {
             self.pin.awaited(turn)?;
         } else {
@@ -256,7 +254,7 @@ impl Object for Counter {
         Ok(Next::At(at + self.poll_ticks))
     }
 
-    /// A worker has read the count, or looked at an expander's pin.
+    /// A worker has read the count, or the pin of an expander.
     fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         if let Some(counted) = &mut self.counted
             && let Some(Back { result, ended, .. }) = counted.reading.back(done)
@@ -267,7 +265,7 @@ impl Object for Counter {
         let Some(look) = self.pin.sampled(turn, done) else { return Ok(()) };
         let Look { level, ended, .. } = look?;
         if std::mem::take(&mut self.counts) {
-            // A pin that could not be looked at keeps its last level.
+            // A pin that could not be read keeps its last level.
             self.look(turn, level.unwrap_or(self.count % 2 == 1), ended);
         }
         Ok(())
@@ -340,7 +338,7 @@ mod tests {
 
     const SETTLE: Ticks = Ticks(100);
 
-    /// Lets a line see levels that each last for so many ticks, of which some edges are dropped.
+    /// Runs a line through `levels`, each with its length in ticks. The edges in `dropped` are lost.
     fn seen(levels: &[u64], dropped: std::ops::Range<usize>) -> Settling {
         let (mut settling, mut at, mut level) = (Settling::new(false), 1000, false);
         let mut lost = 0;
@@ -361,13 +359,13 @@ mod tests {
     }
 
     proptest! {
-        /// Pulses count exactly, also where some edges were dropped amid them.
+        /// Pulses count exactly, even if some edges among them were dropped.
         #[test]
         fn levels_that_last_all_count(
             levels in proptest::collection::vec(100u64..5000, 1..50), from in 0usize..60, count in 0usize..20,
         ) {
             let all = levels.len();
-            // The last edge is seen.
+            // The last edge is never dropped.
             let dropped = from.min(all - 1)..(from + count).min(all - 1);
             let settling = seen(&levels, dropped);
             prop_assert_eq!(settling.count, all as u32);
@@ -375,7 +373,7 @@ mod tests {
             prop_assert_eq!(settling.last, Some(Clock::from_ticks(last)));
         }
 
-        /// Of a line that mostly rests, nothing that is shorter counts, however often it comes.
+        /// Shorter pulses on a line that mostly rests never count, however often they come.
         #[test]
         fn glitches_count_never(glitches in proptest::collection::vec((1u64..100, 100u64..5000), 0..50)) {
             let levels: Vec<u64> = glitches.iter().flat_map(|(glitch, rest)| [*glitch, *rest]).collect();
@@ -383,7 +381,7 @@ mod tests {
             prop_assert_eq!((settling.count, settling.last), (0, None));
         }
 
-        /// An interrupt may find a pulse over: then both edges tell the same level.
+        /// A pulse may be over before the interrupt reads the line. Then both edges report the same level.
         #[test]
         fn pulses_that_were_over_count_never(at in proptest::collection::vec(1u64..5000, 0..50)) {
             let (mut settling, mut now) = (Settling::new(true), 1000);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Digital outputs: queued changes, software PWM, and `max_duration`, a limit to how long an output
-//! may stay at another than its shutdown value without news from the host.
+//! Digital outputs: queued changes, software PWM, and `max_duration`. `max_duration` limits how long an output may
+//! differ from its shutdown value without news from the host.
 
 #![forbid(unsafe_code)]
 
@@ -62,7 +62,7 @@ struct DigitalOut {
     off_ticks: Ticks,
     /// When the timer runs next, if it is running.
     wake: Clock,
-    /// When the present state ends: at the next change, or when `max_duration` runs out.
+    /// When the current state ends: at the next change, or when `max_duration` runs out.
     end: Option<Clock>,
 }
 
@@ -196,28 +196,28 @@ impl Object for DigitalOut {
     }
 }
 
-/// The lines that `set_digital_out` has set. They belong to no object of the host, and keep their
-/// levels even when the machine stops.
+/// The lines that `set_digital_out` has set. They belong to no object of the host. They keep their levels even when the
+/// MCU stops.
 #[derive(Default)]
 struct SetLines(Vec<(Pin, OutputLine)>);
 
 impl SetLines {
-    /// Drives a line, and keeps it claimed from then on.
+    /// Drives a line. The line stays claimed.
     ///
-    /// In the firmware this works at any time. Here it does for a line that is claimed already. A new
-    /// one is refused after `finalize_config`: to claim it, the core would have to open files and wait
-    /// for the guardian, and steps would wait with it. klippy sets its lines before that.
+    /// The firmware allows this at any time. Here it works at any time for a line that is already claimed. A new line
+    /// is refused after `finalize_config`. To claim it, the core would have to open files and wait for the guardian,
+    /// and steps would wait too. klippy sets its lines before that.
     ///
     /// # Errors
     ///
-    /// "Unable to open out GPIO chip line" for such a line, or the 257th; those of [`Mcu::output`](crate::mcu::Mcu::output);
-    /// "GPIO line write failed".
+    /// "Unable to open out GPIO chip line" for a line that is refused, or for the 257th line; the errors of
+    /// [`Mcu::output`](crate::mcu::Mcu::output); "GPIO line write failed".
     fn set(&mut self, turn: &mut Turn, pin: Pin, value: bool) -> Result<(), Shutdown> {
         let known = self.0.iter().position(|(held, _)| *held == pin);
         match known {
             Some(place) if turn.is_finalized() => self.0[place].1.write(turn, value),
             _ if turn.is_finalized() => Err(set_too_late(turn, reason::OUTPUT_LINE, "set_digital_out", pin)),
-            // Claimed anew, so that the guardian learns the new level.
+            // Claim the line again, so that the guardian learns the new level.
             Some(place) => {
                 self.0[place].1 = turn.output(pin, value, value)?;
                 Ok(())

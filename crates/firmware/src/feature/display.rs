@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the displays on bare lines have in common: a command's bytes are written by a worker, at the
-//! display's pace, and the commands behind it wait.
+//! Shared code of the displays on bare lines. A worker writes a command's bytes at the display's pace. The commands
+//! behind it wait.
 
 #![forbid(unsafe_code)]
 
@@ -14,33 +14,33 @@ use pinion_protocol::block::PAYLOAD_MAX;
 
 use super::pace::Pace;
 
-/// All displays share a worker: commands wait for each other anyway.
+/// All displays share a worker, because commands wait for each other anyway.
 const WORKER: &str = "display";
 
 /// A display on bare lines. It runs on the worker.
 pub(super) trait Panel: Send + 'static {
-    /// Writes bytes to the display; ends early when the pace does.
+    /// Writes bytes to the display. It ends early if the pace is stopped.
     fn write(&mut self, register: Register, bytes: &[u8]) -> Result<(), Shutdown>;
 
-    /// Drives the lines to where they belong in a stopped machine.
+    /// Sets the lines to their levels in a stopped MCU.
     fn idle(&mut self) -> Result<(), Shutdown>;
 }
 
-/// What bytes are for.
+/// The display's register for the bytes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Register {
     Commands,
     Data,
 }
 
-/// What is to be done with a display.
+/// A task for a display.
 #[derive(Clone, Copy)]
 pub(super) enum Update {
     Write { register: Register, bytes: [u8; PAYLOAD_MAX], len: usize },
     Idle,
 }
 
-/// A panel, and the pace of its errands.
+/// A panel and the pace of its errands.
 struct Paced<P> {
     panel: P,
     pace: Pace,
@@ -68,14 +68,14 @@ pub(super) struct Display<P: Panel> {
 }
 
 impl<P: Panel> Display<P> {
-    /// A display whose lines stand at their idle levels.
+    /// Makes a display. Its lines are already at their idle levels.
     pub(super) fn new(mcu: &mut Mcu, kind: &'static str, pace: Pace, panel: P) -> Result<Display<P>, Shutdown> {
         let worker = mcu.worker(WORKER)?;
         let panel = Remote::new(worker, Paced { panel, pace: pace.clone() }, Update::Idle);
         Ok(Display { kind, pace, panel })
     }
 
-    /// Writes bytes; the commands behind this one wait until they are with the display.
+    /// Writes bytes. The commands behind this one wait until the display has them.
     pub(super) fn write(&mut self, turn: &mut Turn, register: Register, data: &[u8]) -> Result<(), Shutdown> {
         let mut bytes = [0; PAYLOAD_MAX];
         let len = data.len().min(PAYLOAD_MAX);
@@ -93,7 +93,7 @@ impl<P: Panel> Object for Display<P> {
         self.panel.settle(turn, self.kind, done)
     }
 
-    /// What is being written is broken off.
+    /// Aborts a write that is under way.
     fn make_safe(&mut self, turn: &mut Turn) -> Result<Safe, Shutdown> {
         self.pace.stop();
         self.panel.set(turn, Update::Idle)?;
@@ -101,14 +101,14 @@ impl<P: Panel> Object for Display<P> {
     }
 }
 
-/// An output of a display, which is called only when its level changes: a call costs a microsecond.
+/// An output of a display. It is written only if its level changes, because a write costs a microsecond.
 pub(super) struct Wire {
     line: Arc<dyn Line>,
     level: bool,
 }
 
 impl Wire {
-    /// Claims a line, low.
+    /// Claims a line at low level.
     pub(super) fn claim(mcu: &mut Mcu, pin: Pin) -> Result<Wire, Shutdown> {
         Ok(Wire { line: mcu.shared_output(pin, false)?, level: false })
     }
@@ -121,7 +121,7 @@ impl Wire {
         Ok(())
     }
 
-    /// Drives it low, whatever it was.
+    /// Drives the line low, whatever level it had.
     pub(super) fn idle(&mut self) -> Result<(), Shutdown> {
         self.level = false;
         self.line.write(false)
@@ -131,7 +131,7 @@ impl Wire {
 /// The time that a display needs after each byte.
 pub(super) struct Busy {
     pub(super) pace: Pace,
-    /// When the last byte was with the display.
+    /// When the display got the last byte.
     since: Option<Clock>,
 }
 
@@ -140,18 +140,18 @@ impl Busy {
         Busy { pace, since: None }
     }
 
-    /// Waits until so long after the last byte. False if the errand is to end.
+    /// Waits until `ticks` after the last byte. False: the errand must end.
     pub(super) fn over(&self, ticks: Ticks) -> bool {
         self.pace.until(self.since.map_or_else(|| self.pace.now(), |since| since + ticks))
     }
 
-    /// A byte is with the display now.
+    /// Notes that the display has got a byte now.
     pub(super) fn begin(&mut self) {
         self.since = Some(self.pace.now());
     }
 }
 
-/// Waits for the nanoseconds that a display wants between two edges.
+/// Waits for the nanoseconds that a display needs between two edges.
 pub(super) fn hold(pace: &Pace, ticks: Ticks) {
     let at = pace.now() + ticks;
     pace.until(at);

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! DS18B20 thermometers, read by the kernel's one-wire driver.
+//! DS18B20 thermometers, read through the kernel's 1-Wire driver.
 //!
-//! A reading takes 750 ms on a worker. Sensors that live on the data wire alone take turns, as the kernel
-//! keeps the bus while one of them measures: three take 2.25 s. So a `config_reset` does not wait for it. It is told as soon as it is there; the firmware tells it when
-//! the next one is due.
+//! A reading takes 750 ms on a worker. Sensors that are powered by the data wire take turns, because the kernel keeps
+//! the bus while one of them measures: three take 2.25 s. So a `config_reset` does not wait for a reading. A reading is
+//! reported as soon as it arrives. The firmware reports it when the next one is due.
 
 #![forbid(unsafe_code)]
 
@@ -29,20 +29,20 @@ shutdowns! {
     INVALID_SERIAL = "Invalid DS18B20 serial id, must not contain '/'";
     /// More than `max_error_count` readings in a row failed.
     READ_FAILED = "Error reading DS18B20 sensor";
-    /// A reading is not over after five seconds.
+    /// A reading takes longer than five seconds.
     TOO_SLOW = "DS18B20 sensor didn't respond in time";
     /// A temperature outside its range.
     OUT_OF_RANGE = "DS18B20 out of range";
 }
 
 response! {
-    /// A temperature in thousandths of a degree, measured `rest_ticks` before `next_clock`; or the last
-    /// one, and how many readings failed since.
+    /// A temperature in thousandths of a degree, measured `rest_ticks` before `next_clock`. After a failure: the last
+    /// temperature, and how many readings have failed since.
     "ds18b20_result oid=%c next_clock=%u value=%i fault=%u"
     pub(super) struct Reading { oid: Oid, next_clock: Clock, value: i32, fault: u32 }
 }
 
-/// How long a reading may take (`W1_READ_TIMEOUT_SEC` of the firmware).
+/// Longest time of a reading (`W1_READ_TIMEOUT_SEC` of the firmware).
 const READ_LIMIT: i64 = 5 * CLOCK_FREQ as i64;
 
 const TIMER: Timer = Timer::sampling(0);
@@ -62,17 +62,17 @@ impl Errand for Look {
 struct Ds18b20 {
     worker: WorkerId,
     look: Slot<Look>,
-    /// When the reading under way was asked for.
+    /// When the reading under way was requested.
     asked: Clock,
-    /// The turn after that.
+    /// When the next reading is due.
     next_clock: Clock,
     rest_ticks: Ticks,
     min_value: i32,
     max_value: i32,
     max_error_count: u8,
-    /// Whether any temperature is right.
+    /// Whether every temperature is accepted.
     ignores_limits: bool,
-    /// Readings that failed since the last one that did not.
+    /// How many readings failed since the last success.
     error_count: u8,
     value: i32,
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Endstops: a pin is sampled until it has a level several times in a row, then a trsync is triggered.
+//! Endstops: a pin is sampled until it has a level several times in a row. Then a trsync is triggered.
 
 #![forbid(unsafe_code)]
 
@@ -22,7 +22,7 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 response! {
-    /// The endstop's level, and whether the machine still samples it.
+    /// The endstop's level, and whether the MCU still samples it.
     "endstop_state oid=%c homing=%c next_clock=%u pin_value=%c"
     pub(super) struct State { oid: Oid, homing: bool, next_clock: Clock, pin_value: bool }
 }
@@ -31,15 +31,15 @@ const TIMER: Timer = Timer::exact(0);
 
 struct Endstop {
     pin: InputLine,
-    /// The last `endstop_home`. It stays after the trigger, so that `endstop_query_state` can still
-    /// tell when that came.
+    /// The last `endstop_home`. It stays after the trigger, so that `endstop_query_state` can still report the
+    /// trigger's time.
     homing: Option<Homing>,
-    /// When sampling goes on if the samples after the last match do not confirm it.
+    /// When sampling continues if the samples after the last match do not confirm it.
     next_wake: Clock,
-    /// When the sample was due that the chip's worker is taking; none if it takes none. The timer then runs
-    /// when that takes too long.
+    /// When the sample was due that the chip's worker is taking. `None`: the worker takes none. The timer then runs if
+    /// the sample takes too long.
     due: Option<Clock>,
-    /// A query waits for the worker's look at the line, too, and further commands wait with it.
+    /// A query also waits for the worker to read the line. Further commands wait with it.
     asked: Option<Hold>,
 }
 
@@ -51,12 +51,12 @@ struct Homing {
     pin_value: bool,
     trsync: Oid,
     trigger_reason: u8,
-    /// How many matching samples are still wanted; fewer than `sample_count` while confirming.
+    /// How many matching samples are still needed. While confirming, there are fewer than `sample_count`.
     wanted: u8,
 }
 
 impl Endstop {
-    /// Takes the sample that is due at `at`, or has the chip's worker take it.
+    /// Takes the sample that is due at `at`, or makes the chip's worker take it.
     fn sample(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
         match self.pin.read(turn)? {
             Some(level) => self.judge(turn, level, at, at),
@@ -67,7 +67,7 @@ impl Endstop {
         }
     }
 
-    /// Decides how to go on by a sample that was due at `at` and is of the instant `seen`.
+    /// Decides what comes next. The sample was due at `at` and taken at `seen`.
     fn judge(&mut self, turn: &mut Turn, level: bool, at: Clock, seen: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(Next::Done) };
         let confirming = homing.wanted < homing.sample_count;
@@ -95,7 +95,7 @@ impl Endstop {
         Ok(())
     }
 
-    /// Answers the query that waits, with nothing in a stopped machine whose chip fails.
+    /// Answers the waiting query. There is no answer if the MCU is stopped and the chip fails.
     fn answer(&mut self, turn: &mut Turn, level: Option<bool>) {
         let Some(hold) = self.asked.take() else { return };
         if let Some(level) = level {
@@ -122,20 +122,20 @@ impl Object for Endstop {
         self.sample(turn, at)
     }
 
-    /// The chip's worker has looked.
+    /// The chip's worker has read the line.
     fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         let is_homing = self.due.is_some();
         let look = if is_homing { self.pin.seen(turn, done) } else { self.pin.sampled(turn, done) };
         let Some(look) = look else { return Ok(()) };
         let Look { level, began, ended } = look?;
         match level {
-            // A query is answered with a level that was seen.
+            // A query needs a level, so the line is read again.
             None if self.asked.is_some() && !turn.is_shutdown() => self.pin.read(turn).map(drop)?,
             _ => self.answer(turn, level),
         }
         let (Some(at), Some(level)) = (self.due.take(), level) else { return Ok(()) };
         turn.cancel(TIMER);
-        // The worker may have looked for a query, before the sample was due: then it looks again.
+        // The worker may have read the line for a query, before the sample was due. Then it reads again.
         let next = if began < at { self.sample(turn, at)? } else { self.judge(turn, level, at, ended)? };
         if let Next::At(at) = next {
             let now = turn.now();

@@ -1,12 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Accelerometers that measure at their own pace into a FIFO, which is read every so often: what
-//! ADXL345, LIS2DW, MPU9250, ICM20948 and BMI160 have in common. What differs is a [`FifoChip`] each.
+//! Accelerometers that measure at their own pace into a FIFO. This is the shared code of ADXL345, LIS2DW, MPU9250,
+//! ICM20948 and BMI160. Each [`FifoChip`] has the differences.
 //!
-//! A reading takes what there is, at most one message's samples, so that others on the bus have
-//! their turn; if the chip has more, the next reading follows at once, and otherwise `rest_ticks`
-//! later. Hosts up to v0.12 have the sensor itself switched on and off (`query_at`, `stop`). As one worker has
-//! all conversations of a bus in order, and gives them back in order, what the chip says of its FIFO in a status
-//! fits the samples that the machine has by then.
+//! A reading takes the samples that are there, at most those of one message. So other devices on the bus get their
+//! turn. If the chip has more, the next reading follows at once, otherwise after `rest_ticks`. For hosts up to v0.12
+//! the MCU switches the sensor on and off (`query_at`, `stop`). One worker runs all conversations of a bus in order,
+//! and returns them in order. So the FIFO's fill level in a status matches the samples that the MCU has by then.
 
 #![forbid(unsafe_code)]
 
@@ -31,13 +30,13 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A `bus_oid_type` that the enumeration does not have.
+    /// A `bus_oid_type` outside the enumeration.
     INVALID_BUS_TYPE = "bus_type invalid";
 }
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// Which kind of bus a chip is on (`bus_oid_type`).
+/// The kind of bus that a chip is on (`bus_oid_type`).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum BusType {
     Spi,
@@ -58,9 +57,9 @@ impl BusType {
         }
     }
 
-    /// Reads registers of a chip that takes bit 7 of a register's number on SPI for a read. What else a
-    /// chip wants in the number is in `register` already. Up to [`DATA_MAX`] bytes. Reading must not change the
-    /// registers: I2C may read twice.
+    /// Reads up to [`DATA_MAX`] bytes of registers. On SPI the chip must take bit 7 of a register's number for a read.
+    /// `register` already has all other bits that the chip wants. Reading must not change the registers, because I2C
+    /// may read twice.
     pub(super) fn read_register(self, chip: &mut dyn BusDevice, register: u8, into: &mut [u8]) -> Result<(), BusError> {
         match self {
             BusType::Spi => exchange_register(chip, register, into),
@@ -68,7 +67,7 @@ impl BusType {
         }
     }
 
-    /// The same where reading changes them: a FIFO, or flags.
+    /// The same for registers that reading changes: a FIFO, or flags.
     pub(super) fn read_once(self, chip: &mut dyn BusDevice, register: u8, into: &mut [u8]) -> Result<(), BusError> {
         match self {
             BusType::Spi => exchange_register(chip, register, into),
@@ -76,7 +75,7 @@ impl BusType {
         }
     }
 
-    /// The stop that a conversation that failed is for a sensor.
+    /// The shutdown for a sensor's failed conversation.
     pub(super) fn failed(self, mcu: &Mcu, error: BusError) -> Shutdown {
         match self {
             BusType::Spi => spi_shutdown(error),
@@ -94,48 +93,48 @@ fn exchange_register(chip: &mut dyn BusDevice, register: u8, into: &mut [u8]) ->
     Ok(())
 }
 
-/// What a chip says of its FIFO.
+/// A chip's answer about its FIFO.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Fill {
-    /// Bytes that are in there.
+    /// Bytes in the FIFO.
     pub(super) bytes: u16,
     /// Whether samples may have been dropped.
     pub(super) overflowed: bool,
 }
 
-/// What one kind of chip has of its own. Its methods run on a worker.
+/// The differences between the chips. The methods run on a worker.
 pub(super) trait FifoChip: Copy + Send + 'static {
-    /// Its name.
+    /// The chip's name.
     const NAME: &'static str;
-    /// Bytes of a sample, as the host gets them.
+    /// Bytes of a sample in the host's format.
     const SAMPLE_BYTES: usize;
-    /// Whether there is a register of its own that tells of overflows.
+    /// Whether a separate register reports overflows.
     const HAS_OVERFLOW_REGISTER: bool = false;
 
-    /// Its messages with hosts up to v0.12, if those know it.
+    /// The chip's own messages for hosts up to v0.12, if they know the chip.
     const OWN_WORDS: Option<&'static Words> = None;
-    /// Whether a sensor that was switched off gives away what its FIFO has.
+    /// Whether a sensor still gives out the samples in its FIFO after it was switched off.
     const KEEPS_SAMPLES: bool = false;
 
-    /// Switches the sensor on, for a host that leaves this to the machine.
+    /// Switches the sensor on, for a host that leaves this to the MCU.
     fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
         let _ = chip;
         Ok(())
     }
 
-    /// Switches the sensor off; by one transfer, as the host is told when it was.
+    /// Switches the sensor off, in a single transfer: the host gets the time of it.
     fn switch_off(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
         let _ = chip;
         Ok(())
     }
 
-    /// The bus that it is on.
+    /// The bus that the chip is on.
     fn bus_type(self) -> BusType;
 
     /// Reads samples.
     fn read(self, chip: &mut dyn BusDevice, reading: &mut Reading) -> Result<(), BusError>;
 
-    /// Asks how full the FIFO is; none if the answer makes no sense.
+    /// Asks how full the FIFO is. `None`: the answer makes no sense.
     fn fill(self, chip: &mut dyn BusDevice) -> Result<Option<Fill>, BusError>;
 
     /// Asks whether the FIFO has overflowed since the last time.
@@ -145,22 +144,21 @@ pub(super) trait FifoChip: Copy + Send + 'static {
     }
 }
 
-/// What a reading brings.
+/// The result of a reading.
 #[derive(Clone, Copy)]
 pub(super) struct Reading {
     samples: [u8; DATA_MAX],
     len: usize,
-    /// Bytes that there is room for.
+    /// Highest number of bytes of samples.
     room: usize,
     overflows: u16,
-    /// Bytes that the chip had left when it last told of its FIFO.
+    /// Bytes left in the chip when it last reported its fill level.
     pending: u16,
-    /// Whether there is more to be read at once.
+    /// Whether the next reading follows at once.
     more: bool,
 }
 
-/// Samples that are read at once from a FIFO that is read in blocks: so many bytes of 6 fill a
-/// message.
+/// Bytes that are read at once from a FIFO that is read in blocks. With samples of 6 bytes, a block fills a message.
 pub(super) const BLOCK_BYTES: usize = 48;
 
 impl Reading {
@@ -168,13 +166,13 @@ impl Reading {
         Reading { samples: [0; DATA_MAX], len: 0, room: DATA_MAX, overflows: 0, pending: 0, more: false }
     }
 
-    /// Whether another sample of so many bytes finds room.
+    /// Whether there is room for another sample with this many bytes.
     pub(super) fn has_room(&self, bytes: usize) -> bool {
         self.len + bytes <= self.room
     }
 
-    /// Appends a sample; `filled` is how many samples the FIFO held with it, `limit` from how many on
-    /// it may have dropped some.
+    /// Appends a sample. `filled` is how many samples the FIFO held, including this one. From `limit` on it may have
+    /// dropped some.
     pub(super) fn push(&mut self, sample: &[u8], filled: u8, limit: u8) {
         self.samples[self.len..self.len + sample.len()].copy_from_slice(sample);
         self.len += sample.len();
@@ -182,13 +180,13 @@ impl Reading {
         self.more = filled > 1;
     }
 
-    /// Whether there is more to be read.
+    /// Whether there is more to read.
     pub(super) fn has_more(&self) -> bool {
         self.more
     }
 
-    /// Reads a block, if the FIFO has one. `fill` asks the chip how much it has; that is done only if
-    /// nothing is known of a whole block.
+    /// Reads a block, if the FIFO has one. `fill` asks the chip how much it has. It is called only if no whole block is
+    /// known to be there.
     pub(super) fn block(
         &mut self,
         chip: &mut dyn BusDevice,
@@ -237,8 +235,8 @@ impl<C: FifoChip> Talk for LookAtFill<C> {
     }
 }
 
-/// Asks for overflows, where that is a register of its own. A conversation of its own too, as the
-/// time of a status is that of the question for the fill alone.
+/// Asks for overflows, if a separate register reports them. This is a separate conversation: the time of a status is
+/// the time of the question for the fill level alone.
 struct LookForOverflow<C>(C);
 
 impl<C: FifoChip> Talk for LookForOverflow<C> {
@@ -256,7 +254,7 @@ struct Switch<C> {
 }
 
 impl<C: FifoChip> Talk for Switch<C> {
-    /// Whether it is on now.
+    /// Whether the sensor is on now.
     type Answer = bool;
 
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<bool, BusError> {
@@ -265,21 +263,22 @@ impl<C: FifoChip> Talk for Switch<C> {
     }
 }
 
-/// What a measurement of a host up to v0.12 is at.
+/// The state of a measurement for a host up to v0.12.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Phase {
-    /// None.
+    /// No measurement.
     Idle,
-    /// The sensor is to be switched on by the timer.
+    /// The timer will switch the sensor on.
     Begins,
-    /// It is being switched on.
+    /// The sensor is being switched on.
     SwitchesOn,
-    /// The sensor is being switched off, or was at these instants: the host is told so with the number of
-    /// samples, once the FIFO is read, which may be done so many times more.
+    /// The sensor is being switched off (`None`), or was switched off at these times. The host gets these times and the
+    /// number of samples after the FIFO was read. The FIFO may be read this many more times.
     Ends(Option<(Clock, Clock)>, u8),
 }
 
-/// How often a FIFO of 32 samples is read after the end, so that one that never gets empty ends, too.
+/// Highest number of reads of a FIFO of 32 samples after the end. So the end also comes if the FIFO never becomes
+/// empty.
 const LAST_READS: u8 = 33;
 /// A sensor.
 pub(super) struct FifoSensor<C: FifoChip> {
@@ -290,17 +289,18 @@ pub(super) struct FifoSensor<C: FifoChip> {
     phase: Phase,
     switch: Slot<Conversation<Switch<C>>>,
     read: Slot<Conversation<Read<C>>>,
-    /// Whether a reading is due as soon as the one that is under way is over.
+    /// Whether a reading is due as soon as the one under way is over.
     waiting: bool,
     fill: Slot<Conversation<LookAtFill<C>>>,
     overflow: Slot<Conversation<LookForOverflow<C>>>,
 }
 
 impl<C: FifoChip> FifoSensor<C> {
-    /// What is told of a FIFO that makes no sense: more samples than any has, so the host asks again.
+    /// The fill level that is reported if the FIFO's own makes no sense. No FIFO has this many samples, so the host
+    /// asks again.
     const NONSENSE_BYTES: u32 = 0x7f * C::SAMPLE_BYTES as u32;
 
-    /// Has samples read, as soon as an earlier reading is over.
+    /// Starts a reading, or makes one follow the reading under way.
     fn read(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         let Some(Conversation { talk: Read { reading, .. }, .. }) = self.read.here() else {
             self.waiting = true;
@@ -316,7 +316,7 @@ impl<C: FifoChip> FifoSensor<C> {
             self.bulk.add(turn, sample);
         }
         match self.phase {
-            // Nothing further is read before it is off.
+            // Nothing more is read before the sensor is off.
             Phase::Ends(None, _) => Ok(()),
             Phase::Ends(Some(_), _) => self.ask_status(turn),
             _ if reading.more => self.read(turn),
@@ -335,7 +335,7 @@ impl<C: FifoChip> FifoSensor<C> {
         self.phase = Phase::Idle;
     }
 
-    /// The chip has so many bytes. A reading that is under way knows better.
+    /// Notes how many bytes the chip has. A reading under way knows better and is left alone.
     fn has_pending(&mut self, bytes: u16) {
         if let Some(read) = self.read.here() {
             read.talk.reading.pending = bytes;
@@ -348,16 +348,16 @@ impl<C: FifoChip> FifoSensor<C> {
     }
 
     fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
-        // One after the other: what is wanted by then follows.
+        // A switch is under way. `switched` then does what is wanted by that time.
         let Some(switch) = self.switch.here() else { return Ok(()) };
         switch.talk.on = on;
         self.switch.converse(turn, self.device)
     }
 
-    /// The sensor is on, or off.
+    /// The sensor is now on, or off.
     fn switched(&mut self, turn: &mut Turn, on: bool, span: (Clock, Clock)) -> Result<(), Shutdown> {
         match self.phase {
-            // That was for an earlier query.
+            // It was switched for an earlier query.
             Phase::Idle | Phase::Begins => Ok(()),
             Phase::SwitchesOn if !on => self.switch(turn, true),
             Phase::SwitchesOn => {
@@ -373,8 +373,8 @@ impl<C: FifoChip> FifoSensor<C> {
         }
     }
 
-    /// Measures, for a host up to v0.12: from `clock` on, the sensor is switched on and off by the MCU, and its end is
-    /// answered by the number of samples. `rest_ticks` of 0 ends it.
+    /// Measures from `clock` on, for a host up to v0.12. The MCU switches the sensor on and off. The number of samples
+    /// answers the end. `rest_ticks` of 0 ends the measurement.
     pub(super) fn query_at(&mut self, turn: &mut Turn, clock: WireClock, rest_ticks: Ticks) -> Result<(), Shutdown> {
         if rest_ticks == Ticks(0) {
             return self.stop(turn);
@@ -388,8 +388,8 @@ impl<C: FifoChip> FifoSensor<C> {
         turn.schedule(TIMER, at)
     }
 
-    /// Switches the sensor off, sends what there is, and tells the host how much that was. What is being
-    /// read counts.
+    /// Switches the sensor off, sends the remaining samples, and reports their number to the host. A reading under way
+    /// counts.
     fn stop(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         turn.cancel(TIMER);
         self.waiting = false;
@@ -397,7 +397,7 @@ impl<C: FifoChip> FifoSensor<C> {
         self.switch(turn, false)
     }
 
-    /// The chip has said how full its FIFO is; `None` makes no sense.
+    /// Processes the chip's answer about its FIFO. `None`: the answer makes no sense.
     fn has_filled(&mut self, turn: &mut Turn, fill: Option<Fill>, span: (Clock, Clock)) -> Result<(), Shutdown> {
         if let Phase::Ends(Some(off), reads) = self.phase {
             return self.ended(turn, off, fill, reads);
@@ -411,7 +411,7 @@ impl<C: FifoChip> FifoSensor<C> {
             None if C::OWN_WORDS.is_some() && !turn.speaks::<BulkData<'_>>() => {
                 self.bulk.send_status(turn, span, Self::NONSENSE_BYTES);
             }
-            // Without an answer klippy asks again, since v0.13.
+            // Since v0.13, klippy asks again if it gets no answer.
             None => {}
         }
         Ok(())
@@ -420,7 +420,7 @@ impl<C: FifoChip> FifoSensor<C> {
     /// The same after the sensor was switched off.
     fn ended(&mut self, turn: &mut Turn, off: (Clock, Clock), fill: Option<Fill>, reads: u8) -> Result<(), Shutdown> {
         let bytes = fill.map(|fill| fill.bytes);
-        // What makes no sense is asked again, as samples may be left.
+        // After an answer that makes no sense the chip is asked again, because samples may be left.
         if C::KEEPS_SAMPLES && bytes != Some(0) && reads > 0 {
             self.phase = Phase::Ends(Some(off), reads - 1);
             return if bytes.is_none() { self.ask_status(turn) } else { self.read(turn) };
@@ -431,7 +431,7 @@ impl<C: FifoChip> FifoSensor<C> {
         Ok(())
     }
 
-    /// Measures, with `rest_ticks` between two looks into the FIFO; 0 ends it.
+    /// Measures, with `rest_ticks` between two looks into the FIFO. `rest_ticks` of 0 ends the measurement.
     pub(super) fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) -> Result<(), Shutdown> {
         turn.cancel(TIMER);
         self.end();
@@ -460,7 +460,7 @@ impl<C: FifoChip> FifoSensor<C> {
     }
 }
 
-/// Commands wait for each other, so this is for a machine that was stopped amid a status.
+/// Commands wait for each other, so this happens only if the MCU was stopped during a status.
 #[cold]
 fn status_amid_status() -> Shutdown {
     Shutdown::by_host(reason::WORKER_OVERFLOW, "a status was asked for amid another one")
@@ -521,7 +521,7 @@ impl<C: FifoChip> Object for FifoSensor<C> {
     }
 }
 
-/// Puts a sensor under `oid` that is the bus device `device`.
+/// Makes a sensor with this `oid`, on the bus device `device`.
 pub(super) fn configure<C: FifoChip>(mcu: &mut Mcu, oid: Oid, device: Oid, chip: C) -> Result<(), Shutdown> {
     match chip.bus_type() {
         BusType::Spi => mcu.require::<Spi>(device)?,

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Text displays with an HD44780, on four data lines.
 //!
-//! Times are those of Hitachi's data sheet at 5 V (HD44780U, "Bus timing characteristics"), as the
-//! firmware has them; what the display needs after a byte the host says.
+//! The times are from Hitachi's data sheet at 5 V (HD44780U, "Bus timing characteristics"), as in the firmware. The
+//! host says how long the display needs after a byte.
 
 #![forbid(unsafe_code)]
 
@@ -17,14 +17,14 @@ use super::pace::Pace;
 pub(super) const FEATURE: Feature =
     Feature { name: "hd44780", commands: &[CONFIG_HD44780, HD44780_SEND_CMDS, HD44780_SEND_DATA], ..Feature::EMPTY };
 
-/// E is high for 230 ns at least, rounded up to ticks of 20 ns.
+/// Shortest time that E is high: 230 ns, rounded up to ticks of 20 ns.
 const PULSE: Ticks = Ticks(12);
-/// And low for the rest of a cycle of 500 ns.
+/// How long E is then low: the rest of a cycle of 500 ns.
 const PAUSE: Ticks = Ticks(14);
 
 struct Hd44780 {
     busy: Busy,
-    /// After each byte.
+    /// How long the display needs after each byte.
     delay: Ticks,
     rs: Wire,
     e: Wire,
@@ -45,7 +45,7 @@ impl Hd44780 {
         })
     }
 
-    /// The display takes the lower four bits in as E falls.
+    /// Writes the lower four bits. The display reads them when E falls.
     fn nibble(&mut self, bits: u8) -> Result<(), Shutdown> {
         for (place, wire) in self.data.iter_mut().enumerate() {
             wire.set(bits >> place & 1 != 0)?;

@@ -1,12 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The ADCs HX711 and HX717 for load cells, on two lines (Avia Semiconductor's data sheets).
 //!
-//! A sample is shifted out by 24 pulses on the chip's clock; one to four more choose gain and channel of
-//! the next. A clock that stays high for over 60 us switches the chip off, and it begins anew as the
-//! clock falls. A worker drives the clock, and two system calls make a pulse, so on a slow or busy
-//! machine that may happen: then the bits that follow are all ones, and no check of the protocol would
-//! notice. So the worker measures every pulse, and a sample with one that may have been too long is
-//! sent as the error "read too long", upon which klippy restarts the sensor.
+//! 24 pulses on the chip's clock shift out a sample. One to four more pulses choose gain and channel of the next
+//! sample. A clock that stays high for over 60 us switches the chip off. The chip starts again when the clock falls. A
+//! worker drives the clock, and two system calls make a pulse. So this may happen on a slow or busy computer. The bits
+//! that follow are then all ones, and no check of the protocol would notice. So the worker measures every pulse. If one
+//! may have been too long, its sample is sent as the error "read too long". klippy then restarts the sensor.
 
 #![forbid(unsafe_code)]
 
@@ -39,23 +38,23 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// More or less than one to four pulses for gain and channel.
+    /// The number of pulses for gain and channel is not one to four.
     GAIN_RANGE = "HX71x gain/channel out of range 1-4";
 }
 
-/// What klippy knows errors by: pulses and bits do not fit, and a reading that took too long.
+/// klippy recognizes errors by these values: pulses and bits do not match, or a reading took too long.
 const ERROR_DESYNC: i32 = i32::MIN;
 const ERROR_READ_TOO_LONG: i32 = 1 << 30;
 
 const SAMPLE_BITS: u8 = 24;
-/// At least so long the clock is high, and low (T3 and T4 of the data sheet).
+/// Shortest time that the clock is high, and low (T3 and T4 of the data sheet).
 const PULSE: Duration = Duration::from_nanos(200);
-/// So long the clock may be high before the chip switches itself off.
+/// Longest time that the clock may be high before the chip switches itself off.
 const POWER_DOWN: Ticks = Ticks::from_us(60);
-/// The worker of these chips.
+/// All of these chips share this worker.
 const WORKER: &str = "hx71x";
 
-/// What came in one reading: the sample's bits and those of the further pulses, the last one lowest.
+/// Decodes a reading: the sample's bits, then the bits of the extra pulses, the last one lowest.
 fn decode(raw: u32, gain_channel: u8) -> Result<i32, i32> {
     let extra = (1 << gain_channel) - 1;
     // The data line is high after the sample.
@@ -65,24 +64,24 @@ fn decode(raw: u32, gain_channel: u8) -> Result<i32, i32> {
     Ok(((raw >> gain_channel) << 8) as i32 >> 8)
 }
 
-/// Shifts a sample out.
+/// Shifts out a sample.
 struct Shift {
     sclk: Arc<dyn Line>,
     dout: Arc<dyn Line>,
-    /// Of the sample, and for gain and channel.
+    /// Pulses of the sample, and for gain and channel.
     pulses: u8,
     time: Arc<dyn TimeSource>,
-    /// What the log calls the clock line.
+    /// The clock line's name in the log.
     name: String,
-    /// Whether the log was told of a clock that was high for too long.
+    /// Whether the log already has a line about a clock that was high for too long.
     told: bool,
 }
 
-/// What was shifted out.
+/// The bits that were shifted out.
 #[derive(Clone, Copy)]
 struct Shifted {
     raw: u32,
-    /// Whether the chip may have switched itself off amid the pulses.
+    /// Whether the chip may have switched itself off during the pulses.
     too_long: bool,
 }
 
@@ -111,7 +110,7 @@ impl Errand for Shift {
     }
 }
 
-/// For the log: the clock was high for too long, by this many ticks in all.
+/// For the log: the clock was high for too long, up to this many ticks.
 fn too_slow(name: &str, ticks: i64) -> String {
     let us = ticks / i64::from(Ticks::from_us(1).0);
     format!(
@@ -126,7 +125,7 @@ fn wait() {
     }
 }
 
-/// The clock line while no sample is shifted out: high switches the chip off.
+/// The clock line while no sample is shifted out. High switches the chip off.
 struct PowerDown(Arc<dyn Line>);
 
 impl Settable for PowerDown {
@@ -141,7 +140,7 @@ struct Hx71x {
     worker: WorkerId,
     gain_channel: u8,
     power_down: Remote<PowerDown>,
-    /// Sent instead of samples until measurements begin anew.
+    /// Sent instead of samples until new measurements begin.
     last_error: Option<i32>,
 }
 
@@ -189,7 +188,7 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
         ));
     }
     let dout = mcu.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
-    // Off, until measurements begin and when the program dies.
+    // High is off. The chip is off until measurements begin, and when the program dies.
     let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
     let worker = mcu.worker(WORKER)?;
     let shift = Shift {

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! I2C devices.
 //!
-//! `i2c_transfer` answers with the status of the bus, and klippy decides what becomes of it. The older
-//! `i2c_read`, `i2c_write` and `i2c_modify_bits` have no status: what fails there stops the machine. A
-//! transfer is over, and answered, before the next command runs: klippy configures chips by one transfer
-//! after the other. A plain read is tried again ([`BusDevice::read_register`]); what writes is not.
+//! `i2c_transfer` answers with the status of the bus, and klippy decides what to do. The older `i2c_read`, `i2c_write`
+//! and `i2c_modify_bits` have no status: a failure stops the MCU. A transfer is finished and answered before the next
+//! command runs, because klippy configures chips with one transfer after the other. A plain read is retried
+//! ([`BusDevice::read_register`]). A transfer that writes is not.
 
 #![forbid(unsafe_code)]
 
@@ -46,7 +46,7 @@ shutdowns! {
     I2C_NACK = "I2C NACK";
     /// A sensor did not acknowledge its address.
     I2C_START_NACK = "I2C START NACK";
-    /// A sensor did not acknowledge its address when it was to be read from.
+    /// A sensor did not acknowledge its address for a read.
     I2C_START_READ_NACK = "I2C START READ NACK";
     /// A sensor's bus was not free, or the clock was held, for too long.
     I2C_TIMEOUT = "I2C Timeout";
@@ -54,25 +54,25 @@ shutdowns! {
     I2C_WRITE_FAILED = "Unable write i2c device";
     /// Up to v0.12: reading from a device or a sensor failed.
     I2C_READ_FAILED = "Unable to read i2c device";
-    /// v0.12: a device on lines did not acknowledge.
+    /// v0.12: a device on a software bus did not acknowledge.
     SOFT_I2C_NACK = "soft_i2c NACK";
-    /// `i2c_modify_bits` with bits to clear that have none to set beside them.
+    /// `i2c_modify_bits` with an odd number of bytes. Each byte of bits to clear needs one of bits to set.
     ODD_BITS = "i2c_modify_bits: Odd number of bits!";
 }
 
 response! {
-    /// What a device sent.
+    /// The bytes that a device sent.
     "i2c_read_response oid=%c response=%*s" => until(V0_13).and(Kalico);
     pub(super) struct ReadResponse<'a> { oid: Oid, response: &'a [u8] }
 }
 
 response! {
-    /// How the bus answered, and what a device sent.
+    /// The status of the bus, and the bytes that a device sent.
     "i2c_response oid=%c i2c_bus_status=%c response=%*s" => since(Master);
     pub(super) struct TransferResponse<'a> { oid: Oid, i2c_bus_status: u8, response: &'a [u8] }
 }
 
-/// Bytes that fit an answer beside its id and oid of two bytes each, status and length.
+/// Highest number of bytes in a response. Its id and oid take two bytes each, its status and length one each.
 const RESPONSE_MAX: usize = PAYLOAD_MAX - 6;
 
 const SUCCESS: u8 = 0;
@@ -93,23 +93,23 @@ fn statuses() -> Vec<Range> {
     names.iter().zip(SUCCESS.into()..).map(|(name, first)| Range { name: (*name).into(), first, count: 1 }).collect()
 }
 
-/// The stop of a machine whose sensor can not be talked to (the firmware's `i2c_shutdown_on_err`).
+/// The shutdown for a sensor that cannot be reached (the firmware's `i2c_shutdown_on_err`).
 pub(super) fn i2c_shutdown(mcu: &Mcu, error: BusError) -> Shutdown {
     let reason = if mcu.serves(until(V0_12)) { I2C_READ_FAILED } else { on_wire(error.status).1 };
     Shutdown::because(reason, error.trouble)
 }
 
-/// What a transfer is for.
+/// The command of a transfer.
 #[derive(Clone, Copy)]
 enum Purpose {
-    /// `i2c_transfer`, which is answered with the status of the bus.
+    /// `i2c_transfer`. Its answer has the status of the bus.
     Transfer,
     /// `i2c_write`.
     Write,
     /// `i2c_read`.
     Read,
-    /// `i2c_modify_bits`: bits to be changed in what was read, which is then written to where it was read from. Those
-    /// to be cleared come first, and behind them as many bytes to be set.
+    /// `i2c_modify_bits`: reads bytes, changes bits in them, and writes them to where they were read from. `bits` has
+    /// `len` bytes of bits to clear, then as many bytes of bits to set.
     Modify { bits: [u8; PAYLOAD_MAX], len: usize },
 }
 
@@ -125,7 +125,7 @@ impl Purpose {
 /// Bytes to a device, and bytes from it.
 struct Transfer {
     purpose: Purpose,
-    /// Whether what was changed is being written.
+    /// Whether the changed bytes are being written.
     writes_back: bool,
     write: [u8; PAYLOAD_MAX],
     write_len: usize,
@@ -141,7 +141,7 @@ impl Transfer {
         Transfer { purpose, writes_back: false, write: bytes, write_len, read: [0; u8::MAX as usize], read_len }
     }
 
-    /// What the answer has room for, as in the firmware.
+    /// The bytes for which the answer has room, as in the firmware.
     fn response(&self) -> &[u8] {
         &self.read[..self.read_len.min(RESPONSE_MAX)]
     }
@@ -171,10 +171,11 @@ impl Talk for Transfer {
 /// An I2C device.
 pub(super) struct I2c {
     bus: Option<Bus>,
-    /// Whether the bus is made of lines.
+    /// Whether the bus is a software bus on lines.
     on_lines: bool,
     transfer: Slot<Conversation<Transfer>>,
-    /// Whether the last transfer failed: a display that is unplugged fails many times a second.
+    /// Whether the last transfer failed. Only the first failure is logged: an unplugged display fails many times a
+    /// second.
     failing: bool,
 }
 
@@ -201,10 +202,10 @@ impl I2c {
         Ok(())
     }
 
-    /// Has a transfer of the command that runs.
+    /// Starts a transfer for the running command.
     fn transfer(&mut self, turn: &mut Turn, transfer: Transfer) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
-            // As the firmware answers for a device without a bus.
+            // The firmware answers the same for a device without a bus.
             let status = BusStatus::Nack;
             if let Purpose::Transfer = transfer.purpose {
                 let i2c_bus_status = on_wire(status).0;
@@ -214,7 +215,7 @@ impl I2c {
             let error = BusError::new(status, "it has no bus: a fault of the host, which did not send i2c_set_bus");
             return Err(self.failure(turn, matches!(transfer.purpose, Purpose::Write), error));
         };
-        // Commands wait for each other, so it is here.
+        // Commands wait for each other, so the conversation is here.
         let Some(conversation) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "a transfer came amid another one"));
         };
@@ -222,7 +223,7 @@ impl I2c {
         self.transfer.converse_on(turn, bus)
     }
 
-    /// The stop for a transfer that failed, as it wrote or as it read.
+    /// The shutdown for a failed transfer, depending on whether it was writing or reading.
     fn failure(&self, mcu: &Mcu, writing: bool, error: BusError) -> Shutdown {
         match writing {
             _ if !mcu.serves(until(V0_12)) => i2c_shutdown(mcu, error),
@@ -238,7 +239,7 @@ impl Object for I2c {
         "I2C device"
     }
 
-    /// Tells the host what came of a transfer. Where the answer has no status a failure stops the machine.
+    /// Reports the result of a transfer to the host. If the answer has no status, a failure stops the MCU.
     fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         let Some(Back { result, .. }) = self.transfer.back(done) else { return Ok(()) };
         let result = result.map_err(BusError::clone);
@@ -261,7 +262,7 @@ impl Object for I2c {
             }
             return Ok(());
         }
-        // v0.11 wrote the register by itself before it read.
+        // v0.11 wrote the register in a transfer of its own before the read.
         let of_register =
             turn.serves(only(V0_11)) && transfer.write_len > 0 && error.status != BusStatus::StartReadNack;
         let writing = matches!(transfer.purpose, Purpose::Write) || transfer.writes_back || of_register;
@@ -294,7 +295,7 @@ const I2C_SET_BUS: Command = command!(
 )
 .of(since(V0_12));
 
-/// Half a period of the 100 kHz that the firmware had where it was told a rate, whatever the rate.
+/// Half a period at 100 kHz. The firmware used this rate whatever rate it was given.
 const SOFTWARE_PULSE: Ticks = Ticks::from_us(5);
 
 const I2C_SET_SOFTWARE_BUS: Command = command!(
@@ -354,7 +355,7 @@ fn one_byte(count: u32) -> usize {
     usize::from(count as u8)
 }
 
-/// An address has 7 bits; the firmware drops the others.
+/// An address has 7 bits. The firmware drops the others.
 fn seven_bits(address: u32) -> u8 {
     (address & 0x7f) as u8
 }

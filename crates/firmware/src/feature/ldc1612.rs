@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The inductive sensor LDC1612 on I2C, for eddy current probes (Texas Instruments SNOSCY9).
 //!
-//! klippy sets the chip up by itself. Its INTB line goes low when a sample is ready; without that line
-//! the STATUS register is asked every `rest_ticks`. A bus that fails stops nothing: the host gets an
-//! error in the sample's place, and homing ends. (For hosts that do not know such errors, v0.13 and Kalico, it
-//! stops the machine, as it did in the firmware.)
+//! klippy itself sets up the chip. The chip's INTB line goes low when a sample is ready. Without that line Pinion reads
+//! the STATUS register every `rest_ticks`. A failing bus stops nothing: the host gets an error in the sample's place,
+//! and homing ends. The hosts v0.13 and Kalico do not know these errors. For them a failing bus stops the MCU, as it
+//! did in the firmware.
 
 #![forbid(unsafe_code)]
 
@@ -48,20 +48,20 @@ pub(super) const FEATURE: Feature = Feature {
     ..Feature::EMPTY
 };
 
-/// The hosts that home by the sensor itself, and have the machine stop where its bus fails.
+/// The hosts that home by the sensor itself. For them a failing bus stops the MCU.
 const HOMES_ITSELF: Generations = only(V0_13).and(Kalico);
 
 response! {
-    /// Whether samples are looked at for homing, and when the trigger came.
+    /// Whether samples are checked for homing, and when the trigger came.
     "ldc1612_home_state oid=%c homing=%c trigger_clock=%u" => HOMES_ITSELF;
     pub(super) struct HomeState { oid: Oid, homing: bool, trigger_clock: Clock }
 }
 
-/// Error flags of the chip stand in the sample.
+/// The sample has error flags of the chip.
 const SENSOR_REPORTS_ERROR: u8 = 0;
 const I2C_STATUS_ERROR: u8 = 1;
 const I2C_DATA_ERROR: u8 = 2;
-/// A sample that looks like one of the errors that the host is sent.
+/// The sample looks like one of the errors that the host gets.
 const INVALID_READ_DATA: u8 = 3;
 
 /// "Register Maps".
@@ -72,18 +72,18 @@ enum Register {
     Status = 0x18,
 }
 
-/// UNREADCONV0 of STATUS: channel 0 has a sample that was not read.
+/// UNREADCONV0 of STATUS: channel 0 has an unread sample.
 const UNREADCONV0: u16 = 1 << 3;
 
 const SAMPLE_BYTES: u32 = 4;
-/// The flags of DATA0 that make a sample useless: under range, over range, watchdog. The fourth is an
-/// amplitude that is out of the best range.
+/// The flags of DATA0 that make a sample useless: under range, over range, watchdog. The fourth flag reports an
+/// amplitude outside the best range.
 const ERROR_FLAGS: u32 = 0xe000_0000;
 const DATA: u32 = 0x0fff_ffff;
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// Whether klippy would take such a sample for an error of the machine's.
+/// Whether klippy would take this sample for an error that the MCU reports.
 fn looks_like_an_error(words: u32) -> bool {
     words >> 16 == 0xffff
 }
@@ -94,14 +94,14 @@ fn read_word(chip: &mut dyn BusDevice, register: Register) -> Result<u16, BusErr
     Ok(u16::from_be_bytes(word))
 }
 
-/// Whether channel 0 has a sample that was not read.
+/// Whether channel 0 has an unread sample.
 fn is_ready(chip: &mut dyn BusDevice) -> Result<bool, BusError> {
     Ok(read_word(chip, Register::Status)? & UNREADCONV0 != 0)
 }
 
 /// Reads a sample, if there is one.
 struct Look {
-    /// What the host is told if the bus fails now.
+    /// The error for the host if the bus fails now.
     error: u8,
 }
 
@@ -134,24 +134,24 @@ impl Talk for Ask {
 
 /// Homing by the sensor itself.
 struct Homing {
-    /// Pulled when the trigger comes; none while samples are not looked at.
+    /// The trsync that the trigger pulls. `None`: samples are not checked.
     trsync: Option<Oid>,
     /// A value above it is the trigger.
     threshold: u32,
     trigger_reason: u8,
     error_reason: u8,
-    /// Whether every sample so far was of an instant before `clock`.
+    /// Whether every sample so far was from before `clock`.
     awaits: bool,
-    /// When homing begins; when it was triggered, from then on.
+    /// When homing begins. After the trigger: when it came.
     clock: Clock,
 }
 
 impl Homing {
-    /// Samples are not looked at.
+    /// Samples are not checked.
     const OFF: Homing =
         Homing { trsync: None, threshold: 0, trigger_reason: 0, error_reason: 0, awaits: false, clock: Clock::EPOCH };
 
-    /// Takes in both words of channel 0, read at the instant `at`.
+    /// Processes both words of channel 0, read at `at`.
     fn update(&mut self, mcu: &mut Mcu, words: u32, at: Clock) -> Result<(), Shutdown> {
         let Some(trsync) = self.trsync else { return Ok(()) };
         let reason = if words > DATA {
@@ -177,14 +177,14 @@ struct Ldc1612 {
     /// Low while a sample is ready.
     intb: Option<Arc<dyn Line>>,
     look: Slot<Conversation<Look>>,
-    /// Turns of the timer that came while a reading was under way.
+    /// Turns of the timer that came during a reading.
     missed: u16,
     ask: Slot<Conversation<Ask>>,
     rest_ticks: Ticks,
     bulk: SensorBulk,
     attached: Attached,
     homing: Homing,
-    /// Whether the last conversation failed: the log is told of the first one.
+    /// Whether the last conversation failed. Only the first failure is logged.
     failing: bool,
 }
 
@@ -208,7 +208,7 @@ impl Ldc1612 {
         mcu.assign(oid, sensor)
     }
 
-    /// Says in the log that the bus fails, if it did not before; or stops the machine.
+    /// Logs a failure of the bus if the conversation before did not fail, or stops the MCU.
     fn note(failing: &mut bool, turn: &mut Turn, failure: Option<&BusError>) -> Result<(), Shutdown> {
         let failed_before = std::mem::replace(failing, failure.is_some());
         let Some(error) = failure else { return Ok(()) };
@@ -224,7 +224,7 @@ impl Ldc1612 {
         Ok(())
     }
 
-    /// Has the sensor read, if it may have a sample.
+    /// Makes the worker read the sensor, if it may have a sample.
     fn look(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         if self.intb.as_ref().map_or(Ok(false), |intb| intb.read())? {
             return Ok(());
@@ -232,8 +232,8 @@ impl Ldc1612 {
         self.look.converse(turn, self.i2c)
     }
 
-    /// Makes up for the turns that came while the sensor was read, as in the firmware, whose timer waits for
-    /// the bus: the first one is taken now, each further one says that samples may be lost.
+    /// Makes up for the turns that came while the sensor was read. The firmware's timer waits for the bus. So the first
+    /// of these turns runs now, and each further one counts as possibly lost samples.
     fn make_up(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         let missed = std::mem::take(&mut self.missed);
         if missed == 0 {
@@ -246,7 +246,7 @@ impl Ldc1612 {
         Ok(())
     }
 
-    /// Takes in a sample: both words of channel 0, or an error.
+    /// Processes a sample: both words of channel 0, or an error.
     fn add(&mut self, turn: &mut Turn, words: Result<u32, u8>, read_at: Clock) -> Result<(), Shutdown> {
         let sample = match words {
             Ok(words) if looks_like_an_error(words) && !turn.serves(HOMES_ITSELF) => Err(INVALID_READ_DATA),
@@ -275,7 +275,7 @@ impl Ldc1612 {
             return self.ask.converse(turn, self.i2c);
         };
         let now = turn.now();
-        // One that is being read counts as one in the chip.
+        // A sample that is being read counts as one in the chip.
         let ready = self.look.is_pending() || !intb.read()?;
         self.bulk.send_status(turn, (now, now), if ready { SAMPLE_BYTES } else { 0 });
         Ok(())
@@ -309,7 +309,7 @@ impl Object for Ldc1612 {
             }
             return self.make_up(turn);
         }
-        // Without an answer klippy asks again.
+        // If there is no answer, klippy asks again.
         let Some(Back { result, began, ended, .. }) = self.ask.back(done) else { return Ok(()) };
         if let Ok(ready) = result {
             self.bulk.send_status(turn, (began, ended), if ready { SAMPLE_BYTES } else { 0 });

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The accelerometers LIS2DW and LIS3DH, on SPI or I2C.
 //!
-//! Registers after their data sheets (ST, LIS2DW12 rev. 8: "FIFO_SAMPLES"; LIS3DH rev. 2:
-//! "FIFO_SRC_REG", "SPI read", "I2C operation").
+//! Registers from their data sheets (ST, LIS2DW12 rev. 8: "FIFO_SAMPLES"; LIS3DH rev. 2: "FIFO_SRC_REG", "SPI read",
+//! "I2C operation").
 
 #![forbid(unsafe_code)]
 
@@ -27,7 +27,7 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A `lis_chip_type` that the enumeration does not have.
+    /// A `lis_chip_type` outside the enumeration.
     INVALID_MODEL = "model type invalid";
 }
 
@@ -39,14 +39,14 @@ own_words! {
 
 #[derive(Clone, Copy)]
 enum Register {
-    /// The first of the six data registers, which the FIFO is read through.
+    /// The first of the six data registers. The FIFO is read through them.
     OutXL = 0x28,
     FifoCtrl = 0x2e,
     /// FIFO_SAMPLES of the LIS2DW, FIFO_SRC_REG of the LIS3DH.
     FifoStatus = 0x2f,
 }
 
-/// Continuous mode, of FIFO_CTRL; 0 switches the FIFO off and empties it.
+/// Continuous mode of FIFO_CTRL. 0 switches the FIFO off and empties it.
 const CONTINUOUS: u8 = 0xc0;
 const SAMPLE_BYTES: usize = 6;
 
@@ -69,7 +69,7 @@ impl Model {
         }
     }
 
-    /// What the status register says.
+    /// Decodes the status register.
     fn fill(self, status: u8) -> Fill {
         let samples = match self {
             // DIFF5:0 counts to 32.
@@ -78,7 +78,7 @@ impl Model {
             Model::Lis3dh if status & 0x20 != 0 => 0,
             Model::Lis3dh => status & 0x1f,
         };
-        // A wire that is all ones says 63 samples. The firmware keeps the bytes of that modulo 256, two blocks.
+        // A wire that reads as all ones says 63 samples. The firmware keeps the bytes of that modulo 256: two blocks.
         let bytes = samples.wrapping_mul(SAMPLE_BYTES as u8);
         Fill { bytes: bytes.into(), overflowed: status & 0x40 != 0 }
     }
@@ -91,8 +91,8 @@ struct Lis2dw {
 }
 
 impl Lis2dw {
-    /// The number of the first data register, with what the LIS3DH wants in it to go on to the next
-    /// ones; the LIS2DW does so by itself.
+    /// The number of the first data register. The LIS3DH needs a bit in it to continue with the next registers. The
+    /// LIS2DW continues without it.
     fn data_registers(self) -> u8 {
         let goes_on = match (self.model, self.bus_type) {
             (Model::Lis2dw, _) => 0,
@@ -178,7 +178,7 @@ mod tests {
         for (model, status, bytes, overflowed) in [
             (Model::Lis2dw, 0x00, 0, false),
             (Model::Lis2dw, 0x07, 7 * 6, false),
-            // FTH, the threshold's flag, says nothing here.
+            // FTH, the threshold's flag, means nothing here.
             (Model::Lis2dw, 0x80 | 31, 31 * 6, false),
             (Model::Lis2dw, 0xc0 | 32, 32 * 6, true),
             // Nothing answers: 63 samples are 378 bytes, 122 modulo 256.

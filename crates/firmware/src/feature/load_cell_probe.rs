@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Kalico's probing by load cells: a sensor's sample becomes grams, goes through a filter, and pulls a
-//! trsync when the force is as large as the host set. A sample out of the safe range, grams that
-//! overflow and a sensor that falls silent pull it as well, with a reason of their own. (Klipper's
-//! `trigger_analog` came out of it.)
+//! Kalico's probing with load cells. A sensor's sample is converted to grams and filtered. If the force is as large as
+//! the host has set, it pulls a trsync. A sample outside the safe range, grams that overflow, and a silent sensor also
+//! pull it. Each has a reason of its own. (Klipper's `trigger_analog` developed from this.)
 
 #![forbid(unsafe_code)]
 
@@ -25,11 +24,11 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A highest safe value below the lowest one.
+    /// The highest safe value is below the lowest one.
     RANGE_REVERSED = "Safety range reversed";
     /// A trigger beyond 65535 g.
     TRIGGER_TOO_LARGE = "trigger_grams too large";
-    /// Grams of a count that are no fraction.
+    /// `grams_per_count` is not a fraction.
     GRAMS_PER_COUNT = "grams_per_count is invalid";
 }
 
@@ -44,28 +43,28 @@ const GRAMS_FRAC_BITS: u32 = 15;
 const GRAMS_PER_COUNT_FRAC_BITS: u32 = 29;
 const TRIGGER_GRAMS_MAX: u32 = u16::MAX as u32;
 
-// Errors, which the host finds added to its `error_reason` in the trsync's reason.
+// Error codes. The host finds them added to its `error_reason` in the trsync's reason.
 const SAFETY_RANGE: u8 = 0;
 const OVERFLOW: u8 = 1;
 const WATCHDOG: u8 = 2;
 
 const TIMER: Timer = Timer::exact(0);
 
-/// What the host sets of the sensor.
+/// The host's settings for the sensor.
 #[derive(Default)]
 struct Limits {
-    /// Beyond them a sample is an error.
+    /// A sample at or beyond these is an error.
     counts_min: i32,
     counts_max: i32,
     tare_counts: i32,
-    /// With [`GRAMS_FRAC_BITS`].
+    /// Has [`GRAMS_FRAC_BITS`].
     trigger_grams: i32,
-    /// With [`GRAMS_PER_COUNT_FRAC_BITS`].
+    /// Has [`GRAMS_PER_COUNT_FRAC_BITS`].
     grams_per_count: i32,
 }
 
 impl Limits {
-    /// What a sample weighs; none if that does not fit.
+    /// The weight of a sample. `None`: it does not fit.
     fn grams(&self, counts: i32) -> Option<i32> {
         let delta = counts.wrapping_sub(self.tare_counts);
         let product = i64::from(delta) * i64::from(self.grams_per_count);
@@ -73,16 +72,16 @@ impl Limits {
     }
 }
 
-/// What homing goes on with.
+/// The state of homing.
 struct Homing {
     trsync: Oid,
     trigger_reason: u8,
     error_reason: u8,
-    /// Whether every sample so far was of an instant before `begin`.
+    /// Whether every sample so far was from before `begin`.
     awaits: bool,
     begin: Clock,
     rest_ticks: Ticks,
-    /// Turns of the watchdog without a sample that are one too many.
+    /// Highest number of watchdog turns without a sample. One more is an error.
     watchdog_max: u8,
     watchdog_count: u8,
 }
@@ -90,14 +89,14 @@ struct Homing {
 pub(super) struct LoadCellProbe {
     filter: Oid,
     limits: Limits,
-    /// None while samples are not looked at.
+    /// `None`: samples are not checked.
     homing: Option<Homing>,
     /// When the trigger came.
     triggered: Option<Clock>,
 }
 
 impl LoadCellProbe {
-    /// Takes in a sample of the sensor, read at the instant `at`.
+    /// Processes a sample of the sensor, read at `at`.
     pub(super) fn update(&mut self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
         let Some(homing) = &mut self.homing else { return Ok(()) };
         homing.watchdog_count = 0;
@@ -111,7 +110,7 @@ impl LoadCellProbe {
         }
         let Some(grams) = self.limits.grams(sample) else { return homing.fail(mcu, OVERFLOW) };
         let filtered = mcu.with::<SosFilter, _>(self.filter, |filter, _| filter.apply_scaled(grams))?;
-        // The first one counts: samples go on to be looked at until the host ends that.
+        // The first trigger counts. Samples are still checked until the host ends that.
         if filtered.wrapping_abs() < self.limits.trigger_grams || self.triggered.is_some() {
             return Ok(());
         }
@@ -135,7 +134,7 @@ impl Object for LoadCellProbe {
         "load cell probe"
     }
 
-    /// Looks whether the sensor is silent.
+    /// Checks whether the sensor is silent.
     fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let Some(homing) = self.homing.as_mut().filter(|_| self.triggered.is_none()) else { return Ok(Next::Done) };
         if homing.watchdog_count > homing.watchdog_max {
@@ -200,7 +199,7 @@ const LOAD_CELL_PROBE_HOME: Command = command!(
         let begin = turn.instant(clock);
         turn.cancel(TIMER);
         (probe.homing, probe.triggered) = (None, None);
-        // That is how the host ends it.
+        // The host ends probing this way.
         if error_reason == 0 {
             return Ok(());
         }
@@ -242,7 +241,7 @@ mod tests {
         assert_eq!(limits.grams(1000 + 131_071), Some(131_071 << 14));
         assert_eq!(limits.grams(1000 + 131_072), None);
         assert_eq!(limits.grams(1000 - 131_072), Some(i32::MIN));
-        // Down, as a shift does.
+        // A shift rounds down.
         let small = Limits { grams_per_count: 1, ..Limits::default() };
         assert_eq!((small.grams(1), small.grams(-1), small.grams(1 << 14)), (Some(0), Some(-1), Some(1)));
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The features of the machine, one file each, and the list of them all.
+//! The features of the MCU, one file each, and the list of all features.
 
 #![forbid(unsafe_code)]
 
@@ -46,8 +46,8 @@ mod trigger_analog;
 mod trsync;
 mod value_queue;
 
-/// Every feature. One that is not listed here does not get into the dictionary. Commands that come
-/// often stand first: there are more messages than ids of one byte, which are given in this order.
+/// Every feature. A feature that is missing here is not in the dictionary. Features with frequent commands come first:
+/// ids are given in this order, and there are more messages than ids of one byte.
 pub const FEATURES: &[Feature] = &[
     base::FEATURE,
     stepper::FEATURE,
@@ -84,7 +84,7 @@ pub const FEATURES: &[Feature] = &[
     trigger_analog::FEATURE,
 ];
 
-/// The place of a response in the list of all, found by the compiler.
+/// The index of a response in the list of all responses, computed by the compiler.
 const fn response_index(format: &str) -> usize {
     place_of_response(FEATURES, format)
 }
@@ -94,7 +94,7 @@ fn named(values: &[(&str, u8)]) -> Vec<Range> {
     values.iter().map(|&(name, value)| Range { name: name.into(), first: value.into(), count: 1 }).collect()
 }
 
-/// The resistor that a command's `pull_up` asks for.
+/// The resistor for a command's `pull_up`.
 fn bias(pull_up: i8) -> Bias {
     match pull_up {
         1.. => Bias::PullUp,
@@ -103,7 +103,7 @@ fn bias(pull_up: i8) -> Bias {
     }
 }
 
-/// The stop for an output whose `max_duration` ran out before the host changed it again.
+/// The shutdown for an output whose `max_duration` ran out before the host changed it again.
 #[cold]
 fn not_refreshed(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     let ms = max_duration.0 / Ticks::from_us(1000).0;
@@ -113,14 +113,14 @@ fn not_refreshed(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     )
 }
 
-/// The stop for an output whose next change is queued for later than its `max_duration` allows.
+/// The shutdown for an output whose next change is queued for later than its `max_duration` allows.
 #[cold]
 fn changes_too_late(reason: ShutdownReason, max_duration: Ticks) -> Shutdown {
     let ms = max_duration.0 / Ticks::from_us(1000).0;
     Shutdown::by_host(reason, format_args!("its next change is scheduled later than its max_duration of {ms} ms"))
 }
 
-/// The stop for a `set_digital_out` or `set_pwm_out` that names a new pin after `finalize_config`.
+/// The shutdown for a `set_digital_out` or `set_pwm_out` that names a new pin after `finalize_config`.
 #[cold]
 fn set_too_late(mcu: &Mcu, reason: ShutdownReason, command: &str, pin: Pin) -> Shutdown {
     let name = mcu.name(pin);

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! InvenSense's accelerometers on I2C: the MPU9250 and its kin (MPU9255, MPU9515, MPU6500, MPU6050), and the ICM20948.
+//! InvenSense's accelerometers on I2C: the MPU9250 and similar chips (MPU9255, MPU9515, MPU6500, MPU6050), and the
+//! ICM20948.
 //!
-//! Registers after their register maps (InvenSense, RM-MPU-9250A-00, rev. 1.6; DS-000189, rev. 1.3).
+//! Registers from their register maps (InvenSense, RM-MPU-9250A-00, rev. 1.6; DS-000189, rev. 1.3).
 
 #![forbid(unsafe_code)]
 
@@ -39,17 +40,17 @@ enum Register {
     UserCtrl = 0x6a,
 }
 
-/// ACCEL, of FIFO_EN.
+/// ACCEL of FIFO_EN.
 const ACCEL: u8 = 0x08;
-/// FIFO_RST and FIFO_EN, of USER_CTRL.
+/// FIFO_RST and FIFO_EN of USER_CTRL.
 const FIFO_RESET: u8 = 0x04;
 const FIFO_ENABLED: u8 = 0x40;
 
-/// Where a chip has its FIFO, and what tells that it overflowed.
+/// A chip's registers for its FIFO and for overflows.
 struct FifoRegisters {
     /// Reading it clears the flags.
     int_status: u8,
-    /// The bits of it that tell of an overflow.
+    /// The bits of it that report an overflow.
     overflow: u8,
     /// Two bytes, the high one first.
     count: u8,
@@ -82,7 +83,7 @@ impl Mpu for Icm20948 {
     const FIFO: FifoRegisters = FifoRegisters { int_status: 0x1b, overflow: 0x0f, count: 0x70, data: 0x72 };
 }
 
-/// Asks for the bytes in the FIFO: 13 bits.
+/// Asks for the number of bytes in the FIFO: 13 bits.
 fn ask_fill<M: Mpu>(chip: &mut dyn BusDevice) -> Result<Fill, BusError> {
     let mut count = [0; 2];
     chip.read_register(&[M::FIFO.count], &mut count)?;
@@ -95,7 +96,7 @@ impl<M: Mpu> FifoChip for M {
     const HAS_OVERFLOW_REGISTER: bool = true;
     const OWN_WORDS: Option<&'static Words> = M::OWN_WORDS;
 
-    /// Hosts that leave this to the machine have the MPU9250 only.
+    /// Hosts that leave this to the MCU know only the MPU9250.
     fn switch_on(self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
         chip.write_read(&[Register::FifoEn as u8, 0], &mut [])?;
         chip.write_read(&[Register::UserCtrl as u8, FIFO_RESET], &mut [])?;

@@ -1,18 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Chains of WS2812 LEDs ("neopixels") on the data output (MOSI) of an SPI controller.
 //!
-//! A data bit of the chain is a pulse: a short one is 0, a long one is 1. Those times are too short for
-//! a program on Linux; the SPI controller's clock keeps them. Four of its bits make one bit of the
-//! chain: `1000` for 0, `1110` for 1. At 3.2 MHz these are 312.5 and 937.5 ns high of 1250 ns, within
-//! the data sheet's 400 and 800 ns, 150 more or less, of 1250 ns (Worldsemi WS2812B, "Data transfer
-//! time"). Each byte on the wire ends low, so that a pause of the controller between two bytes does
-//! not change a bit, and a controller that has only a lower rate, down to 2 MHz, will do: what is
-//! critical is the short pulse, below 500 ns (the firmware's src/neopixel.c on what chips really
-//! need).
+//! A data bit of the chain is a pulse: a short one is 0, a long one is 1. These times are too short for a program on
+//! Linux. The SPI controller's clock keeps them. Four of its bits make one bit of the chain. `1000` stands for 0,
+//! `1110` for 1. At 3.2 MHz these are 312.5 and 937.5 ns high, of 1250 ns. The data sheet has 400 and 800 ns, 150 more
+//! or less, of 1250 ns (Worldsemi WS2812B, "Data transfer time"). Each byte on the wire ends low. So a pause of the
+//! controller between two bytes does not change a bit. A controller that only has a lower rate, down to 2 MHz, also
+//! works. Only the short pulse is critical. It must be below 500 ns (the firmware's src/neopixel.c says what chips
+//! really need).
 //!
-//! The firmware gives up a frame, and klippy sends it again, if a bit comes more than `bit_max_ticks` behind the one
-//! before. Nobody can see from here whether a controller pauses amid a message: the board says in the
-//! log of one that is known to, and a frame that its driver took counts as sent.
+//! The firmware gives up a frame if a bit comes more than `bit_max_ticks` after the one before. klippy then sends the
+//! frame again. Nobody can see from here whether a controller pauses during a message. The board logs a controller that
+//! is known to pause. A frame counts as sent if its driver took it.
 
 #![forbid(unsafe_code)]
 
@@ -34,27 +33,27 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A chain of more bytes than the format or the SPI driver has room for.
+    /// The chain has more bytes than the format or the SPI driver has room for.
     INVALID_SIZE = "Invalid neopixel data_size";
     /// `neopixel_update` past the end of the chain.
     INVALID_UPDATE = "Invalid neopixel update command";
 }
 
 response! {
-    /// The colours are on their way to the LEDs, or could not be sent; klippy then sends once more.
+    /// The colors are on their way to the LEDs, or could not be sent. klippy sends again after a failure.
     "neopixel_result oid=%c success=%c"
     pub(super) struct Sent { oid: Oid, success: bool }
 }
 
-/// Bits of the SPI bus in a second.
+/// Bits per second of the SPI bus.
 const RATE_HZ: u32 = 3_200_000;
-/// Bytes of the SPI bus for one of the chain.
+/// Bytes of the SPI bus for one byte of the chain.
 const WIRE_BYTES: usize = 4;
-/// Shortest time for which the line is low before and behind the colours. klippy asks for 50 us, and newer WS2812B
-/// need 280 us (Worldsemi WS2812B-V5, "Data transfer time": RES) to take their colours; where the data output idles
-/// high, this is all that they get.
+/// Shortest time that the line is low before and after the colors. klippy asks for 50 us. Newer WS2812B need 280 us to
+/// take their colors (Worldsemi WS2812B-V5, "Data transfer time": RES). If the data output idles high, this is all the
+/// low time that they get.
 const RESET_MIN: Ticks = Ticks::from_us(300);
-/// Sizes and positions from here on are refused, as in the firmware.
+/// Lowest size and position that are refused, as in the firmware.
 const SIZE_LIMIT: u16 = 0x8000;
 
 /// The bytes of the SPI bus for one byte of the chain.
@@ -63,17 +62,17 @@ fn encode(byte: u8) -> [u8; WIRE_BYTES] {
     [(7, 6), (5, 4), (3, 2), (1, 0)].map(|(first, second)| half(first) << 4 | half(second))
 }
 
-/// How many bytes keep the line low for at least so long.
+/// How many bytes keep the line low for at least `ticks`.
 fn low_bytes(ticks: Ticks) -> usize {
     let bits = u64::from(ticks.0) * u64::from(RATE_HZ);
     usize::try_from(bits.div_ceil(u64::from(CLOCK_FREQ) * 8)).unwrap_or(usize::MAX)
 }
 
-/// The chain's colours on their way.
+/// The chain's colors on their way to the LEDs.
 struct Frame {
     data: Vec<u8>,
-    /// Low for the reset time, the colours, low for the reset time. Low before: the controller may
-    /// leave its output high when it rests. Low behind: then the LEDs take the colours before that.
+    /// Low for the reset time, the colors, low for the reset time. Low before, because the controller may leave its
+    /// output high while it rests. Low after, because the LEDs then take the colors.
     message: Vec<u8>,
     low_bytes: usize,
 }
@@ -94,7 +93,7 @@ struct Neopixel {
     bus: Bus,
     data: Vec<u8>,
     frame: Slot<Conversation<Frame>>,
-    /// Whether the log knows that sending fails.
+    /// Whether the log already has a line about failed sending.
     failing: bool,
 }
 
@@ -112,7 +111,7 @@ impl Neopixel {
     }
 
     fn send(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
-        // Commands wait for each other, so it is here.
+        // Commands wait for each other, so the conversation is here.
         let Some(frame) = self.frame.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "neopixel_send came amid another one"));
         };
@@ -129,7 +128,7 @@ impl Object for Neopixel {
     fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         let Some(Back { result, .. }) = self.frame.back(done) else { return Ok(()) };
         turn.send(Sent { oid: turn.oid(), success: result.is_ok() });
-        // No colour is worth a print. klippy tries eight times for each change: once is enough in the log.
+        // No color is worth a print. klippy tries eight times for each change, so only the first failure is logged.
         let known = std::mem::replace(&mut self.failing, result.is_err());
         if let (Err(error), false) = (result, known) {
             let trouble = spi_shutdown(error.clone());
@@ -142,7 +141,7 @@ impl Object for Neopixel {
 const CONFIG_NEOPIXEL: Command = command!(
     "config_neopixel oid=%c pin=%u data_size=%hu bit_max_ticks=%u reset_min_ticks=%u",
     |mcu, oid: Oid, pin: Pin, data_size: u16, bit_max_ticks: Ticks, reset_min_ticks: Ticks| {
-        // The file's head says why.
+        // The head of this file says why.
         let _ = bit_max_ticks;
         mcu.vacant(oid)?;
         if data_size >= SIZE_LIMIT {
@@ -182,7 +181,7 @@ mod tests {
         assert_eq!(encode(0x93), [0xe8, 0x8e, 0x88, 0xee]);
     }
 
-    /// High and low times of each bit, as the data sheet has them (WS2812B: T0H, T1H, T0L, T1L).
+    /// High and low times of each bit, from the data sheet (WS2812B: T0H, T1H, T0L, T1L).
     #[test]
     fn pulses_are_within_the_data_sheet() {
         let bit_ns = 1e9 / f64::from(RATE_HZ);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The time of an errand that drives lines itself, with a few microseconds between two edges.
 //!
-//! Where the firmware waits in a loop, or has a timer for each bit, a worker waits in a loop here: the
-//! core is free meanwhile, and between two edges nothing has to be woken up.
+//! Where the firmware waits in a loop, or has a timer for each bit, a worker waits in a loop here. Meanwhile the core
+//! is free, and nothing has to wake up between two edges.
 
 #![forbid(unsafe_code)]
 
@@ -12,10 +12,10 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use crate::mcu::Mcu;
 use crate::time::{Clock, Ticks, TimeSource};
 
-/// How long a wait may go on after it is told to stop.
+/// Longest time that a wait continues after a stop.
 const SLICE: Ticks = Ticks::from_us(1000);
 
-/// Keeps time on a worker, until the core says stop. The errand and its object have one each.
+/// Keeps time on a worker, until the core stops it. The errand and its object have a copy each.
 #[derive(Clone)]
 pub(super) struct Pace {
     clock: Arc<dyn TimeSource>,
@@ -28,7 +28,7 @@ impl Pace {
         Pace::of(mcu.clock())
     }
 
-    /// A pace by this clock.
+    /// A pace with this clock.
     pub(super) fn of(clock: Arc<dyn TimeSource>) -> Pace {
         Pace { clock, stopped: Arc::default() }
     }
@@ -37,7 +37,7 @@ impl Pace {
         self.clock.now()
     }
 
-    /// Waits for an instant. False if the errand is to end, as the machine stopped.
+    /// Waits until `at`. False if the errand must end, because the MCU stopped.
     pub(super) fn until(&self, at: Clock) -> bool {
         loop {
             if self.stopped.load(Ordering::Relaxed) {
@@ -51,7 +51,7 @@ impl Pace {
         }
     }
 
-    /// Has the errand that is under way end soon, and no wait succeed until [`Pace::resume`].
+    /// Makes the errand under way end soon. No wait succeeds until [`Pace::resume`].
     pub(super) fn stop(&self) {
         self.stopped.store(true, Ordering::Relaxed);
     }

@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! PCA9685: 16 PWM outputs behind I2C, with queued values and a limit to how long the host may be
-//! silent.
+//! PCA9685: 16 PWM outputs on I2C, with queued values and a limit to how long the host may be silent.
 //!
-//! Registers and times are those of NXP's data sheet, PCA9685 rev. 4.
+//! Registers and times are from NXP's data sheet, PCA9685 rev. 4.
 
 #![forbid(unsafe_code)]
 
@@ -33,13 +32,13 @@ shutdowns! {
     INVALID_CHANNEL = "Invalid pca9685 channel or value";
     /// A queued value above 4096.
     INVALID_VALUE = "Invalid pca9685 value";
-    /// A second period for one chip, which has a single one.
+    /// A second period for one chip. A chip has only one.
     OTHER_CYCLE = "All PCA9685 channels must have the same cycle_ticks";
     /// More than 16 chips.
     TOO_MANY = "Too many i2c devices";
-    /// The bus is not there, or the chip does not answer as it is set up.
+    /// The bus is missing, or the chip does not answer during its setup.
     NOT_SET_UP = "Unable to open and init PCA9685 device";
-    /// The chip does not take a value.
+    /// The chip does not accept a value.
     NOT_UPDATED = "Unable to update PCA9685 value";
     /// The host did not refresh an output in time.
     MISSED = "Missed scheduling of next pca9685 event";
@@ -70,20 +69,20 @@ const ALL_CALL: u8 = 0x01;
 /// The bit of LEDn_ON_H and LEDn_OFF_H that means always.
 const FULL: u8 = 0x10;
 const OSCILLATOR_HZ: u64 = 25_000_000;
-/// Until the oscillator runs, at most.
+/// Longest time until the oscillator runs.
 const OSCILLATOR_START: Duration = Duration::from_micros(500);
-/// The host names none, and the driver has its own.
+/// The host gives no rate, and the driver has its own.
 const RATE_HZ: u32 = 100_000;
 
-/// The value of PRE_SCALE for a period: 25 MHz / (4096 * rate) - 1, within 3 and 255.
+/// The value of PRE_SCALE for a period: 25 MHz / (4096 * rate) - 1, limited to 3 to 255.
 fn prescale(cycle: Ticks) -> u8 {
     let divisor = u64::from(VALUE_MAX) * u64::from(CLOCK_FREQ);
     let rounded = (OSCILLATOR_HZ * u64::from(cycle.0) + divisor / 2) / divisor;
-    // A period of next to nothing becomes the longest one, as in the firmware.
+    // A period close to zero becomes the longest one, as in the firmware.
     rounded.wrapping_sub(1).clamp(3, 0xff) as u8
 }
 
-/// What sets the output at register `first` to a value.
+/// The message that sets the output at register `first` to a value.
 fn message(first: u8, value: u16) -> [u8; 5] {
     let (on, off) = match value {
         0 => (0, u16::from(FULL) << 8),
@@ -94,8 +93,8 @@ fn message(first: u8, value: u16) -> [u8; 5] {
     [first, on_low, on_high, off_low, off_high]
 }
 
-/// A chip, as its outputs share it. They all run on the worker of its bus, so nobody ever waits for
-/// the lock, and the core never takes it.
+/// A chip, shared by its outputs. They all run on the worker of its bus. So nobody ever waits for the lock, and the
+/// core never takes it.
 struct Chip {
     device: Box<dyn BusDevice>,
     calls: Calls,
@@ -104,7 +103,7 @@ struct Chip {
 }
 
 impl Chip {
-    /// Writes registers, which may be done twice.
+    /// Writes registers. Writing them twice does no harm, so a failed write is retried.
     fn write(&mut self, bytes: &[u8]) -> Result<(), BusError> {
         self.calls.repeat(|| self.device.write_read(bytes, &mut []))
     }
@@ -113,7 +112,7 @@ impl Chip {
         if self.is_set_up {
             return Ok(());
         }
-        // The prescaler takes a value in sleep only.
+        // The prescaler takes a value only in sleep.
         self.write(&[Register::Mode1 as u8, AUTO_INCREMENT | SLEEP | ALL_CALL])?;
         self.write(&[Register::PreScale as u8, self.prescale])?;
         self.write(&[Register::Mode1 as u8, AUTO_INCREMENT | ALL_CALL])?;
@@ -132,10 +131,10 @@ struct Channel {
 
 #[derive(Clone, Copy)]
 enum Setting {
-    /// The chip is to be set up; then the output is off.
+    /// Sets up the chip. The output is then off.
     SetUp,
     Value(u16),
-    /// Where it belongs in a stopped machine. A chip that was never set up drives nothing.
+    /// The output's value in a stopped MCU. A chip that was never set up drives nothing.
     ShutdownValue(u16),
 }
 
@@ -160,9 +159,9 @@ impl Settable for Channel {
 struct Output {
     channel: Remote<Channel>,
     shutdown_value: u16,
-    /// Whether it was ever set.
+    /// Whether the output was ever set.
     is_used: bool,
-    /// Whether it is still on its way to its shutdown value.
+    /// Whether the shutdown value is still being written.
     is_pending: bool,
 }
 
@@ -172,18 +171,18 @@ struct Address {
     cycle: Ticks,
 }
 
-/// The chips and their outputs, whose errands come back to it.
+/// The chips and their outputs. The errands of the outputs return to this object.
 #[derive(Default)]
 struct Chips {
     chips: Vec<Address>,
-    /// Of all the chips together; none before the first.
+    /// The calls of all chips together. `None` before the first chip.
     calls: Option<Calls>,
     /// 16 for each chip.
     outputs: Vec<Output>,
 }
 
 impl Chips {
-    /// The place of an output; its chip is opened if it is the first of that.
+    /// Returns the index of an output. Opens the chip if this is its first output.
     fn output(&mut self, mcu: &mut Mcu, wanted: Address, channel: u8) -> Result<usize, Shutdown> {
         let Address { bus, address, cycle } = wanted;
         let known = self.chips.iter().position(|chip| chip.bus == bus && chip.address == address);
@@ -259,7 +258,7 @@ impl Object for Chips {
         self.calls.as_ref().map(Calls::counts)
     }
 
-    /// It can not: it holds descriptors of lines and of PWM channels, and no chips on a bus.
+    /// The guardian cannot set the outputs. It holds descriptors of lines and of PWM channels, and no chips on a bus.
     fn is_guarded(&self) -> bool {
         false
     }
@@ -310,7 +309,7 @@ impl Object for Pca9685 {
     }
 }
 
-/// Says whether a chip has this channel and all of these values.
+/// Checks that a chip has this channel and accepts all of these values.
 fn check(channel: u8, values: &[u16]) -> Result<(), Shutdown> {
     if usize::from(channel) < CHANNELS && values.iter().all(|value| *value <= VALUE_MAX) {
         return Ok(());

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Hardware PWM outputs: queued values, and `max_duration`, a limit to how long an output may stay at
-//! another than its shutdown value without news from the host.
+//! Hardware PWM outputs: queued values, and `max_duration`. `max_duration` limits how long an output may differ from
+//! its shutdown value without news from the host.
 
 #![forbid(unsafe_code)]
 
@@ -32,13 +32,13 @@ shutdowns! {
 
 const KIND: &str = "PWM output";
 
-/// A PWM channel, as the worker of its chip has it.
+/// A PWM channel, on the worker of its chip.
 struct Channel {
     pwm: Box<dyn Pwm>,
     calls: Calls,
 }
 
-/// What a channel is set to: a value of 0 to [`PWM_MAX`], and by `set_pwm_out` a new period as well.
+/// A channel's setting: a value of 0 to [`PWM_MAX`]. `set_pwm_out` also sets a new period.
 #[derive(Clone, Copy)]
 struct Setting {
     value: u16,
@@ -56,8 +56,7 @@ impl Settable for Channel {
     }
 }
 
-/// Opens a channel. As in the firmware, several objects may have the same one, each with files of its
-/// own.
+/// Opens a channel. As in the firmware, several objects may have the same channel, each with its own files.
 fn open(mcu: &mut Mcu, config: PwmConfig) -> Result<(Remote<Channel>, Calls), Shutdown> {
     let OnWorker { bus, device: pwm } = mcu.board()?.pwm(config)?;
     let (worker, calls) = (mcu.worker(&bus)?, Calls::new(mcu.clock()));
@@ -70,7 +69,7 @@ const TEXTS: Texts = Texts { max_duration: PWM_MAX_DURATION, missed: MISSED_PWM 
 struct PwmOut {
     channel: Remote<Channel>,
     calls: Calls,
-    /// The value that it was set to last.
+    /// The last value that was set.
     value: u16,
     queue: ValueQueue,
 }
@@ -115,14 +114,14 @@ impl Object for PwmOut {
     }
 }
 
-/// The channels that `set_pwm_out` has set. They belong to no object of the host, and keep their
-/// values even when the machine stops.
+/// The channels that `set_pwm_out` has set. They belong to no object of the host. They keep their values even when the
+/// MCU stops.
 #[derive(Default)]
 struct SetChannels(Vec<(Pin, Remote<Channel>)>);
 
 impl SetChannels {
-    /// Sets a channel, and keeps it open from then on. As with `set_digital_out`, a channel that is
-    /// open may be set again at any time; a new one is refused after `finalize_config`.
+    /// Sets a channel. The channel stays open. As with `set_digital_out`, an open channel may be set again at any time.
+    /// A new one is refused after `finalize_config`.
     fn set(&mut self, turn: &mut Turn, config: PwmConfig) -> Result<(), Shutdown> {
         let PwmConfig { pin, cycle, value, .. } = config;
         let known = self.0.iter().position(|(held, _)| *held == pin);

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! ADCs for load cells that pull a line low when a sample is ready: what HX711, ADS1220 and ADS131M0x
-//! have in common. What differs is a [`ReadyChip`] each.
+//! ADCs for load cells that pull a line low when a sample is ready. This is the shared code of HX711, ADS1220 and
+//! ADS131M0x. Each [`ReadyChip`] has the differences.
 //!
-//! A timer looks at the line every `rest_ticks` (klippy: ten times a sample), and has a worker read the
-//! sample that is ready. It then leaves the chip alone for 8 `rest_ticks`; a reading that is not back by
-//! then may have cost the next sample, and is counted as a possible overflow.
+//! A timer reads the line every `rest_ticks` (klippy: ten times per sample). A worker reads a sample that is ready. The
+//! timer then leaves the chip alone for 8 `rest_ticks`. A reading that is not back by then may have cost the next
+//! sample. It is counted as a possible overflow.
 
 #![forbid(unsafe_code)]
 
@@ -21,46 +21,46 @@ use super::trigger_analog::Attached;
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// What a reading came to.
+/// The result of a reading.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sample {
     /// A value.
     Value(i32),
-    /// An error, and what stands in the place of the value.
+    /// An error, and the number in place of the value.
     Error {
         /// The sensor's number of the error, if homing ends with it.
         code: Option<u8>,
-        /// What klippy knows the error by.
+        /// klippy recognizes the error by this value.
         value: i32,
     },
-    /// A value of each channel that is sampled, or in its place what klippy knows an error by.
+    /// One value for each sampled channel, or klippy's error value in its place.
     Channels {
-        /// As many as there are channels.
+        /// One for each channel.
         values: [i32; CHANNELS_MAX],
         /// How many channels there are.
         count: usize,
-        /// What they come to for homing; none if that is an error.
+        /// The value for homing. `None`: an error.
         sum: Option<i32>,
     },
 }
 
-/// How many channels of a chip may be sampled.
+/// Highest number of sampled channels of a chip.
 pub(super) const CHANNELS_MAX: usize = 4;
 
-/// What one kind of chip has of its own.
+/// The differences between the chips.
 pub(super) trait ReadyChip: Send + Sized + 'static {
-    /// What the log calls it.
+    /// The chip's name in the log.
     const NAME: &'static str;
     /// Reads a sample on a worker.
     type Reading: Errand;
 
-    /// Has a sample read.
+    /// Starts to read a sample.
     fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Self::Reading>) -> Result<(), Shutdown>;
 
-    /// The stop for a chip that could not be read.
+    /// The shutdown for a chip that could not be read.
     fn stop(failure: &<Self::Reading as Errand>::Failure) -> Shutdown;
 
-    /// What a reading that counts came to. `late` says that it was not back when it should have been.
+    /// Converts the answer of a reading that counts. `late` says that the reading was not back in time.
     fn sample(&mut self, answer: <Self::Reading as Errand>::Answer, late: bool) -> Sample;
 
     /// How many values make a sample.
@@ -68,13 +68,13 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
         1
     }
 
-    /// Measurements begin anew, or end.
+    /// Begins measurements, or ends them.
     fn switch(&mut self, turn: &mut Turn, on: bool) -> Result<(), Shutdown> {
         let _ = (turn, on);
         Ok(())
     }
 
-    /// An errand of [`ReadyChip::switch`] may be back.
+    /// An errand of [`ReadyChip::switch`] may have returned.
     fn switched(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         let _ = (turn, done);
         Ok(())
@@ -88,11 +88,11 @@ pub(super) struct ReadyAdc<C: ReadyChip> {
     chip: C,
     ready: Arc<dyn Line>,
     reading: Slot<C::Reading>,
-    /// Whether the reading under way is not back in time.
+    /// Whether the reading under way is late.
     late: bool,
     rest_ticks: Ticks,
     bulk: SensorBulk,
-    /// What is homed or probed by its samples.
+    /// The object that homes or probes with the samples.
     pub(super) attached: Attached,
 }
 
@@ -110,13 +110,13 @@ impl<C: ReadyChip> ReadyAdc<C> {
         }
     }
 
-    /// Lets a reading under way count no more.
+    /// Discards a reading under way.
     fn restart(&mut self) {
         self.reading.drop_pending();
         self.late = false;
     }
 
-    /// Begins measurements, or with `rest_ticks` of 0 ends them.
+    /// Begins measurements. `rest_ticks` of 0 ends them.
     pub(super) fn query(&mut self, turn: &mut Turn, rest_ticks: Ticks) -> Result<(), Shutdown> {
         turn.cancel(TIMER);
         self.restart();
@@ -131,7 +131,7 @@ impl<C: ReadyChip> ReadyAdc<C> {
         turn.schedule(TIMER, at)
     }
 
-    /// Tells the host how many samples there are. One that is being read counts as one in the chip.
+    /// Reports to the host how many samples there are. A sample that is being read counts as one in the chip.
     pub(super) fn query_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         let now = turn.now();
         let ready = self.reading.is_pending() || !self.ready.read()?;
@@ -207,7 +207,7 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
     }
 }
 
-/// Bytes that a chip on SPI sends while it is sent zeros; up to `N`.
+/// Bytes that a chip on SPI sends while it receives zeros, up to `N`.
 #[derive(Clone, Copy)]
 pub(super) struct Frame<const N: usize> {
     bytes: [u8; N],
@@ -215,7 +215,7 @@ pub(super) struct Frame<const N: usize> {
 }
 
 impl<const N: usize> Frame<N> {
-    /// The bytes that came.
+    /// The bytes that were received.
     pub(super) fn received(&self) -> &[u8] {
         &self.bytes[..self.len]
     }
@@ -231,7 +231,7 @@ impl<const N: usize> Talk for Frame<N> {
     }
 }
 
-/// Puts a sensor that is read in frames of `len` bytes over SPI under `oid`.
+/// Makes a sensor with this `oid`. It is read over SPI in frames of `len` bytes.
 pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<Frame<N>>>>(
     mcu: &mut Mcu,
     oid: Oid,
@@ -245,7 +245,7 @@ pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<
     mcu.assign_on(ready_pin, oid, ReadyAdc::new(chip, ready, Slot::talking(Frame { bytes: [0; N], len: len.min(N) })))
 }
 
-/// The number that 24 bits in two's complement stand for, the highest byte first.
+/// Converts 24 bits in two's complement, the highest byte first.
 pub(super) fn signed_24([high, middle, low]: [u8; 3]) -> i32 {
     i32::from_be_bytes([high, middle, low, 0]) >> 8
 }

@@ -1,14 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Measurements in bulk: samples are packed into messages that are counted, and the host learns at
-//! which instant how many samples there were.
+//! Measurements in bulk. Samples are packed into numbered messages. The host also learns how many samples there were at
+//! which time.
 //!
-//! klippy (`extras/bulk_sensor.py`) computes the time of each sample from that: it knows from
-//! `next_sequence` and `buffered` how many samples the sensor has taken, and fits a line through
-//! those counts and the instants of `sensor_bulk_status`. So a sample must never be counted twice or
-//! be left out, and the instants are those at which the bus was busy with the question, not those at
-//! which the core asked it.
+//! klippy (`extras/bulk_sensor.py`) computes the time of each sample from this. It knows from `next_sequence` and
+//! `buffered` how many samples the sensor has taken. It fits a line through these counts and the times of
+//! `sensor_bulk_status`. So a sample must never be counted twice or left out. The times are when the bus was busy with
+//! the question, not when the core asked it.
 //!
-//! Up to v0.12 each sensor had messages of its own for this ([`Words`]), which stand in its file.
+//! Up to v0.12 each sensor had its own messages for this ([`Words`]). They are in the sensor's file.
 
 #![forbid(unsafe_code)]
 
@@ -19,14 +18,14 @@ pub(super) const FEATURE: Feature =
     Feature { name: "sensor_bulk", responses: &[BulkData::FORM, BulkStatus::FORM], ..Feature::EMPTY };
 
 response! {
-    /// Samples, packed as the sensor's module of klippy expects them.
+    /// Samples, packed in the format of the sensor's klippy module.
     "sensor_bulk_data oid=%c sequence=%hu data=%*s" => since(V0_13);
     pub(super) struct BulkData<'a> { oid: Oid, sequence: u16, data: &'a [u8] }
 }
 
 response! {
-    /// How many samples there were at `clock` to `clock + query_ticks`: `next_sequence` messages, and
-    /// `buffered` bytes that are not sent yet.
+    /// How many samples there were between `clock` and `clock + query_ticks`: `next_sequence` messages, and `buffered`
+    /// bytes that are not sent yet.
     "sensor_bulk_status oid=%c clock=%u query_ticks=%u next_sequence=%hu buffered=%u possible_overflows=%hu" => since(V0_13);
     pub(super) struct BulkStatus {
         oid: Oid,
@@ -38,21 +37,21 @@ response! {
     }
 }
 
-/// Bytes of samples that a message holds (`MAX_BULK_MSG_SIZE` of klippy, which computes from it how
-/// many samples each message has).
+/// Highest number of bytes of samples in a message (`MAX_BULK_MSG_SIZE` of klippy). klippy computes from it how many
+/// samples each message has.
 pub(super) const DATA_MAX: usize = 51;
 
-/// The messages that samples are sent in.
+/// The messages for samples.
 pub(super) struct Words {
-    /// Bytes of samples that a message holds.
+    /// Highest number of bytes of samples in a message.
     pub(super) data_max: usize,
     /// Sends samples.
     pub(super) data: fn(&mut Mcu, BulkData<'_>),
-    /// Sends how many there are.
+    /// Sends how many samples there are.
     pub(super) status: fn(&mut Mcu, Status),
 }
 
-/// How many samples there were at `clock` to `clock + query_ticks`.
+/// How many samples there were between `clock` and `clock + query_ticks`.
 pub(super) struct Status {
     pub(super) oid: Oid,
     pub(super) clock: Clock,
@@ -61,7 +60,7 @@ pub(super) struct Status {
     pub(super) next_sequence: u16,
     /// Bytes that wait for the next message.
     pub(super) in_message: u8,
-    /// Bytes that are in the sensor.
+    /// Bytes in the sensor.
     pub(super) in_sensor: u32,
     pub(super) possible_overflows: u16,
 }
@@ -79,7 +78,7 @@ macro_rules! own_words {
         }
 
         $crate::response! {
-            /// How many samples there were, of them `fifo` in the chip.
+            /// How many samples there were. `fifo` of them are in the chip.
             $status => $hosts;
             pub(super) struct OwnStatus {
                 oid: Oid,
@@ -112,7 +111,7 @@ macro_rules! own_words {
 
 pub(super) use own_words;
 
-/// Those that all sensors have in common, since v0.13.
+/// The messages of all sensors since v0.13.
 const COMMON: Words = Words {
     data_max: DATA_MAX,
     data: |mcu, data| mcu.send(data),
@@ -133,12 +132,12 @@ pub(super) struct SensorBulk {
 }
 
 impl SensorBulk {
-    /// Nothing measured yet.
+    /// No measurements yet.
     pub(super) const fn new() -> SensorBulk {
         SensorBulk::in_words(&COMMON)
     }
 
-    /// Nothing measured yet, by a sensor that has messages of its own with hosts up to v0.12.
+    /// No measurements yet. The sensor has its own messages for hosts up to v0.12.
     pub(super) fn with_own(mcu: &Mcu, own: &'static Words) -> SensorBulk {
         SensorBulk::in_words(if mcu.speaks::<BulkData<'_>>() { &COMMON } else { own })
     }
@@ -147,12 +146,12 @@ impl SensorBulk {
         SensorBulk { words, sequence: 0, possible_overflows: 0, data: [0; DATA_MAX], len: 0 }
     }
 
-    /// Begins to count anew.
+    /// Starts to count again.
     pub(super) fn reset(&mut self) {
         *self = SensorBulk::in_words(self.words);
     }
 
-    /// Appends one sample, and sends the message once another sample of its size has no room.
+    /// Appends one sample. Sends the message when it has no room for another sample of this size.
     pub(super) fn add(&mut self, turn: &mut Turn, sample: &[u8]) {
         let end = self.len + sample.len();
         self.data[self.len..end].copy_from_slice(sample);
@@ -162,8 +161,7 @@ impl SensorBulk {
         }
     }
 
-    /// Sends the samples that wait for more, if there are any: the last message of a measurement, which
-    /// hosts up to v0.12 expect.
+    /// Sends the waiting samples, if there are any. Hosts up to v0.12 expect this last message of a measurement.
     pub(super) fn flush(&mut self, turn: &mut Turn) {
         if self.len > 0 {
             self.send(turn);
@@ -177,7 +175,7 @@ impl SensorBulk {
         self.len = 0;
     }
 
-    /// Bytes that the message has room for.
+    /// Free bytes in the message.
     pub(super) fn room(&self) -> usize {
         self.words.data_max - self.len
     }
@@ -187,8 +185,8 @@ impl SensorBulk {
         self.possible_overflows = self.possible_overflows.wrapping_add(times);
     }
 
-    /// Tells the host how many samples there are: `in_sensor` bytes of them are still in the sensor, as
-    /// it said between `began` and `ended`.
+    /// Reports to the host how many samples there are. `in_sensor` bytes are still in the sensor, as it said between
+    /// `began` and `ended`.
     pub(super) fn send_status(&self, turn: &mut Turn, (began, ended): (Clock, Clock), in_sensor: u32) {
         let status = Status {
             oid: turn.oid(),

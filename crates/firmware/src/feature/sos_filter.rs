@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Filters of second-order sections in fixed point, for the samples of a sensor that triggers.
 //!
-//! klippy designs the filter (scipy's `sosfilt`) and sends its coefficients as integers. Each result
-//! is the firmware's to the bit, also where its 32-bit sums wrap.
+//! klippy designs the filter (scipy's `sosfilt`) and sends its coefficients as integers. Each result equals the
+//! firmware's to the bit, even if its 32-bit sums wrap.
 
 #![forbid(unsafe_code)]
 
@@ -26,7 +26,7 @@ pub(super) const FEATURE: Feature = Feature {
 shutdowns! {
     /// A section beyond the `max_sections` of its filter.
     SECTION_INDEX = "Filter section index larger than max_sections";
-    /// Kalico: a sample for a filter that is not set active.
+    /// Kalico: a sample for a filter that was not set active.
     NOT_ACTIVE = "sos_filter not property initialized";
     /// Kalico: a product does not fit 32 bits.
     FILTER_OVERFLOW = "fixed_mul: overflow";
@@ -36,7 +36,7 @@ shutdowns! {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Overflow;
 
-/// Bits that a count of fractional bits has.
+/// The bits that are used of a count of fractional bits.
 const FRAC_BITS_MASK: u8 = 0x3f;
 
 /// The product of a coefficient with `frac_bits` fractional bits and a value, rounded half up.
@@ -58,7 +58,7 @@ struct Section {
 }
 
 impl Section {
-    /// Filters a value. One that overflows leaves the state alone.
+    /// Filters a value. An overflow leaves the state unchanged.
     fn apply(&mut self, input: i32, frac_bits: u8) -> Result<i32, Overflow> {
         let [b0, b1, b2, a1, a2] = self.coefficients;
         let output = fixed_mul(b0, input, frac_bits)?.wrapping_add(self.state[0]);
@@ -70,17 +70,17 @@ impl Section {
 }
 
 pub(super) struct SosFilter {
-    /// As many as `max_sections`.
+    /// There are `max_sections` of them.
     sections: Box<[Section]>,
-    /// How many of them, from the first on, a value goes through.
+    /// How many sections a value goes through, from the first one on.
     active: usize,
-    /// Whether it was set active since a section was changed.
+    /// Whether the filter was set active after the last change of a section.
     is_ready: bool,
     coeff_frac_bits: u8,
     offset: i32,
     scale: i32,
     scale_frac_bits: u8,
-    /// Whether the next value is to be zero: its negative becomes the offset.
+    /// Whether the next value becomes zero: its negative becomes the offset.
     auto_offset: bool,
 }
 
@@ -98,7 +98,7 @@ impl SosFilter {
         }
     }
 
-    /// Filters a sample. One that overflows in a section has changed the state of those before.
+    /// Filters a sample. If a section overflows, the sections before it have already changed their state.
     pub(super) fn apply(&mut self, sample: i32) -> Result<i32, Overflow> {
         if std::mem::take(&mut self.auto_offset) {
             self.offset = sample.wrapping_neg();
@@ -107,14 +107,14 @@ impl SosFilter {
         self.filter(fixed_mul(self.scale, shifted, self.scale_frac_bits)?)
     }
 
-    /// Filters a value that is scaled already.
+    /// Filters a value that is already scaled.
     fn filter(&mut self, scaled: i32) -> Result<i32, Overflow> {
         self.sections[..self.active]
             .iter_mut()
             .try_fold(scaled, |value, section| section.apply(value, self.coeff_frac_bits))
     }
 
-    /// Filters a value for Kalico, whose load cell probes scale it themselves.
+    /// Filters a value for Kalico. Its load cell probes scale the value themselves.
     ///
     /// # Errors
     ///
@@ -129,7 +129,7 @@ impl SosFilter {
         })
     }
 
-    /// A section to be changed: the filter is off until `sos_filter_set_active`.
+    /// Returns a section for a change. The filter is off until `sos_filter_set_active`.
     fn section(&mut self, index: u8) -> Result<&mut Section, Shutdown> {
         let max_sections = self.sections.len();
         let section = self.sections.get_mut(usize::from(index)).ok_or_else(|| {
@@ -224,19 +224,19 @@ mod tests {
     use proptest::collection::vec;
     use proptest::prelude::*;
 
-    /// What a 32-bit register keeps of a sum.
+    /// The part of a sum that a 32-bit register keeps.
     fn wrapped(sum: i128) -> i128 {
         (sum + (1 << 31)).rem_euclid(1 << 32) - (1 << 31)
     }
 
-    /// A product in units of 2^-`frac_bits`, rounded half up; none if it does not fit.
+    /// A product in units of 2^-`frac_bits`, rounded half up. `None`: it does not fit.
     fn product(a: i128, b: i128, frac_bits: u32) -> Option<i128> {
         let unit = 1i128 << frac_bits;
         let rounded = (2 * a * b + unit).div_euclid(2 * unit);
         (wrapped(rounded) == rounded).then_some(rounded)
     }
 
-    /// The filter in numbers so wide that nothing is lost on the way.
+    /// The filter in numbers wide enough to lose nothing.
     struct Wide {
         sections: Vec<([i128; 5], [i128; 2])>,
         frac_bits: u32,
@@ -275,7 +275,7 @@ mod tests {
         fn every_bit_is_that_of_wide_arithmetic(
             design in vec((vec(number(), 5), number(), number()), 0..5),
             samples in vec(number(), 1..40),
-            // 63 is a case of its own, below.
+            // 63 is a separate case, below.
             frac_bits in 0u8..63,
             scale in number(),
             scale_frac_bits in 0u8..63,
@@ -315,7 +315,7 @@ mod tests {
         assert_eq!(halves, [-2, -2, -1, -1, 0, 0, 1, 1, 2, 2, 3]);
     }
 
-    /// klippy's low pass of 25 Hz at 400 samples a second, with 29 fractional bits.
+    /// klippy's low pass of 25 Hz at 400 samples per second, with 29 fractional bits.
     fn low_pass() -> SosFilter {
         let mut filter = SosFilter::new(2);
         filter.section(0).unwrap().coefficients = [501_168, 1_002_337, 501_168, -732_891_736, 256_405_387];
@@ -325,8 +325,8 @@ mod tests {
         filter
     }
 
-    /// What the firmware's C program made of these samples, an overflow of the offset and one of a section
-    /// among them.
+    /// The results of the firmware's C program for these samples. They include an overflow of the offset and one of a
+    /// section.
     #[test]
     fn a_low_pass_answers_as_the_firmware() {
         let mut filter = low_pass();
@@ -373,7 +373,7 @@ mod tests {
                 *state = [*b1 * x - *a1 * y + state[1], *b2 * x - *a2 * y];
                 y
             });
-            // Each section's results are rounded to integers, which the next amplifies.
+            // Each section rounds its results to integers, and the next one amplifies the rounding.
             assert!(
                 (f64::from(value) - expected).abs() < 2000.0,
                 "sample {n}: {value}, and in real numbers {expected}"

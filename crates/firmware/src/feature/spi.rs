@@ -1,12 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! SPI devices, with or without a GPIO line that selects the chip, and the messages that they are
-//! sent at a shutdown.
+//! SPI devices, with or without a GPIO line as chip select, and the messages that they get at a shutdown.
 //!
-//! A `spi_send` or `spi_transfer` is over, and answered, before the next command runs. klippy relies
-//! on that: for displays it sets the D/C line by the commands before and after a `spi_send`, and when
-//! the acknowledgement of a query arrives it does not wait for the answer any longer. Only a `spi_send` behind a `spi_send` to
-//! the same device does not wait: the worker does them in their order. Once one fails, or the MCU stops, the rest is
-//! not sent.
+//! A `spi_send` or `spi_transfer` is finished and answered before the next command runs. klippy relies on that. For
+//! displays it sets the D/C line with the commands before and after a `spi_send`. It also stops waiting for an answer
+//! when the acknowledgement of the query arrives. Only a `spi_send` behind a `spi_send` to the same device does not
+//! wait. The worker runs them in their order. After a failure, or when the MCU stops, the rest is not sent.
 
 #![forbid(unsafe_code)]
 
@@ -50,36 +48,36 @@ shutdowns! {
 }
 
 response! {
-    /// What an SPI device sent back.
+    /// The bytes that an SPI device sent back.
     "spi_transfer_response oid=%c response=%*s"
     pub(super) struct TransferResponse<'a> { oid: Oid, response: &'a [u8] }
 }
 
-/// The bytes for a device, and afterwards those that came back. A message block's bytes fit.
+/// The bytes for a device, and afterwards the bytes that came back. There is room for the bytes of a message block.
 #[derive(Clone)]
 pub(super) struct Transfer {
     bytes: [u8; PAYLOAD_MAX],
     len: usize,
-    /// Whether what comes back is read.
+    /// Whether the bytes that come back are read.
     reads: bool,
 }
 
 impl Transfer {
     const EMPTY: Transfer = Transfer { bytes: [0; PAYLOAD_MAX], len: 0, reads: true };
 
-    /// One that is to be loaded.
+    /// An empty transfer, for a later load.
     pub(super) fn slot() -> Slot<Conversation<Transfer>> {
         Slot::talking(Transfer::EMPTY)
     }
 
-    /// These bytes are to be exchanged for what comes back.
+    /// Loads bytes to exchange for the bytes that come back.
     pub(super) fn load(&mut self, data: &[u8]) {
         self.len = data.len().min(PAYLOAD_MAX);
         self.bytes[..self.len].copy_from_slice(&data[..self.len]);
         self.reads = true;
     }
 
-    /// These bytes are to be sent, whatever comes back.
+    /// Loads bytes to send. The bytes that come back are ignored.
     pub(super) fn load_to_send(&mut self, data: &[u8]) {
         self.load(data);
         self.reads = false;
@@ -99,10 +97,11 @@ impl Talk for Transfer {
     }
 }
 
-/// How many messages of one device may be under way: enough that the core is woken for one in several.
+/// Highest number of messages of one device under way. With this many, the core wakes up only for one of several.
 const UNDER_WAY_MAX: usize = 8;
 
-/// Numbers the messages that may be sent together. A failure or a stop takes the next number: what waits then is not sent.
+/// Numbers the messages that may be sent together. A failure or a stop takes the next number. Messages that still wait
+/// are then not sent.
 #[derive(Clone, Default)]
 struct Round(Arc<AtomicU32>);
 
@@ -116,7 +115,7 @@ impl Round {
     }
 }
 
-/// A transfer that is one of a round.
+/// A transfer that belongs to a round.
 struct Message {
     transfer: Transfer,
     round: Round,
@@ -128,7 +127,7 @@ impl Talk for Message {
     type Answer = ();
 
     fn talk(&mut self, chip: &mut dyn BusDevice) -> Result<(), BusError> {
-        // The host waits for the answer of one that is read.
+        // A transfer that reads is not skipped, because the host waits for its answer.
         if self.number != self.round.number() && !self.transfer.reads {
             return Ok(());
         }
@@ -153,12 +152,12 @@ impl Spi {
         Spi { bus: None, chip_select, messages, round }
     }
 
-    /// Whether it has a chip select line of its own.
+    /// Whether the device has a chip select line of its own.
     pub(super) fn has_chip_select(&self) -> bool {
         self.chip_select.is_some()
     }
 
-    /// Whether it may get a bus, of this mode.
+    /// Checks that the device may get a bus, with this mode.
     fn may_have_bus(&self, mcu: &Mcu, mode: u8) -> Result<(), Shutdown> {
         if mode > 3 {
             return Err(invalid(format_args!("mode {mode} is none of 0 to 3")));
@@ -166,8 +165,7 @@ impl Spi {
         if self.bus.is_some() {
             return Err(invalid("it has a bus already"));
         }
-        // The firmware opens it even after that. Here the core would have to wait for the files, and
-        // steps with it.
+        // The firmware opens a bus even then. Here the core would have to wait for the files, and steps with it.
         if mcu.is_finalized() {
             return Err(invalid("it gets a bus after finalize_config"));
         }
@@ -185,7 +183,7 @@ impl Spi {
     fn set_lines(&mut self, mcu: &mut Mcu, pins: [Pin; 3], mode: u8, pulse: Ticks) -> Result<(), Shutdown> {
         self.may_have_bus(mcu, mode)?;
         let [miso, mosi, sclk] = pins;
-        // In the firmware's order, which counts where one line is MISO and MOSI: it drives.
+        // The firmware's order. It matters if one line is both MISO and MOSI: the line then drives.
         let device = SoftSpi {
             miso: mcu.shared_input(miso)?,
             mosi: mcu.shared_output(mosi, false)?,
@@ -199,7 +197,7 @@ impl Spi {
         Ok(())
     }
 
-    /// Has a transfer: with an answer, for `spi_transfer`, or without one, for `spi_send`.
+    /// Starts a transfer: with an answer for `spi_transfer`, without one for `spi_send`.
     fn transfer(&mut self, turn: &mut Turn, answers: bool, data: &[u8]) -> Result<(), Shutdown> {
         let Some(bus) = &self.bus else {
             // A device without a bus echoes, as in the firmware.
@@ -208,7 +206,7 @@ impl Spi {
             }
             return Ok(());
         };
-        // One is here, unless a bus has hung since before a stop.
+        // A slot is free, unless a bus has been hanging since before a stop.
         let Some(slot) = self.messages.iter_mut().find(|slot| slot.is_here()) else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "the messages from before the stop are under way"));
         };
@@ -229,8 +227,8 @@ fn invalid(what: impl fmt::Display) -> Shutdown {
     Shutdown::by_host(INVALID_SPI, what)
 }
 
-/// The stop for an SPI conversation that failed. Not a conversion of any `BusError`: one of an I2C
-/// bus has texts of its own (`i2c_shutdown`).
+/// The shutdown for a failed SPI conversation. It does not convert every `BusError`: an I2C bus has its own texts
+/// (`i2c_shutdown`).
 pub(super) fn spi_shutdown(error: BusError) -> Shutdown {
     Shutdown::because(SPI_TRANSFER_FAILED, error.trouble)
 }
@@ -265,7 +263,7 @@ impl Object for Spi {
     }
 }
 
-/// The message that a device is sent at a shutdown.
+/// The message for a device at a shutdown.
 struct SpiShutdown {
     spi: Oid,
     message: Slot<Conversation<Transfer>>,
@@ -291,7 +289,7 @@ impl Object for SpiShutdown {
         }
     }
 
-    /// It can not: it holds no chips on a bus.
+    /// The guardian cannot send the message: it holds no chips on a bus.
     fn is_guarded(&self) -> bool {
         false
     }
@@ -332,8 +330,8 @@ const SPI_SET_SOFTWARE_BUS: Command = command!(
     |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, rate: u32| {
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
-        // The firmware ignored the rate and was as fast as its system calls. Lines that are written
-        // through mapped registers would be too fast for a chip.
+        // The firmware ignored the rate and was as fast as its system calls. Lines that are written through mapped
+        // registers would be too fast for a chip.
         let pulse = Ticks(CLOCK_FREQ.checked_div(rate).unwrap_or(0));
         spi.set_lines(turn, pins, mode, pulse)
     }
@@ -344,7 +342,7 @@ const SPI_SET_SW_BUS: Command = command!(
     "spi_set_sw_bus oid=%c miso_pin=%u mosi_pin=%u sclk_pin=%u mode=%u pulse_ticks=%u",
     Spi,
     |spi, turn, miso_pin: Pin, mosi_pin: Pin, sclk_pin: Pin, mode: u32, pulse_ticks: Ticks| {
-        // Of one byte, as in the firmware.
+        // The mode has one byte, as in the firmware.
         let mode = mode as u8;
         let pins = [miso_pin, mosi_pin, sclk_pin];
         spi.set_lines(turn, pins, mode, pulse_ticks)

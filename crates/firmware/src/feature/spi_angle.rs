@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Magnetic angle sensors on SPI: A1333, AS5047D, TLE5012B, MT6816, MT6826S.
 //!
-//! Every `rest_ticks` there is one entry for the host, be it an angle or an error: klippy
-//! (`extras/angle.py`) counts entries to tell when each was due, and an entry has by how much it came
-//! later (or, of the TLE5012B, the chip's own clock). A sensor is asked one thing at a time: what it
-//! latched for a measurement is read before a transfer of the host's latches anew.
+//! Every `rest_ticks` the host gets one entry, an angle or an error. klippy (`extras/angle.py`) counts entries to know
+//! when each was due. An entry says by how much it came later (for the TLE5012B: the chip's own clock). A sensor gets
+//! one request at a time. Its latched measurement is read before a transfer of the host latches a new one.
 
 #![forbid(unsafe_code)]
 
@@ -31,7 +30,7 @@ pub(super) const FEATURE: Feature = Feature {
     ..Feature::EMPTY
 };
 
-/// The hosts that know these sensors: Kalico has them for other boards only.
+/// The hosts that know these sensors. Kalico has them only for other boards.
 const KNOWN: Generations = Generations::ALL.except(Kalico);
 
 const TYPES: [(&str, u8); 5] = [("a1333", 0), ("as5047d", 1), ("tle5012b", 2), ("mt6816", 3), ("mt6826s", 4)];
@@ -39,7 +38,7 @@ const TYPES: [(&str, u8); 5] = [("a1333", 0), ("as5047d", 1), ("tle5012b", 2), (
 const TYPES_OF_V0_12: usize = 3;
 
 shutdowns! {
-    /// A `spi_angle_type` that the enumeration does not have.
+    /// A `spi_angle_type` outside the enumeration.
     INVALID_CHIP = "Invalid spi_angle chip type";
     /// The SPI device has no chip select line of its own.
     NEEDS_CS = "angle sensor requires cs pin";
@@ -52,7 +51,7 @@ response! {
 }
 
 response! {
-    /// The measurements have ended, with the message before this number.
+    /// The measurements have ended. The last message has the number before this one.
     "spi_angle_end oid=%c sequence=%hu" => until(V0_12);
     pub(super) struct OwnEnd { oid: Oid, sequence: u16 }
 }
@@ -65,37 +64,37 @@ const OWN_WORDS: Words = Words {
 };
 
 response! {
-    /// What a sensor sent back, and when it latched that; nothing if the bus was too slow to tell.
+    /// The bytes that a sensor sent back, and when it latched them. There are none if the bus was too slow to tell.
     "spi_angle_transfer_response oid=%c clock=%u response=%*s" => KNOWN;
     pub(super) struct TransferResponse<'a> { oid: Oid, clock: Clock, response: &'a [u8] }
 }
 
-/// A transfer that takes longer says too little about when the sensor latched.
+/// Longest transfer. A longer one says too little about when the sensor latched.
 const TRANSFER_MAX: Ticks = Ticks::from_us(50);
-/// What stands for the time in an entry that is an error.
+/// The time field of an entry that is an error.
 const TIME_ERROR: u8 = 0xff;
-/// How long the TLE5012B's frame counter of 6 bits is unambiguous, with some margin: 32 times 32
-/// periods of its timer of 750 kHz, in whole microseconds.
+/// Longest time for which the TLE5012B's 6-bit frame counter is unambiguous, with some margin: 32 times 32 periods of
+/// its 750 kHz timer, in whole microseconds.
 const FRAMES_MAX: Ticks = Ticks::from_us((32 * 32 * 1_000_000u64 / 750_000) as u32);
 const ENTRY_BYTES: usize = 3;
 const MESSAGE_MAX: usize = 10;
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// Why there is no angle, as klippy's log counts it.
+/// Why there is no angle. klippy's log counts these.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Fault {
-    /// The measurement before was not over in time.
+    /// The measurement before was not finished in time.
     Overflow = 0,
-    /// It came too late to be told by how much.
+    /// The measurement came too late: an entry cannot hold the lateness.
     Schedule = 1,
     /// The transfer took too long.
     SpiTime = 2,
-    /// A check sum or parity is wrong.
+    /// A checksum or parity bit is wrong.
     Crc = 3,
-    /// The angle was told before.
+    /// The angle was already reported.
     Duplicate = 4,
-    /// The sensor says that it has none.
+    /// The sensor reports that it has no angle.
     NoAngle = 5,
 }
 
@@ -109,7 +108,7 @@ enum Chip {
     Mt6826s,
 }
 
-/// An angle of 16 bits, and of the TLE5012B its own clock.
+/// An angle of 16 bits. `frame` is the TLE5012B's own clock.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 struct Angle {
     angle: u16,
@@ -136,9 +135,9 @@ impl Chip {
         })
     }
 
-    /// What has to be said before the message: the end of this transfer is when the sensor latches.
-    /// The TLE5012B latches at the end of an empty one, which selects it for 1 us at least; the AS5047D at the end of the one that asks
-    /// for the angle (ANGLECOM), which the next one brings.
+    /// The transfer before the message. Its end is when the sensor latches. The TLE5012B latches at the end of an empty
+    /// transfer, which selects it for at least 1 us. The AS5047D latches at the end of the transfer that asks for the
+    /// angle (ANGLECOM). The next transfer brings this angle.
     fn preface(self, purpose: &Purpose) -> Option<&'static [u8]> {
         match (self, purpose) {
             (Chip::Tle5012b, _) => Some(&[]),
@@ -150,11 +149,11 @@ impl Chip {
     /// The message that brings the angle.
     fn message(self) -> &'static [u8] {
         match self {
-            // Angle register, for the next transfer.
+            // Asks for the angle register. The next transfer brings it.
             Chip::A1333 => &[0x32, 0x00],
             // No operation.
             Chip::As5047d => &[0xc0, 0x00],
-            // Three registers from AVAL on, of those that were latched, and the safety word.
+            // Three latched registers from AVAL on, and the safety word.
             Chip::Tle5012b => &[0x84, 0x23, 0, 0, 0, 0, 0, 0, 0, 0],
             // Two registers from 3 on.
             Chip::Mt6816 => &[0x83, 0x00, 0x00],
@@ -163,8 +162,8 @@ impl Chip {
         }
     }
 
-    /// Whether what is measured is that of the transfer's end, where it has no preface. (Of the
-    /// MT6816 and MT6826S that is so for measurements only.)
+    /// Whether the value is from the transfer's end, for a transfer without a preface. (For the MT6816 and MT6826S this
+    /// is so only in measurements.)
     fn latches_at_end(self, purpose: &Purpose) -> bool {
         match purpose {
             Purpose::Measurement { .. } => matches!(self, Chip::Mt6816 | Chip::Mt6826s),
@@ -172,7 +171,7 @@ impl Chip {
         }
     }
 
-    /// The angle in what a message brought back.
+    /// Decodes the angle from a message's reply.
     fn decode(self, reply: &[u8; MESSAGE_MAX]) -> Result<Angle, Fault> {
         let [b0, b1, b2, b3, b4, b5, b6, .., b8, b9] = *reply;
         let word = |high: u8, low: u8| u16::from_be_bytes([high, low]);
@@ -188,7 +187,7 @@ impl Chip {
                 (word(b0, b1) << 2, None)
             }
             Chip::Tle5012b => {
-                // SAE J1850, over the command too.
+                // SAE J1850. It also covers the command.
                 let crc = crc8(0x1d, crc8(0x1d, 0xff, &self.message()[..2]), &reply[2..8]);
                 check(!crc != b9, Fault::Crc)?;
                 check(b8 & 0x10 == 0, Fault::NoAngle)?;
@@ -210,7 +209,7 @@ impl Chip {
     }
 }
 
-/// An entry: of an angle that was latched so many ticks after it was due.
+/// An entry for an angle that was latched `late` ticks after it was due.
 fn entry(measured: Result<Angle, Fault>, late: u32, time_shift: u8) -> [u8; ENTRY_BYTES] {
     let timed = measured.and_then(|Angle { angle, frame }| match frame {
         Some(_) if late > FRAMES_MAX.0 => Err(Fault::Schedule),
@@ -228,25 +227,25 @@ fn entry(measured: Result<Angle, Fault>, late: u32, time_shift: u8) -> [u8; ENTR
     [time, low, high]
 }
 
-/// What a sensor is asked for.
+/// The purpose of a request to a sensor.
 enum Purpose {
-    /// A measurement of the timer, which was due then; `None` if it is of an earlier query, and counts no more.
+    /// A measurement of the timer, with its due time. `None`: it is from an earlier query, and no longer counts.
     Measurement { due: Option<Clock> },
-    /// A transfer of the host, with what commands wait by; `None` once the machine is stopped.
+    /// A transfer of the host. Commands wait with its `hold`. `None`: the MCU has stopped.
     Transfer { hold: Option<Hold> },
 }
 
-/// What is under way with a sensor.
+/// A request under way.
 struct Asking {
     purpose: Purpose,
-    /// When the preface was over; `None` before, and without one.
+    /// When the preface ended. `None`: it has not ended, or there is no preface.
     latched: Option<Clock>,
 }
 
-/// The measurement that comes next.
+/// The next measurement.
 struct Upcoming {
     due: Clock,
-    /// How many before it there was no time for.
+    /// How many measurements before it there was no time for.
     missed: u16,
 }
 
@@ -258,19 +257,19 @@ struct SpiAngle {
     bulk: SensorBulk,
     rest_ticks: Ticks,
     time_shift: u8,
-    /// A sensor is asked one thing at a time.
+    /// A sensor gets one request at a time.
     asking: Option<Asking>,
     upcoming: Option<Upcoming>,
-    /// The host's transfer waits for what is under way, and commands for it.
+    /// The host's transfer waits for the request under way. Commands wait for the transfer.
     asked: Option<Hold>,
     /// For measurements, and prefaces of transfers.
     measurement: Slot<Conversation<Transfer>>,
-    /// The host's.
+    /// For transfers of the host.
     transfer: Slot<Conversation<Transfer>>,
 }
 
 impl SpiAngle {
-    /// Begins what comes next, if nothing is under way. The host goes first.
+    /// Begins the next request, if none is under way. The host goes first.
     fn go_on(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         if self.asking.is_some() {
             return Ok(());
@@ -299,14 +298,14 @@ impl SpiAngle {
     }
 
     fn say(&mut self, turn: &mut Turn, message: &[u8]) -> Result<(), Shutdown> {
-        // Nothing else is under way, so it is here.
+        // Nothing else is under way, so the conversation is here.
         if let Some(measurement) = self.measurement.here() {
             measurement.talk.load(message);
         }
         self.measurement.converse(turn, self.spi)
     }
 
-    /// Takes in the end of a conversation. True if that is all that was under way.
+    /// Processes the end of a conversation. Returns true if the request is finished.
     fn take_in(&mut self, turn: &mut Turn, began: Clock, ended: Clock) -> Result<bool, Shutdown> {
         let Some(Asking { purpose, latched }) = &mut self.asking else { return Ok(true) };
         let too_slow = ended.since(began) > i64::from(TRANSFER_MAX.0);
@@ -314,7 +313,7 @@ impl SpiAngle {
         if has_preface && latched.is_none() {
             *latched = Some(ended);
             match purpose {
-                // The TLE5012B latches at an edge.
+                // The TLE5012B latches at an edge, so the length of its preface does not matter.
                 Purpose::Measurement { due } if self.chip == Chip::As5047d && too_slow => {
                     let due = *due;
                     self.measured(turn, due, Err(Fault::SpiTime), ended);
@@ -351,7 +350,7 @@ impl SpiAngle {
         }
     }
 
-    /// Nothing is under way any more.
+    /// Ends the request under way, and releases the commands that wait for it.
     fn over(&mut self, turn: &mut Turn) {
         if let Some(Asking { purpose: Purpose::Transfer { hold: Some(hold) }, .. }) = self.asking.take() {
             turn.release(hold);
@@ -384,12 +383,12 @@ impl SpiAngle {
     }
 
     fn ask(&mut self, turn: &mut Turn, data: &[u8]) -> Result<(), Shutdown> {
-        // Commands wait for each other, so it is here; a stopped machine's may be still under way.
+        // Commands wait for each other, so the conversation is here. One from before a stop may still be under way.
         let Some(transfer) = self.transfer.here() else {
             return Err(Shutdown::by_host(reason::WORKER_OVERFLOW, "spi_angle_transfer came amid another one"));
         };
         transfer.talk.load(data);
-        // A timer may have begun what is under way: then what is sent next does not hold by itself.
+        // A timer may have begun the request under way. The transfer behind it then does not hold commands by itself.
         self.asked = Some(turn.hold());
         self.go_on(turn)
     }
@@ -423,7 +422,7 @@ impl Object for SpiAngle {
 
     fn shutdown(&mut self, turn: &mut Turn) {
         self.end();
-        // A stopped machine is held by nothing.
+        // A stopped MCU is not held.
         let under_way = match &mut self.asking {
             Some(Asking { purpose: Purpose::Transfer { hold }, .. }) => hold.take(),
             _ => None,
@@ -491,7 +490,7 @@ mod tests {
 
     #[test]
     fn check_sums_are_those_of_the_data_sheets() {
-        // The catalogue's check values of CRC-8/SAE-J1850 and CRC-8/SMBUS.
+        // The catalog's check values of CRC-8/SAE-J1850 and CRC-8/SMBUS.
         assert_eq!(!crc8(0x1d, 0xff, b"123456789"), 0x4b);
         assert_eq!(crc8(0x07, 0, b"123456789"), 0xf4);
     }
@@ -499,7 +498,7 @@ mod tests {
     #[test]
     fn angles_and_faults_of_each_chip() {
         for (chip, bytes, expected) in [
-            // 15 bits behind a zero.
+            // 15 bits after a zero.
             (Chip::A1333, &[0x00, 0x00][..], angle(0)),
             (Chip::A1333, &[0x7f, 0xff], angle(0xfffe)),
             (Chip::A1333, &[0x40, 0x01], angle(0x8002)),
@@ -517,7 +516,7 @@ mod tests {
             (Chip::Mt6816, &[0, 0xff, 0xfc], angle(0xfffc)),
             (Chip::Mt6816, &[0, 0x80, 0x00], Err(Fault::Crc)),
             (Chip::Mt6816, &[0, 0x80, 0x02], Err(Fault::NoAngle)),
-            // 15 bits, status, check sum.
+            // 15 bits, status, checksum.
             (Chip::Mt6826s, &[0, 0, 0x00, 0x00, 0x00, 0x00], angle(0)),
             (Chip::Mt6826s, &[0, 0, 0x12, 0x34, 0x00, crc8(7, 0, &[0x12, 0x34, 0])], angle(0x1234)),
             (Chip::Mt6826s, &[0, 0, 0x12, 0x34, 0x02, crc8(7, 0, &[0x12, 0x34, 2])], Err(Fault::NoAngle)),
@@ -576,7 +575,7 @@ mod tests {
     }
 
     proptest! {
-        /// What klippy makes of it: never an angle where the sensor told of none.
+        /// klippy must never read an angle from an entry if the sensor reported none.
         #[test]
         fn a_fault_is_never_an_angle(late: u32, shift: u8, bytes: [u8; MESSAGE_MAX], which in 0u8..5) {
             let measured = Chip::of(which).unwrap().decode(&bytes);

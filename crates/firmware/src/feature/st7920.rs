@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Graphic displays with an ST7920, on its serial interface.
 //!
-//! A message is a synchronising byte, which says whether commands or data follow, and each byte as two
-//! with the upper and the lower four bits in front (Sitronix' data sheet, "Serial interface"). The
-//! display executes a byte as its second half ends, so what it needs of time passes before that.
+//! A message begins with a synchronizing byte, which says whether commands or data follow. Each byte then becomes two,
+//! with its upper and its lower four bits in front (Sitronix' data sheet, "Serial interface"). The display executes a
+//! byte when its second half ends. So the time that the display needs passes before that.
 
 #![forbid(unsafe_code)]
 
@@ -18,23 +18,23 @@ use super::pace::Pace;
 pub(super) const FEATURE: Feature =
     Feature { name: "st7920", commands: &[CONFIG_ST7920, ST7920_SEND_CMDS, ST7920_SEND_DATA], ..Feature::EMPTY };
 
-/// SCLK is high and low for 200 ns at least.
+/// Shortest time that SCLK is high, and low: 200 ns.
 const HALF_CLOCK: Ticks = Ticks(10);
 const SYNC_COMMANDS: u8 = 0xf8;
 const SYNC_DATA: u8 = 0xfa;
 
 struct St7920 {
     busy: Busy,
-    /// From a message's last byte to the first byte of the next.
+    /// Delay from a message's last byte to the first byte of the next.
     sync_delay: Ticks,
-    /// Between bytes of a message.
+    /// Delay between the bytes of a message.
     delay: Ticks,
     sclk: Wire,
     sid: Wire,
 }
 
 impl St7920 {
-    /// The display takes a bit in as SCLK rises.
+    /// Writes a byte. The display reads a bit when SCLK rises.
     fn byte(&mut self, byte: u8) -> Result<(), Shutdown> {
         for place in (0..8).rev() {
             self.sid.set(byte >> place & 1 != 0)?;
@@ -85,7 +85,7 @@ const CONFIG_ST7920: Command = command!(
             sclk: Wire::claim(mcu, sclk_pin)?,
             sid: Wire::claim(mcu, sid_pin)?,
         };
-        // Selected from now on, also in a stopped machine.
+        // The display is selected from now on, even in a stopped MCU.
         mcu.shared_output(cs_pin, true)?;
         let display = Display::new(mcu, "ST7920 display", pace, panel)?;
         mcu.assign_on(sclk_pin, oid, display)

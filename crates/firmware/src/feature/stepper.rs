@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Steppers: queued moves, step pulses or both-edge steps, direction changes with their set-up
-//! time, a stop by a trsync.
+//! Steppers: queued moves, step pulses or both-edge steps, direction changes with their setup time, and a stop by a
+//! trsync.
 
 #![forbid(unsafe_code)]
 
@@ -37,20 +37,20 @@ shutdowns! {
     RESET_WHILE_STEPPING = "Can't reset time when stepper active";
     /// `queue_step` with a count of zero.
     INVALID_COUNT = "Invalid count parameter";
-    /// A step over a millisecond late.
+    /// A step is over a millisecond late.
     STEPPER_PAST = "Stepper too far in past";
 }
 
 response! {
-    /// Steps since the configuration, forwards less backwards.
+    /// Steps since the configuration: forward steps minus backward steps.
     "stepper_position oid=%c pos=%i"
     pub(super) struct Position { oid: Oid, pos: i32 }
 }
 
 const TIMER: Timer = Timer::exact(0);
 
-/// `count` steps, the first `interval` ticks after the step before, each interval longer by
-/// `add` than the one before.
+/// `count` steps. The first one comes `interval` ticks after the step before. Each interval is longer by `add` than the
+/// one before.
 struct Move {
     interval: u32,
     count: u16,
@@ -63,42 +63,41 @@ struct Stepper {
     dir: PromptLine,
     /// The step pin's idle level.
     invert_step: bool,
-    /// Every edge is a step, rather than a rising one followed by an unstep.
+    /// Every edge is a step. Otherwise an edge that is a step is followed by one back.
     both_edges: bool,
     pulse_ticks: Ticks,
     late_limit: Ticks,
     queue: MoveQueue<Move>,
-    /// Edges of the present move still to come; zero while idle.
+    /// Edges of the current move that are still to come. Zero while idle.
     edges: u32,
     interval: u32,
     add: i16,
-    /// When the present or last step is due.
+    /// When the current or last step is due.
     next_step: Clock,
-    /// The next edge comes no earlier: the pulse before it ends then, or the direction is set up.
+    /// Earliest time of the next edge. The pulse before it ends then, or the direction has had its setup time.
     earliest: Clock,
-    /// A reversal waits for this event, the end of the last step's pulse.
+    /// A reversal waits for the next event, the end of the last step's pulse.
     reverse_pending: bool,
-    /// Where the stepper stands after the present move. While the direction is reversed it
-    /// counts down from zero, so that a step always adds one.
+    /// The stepper's position after the current move. While the direction is reversed it counts down from zero, so that
+    /// a step always adds one.
     position: u32,
     last_dir: bool,
     next_dir: bool,
     /// After a stop, steps are dropped until the host sets a new clock.
     need_reset: bool,
-    /// The trsync that was last told to stop this stepper.
+    /// The last trsync that was set to stop this stepper.
     stopper: Option<Oid>,
 }
 
-/// How far behind, in ticks, a stepper that homes makes its steps in order. A machine that runs is not 50 us late. One
-/// that is 50 ms behind is asked for more steps than it can make, and other timers are not to wait for these.
+/// A homing stepper makes its steps in order if they are this many ticks late. An MCU that runs is not 50 us late. An
+/// MCU that is 50 ms late has more steps to make than it can. Other timers must not wait for these.
 const IN_ORDER: Range<i64> = Ticks::from_us(50).0 as i64..Ticks::from_us(50_000).0 as i64;
 
-/// Keeps the position's top bit free to tell the direction.
+/// Keeps the position's top bit free for the direction.
 const POSITION_BIAS: u32 = 0x4000_0000;
 
 impl Stepper {
-    /// Takes the next move. `earliest` is when its first edge may come at the earliest, if the
-    /// stepper is running.
+    /// Takes the next move. `earliest` is the earliest time of its first edge. `None`: the stepper is idle.
     fn load(&mut self, turn: &mut Turn, earliest: Option<Clock>) -> Result<Next, Shutdown> {
         let Some(Move { interval, count, add, reverses }) = self.queue.pop(&mut turn.moves) else {
             self.edges = 0;
@@ -110,10 +109,10 @@ impl Stepper {
         self.interval = interval.wrapping_add_signed(i32::from(add));
         self.edges = u32::from(count) << u32::from(!self.both_edges);
         let Some(earliest) = earliest else {
-            // After a long pause the interval has wrapped, and the step's clock is right.
+            // After a long pause the interval has wrapped, but the step's 32-bit clock is right.
             let clock = self.next_step.wire().wrapping_add(interval);
             self.next_step = turn.instant(WireClock(clock));
-            // Whatever pulse there was before is over, as for the firmware.
+            // Any earlier pulse is over, as for the firmware.
             self.earliest = self.next_step;
             if reverses {
                 self.dir.toggle()?;
@@ -143,13 +142,14 @@ impl Stepper {
         Ok(self.edge_at(turn, self.next_step, earliest))
     }
 
-    /// Has the next edge come when it is due, or at `earliest`, the end of a pulse that begins now, if that is later.
-    /// An edge that has no instant of its own (the end of a pulse, a reversal) is due by the step that it belongs to.
+    /// Sets the time of the next edge: its due time, or `earliest` if that is later. `earliest` is the end of a pulse
+    /// that begins now. An edge without a time of its own has the due time of its step: the end of a pulse, or a
+    /// reversal.
     ///
-    /// While a trsync may stop the stepper, edges that are behind keep their place among the other timers, in the order
-    /// in which all were due, and wait for `earliest` when it is their turn. Otherwise a machine that could not run for
-    /// a while would take every sample of an endstop before the first of the steps between them, and home at a wrong
-    /// place. A stepper that nothing stops does not wait: the pulses of several would add up, and none would catch up.
+    /// While a trsync may stop the stepper, late edges keep their place among the other timers. They stay in the order
+    /// of their due times, and wait for `earliest` when it is their turn. Otherwise a paused MCU would take every
+    /// sample of an endstop before the first of the steps between them. It would home at a wrong place. A stepper that
+    /// nothing stops does not wait: the pulses of several steppers would add up, and none would catch up.
     #[inline]
     fn edge_at(&mut self, turn: &mut Turn, due: Clock, earliest: Clock) -> Next {
         self.earliest = earliest;
@@ -163,21 +163,21 @@ impl Stepper {
         self.stopper.is_some_and(|trsync| Trsync::may_stop(turn, trsync))
     }
 
-    /// Moves on to the step after the present one, `interval` later by a clock of 32 bits: what
-    /// is 2^31 ticks or more after `earliest` has passed, as for the firmware's comparisons.
+    /// Moves on to the next step, `interval` later on a 32-bit clock. A time that is 2^31 ticks or more after
+    /// `earliest` has passed, as for the firmware's comparisons.
     #[inline]
     fn advance(&mut self, interval: u32, earliest: Clock) {
         self.next_step = Clock::widen(self.next_step.wire().wrapping_add(interval), earliest);
     }
 
-    /// Changes the direction and leaves it its set-up time.
+    /// Changes the direction and gives it its setup time.
     fn reverse(&mut self, turn: &mut Turn) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
         let earliest = turn.now() + self.pulse_ticks;
         Ok(self.edge_at(turn, self.next_step, earliest))
     }
 
-    /// The position that the host knows: after the steps that were made.
+    /// The position that the host knows: after the steps made so far.
     fn position(&self) -> u32 {
         let to_come = self.edges >> u32::from(!self.both_edges);
         let position = self.position.wrapping_sub(to_come);
@@ -195,7 +195,7 @@ impl Stepper {
         self.queue.clear(&mut mcu.moves);
     }
 
-    /// Drives the lines to where an idle motor has them.
+    /// Sets the lines to the levels of an idle motor.
     fn idle(&mut self) -> Result<(), Shutdown> {
         let dir = self.dir.write(false);
         if !self.both_edges {
@@ -237,7 +237,7 @@ impl Object for Stepper {
             return self.reverse(turn);
         }
         self.step.toggle()?;
-        // Counted from a reading after the edge was written: a write may be slow.
+        // Read the time after the edge was written, because a write may be slow.
         let earliest = turn.now() + self.pulse_ticks;
         let edges = self.edges.saturating_sub(1);
         if edges & 1 != 0 && !self.both_edges {

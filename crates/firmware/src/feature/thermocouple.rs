@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Thermocouple and RTD converters on SPI: MAX31855, MAX31856, MAX31865, MAX6675.
 //!
-//! The machine passes the chip's word on, and klippy makes degrees of it.
+//! The MCU passes the chip's word on, and klippy converts it to degrees.
 
 #![forbid(unsafe_code)]
 
@@ -26,7 +26,7 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A `thermocouple_type` that is none.
+    /// A `thermocouple_type` outside the enumeration.
     INVALID_TYPE = "Invalid thermocouple chip type";
     /// Faults, or values out of range, `max_invalid_count` times in a row.
     READER_FAULT = "Thermocouple reader fault";
@@ -40,7 +40,7 @@ response! {
 
 const TIMER: Timer = Timer::sampling(0);
 
-/// A chip; its number on the wire is its place in [`Chip::ALL`].
+/// A chip. Its number on the wire is its index in [`Chip::ALL`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Chip {
     Max31855,
@@ -77,10 +77,10 @@ impl Chip {
         Chip::ALL.iter().find(|(chip, _)| *chip == self).map_or("", |(_, name)| name)
     }
 
-    /// What is sent: the word's register and room for the word.
+    /// The message for a word: the word's register, and room for the word.
     fn word_message(self) -> &'static [u8] {
         match self {
-            // They have no registers: each transfer is the one word.
+            // These chips have no registers: each transfer is the one word.
             Chip::Max31855 => &[0; 4],
             Chip::Max6675 => &[0; 2],
             Chip::Max31856 => &[Max31856::LinearizedTemperature as u8, 0, 0, 0],
@@ -88,7 +88,7 @@ impl Chip {
         }
     }
 
-    /// The register with the faults; none if they are in the word.
+    /// The register with the faults. `None`: they are in the word.
     fn fault_register(self) -> Option<u8> {
         match self {
             Chip::Max31855 | Chip::Max6675 => None,
@@ -97,10 +97,10 @@ impl Chip {
         }
     }
 
-    /// The word of an answer to [`word_message`](Self::word_message), and the fault bits, with those of
-    /// the fault register.
+    /// Returns the word of an answer to [`word_message`](Self::word_message), and the fault bits. `register` is the
+    /// value of the fault register.
     fn decode(self, answer: &[u8], register: u8) -> (u32, u8) {
-        // The byte that came back while a register was named says nothing.
+        // The byte that came back while the register was sent means nothing.
         let word = answer.iter().skip(usize::from(self.fault_register().is_some()));
         let value = word.fold(0, |value, byte| value << 8 | u32::from(*byte));
         let low = value as u8;
@@ -108,7 +108,7 @@ impl Chip {
             // Short to VCC, short to GND, open (data sheet 19-5793, table 2: D2 to D0).
             Chip::Max31855 => low & 0x07,
             Chip::Max31856 => register,
-            // Bits 1 and 0 of the register are not used; D0 of the word is "any fault".
+            // Bits 1 and 0 of the register are not used. D0 of the word is "any fault".
             Chip::Max31865 => register & !0x03 | low & 0x01,
             // Open (D2), and the device ID (D1), which reads 0 (data sheet 19-2235, table 2).
             Chip::Max6675 => low & 0x06,
@@ -152,13 +152,13 @@ struct Thermocouple {
     max_value: u32,
     max_invalid_count: u8,
     invalid_count: u8,
-    /// The turn after the one that is being looked for.
+    /// When the turn after the current look is due.
     next_clock: Clock,
 }
 
 impl Thermocouple {
     fn check(&mut self, mcu: &Mcu, value: u32, fault: u8) -> Result<(), Shutdown> {
-        // Kalico's way to say that the host alone looks at the values.
+        // Kalico says this way that only the host checks the values.
         if self.max_invalid_count == 0 && mcu.serves(since(Kalico)) {
             return Ok(());
         }
@@ -191,7 +191,7 @@ impl Object for Thermocouple {
 
     fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         let next = at + self.rest_ticks;
-        // A chip that is still being asked misses this turn.
+        // A chip that is still being read misses this turn.
         if self.look.is_here() {
             self.next_clock = next;
             self.look.converse(turn, self.spi)?;
@@ -261,7 +261,7 @@ const QUERY_THERMOCOUPLE: Command = command!(
 mod tests {
     use super::*;
 
-    /// Words of the data sheets' tables; for chips with registers behind the byte that means nothing.
+    /// Words from the data sheets' tables. For chips with registers, a byte without meaning comes first.
     #[test]
     fn words_and_faults() {
         type Case = (Chip, &'static [u8], u8, (u32, u8));

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The UART of Trinamic's stepper drivers (TMC2208, TMC2209 and their like), bit by bit on one wire
-//! or two. klippy writes the start and stop bits itself, checks those of the reply, and asks again.
+//! The UART of Trinamic's stepper drivers (TMC2208, TMC2209 and similar), bit by bit on one wire or two. klippy writes
+//! the start and stop bits itself, checks those of the reply, and asks again.
 //!
-//! The firmware has a timer for each bit. Here an errand times a whole message on a worker: at 40
-//! kbaud that is up to 5 ms of edges 25 us apart, which would keep the core awake. How late bits
-//! are either way `bits_on_time` below measures (docs/develop/performance.md).
+//! The firmware has a timer for each bit. Here an errand times a whole message on a worker. At 40 kbaud a message is up
+//! to 5 ms of edges 25 us apart, which would keep the core awake. `bits_on_time` below measures how late bits are
+//! either way (docs/develop/performance.md).
 //!
-//! The firmware samples a reply wherever in a bit its timer happens to be. Here the start bit of each
-//! byte is looked for, and bits are read in their middle, so that half a bit of lateness does no harm. A
-//! start bit that is high again in its middle is a glitch, and none.
+//! The firmware samples a reply anywhere within a bit, wherever its timer happens to be. Here the start bit of each
+//! byte is found, and bits are read in their middle. So half a bit of lateness does no harm. A start bit that is high
+//! again in its middle is a glitch and does not count.
 
 #![forbid(unsafe_code)]
 
@@ -33,36 +33,36 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// `tmcuart_send` with more than ten bytes, or for more.
+    /// `tmcuart_send` with more than ten bytes to send or to read.
     DATA_TOO_LARGE = "tmcuart data too large";
 }
 
 response! {
-    /// A message was sent. The bits of the reply, from its first start bit on; none if none was asked
-    /// for or none came.
+    /// A message was sent. `read` has the bits of the reply, from its first start bit on. It is empty if no reply was
+    /// requested or none came.
     "tmcuart_response oid=%c read=%*s"
     pub(super) struct UartResponse<'a> { oid: Oid, read: &'a [u8] }
 }
 
-/// All UARTs share a worker: klippy talks to one at a time (`PrinterTMCUartMutexes` in tmc_uart.py).
+/// All UARTs share a worker, because klippy talks to one at a time (`PrinterTMCUartMutexes` in tmc_uart.py).
 const WORKER: &str = "tmcuart";
-/// Bytes of a message with start and stop bits: eight of ten bits.
+/// Highest number of bytes in a message, with start and stop bits: eight bytes of ten bits.
 const DATA_MAX: usize = 10;
-/// Between the command and the first edge, as in the firmware: a driver wants the line to be quiet in
+/// How long the line is quiet between the command and the first edge, as in the firmware. A driver wants a quiet line
 /// between messages.
 const QUIET: Ticks = Ticks::from_us(200);
-/// From the end of a message, before the reply is looked for.
+/// How long to wait after a message before looking for the reply, in bits.
 const TURN_BITS: u32 = 4;
-/// For how long the reply is looked for.
+/// How long to look for the reply, in bits.
 const REPLY_BITS: u32 = 65;
 /// A byte with its start and its stop bit.
 const FRAME_BITS: usize = 10;
-/// How often the line is looked at, while an edge is waited for, in each bit.
+/// How often the line is read in each bit while waiting for an edge.
 const LOOKS: u32 = 16;
-/// How often a register is asked for where a bit was late. klippy itself asks five times, and can not
-/// know whether it was the driver or this machine.
+/// How often a register is read if a bit was late. klippy itself asks five times. It cannot know whether the driver or
+/// this computer was late.
 const TRIES: u32 = 3;
-/// A message that begins with a start bit and a sync nibble, from which the driver takes its rate.
+/// A message begins with a start bit and a sync nibble. The driver takes its rate from them.
 const SYNC: u8 = 0b10_1010;
 const SYNC_MASK: u8 = 0b11_1111;
 /// The bits between the first and the last falling edge of these.
@@ -75,12 +75,12 @@ const TIMER: Timer = Timer::exact(0);
 struct Wires {
     tx: Arc<dyn Line>,
     rx: Arc<dyn Line>,
-    /// The resistor of a single wire while it listens; none if there are two.
+    /// The resistor of a single wire while it listens. `None`: there are two wires.
     single: Option<Bias>,
 }
 
 impl Wires {
-    /// Drives the line high, as it is between messages.
+    /// Drives the line high, its level between messages.
     fn idle(&self) -> Result<(), Shutdown> {
         match self.single {
             Some(_) => self.tx.turn(Direction::Output { level: true, shutdown_value: true }),
@@ -93,20 +93,20 @@ impl Wires {
     }
 }
 
-/// A message and its reply: there is one box for each UART.
+/// A message and its reply. Each UART has one box for them.
 struct Exchange {
     pace: Pace,
     wires: Wires,
-    /// As configured.
+    /// The configured length of a bit.
     bit: Ticks,
-    /// What is sent; the first bit is the lowest.
+    /// The bits to send. The first bit is the lowest.
     data: [u8; DATA_MAX],
     write_len: usize,
     reply: [u8; DATA_MAX],
     read_len: usize,
     /// Whether a reply came.
     replied: bool,
-    /// Whether a bit was so late that it may have been taken for another.
+    /// Whether a bit was late enough to be taken for another.
     spoilt: bool,
 }
 
@@ -122,12 +122,12 @@ impl Errand for Exchange {
 }
 
 impl Exchange {
-    /// To read a register changes nothing in the driver, so it may be done again; a write is klippy's to
-    /// repeat, which counts those that arrived.
+    /// Reading a register changes nothing in the driver, so it is retried here. klippy repeats a write, and counts the
+    /// writes that arrived.
     fn exchange(&mut self) -> Result<(), Shutdown> {
         for _ in 0..TRIES {
             self.spoilt = false;
-            // The first call is slower than the others, and would make the first bit longer.
+            // The first call is slower than the others. Without this one, the first bit would be longer.
             self.wires.tx.write(true)?;
             let Some((end, bit)) = self.send(self.pace.now())? else { break };
             if self.read_len == 0 {
@@ -150,8 +150,7 @@ impl Exchange {
         if self.replied { &self.reply[..self.read_len] } else { &[] }
     }
 
-    /// Sends the bits, from `at` on. Tells when the last one ended, and how long a bit was; nothing if it
-    /// was stopped.
+    /// Sends the bits, from `at` on. Returns when the last one ended, and the length of a bit. `None`: it was stopped.
     fn send(&mut self, mut at: Clock) -> Result<Option<(Clock, Ticks)>, Shutdown> {
         let mut bit = self.bit;
         let mut first_late = 0;
@@ -167,12 +166,12 @@ impl Exchange {
                 self.wires.tx.write(level)?;
                 line = level;
                 let late = self.pace.now().since(at);
-                // A fault of the sync nibble's four bits is 2.5 times that at the end of a byte.
+                // A fault of the sync nibble's four bits is 2.5 times as large at the end of a byte.
                 let fault = bit.0 / if place == SYNC_BITS && synced { 16 } else { 4 };
                 self.spoilt |= place > 0 && (late - first_late).abs() > i64::from(fault);
                 match place {
                     0 => first_late = late,
-                    // The driver has measured these bits, and expects the others to be as long.
+                    // The driver has measured these bits, and expects the others to have the same length.
                     SYNC_BITS if synced => {
                         let longer = late - first_late;
                         bit = longer_by(bit, div_round(longer, SYNC_BITS as i64));
@@ -186,7 +185,7 @@ impl Exchange {
         Ok(self.pace.until(at).then_some((at, bit)))
     }
 
-    /// Reads the reply to a message that ended at `end`. False if none came.
+    /// Reads the reply to a message that ended at `end`. Returns false if none came.
     fn receive(&mut self, end: Clock, bit: Ticks) -> Result<bool, Shutdown> {
         let from = end + bits(bit, TURN_BITS);
         if !self.pace.until(from) {
@@ -195,7 +194,7 @@ impl Exchange {
         let Some(mut at) = self.start_bit(from, from + bits(bit, REPLY_BITS), bit)? else { return Ok(false) };
         for place in 0..8 * self.read_len {
             if place > 0 && place % FRAME_BITS == 0 {
-                // Each start bit tells anew where the bits are.
+                // Each start bit shows again where the bits are.
                 at = self.start_bit(self.pace.now(), at, bit)?.unwrap_or(at);
             }
             if !self.pace.until(at) {
@@ -209,8 +208,8 @@ impl Exchange {
         Ok(true)
     }
 
-    /// Looks for a start bit until `limit`, and tells its middle. A line that falls and is high again by then
-    /// had a glitch.
+    /// Looks for a start bit until `limit`, and returns its middle. If the line falls and is high again in the middle,
+    /// it was a glitch.
     fn start_bit(&mut self, from: Clock, limit: Clock, bit: Ticks) -> Result<Option<Clock>, Shutdown> {
         let mut last = from;
         while let Some(edge) = self.falling_edge(last, limit, bit)? {
@@ -227,8 +226,8 @@ impl Exchange {
         Ok(None)
     }
 
-    /// Looks at the line until it falls; none if it does not until `limit`. `last` is when it was looked
-    /// at last, or need not be before.
+    /// Reads the line until it falls. `None`: it does not fall until `limit`. `last` is when the line was last read, or
+    /// the time before which it need not be read.
     fn falling_edge(&mut self, mut last: Clock, limit: Clock, bit: Ticks) -> Result<Option<Clock>, Shutdown> {
         let pause = Ticks((bit.0 / LOOKS).max(1));
         let mut was_high = false;
@@ -242,7 +241,7 @@ impl Exchange {
             if level {
                 was_high = true;
             } else if was_high {
-                // It lies between two looks.
+                // The edge lies between two reads.
                 return Ok(Some(now - Ticks(gap as u32 / 2)));
             }
             if now >= limit || !self.pace.until(now + pause) {
@@ -252,7 +251,7 @@ impl Exchange {
     }
 }
 
-/// As long as so many bits: a rate that no driver has may last until a shutdown, but does not overflow.
+/// The length of `count` bits. A rate that no driver has may last until a shutdown, but does not overflow.
 fn bits(bit: Ticks, count: u32) -> Ticks {
     Ticks(bit.0.saturating_mul(count))
 }
@@ -270,13 +269,13 @@ struct TmcUart {
     worker: WorkerId,
     pace: Pace,
     exchange: Slot<Exchange>,
-    /// Whether the host is owed an answer.
+    /// Whether the host still expects an answer.
     asked: bool,
 }
 
 impl TmcUart {
     fn send(&mut self, turn: &mut Turn, write: &[u8], read_len: u8) -> Result<(), Shutdown> {
-        // As in the firmware: who is busy does not listen, and the host asks again.
+        // As in the firmware: a busy UART ignores the command, and the host asks again.
         let Some(exchange) = self.exchange.here().filter(|_| !self.asked) else { return Ok(()) };
         let read_len = usize::from(read_len);
         if write.len() > DATA_MAX || read_len > DATA_MAX {
@@ -300,7 +299,7 @@ impl Object for TmcUart {
         "TMC UART"
     }
 
-    /// Sends the message from here, so that no command waits for it.
+    /// Sends the message from a timer, so that no command waits for it.
     fn event(&mut self, turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         self.exchange.send(turn, self.worker)?;
         Ok(Next::Done)
@@ -329,7 +328,7 @@ impl Object for TmcUart {
         self.asked = false;
     }
 
-    /// A message that is under way is broken off, and leaves the line idle.
+    /// Aborts a message under way. The errand then leaves the line idle.
     fn make_safe(&mut self, _turn: &mut Turn) -> Result<Safe, Shutdown> {
         match self.exchange.here() {
             Some(exchange) => exchange.wires.idle().map(|()| Safe::Now),
@@ -385,17 +384,16 @@ mod tests {
     /// 40 kbaud.
     const BIT: Ticks = Ticks::from_us(25);
 
-    /// A wire whose other end sends `reply` a while after the last edge, and which knows when each
-    /// edge came.
+    /// A wire that records the time of each edge. Its other end sends `reply` some time after the last edge.
     struct Wire {
         clock: Arc<dyn TimeSource>,
         edges: Mutex<Vec<(Clock, bool)>>,
         reply: Vec<u8>,
-        /// Called at each edge, with how many there were.
+        /// Called at each edge, with the number of edges so far.
         at_edge: Box<dyn Fn(usize) + Send + Sync>,
     }
 
-    /// From the last edge of a message to its reply: the end of its last byte, eight bits and some.
+    /// Time from the last edge of a message to its reply: the end of its last byte, eight bits and a little.
     const REPLY_AFTER: i64 = 20 * BIT.0 as i64 + 333;
 
     impl Line for Wire {
@@ -421,9 +419,9 @@ mod tests {
         bytes.get(place / 8).is_none_or(|byte| byte >> (place % 8) & 1 != 0)
     }
 
-    /// What klippy sends to read a register (`_encode_read(0xf5, 0, 2)` of tmc_uart.py), and a reply.
+    /// klippy's message to read a register (`_encode_read(0xf5, 0, 2)` of tmc_uart.py), and a reply.
     const MESSAGE: [u8; 5] = [0xea, 0x03, 0x48, 0x20, 0xe4];
-    /// Its edges, and those back to idle.
+    /// The message's edges, and those back to idle.
     const EDGES: usize = 16;
     const REPLY: [u8; 10] = [0x0a, 0xfa, 0x4f, 0x20, 0x80, 0x00, 0x02, 0xe8, 0x20, 0xf1];
 
@@ -491,7 +489,7 @@ mod tests {
         assert_eq!([-6, -5, -2, -1, 0, 1, 2, 5, 6].map(|n| div_round(n, 4)), [-2, -1, -1, 0, 0, 0, 1, 1, 2]);
     }
 
-    /// A reply that came while the worker was without its processor is asked for again; a write is not.
+    /// A register is read again if its reply came while the worker had no processor. A write is not repeated.
     #[test]
     fn a_register_is_asked_for_again_where_this_machine_was_late() {
         for (read_len, messages) in [(REPLY.len(), 2), (0, 1)] {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Homing and probing by the samples of a sensor: what a sensor reads goes through a filter, and pulls
-//! a trsync when it crosses the value that the host set. Samples out of range, a filter that overflows,
-//! a sensor that reports an error or falls silent pull it as well, with a reason of their own.
+//! Homing and probing with the samples of a sensor. Samples go through a filter. They pull a trsync when they cross the
+//! host's value. Samples out of range, a filter overflow, an error of the sensor and a silent sensor also pull it. Each
+//! has a reason of its own.
 
 #![forbid(unsafe_code)]
 
@@ -45,20 +45,19 @@ pub(super) const FEATURE: Feature = Feature {
 };
 
 shutdowns! {
-    /// A `trigger_analog_type` that the enumeration does not have (Pinion's own text: in the firmware nothing triggers
-    /// then).
+    /// A `trigger_analog_type` outside the enumeration. (Pinion's own text. In the firmware nothing triggers then.)
     INVALID_TYPE = "Invalid trigger_analog_type";
 }
 
 response! {
-    /// Whether samples are looked at, and when the trigger came.
+    /// Whether samples are checked, and when the trigger came.
     "trigger_analog_state oid=%c homing=%c homing_clock=%u" => since(Master);
     pub(super) struct State { oid: Oid, homing: bool, homing_clock: Clock }
 }
 
 const TIMER: Timer = Timer::exact(0);
 
-/// What pulls the trigger.
+/// The condition that pulls the trigger.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum TriggerType {
     /// The absolute value is at least the trigger value.
@@ -86,11 +85,11 @@ impl TriggerType {
     }
 }
 
-// Errors, which the host finds added to its `error_reason` in the trsync's reason.
+// Error codes. The host finds them added to its `error_reason` in the trsync's reason.
 const RAW_RANGE: u8 = 0;
 const OVERFLOW: u8 = 1;
 const MONITOR: u8 = 2;
-/// The first of the sensor's own.
+/// The first of the sensor's own error codes.
 const SENSOR_SPECIFIC: u8 = 3;
 
 pub(super) struct TriggerAnalog {
@@ -101,11 +100,11 @@ pub(super) struct TriggerAnalog {
     trigger_value: i32,
     /// The highest filtered value since `trigger_analog_home`.
     peak: i32,
-    /// Whether samples are looked at.
+    /// Whether samples are checked.
     homing: bool,
-    /// Whether every sample so far was of an instant before `homing_clock`.
+    /// Whether every sample so far was from before `homing_clock`.
     awaits: bool,
-    /// When homing begins; when it was triggered, from then on.
+    /// When homing begins. After the trigger: when it came.
     homing_clock: Clock,
     trsync: Option<Oid>,
     trigger_reason: u8,
@@ -117,7 +116,7 @@ pub(super) struct TriggerAnalog {
 }
 
 impl TriggerAnalog {
-    /// Takes in a sample of the sensor, read at the instant `at`.
+    /// Processes a sample of the sensor, read at `at`.
     fn update(&mut self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
         if !self.homing || self.awaits && at < self.homing_clock {
             return Ok(());
@@ -138,8 +137,8 @@ impl TriggerAnalog {
         self.pull(mcu, self.trigger_reason)
     }
 
-    /// Whether a filtered value pulls the trigger. The firmware compares a negative trigger value as
-    /// an unsigned one, except for [`TriggerType::Gt`].
+    /// Whether a filtered value pulls the trigger. The firmware compares a negative trigger value as unsigned, except
+    /// for [`TriggerType::Gt`].
     fn crosses(&mut self, value: i32) -> bool {
         match self.trigger_type {
             TriggerType::AbsGe => value.unsigned_abs() >= self.trigger_value as u32,
@@ -152,7 +151,7 @@ impl TriggerAnalog {
         }
     }
 
-    /// Homing ends with an error.
+    /// Ends homing with an error.
     fn fail(&mut self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
         if !std::mem::take(&mut self.homing) {
             return Ok(());
@@ -171,8 +170,8 @@ impl Object for TriggerAnalog {
         "analog trigger"
     }
 
-    /// Looks whether the sensor is silent. If it is the trigger is pulled, and samples that come later
-    /// are looked at all the same, as in the firmware: a trsync is pulled once.
+    /// Checks whether the sensor is silent, and pulls the trigger if it is. Later samples are still checked, as in the
+    /// firmware: a trsync is pulled only once.
     fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
         if !self.homing {
             return Ok(Next::Done);
@@ -212,7 +211,7 @@ impl Attached {
         Ok(())
     }
 
-    /// A sample that was read at the instant `at`.
+    /// Passes on a sample that was read at `at`.
     pub(super) fn update(self, mcu: &mut Mcu, sample: i32, at: Clock) -> Result<(), Shutdown> {
         match self {
             Attached::Nothing => Ok(()),
@@ -223,7 +222,7 @@ impl Attached {
         }
     }
 
-    /// An error of the sensor, by its own number. (A load cell probe is told of none: it notices that
+    /// Passes on an error of the sensor, by the sensor's own number. (A load cell probe gets no errors: it notices that
     /// samples are missing.)
     pub(super) fn note_error(self, mcu: &mut Mcu, error: u8) -> Result<(), Shutdown> {
         let Attached::Trigger(oid) = self else { return Ok(()) };

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Trsync: a trigger that stops several steppers at once, with a time-out and reports.
+//! Trsync: a trigger that stops several steppers at once, with a timeout and reports.
 
 #![forbid(unsafe_code)]
 
@@ -21,7 +21,7 @@ shutdowns! {
 }
 
 response! {
-    /// Whether the trigger was not pulled yet, and if it was, why.
+    /// Whether the trigger can still be pulled, and if not, why it was pulled.
     "trsync_state oid=%c can_trigger=%c trigger_reason=%c clock=%u"
     pub(super) struct State { oid: Oid, can_trigger: bool, trigger_reason: u8, clock: Clock }
 }
@@ -35,16 +35,15 @@ pub(super) struct Trsync {
     signals: Vec<Oid>,
 }
 
-/// There are no more objects than this, and none waits for two triggers: so this much room, made at
-/// configuration, is always enough.
+/// Room for the waiting objects, made at configuration. It is always enough: there are no more objects, and none waits
+/// for two triggers.
 const SIGNALS_MAX: usize = 256;
 
 const REPORT: Timer = Timer::exact(0);
 const EXPIRE: Timer = Timer::exact(1);
 
 impl Trsync {
-    /// Pulls the trigger, unless it was pulled before: tells every object that waits for it, and the
-    /// host.
+    /// Pulls the trigger, unless it was pulled before. Every waiting object and the host then learn of it.
     pub(super) fn trigger(&mut self, turn: &mut Turn, reason: u8) -> Result<(), Shutdown> {
         if self.pull(turn, reason)? {
             self.report(turn);
@@ -52,7 +51,7 @@ impl Trsync {
         Ok(())
     }
 
-    /// Pulls the trigger without telling the host. False if it was pulled before.
+    /// Pulls the trigger without a report to the host. False if it was pulled before.
     fn pull(&mut self, mcu: &mut Mcu, reason: u8) -> Result<bool, Shutdown> {
         let pulled = std::mem::take(&mut self.can_trigger);
         if pulled {
@@ -69,7 +68,7 @@ impl Trsync {
         turn.send(State { oid: turn.oid(), can_trigger: self.can_trigger, trigger_reason: self.trigger_reason, clock });
     }
 
-    /// Adds the object whose turn it is to those that are told of the trigger.
+    /// Adds the object whose turn it is to the objects that wait for the trigger.
     ///
     /// # Errors
     ///
@@ -85,7 +84,7 @@ impl Trsync {
         })
     }
 
-    /// Whether this trsync still waits for a trigger, of which it then tells the object whose turn it is.
+    /// Whether this trsync can still be triggered, and the object whose turn it is waits for it.
     pub(super) fn may_stop(turn: &mut Turn, trsync: Oid) -> bool {
         let waiting = turn.oid();
         let may = |trsync: &mut Trsync, _: &mut Turn| Ok(trsync.can_trigger && trsync.signals.contains(&waiting));
@@ -163,8 +162,7 @@ const TRSYNC_TRIGGER: Command = command!("trsync_trigger oid=%c reason=%c", Trsy
     turn.cancel(REPORT);
     turn.cancel(EXPIRE);
     let trigger_reason = trsync.trigger_reason;
-    // The host itself pulled the trigger and does not need to know when: the clock is 0, as in the
-    // firmware.
+    // The host itself pulled the trigger and does not need to know when. The clock is 0, as in the firmware.
     turn.send(State { oid: turn.oid(), can_trigger: false, trigger_reason, clock: Clock::EPOCH });
     Ok(())
 });

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Queued values of an output, and `max_duration`, a limit to how long it may stay at another than its
-//! shutdown value without news from the host: what hardware PWM channels and PCA9685 have in common.
+//! Queued values of an output, and `max_duration`. `max_duration` limits how long the output may differ from its
+//! shutdown value without news from the host. Hardware PWM channels and PCA9685 share this code.
 
 #![forbid(unsafe_code)]
 
@@ -25,13 +25,13 @@ pub(super) struct Texts {
     pub(super) missed: ShutdownReason,
 }
 
-/// The values that an output is to have. The object has no other timer than the queue's.
+/// The values of an output. The object has no timer except the queue's.
 pub(super) struct ValueQueue {
     shutdown_value: u16,
     max_duration: Ticks,
     texts: &'static Texts,
     queue: MoveQueue<Move>,
-    /// When the present value ends: the host must have queued another one by then.
+    /// When the current value ends. The host must have queued another one by then.
     end: Option<Clock>,
 }
 
@@ -40,7 +40,7 @@ impl ValueQueue {
         ValueQueue { shutdown_value, max_duration, texts, queue: MoveQueue::default(), end: None }
     }
 
-    /// The value of a stopped machine.
+    /// The value in a stopped MCU.
     pub(super) fn shutdown_value(&self) -> u16 {
         self.shutdown_value
     }
@@ -70,7 +70,7 @@ impl ValueQueue {
         due.map(|due| due.value).ok_or_else(|| not_refreshed(self.texts.missed, self.max_duration))
     }
 
-    /// When the timer runs next, now that the output has a value that was due at `at`.
+    /// When the timer runs next, after the output got a value that was due at `at`.
     pub(super) fn next(&mut self, value: u16, at: Clock) -> Result<Next, Shutdown> {
         let limited = value != self.shutdown_value && self.max_duration.0 != 0;
         let end = limited.then(|| at + self.max_duration);
@@ -84,7 +84,7 @@ impl ValueQueue {
         Ok(Next::At(next))
     }
 
-    /// Forgets all values, as the machine stops.
+    /// Forgets all values when the MCU stops.
     pub(super) fn clear(&mut self, mcu: &mut Mcu) {
         self.end = None;
         self.queue.clear(&mut mcu.moves);
