@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! ADC channels of the Industrial I/O subsystem, through libiio.
 //!
-//! A reading may take milliseconds, as the driver has to talk to its chip. So a worker takes it,
-//! one for each IIO device.
+//! A worker for each IIO device takes the readings. A reading may take milliseconds, because the driver talks to its
+//! chip.
 
 #![forbid(unsafe_code)]
 
@@ -17,7 +17,7 @@ use pinion_firmware::board::{self, ADC_MAX};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::trouble::Trouble;
 
-/// The format that the C program assumes for every channel; here for those that do not tell theirs.
+/// The format that the C program assumes for every channel. Here it is for channels that do not report one.
 const ASSUMED: Format = Format { bits: 12, signed: false };
 
 /// An IIO device with voltage inputs.
@@ -38,7 +38,7 @@ pub struct IioDevice {
 pub struct Channel {
     /// The driver's name for it, such as `voltage3` or `voltage0-voltage1`.
     pub id: String,
-    /// Its resolution, where the driver tells it.
+    /// The resolution, if the driver reports it.
     pub format: Option<Format>,
 }
 
@@ -50,13 +50,13 @@ pub struct Format {
 }
 
 impl Format {
-    /// A format of 1 to 64 bits (signed: 2 to 64); none for another number.
+    /// A format of 1 to 64 bits (signed: 2 to 64). `None` for another number.
     pub fn new(bits: u32, signed: bool) -> Option<Format> {
         (1 + u32::from(signed)..=64).contains(&bits).then_some(Format { bits, signed })
     }
 
-    /// Turns a raw reading into counts of 0 to [`ADC_MAX`], rounded to the nearest. A raw reading out
-    /// of range is clamped, a negative one to 0.
+    /// Converts a raw reading to counts of 0 to [`ADC_MAX`], rounded to the nearest. A raw reading out of range is
+    /// clamped, a negative one to 0.
     pub(super) fn scale(self, raw: i64) -> u16 {
         let full = (1i128 << (self.bits - u32::from(self.signed))) - 1;
         let raw = i128::from(raw).clamp(0, full);
@@ -72,7 +72,7 @@ impl fmt::Display for Format {
     }
 }
 
-/// libiio's view of this computer. None without IIO devices: libiio would take memory for nothing.
+/// libiio's view of this computer. `None` without IIO devices: libiio would take memory for nothing.
 pub(super) fn context(devices: &Path) -> Result<Option<Context>, Trouble> {
     let any = fs::read_dir(devices)
         .into_iter()
@@ -110,8 +110,8 @@ pub(super) fn scan(context: &Context) -> Vec<IioDevice> {
     adcs
 }
 
-/// A key that sorts `voltage10` after `voltage9`. A channel's place is part of its pin number, so it
-/// must always be the same, and libiio's own order is that of the directory, which is not.
+/// A key that sorts `voltage10` after `voltage9`. A channel's position is part of its pin number, so it must always be
+/// the same. libiio's own order is the order of the directory, which varies.
 fn in_order(id: &str) -> (u32, String) {
     let digits = id.trim_start_matches(|c: char| !c.is_ascii_digit());
     let end = digits.find(|c: char| !c.is_ascii_digit()).unwrap_or(digits.len());
@@ -122,15 +122,15 @@ fn number(device: &industrial_io::Device) -> Option<u32> {
     device.id()?.strip_prefix("iio:device")?.parse().ok()
 }
 
-/// The driver's name for a channel that is a voltage input and can be read one reading at a time;
-/// none for any other channel.
+/// The driver's name for a channel that is a voltage input and can be read one reading at a time. `None` for any other
+/// channel.
 fn input_id(channel: &industrial_io::Channel) -> Option<String> {
     let id = channel.id()?;
     (channel.is_input() && id.starts_with("voltage") && channel.has_attr("raw")).then_some(id)
 }
 
 fn format(channel: &industrial_io::Channel) -> Option<Format> {
-    // Only a channel that can also be read through a buffer (a "scan element") tells its format.
+    // Only a channel that can also be read through a buffer (a "scan element") reports its format.
     let format = channel.is_scan_element().then(|| channel.data_format())?;
     Format::new(format.bits(), format.is_signed())
 }
@@ -144,7 +144,7 @@ pub struct ChannelReader {
 }
 
 impl ChannelReader {
-    /// Opens the channel that the driver of `iio:device<number>` calls `id`, if it is there.
+    /// Opens the channel that the driver of `iio:device<number>` calls `id`, if it exists.
     pub(super) fn open(context: &Context, number: u32, id: &str) -> Option<ChannelReader> {
         let device = context.devices().find(|d| self::number(d) == Some(number))?;
         let (index, channel) =
@@ -158,7 +158,7 @@ impl ChannelReader {
         })
     }
 
-    /// Its resolution, where the driver tells it.
+    /// The resolution, if the driver reports it.
     pub(super) fn format(&self) -> Option<Format> {
         self.format
     }
@@ -167,7 +167,7 @@ impl ChannelReader {
     ///
     /// # Errors
     ///
-    /// libiio's own.
+    /// The errors of libiio.
     pub fn read_raw(&self) -> Result<i64, industrial_io::Error> {
         self.device.get_channel(self.index)?.attr_read_int("raw")
     }
@@ -200,7 +200,7 @@ fn read_failure(subject: &str, error: &str) -> Trouble {
     Trouble::new(format!("{subject} can not be read: {error}")).remedy(remedy)
 }
 
-/// Says that a channel is not there, but these.
+/// Says that a channel is missing, and lists those that exist.
 pub(super) fn missing(number: u32, id: &str, adcs: &[IioDevice]) -> Trouble {
     let known: Vec<String> = adcs
         .iter()

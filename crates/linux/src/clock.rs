@@ -9,18 +9,16 @@ use nix::time::{ClockId, clock_gettime};
 
 use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, TimeSource};
 
-/// CLOCK_MONOTONIC in ticks. Tick 0 is a whole second of it, so that the lateness of an edge
-/// can be measured from outside.
+/// CLOCK_MONOTONIC in ticks. Tick 0 is at a whole second, so that the lateness of an edge can be measured from outside.
 #[derive(Clone, Copy, Debug)]
 pub struct Monotonic {
     origin_s: u64,
 }
 
 impl Monotonic {
-    /// A clock whose tick 0 is the whole second before this call.
+    /// A clock with tick 0 at the whole second before this call.
     ///
-    /// (Klipper's own program takes the next second, which starts it with a clock near 2^32;
-    /// its host accepts both.)
+    /// (Klipper's own program takes the next second, so its clock starts near 2^32. The host accepts both.)
     pub fn start() -> Monotonic {
         Monotonic { origin_s: monotonic().as_secs() }
     }
@@ -43,7 +41,7 @@ impl TimeSource for Monotonic {
 
 /// CLOCK_MONOTONIC as the time since the kernel's start.
 pub fn monotonic() -> Duration {
-    // clock_gettime(2) fails for an unknown clock or a bad pointer only.
+    // clock_gettime(2) fails only for an unknown clock or a bad pointer.
     clock_gettime(ClockId::CLOCK_MONOTONIC).map_or(Duration::ZERO, Duration::from)
 }
 

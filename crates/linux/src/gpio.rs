@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! GPIO lines through the kernel's character device.
 //!
-//! Whether a chip has really switched a pull resistor on can not be seen: if its driver answers
-//! `ENOTSUPP`, the kernel takes that for success, and what the kernel tells of a line is what was
-//! asked for. So a resistor is refused where the kernel refuses it, and on the chips in
-//! [`WITHOUT_BIAS`], which are known to have none. On any other chip we have to trust the driver.
+//! Pinion cannot see whether a chip has really switched a pull resistor on. If the driver answers `ENOTSUPP`, the
+//! kernel takes this for success. The kernel's information about a line only repeats the request. So a resistor is
+//! refused if the kernel refuses it. It is also refused on the chips in [`WITHOUT_BIAS`], which are known to have none.
+//! On any other chip Pinion trusts the driver.
 
 #![forbid(unsafe_code)]
 
@@ -38,7 +38,7 @@ const CONSUMER: &str = "pinion";
 /// GPIOHANDLE_REQUEST_BIAS_PULL_UP and _DOWN (Linux 5.5), which gpio-cdev does not name.
 const PULL_UP: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 5);
 const PULL_DOWN: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 6);
-/// How the labels of chips without certain resistors begin, and which resistors these chips lack.
+/// The beginnings of the labels of chips without certain resistors, and the resistors that these chips lack.
 const WITHOUT_BIAS: [(&str, &[Bias]); 4] = [
     ("raspberrypi-exp-gpio", &[Bias::PullUp, Bias::PullDown]),
     ("brcmvirt-gpio", &[Bias::PullUp, Bias::PullDown]),
@@ -56,8 +56,7 @@ pub(super) struct Handle {
 ///
 /// # Errors
 ///
-/// "GPIO chip device not found", "Unable to open GPIO chip device"; `refused` if the chip has no
-/// such line.
+/// "GPIO chip device not found", "Unable to open GPIO chip device"; `refused` if the chip does not have this line.
 pub(super) fn open(dev: &Path, number: u32, offset: u32, refused: ShutdownReason) -> Result<Handle, Shutdown> {
     let path = node(dev, number);
     let mut chip = gpio_cdev::Chip::new(&path).map_err(|error| match errno(&error) {
@@ -82,8 +81,8 @@ impl Handle {
         &self.subject.label
     }
 
-    /// Requests the line from the kernel; an output is given to the guardian. `sleeping` is the name
-    /// of the line's chip if calls to that may block.
+    /// Requests the line from the kernel, and gives an output to the guardian. `sleeping` is the name of the line's
+    /// chip, if calls to this chip may block.
     ///
     /// # Errors
     ///
@@ -108,11 +107,11 @@ impl Handle {
     }
 }
 
-/// What the kernel is asked for.
+/// The settings for a request to the kernel.
 struct LineSetup {
     flags: LineRequestFlags,
     level: bool,
-    /// The reason to stop with if the kernel refuses.
+    /// The shutdown reason if the kernel refuses.
     refused: ShutdownReason,
 }
 
@@ -121,12 +120,12 @@ pub(super) struct HeldLine {
     handle: LineHandle,
     line: gpio_cdev::Line,
     subject: Subject,
-    /// What its last set-up made it (`GPIOHANDLE_REQUEST_` flags).
+    /// The flags of the last setup (`GPIOHANDLE_REQUEST_`).
     flags: AtomicU32,
     guard: SharedGuard,
     /// Whether the guardian has a copy of it.
     watched: AtomicBool,
-    /// The name of its chip, if calls to that may block.
+    /// The name of the line's chip, if calls to this chip may block.
     sleeping: Option<String>,
 }
 
@@ -138,7 +137,7 @@ impl HeldLine {
         Shutdown::because(reason, self.subject.lost(what, code, self.sleeping.is_some()))
     }
 
-    /// Has the guardian hold the line if it is an output now, and let go of it if it no longer is.
+    /// Gives the line to the guardian if it is an output now. Otherwise takes it back from the guardian.
     fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
         match direction {
             Direction::Output { shutdown_value, .. } => {
@@ -162,12 +161,12 @@ impl HeldLine {
         format!("{} line {}", self.subject.chip, self.subject.offset)
     }
 
-    /// Lets the line go and requests it anew, as Linux before 5.5 can not change one that is held. That
-    /// is what Klipper's C program always does. If it is refused, the line stays what it was.
+    /// Releases the line and requests it again, because Linux before 5.5 cannot change a held line. Klipper's C program
+    /// always does this. If the request is refused, the line stays what it was.
     fn request_anew(&self, setup: &LineSetup) -> Result<i32, Shutdown> {
         let before = LineRequestFlags::from_bits_retain(self.flags.load(Ordering::Relaxed));
         let level = self.handle.get_value().unwrap_or_default();
-        // The kernel keeps a line for as long as anybody has a copy.
+        // The kernel keeps a line as long as anybody has a copy.
         self.watch_no_more()?;
         let request = |flags, level| match self.line.request(flags, level, CONSUMER) {
             Ok(handle) => sys::replace(&self.handle, &handle).map_or_else(code_of, |()| 0),
@@ -235,8 +234,8 @@ impl Subject {
             Direction::Output { level, .. } => {
                 Ok(LineSetup { flags: LineRequestFlags::OUTPUT, level, refused: reason::OUTPUT_LINE })
             }
-            // The kernel never drives it high: where the chip has no open drain, it makes the line an
-            // input instead.
+            // The kernel never drives it high. If the chip has no open drain, the kernel makes the line an input
+            // instead.
             Direction::OpenDrain => {
                 let pull = if lacks(&self.label, Bias::PullUp) { LineRequestFlags::empty() } else { PULL_UP };
                 let flags = LineRequestFlags::OUTPUT | LineRequestFlags::OPEN_DRAIN | pull;
@@ -256,7 +255,7 @@ impl Subject {
         }
     }
 
-    /// The error for a line that the kernel has refused with the error number `code`.
+    /// The error for a line that the kernel refused with the error number `code`.
     fn refused(&self, reason: ShutdownReason, code: i32, direction: Direction, line: &gpio_cdev::Line) -> Shutdown {
         let release = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
         let (action, bias) = match direction {
@@ -268,7 +267,7 @@ impl Subject {
     }
 }
 
-/// Whether the chip with this label is known not to have this resistor.
+/// Whether the chip with this label is known to lack this resistor.
 fn lacks(label: &str, bias: Bias) -> bool {
     WITHOUT_BIAS.iter().any(|(chip, lacking)| label.starts_with(chip) && lacking.contains(&bias))
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The board's way to the guardian process, which is given every output.
+//! The board's connection to the guardian process, which gets every output.
 
 #![forbid(unsafe_code)]
 
@@ -9,32 +9,31 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use pinion_firmware::shutdown::{Shutdown, reason};
 
-/// Holds copies of the outputs' descriptors, to drive the outputs to their shutdown values if the
-/// program dies.
+/// Holds copies of the outputs' descriptors. If the program dies, it sets the outputs to their shutdown values.
 ///
-/// An output is known by its name, such as `gpiochip0 line 5` or `pwmchip0/pwm1`, which the log uses,
-/// too. An output that is given again under its name replaces the earlier one.
+/// An output is known by its name, for example `gpiochip0 line 5` or `pwmchip0/pwm1`. The log uses the same name. A new
+/// output with the same name replaces the earlier one.
 ///
 /// Each call fails if the guardian refuses or does not answer.
 pub trait Guard: Send {
-    /// Copies an output line's descriptor (a GPIO line handle of the character device).
-    /// `sleeping` is the name of the line's chip if calls to that may block. The lines of such a
-    /// chip are driven by a thread of their own, so that no other output waits for it.
+    /// Copies an output line's descriptor (a GPIO line handle of the character device). `sleeping` is the name of the
+    /// line's chip, if calls to this chip may block. The lines of this chip have a thread of their own, so that no
+    /// other output waits for it.
     fn output(&mut self, name: &str, line: RawFd, shutdown_value: bool, sleeping: Option<&str>) -> io::Result<()>;
 
-    /// Copies the descriptors of the files that set one output, such as a PWM's `duty_cycle` and
-    /// `enable`. `shutdown` has what is to be written at the beginning of each, in this order.
+    /// Copies the descriptors of the files that set one output, for example a PWM's `duty_cycle` and `enable`.
+    /// `shutdown` has the text to write at the beginning of each file, in this order.
     fn files(&mut self, name: &str, shutdown: &[(RawFd, &[u8])]) -> io::Result<()>;
 
-    /// Drops the copies of a line or channel that is no output any more.
+    /// Drops the copies of a line or channel that is no longer an output.
     fn forget(&mut self, name: &str) -> io::Result<()>;
 
     /// Drops all copies. When this returns, the lines can be requested again.
     fn release(&mut self) -> io::Result<()>;
 }
 
-/// The guard, if there is one, as the board and its workers share it. A call waits for the
-/// guardian's answer. So the core calls it only until the MCU is configured, and workers later.
+/// The guard, if there is one, shared by the board and its workers. A call waits for the guardian's answer. So the core
+/// calls it only until the MCU is configured. Later only workers call it.
 #[derive(Clone)]
 pub(super) struct SharedGuard(Option<Arc<Mutex<Box<dyn Guard>>>>);
 

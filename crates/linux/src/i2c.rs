@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! I2C devices of i2c-dev.
+//! I2C devices through i2c-dev.
 
 #![forbid(unsafe_code)]
 
@@ -16,7 +16,7 @@ use pinion_firmware::board::{BusDevice, BusError, BusStatus, I2cConfig, Range};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::trouble::Trouble;
 
-/// Buses with names of the C program, from 0 on.
+/// How many buses the C program has names for, from 0 on.
 const BUSES: u32 = 15;
 
 /// The numbers of the buses in `dev`, in order.
@@ -31,7 +31,7 @@ pub fn scan(dev: &Path) -> Vec<u32> {
     buses
 }
 
-/// The dictionary's enumeration `i2c_bus`: the C program's, and the buses beyond it.
+/// The dictionary's enumeration `i2c_bus`: the buses of the C program, and the buses beyond them.
 pub fn ranges(buses: &[u32]) -> Vec<Range> {
     let c_program = Range { name: "i2c.0".into(), first: 0, count: BUSES };
     let further = buses.iter().filter(|bus| **bus >= BUSES);
@@ -42,7 +42,7 @@ pub fn ranges(buses: &[u32]) -> Vec<Range> {
 /// An open I2C device.
 pub struct I2c {
     device: LinuxI2CDevice,
-    /// Such as `/dev/i2c-1 address 0x48`.
+    /// For example `/dev/i2c-1 address 0x48`.
     name: String,
 }
 
@@ -51,8 +51,8 @@ impl I2c {
     ///
     /// # Errors
     ///
-    /// "Unable to open i2c device": no such bus, no permission, a kernel driver that has the chip, or an
-    /// adapter that knows SMBus only.
+    /// "Unable to open i2c device": the bus or the permission is missing, a kernel driver has the chip, or the adapter
+    /// only knows SMBus.
     pub fn open(dev: &Path, config: I2cConfig) -> Result<I2c, Shutdown> {
         let I2cConfig { bus, address, .. } = config;
         let path = dev.join(format!("i2c-{bus}"));
@@ -80,13 +80,12 @@ impl BusDevice for I2c {
     }
 }
 
-/// What an error number of a transfer means, by Documentation/i2c/fault-codes.rst of the kernel, and
-/// what to do.
+/// The meaning of a transfer's error number, from the kernel's Documentation/i2c/fault-codes.rst, and the remedy.
 fn failure(name: &str, (written, read): (usize, usize), error: &io::Error) -> BusError {
     const CHECK_CHIP: &str = "check its wiring, its power and i2c_address";
     let (status, trouble) = match error.raw_os_error().unwrap_or_default() {
         libc::ENXIO => (BusStatus::StartNack, Trouble::new("no chip acknowledges the address").remedy(CHECK_CHIP)),
-        // Drivers that do not tell an address from a byte: i2c-bcm2835, i2c-designware.
+        // Some drivers do not tell an address from a byte: i2c-bcm2835, i2c-designware.
         libc::EREMOTEIO => (BusStatus::Nack, Trouble::new("the chip does not acknowledge").remedy(CHECK_CHIP)),
         libc::ETIMEDOUT | libc::EBUSY => (
             BusStatus::Timeout,

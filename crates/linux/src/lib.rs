@@ -34,7 +34,7 @@ pub mod sysfs;
 mod w1;
 
 const DEV: &str = "/dev";
-/// The remedy where only the kernel knows more.
+/// The remedy if only the kernel knows more.
 pub const LOOK_AT_LOG: &str = "look at the kernel's log (dmesg)";
 const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
@@ -44,7 +44,7 @@ const W1: &str = "/sys/bus/w1/devices";
 const EDGE_WORKER: &str = "edges";
 const IIO: &str = "/sys/bus/iio/devices";
 
-/// What this computer has.
+/// The devices of this computer.
 #[derive(Debug, Default)]
 pub struct Inventory {
     /// GPIO chips.
@@ -55,14 +55,14 @@ pub struct Inventory {
     pub spi: Vec<spi::Node>,
     /// Numbers of I2C buses.
     pub i2c: Vec<u32>,
-    /// Each thing that is there and can not be used.
+    /// Each thing that exists but cannot be used.
     pub problems: Vec<Trouble>,
-    /// libiio's view of this computer; none without IIO devices.
+    /// libiio's view of this computer. `None` without IIO devices.
     pub context: Option<Context>,
 }
 
 impl Inventory {
-    /// Looks for chips, ADCs and buses. A computer that has none of them is no error.
+    /// Looks for chips, ADCs and buses. A computer without any of them is no error.
     pub fn scan() -> Inventory {
         let dev = Path::new(DEV);
         let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
@@ -78,7 +78,7 @@ impl Inventory {
         inventory
     }
 
-    /// Opens the channel that the driver of `iio:device<device>` calls `id`, if it is there.
+    /// Opens the channel that the driver of `iio:device<device>` calls `id`, if it exists.
     pub fn adc(&self, device: u32, id: &str) -> Option<adc::ChannelReader> {
         adc::ChannelReader::open(self.context.as_ref()?, device, id)
     }
@@ -105,7 +105,7 @@ impl Inventory {
     }
 }
 
-/// What was found when somebody looked around last.
+/// The result of the last search.
 #[derive(Default)]
 struct Seen {
     inventory: Inventory,
@@ -121,22 +121,22 @@ impl Seen {
         Seen { names: Names::of(&inventory), inventory }
     }
 
-    /// All that a host is told of it.
+    /// Everything that a host learns from it.
     fn told(&self) -> (String, [Vec<Range>; 3]) {
         let Seen { inventory, names } = self;
         (inventory.describe(), [names.ranges(), spi::ranges(&inventory.spi), i2c::ranges(&inventory.i2c)])
     }
 }
 
-/// The board that is this computer.
+/// This computer as a board.
 pub struct LinuxBoard {
-    /// Shared with the thread that looks again. The core asks for it while it is being configured only,
-    /// and who has it keeps it for a moment: nobody looks around meanwhile.
+    /// Shared with the thread that searches again. The core locks it only during configuration. The lock is always held
+    /// only for a moment: no search runs meanwhile.
     seen: Arc<Mutex<Seen>>,
     guard: SharedGuard,
     /// The SPI controllers in use.
     spi_controllers: HashMap<u32, Arc<Mutex<spi::Controller>>>,
-    /// The numbers of IIO devices that tell no resolution, and of which the log has said so.
+    /// The numbers of IIO devices that do not report a resolution, and that the log has already named.
     assumed: BTreeSet<u32>,
     dev: PathBuf,
     gpio: PathBuf,
@@ -144,7 +144,7 @@ pub struct LinuxBoard {
 }
 
 impl LinuxBoard {
-    /// Looks around and publishes what is there. Every output is given to `guard`.
+    /// Searches this computer and publishes the result. Every output is given to `guard`.
     pub fn new(guard: Option<Box<dyn Guard>>) -> LinuxBoard {
         let seen = Seen::look();
         for problem in &seen.inventory.problems {
@@ -187,7 +187,7 @@ impl LinuxBoard {
         spi::Spi::open(&self.dev, config, controller)
     }
 
-    /// The number of a pin's IIO device, and the name that its driver has for the channel.
+    /// The number of a pin's IIO device, and the driver's name for the channel.
     fn channel(&self, pin: Pin) -> Result<(u32, String), Shutdown> {
         match Target::of(pin) {
             Target::Analog(n) => Ok((0, format!("voltage{n}"))),
@@ -238,8 +238,7 @@ impl Board for LinuxBoard {
         true
     }
 
-    /// A chip may have several nodes in /dev: on a Raspberry Pi 5, `gpiochip4` is a link to
-    /// `gpiochip0`.
+    /// A chip may have several nodes in /dev: on a Raspberry Pi 5, `gpiochip4` is a link to `gpiochip0`.
     fn canonical(&self, pin: Pin) -> Pin {
         let Target::Line { chip, offset } = Target::of(pin) else { return pin };
         gpio::number_behind(&self.dev, chip).and_then(|chip| pins::line_number(chip, offset)).map_or(pin, Pin)
@@ -253,8 +252,8 @@ impl Board for LinuxBoard {
         Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
     }
 
-    /// A line of a chip on a bus is polled: its driver has to ask the chip at each interrupt which line
-    /// it was, and dates and counts what it then finds.
+    /// A line of a chip on a bus is polled. At each interrupt its driver asks the chip which line changed. It then
+    /// timestamps and counts only what it finds.
     fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
         let handle = self.open_line(pin, Direction::Input(bias))?;
         let edges = match gpio::may_sleep(&self.gpio, handle.chip(), handle.label()) {
@@ -274,8 +273,8 @@ impl Board for LinuxBoard {
         let (device, id) = self.channel(pin)?;
         let mut seen = self.seen();
         if seen.inventory.adc(device, &id).is_none() {
-            // The device's driver may have been loaded after the host came: look again. The
-            // pin numbers stay as they were published then.
+            // The device's driver may have been loaded after the host came, so search again. The pin numbers stay as
+            // they were published then.
             seen.inventory.context =
                 adc::context(Path::new(IIO)).map_err(|problem| Shutdown::because(reason::ADC_OPEN, problem))?;
         }
@@ -312,8 +311,8 @@ impl Board for LinuxBoard {
         };
         let channel = pwm::Channel { chip, channel };
         let device = pwm::Pwm::open(&self.pwm, channel, &config, self.guard.clone())?;
-        // A write to one channel may block in the driver of the chip, which the chip's other
-        // channels share: so they share a worker, too.
+        // A write to one channel may block in the chip's driver. The chip's channels share this driver, so they share a
+        // worker.
         Ok(OnWorker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
     }
 
@@ -333,7 +332,7 @@ impl Board for LinuxBoard {
         Ok(Mosi { line, message_max: spi::message_max() })
     }
 
-    /// Each sensor has a worker: the kernel lets others use the bus while one measures.
+    /// Each sensor has its own worker: the kernel lets others use the bus while one measures.
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
         let device = w1::Ds18b20::open(Path::new(W1), serial)?;
         Ok(OnWorker { bus: format!("w1 {}", String::from_utf8_lossy(serial)), device: Box::new(device) })
@@ -390,7 +389,7 @@ mod tests {
         let names = Names::of(&Inventory { spi: vec![spi::Node::of(256), spi::Node::of(257)], ..Inventory::default() });
         let range = names.ranges().into_iter().find(|range| range.name == "spidev1.0").unwrap();
         assert_eq!(range.count, 2);
-        // It is named as what it is, and it is no GPIO line.
+        // The error names the pin as an SPI device, and it is no GPIO line.
         let error = board.mosi(Pin(range.first + 1), 3_200_000).err().unwrap();
         assert_eq!(error.reason, reason::SPI_OPEN);
         assert!(error.trouble.cause.contains("spidev1.1"), "{error}");

@@ -10,10 +10,10 @@
 //! | 2^25.. | every other ADC channel: 256 numbers for each device | |
 //! | 2^26.. | the data outputs (MOSI) of SPI devices, which LEDs may be connected to | `spidev0.0` |
 //!
-//! `gpio17` stands for `gpiochip0/gpio17`. The computer's own names are published as well: `GPIO17`
-//! (the name that the device tree gives a line), `pinctrl-rp1/gpio17` (by the chip's label) and
-//! `mcp3208/voltage3`. A name is left out if two things share it, if it looks like one of the numeric
-//! names, or if klippy can not read it from a configuration.
+//! `gpio17` stands for `gpiochip0/gpio17`. The computer's own names are also published: `GPIO17` (the device tree's
+//! name for a line), `pinctrl-rp1/gpio17` (with the chip's label) and `mcp3208/voltage3`. A name is left out if two
+//! things share it, or if it looks like a numeric name. A name that klippy cannot read from a configuration is also
+//! left out.
 
 #![forbid(unsafe_code)]
 
@@ -36,11 +36,11 @@ const ANALOG_CHANNELS: u32 = 8;
 const PWM: u32 = 1 << 16;
 const PWM_CHIPS: u32 = 8;
 const PWM_CHIP_CHANNELS: u32 = 16;
-/// The first number of the lines for which the C program has none.
+/// The first number of the lines without a number in the C program.
 const FURTHER_LINES: u32 = 1 << 24;
 const FURTHER_CHIPS: u32 = 1 << 12;
 const FURTHER_CHIP_LINES: u32 = 1 << 12;
-/// The first number of the ADC channels for which the C program has none.
+/// The first number of the ADC channels without a number in the C program.
 const FURTHER_CHANNELS: u32 = 1 << 25;
 const FURTHER_DEVICES: u32 = 1 << 12;
 const FURTHER_DEVICE_CHANNELS: u32 = 1 << 8;
@@ -48,7 +48,7 @@ const FURTHER_DEVICE_CHANNELS: u32 = 1 << 8;
 const MOSI: u32 = 1 << 26;
 const MOSI_NODES: u32 = 1 << 16;
 
-/// What a pin's number stands for.
+/// The thing that a pin's number stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Target {
     /// A line of `/dev/gpiochip<chip>`.
@@ -60,7 +60,7 @@ pub enum Target {
     },
     /// Channel `voltage<n>` of iio:device0.
     Analog(u32),
-    /// A channel of an IIO device, by its place among the device's channels.
+    /// A channel of an IIO device, by its position among the device's channels.
     Channel {
         /// The number of `iio:device<n>`.
         device: u32,
@@ -128,7 +128,7 @@ pub fn line_number(chip: u32, offset: u32) -> Option<u32> {
     }
 }
 
-/// The number of an ADC channel, if it has one; `id` is the driver's, such as `voltage3`.
+/// The number of an ADC channel, if it has one. `id` is the driver's name, for example `voltage3`.
 pub fn channel_number(device: u32, position: usize, id: &str) -> Option<u32> {
     let plain =
         id.strip_prefix("voltage").and_then(|n| n.parse::<u32>().ok()).filter(|n| device == 0 && *n < ANALOG_CHANNELS);
@@ -147,12 +147,12 @@ pub fn pwm_number(chip: u32, channel: u32) -> Option<u32> {
     (chip < PWM_CHIPS && channel < PWM_CHIP_CHANNELS).then_some(PWM + chip * PWM_CHIP_CHANNELS + channel)
 }
 
-/// The names that this computer has beyond those of the C program, each with its number.
+/// The names of this computer that the C program does not have, each with its number.
 #[derive(Debug, Default)]
 pub struct Names(Vec<(String, u32)>);
 
 impl Names {
-    /// The names of what was found.
+    /// The names of the devices in `inventory`.
     pub fn of(inventory: &Inventory) -> Names {
         let mut numeric = Vec::new();
         let mut own = Vec::new();
@@ -177,7 +177,7 @@ impl Names {
                 for holder in holders.into_iter().flatten() {
                     own.push((format!("{holder}/{}", channel.id), number));
                 }
-                // The driver's name alone does not tell two devices of one type apart.
+                // The driver's name alone does not distinguish two devices of one type.
                 own.push((format!("iio{}/{}", adc.number, channel.id), number));
             }
         }
@@ -192,7 +192,7 @@ impl Names {
         Names(names)
     }
 
-    /// The names of one pin: the line's own name first, then those with the chip in front.
+    /// The names of one pin: the line's own name first, then the names with the chip in front.
     pub fn of_pin(&self, number: u32) -> Vec<&str> {
         let mut names: Vec<&str> = self.0.iter().filter(|(_, n)| *n == number).map(|(name, _)| name.as_str()).collect();
         // A line's own name has no slash, so it sorts first.
@@ -200,7 +200,7 @@ impl Names {
         names
     }
 
-    /// The dictionary's enumeration `pin`: the C program's ranges and these names.
+    /// The dictionary's enumeration `pin`: the ranges of the C program, and these names.
     pub(super) fn ranges(&self) -> Vec<Range> {
         let range = |name: String, first, count| Range { name, first, count };
         let mut ranges = vec![range("gpio0".into(), 0, CHIP_LINES)];
@@ -218,26 +218,26 @@ impl Names {
     }
 }
 
-/// Leaves out names that stand for several pins, and the repetitions of a name and pin.
+/// Leaves out names that stand for several pins, and repetitions of a name with the same pin.
 fn unshared(names: Vec<(String, u32)>) -> Vec<(String, u32)> {
     let mut owner: HashMap<String, Option<u32>> = HashMap::new();
     for (name, number) in &names {
         owner.entry(name.clone()).and_modify(|one| *one = one.filter(|one| one == number)).or_insert(Some(*number));
     }
     let mut names = names;
-    // Of a name that occurs twice for one pin the first is kept: `remove` finds nothing for the second.
+    // If a name occurs twice for one pin, the first is kept: `remove` finds nothing for the second.
     names.retain(|(name, _)| owner.remove(name).flatten().is_some());
     names
 }
 
-/// Whether klippy takes this name from a configuration unchanged.
+/// Whether klippy reads this name from a configuration unchanged.
 fn writable(name: &str) -> bool {
     !name.starts_with('/')
         && name.chars().any(|c| c.is_ascii_alphanumeric())
         && name.chars().all(|c| c.is_ascii_graphic() && !":!^~,#;".contains(c))
 }
 
-/// Whether this looks like a name of the numeric kind (`gpio17`, `analog3`), whatever its number.
+/// Whether this looks like a numeric name (`gpio17`, `analog3`), whatever its number.
 fn numeric_name(name: &str) -> bool {
     let digits = |s: &str| !s.is_empty() && s.bytes().all(|c| c.is_ascii_digit());
     let counted = |s: &str, word: &str| s.strip_prefix(word).is_some_and(digits);
@@ -249,7 +249,7 @@ fn numeric_name(name: &str) -> bool {
     }
 }
 
-/// Joins names whose numbers count up along with their values into ranges.
+/// Joins names into ranges if their numbers count up together with their values.
 fn runs(names: &[(String, u32)]) -> Vec<Range> {
     let mut names: Vec<(&str, Option<u64>, u32, &str)> = names
         .iter()
@@ -298,7 +298,7 @@ mod tests {
         Names::of(&inventory).0
     }
 
-    /// What klippy makes of the ranges (klippy/msgproto.py, `fill_enumerations`).
+    /// The names that klippy reads from the ranges (klippy/msgproto.py, `fill_enumerations`).
     fn expanded(ranges: &[Range]) -> Vec<(String, u32)> {
         let mut names = Vec::new();
         for range in ranges {
@@ -343,7 +343,7 @@ mod tests {
     fn a_shared_name_is_left_out() {
         let chips = vec![chip(0, "expander", &["NC", "A", "NC"]), chip(1, "expander", &["B"])];
         let found: Vec<String> = names(chips, vec![]).into_iter().map(|n| n.0).collect();
-        // expander/gpio0 stands for two lines, the others for one each.
+        // expander/gpio0 stands for two lines, each other name for one.
         assert_eq!(found, ["expander/gpio1", "A", "expander/gpio2", "B"]);
     }
 

@@ -46,8 +46,8 @@ pub(super) struct Pwm {
 }
 
 impl Pwm {
-    /// Exports the channel if it is not, sets its period and value, and gives it to the guardian.
-    /// `class` is `/sys/class/pwm`.
+    /// Exports the channel if necessary, sets its period and value, and gives it to the guardian. `class` is
+    /// `/sys/class/pwm`.
     ///
     /// # Errors
     ///
@@ -74,10 +74,9 @@ impl Pwm {
         Ok(pwm)
     }
 
-    /// Sets the period, on the way to a value. An output that is on stays on, and is on for a smaller part of
-    /// the time than before or after for the moment between two writes: a longer period is set before its
-    /// duty cycle, a shorter one behind it. So the duty cycle is at no time longer than the period, which
-    /// the kernel would refuse.
+    /// Sets the period, on the way to a value. An output that is on stays on. Between the two writes it is on for a
+    /// smaller part of the time than before or after. A longer period is written before its duty cycle, a shorter one
+    /// after it. So the duty cycle is never longer than the period, which the kernel would refuse.
     fn set_period(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         self.period_ns = u64::from(cycle.0) * NS_PER_TICK;
         if self.period_ns < self.present_period_ns() {
@@ -88,7 +87,7 @@ impl Pwm {
         written.map_err(|error| self.not_configured(&error))
     }
 
-    /// The period that the channel has from before, which may be another object's or program's; 0 if none.
+    /// The channel's period so far, perhaps from another object or program. 0 if it has none.
     fn present_period_ns(&self) -> u64 {
         let mut text = [0; 24];
         let read = self.period.read_at(&mut text, 0).unwrap_or_default();
@@ -134,8 +133,7 @@ impl board::Pwm for Pwm {
         })
     }
 
-    /// An output of `set_pwm_out` stays as it is when the MCU stops. So the guardian is told to
-    /// set it to this value, too.
+    /// An output of `set_pwm_out` keeps its value when the MCU stops. So the guardian gets this value, too.
     fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
         self.set_period(cycle, value)?;
         self.set(value)?;
@@ -143,7 +141,7 @@ impl board::Pwm for Pwm {
     }
 }
 
-/// The channel's folder, which is made if it is not there. BeagleBone kernels call it `pwm-C:N`.
+/// The channel's folder. It is made if it is missing. BeagleBone kernels call it `pwm-C:N`.
 fn export(class: &Path, channel: Channel) -> io::Result<PathBuf> {
     let chip = class.join(format!("pwmchip{}", channel.chip));
     let folder = chip.join(format!("pwm{}", channel.channel));
@@ -163,7 +161,7 @@ fn export(class: &Path, channel: Channel) -> io::Result<PathBuf> {
     Ok(folder)
 }
 
-/// What an error means beyond `cause`, and what to do about it.
+/// The meaning of an error beyond `cause`, and the remedy.
 fn trouble(error: &io::Error, cause: String) -> Trouble {
     match (error.kind(), error.raw_os_error()) {
         (io::ErrorKind::NotFound, _) => Trouble::new(cause)
@@ -245,7 +243,7 @@ mod tests {
             assert_eq!(pwm.present_period_ns(), 1_000_000);
             pwm.set_cycle(Ticks::from_us(100), value).unwrap();
             let duty = (100_000 * u64::from(value) / 32768).to_string();
-            // (A file keeps what is behind that, which a shorter number does not replace.)
+            // (A shorter number does not replace the rest of a file, so the rest stays.)
             assert!(read(&class, "duty_cycle").starts_with(&duty) && read(&class, "period").starts_with("100000"));
             assert!(read(&class, "enable").starts_with(if value == 0 { '0' } else { '1' }));
         }

@@ -33,12 +33,12 @@ pub struct Node {
 }
 
 impl Node {
-    /// The node of a bus number on the wire, which is the C program's.
+    /// The node for a bus number on the wire. The numbers are those of the C program.
     pub fn of(number: u32) -> Node {
         Node { bus: number >> 8, select: number & 0xff }
     }
 
-    /// The number on the wire; none for a chip select above 255, which the number has no room for.
+    /// The number on the wire. `None` for a chip select above 255: the number has no room for it.
     pub fn number(self) -> Option<u32> {
         let fits = self.select <= 0xff && self.bus <= u32::MAX >> 8;
         fits.then_some(self.bus << 8 | self.select)
@@ -68,7 +68,7 @@ pub(super) fn scan(dev: &Path) -> Vec<Node> {
     nodes
 }
 
-/// The dictionary's enumeration `spi_bus`: the C program's, and the nodes beyond it.
+/// The dictionary's enumeration `spi_bus`: the nodes of the C program, and the nodes beyond them.
 pub(super) fn ranges(nodes: &[Node]) -> Vec<Range> {
     let c_program = (0..BUSES).map(|bus| Range { name: format!("spidev{bus}.0"), first: bus << 8, count: BUS_NODES });
     let further = nodes
@@ -78,7 +78,7 @@ pub(super) fn ranges(nodes: &[Node]) -> Vec<Range> {
     c_program.chain(further).collect()
 }
 
-/// The longest transfer that the driver takes, which it tells as its parameter `bufsiz`.
+/// The longest transfer that the driver accepts: its parameter `bufsiz`.
 pub(super) fn message_max() -> usize {
     let told = fs::read_to_string("/sys/module/spidev/parameters/bufsiz").ok();
     told.and_then(|text| text.trim().parse().ok()).unwrap_or(4096)
@@ -86,28 +86,28 @@ pub(super) fn message_max() -> usize {
 
 /// SPI_CPOL of a mode: the clock idles high.
 const CPOL: u32 = SpiModeFlags::SPI_CPOL.bits();
-/// SPI_MOSI_IDLE_LOW of a mode: the data output is low between two messages. Few kernels and controllers have it.
+/// SPI_MOSI_IDLE_LOW of a mode: the data output is low between two messages. Few kernels and controllers support it.
 const MOSI_IDLE_LOW: u32 = 1 << 17;
 
-/// What the chips of one controller have in common. A worker speaks to all of them, so the order of their
-/// conversations is clear.
+/// The shared state of one controller's chips. One worker talks to all of them, so the order of their conversations is
+/// clear.
 #[derive(Default)]
 pub(super) struct Controller {
-    /// The mode that each node is set to, by its chip select. Chips that lines select may share a node and need
-    /// different modes; the kernel keeps one for the node.
+    /// The current mode of each node, by its chip select. Chips with GPIO lines as chip selects may share a node and
+    /// need different modes. The kernel keeps only one mode for the node.
     modes: HashMap<u32, u32>,
-    /// The level at which the clock stands since the last transfer; none if that is not known.
+    /// The clock's level since the last transfer. `None`: unknown.
     idles_high: Option<bool>,
 }
 
-/// What is asked of a node.
+/// The operations of a node.
 pub(super) trait SpiNode: Send {
     fn set_rate(&mut self, hz: u32) -> io::Result<()>;
     fn set_mode(&mut self, mode: u32) -> io::Result<()>;
     fn transfer(&mut self, rate_hz: u32, bytes: Bytes<'_>) -> io::Result<()>;
 }
 
-/// What goes over the wires. Without a buffer for what comes back, a controller of one data line takes it, too.
+/// The bytes on the wires. Without a buffer for the reply, a controller with one data line also accepts them.
 pub(super) enum Bytes<'a> {
     Exchanged(&'a mut [u8]),
     Sent(&'a [u8]),
@@ -181,7 +181,7 @@ impl Spi {
 }
 
 impl<N: SpiNode> Spi<N> {
-    /// Has the data output low between two messages, where the controller can do that.
+    /// Keeps the data output low between two messages, if the controller can do that.
     pub(super) fn with_mosi_idle_low(mut self) -> Spi<N> {
         let plain = self.mode;
         self.mode |= MOSI_IDLE_LOW;
@@ -195,8 +195,8 @@ impl<N: SpiNode> Spi<N> {
         self.controller.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Sets all mode bits of the node, as the C program does. That clears SPI_CS_HIGH, too, but the
-    /// kernel itself keeps the polarity of a chip select that the device tree describes.
+    /// Sets all mode bits of the node, as the C program does. This also clears SPI_CS_HIGH. But the kernel itself keeps
+    /// the polarity of a chip select that the device tree describes.
     fn set_mode(&mut self) -> Result<(), Trouble> {
         self.device.set_mode(self.mode).map_err(|error| {
             Trouble::new(format!(
@@ -211,7 +211,7 @@ impl<N: SpiNode> Spi<N> {
 
     fn transfer(&mut self, bytes: Bytes<'_>) -> Result<(), Trouble> {
         let count = bytes.len();
-        // A transfer that fails may have moved the clock, or not.
+        // A failed transfer may have moved the clock, or not.
         self.controller().idles_high = None;
         self.device.transfer(self.rate_hz, bytes).map_err(|error| {
             Trouble::new(format!("/dev/{} failed to transfer {count} bytes at {} Hz: {error}", self.node, self.rate_hz))
@@ -221,10 +221,10 @@ impl<N: SpiNode> Spi<N> {
         Ok(())
     }
 
-    /// Sets the node's mode, and has the clock stand at its idle level, before a line of ours selects the chip. A
-    /// driver moves the clock only as a transfer begins (spi-bcm2835: in `prepare_message`), which a chip that is
-    /// selected by then would count as an edge. So a byte goes to nobody first. A chip that the controller
-    /// selects is the kernel's affair.
+    /// Sets the node's mode, and puts the clock at its idle level, before a GPIO line selects the chip. A driver moves
+    /// the clock only when a transfer begins (spi-bcm2835: in `prepare_message`). A chip that is already selected would
+    /// count this as an edge. So a byte is first sent with no chip selected. If the controller itself selects the chip,
+    /// the kernel takes care of this.
     fn prepare(&mut self) -> Result<(), Trouble> {
         let known = self.controller().modes.get(&self.node.select) == Some(&self.mode);
         if !known {
@@ -234,7 +234,7 @@ impl<N: SpiNode> Spi<N> {
         if self.chip_select.is_none() || stands { Ok(()) } else { self.transfer(Bytes::Sent(&[0])) }
     }
 
-    /// Drives the line that selects the chip, if there is one.
+    /// Drives the chip select line, if there is one.
     fn drive(&self, how: impl FnOnce(&ChipSelect) -> Result<(), Shutdown>) -> Result<(), Trouble> {
         self.chip_select.as_ref().map_or(Ok(()), how).map_err(|failure| *failure.trouble)
     }
@@ -263,7 +263,7 @@ impl<N: SpiNode> BusDevice for Spi<N> {
     }
 }
 
-/// The driver of the node's controller, if it is known to have no DMA: its FIFO may run empty amid a message.
+/// The driver of the node's controller, if it is known to have no DMA: its FIFO may run empty during a message.
 pub(super) fn driver_without_dma(masters: &Path, node: Node) -> Option<String> {
     const WITHOUT_DMA: [&str; 2] = ["spi-bcm2835aux", "spi_gpio"];
     let driver = fs::read_link(masters.join(format!("spi{}/device/driver", node.bus))).ok()?;
@@ -358,17 +358,17 @@ mod tests {
         Arc::new(VirtualClock::at(Clock::EPOCH))
     }
 
-    /// A controller as spi-bcm2835 has it, and the lines that select chips. The clock moves only with a transfer.
+    /// A controller like that of spi-bcm2835, and the chip select lines. The clock moves only with a transfer.
     #[derive(Default)]
     struct Wires {
         clock: bool,
         /// The mode of each node.
         modes: HashMap<u32, u32>,
-        /// The mode of each chip, by the line that selects it, and whether that is low.
+        /// The mode of each chip, by its chip select line, and whether this line is low.
         chips: HashMap<&'static str, (u32, bool)>,
         /// The edges that a chip saw while it was selected.
         seen: Vec<(&'static str, u32)>,
-        /// How many bytes went over the wires, and whether one data line is all that there is.
+        /// How many bytes went over the wires, and whether there is only one data line.
         bytes: usize,
         half_duplex: bool,
         fails: bool,
@@ -436,7 +436,7 @@ mod tests {
         }
     }
 
-    /// Chips of these names, nodes and modes, on one controller. One without a name is selected by its node.
+    /// Chips with these names, nodes and modes, on one controller. The node selects a chip without a name.
     fn chips<const N: usize>(chips: [(&'static str, u32, u32); N]) -> (Arc<Mutex<Wires>>, [Spi<FakeNode>; N]) {
         let wires: Arc<Mutex<Wires>> = Arc::default();
         let controller: Arc<Mutex<Controller>> = Arc::default();
@@ -460,7 +460,7 @@ mod tests {
 
     #[test]
     fn the_clock_idles_at_a_chip_s_level_before_the_chip_is_selected() {
-        // Two chips of one node, and one of another node, whose lines all select, and one that its node selects.
+        // Two chips of one node and one of another node, all selected by lines, and one selected by its node.
         let all = [("a", 0, 0), ("b", 0, 3), ("c", 1, 2), ("", 2, 0)];
         for order in [[0, 1, 0, 2, 1], [1, 0, 3, 1, 2], [2, 3, 2, 1, 0], [3, 0, 1, 1, 3]] {
             let (wires, mut spis) = chips(all);
@@ -481,11 +481,11 @@ mod tests {
             spi.exchange(&mut [1, 2]).unwrap();
             std::mem::take(&mut wires.lock().unwrap().bytes)
         };
-        // Where it stands at the beginning is not known.
+        // At the beginning the clock's level is unknown.
         assert_eq!((bytes(&mut low), bytes(&mut low)), (3, 2));
         assert_eq!((bytes(&mut high), bytes(&mut high), bytes(&mut other_high)), (3, 2, 2));
         assert_eq!((bytes(&mut high), bytes(&mut low)), (2, 3));
-        // Nor after a failure.
+        // It is also unknown after a failure.
         wires.lock().unwrap().fails = true;
         assert!(high.exchange(&mut [1]).is_err());
         assert_eq!(bytes(&mut low), 3);

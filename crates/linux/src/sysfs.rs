@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What sysfs and debugfs tell of pins and buses, for people: the board itself needs none of it.
+//! Information from sysfs and debugfs about pins and buses, for people. The board itself needs none of it.
 //!
-//! debugfs is root's, so what only that knows is missing for others.
+//! Only root can read debugfs, so its information is missing for others.
 
 #![forbid(unsafe_code)]
 
@@ -9,17 +9,17 @@ use std::collections::HashMap;
 use std::fs;
 use std::path::Path;
 
-/// What was found.
+/// The result of a search.
 #[derive(Debug, Default)]
 pub struct Sysfs {
     /// PWM chips by number.
     pub pwm: Vec<PwmChip>,
     /// I2C buses that have a node in /dev, by number.
     pub i2c: Vec<I2cBus>,
-    /// DS18B20 sensors on one-wire buses, as the kernel calls them: `28-0316a4f1ff27`.
+    /// DS18B20 sensors on 1-Wire buses, with the kernel's names: `28-0316a4f1ff27`.
     pub thermometers: Vec<String>,
-    /// The device that a line's pin is switched to, such as `fe804000.i2c (i2c1)`, by the label of the
-    /// line's chip and its offset. Such a line is free for the GPIO subsystem, and yet in use.
+    /// The device that a line's pin is switched to, for example `fe804000.i2c (i2c1)`. The keys are the label of the
+    /// line's chip and the line's offset. The GPIO subsystem sees the line as free, but it is in use.
     pub devices: HashMap<(String, u32), String>,
 }
 
@@ -37,9 +37,9 @@ pub struct PwmChip {
 /// A channel of a PWM chip.
 #[derive(Debug, Default, PartialEq, Eq)]
 pub struct PwmChannel {
-    /// Whether it is there for programs already; Pinion exports the others itself.
+    /// Whether programs can already use it. Pinion exports the others itself.
     pub exported: bool,
-    /// Who uses it, as far as the kernel tells: a driver's device, or `sysfs` for a program.
+    /// The channel's user, if the kernel knows it: a driver's device, or `sysfs` for a program.
     pub consumer: Option<String>,
 }
 
@@ -61,12 +61,12 @@ pub struct I2cChip {
     pub address: u16,
     /// Its type, such as `ads1115`.
     pub name: String,
-    /// The driver that has it; no program can use it then.
+    /// The chip's kernel driver. If there is one, no program can use the chip.
     pub driver: Option<String>,
 }
 
 impl Sysfs {
-    /// Looks around below `root`, which is `/`. What is not there or can not be read is left out.
+    /// Searches below `root`, which is `/`. Missing and unreadable files are left out.
     pub fn scan(root: &Path) -> Sysfs {
         Sysfs {
             pwm: pwm(&root.join("sys/class/pwm"), &root.join("sys/kernel/debug/pwm")),
@@ -77,13 +77,13 @@ impl Sysfs {
     }
 }
 
-/// A file's text without the white space around it; none if there is none.
+/// A file's text without the white space around it. `None` if there is no text.
 fn text(path: &Path) -> Option<String> {
     let text = fs::read_to_string(path).ok()?.trim().to_owned();
     (!text.is_empty()).then_some(text)
 }
 
-/// The name of what a symbolic link leads to.
+/// The name of a symbolic link's target.
 fn target(link: &Path) -> Option<String> {
     fs::read_link(link).ok()?.file_name()?.to_str().map(str::to_owned)
 }
@@ -96,7 +96,7 @@ fn names(folder: &Path) -> Vec<String> {
 }
 
 fn pwm(class: &Path, debug: &Path) -> Vec<PwmChip> {
-    /// More than any chip has.
+    /// More channels than any chip has.
     const CHANNELS_MAX: usize = 256;
     let users = text(debug).map_or_else(HashMap::new, |text| pwm_users(&text));
     let chip = |name: &String| {
@@ -116,7 +116,7 @@ fn pwm(class: &Path, debug: &Path) -> Vec<PwmChip> {
     chips
 }
 
-/// The users of channels by device and number, from a text such as (drivers/pwm/core.c)
+/// The users of channels by device and number, from a text like this (drivers/pwm/core.c)
 ///
 /// ```text
 /// 0: platform/fe20c000.pwm, 2 PWM devices
@@ -144,7 +144,7 @@ fn pwm_users(text: &str) -> HashMap<(String, usize), String> {
 fn i2c(dev: &Path, devices: &Path) -> Vec<I2cBus> {
     let known = names(devices);
     let bus = |number: u32| {
-        // Such as 1-0048; addresses of 10 bits have an `a` in front.
+        // For example 1-0048. Addresses of 10 bits have an `a` in front.
         let chip = |name: &String| {
             let address = name.strip_prefix(&format!("{number}-"))?;
             let folder = devices.join(name);
@@ -160,7 +160,7 @@ fn i2c(dev: &Path, devices: &Path) -> Vec<I2cBus> {
     super::i2c::scan(dev).into_iter().map(bus).collect()
 }
 
-/// Which devices the pin controllers have switched lines to.
+/// The devices that the pin controllers have switched lines to.
 fn devices(pinctrl: &Path) -> HashMap<(String, u32), String> {
     let mut devices = HashMap::new();
     for controller in names(pinctrl) {
@@ -189,8 +189,8 @@ struct GpioRange {
     last_pin: u32,
 }
 
-/// Reads lines such as `0: pinctrl-bcm2711 GPIOS [512 - 569] PINS [0 - 57]` (drivers/pinctrl/core.c). The
-/// numbers of a chip's lines begin anywhere, so the lowest is taken for its first line's.
+/// Reads lines like `0: pinctrl-bcm2711 GPIOS [512 - 569] PINS [0 - 57]` (drivers/pinctrl/core.c). The numbers of a
+/// chip's lines begin anywhere. So the lowest number is taken for the first line.
 fn gpio_ranges(text: &str) -> Vec<GpioRange> {
     let pair = |text: &str| {
         let (first, last) = text.split_once('[')?.1.split_once(']')?.0.split_once(" - ")?;
@@ -214,7 +214,8 @@ fn gpio_ranges(text: &str) -> Vec<GpioRange> {
     ranges
 }
 
-/// The number of a pin that a device has, and the device with its function, from a line such as (drivers/pinctrl/pinmux.c)
+/// The number of a pin that a device has, and the device with its function, from a line like these
+/// (drivers/pinctrl/pinmux.c)
 ///
 /// ```text
 /// pin 2 (gpio2): fe804000.i2c (GPIO UNCLAIMED) function i2c1 group gpio2
@@ -226,7 +227,7 @@ fn muxed_pin(line: &str) -> Option<(u32, String)> {
     let rest = rest.split_once("): ")?.1;
     let rest = rest.strip_prefix("device ").unwrap_or(rest);
     let owner = rest.split_whitespace().next()?;
-    // A hog is a set-up of the controller's own, which no device has asked for.
+    // A hog is a setup by the controller itself, without a device that asked for it.
     if owner.starts_with('(') || ["GPIO", "UNCLAIMED"].contains(&owner) || rest.contains("(HOG)") {
         return None;
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Thermometers on one-wire buses, by the kernel's w1_therm.
+//! Thermometers on 1-Wire buses, through the kernel's w1_therm.
 
 #![forbid(unsafe_code)]
 
@@ -13,7 +13,7 @@ use pinion_firmware::board::Thermometer;
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::trouble::Trouble;
 
-/// The sensors of the family of the DS18B20.
+/// The names of sensors in the DS18B20's family begin with this.
 const FAMILY: &str = "28-";
 
 /// The sensors in `devices`, in order.
@@ -32,8 +32,8 @@ pub(super) struct Ds18b20 {
 }
 
 impl Ds18b20 {
-    /// The sensor that the kernel calls `serial` in `devices`. Reading would take 750 ms: it is only
-    /// seen whether it may be opened.
+    /// The sensor that the kernel calls `serial` in `devices`. A reading would take 750 ms, so this only checks whether
+    /// the file can be opened.
     pub(super) fn open(devices: &Path, serial: &[u8]) -> Result<Ds18b20, Shutdown> {
         let file = devices.join(OsStr::from_bytes(serial)).join("w1_slave");
         match fs::File::open(&file) {
@@ -46,7 +46,7 @@ impl Ds18b20 {
 impl Thermometer for Ds18b20 {
     fn read(&mut self) -> Result<i32, Trouble> {
         let path = self.file.display();
-        // Opened each time: a sensor that was unplugged and is back has a new file.
+        // Opened each time, because a sensor that was unplugged and is back has a new file.
         let text = fs::read_to_string(&self.file).map_err(|error| {
             Trouble::new(format!("{path} can not be read: {error}")).remedy("is the sensor plugged in?")
         })?;
@@ -55,14 +55,14 @@ impl Thermometer for Ds18b20 {
     }
 }
 
-/// The temperature in thousandths of a degree, of a text such as
+/// The temperature in thousandths of a degree, from a text like this
 ///
 /// ```text
 /// 31 00 4b 46 7f ff 0c 10 77 : crc=77 YES
 /// 31 00 4b 46 7f ff 0c 10 77 t=3062
 /// ```
 ///
-/// The kernel checks the CRC. Zeros have a good one, and are what a bus that is shorted reads.
+/// The kernel checks the CRC. Zeros have a valid CRC, and a shorted bus reads as zeros.
 fn parse(text: &str) -> Result<i32, &'static str> {
     let bytes = text.split(" : ").next().unwrap_or_default();
     if !text.contains("YES") {

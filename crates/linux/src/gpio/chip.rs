@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The GPIO chips of a computer, and what the kernel tells of them and their lines.
+//! The GPIO chips of a computer, and the kernel's information about them and their lines.
 
 #![forbid(unsafe_code)]
 
@@ -11,10 +11,10 @@ use gpio_cdev::LineDirection;
 use super::refusal::{cannot_open, errno};
 use pinion_firmware::trouble::Trouble;
 
-/// Subsystems whose drivers send their devices messages and sleep until these are answered.
+/// Subsystems whose drivers send messages to their devices and sleep until the answer comes.
 const SLEEPING_BUSES: [&str; 7] = ["i2c", "spi", "usb", "hid", "serial", "virtio", "w1"];
-/// Labels of chips that are on none of these buses, but whose drivers sleep all the same. That of the
-/// Raspberry Pi 3 and 4 asks the firmware (drivers/gpio/gpio-raspberrypi-exp.c, `can_sleep`).
+/// Labels of chips that are on none of these buses, but whose drivers also sleep. The chip of the Raspberry Pi 3 and 4
+/// asks the firmware (drivers/gpio/gpio-raspberrypi-exp.c, `can_sleep`).
 const SLEEPING_LABELS: [&str; 1] = ["raspberrypi-exp-gpio"];
 
 /// A GPIO chip as it was found.
@@ -24,7 +24,7 @@ pub struct Chip {
     pub number: u32,
     /// The driver's label, such as `pinctrl-bcm2835`.
     pub label: String,
-    /// Whether calls to it may block: an expander.
+    /// Whether calls to it may block, as for an expander.
     pub sleeps: bool,
     /// Its lines by offset.
     pub lines: Vec<LineInfo>,
@@ -39,14 +39,14 @@ pub struct LineInfo {
     pub output: bool,
     /// Whether the kernel or a program uses it.
     pub held: bool,
-    /// Who uses it, as far as the kernel tells.
+    /// The line's user, if the kernel knows it.
     pub consumer: Option<String>,
 }
 
-/// The chips of this computer by number, and why the others can not be read.
+/// The chips of this computer by number, and why the others cannot be read.
 ///
-/// A node that is a link to another chip's (`/dev/gpiochip4` on a Raspberry Pi 5) is left out, as
-/// its lines are those of the other chip. Pins with its number work all the same.
+/// A node that links to another chip's node (`/dev/gpiochip4` on a Raspberry Pi 5) is left out. Its lines are those of
+/// the other chip. Pins with its number still work.
 pub(crate) fn scan(dev: &Path, devices: &Path) -> (Vec<Chip>, Vec<Trouble>) {
     let mut chips = Vec::new();
     let mut problems = Vec::new();
@@ -69,7 +69,7 @@ pub(crate) fn scan(dev: &Path, devices: &Path) -> (Vec<Chip>, Vec<Trouble>) {
     (chips, problems)
 }
 
-/// Says that a chip is not there, but these.
+/// Says that a chip is missing, and lists those that exist.
 pub(super) fn missing(path: &Path, chips: &[Chip]) -> Trouble {
     let known: Vec<String> = chips.iter().map(|chip| format!("gpiochip{} ({})", chip.number, chip.label)).collect();
     let known = match known.is_empty() {
@@ -103,7 +103,7 @@ pub(super) fn look_at(line: &gpio_cdev::Line) -> LineInfo {
         |info| LineInfo {
             name: info.name().map(str::to_owned),
             output: info.direction() == LineDirection::Out,
-            // Despite its name this flag means "in use", be it by the kernel or by a program.
+            // Despite its name this flag means "in use", by the kernel or by a program.
             held: info.is_kernel(),
             consumer: info.consumer().map(str::to_owned),
         },
@@ -116,8 +116,8 @@ pub(crate) fn number_behind(dev: &Path, number: u32) -> Option<u32> {
     target.file_name()?.to_str()?.strip_prefix("gpiochip")?.parse().ok()
 }
 
-/// Whether calls to a chip may block, as its driver talks to it over a bus or asks a firmware: told
-/// by the subsystems of the devices above the chip in `devices`, which is `/sys/bus/gpio/devices`.
+/// Whether calls to a chip may block, because its driver talks to it over a bus or asks a firmware. The subsystems of
+/// the devices above the chip in `devices` show this. `devices` is `/sys/bus/gpio/devices`.
 pub(crate) fn may_sleep(devices: &Path, chip: &str, label: &str) -> bool {
     if SLEEPING_LABELS.contains(&label) {
         return true;
@@ -135,7 +135,7 @@ mod tests {
     use super::*;
     use std::os::unix::fs::symlink;
 
-    /// A made-up `/sys` of one GPIO chip, below devices of which each has its name and its subsystem.
+    /// A made-up `/sys` with one GPIO chip below devices with these names and subsystems.
     fn sleeps(devices: &[(&str, &str)], label: &str) -> bool {
         let sys = tempfile::tempdir().unwrap();
         let mut device = sys.path().join("devices");

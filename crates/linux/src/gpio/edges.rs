@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Lines whose edges the kernel dates, by its newer kind of request (`gpio_v2`, Linux 5.10).
+//! Lines whose edges the kernel timestamps, through its newer kind of request (`gpio_v2`, Linux 5.10).
 
 #![forbid(unsafe_code)]
 
@@ -24,7 +24,7 @@ mod flag {
     pub(super) const PULL_DOWN: u64 = 1 << 9;
 }
 
-/// Edges that the kernel keeps for us: the most that it offers (gpiolib-cdev.c).
+/// How many edges the kernel keeps: the most that it offers (gpiolib-cdev.c).
 const EVENTS_KEPT: u32 = 1024;
 /// Edges taken by one read.
 const EVENTS: usize = 16;
@@ -37,7 +37,7 @@ const RISING: u32 = 1;
 struct EdgeRequest {
     file: File,
     subject: Subject,
-    /// `GPIO_V2_LINE_FLAG_` flags of its last set-up.
+    /// The flags of the last setup (`GPIO_V2_LINE_FLAG_`).
     flags: AtomicU64,
 }
 
@@ -58,8 +58,8 @@ impl EdgeRequest {
     }
 }
 
-/// An input line whose edges the kernel counts. The kernel has no way from the requests of [`HeldLine`](super::HeldLine)
-/// to one with edges, so this is another kind of line, and can not become an output.
+/// An input line whose edges the kernel counts. The kernel cannot turn a request of [`HeldLine`](super::HeldLine) into
+/// one with edges. So this is another kind of line, and cannot become an output.
 pub(crate) struct EdgeLine(Arc<EdgeRequest>);
 
 /// The edges of an [`EdgeLine`].
@@ -70,8 +70,8 @@ pub(crate) struct LineEdges {
 }
 
 impl Handle {
-    /// Requests the line as an input, from the kernel, with its edges. An error for the log, if that can
-    /// not be: the line may still be had without.
+    /// Requests the line from the kernel as an input, with its edges. If this fails, the error is for the log: a
+    /// request without edges may still work.
     pub(crate) fn request_edges(self, dev: &Path, bias: Bias) -> Result<(EdgeLine, LineEdges), Box<str>> {
         if lacks(&self.subject.label, bias) {
             return Err(self.subject.no_bias(bias).to_string().into());
@@ -93,7 +93,7 @@ fn bias_flag(bias: Bias) -> u64 {
     }
 }
 
-/// For the log: why the kernel does not tell of a line's edges.
+/// For the log: why the kernel does not report a line's edges.
 fn no_edges(code: i32) -> Box<str> {
     let why = match code {
         libc::ENXIO => "its chip has no interrupts".to_owned(),
@@ -105,7 +105,7 @@ fn no_edges(code: i32) -> Box<str> {
 }
 
 impl Line for EdgeLine {
-    /// It is an input.
+    /// Does nothing, because the line is an input.
     fn write(&self, _level: bool) -> Result<(), Shutdown> {
         Ok(())
     }
@@ -126,7 +126,7 @@ impl Line for EdgeLine {
 }
 
 impl Edges for LineEdges {
-    /// Takes no more than the kernel keeps, so that a line that never rests does not hold the worker.
+    /// Takes at most as many edges as the kernel keeps. So a line that never rests does not hold up the worker.
     fn take(&mut self, see: &mut dyn FnMut(Edge)) -> Result<(), Shutdown> {
         let mut events = [0; EVENTS * EVENT_BYTES];
         for _ in 0..EVENTS_KEPT as usize / EVENTS {
@@ -151,7 +151,7 @@ impl Edges for LineEdges {
     }
 }
 
-/// What an event tells, and its `line_seqno`; that of the event before it is `seen`.
+/// The edge in an event, and its `line_seqno`. `seen` is the `line_seqno` of the event before.
 fn edge_of(event: &[u8], seen: u32) -> (Edge, u32) {
     let word = |at: usize| {
         let bytes = event.get(at..).and_then(|rest| rest.first_chunk());

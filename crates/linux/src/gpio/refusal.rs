@@ -17,10 +17,10 @@ use pinion_firmware::trouble::Trouble;
 
 use crate::LOOK_AT_LOG;
 
-/// What a driver answers if it does not support a request (include/linux/errno.h).
+/// A driver's answer to a request that it does not support (include/linux/errno.h).
 const ENOTSUPP: i32 = 524;
 
-/// What errors say of a line.
+/// The line that an error is about.
 #[derive(Clone, Debug)]
 pub(super) struct Subject {
     pub(super) chip: String,
@@ -53,7 +53,7 @@ impl Subject {
             .remedy(format!("solder one and write the pin without the {sign}, or choose another pin"))
     }
 
-    /// `what` is "read" or "written"; `sleeping` tells whether the chip is on a bus.
+    /// `what` is "read" or "written". `sleeping` says whether the chip is on a bus.
     pub(super) fn lost(&self, what: &str, code: i32, sleeping: bool) -> Trouble {
         let (why, remedy) = match sleeping {
             true => (
@@ -65,7 +65,7 @@ impl Subject {
         Trouble::new(format!("{self} can no longer be {what}: {}: {why}", text(code))).remedy(remedy)
     }
 
-    /// `consumer` is who holds the line, as far as the kernel tells.
+    /// `consumer` is the line's holder, if the kernel knows it.
     pub(super) fn refusal(
         &self,
         action: &str,
@@ -102,7 +102,7 @@ impl Subject {
     }
 }
 
-/// A resistor's name, and the sign in front of a pin that asks for it in printer.cfg.
+/// A resistor's name, and the sign that requests it in front of a pin in printer.cfg.
 fn pull(bias: Bias) -> (&'static str, char) {
     match bias {
         Bias::PullDown => ("pull-down", '~'),
@@ -110,9 +110,9 @@ fn pull(bias: Bias) -> (&'static str, char) {
     }
 }
 
-/// The first Linux that switches resistors on.
+/// The first Linux version that switches resistors on.
 pub const BIAS_SINCE: (u32, u32) = (5, 5);
-/// The first Linux that tells of a line's edges as Pinion asks for them.
+/// The first Linux version with the request that Pinion uses for a line's edges.
 pub const EDGES_SINCE: (u32, u32) = (5, 10);
 
 /// Whether a kernel's release, such as `5.4.0-rpi`, comes before a version.
@@ -135,19 +135,19 @@ pub(super) fn cannot_open(path: &Path, code: i32) -> Trouble {
     }
 }
 
-/// To whom a device node belongs, and how to get permission to open it.
+/// The owner of a device node, and how to get permission to open it.
 pub(crate) fn not_permitted(path: &Path) -> Trouble {
     forbidden(path, &Opener::of(path))
 }
 
-/// Who asks for a file, and the group whose members may open it, if there is one.
+/// The user that opens a file, and the group whose members may open it, if there is one.
 pub struct Opener {
     who: String,
     group: Option<String>,
 }
 
 impl Opener {
-    /// Who runs this program, for this file.
+    /// The user of this program, and the group of this file.
     pub fn of(path: &Path) -> Opener {
         let user = User::from_uid(geteuid()).ok().flatten();
         let who = user.map_or_else(|| format!("user {}", geteuid()), |user| user.name);
@@ -156,11 +156,11 @@ impl Opener {
             let gid = Gid::from_raw(about.gid());
             Group::from_gid(gid).ok().flatten().map_or_else(|| gid.to_string(), |group| group.name)
         });
-        // Who is in root's group may do more than that.
+        // Members of root's group may do more than open this file.
         Opener { who, group: group.filter(|group| group != "root") }
     }
 
-    /// The command that has the user open such files.
+    /// The command that lets the user open these files.
     pub fn command(&self) -> Option<String> {
         let Opener { who, group } = self;
         group.as_ref().map(|group| format!("sudo usermod -aG {group} {who}"))
@@ -183,8 +183,8 @@ fn forbidden(path: &Path, opener: &Opener) -> Trouble {
 
 /// The error number of a call that has just failed.
 ///
-/// gpio-cdev hides the number in an error type of another version of nix than ours. But it makes no
-/// system call between the one that fails and its own return, so the thread's errno is still that.
+/// gpio-cdev hides the number in an error type from another version of nix. But it makes no system call between the
+/// failed one and its own return. So the thread's errno is still the failed call's.
 pub(super) fn errno(error: &gpio_cdev::Error) -> i32 {
     let last = io::Error::last_os_error().raw_os_error();
     error
@@ -195,7 +195,7 @@ pub(super) fn errno(error: &gpio_cdev::Error) -> i32 {
         .unwrap_or_default()
 }
 
-/// The meaning of an error number, in lower case, as it stands in a sentence.
+/// The meaning of an error number, in lower case, for use in a sentence.
 pub(super) fn text(code: i32) -> String {
     match code {
         ENOTSUPP => "not supported by the driver (error 524)".to_owned(),
@@ -277,7 +277,7 @@ mod tests {
             Opener::of(file.path()).command()
         };
         assert_eq!(command(0o600), None);
-        // Who runs the tests may be root, and have root's group.
+        // The tests may run as root, with root's group.
         let gid = fs::metadata(file.path()).unwrap().gid();
         assert_eq!(command(0o660).is_some(), gid != 0);
     }

@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a process may ask the kernel for that only reads files and answers on a socket (seccomp(2)).
+//! The system calls that are left to a process that only reads files and answers on a socket (seccomp(2)).
 //!
-//! Anything else fails with EPERM. A crate that makes such filters was left out: seccompiler does not know
-//! 32-bit ARM.
+//! Anything else fails with EPERM. The crate seccompiler makes filters like this one, but does not know 32-bit ARM.
 
 use std::io;
 
@@ -11,7 +10,7 @@ use libc::{
     sock_filter, sock_fprog,
 };
 
-/// `AUDIT_ARCH_` of this processor (linux/audit.h); none: its system calls are not listed here.
+/// `AUDIT_ARCH_` of this processor (linux/audit.h). `None`: its system calls are not listed here.
 const ARCHITECTURE: Option<u32> = if cfg!(target_arch = "x86_64") {
     Some(0xC000_003E)
 } else if cfg!(target_arch = "aarch64") {
@@ -22,7 +21,7 @@ const ARCHITECTURE: Option<u32> = if cfg!(target_arch = "x86_64") {
     None
 };
 
-/// Reading files and folders; memory; the socket that the process has; time; its own end.
+/// Reading files and folders, memory, the socket that the process has, time, its own end.
 const ALLOWED: &[c_long] = &[
     libc::SYS_read,
     libc::SYS_close,
@@ -66,7 +65,7 @@ const ALLOWED: &[c_long] = &[
     libc::SYS_sigreturn,
     #[cfg(target_arch = "arm")]
     libc::SYS_gettimeofday,
-    // clock_gettime64 and futex_time64, which libc does not name.
+    // clock_gettime64 and futex_time64: libc does not name them.
     #[cfg(target_arch = "arm")]
     403,
     #[cfg(target_arch = "arm")]
@@ -78,14 +77,14 @@ const SYS_MMAP: c_long = libc::SYS_mmap;
 #[cfg(target_arch = "arm")]
 const SYS_MMAP: c_long = libc::SYS_mmap2;
 
-/// System calls that are allowed as long as an argument, by its number, has none of these bits.
+/// System calls that are allowed only if an argument has none of these bits: call, number of the argument, bits.
 const ALLOWED_WITHOUT: &[(c_long, u32, i32)] = &[
     (libc::SYS_openat, 2, libc::O_ACCMODE | libc::O_CREAT | libc::O_TRUNC),
     (SYS_MMAP, 2, libc::PROT_EXEC),
     (libc::SYS_mprotect, 2, libc::PROT_EXEC),
 ];
 
-/// Offsets in `struct seccomp_data` (linux/seccomp.h); those of arguments are of their lower halves.
+/// Offsets in `struct seccomp_data` (linux/seccomp.h). Those of arguments are the offsets of their lower halves.
 const NUMBER: u32 = 0;
 const ARCH: u32 = 4;
 const fn argument(number: u32) -> u32 {
@@ -98,7 +97,7 @@ fn load(offset: u32) -> sock_filter {
     sock_filter { code: (BPF_LD | BPF_W | BPF_ABS) as u16, jt: 0, jf: 0, k: offset }
 }
 
-/// Skips so many instructions if the test holds, and so many if not.
+/// Skips `if_so` instructions if the test holds, and `if_not` otherwise.
 fn skip(how: u32, value: u32, if_so: u8, if_not: u8) -> sock_filter {
     sock_filter { code: (BPF_JMP | how | BPF_K) as u16, jt: if_so, jf: if_not, k: value }
 }
@@ -108,7 +107,7 @@ fn answer(answer: u32) -> sock_filter {
 }
 
 fn program(architecture: u32) -> Vec<sock_filter> {
-    // A program of this processor's older instruction set would have other numbers.
+    // A program for this processor's older instruction set would have other numbers.
     let mut program = vec![load(ARCH), skip(BPF_JEQ, architecture, 1, 0), answer(DENY), load(NUMBER)];
     for number in ALLOWED {
         program.extend([skip(BPF_JEQ, *number as u32, 0, 1), answer(SECCOMP_RET_ALLOW)]);
@@ -126,7 +125,7 @@ fn program(architecture: u32) -> Vec<sock_filter> {
     program
 }
 
-/// Has this process, which must have one thread, do nothing any more but read files and use the sockets that it has.
+/// Limits this process to reading files and to its open sockets. The process must have only one thread.
 pub fn allow_only_reading() -> io::Result<()> {
     let architecture =
         ARCHITECTURE.ok_or_else(|| io::Error::other("Pinion has no list of this processor's system calls"))?;
@@ -177,7 +176,7 @@ mod tests {
             is_refused(thread::Builder::new().spawn(|| ()).map(drop)),
             is_refused(nix::sys::signal::kill(me, None).map_err(Into::into)),
         ];
-        // It can print nothing any more.
+        // The process can no longer print.
         process::exit(checks.iter().position(|is_right| !is_right).map_or(100, |number| number as i32));
     }
 

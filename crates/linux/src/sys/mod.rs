@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Every `unsafe` of the project: system calls that no crate of ours wraps.
+//! All `unsafe` code of the project: system calls that none of our crates wraps.
 
 use std::fs;
 use std::io::{self, IoSliceMut};
@@ -38,8 +38,8 @@ fn set_scheduler(policy: i32, priority: i32) -> io::Result<()> {
     }
 }
 
-/// Gives the calling thread a nice value (-20 to 19), which counts while it is SCHED_OTHER
-/// (setpriority(2), "C library/kernel differences": per thread).
+/// Gives the calling thread a nice value (-20 to 19). It counts while the thread is SCHED_OTHER (setpriority(2), "C
+/// library/kernel differences": per thread).
 pub fn set_nice(value: i32) -> io::Result<()> {
     // SAFETY: takes no pointers; 0 is the calling thread.
     match unsafe { libc::setpriority(libc::PRIO_PROCESS, 0, value) } {
@@ -48,28 +48,27 @@ pub fn set_nice(value: i32) -> io::Result<()> {
     }
 }
 
-/// CAP_DAC_READ_SEARCH and CAP_SYS_PTRACE (linux/capability.h): to look into the processes and files
-/// of other users.
+/// CAP_DAC_READ_SEARCH and CAP_SYS_PTRACE (linux/capability.h): to look into the processes and files of other users.
 pub const LOOK_INTO_OTHERS: u32 = 1 << 2 | 1 << 19;
 
-/// What the program itself may need: CAP_IPC_LOCK and CAP_SYS_NICE for real time; and if root starts it,
-/// CAP_CHOWN, CAP_DAC_OVERRIDE and CAP_FOWNER, for the terminal's group and for links and sockets in folders of
-/// other users.
+/// The capabilities that the program itself may need. CAP_IPC_LOCK and CAP_SYS_NICE are for real time. If root starts
+/// the program, it also needs CAP_CHOWN, CAP_DAC_OVERRIDE and CAP_FOWNER. They are for the terminal's group, and for
+/// links and sockets in folders of other users.
 pub const SERVE: u32 = 1 << 14 | 1 << 23 | 1 << 0 | 1 << 1 | 1 << 3;
 
-/// Takes all capabilities but these, a bit for each of the first 32, from the calling thread and those that it
-/// starts from now on, and from programs that it may become as far as that is permitted.
+/// Drops all capabilities except these. `capabilities` has a bit for each of the first 32. The calling thread loses the
+/// others, and so do the threads that it starts from now on. Programs that it may become lose them as far as permitted.
 pub fn keep_only(capabilities: u32) -> io::Result<()> {
     /// _LINUX_CAPABILITY_VERSION_3, for the calling thread (capset(2)).
     const HEADER: [u32; 2] = [0x2008_0522, 0];
     let dropped = (0..).filter(|number| *number >= u32::BITS || capabilities >> number & 1 == 0);
     for number in dropped {
-        // SAFETY: takes a number. It ends behind the last capability, and where CAP_SETPCAP is missing.
+        // SAFETY: takes a number. The loop ends after the last capability, or if CAP_SETPCAP is missing.
         if unsafe { libc::prctl(libc::PR_CAPBSET_DROP, libc::c_ulong::from(number)) } != 0 {
             break;
         }
     }
-    // Linux before 4.3 has no ambient ones.
+    // Linux before 4.3 has no ambient capabilities.
     // SAFETY: takes numbers.
     unsafe { libc::prctl(libc::PR_CAP_AMBIENT, libc::PR_CAP_AMBIENT_CLEAR_ALL as libc::c_ulong, 0, 0, 0) };
     // Effective, permitted and inheritable of the first 32 capabilities, then of the rest.
@@ -80,18 +79,17 @@ pub fn keep_only(capabilities: u32) -> io::Result<()> {
     }
     sets[..3].iter_mut().for_each(|set| *set &= capabilities);
     sets[3..].fill(0);
-    // SAFETY: and reads as many.
+    // SAFETY: the kernel reads the same two structures.
     match unsafe { libc::syscall(libc::SYS_capset, HEADER.as_ptr(), sets.as_ptr()) } {
         0 => Ok(()),
         _ => Err(io::Error::last_os_error()),
     }
 }
 
-/// Words that stay common to this process and to those that it forks.
+/// How many words this process shares with the processes that it forks.
 pub const SHARED_WORDS: usize = 1024;
 
-/// A page of zeros that stays common to this process and to those that it forks. It is never
-/// given back.
+/// A page of zeros that this process shares with the processes that it forks. It is never given back.
 pub fn shared_words() -> io::Result<&'static [AtomicU32; SHARED_WORDS]> {
     let length = NonZeroUsize::MIN.saturating_add(size_of::<[AtomicU32; SHARED_WORDS]>() - 1);
     // SAFETY: a new anonymous mapping at an address of the kernel's choice touches no memory
@@ -103,9 +101,9 @@ pub fn shared_words() -> io::Result<&'static [AtomicU32; SHARED_WORDS]> {
     Ok(unsafe { page.cast::<[AtomicU32; SHARED_WORDS]>().as_ref() })
 }
 
-/// Forks a process that runs `child` and ends with the status that it returns. An error if this process has more
-/// than `threads_max` threads: the child would miss them, and the locks that they hold. A program allows one; a test
-/// runs in a second one while the first waits and holds no lock.
+/// Forks a process that runs `child` and ends with the status that it returns. Fails if this process has more than
+/// `threads_max` threads: the child would miss them, and the locks that they hold. A program allows one. A test runs in
+/// a second thread while the first one waits and holds no lock.
 pub fn fork(threads_max: usize, child: impl FnOnce() -> i32) -> io::Result<Pid> {
     if fs::read_dir("/proc/self/task")?.count() > threads_max {
         return Err(io::Error::other("threads have been started already"));
@@ -121,36 +119,36 @@ pub fn fork(threads_max: usize, child: impl FnOnce() -> i32) -> io::Result<Pid> 
     }
 }
 
-/// Closes all descriptors of this process but these. To be called in a new process only, in which nothing that
-/// owns another is used any more.
+/// Closes all descriptors of this process except these. Call it only in a new process, and only if nothing that owns
+/// another descriptor is used any more.
 pub fn close_all_but(kept: &[RawFd]) -> io::Result<()> {
     let entries = fs::read_dir("/proc/self/fd")?;
     let open: Vec<RawFd> = entries.filter_map(|entry| entry.ok()?.file_name().to_str()?.parse().ok()).collect();
     for fd in open.into_iter().filter(|fd| !kept.contains(fd)) {
-        // SAFETY: as the caller promises, no owner uses it. That of the folder itself is closed by now.
+        // SAFETY: the caller promises that no owner uses it. The folder's own descriptor is already closed.
         unsafe { libc::close(fd) };
     }
     Ok(())
 }
 
-/// Has this process ignore a signal.
+/// Makes this process ignore a signal.
 pub fn ignore(ignored: Signal) -> io::Result<()> {
     // SAFETY: no handler is installed.
     unsafe { signal(ignored, SigHandler::SigIgn) }?;
     Ok(())
 }
 
-/// A descriptor that is readable once process `pid` has ended (Linux 5.3).
+/// A descriptor that becomes readable when process `pid` has ended (Linux 5.3).
 pub fn pidfd(pid: Pid) -> io::Result<OwnedFd> {
     // SAFETY: the call takes two numbers.
     match unsafe { libc::syscall(libc::SYS_pidfd_open, pid.as_raw(), 0) } {
         -1 => Err(io::Error::last_os_error()),
-        // SAFETY: a new descriptor that nobody else knows of; descriptors fit an i32.
+        // SAFETY: a new descriptor that nobody else knows. Descriptors fit an i32.
         fd => Ok(unsafe { OwnedFd::from_raw_fd(fd as i32) }),
     }
 }
 
-/// Receives a message and the descriptor that may come with it; 0 bytes are the other end's end.
+/// Receives a message, and the descriptor that may come with it. 0 bytes: the other end is closed.
 pub fn receive(socket: BorrowedFd<'_>, buffer: &mut [u8]) -> io::Result<(usize, Option<OwnedFd>)> {
     let mut control = cmsg_space!([i32; 1]);
     let mut pieces = [IoSliceMut::new(buffer)];
@@ -180,8 +178,8 @@ pub struct LineConfig {
     padding: [u32; 4],
 }
 
-/// `struct gpio_v2_line_config` (linux/gpio.h, since Linux 5.10): flags and attributes of a line
-/// request's lines. An attribute is of 24 bytes.
+/// `struct gpio_v2_line_config` (linux/gpio.h, since Linux 5.10): flags and attributes of a line request's lines. An
+/// attribute has 24 bytes.
 #[repr(C)]
 pub struct LineRequestConfig {
     flags: u64,
@@ -229,8 +227,8 @@ pub fn set_line(line: &impl AsRawFd, value: bool) -> io::Result<()> {
     Ok(())
 }
 
-/// Gives the only line of a handle of the GPIO character device another direction and bias
-/// (`GPIOHANDLE_REQUEST_` flags), and as an output its level.
+/// Sets direction and bias (`GPIOHANDLE_REQUEST_` flags) of the only line of a handle of the GPIO character device.
+/// Also sets the level of an output.
 pub fn set_line_config(line: &impl AsRawFd, flags: u32, level: bool) -> io::Result<()> {
     let mut config = LineConfig { flags, default_values: [0; 64], padding: [0; 4] };
     config.default_values[0] = level.into();
@@ -242,13 +240,12 @@ pub fn set_line_config(line: &impl AsRawFd, flags: u32, level: bool) -> io::Resu
 /// GPIOHANDLE_REQUEST_OUTPUT.
 pub const OUTPUT: u32 = 1 << 1;
 
-/// Drives the only line of a handle, of a chip that is spoken to over a bus, and learns whether the
-/// chip has taken it. `flags` are those that the line was made an output with.
+/// Drives the only line of a handle, for a chip on a bus. Reports whether the chip has accepted the level. `flags` are
+/// the flags that made the line an output.
 ///
-/// [`set_line`] does not tell: on many kernels, 6.1 among them, a driver's function that sets a level
-/// returns nothing, and a chip that does not answer goes unnoticed. The one that makes a line an
-/// output of some level does return an error. Linux before 5.5 offers that for new handles only, and
-/// says EINVAL.
+/// [`set_line`] does not report this. On many kernels, 6.1 among them, a driver's function that sets a level returns
+/// nothing. A chip that does not answer goes unnoticed. The driver's function that makes a line an output does return
+/// an error. Linux before 5.5 offers this only for new handles, and answers EINVAL.
 pub fn set_line_checked(line: &impl AsRawFd, flags: u32, value: bool) -> io::Result<()> {
     match set_line_config(line, flags, value) {
         Err(error) if error.raw_os_error() == Some(libc::EINVAL) => set_line(line, value),
@@ -256,22 +253,22 @@ pub fn set_line_checked(line: &impl AsRawFd, flags: u32, value: bool) -> io::Res
     }
 }
 
-/// Closes what `held` is and puts a copy of another descriptor in its place, under the same number.
+/// Closes the file of `held` and puts a copy of another descriptor in its place, under the same number.
 pub fn replace(held: &impl AsRawFd, by: &impl AsRawFd) -> io::Result<()> {
-    // SAFETY: takes numbers. The one of `held` stays open, and belongs to `held` as before.
+    // SAFETY: takes numbers. The number of `held` stays open, and still belongs to `held`.
     match unsafe { libc::dup3(by.as_raw_fd(), held.as_raw_fd(), libc::O_CLOEXEC) } {
         -1 => Err(io::Error::last_os_error()),
         _ => Ok(()),
     }
 }
 
-/// What `flags` (`GPIO_V2_LINE_FLAG_`) make a line, without attributes.
+/// The configuration of a line with these flags (`GPIO_V2_LINE_FLAG_`), without attributes.
 fn line_request_config(flags: u64) -> LineRequestConfig {
     LineRequestConfig { flags, num_attrs: 0, padding: [0; 5], attrs: [[0; 3]; 10] }
 }
 
-/// Requests one line of an open GPIO chip with `GPIO_V2_LINE_FLAG_` flags. What is read from the file is its
-/// edges, if the flags ask for them; a read without any does not wait. The kernel keeps `events` edges.
+/// Requests one line of an open GPIO chip with `GPIO_V2_LINE_FLAG_` flags. If the flags ask for edges, the file reads
+/// as the line's edges. A read without any does not wait. The kernel keeps `events` edges.
 pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, events: u32, consumer: &str) -> io::Result<fs::File> {
     let mut request = LineRequest {
         offsets: [0; 64],
@@ -293,7 +290,7 @@ pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, events: u32, c
     Ok(line.into())
 }
 
-/// Gives a line of [`request_line`] other flags.
+/// Changes the flags of a line of [`request_line`].
 pub fn set_line_flags(line: &impl AsRawFd, flags: u64) -> io::Result<()> {
     let mut config = line_request_config(flags);
     // SAFETY: the request takes a `struct gpio_v2_line_config`, which lives through the call.
@@ -309,8 +306,8 @@ pub fn line_level(line: &impl AsRawFd) -> io::Result<bool> {
     Ok(values.bits & 1 != 0)
 }
 
-/// Whether the adapter of an I2C bus takes plain messages (I2C_FUNC_I2C of linux/i2c.h); those of many
-/// PC chipsets know SMBus only.
+/// Whether the adapter of an I2C bus accepts plain messages (I2C_FUNC_I2C of linux/i2c.h). The adapters of many PC
+/// chipsets know only SMBus.
 pub fn is_plain_i2c(bus: &impl AsRawFd) -> io::Result<bool> {
     let mut functions: libc::c_ulong = 0;
     // SAFETY: the request writes an unsigned long, which lives through the call.
@@ -318,7 +315,7 @@ pub fn is_plain_i2c(bus: &impl AsRawFd) -> io::Result<bool> {
     Ok(functions & 1 != 0)
 }
 
-/// After how many seconds without food a hardware watchdog resets the computer.
+/// The timeout of a hardware watchdog, in seconds. Without food for this time, it resets the computer.
 pub fn watchdog_timeout_s(watchdog: BorrowedFd<'_>) -> io::Result<i32> {
     let mut seconds = 0;
     // SAFETY: the request writes an int, which lives through the call.
@@ -326,14 +323,14 @@ pub fn watchdog_timeout_s(watchdog: BorrowedFd<'_>) -> io::Result<i32> {
     Ok(seconds)
 }
 
-/// Opens the other end of the pseudo terminal whose master this is, whatever its permissions are
-/// (Linux 4.13). It does not become the process's controlling terminal.
+/// Opens the other end of the pseudo terminal with this master, whatever its permissions are (Linux 4.13). It does not
+/// become the process's controlling terminal.
 pub fn pty_slave(master: BorrowedFd<'_>) -> io::Result<OwnedFd> {
     let flags = libc::O_RDWR | libc::O_NOCTTY | libc::O_CLOEXEC;
     // SAFETY: the request takes a number.
     match unsafe { libc::ioctl(master.as_raw_fd(), libc::TIOCGPTPEER, flags) } {
         -1 => Err(io::Error::last_os_error()),
-        // SAFETY: a new descriptor that nobody else knows of.
+        // SAFETY: a new descriptor that nobody else knows.
         fd => Ok(unsafe { OwnedFd::from_raw_fd(fd) }),
     }
 }
