@@ -54,7 +54,7 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
-        // After a failed assertion it still runs.
+        // After a failed assertion the program still runs.
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
@@ -110,7 +110,7 @@ fn a_key_that_stops_programs_does_not_stop_this_one() {
         kill(program.pid(), signal).unwrap();
         kill(program.guardian(), signal).unwrap();
     }
-    // One that is stopped would not end.
+    // A stopped program would not end.
     kill(program.pid(), Signal::SIGTERM).unwrap();
     wait_until("the program ends", || !exists(program.pid()));
     let (status, log) = program.end();

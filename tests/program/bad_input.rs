@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a host may send wrong: each ends in the firmware's shutdown text, a log line that
-//! names the thing and the remedy, and a process that is there for the next FIRMWARE_RESTART.
+//! Invalid input from a host. Each case ends in the firmware's shutdown text, and in a log line with the cause and the
+//! remedy. The process is ready for the next FIRMWARE_RESTART.
 
 use std::time::{Duration, Instant};
 
@@ -9,8 +9,8 @@ use pinion_protocol::block::Sequence;
 
 use crate::process::{Pinion, WAIT_MAX};
 
-/// Sends the lines to an MCU with eight ids; it must stop for `reason` and log each of
-/// `words` in one line. Then a reset must make it new.
+/// Sends the lines to an MCU with eight ids. It must stop for `reason` and log all of `words` in one line. Then a reset
+/// must make it ready again.
 #[track_caller]
 fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
     let mut client = pinion.client();
@@ -29,7 +29,7 @@ fn stops(pinion: &Pinion, lines: &[&str], reason: &str, words: &[&str]) {
     restarts(&mut client);
 }
 
-/// The line with the clock that `@3` in it means: three seconds after it is sent.
+/// The line with a clock for its `@3`: three seconds after the line is sent.
 fn timed(client: &mut Client, line: &str) -> String {
     let Some((before, after)) = line.split_once('@') else { return line.into() };
     let (seconds, after) = after.split_once(' ').unwrap_or((after, ""));
@@ -110,7 +110,7 @@ fn memory_is_not_poked() {
 #[test]
 fn commands_that_are_none_and_commands_cut_short() {
     let pinion = Pinion::simulated(&[]);
-    // A number that no command has, and identify without its count.
+    // An unknown command number, and identify without its count.
     for (payload, reason) in [(&[0x9f, 0x7f][..], "Invalid command"), (&[0x01, 0x00][..], "Command parser error")] {
         let mut client = pinion.client();
         client.link().send(payload).unwrap();
@@ -133,7 +133,7 @@ fn garbage_truncated_and_endless_blocks_are_answered_by_a_nak_and_overcome() {
         b"FORCE_SHUTDOWN",
     ] {
         client.link().port().queue(noise);
-        // A sync byte ends whatever the noise began.
+        // A sync byte ends any block that the noise began.
         client.link().port().queue(&[0x7e; 64]);
         assert!(!client.status().unwrap().is_shutdown);
     }
@@ -143,13 +143,13 @@ fn garbage_truncated_and_endless_blocks_are_answered_by_a_nak_and_overcome() {
 fn a_block_out_of_order_is_answered_by_a_nak() {
     let pinion = Pinion::simulated(&[]);
     let mut port = pinion.port();
-    // Nothing was sent before: the MCU expects number 0.
+    // No block was sent before, so the MCU expects number 0.
     port.queue_block(&[], Sequence::default().next());
     let mut until = Instant::now() + WAIT_MAX;
     let mut empty = 0;
     while let Some((sequence, payload)) = port.wait_block(until).unwrap() {
         assert_eq!(sequence, Sequence::default());
-        // An MCU that was just made says `starting`.
+        // A new MCU sends `starting`.
         if payload.is_empty() {
             empty += 1;
             until = Instant::now() + Duration::from_millis(50);

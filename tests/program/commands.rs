@@ -11,7 +11,7 @@ use serde_json::Value;
 
 use crate::process::{Pinion, closed_pipe, folder_with, output};
 
-/// The built-in printer with a bed that is warm within seconds.
+/// The built-in printer with a bed that warms up within seconds.
 fn quick_printer() -> String {
     let printer = output(&["sim", "--print-board"]);
     let printer = String::from_utf8(printer.stdout).unwrap();
@@ -20,11 +20,10 @@ fn quick_printer() -> String {
     quick
 }
 
-/// Whether this is what the demonstration says of an axis that was homed as far off as it may have
-/// gone while the MCU's timers were so late: without real time a busy computer sees to that.
+/// Whether the demonstration's error about a homed axis can come from timers of the MCU that were this late. On a busy
+/// computer without real time they are late.
 fn comes_of_lateness(wrong: &str, late_us: f64) -> bool {
-    // Every axis of the built-in printer homes at 4000 steps a second; each of the two times that
-    // are compared may be late.
+    // Every axis of the built-in printer homes at 4000 steps per second. Both of the compared times may be late.
     let steps = 2.0 * 0.004 * late_us;
     let numbers = wrong.split(|c: char| !c.is_ascii_digit()).filter_map(|number| number.parse::<f64>().ok());
     let [went, expected, apart, allowed] = numbers.collect::<Vec<_>>()[..] else { return false };
@@ -49,7 +48,7 @@ fn the_demonstration_is_right_and_draws_its_picture() {
     let args = ["sim", "-r", toml.to_str().unwrap(), "--demo", "--picture", svg.to_str().unwrap()];
     let mut pinion = Pinion::start(&args);
     let mut status = pinion.end();
-    // Where the host itself, which has a quarter of a second, comes too late the MCU stops.
+    // The MCU stops if the host itself, which has a quarter of a second, is too late.
     for _ in 0..2 {
         if !pinion.log().contains("shutdown: Timer too close: ") {
             break;
@@ -72,7 +71,7 @@ fn the_demonstration_is_right_and_draws_its_picture() {
 
 #[test]
 fn the_demonstration_fails_where_something_is_wrong() {
-    // Axes that stand against a wall at their endstops lose the steps of the way to a stop.
+    // Axes against a wall at their endstops lose the steps of the way to a stop.
     let walled = quick_printer().replace("microsteps = 16", "microsteps = 16\novertravel_mm = 0.0");
     let (_folder, toml) = folder_with("walled.toml", &walled);
     let mut pinion = Pinion::start(&["sim", "-r", toml.to_str().unwrap(), "--demo"]);
@@ -98,13 +97,12 @@ fn dict_prints_what_identify_serves() {
     assert!(printed.status.success());
     let pinion = Pinion::simulated(&["--dialect", "master"]);
     let served = pinion.client().dictionary().json().unwrap();
-    // Not assert_eq, which would print some ten thousand numbers.
+    // Not assert_eq, because it would print about ten thousand numbers.
     assert!(fs::read(&file).unwrap() == served);
     assert!(output(&["dict", "--board", "sim"]).stdout == served);
 }
 
-/// The dictionaries of the firmwares' own `linux` processes, by the dialect that is theirs, with the
-/// versions that they are of.
+/// The dictionaries of the firmwares' own `linux` processes, with their dialect and their version.
 const FIRMWARES: [(&str, &str); 5] = [
     // Klipper v0.11.0, v0.12.0, v0.13.0 and 84104bbbd (August 2026).
     ("v0.11", include_str!("../dictionaries/klipper-v0.11.json")),
@@ -115,8 +113,8 @@ const FIRMWARES: [(&str, &str); 5] = [
     ("kalico", include_str!("../dictionaries/kalico.json")),
 ];
 
-/// Texts of the firmwares' shutdowns that can not come about here: their threads, allocator, timers and
-/// limits are not ours. No host matches on them (klippy/extras/error_mcu.py).
+/// Shutdown texts of the firmwares that cannot occur here: their threads, allocator, timers and limits are not ours. No
+/// host matches on them (klippy/extras/error_mcu.py).
 const NOT_OURS: [&str; 14] = [
     "Could not start DS18B20 reader thread",
     "Could not start DS18B20 reader thread (cond init)",
@@ -148,7 +146,7 @@ fn strings(list: &Value) -> Vec<&str> {
     list.as_array().unwrap().iter().filter_map(Value::as_str).collect()
 }
 
-/// Each name of an enumeration with its value: a range stands for names that count up.
+/// Each name of an enumeration with its value. A range stands for names with consecutive numbers.
 fn expanded(enumeration: &Value) -> HashMap<String, u64> {
     let mut all = HashMap::new();
     for (name, value) in enumeration.as_object().unwrap() {
@@ -173,7 +171,7 @@ fn each_dictionary_has_what_the_firmware_of_its_hosts_has() {
             assert_eq!(keys(&ours[kind]), strings(&theirs[kind]), "{dialect} {kind}");
         }
         let mut config = ours["config"].as_object().unwrap().clone();
-        // Ours alone: more than the 192 bytes that a host takes for granted.
+        // Only ours: more than the 192 bytes that a host assumes.
         assert!(config.remove("RECEIVE_WINDOW").is_some_and(|window| window.as_u64() >= Some(512)));
         assert_eq!(Value::Object(config), theirs["config"], "{dialect}");
         for (name, values) in theirs["enumerations"].as_object().unwrap() {
@@ -182,8 +180,8 @@ fn each_dictionary_has_what_the_firmware_of_its_hosts_has() {
                 assert_eq!(ours, values, "{dialect} {name}");
                 continue;
             }
-            // The MCU's own: at least the firmware's names, with the firmware's numbers. v0.11 had other
-            // numbers for the lines of GPIO chips; to a host they are just numbers.
+            // The MCU's enumerations have at least the firmware's names, with the firmware's numbers. v0.11 had other
+            // numbers for the lines of GPIO chips. A host does not interpret these numbers.
             let ours = expanded(ours);
             for (entry, value) in expanded(values) {
                 let found = ours.get(&entry).copied();
@@ -221,7 +219,7 @@ fn ids_are_as_the_hosts_can_take_them() {
                 .collect()
         };
         let (commands, responses) = (ids("commands"), ids("responses"));
-        // A host finds a message by its name, so a name has one form, and an id one message.
+        // A host finds a message by its name. So a name has one form, and an id one message.
         assert_eq!(commands.len(), ours["commands"].as_object().unwrap().len(), "{dialect}");
         assert_eq!(responses.len(), ours["responses"].as_object().unwrap().len(), "{dialect}");
         let mut all: Vec<i64> = commands.values().chain(responses.values()).copied().collect();
@@ -230,7 +228,8 @@ fn ids_are_as_the_hosts_can_take_them() {
         all.dedup();
         assert_eq!(all.len(), count, "{dialect}");
         assert_eq!((commands["identify"], responses["identify_response"]), (1, 0));
-        // Of one byte: all of them for hosts that know no other, and what comes often or in full blocks.
+        // Ids of one byte: all messages for hosts that know no others, and messages that are frequent or come in full
+        // blocks.
         let short = |id: &i64| (-32..96).contains(id);
         if ["v0.11", "v0.12"].contains(&dialect) {
             assert!(all.iter().all(short), "{dialect}");
@@ -239,7 +238,7 @@ fn ids_are_as_the_hosts_can_take_them() {
         for often in ["queue_step", "set_next_step_dir", "queue_digital_out", "queue_pwm_out", "trsync_set_timeout"] {
             assert!(short(&commands[often]), "{dialect} {often}");
         }
-        // klippy's C code takes these for numbers that are not negative.
+        // klippy's C code requires nonnegative ids for these.
         for plain in ["queue_step", "set_next_step_dir", "trsync_set_timeout", "trsync_trigger"] {
             assert!(commands[plain] >= 0, "{dialect} {plain}");
         }
@@ -247,8 +246,8 @@ fn ids_are_as_the_hosts_can_take_them() {
     }
 }
 
-/// A host of v0.13, of master or of Kalico finds in the union what it looks up; but for these, which the
-/// three have in different forms.
+/// A host of v0.13, of master or of Kalico finds all its messages in the union, except for these. The three have them
+/// in different forms.
 #[test]
 fn the_union_is_what_three_generations_take() {
     let union = dictionary("union");
@@ -262,7 +261,7 @@ fn the_union_is_what_three_generations_take() {
         }
     }
     let expected = [
-        // Where it is the one of v0.13, master's host takes that as well (klippy/mcu.py, MCU_adc).
+        // If it is v0.13's form, master's host accepts it as well (klippy/mcu.py, MCU_adc).
         "master query_analog_in",
         "master analog_in_state",
         "kalico config_ads131m0x",
@@ -300,13 +299,13 @@ fn a_board_that_is_none_is_explained() {
     assert!(String::from_utf8_lossy(&refused.stderr).contains("linux, sim and sim:FILE.toml"));
 }
 
-/// Held by tests that measure the latency, or keep others from it.
+/// Held by tests that measure the latency, or that disturb it for others.
 static LATENCY: Mutex<()> = Mutex::new(());
 
 #[test]
 fn the_latency_is_not_measured_while_a_host_may_print() {
     let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
-    // Not a simulated printer, though this computer may have no pins.
+    // Not a simulated printer, even if this computer has no pins.
     let pinion = Pinion::start(&["run", "--dialect", "master"]);
     pinion.wait_for_link();
     let client = pinion.client();
@@ -356,7 +355,7 @@ fn a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed() {
         let closed = child.wait_with_output().unwrap();
         let log = String::from_utf8(closed.stderr).unwrap();
         assert!(!log.contains("panicked"), "{args:?}: {log}");
-        // A computer without pins has none to list.
+        // A computer without pins cannot list any.
         let expected = if args == ["pins"] { output(args).status.code() } else { Some(0) };
         assert_eq!(closed.status.code(), expected, "{args:?}: {log}");
     }
@@ -367,7 +366,7 @@ fn a_simulated_printer_of_which_nobody_reads_goes_on_to_serve_its_host() {
     let (folder, toml) = folder_with("quick.toml", &quick_printer());
     let log = fs::File::create(folder.path().join("log")).unwrap();
     let mut pinion = Pinion::start_to(folder, &["sim", "-r", toml.to_str().unwrap()], closed_pipe(), log);
-    // The demonstration's own host leaves at its end.
+    // The demonstration's own host leaves when it ends.
     pinion.logged("host gone");
     let mut client = pinion.client();
     assert!(!client.status().unwrap().is_shutdown);
@@ -384,14 +383,14 @@ fn the_version_tells_the_state_of_the_sources_and_the_dictionary_tells_the_same(
     let (number, state) = version.split_once('-').unwrap_or((version, ""));
     assert_eq!(number, env!("CARGO_PKG_VERSION"));
     let head = Command::new("git").args(["rev-parse", "--verify", "HEAD"]).output();
-    // Where there is no git, as in a tree that was unpacked, it tells no state.
+    // Without git, for example in an unpacked archive, it reports no state.
     if head.is_ok_and(|head| head.status.success()) {
         let commit = state.strip_suffix("-dirty").unwrap_or(state).strip_prefix('g').unwrap();
         assert!(commit.len() >= 12 && commit.chars().all(|digit| digit.is_ascii_hexdigit()), "{version}");
     }
     let dictionary: Value = serde_json::from_slice(&output(&["dict", "--board", "sim"]).stdout).unwrap();
     assert_eq!(dictionary["version"], format!("pinion-{version}"));
-    // As `rustc --version` says it, without its own name.
+    // As in the output of `rustc --version`, without the name `rustc`.
     let compiler = dictionary["build_versions"].as_str().unwrap().strip_prefix("rustc: ").unwrap();
     let number = compiler.split_whitespace().next().unwrap();
     assert!(number.split('.').count() == 3 && !compiler.contains("later"), "{compiler}");
@@ -406,12 +405,12 @@ fn shells_get_completions_with_every_subcommand_and_option() {
         for word in ["doctor", "latency", "print-config", "dialect"] {
             assert!(script.contains(word), "{shell} knows no {word}");
         }
-        // The values of the options that have names, rather than files.
+        // Values of the options that have fixed values instead of files.
         for word in ["linux", "auto", "kalico", "trace"] {
             assert!(script.contains(word), "{shell} offers no {word}");
         }
     }
-    // What bash itself makes of it.
+    // bash's own result.
     let script = String::from_utf8(output(&["completions", "bash"]).stdout).unwrap();
     for (words, offered) in [
         ("--board ''", "linux sim"),

@@ -12,7 +12,7 @@ fn text(output: &Output) -> (Option<i32>, String, String) {
     (output.status.code(), text(&output.stdout), text(&output.stderr))
 }
 
-/// `pinion run --check` with a file of this text, and further arguments.
+/// `pinion run --check` with a file of this text, and more arguments.
 fn checked(config: &str, args: &[&str]) -> (Option<i32>, String, String) {
     let (folder, path) = folder_with("pinion.toml", config);
     let link = folder.path().join("tty");
@@ -28,7 +28,7 @@ fn the_file_says_what_the_command_line_leaves_open() {
         "pinion.toml",
         "board = \"sim\"\ndialect = \"v0.13\"\nmode = \"0604\"\nlog_level = \"warn\"\nsymlink = \"/nonexistent/tty\"\n",
     );
-    // The harness gives -I, which goes before the file's symlink.
+    // The harness passes -I, which overrides the file's symlink.
     let pinion = Pinion::start_in(folder, &["run", "--config", path.to_str().unwrap(), "-m", "0600"]);
     pinion.wait_for_link();
     let dictionary = pinion.client().dictionary().json().unwrap();
@@ -97,7 +97,7 @@ fn a_check_says_what_can_not_be_served() {
 
 #[test]
 fn a_bare_run_reads_no_file() {
-    // Otherwise a file for the service would change what a user starts by hand.
+    // Otherwise a file for the service would change a program that a user starts by hand.
     let help = String::from_utf8(output(&["run", "--help"]).stdout).unwrap();
     assert!(help.contains("--config <FILE>") && !help.contains("[default: /etc"), "{help}");
 }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion console`: scripts, a person at a terminal, and who is not let in.
+//! `pinion console`: scripts, a person at a terminal, and refused clients.
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -28,7 +28,7 @@ fn console(args: &[&str], script: &str) -> Output {
         .stderr(Stdio::piped())
         .spawn()
         .unwrap();
-    // It may have been refused before it reads.
+    // The console may have been refused before it reads.
     let _ = child.stdin.take().unwrap().write_all(script.as_bytes());
     child.wait_with_output().unwrap()
 }
@@ -54,7 +54,7 @@ fn a_script_configures_a_simulated_mcu_and_sets_an_output() {
     assert!(out.contains("> update_digital_out oid=0 value=1\n"), "{out}");
     let clock = out.lines().find(|line| line.contains("] clock clock=")).unwrap();
     let (stamp, ticks) = clock.strip_prefix('[').unwrap().split_once("] clock clock=").unwrap();
-    // The stamp is the MCU's own time, in seconds: 50 million ticks each.
+    // The stamp is the MCU's own time in seconds, with 50 million ticks each.
     let apart = stamp.trim().parse::<f64>().unwrap() - ticks.parse::<f64>().unwrap() / 50e6;
     assert!((-0.01..5.0).contains(&apart), "{clock}");
     assert!(out.contains("] config is_config=1 crc=1 is_shutdown=0 move_count=1024\n"), "{out}");
@@ -85,7 +85,7 @@ fn a_shutdown_is_told_with_its_text_and_reset_ends_it() {
     assert_eq!(output.status.code(), Some(1), "{out}\n{log}");
     assert!(log.contains("line 2: the machine shut down: oids already allocated"), "{log}");
     assert!(!out.contains("] clock "), "{out}");
-    // What was asked for is no error.
+    // A requested stop is not an error.
     let script = format!("{OUTPUT}emergency_stop\nreset\n{OUTPUT}get_config\n");
     let output = console(&["--board", "sim"], &script);
     let (out, log) = (text(&output.stdout), text(&output.stderr));
@@ -96,7 +96,7 @@ fn a_shutdown_is_told_with_its_text_and_reset_ends_it() {
 
 #[test]
 fn an_output_follows_an_instant_that_is_given_from_now() {
-    // Refreshed within two seconds it stays; then nobody does.
+    // An output that is refreshed within two seconds stays. Then nobody refreshes it.
     let script =
         format!("{OUTPUT}queue_digital_out oid=0 clock=@clock+0.2s on_ticks=1\ndelay 0.5\nget_config\ndelay 20\n");
     let output = console(&["--board", "sim"], &script);
@@ -113,7 +113,7 @@ fn a_running_mcu_is_spoken_to_and_one_with_a_host_is_not() {
     let output = console(&[link], "get_config\n");
     assert!(output.status.success(), "{output:?}");
     assert!(text(&output.stdout).contains("] config is_config=0 "), "{output:?}");
-    // Another process with the terminal open; this one's own client, too, is another for the console.
+    // Another process has the terminal open. This process's own client also counts as another process for the console.
     let mut client = pinion.client();
     Config::default().apply(&mut client).unwrap();
     let refused = console(&[link], "emergency_stop\n");
@@ -212,7 +212,7 @@ fn at_a_terminal_tab_completes_and_lines_are_remembered() {
         if times == 1 {
             person.types("get_up\t\r");
         } else {
-            // The line of before, by the key that goes up.
+            // The line before, by the up key.
             person.types("\x1b[A\x1b[A\r");
         }
         person.until("] uptime high=");
@@ -224,7 +224,7 @@ fn at_a_terminal_tab_completes_and_lines_are_remembered() {
         assert!(after.contains(LocalFlags::ICANON | LocalFlags::ECHO) || after == before);
         let kept = fs::read_to_string(state.path().join("pinion/console_history")).unwrap();
         assert!(kept.lines().any(|line| line == "get_uptime"), "{kept}");
-        // The second time goes up beyond "quit" and "helo".
+        // The second time, the up key goes past "quit" and "helo".
         fs::write(state.path().join("pinion/console_history"), "#V2\nget_uptime\nhelo\n").unwrap();
     }
 }
@@ -239,7 +239,7 @@ fn a_signal_ends_it_and_the_terminal_is_as_it_was() {
             let mut person = Person::new(args, state.path());
             let before = tcgetattr(&person.slave).unwrap();
             person.until("help tells of them");
-            // The line editor has the terminal, and somebody has begun a line.
+            // The line editor has the terminal, and the person has begun a line.
             person.until("> ");
             person.types("get_upt");
             person.until("get_upt");
@@ -252,12 +252,12 @@ fn a_signal_ends_it_and_the_terminal_is_as_it_was() {
             person.until("\x1b[?2004l");
         }
     }
-    // A script ends by it, too.
+    // The signal also ends a script.
     let script = console_ended_by(Signal::SIGTERM);
     assert_eq!(script.signal(), Some(Signal::SIGTERM as i32), "{script}");
 }
 
-/// How a console ends that is sent a signal amid a script.
+/// The exit status of a console that gets a signal during a script.
 fn console_ended_by(signal: Signal) -> ExitStatus {
     let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
         .args(["console", "--board", "sim"])

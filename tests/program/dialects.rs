@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Hosts of several generations, each recognised by the sources that it runs from. A shell that is
-//! called as klippy is has the pty open; what klippy would say, our own client says.
+//! Hosts of several generations, recognized by their sources. A shell with klippy's name has the pty open, and our own
+//! client sends klippy's messages.
 
 use std::fs;
 use std::io::Write;
@@ -15,11 +15,11 @@ use tempfile::TempDir;
 use crate::process::{Pinion, output};
 use crate::search::{field, search_of};
 
-/// The form of `query_analog_in` up to v0.13, and today's.
+/// The form of `query_analog_in` up to v0.13, and the present form.
 const ONE_VALUE: &str = "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u min_value=%hu max_value=%hu range_check_count=%c";
 const MANY_VALUES: &str = "query_analog_in oid=%c clock=%u sample_ticks=%u sample_count=%c rest_ticks=%u bytes_per_report=%c min_value=%hu max_value=%hu range_check_count=%c";
 
-/// A checkout that looks up what the dictionary of a dialect has.
+/// A checkout that looks up the messages of a dialect's dictionary.
 struct Checkout(TempDir);
 
 impl Checkout {
@@ -29,7 +29,7 @@ impl Checkout {
         checkout
     }
 
-    /// Puts the sources of another host into the place of these.
+    /// Replaces these sources by those of another host.
     fn change(&self, dialect: &str, change: impl Fn(String) -> String) {
         let dictionary = output(&["dict", "--board", "sim", "--dialect", dialect]).stdout;
         let dictionary: Value = serde_json::from_slice(&dictionary).unwrap();
@@ -45,8 +45,7 @@ impl Checkout {
     }
 }
 
-/// A process called as klippy is. Each line that it is given has it open the pty or close it. Killed on
-/// drop.
+/// A process with klippy's name. Each input line makes it open or close the pty. Killed on drop.
 struct Host(Child);
 
 impl Host {
@@ -68,7 +67,7 @@ impl Host {
         host
     }
 
-    /// Opens or closes the pty, and waits until that is done.
+    /// Opens or closes the pty, and waits for the result.
     fn turn(&mut self, done: &str) {
         use std::io::{BufRead, BufReader};
         writeln!(self.0.stdin.as_mut().unwrap()).unwrap();
@@ -85,7 +84,7 @@ impl Drop for Host {
     }
 }
 
-/// How often the log has a text by now, and waits until it has it once more after `act`.
+/// Counts a text in the log, and waits for one more after `act`.
 fn until_once_more<T>(pinion: &Pinion, text: &str, act: impl FnOnce() -> T) -> T {
     let count = || pinion.log().matches(text).count();
     let before = count();
@@ -116,10 +115,10 @@ fn each_host_gets_the_dictionary_of_its_generation() {
 fn a_host_that_is_no_klippy_gets_what_most_hosts_take() {
     let pinion = Pinion::simulated(&[]);
     let client = pinion.client();
-    // It is this very process.
+    // The host is this process.
     let pid = std::process::id();
     pinion.logged(&format!("the host, process {pid}, is no klippy: it is served as Klipper v0.13, master and Kalico"));
-    // Today's hosts take the older form, too.
+    // Today's hosts also accept the older form.
     assert!(client.dictionary().commands.contains_key(ONE_VALUE));
     until_once_more(&pinion, "host gone", || drop(client));
     let checkout = Checkout::of("v0.12");
@@ -127,7 +126,7 @@ fn a_host_that_is_no_klippy_gets_what_most_hosts_take() {
     let mut host = Host::start(&pinion, &checkout);
     pinion.client();
     pinion.logged("it does not hold klippy's sources: it is served as Klipper v0.13, master and Kalico");
-    // What could not be told of a process once is not held against it.
+    // A process that was unknown once is examined again.
     until_once_more(&pinion, "host gone", || host.turn("closed"));
     checkout.change("v0.12", |sources| sources);
     host.turn("open");
@@ -140,7 +139,7 @@ fn a_host_that_is_named_for_mischief_gets_its_dialect_and_no_line_of_its_own() {
     let folder = tempfile::Builder::new().prefix("x\n<0>forged\x1b[2J\u{9b}31m\r").tempdir().unwrap();
     let checkout = Checkout(folder);
     checkout.change("v0.12", |formats| formats);
-    // What git keeps is a pipe that nobody writes to.
+    // Git's file is a pipe without a writer.
     fs::create_dir(checkout.0.path().join(".git")).unwrap();
     nix::unistd::mkfifo(&checkout.0.path().join(".git/HEAD"), nix::sys::stat::Mode::S_IRWXU).unwrap();
     let _host = Host::start(&pinion, &checkout);
@@ -165,14 +164,14 @@ fn a_dialect_that_is_named_is_spoken_whoever_comes() {
     assert!(error.contains("v0.11, v0.12, v0.13, master, kalico, union"), "{error}");
 }
 
-/// The reading of a thermistor in the words of a generation.
+/// The reading of a thermistor, with a generation's message.
 fn read_temperature(pinion: &Pinion, query: &str) -> String {
     let mut client = pinion.client();
     let mut config = Config::default();
     let oid = config.oid().unwrap();
     config.add(format!("config_analog_in oid={oid} pin=bed_sensor"));
-    // That the MCU is configured by another host, klippy finds as this client does: by the check
-    // sum. It then resets the MCU.
+    // klippy finds out that another host configured the MCU as this client does: from the checksum. It then resets the
+    // MCU.
     config.apply(&mut client).unwrap();
     let clock = client.clock_in(0.05).unwrap();
     client.send_line(&format!("query_analog_in oid={oid} clock={} {query}", clock.wire())).unwrap();
@@ -206,7 +205,7 @@ fn a_process_goes_on_with_the_sources_that_it_has_loaded() {
     let checkout = Checkout::of("v0.13");
     let mut host = Host::start(&pinion, &checkout);
     assert!(pinion.client().dictionary().commands.contains_key(ONE_VALUE));
-    // klippy's RESTART closes the pty and opens it anew, after an update of the files.
+    // klippy's RESTART closes the pty and opens it again, after an update of the files.
     until_once_more(&pinion, "host gone", || host.turn("closed"));
     checkout.change("master", |sources| sources);
     host.turn("open");
@@ -225,7 +224,7 @@ fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
     assert!(pinion.client().dictionary().commands.contains_key(MANY_VALUES), "the nearest dialect");
     let line = pinion.logged("the host is newer than Pinion");
     assert!(line.contains("forms of messages: query_adxl345 oid rest_ticks range: "), "{line}");
-    // Of a system without files, so that nothing of this one counts.
+    // An empty root, so that no file of this computer counts.
     let system = tempfile::tempdir().unwrap();
     let root = system.path().to_str().unwrap();
     let doctor = |folder: &Path| output(&["doctor", "--root", root, "--klipper", folder.to_str().unwrap()]);
@@ -249,7 +248,7 @@ fn what_a_newer_host_will_miss_is_named_by_the_log_and_by_the_doctor() {
     assert!(error.contains("/nonexistent") && error.contains("name a checkout of Klipper or Kalico"), "{error}");
 }
 
-/// All capabilities that any thread of a process has, could take or would hand on.
+/// All capabilities that any thread of a process has, could take or would pass on.
 fn capabilities(pid: u32) -> u64 {
     let threads = fs::read_dir(format!("/proc/{pid}/task")).unwrap().map(|thread| thread.unwrap().path());
     threads
@@ -311,7 +310,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
             .spawn();
         let mut host = Host(host.unwrap());
         std::io::Read::read_exact(host.0.stdout.as_mut().unwrap(), &mut [0; 4]).unwrap();
-        // The test's own client is root's, and so is hidden, too; it is no klippy.
+        // The test's own client belongs to root, so it is hidden too. It is not klippy.
         let client = pinion_client::Client::connect(&tty, crate::process::WAIT_MAX).unwrap();
         let has_it = client.dictionary().commands.contains_key("config_lis2dw oid=%c spi_oid=%c");
         assert_eq!(has_it, may_look);
@@ -321,7 +320,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
             let search = search_of(pinion.0.id()).unwrap();
             assert_eq!((capabilities(pinion.0.id()), capabilities(search)), (0, LOOKS));
         } else {
-            // Other klippys may run here, which are hidden as well.
+            // Other klippys may run here, and they are hidden as well.
             until("CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH, as pinion-mcu.service has them");
         }
     }

@@ -83,7 +83,7 @@ fn a_root_that_is_not_there_is_no_system_without_mistakes() {
     assert!(log.contains("/no/such/folder: there is no such folder") && examined.stdout.is_empty(), "{log}");
 }
 
-/// Below a root: files, links, and processes of users and units.
+/// A file tree below a root: files, links, and processes of users and units.
 struct Tree(TempDir);
 
 impl Tree {
@@ -112,7 +112,7 @@ impl Tree {
     }
 }
 
-/// Two printers on one computer: an instance and a klippy for each, each klippy of another user and unit.
+/// Two printers on one computer, with an instance and a klippy for each. Each klippy has its own user and unit.
 #[test]
 fn each_instance_and_each_klippy_is_judged() {
     let tree = Tree(tempfile::tempdir().unwrap());
@@ -159,7 +159,7 @@ fn each_instance_and_each_klippy_is_judged() {
     ] {
         assert!(text.contains(line), "{line}\n{text}");
     }
-    // The second one has ended, and its configuration has a mistake.
+    // The second instance has ended, and its configuration has an error.
     fs::remove_dir_all(tree.0.path().join("proc/4")).unwrap();
     tree.put("etc/pinion/second.toml", "watchdogg = true\n");
     let (_, text) = doctor();

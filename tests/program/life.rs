@@ -58,22 +58,22 @@ fn a_link_that_a_running_pinion_serves_is_refused_and_left_alone() {
     refused(&["-r", "--board", "sim"], false);
     refused(&["sim", "--show"], false);
     if nix::unistd::geteuid().is_root() {
-        // Who may not look into the other's process, in a folder such as /tmp, is told the same.
+        // A user who may not inspect the other's process, in a folder such as /tmp, gets the same answer.
         let folder = pinion.link().parent().unwrap().to_owned();
         fs::set_permissions(&folder, fs::Permissions::from_mode(0o1777)).unwrap();
         refused(&["run", "--board", "sim"], true);
     }
-    // A mode that somebody has given the terminal since makes no difference.
+    // A later change of the terminal's mode makes no difference.
     fs::set_permissions(&target, fs::Permissions::from_mode(0o666)).unwrap();
     made_an_hour_ago(&pinion.link());
     refused(&["run", "--board", "sim"], false);
     assert!(client.status().is_ok(), "the host keeps its MCU");
-    // What is to be restarted may be checked meanwhile.
+    // The configuration can be checked while the program runs, for example before a restart.
     let (status, _) = pinion.beside(&["run", "--board", "sim", "--check"], false);
     assert_eq!(status, Some(0));
 }
 
-/// Has a link look older than it is.
+/// Makes a link look older than it is.
 fn made_an_hour_ago(link: &Path) {
     let then = TimeSpec::seconds(fs::symlink_metadata(link).unwrap().mtime() - 3600);
     utimensat(AT_FDCWD, link, &then, &then, UtimensatFlags::NoFollowSymlink).unwrap();
@@ -91,9 +91,9 @@ fn a_link_that_a_killed_pinion_left_is_replaced_though_a_login_may_have_its_term
     pinion.client().status().unwrap();
     pinion.signal(Signal::SIGKILL);
     pinion.end();
-    // Its number is given to the next one who opens a terminal.
+    // Its number goes to the next process that opens a terminal.
     let login = openpty(None, None).unwrap();
-    // No program of another test is to have it as well.
+    // No program of another test may inherit it.
     fcntl(&login.master, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC)).unwrap();
     let (folder, link) = pinion.into_folder();
     fs::remove_file(&link).unwrap();
@@ -123,7 +123,7 @@ fn a_signal_at_the_first_sight_of_the_link_ends_the_program_in_order() {
         let end = Instant::now() + WAIT_MAX;
         while !exists(&pinion.link()) {
             assert!(Instant::now() < end, "no link; the log:\n{}", pinion.log());
-            // Without a pause, which would be long enough for the program to be quite ready.
+            // Without a pause: a pause would give the program time to become ready.
             std::thread::yield_now();
         }
         pinion.signal(Signal::SIGTERM);
@@ -176,7 +176,7 @@ fn mode_and_group_of_the_pty_are_as_asked() {
 
 #[test]
 fn a_user_whom_tty_is_not_open_to_is_served_as_by_the_c_program() {
-    // Nobody else may read the folder where cargo builds.
+    // Nobody else may read cargo's build folder.
     let folder = tempfile::tempdir().unwrap();
     let program = folder.path().join("pinion");
     fs::copy(env!("CARGO_BIN_EXE_pinion"), &program).unwrap();
@@ -230,7 +230,7 @@ fn sigterm_tells_the_host_and_drives_outputs_to_their_shutdown_values() {
     client.send_line("update_digital_out oid=0 value=1").unwrap();
     client.link().settle().unwrap();
     pinion.signal(Signal::SIGTERM);
-    // The terminal stays open for as long as the news takes to be read.
+    // The terminal stays open until the host has read the news.
     assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Force shutdown command"));
     drop(client);
     assert_eq!(pinion.end().code(), Some(0));
@@ -242,13 +242,13 @@ fn a_host_that_was_slow_to_read_still_reads_why_the_program_ended() {
     let mut client = pinion.client();
     let query = client.messages().encode_line("identify offset=0 count=40").unwrap();
     let stop = client.messages().encode_line("emergency_stop").unwrap();
-    // More answers than the terminal has room for, and fewer than the program drops.
+    // More answers than the terminal can hold, and fewer than the program drops.
     let queries = query.repeat(PAYLOAD_MAX / query.len());
     let answers_bytes = PAYLOAD_MAX / query.len() * 40;
     let blocks = (terminal_bytes() + 40 * 1024) / answers_bytes;
     let mut sequence = Sequence::default();
     let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
-    // The number that is expected is not known: the first fifteen find it. What follows goes on from there.
+    // The expected number is unknown: the first fifteen blocks find it. The others continue from there.
     for _ in 0..15 + blocks {
         let mut block = Vec::new();
         frame(&queries, sequence, &mut block);
@@ -274,7 +274,7 @@ fn a_host_that_was_slow_to_read_still_reads_why_the_program_ended() {
     assert_eq!(pinion.end().code(), Some(0));
 }
 
-/// How much a terminal holds for a host that does not read.
+/// Number of bytes that a terminal holds for a host that does not read.
 fn terminal_bytes() -> usize {
     let terminal = openpty(None, None).unwrap();
     let mut attributes = tcgetattr(&terminal.slave).unwrap();
@@ -296,7 +296,7 @@ fn sigusr1_tells_how_late_timers_were() {
 
 #[test]
 fn a_host_that_never_reads_neither_blocks_the_mcu_nor_makes_it_grow() {
-    // One that the core answers, and two that the link answers by itself.
+    // One query for the core, and two that the link answers itself.
     for query in ["get_uptime", "get_clock", "identify offset=0 count=40"] {
         let pinion = Pinion::simulated(&[]);
         let payload = pinion.client().messages().encode_line(query).unwrap();
@@ -304,7 +304,7 @@ fn a_host_that_never_reads_neither_blocks_the_mcu_nor_makes_it_grow() {
         let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
         let (done, finished) = std::sync::mpsc::channel();
         std::thread::spawn(move || {
-            // Who does not read does not know the expected number: all sixteen are tried in turn.
+            // A host that does not read does not know the expected number. It tries all sixteen in turn.
             let (mut blocks, mut sequence) = (Vec::new(), Sequence::default());
             for _ in 0..16 {
                 frame(&payload, sequence, &mut blocks);
@@ -314,19 +314,19 @@ fn a_host_that_never_reads_neither_blocks_the_mcu_nor_makes_it_grow() {
                 tty.write_all(&blocks).unwrap();
             }
             done.send(()).unwrap();
-            // The terminal stays open: a host that hangs is no host that is gone.
+            // The terminal stays open: a host that hangs is not gone.
             std::thread::park();
         });
         finished.recv_timeout(WAIT_MAX).expect("the MCU takes commands in");
         let grown = pinion.anonymous_kb().saturating_sub(before);
         assert!(grown < 2048, "{query}: grew by {grown} kB; the log:\n{}", pinion.log());
-        // And why the MCU stops is in the log all the same. (It counts only if it is read apart
-        // from the blocks.)
+        // The reason for the MCU's stop is in the log anyway. (It counts only if it is read separately from the
+        // blocks.)
         pinion.until("the reason of the stop in the log", || {
             fs::write(pinion.link(), "FORCE_SHUTDOWN\n").unwrap();
             pinion.log().contains("shutdown: Force shutdown command: ")
         });
-        // Who reads is served.
+        // A host that reads is served.
         let mut client = pinion.client();
         client.reset().unwrap();
         assert!(!client.status().unwrap().is_shutdown);
@@ -342,7 +342,7 @@ fn hosts_that_come_and_go_by_the_thousand_do_not_hide_the_one_that_leaves() {
     let mut client = pinion.client();
     client.status().unwrap();
     pinion.logged("host attached");
-    // Another process that opens and closes the terminal meanwhile takes nothing from it.
+    // Another process that opens and closes the terminal at the same time takes no data from it.
     for _ in 0..20_000 {
         drop(fs::File::open(pinion.link()).unwrap());
     }
@@ -366,7 +366,7 @@ fn what_the_host_and_the_service_manager_ask_for_is_no_warning() {
     assert!(!log.contains("WARN") && !log.contains("ERROR"), "{log}");
 }
 
-/// A pipe that has no room left.
+/// A full pipe.
 fn full_pipe() -> (PipeReader, PipeWriter) {
     let (reader, mut writer) = std::io::pipe().unwrap();
     fcntl(&writer, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)).unwrap();
@@ -398,7 +398,7 @@ fn a_log_that_is_read_again_tells_how_much_of_it_was_lost() {
     let mut pinion = Pinion::start_to(folder, &["run", "--board", "sim"], Stdio::null(), writer);
     pinion.wait_for_link();
     let mut client = pinion.client();
-    // Each has three lines for the log: that is more than the program keeps.
+    // Each reset gives three log lines. Together that is more than the program keeps.
     for _ in 0..200 {
         client.reset().unwrap();
     }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One order, as a host sees it over the pty and a chip at its pins: the client asks again as
-//! klippy does, the simulated bus takes its time and records what was said on it.
+//! One order, as a host on the pty and a chip at its pins see it. The client retries as klippy does. The simulated bus
+//! takes time and records its transfers.
 
 use std::fs;
 use std::io::Write;
@@ -11,7 +11,7 @@ use pinion_client::{Arg, Client, Error};
 
 use crate::process::{Pinion, WAIT_MAX, output};
 
-/// A printer whose buses take so long for a transfer, and the record of its first bus, a loop.
+/// A printer with buses that need this time for a transfer, and the record of its first bus, a loop.
 fn slow_printer(delay_ms: u64) -> (Pinion, PathBuf) {
     let folder = tempfile::tempdir().unwrap();
     let (toml, trace) = (folder.path().join("slow.toml"), folder.path().join("trace"));
@@ -49,14 +49,14 @@ fn configured(pinion: &Pinion) -> Client {
     client
 }
 
-/// Asks the device to send back this number.
+/// Asks the device to send this number back.
 fn transfer(client: &mut Client, number: u8) -> Result<Vec<u8>, Error> {
     let args = [("oid", SPI.into()), ("data", Arg::Bytes(&[number]))];
     let answer = client.query("spi_transfer", &args, "spi_transfer_response", Some(SPI))?;
     Ok(answer.bytes("response")?.to_vec())
 }
 
-/// The bytes that the chip got in each transfer, in hex, and the level of D/C at each.
+/// The bytes that the chip received in each transfer, in hex, and the level of D/C at each byte.
 fn heard(trace: &PathBuf) -> Vec<(String, String)> {
     let trace = fs::read_to_string(trace).unwrap();
     let field = |line: &str, key: &str| {
@@ -88,13 +88,13 @@ fn transfers_of_400_ms_happen_once_and_have_their_own_answers() {
     each_transfer_happens_once_and_has_its_own_answer(400, 5);
 }
 
-/// klippy's SPI4wire (extras/display/uc1701.py): D/C to where it belongs, the bytes.
+/// klippy's SPI4wire (extras/display/uc1701.py): D/C at its level, then the bytes.
 #[test]
 fn a_display_sees_its_line_and_its_bytes_in_order() {
     let (pinion, trace) = slow_printer(4);
     let mut client = configured(&pinion);
     for n in 0..60 {
-        // Short ones share their blocks, long ones have them for themselves.
+        // Short messages share blocks. Each long message has its own block.
         let bytes = format!("{n:02x}").repeat(1 + n % 40);
         client.send_line(&format!("update_digital_out oid=1 value={}", n % 2)).unwrap();
         let commands = [
@@ -126,13 +126,13 @@ fn the_clock_is_told_beside_a_slow_transfer() {
     assert_eq!(answer.bytes("response").unwrap(), [0x2a]);
 }
 
-/// An MCU whose bus hangs, with a command that waits for it.
+/// An MCU with a bus that hangs, and a command that waits for the bus.
 fn hanging() -> (Pinion, Client) {
     let (pinion, trace) = slow_printer(60_000);
     let mut client = configured(&pinion);
     client.send_line("spi_transfer oid=0 data=01").unwrap();
     client.send_line("update_digital_out oid=1 value=1").unwrap();
-    // The answer shows that the MCU has the transfer, too.
+    // The answer shows that the MCU has also received the transfer.
     client.query("get_clock", &[], "clock", None).unwrap();
     assert_eq!(heard(&trace), []);
     (pinion, client)
@@ -143,7 +143,7 @@ fn an_emergency_stop_gets_past_a_bus_that_hangs() {
     let (_pinion, mut client) = hanging();
     client.send_line("emergency_stop").unwrap();
     assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Command request"));
-    // A stopped MCU acknowledges what waited behind the transfer.
+    // A stopped MCU acknowledges the commands after the transfer.
     client.link().settle().unwrap();
 }
 

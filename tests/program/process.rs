@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The program as a process of its own, with a pty and a log.
+//! The program as a separate process, with a pty and a log.
 
 use std::fs::{self, File};
 use std::os::unix::fs::PermissionsExt;
@@ -15,7 +15,7 @@ use pinion_client::Client;
 use pinion_client::serial::Port;
 use tempfile::TempDir;
 
-/// How long a test waits for anything: long enough for any computer, as nothing here measures speed.
+/// Timeout of a test: long enough for any computer, because no test here measures speed.
 pub const WAIT_MAX: Duration = Duration::from_secs(30);
 
 /// A running `pinion`, ended on drop.
@@ -32,20 +32,20 @@ impl Pinion {
         pinion
     }
 
-    /// `pinion` with these arguments and `-I` with a path of its own.
+    /// `pinion` with these arguments, and `-I` with its own path.
     pub fn start(args: &[&str]) -> Pinion {
         let folder = tempfile::tempdir().unwrap();
         Pinion::start_in(folder, args)
     }
 
-    /// The same, in a folder that was prepared.
+    /// The same, in a prepared folder.
     pub fn start_in(folder: TempDir, args: &[&str]) -> Pinion {
         let out = File::create(folder.path().join("out")).unwrap();
         let log = File::create(folder.path().join("log")).unwrap();
         Pinion::start_to(folder, args, out, log)
     }
 
-    /// The same, with a stdout and a stderr of the test's.
+    /// The same, with the test's own stdout and stderr.
     pub fn start_to(folder: TempDir, args: &[&str], out: impl Into<Stdio>, log: impl Into<Stdio>) -> Pinion {
         let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
             .args(args)
@@ -59,10 +59,11 @@ impl Pinion {
         Pinion { child, folder }
     }
 
-    /// Another `pinion` at the same link, run to its end: its status and its log. `as_nobody` runs it as that user.
+    /// Runs another `pinion` at the same link to its end. Returns its status and its log. `as_nobody` runs it as that
+    /// user.
     pub fn beside(&self, args: &[&str], as_nobody: bool) -> (Option<i32>, String) {
         let folder = tempfile::tempdir().unwrap();
-        // Nobody else may read the folder where cargo builds.
+        // Nobody else may read cargo's build folder.
         let program = folder.path().join("pinion");
         fs::copy(env!("CARGO_BIN_EXE_pinion"), &program).unwrap();
         fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
@@ -77,7 +78,7 @@ impl Pinion {
         (status.code(), fs::read_to_string(log).unwrap())
     }
 
-    /// What is left of a program that has ended: its folder, and its link there.
+    /// The remains of a program that has ended: its folder, and its link there.
     pub fn into_folder(mut self) -> (TempDir, PathBuf) {
         let link = self.link();
         (std::mem::replace(&mut self.folder, tempfile::tempdir().unwrap()), link)
@@ -88,7 +89,7 @@ impl Pinion {
     }
 
     pub fn log(&self) -> String {
-        // There is none where the test has stderr.
+        // There is no log file if the test has stderr.
         fs::read_to_string(self.folder.path().join("log")).unwrap_or_default()
     }
 
@@ -104,7 +105,7 @@ impl Pinion {
         self.until("the link", || fs::read_link(self.link()).is_ok());
     }
 
-    /// Waits until the log has a line with this text, and returns the last of them.
+    /// Waits until the log has a line with this text, and returns the last of these lines.
     #[track_caller]
     pub fn logged(&self, text: &str) -> String {
         let line = || self.log().lines().rfind(|line| line.contains(text)).map(str::to_owned);
@@ -145,8 +146,8 @@ impl Pinion {
         }
     }
 
-    /// Memory of the process itself, without files, in kB. It counts pages that a forked process shares: these do not
-    /// become more when that process writes to its copies or ends.
+    /// Memory of the process itself, without files, in kB. It counts pages shared with a forked process. Their number
+    /// does not grow when that process writes to its copies or ends.
     pub fn anonymous_kb(&self) -> u64 {
         let status = fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
         let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
@@ -169,7 +170,7 @@ pub fn folder_with(name: &str, text: &str) -> (TempDir, PathBuf) {
     (folder, path)
 }
 
-/// A stdout whose reader has closed it, as `head` does.
+/// A stdout that its reader has closed, as `head` does.
 pub fn closed_pipe() -> std::io::PipeWriter {
     let (reader, writer) = std::io::pipe().unwrap();
     drop(reader);

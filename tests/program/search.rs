@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The process that looks for the host: what it may do, and what becomes of it and of the program.
+//! The process that searches for the host: its rights, and the end of it and of the program.
 
 use std::fs;
 use std::path::Path;
@@ -16,7 +16,7 @@ pub fn field(process: &Path, name: &str) -> String {
     line.unwrap_or_else(|| panic!("{name} in {status}")).trim().to_owned()
 }
 
-/// The process that looks for the host of the program `pid`, if it has one.
+/// The process that searches for the host of the program `pid`; `None` if there is none.
 pub fn search_of(pid: u32) -> Option<u32> {
     let is_it = |pid_there: &u32| {
         let status = fs::read_to_string(format!("/proc/{pid_there}/status")).unwrap_or_default();
@@ -27,7 +27,7 @@ pub fn search_of(pid: u32) -> Option<u32> {
 }
 
 fn is_gone(pid: u32) -> bool {
-    // An orphan's zombie may wait for an init that does not care.
+    // An orphan's zombie may wait for an init that does not collect it.
     fs::read_to_string(format!("/proc/{pid}/stat")).map_or(true, |stat| stat.contains(") Z "))
 }
 
@@ -36,12 +36,12 @@ fn the_search_has_nothing_but_its_socket_and_may_only_read() {
     let pinion = Pinion::simulated(&["-r"]);
     let search = search_of(pinion.pid()).unwrap();
     let process = Path::new("/proc").join(search.to_string());
-    // It has filters, and can not become another program with more rights.
+    // It has filters, and cannot become another program with more rights.
     assert_eq!((field(&process, "Seccomp").as_str(), field(&process, "NoNewPrivs").as_str()), ("2", "1"));
     let files: Vec<_> = fs::read_dir(process.join("fd")).unwrap().map(|file| file.unwrap().path()).collect();
     let [socket] = &files[..] else { panic!("{files:?}") };
     assert!(fs::read_link(socket).unwrap().to_str().unwrap().starts_with("socket:"));
-    // Neither the program's memory lock nor its scheduling, and the kernel kills it first.
+    // It has neither the program's memory lock nor its scheduling, and the kernel kills it first.
     assert_eq!(field(&process, "VmLck"), "0 kB");
     let stat = fs::read_to_string(process.join("stat")).unwrap();
     assert_eq!(stat.rsplit_once(')').unwrap().1.split_whitespace().nth(38), Some("0"), "SCHED_OTHER");
@@ -52,7 +52,7 @@ fn the_search_has_nothing_but_its_socket_and_may_only_read() {
 fn the_search_ends_with_the_program_and_not_before() {
     let mut pinion = Pinion::simulated(&[]);
     let search = search_of(pinion.pid()).unwrap();
-    // As systemd and a terminal send them to every process.
+    // systemd and a terminal send these to every process.
     for signal in [Signal::SIGTERM, Signal::SIGINT, Signal::SIGHUP, Signal::SIGQUIT] {
         kill(Pid::from_raw(search as i32), signal).unwrap();
     }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion sim --show`: what a person sees while a host drives the printer.
+//! `pinion sim --show`: the output while a host drives the printer.
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -44,7 +44,7 @@ fn policy(pinion: &Pinion, thread: &str) -> u32 {
     let read = |folder: &Path, name: &str| fs::read_to_string(folder.join(name)).unwrap();
     let mut folders = folders.map(|entry| entry.unwrap().path());
     let folder = folders.find(|folder| read(folder, "comm").trim() == thread).unwrap();
-    // The third field comes behind the name, which is in brackets.
+    // The third field comes after the name, which is in parentheses.
     let stat = read(&folder, "stat");
     stat.rsplit_once(") ").unwrap().1.split(' ').nth(41 - 3).unwrap().parse().unwrap()
 }
@@ -91,7 +91,7 @@ fn on_a_terminal_there_is_a_picture_and_the_terminal_is_given_back() {
         let mut master = File::from(terminal.master);
         move || {
             let mut piece = [0; 4096];
-            // Fails once the program, and with it the terminal's last user, is gone.
+            // Fails when the program is gone, which is the last user of the terminal.
             while let Ok(count @ 1..) = master.read(&mut piece) {
                 seen.lock().unwrap().extend(&piece[..count]);
             }
@@ -100,12 +100,12 @@ fn on_a_terminal_there_is_a_picture_and_the_terminal_is_given_back() {
     let text = || String::from_utf8_lossy(&seen.lock().unwrap()).into_owned();
     pinion.wait_for_link();
     let client = drive(&pinion);
-    // The colours as such.
+    // The colors themselves.
     let (red, blue) = ("\x1b[48;2;255;0;0m   \x1b[m", "\x1b[48;2;0;0;32m   \x1b[m");
     pinion.until("the strip", || text().contains(&format!("{red} {blue} off off")));
     pinion.until("the light", || text().contains("light on"));
     assert!(text().contains("--print-config > printer.cfg"), "how to connect a host");
-    // The picture has rows of its own below those that scroll.
+    // The picture has its own rows below the rows that scroll.
     let regions: Vec<String> = text().split("\x1b[1;").skip(1).map(|rest| rest[..2].to_owned()).collect();
     assert_eq!(regions.len(), 1, "{regions:?}");
     drop(client);
@@ -130,7 +130,7 @@ fn q_ends_the_program_and_gives_the_keys_back() {
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
-    // Whatever is not read fills the terminal.
+    // Unread output fills the terminal.
     let mut master = File::from(terminal.master.try_clone().unwrap());
     let reader = thread::spawn(move || std::io::copy(&mut master, &mut std::io::sink()));
     let end = Instant::now() + WAIT_MAX;
@@ -153,7 +153,7 @@ fn q_ends_the_program_and_gives_the_keys_back() {
     let _ = reader.join();
 }
 
-/// As a person does who presses Ctrl-\\, or a service manager whose program hangs.
+/// As with Ctrl-\\, or with a service manager when a program hangs.
 #[test]
 fn a_signal_that_kills_the_program_gives_the_terminal_back() {
     let terminal = openpty(None, None).unwrap();
@@ -199,7 +199,7 @@ fn a_reader_that_goes_away_leaves_the_printer_serving() {
 
 #[test]
 fn a_terminal_that_takes_nothing_does_not_keep_the_program() {
-    // A pipe of which nobody reads fills up.
+    // A pipe without a reader fills up.
     let (_reader, writer) = std::io::pipe().unwrap();
     fill(&writer);
     let folder = tempfile::tempdir().unwrap();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion status`: what a running MCU tells of itself, and that asking does it no harm.
+//! `pinion status`: the state of a running MCU. A request does not disturb the MCU.
 
 use std::fs::{self, File};
 use std::io::{Read, Write};
@@ -72,7 +72,7 @@ fn an_mcu_tells_how_it_is_in_each_state() {
     }
     client.send_line("update_digital_out oid=0 value=1").unwrap();
     let clock = client.clock_in(0.1).unwrap().wire();
-    // An edge, which is what the core is to be awake for.
+    // An edge, for which the core must be awake.
     client.send_line(&format!("queue_digital_out oid=0 clock={clock} on_ticks=1")).unwrap();
     client.send_line(&format!("query_analog_in oid=2 clock={clock} sample_ticks=0 sample_count=1 rest_ticks=500000 bytes_per_report=4 min_value=0 max_value=65535 range_check_count=0")).unwrap();
     assert!(client.status().unwrap().is_config);
@@ -105,7 +105,7 @@ fn an_mcu_tells_how_it_is_in_each_state() {
     let stopped = status(&pinion);
     assert_eq!(stopped["state"], "shutdown");
     assert_eq!(stopped["shutdown"]["reason"], "Command request");
-    // The same that the log says.
+    // The log has the same text.
     let logged = pinion.logged("shutdown: Command request: ");
     assert!(logged.ends_with(stopped["shutdown"]["detail"].as_str().unwrap()), "{logged}\n{stopped}");
     assert_eq!(line(&stopped, "led")["level"], 0);
@@ -163,7 +163,7 @@ fn clients_that_do_not_read_or_talk_rubbish_or_are_many_disturb_nobody() {
         client.send_line(command).unwrap();
     }
     assert!(client.status().unwrap().is_config);
-    // None of these reads, some say something, some go at once.
+    // None of these clients reads, some send data, some leave at once.
     let mut silent = Vec::new();
     for n in 0..200 {
         let Ok(mut socket) = UnixStream::connect(&path) else { continue };
@@ -179,7 +179,7 @@ fn clients_that_do_not_read_or_talk_rubbish_or_are_many_disturb_nobody() {
     assert_eq!(status(&pinion)["state"], "configured");
     let status = client.status().unwrap();
     assert!(status.is_config && !status.is_shutdown);
-    // What they did not read is there for them still, and whole.
+    // The unread status is still there, and complete.
     let mut last = String::new();
     silent.pop().unwrap().read_to_string(&mut last).ok();
     assert!(last.is_empty() || serde_json::from_str::<Value>(&last).is_ok(), "{last}");
@@ -241,7 +241,7 @@ fn a_page_that_is_longer_than_the_terminal_is_scrolled_by_keys() {
     assert!(watch.wait().unwrap().success());
 }
 
-/// Others ask as well, more than there is room for in the socket's queue.
+/// Other clients also ask, more than fit into the socket's queue.
 #[test]
 fn a_crowd_is_waited_for_and_then_named() {
     let folder = tempfile::tempdir().unwrap();
@@ -280,7 +280,7 @@ fn a_crowd_is_waited_for_and_then_named() {
 fn keys_that_the_kernel_makes_signals_of_leave_no_terminal_behind() {
     let pinion = Pinion::simulated(&[]);
     pinion.until("the socket", || exists(&socket(&pinion)));
-    // Ctrl-C, and Ctrl-\\, of which a program dies by itself.
+    // Ctrl-C, and Ctrl-\\, which kills a program by default.
     for key in [b"\x03", b"\x1c"] {
         let terminal = openpty(None, None).unwrap();
         let before = tcgetattr(&terminal.slave).unwrap();
@@ -326,7 +326,7 @@ fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
     while !is_stopped() && Instant::now() < end {
         thread::sleep(std::time::Duration::from_millis(10));
     }
-    // In a group that no shell looks after, the kernel does not stop it.
+    // In a process group without a shell the kernel does not stop it.
     if is_stopped() {
         assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
     }
@@ -341,7 +341,7 @@ fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
 fn a_terminal_that_is_gone_ends_it() {
     let pinion = Pinion::simulated(&[]);
     pinion.until("the socket", || exists(&socket(&pinion)));
-    // No child may inherit the master end: it would keep the terminal.
+    // No child may inherit the master end, because it would keep the terminal open.
     let mut master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).unwrap();
     grantpt(&master).unwrap();
     unlockpt(&master).unwrap();
@@ -378,7 +378,7 @@ fn a_terminal_that_takes_no_output_does_not_keep_it_from_its_end() {
         let read = master.read(&mut piece).unwrap();
         shown += &String::from_utf8_lossy(&piece[..read]);
     }
-    // As by Ctrl-S. The next page, a second later, finds no room.
+    // As with Ctrl-S. The next page, a second later, finds no room.
     tcflow(&terminal.slave, FlowArg::TCOOFF).unwrap();
     thread::sleep(std::time::Duration::from_millis(1500));
     kill(Pid::from_raw(watch.id() as i32), Signal::SIGTERM).unwrap();
@@ -407,7 +407,7 @@ fn watching_into_a_pipe_is_a_page_each_second() {
         shown += &String::from_utf8_lossy(&piece[..read]);
     }
     assert!(!shown.contains('\x1b'));
-    // A reader that has gone ends it.
+    // It ends when its reader has gone.
     drop(out);
     let end = Instant::now() + WAIT_MAX;
     while watch.try_wait().unwrap().is_none() {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! docs/guide/troubleshooting.md explains what the program says, all of it and nothing else.
+//! docs/guide/troubleshooting.md explains the program's messages: all of them and nothing else.
 
 use std::collections::BTreeSet;
 use std::fs;
@@ -10,14 +10,14 @@ use serde_json::Value;
 use crate::process::output;
 
 const PAGE: &str = include_str!("../../docs/guide/troubleshooting.md");
-/// What a line of the log is made by; the search for the host has the program log its lines.
+/// The code that makes a line of the log. The search for the host sends its lines to the program's log.
 const LOGGING: [&str; 5] = ["error!(", "warn!(", "info!(", ".warn(format!(", ".info(format!("];
-/// What stands in a quotation for what varies.
+/// Stands for the variable parts in a quotation.
 const ANYTHING: &str = "...";
-/// Fewer letters could be anybody's.
+/// Fewest letters of a quotation. A shorter one could match any line.
 const LETTERS_MIN: usize = 5;
 
-/// The first cells of the tables below this heading, down to the next one that is as high.
+/// The first cells of the tables below this heading, up to the next heading of the same level.
 fn first_cells(heading: &str) -> Vec<&'static str> {
     let level = heading.split(' ').next().unwrap_or_default();
     let lines = PAGE.lines().skip_while(|line| *line != heading).skip(1);
@@ -31,12 +31,12 @@ fn first_cells(heading: &str) -> Vec<&'static str> {
     cells
 }
 
-/// What stands in backquotes.
+/// The texts in backquotes.
 fn quotations(cell: &'static str) -> impl Iterator<Item = &'static str> {
     cell.split('`').skip(1).step_by(2)
 }
 
-/// Whether a text has the fixed parts of a quotation, one after the other.
+/// Whether a text has the fixed parts of a quotation, in order.
 fn has(text: &str, quotation: &str) -> bool {
     let mut rest = text;
     quotation.split(ANYTHING).map(str::trim).all(|part| {
@@ -51,7 +51,7 @@ fn files(folder: &Path) -> Vec<PathBuf> {
     paths.flat_map(|path| if path.is_dir() { files(&path) } else { vec![path] }).collect()
 }
 
-/// The program's sources without their tests, with each literal as it is printed; and the service's script.
+/// The program's sources without their tests, with each literal in its printed form, and the service's script.
 fn sources() -> Vec<(String, String)> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let crates = ["client", "firmware", "linux", "protocol", "sim"].map(|name| format!("crates/{name}/src"));
@@ -61,7 +61,7 @@ fn sources() -> Vec<(String, String)> {
     let source = |path: PathBuf| {
         let text = fs::read_to_string(&path).unwrap();
         let text = text.split("#[cfg(test)]\nmod tests").next().unwrap_or_default();
-        // A literal goes on in the next line behind a backslash.
+        // A literal continues on the next line after a backslash.
         let mut lines = text.split("\\\n");
         let mut joined = lines.next().unwrap_or_default().to_owned();
         lines.for_each(|line| joined.push_str(line.trim_start()));
@@ -77,14 +77,14 @@ fn each_line_that_the_page_quotes_is_one_of_the_program_s() {
         for quotation in quotations(cell) {
             let longest = quotation.split(ANYTHING).map(str::len).max().unwrap_or(0);
             assert!(longest >= LETTERS_MIN, "`{quotation}` says too little");
-            // What a line is joined of, subject, cause and remedy, may stand in different places.
+            // The parts of a line (subject, cause and remedy) may be in different places.
             let is_there = |part: &str| sources.iter().any(|(_, text)| has(text, part));
             assert!(quotation.split(": ").all(is_there), "no source has `{quotation}`");
         }
     }
 }
 
-/// The literals that these macros are called with, as far as they are called with one.
+/// The literals in calls of these macros.
 fn logged(source: &str, macros: &[&str]) -> Vec<String> {
     let calls = macros.iter().flat_map(|name| source.match_indices(name).map(|(at, _)| &source[at + name.len()..]));
     calls
@@ -98,7 +98,7 @@ fn logged(source: &str, macros: &[&str]) -> Vec<String> {
         .collect()
 }
 
-/// The parts of a format that are printed as they stand.
+/// The parts of a format that are printed unchanged.
 fn fixed_parts(format: &str) -> Vec<&str> {
     let mut parts = format.split('{');
     let first = parts.next().into_iter();
@@ -110,12 +110,12 @@ fn each_line_that_the_program_logs_is_on_the_page() {
     let cells = first_cells("## Lines of the log");
     let quotations: Vec<&str> = cells.into_iter().flat_map(quotations).collect();
     for (file, text) in sources() {
-        // The core's lines are made there.
+        // This file makes the core's lines.
         let macros: &[&str] = if file.ends_with("runtime/outlet.rs") { &["format_args!("] } else { &LOGGING };
         for line in logged(&text, macros) {
             let parts = fixed_parts(&line);
             if parts.iter().all(|part| part.chars().filter(|c| c.is_alphabetic()).count() < LETTERS_MIN) {
-                // What it says comes from elsewhere.
+                // Its text comes from elsewhere.
                 continue;
             }
             assert!(
