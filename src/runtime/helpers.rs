@@ -6,12 +6,8 @@
 
 use std::ffi::CStr;
 use std::io;
-use std::os::fd::RawFd;
 
 use log::warn;
-use nix::sys::prctl;
-use nix::sys::signal::Signal;
-use nix::unistd::{chdir, setsid};
 
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
@@ -21,9 +17,6 @@ use super::host::{self, HostSearch};
 
 /// The kernel's names of these processes. Their command lines are the program's.
 pub(crate) const NAMES: [&CStr; 2] = [guardian::NAME, host::NAME];
-
-/// Highest number of threads when the program forks them. A test also has its harness's thread.
-pub(super) const THREADS_MAX: usize = if cfg!(test) { 2 } else { 1 };
 
 /// The program's helper processes.
 #[derive(Default)]
@@ -51,29 +44,5 @@ impl Helpers {
             );
         }
         Ok(Helpers { guardian, search })
-    }
-}
-
-/// Gives a new process its name and its session, and closes all descriptors except `kept`. The process ignores the
-/// signals that ask a program to end. A terminal and a service manager send them to all processes, and these processes
-/// end with the program.
-pub(super) fn settle(name: &CStr, kept: &[RawFd]) {
-    // A failure is ignored: the process can work without any of these.
-    let _ = prctl::set_name(name);
-    let _ = setsid();
-    let _ = chdir("/");
-    let _ = sys::close_all_but(kept);
-    for ignored in [
-        Signal::SIGTERM,
-        Signal::SIGINT,
-        Signal::SIGHUP,
-        Signal::SIGQUIT,
-        Signal::SIGTSTP,
-        Signal::SIGTTIN,
-        Signal::SIGTTOU,
-        Signal::SIGUSR1,
-        Signal::SIGUSR2,
-    ] {
-        let _ = sys::ignore(ignored);
     }
 }

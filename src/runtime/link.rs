@@ -17,12 +17,11 @@ use pinion_firmware::mcu::base::{ClockResponse, IdentifyResponse, identify_respo
 use pinion_firmware::mcu::{Dialect, Response};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, TimeSource};
-use pinion_linux::clock::monotonic;
+use pinion_linux::clock::{monotonic, poll_timeout};
 use pinion_protocol::vlq::{Reader, Writer};
 
 use super::core::{Payload, Request};
 use super::core_end::{CoreEnd, STALL};
-use super::guardian::in_ms;
 use super::host_end::{HostEnd, Next};
 use super::introduction::{Introduction, Step};
 use super::ledger::is_after;
@@ -171,7 +170,7 @@ impl Link {
             let events = if is_out { PollFlags::empty() } else { PollFlags::POLLOUT };
             let mut fds = [PollFd::new(self.host.event(), events)];
             // A host that hangs up has read it. A further signal ends the wait.
-            if poll(&mut fds, in_ms(end.saturating_sub(monotonic()))) != Ok(1)
+            if poll(&mut fds, poll_timeout(end.saturating_sub(monotonic()))) != Ok(1)
                 || fds[0].revents() != Some(PollFlags::POLLOUT)
             {
                 return;
@@ -243,7 +242,7 @@ impl Link {
 
     fn timeout(&self, stalled: bool) -> PollTimeout {
         let due: Option<Duration> = self.oversight.due().map(|at| at.saturating_sub(monotonic()));
-        stalled.then_some(STALL).into_iter().chain(due).min().map_or(PollTimeout::NONE, in_ms)
+        stalled.then_some(STALL).into_iter().chain(due).min().map_or(PollTimeout::NONE, poll_timeout)
     }
 
     /// The guardian is gone or of no use. This stops the MCU. The program ends when the host has had time to read why.

@@ -24,6 +24,7 @@ mod budget;
 mod core;
 mod core_end;
 mod core_thread;
+mod forked;
 pub mod guardian;
 pub(crate) mod helpers;
 mod host;

@@ -5,6 +5,7 @@
 
 use std::time::Duration;
 
+use nix::poll::PollTimeout;
 use nix::time::{ClockId, clock_gettime};
 
 use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, TimeSource};
@@ -43,6 +44,12 @@ impl TimeSource for Monotonic {
 pub fn monotonic() -> Duration {
     // clock_gettime(2) fails only for an unknown clock or a bad pointer.
     clock_gettime(ClockId::CLOCK_MONOTONIC).map_or(Duration::ZERO, Duration::from)
+}
+
+/// A timeout for poll(2), rounded up to whole milliseconds. Without an end if it is longer than poll(2) can wait.
+pub fn poll_timeout(timeout: Duration) -> PollTimeout {
+    let ms = timeout.as_nanos().div_ceil(1_000_000);
+    PollTimeout::try_from(ms).unwrap_or(PollTimeout::MAX)
 }
 
 #[cfg(test)]

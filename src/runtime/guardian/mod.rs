@@ -30,7 +30,6 @@
 mod message;
 mod watcher;
 
-use std::ffi::CStr;
 use std::io::{self, IoSlice};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::sync::Arc;
@@ -39,7 +38,6 @@ use std::time::Duration;
 
 use log::warn;
 use nix::errno::Errno;
-use nix::poll::PollTimeout;
 use nix::sys::signal::{Signal, kill};
 use nix::sys::socket::{
     AddressFamily, ControlMessage, MsgFlags, SockFlag, SockType, recv, send, sendmsg, setsockopt, socketpair, sockopt,
@@ -52,18 +50,16 @@ use pinion_linux::Guard;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys;
 
-use super::helpers::THREADS_MAX;
+use super::forked::THREADS_MAX;
 use super::pulse::{GuardianEar, Pulse};
 
 use message::{Message, TAKEN};
-use watcher::{Program, Watcher};
+use watcher::{END_LIMIT, Program, Watcher};
 
-/// The kernel's name of the guardian's process (proc_pid_comm(5)). Its command line is the program's.
-pub(crate) const NAME: &CStr = c"pinion-guardian";
+pub(crate) use watcher::NAME;
+
 /// How long the program waits for the guardian's answer, in seconds.
 const ANSWER_S: i64 = 5;
-/// How long to wait for the end of a process that was asked to end, or was killed.
-const END_LIMIT: Duration = Duration::from_secs(2);
 
 /// The program's side of the guardian. If it is dropped without [`Guardian::goodbye`], the guardian
 /// drives the outputs that it holds.
@@ -238,12 +234,6 @@ impl Guard for Lifeline {
     fn release(&mut self) -> io::Result<()> {
         self.ask(&Message::Release, None)
     }
-}
-
-/// A timeout for poll(2), rounded up to whole milliseconds.
-pub(super) fn in_ms(timeout: Duration) -> PollTimeout {
-    let ms = timeout.as_nanos().div_ceil(1_000_000);
-    PollTimeout::try_from(ms).unwrap_or(PollTimeout::MAX)
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::ffi::CStr;
 use std::io;
 use std::iter;
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd};
@@ -18,15 +19,18 @@ use nix::sys::socket::{MsgFlags, send};
 use nix::sys::uio::pwrite;
 use nix::unistd::{Pid, alarm, getppid};
 
-use pinion_linux::clock::monotonic;
+use pinion_linux::clock::{monotonic, poll_timeout};
 use pinion_linux::sys;
 
-use super::super::helpers;
+use super::super::forked;
 use super::super::pulse::{Ear, Pulse};
 use super::super::realtime;
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
-use super::{END_LIMIT, in_ms};
 
+/// The kernel's name of the guardian's process (proc_pid_comm(5)). Its command line is the program's.
+pub(crate) const NAME: &CStr = c"pinion-guardian";
+/// How long to wait for the end of a process that was asked to end, or was killed.
+pub(super) const END_LIMIT: Duration = Duration::from_secs(2);
 /// How long to retry an output that cannot be driven, and how long to wait for a driver that hangs.
 const TRY_FOR: Duration = Duration::from_secs(2);
 /// Pause between two attempts to drive an output.
@@ -38,7 +42,7 @@ const LOG_S: u32 = 2;
 pub(super) fn settle(realtime: bool, socket: &OwnedFd, program: &Program) {
     // The program's ends of its sockets are not kept: the guardian and the search would not notice that it closes them.
     let kept = [0, 1, 2, socket.as_raw_fd()].into_iter().chain(program.pidfd.as_ref().map(AsRawFd::as_raw_fd));
-    helpers::settle(super::NAME, &kept.collect::<Vec<_>>());
+    forked::settle(NAME, &kept.collect::<Vec<_>>());
     // Failures are ignored here: without any of these the guardian can still do its work.
     // When memory is short, the kernel now kills other processes first. Only root may ask for this.
     let _ = std::fs::write("/proc/self/oom_score_adj", "-1000");
@@ -255,7 +259,7 @@ impl Watcher {
 
     /// Waits for up to `timeout`. Returns whether a message has come, and whether the program has ended.
     fn wait(&self, timeout: Option<Duration>) -> (bool, bool) {
-        let timeout = timeout.map_or(PollTimeout::NONE, in_ms);
+        let timeout = timeout.map_or(PollTimeout::NONE, poll_timeout);
         let pidfd = self.program.pidfd.as_ref().map_or(self.socket.as_fd(), AsFd::as_fd);
         let mut fds = [PollFd::new(self.socket.as_fd(), PollFlags::POLLIN), PollFd::new(pidfd, PollFlags::POLLIN)];
         if poll(&mut fds, timeout).is_err() {

@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::ffi::CStr;
 use std::fs;
 use std::io;
 use std::os::fd::{AsRawFd, OwnedFd};
@@ -24,10 +25,12 @@ use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::DialectName;
 use pinion_linux::sys;
 
-use super::super::helpers;
+use super::super::forked;
 use super::super::status::FoundHost;
 use super::message::{Answer, Hello, Line, MESSAGE_BYTES_MAX, Question};
 
+/// The kernel's name of its process (proc_pid_comm(5)). Its command line is the program's.
+pub(crate) const NAME: &CStr = c"pinion-search";
 const PROC: &str = "/proc";
 /// Highest number of bytes of memory that it may write to. klippy's sources take 3 MB.
 const MEMORY_BYTES_MAX: rlim_t = 64 << 20;
@@ -82,7 +85,7 @@ fn settle(socket: &OwnedFd) -> io::Result<()> {
     let _ = setrlimit(Resource::RLIMIT_CORE, 0, 0);
     // The program may have been started in real time.
     let _ = sys::set_other();
-    helpers::settle(super::NAME, &[socket.as_raw_fd()]);
+    forked::settle(NAME, &[socket.as_raw_fd()]);
     sys::keep_only(sys::LOOK_INTO_OTHERS)?;
     // The process ends with the program's first thread, whatever it waits for then. That thread lives as long as the
     // program.

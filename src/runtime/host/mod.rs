@@ -14,7 +14,6 @@
 mod looker;
 mod message;
 
-use std::ffi::CStr;
 use std::io;
 use std::os::fd::{AsRawFd, OwnedFd};
 use std::path::Path;
@@ -31,13 +30,13 @@ use crate::klippy::process::Terminal;
 use pinion_firmware::mcu::DialectName;
 use pinion_linux::sys;
 
-use super::helpers::THREADS_MAX;
+use super::forked::THREADS_MAX;
 use super::outlet::LinkWake;
 use super::status::HostBoard;
 use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
 
-/// The kernel's name of its process (proc_pid_comm(5)). Its command line is the program's.
-pub(crate) const NAME: &CStr = c"pinion-search";
+pub(crate) use looker::NAME;
+
 /// How long the new process may take to be ready, in seconds.
 const START_S: i64 = 5;
 
