@@ -6,14 +6,14 @@ use pinion_testbench::rig::Rig;
 
 /// 300 us at 3.2 MHz.
 const RESET_BYTES: usize = 120;
-/// Two LEDs, and 50 us of reset, which klippy asks for, and newer LEDs find too short.
+/// Two LEDs, and klippy's reset time of 50 us, which is too short for newer LEDs.
 const CHAIN: &str = "config_neopixel oid=0 pin=700 data_size=6 bit_max_ticks=200 reset_min_ticks=2500";
 
 fn sent(rig: &Rig) -> Vec<Vec<u8>> {
     rig.bench.transfers().into_iter().map(|transfer| transfer.data).collect()
 }
 
-/// What an LED chain reads from the line: a pulse of two bits or more is a 1.
+/// An LED chain's view of the line: a pulse of two bits or more is a 1.
 fn colours(wire: &[u8]) -> Vec<u8> {
     let bits: Vec<u8> = wire.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1)).collect();
     let pulses = bits.split(|bit| *bit == 0).filter(|pulse| !pulse.is_empty());
@@ -27,7 +27,7 @@ fn a_chain_gets_its_colours_between_two_resets() {
     rig.send_all(&["neopixel_update oid=0 pos=0 data=ff00a5", "neopixel_update oid=0 pos=4 data=0180"]);
     assert_eq!(rig.responses(), [""; 0]);
     assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
-    // Only what changes is told, and all of it is sent; nothing that came in is sent again.
+    // The host sends only the bytes that change. The chain gets all of them, and nothing that came in is sent again.
     rig.send("neopixel_update oid=0 pos=5 data=81");
     assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
     let Transfer { bus, mode, rate_hz, read, .. } = rig.bench.transfers().remove(0);
@@ -102,7 +102,7 @@ fn what_can_not_be_configured() {
     const MOST: u32 = ((MESSAGE_MAX - 2 * RESET_BYTES) / 4) as u32;
     assert_eq!(refusal(MOSI, MOST, 2500).0, "");
     assert_eq!(refusal(MOSI, MOST, 15_000).0, "");
-    // One more than the bench's bus takes at once; a reset that is too long for it.
+    // One byte more than the bench's bus takes at once, and a reset that is too long for the bus.
     for (size, reset) in [(MOST + 1, 2500), (MOST, 15_001), (0, u32::MAX)] {
         let (text, note) = refusal(MOSI, size, reset);
         assert_eq!(text, "Invalid neopixel data_size");

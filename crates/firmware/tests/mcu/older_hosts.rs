@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What hosts before Klipper's master say, and what they are answered: the forms that the dictionary of
-//! master no longer has. Kalico grew out of v0.13 and has many of them, too.
+//! Commands of the hosts before Klipper's master, and the answers to them. The dictionary of master no longer has these
+//! forms. Kalico developed from v0.13 and also has many of them.
 
 use std::sync::{Arc, Mutex};
 
@@ -31,7 +31,7 @@ fn each_sum_of_readings_is_a_report() {
         assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@105000 value=16379"], "{generation}");
         rig.run_until(108_000);
         assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@205000 value=10"]);
-        // 8000 is out of range; the second time in a row ends it.
+        // 8000 is out of range. The second value out of range in a row stops the MCU.
         rig.run_until(307_999);
         assert_eq!(rig.responses(), ["analog_in_state oid=0 next_clock=@305000 value=8000"]);
         rig.run_until(308_000);
@@ -51,8 +51,8 @@ fn device(generation: Generation) -> &'static [&'static str] {
 
 type Heard = Arc<Mutex<Vec<(Vec<u8>, usize)>>>;
 
-/// A chip that counts up from the first byte written to it, and answers with this status once `after`
-/// conversations are over.
+/// A chip that counts up from the first byte written to it. It answers with `status` once `after` conversations are
+/// over.
 fn plug_i2c(rig: &Rig, after: usize, status: Result<(), BusStatus>) -> Heard {
     let heard = Heard::default();
     let log = heard.clone();
@@ -119,12 +119,12 @@ fn a_chip_that_does_not_answer_stops_the_mcu_in_the_words_of_its_time() {
         let responses = rig.responses();
         assert_eq!(responses.len(), 1, "no answer: {responses:?}");
         assert!(responses[0].ends_with(&format!("static_string_id={text}")), "{generation} {command}: {responses:?}");
-        // Only what writes nothing is tried again.
+        // Only a transfer that writes nothing is retried.
         let tries = if command.contains("reg= ") { 3 } else { 1 };
         assert_eq!(heard.lock().unwrap().len(), tries);
         assert!(rig.notes().iter().any(|note| note.contains("I2C device oid 0")), "the log names the device");
     }
-    // What was read is written back.
+    // The transfer that writes back the changed bytes fails.
     let mut rig = configured(V0_12, device(V0_12));
     plug_i2c(&rig, 1, Err(Nack));
     rig.send(MODIFY);
@@ -179,16 +179,16 @@ fn lines_are_an_spi_bus_of_the_rate() {
 
 // ---- accelerometers
 
-/// An ADXL345 that measures one sample each 1000 ticks while it is switched on; a sample is its number.
+/// An ADXL345 that measures one sample every 1000 ticks while it is on. A sample is its own number.
 #[derive(Default)]
 struct Adxl345 {
     on_since: Option<u64>,
-    /// Samples made before it was switched off, and those that were read.
+    /// Samples made before it was switched off, and samples that were read.
     made: u64,
     read: u64,
-    /// How many times more it tells rubbish of its FIFO.
+    /// How many more times it reports nonsense about its FIFO.
     rubbish: usize,
-    /// What was written to it, and when.
+    /// The bytes written to it, with their times.
     written: Vec<(u64, [u8; 2])>,
 }
 
@@ -243,7 +243,7 @@ fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
         assert_eq!(chip.lock().unwrap().written, []);
         rig.run_until(17_500);
         assert_eq!(chip.lock().unwrap().written, [(5000, [0x2d, 0x08])]);
-        // Ten samples of five bytes; two more were there at the last look, at 17000.
+        // Ten samples of five bytes. Two more were there at the last look, at 17000.
         assert_eq!(rig.responses(), [adxl345_data(0, 0..10)], "{generation}");
         let status = "adxl345_status oid=1 clock=@17500 query_ticks=0 next_sequence=1 buffered=10 fifo=0 limit_count=0";
         assert_eq!(rig.ask("query_adxl345_status oid=1"), status);
@@ -254,7 +254,7 @@ fn an_adxl345_is_switched_on_at_its_clock_and_off_with_all_its_samples_told() {
         assert_eq!(rig.responses(), [adxl345_data(1, 10..15), status.to_owned()], "{generation}");
         rig.run_until(100_000);
         assert_eq!(rig.responses(), [""; 0], "it has ended");
-        // And once more, from the beginning.
+        // The same once more, from the beginning.
         rig.send("query_adxl345 oid=1 clock=@110000 rest_ticks=4000");
         rig.run_until(122_500);
         assert_eq!(rig.responses(), [adxl345_data(0, 15..25)]);
@@ -267,7 +267,7 @@ fn an_adxl345_that_is_read_as_it_is_to_end_loses_no_sample() {
     let chip = plug_adxl345(&rig);
     rig.bench.state().answer_ticks = 700;
     rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
-    // Switched on from 5000 to 5700; the reading of 9700 is under way.
+    // It is switched on from 5000 to 5700. The reading of 9700 is under way.
     rig.run_until(9800);
     rig.send("query_adxl345 oid=1 clock=0 rest_ticks=0");
     let responses = rig.responses();
@@ -285,7 +285,7 @@ fn an_adxl345_that_makes_no_sense_is_told_as_that_and_ends() {
     rig.send("query_adxl345 oid=1 clock=@5000 rest_ticks=4000");
     rig.run_until(6000);
     chip.lock().unwrap().rubbish = usize::MAX;
-    // klippy asks again where there are more than 32.
+    // klippy asks again if there are more than 32.
     let status = rig.ask("query_adxl345_status oid=1");
     assert!(status.contains(" fifo=127 "), "{status}");
     let status = rig.ask("query_adxl345 oid=1 clock=0 rest_ticks=0");
@@ -372,8 +372,8 @@ fn an_mpu9250_has_its_fifo_emptied_at_the_beginning_and_tells_of_overflows() {
     }
 }
 
-/// The firmware asks the chip how much its FIFO has, and tells what it remembered from the last reading instead. klippy
-/// dates samples by this count, so here it is that of the instant.
+/// The firmware asks the chip how much its FIFO has, but reports the value from the last reading. klippy dates samples
+/// by this count. So here the status has the current count.
 #[test]
 fn a_status_of_an_mpu9250_counts_the_samples_of_its_instant() {
     const PERIOD: u64 = 12_500;
@@ -431,7 +431,7 @@ fn a_sensor_whose_bus_fails_stops_the_mcu_in_the_words_of_its_time() {
     }
 }
 
-/// A host that goes, comes back and measures anew, at any instant of a measurement.
+/// A host goes, comes back and starts a new measurement, at any time of a measurement.
 #[test]
 fn a_measurement_may_be_ended_and_begun_at_any_instant() {
     for stop_at in (4000..14_000).step_by(50) {
@@ -456,7 +456,7 @@ fn a_measurement_may_be_ended_and_begun_at_any_instant() {
     }
 }
 
-/// A query amid the one before: the sensor is switched on at the later one's clock, and one timer looks at it.
+/// A query during the one before: the sensor is switched on at the later query's clock, and only one timer reads it.
 #[test]
 fn a_measurement_that_is_asked_for_anew_begins_at_its_own_clock() {
     for again_at in (4900..6000).step_by(50) {
@@ -476,7 +476,7 @@ fn a_measurement_that_is_asked_for_anew_begins_at_its_own_clock() {
     }
 }
 
-/// It is on, however soon after its end.
+/// The sensor is then on, however soon after its end.
 #[test]
 fn a_measurement_may_begin_amid_the_end_of_another() {
     let mut rig = configured(V0_12, ADXL345);
@@ -536,7 +536,7 @@ fn an_angle_sensor_sends_sixteen_entries_a_message_and_its_end() {
 
 // ---- the eddy current probe
 
-/// An LDC1612 that always has a sample, of the value that stands here; or fails.
+/// An LDC1612 that always has a sample, with the value that the mutex holds, or fails.
 fn ldc1612(generation: Generation) -> (Rig, Arc<Mutex<Result<u32, BusStatus>>>) {
     let rig = configured(
         generation,
@@ -574,7 +574,7 @@ fn an_eddy_current_probe_triggers_above_its_threshold() {
             SETUP,
             "query_ldc1612 oid=1 rest_ticks=10000",
         ]);
-        // Above it before homing begins: that does not count.
+        // A value above the threshold does not count before homing begins.
         *value.lock().unwrap() = Ok(2001);
         rig.run_until(45_000);
         *value.lock().unwrap() = Ok(2000);
@@ -598,13 +598,13 @@ fn an_eddy_current_probe_that_tells_of_an_error_ends_the_homing_and_one_that_is_
             SETUP,
             "query_ldc1612 oid=1 rest_ticks=10000",
         ]);
-        // Even before homing begins.
+        // An error counts even before homing begins.
         *value.lock().unwrap() = Ok(0x1000_0000);
         rig.run_until(15_000);
         let state = rig.responses().pop().unwrap();
         assert!(state.starts_with("trsync_state oid=2 can_trigger=0 trigger_reason=3 "), "{generation}: {state}");
         assert_eq!(rig.ask("query_ldc1612_home_state oid=1"), "ldc1612_home_state oid=1 homing=0 trigger_clock=@50000");
-        // What master calls INVALID_READ_DATA is a sample like others here.
+        // Master reports this as INVALID_READ_DATA. Here it is an ordinary sample.
         *value.lock().unwrap() = Ok(0xffff_1234);
         rig.run_until(125_000);
         let data = rig.responses().pop().unwrap();

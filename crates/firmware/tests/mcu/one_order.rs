@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One order: a conversation that a command began holds back the commands behind it, and nothing
-//! else.
+//! One order: a command's conversation holds back the commands behind it, and nothing else.
 
 use pinion_testbench::board::SPI_CHIPS;
 use pinion_testbench::rig::Rig;
@@ -36,7 +35,7 @@ fn a_display_sees_its_line_and_its_bytes_in_order() {
     }
 }
 
-/// With a second device, and a message for the first one at a stop.
+/// Adds a second device, and a message for the first one at a stop.
 fn two_devices(answer_ticks: u32) -> Rig {
     let more = [
         "config_spi_without_cs oid=2",
@@ -74,7 +73,7 @@ fn what_is_only_sent_does_not_wait_for_what_was_sent_before_to_the_same_device()
     rig.run_until(9000);
     assert!(!rig.mcu.is_held());
     assert_eq!(sent(&rig), (0..9).map(|n| vec![n]).collect::<Vec<_>>());
-    // What is answered keeps its block, and nothing joins it.
+    // A command with an answer keeps its block, and nothing joins it.
     rig.begin("spi_transfer oid=0 data=01");
     assert!(rig.mcu.keeps_block() && !rig.mcu.joins(&next));
 }
@@ -101,7 +100,7 @@ fn a_stop_ends_what_is_under_way() {
     (0..4).for_each(|n| rig.begin(&format!("spi_send oid=0 data={n:02x}")));
     rig.run_until(1000);
     rig.begin("emergency_stop");
-    // Of the round that ended.
+    // The messages that wait belong to the round that ended, so they are not sent.
     rig.begin("clear_shutdown");
     rig.run_until(50_000);
     assert_eq!(sent(&rig), [[0], [0xee]]);
@@ -183,7 +182,7 @@ fn a_bus_that_hangs_stops_the_mcu_when_the_host_has_given_up() {
     assert!(notes.iter().any(|note| note.contains("SPI device oid 0 has not answered for 5 s")), "{notes:?}");
 }
 
-/// After a `clear_shutdown` commands wait for that bus again, and no longer than before.
+/// After a `clear_shutdown`, commands wait for this bus again, and no longer than before.
 #[test]
 fn a_bus_that_still_hangs_stops_the_mcu_again() {
     let mut rig = Rig::with_workers(4_000_000_000, DISPLAY);

@@ -14,7 +14,7 @@ const OUTPUT: &str =
 const FREE: &str =
     "config_pca9685 oid=1 bus=1 addr=64 channel=15 cycle_ticks=1000000 value=2048 default_value=4096 max_duration=0";
 
-/// What a chip was told, and when.
+/// The bytes that a chip received, with their times.
 type Heard = Arc<Mutex<Vec<(u64, Vec<u8>)>>>;
 
 fn plug(rig: &Rig) -> Heard {
@@ -28,7 +28,7 @@ fn plug(rig: &Rig) -> Heard {
     heard
 }
 
-/// What the chip was told since the last call.
+/// The bytes that the chip received since the last call.
 fn heard(heard: &Heard) -> Vec<(u64, Vec<u8>)> {
     std::mem::take(&mut heard.lock().unwrap())
 }
@@ -53,12 +53,12 @@ fn a_chip_is_set_up_once_and_its_outputs_get_their_values() {
         vec![0xfe, 121],
         vec![0, 0x21],
         vec![0xfa, 0, 0, 0, 0x10],
-        // Channel 15 at half; channel 2 is off already.
+        // Channel 15 is at half. Channel 2 is already off.
         vec![66, 0, 0, 0, 8],
     ];
     assert_eq!(bytes(&chip), set_up);
     assert_eq!(rig.dictionary().config["PCA9685_MAX"], 4096);
-    // FIRMWARE_RESTART sets it up anew.
+    // FIRMWARE_RESTART sets up the chip again.
     rig.send_all(&["emergency_stop", "config_reset"]);
     bytes(&chip);
     rig.forget_responses();
@@ -96,7 +96,7 @@ fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
         rig.send_all(commands);
         rig.run_until(200_000);
         assert_eq!(rig.shutdown().as_deref(), Some(text));
-        // Both are where they belong: off, and on.
+        // Both outputs have their shutdown values: off, and on.
         let told = bytes(&chip);
         let last = |register: u8| told.iter().rfind(|bytes| bytes[0] == register);
         assert_eq!(last(14), Some(&vec![14, 0, 0, 0, 0x10]));
@@ -107,7 +107,7 @@ fn a_host_that_is_silent_or_plans_too_far_ahead_stops_the_mcu() {
 
 #[test]
 fn a_slow_chip_gets_the_newest_value_and_its_shutdown_value_last() {
-    // 1 ms for each.
+    // Each write takes 1 ms.
     let (mut rig, chip) = rig(50_000, &[FREE]);
     bytes(&chip);
     let now = rig.now();
@@ -141,9 +141,9 @@ fn what_can_not_be_is_refused() {
         (&[&OUTPUT.replace("channel=2", "channel=16")], "Invalid pca9685 channel or value"),
         (&[&OUTPUT.replace("default_value=0", "default_value=4097")], "Invalid pca9685 channel or value"),
         (&["set_pca9685_out bus=1 addr=64 channel=0 cycle_ticks=1 value=4097"], "Invalid pca9685 channel or value"),
-        // No such bus.
+        // There is no bus with this number.
         (&[&OUTPUT.replace("bus=1", "bus=2")], "Unable to open and init PCA9685 device"),
-        // No chip.
+        // There is no chip at this address.
         (&[&OUTPUT.replace("addr=64", "addr=65")], "Unable to open and init PCA9685 device"),
     ] {
         let mut rig = Rig::new();
@@ -151,7 +151,7 @@ fn what_can_not_be_is_refused() {
         rig.send("allocate_oids count=2");
         rig.send_all(commands);
         assert_eq!(rig.shutdown().as_deref(), Some(text), "{commands:?}");
-        // And it is there for the next configuration.
+        // The chip works in the next configuration.
         rig.run_until(1_000_000);
         rig.send("config_reset");
         rig.forget_responses();
@@ -207,7 +207,7 @@ fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() 
     let now = rig.now();
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=1", now + 1000));
     rig.send(&format!("queue_pca9685_out oid=1 clock=@{} value=2", now + 9000));
-    // The guardian takes over after a second without a heartbeat, which there is none while this is owed.
+    // The guardian takes over after a second without a heartbeat. There is no heartbeat while this value is owed.
     rig.run_until(now + 24_000_000);
     assert_eq!(rig.mcu.debtor(), Some("PCA9685"));
     rig.run_until(now + 30_000_000);
@@ -216,13 +216,13 @@ fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() 
     let given_up = notes.iter().filter(|note| note.contains("PCA9685 has not taken its shutdown values for 500 ms"));
     assert_eq!(given_up.count(), 1, "{notes:?}");
 
-    // It is still tried, and told of when it works.
+    // It is still retried, and reported when it works.
     let chip = plug(&rig);
     rig.run_until(now + 40_000_000);
     assert_eq!(bytes(&chip), [[14, 0, 0, 0, 0x10], [66, 0, 0x10, 0, 0]]);
     assert_eq!(rig.notes(), ["safe: PCA9685"]);
 
-    // Silent again: the MCU can be configured, without that chip.
+    // The chip is silent again. The MCU can be configured, but not this chip.
     rig.bench.plug_i2c(1, ADDRESS, says_nothing);
     rig.send("config_reset");
     rig.forget_responses();
@@ -238,7 +238,7 @@ fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() 
 
 #[test]
 fn a_config_reset_waits_for_a_silent_chip_and_no_longer_than_that() {
-    // A second for each: a bus whose driver waits until it gives up.
+    // Each write takes a second: the bus's driver waits until it gives up.
     let (mut rig, _) = rig(1000, &[OUTPUT, FREE]);
     rig.bench.state().answer_ticks = 50_000_000;
     let now = rig.now();

@@ -4,7 +4,7 @@
 use pinion_testbench::board::PWM;
 use pinion_testbench::rig::Rig;
 
-/// A heater on hardware PWM: off by default, to be refreshed every 100000 ticks.
+/// A heater on hardware PWM. It is off by default and needs a refresh every 100000 ticks.
 const HEATER: &str = "config_pwm_out oid=0 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=100000";
 
 fn values(rig: &Rig) -> Vec<(u64, u16)> {
@@ -67,7 +67,7 @@ fn a_channel_that_fails_stops_the_mcu() {
 const SECOND: &str = "config_pwm_out oid=1 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0";
 const SET: &str = "set_pwm_out pin=500 cycle_ticks=50000 value=100";
 
-/// Klipper allows that with `[duplicate_pin_override]`, and its firmware opens the channel anew.
+/// Klipper allows this with `[duplicate_pin_override]`. Its firmware then opens the channel again.
 #[test]
 fn two_objects_may_have_one_channel() {
     let mut rig = Rig::configured(&[HEATER, SECOND]);
@@ -103,7 +103,7 @@ fn a_channel_that_is_set_once_stays_and_may_be_set_again() {
     rig.send("emergency_stop");
     rig.run_until(30_000);
     assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
-    // Before finalize_config the channel is set up anew, afterwards a worker sets it.
+    // Before finalize_config the channel is set up again. Afterwards a worker sets it.
     assert_eq!(values(&rig), [(0, 100), (0, 200), (12_000, 300)]);
     assert_eq!(rig.bench.state().pwm_cycles[&PWM], 20_000);
 }

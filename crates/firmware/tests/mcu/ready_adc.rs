@@ -9,13 +9,13 @@ use pinion_testbench::rig::Rig;
 const READY: u32 = 10;
 const PERIOD: u64 = 100_000;
 
-/// A chip that has a sample every [`PERIOD`], and gives it away once.
+/// A chip that has a sample every [`PERIOD`]. Each sample can be read once.
 #[derive(Default)]
 struct Adc {
     read: u64,
     /// The frame of a sample, by its number.
     frame: Option<fn(u64) -> Vec<u8>>,
-    /// What it was sent.
+    /// The bytes that it received.
     heard: Vec<Vec<u8>>,
 }
 
@@ -51,7 +51,7 @@ fn crc(words: &[u8]) -> u16 {
     crc
 }
 
-/// The same in channel 1; channel 0 has something else.
+/// The same sample in channel 1. Channel 0 has something else.
 fn ads131m02(n: u64) -> Vec<u8> {
     let mut frame = vec![0x05 & !4, 0x03, 0, 0x12, 0x34, 0x56];
     frame.extend(ads1220(n));
@@ -61,7 +61,7 @@ fn ads131m02(n: u64) -> Vec<u8> {
     frame
 }
 
-/// After five samples the chip was reset.
+/// The chip is reset after five samples.
 fn reset_after_five(n: u64) -> Vec<u8> {
     let mut frame = ads131m02(n);
     if n == 6 {
@@ -136,7 +136,7 @@ fn a_status_counts_every_sample_once() {
         let (mut rig, _adc) = rig(sensor, frame, 2000);
         rig.send(&query(sensor));
         let status = format!("query_{}_status oid=1", name(sensor));
-        // At each instant there are as many samples as the chip has made.
+        // At any time, the status counts as many samples as the chip has made.
         for at in (5000..11 * PERIOD).step_by(777) {
             rig.run_until(at);
             let expected = format!("next_sequence=0 buffered={} possible_overflows=0", 4 * (at / PERIOD));
@@ -206,7 +206,7 @@ fn a_frame_that_is_damaged_and_a_chip_that_was_reset_are_errors_that_end_homing(
             "trigger_analog_home oid=3 trsync_oid=4 trigger_reason=1 error_reason=40 clock=@50000 monitor_ticks=100000 monitor_max=3",
         ]);
         rig.run_until(6 * PERIOD);
-        // The error's number follows those of trigger_analog_error.
+        // The numbers of the sensor's errors follow those of trigger_analog_error.
         let report = format!("trsync_state oid=4 can_trigger=0 trigger_reason={} clock=@600000", 40 + 3 + code);
         assert_eq!(rig.responses(), [report]);
         rig.run_until(12 * PERIOD);
@@ -214,7 +214,7 @@ fn a_frame_that_is_damaged_and_a_chip_that_was_reset_are_errors_that_end_homing(
         assert_eq!(values[..5], [-1000, -2000, -3000, -4000, -5000]);
         assert_eq!(values[5], code << 24);
         assert_eq!(values[6], if lasts { code << 24 } else { -7000 });
-        // klippy sets the chip up and asks anew.
+        // klippy sets up the chip and queries it again.
         rig.send(&query(ADS131M02));
         rig.run_until(24 * PERIOD);
         assert_eq!(samples(&rig), (13..=24).map(|n| -1000 * n).collect::<Vec<i32>>());
@@ -251,7 +251,7 @@ fn measurements_that_begin_anew_amid_a_reading_have_none_of_it() {
     assert!(rig.ask("query_ads1220_status oid=1").contains("buffered=0"));
     rig.run_until(16 * PERIOD);
     assert_eq!(samples(&rig)[0], -2000);
-    // And an end is an end.
+    // After the end of the query nothing more comes.
     rig.run_until(17 * PERIOD + 20_000);
     rig.send("query_ads1220 oid=1 rest_ticks=0");
     rig.run_until(60 * PERIOD);

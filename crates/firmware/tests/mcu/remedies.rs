@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the log says of a shutdown: the thing that it is about, and the remedy.
+//! The log's line about a shutdown names the thing that it is about, and the remedy.
 
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::rig::Rig;
@@ -8,7 +8,7 @@ const STEPPER: &str = "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=0 s
 const OUTPUT: &str = "config_digital_out oid=3 pin=20 value=0 default_value=0 max_duration=50000";
 const PWM: &str = "config_pwm_out oid=6 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=50000";
 
-/// Runs the commands and tells what the log has of the shutdown that they end in.
+/// Runs the commands. Returns the log's line about the shutdown that they end in.
 fn log_of(objects: &[&str], commands: &[&str]) -> String {
     let mut rig = Rig::new();
     rig.send("allocate_oids count=10");
@@ -26,7 +26,7 @@ fn log_of(objects: &[&str], commands: &[&str]) -> String {
 
 #[test]
 fn the_log_names_the_thing_and_the_remedy() {
-    // The commands, what the line names, and a word of its remedy.
+    // The commands, the thing that the line names, and a word of its remedy.
     for (objects, commands, thing, remedy) in [
         // Pins.
         (

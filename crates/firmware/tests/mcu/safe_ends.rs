@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A shutdown value that can not be written is owed: it is tried again, and nothing is forgotten
-//! before it is written.
+//! A shutdown value that cannot be written is owed. It is retried, and nothing is forgotten before it is written.
 
 use pinion_testbench::board::{PWM, SPI_CHIPS};
 use pinion_testbench::rig::Rig;
@@ -82,7 +81,7 @@ fn a_reset_waits_for_no_more_than_the_last_writes() {
     rig.configure(&[HEATER]);
 }
 
-/// The firmware looks at the first 20 timers, then at each 100, whether they are 100 ms late.
+/// After 20 timers in a row, then after every 100, the firmware checks if the next one is over 100 ms late.
 #[test]
 fn a_timer_that_repeats_in_the_past_stops_the_mcu_where_the_firmware_stops() {
     let pulses = |late_ticks: u64| {
@@ -98,7 +97,7 @@ fn a_timer_that_repeats_in_the_past_stops_the_mcu_where_the_firmware_stops() {
         rig.run_turns(3);
         rig.shutdown()
     };
-    // Two events to a cycle of 20 ms: the twentieth is 190 ms after the first.
+    // A cycle of 20 ms has two events. The twentieth event is 190 ms after the first.
     assert_eq!(pulses(28_000_000).as_deref(), Some("Rescheduled timer in the past"));
     assert_eq!(pulses(14_000_000), None);
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Lines of chips that may sleep, expanders: a worker calls them (the bench panics if the core
-//! does), and everything else goes on.
+//! Lines of chips that may sleep: expanders. A worker calls them (the bench panics if the core does), and everything
+//! else continues.
 
 use pinion_testbench::rig::Rig;
 
@@ -8,7 +8,7 @@ const PIN: u32 = 50;
 const FAN: &str = "config_digital_out oid=0 pin=50 value=0 default_value=0 max_duration=0";
 const STEPPER: &str = "config_stepper oid=1 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0";
 
-/// An MCU whose pins 50 and 51 are an expander's, which takes 20000 ticks (0.4 ms) for a call.
+/// An MCU with pins 50 and 51 on an expander. A call to the expander takes 20000 ticks (0.4 ms).
 fn rig(objects: &[&str]) -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().sleeping.extend([PIN, PIN + 1]);
@@ -92,8 +92,8 @@ fn an_endstop_is_sampled_by_the_worker() {
     rig.bench.script_input(PIN + 1, &[(115_000, 1)]);
     home(&mut rig, 10_000);
     rig.run_until(1_000_000);
-    // Looks begin at 10000, 60000 and 110000; that one ends at 130000, past the change, and the
-    // one that confirms it at 150000.
+    // Looks begin at 10000, 60000 and 110000. The last one ends at 130000, after the change. The look that confirms it
+    // ends at 150000.
     assert_eq!(rig.responses(), ["trsync_state oid=3 can_trigger=0 trigger_reason=1 clock=@150050"]);
 }
 
@@ -103,7 +103,7 @@ fn a_look_that_began_before_a_sample_is_due_is_not_taken_for_it() {
     rig.bench.script_input(PIN + 1, &[(0, 1), (25_000, 0)]);
     home(&mut rig, 1000);
     rig.run_until(5000);
-    // Homing begins anew amid the look.
+    // Homing begins again during the look.
     home(&mut rig, 10_000);
     rig.run_until(1_000_000);
     assert_eq!(rig.responses(), [""; 0], "the switch was open at 41000, when the second look ended");
@@ -115,7 +115,7 @@ fn a_query_is_answered_with_a_fresh_look_before_the_next_command() {
     rig.bench.script_input(PIN + 1, &[(10_000, 1)]);
     assert_eq!(rig.ask("endstop_query_state oid=2"), "endstop_state oid=2 homing=0 next_clock=@-10000000 pin_value=1");
     assert_eq!(rig.now(), 20_000);
-    // Amid a sample of a homing, too.
+    // The same during a sample of a homing.
     rig.bench.script_input(PIN + 1, &[(20_000, 0)]);
     home(&mut rig, 30_000);
     rig.run_until(31_000);
@@ -144,10 +144,10 @@ fn a_chip_that_fails_stops_the_mcu_and_is_tried_until_it_answers() {
     assert_eq!(notes.last().unwrap(), "safe: digital output oid 0 (gpio50)");
 }
 
-/// Ticks of 100 ms.
+/// 100 ms in ticks.
 const UNREAD_LIMIT: u64 = 5_000_000;
 
-/// The instant of the sample that closed the switch, as klippy works it out.
+/// The time of the sample that closed the switch, as klippy computes it.
 fn trigger(rig: &mut Rig) -> i64 {
     let state = rig.ask("endstop_query_state oid=2");
     let next_clock = state.split(['@', ' ']).filter_map(|word| word.parse::<i64>().ok()).next().unwrap();
@@ -166,7 +166,7 @@ fn an_endstop_is_dated_by_the_end_of_the_look_that_saw_it() {
 
 #[test]
 fn an_endstop_is_dated_by_its_look_after_a_stall_too() {
-    // The core stands still for 15 ms before the look is asked for.
+    // The core stands still for 15 ms before the look is requested.
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(800_000, 1)]);
     home(&mut rig, 10_000);
@@ -174,7 +174,7 @@ fn an_endstop_is_dated_by_its_look_after_a_stall_too() {
     rig.stall_until(850_000);
     rig.run_until(2_000_000);
     assert_eq!(trigger(&mut rig), 870_000);
-    // It stands still while the worker looks: what the look saw is no younger than its end.
+    // The core stands still while the worker looks. The level that the look saw counts from the look's end.
     let mut rig = self::rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(75_000, 1)]);
     home(&mut rig, 10_000);
@@ -222,7 +222,7 @@ fn a_homing_whose_chip_hangs_stops_the_mcu_after_100_ms() {
 fn a_query_looks_again_for_100_ms() {
     let mut rig = rig(HOMING);
     rig.bench.script_input(PIN + 1, &[(0, 1)]);
-    // 20 looks of three tries each.
+    // 20 looks with three tries each.
     rig.bench.state().nacks.insert(PIN + 1, 60);
     let state = rig.ask("endstop_query_state oid=2");
     assert_eq!(state, "endstop_state oid=2 homing=0 next_clock=@-10000000 pin_value=1");
@@ -249,7 +249,7 @@ fn an_output_is_written_again_before_that_stops_the_mcu() {
 
 #[test]
 fn a_driver_that_took_its_time_to_give_up_is_not_asked_again() {
-    // 25 ms.
+    // A call that fails takes 25 ms.
     let mut rig = rig(&[FAN]);
     rig.bench.state().fail_ticks = 1_250_000;
     rig.bench.state().nacks.insert(PIN, 1);
@@ -261,7 +261,7 @@ fn a_driver_that_took_its_time_to_give_up_is_not_asked_again() {
 fn a_chip_that_hung_during_a_reset_keeps_no_line_once_it_is_back() {
     let mut rig = rig(HOMING);
     home(&mut rig, 10_000);
-    // 12 s.
+    // A call takes 12 s.
     rig.bench.state().answer_ticks = 600_000_000;
     rig.run_until(20_000);
     rig.send_all(&["emergency_stop", "config_reset"]);

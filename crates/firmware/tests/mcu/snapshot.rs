@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the MCU tells of itself: levels, queues, what went over a bus, why it stopped.
+//! The MCU's report about itself: levels, queues, bus counts, and why it stopped.
 
 use pinion_firmware::board::{BusStatus, Pin};
 use pinion_firmware::mcu::{BusCounts, LineUse, Present, Snapshot};
@@ -27,7 +27,7 @@ fn levels_are_those_of_the_last_write_or_look() {
             "config_digital_out oid=0 pin=7 value=1 default_value=0 max_duration=0",
             "config_endstop oid=1 pin=6 pull_up=1",
             "set_digital_out pin=9 value=1",
-            // A line of a chip that sleeps.
+            // A line of a chip that may sleep.
             "config_digital_out oid=2 pin=200 value=0 default_value=0 max_duration=0",
         ]);
         assert_eq!(level(&rig, 7), (LineUse::Output, Some(true)));
@@ -55,7 +55,7 @@ fn levels_are_those_of_the_last_write_or_look() {
 fn why_it_stopped_comes_with_what_helps() {
     let mut rig = Rig::new();
     rig.send("emergency_stop");
-    // Which is how a FIRMWARE_RESTART begins.
+    // A FIRMWARE_RESTART begins this way.
     let detail = tell(&rig).detail.to_string();
     assert!(detail.starts_with("the host asked for it, by FIRMWARE_RESTART, M112 or"), "{detail}");
     let mut rig = Rig::configured(&["config_counter oid=0 pin=5 pull_up=0"]);
@@ -129,7 +129,7 @@ fn calls_to_lines_of_expanders_to_adcs_and_to_pwm_channels_are_counted() {
     let counts = |transfers, errors, retries| Some(BusCounts { transfers, errors, retries });
     let line = |pin| told.lines.iter().find(|line| line.pin == Pin(pin)).unwrap().bus;
     assert_eq!(line(200), counts(2, 1, 1));
-    // Two looks: three tries fail, then one.
+    // There are two looks. Three tries fail in the first, and one in the second.
     assert_eq!(line(201), counts(5, 4, 3));
     assert_eq!(line(6), None, "the core reads it");
     assert_eq!((told.objects[3].bus, told.objects[4].bus), (counts(3, 2, 2), counts(2, 1, 1)));

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! SPI and I2C by GPIO lines, as a host configures them. How bits go over the wires is tested where
-//! that is done, `crates/firmware/src/board/soft_spi.rs` and `soft_i2c.rs`.
+//! SPI and I2C on GPIO lines, as a host configures them. `crates/firmware/src/board/soft_spi.rs` and `soft_i2c.rs` test
+//! the bits on the wires.
 
 use pinion_firmware::board::{Bias, Direction};
 
@@ -25,10 +25,10 @@ fn spi_lines_are_driven_at_the_hosts_pace() {
     rig.bench.script_input(MISO, &[(0, 1)]);
     assert_eq!(rig.ask("spi_transfer oid=0 data=a5"), "spi_transfer_response oid=0 response=ff");
     let clock = rig.edges(SCLK);
-    // It idles for a pulse; each bit is low for a half, high for a half.
+    // It idles for a pulse. Each bit is low for a half, then high for a half.
     let expected: Vec<_> = (0..16).map(|n| (150 + 50 * n, u8::from(n % 2 == 0))).collect();
     assert_eq!(clock, expected);
-    // 1010 0101, each at its bit's beginning.
+    // 1010 0101, each bit at its beginning.
     assert_eq!(rig.edges(MOSI), [(150, 1), (250, 0), (350, 1), (450, 0), (650, 1), (750, 0), (850, 1)]);
     assert_eq!(rig.edges(CS), [(100, 0), (900, 1)]);
 }
@@ -41,7 +41,7 @@ fn chips_share_lines_and_keep_their_modes() {
             &[
                 "config_spi oid=2 pin=41 cs_active_high=1",
                 "spi_set_sw_bus oid=2 miso_pin=30 mosi_pin=31 sclk_pin=32 mode=3 pulse_ticks=10",
-                // A Dotstar's: nothing comes back.
+                // A Dotstar's lines: nothing comes back.
                 "config_spi_without_cs oid=3",
                 "spi_set_sw_bus oid=3 miso_pin=33 mosi_pin=33 sclk_pin=32 mode=0 pulse_ticks=10",
             ],
@@ -80,7 +80,7 @@ fn an_i2c_wire_is_an_open_drain_and_an_empty_bus_acknowledges_nothing() {
     let notes = rig.notes();
     let named = |note: &String| ["scl gpio50", "sda gpio51", "0x48", "wiring"].iter().all(|word| note.contains(word));
     assert!(notes.iter().any(named), "{notes:?}");
-    // The address is 1001 000, and 0 for a write: the clock has nine pulses, two more for start and stop.
+    // The address is 1001 000, then 0 for a write. The clock has nine pulses, and two more for start and stop.
     let rises = rig.edges(SCL).iter().filter(|(_, level)| *level == 1).count();
     assert_eq!(rises, 9 + 2);
 }

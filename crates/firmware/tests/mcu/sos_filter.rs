@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a host may say of a filter. Its arithmetic is tested beside it, and what comes out of it in
-//! `trigger_analog.rs`.
+//! The commands that a host may send to a filter. The filter's own file tests its arithmetic, and `trigger_analog.rs`
+//! its results.
 
 use pinion_testbench::rig::Rig;
 

@@ -24,12 +24,12 @@ fn a_transfer_has_the_devices_mode_and_rate_and_its_answer() {
     assert_eq!(rig.ask("spi_transfer oid=0 data="), "spi_transfer_response oid=0 response=");
     assert_eq!(rig.ask("spi_send oid=0 data=aa"), "");
     let transfer = |data: &[u8], read| Transfer { at: 0, bus: 1, mode: 3, rate_hz: 5_000_000, data: data.into(), read };
-    // What comes back for a `spi_send` is not read: a controller of one data line could not do both.
+    // The reply to a `spi_send` is not read: a controller with one data line could not do both.
     let expected = [transfer(&[0, 0xff, 0x0f], true), transfer(&[], true), transfer(&[0xaa], false)];
     assert_eq!(rig.bench.transfers(), expected);
 }
 
-/// What a worker does not take stays with its device, and commands do not wait for it.
+/// A transfer that no worker takes stays with its device. Commands do not wait for it.
 #[test]
 fn a_transfer_that_no_worker_takes_is_not_lost() {
     let mut rig = Rig::configured(&["config_spi_without_cs oid=0", "spi_set_bus oid=0 spi_bus=1 mode=3 rate=5000000"]);
@@ -66,7 +66,7 @@ fn a_device_gets_its_message_at_a_shutdown_and_says_nothing() {
             "config_spi oid=0 pin=40 cs_active_high=0",
             "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000",
             "config_spi_shutdown oid=1 spi_oid=0 shutdown_msg=deadbeef",
-            // Without a bus there is no one to tell.
+            // A device without a bus gets no message.
             "config_spi_without_cs oid=2",
             "config_spi_shutdown oid=3 spi_oid=2 shutdown_msg=01",
         ]);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Angle sensors: one entry each time one is due, on its bytes and with its time.
+//! Angle sensors: one entry each time one is due, from the sensor's bytes and with its time.
 
 use pinion_testbench::board::SPI_CHIPS;
 use pinion_testbench::rig::Rig;
@@ -27,7 +27,7 @@ fn rig(chip: u8, byte_ticks: u32, answer_ticks: u32) -> Rig {
     rig
 }
 
-/// What a sensor of each kind answers that stands at half a turn.
+/// The answers of each kind of sensor at half a turn.
 fn plug(rig: &Rig, chip: u8) {
     rig.bench.plug_spi(0, move |_, bytes| {
         let answer: &[u8] = match (chip, bytes.len()) {
@@ -57,12 +57,12 @@ fn entries(rig: &Rig) -> Vec<String> {
 
 #[test]
 fn each_sensor_is_asked_in_its_way_and_its_angle_told_with_its_time() {
-    // Half a turn is 0x8000, low byte first. With 10 ticks a byte and a shift of 2: a sensor that
-    // latches at the beginning is 0 late; the others by their bytes.
+    // Half a turn is 0x8000, low byte first. A byte takes 10 ticks, and the shift is 2. A sensor that latches at the
+    // beginning is 0 late. The others are late by their bytes.
     for (chip, words, entry) in [
         (A1333, vec!["3200"], "000080"),
         (AS5047D, vec!["7ffe", "c000"], "050080"),
-        // Its own clock.
+        // The entry has the chip's own clock.
         (TLE5012B, vec!["", "84230000000000000000"], "050080"),
         (MT6816, vec!["830000"], "080080"),
         (MT6826S, vec!["300300000000"], "0f0080"),
@@ -78,12 +78,12 @@ fn each_sensor_is_asked_in_its_way_and_its_angle_told_with_its_time() {
         assert_eq!(sent[..words.len()], words);
         assert_eq!(sent.len(), 17 * words.len());
         assert_eq!(entries(&rig), vec![entry; 17], "chip {chip}");
-        // Each word has the sensor selected.
+        // The sensor is selected once for each word.
         assert_eq!(rig.edges(CS).len(), 2 * 17 * words.len());
     }
 }
 
-/// The TLE5012B latches at the end of a pulse of 1 us on its select line, with no clock meanwhile.
+/// The TLE5012B latches at the end of a pulse of 1 us on its select line, without a clock meanwhile.
 #[test]
 fn a_tle5012b_is_selected_for_a_microsecond_before_it_is_read() {
     let mut rig = rig(TLE5012B, 0, 1);
@@ -114,7 +114,7 @@ fn messages_are_counted_from_zero_in_each_query() {
     }
 }
 
-/// klippy counts entries: one for each time that was due, however slow the bus is.
+/// klippy counts entries: one for each due time, however slow the bus is.
 #[test]
 fn what_there_was_no_time_for_is_an_entry_too() {
     let mut rig = rig(A1333, 0, 2400);
@@ -122,7 +122,7 @@ fn what_there_was_no_time_for_is_an_entry_too() {
     rig.send("query_spi_angle oid=1 clock=@1000 rest_ticks=1000 time_shift=4");
     rig.run_until(1000 + 1000 * 1700);
     let entries = entries(&rig);
-    // At most those are missing that are under way or in a message that is not full.
+    // The only missing entries are under way, or in a message that is not full.
     assert!((1700 - 20..=1700).contains(&entries.len()), "{}", entries.len());
     let overflows = entries.iter().filter(|entry| *entry == "ff0000").count();
     assert!(overflows * 10 > entries.len() * 5 && overflows * 10 < entries.len() * 7, "{overflows} overflows");
@@ -166,18 +166,18 @@ fn a_transfer_of_the_host_s_has_the_clock_of_its_latch() {
         let answer = rig.ask("spi_angle_transfer oid=1 data=8442");
         assert_eq!(answer, format!("spi_angle_transfer_response oid=1 clock=@{clock} response=5a5a"));
     }
-    // Too slow to tell.
+    // This transfer is too slow to tell a time.
     let mut slow = rig(MT6816, 0, 2501);
     let answer = slow.ask("spi_angle_transfer oid=1 data=8442");
     assert_eq!(answer, "spi_angle_transfer_response oid=1 clock=@0 response=");
-    // The TLE5012B's is the end of the empty transfer, with its microsecond, however long the next one takes.
+    // The TLE5012B's time is the end of the empty transfer with its microsecond, however long the next transfer takes.
     let mut tle = rig(TLE5012B, 0, 2501);
     plug(&tle, TLE5012B);
     let answer = tle.ask("spi_angle_transfer oid=1 data=84420000");
     assert_eq!(answer, "spi_angle_transfer_response oid=1 clock=@2551 response=01020304");
 }
 
-/// What a measurement latched is read before the host's transfer latches anew.
+/// A latched measurement is read before the host's transfer latches a new one.
 #[test]
 fn a_transfer_waits_for_the_measurement_under_way() {
     let mut rig = rig(TLE5012B, 0, 1000);
@@ -186,7 +186,7 @@ fn a_transfer_waits_for_the_measurement_under_way() {
     rig.run_until(1500);
     rig.begin("spi_angle_transfer oid=1 data=84420000");
     assert!(rig.mcu.is_held());
-    // Two latches of a microsecond each.
+    // There are two latches of a microsecond each.
     rig.run_until(5099);
     assert!(rig.mcu.is_held(), "commands wait for it");
     rig.run_until(5100);

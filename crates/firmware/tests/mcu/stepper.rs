@@ -10,7 +10,7 @@ use pinion_testbench::rig::Rig;
 const STEP: u32 = 1;
 const DIR: u32 = 2;
 
-// Direction 0, where a stepper starts, counts down: klippy asks for 1 to go forwards.
+// Direction 0 is the initial one and counts down. klippy uses 1 to go forwards.
 const PULSED: &str = "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=100";
 const BOTH_EDGES: &str = "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=100";
 
@@ -18,7 +18,7 @@ fn position(rig: &mut Rig) -> String {
     rig.ask("stepper_get_position oid=0")
 }
 
-/// Where the edges are, whatever their level.
+/// The times of the edges, whatever their levels.
 fn instants(edges: &[Edge]) -> Vec<u64> {
     edges.iter().map(|(at, _)| *at).collect()
 }
@@ -85,7 +85,7 @@ fn a_move_of_one_step_ignores_add() {
 
 #[test]
 fn steps_closer_than_the_pulse_are_pushed_back_and_none_is_lost() {
-    // A pulse takes 100 ticks and the pause after it as many.
+    // A pulse takes 100 ticks, and so does the pause after it.
     let mut rig = Rig::configured(&[PULSED]);
     rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=150 count=4 add=0"]);
     rig.run_until(100_000);
@@ -100,7 +100,7 @@ fn steps_closer_than_the_pulse_are_pushed_back_and_none_is_lost() {
         "queue_step oid=0 interval=1000 count=1 add=0",
     ]);
     rig.run_until(100_000);
-    // The last step is in its place again: pushed back steps shift no later one.
+    // The last step is on time again: steps that were pushed back do not shift later ones.
     assert_eq!(instants(&rig.edges(STEP)), [1000, 1100, 1200, 1300, 2090]);
 }
 
@@ -140,8 +140,8 @@ fn a_reversal_with_pulses_changes_the_direction_after_the_pulse_and_leaves_it_ti
         "queue_step oid=0 interval=5000 count=1 add=0",
     ]);
     rig.run_until(100_000);
-    // The direction changes with the falling edge of the last pulse; the step that was due 20
-    // ticks later waits for the rest of the 100.
+    // The direction changes with the falling edge of the last pulse. The next step was due 20 ticks later. It waits for
+    // the rest of the 100.
     assert_eq!(rig.edges(DIR), [(10_100, 1), (15_340, 0)]);
     assert_eq!(rising(&rig.edges(STEP)), [5000, 10_000, 10_200, 15_240, 20_240]);
     assert_eq!(position(&mut rig), "stepper_position oid=0 pos=-1");
@@ -225,7 +225,7 @@ fn a_trigger_keeps_the_position_in_the_middle_of_a_reverse_move() {
         rig.run_until(50_000);
         assert_eq!(rig.edges(STEP), []);
 
-        // Backwards and forwards from there; the direction is set anew.
+        // Backwards and forwards from there. The direction is set again.
         rig.send_all(&[
             "reset_step_clock oid=0 clock=@50000",
             "set_next_step_dir oid=0 dir=1",
@@ -270,7 +270,7 @@ fn moves_after_a_stop_are_dropped_until_the_clock_is_reset() {
         "stepper_stop_on_trigger oid=0 trsync_oid=1",
         "trsync_trigger oid=1 reason=3",
     ]);
-    // More than the queue takes: dropped moves hold no place in it.
+    // More moves than the queue has room for: dropped moves take no place in it.
     for _ in 0..2000 {
         rig.send("queue_step oid=0 interval=1000 count=10 add=0");
     }
@@ -353,7 +353,7 @@ fn a_move_after_a_long_pause_starts_on_its_tick() {
     {
         let mut rig = Rig::configured(&[PULSED]);
         rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=1000 count=1 add=0"]);
-        // The host sends the next move some 100 ms ahead of it.
+        // The host sends the next move about 100 ms ahead of it.
         rig.run_until(pause - 5_000_000);
         rig.edges(STEP);
         rig.send(&format!("queue_step oid=0 interval={} count=1 add=0", pause as u32));
@@ -364,13 +364,13 @@ fn a_move_after_a_long_pause_starts_on_its_tick() {
     }
 }
 
-/// The firmware compares clocks of 32 bits: a step that seems to lie in the past comes as soon as
-/// the pulse before it allows, and the one after it is counted from where it should have been.
+/// The firmware compares 32-bit clocks. A step that seems to lie in the past comes as soon as the pulse before it
+/// allows. The step after it is counted from the time when it should have come.
 #[test]
 fn an_interval_that_grows_past_half_the_clocks_range_looks_past() {
     const HALF: u64 = 1 << 31;
     const FIRST: u64 = HALF - 32_000;
-    // A step's earliest instant is a pulse of 100 ticks after the one before.
+    // The earliest time of a step is a pulse of 100 ticks after the step before.
     for (second, expected) in [(HALF + 99, [FIRST, FIRST + HALF + 99]), (HALF + 100, [FIRST, FIRST + 100])] {
         let mut rig = Rig::configured(&[BOTH_EDGES]);
         rig.send("reset_step_clock oid=0 clock=@0");
@@ -388,13 +388,12 @@ fn intervals_past_half_the_clocks_range_do_not_stall_a_move() {
     rig.send("reset_step_clock oid=0 clock=@0");
     rig.send(&format!("queue_step oid=0 interval={FIRST} count=7 add=1000"));
     rig.run_until(20 << 31);
-    // Two of the long intervals are a whole turn of the clock and a little more: every other
-    // step comes in its place again.
+    // Two of the long intervals are a whole turn of the clock and a little more. So every other step is on time again.
     let (third, fifth, seventh) = (FIRST + 2800, FIRST + 9600, FIRST + 20_400);
     assert_eq!(instants(&rig.edges(STEP)), [FIRST, FIRST + 100, third, third + 100, fifth, fifth + 100, seventh]);
     assert_eq!(position(&mut rig), "stepper_position oid=0 pos=-7");
 
-    // A move that begins so late is refused.
+    // A move that begins this late is refused.
     let mut rig = Rig::configured(&[BOTH_EDGES]);
     rig.send_all(&[
         "reset_step_clock oid=0 clock=@0",
@@ -425,7 +424,7 @@ fn steps_that_are_far_behind_are_caught_up_with_a_pulse_apart_and_then_come_on_t
     assert_eq!((gap(&instants(&pulsed)), gap(&both)), (Some(100), Some(100)), "{pulsed:?} {both:?}");
     let late: Vec<u64> = rising(&pulsed).into_iter().filter(|at| at % 5000 != 0).collect();
     assert_eq!(late.len(), 7, "{late:?}");
-    // The reversal comes after the eighth step and before the ninth, of either.
+    // For both steppers, the reversal comes after the eighth step and before the ninth.
     for (dir, steps) in [(DIR, rising(&pulsed)), (4, both.clone())] {
         let [(reversed, 1)] = rig.edges(dir)[..] else { panic!("{:?}", rig.edges(dir)) };
         assert!(steps[7] < reversed && reversed + 100 <= steps[8], "{steps:?} {reversed}");
@@ -436,7 +435,7 @@ fn steps_that_are_far_behind_are_caught_up_with_a_pulse_apart_and_then_come_on_t
 
 #[test]
 fn a_long_pulse_keeps_nothing_else_waiting() {
-    // Edges are 1 ms apart at least, and a step is asked for every 1.5 ms.
+    // Edges are at least 1 ms apart, and a step is due every 1.5 ms.
     let mut rig = Rig::configured(&[
         "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=50000",
         "config_digital_out oid=1 pin=5 value=0 default_value=0 max_duration=0",
@@ -460,8 +459,8 @@ fn a_move_goes_on_after_a_stall_of_150_ms() {
     assert_eq!((rig.shutdown(), rising(&rig.edges(STEP)).len()), (None, 400));
 }
 
-/// Three steppers of 100,000 steps a second each with pulses of 3 us: the pulses of all take 90 % of the time if each
-/// waits for the others'. Edges that overlap catch up.
+/// Three steppers make 100,000 steps per second each, with pulses of 3 us. If each waits for the others' pulses, all
+/// pulses take 90 % of the time. Edges that overlap catch up.
 #[test]
 fn a_print_catches_up_after_a_short_stall() {
     const STEPPERS: u32 = 3;
@@ -492,13 +491,13 @@ fn a_print_catches_up_after_a_short_stall() {
         let steps = rising(&rig.edges(2 * n + 1));
         assert_eq!(steps.len() as u64, STEPS, "stepper {n}");
         let due = |step: u64| u64::from(n) * INTERVAL / 3 + (step + 1) * INTERVAL;
-        // On time again within 3 ms, give or take the calls for the other steppers.
+        // All steps are on time again within 3 ms, give or take the calls for the other steppers.
         let late = steps.iter().zip(0..).filter(|(at, step)| **at > due(*step) + 150 && due(*step) > 190_000);
         assert_eq!(late.count(), 0, "stepper {n}");
     }
 }
 
-/// A pulse of five seconds, one edge of it, a stop: what comes then does not wait for the pulse.
+/// A pulse takes five seconds. After one edge of it and a stop, the next edge does not wait for the pulse.
 #[test]
 fn no_wait_is_longer_than_a_short_pulse() {
     for (invert_step, edges) in [(0, &[(1000, 1), (2000, 0), (6000, 1)][..]), (-1, &[(1000, 1), (6000, 0)])] {
@@ -529,7 +528,7 @@ fn no_wait_is_longer_than_a_short_pulse() {
     }
 }
 
-/// Whoever asks, the core itself waits no longer than that.
+/// The core itself never waits longer than this.
 #[test]
 fn the_core_waits_for_50_us_at_most() {
     let mut rig = Rig::configured(&[]);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Thermocouple converters: read in intervals, and an MCU that stops when they tell nothing good.
+//! Thermocouple converters are read at intervals, and bad readings stop the MCU.
 
 use std::sync::{Arc, Mutex};
 
@@ -11,11 +11,11 @@ const MAX31856: u8 = 1;
 const MAX31865: u8 = 2;
 const MAX6675: u8 = 3;
 
-/// Asked every 10000 ticks from 1000 on; three bad values in a row stop the MCU.
+/// Reads every 10000 ticks from 1000 on. Three bad values in a row stop the MCU.
 const QUERY: &str =
     "query_thermocouple oid=1 clock=@1000 rest_ticks=10000 min_value=100 max_value=4294967040 max_invalid_count=3";
 
-/// A chip that takes `answer_ticks` for a conversation and answers each transfer by `chip`.
+/// A chip that takes `answer_ticks` for a conversation. `chip` answers each transfer.
 fn rig(kind: u8, answer_ticks: u32, mut chip: impl FnMut(&mut [u8]) + Send + 'static) -> Rig {
     let mut rig = Rig::new();
     rig.bench.state().answer_ticks = answer_ticks;
@@ -59,7 +59,7 @@ fn what_is_sent_to_a_chip_and_what_is_told() {
         assert_eq!(rig.responses(), [reading(11_000, value, fault)]);
         let transfers: Vec<Vec<u8>> = rig.bench.transfers().into_iter().map(|transfer| transfer.data).collect();
         assert_eq!(transfers, sent);
-        // Each message is one selection of the chip.
+        // The chip is selected once for each message.
         assert_eq!(rig.edges(40).len(), 2 * sent.len());
     }
 }
@@ -73,7 +73,7 @@ fn with_word(answer_ticks: u32, word: u16) -> (Rig, Arc<Mutex<u16>>) {
 
 #[test]
 fn the_third_bad_value_in_a_row_stops_the_mcu() {
-    // Below the range; a fault bit.
+    // One value is below the range, the other has a fault bit.
     for (bad, fault) in [(96, 0), (404, 4)] {
         let (mut rig, word) = with_word(0, 400);
         rig.send(QUERY);
@@ -81,7 +81,7 @@ fn the_third_bad_value_in_a_row_stops_the_mcu() {
         let set = |value: u16| *word.lock().unwrap() = value;
         set(bad);
         rig.run_until(21_000);
-        // One good one, and the count begins anew.
+        // After one good value, the count begins again.
         set(400);
         rig.run_until(31_000);
         set(bad);
@@ -140,7 +140,7 @@ fn an_answer_to_an_earlier_query_is_not_told() {
     rig.send(&QUERY.replace("@1000", "@8000"));
     rig.run_until(12_000);
     assert_eq!(rig.responses(), [reading(18_000, 400, 0)]);
-    // Nor after a stop.
+    // There is none after a stop either.
     rig.run_until(19_000);
     rig.send("emergency_stop");
     rig.run_until(100_000);

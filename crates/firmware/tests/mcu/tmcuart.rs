@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The UART of stepper drivers, on one wire and on two, with a driver played by the test.
+//! The UART of stepper drivers, on one wire and on two. The test plays the driver.
 
 use pinion_firmware::board::{Bias, Direction};
 use proptest::prelude::*;
@@ -11,14 +11,14 @@ const TX: u32 = 10;
 const RX: u32 = 11;
 /// 40 kbaud.
 const BIT: u64 = 1250;
-/// From the command to the first edge.
+/// Quiet time from the command to the first edge.
 const QUIET: u64 = 10_000;
 
 const ONE_WIRE: &str = "config_tmcuart oid=0 rx_pin=10 pull_up=1 tx_pin=10 bit_time=1250";
 const TWO_WIRES: &str = "config_tmcuart oid=0 rx_pin=11 pull_up=0 tx_pin=10 bit_time=1250";
 
-/// Bytes with a start bit (0) and a stop bit (1) each, lowest bit first, as `_add_serial_bits` of
-/// klippy's tmc_uart.py has them.
+/// Bytes with a start bit (0) and a stop bit (1) each, lowest bit first, like `_add_serial_bits` of klippy's
+/// tmc_uart.py.
 fn with_serial_bits(message: &[u8]) -> Vec<u8> {
     let mut bits = Vec::new();
     for byte in message {
@@ -29,8 +29,7 @@ fn with_serial_bits(message: &[u8]) -> Vec<u8> {
     bits.chunks(8).map(|bits| bits.iter().rev().fold(0, |byte, bit| byte << 1 | u8::from(*bit))).collect()
 }
 
-/// What a UART hears, by a receiver of its own: it waits for a falling edge and looks at each bit's
-/// middle.
+/// The bytes that a UART hears. This receiver waits for a falling edge and reads each bit in its middle.
 fn hear(edges: &[Edge], bit: u64) -> Vec<u8> {
     let level = |at: u64| edges.iter().rev().find(|(from, _)| *from <= at).is_none_or(|(_, level)| *level != 0);
     let mut heard = Vec::new();
@@ -44,7 +43,7 @@ fn hear(edges: &[Edge], bit: u64) -> Vec<u8> {
     heard
 }
 
-/// The levels of a driver that says this from an instant on, with bits of its own length.
+/// The levels of a driver that sends this message from a given time on, with bits of its own length.
 fn speak(message: &[u8], from: u64, bit: f64) -> Vec<Edge> {
     let mut levels = vec![(0, 1)];
     for (byte, n) in message.iter().zip(0u32..) {
@@ -68,14 +67,14 @@ const READ_IFCNT: &[u8] = &[0xf5, 0x00, 0x02, 0xc8];
 const IFCNT: &[u8] = &[0x05, 0xff, 0x02, 0x00, 0x00, 0x00, 0x07, 0xe2];
 
 proptest! {
-    /// A message of several drivers' rates: it arrives, and is answered when its last stop bit is over.
+    /// A message at the rates of several drivers arrives. The answer comes when its last stop bit is over.
     #[test]
     fn any_bytes_arrive(message in proptest::collection::vec(any::<u8>(), 1..=8), one_wire: bool, bit in 100u64..6000) {
         let rx = if one_wire { TX } else { RX };
         let mut rig = Rig::configured(&[&format!("config_tmcuart oid=0 rx_pin={rx} pull_up=0 tx_pin={TX} bit_time={bit}")]);
         rig.bench.forget_edges();
         rig.send(&send(&message, 0));
-        // The answer comes once the padding of the last byte is out, too.
+        // The answer also waits for the padding of the last byte.
         let bits = with_serial_bits(&message).len() as u64 * 8;
         rig.run_until(QUIET + bits * bit - 1);
         prop_assert_eq!(rig.responses(), [""; 0]);
@@ -84,20 +83,20 @@ proptest! {
         let edges = rig.edges(TX);
         prop_assert_eq!(edges[0], (QUIET, 0));
         prop_assert!(edges.iter().all(|(at, _)| (at - QUIET).is_multiple_of(bit)), "{:?}", edges);
-        // Bits of padding in the last byte are low, and a UART takes them for another byte.
+        // Padding bits in the last byte are low, and a UART takes them for another byte.
         let heard = hear(&edges, bit);
         prop_assert_eq!(&heard[..message.len()], &message[..]);
         prop_assert!(rig.bench.level(TX));
     }
 
-    /// A reply is read wherever its start bit lies, and from a driver whose clock is off by 4 %.
+    /// A reply is read wherever its start bit lies, even if the driver's clock is off by 4 %.
     #[test]
     fn a_reply_arrives(
         message: [u8; 8], wait in 0u64..60 * BIT, off in 0.96..1.04f64, one_wire: bool,
     ) {
         let (config, rx) = if one_wire { (ONE_WIRE, TX) } else { (TWO_WIRES, RX) };
         let mut rig = Rig::configured(&[config]);
-        // Four bits of silence, in which the firmware does not listen.
+        // Four bits of silence: the firmware does not listen then.
         let from = QUIET + 44 * BIT + wait + 200;
         rig.bench.script_input(rx, &speak(&message, from, BIT as f64 * off));
         rig.send(&send(READ_IFCNT, 10));
@@ -108,8 +107,8 @@ proptest! {
 }
 
 proptest! {
-    /// A glitch shorter than half a bit, before the reply or in the stop bit between two bytes, is no start
-    /// bit.
+    /// A glitch shorter than half a bit is no start bit. It may come before the reply, or in the stop bit between two
+    /// bytes.
     #[test]
     fn a_glitch_starts_no_byte(
         message: [u8; 8], at in 20u64..60 * BIT, width in 100u64..BIT / 2 - 80, gap in 0u64..BIT / 16,
@@ -119,7 +118,7 @@ proptest! {
         let reply = from + at + width + BIT;
         let mut levels = speak(&message, reply, BIT as f64);
         levels.extend([(from + at, 0), (from + at + width, 1)]);
-        // In the stop bit of the third byte, behind its middle, where the driver pauses for a moment.
+        // In the stop bit of the third byte, after its middle. The driver pauses there for a moment.
         let stop = reply + 29 * BIT;
         let glitch = stop + 5 * BIT / 8 + gap;
         levels.retain(|(at, _)| *at <= stop);
@@ -145,7 +144,7 @@ fn a_glitch_alone_is_no_reply() {
 
 #[test]
 fn serial_bits_are_klippys() {
-    // What klippy's _encode_read(0xf5, 0, 2) sends.
+    // The bytes of klippy's _encode_read(0xf5, 0, 2).
     assert_eq!(with_serial_bits(READ_IFCNT), [0xea, 0x03, 0x48, 0x20, 0xe4]);
 }
 
@@ -175,15 +174,14 @@ fn without_a_reply_the_answer_is_empty() {
         assert_eq!(rig.responses(), [""; 0], "{what}");
         rig.run_until(end + BIT);
         assert_eq!(rig.responses(), [response(&[])], "{what}");
-        // And it is asked again.
+        // The UART can be asked again.
         rig.send(&send(READ_IFCNT, 10));
         rig.run_until(1_000_000);
         assert_eq!(rig.responses(), [response(&[])], "{what}");
     }
 }
 
-/// Where a write takes its time, the driver takes a bit to be longer; where each takes the same, it is
-/// not.
+/// If only one write is slow, the driver takes a bit for longer. If all writes are equally slow, it does not.
 #[test]
 fn a_message_arrives_over_slow_lines() {
     for write_ticks in [50, 600] {
@@ -209,7 +207,7 @@ fn rubbish_is_passed_on_for_klippy_to_refuse() {
 fn who_is_busy_does_not_listen() {
     let mut rig = Rig::configured(&[TWO_WIRES]);
     rig.send(&send(&[1, 2, 3], 0));
-    // Before the first edge, and amid the message.
+    // One before the first edge, one during the message.
     rig.send(&send(&[4], 0));
     rig.run_until(QUIET + 3 * BIT);
     rig.send(&send(&[5], 0));
@@ -257,7 +255,7 @@ fn a_shutdown_leaves_the_line_high_and_says_nothing_more() {
         assert_eq!(rig.responses(), [""; 0]);
         assert!(rig.bench.level(TX) && !rig.mcu.owes());
         assert!(matches!(rig.bench.state().directions[&TX], Direction::Output { level: true, .. }));
-        // And it is there for the next configuration.
+        // The UART works in the next configuration.
         rig.send("config_reset");
         rig.configure(&[TWO_WIRES]);
         rig.edges(TX);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Homing by the values of a sensor: an analog input, sampled every 10000 ticks from tick 100000 on,
-//! with a stepper that stops on the trigger.
+//! Homing with the values of a sensor: an analog input, sampled every 10000 ticks from tick 100000 on. A stepper stops
+//! on the trigger.
 
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::rig::Rig;
@@ -23,7 +23,7 @@ fn read(rig: &mut Rig, values: &[u16]) {
     rig.send("query_analog_in oid=2 clock=@100000 sample_ticks=0 sample_count=1 rest_ticks=10000 bytes_per_report=2 min_value=0 max_value=65535 range_check_count=0");
 }
 
-/// Homes from `clock` on: reason 1 for a trigger, 40 and what follows for errors.
+/// Homes from `clock` on. The reason is 1 for a trigger, and 40 or more for errors.
 fn home(rig: &mut Rig, clock: u64) {
     rig.send_all(&[
         "trsync_start oid=1 report_clock=@0 report_ticks=0 expire_reason=2",
@@ -35,7 +35,7 @@ fn home(rig: &mut Rig, clock: u64) {
     rig.send(&format!("trigger_analog_home oid=4 trsync_oid=1 trigger_reason=1 error_reason=40 {clock}"));
 }
 
-/// An MCU that homes as values come in: those of the ADC less `offset`.
+/// An MCU that homes while values come in: the values of the ADC minus `offset`.
 fn homing(offset: i32, trigger_type: u8, trigger_value: i32, values: &[u16]) -> Rig {
     let mut rig = Rig::configured(OBJECTS);
     rig.send_all(&[
@@ -49,7 +49,7 @@ fn homing(offset: i32, trigger_type: u8, trigger_value: i32, values: &[u16]) -> 
     rig
 }
 
-/// Runs for twenty samples, and tells the reason and the instant of the trigger, if it came.
+/// Runs for twenty samples. Returns the reason and the time of the trigger, if it came.
 fn triggered(rig: &mut Rig) -> Option<(u8, u64)> {
     rig.edges(1);
     rig.run_until(300_000);
@@ -72,12 +72,12 @@ fn the_enumerations_are_klippers() {
 
 #[test]
 fn each_type_triggers_at_its_value() {
-    // Values less 1000; the index of the sample that triggers.
+    // Values minus 1000, and the index of the sample that triggers.
     let cases: &[(u8, i32, &[u16], Option<u64>)] = &[
         (ABS_GE, 100, &[1000, 1099, 901, 1100, 1000], Some(3)),
         (ABS_GE, 100, &[1000, 1099, 901, 900, 1000], Some(3)),
         (ABS_GE, 0, &[1000], Some(0)),
-        // A negative value is one beyond all numbers.
+        // A negative trigger value is beyond all numbers.
         (ABS_GE, -1, &[1000, 3000, 10], None),
         (GT, 100, &[1000, 900, 1100, 1101], Some(3)),
         (GT, -100, &[900, 899, 901], Some(2)),
@@ -95,7 +95,7 @@ fn each_type_triggers_at_its_value() {
     }
 }
 
-/// A type that nothing triggers by would let a probe run into the bed.
+/// A type that never triggers would let a probe run into the bed.
 #[test]
 fn a_type_that_the_dictionary_does_not_have_is_refused() {
     let mut rig = homing(1000, GT, 100, &[1000]);
@@ -112,7 +112,7 @@ fn samples_before_the_homing_clock_count_for_nothing() {
         "trigger_analog_set_raw_range oid=4 raw_min=0 raw_max=4000",
         "trigger_analog_set_trigger oid=4 trigger_analog_type=1 trigger_value=500",
     ]);
-    // Out of range, above, above; then homing begins with the sample of its very instant.
+    // One sample is out of range, two are above the trigger. Then homing begins with the sample of exactly this time.
     read(&mut rig, &[4001, 600, 600, 400, 600]);
     home(&mut rig, 130_000);
     assert_eq!(triggered(&mut rig), Some((1, 140_000)));
@@ -138,7 +138,7 @@ fn a_sample_out_of_range_ends_homing_with_its_error() {
     for value in [9, 4001] {
         let mut rig = homing(0, GT, 3999, &[10, 3999, value, 4000]);
         assert_eq!(triggered(&mut rig), Some((40, 120_000)), "{value}");
-        // The instant of homing stays: nothing was hit.
+        // The time of homing stays, because nothing was hit.
         let state = rig.ask("trigger_analog_query_state oid=4");
         assert_eq!(state, "trigger_analog_state oid=4 homing=0 homing_clock=@95000");
     }
@@ -157,7 +157,7 @@ fn a_sensor_that_falls_silent_ends_homing_with_its_error() {
     let mut rig = homing(0, GT, 4000, &[1000]);
     rig.run_until(151_000);
     rig.send("query_analog_in oid=2 clock=@0 sample_ticks=0 sample_count=0 rest_ticks=0 bytes_per_report=0 min_value=0 max_value=0 range_check_count=0");
-    // The last sample was at 150000; the monitor looks at 155000, and its fourth look after that is too much.
+    // The last sample was at 150000. The monitor looks at 155000. Its fourth look after that is one too many.
     assert_eq!(triggered(&mut rig), Some((42, 195_000)));
 }
 
@@ -170,7 +170,7 @@ fn a_sensor_that_is_not_there_ends_homing_too() {
 
 #[test]
 fn values_go_through_the_active_sections_and_a_section_that_is_set_anew_through_none() {
-    // The difference of two samples; klippy's derivative filter.
+    // The difference of two samples: klippy's derivative filter.
     let derivative = [
         "sos_filter_set_section oid=3 section_idx=0 sos0=1 sos1=-1 sos2=0 sos3=0 sos4=0",
         "sos_filter_set_state oid=3 section_idx=0 state0=0 state1=0",
@@ -184,7 +184,7 @@ fn values_go_through_the_active_sections_and_a_section_that_is_set_anew_through_
     let mut rig = homing(0, GT, 50, &values);
     rig.send_all(&derivative);
     rig.send(derivative[1]);
-    // Without it, the offset of the first sample is all that is left.
+    // Without the section, only the offset of the first sample is left.
     assert_eq!(triggered(&mut rig), Some((1, 120_000)));
 }
 
