@@ -12,11 +12,11 @@ use serde_json::{Value, json};
 
 use pinion_testkit::process;
 
-/// Longer than a boot, or a test, takes on a busy computer.
+/// Longest silence: more than a boot, or a test, takes on a busy computer.
 pub const SILENCE_MAX: Duration = Duration::from_secs(180);
 const POLL_INTERVAL: Duration = Duration::from_millis(10);
 
-/// Ends when this is dropped.
+/// It ends when this is dropped.
 pub struct Emulator {
     qemu: Child,
     input: ChildStdin,
@@ -25,7 +25,7 @@ pub struct Emulator {
 }
 
 impl Emulator {
-    /// Runs the command, with what it and the VM say in files of the folder.
+    /// Runs the command. The output of the command and of the VM goes to files of the folder.
     pub fn start(mut vm: Command, folder: &Path) -> Result<Emulator, String> {
         vm.arg("-serial").arg(format!("file:{}", folder.join("console").display())).args(["-qmp", "stdio"]);
         let (qemu, input, output) = process::start_emulator(&mut vm, folder)?;
@@ -35,24 +35,23 @@ impl Emulator {
         Ok(emulator)
     }
 
-    /// Has the emulator's main thread run before the one that is the processor, whenever it has
-    /// something to do: both are on one processor of ours (see `at_once`). The main thread passes
-    /// the time when the guest idles. Should it wake at the moment in which the guest begins to,
-    /// instructions that are not accounted for yet would come on top of the time passed, up to
-    /// microseconds of them, and a run would not be the same twice.
+    /// Makes the emulator's main thread run before its processor thread, whenever the main thread has work. Both are on
+    /// one processor of the computer (see `at_once`). The main thread advances the time while the guest is idle. It may
+    /// wake at the moment when the guest becomes idle. Instructions that are not yet accounted for would then be added
+    /// to the passed time: up to several microseconds. Two runs would then not be the same.
     fn settle_order(&self) {
         let mut chrt = Command::new("chrt");
-        // Of this one thread: -R keeps it from those that it begins.
+        // Only for this thread: -R excludes the threads that it starts.
         chrt.args(["-R", "-f", "-p", "1", &self.qemu.id().to_string()]);
         if let Err(cause) = process::run(&mut chrt) {
             eprintln!("figures may differ from one run to the next in the fourth digit: {cause}");
         }
     }
 
-    /// Gives the monitor a command, and returns its answer.
+    /// Sends a command to the monitor, and returns its answer.
     pub fn ask(&mut self, command: Value) -> Result<Value, String> {
         let failed = |cause: String, emulator: &Emulator| format!("{command}: {cause}\n{}", emulator.said());
-        // In one piece: the monitor quits at the last brace, before a line's end that comes after.
+        // In one piece: the monitor quits at the last brace, before a line end that comes later.
         let line = format!("{command}\n");
         self.input.write_all(line.as_bytes()).map_err(|error| failed(error.to_string(), self))?;
         loop {
@@ -72,7 +71,7 @@ impl Emulator {
         }
     }
 
-    /// Waits until the VM has come to this state, one of QMP's `RunState`.
+    /// Waits until the VM is in this state, one of QMP's `RunState`.
     pub fn wait_until(&mut self, reached: impl Fn(&str) -> bool) -> Result<(), String> {
         let started = Instant::now();
         loop {
@@ -88,17 +87,17 @@ impl Emulator {
         }
     }
 
-    /// Its status, if it has ended.
+    /// Its status; `None` if it has not ended.
     pub fn ended(&mut self) -> Result<Option<ExitStatus>, String> {
         self.qemu.try_wait().map_err(|error| error.to_string())
     }
 
-    /// What the VM has written to its console.
+    /// The VM's console output.
     pub fn console(&self) -> String {
         self.read("console")
     }
 
-    /// All that the VM and the emulator have said.
+    /// The whole output of the VM and the emulator.
     pub fn said(&self) -> String {
         format!("--- console\n{}\n--- emulator\n{}", self.console(), self.read("qemu"))
     }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The test program that runs in the guest: cargo's test target `kernel_guest`, with
-//! `pinion` itself, other programs to be measured, and the libraries that they need.
+//! The test program for the guest: cargo's test target `kernel_guest`, with `pinion` itself, other programs to measure,
+//! and their libraries.
 
 use std::env;
 use std::ffi::OsStr;
@@ -13,10 +13,10 @@ use std::str::FromStr;
 use pinion_testkit::initramfs::Archive;
 use pinion_testkit::process;
 
-/// Programs of the host that busybox has no equivalent of.
+/// Programs of the computer without an equivalent in busybox.
 const HOST_PROGRAMS: [&str; 1] = ["/usr/bin/chrt"];
 
-/// A micro-controller program of the host that is measured beside Pinion.
+/// An MCU program of the computer that is measured in addition to Pinion.
 pub struct OtherProgram {
     pub name: String,
     path: PathBuf,
@@ -24,12 +24,12 @@ pub struct OtherProgram {
 }
 
 impl OtherProgram {
-    /// Where the guest has it.
+    /// Its path in the guest.
     fn path_inside(&self) -> String {
         format!("/tests/programs/{}", self.name)
     }
 
-    /// How the guest starts it, with words between spaces.
+    /// The guest's command for it, with words between spaces.
     pub fn command(&self) -> String {
         format!("{} {}", self.path_inside(), self.arguments)
     }
@@ -55,7 +55,7 @@ pub struct GuestProgram<'a> {
 }
 
 impl<'a> GuestProgram<'a> {
-    /// Has cargo build it, in the profile that this harness was built in.
+    /// Builds it with cargo, in the profile of this harness.
     pub fn build(others: &'a [OtherProgram]) -> Result<GuestProgram<'a>, String> {
         let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
         cargo.current_dir(env!("CARGO_MANIFEST_DIR"));
@@ -81,8 +81,8 @@ impl<'a> GuestProgram<'a> {
         Ok(list.lines().filter_map(|line| line.strip_suffix(": test")).map(str::to_owned).collect())
     }
 
-    /// The second part of the guest's root folder: init and the programs, with
-    /// their libraries at the paths where the host's loader looks for them.
+    /// The second part of the guest's root folder: init and the programs. Their libraries are at the paths of the
+    /// computer's loader.
     pub fn payload(&self) -> Result<Vec<u8>, String> {
         let stripped = tempfile::tempdir().map_err(|error| error.to_string())?;
         let mut archive = Archive::default();
@@ -106,7 +106,7 @@ impl<'a> GuestProgram<'a> {
         Ok(archive.finish())
     }
 
-    /// Changes with everything that the payload is made of.
+    /// Changes with everything that makes the payload.
     pub fn hash_files(&self, hasher: &mut impl Hasher) -> Result<(), String> {
         for source in [include_str!("guest_program.rs"), pinion_testkit::initramfs::SOURCE, include_str!("init.sh")] {
             source.hash(hasher);
@@ -115,7 +115,7 @@ impl<'a> GuestProgram<'a> {
         for path in self.programs().into_iter().chain(libraries.iter().map(Path::new)) {
             let describe = |error| format!("cannot read {}: {error}", path.display());
             let metadata = fs::metadata(path).map_err(describe)?;
-            // cargo and dpkg write a file anew: none changes without this.
+            // cargo and dpkg replace a file, so no file changes without a change of these values.
             (path, metadata.len(), metadata.modified().map_err(describe)?).hash(hasher);
         }
         Ok(())
@@ -131,7 +131,7 @@ fn pinion() -> &'static Path {
     Path::new(env!("CARGO_BIN_EXE_pinion"))
 }
 
-/// The paths that the loader finds, itself among them.
+/// The paths that the loader finds, including the loader's own.
 fn libraries(programs: &[&Path]) -> Result<Vec<String>, String> {
     let mut libraries = Vec::new();
     for program in programs {

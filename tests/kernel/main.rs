@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The suite on kernel drivers: the tests of `tests/kernel/guest`, run against real kernel drivers in a
-//! VM, on each kernel flavour. docs/develop/test-kernel.md tells how to use it.
+//! The suite on kernel drivers. It runs the tests of `tests/kernel/guest` against real kernel drivers in a VM, on each
+//! kernel flavor. docs/develop/test-kernel.md explains its use.
 //!
-//! This is the host's side, a test harness of its own. It builds what the
-//! VMs boot, lists the tests that the guest binary holds, shares each flavour's
-//! among a few VMs, and prints each test by name as libtest does.
+//! This is the computer's side, a separate test harness. It builds the VMs' boot files and lists the tests of the guest
+//! binary. It distributes each flavor's tests to a few VMs, and prints each test by name as libtest does.
 
 mod emulator;
 mod guest_program;
@@ -29,16 +28,15 @@ use report::Report;
 use snapshot::Snapshot;
 use vm::Run;
 
-/// A failed run exits as libtest's do.
+/// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
-/// So many at most in one VM. To start one costs as much as some tests; with
-/// more VMs than processors none of those is idle while another has half of
-/// the work left.
+/// Highest number of tests in one VM. The start of a VM takes as long as several tests. With more VMs than processors,
+/// no processor is idle while another one has half of its work left.
 const TESTS_IN_A_VM: usize = 32;
 
-/// Tests whose figures are to be compared with those of another run, or of another program: they
-/// have a VM for themselves, so that they do not depend on what ran there before.
+/// Tests with figures that are compared with another run or another program. They have their own VM, so that their
+/// figures do not depend on earlier tests.
 const FIGURES: &str = "figures::";
 
 fn main() -> ExitCode {
@@ -52,7 +50,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Whether every selected test passed; an error is the suite's own failure.
+/// Whether every selected test passed. An error is the suite's own failure.
 fn run(options: &Options) -> Result<bool, String> {
     let program = GuestProgram::build(&options.programs)?;
     if options.shell {
@@ -79,7 +77,7 @@ fn run(options: &Options) -> Result<bool, String> {
     Ok(report.finish())
 }
 
-/// The VMs' runs, and how many tests were not selected.
+/// The VMs' runs, and the number of tests that were not selected.
 fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
     let (figures, others): (Vec<_>, Vec<_>) = tests.into_iter().partition(|test| test.starts_with(FIGURES));
     let mut runs = Vec::new();
@@ -91,7 +89,7 @@ fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
                 tests.iter().partition(|test| options.selects(flavour, &whole.name_of(test)));
             filtered_out += left_out.len();
             let vms = selected.len().div_ceil(in_a_vm);
-            // By turns: the tests of one file take alike, and may be the longest.
+            // In turn: the tests of one file take about the same time, and may be the longest.
             runs.extend((0..vms).map(|vm| {
                 let tests = selected.iter().skip(vm).step_by(vms).map(|test| (*test).clone()).collect();
                 Run { flavour, program, tests }
@@ -121,7 +119,7 @@ fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -
         }
         at_once(&kernels, kernels.len(), |kernel| Snapshot::prepare(kernel, program, &cache))?
     };
-    // The slower kernel's first.
+    // The slower kernel first.
     let order: Vec<&Run<'_>> = runs.iter().rev().collect();
     let report = Mutex::new(report);
     // A VM emulates one processor.
@@ -133,9 +131,9 @@ fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -
     .map(drop)
 }
 
-/// What the function makes of each item, in their order; so many threads take the next one when
-/// they are done with the one before. Each stays on a processor, and so do the threads of the
-/// emulators that it starts: `Emulator` tells why.
+/// Applies the function to the items, and returns the results in their order. This many threads each take the next item
+/// when they are done. Each thread stays on one processor, and so do the threads of its emulators. `Emulator` explains
+/// the reason.
 fn at_once<T: Sync, R: Send>(
     items: &[T],
     threads: usize,
@@ -165,8 +163,7 @@ fn at_once<T: Sync, R: Send>(
     Ok(done.into_iter().map(|(_, result)| result).collect())
 }
 
-/// Keeps this thread on the n-th of the processors that it may use, or on one of them if there are
-/// fewer.
+/// Keeps this thread on the n-th of its allowed processors, or on one of them if there are fewer.
 fn stay_on_processor(number: usize) -> Result<(), String> {
     let me = Pid::from_raw(0);
     let choose = |allowed: CpuSet| {

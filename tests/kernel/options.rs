@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The command line: libtest's as far as it makes sense here, and the suite's own.
+//! The command line: the useful part of libtest's options, and the suite's own.
 
 use std::env;
 use std::process;
@@ -24,7 +24,7 @@ Options:
                      host, too: one that takes the options of Klipper's linux MCU
   --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
 
-/// What to run, and how.
+/// The selected tests and the way to run them.
 #[derive(Default)]
 pub struct Options {
     filters: Vec<String>,
@@ -39,7 +39,7 @@ pub struct Options {
 }
 
 impl Options {
-    /// Exits on a mistake, and for `--help`.
+    /// Exits after an error, and for `--help`.
     pub fn from_args() -> Options {
         Options::parse(env::args().skip(1)).unwrap_or_else(|mistake| {
             eprintln!("{mistake}\n\n{USAGE}");
@@ -49,7 +49,7 @@ impl Options {
 
     fn parse(args: impl Iterator<Item = String>) -> Result<Options, String> {
         let mut options = Options::default();
-        // `--name=value` and `--name value` are the same.
+        // `--name=value` and `--name value` mean the same.
         let mut args = args.flat_map(|arg| match arg.split_once('=') {
             Some((name, value)) if name.starts_with("--") => vec![name.into(), value.into()],
             _ => vec![arg],
@@ -69,7 +69,7 @@ impl Options {
                 "--program" => options.programs.push(value()?.parse()?),
                 "--shell" => options.shell = true,
                 "--ignored" => options.only_ignored = true,
-                // `cargo test -- ...` gives every test program the same words.
+                // `cargo test -- ...` passes the same words to every test program.
                 "--include-ignored" | "-q" | "--quiet" => {}
                 "--test-threads" | "--color" | "--format" => drop(value()?),
                 unknown if unknown.starts_with('-') => {
@@ -81,7 +81,7 @@ impl Options {
         Ok(options)
     }
 
-    /// Whether the test is to run on this flavour. The name is that under which it is reported.
+    /// Whether the test runs on this flavor. The name is the test's name in the report.
     pub fn selects(&self, flavour: Flavour, name: &str) -> bool {
         let matches = |filter: &String| match self.exact {
             true => name == *filter,

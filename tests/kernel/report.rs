@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the run prints, in libtest's form.
+//! The output of the run, in libtest's form.
 
 use std::time::Instant;
 
@@ -50,7 +50,7 @@ impl Report {
         }
     }
 
-    /// Prints the rest. Whether every test that was planned has passed.
+    /// Prints the rest. Returns whether every planned test passed.
     pub fn finish(mut self) -> bool {
         self.table.print();
         if !self.failures.is_empty() {

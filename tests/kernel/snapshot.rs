@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A VM that has booted and loaded its modules, kept in a file: tests go on
-//! from there. To boot takes an emulated computer longer than a dozen tests do.
+//! A file with a VM that has booted and loaded its modules. Tests continue from there. An emulated boot takes longer
+//! than a dozen tests.
 
 use std::fs::{self, File};
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -22,8 +22,7 @@ const PREFIX: &str = "booted-";
 pub struct Snapshot(File);
 
 impl Snapshot {
-    /// Boots the kernel with the program unless that was done before. The caller
-    /// has the cache's lock.
+    /// Boots the kernel with the program, unless the snapshot exists. The caller has the cache's lock.
     pub fn prepare(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache) -> Result<Snapshot, String> {
         let folder = kernel.folder();
         let path = folder.join(format!("{PREFIX}{:016x}", key(kernel, program)?));
@@ -37,8 +36,8 @@ impl Snapshot {
         File::open(&path).map(Snapshot).map_err(|error| format!("cannot read {}: {error}", path.display()))
     }
 
-    /// Where a VM finds it. A run of another checkout may remove the file's name
-    /// meanwhile, and a path in the emulator's command would want quoting.
+    /// A VM's source for the snapshot. A run of another checkout may remove the file's name. A path in the emulator's
+    /// command would need quotes.
     pub fn source(&self) -> String {
         format!("exec:cat {}", name_of(&self.0))
     }
@@ -48,7 +47,7 @@ fn make(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache, path: &Path)
     let folder = cache.run_folder()?;
     let file = File::create(path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
     let mut emulator = Emulator::start(vm::booting(kernel, &program.payload()?, folder.path())?, folder.path())?;
-    // init stops the VM when it is ready for tests.
+    // init stops the VM when the VM is ready for tests.
     emulator.wait_until(|status| status == "guest-panicked")?;
     emulator.ask(json!({"execute": "migrate-set-parameters", "arguments": {"max-bandwidth": 1_u64 << 40}}))?;
     emulator.ask(json!({"execute": "migrate", "arguments": {"uri": format!("exec:cat >{}", name_of(&file))}}))?;
@@ -56,12 +55,12 @@ fn make(kernel: &Kernel, program: &GuestProgram<'_>, cache: &Cache, path: &Path)
     emulator.ask(json!({"execute": "quit"})).map(drop)
 }
 
-/// The open file, as other programs can name it.
+/// A name of the open file for other programs.
 fn name_of(file: &File) -> String {
     format!("/proc/{}/fd/{}", std::process::id(), file.as_raw_fd())
 }
 
-/// Changes with everything that a booted VM is made of.
+/// Changes with everything that makes a booted VM.
 fn key(kernel: &Kernel, program: &GuestProgram<'_>) -> Result<u64, String> {
     let mut hasher = DefaultHasher::new();
     process::output(Command::new(vm::EMULATOR).arg("--version"))?.hash(&mut hasher);

@@ -3,24 +3,24 @@
 
 use std::collections::BTreeMap;
 
-/// What a test prints of a figure has it before (libtest may have begun the line): then follow, each behind a tab, what it is a
-/// figure of, the case and the value. See `guest/timing/figures.rs`.
+/// The start of a figure in a test's output (libtest may have begun the line). The rest follows after tabs: the subject
+/// of the figure, the case and the value. See `guest/figures.rs`.
 const MARK: &str = "figure\t";
 
 /// Figures by kernel and program.
 pub struct Table {
     columns: Vec<String>,
-    /// By what they are figures of.
+    /// By the subject of the figures.
     groups: Named<Named<Values>>,
 }
 
-/// In the order in which they came.
+/// In the order of arrival.
 type Named<T> = Vec<(String, T)>;
 /// By column.
 type Values = BTreeMap<usize, String>;
 
 impl Table {
-    /// Columns that are named again are one.
+    /// A column that is named twice exists once.
     pub fn new(names: impl Iterator<Item = String>) -> Table {
         let mut columns = Vec::new();
         for name in names {
@@ -31,7 +31,7 @@ impl Table {
         Table { columns, groups: Vec::new() }
     }
 
-    /// Takes the figures out of what a test printed.
+    /// Takes the figures from a test's output.
     pub fn take(&mut self, column: &str, output: &str) {
         let column = self.columns.iter().position(|name| name == column).expect("a column of the runs");
         for figure in output.lines().filter_map(|line| Some(line.split_once(MARK)?.1)) {
@@ -42,7 +42,7 @@ impl Table {
         }
     }
 
-    /// Prints them, if there are any, as Markdown.
+    /// Prints the figures as Markdown, if there are any.
     pub fn print(&self) {
         if self.groups.is_empty() {
             return;
@@ -70,7 +70,7 @@ impl Table {
     }
 }
 
-/// The value of this name, which is appended if it is not there.
+/// The value with this name. It is appended if it does not exist.
 fn entry<T: Default>(list: &mut Named<T>, name: String) -> &mut T {
     let at = list.iter().position(|(other, _)| *other == name).unwrap_or_else(|| {
         list.push((name, T::default()));

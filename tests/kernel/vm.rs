@@ -21,37 +21,36 @@ pub const EMULATOR: &str = "qemu-system-x86_64";
 
 const POLL_INTERVAL: Duration = Duration::from_millis(20);
 
-/// What init makes QEMU exit with when every test of the plan has run.
+/// QEMU's exit code from init after all tests of the plan.
 const EXIT_PLAN_DONE: i32 = 33;
 
-/// What init begins a line of the console with that names the next test.
+/// The start of a console line with the name of the next test.
 const MARK: &str = "test: ";
 
-/// The guest's time: an instruction takes 1 ns. It is the same on every host, to
-/// the nanosecond, and passes at once when the guest has nothing to do. By the
-/// host's clock an emulated processor would be slow, and stop whenever the host does.
+/// The guest's time: an instruction takes 1 ns. It is the same on every computer, to the nanosecond. It passes at once
+/// when the guest is idle. By the computer's clock an emulated processor would be slow, and would stop when the
+/// computer stops.
 const TIME: [&str; 6] = ["-icount", "shift=0,sleep=off", "-rtc", "base=2026-01-01T00:00:00,clock=vm", "-seed", "1"];
 
-/// A panic reboots, which ends the emulator. The rest is what an emulated processor would
-/// spend time on and no test is about: guards against the faults of real processors, the
-/// ciphers' self-tests, security modules, auditing, clearing of memory, looking for lockups.
+/// A panic reboots, which ends the emulator. The other options save an emulated processor work that no test needs:
+/// guards against the faults of real processors, the ciphers' self-tests, security modules, auditing, clearing of
+/// memory, lockup detection.
 const COMMAND_LINE: &str = "console=ttyS0 quiet panic=-1 mitigations=off cryptomgr.notests lsm= audit=0 \
      init_on_alloc=0 nowatchdog psi=0";
 
-/// The plainest is emulated fastest; random numbers must not wait for a boot that
-/// has little chance in it.
+/// The plainest processor is emulated fastest. Random numbers must not wait for a boot with little entropy.
 const PROCESSOR: &str = "qemu64,+rdrand";
 
 /// The tests that one VM runs.
 pub struct Run<'a> {
     pub flavour: Flavour,
-    /// What they measure, if not Pinion.
+    /// The measured program, if it is not Pinion.
     pub program: Option<&'a OtherProgram>,
     pub tests: Vec<String>,
 }
 
 impl Run<'_> {
-    /// The name under which a test is reported.
+    /// A test's name in the report.
     pub fn name_of(&self, test: &str) -> String {
         match self.program {
             Some(program) => format!("{}::{}::{test}", self.flavour.name(), program.name),
@@ -59,14 +58,14 @@ impl Run<'_> {
         }
     }
 
-    /// Whose figures the tests print.
+    /// The column for the tests' figures.
     pub fn column(&self) -> String {
         let program = self.program.map_or("pinion", |program| &program.name);
         format!("{} {program}", self.flavour.name())
     }
 
-    /// Runs the tests and reports them. An error is a failure of the suite; one of
-    /// the guest is that of the tests it left out.
+    /// Runs the tests and reports them. An error is a failure of the suite. An error of the guest counts for the tests
+    /// that it left out.
     pub fn perform(&self, snapshot: &Snapshot, cache: &Cache, report: &Mutex<&mut Report>) -> Result<(), String> {
         let folder = cache.run_folder()?;
         let folder = folder.path();
@@ -76,7 +75,7 @@ impl Run<'_> {
         fs::write(&plan, text).map_err(|error| format!("cannot write {}: {error}", plan.display()))?;
         let mut vm = vm(folder)?;
         vm.args(TIME)
-            // What `-kernel` put into the VM that was booted.
+            // The file that `-kernel` put into the VM that was booted.
             .args(["-option-rom", "pvh.bin", "-incoming", &snapshot.source(), "-fw_cfg"])
             .arg(format!("name=opt/pinion/plan,file={}", plan.display()));
         let mut emulator = Emulator::start(vm, folder)?;
@@ -102,11 +101,11 @@ impl Run<'_> {
         Ok(())
     }
 
-    /// Reports what the guest left in the folder, and returns of how many tests.
+    /// Reports the guest's results from the folder, and returns their number.
     fn report_results(&self, share: &Path, report: &Mutex<&mut Report>) -> Result<usize, String> {
         let results = fs::read_to_string(share.join("results")).unwrap_or_default();
         let mut reported = 0;
-        // A line without its end was being written.
+        // A line without an end was still being written.
         for line in results.split_inclusive('\n').filter_map(|line| line.strip_suffix('\n')) {
             let (test, status) = line.split_once(' ').unwrap_or((line, ""));
             if self.tests.get(reported).is_none_or(|planned| planned != test) {
@@ -114,7 +113,7 @@ impl Run<'_> {
             }
             let output = fs::read(share.join("output").join(test)).unwrap_or_default();
             let output = String::from_utf8_lossy(&output);
-            // A name that the program does not know is a success to libtest.
+            // libtest reports success for a name that the program does not know.
             let passed = status == "0" && output.contains("test result: ok. 1 passed;");
             let outcome = if passed { Outcome::Passed } else { Outcome::Failed };
             report.lock().expect("no VM panics").test(self, test, outcome, &output);
@@ -124,7 +123,7 @@ impl Run<'_> {
     }
 }
 
-/// Waits until the VM has ended, and returns how, for the tests of which it left no result.
+/// Waits until the VM has ended. Returns how it ended, for the tests without a result.
 fn follow(emulator: &mut Emulator) -> Result<String, String> {
     let mut said = 0;
     let mut heard = Instant::now();
@@ -135,7 +134,7 @@ fn follow(emulator: &mut Emulator) -> Result<String, String> {
                 _ => format!("the VM died: {status}"),
             });
         }
-        // The console has each test's name as it begins.
+        // The console shows each test's name when it starts.
         let length = emulator.console().len();
         if length != said {
             (said, heard) = (length, Instant::now());
@@ -147,11 +146,11 @@ fn follow(emulator: &mut Emulator) -> Result<String, String> {
     }
 }
 
-/// The VM of which a snapshot is taken.
+/// The VM for a snapshot.
 pub fn booting(kernel: &Kernel, payload: &[u8], folder: &Path) -> Result<Command, String> {
     let mut vm = vm(folder)?;
     vm.args(TIME);
-    // Every run is to begin, and to go on, with the same numbers.
+    // Every run must start, and continue, with the same numbers.
     boot(&mut vm, kernel, payload, folder, "nokaslr norandmaps random.trust_cpu=on")?;
     Ok(vm)
 }
@@ -167,8 +166,7 @@ pub fn shell(kernel: &Kernel, payload: &[u8], cache: &Cache) -> Result<(), Strin
     vm.status().map(drop).map_err(|error| format!("cannot start the emulator: {error}"))
 }
 
-/// The VM that every run has. KVM is left alone even where there is one:
-/// the suite is to be the same everywhere.
+/// The common VM of all runs. It does not use KVM, even if there is one: the suite must be the same everywhere.
 fn vm(folder: &Path) -> Result<Command, String> {
     let share = folder.join("share");
     fs::create_dir(&share).map_err(|error| format!("cannot create {}: {error}", share.display()))?;

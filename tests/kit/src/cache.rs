@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The folder that keeps what is expensive to make. Deleting it is always safe.
+//! The folder for results that are expensive to make. Deleting it is always safe.
 
 use std::env;
 use std::fs::{self, File};
@@ -14,7 +14,7 @@ pub struct Cache {
 }
 
 impl Cache {
-    /// Opens the cache, and makes its folder if it is not there.
+    /// Opens the cache, and creates its folder if necessary.
     pub fn open() -> Result<Cache, String> {
         let root = match env::var_os("PINION_VM_CACHE") {
             Some(folder) => PathBuf::from(folder),
@@ -22,7 +22,7 @@ impl Cache {
         };
         let runs = root.join("runs");
         fs::create_dir_all(&runs).map_err(|error| format!("cannot create {}: {error}", runs.display()))?;
-        // The kernel's makefiles run elsewhere.
+        // The kernel's makefiles run in another folder, so the path must be absolute.
         let root = root.canonicalize().map_err(|error| error.to_string())?;
         Ok(Cache { root })
     }
@@ -32,7 +32,7 @@ impl Cache {
         &self.root
     }
 
-    /// Held while something is made, so that two runs do not make it at once.
+    /// A lock for making something, so that two runs do not make it at the same time.
     pub fn lock(&self) -> Result<Flock<File>, String> {
         let path = self.root.join("lock");
         let file = File::create(&path).map_err(|error| format!("cannot create {}: {error}", path.display()))?;
@@ -40,14 +40,14 @@ impl Cache {
             .map_err(|(_, error)| format!("cannot lock {}: {error}", path.display()))
     }
 
-    /// A folder for one machine's files, which goes when it is dropped.
+    /// A folder for one VM's files. It is removed when it is dropped.
     pub fn run_folder(&self) -> Result<TempDir, String> {
         tempfile::tempdir_in(self.root.join("runs"))
             .map_err(|error| format!("cannot create a folder for the run: {error}"))
     }
 }
 
-/// Cargo's target folder: the harness that runs is in `debug/deps` there.
+/// Cargo's target folder. The running harness is in `debug/deps` there.
 fn target() -> Result<PathBuf, String> {
     let harness = env::current_exe().map_err(|error| format!("cannot tell which program this is: {error}"))?;
     let target = harness.ancestors().nth(3).map(Path::to_owned);

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The archive that becomes the guest's root folder: cpio's "newc" form, not
-//! compressed, for a guest unpacks slowly. Linux takes several in a row.
+//! The archive for the guest's root folder, in cpio's "newc" form. It is not compressed, because a guest unpacks
+//! slowly. Linux accepts several archives in a row.
 
 use std::collections::HashSet;
 use std::fs;
 use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 
-/// This file: what is made by it is made anew when it changes.
+/// This file. Its archives are made again when it changes.
 pub const SOURCE: &str = include_str!("initramfs.rs");
 
 const FOLDER: u32 = 0o040_755;
@@ -15,8 +15,7 @@ const PROGRAM: u32 = 0o100_755;
 const FILE: u32 = 0o100_644;
 const SYMLINK: u32 = 0o120_777;
 
-/// An archive being written. Paths are absolute in the guest; the folders above
-/// a path are made with it.
+/// An archive that is being written. Paths are absolute in the guest. Their parent folders are made automatically.
 #[derive(Default)]
 pub struct Archive {
     bytes: Vec<u8>,
@@ -24,7 +23,7 @@ pub struct Archive {
 }
 
 impl Archive {
-    /// What every VM has: folders, busybox, and what its init begins with.
+    /// The common content of every VM: folders, busybox, and the first part of init.
     pub fn with_busybox(busybox: &Path) -> Result<Archive, String> {
         let mut archive = Archive::default();
         for folder in ["/dev", "/proc", "/sys", "/tmp", "/run", "/root", "/etc"] {
@@ -41,12 +40,12 @@ impl Archive {
         self.add(path, FOLDER, b"");
     }
 
-    /// Adds a file that all may read.
+    /// Adds a file that everybody may read.
     pub fn file(&mut self, path: &str, content: &[u8]) {
         self.add(path, FILE, content);
     }
 
-    /// Adds a file that all may run.
+    /// Adds a file that everybody may run.
     pub fn program(&mut self, path: &str, content: &[u8]) {
         self.add(path, PROGRAM, content);
     }
@@ -56,7 +55,7 @@ impl Archive {
         self.add(path, SYMLINK, target.as_bytes());
     }
 
-    /// A file of the host, executable if it is so there.
+    /// A file of the computer, executable if it is executable there.
     pub fn copy(&mut self, path: &str, from: &Path) -> Result<(), String> {
         let describe = |error| format!("cannot read {}: {error}", from.display());
         let mode = fs::metadata(from).map_err(describe)?.permissions().mode();
@@ -65,7 +64,7 @@ impl Archive {
         Ok(())
     }
 
-    /// The archive, complete.
+    /// The complete archive.
     pub fn finish(mut self) -> Vec<u8> {
         self.append("TRAILER!!!", 0, b"");
         self.bytes
@@ -86,8 +85,8 @@ impl Archive {
         let inode = self.paths.len();
         let size = content.len();
         let name_size = path.len() + 1;
-        // Magic, inode, mode, owner, group, links, time, size, the device and the
-        // special file by major and minor number, size of the name, checksum.
+        // Magic, inode, mode, owner, group, links, time, size, major and minor numbers of the device and of the special
+        // file, size of the name, checksum.
         let header = format!(
             "070701{inode:08x}{mode:08x}{0:08x}{0:08x}{1:08x}{0:08x}{size:08x}\
              {0:08x}{0:08x}{0:08x}{0:08x}{name_size:08x}{0:08x}",

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a machine boots: Debian's own kernel, those of its modules that the tests
-//! use, and the modules of `tests/kit/modules` built for it.
+//! The boot files of a VM: Debian's own kernel, the modules that the tests use, and the modules of `tests/kit/modules`
+//! built for it.
 //!
-//! Modules fit one exact kernel, so every version is taken from what apt offers.
-//! Packages are unpacked below the cache, never installed.
+//! Modules fit one exact kernel, so every version comes from apt. Packages are unpacked below the cache, never
+//! installed.
 
 use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -16,7 +16,7 @@ use super::cache::Cache;
 use super::initramfs::Archive;
 use super::{process, tools};
 
-/// The kernels that Debian offers and Pinion meets.
+/// Debian's kernels on which Pinion runs.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub enum Flavour {
     /// Debian's default kernel.
@@ -26,10 +26,10 @@ pub enum Flavour {
 }
 
 impl Flavour {
-    /// Each flavour that tests run on.
+    /// The flavors for the tests.
     pub const ALL: [Flavour; 2] = [Flavour::Stock, Flavour::Rt];
 
-    /// The name at the beginning of a test.
+    /// The first part of a test's name.
     pub fn name(self) -> &'static str {
         match self {
             Flavour::Stock => "stock",
@@ -37,7 +37,7 @@ impl Flavour {
         }
     }
 
-    /// The package which always depends on the newest kernel.
+    /// The package that always depends on the newest kernel.
     fn package(self) -> &'static str {
         match self {
             Flavour::Stock => "linux-image-amd64",
@@ -57,7 +57,7 @@ impl FromStr for Flavour {
     }
 }
 
-/// Loaded in this order, with options. What they depend on comes before them.
+/// Loaded in this order, with options. Dependencies come before them.
 const MODULES: [(&str, &str); 18] = [
     ("virtio_pci", ""),
     ("9pnet_virtio", ""),
@@ -75,18 +75,18 @@ const MODULES: [(&str, &str); 18] = [
     ("mock_w1", ""),
     ("vcan", ""),
     ("can-raw", ""),
-    // A watchdog that nobody feeds says so, and the other tests go on.
+    // An unfed watchdog writes a message, and the other tests continue.
     ("softdog", "soft_noboot=1"),
     ("i2c-stub", "chip_addr=0x1c"),
 ];
 
-/// Shows the plan to the guest, which loads it later than the others: see `init.sh`.
+/// Shows the plan to the guest. The guest loads it later than the others: see `init.sh`.
 const PLAN_READER: &str = "qemu_fw_cfg";
 
-/// The parts of an image package that hold these modules.
+/// The parts of an image package with these modules.
 const IMAGE_PARTS: [&str; 22] = [
     "*/modules.builtin*",
-    // The last ones are for the system that `tests/package` boots from a disk.
+    // The last parts are for the system that `tests/package` boots from a disk.
     "*/drivers/firmware/qemu_fw_cfg.ko",
     "*/drivers/i2c/*",
     "*/drivers/iio/*",
@@ -110,7 +110,7 @@ const IMAGE_PARTS: [&str; 22] = [
     "*/lib/crc*.ko",
 ];
 
-/// Upstream's mocks and drivers, and what they include. Folders stand for all their files.
+/// Upstream's mocks and drivers, with their includes. A folder means all its files.
 const UPSTREAM: [&str; 7] = [
     "kernel/irq/irq_sim.c",
     "drivers/gpio/gpio-pca953x.c",
@@ -121,7 +121,7 @@ const UPSTREAM: [&str; 7] = [
     "drivers/iio/industrialio-sw-device.c",
 ];
 
-/// A module that is made of a source of the same name needs that source renamed.
+/// If a module is made of a source of the same name, that source must be renamed.
 const UPSTREAM_RENAMED: [(&str, &str); 3] = [
     ("gpio-pca953x.c", "gpio-pca953x-main.c"),
     ("gpio-sim.c", "gpio-sim-main.c"),
@@ -139,12 +139,12 @@ pub struct Kernel {
 }
 
 impl Kernel {
-    /// What is kept of it in the cache.
+    /// Its folder in the cache.
     pub fn folder(&self) -> &Path {
         self.vmlinux.parent().expect("it is in a folder")
     }
 
-    /// Makes what the cache does not hold yet. The caller has its lock.
+    /// Makes everything that the cache does not contain yet. The caller has its lock.
     pub fn prepare(flavour: Flavour, offers: &Offers, cache: &Cache) -> Result<Kernel, String> {
         let newest = offers.newest(flavour)?;
         let release = newest.dependency("linux-image-")?.replace("linux-image-", "");
@@ -162,13 +162,13 @@ impl Kernel {
     }
 }
 
-/// The newest kernels that apt offers.
+/// The newest kernels in apt.
 pub struct Offers {
     packages: Vec<Fields>,
 }
 
 impl Offers {
-    /// Asks apt which kernels it has.
+    /// Queries apt's kernels.
     pub fn ask() -> Result<Offers, String> {
         let names = Flavour::ALL.map(Flavour::package);
         let packages = Fields::of(&names).or_else(|_| {
@@ -186,7 +186,7 @@ impl Offers {
     }
 }
 
-/// The names that apt gives to what one kernel is built of.
+/// apt's names of the packages for one kernel.
 struct Packages {
     image: String,
     headers: String,
@@ -201,7 +201,7 @@ impl Packages {
         let headers = format!("linux-headers-{release}");
         let fields = Fields::of(&[&headers])?.pop().ok_or_else(|| format!("apt offers no {headers}"))?;
         let kbuild = fields.dependency("linux-kbuild-")?;
-        // linux-compiler-gcc-12-x86 stands for gcc-12.
+        // linux-compiler-gcc-12-x86 means gcc-12.
         let compiler = fields.dependency("linux-compiler-")?;
         let compiler = compiler.trim_start_matches("linux-compiler-").trim_end_matches("-x86");
         Ok(Packages {
@@ -215,7 +215,7 @@ impl Packages {
     }
 }
 
-/// What apt knows of a package.
+/// apt's fields of a package.
 struct Fields(String);
 
 impl Fields {
@@ -246,7 +246,7 @@ impl Fields {
     }
 }
 
-/// Changes with everything that a prepared kernel is made of, save its version.
+/// Changes with everything that makes a prepared kernel, except its version.
 fn key(sources: &Path) -> Result<u64, String> {
     let mut hasher = DefaultHasher::new();
     include_str!("kernel.rs").hash(&mut hasher);
@@ -274,7 +274,7 @@ fn build(release: &str, tree: &Path, sources: &Path, folder: &Path) -> Result<()
         Command::new("make")
             .arg("-C")
             .arg(headers.join(&packages.headers))
-            // The one that the headers include has an absolute path of the host.
+            // The Makefile that the headers include has an absolute path of the computer.
             .arg("-f")
             .arg(headers.join(&packages.headers_common).join("Makefile"))
             .arg(format!("M={}", modules.display()))
@@ -289,7 +289,7 @@ fn build(release: &str, tree: &Path, sources: &Path, folder: &Path) -> Result<()
     fs::rename(&partial, folder).map_err(|error| describe("rename", &partial, &error))
 }
 
-/// Downloads and unpacks what the tree lacks; flavours share much of it.
+/// Downloads and unpacks the parts that the tree lacks. Flavors share most parts.
 fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
     let stamps = tree.join("unpacked");
     let archives = tree.join("archives");
@@ -303,7 +303,7 @@ fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
         (&packages.source, &["./usr/src/*"]),
         (&"busybox-static".to_owned(), &["./bin/busybox"]),
     ];
-    // A stamp tells which parts were unpacked.
+    // A stamp lists the unpacked parts.
     let stamp_of = |package: &String, parts: &[&str]| match *package == packages.source {
         true => UPSTREAM.join(" "),
         false => parts.join(" "),
@@ -323,7 +323,7 @@ fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
                 .current_dir(&archives),
         )
     };
-    // The archives drop a version soon after a newer one has come.
+    // The archives drop a version soon after a newer one is published.
     download().or_else(|_| tools::update_package_lists().and_then(|()| download()))?;
 
     for (package, parts) in missing {
@@ -348,7 +348,7 @@ fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// A few files of the whole kernel's sources, side by side in `upstream`.
+/// A few files of the kernel's sources, in `upstream`.
 fn unpack_upstream(package: &str, tree: &Path) -> Result<(), String> {
     let tarball = tree.join(format!("usr/src/{package}.tar.xz"));
     let upstream = tree.join("upstream");
@@ -356,7 +356,7 @@ fn unpack_upstream(package: &str, tree: &Path) -> Result<(), String> {
     let members = UPSTREAM.map(|path| format!("{package}/{path}"));
     let mut words = vec![path_str(&tarball)?, path_str(&upstream)?];
     words.extend(members.iter().map(String::as_str));
-    // tar stops after the last member, and xz with it, by a signal: no pipeline.
+    // tar stops after the last member, and so does xz, by a signal. So this is not a pipeline.
     process::pipeline(
         r#"tarball=$1 upstream=$2; shift 2
            tar -x -f <(xz -dc -T0 "$tarball") -C "$upstream" \
@@ -370,7 +370,7 @@ fn unpack_upstream(package: &str, tree: &Path) -> Result<(), String> {
     remove(&tarball)
 }
 
-/// The plain ELF boots by PVH, and spares an emulated processor the unpacking.
+/// The plain ELF boots by PVH. So the emulated processor does not have to unpack it.
 fn extract_vmlinux(vmlinuz: &Path, vmlinux: &Path) -> Result<(), String> {
     const XZ_MAGIC: &[u8] = b"\xfd7zXZ\0";
     let image = read(vmlinuz)?;
@@ -380,7 +380,7 @@ fn extract_vmlinux(vmlinuz: &Path, vmlinux: &Path) -> Result<(), String> {
         .ok_or_else(|| format!("{} is not packed by xz", vmlinuz.display()))?;
     let packed = vmlinux.with_extension("xz");
     fs::write(&packed, &image[start..]).map_err(|error| describe("write", &packed, &error))?;
-    // What follows the packed kernel in the image makes xz fail after it.
+    // The data after the packed kernel in the image makes xz fail at the end.
     process::pipeline(
         r#"xz -dc --single-stream "$1" >"$2" 2>/dev/null || true; strip "$2""#,
         &[path_str(&packed)?, path_str(vmlinux)?],
@@ -393,7 +393,7 @@ fn archive_modules(image: &Path, ours: &Path, tree: &Path, to: &Path) -> Result<
         .map_err(|error| describe("read", &image.join("modules.builtin"), &error))?;
     let built_in = built_in.lines().map(|line| module_name(Path::new(line))).collect();
     let mut loader = Loader { paths: Vec::new(), built_in, order: Vec::new() };
-    // Ours come first: they are found before a module of the same name.
+    // Our modules come first, so they take precedence over a module of the same name.
     find_modules(ours, &mut loader.paths)?;
     find_modules(image, &mut loader.paths)?;
     for (module, options) in MODULES {
@@ -415,7 +415,7 @@ fn archive_modules(image: &Path, ours: &Path, tree: &Path, to: &Path) -> Result<
     fs::write(to, archive.finish()).map_err(|error| describe("write", to, &error))
 }
 
-/// Puts modules into an order in which they can be loaded.
+/// Finds an order in which modules can be loaded.
 struct Loader {
     paths: Vec<PathBuf>,
     built_in: Vec<String>,
@@ -445,7 +445,7 @@ impl Loader {
     }
 }
 
-/// A module's own words: packages hold no modules.dep.
+/// A module's own list, because packages contain no modules.dep.
 fn dependencies(module: &Path) -> Result<Vec<String>, String> {
     const KEY: &[u8] = b"\0depends=";
     let content = read(module)?;
@@ -472,12 +472,12 @@ fn find_modules(folder: &Path, found: &mut Vec<PathBuf>) -> Result<(), String> {
     Ok(())
 }
 
-/// As the kernel writes it: without its path, and with underscores.
+/// The kernel's form of the name: without its path, and with underscores.
 fn module_name(path: &Path) -> String {
     path.file_stem().unwrap_or_default().to_string_lossy().replace('-', "_")
 }
 
-/// Removes what earlier versions left.
+/// Removes the files of earlier versions.
 pub fn remove_others(folder: &Path, prefix: &str, keep: &Path) -> Result<(), String> {
     entries(folder)?
         .iter()
@@ -520,7 +520,7 @@ fn copy_files(from: &Path, to: &Path) -> Result<(), String> {
     Ok(())
 }
 
-/// A file or a whole folder; neither need exist.
+/// Removes a file or a whole folder, if it exists.
 fn remove(path: &Path) -> Result<(), String> {
     let removed = if path.is_dir() { fs::remove_dir_all(path) } else { fs::remove_file(path) };
     match removed {

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What several test suites share.
+//! The code that several test suites share.
 //!
-//! - [`cache`], [`tools`], [`process`]: where a suite keeps its downloads, and the programs that it runs
-//! - [`kernel`], [`initramfs`]: what a virtual machine boots
+//! - [`cache`], [`tools`], [`process`]: the folder for a suite's downloads, and the programs that it runs
+//! - [`kernel`], [`initramfs`]: the boot files of a virtual machine
 //! - [`markdown`]: the pages for users, and the blocks in them
 
 #![forbid(unsafe_code)]

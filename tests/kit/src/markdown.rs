@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The pages of the project, with their fenced blocks. `docs/develop/test-package.md` says what each kind of block means.
+//! The pages of the project, with their fenced blocks. `docs/develop/test-package.md` explains the kinds of blocks.
 
 use std::fs;
 use std::path::Path;
 
-/// What a user types; tried in the booted system.
+/// Commands that a user types. They are tried in the booted system.
 pub const COMMANDS: &str = "sh";
-/// On the line before commands that can not be tried there.
+/// The line before commands that cannot be tried there.
 const NOT_TRIED: &str = "<!-- not tried:";
 
 /// A file of Markdown.
 pub struct Page {
-    /// Path from the project's folder, such as `docs/guide/install.md`.
+    /// Path from the project's folder, for example `docs/guide/install.md`.
     pub name: String,
     /// The whole file.
     pub text: String,
@@ -19,19 +19,19 @@ pub struct Page {
 
 /// A fenced block.
 pub struct Block {
-    /// What stands behind the fence.
+    /// The text after the fence.
     pub kind: String,
     /// The number of its first line, counted from 1.
     pub line: usize,
-    /// What stands between the fences.
+    /// The text between the fences.
     pub text: String,
-    /// The paragraph before it, which says what it is.
+    /// The paragraph before it, which describes it.
     pub before: String,
     /// Why its commands are not tried.
     pub not_tried: Option<String>,
 }
 
-/// The pages of the top folder, README.md first, then those below docs/ sorted by name.
+/// The pages of the top folder, README.md first, then the pages below docs/ sorted by name.
 pub fn pages() -> Vec<Page> {
     let project = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."));
     let mut names: Vec<String> = ["README.md", "CONTRIBUTING.md", "SECURITY.md"].map(str::to_owned).into();
@@ -73,7 +73,7 @@ impl Page {
     }
 }
 
-/// The reason on a line that says that the block below it is not tried.
+/// The reason in a line that marks the next block as not tried.
 pub fn reason(line: &str) -> Option<String> {
     Some(line.trim().strip_prefix(NOT_TRIED)?.strip_suffix("-->")?.trim().to_owned())
 }

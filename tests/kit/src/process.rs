@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Other programs, with errors that tell what was run and what it said.
+//! Other programs, with errors that include the command and its output.
 
 use std::fs::File;
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Output, Stdio};
 
-/// What the command printed; its output and standard error are in the error.
+/// The command's output. An error contains its output and standard error.
 pub fn output(command: &mut Command) -> Result<String, String> {
     let output = finished(command)?;
     String::from_utf8(output.stdout).map_err(|_| format!("{command:?} did not print text"))
@@ -29,8 +29,8 @@ fn finished(command: &mut Command) -> Result<Output, String> {
     ))
 }
 
-/// Starts an emulator, for a conversation over its standard input and output. What it says to
-/// standard error is in the file `qemu` of the folder.
+/// Starts an emulator, for a conversation over its standard input and output. Its standard error goes to the file
+/// `qemu` of the folder.
 pub fn start_emulator(command: &mut Command, folder: &Path) -> Result<(Child, ChildStdin, ChildStdout), String> {
     let log = File::create(folder.join("qemu")).map_err(|error| error.to_string())?;
     let mut emulator = command
@@ -44,8 +44,8 @@ pub fn start_emulator(command: &mut Command, folder: &Path) -> Result<(Child, Ch
     Ok((emulator, input, output))
 }
 
-/// Runs a shell pipeline which fails if any part of it does. The words come in as
-/// `$1`, `$2` and so on, and need no quoting.
+/// Runs a shell pipeline. It fails if any part of the pipeline fails. The words are passed as `$1`, `$2` and so on, and
+/// need no quotes.
 pub fn pipeline(script: &str, words: &[&str]) -> Result<(), String> {
     let mut bash = Command::new("bash");
     bash.args(["-o", "pipefail", "-euc", script, "tests"]).args(words);

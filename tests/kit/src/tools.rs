@@ -1,13 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The programs that VMs take on the computer.
+//! The programs that VMs need on the computer.
 
 use std::env;
 use std::process::Command;
 
 use super::process;
 
-/// Program and the Debian package that has it. The compiler is the kernel's
-/// choice: see [`super::kernel`].
+/// Programs with their Debian packages. The kernel determines the compiler: see [`super::kernel`].
 const TOOLS: [(&str, &str); 6] = [
     ("qemu-system-x86_64", "qemu-system-x86"),
     ("make", "make"),
@@ -17,7 +16,7 @@ const TOOLS: [(&str, &str); 6] = [
     ("ldd", "libc-bin"),
 ];
 
-/// Sees to it that every program is there.
+/// Makes sure that every program is installed.
 pub fn ensure() -> Result<(), String> {
     if !cfg!(target_arch = "x86_64") {
         return Err("the guest is an x86-64 machine and runs the host's own programs: \
@@ -32,7 +31,7 @@ pub fn ensure() -> Result<(), String> {
     install(&TOOLS)
 }
 
-/// Installs the packages of those programs that are missing.
+/// Installs the packages of the missing programs.
 pub fn install(tools: &[(&str, &str)]) -> Result<(), String> {
     let missing: Vec<&str> = tools.iter().filter(|(program, _)| !has(program)).map(|(_, package)| *package).collect();
     if missing.is_empty() {
@@ -53,7 +52,7 @@ pub fn install(tools: &[(&str, &str)]) -> Result<(), String> {
     .map_err(|cause| format!("the tests in VMs need the packages {packages}: {cause}"))
 }
 
-/// What apt offers may be older than what its archives still hold.
+/// apt's lists may be older than its archives.
 pub fn update_package_lists() -> Result<(), String> {
     process::run(Command::new("apt-get").args(["update", "-qq"]))
 }
