@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! How late bits are at 40 kbaud on this computer, timed by a worker as Pinion does it, and by the core with a timer
-//! for each bit as the firmware does it; alone and beside four steppers of 10,000 steps a second.
+//! Measures how late bits are at 40 kbaud on this computer. A worker times them as Pinion does. The core times them
+//! with a timer for each bit, as the firmware does. Both run alone, and beside four steppers of 10,000 steps a second.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::mpsc::{self, Receiver, Sender};
@@ -26,23 +26,23 @@ use pinion_testbench::board::{Bench, FakeBoard};
 
 /// 40 kbaud.
 const BIT: Ticks = Ticks::from_us(25);
-/// Messages of each kind that the worker exchanges.
+/// How many messages of each kind the worker exchanges.
 const MESSAGES: u32 = 1000;
 /// How long the core runs timers for bits.
 const CORE_RUNS: Duration = Duration::from_secs(3);
-/// What klippy sends to read a register (`_encode_read(0xf5, 0, 2)` of tmc_uart.py), and a reply.
+/// klippy's bytes to read a register (`_encode_read(0xf5, 0, 2)` of tmc_uart.py), and a reply.
 const MESSAGE: [u8; 5] = [0xea, 0x03, 0x48, 0x20, 0xe4];
 const REPLY: [u8; 10] = [0x0a, 0xfa, 0x4f, 0x20, 0x80, 0x00, 0x02, 0xe8, 0x20, 0xf1];
 /// Edges of the message, and those back to idle.
 const EDGES: usize = 16;
-/// From the last edge of a message to its reply: the end of its last byte, eight bits and some.
+/// Time from the last edge of a message to its reply: the end of its last byte, eight bits and some.
 const REPLY_AFTER: i64 = 20 * BIT.0 as i64 + 333;
 
 fn bit_of(bytes: &[u8], place: usize) -> bool {
     bytes.get(place / 8).is_none_or(|byte| byte >> (place % 8) & 1 != 0)
 }
 
-/// A wire whose other end replies a while after the last edge, and which knows when each edge came.
+/// A wire whose other end replies a while after the last edge. It records when each edge came.
 struct Wire {
     clock: Monotonic,
     edges: Arc<Mutex<Vec<(Clock, bool)>>>,
@@ -65,7 +65,7 @@ impl Line for Wire {
     }
 }
 
-/// The bench's board, each line of which is the wire.
+/// The bench's board. Each of its lines is the wire.
 struct Wires {
     rest: FakeBoard,
     clock: Monotonic,
@@ -206,7 +206,7 @@ impl Uart {
         self.mcu.execute(&mut Reader::new(command.payload().expect("it fits")));
     }
 
-    /// Sends the message, and reads a reply of this length; the edges, and whether the reply came whole.
+    /// Sends the message, and reads a reply of this length. Returns the edges, and whether the reply came whole.
     fn exchange(&mut self, read: usize) -> (Vec<(Clock, bool)>, bool) {
         self.edges.lock().unwrap().clear();
         *self.heard.last.lock().unwrap() = None;
@@ -223,16 +223,16 @@ impl Uart {
     }
 }
 
-/// What the core did for a while.
+/// The results of the core.
 struct Core {
     steps: Lateness,
     bits: Lateness,
-    /// Messages of 120 bits, and how many of them had no bit that was late by half of one.
+    /// Messages of 120 bits, and how many of them had no bit that was late by half a bit.
     messages: [u64; 2],
 }
 
-/// Has four steppers of 10,000 steps a second each run as the core runs them, each step taking 2 us, with a timer for
-/// each bit as the firmware has it, or without.
+/// Runs `steppers` steppers of 10,000 steps a second each as the core runs them. Each step takes 2 us. With `with_bits` there
+/// is a timer for each bit too, as in the firmware.
 fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> Core {
     let scheduling = realtime::enter(Role::Core);
     let processors = Processors::new(None).expect("the processors");
@@ -240,7 +240,7 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
     let mut core = Core { steps: Lateness::default(), bits: Lateness::default(), messages: [0; 2] };
     let mut good = true;
     let start = clock.now() + Ticks::from_ms(1);
-    // Due at, every, whether a bit.
+    // Due time, interval, whether it is a bit.
     let stepper = |n: u32| (start + Ticks::from_us(17 * n), Ticks::from_us(100), false);
     let mut timers: Vec<(Clock, Ticks, bool)> = (0..steppers).map(stepper).collect();
     timers.extend(with_bits.then_some((start, BIT, true)));
@@ -268,7 +268,7 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
     core
 }
 
-/// How late the edges were, and how many of the messages and of the replies arrived whole.
+/// How late the edges were, and how many messages and replies arrived whole.
 fn worker(clock: Monotonic) -> (Lateness, u32, u32) {
     let mut uart = Uart::new(clock);
     let (mut late, mut sent, mut read) = (Lateness::default(), 0, 0);
@@ -276,7 +276,7 @@ fn worker(clock: Monotonic) -> (Lateness, u32, u32) {
         let (edges, _) = uart.exchange(0);
         let edges = &edges[1..=EDGES];
         let start = edges[0].0;
-        // What a driver reads that looks at the middle of each bit, which it has measured.
+        // The bits that a driver reads. It measures the length of a bit, and looks at the middle of each.
         let level = |at: Clock| edges.iter().rev().find(|(from, _)| *from <= at).is_none_or(|(_, level)| *level);
         let bit = edges[4].0.since(start) / 4;
         let middle = |n: usize| start + Ticks((bit * n as i64 + bit / 2) as u32);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the MCU itself costs, in virtual time and with lines that do nothing: decoding and
-//! dispatch of commands, a step's event, the dictionary.
+//! Measures the cost of the MCU itself, in virtual time and with lines that do nothing: decoding and dispatch of
+//! commands, a step's event, the dictionary.
 
 use std::hint::black_box;
 use std::sync::Arc;
@@ -16,7 +16,7 @@ use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_testbench::board::{Bench, FakeBoard};
 use pinion_testbench::rig::{FIRMWARE, Rig};
 
-/// The bench's board with outputs that do nothing: what is left is the MCU.
+/// The bench's board with outputs that do nothing, so that only the MCU's cost is left.
 struct Quiet(FakeBoard);
 
 struct QuietLine;
@@ -83,7 +83,7 @@ fn rig_of(steppers: u8, invert_step: i8) -> Rig {
     rig
 }
 
-/// As many of a command as a message block takes.
+/// As many copies of a command as a message block takes.
 fn block(rig: &Rig, command: &str) -> (Vec<u8>, usize) {
     let command = rig.encode(command);
     let count = PAYLOAD_MAX / command.len();
@@ -102,7 +102,7 @@ fn commands(c: &mut Criterion) {
     let (payload, count) = block(&rig, "queue_step oid=0 interval=20000 count=1 add=3");
     let blocks = usize::from(MOVE_COUNT) / count;
     group.throughput(Throughput::Elements((blocks * count) as u64));
-    // The steps that empty the queue again are another benchmark's.
+    // Another benchmark measures the steps that empty the queue again.
     group.bench_function("queue_step, a queue full", |b| {
         b.iter_custom(|iterations| {
             let mut spent = Duration::ZERO;
@@ -167,9 +167,8 @@ fn steps(c: &mut Criterion) {
     group.finish();
 }
 
-/// What it costs the core to tell its status: a whole snapshot, and what steps lose by one that is asked for a
-/// hundred times a second of their time. The two are measured in turns, so that their ratio holds on a busy computer,
-/// too.
+/// The core's cost of telling its status: a whole snapshot, and the share of their time that steps lose by a hundred
+/// snapshots a second. The two are measured in turns, so that their ratio also holds on a busy computer.
 fn status(c: &mut Criterion) {
     let mut rig = rig_of(8, -1);
     let mut snapshot = Snapshot::default();

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Runs micro-controller programs under the same load, in turn, and prints their figures side
-//! by side. docs/develop/performance.md says what is measured and how.
+//! Runs MCU programs under the same load, in turn, and prints their figures side by side. docs/develop/performance.md
+//! says what is measured and how.
 //!
 //! - [`rig`]: a /dev of null devices, the stand-in for their drivers, the program's start
 //! - [`steps`]: step edges at a steady rate: how late, how much CPU, how fast at most
@@ -86,13 +86,13 @@ enum Measure {
 const STEPPERS: [usize; 2] = [1, 3];
 /// How long the SPI driver takes for a transfer.
 const BUS_US: u32 = 4_000;
-/// How long it takes for a short one.
+/// How long it takes for a short transfer.
 const SHORT_US: u32 = 30;
 
 fn main() -> ExitCode {
     let options = Options::parse();
     if options.programs.is_empty() {
-        // A plain `cargo bench` gets here, too, without permission to take minutes.
+        // A plain `cargo bench` gets here too, without permission to take minutes.
         eprintln!("compare: name programs: cargo bench --bench compare -- --program pinion --program c=PATH");
         return ExitCode::SUCCESS;
     }
@@ -130,7 +130,7 @@ fn measure(options: &Options) -> Result<(), String> {
     Ok(())
 }
 
-/// One line of the table, measured in a program of its own start.
+/// One line of the table, measured in a program that is started for it.
 #[derive(Debug)]
 enum Case {
     Floor,

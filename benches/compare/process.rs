@@ -15,7 +15,7 @@ pub struct Memory {
     pub private_kib: u64,
 }
 
-/// Memory of a program: its main process, and others that it forked.
+/// Memory of a program: its main process, and the processes that it forked.
 #[derive(Debug)]
 pub struct Memories {
     main: Memory,
@@ -28,7 +28,7 @@ impl Memories {
     }
 }
 
-/// A process and those that it forked.
+/// A process and the processes that it forked.
 fn family(pid: u32) -> Vec<u32> {
     let mut family = Vec::new();
     let mut left = VecDeque::from([pid]);
@@ -77,7 +77,7 @@ pub fn memory(pid: u32) -> Result<Memories, String> {
     Ok(Memories { main: of_process(pid)?, forked })
 }
 
-/// How busy others keep this computer: neither the program nor the bench.
+/// How busy other processes keep this computer: neither the program nor the bench.
 pub struct Others {
     pid: u32,
     since: Instant,
@@ -90,7 +90,7 @@ impl Others {
         Others { pid, since: Instant::now(), all: computer(), known: cpu(pid) + own() }
     }
 
-    /// CPUs that others used since the start.
+    /// CPUs that other processes used since the start.
     pub fn cpus(&self) -> f64 {
         let known = (cpu(self.pid) + own()).saturating_sub(self.known);
         let all = computer().saturating_sub(self.all);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Where the programs run: a mount namespace with a /dev of null devices, behind which the
-//! stand-in (standin.c) plays the drivers.
+//! The place where the programs run: a mount namespace with a /dev of null devices. Behind these the stand-in
+//! (standin.c) plays the drivers.
 
 use std::fs::{self, File};
 use std::io;
@@ -50,11 +50,11 @@ pub struct Launch {
     pub realtime: bool,
     /// How many edges to record.
     pub edges_max: usize,
-    /// What an SPI transfer takes.
+    /// How long an SPI transfer takes.
     pub bus_us: u32,
 }
 
-/// The place where programs run. It is gone with this process.
+/// The place where programs run. It ends with this process.
 pub struct Rig {
     dir: PathBuf,
     standin: PathBuf,
@@ -76,7 +76,7 @@ impl Rig {
         Ok(Rig { dir: dir.join("run"), standin, floor, syscall })
     }
 
-    /// How late, in ns, a loop is here that only waits, for so many seconds.
+    /// How late, in ns, a loop that only waits is here, for this many seconds.
     pub fn floor_ns(&self, seconds: f64) -> Result<Vec<i64>, String> {
         let failed = |why: String| format!("{}: {why}", self.floor.display());
         let output = Command::new(&self.floor)
@@ -129,7 +129,7 @@ impl Rig {
     }
 }
 
-/// A program at work; ended when dropped.
+/// A program at work. It is ended when this is dropped.
 pub struct Running {
     child: Child,
     tty: PathBuf,
@@ -193,11 +193,11 @@ fn build(dir: &Path, name: &str, flags: &[&str]) -> Result<PathBuf, String> {
     if built.success() { Ok(binary) } else { Err(format!("{} does not compile", source.display())) }
 }
 
-/// Enters a mount namespace whose /dev and /sys hold what the programs look for.
+/// Enters a mount namespace whose /dev and /sys have the files that the programs look for.
 fn separate(dir: &Path) -> Result<(), String> {
     let done = || -> io::Result<()> {
         unshare(CloneFlags::CLONE_NEWNS)?;
-        // What is mounted from here on stays in here.
+        // Mounts from here on stay in this namespace.
         let none = None::<&str>;
         mount(none, "/", none, MsFlags::MS_REC | MsFlags::MS_PRIVATE, none)?;
         let run = dir.join("run");

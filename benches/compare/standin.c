@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-// Stands in for the GPIO character device and spidev, by LD_PRELOAD: a program that opens
-// /dev/gpiochip0 or /dev/spidevB.C (null devices, made by the bench) and speaks the ioctls of
-// uAPI v1 or v2 sees a chip of 64 lines. Every change of an output is stamped with
-// CLOCK_MONOTONIC, so that two programs are measured alike.
+// Stands in for the GPIO character device and spidev, by LD_PRELOAD. A program opens /dev/gpiochip0 or /dev/spidevB.C
+// (null devices, made by the bench), and speaks the ioctls of uAPI v1 or v2. It sees a chip of 64 lines. Every change
+// of an output is stamped with CLOCK_MONOTONIC, so that two programs are measured alike.
 //
 //   BENCH_EDGES=FILE   where the changes go: one 64-bit word each,
 //                      nanoseconds << 8 | line << 1 | level, in order, up to the first zero
@@ -36,7 +35,7 @@ struct request {
 };
 
 static struct request requests[DESCRIPTORS];
-// Descriptors of spidev: those that were asked for something of SPI.
+// Descriptors of spidev: those that got an SPI request.
 static uint8_t buses[DESCRIPTORS];
 static uint8_t levels[LINES];
 static _Atomic uint64_t *edges;
@@ -110,7 +109,7 @@ int close(int fd)
     return real_close(fd);
 }
 
-// A driver's transfer is not cut short by a signal.
+// A signal does not cut a driver's transfer short.
 static void transfer(void)
 {
     struct timespec until;

@@ -13,28 +13,27 @@ use super::{BUS_US, table};
 
 /// Step and direction pin of each stepper.
 const PINS: [(u8, u8); 3] = [(17, 18), (22, 24), (23, 25)];
-/// What klippy asks for with a driver of unknown needs: 2 us, then an unstep.
+/// klippy's pulse for a driver of unknown needs: 2 us, then an unstep.
 const PULSE: Ticks = Ticks::from_us(2);
-/// What it asks for with a driver that steps on both edges: 100 ns.
+/// klippy's pulse for a driver that steps on both edges: 100 ns.
 const PULSE_BOTH_EDGES: Ticks = Ticks(5);
-/// The steps of a move last about this long.
+/// How long the steps of a move last, about, in seconds.
 const MOVE_S: f64 = 0.025;
 /// How long before the first step the first move is queued, and how far ahead the last one.
 const AHEAD_S: f64 = 0.5;
-/// Moves queued at most, of the 1,024 that there are.
+/// Highest number of moves that are queued, of the 1,024 that there are.
 const MOVES_MAX: u16 = 900;
-/// The client sleeps in between, and sends an SPI transfer each time if the load has them.
+/// How long the client sleeps between feeds. Each time it also sends an SPI transfer, if the load has them.
 const FEED: Duration = Duration::from_millis(25);
-/// The second and third stepper step a little slower, so that their edges meet those of the
-/// others at every distance.
+/// The second and third stepper step a little slower. So their edges meet the others' edges at every distance.
 const SLOWER: [f64; 3] = [1.0, 1.003, 1.011];
 /// The SPI device of a load with transfers.
 pub const SPI_OID: u8 = 3;
 
-/// What the steppers do.
+/// The steppers' work.
 #[derive(Clone, Debug)]
 pub struct Load {
-    /// Of each stepper, in ticks.
+    /// The interval of each stepper, in ticks.
     intervals: Vec<u32>,
     both_edges: bool,
     transfers: bool,
@@ -63,8 +62,8 @@ impl Load {
         }
     }
 
-    /// A load of which as much is queued at once as the move queue takes, in the longest moves:
-    /// it is the steps that count, not whether the program still finds time for commands.
+    /// A load that queues at once as much as the move queue takes, in the longest moves. Only the steps count, not
+    /// whether the program still finds time for commands.
     fn fast(ticks: u32, steppers: usize, realtime: bool, run_s: f64) -> Load {
         let intervals = vec![ticks; steppers];
         let move_s = seconds(ticks) * f64::from(u16::MAX);
@@ -82,21 +81,21 @@ fn seconds(ticks: u32) -> f64 {
     f64::from(ticks) / f64::from(pinion_firmware::time::CLOCK_FREQ)
 }
 
-/// What became of a load.
+/// The result of a load.
 #[derive(Debug)]
 pub struct Outcome {
-    /// Of each step edge, in nanoseconds, sorted.
+    /// The lateness of each step edge, in nanoseconds, sorted.
     late_ns: Vec<i64>,
     pub cpu_us_per_step: f64,
     /// Why the MCU stopped, if it did.
     pub shutdown: Option<String>,
     pub lasted_s: f64,
-    /// CPUs that others used meanwhile.
+    /// CPUs that other processes used meanwhile.
     pub others: f64,
 }
 
 impl Outcome {
-    /// How late this share of the edges was at most.
+    /// The highest lateness of this share of the edges.
     pub fn late_us(&self, share: f64) -> f64 {
         table::quantile(&self.late_ns, share) as f64 / 1e3
     }
@@ -258,8 +257,8 @@ impl Queue {
     }
 }
 
-/// How late each step's edge was: the n-th rising edge of a line is the n-th step. Tick 0 is a
-/// whole second of CLOCK_MONOTONIC, the one that makes the first step the least late or early.
+/// How late each step's edge was. The n-th rising edge of a line is the n-th step. Tick 0 is a whole second of
+/// CLOCK_MONOTONIC: the one that makes the first step the least late or early.
 fn lateness(edges: &[(u64, u8, bool)], start: Clock, load: &Load) -> Result<Vec<i64>, String> {
     const SECOND: i64 = 1_000_000_000;
     let mut late = Vec::with_capacity(edges.len() / 2);
@@ -284,18 +283,18 @@ fn lateness(edges: &[(u64, u8, bool)], start: Clock, load: &Load) -> Result<Vec<
 /// The smallest interval that survives, and what happens below it.
 #[derive(Debug)]
 pub struct Smallest {
-    /// None if it survives none.
+    /// `None` if it survives none.
     pub ticks: Option<u32>,
     pub below: String,
 }
 
-/// Beyond this nothing is looked for.
+/// Highest interval that is tried.
 const TICKS_MAX: u32 = 20_000;
-/// So often it must die: once may be the fault of others on this computer.
+/// How often the MCU must die at an interval. One death may be the fault of other processes on this computer.
 const DEATHS: u32 = 2;
 
-/// Finds the smallest step interval at which the MCU goes on for so many seconds, within
-/// some 3 %. A driver that steps on both edges: one edge a step.
+/// Finds the smallest step interval at which the MCU continues for this many seconds, within some 3 %. The driver steps
+/// on both edges: one edge a step.
 pub fn smallest_interval(
     rig: &Rig,
     program: &Program,

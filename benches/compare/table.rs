@@ -12,7 +12,7 @@ pub fn quantile(sorted: &[i64], share: f64) -> i64 {
     sorted.get(rank.clamp(1, sorted.len().max(1)) - 1).copied().unwrap_or(0)
 }
 
-/// Where a figure stands.
+/// The place of a figure in the table.
 #[derive(Clone, Debug, PartialEq, Eq)]
 struct Place {
     group: String,
@@ -65,14 +65,14 @@ impl<'a> Run<'a> {
         self.table.figures.push(Figure { place, name, unit, program, round, value });
     }
 
-    /// Says something about a figure.
+    /// Adds a note to a figure.
     pub fn note(&mut self, group: &str, case: &str, text: &str) {
         let _ = write!(self.summary, "; {text}");
         let place = Place { group: group.into(), case: case.into() };
         self.table.notes.push(Remark { place, program: self.program, text: text.into() });
     }
 
-    /// CPUs that others used meanwhile.
+    /// CPUs that other processes used meanwhile.
     pub fn others(&mut self, cpus: f64) {
         let _ = write!(self.summary, "; others used {cpus:.2} CPUs");
         self.table.others.push(cpus);
@@ -102,7 +102,7 @@ impl Table {
         std::fs::write(file, text)
     }
 
-    /// One line for each case: medians over all rounds, for a single figure with their spread.
+    /// One line for each case: medians over all rounds. A single figure also gets its spread.
     pub fn render(&self, markdown: bool) -> String {
         let mut groups: Vec<&str> = Vec::new();
         for figure in &self.figures {
@@ -170,7 +170,7 @@ impl Table {
         rows
     }
 
-    /// What was said about a cell, the same in several rounds once.
+    /// The notes on a cell. A note of several rounds appears once.
     fn remark(&self, place: &Place, program: usize) -> Option<String> {
         let mut texts: BTreeMap<&str, u32> = BTreeMap::new();
         for note in self.notes.iter().filter(|note| note.place == *place && note.program == program) {

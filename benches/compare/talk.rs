@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Round trips and commands a second, measured at the terminal by a client that does as little
-//! as possible.
+//! Measures round trips and commands a second, at the terminal, with a client that does as little as possible.
 //!
-//! It is an ordinary process. As a real-time one it would not be kept from running by others,
-//! but it would itself keep the kernel's worker from running that carries bytes through a
-//! terminal.
+//! The client is an ordinary process. Others would not keep a real-time process from running. But it would keep the
+//! kernel's worker that carries bytes through a terminal from running.
 
 use std::fs::{File, OpenOptions};
 use std::io::{ErrorKind, Read, Write};
@@ -20,11 +18,11 @@ use pinion_protocol::block::{Found, PAYLOAD_MAX, Resync, Sequence, frame};
 
 use super::rig::Running;
 
-/// The program is given this long to go to sleep before the next round trip.
+/// How long the program has to go to sleep before the next round trip.
 const PAUSE: Duration = Duration::from_micros(300);
 const SILENCE: Duration = Duration::from_secs(2);
 
-/// Sends blocks whose bytes were made beforehand.
+/// Sends blocks that were made beforehand.
 struct Bare {
     tty: File,
     input: Vec<u8>,
@@ -42,7 +40,7 @@ impl Bare {
         tcsetattr(&file, SetArg::TCSANOW, &raw).map_err(|error| failed(error.into()))?;
         let input = Vec::with_capacity(8192);
         let mut bare = Bare { tty: file, input, resync: Resync::default(), expected: Sequence::default() };
-        // An empty block, expected or not, is answered by the number of the next.
+        // An empty block, expected or not, is answered with the number of the next block.
         let mut hello = Vec::new();
         frame(&[], Sequence::default(), &mut hello);
         bare.write(&hello)?;
@@ -58,7 +56,7 @@ impl Bare {
         self.tty.write_all(bytes).map_err(|error| format!("writing to the terminal: {error}"))
     }
 
-    /// Takes in what is there.
+    /// Takes in the bytes that are there.
     fn read(&mut self) -> Result<(), String> {
         let mut bytes = [0; 4096];
         match self.tty.read(&mut bytes) {
@@ -124,7 +122,7 @@ pub fn round_trips(running: &Running, command: Command<'_>, count: usize) -> Res
     Ok(times)
 }
 
-/// How many `debug_nop` a program takes in a second, in blocks full of them.
+/// How many `debug_nop` commands a program takes in a second, in full blocks.
 pub fn commands_a_second(running: &Running, span: Duration) -> Result<f64, String> {
     let nop = encoded(running, ("debug_nop", &[]))?;
     let in_block = PAYLOAD_MAX / nop.len();
@@ -137,7 +135,7 @@ pub fn commands_a_second(running: &Running, span: Duration) -> Result<f64, Strin
     Ok(blocks as f64 * in_block as f64 / start.elapsed().as_secs_f64())
 }
 
-/// How long, in nanoseconds, each of `count` commands takes that are sent one a block: the mean of each hundred, sorted.
+/// How long, in nanoseconds, each of `count` commands takes with one command a block: the mean of each hundred, sorted.
 pub fn each_alone(running: &Running, command: Command<'_>, count: usize) -> Result<Vec<i64>, String> {
     const HUNDRED: u64 = 100;
     let mut stream = Stream::open(running, &encoded(running, command)?)?;
@@ -153,7 +151,7 @@ pub fn each_alone(running: &Running, command: Command<'_>, count: usize) -> Resu
     Ok(each)
 }
 
-/// Blocks of one payload, as many under way as klippy has at most.
+/// Blocks of one payload. As many are under way as klippy has at most.
 struct Stream {
     bare: Bare,
     numbers: Vec<Sequence>,
@@ -173,7 +171,7 @@ impl Stream {
         Ok(Stream { bare, numbers, blocks, sent: 0, taken: 0 })
     }
 
-    /// Sends what may be sent, and waits until further blocks are acknowledged. Returns how many.
+    /// Sends as many blocks as it may, and waits until further blocks are acknowledged. Returns how many.
     fn acknowledged(&mut self) -> Result<u64, String> {
         let mut bytes = Vec::new();
         while self.sent - self.taken < WINDOW as u64 {
