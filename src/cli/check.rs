@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion run --check`: whether a configuration can be served on this machine. Nothing is changed: no
-//! link is made, no output is touched, and the hardware watchdog, which to open would start, is not
-//! opened.
+//! `pinion run --check`: whether a configuration can be served on this computer. Nothing is changed: no link is made
+//! and no output is touched. The hardware watchdog is not opened, because opening it would start it.
 
 #![forbid(unsafe_code)]
 
@@ -24,7 +23,7 @@ use super::finding::{self, Finding, Group, Level};
 use super::quietly;
 use super::settings::{BoardName, Settings, WATCHDOG, WATCHDOG_REMEDY};
 
-/// Checks and tells; `file` is the configuration file, which has been read.
+/// Checks, and prints the findings. `file` is the configuration file, which has been read.
 pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
     let mut findings = Vec::new();
     if let Some(file) = file {
@@ -41,11 +40,11 @@ pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
     finding::finish(&finding::text(&groups), &groups)
 }
 
-/// Whether the board opens, its devices may be opened, and the dialect can be made of its pins.
+/// Whether the board opens, its devices may be opened, and the dialect can be made from its pins.
 fn board(settings: &Settings) -> Vec<Finding> {
     let mut findings = Vec::new();
     if settings.board == BoardName::Linux {
-        // The board would log these, and serve what is left.
+        // The board would log these problems, and serve the rest.
         let problems = Inventory::scan().problems;
         findings.extend(problems.into_iter().map(|problem| Finding::of("devices", Level::Error, problem)));
     }
@@ -85,7 +84,7 @@ fn link(symlink: &Path) -> Finding {
         let remedy = "run Pinion as another user, or choose another path (symlink)";
         return Finding::error("symlink", format!("{path}: nothing may be written in {}", folder.display()), remedy);
     }
-    // As a rule it is the one that is to be restarted.
+    // As a rule, this is the program that is about to be restarted.
     if let Some(served) = runtime::served(symlink)
         && !leads_to_ours(symlink)
     {
@@ -103,7 +102,7 @@ fn link(symlink: &Path) -> Finding {
         Ok(_) if leads_to_ours(symlink) => {
             Finding::ok("symlink", format!("{path} is the service's link, which root puts in place for it"))
         }
-        // Only its owner and the folder's may replace a file in a folder such as /tmp.
+        // In a folder such as /tmp, only the owners of a file and of the folder may replace the file.
         Ok(there) if about_folder.mode() & 0o1000 != 0 && !is_one_of(&[there.uid(), about_folder.uid()]) => {
             Finding::error("symlink", format!("{path} is another user's link"), format!("sudo rm {path}"))
         }
@@ -112,8 +111,8 @@ fn link(symlink: &Path) -> Finding {
     }
 }
 
-/// Whether a link leads into a folder of this user's, as the service has it: klippy could not follow this
-/// user's own link in /tmp (systemd/link).
+/// Whether a link leads into a folder of this user, as the service has it. klippy could not follow this user's own link
+/// in /tmp (systemd/link).
 fn leads_to_ours(symlink: &Path) -> bool {
     let target = fs::read_link(symlink).ok();
     let folder = target.as_deref().and_then(Path::parent).and_then(|folder| fs::metadata(folder).ok());
@@ -143,14 +142,14 @@ fn group(name: Option<&str>) -> Finding {
         return Finding::ok("group", format!("the terminal goes to the group {wanted}"));
     }
     let remedy = match gid.as_raw() {
-        // Its members could do more than open a terminal.
+        // Members of this group could do more than open a terminal.
         0 => "choose another group, such as tty".to_owned(),
         _ => format!("sudo usermod -aG {wanted} {}, and log in anew", user_name()),
     };
     let what = format!("the terminal can not be given to the group {wanted}, of which this user is no member");
     match name {
         Some(_) => Finding::error("group", what, remedy),
-        // The program then goes on with the user's own group.
+        // The program then continues with the user's own group.
         None => Finding::warning("group", format!("{what}: a klippy of another user can not open it"), remedy),
     }
 }
@@ -160,7 +159,7 @@ fn user_name() -> String {
     user.map_or_else(|| geteuid().to_string(), |user| user.name)
 }
 
-/// Whether the processor is there, and whether real time is permitted, if it is asked for.
+/// Whether the processor is there. If real time is asked for, whether it is permitted.
 fn real_time(settings: &Settings) -> Vec<Finding> {
     let mut findings = Vec::new();
     match (settings.cpu, Processors::new(settings.cpu)) {

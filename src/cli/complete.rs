@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a shell offers for an option's value: the names that it may have, where it may be more than these.
+//! The names that a shell offers for the value of an option. The option may take other values too.
 
 #![forbid(unsafe_code)]
 
@@ -16,12 +16,12 @@ pub(super) const BOARDS: &[&str] = &["linux", "sim"];
 pub(super) const SIMULATED: &[&str] = &["sim"];
 /// Names of dialects.
 pub(super) const DIALECTS: &[&str] = &["v0.11", "v0.12", "v0.13", "master", "kalico", "union"];
-/// The same, with the one that is found by the host.
+/// The same, with the one that is found from the host.
 pub(super) const SPOKEN: &[&str] = &["auto", "v0.11", "v0.12", "v0.13", "master", "kalico", "union"];
-/// How much is logged.
+/// The levels of the log.
 pub(super) const LEVELS: &[&str] = &["error", "warn", "info", "debug", "trace", "off"];
 
-/// Reads a value; a shell is told these names of it.
+/// Reads a value, and offers these names for it to a shell.
 pub(super) fn offering<T>(names: &'static [&'static str]) -> impl TypedValueParser<Value = T>
 where
     T: FromStr<Err: Display> + Clone + Send + Sync + 'static,

@@ -25,14 +25,14 @@ const FOREIGN_BYTES_MAX: u64 = 1 << 20;
 /// A key of the file.
 struct Key {
     name: &'static str,
-    /// What its value has to look like, for whoever wrote another.
+    /// An example of its value, for error messages.
     example: &'static str,
-    /// Takes the value in. The error says what is wrong with it, if that is not clear from the example.
+    /// Takes the value in. The error says what is wrong with it, if the example does not make that clear.
     set: fn(&mut Given, &DeValue<'_>) -> Result<(), Option<String>>,
 }
 
 impl Key {
-    /// What is wrong with its value, and how it is to be written.
+    /// The error about its value, and how to write it.
     fn wrong(&self, why: Option<String>) -> Trouble {
         let Key { name, example, .. } = self;
         let form = format!("write it such as {name} = {example}");
@@ -44,7 +44,7 @@ impl Key {
     }
 }
 
-/// The key whose value a mistake is in that is no TOML, such as `mode = 0660`: it tells more than the parser.
+/// The key whose value is not TOML, such as `mode = 0660`. It tells more than the parser.
 fn key_at(text: &str, mistake: Option<Range<usize>>) -> Option<&'static Key> {
     let before = text.get(..mistake?.start)?;
     let (name, _) = before.rsplit('\n').next()?.split_once('=')?;
@@ -126,7 +126,7 @@ pub(super) fn load(path: &Path) -> Result<Given, Trouble> {
     of_file(&path.display(), fs::read(path))
 }
 
-/// The same of a file that another process names as `file`, and which may be anything.
+/// The same for a file that another process names as `file`. The file may be anything.
 pub(super) fn load_foreign(path: &Path, file: &str) -> Result<Given, Trouble> {
     of_file(&file, foreign::read(path, FOREIGN_BYTES_MAX))
 }
@@ -145,7 +145,7 @@ fn of_file(file: &dyn fmt::Display, bytes: io::Result<Vec<u8>>) -> Result<Given,
     }
 }
 
-/// Reads the text of a file; `file` is how an error calls it.
+/// Reads the text of a file. Errors call it `file`.
 fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, Trouble> {
     let wrong = |span: Option<Range<usize>>, what: Trouble| what.at(file, text, span.map_or(0, |span| span.start));
     let table = DeTable::parse(text)
@@ -157,7 +157,7 @@ fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, Trouble> {
             wrong(error.span(), what)
         })?
         .into_inner();
-    // A map sorts its keys; whoever corrects a file does so from its top.
+    // A map sorts its keys. People correct a file from its top.
     let mut entries: Vec<_> = table.iter().collect();
     entries.sort_by_key(|(key, _)| key.span().start);
     let mut given = Given::default();
@@ -170,7 +170,7 @@ fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, Trouble> {
     Ok(given)
 }
 
-/// How many letters of a name may be wrong for another to be what was meant.
+/// Highest number of wrong letters in a name for which another name is suggested.
 const LETTERS_WRONG: usize = 3;
 
 fn unknown(name: &str) -> Trouble {
@@ -178,7 +178,7 @@ fn unknown(name: &str) -> Trouble {
         true => 1,
         false => strsim::damerau_levenshtein(&name.to_lowercase().replace('-', "_"), key.name),
     };
-    // Two short names are as far apart as they are long.
+    // Two short names are as far apart as they are long, so the length counts too.
     let is_near = |key: &&Key| distance(key) <= LETTERS_WRONG.min(key.name.len() / 2);
     let meant = match KEYS.iter().filter(is_near).min_by_key(|key| distance(key)) {
         Some(key) => format!("did you mean {}?", key.name),
@@ -200,7 +200,7 @@ mod tests {
     fn the_file_that_is_installed_says_every_key_with_its_default() {
         let installed = include_str!("../../systemd/pinion.toml");
         assert_eq!(parse(installed, &"").unwrap(), Given::default(), "all of it is a comment");
-        // A line such as `#cpu = 3` is a setting, others are prose.
+        // A line such as `#cpu = 3` is a setting. The others are prose.
         let settings: Vec<&str> = installed
             .lines()
             .filter_map(|line| line.strip_prefix('#'))
@@ -213,7 +213,7 @@ mod tests {
         let mut given = parse(&settings.join("\n"), &"").unwrap();
         // These have no default that could be written down: any processor, and "tty if that is permitted".
         assert_eq!((given.cpu.take(), given.group.take().as_deref()), (Some(3), Some("tty")));
-        // The service's own.
+        // These are the service's own.
         assert_eq!(given.realtime.take(), Some(true));
         assert_eq!(given.symlink.take().unwrap(), Path::new("/run/pinion/klipper_host_mcu"));
         assert_eq!(given.socket.take().unwrap(), Path::new("/run/pinion/mcu.sock"));
@@ -258,7 +258,7 @@ mod tests {
         assert!(error("board = \"toaster\"").contains("f.toml:1:9: board: there are the boards linux, sim"));
         assert!(error("dialect = \"v0.10\"").contains("f.toml:1:11: dialect: there are the dialects "));
         assert!(error("log_level = \"loud\"").contains("there are error, warn, info, debug, trace and off"));
-        // The first of two mistakes is told, whatever their keys are.
+        // The first of two mistakes is reported, whatever their keys are.
         assert!(error("watchdog = 1\ncpu = true").starts_with("f.toml:1:12: watchdog: "));
     }
 

@@ -47,7 +47,7 @@ use super::{failed, logging, not_permitted};
 
 /// Longest wait for an answer of the MCU.
 const ANSWER_WAIT_MAX: Duration = Duration::from_secs(2);
-/// How often a console that waits for a line looks for what the machine says.
+/// How often a console that waits for a line looks for messages of the MCU.
 const LOOK: Duration = Duration::from_millis(20);
 /// How many lines are remembered.
 const HISTORY_LINES: usize = 1000;
@@ -68,7 +68,7 @@ pub(super) struct ConsoleArgs {
     board: Option<BoardName>,
 }
 
-/// Speaks to a machine until there are no more lines.
+/// Talks to an MCU until there are no more lines.
 pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
     let done = match &args.board {
         None => {
@@ -85,18 +85,18 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
     done.map_or_else(failed, |()| ExitCode::SUCCESS)
 }
 
-/// Fails if a host has the terminal open: two at once would take each other's answers.
+/// Fails if a host has the terminal open. Two hosts would take each other's answers.
 fn free(pty: &Path) -> Result<(), String> {
     let device = fs::canonicalize(pty)
         .map_err(|error| format!("{}: {error}: is Pinion running, and with this link?", pty.display()))?;
     let flags = (OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits();
     match fs::OpenOptions::new().read(true).write(true).custom_flags(flags).open(&device) {
-        // Anything else many a process may have open.
+        // A file that is no terminal may be open in many processes.
         Ok(file) if !file.is_terminal() => {
             return Err(pinion_client::Error::NoTerminal { port: pty.display().to_string() }.to_string());
         }
         Err(error) if error.kind() == io::ErrorKind::PermissionDenied => return Err(not_permitted(pty, &device)),
-        // What else is wrong is told of later.
+        // Other errors are reported later.
         Ok(_) | Err(_) => {}
     }
     let name = |processes: &[crate::klippy::process::Process]| {
@@ -120,11 +120,11 @@ fn free(pty: &Path) -> Result<(), String> {
     }
 }
 
-/// Runs a simulated machine, and speaks to it.
+/// Runs a simulated MCU, and talks to it.
 fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
-    // The one host is this console, which speaks every dialect.
+    // The only host is this console, and it speaks every dialect.
     let helpers = Helpers::default();
-    // The others end the machine in order, which then tells which it was.
+    // The other signals end the MCU in order. Then `signal` says which one it was.
     let terminal = lend_terminal(&[SIGQUIT])?;
     let signal = Arc::new(AtomicUsize::new(0));
     let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
@@ -132,7 +132,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
         signal_hook::flag::register_usize(ending, signal.clone(), ending.unsigned_abs() as usize)
             .map_err(|error| format!("signals can not be taken in: {error}"))?;
     }
-    // The lines that tell of each event are those of a service.
+    // The lines about each event are for a service.
     log::set_max_level(log::max_level().min(LevelFilter::Warn));
     logging::detach();
     let clock = Monotonic::start();
@@ -149,19 +149,19 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
         watchdog: None,
         sockets: Vec::new(),
     };
-    // What the console ended with; none as long as it has not.
+    // The console's result. `None` until the console has ended.
     let said = Arc::new(Mutex::new(None));
     let ready = {
         let (args, said, signal) = (args.clone(), said.clone(), signal.clone());
         move || {
             let speaking = thread::Builder::new().name("console".into()).spawn(move || {
                 let done = speak(&args, &symlink);
-                // A machine that a signal ends is gone for the console, too: that is no error of the console's.
+                // When a signal ends the MCU, the console loses it too. That is no error of the console.
                 if signal.load(Ordering::Relaxed) != 0 {
                     return;
                 }
                 *said.lock().unwrap_or_else(PoisonError::into_inner) = Some(done);
-                // SIGTERM to ourselves: the machine ends in order.
+                // SIGTERM to ourselves: the MCU ends in order.
                 if let Err(error) = kill(getpid(), Signal::SIGTERM) {
                     log::error!("ending: {error}");
                 }
@@ -183,10 +183,10 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     })
 }
 
-/// Lends the terminal, if stdin is one, to the line editor, which has it while somebody writes a line. These signals
-/// give it back.
+/// Lends the terminal, if stdin is one, to the line editor. The editor has it while a person writes a line. These
+/// signals give it back.
 fn lend_terminal(signals: &[i32]) -> Result<Option<Terminal>, String> {
-    // The editor asks the terminal to mark what is pasted.
+    // The editor asks the terminal to mark pasted text.
     let terminal = Terminal::lend(format_args!("{}\r\n", off(DecPrivateModeCode::BracketedPaste)));
     if terminal.is_some() {
         give_back_at(signals, Duration::ZERO)?;
@@ -194,7 +194,7 @@ fn lend_terminal(signals: &[i32]) -> Result<Option<Terminal>, String> {
     Ok(terminal)
 }
 
-/// Speaks to the machine of a terminal: the lines of a file, of a pipe, or of a person.
+/// Talks to the MCU of a terminal. The lines come from a file, from a pipe, or from a person.
 fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
     let client = Client::connect(pty, ANSWER_WAIT_MAX).map_err(|error| error.to_string())?;
     let console = Console::new(client);
@@ -236,8 +236,8 @@ fn one(line: &str) -> Page {
 
 // ---- a person
 
-/// Takes lines from a person. The machine is spoken to by a thread of its own, so that what it says meanwhile is
-/// printed above the line that is being written.
+/// Takes lines from a person. A thread of its own talks to the MCU. So the MCU's messages are printed above the line
+/// that is being written.
 fn converse(console: Console) -> Result<(), String> {
     let about = |error: ReadlineError| format!("the terminal: {error}");
     let config = Config::builder().completion_type(CompletionType::List).max_history_size(HISTORY_LINES);
@@ -246,10 +246,10 @@ fn converse(console: Console) -> Result<(), String> {
     editor.set_helper(Some(Words(console.vocabulary().clone())));
     let history = history_file();
     if let Some(path) = &history {
-        // There is none at the first time.
+        // There is no history at the first time.
         let _ = editor.load_history(path);
     }
-    // Where nothing can be drawn, as the output goes elsewhere or the terminal is too simple, lines come as they are.
+    // Nothing can be drawn if the output goes elsewhere or the terminal is too simple. Then lines come as they are.
     let Ok(printer) = editor.create_external_printer() else { return script(console, io::stdin().lock()) };
     let greeting = console.greeting();
     print(&one(&greeting))?;
@@ -280,7 +280,7 @@ fn read_lines(
 ) -> Result<(), String> {
     loop {
         match editor.readline(PROMPT) {
-            // What is pasted may have several lines.
+            // A pasted text may have several lines.
             Ok(text) => {
                 for line in text.lines() {
                     let is_gone = lines.send(line.to_owned()).is_err();
@@ -299,7 +299,7 @@ fn read_lines(
     }
 }
 
-/// Speaks to the machine: carries lines out as they come, and prints what it says.
+/// Talks to the MCU: carries out lines as they come, and prints the MCU's messages.
 fn attend(
     mut console: Console,
     mut printer: impl ExternalPrinter,
@@ -334,7 +334,7 @@ fn attend(
     }
 }
 
-/// Where lines are remembered (XDG Base Directory Specification).
+/// The file of the remembered lines (XDG Base Directory Specification).
 fn history_file() -> Option<PathBuf> {
     let folder = |name| std::env::var_os(name).map(PathBuf::from).filter(|folder| folder.is_absolute());
     let state = folder("XDG_STATE_HOME").or_else(|| Some(folder("HOME")?.join(".local/state")))?;

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The demonstration: identify a micro-controller, configure it, home its axes, heat its bed,
-//! and check each thing that was shown.
+//! The demonstration. It identifies an MCU, configures it, homes its axes, heats its bed, and checks each result.
 
 #![forbid(unsafe_code)]
 
@@ -19,9 +18,9 @@ use pinion_client::{Client, Error};
 use pinion_protocol::clock::Clock;
 use pinion_sim::Thermistor;
 
-/// An axis looks for its endstop over its travel times this.
+/// How far an axis looks for its endstop, as a multiple of its travel.
 const OVERTRAVEL: f64 = 1.2;
-/// The second approach to the endstop has the speed of the first times this.
+/// Speed of the second approach to the endstop, as a part of the first one's.
 const SECOND_SPEED: f64 = 0.5;
 
 /// A pin by its name, and whether it is inverted.
@@ -36,7 +35,7 @@ pub struct NamedPin {
 /// An axis.
 #[derive(Clone, Debug, PartialEq)]
 pub struct AxisPlan {
-    /// What people call it.
+    /// Its name for people.
     pub name: String,
     /// The step pin.
     pub step: NamedPin,
@@ -48,30 +47,30 @@ pub struct AxisPlan {
     pub endstop: NamedPin,
     /// The endstop's resistor: 1 pulls up, -1 down, 0 is none.
     pub endstop_pull: i8,
-    /// Steps in a millimetre.
+    /// Steps per millimeter.
     pub steps_per_mm: f64,
     /// Whether the driver steps on both edges.
     pub both_edges: bool,
     /// Width of a step pulse in microseconds.
     pub pulse_us: f64,
-    /// How far the axis can go, in millimetres.
+    /// How far the axis can go, in millimeters.
     pub travel_mm: f64,
-    /// How far the axis is from the endstop at first, in millimetres, if that is known.
+    /// How far the axis is from the endstop at first, in millimeters, if that is known.
     pub start_mm: Option<f64>,
-    /// Whether the endstop is where the position is greatest.
+    /// Whether the endstop is at the highest position.
     pub home_positive: bool,
     /// Speed towards the endstop, in mm/s.
     pub speed_mm_s: f64,
     /// Acceleration in mm/s².
     pub acceleration_mm_s2: f64,
-    /// How far the axis goes back before its second approach, in millimetres.
+    /// How far the axis goes back before its second approach, in millimeters.
     pub retract_mm: f64,
 }
 
 /// A heater.
 #[derive(Clone, Debug, PartialEq)]
 pub struct HeaterPlan {
-    /// What people call it.
+    /// Its name for people.
     pub name: String,
     /// The output's pin.
     pub heater: NamedPin,
@@ -79,15 +78,15 @@ pub struct HeaterPlan {
     pub sensor: String,
     /// The sensor.
     pub thermistor: Thermistor,
-    /// Degrees Celsius below which the micro-controller shuts down.
+    /// Degrees Celsius below which the MCU shuts down.
     pub min_c: f64,
-    /// Degrees Celsius above which the micro-controller shuts down.
+    /// Degrees Celsius above which the MCU shuts down.
     pub max_c: f64,
-    /// What is to be shown.
+    /// The goal to reach.
     pub goal: Goal,
 }
 
-/// What a demonstration is to show.
+/// The plan of a demonstration.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Plan {
     /// The axes, homed in this order.
@@ -96,14 +95,14 @@ pub struct Plan {
     pub heater: Option<HeaterPlan>,
 }
 
-/// What was seen of an axis at an instant.
+/// A sample of an axis.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct AxisSample {
     /// Seconds since the first move of the demonstration.
     pub t_s: f64,
-    /// Millimetres from the position at which the second approach ended.
+    /// Millimeters from the position at which the second approach ended.
     pub mm: f64,
-    /// Steps in a second since the sample before, with the sign of the direction.
+    /// Steps per second since the previous sample, with the sign of the direction.
     pub steps_per_s: f64,
     /// Whether the endstop was triggered.
     pub triggered: bool,
@@ -114,13 +113,13 @@ pub struct AxisSample {
 pub struct AxisReport {
     /// The axis.
     pub name: String,
-    /// What was seen, in order.
+    /// The samples, in order.
     pub samples: Vec<AxisSample>,
     /// When its endstop triggered, in seconds since the first move of the demonstration.
     pub triggers_s: Vec<f64>,
 }
 
-/// What was seen of a heater at an instant.
+/// A sample of a heater.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct HeatSample {
     /// Seconds since heating began.
@@ -138,22 +137,22 @@ pub struct HeatReport {
     pub name: String,
     /// Degrees Celsius.
     pub target_c: f64,
-    /// What was seen, in order.
+    /// The samples, in order.
     pub samples: Vec<HeatSample>,
 }
 
-/// Something that was shown, and whether it went as it should.
+/// A check, and its result.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Check {
-    /// What was to be shown.
+    /// The subject of the check.
     pub what: String,
-    /// Whether it went as it should.
+    /// Whether it passed.
     pub passed: bool,
-    /// What was seen.
+    /// The values that were seen.
     pub seen: String,
 }
 
-/// What the demonstration saw.
+/// The result of the demonstration.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Report {
     /// The program at the other end.
@@ -164,12 +163,12 @@ pub struct Report {
     pub axes: Vec<AxisReport>,
     /// The heater, if there was one.
     pub heater: Option<HeatReport>,
-    /// All that was checked.
+    /// All checks.
     pub checks: Vec<Check>,
 }
 
 impl Report {
-    /// Whether everything that was shown went as it should.
+    /// Whether all checks passed.
     pub fn passed(&self) -> bool {
         self.checks.iter().all(|check| check.passed)
     }
@@ -181,16 +180,16 @@ impl Report {
     }
 }
 
-/// Whoever is told how the demonstration goes.
+/// Gets the progress of the demonstration.
 pub trait Observer {
     /// `what` is under way; `part` of it, 0 to 1, is done.
     fn update(&mut self, what: &str, part: f64, detail: &str);
-    /// Something was shown.
+    /// A check is done.
     fn checked(&mut self, check: &Check);
 }
 
-/// Writes how the demonstration goes: on a terminal as one line that is written over, elsewhere as
-/// one line a second.
+/// Writes the progress of the demonstration. On a terminal it is one line that is written over. Elsewhere it is one
+/// line a second.
 #[derive(Debug)]
 pub struct ProgressLines<W: Write> {
     out: W,
@@ -208,12 +207,12 @@ impl ProgressLines<io::Stdout> {
 }
 
 impl<W: Write> ProgressLines<W> {
-    /// Writes to `out`; `live` tells whether a line there can be written over.
+    /// Writes to `out`. `live`: a line there can be written over.
     pub fn new(out: W, live: bool) -> ProgressLines<W> {
         ProgressLines { out, live, next: None }
     }
 
-    // Errors are ignored: the demonstration goes on even if nobody reads how it goes.
+    // Errors are ignored: the demonstration continues even if nobody reads its progress.
     fn write(&mut self, before: &str, line: &str, after: &str) {
         let _ = write!(self.out, "{before}{}{after}", plain(line)).and_then(|()| self.out.flush());
     }
@@ -253,11 +252,11 @@ struct Axis<'a> {
     enable: Option<(u8, bool)>,
 }
 
-/// Carries out the plan. What was shown and did not go as it should stands in the report.
+/// Carries out the plan. Checks that failed are in the report.
 ///
 /// # Errors
 ///
-/// The micro-controller does not answer or shuts down, or the plan can not be carried out.
+/// The MCU does not answer or shuts down, or the plan cannot be carried out.
 pub fn demonstrate(client: &mut Client, plan: &Plan, progress: &mut dyn Observer) -> Result<Report, Error> {
     let dictionary = client.dictionary();
     let mut report = Report { app: dictionary.app.clone(), version: dictionary.version.clone(), ..Report::default() };
@@ -396,8 +395,8 @@ impl<'a> Axis<'a> {
         Ok(())
     }
 
-    /// Whether both approaches, the first begun at position `from`, ended at the endstop and at the
-    /// same place, and what was seen. `released` tells whether the endstop opened in between.
+    /// Whether both approaches ended at the endstop and at the same place, and the values that were seen. The first one
+    /// began at position `from`. `released`: the endstop opened in between.
     fn judge(&self, from: i64, first: Homed, released: bool, second: Homed) -> (bool, String) {
         let went = (first.position - from).abs();
         let slack = i64::from(first.slack_steps);
@@ -445,7 +444,7 @@ impl<'a> Axis<'a> {
     }
 }
 
-/// Keeps what is seen of an axis while it moves, and shows it to the observer.
+/// Keeps the samples of an axis while it moves, and shows them to the observer.
 struct AxisRecorder<'a> {
     what: &'a str,
     steps_per_mm: f64,

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What `pinion doctor` and `pinion run --check` say: one finding after the other, each fine or not,
-//! with what mends it.
+//! The report of `pinion doctor` and `pinion run --check`: findings, each with its level and its remedy.
 
 #![forbid(unsafe_code)]
 
@@ -14,13 +13,13 @@ use pinion_firmware::trouble::Trouble;
 use super::failed;
 use super::page::{Page, print};
 
-/// How grave a finding is.
+/// The level of a finding.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize)]
 #[serde(rename_all = "lowercase")]
 pub(super) enum Level {
-    /// Nothing needs to be mended.
+    /// Nothing needs to be fixed.
     Ok,
-    /// Something works worse than it could, or may not work, or is not known.
+    /// Something works worse than it could, or may not work, or is unknown.
     Warning,
     /// Something does not work.
     Error,
@@ -36,13 +35,13 @@ impl Level {
     }
 }
 
-/// What was found.
+/// A finding.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) struct Finding {
-    /// What was looked at, in one word that stays the same from version to version.
+    /// The check's name, in one word that stays the same in all versions.
     pub(super) check: &'static str,
     pub(super) status: Level,
-    /// What is so, and the command that mends it, or what else to do.
+    /// The state, and the remedy: a command or another step.
     pub(super) told: Trouble,
 }
 
@@ -54,27 +53,27 @@ impl Serialize for Finding {
 }
 
 impl Finding {
-    /// It is as it should be.
+    /// The state is as it should be.
     pub(super) fn ok(check: &'static str, told: impl Into<Trouble>) -> Finding {
         Finding::of(check, Level::Ok, told)
     }
 
-    /// It may be a reason why something does not work well.
+    /// The state may be a reason why something does not work well.
     pub(super) fn warning(check: &'static str, told: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
         Finding::of(check, Level::Warning, told).or(remedy)
     }
 
-    /// It is why something does not work.
+    /// The state is the reason why something does not work.
     pub(super) fn error(check: &'static str, told: impl Into<Trouble>, remedy: impl Into<Box<str>>) -> Finding {
         Finding::of(check, Level::Error, told).or(remedy)
     }
 
-    /// So grave, with the remedy that it has.
+    /// A finding of this level, with the remedy in `told`.
     pub(super) fn of(check: &'static str, status: Level, told: impl Into<Trouble>) -> Finding {
         Finding { check, status, told: told.into() }
     }
 
-    /// The same with a remedy, for something that is fine but may be wanted otherwise.
+    /// The same with a remedy, for a state that is fine but may be unwanted.
     pub(super) fn or(self, remedy: impl Into<Box<str>>) -> Finding {
         Finding { told: self.told.remedy(remedy), ..self }
     }
@@ -93,7 +92,7 @@ impl Group {
     }
 }
 
-/// For people: a line for each finding, and below it what mends it.
+/// The report for people: a line for each finding, with the remedy below it.
 pub(super) fn text(groups: &[Group]) -> Page {
     let mut page = Page::default();
     for Group { name, findings } in groups.iter().filter(|group| !group.findings.is_empty()) {
@@ -110,7 +109,7 @@ pub(super) fn text(groups: &[Group]) -> Page {
     page
 }
 
-/// For programs.
+/// The report for programs.
 pub(super) fn json(groups: &[Group]) -> Page {
     let [warnings, errors] = [Level::Warning, Level::Error].map(|level| count(groups, level));
     Page::json(&format!("{:#}\n", json!({ "groups": groups, "errors": errors, "warnings": warnings })))

@@ -62,7 +62,7 @@ const PANEL: f64 = 190.0;
 const LEFT: f64 = 50.0;
 const RIGHT: f64 = 50.0;
 
-/// Where a lateness stands on the horizontal axis, which is logarithmic from 0.02 us to 100 ms.
+/// The place of a lateness on the horizontal axis, which is logarithmic from 0.02 us to 100 ms.
 fn place(late_us: f64) -> f64 {
     LEFT + (late_us.max(0.02) / 0.02).log10() / 6.7 * (WIDTH - LEFT - RIGHT)
 }
@@ -106,7 +106,7 @@ fn draw_bars(svg: &mut String, lateness: &Lateness, color: &str, base: f64) {
     let most = lateness.buckets().map(|(_, count)| count).max().unwrap_or(1) as f64;
     let mut before = 0.0;
     for (upper, count) in lateness.buckets() {
-        // The height is logarithmic, too, so that one late event in ten thousand can be seen.
+        // The height is logarithmic too, so that one late event in ten thousand is visible.
         let tall = (count as f64 + 1.0).ln() / (most + 1.0).ln() * (PANEL - 90.0);
         let (from, to) = (place((us(upper) * 8.0 / 9.0).max(before)), place(us(upper)));
         before = us(upper);

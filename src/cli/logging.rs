@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The log: one line on stderr for each event.
 //!
-//! While the program serves a host, no thread may block because nobody reads stderr, such as a journal
-//! that stalls or a terminal that Ctrl-S has stopped. So lines go through a bounded queue to a thread
-//! that writes them. Before the guardian is forked there can be no thread, and the guardian has none.
-//! There, a line is written at once, and dropped if nobody reads it for a second.
+//! While the program serves a host, no thread may block because nobody reads stderr. A journal may stall, and Ctrl-S
+//! may stop a terminal. So lines go through a bounded queue to a thread that writes them. Before the guardian is forked
+//! there can be no thread, and the guardian has none. There, a line is written at once, and dropped if nobody reads it
+//! for a second.
 
 #![forbid(unsafe_code)]
 
@@ -25,11 +25,11 @@ use nix::unistd::write;
 
 use crate::foreign::plain;
 
-/// How many lines may wait to be written. Further ones are dropped and counted.
+/// Highest number of lines that may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
-/// How long the program waits at its end until the queue is written.
+/// How long the program's end waits until the queue is written.
 const FAREWELL: Duration = Duration::from_secs(1);
-/// How long a line that is written at once may wait for somebody to read, in milliseconds.
+/// How long a line that is written at once may wait for a reader, in milliseconds.
 const WRITE_TIMEOUT_MS: u16 = 1000;
 /// How many bytes a pipe takes without blocking once poll(2) says that it can be written (`PIPE_BUF`).
 const PIECE_BYTES: usize = 4096;
@@ -39,7 +39,7 @@ static STDERR: Stderr = Stderr { style: OnceLock::new(), queue: Mutex::new(Queue
 struct Stderr {
     style: OnceLock<Style>,
     queue: Mutex<Queue>,
-    /// Told when a line comes, and when the queue has been written.
+    /// Notified when a line comes, and when the queue has been written.
     changed: Condvar,
 }
 
@@ -68,7 +68,7 @@ impl Queue {
         }
     }
 
-    /// The next line to write. Once the queue is empty this is one that tells how many lines were lost.
+    /// The next line to write. After the last one comes a line that tells how many lines were lost.
     fn pop(&mut self, style: Style) -> Option<String> {
         self.lines.pop_front().or_else(|| {
             let lost = std::mem::take(&mut self.lost);
@@ -87,15 +87,14 @@ impl Queue {
 enum Style {
     /// For the journal: with the level as a prefix (sd-daemon(3)).
     Journal,
-    /// For people: with level and time, in seconds of CLOCK_MONOTONIC, by which the machine's own
-    /// clock runs, too.
+    /// For people: with the level and the time in seconds of CLOCK_MONOTONIC. The MCU's own clock runs by it too.
     Plain,
 }
 
 impl Style {
     fn line(self, level: Level, text: fmt::Arguments<'_>) -> String {
         let text = text.to_string();
-        // A line feed in a name would begin a line of its own, and with `<0>` one of any priority.
+        // A line feed in a name would begin a new line, and with `<0>` a line of any priority.
         let text = plain(&text);
         match self {
             Style::Journal => {
@@ -149,8 +148,8 @@ impl Stderr {
     }
 }
 
-/// Whether a descriptor is of the file that is named by its device and inode, as `JOURNAL_STREAM` does it
-/// (systemd.exec(5)): whatever a service starts inherits the variable, though its stderr may be another.
+/// Whether a descriptor is of the file that `named` gives by its device and inode, as `JOURNAL_STREAM` does
+/// (systemd.exec(5)). Every program that a service starts inherits the variable, though its stderr may be another file.
 fn is_same(named: &str, descriptor: BorrowedFd<'_>) -> bool {
     let file = descriptor.try_clone_to_owned().and_then(|descriptor| File::from(descriptor).metadata());
     file.is_ok_and(|file| named == format!("{}:{}", file.dev(), file.ino()))
@@ -179,8 +178,8 @@ impl Log for Stderr {
     fn flush(&self) {}
 }
 
-/// Writes a line to stderr. The rest of it is dropped if nobody reads for as long as `patience`, or if
-/// it can not be written: there is no other place to report that.
+/// Writes a line to stderr. The rest of it is dropped if nobody reads for `patience`, or if it cannot be written: there
+/// is no other place to report that.
 fn put(line: &str, patience: PollTimeout) {
     let stderr = io::stderr();
     let mut rest = line.as_bytes();
@@ -201,13 +200,13 @@ fn put(line: &str, patience: PollTimeout) {
 
 /// Turns the log on, for lines at `level` or graver.
 pub(super) fn start(level: LevelFilter) {
-    // This fails if another logger is set already, as a test may have done. That one stays.
+    // This fails if another logger is set already, for example by a test. That one stays.
     let _ = log::set_logger(&STDERR);
     log::set_max_level(level);
 }
 
-/// Starts the thread that writes, so that no other thread waits for whoever reads stderr. To be called
-/// after the guardian is forked, as a process with threads can not be.
+/// Starts the thread that writes, so that no other thread waits for a reader of stderr. Call it after the guardian is
+/// forked, because a process with threads cannot be forked.
 pub(super) fn detach() {
     match thread::Builder::new().name("log".into()).spawn(|| STDERR.write_on()) {
         Ok(_) => STDERR.queue().has_writer = true,
@@ -215,7 +214,7 @@ pub(super) fn detach() {
     }
 }
 
-/// Waits for a second at most until the queue is written. Later lines are written at once.
+/// Waits up to a second until the queue is written. Later lines are written at once.
 pub(super) fn finish() {
     let mut queue = STDERR.queue();
     if queue.has_writer {

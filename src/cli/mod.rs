@@ -103,8 +103,8 @@ pub fn main() -> ExitCode {
     status
 }
 
-/// What a command line says to `pinion run`, such as that of a process that runs; none if it is not that of
-/// a machine.
+/// The options of `pinion run` in a command line, such as a running process's. `None` if the command line does not
+/// serve a host.
 fn run_args(arguments: impl IntoIterator<Item = OsString>) -> Result<Option<run::RunArgs>, clap::Error> {
     let cli = Cli::try_parse_from(arguments)?;
     Ok(match cli.command {
@@ -124,11 +124,11 @@ fn completions(shell: clap_complete::Shell) -> ExitCode {
     }
 }
 
-/// Has a panic in any thread logged and end the process. Otherwise only that thread would end: without
-/// its core, for one, the machine would still answer its host, with the outputs as they are.
+/// Makes a panic in any thread log a line and end the process. Otherwise only that thread would end. Without its core,
+/// for example, the MCU would still answer its host, with the outputs as they are.
 fn end_by_panic() {
     std::panic::set_hook(Box::new(|panic| {
-        // First, as the lines that wait in the log's queue are lost once the process has ended.
+        // This comes first: the lines in the log's queue are lost when the process has ended.
         logging::finish();
         let panic = panic.to_string().replace('\n', " ");
         log::error!("this is a bug in Pinion, which ends here: please report it with this line: {panic}");
@@ -136,7 +136,7 @@ fn end_by_panic() {
     }));
 }
 
-/// Does `work` with nothing but errors logged, as what it finds is printed.
+/// Does `work` with only errors logged, because its findings are printed.
 fn quietly<T>(work: impl FnOnce() -> T) -> T {
     let level = log::max_level();
     log::set_max_level(level.min(LevelFilter::Error));
@@ -145,7 +145,7 @@ fn quietly<T>(work: impl FnOnce() -> T) -> T {
     done
 }
 
-/// Why somebody may not ask a running Pinion by a link of it, which leads to this file.
+/// Why a user may not ask a running Pinion by its link, which leads to this file.
 fn not_permitted(link: &Path, file: &Path) -> String {
     let remedy = match Opener::of(file).command() {
         Some(command) => format!("\"{command}\" and log in anew, or use sudo"),

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The way to stdout: pages of whole lines.
 //!
-//! What a line says may come from anywhere: a host, a process, a file, a device. In a [`Page`] it stays in
-//! its line, and holds nothing that a terminal takes for a command. The log does the same (`logging.rs`).
+//! The text of a line may come from anywhere: a host, a process, a file, a device. In a [`Page`] it stays in its line,
+//! and has nothing that a terminal takes for a command. The log does the same (`logging.rs`).
 
 #![forbid(unsafe_code)]
 
@@ -66,8 +66,8 @@ pub(super) fn aligned(rows: &[Vec<String>]) -> Vec<String> {
     rows.iter().map(line).collect()
 }
 
-/// Prints on stdout. A reader that has closed it, such as `head`, is no failure: the program goes on
-/// with what else it has to do.
+/// Prints on stdout. A reader that has closed it, such as `head`, is no failure: the program continues with its other
+/// work.
 pub(super) fn print(page: &Page) -> Result<(), String> {
     match draw(&page.0) {
         Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout can not be written: {error}")),
@@ -75,7 +75,7 @@ pub(super) fn print(page: &Page) -> Result<(), String> {
     }
 }
 
-/// Writes on stdout what moves the cursor and paints. The texts in it come from a page or from [`plain`].
+/// Writes text on stdout that moves the cursor and paints. The names in it come from a page or from [`plain`].
 pub(super) fn draw(text: &str) -> io::Result<()> {
     let mut out = io::stdout().lock();
     out.write_all(text.as_bytes())?;
@@ -88,7 +88,7 @@ pub(in crate::cli) mod tests {
     use crate::foreign::tests::any_name;
     use proptest::prelude::*;
 
-    /// Asserts that nothing but lines leaves a printer, and no more of them than with harmless names.
+    /// Asserts that only lines leave a printer, and no more of them than with harmless names.
     #[track_caller]
     pub(in crate::cli) fn assert_plain(text: &str, lines: usize) {
         let control = text.chars().find(|c| c.is_control() && *c != '\n');

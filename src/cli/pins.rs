@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion pins`: the pins and buses of this computer, and how to write them in printer.cfg.
 //!
-//! What is listed is gathered first, and then written as a table or as JSON.
+//! The list is gathered first, then written as a table or as JSON.
 
 #![forbid(unsafe_code)]
 
@@ -44,10 +44,10 @@ pub(super) fn run(args: &PinsArgs) -> ExitCode {
     let page = list.page();
     let is_nothing = !args.json && page.is_empty();
     for problem in &inventory.problems {
-        // Where nothing is listed, this is why.
+        // If nothing is listed, this is the reason.
         log::log!(if is_nothing { log::Level::Error } else { log::Level::Warn }, "{problem}");
     }
-    // Programs want JSON of nothing, too.
+    // Programs want JSON even if nothing is listed.
     if args.json {
         return print(&Page::json(&list.json())).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
@@ -70,11 +70,11 @@ fn nothing(args: &PinsArgs) -> String {
     }
 }
 
-/// What a channel reads now.
+/// The present reading of a channel.
 #[derive(Clone, Debug, Serialize)]
 #[serde(untagged)]
 enum Reading {
-    /// As its driver has it, and in counts of 0 to 4095, as a host gets it.
+    /// The driver's value, and the host's value in counts of 0 to 4095.
     Good {
         raw: i64,
         counts: u16,
@@ -104,7 +104,7 @@ fn reading(inventory: &Inventory, device: u32, id: &str) -> Reading {
     }
 }
 
-/// All that is listed. The field names are those of the JSON, which others rely on.
+/// The whole list. The field names are the keys of the JSON, and other programs rely on them.
 #[derive(Debug, Serialize)]
 struct List {
     gpio: Vec<GpioChip>,
@@ -113,7 +113,7 @@ struct List {
     spi: Vec<SpiDevice>,
     i2c: Vec<I2cEntry>,
     w1: Vec<W1Sensor>,
-    /// What is there and can not be used.
+    /// Devices that are there and cannot be used.
     problems: Vec<String>,
 }
 
@@ -122,7 +122,7 @@ struct GpioChip {
     chip: String,
     label: String,
     line_count: usize,
-    /// An expander: no lines for steps or other timed edges.
+    /// An expander: its lines are not for steps or other timed edges.
     behind_bus: bool,
     lines: Vec<GpioLine>,
 }
@@ -135,7 +135,7 @@ struct GpioLine {
     direction: &'static str,
     /// Whether a driver or a program has it.
     held: bool,
-    /// Who has it, as far as the kernel tells.
+    /// Its holder, as far as the kernel tells.
     consumer: Option<String>,
     /// The device that the pin is switched to.
     device: Option<String>,
@@ -169,7 +169,7 @@ struct AdcDevice {
 #[derive(Debug, Serialize)]
 struct AdcChannel {
     channel: String,
-    /// None if its driver does not tell it.
+    /// `None` if the driver does not tell it.
     resolution: Option<String>,
     reading: Reading,
     pins: Vec<String>,
@@ -187,7 +187,7 @@ struct PwmLine {
     channel: u32,
     exported: bool,
     consumer: Option<String>,
-    /// None if it is beyond the channels that have names.
+    /// `None` if it is beyond the channels that have names.
     pin: Option<String>,
 }
 
@@ -202,7 +202,7 @@ struct I2cEntry {
     device: String,
     adapter: Option<String>,
     i2c_bus: String,
-    /// Chips that the kernel knows of; one with a driver is not for printer.cfg.
+    /// Chips that the kernel knows. A chip with a driver is not for printer.cfg.
     chips: Vec<I2cDevice>,
 }
 
@@ -219,8 +219,8 @@ struct W1Sensor {
 }
 
 impl List {
-    /// What is wanted of all that was found. `reading` returns what a channel (its driver's name) of a
-    /// device (its number) reads.
+    /// The wanted part of everything that was found. `reading` reads a channel (its driver's name) of a device (its
+    /// number).
     fn new(inventory: &Inventory, sysfs: &Sysfs, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> Reading) -> List {
         let names = Names::of(inventory);
         let mut list = List {
@@ -293,7 +293,7 @@ fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip 
         let mut pins = number.map_or_else(Vec::new, |n| names.of_pin(n));
         pins.retain(|name| *name != numbered);
         let mut pins: Vec<String> = pins.into_iter().map(str::to_owned).collect();
-        // The first name, which is the line's own if it has one, then the numeric one.
+        // The numeric name comes second. The first name is the line's own, if it has one.
         pins.insert(pins.len().min(1), numbered);
         let line = GpioLine {
             line: offset,
@@ -384,7 +384,7 @@ fn i2c(bus: &I2cBus, args: &PinsArgs) -> Option<I2cEntry> {
     })
 }
 
-/// A heading and a table; nothing if there are no rows.
+/// A heading and a table. Nothing if there are no rows.
 fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> Page {
     let mut page = Page::default();
     if rows.is_empty() {
@@ -412,7 +412,7 @@ fn gpio_section(chip: &GpioChip) -> Page {
             cut(line.name.as_deref().unwrap_or("-")),
             line.direction.to_owned(),
             cut(line.used_by()),
-            // What the others look like is said in the heading.
+            // The heading says what the other names look like.
             line.pins[..line.pins.len().min(2)].join(", "),
         ]
     };
@@ -647,7 +647,7 @@ I2C
         assert_eq!(filtered("nonesuch"), "");
     }
 
-    /// These keys are what programs rely on, and the manual page names.
+    /// Programs rely on these keys, and the manual page names them.
     #[test]
     fn the_json_has_all_of_it_under_keys_that_stay() {
         let value: Value = serde_json::from_str(&of(&pi(), &PinsArgs::default()).json()).unwrap();

@@ -20,7 +20,7 @@ use super::{check, config, end_by_panic, failed, logging};
 
 /// Options of `pinion run`, and of `pinion` alone.
 #[derive(Args, Clone, Debug)]
-// What the unit and PINION_OPTIONS both say is no mistake: the last one counts.
+// An option may stand both in the unit and in PINION_OPTIONS. The last one counts.
 #[command(args_override_self = true)]
 pub(super) struct RunArgs {
     #[command(flatten)]
@@ -34,7 +34,7 @@ pub(super) struct RunArgs {
 }
 
 impl Settings {
-    /// What the runtime needs to know.
+    /// The options of the runtime.
     fn options(&self) -> Options {
         Options {
             symlink: self.symlink.clone(),
@@ -50,12 +50,12 @@ impl Settings {
 }
 
 impl RunArgs {
-    /// What the command line says by itself, and the configuration file that it names.
+    /// The command line's own settings, and the configuration file that it names.
     pub(super) fn into_parts(self) -> (Given, Option<PathBuf>) {
         (self.given, self.config)
     }
 
-    /// What the command line says, then the configuration file; `log_level` is the command line's.
+    /// The command line's settings, then the configuration file's. `log_level` is the command line's.
     ///
     /// # Errors
     ///
@@ -67,7 +67,7 @@ impl RunArgs {
     }
 }
 
-/// Serves until SIGTERM, SIGINT or SIGHUP; with `--check` only tells whether that could be done.
+/// Serves until SIGTERM, SIGINT or SIGHUP. With `--check` it only tells whether that is possible.
 pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     let settings = match args.settings(log_level) {
         Ok(settings) => settings,

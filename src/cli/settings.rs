@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What `pinion run` runs by: what its command line and its configuration file may say, and the defaults.
+//! The settings of `pinion run`: from its command line, its configuration file and the defaults.
 
 #![forbid(unsafe_code)]
 
@@ -22,10 +22,10 @@ use super::complete::{BOARDS, SPOKEN, offering};
 
 /// The device of the watchdog that -w feeds.
 pub(super) const WATCHDOG: &str = "/dev/watchdog";
-/// What to do where it is not there.
+/// The remedy if the device is missing.
 pub(super) const WATCHDOG_REMEDY: &str =
     "sudo modprobe softdog; on a Raspberry Pi dtparam=watchdog=on in config.txt, and reboot";
-/// The longest margin that may be asked for.
+/// Highest margin that may be asked for.
 pub(super) const MARGIN_MAX_US: u32 = 10_000;
 
 /// What the command line or the configuration file says, as far as it says anything.
@@ -63,12 +63,12 @@ pub(super) struct Given {
     /// Where to put the socket for `pinion status` [default: named for the link, in /run/pinion or beside it]
     #[arg(long, value_name = "PATH")]
     pub(super) socket: Option<PathBuf>,
-    /// The command line's is an option of all subcommands.
+    /// The command line's level is an option of all subcommands.
     #[arg(skip)]
     pub(super) log_level: Option<LevelFilter>,
 }
 
-/// What the program runs by.
+/// The settings that the program runs by.
 #[derive(Clone, Debug)]
 pub(super) struct Settings {
     pub(super) symlink: PathBuf,
@@ -84,7 +84,7 @@ pub(super) struct Settings {
 }
 
 impl Given {
-    /// What is said here, and where nothing is, what `other` says.
+    /// The values given here. Where one is missing, it is `other`'s.
     pub(super) fn or(self, other: Given) -> Given {
         Given {
             symlink: self.symlink.or(other.symlink),
@@ -101,7 +101,7 @@ impl Given {
         }
     }
 
-    /// The same with the defaults.
+    /// The same, with the defaults for missing values.
     pub(super) fn settings(self) -> Settings {
         Settings {
             symlink: self.symlink.unwrap_or_else(|| "/tmp/klipper_host_mcu".into()),
@@ -126,12 +126,12 @@ pub(super) fn mode(text: &str) -> Result<u32, String> {
     }
 }
 
-/// Which board, as the command line names it.
+/// A board, as the command line names it.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub(super) enum BoardName {
-    /// This machine's pins.
+    /// This computer's pins.
     Linux,
-    /// The simulated printer: the default one, or that of a TOML file.
+    /// The simulated printer: the default one, or the one in a TOML file.
     Sim(Option<PathBuf>),
 }
 
@@ -148,7 +148,7 @@ impl FromStr for BoardName {
     }
 }
 
-/// The dialect that is spoken; none: that of the host that comes.
+/// The dialect to speak. `None`: the dialect of the host that comes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Spoken(Option<DialectName>);
 
@@ -164,7 +164,7 @@ impl FromStr for Spoken {
 }
 
 impl BoardName {
-    /// Opens the board. Its outputs are given to `guard`. The timing is that of its MCU.
+    /// Opens the board. Its outputs are given to `guard`. The timing is for its MCU.
     pub(super) fn open(
         &self,
         clock: Arc<dyn TimeSource>,
@@ -181,7 +181,7 @@ impl BoardName {
     }
 }
 
-/// The description of a simulated printer: that of a file, or the default one.
+/// The description of a simulated printer: from a file, or the default one.
 pub(super) fn sim_config(file: Option<&Path>) -> Result<SimConfig, Trouble> {
     file.map_or_else(|| Ok(SimConfig::default_printer()), SimConfig::load)
 }

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a person would see of the simulated printer, as it changes (`pinion sim --show`).
+//! Shows the simulated printer as a person would see it, while it changes (`pinion sim --show`).
 //!
-//! On a terminal it is a picture in the lowest rows, drawn anew in place; the log goes on scrolling in
-//! the rows above. Anywhere else it is a line, or a block for a picture, for each change.
+//! On a terminal it is a picture in the lowest rows, drawn again in place. The log continues to scroll in the rows
+//! above. Anywhere else each change is a line, or a block for a picture.
 
 #![forbid(unsafe_code)]
 
@@ -31,27 +31,27 @@ use changes::Changes;
 
 mod changes;
 
-/// Between two pictures on a terminal, and between two looks for changes.
+/// Time between two pictures on a terminal, and between two looks for changes.
 const DRAW_PERIOD: Duration = Duration::from_millis(100);
 const LOOK_PERIOD: Duration = Duration::from_millis(200);
-/// How long the program's end waits for a terminal that takes nothing.
+/// How long the program's end waits for a terminal that takes no output.
 const FAREWELL: Duration = Duration::from_secs(1);
-/// Rows of a terminal that are left to the log.
+/// Rows of a terminal that the log keeps.
 const LOG_ROWS: usize = 3;
 
-/// What a thing is among. Those of a kind share a line on a terminal.
+/// The kind of a thing. Things of one kind share a line on a terminal.
 #[derive(Clone, Copy, Debug, PartialEq)]
 enum Kind {
     Axis,
     Heater,
     Fan,
     Output,
-    /// Whatever has a line of its own.
+    /// A part has a line of its own.
     Part,
 }
 
 impl Kind {
-    /// What many and one of them are called; a part has a name of its own.
+    /// The names of many things of this kind, and of one. A part has a name of its own.
     fn names(self) -> Option<(&'static str, &'static str)> {
         match self {
             Kind::Axis => Some(("axes", "axis")),
@@ -63,13 +63,13 @@ impl Kind {
     }
 }
 
-/// A thing that can be seen.
+/// A visible thing.
 struct Item {
     kind: Kind,
     name: String,
-    /// What changes by small steps.
+    /// The value that changes by small steps.
     number: Option<Number>,
-    /// All that there is to say of it.
+    /// Everything about it, as text.
     text: String,
 }
 
@@ -81,21 +81,21 @@ impl Item {
     }
 }
 
-/// A number that moves: it is told anew once it went by a step, or stands.
+/// A number that moves. It is reported again when it has moved by a step, or when it stands.
 #[derive(Clone, Copy, PartialEq)]
 struct Number {
     value: f64,
     step: f64,
-    /// It stands though it goes up and down by less than this.
+    /// The number stands while it goes up and down by less than this.
     ripple: f64,
 }
 
-/// All that can be seen now.
+/// All visible things now.
 fn look(probe: &SimProbe) -> Vec<Item> {
     let mut items = Vec::new();
     for axis in probe.axes() {
         let lost = if axis.lost_steps > 0 { format!(" ({} steps lost)", axis.lost_steps) } else { String::new() };
-        // What is next to zero is not to be "-0.00".
+        // A value next to zero must not be "-0.00".
         let mm = (axis.position_mm * 100.0).round() / 100.0 + 0.0;
         items.push(Item {
             kind: Kind::Axis,
@@ -116,7 +116,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
         items.push(Item {
             kind: Kind::Fan,
             name: fan.name.into(),
-            // klippy's cycle of 10 ms has a fan at half speed go up and down by 28 rpm.
+            // klippy's cycle of 10 ms makes a fan at half speed go up and down by 28 rpm.
             number: Some(Number { value: fan.rpm, step: 100.0, ripple: 30.0 }),
             text: format!("{:.0} rpm", fan.rpm),
         });
@@ -136,7 +136,7 @@ fn look(probe: &SimProbe) -> Vec<Item> {
     items.into_iter().map(Item::plain).collect()
 }
 
-/// Has `with` write each `#rrggbb` of a text.
+/// Writes a text, and lets `with` write each `#rrggbb` in it.
 fn each_colour(text: &str, with: impl Fn(&mut String, &str, [u8; 3])) -> String {
     let mut written = String::new();
     let mut rest = text;
@@ -156,7 +156,7 @@ fn each_colour(text: &str, with: impl Fn(&mut String, &str, [u8; 3])) -> String 
     written + rest
 }
 
-/// Adds to each colour the name that it goes by.
+/// Adds its name to each color.
 fn name_colours(text: &str) -> String {
     each_colour(text, |written, digits, parts| {
         let strongest = parts.iter().copied().max().unwrap_or(0).max(1);
@@ -175,7 +175,7 @@ fn name_colours(text: &str) -> String {
     })
 }
 
-/// Paints each colour as a block.
+/// Paints each color as a block.
 fn paint_colours(text: &str) -> String {
     each_colour(text, |written, _, [red, green, blue]| {
         let background = Csi::Sgr(Sgr::Background(RgbColor::new(red, green, blue).into()));
@@ -197,7 +197,7 @@ fn picture(items: &[Item], paint: bool) -> Vec<String> {
                 lines.extend(text.lines().map(str::to_owned));
             }
             None => lines.push(format!("{:width$}{text}", item.name)),
-            // One more of the kind that the last line is of.
+            // The last line is of the same kind.
             Some(_) if item.kind == kind => {
                 if let Some(line) = lines.last_mut() {
                     *line += &format!("   {} {text}", item.name);
@@ -210,19 +210,19 @@ fn picture(items: &[Item], paint: bool) -> Vec<String> {
     lines
 }
 
-/// The lowest rows of a terminal, kept out of the part that scrolls (DECSTBM of the VT100, as every
-/// terminal of today has it).
+/// The lowest rows of a terminal, outside the part that scrolls (DECSTBM of the VT100, which every terminal of today
+/// has).
 #[derive(Default)]
 struct Screen {
-    /// The terminal's rows, and how many of them are the picture's; none before the first one.
+    /// The terminal's rows, and how many of them are the picture's. Both are 0 before the first picture.
     rows: usize,
     picture_rows: usize,
-    /// What stands in the picture's rows.
+    /// The lines in the picture's rows.
     drawn: Vec<String>,
 }
 
 impl Screen {
-    /// What draws these lines on a terminal of so many rows, if that is not what it shows.
+    /// The output that draws these lines on a terminal of `rows` rows. Empty if they are there already.
     fn draw(&mut self, mut lines: Vec<String>, rows: usize) -> String {
         let mut out = String::new();
         let room = rows.saturating_sub(LOG_ROWS).max(1);
@@ -231,7 +231,7 @@ impl Screen {
             lines.truncate(room - 1);
             lines.push(format!("... and {left_out} lines more, on a terminal with more rows"));
         }
-        // It does not shrink: what is above does not jump.
+        // The picture does not shrink, so that the rows above do not jump.
         let picture_rows = if rows == self.rows { lines.len().max(self.picture_rows) } else { lines.len() };
         if (rows, picture_rows) != (self.rows, self.picture_rows) {
             if self.rows > 0 {
@@ -251,7 +251,7 @@ impl Screen {
         };
         let changed: String = lines.iter().enumerate().filter_map(changed).collect();
         if !changed.is_empty() {
-            // Without wrapping, which would reach into the next line; the cursor goes back to the log.
+            // It is drawn without wrapping, which would reach into the next line. The cursor goes back to the log.
             let wrap = DecPrivateModeCode::AutoWrap;
             out += &format!("{SAVE_CURSOR}{}{changed}{}{RESTORE_CURSOR}", off(wrap), on(wrap));
             self.drawn = lines;
@@ -260,23 +260,23 @@ impl Screen {
     }
 }
 
-/// The thread that shows.
+/// The thread that shows the printer.
 pub(super) struct Show {
-    /// Has it begin; dropped, has it end.
+    /// Starts it. When this is dropped, the thread ends.
     go: Sender<()>,
     done: Receiver<()>,
 }
 
 impl Show {
-    /// A thread that is to show the printer on stdout. Make it before the machine runs: a thread that a
-    /// real-time one starts has its scheduling, and would keep a host from the processor.
+    /// Makes a thread that will show the printer on stdout. Make it before the MCU runs. A real-time thread passes its
+    /// scheduling on to the threads that it starts. Such a thread would keep a host from the processor.
     pub(super) fn prepare(probe: SimProbe) -> io::Result<Show> {
         let (go, went) = mpsc::channel();
         let (finished, done) = mpsc::channel();
         thread::Builder::new().name("show".into()).spawn(move || {
             let shown = went.recv().map_or(Ok(()), |()| show(&probe, &went));
             if let Err(error) = shown {
-                // A reader that went away, such as `head`, is no failure, and the printer serves on.
+                // A reader that went away, such as `head`, is no failure. The printer continues to serve.
                 if error.kind() != io::ErrorKind::BrokenPipe {
                     log::warn!("the printer is shown no longer: stdout can not be written: {error}");
                 }
@@ -288,11 +288,11 @@ impl Show {
 
     /// Shows the printer from now on.
     pub(super) fn begin(&self) {
-        // It fails only if the thread is gone, and with it what it could show.
+        // It fails only if the thread is gone. Then nothing can be shown.
         let _ = self.go.send(());
     }
 
-    /// Shows how it ended and gives the terminal back, unless nobody reads there.
+    /// Shows the final state and gives the terminal back, unless nobody reads there.
     pub(super) fn end(self) {
         drop(self.go);
         let _ = self.done.recv_timeout(FAREWELL);
@@ -357,7 +357,7 @@ mod tests {
     proptest! {
         #[test]
         fn a_name_stays_in_its_line_and_moves_nothing(name in any_name()) {
-            // Between the rows of a display stand line feeds of ours.
+            // The rows of a display have our own line feeds between them.
             let text = name.replace('\n', "");
             let items = || [Kind::Axis, Kind::Part].map(|kind| item(kind, &name, None, &text).plain());
             for line in picture(&items(), false) {
@@ -391,7 +391,7 @@ mod tests {
         assert_eq!(picture(&items, true), lines);
     }
 
-    /// What a terminal of 10 rows shows, as far as the sequences go that are used here.
+    /// The display of a terminal of 10 rows, as far as the sequences here need it.
     #[derive(Default)]
     struct Terminal {
         screen: [String; 10],
@@ -463,7 +463,7 @@ mod tests {
         assert_eq!(terminal.rows()[7..], ["a", "c", "d"]);
         terminal.take("log\n");
         assert_eq!(terminal.rows()[5..], ["log", "", "a", "c", "d"]);
-        // Too much for this terminal: three rows are the log's.
+        // This is too much for the terminal: three rows are the log's.
         let many = screen.draw((0..30).map(|n| n.to_string()).collect(), 10);
         terminal.take(&many);
         assert_eq!(terminal.rows()[8..], ["5", "... and 24 lines more, on a terminal with more rows"]);

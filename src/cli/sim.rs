@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion sim`: the simulated printer, shown at work by our own host client.
+//! `pinion sim`: the simulated printer, shown at work by our own client.
 
 #![forbid(unsafe_code)]
 
@@ -62,7 +62,7 @@ pub(super) struct SimArgs {
     symlink: PathBuf,
 }
 
-/// Shows the printer at work and goes on serving it, or prints its configuration.
+/// Shows the printer at work and continues to serve it, or prints its configuration.
 pub(super) fn run(args: &SimArgs) -> ExitCode {
     let config = match sim_config(args.file.as_deref()) {
         Ok(config) => config,
@@ -101,7 +101,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         return show_as_it_changes(args, board, probe, &options, clock, helpers);
     }
     let right = Arc::new(AtomicBool::new(false));
-    // Set once the program is asked to end: a demonstration that this interrupts has not failed.
+    // Set when the program is asked to end. A demonstration that this interrupts has not failed.
     let ended = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
         if let Err(error) = signal_hook::flag::register(signal, ended.clone()) {
@@ -126,7 +126,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     }
 }
 
-/// Serves a host, and shows what it does to the printer.
+/// Serves a host, and shows the effects on the printer.
 fn show_as_it_changes(
     args: &SimArgs,
     board: SimBoard,
@@ -182,7 +182,7 @@ fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, 
     if let Some(path) = &args.picture {
         draw(path, &report)?;
     }
-    // Reset the machine, so that the next host finds it as if just started.
+    // Reset the MCU, so that the next host finds it as after a start.
     client.reset().map_err(|error| error.to_string())?;
     for axis in probe.axes().filter(|axis| axis.endstop.is_some()) {
         tell(format_args!(
@@ -199,8 +199,8 @@ fn demonstration(args: &SimArgs, plan: &Plan, probe: &SimProbe) -> Result<bool, 
     Ok(all_right)
 }
 
-/// Prints a line on how the demonstration goes. Errors are ignored: the printer serves its host even if nothing
-/// can be printed.
+/// Prints a line about the demonstration. Errors are ignored: the printer serves its host even if nothing can be
+/// printed.
 fn tell(line: impl Display) {
     let mut page = Page::default();
     page.line(line);
@@ -228,7 +228,7 @@ fn pin(name: &PinName) -> NamedPin {
     NamedPin { name: name.name.clone(), invert: name.inverted }
 }
 
-/// The plan for an axis; none if it can not be homed.
+/// The plan for an axis. `None` if it cannot be homed.
 fn axis(axis: &AxisConfig) -> Option<AxisPlan> {
     let travel_mm = axis.travel_mm?;
     Some(AxisPlan {
@@ -253,7 +253,7 @@ fn axis(axis: &AxisConfig) -> Option<AxisPlan> {
     })
 }
 
-/// The plan for a heater; none if nothing heats it.
+/// The plan for a heater. `None` if nothing heats it.
 fn heater(heater: &HeaterConfig) -> Option<HeaterPlan> {
     Some(HeaterPlan {
         name: heater.name.clone(),

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion status`: asks a running Pinion how it is.
+//! `pinion status`: asks a running Pinion for its status.
 
 #![forbid(unsafe_code)]
 
@@ -39,7 +39,7 @@ pub(super) struct StatusArgs {
     socket: Option<PathBuf>,
 }
 
-/// Prints what the instance tells.
+/// Prints the instance's status.
 pub(super) fn run(args: &StatusArgs) -> ExitCode {
     let done = match args.watch {
         true => watch::watch(args),
@@ -76,7 +76,7 @@ mod tests {
     use proptest::prelude::*;
     use serde_json::{Value, json};
 
-    /// A Pinion that is shut down, with something of everything.
+    /// The status of a Pinion that is shut down, with an example of everything.
     pub(super) fn stopped() -> Status {
         let document = json!({
             "form": 1, "version": "1", "pid": 5, "uptime_s": 3700.0, "link": "/tmp/l", "terminal": "/dev/pts/1",
@@ -103,12 +103,12 @@ mod tests {
         status
     }
 
-    /// Puts a text in the place of each text that an instance chooses.
+    /// Replaces each text that an instance chooses.
     fn rename(value: &mut Value, name: &str) {
         match value {
             Value::String(text) => *text = name.to_owned(),
             Value::Array(values) => values.iter_mut().for_each(|value| rename(value, name)),
-            // These are words of ours.
+            // These are our own words.
             Value::Object(values) => {
                 let values = values.iter_mut().filter(|(key, _)| !["state", "use"].contains(&key.as_str()));
                 values.for_each(|(_, value)| rename(value, name));

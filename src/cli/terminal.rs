@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The terminal: how this program changes it, and that it is as before at the end.
+//! The terminal: how this program changes it, and how it is restored at the end.
 //!
-//! Three things change it: `pinion status --watch`, `pinion sim --show` and the console's line editor. What
-//! they change is remembered here. It is undone once they are dropped, and if the program panics or is ended
-//! by a signal. The escape sequences and the names of keys are termina's.
+//! Three things change it: `pinion status --watch`, `pinion sim --show` and the console's line editor. Their changes
+//! are remembered here. They are undone when they are dropped, when the program panics, and when a signal ends it. The
+//! escape sequences and the names of keys are termina's.
 
 #![forbid(unsafe_code)]
 
@@ -28,11 +28,11 @@ use terminal_size::{Height, terminal_size_of};
 
 use super::page::draw;
 
-/// Rows of a terminal that does not tell its size, which are those of the VT100.
+/// Rows of a terminal that does not report its size: the rows of the VT100.
 const ROWS: usize = 24;
 /// Longest wait for a terminal that takes no output, as after Ctrl-S, in milliseconds.
 const FAREWELL_MS: u16 = 1000;
-/// A row below that of any terminal: a terminal takes it for its last one.
+/// A row below the last one of any terminal. A terminal takes it for its last row.
 const LAST_ROW: usize = 999;
 const FIRST: OneBased = OneBased::from_zero_based(0);
 
@@ -59,12 +59,12 @@ pub(super) fn to_row(row: usize) -> Csi {
     Csi::Cursor(Cursor::Position { line: row_number(row), col: FIRST })
 }
 
-/// Has the rows down to this one scroll, and no others.
+/// Makes the rows down to this one scroll, and no others.
 pub(super) fn scrolling(bottom: usize) -> Csi {
     Csi::Cursor(Cursor::SetTopAndBottomMargins { top: FIRST, bottom: row_number(bottom) })
 }
 
-/// Has all rows scroll again, and moves the cursor below all that is shown.
+/// Makes all rows scroll again, and moves the cursor below everything that is shown.
 pub(super) fn all_scrolls() -> String {
     format!("{}{}\n", scrolling(usize::MAX), to_row(LAST_ROW))
 }
@@ -79,13 +79,13 @@ pub(super) fn rows() -> usize {
     terminal_size_of(io::stdout()).map_or(ROWS, |(_, Height(rows))| rows.into())
 }
 
-/// What undoes the changes.
+/// How to undo the changes.
 struct Before {
     /// The settings of the terminal on stdin.
     settings: Option<Termios>,
-    /// What to write on stdout.
+    /// The text to write on stdout.
     undo: String,
-    /// Whether somebody else changes it from time to time, and undoes that.
+    /// Whether the line editor changes it from time to time, and undoes that.
     is_lent: bool,
 }
 
@@ -105,7 +105,7 @@ fn give_back() {
         if is_lent && !is_changed {
             return;
         }
-        // Another program's terminal is not ours to set. One that is gone needs nothing back.
+        // Another program's terminal is not ours to set. A terminal that is gone needs nothing back.
         if is_ours() {
             let _ = tcsetattr(&stdin, SetArg::TCSANOW, &settings);
         }
@@ -120,7 +120,7 @@ fn give_back() {
     }
 }
 
-/// Has a panic in any thread give the terminal back before it is reported.
+/// Makes a panic in any thread give the terminal back before the panic is reported.
 fn give_back_at_panic() {
     static ONCE: Once = Once::new();
     ONCE.call_once(|| {
@@ -132,8 +132,8 @@ fn give_back_at_panic() {
     });
 }
 
-/// Has these signals end the program as they do by themselves, with the terminal given back first. The program has
-/// until `grace` is over to end in order.
+/// Makes these signals give the terminal back, and then end the program as they do by themselves. The program has
+/// `grace` to end in order.
 pub(super) fn give_back_at(signals: &[i32], grace: Duration) -> Result<(), String> {
     let mut signals = Signals::new(signals).map_err(|error| format!("signals can not be taken in: {error}"))?;
     let wait = move || {
@@ -147,7 +147,7 @@ pub(super) fn give_back_at(signals: &[i32], grace: Duration) -> Result<(), Strin
     waiting.map(drop).map_err(|error| format!("no thread can be started: {error}"))
 }
 
-/// Whether the shell has this program in the foreground. Without job control nobody says so.
+/// Whether the shell has this program in the foreground. Without job control this is unknown and counts as true.
 fn is_ours() -> bool {
     tcgetpgrp(io::stdin()).map_or(true, |group| group == getpgrp())
 }
@@ -155,26 +155,26 @@ fn is_ours() -> bool {
 /// Which keys come to the program one by one, without Enter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Keys {
-    /// All.
+    /// All keys.
     All,
-    /// All but those that the kernel makes signals of, such as Ctrl-C.
+    /// All keys except those that the kernel makes signals of, such as Ctrl-C.
     ButSignals,
 }
 
 /// A key that was pressed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Key {
-    /// One whose signal ends a program: Ctrl-C and Ctrl-\.
+    /// Its signal ends a program: Ctrl-C and Ctrl-\.
     End,
-    /// One whose signal stops a program: Ctrl-Z.
+    /// Its signal stops a program: Ctrl-Z.
     Stop,
-    /// Any other.
+    /// Any other key.
     Other(KeyCode),
 }
 
-/// The terminal on stdin and stdout while the program changes it. Dropped, it is as before.
+/// The terminal on stdin and stdout while the program changes it. When this is dropped, the terminal is as before.
 pub(super) struct Terminal {
-    /// Its settings before; `None` if no keys are read.
+    /// Its settings before. `None` if no keys are read.
     before: Option<Termios>,
     parser: Parser,
 }
@@ -184,7 +184,7 @@ impl Terminal {
     pub(super) fn take(keys: Keys) -> Terminal {
         give_back_at_panic();
         let stdin = io::stdin();
-        // Taking all keys in the background stops the program until the shell has it in the foreground.
+        // Taking all keys in the background stops the program until the shell puts it in the foreground.
         let settings = tcgetattr(&stdin).ok().filter(|_| keys == Keys::All || is_ours());
         *before() = Some(Before { settings: settings.clone(), undo: String::new(), is_lent: false });
         let keyed = settings.filter(|before| {
@@ -198,8 +198,7 @@ impl Terminal {
         Terminal { before: keyed, parser: Parser::default() }
     }
 
-    /// Lends the terminal to a line editor, which has it while somebody writes a line. `None` if stdin is no
-    /// terminal.
+    /// Lends the terminal to a line editor, which has it while a person writes a line. `None` if stdin is no terminal.
     pub(super) fn lend(undo: impl Display) -> Option<Terminal> {
         give_back_at_panic();
         let settings = tcgetattr(io::stdin()).ok()?;
@@ -207,7 +206,7 @@ impl Terminal {
         Some(Terminal { before: None, parser: Parser::default() })
     }
 
-    /// Writes what changes the terminal, to be undone by `undo`.
+    /// Writes `changes` to the terminal. `undo` undoes them.
     pub(super) fn change(&self, changes: impl Display, undo: impl Display) -> io::Result<()> {
         if let Some(before) = &mut *before() {
             before.undo = undo.to_string();
@@ -257,9 +256,9 @@ impl Terminal {
     }
 }
 
-/// What a byte is that the kernel would make a signal of.
+/// The key of a byte that the kernel would make a signal of.
 fn signal_key(settings: &Termios, byte: u8) -> Option<Key> {
-    // 0 says that no key is one.
+    // 0 means that no key has this function.
     let is = |special: SpecialCharacterIndices| byte != 0 && settings.control_chars[special as usize] == byte;
     match () {
         () if is(SpecialCharacterIndices::VINTR) || is(SpecialCharacterIndices::VQUIT) => Some(Key::End),
@@ -309,7 +308,7 @@ mod tests {
     fn whatever_ends_the_program_the_terminal_is_as_before() {
         for (end, code, signal) in [("drop", Some(0), None), ("panic", Some(3), None), ("signal", None, Some(15))] {
             let pty = openpty(None, None).unwrap();
-            // The master end tells the slave's settings. It fails to be read once no slave end is open.
+            // The master end tells the slave's settings. It cannot be read when no slave end is open.
             let before = tcgetattr(&pty.master).unwrap();
             let mut child = Command::new(std::env::current_exe().unwrap())
                 .args(["--ignored", "--exact", "--nocapture", "cli::terminal::tests::taking"])

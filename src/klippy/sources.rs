@@ -29,9 +29,9 @@ const SHAPES_MAX: usize = 10_000;
 /// Highest depth of folders: klippy's own folder, `extras`, and packages in there.
 const DEPTH_MAX: usize = 3;
 
-/// A message as a host looks it up: its name and its parameters' names, in order, such as `query_adxl345 oid
-/// rest_ticks`. The conversions are left out, because klippy writes the parameters of `config_` commands with Python's
-/// conversions.
+/// A message as a host looks it up: its name and its parameters' names, in order. An example is
+/// `query_adxl345 oid rest_ticks`. The conversions are left out, because klippy writes the parameters of `config_`
+/// commands with Python's conversions.
 #[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Shape(String);
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The computer that `pinion doctor` looks at: its files below a root, and its users. `units.rs` and `running.rs` add its
-//! units and processes.
+//! The computer that `pinion doctor` looks at: its files below a root, and its users. `units.rs` adds its units, and
+//! `running.rs` its processes.
 
 #![forbid(unsafe_code)]
 
@@ -17,17 +17,18 @@ use crate::foreign;
 pub(super) mod running;
 pub(super) mod units;
 
-/// Nothing that is read here is as long.
+/// Longest text that is read. Every file that is read here is shorter.
 const TEXT_MAX: u64 = 4 << 20;
-/// As many links as the kernel follows (path_resolution(7)).
+/// Highest number of links that the kernel follows (path_resolution(7)).
 const LINKS_MAX: usize = 40;
-/// Most files that a pattern finds. A pattern in klippy's configuration may name every file of the computer.
+/// Highest number of files that a pattern finds. A pattern in klippy's configuration may name every file of the
+/// computer.
 const MATCHES_MAX: usize = 1000;
-/// As in a shell, what is hidden has to be asked for by its dot.
+/// As in a shell, a pattern finds hidden files only by their dot.
 const LIKE_A_SHELL: MatchOptions =
     MatchOptions { case_sensitive: true, require_literal_separator: false, require_literal_leading_dot: true };
 
-/// What the program looks at.
+/// The computer that the program looks at.
 pub(in crate::cli) struct Machine {
     root: PathBuf,
 }
@@ -50,7 +51,7 @@ impl Access {
     pub(in crate::cli) const READ_WRITE: Access = Access(6);
     pub(in crate::cli) const SEARCH: Access = Access(1);
 
-    /// Whether a file gives this to its group.
+    /// Whether a file gives this access to its group.
     pub(in crate::cli) fn is_given_to_group(self, file: &fs::Metadata) -> bool {
         file.mode() >> 3 & self.0 == self.0
     }
@@ -74,29 +75,29 @@ impl Machine {
         Machine { root: root.to_owned() }
     }
 
-    /// Whether it is this one, of which the kernel can be asked more than files tell.
+    /// True for the live system (root is `/`). Its kernel can be asked more than its files tell.
     pub(in crate::cli) fn is_this(&self) -> bool {
         self.root == Path::new("/")
     }
 
-    /// Where a file of the machine is.
+    /// Where this program finds a file of the computer.
     pub(in crate::cli) fn path(&self, path: impl AsRef<Path>) -> PathBuf {
         let path = path.as_ref();
         self.root.join(path.strip_prefix("/").unwrap_or(path))
     }
 
-    /// How the machine itself calls a file.
+    /// The path of a file on the computer itself.
     pub(in crate::cli) fn name(&self, path: &Path) -> PathBuf {
         Path::new("/").join(path.strip_prefix(&self.root).unwrap_or(path))
     }
 
-    /// A file's text without the white space around it. None if there is none or it can not be read.
+    /// A file's text without the white space around it. `None` if the file is missing or cannot be read.
     pub(in crate::cli) fn text(&self, path: impl AsRef<Path>) -> Option<String> {
         let bytes = foreign::read(&self.path(path), TEXT_MAX).ok()?;
         Some(String::from_utf8_lossy(&bytes).trim().to_owned())
     }
 
-    /// The names in a folder, in order; none if there is no such folder.
+    /// The names in a folder, in order. Empty if the folder is missing.
     fn names(&self, folder: &Path) -> Vec<String> {
         let entries = fs::read_dir(self.path(folder)).into_iter().flatten().flatten();
         let mut names: Vec<String> = entries.filter_map(|entry| entry.file_name().into_string().ok()).collect();
@@ -105,7 +106,7 @@ impl Machine {
     }
 
     /// The files that an absolute pattern of `*`, `?` and `[...]` finds, in order, as paths for this program. A path
-    /// without any of these finds itself, even if there is no such file.
+    /// without any of these finds itself, even if the file is missing.
     pub(in crate::cli) fn matching(&self, pattern: impl AsRef<Path>) -> Vec<PathBuf> {
         let mut paths = vec![PathBuf::from("/")];
         let mut is_pattern = false;
@@ -131,13 +132,12 @@ impl Machine {
         paths.filter(|path| !is_pattern || fs::symlink_metadata(path).is_ok()).collect()
     }
 
-    /// The first of these files that is there.
+    /// The first of these files that exists.
     pub(in crate::cli) fn first<'a>(&self, paths: &[&'a str]) -> Option<&'a str> {
         paths.iter().find(|path| self.path(path).exists()).copied()
     }
 
-    /// Follows symbolic links as the machine itself would: all paths on the way, the last of which is no
-    /// link.
+    /// Follows symbolic links as the computer itself would. Returns all paths on the way. The last one is no link.
     pub(in crate::cli) fn follow(&self, path: &Path) -> io::Result<Vec<PathBuf>> {
         let mut way = vec![self.path(path)];
         for _ in 0..LINKS_MAX {
@@ -155,7 +155,7 @@ impl Machine {
         Err(io::Error::from_raw_os_error(libc::ELOOP))
     }
 
-    /// A user by name, from the machine's files.
+    /// A user by name, from the computer's files.
     pub(in crate::cli) fn user(&self, name: &str) -> Option<Who> {
         let passwd = self.text("/etc/passwd")?;
         let fields: Vec<&str> =
@@ -179,7 +179,7 @@ impl Machine {
         self.name_of("/etc/group", gid)
     }
 
-    /// The group of a file, if membership of it is no more than a way to such files: root's would be.
+    /// The group of a file, if membership only opens files of this kind. root's group would open more.
     pub(in crate::cli) fn common_group(&self, file: &fs::Metadata) -> Option<String> {
         let group = self.group_name(file.gid());
         (group != "root" && group != "0").then_some(group)
@@ -193,7 +193,7 @@ impl Machine {
         line.map_or_else(|| group.parse().ok(), |fields| fields.get(2)?.parse().ok())
     }
 
-    /// The name that a number has in /etc/passwd or /etc/group; the number if it has none.
+    /// The name of a number in /etc/passwd or /etc/group. Without a name it is the number itself.
     fn name_of(&self, file: &str, number: u32) -> String {
         let text = self.text(file).unwrap_or_default();
         let has = |line: &&str| line.split(':').nth(2) == Some(&number.to_string());
@@ -201,13 +201,14 @@ impl Machine {
         name.map_or_else(|| number.to_string(), str::to_owned)
     }
 
-    /// How a file's owner, group and mode are written: `root:gpio 0660`.
+    /// A file's owner, group and mode as text: `root:gpio 0660`.
     pub(in crate::cli) fn ownership(&self, file: &fs::Metadata) -> String {
         let (user, group) = (self.user_name(file.uid()), self.group_name(file.gid()));
         format!("{user}:{group} {:04o}", file.mode() & 0o7777)
     }
 
-    /// Who has started this program, if this machine is looked at, and it is not root, who may do anything.
+    /// The user that has started this program. `None` for root, which may do anything, and if another computer is
+    /// looked at.
     pub(in crate::cli) fn caller(&self) -> Option<Who> {
         let uid = geteuid();
         if uid.is_root() || !self.is_this() {
@@ -226,7 +227,7 @@ pub(super) mod tests {
     use std::os::unix::fs::{PermissionsExt, symlink};
     use tempfile::TempDir;
 
-    /// A machine that a test has made of files.
+    /// A computer that a test has made of files.
     pub(in crate::cli) struct Tree(TempDir);
 
     impl Tree {
@@ -288,7 +289,7 @@ pub(super) mod tests {
         assert_eq!(matching("/a/../b/*.bak"), ["/a/../b/y.cfg.bak"]);
         assert_eq!(matching("/none/*").len() + matching("/a/[").len(), 1);
         assert_eq!(matching("/none"), ["/none"]);
-        // In no time, though there are so many ways to try it.
+        // This takes no time, though there are many ways to try it.
         tree.put(&format!("c/{}", "a".repeat(200)), "");
         assert_eq!(matching(&format!("/c/{}", "*a".repeat(40))).len(), 1);
         assert!(matching(&format!("/c/{}b", "*a".repeat(40))).is_empty());

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The processes of the computer that is looked at: whose they are, which units started them, which are Pinions.
+//! The processes of the computer: their users, the units that started them, and the Pinions among them.
 
 #![forbid(unsafe_code)]
 
@@ -15,27 +15,26 @@ use crate::runtime::helpers;
 use super::units::{self, setting};
 use super::{Machine, Who};
 
-/// A process of Pinion's that serves hosts.
+/// A Pinion process that serves hosts.
 pub(in crate::cli) struct Running {
     pub(in crate::cli) pid: u32,
     /// The unit that has started it, without `.service`.
     pub(in crate::cli) unit: Option<String>,
     /// The configuration file that its command line names.
     pub(in crate::cli) config: Option<String>,
-    /// What it runs by, as far as its command line and its configuration file can be read.
+    /// Its settings, as far as its command line and its configuration file can be read.
     pub(in crate::cli) settings: Option<Settings>,
 }
 
 impl Machine {
-    /// The user of a process, with the groups that it has, which are those of the time when it was
-    /// started.
+    /// The user of a process, with the process's groups. A process has the groups of the time when it was started.
     pub(in crate::cli) fn user_of(&self, pid: u32) -> Option<Who> {
         let status = self.text(format!("/proc/{pid}/status"))?;
         let numbers = |field: &str| -> Vec<u32> {
             let numbers = status_field(&status, field).unwrap_or_default().split_whitespace();
             numbers.filter_map(|number| number.parse().ok()).collect()
         };
-        // The effective ones are the second.
+        // The second number is the effective one.
         let uid = *numbers("Uid").get(1)?;
         let gids = numbers("Gid").get(1).copied().into_iter().chain(numbers("Groups")).collect();
         Some(Who { name: self.user_name(uid), uid, gids })
@@ -48,7 +47,7 @@ impl Machine {
         processes
     }
 
-    /// The Pinions that run, without their helpers.
+    /// The running Pinions, without their helpers.
     pub(in crate::cli) fn running(&self) -> Vec<Running> {
         let running = |process: Process| {
             let program = process.arguments.first()?;
@@ -67,7 +66,7 @@ impl Machine {
                     );
                     file.ok().map(|file| given.or(file).settings())
                 }
-                // Another version of Pinion.
+                // This is another version of Pinion.
                 Err(_) => None,
             };
             let words: Vec<_> = process.arguments.iter().map(|word| word.to_string_lossy()).collect();
@@ -77,13 +76,13 @@ impl Machine {
         self.processes().into_iter().filter_map(running).collect()
     }
 
-    /// The unit whose program a process of ours or klippy's is, without `.service`: that of its control group
-    /// (systemd.resource-control(5)). None if it was started from a user's session or manager, which `sudo systemctl`
-    /// does not reach, or by another service's program, as by cron.
+    /// The unit that started a process of ours or klippy's, without `.service`. It is the unit of its control group
+    /// (systemd.resource-control(5)). `None` if the process was started from a user's session or manager, which
+    /// `sudo systemctl` does not reach. `None` also if another service's program started it, such as cron.
     pub(in crate::cli) fn unit_of(&self, pid: u32) -> Option<String> {
         let groups = self.text(format!("/proc/{pid}/cgroup"))?;
         let unit = process::unit(&groups)?;
-        // A unit that the folders of units do not have, as that of a template, is taken at its name.
+        // The folders of units may not have the unit, such as an instance of a template. Then its name counts.
         let text = units::text(self, unit).unwrap_or_default();
         let starts_it = setting(&text, "ExecStart").is_none_or(|command| {
             let command = command.to_lowercase();
@@ -93,7 +92,7 @@ impl Machine {
     }
 }
 
-/// The configuration file that a command line of Pinion's names, of whatever version.
+/// The configuration file that a command line of any version of Pinion names.
 pub(in crate::cli) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>) -> Option<String> {
     while let Some(word) = words.next() {
         match word.strip_prefix("--config") {
@@ -105,8 +104,8 @@ pub(in crate::cli) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>)
     None
 }
 
-/// Why this computer must not be kept busy: a host may have a Pinion print on its pins. A simulated printer has
-/// nothing to spoil.
+/// Why this computer must not be kept busy: a host may be printing through a Pinion on its pins. A simulated printer
+/// has nothing to spoil.
 pub(in crate::cli) fn print_at_risk(machine: &Machine) -> Option<String> {
     let proc = machine.path("/proc");
     let is_simulated = |pinion: &Running| matches!(&pinion.settings, Some(by) if matches!(by.board, BoardName::Sim(_)));
@@ -160,7 +159,7 @@ mod tests {
         assert_eq!(unit("/user.slice/user-1000.slice/user@1000.service/app.slice/klipper.service"), None);
         tree.put("lib/systemd/system/cron.service", "[Service]\nExecStart=/usr/sbin/cron -f -P $EXTRA_OPTS\n");
         assert_eq!(unit("/system.slice/cron.service"), None);
-        // The program's name may stand in a variable's only.
+        // The program's name may stand only in a variable.
         tree.put("etc/systemd/system/klipper.service", "[Service]\nExecStart=/home/pi/env/bin/python $KLIPPER_ARGS\n");
         assert_eq!(unit("/system.slice/klipper.service").as_deref(), Some("klipper"));
         tree.put("etc/systemd/system/mine.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");

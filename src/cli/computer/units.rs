@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Units of systemd, as their files tell of them. They are called without `.service` here.
+//! Units of systemd, from their files. Their names here are without `.service`.
 
 #![forbid(unsafe_code)]
 
@@ -11,13 +11,13 @@ use glob::Pattern;
 
 use super::Machine;
 
-/// Where units stand, those of the administrator first (systemd.unit(5)).
+/// The folders of units, the administrator's first (systemd.unit(5)).
 const FOLDERS: [&str; 4] =
     [ADMINISTRATOR_S, "/usr/local/lib/systemd/system", "/usr/lib/systemd/system", "/lib/systemd/system"];
 pub(in crate::cli) const ADMINISTRATOR_S: &str = "/etc/systemd/system";
 const ENDING: &str = ".service";
 
-/// Whether a unit is installed and not masked; an instance of a template if that is.
+/// Whether a unit is installed and not masked. An instance of a template is installed if the template is.
 pub(in crate::cli) fn is_installed(machine: &Machine, unit: &str) -> bool {
     let template = unit.split_once('@').map(|(name, _)| format!("{name}@"));
     file(machine, unit).or_else(|| file(machine, &template?)).is_some()
@@ -31,40 +31,40 @@ pub(in crate::cli) fn file(machine: &Machine, unit: &str) -> Option<String> {
     (!is_masked).then_some(file)
 }
 
-/// The units that are started at boot, as some target wants them, in order; of these the ones that are `wanted`.
+/// The units that a target starts at boot, in order, if they are `wanted`.
 pub(in crate::cli) fn enabled(machine: &Machine, wanted: impl Fn(&str) -> bool) -> Vec<String> {
     let kinds = ["wants", "requires"].into_iter();
     let units = named(kinds.flat_map(|kind| machine.matching(format!("{ADMINISTRATOR_S}/*.{kind}/*{ENDING}"))));
     units.into_iter().filter(|unit| wanted(unit)).collect()
 }
 
-/// All units that are installed, in order.
+/// All installed units, in order.
 pub(in crate::cli) fn all(machine: &Machine) -> BTreeSet<String> {
     named(FOLDERS.iter().flat_map(|folder| machine.matching(format!("{folder}/*{ENDING}"))))
 }
 
-/// The units that files are called for.
+/// The units that these files are named after.
 fn named(files: impl Iterator<Item = PathBuf>) -> BTreeSet<String> {
     files.filter_map(|file| Some(file.file_name()?.to_str()?.strip_suffix(ENDING)?.to_owned())).collect()
 }
 
-/// The text of a unit, with that of the files which add to it.
+/// The text of a unit, with the texts of the files that add to it.
 pub(in crate::cli) fn text(machine: &Machine, unit: &str) -> Option<String> {
     let file = FOLDERS.iter().find_map(|folder| machine.text(format!("{folder}/{unit}{ENDING}")))?;
-    // The administrator's come last.
+    // The administrator's files come last.
     let unit = Pattern::escape(unit);
     let added = FOLDERS.iter().rev().flat_map(|folder| machine.matching(format!("{folder}/{unit}{ENDING}.d/*.conf")));
     let added = added.filter_map(|file| machine.text(machine.name(&file)));
     Some(std::iter::once(file).chain(added).collect::<Vec<_>>().join("\n"))
 }
 
-/// A setting in a unit's text: the last one counts.
+/// A setting in a unit's text. The last one counts.
 pub(in crate::cli) fn setting<'a>(text: &'a str, key: &str) -> Option<&'a str> {
     let values = text.lines().filter_map(|line| line.trim().strip_prefix(key)?.trim_start().strip_prefix('='));
     values.map(str::trim).rfind(|value| !value.is_empty())
 }
 
-/// Whether this is what a unit of Klipper's own micro-controller program is called.
+/// Whether this is the name of a unit of Klipper's own MCU program.
 pub(in crate::cli) fn of_klipper_mcu(unit: &str) -> bool {
     ["klipper-mcu", "klipper_mcu"].contains(&unit)
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! One heater: a sensor's readings turned into temperatures, an output pulsed in software, and
-//! a proportional-integral loop between them.
+//! One heater. A sensor's readings become temperatures, an output is pulsed in software, and a proportional-integral
+//! loop connects them.
 
 #![forbid(unsafe_code)]
 
@@ -12,15 +12,14 @@ use pinion_protocol::clock::Clock;
 
 /// The output's period, in seconds.
 const CYCLE_S: f64 = 0.1;
-/// The output's `max_duration`, in seconds: after this time without a new value the micro-controller
-/// shuts down.
+/// The output's `max_duration`, in seconds. After this time without a new value the MCU shuts down.
 const MAX_DURATION_S: f64 = 3.0;
 const REPORT_S: f64 = 0.3;
 const SAMPLE_S: f64 = 0.001;
 const SAMPLES: u8 = 8;
-/// How many readings in a row may be out of range before the micro-controller shuts down.
+/// How many readings in a row may be out of range before the MCU shuts down.
 const RANGE_CHECKS: u8 = 4;
-/// How long after the present a new value of the output takes effect, in seconds.
+/// How far ahead a new value of the output takes effect, in seconds.
 const LEAD_S: f64 = 0.25;
 /// How long to wait for a reading.
 const READING_TIMEOUT: Duration = Duration::from_secs(3);
@@ -34,13 +33,13 @@ pub struct Wiring {
     pub invert: bool,
     /// The sensor's pin.
     pub sensor_pin: String,
-    /// Below this the micro-controller shuts down, in degrees Celsius.
+    /// The MCU shuts down below this, in degrees Celsius.
     pub min_c: f64,
-    /// Above this the micro-controller shuts down, in degrees Celsius.
+    /// The MCU shuts down above this, in degrees Celsius.
     pub max_c: f64,
 }
 
-/// A reading and what was done about it.
+/// A reading, and the output that follows from it.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reading {
     /// When the samples began.
@@ -60,23 +59,22 @@ pub struct Heater {
     last: Option<Clock>,
 }
 
-/// What a heater is to reach.
+/// The goal of a heater.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Goal {
     /// Degrees Celsius.
     pub target_c: f64,
-    /// How far off it may be, in degrees.
+    /// How far off the temperature may be, in degrees.
     pub tolerance_c: f64,
-    /// For how long it must stay within the tolerance, in seconds.
+    /// How long it must stay within the tolerance, in seconds.
     pub hold_s: f64,
     /// When to give up, in seconds.
     pub timeout_s: f64,
 }
 
 impl Heater {
-    /// Adds a heater to a configuration. `celsius` turns a reading, as a part of the full
-    /// scale, into degrees; it must fall as the reading rises. Fails if there are too many
-    /// objects.
+    /// Adds a heater to a configuration. `celsius` converts a reading, as a part of the full scale, to degrees. The
+    /// degrees must fall as the reading rises. Fails if there are too many objects.
     pub fn configure(
         client: &Client,
         config: &mut Config,
@@ -96,12 +94,12 @@ impl Heater {
         Ok(Heater { sensor, output, wiring, celsius, last: None })
     }
 
-    /// Heats until the goal is reached and held, switches off, and returns the last reading. Fails if
-    /// the goal is not reached in time.
+    /// Heats until the goal is reached and held. Then it switches off and returns the last reading. Fails if the goal
+    /// is not reached in time.
     pub fn heat(&mut self, client: &mut Client, goal: Goal, seen: &mut dyn FnMut(Reading)) -> Result<Reading, Error> {
         self.query(client, SAMPLES)?;
         let result = self.pursue(client, goal, seen);
-        // After a shutdown the output is off, and the error to return is that of the shutdown.
+        // After a shutdown the output is off, and the error to return is the shutdown's.
         if client.check().is_ok() {
             self.set(client, 0.0)?;
             self.query(client, 0)?;
@@ -203,7 +201,7 @@ impl Heater {
     }
 }
 
-/// The sum of a report's samples: one number, or the first of a row of 16-bit ones.
+/// The sum of a report's samples: one number, or the first of a row of 16-bit numbers.
 fn value(state: &Params) -> Result<f64, Error> {
     if state.get("value").is_some() {
         return Ok(state.int("value")? as f64);
@@ -218,7 +216,7 @@ fn seconds(span: f64) -> Duration {
     Duration::try_from_secs_f64(span).unwrap_or(Duration::MAX / 4)
 }
 
-/// A proportional-integral controller: full power far below the target, and near it a power in
+/// A proportional-integral controller. Far below the target it gives full power. Near the target the power is in
 /// proportion to the error and its integral.
 #[derive(Debug, Default)]
 struct Control {

@@ -17,7 +17,7 @@ const POSITION: f64 = 190.0;
 const LANE: f64 = 22.0;
 const RATE: f64 = 130.0;
 const BOTTOM: f64 = 46.0;
-/// Colours that can be seen on white and on black.
+/// Colors that are visible on white and on black.
 const COLOURS: [&str; 6] = ["#d9580d", "#1a8fe3", "#2f9e44", "#b04fc4", "#c49a00", "#e0457b"];
 
 /// Draws the homing of the report's axes as an SVG document: readable on light and on dark
@@ -55,7 +55,7 @@ pub fn homing(report: &Report) -> String {
     svg.finish()
 }
 
-/// Where the axis was at that time, between the samples around it.
+/// The axis' position at that time, between the samples around it.
 fn mm_at(axis: &AxisReport, t_s: f64) -> f64 {
     let after = axis.samples.iter().position(|s| s.t_s >= t_s);
     let after = after.unwrap_or(axis.samples.len());
@@ -115,7 +115,7 @@ impl Scale {
 
     fn label(&self, value: f64) -> String {
         let decimals = (-self.step.log10().floor()).clamp(0.0, 3.0) as usize;
-        // A value near zero would be labelled "-0".
+        // A value near zero would be labeled "-0".
         let value = if value.abs() < self.step / 2.0 { 0.0 } else { value };
         format!("{value:.decimals$}")
     }
@@ -278,7 +278,7 @@ mod tests {
     use crate::foreign::tests::any_name;
     use proptest::prelude::*;
 
-    /// Every tag that opens closes, in order, and no bare sign stands in the text.
+    /// Asserts that every tag that opens closes, in order, and that no bare sign stands in the text.
     fn assert_well_formed(svg: &str) {
         let mut open = Vec::new();
         for piece in svg.split('<').skip(1) {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Pins and buses: whether they are there, whether Pinion may open them, who holds the lines, and what
-//! the computer's firmware says of its power.
+//! Pins and buses: whether they are there, whether Pinion may open them, and which processes hold the lines. Also the
+//! firmware's report about the computer's power.
 
 #![forbid(unsafe_code)]
 
@@ -28,9 +28,9 @@ struct Class {
     access: Access,
     /// udev's subsystem.
     subsystem: &'static str,
-    /// The line of a Raspberry Pi's config.txt, and what begins one that enables it, too.
+    /// The line of a Raspberry Pi's config.txt that enables it, and the beginnings of other lines that do.
     enabled_by: Option<(&'static str, &'static [&'static str])>,
-    /// The files that have to be opened.
+    /// The files that Pinion has to open.
     nodes: &'static str,
 }
 
@@ -85,7 +85,7 @@ const CLASSES: [Class; 6] = [
     },
 ];
 
-/// Whether the users that Pinion runs as may open what is there; where there is no service, the caller.
+/// Whether the users that Pinion runs as may open the devices. Without a service it judges the caller.
 pub(super) fn permissions(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     let on_pins = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
     let mut users: Vec<(Who, Vec<&Instance>)> = Vec::new();
@@ -105,7 +105,7 @@ pub(super) fn permissions(machine: &Machine, instances: &[Instance]) -> Vec<Find
     users.iter().flat_map(|(user, instances)| permissions_of(machine, instances, user)).collect()
 }
 
-/// Whether `user`, as whom these instances run, may open what is there.
+/// Whether `user` may open the devices. These instances run as `user`.
 fn permissions_of(machine: &Machine, instances: &[&Instance], user: &Who) -> Vec<Finding> {
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
     let anew = match &units[..] {
@@ -128,9 +128,9 @@ fn permissions_of(machine: &Machine, instances: &[&Instance], user: &Who) -> Vec
     findings
 }
 
-/// None where there is nothing to open. `anew` is what has the user's groups read again.
+/// `None` if there is nothing to open. `anew` is the remedy that makes the user's new groups count.
 fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &[PathBuf]) -> Option<Finding> {
-    // One that vanishes meanwhile is none.
+    // A node that vanishes meanwhile does not count.
     let nodes: Vec<_> = nodes.iter().filter_map(|node| Some((node, fs::metadata(node).ok()?))).collect();
     let refused: Vec<_> = nodes.iter().filter(|(_, about)| !user.may(class.access, about)).collect();
     let (name, who) = (class.name, &user.name);
@@ -159,7 +159,7 @@ fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &
     Some(Finding::error(class.check, found, remedy))
 }
 
-/// The first of so many.
+/// The first path, and how many more there are.
 fn with_others(first: &Path, count: usize) -> String {
     let more = if count > 1 { format!(" and {} more", count - 1) } else { String::new() };
     format!("{}{more}", first.display())
@@ -170,7 +170,7 @@ fn rules_are_there(machine: &Machine) -> bool {
     folders.iter().any(|folder| !machine.matching(format!("{folder}/*pinion-mcu.rules")).is_empty())
 }
 
-/// Which pins and buses there are, and how to enable those that there are not.
+/// Which pins and buses there are, and how to enable the missing ones.
 pub(super) fn presence(machine: &Machine) -> Vec<Finding> {
     CLASSES.iter().map(|class| present(machine, class)).collect()
 }
@@ -229,7 +229,7 @@ fn model(machine: &Machine) -> String {
 fn other_subsystem(machine: &Machine, class: &Class, node: &Path) -> Option<String> {
     let about = fs::metadata(node).ok().filter(|about| about.file_type().is_char_device())?;
     let (major, minor) = (nix::sys::stat::major(about.rdev()), nix::sys::stat::minor(about.rdev()));
-    // What the kernel does not tell is taken to be right.
+    // If the kernel does not tell, the node counts as right.
     let subsystem = fs::read_link(machine.path(format!("/sys/dev/char/{major}:{minor}/subsystem"))).ok()?;
     let subsystem = subsystem.file_name()?.to_string_lossy().into_owned();
     (subsystem != class.subsystem).then_some(subsystem)
@@ -244,13 +244,13 @@ fn pi_config(machine: &Machine) -> Option<&'static str> {
     machine.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
 }
 
-/// How the VPU's clock of some Raspberry Pis is held, which SPI's is made of.
+/// How the VPU's clock of some Raspberry Pis is held. The SPI clock is made from it.
 struct Vpu {
     models: &'static [&'static str],
-    /// How the sections of config.txt begin that are for these models alone.
+    /// How the sections of config.txt begin that apply only to these models.
     sections: &'static [&'static str],
     core_freq: u32,
-    /// What `core_freq_min` is where nothing is said.
+    /// The value of `core_freq_min` if config.txt does not set it.
     slowest: u32,
     lines: &'static str,
 }
@@ -296,7 +296,7 @@ impl Vpu {
     }
 }
 
-/// Whether the SPI clock of a Raspberry Pi is one that LEDs on these pins can be driven by.
+/// Whether the SPI clock of a Raspberry Pi can drive LEDs on these pins.
 pub(super) fn leds(machine: &Machine, pins: &BTreeSet<&str>) -> Vec<Finding> {
     const CHECK: &str = "leds";
     let model = model(machine);
@@ -322,10 +322,10 @@ pub(super) fn leds(machine: &Machine, pins: &BTreeSet<&str>) -> Vec<Finding> {
     [Some(clock), bus].into_iter().flatten().collect()
 }
 
-/// Who holds GPIO lines.
+/// The holders of GPIO lines.
 pub(super) fn holders(machine: &Machine, chips: &[Chip]) -> Vec<Finding> {
     const CHECK: &str = "gpio_lines";
-    /// More are listed by `pinion pins`.
+    /// `pinion pins` lists more.
     const SHOWN: usize = 8;
     let chip = |chip: &Chip| {
         let held = (0u32..).zip(&chip.lines).filter(|(_, line)| line.held);
@@ -348,7 +348,7 @@ pub(super) fn holders(machine: &Machine, chips: &[Chip]) -> Vec<Finding> {
             let folder = machine.path(format!("/proc/{}/fd", process.pid));
             let files = fs::read_dir(folder).into_iter().flatten().flatten();
             let mut targets = files.filter_map(|file| fs::read_link(file.path()).ok());
-            // Of a line, of several, or of one with edges (drivers/gpio/gpiolib-cdev.c).
+            // The target is of one line, of several lines, or of a line with edges (drivers/gpio/gpiolib-cdev.c).
             targets.any(|target| target.to_string_lossy().starts_with("anon_inode:gpio"))
         })
         .map(|process| {
@@ -362,8 +362,8 @@ pub(super) fn holders(machine: &Machine, chips: &[Chip]) -> Vec<Finding> {
     findings
 }
 
-/// What the firmware of a Raspberry Pi says of its power and temperature. `vcgencmd` is the program that asks
-/// it, where that may be started.
+/// The report of a Raspberry Pi's firmware about its power and temperature. `vcgencmd` is the program that asks the
+/// firmware, if it may be started.
 pub(super) fn power(machine: &Machine, vcgencmd: Option<&Path>) -> Vec<Finding> {
     const CHECK: &str = "power";
     let Some(bits) = throttled(machine, vcgencmd) else {
@@ -396,7 +396,7 @@ pub(super) fn power(machine: &Machine, vcgencmd: Option<&Path>) -> Vec<Finding> 
     findings
 }
 
-/// The firmware's bits, from sysfs or by vcgencmd.
+/// The firmware's bits, from sysfs or from vcgencmd.
 fn throttled(machine: &Machine, vcgencmd: Option<&Path>) -> Option<u32> {
     let hex = |text: &str| u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok();
     let files = machine.matching("/sys/devices/platform/*/*firmware/get_throttled");
@@ -407,7 +407,7 @@ fn throttled(machine: &Machine, vcgencmd: Option<&Path>) -> Option<u32> {
     hex(told.trim().strip_prefix("throttled=")?)
 }
 
-/// What a program prints; none if it does not end within two seconds.
+/// The output of a program. `None` if the program does not end within two seconds.
 fn output(command: &mut Command) -> Option<String> {
     const OUTPUT_TIMEOUT: Duration = Duration::from_secs(2);
     let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
@@ -417,7 +417,7 @@ fn output(command: &mut Command) -> Option<String> {
         match child.try_wait() {
             Ok(None) if Instant::now() < end => thread::sleep(Duration::from_millis(10)),
             Ok(Some(_)) => break,
-            // It hangs: it is told to end, and left alone should it not.
+            // It hangs. It is killed, and left alone if it does not end.
             _ => {
                 let _ = child.kill();
                 return None;
@@ -443,7 +443,7 @@ mod tests {
         permissions_of(&tree.machine(), &instances.iter().collect::<Vec<_>>(), user)
     }
 
-    /// Somebody who is neither root nor the one who runs the tests.
+    /// A user other than root and other than the one that runs the tests.
     fn stranger(gids: Vec<u32>) -> Who {
         Who { name: "pinion".into(), uid: 54_321, gids }
     }
@@ -487,10 +487,10 @@ mod tests {
         tree.put("etc/group", &format!("gpio:x:{gid}:pi\n"));
         // The service would run as pinion.
         told(&look(), "gpio", Error, "pinion may not open");
-        // What runs counts, with the groups that it has.
+        // A running process counts, with its groups.
         tree.process(10, &["/usr/bin/pinion", "run"], 54_321, &[gid]);
         told(&look(), "gpio", Fine, "pinion may open");
-        // Two users, one of a unit of their own.
+        // Two users, one from a unit of its own.
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\nUser=pi\n");
         tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
         let findings = look();
@@ -511,7 +511,7 @@ mod tests {
         told(&look(), "user", Warning, "there is no user pinion");
     }
 
-    /// A link to a device of this computer in the place of a node, as a test can not make nodes.
+    /// A link to a device of this computer, in the place of a node: a test cannot make nodes.
     #[test]
     fn a_node_of_another_kind_is_no_chip() {
         let tree = Tree::new();
@@ -658,12 +658,11 @@ mod tests {
         assert_eq!(findings.len(), 2);
     }
 
-    /// A program that is this script.
+    /// A program made from this script.
     fn program(tree: &Tree, script: &str) -> PathBuf {
         tree.put_mode("vcgencmd", script, 0o755);
         let path = tree.machine().path("/vcgencmd");
-        // A process that another test forked in the meantime may have it open for writing until it becomes
-        // another program.
+        // A process that another test forked meanwhile may have it open for writing, until it becomes another program.
         loop {
             match Command::new(&path).stdout(Stdio::null()).spawn() {
                 Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy => {

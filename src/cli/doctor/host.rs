@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The host: which klippy there is, and whether its messages are those that Pinion speaks.
+//! The host: which klippys there are, and whether Pinion speaks their messages.
 
 #![forbid(unsafe_code)]
 
@@ -18,18 +18,18 @@ use super::UPGRADE;
 use super::instance::Instance;
 use super::printer::{self, Printer};
 
-/// A klippy, running or set up.
+/// A klippy that runs or is set up.
 pub(super) struct Klippy {
     pub(super) who: Who,
-    /// klippy's folder, that of klippy.py.
+    /// The folder of klippy.py.
     folder: Option<PathBuf>,
-    /// What its configuration says; none if that can not be read.
+    /// Its configuration. `None` if it cannot be read.
     pub(super) printer: Option<Printer>,
     /// How it was found.
     pub(super) found_by: String,
     /// The unit that starts it, without `.service`.
     pub(super) unit: Option<String>,
-    /// It has the groups of the time when it was started.
+    /// A running klippy has the groups of the time when it was started.
     pub(super) is_running: bool,
 }
 
@@ -44,7 +44,7 @@ impl Klippy {
     }
 }
 
-/// Each klippy: those that run, and those whose units are enabled; if there is none, those that are installed.
+/// Each klippy: the running ones, and those whose units are enabled. If there is none: the installed ones.
 pub(super) fn klippys(machine: &Machine) -> Vec<Klippy> {
     let processes = machine.processes().into_iter().filter(Process::is_klippy);
     let mut klippys: Vec<Klippy> = processes.filter_map(|process| running(machine, &process)).collect();
@@ -70,7 +70,7 @@ fn running(machine: &Machine, process: &Process) -> Option<Klippy> {
     })
 }
 
-/// The klippy that a unit starts, if that is what it starts.
+/// The klippy that a unit starts. `None` if it starts something else.
 fn set_up(machine: &Machine, unit: &str) -> Option<Klippy> {
     let text = units::text(machine, unit)?;
     let arguments = arguments(machine, &text)?;
@@ -78,7 +78,7 @@ fn set_up(machine: &Machine, unit: &str) -> Option<Klippy> {
     let user = setting(&text, "User").unwrap_or("root");
     let who = machine.user(user).unwrap_or_else(|| match user {
         "root" => Who { name: "root".into(), uid: 0, gids: vec![0] },
-        // Somebody of whom nothing is known.
+        // Nothing is known about this user.
         _ => Who { name: user.to_owned(), uid: u32::MAX, gids: vec![] },
     });
     Some(Klippy {
@@ -91,12 +91,12 @@ fn set_up(machine: &Machine, unit: &str) -> Option<Klippy> {
     })
 }
 
-/// A folder as the process calls it, where this program finds it.
+/// Where this program finds a folder that the process names.
 fn reachable(machine: &Machine, folder: PathBuf) -> PathBuf {
     if folder.starts_with(machine.path("/proc")) { folder } else { machine.path(folder) }
 }
 
-/// klippy's command line, from a unit's command or the file that has its arguments.
+/// klippy's command line, from a unit's command or from the file with its arguments.
 fn arguments(machine: &Machine, unit: &str) -> Option<Vec<PathBuf>> {
     let file = setting(unit, "EnvironmentFile").map(|file| file.trim_start_matches('-'));
     let texts = [setting(unit, "ExecStart").map(str::to_owned), file.and_then(|file| machine.text(file))];
@@ -111,12 +111,12 @@ pub(super) fn printers(klippys: &[Klippy]) -> impl Iterator<Item = &Printer> {
     klippys.iter().filter_map(|klippy| klippy.printer.as_ref())
 }
 
-/// The pins of LEDs on SPI buses that their configurations name.
+/// The pins of LEDs on SPI buses in the klippys' configurations.
 pub(super) fn leds(klippys: &[Klippy]) -> BTreeSet<&str> {
     printers(klippys).flat_map(|printer| &printer.leds).map(String::as_str).collect()
 }
 
-/// Whether the messages of each host are those that Pinion speaks.
+/// Whether Pinion speaks the messages of each host.
 pub(super) fn dialects(machine: &Machine, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
     if klippys.is_empty() {
         let found = "which host comes is unknown: no klippy runs, and no unit starts one";
@@ -201,7 +201,7 @@ mod tests {
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
         let printer = klippys(&tree.machine()).remove(0).printer;
         assert_eq!(printer.unwrap().serials, [PathBuf::from("/tmp/klipper_host_mcu")].into());
-        // What is enabled counts, and one that runs is not counted twice.
+        // An enabled unit counts, and a klippy that runs is not counted twice.
         tree.put(
             "etc/systemd/system/klipper-2.service",
             "ExecStart=/usr/bin/python3 /home/b/klipper/klippy/klippy.py b.cfg\n",
@@ -241,7 +241,7 @@ mod tests {
         told(&look(), "dialect", Ok, "as Pinion is told");
         speak("kalico");
         told(&look(), "dialect", Warning, "its dialect is v0.12, and Pinion is told to speak kalico");
-        // It is another instance's host.
+        // This klippy is another instance's host.
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_b\n");
         told(&look(), "dialect", Ok, "it is served in the dialect v0.12");
         tree.put("home/pi/klipper/klippy/new.py", "mcu.lookup_command(\"query_adxl345 oid=%c wings=%u\")\n");

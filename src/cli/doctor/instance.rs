@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The instances of Pinion: those that run, and those whose units are enabled.
+//! The instances of Pinion: the running ones, and those whose units are enabled.
 
 #![forbid(unsafe_code)]
 
@@ -14,11 +14,11 @@ use crate::cli::run_args;
 use crate::cli::settings::{Given, Settings};
 use crate::klippy::{HOST_PATHS, is_host_path};
 
-/// The unit of the instance that there is as a rule.
+/// The unit of the usual instance.
 const UNIT: &str = "pinion-mcu";
-/// The configuration as the package delivers it.
+/// The configuration that the package delivers.
 const DELIVERED: &str = "/usr/share/pinion-mcu/pinion.toml";
-/// The unit that makes a link, as [`Files`] tells which link a unit makes.
+/// The unit that makes this link: the reverse of [`Files`].
 pub(super) fn unit_for(link: &Path) -> String {
     match link.to_string_lossy().strip_prefix(HOST_PATHS) {
         None | Some("mcu") => UNIT.to_owned(),
@@ -26,30 +26,30 @@ pub(super) fn unit_for(link: &Path) -> String {
     }
 }
 
-/// A Pinion that runs, or is to run.
+/// A Pinion that runs, or that will run.
 pub(super) struct Instance {
-    /// The unit that starts it, without `.service`; none if it was started by hand.
+    /// The unit that starts it, without `.service`. `None` if it was started by hand.
     pub(super) unit: Option<String>,
     /// Its process, if it runs.
     pub(super) pid: Option<u32>,
-    /// The configuration file that it reads; none if it reads none.
+    /// The configuration file that it reads, if any.
     config: Option<String>,
     pub(super) settings: Settings,
-    /// Where klippy finds it; none if klippy does not.
+    /// Where klippy finds it. `None` if klippy does not find it.
     pub(super) link: Option<PathBuf>,
 }
 
-/// What the files that belong to a unit are called.
+/// The names of the files that belong to a unit.
 struct Files {
     config: String,
     options: String,
-    /// What the unit has the program put in place, and what leads klippy there.
+    /// The unit's program makes `symlink`, and `link` leads klippy there.
     symlink: PathBuf,
     link: PathBuf,
 }
 
 impl Files {
-    /// Those that systemd/pinion-mcu.service and pinion-mcu@.service have; none of another unit.
+    /// The files of systemd/pinion-mcu.service and pinion-mcu@.service. `None` for another unit.
     fn of(unit: &str) -> Option<Files> {
         let name = match unit.strip_prefix(UNIT)? {
             "" => None,
@@ -66,7 +66,7 @@ impl Files {
 }
 
 impl Instance {
-    /// What people call it.
+    /// Its name for people.
     pub(super) fn name(&self) -> String {
         match (&self.unit, self.pid) {
             (Some(unit), _) => unit.clone(),
@@ -75,7 +75,7 @@ impl Instance {
         }
     }
 
-    /// What starts it anew.
+    /// How to restart it.
     pub(super) fn restart(&self) -> String {
         match &self.unit {
             Some(unit) => format!("sudo systemctl restart {unit}"),
@@ -83,7 +83,7 @@ impl Instance {
         }
     }
 
-    /// The user that it runs as, or will; none if that is not known.
+    /// The user that it runs as, or will run as. `None` if unknown.
     pub(super) fn user(&self, machine: &Machine) -> Option<Who> {
         if let Some(who) = self.pid.and_then(|pid| machine.user_of(pid)) {
             return Some(who);
@@ -98,14 +98,14 @@ impl Instance {
         Some(who)
     }
 
-    /// What to change its settings in.
+    /// Where to change its settings.
     pub(super) fn config(&self) -> &str {
         self.config.as_deref().unwrap_or("its command line")
     }
 }
 
-/// All instances, or, where there is none, the one that the service would be; and what is wrong with the files that
-/// say by what they run.
+/// All instances, or, if there are none, the one that the service would be. Also the errors in the files with their
+/// settings.
 pub(super) fn instances(machine: &Machine) -> (Vec<Instance>, Vec<Finding>) {
     let running = machine.running();
     let mut units = units::enabled(machine, |unit| is_ours(machine, unit));
@@ -125,7 +125,7 @@ pub(super) fn instances(machine: &Machine) -> (Vec<Instance>, Vec<Finding>) {
     (instances, findings)
 }
 
-/// Whether a unit starts Pinion: one of ours, or the one of Klipper's own program with ours in its place.
+/// Whether a unit starts Pinion: one of ours, or the one of Klipper's own program with Pinion in its place.
 fn is_ours(machine: &Machine, unit: &str) -> bool {
     let is_pinion = || {
         let text = units::text(machine, unit).unwrap_or_default();
@@ -155,33 +155,34 @@ fn instance(
         (Some(unit), Some(files)) => given(machine, unit, files, config.as_deref(), findings),
         _ => Given::default(),
     };
-    // The one that runs knows best. Of another version, whose command line is not understood, real time is expected.
+    // The running process knows best. If its command line is another version's and not understood, real time is
+    // expected.
     let settings = settings.unwrap_or_else(|| Given { realtime: Some(true), ..given }.settings());
     let link = if is_host_path(&settings.symlink) {
         Some(settings.symlink.clone())
     } else {
-        // The unit's own, or one that somebody has made.
+        // The unit's own link, or one that somebody has made.
         files.map(|files| files.link).or_else(|| link_to(machine, &settings.symlink))
     };
     Instance { unit, pid, config, settings, link }
 }
 
-/// The configuration file that the program of a unit is to read.
+/// The configuration file that a unit's program reads.
 fn config_of(machine: &Machine, unit: &str) -> Option<String> {
     match setting(&units::text(machine, unit).unwrap_or_default(), "ExecStart") {
         Some(command) => named_config(command.split_whitespace()),
-        // One that is not installed, or an instance of a template.
+        // The unit is not installed, or it is an instance of a template.
         None => Files::of(unit).map(|files| files.config),
     }
 }
 
-/// A link that klippy takes, and that leads to this path.
+/// A link that klippy takes and that leads to this path.
 fn link_to(machine: &Machine, path: &Path) -> Option<PathBuf> {
     let mut links = machine.matching(format!("{HOST_PATHS}*")).into_iter().map(|link| machine.name(&link));
     links.find(|link| machine.follow(link).is_ok_and(|way| way.contains(&machine.path(path))))
 }
 
-/// What the files of a unit say.
+/// The settings in the files of a unit.
 fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, findings: &mut Vec<Finding>) -> Given {
     let Files { options: options_name, symlink, .. } = files;
     let restart = format!("sudo systemctl restart {unit}");
@@ -194,7 +195,7 @@ fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, fin
             format!("sudo nano {options_name}, then {restart}"),
         )),
     }
-    // On the unit's command line, after which come the options.
+    // This is on the unit's command line, before the options.
     given.symlink.get_or_insert_with(|| symlink.clone());
     let Some(config_name) = config else { return given };
     let file = machine.path(config_name);
@@ -296,7 +297,7 @@ mod tests {
         let (_, findings) = instances(&tree.machine());
         let remedy = told(&findings, "config", Error, "there is no /etc/pinion/second.toml");
         assert!(remedy.starts_with("sudo cp /etc/pinion/pinion.toml /etc/pinion/second.toml"), "{remedy}");
-        // Of one that runs the process counts, and its guardian is none.
+        // For a running instance the process counts. Its guardian is no instance.
         tree.put("etc/pinion/second.toml", "cpu = 3\n");
         let command =
             ["/usr/bin/pinion", "run", "-I", "/run/pinion/klipper_host_second", "--config", "/etc/pinion/second.toml"];
@@ -328,14 +329,14 @@ mod tests {
         let tree = Tree::new();
         let config = || instances(&tree.machine()).0[0].config().to_owned();
         assert_eq!(config(), "/etc/pinion/pinion.toml");
-        // A unit of one's own.
+        // A unit that the user has written.
         tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
         assert_eq!(config(), "its command line");
         let command = "[Service]\nExecStart=/usr/bin/pinion run --config=/home/pi/pins.toml -r\n";
         tree.put("etc/systemd/system/klipper-mcu.service", command);
         assert_eq!(config(), "/home/pi/pins.toml");
-        // What runs counts, also that of another version.
+        // A running process counts, also one of another version.
         tree.process(9, &["/usr/bin/pinion", "run", "--new", "--config", "/home/pi/other.toml"], 0, &[]);
         assert_eq!(config(), "/home/pi/other.toml");
         tree.process(9, &["/usr/bin/pinion", "run", "-r"], 0, &[]);

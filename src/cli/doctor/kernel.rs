@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The kernel: whether it is made and set up for real time.
+//! The kernel: whether it is built and set up for real time.
 
 #![forbid(unsafe_code)]
 
@@ -10,7 +10,7 @@ use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
 
 use super::instance::Instance;
 
-/// The oldest kernel, which opens a terminal whatever its permissions are (TIOCGPTPEER).
+/// The oldest supported kernel: it opens a terminal whatever the terminal's permissions are (TIOCGPTPEER).
 const OLDEST: (u32, u32) = (4, 13);
 
 pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
@@ -18,7 +18,7 @@ pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding
     kernel.chain(isolation(machine, instances)).chain(governor(machine)).collect()
 }
 
-/// Whether the kernel has what Pinion asks of it.
+/// Whether the kernel has everything that Pinion needs.
 fn version(machine: &Machine) -> Finding {
     const CHECK: &str = "kernel_version";
     const REMEDY: &str = "update the system, or install a newer kernel";
@@ -90,7 +90,7 @@ fn isolation(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     let Some(isolated) = machine.text("/sys/devices/system/cpu/isolated") else {
         return vec![Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell")];
     };
-    // Where the kernel does not tell, any may be there.
+    // If the kernel does not tell, any processor may be there.
     let present = machine.text("/sys/devices/system/cpu/present").filter(|present| !present.is_empty());
     let mut findings = Vec::new();
     let mut taken: Vec<usize> = Vec::new();
@@ -156,7 +156,7 @@ fn first(range: &str) -> &str {
     range.split([',', '-']).next().unwrap_or(range)
 }
 
-/// None where processors have one frequency only, as in a virtual machine.
+/// `None` if processors have only one frequency, as in a virtual machine.
 fn governor(machine: &Machine) -> Option<Finding> {
     const CHECK: &str = "governor";
     let files = machine.matching("/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor");
@@ -231,7 +231,7 @@ mod tests {
         assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
         tree.put("sys/devices/system/cpu/present", "0-3\n");
         assert!(told(&found(&tree, Some(2)), "isolated_cpus", Warning, "not isolated").contains("isolcpus=2"));
-        // One that is not there can not be isolated either.
+        // A processor that is not there cannot be isolated either.
         for isolated in ["", "99", "2-3"] {
             tree.put("sys/devices/system/cpu/isolated", isolated);
             let remedy = told(&found(&tree, Some(99)), "isolated_cpus", Error, "99, which is not there");

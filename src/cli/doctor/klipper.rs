@@ -14,7 +14,7 @@ use pinion_firmware::feature::FEATURES;
 
 use super::UPGRADE;
 
-/// Reads a checkout, named by itself or by klippy's folder in it.
+/// Reads a checkout. `folder` is the checkout, or klippy's folder in it.
 pub(super) fn read(folder: &Path) -> Result<Checkout, String> {
     let inside = folder.join("klippy");
     let klippy = if inside.join("klippy.py").exists() { inside } else { folder.to_owned() };

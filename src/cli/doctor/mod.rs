@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion doctor`: what works and what does not, and what mends it.
+//! `pinion doctor`: what works, what does not, and how to fix it.
 //!
-//! Each check reads files below a root, so that a test can make them, and says what it found; what can
-//! not be known it calls unknown. Nothing is changed.
+//! Each check reads files below a root, so that a test can make them. It reports its findings, and calls unknown
+//! whatever it cannot know. Nothing is changed.
 
 #![forbid(unsafe_code)]
 
@@ -28,11 +28,11 @@ mod printer;
 mod service;
 mod terminal;
 
-/// How the package is had, which no repository of a distribution's has.
+/// How to get the package, which is in no distribution's repository.
 const INSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install ./target/deb/pinion-mcu_*.deb (or sudo make install)";
-/// How its files are put in place once more.
+/// How to install its files again.
 const REINSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install --reinstall ./target/deb/pinion-mcu_*.deb (or sudo make install)";
-/// How a newer one is had.
+/// How to get a newer version.
 const UPGRADE: &str =
     "in the folder with Pinion's sources: git pull && make deb && sudo apt install ./target/deb/pinion-mcu_*.deb";
 
@@ -51,7 +51,7 @@ pub(super) struct DoctorArgs {
     root: PathBuf,
 }
 
-/// Prints what was found; fails if something does not work.
+/// Prints the findings. Fails if something does not work.
 pub(super) fn run(args: &DoctorArgs) -> ExitCode {
     let checkout = match args.klipper.as_deref().map(klipper::read).transpose() {
         Ok(checkout) => checkout,
@@ -103,7 +103,7 @@ fn examine(machine: &Machine) -> Vec<Group> {
     groups
 }
 
-/// A sample of two seconds proves nothing: what it shows is no error.
+/// A sample of two seconds proves nothing, so its result is no error.
 fn latency(sample: Result<Verdict, String>) -> Finding {
     const CHECK: &str = "latency";
     match sample {
@@ -125,7 +125,7 @@ mod tests {
     use super::*;
     use std::fs;
 
-    /// Asserts that a check has found something with these words, and returns what mends it.
+    /// Asserts that a check has found something with these words, and returns the remedy.
     #[track_caller]
     pub(super) fn told(findings: &[Finding], check: &str, status: Level, words: &str) -> String {
         let is_it = |finding: &&Finding| {
@@ -169,7 +169,7 @@ mod tests {
             tree.put(path, text);
         }
         examine(&tree.machine());
-        // A pipe that nobody writes to, and a folder in a file's place.
+        // A pipe without a writer, and a folder in a file's place.
         let pipe = tree.machine().path("/sys/kernel/realtime");
         fs::create_dir_all(pipe.parent().unwrap()).unwrap();
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).unwrap();

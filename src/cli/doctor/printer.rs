@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What klippy's configuration says of pseudo terminals, and of LEDs on SPI buses.
+//! Reads klippy's configuration: its pseudo terminals, and its LEDs on SPI buses.
 
 #![forbid(unsafe_code)]
 
@@ -8,10 +8,10 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::computer::Machine;
 
-/// No configuration has as many files.
+/// Highest number of files in a configuration. No configuration has as many.
 const FILES_MAX: usize = 500;
 
-/// What counts of a configuration.
+/// The parts of a configuration that count here.
 #[derive(Debug, PartialEq)]
 pub(super) struct Printer {
     /// The `serial` of each `[mcu]` section.
@@ -20,8 +20,8 @@ pub(super) struct Printer {
     pub(super) leds: BTreeSet<String>,
 }
 
-/// Reads a configuration, with the files that it includes. None if one of them can not be read. As in
-/// klippy/configfile.py the last word on a section counts.
+/// Reads a configuration, with the files that it includes. `None` if one of them cannot be read. As in
+/// klippy/configfile.py the last entry of a section counts.
 pub(super) fn read(machine: &Machine, config: &Path) -> Option<Printer> {
     let mut reader = Reader { machine, serials: BTreeMap::new(), led_pins: BTreeMap::new(), files: 0 };
     reader.file(config, &mut Vec::new())?;
@@ -34,20 +34,20 @@ pub(super) fn read(machine: &Machine, config: &Path) -> Option<Printer> {
 
 struct Reader<'a> {
     machine: &'a Machine,
-    /// By the section's name.
+    /// Indexed by the section's name.
     serials: BTreeMap<String, PathBuf>,
     led_pins: BTreeMap<String, String>,
     files: usize,
 }
 
 impl Reader<'_> {
-    /// Reads a file; `within` are those that include it.
+    /// Reads a file. `within` are the files that include it.
     fn file(&mut self, path: &Path, within: &mut Vec<PathBuf>) -> Option<()> {
         self.files += 1;
         if self.files > FILES_MAX || within.iter().any(|outer| outer == path) {
             return None;
         }
-        // A link leads where it does on the machine that is looked at.
+        // A link leads where it leads on the computer that is looked at.
         let target = self.machine.follow(path).ok()?.pop()?;
         let text = self.machine.text(self.machine.name(&target))?;
         within.push(path.to_owned());
@@ -77,8 +77,8 @@ impl Reader<'_> {
     }
 }
 
-/// A line up to its comment. klippy cuts at any `#` itself; a `;` counts for Python's configparser, to which it gives
-/// the rest, at the line's start or after white space.
+/// A line up to its comment. klippy itself cuts at any `#`, and gives the rest to Python's configparser. There a `;`
+/// begins a comment at the line's start or after white space.
 fn without_comment(line: &str) -> &str {
     let line = line.split('#').next().unwrap_or_default();
     let begins = |at: &usize| line[..*at].chars().next_back().is_none_or(char::is_whitespace);
@@ -123,7 +123,7 @@ mod tests {
         tree.put("home/pi/config/parts/.hidden.cfg", "[mcu hidden]\nserial: /no\n");
         tree.put("home/pi/config/up.cfg", "[mcu]\nserial: /tmp/klipper_host_up\n");
         assert_eq!(serials(&tree).unwrap(), ["/tmp/a;b", "/tmp/klipper_host_b", "/tmp/klipper_host_up"]);
-        // A link by the path that the machine itself has for it.
+        // The link has the path of the computer itself.
         tree.link("home/pi/config/parts/c.cfg", "/usr/share/c.cfg");
         assert_eq!(serials(&tree), None, "it leads nowhere");
         tree.put("usr/share/c.cfg", "[mcu c]\nserial: /tmp/klipper_host_c\n");

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The service: its configuration, whether it runs, and in real time; and what stands in its way.
+//! The service: its configuration, whether it runs and in real time, and the obstacles to it.
 
 #![forbid(unsafe_code)]
 
@@ -11,7 +11,7 @@ use crate::proc::stat_field;
 use super::INSTALL;
 use super::instance::{Instance, is_klipper_s};
 
-/// The number of the field of /proc/PID/stat that has the scheduling class.
+/// Number of the field in /proc/PID/stat that has the scheduling class.
 const POLICY: usize = 41;
 /// SCHED_FIFO (linux/sched.h).
 const SCHED_FIFO: &str = "1";
@@ -50,7 +50,7 @@ fn state(machine: &Machine, instance: &Instance) -> Finding {
     }
 }
 
-/// None for an instance that has this computer's pins, as it should be.
+/// `None` for an instance that has this computer's pins, as it should be.
 fn board(instance: &Instance) -> Option<Finding> {
     const CHECK: &str = "board";
     let name = instance.name();
@@ -69,7 +69,7 @@ fn board(instance: &Instance) -> Option<Finding> {
     }
 }
 
-/// Whether an instance that runs got the real time that it asked for; none if it does not run.
+/// Whether a running instance got the real time that it asked for. `None` if it does not run.
 fn real_time(machine: &Machine, instance: &Instance) -> Option<Finding> {
     const CHECK: &str = "realtime";
     let pid = instance.pid?;
@@ -95,12 +95,12 @@ fn real_time(machine: &Machine, instance: &Instance) -> Option<Finding> {
     })
 }
 
-/// Klipper's own program, which wants the same link and the same pins.
+/// Klipper's own program. It wants the same link and the same pins.
 fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "klipper_mcu";
     const STOP: &str = "sudo systemctl disable --now klipper-mcu";
     const SCRIPT: &str = "/etc/init.d/klipper_mcu";
-    // scripts/flash-linux.sh of Klipper starts what it finds, enabled or not.
+    // Klipper's scripts/flash-linux.sh starts whatever it finds, enabled or not.
     const STARTED_BY_FLASH: &str = "Klipper's make flash starts it, which stops Pinion, while printing, too";
     let mut findings = Vec::new();
     let is_it = |name: &std::ffi::OsStr| name == "klipper_mcu";
@@ -123,14 +123,14 @@ fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
             Some((unit, file))
         })
     {
-        // A link to /dev/null, as `systemctl mask` makes it, would be in the place of one in that folder.
+        // `systemctl mask` would make a link to /dev/null in the place of a file in that folder.
         let remedy = match file.starts_with(units::ADMINISTRATOR_S) {
             true => format!("sudo mv {file} {file}.before-pinion && sudo systemctl daemon-reload"),
             false => format!("sudo systemctl mask {unit}"),
         };
         findings.push(Finding::warning(CHECK, format!("{file} is still there: {STARTED_BY_FLASH}"), remedy));
     }
-    // A script of System V's, as Klipper's documentation had it once.
+    // A System V script, as Klipper's documentation once had it.
     let is_started_at_boot = !machine.matching("/etc/rc*/S*klipper_mcu").is_empty();
     if !is_started_at_boot && is_pinion_enabled && machine.path(SCRIPT).exists() {
         let found = format!("{SCRIPT} is still there: {STARTED_BY_FLASH}");
@@ -146,7 +146,7 @@ fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     findings
 }
 
-/// The hardware watchdog, as far as it is not a matter of permissions.
+/// The hardware watchdog, except for its permissions.
 pub(super) fn watchdog(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "watchdog_device";
     let is_there = machine.path(WATCHDOG).exists();
@@ -216,7 +216,7 @@ mod tests {
         );
         tree.link("etc/systemd/system/multi-user.target.wants/pinion-mcu.service", "/usr/lib/systemd/system/x");
         told(&found(&tree), "service", Ok, "Pinion runs as process 10 (pinion-mcu)");
-        // One that somebody else has started is not the service's.
+        // A process that somebody else has started is not the service's.
         tree.put("proc/10/cgroup", "0::/user.slice/user-1000.slice/session-1.scope\n");
         told(&found(&tree), "service", Ok, "Pinion runs as process 10: no service has started it");
         told(&found(&tree), "service", Error, "though its service is enabled");
@@ -243,7 +243,7 @@ mod tests {
         );
         tree.put("etc/default/pinion-mcu", "PINION_OPTIONS=--board linux\n");
         assert!(!is_told());
-        // By hand that is how it is tried.
+        // People try it by hand in this way.
         tree.process(10, &["pinion", "run", "--board", "sim"], 1000, &[]);
         told(&found(&tree), "board", Ok, "process 10 has a simulated printer");
     }
@@ -258,7 +258,7 @@ mod tests {
         told(&found(&tree), "realtime", Warning, "not permitted");
         tree.put("proc/10/task/12/stat", &stat("1"));
         told(&found(&tree), "realtime", Ok, "runs in real time");
-        // Each is judged.
+        // Each instance is judged.
         tree.process(12, &["/usr/bin/pinion", "run", "-I", "/tmp/klipper_host_b"], 990, &[]);
         let findings = found(&tree);
         told(&findings, "realtime", Ok, "Pinion (process 10) runs in real time");

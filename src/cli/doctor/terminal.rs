@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The terminal: whether klippy finds it at the link that its configuration names, and whether its user can open it.
+//! The terminal: whether klippy finds it at the link in its configuration, and whether klippy's user can open it.
 
 #![forbid(unsafe_code)]
 
@@ -18,7 +18,7 @@ use super::instance::{Instance, unit_for};
 
 const CHECK: &str = "terminal";
 
-/// For each terminal whether the klippy that is to open it finds it, and may.
+/// For each terminal: whether its klippy finds it and may open it.
 pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
     let mut findings = Vec::new();
     let mut links: Vec<&Path> = Vec::new();
@@ -52,8 +52,8 @@ pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Kl
     findings
 }
 
-/// Whether those who are to open a link find a terminal there, and may open it. It is that of `instance`, or one that
-/// a klippy's configuration names and no instance has.
+/// Whether the klippys that open a link find a terminal there, and may open it. The link is `instance`'s, or one that a
+/// klippy's configuration names and no instance has.
 fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys: &[Klippy]) -> Vec<Finding> {
     let shown = path.display();
     let opening: Vec<&Klippy> = klippys.iter().filter(|klippy| klippy.opens(path)).collect();
@@ -61,7 +61,7 @@ fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys
     let place = Place::of(&machine.path(path));
     if let Some(obstacle) = place.obstacle(path) {
         let clear = match place {
-            // It may have something in it.
+            // The folder may have something in it.
             Place::Folder => format!("sudo mv {shown} {shown}.old"),
             _ => format!("sudo rm {shown}"),
         };
@@ -97,7 +97,7 @@ fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys
     opened.chain(wanted_by_several(path, &opening)).collect()
 }
 
-/// What it means that there is no link.
+/// The finding for a missing link.
 fn no_link(path: &Path, instance: Option<&Instance>, opening: &[&Klippy]) -> Finding {
     let shown = path.display();
     match instance.map(|instance| (instance, instance.pid)) {
@@ -121,7 +121,7 @@ fn no_link(path: &Path, instance: Option<&Instance>, opening: &[&Klippy]) -> Fin
     }
 }
 
-/// That the configurations of several klippys name one link.
+/// The finding if the configurations of several klippys name one link.
 fn wanted_by_several(path: &Path, opening: &[&Klippy]) -> Option<Finding> {
     let sure: Vec<&Klippy> = opening.iter().copied().filter(|klippy| klippy.printer.is_some()).collect();
     let shown = path.display();
@@ -135,7 +135,7 @@ fn by(klippys: &[&Klippy]) -> String {
     format!(" ({})", names.join(", "))
 }
 
-/// A terminal that is there.
+/// A terminal that exists.
 struct Terminal<'a> {
     path: &'a Path,
     link: &'a fs::Metadata,
@@ -146,11 +146,11 @@ struct Terminal<'a> {
     told: &'a str,
 }
 
-/// What to do about a process that is called as klippy is and that no unit started. Any user can have one, and what
-/// it wants is none of the administrator's affairs.
+/// The remedy for a process that is called like klippy and that no unit started. Any user can have one, and its needs
+/// are no affair of the administrator.
 const STRANGER: &str = "no service has started that process: if it is your klippy, have a service start it";
 
-/// Whether a klippy's user may open a terminal. Advice about users is for those of services.
+/// Whether a klippy's user may open a terminal. Only a service's klippy gets advice about users.
 fn access(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
     let judged = judged(machine, terminal, instance, klippy);
     if klippy.unit.is_some() || judged.status == Level::Ok {
@@ -195,7 +195,7 @@ fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance
     Finding::error(CHECK, format!("{name}, klippy's user ({found_by}), may not open it: {told}"), remedy)
 }
 
-/// Whose link it is, should the kernel refuse to follow it.
+/// The owner of a link that the kernel refuses to follow.
 fn link_is_refused(machine: &Machine, path: &Path, link: &fs::Metadata, who: &Who) -> Option<String> {
     let is_on = machine.text("/proc/sys/fs/protected_symlinks").is_some_and(|text| text == "1");
     let folder = fs::metadata(machine.path(path.parent()?)).ok()?;
@@ -203,8 +203,8 @@ fn link_is_refused(machine: &Machine, path: &Path, link: &fs::Metadata, who: &Wh
     refused.then(|| machine.ownership(link).split(':').next().unwrap_or_default().to_owned())
 }
 
-/// Whether a link in a folder of this mode and owner is one that this user may not follow: in a folder that
-/// all write to and that is sticky, only its owner may, unless it is the folder's owner's
+/// Whether this user may not follow a link in a folder of this mode and owner. In a sticky folder that all may write
+/// to, only the link's owner may follow it. A link of the folder's owner is an exception: everybody may follow it
 /// (proc_sys_fs(5), `protected_symlinks`).
 fn is_protected(folder_mode: u32, folder_uid: u32, link_uid: u32, uid: u32) -> bool {
     folder_mode & 0o1002 == 0o1002 && link_uid != uid && link_uid != folder_uid
@@ -221,7 +221,7 @@ mod tests {
 
     const PI: u32 = 54_321;
 
-    /// A machine with a terminal that the service has made, of this mode, and a user of klippy's.
+    /// A computer with a terminal of this mode that the service has made, and with klippy's user.
     fn with_terminal(mode: u32) -> (Tree, u32) {
         let tree = Tree::new();
         tree.put_mode("dev/pts/3", "", mode);
@@ -250,7 +250,7 @@ mod tests {
         tree.process(8, &KLIPPY, PI, &[gid]);
         told(&looked(&tree), "terminal", Ok, "for klippy's user pi (process 8)");
         tree.process(8, &KLIPPY, PI, &[]);
-        // Whoever calls a process so gets no advice that is of use to him.
+        // A user that names a process like this gets no advice that is of use.
         let remedy = told(&looked(&tree), "terminal", Warning, "pi, klippy's user (process 8), may not open it");
         assert!(!remedy.contains("sudo"), "{remedy}");
         tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
@@ -282,7 +282,7 @@ mod tests {
         tree.process(8, &KLIPPY, PI, &[gid]);
         tree.mode("tmp", 0o1777);
         tree.put("proc/sys/fs/protected_symlinks", "1\n");
-        // The link's owner is the folder's here: that is root's link in root's folder.
+        // The link's owner is the folder's owner here, as for root's link in root's folder.
         told(&looked(&tree), "terminal", Ok, "for klippy's user pi");
         let tmp = 0o1777;
         assert!(is_protected(tmp, 0, 990, PI), "a link of Pinion's user");
@@ -311,8 +311,7 @@ mod tests {
         assert!(remedy.starts_with("sudo rm /tmp/klipper_host_mcu"), "{remedy}");
     }
 
-    /// Two printers: the users pi and other, each with a klippy that runs and a configuration, and an instance for
-    /// each.
+    /// Two printers, for the users pi and other. Each has a running klippy, a configuration and an instance.
     fn two_printers() -> (Tree, u32) {
         let (tree, gid) = with_terminal(0o660);
         tree.put_mode("dev/pts/4", "", 0o660);
@@ -345,7 +344,7 @@ mod tests {
         told(&findings, "terminal", Ok, "/tmp/klipper_host_mcu leads to /dev/pts/3");
         told(&findings, "terminal", Ok, "/dev/pts/4, which is");
         told(&findings, "terminal", Ok, "for klippy's user other (process 22)");
-        // The second one is not in the group.
+        // The second user is not in the group.
         tree.process(
             22,
             &["/usr/bin/python3", "/home/other/klipper/klippy/klippy.py", "/home/other/printer.cfg"],
@@ -356,7 +355,7 @@ mod tests {
         told(&findings, "terminal", Ok, "for klippy's user pi (process 21)");
         let remedy = told(&findings, "terminal", Error, "other, klippy's user (process 22), may not open it");
         assert_eq!(remedy, "sudo usermod -aG tty other && sudo systemctl restart klipper-2");
-        // It is the second instance's terminal that is shut.
+        // The second instance's terminal is closed to its klippy.
         tree.mode("dev/pts/4", 0o600);
         tree.process(
             22,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What has changed since it was told last, for a pipe or a file: a line for each thing, or a block for a picture.
+//! The changes since the last report, for a pipe or a file: a line for each thing, or a block for a picture.
 
 #![forbid(unsafe_code)]
 
@@ -9,10 +9,10 @@ use std::time::Duration;
 
 use super::{Item, Number, name_colours};
 
-/// How many looks a number has to stay where it is for that to be told, if something still moves it.
+/// How many looks a number has to stand before that is reported, if something still moves it.
 const STANDING_LOOKS: usize = 10;
 
-/// What an item is called where no kind stands before it: two that share a name are told apart by their kinds.
+/// An item's name where its kind does not stand before it. Two items that share a name also get their kinds.
 fn called(items: &[Item], item: &Item) -> String {
     let shared = items.iter().filter(|other| other.name == item.name).count() > 1;
     match item.kind.names().filter(|_| shared) {
@@ -21,7 +21,7 @@ fn called(items: &[Item], item: &Item) -> String {
     }
 }
 
-/// What was told of an item last, and what the looks since then saw of its number.
+/// The last report of an item, and its number in the looks since then.
 struct Told {
     value: f64,
     text: String,
@@ -29,7 +29,7 @@ struct Told {
 }
 
 impl Told {
-    /// Takes in a look. True if there is news to tell.
+    /// Takes in a look. True if there is news to report.
     fn is_news(&mut self, item: &Item) -> bool {
         let Some(Number { value, step, ripple }) = item.number else { return item.text != self.text };
         let last = self.seen.back().map(|(last, _)| *last);
@@ -47,9 +47,10 @@ impl Told {
         way >= step || last == Some(value) || self.seen.len() == STANDING_LOOKS && self.stands(value, way, step)
     }
 
-    /// Whether a number that is never twice the same ends up at this value, so far from what was told.
+    /// Whether a number that is never twice the same ends up at this value, `way` from the last report.
     fn stands(&self, value: f64, way: f64, step: f64) -> bool {
-        // A filter takes it on by less than is printed. What flickers between two prints is not told each time.
+        // A filter moves the number by less than is printed. A number that flickers between two prints is not reported
+        // each time.
         if self.seen.iter().all(|(_, text)| self.seen[0].1 == *text) {
             return way >= step / 20.0;
         }
@@ -63,7 +64,7 @@ impl Told {
     }
 }
 
-/// The lines that tell of what changed.
+/// The lines that report changes.
 #[derive(Default)]
 pub(super) struct Changes {
     /// In the order of the items.
@@ -71,7 +72,7 @@ pub(super) struct Changes {
 }
 
 impl Changes {
-    /// Of the last look everything is told that was not yet.
+    /// The lines for a look. The last look reports everything that was not reported yet.
     pub(super) fn lines(&mut self, items: &[Item], at: Duration, is_last: bool) -> String {
         let mut lines = String::new();
         for (n, item) in items.iter().enumerate() {
@@ -103,7 +104,7 @@ mod tests {
     use super::super::{Kind, tests::item};
     use super::*;
 
-    /// What is told of a temperature that goes through these values, in C, without the time.
+    /// The reports of a temperature that goes through these values, in C, without the time.
     fn told(values: impl Iterator<Item = f64>) -> Vec<String> {
         let mut changes = Changes::default();
         let lines = values.map(|celsius| {
@@ -116,7 +117,7 @@ mod tests {
 
     #[test]
     fn a_number_that_a_filter_moves_is_told_as_it_ends_up() {
-        // Never twice the same, and never there.
+        // It is never twice the same, and never reaches its end.
         let told = told((0..200).map(|look| 60.0 - 5.0 * (-f64::from(look) / 10.0).exp()));
         assert_eq!(told[..3], ["55.0 C", "56.3 C", "57.5 C"]);
         assert_eq!(told.last().unwrap(), "60.0 C");
@@ -133,7 +134,7 @@ mod tests {
         assert!(told.len() < 12, "{told:?}");
     }
 
-    /// Looks that meet the ripple at one phase for a while see it stand, at another place each time.
+    /// For a while, looks meet the ripple at one phase. They see the number stand, each time at another place.
     #[test]
     fn a_fan_that_is_looked_at_in_step_with_its_ripple_is_told_once() {
         let mut changes = Changes::default();

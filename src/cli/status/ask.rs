@@ -24,14 +24,14 @@ const ANSWER_WAIT_MAX: Duration = Duration::from_secs(5);
 /// Longest answer that is read.
 const ANSWER_MAX: usize = 4 << 20;
 
-/// What a Pinion answered.
+/// A Pinion's answer.
 pub(super) struct Answer {
     pub(super) status: Status,
-    /// One line about what it told that this version does not know.
+    /// One line about the fields that this version does not know.
     pub(super) notice: Option<String>,
 }
 
-/// Asks the first of the sockets that answers.
+/// Asks the first socket that answers.
 pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
     let paths = args.socket.clone().map_or_else(|| socket_paths(&args.symlink), |path| vec![path]);
     let mut missing = Vec::new();
@@ -64,7 +64,7 @@ pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
 
 /// Reads a document.
 fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
-    /// What every document has, whatever its version.
+    /// The part that every version's document has.
     #[derive(Deserialize)]
     struct Sender {
         version: String,
@@ -91,10 +91,10 @@ fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
     }
 }
 
-/// The document that is sent at a socket.
+/// The document from a socket.
 fn document_at(path: &Path) -> io::Result<Vec<u8>> {
     let until = Instant::now() + ANSWER_WAIT_MAX;
-    // Others may ask as well: then it takes a while until there is room for one more.
+    // Other clients may ask as well. Then it takes a while until there is room for one more.
     let mut socket = loop {
         match connect(path) {
             Err(error) if error.kind() == io::ErrorKind::WouldBlock && Instant::now() < until => {

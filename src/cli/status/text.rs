@@ -74,7 +74,7 @@ fn host(host: &Host, mcu: Option<&McuStatus>) -> String {
 }
 
 fn lateness(late: &Lateness) -> String {
-    // Debug keeps the point of a whole number, as JSON does.
+    // Debug keeps the decimal point of a whole number, as JSON does.
     format!(
         "{} run, late by p50 {:?} us, p99 {:?} us, p99.9 {:?} us, at most {:?} us; the core wakes {:?} us early",
         late.timers, late.p50_us, late.p99_us, late.p999_us, late.max_us, late.margin_us

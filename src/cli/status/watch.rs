@@ -23,10 +23,10 @@ use super::{StatusArgs, show};
 
 /// Time between two looks.
 const PERIOD: Duration = Duration::from_secs(1);
-/// How long a signal gives the loop to end: longer than an answer takes. A terminal that takes no output, as after
-/// Ctrl-S, keeps the loop for ever.
+/// How long the loop may take to end after a signal: longer than an answer takes. A terminal that takes no output, as
+/// after Ctrl-S, keeps the loop forever.
 const GRACE: Duration = Duration::from_secs(6);
-/// Longest wait for a key, after which a signal is looked for.
+/// Longest wait for a key before the loop looks for a signal.
 const KEY_WAIT: Duration = Duration::from_millis(50);
 
 /// Prints the status each second, until it is asked to end.
@@ -39,7 +39,7 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
             .map_err(|error| format!("signals can not be taken in: {error}"))?;
     }
     give_back_at(&signals, GRACE)?;
-    // An instance that cannot be asked at first is a mistake. Later it is one that is being restarted.
+    // If the instance does not answer at first, the command was a mistake. Later the instance may be restarting.
     let first = ask(args)?;
     if let Some(notice) = &first.notice {
         log::warn!("{notice}");
@@ -55,7 +55,7 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
             Some(screen) => screen.show(page),
             None => draw(&format!("{page}\n")),
         };
-        // A reader that is gone wants no more.
+        // The reader is gone and wants no more.
         if shown.is_err() {
             return Ok(());
         }
@@ -78,7 +78,7 @@ pub(super) fn watch(args: &StatusArgs) -> Result<(), String> {
             }
             if wish == Some(Wish::Stop) {
                 drop(screen.take());
-                // Where nobody could have it go on again, the kernel does not stop it.
+                // The kernel does not stop it if nobody could continue it.
                 let _ = raise(Signal::SIGTSTP);
                 screen = Some(Screen::enter().map_err(gone)?);
                 break;
@@ -91,29 +91,29 @@ fn gone(error: io::Error) -> String {
     format!("the terminal cannot be written: {error}")
 }
 
-/// What a key asks for.
+/// The wish behind a key.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Wish {
-    /// To end.
+    /// End.
     End,
-    /// To stop until the shell has it go on.
+    /// Stop until the shell continues the program.
     Stop,
-    /// To see another part of the page.
+    /// Show another part of the page.
     Scroll(Scroll),
 }
 
-/// Which part of a page.
+/// A part of a page.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Scroll {
-    /// So many lines further down.
+    /// This many lines further down.
     Lines(isize),
-    /// So many screens further down.
+    /// This many screens further down.
     Screens(isize),
     Top,
     Bottom,
 }
 
-/// What a key asks for.
+/// The wish behind a key, if it has one.
 fn wish(key: Key) -> Option<Wish> {
     Some(match key {
         Key::End | Key::Other(KeyCode::Char('q' | 'Q')) => Wish::End,
@@ -128,20 +128,20 @@ fn wish(key: Key) -> Option<Wish> {
     })
 }
 
-/// The lines of a page that are to be seen.
+/// The visible lines of a page.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct View {
-    /// How many are above.
+    /// How many lines are above.
     above: usize,
-    /// How many there is room for.
+    /// How many lines there is room for.
     room: usize,
 }
 
 impl View {
-    /// Moves over a page of so many lines.
+    /// Moves over a page of `lines` lines.
     fn scroll(&mut self, scroll: Scroll, lines: usize) {
         let lowest = lines.saturating_sub(self.room);
-        // What is at the edge stays in sight.
+        // The line at the edge stays in sight.
         let screen = self.room.saturating_sub(1).max(1) as isize;
         self.above = match scroll {
             Scroll::Lines(by) => self.above.saturating_add_signed(by),
@@ -152,7 +152,7 @@ impl View {
         .min(lowest);
     }
 
-    /// The lines of a page that are to be seen, and what is said below them.
+    /// The visible lines of a page, and the text below them.
     fn of<'a>(&mut self, page: &'a Page, ends: &str) -> (Vec<&'a str>, String) {
         let lines = page.lines().count();
         self.scroll(Scroll::Lines(0), lines);
@@ -166,8 +166,8 @@ impl View {
     }
 }
 
-/// A terminal that is drawn on in place: its alternate screen, without a cursor, long lines cut off. Dropped, it is as
-/// before.
+/// A terminal that is drawn on in place: its alternate screen, without a cursor, with long lines cut off. When this is
+/// dropped, the terminal is as before.
 struct Screen {
     terminal: Terminal,
     page: Page,
@@ -185,7 +185,7 @@ impl Screen {
         Ok(Screen { terminal, page: Page::default(), view: View::default() })
     }
 
-    /// Shows a new page, at the place that the last one was seen at.
+    /// Shows a new page, at the place of the last one.
     fn show(&mut self, page: Page) -> io::Result<()> {
         self.page = page;
         self.draw()
@@ -205,11 +205,11 @@ impl Screen {
         draw(&format!("{}{lines}{ERASE_BELOW}{foot}", to_row(1)))
     }
 
-    /// What somebody has pressed a key for. Waits a little for that.
+    /// The wish behind a pressed key. It waits a little for a key.
     fn wish(&mut self) -> Option<Wish> {
         match self.terminal.keys(KEY_WAIT) {
             Ok(keys) => keys.into_iter().find_map(wish),
-            // Without a terminal there is nobody to show anything.
+            // Without a terminal there is nobody to show anything to.
             Err(_) => Some(Wish::End),
         }
     }
@@ -245,7 +245,7 @@ mod tests {
         ] {
             assert_eq!(seen(scroll), first, "{scroll:?}");
         }
-        // A page that has become shorter is seen whole, or from where its last line is the last.
+        // A page that has become shorter is shown whole, or so that its last line is the last one shown.
         let mut view = View { above: 17, room: 23 };
         assert_eq!(view.of(&lines(25), "q ends").0[0], "line 3");
         assert_eq!(view.of(&lines(2), "q ends"), (vec!["line 1", "line 2"], "q ends".to_owned()));
