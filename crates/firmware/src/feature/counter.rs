@@ -38,7 +38,7 @@ response! {
     pub(super) struct State { oid: Oid, next_clock: Clock, count: u32, count_clock: Clock }
 }
 
-/// Highest rate of interrupts that is accepted as a tachometer. 20,000 rpm with two pulses are 1333 edges per second. A
+/// Highest rate of interrupts that a tachometer may have. 20,000 rpm with two pulses are 1333 edges per second. A
 /// pin with a higher rate floats or oscillates. Each interrupt costs the kernel 10 us or more, and delays everything
 /// else on this computer.
 const EDGES_PER_S_MAX: u32 = 20_000;

@@ -57,9 +57,9 @@ struct Limits {
     counts_min: i32,
     counts_max: i32,
     tare_counts: i32,
-    /// Has [`GRAMS_FRAC_BITS`].
+    /// Has [`GRAMS_FRAC_BITS`] fractional bits.
     trigger_grams: i32,
-    /// Has [`GRAMS_PER_COUNT_FRAC_BITS`].
+    /// Has [`GRAMS_PER_COUNT_FRAC_BITS`] fractional bits.
     grams_per_count: i32,
 }
 

@@ -10,8 +10,8 @@
 //! really need).
 //!
 //! The firmware gives up a frame if a bit comes more than `bit_max_ticks` after the one before. klippy then sends the
-//! frame again. Nobody can see from here whether a controller pauses during a message. The board logs a controller that
-//! is known to pause. A frame counts as sent if its driver took it.
+//! frame again. Pinion cannot see whether a controller pauses during a message. The board logs a controller that is
+//! known to pause. A frame counts as sent if its driver took it.
 
 #![forbid(unsafe_code)]
 

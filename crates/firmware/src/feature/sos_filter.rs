@@ -36,7 +36,7 @@ shutdowns! {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) struct Overflow;
 
-/// The bits that are used of a count of fractional bits.
+/// The used bits of a count of fractional bits.
 const FRAC_BITS_MASK: u8 = 0x3f;
 
 /// The product of a coefficient with `frac_bits` fractional bits and a value, rounded half up.

@@ -231,7 +231,7 @@ fn entry(measured: Result<Angle, Fault>, late: u32, time_shift: u8) -> [u8; ENTR
 enum Purpose {
     /// A measurement of the timer, with its due time. `None`: it is from an earlier query, and no longer counts.
     Measurement { due: Option<Clock> },
-    /// A transfer of the host. Commands wait with its `hold`. `None`: the MCU has stopped.
+    /// A transfer of the host. Commands wait until its `hold` is released. `None`: the MCU has stopped.
     Transfer { hold: Option<Hold> },
 }
 
@@ -245,7 +245,7 @@ struct Asking {
 /// The next measurement.
 struct Upcoming {
     due: Clock,
-    /// How many measurements before it there was no time for.
+    /// How many measurements before it were skipped, because there was no time for them.
     missed: u16,
 }
 

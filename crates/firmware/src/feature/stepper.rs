@@ -63,7 +63,7 @@ struct Stepper {
     dir: PromptLine,
     /// The step pin's idle level.
     invert_step: bool,
-    /// Every edge is a step. Otherwise an edge that is a step is followed by one back.
+    /// Every edge is a step. Otherwise an edge back follows each step.
     both_edges: bool,
     pulse_ticks: Ticks,
     late_limit: Ticks,
@@ -164,13 +164,13 @@ impl Stepper {
     }
 
     /// Moves on to the next step, `interval` later on a 32-bit clock. A time that is 2^31 ticks or more after
-    /// `earliest` has passed, as for the firmware's comparisons.
+    /// `earliest` counts as past, as in the firmware's comparisons.
     #[inline]
     fn advance(&mut self, interval: u32, earliest: Clock) {
         self.next_step = Clock::widen(self.next_step.wire().wrapping_add(interval), earliest);
     }
 
-    /// Changes the direction and gives it its setup time.
+    /// Changes the direction. The next step waits for the setup time.
     fn reverse(&mut self, turn: &mut Turn) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
         let earliest = turn.now() + self.pulse_ticks;

@@ -158,7 +158,7 @@ struct Thermocouple {
 
 impl Thermocouple {
     fn check(&mut self, mcu: &Mcu, value: u32, fault: u8) -> Result<(), Shutdown> {
-        // Kalico says this way that only the host checks the values.
+        // This is Kalico's way to say that only the host checks the values.
         if self.max_invalid_count == 0 && mcu.serves(since(Kalico)) {
             return Ok(());
         }

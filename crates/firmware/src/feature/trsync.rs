@@ -43,7 +43,7 @@ const REPORT: Timer = Timer::exact(0);
 const EXPIRE: Timer = Timer::exact(1);
 
 impl Trsync {
-    /// Pulls the trigger, unless it was pulled before. Every waiting object and the host then learn of it.
+    /// Pulls the trigger, unless it was pulled before. Calls every waiting object, and reports to the host.
     pub(super) fn trigger(&mut self, turn: &mut Turn, reason: u8) -> Result<(), Shutdown> {
         if self.pull(turn, reason)? {
             self.report(turn);

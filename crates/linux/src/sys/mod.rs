@@ -52,7 +52,7 @@ pub fn set_nice(value: i32) -> io::Result<()> {
 pub const LOOK_INTO_OTHERS: u32 = 1 << 2 | 1 << 19;
 
 /// The capabilities that the program itself may need. CAP_IPC_LOCK and CAP_SYS_NICE are for real time. If root starts
-/// the program, it also needs CAP_CHOWN, CAP_DAC_OVERRIDE and CAP_FOWNER. They are for the terminal's group, and for
+/// the program, it may also need CAP_CHOWN, CAP_DAC_OVERRIDE and CAP_FOWNER. They are for the terminal's group, and for
 /// links and sockets in folders of other users.
 pub const SERVE: u32 = 1 << 14 | 1 << 23 | 1 << 0 | 1 << 1 | 1 << 3;
 
