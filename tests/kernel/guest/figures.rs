@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What a micro-controller program costs, and how late it is: the tests that `--program` runs
-//! with another program, too. Each figure is a line that the host's side puts into its table.
+//! The costs and the lateness of an MCU program. `--program` runs these tests with another program too. Each figure is
+//! a line for the table on the computer's side.
 //!
-//! Of Pinion alone they assert something.
+//! Only Pinion's figures are asserted.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -17,34 +17,33 @@ use crate::program::{self, Program};
 use crate::sysfs;
 use crate::trace::{Calls, Trace};
 
-/// Of the VM: see `TIME` in `tests/kernel/vm.rs`.
+/// The VM's value: see `TIME` in `tests/kernel/vm.rs`.
 const NS_PER_INSTRUCTION: f64 = 1.0;
-/// The steps of a move last about this long, as klippy's do.
+/// Approximate time of a move's steps, as with klippy.
 const MOVE: Ticks = Ticks::from_ms(25);
-/// Moves that are queued before the first step, and that the queue is kept ahead by.
+/// Number of moves that are queued before the first step, and that the queue stays ahead by.
 const MOVES_AHEAD: u32 = 20;
-/// From the first moves' sending to the first step.
+/// Time from the first moves to the first step.
 const LEAD_S: f64 = 0.2;
-/// The second and third stepper step a little slower, so that their edges meet those of the others
-/// at every distance.
+/// The second and third stepper step a little slower. So their edges meet the edges of the others at every distance.
 const SLOWER: [f64; 3] = [1.0, 1.003, 1.011];
-/// What klippy asks for with a driver that steps on both edges: 100 ns.
+/// klippy's value for a driver that steps on both edges: 100 ns.
 const PULSE_TICKS: u32 = 5;
-/// Step and direction of the n-th stepper are the lines 2 n and 2 n + 1.
+/// The n-th stepper has the lines 2 n (step) and 2 n + 1 (direction).
 const LINES: u32 = 2 * SLOWER.len() as u32;
-/// Of spidev.
+/// Settings of spidev.
 const DELAY_MS: &str = "/sys/devices/platform/mock-spi/delay_ms";
 const DELAY_US: &str = "/sys/devices/platform/mock-spi/delay_us";
 const SPI_DATA: Arg<'_> = Arg::Bytes(&[0x5a; 8]);
 
-/// Thousands of steps a second, how many moves of them are made, and how many steppers there are.
-/// (A debug build's figures are nobody's: of the tests themselves this is enough.)
+/// Thousands of steps per second, number of moves, and number of steppers. (The figures of a debug build are not used.
+/// This is enough to test the tests themselves.)
 const CASES: &[(u32, u32, usize)] = match cfg!(debug_assertions) {
     true => &[(10, 8, 1)],
     false => &[(1, 120, 1), (10, 40, 1), (50, 24, 1), (1, 120, 3), (10, 40, 3), (50, 24, 3)],
 };
 
-/// A figure of the program, for the table: see `tests/kernel/table.rs`.
+/// A figure of the program for the table: see `tests/kernel/table.rs`.
 fn figure(of: &str, case: &str, value: &str) {
     println!("figure\t{of}\t{case}\t{value}");
 }
@@ -57,14 +56,14 @@ fn instructions(time: Duration) -> f64 {
     time.as_nanos() as f64 / NS_PER_INSTRUCTION
 }
 
-/// Steppers that move evenly, a step on each edge.
+/// Steppers that move evenly, with a step on each edge.
 struct Load {
-    /// Of each stepper, in ticks.
+    /// The interval of each stepper, in ticks.
     intervals: Vec<u32>,
     moves: u32,
     moves_ahead: u32,
-    /// Whether an SPI transfer begins in the middle of each move. (One that keeps a program busy
-    /// beyond the end of a move may end in "Stepper too far in past".)
+    /// Whether an SPI transfer begins in the middle of each move. (A transfer that keeps a program busy beyond the end
+    /// of a move may end in "Stepper too far in past".)
     transfers: bool,
 }
 
@@ -75,7 +74,7 @@ impl Load {
         Load { intervals, moves, moves_ahead: MOVES_AHEAD, transfers }
     }
 
-    /// All of it is queued before it begins.
+    /// The whole load is queued before it begins.
     fn fast(interval: u32, steppers: usize) -> Load {
         Load { intervals: vec![interval; steppers], moves: 12, moves_ahead: 12, transfers: false }
     }
@@ -88,7 +87,7 @@ impl Load {
         self.intervals.iter().map(|interval| Self::steps_a_move(*interval) * self.moves)
     }
 
-    /// Steps of all steppers in a span within the load.
+    /// Number of steps of all steppers in a time span within the load.
     fn steps_in(&self, span: Duration) -> f64 {
         let ticks = span.as_nanos() as f64 / NS_PER_TICK as f64;
         self.intervals.iter().map(|interval| ticks / f64::from(*interval)).sum()
@@ -97,7 +96,7 @@ impl Load {
 
 /// A program that is configured for loads, and its host.
 struct Session {
-    // Dropped before the chip whose lines it holds: the next chip is to have the same number.
+    // Dropped before the chip with its lines: the next chip must have the same number.
     program: Program,
     sim: GpioSim,
     client: Client,
@@ -123,8 +122,8 @@ impl Session {
         Session { program, sim, client, steppers, spi_oid }
     }
 
-    /// Runs a load. Of the part in which all steppers move, `look` sees the beginning and the end.
-    /// Returns when the first interval began, or why the MCU stopped.
+    /// Runs a load. `look` is called at the beginning and at the end of the part in which all steppers move. Returns
+    /// the start of the first interval, or the reason for a shutdown of the MCU.
     fn run(&mut self, load: &Load, look: impl FnMut(&Program)) -> Result<Clock, String> {
         match self.try_run(load, look) {
             Ok(start) => Ok(start),
@@ -151,7 +150,7 @@ impl Session {
                 self.client.send("spi_transfer", &[("oid", self.spi_oid.into()), ("data", SPI_DATA)])?;
             }
         }
-        // What is late is made, too, before the program is asked.
+        // Late steps are also made before the positions are queried.
         self.client.listen(Instant::now() + Duration::from_millis(100))?;
         for (stepper, steps) in self.steppers.iter().zip(load.steps()) {
             let made = stepper.position(&mut self.client)?;
@@ -163,13 +162,13 @@ impl Session {
         Ok(start)
     }
 
-    /// A busy program may have kept its host waiting.
+    /// Checks that a busy program did not make its host wait too long.
     fn assert_within(&self, load: &Load, start: Clock, look: Instant) {
         let end = self.client.instant_of(start + Ticks(MOVE.0 * load.moves));
         assert!(look < end, "the load was over {:?} before the host looked", look - end);
     }
 
-    /// Queues so many moves of each stepper.
+    /// Queues this number of moves for each stepper.
     fn queue(&mut self, load: &Load, moves: u32) -> Result<(), Error> {
         let mut commands = Vec::new();
         for _ in 0..moves {
@@ -195,7 +194,7 @@ impl Session {
         for (line, interval) in (0..LINES).step_by(2).zip(&load.intervals) {
             let number = self.sim.kernel_number(line);
             let edges = writes.iter().filter(|write| write.line == number);
-            // Tick 0 is a whole second of CLOCK_MONOTONIC, and a program may start before it.
+            // Tick 0 is a whole second of CLOCK_MONOTONIC. A program may start before it.
             let begin = i64::from(start.wire() as i32);
             let due_ns = |step: i64| (begin + step * i64::from(*interval)) * NS_PER_TICK as i64;
             late.extend((1..).zip(edges).map(|(step, edge)| {
@@ -208,7 +207,7 @@ impl Session {
     }
 }
 
-/// Prints a figure of every case, or why the MCU stopped, which Pinion's may not.
+/// Prints a figure for every case, or the reason for a shutdown of the MCU. Pinion must not shut down.
 fn figures(of: &str, transfers: bool, measure: impl Fn(&mut Session, &Load, &str) -> Result<String, String>) {
     for &(thousands, moves, steppers) in CASES {
         let load = Load::steady(thousands, moves, steppers, transfers);
@@ -276,26 +275,26 @@ fn edges_cost_system_calls() {
         println!("{case}, by number: {}", by_number.collect::<Vec<_>>().join(", "));
         if is_pinion() {
             let [writes, waits, looks] = [libc::SYS_ioctl, libc::SYS_futex, libc::SYS_clock_gettime].map(count);
-            // (Something else may have the processor between the look at the clock and the count.)
+            // (Another thread may have the processor between reading the clock and the count.)
             assert!((0.95..1.05).contains(&(writes / steps)) && waits <= 1.1 * steps, "{case}");
-            // The clock is read without a call; the core asks for its running time by one, every
-            // 24 ms unless it is short of that. A few more are the link's.
+            // Reading the clock needs no system call. The core makes one call for its running time every 24 ms, unless
+            // it has little of that time left. A few more calls are the link's.
             let span_ms = (*to - *from).as_secs_f64() * 1000.0;
             assert!(looks <= span_ms / 10.0 && all - writes - waits - looks <= span_ms / 2.0, "{case}");
         }
-        // Each edge is one write, and the steps in a span are not known as exactly.
+        // Each edge is one write. The number of steps in a span is not known as exactly.
         Ok(format!("{:.3}", all / count(libc::SYS_ioctl)))
     });
 }
 
-/// A load whose steps take longer than their interval ends in "Stepper too far in past" as soon as
-/// a move begins a millisecond late: within 0.3 seconds if they take 0.4 % longer. The interval
-/// is found to within 0.5 %.
+/// If the steps of a load take longer than their interval, the load ends in "Stepper too far in past" when a move
+/// begins a millisecond late. That is within 0.3 seconds if the steps take 0.4 % longer. The interval is found to
+/// within 0.5 %.
 #[test]
 fn smallest_interval() {
     for steppers in [1, 3] {
         let holds = |interval: u32| Session::start().run(&Load::fast(interval, steppers), |_| ()).is_ok();
-        // Less than a system call takes, and more than a step does.
+        // 20 ticks are less than a system call takes, and 1000 are more than a step takes.
         let (mut fails, mut least) = (20_u32, 1000);
         assert!(holds(least));
         while least - fails > least.div_ceil(200) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Simulated GPIO chips: the kernel's gpio-sim, made through configfs.
+//! Simulated GPIO chips: the kernel's gpio-sim, created through configfs.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -9,7 +9,7 @@ use super::sysfs;
 
 const CONFIGFS: &str = "/sys/kernel/config/gpio-sim";
 
-/// What a chip is to be like.
+/// The properties of a chip.
 pub struct Builder {
     label: String,
     line_count: u32,
@@ -24,7 +24,7 @@ impl Builder {
         self
     }
 
-    /// Lets the kernel hold a line as an input, for this consumer.
+    /// Makes the kernel hold a line as an input, for this consumer.
     pub fn hog(mut self, offset: u32, consumer: &str) -> Builder {
         self.hogs.push((offset, consumer.to_owned()));
         self
@@ -34,7 +34,7 @@ impl Builder {
     pub fn build(self) -> GpioSim {
         sysfs::assert_in_guest();
         static COUNT: AtomicUsize = AtomicUsize::new(0);
-        // A test that was killed leaves its chips to those after it.
+        // A killed test leaves its chips to the next tests.
         let instance = format!("{}-{}", std::process::id(), COUNT.fetch_add(1, Ordering::Relaxed));
         let config = Path::new(CONFIGFS).join(instance);
         let bank = config.join("bank");
@@ -64,7 +64,7 @@ impl Builder {
     }
 }
 
-/// A chip, from the side of the hardware. It goes when dropped.
+/// A chip, seen from the hardware. It is removed when dropped.
 pub struct GpioSim {
     config: PathBuf,
     device: PathBuf,
@@ -73,17 +73,17 @@ pub struct GpioSim {
 }
 
 impl GpioSim {
-    /// A chip of so many lines.
+    /// A chip with this number of lines.
     pub fn builder(label: &str, line_count: u32) -> Builder {
         Builder { label: label.to_owned(), line_count, names: Vec::new(), hogs: Vec::new() }
     }
 
-    /// A chip whose lines have no names.
+    /// A chip with unnamed lines.
     pub fn new(label: &str, line_count: u32) -> GpioSim {
         GpioSim::builder(label, line_count).build()
     }
 
-    /// As in `gpiochip0`.
+    /// The chip's name, for example `gpiochip0`.
     pub fn chip_name(&self) -> &str {
         &self.chip_name
     }
@@ -97,38 +97,36 @@ impl GpioSim {
         Path::new("/dev").join(&self.chip_name)
     }
 
-    /// The level of the line, whoever drives it.
+    /// The level of the line, whatever drives it.
     pub fn level(&self, offset: u32) -> bool {
         sysfs::read(self.line(offset).join("value")) == "1"
     }
 
-    /// Drives the line from outside, as a switch and a resistor would. A line
-    /// that is an output does not heed it.
+    /// Drives the line from outside, as a switch and a resistor would. An output line ignores it.
     pub fn pull(&self, offset: u32, up: bool) {
         sysfs::write(self.line(offset).join("pull"), if up { "pull-up" } else { "pull-down" });
     }
 
-    /// The file that [`GpioSim::pull`] writes, for whoever has to be faster.
+    /// The file that [`GpioSim::pull`] writes, for tests that must be faster.
     pub fn pull_file(&self, offset: u32) -> fs::File {
         let file = fs::OpenOptions::new().write(true).open(self.line(offset).join("pull"));
         file.unwrap_or_else(|error| panic!("{}'s pull: {error}", self.label))
     }
 
-    /// Which way the line is pulled: by [`GpioSim::pull`], or by its own bias.
+    /// The direction in which the line is pulled: by [`GpioSim::pull`], or by its own bias.
     pub fn is_pulled_up(&self, offset: u32) -> bool {
         sysfs::read(self.line(offset).join("pull")) == "pull-up"
     }
 
-    /// Takes the chip away from under its users.
+    /// Removes the chip while it is in use.
     pub fn unplug(&self) {
         sysfs::write(self.config.join("live"), "0");
     }
 
-    /// The kernel's own number of the line, which its traces have.
+    /// The kernel's own number of the line, as in its traces.
     pub fn kernel_number(&self, offset: u32) -> u32 {
         // gpiochip0: GPIOs 504-511, parent: platform/gpio-sim.0, label:
-        // (Not always on a line of its own: a chip that is gone and was held stays, without its
-        // newline.)
+        // (Not always on a separate line: a removed chip that was held stays, without its newline.)
         let chips = sysfs::read("/sys/kernel/debug/gpio");
         let rest = chips.split(&format!("{}: GPIOs ", self.chip_name)).nth(1).and_then(|rest| rest.split('-').next());
         let first: Option<u32> = rest.and_then(|first| first.parse().ok());
@@ -144,7 +142,7 @@ impl Drop for GpioSim {
     fn drop(&mut self) {
         // Not through helpers that panic: the test may be panicking already.
         let _ = fs::write(self.config.join("live"), "0");
-        // Configfs folders go from the inside out.
+        // Configfs folders are removed from the inside out.
         for folder in ["bank", ""] {
             let _ = remove_folders(&self.config.join(folder));
         }

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! `pinion run`, or another micro-controller program, as a child of the test, and what a host
-//! says to it.
+//! `pinion run`, or another MCU program, as a child of the test, and the host's messages to it.
 
 use std::env;
 use std::fs::{self, DirEntry, File};
@@ -20,11 +19,10 @@ use pinion_client::{Client, Error};
 
 use super::{sysfs, uapi};
 
-/// How long a test waits for anything: far longer than it takes.
+/// Timeout of a test: far longer than any operation takes.
 const WAIT_MAX: Duration = Duration::from_secs(10);
 
-/// The running program. It is killed when dropped; the log of one under which a test fails is
-/// shown.
+/// The running program. It is killed when dropped. If the test fails, its log is shown.
 pub struct Program {
     child: Child,
     link: PathBuf,
@@ -32,20 +30,19 @@ pub struct Program {
 }
 
 impl Program {
-    /// In real time, as a printer's service starts it.
+    /// Starts it in real time, as a printer's service does.
     pub fn start() -> Program {
         Program::with(&["-r"], &[])
     }
 
-    /// With these arguments to `pinion run`, and this in its environment; returns once a host
-    /// may come.
+    /// Starts it with these arguments to `pinion run` and this environment. Returns when a host may connect.
     pub fn with(args: &[&str], environment: &[(&str, &str)]) -> Program {
         let mut command = Command::new("pinion");
         command.args(["run", "-g", "0"]).args(args).envs(environment.iter().copied());
         Program::spawn(command)
     }
 
-    /// As on a kernel that answers an ioctl with this error.
+    /// Starts it as on a kernel that answers an ioctl with this error.
     pub fn without_ioctl(request: u32, errno: Errno) -> Program {
         let mut command = Command::new("pinion");
         command.args(["run", "-g", "0", "-r"]);
@@ -53,8 +50,8 @@ impl Program {
         Program::spawn(command)
     }
 
-    /// The program that the suite measures, in real time: Pinion, or the one that the host's
-    /// `--program` gave, which takes the options of Klipper's.
+    /// The measured program, in real time: Pinion, or the program from the computer's `--program`, which takes the
+    /// options of Klipper's program.
     pub fn measured() -> Program {
         match other() {
             Some(words) => {
@@ -97,7 +94,7 @@ impl Program {
         Pid::from_raw(self.child.id().try_into().expect("a process id"))
     }
 
-    /// The process that watches over its outputs.
+    /// The process that watches its outputs.
     pub fn guardian(&self) -> Pid {
         self.find_guardian().expect("a guardian")
     }
@@ -109,7 +106,7 @@ impl Program {
         pids.find(|pid| fs::read_to_string(format!("/proc/{pid}/comm")).is_ok_and(|name| name == "pinion-guardian\n"))
     }
 
-    /// It and the process that it forked, if any.
+    /// The program and the process that it forked, if any.
     fn processes(&self) -> impl Iterator<Item = Pid> {
         [self.pid()].into_iter().chain(self.find_guardian())
     }
@@ -122,7 +119,7 @@ impl Program {
         all.map(|thread| Pid::from_raw(id(thread.expect("a readable folder")))).collect()
     }
 
-    /// The processor's time that all of its threads had so far.
+    /// The processor time of all its threads so far.
     pub fn cpu_time(&self) -> Duration {
         let of = |process| clock_getcpuclockid(process).and_then(clock_gettime).expect("a running program");
         self.processes().map(|process| Duration::from(of(process))).sum()
@@ -132,12 +129,12 @@ impl Program {
         kill(self.pid(), signal).expect("a running program");
     }
 
-    /// What it has logged so far.
+    /// Its log so far.
     pub fn log(&self) -> String {
         fs::read_to_string(&self.log).expect("its log")
     }
 
-    /// Waits until a line of the log has all of these in it, and returns it.
+    /// Waits until a line of the log contains all of these, and returns the line.
     pub fn wait_for_line(&self, parts: &[&str]) -> String {
         let find = || {
             let log = self.log();
@@ -158,7 +155,7 @@ impl Program {
         self.child.wait().expect("our child")
     }
 
-    /// Kills it, as nothing can forbid.
+    /// Kills it with a signal that nothing can block.
     pub fn kill(&mut self) {
         self.signal(Signal::SIGKILL);
         assert_eq!(self.wait().signal(), Some(Signal::SIGKILL as i32));
@@ -167,7 +164,7 @@ impl Program {
 
 impl Drop for Program {
     fn drop(&mut self) {
-        // It may have ended, and its guardian, who else holds its lines for a moment more.
+        // It may have ended. Its guardian holds the lines a moment longer.
         let guardian = self.find_guardian();
         let _ = self.child.kill();
         let _ = self.child.wait();
@@ -181,17 +178,17 @@ impl Drop for Program {
     }
 }
 
-/// The command of the program to be measured instead of Pinion: see `init.sh`.
+/// The command of the program that is measured instead of Pinion: see `init.sh`.
 pub fn other() -> Option<String> {
     env::var("MEASURED_PROGRAM").ok().filter(|command| !command.is_empty())
 }
 
-/// Whether the process is there and has not ended.
+/// Whether the process exists and has not ended.
 pub fn exists(pid: Pid) -> bool {
     fs::read_to_string(format!("/proc/{pid}/stat")).is_ok_and(|stat| !stat.contains(") Z "))
 }
 
-/// A configuration of so many objects, as commands in klippy's notation.
+/// A configuration with this number of objects, as commands in klippy's notation.
 pub fn config<L: AsRef<str>>(oids: u8, lines: &[L]) -> Config {
     let mut config = Config::default();
     for _ in 0..oids {
@@ -203,12 +200,12 @@ pub fn config<L: AsRef<str>>(oids: u8, lines: &[L]) -> Config {
     config
 }
 
-/// Configures the MCU anew.
+/// Resets and configures the MCU.
 pub fn configure<L: AsRef<str>>(client: &mut Client, oids: u8, lines: &[L]) {
     config(oids, lines).apply(client).expect("a configuration that it takes");
 }
 
-/// Configures the MCU anew, and returns the text that it stops with.
+/// Configures the MCU, and returns the text of its shutdown.
 pub fn refusal<L: AsRef<str>>(client: &mut Client, oids: u8, lines: &[L]) -> String {
     match config(oids, lines).apply(client) {
         Err(Error::Shutdown { reason }) => reason,
@@ -222,7 +219,7 @@ pub fn shutdown_of(client: &mut Client) -> String {
     client.wait_shutdown(WAIT_MAX).expect("a session").expect("a shutdown")
 }
 
-/// Sends a command and waits until it was run.
+/// Sends a command and waits until it has run.
 pub fn run(client: &mut Client, line: &str) {
     client.send_line(line).expect("a command of the dictionary");
     client.status().expect("a session");

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Files of the kernel: sysfs, configfs and tracefs. A test ends where one of
-//! them cannot be read or written, with the file's name.
+//! Files of the kernel: sysfs, configfs and tracefs. A test ends with the file's name if a file cannot be read or
+//! written.
 
 use std::fs;
 use std::io;
@@ -8,7 +8,7 @@ use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
-/// Tests write to whatever hardware they find: in the guest, and nowhere else.
+/// Tests write to any hardware that they find. That is allowed in the guest only.
 pub fn assert_in_guest() {
     assert!(
         Path::new("/run/pinion-tests").exists(),
@@ -28,20 +28,20 @@ pub fn write(path: impl AsRef<Path>, value: impl AsRef<str>) {
     try_write(path, value).unwrap_or_else(|error| panic!("writing {value:?} to {}: {error}", path.display()));
 }
 
-/// For a write that may fail.
+/// A write that may fail.
 pub fn try_write(path: impl AsRef<Path>, value: impl AsRef<str>) -> io::Result<()> {
     assert_in_guest();
     fs::write(path, value.as_ref())
 }
 
-/// A setting of a mock that is in force until this is dropped: the next test is to find it as
-/// it was, whether this one passes or not.
+/// A setting of a mock. It is undone when this is dropped, so the next test finds the former value even if this test
+/// fails.
 pub struct Setting {
     path: PathBuf,
     before: &'static str,
 }
 
-/// Writes `value`, and in the end `before`.
+/// Writes `value` now, and `before` at the end.
 pub fn set(path: impl Into<PathBuf>, value: impl AsRef<str>, before: &'static str) -> Setting {
     let path = path.into();
     write(&path, value);
@@ -55,8 +55,7 @@ impl Drop for Setting {
     }
 }
 
-/// The entry of the folder whose file `name` says `value`: devices are numbered
-/// in whatever order they came.
+/// The folder's entry with `value` in its file `name`. Devices are numbered in the order in which they came.
 pub fn entry_with(folder: &str, name: &str, value: &str) -> PathBuf {
     fs::read_dir(folder)
         .unwrap_or_else(|error| panic!("{folder}: {error}"))
@@ -65,7 +64,7 @@ pub fn entry_with(folder: &str, name: &str, value: &str) -> PathBuf {
         .unwrap_or_else(|| panic!("nothing in {folder} has {value:?} in its {name}"))
 }
 
-/// Waits for what another thread or process does.
+/// Waits for the result of another thread or process.
 pub fn wait_until(what: &str, condition: impl Fn() -> bool) {
     let deadline = Instant::now() + Duration::from_secs(10);
     while !condition() {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What really happened on the lines, and when; and which system calls a program made: the
-//! kernel's own trace points.
+//! The real events on the lines with their times, and the system calls of a program, from the kernel's own trace
+//! points.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;
@@ -15,7 +15,7 @@ use super::sysfs;
 
 const TRACEFS: &str = "/sys/kernel/tracing";
 
-/// A level being written to a line.
+/// A write of a level to a line.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Write {
     /// The kernel's number of the line.
@@ -25,17 +25,16 @@ pub struct Write {
     pub at_ns: u64,
 }
 
-/// Records every write to every GPIO line until it is dropped. There is one
-/// recorder in a guest.
+/// Records every write to every GPIO line until it is dropped. A guest has one recorder.
 ///
-/// It reads the ring buffer's pages rather than the file `trace`: that text has microseconds
-/// only, and to make it takes an emulated processor long.
+/// It reads the ring buffer's pages instead of the file `trace`. That text has only microseconds, and an emulated
+/// processor needs a long time to make it.
 pub struct Trace {
     event: Event,
     writes: RefCell<Vec<Write>>,
 }
 
-/// Where the pages have what is looked for, from the event's `id` and `format`.
+/// The places of the fields in the pages, from the event's `id` and `format`.
 struct Event {
     id: u64,
     gpio: usize,
@@ -73,14 +72,14 @@ impl Trace {
         writes.clone()
     }
 
-    /// Those to one line, by the kernel's number of it.
+    /// The writes to one line, by the kernel's number of the line.
     pub fn writes_to(&self, line: u32) -> Vec<Write> {
         let mut writes = self.writes();
         writes.retain(|write| write.line == line);
         writes
     }
 
-    /// Takes what one processor has recorded out of the ring buffer.
+    /// Reads one processor's records from the ring buffer.
     fn read(&self, processor: usize, writes: &mut Vec<Write>) {
         let path = format!("{TRACEFS}/per_cpu/cpu{processor}/trace_pipe_raw");
         let mut pages = OpenOptions::new()
@@ -109,8 +108,8 @@ impl Drop for Trace {
 }
 
 impl Event {
-    /// Appends the writes of a page. Its form is told by `events/header_page` and
-    /// `events/header_event`, and in the kernel's include/linux/ring_buffer.h.
+    /// Appends the writes of a page. `events/header_page`, `events/header_event` and the kernel's
+    /// include/linux/ring_buffer.h describe its format.
     fn find(&self, page: &[u8], writes: &mut Vec<Write>) {
         const MISSED_EVENTS: u64 = 1 << 31;
         const LENGTH: u64 = 0xf_ffff;
@@ -138,14 +137,14 @@ impl Event {
                 }
                 _ => {
                     at_ns += delta;
-                    // A long event's first word is its length, and so is that of a dropped one.
+                    // The first word of a long event is its length. The same is true for a dropped event.
                     if kind == 0 || kind == 29 { word(at + WORD) as usize } else { kind as usize * WORD }
                 }
             };
             let data = at + WORD;
             at = data + len;
             let is_small = (1..=28).contains(&kind);
-            // The event's id is the first field of each.
+            // The event's id is the first field of each event.
             if is_small && word(data) as u64 & 0xffff == self.id && word(data + self.get) == 0 {
                 let (line, level) = (word(data + self.gpio), word(data + self.value) != 0);
                 writes.push(Write { line, level, at_ns });
@@ -154,8 +153,8 @@ impl Event {
     }
 }
 
-/// Counts the system calls of threads until it is dropped. The kernel itself counts, which takes
-/// less time than to record each.
+/// Counts the system calls of threads until it is dropped. The kernel itself counts, which takes less time than a
+/// record of each call.
 pub struct Calls {
     trigger: String,
 }
@@ -170,7 +169,7 @@ impl Calls {
         calls
     }
 
-    /// How many so far, by number as in `libc::SYS_ioctl`.
+    /// The number of calls so far, by system call number as in `libc::SYS_ioctl`.
     pub fn so_far(&self) -> BTreeMap<i64, u64> {
         // { id:         16 } hitcount:       1000
         let count = |line: &str| {

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The kernel's interfaces, bare: what a test sees through them owes nothing to
-//! the code that it tests.
+//! The kernel's interfaces, used directly: a test's view does not depend on the code that it tests.
 #![allow(unsafe_code)]
 
 use std::fs::File;
@@ -29,7 +28,7 @@ struct RawLineInfo {
 
 nix::ioctl_readwrite!(gpio_get_lineinfo, 0xb4, 0x02, RawLineInfo);
 
-/// A GPIO line as the kernel describes it, `flags` being `GPIOLINE_FLAG_*`.
+/// The kernel's description of a GPIO line; `flags` is `GPIOLINE_FLAG_*`.
 #[derive(Debug)]
 pub struct LineInfo {
     pub flags: u32,
@@ -40,7 +39,7 @@ pub struct LineInfo {
 pub fn line_info(chip: &Path, offset: u32) -> LineInfo {
     let file = open(chip);
     let mut info = RawLineInfo { offset, flags: 0, name: [0; 32], consumer: [0; 32] };
-    // SAFETY: the structure is the one that this ioctl fills.
+    // SAFETY: this ioctl fills this structure.
     unsafe { gpio_get_lineinfo(file.as_raw_fd(), &mut info) }.expect("line information");
     LineInfo { flags: info.flags, name: text(&info.name), consumer: text(&info.consumer) }
 }
@@ -76,7 +75,7 @@ const V2_DEBOUNCE: u32 = 3;
 
 nix::ioctl_readwrite!(gpio_v2_get_line, 0xb4, 0x07, RawLineRequest);
 
-/// An input whose edges the kernel debounces: each event that is read has 48 bytes.
+/// An input with edges that the kernel debounces. Each event has 48 bytes.
 pub fn debounced_input(chip: &Path, offset: u32, period_us: u64) -> File {
     let file = open(chip);
     let mut request = RawLineRequest {
@@ -93,22 +92,22 @@ pub fn debounced_input(chip: &Path, offset: u32, period_us: u64) -> File {
     };
     request.offsets[0] = offset;
     request.attrs[1..].fill(RawLineAttribute { id: 0, padding: 0, value: 0, mask: 0 });
-    // SAFETY: the structure is the one that this ioctl takes, and the descriptor that it makes is ours.
+    // SAFETY: this ioctl takes this structure, and the descriptor that it makes is ours.
     unsafe {
         gpio_v2_get_line(file.as_raw_fd(), &mut request).expect("a line");
         File::from_raw_fd(request.fd)
     }
 }
 
-/// GPIOHANDLE_SET_CONFIG_IOCTL, which Linux has since 5.5.
+/// GPIOHANDLE_SET_CONFIG_IOCTL, which Linux has had since 5.5.
 pub const GPIOHANDLE_SET_CONFIG: u32 = 0xc054_b40a;
 
-/// Has an ioctl fail in the program that is to be started, as in a kernel that does not know it.
+/// Makes an ioctl fail in the program that will be started, as in a kernel that does not know the ioctl.
 pub fn without_ioctl(command: &mut Command, request: u32, errno: i32) {
     let load = |at: u32| (libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0, at);
     let is = |value: u32, otherwise: u8| (libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K, 0, otherwise, value);
     let answer = |value: u32| (libc::BPF_RET | libc::BPF_K, 0, 0, value);
-    // Of `struct seccomp_data` the number of the call, and the lower half of its second argument.
+    // From `struct seccomp_data`: the number of the call, and the lower half of its second argument.
     let program = [
         load(0),
         is(libc::SYS_ioctl as u32, 3),
@@ -118,7 +117,7 @@ pub fn without_ioctl(command: &mut Command, request: u32, errno: i32) {
         answer(libc::SECCOMP_RET_ALLOW),
     ];
     let filter = program.map(|(code, jt, jf, k)| libc::sock_filter { code: code as u16, jt, jf, k });
-    // SAFETY: between fork and exec there are two system calls, on memory that the closure has.
+    // SAFETY: between fork and exec there are two system calls, on memory that the closure owns.
     unsafe {
         command.pre_exec(move || {
             let program = libc::sock_fprog { len: filter.len() as u16, filter: filter.as_ptr().cast_mut() };
@@ -150,7 +149,7 @@ struct RawSpiTransfer {
 nix::ioctl_write_ptr!(spi_write_mode, b'k', 1, u8);
 nix::ioctl_write_buf!(spi_message, b'k', 0, RawSpiTransfer);
 
-/// Sends in this mode, and returns what came back meanwhile.
+/// Sends in this mode, and returns the bytes received at the same time.
 pub fn spi_transfer(device: &str, mode: u8, speed_hz: u32, sent: &[u8]) -> nix::Result<Vec<u8>> {
     let file = open(device.as_ref());
     let mut received = vec![0; sent.len()];
@@ -161,8 +160,7 @@ pub fn spi_transfer(device: &str, mode: u8, speed_hz: u32, sent: &[u8]) -> nix::
         speed_hz,
         ..RawSpiTransfer::default()
     };
-    // SAFETY: the mode outlives the call; the buffers are as long as the transfer
-    // says, and outlive it too.
+    // SAFETY: the mode outlives the call. The buffers have the transfer's length, and also outlive the call.
     unsafe {
         spi_write_mode(file.as_raw_fd(), &mode)?;
         spi_message(file.as_raw_fd(), &[transfer])?;
@@ -190,7 +188,7 @@ const I2C_READ: u16 = 1;
 
 nix::ioctl_write_ptr_bad!(i2c_rdwr, 0x0707, RawI2cTransfer);
 
-/// Writes, then reads so many bytes after a repeated start.
+/// Writes, then reads this number of bytes after a repeated start.
 pub fn i2c_transfer(device: &Path, address: u16, written: &[u8], read_len: usize) -> nix::Result<Vec<u8>> {
     let file = open(device);
     let mut written = written.to_vec();
@@ -207,18 +205,17 @@ pub fn i2c_transfer(device: &Path, address: u16, written: &[u8], read_len: usize
     }
     let transfer =
         RawI2cTransfer { messages: messages.as_mut_ptr(), count: u32::try_from(messages.len()).expect("two at most") };
-    // SAFETY: the messages point into buffers that are as long as they say, and
-    // outlive the call.
+    // SAFETY: the messages point into buffers of the stated length, which outlive the call.
     unsafe { i2c_rdwr(file.as_raw_fd(), &transfer) }?;
     Ok(read)
 }
 
 nix::ioctl_readwrite!(watchdog_settimeout, b'W', 6, i32);
 
-/// How long the watchdog may go unfed.
+/// Sets the watchdog's timeout.
 pub fn set_watchdog_timeout(watchdog: &File, seconds: u32) {
     let mut seconds = seconds.try_into().expect("not a century");
-    // SAFETY: the integer is the one that this ioctl takes and fills.
+    // SAFETY: this ioctl takes and fills this integer.
     unsafe { watchdog_settimeout(watchdog.as_raw_fd(), &mut seconds) }.expect("a timeout that it takes");
 }
 
@@ -228,7 +225,7 @@ pub struct CanSocket(OwnedFd);
 impl CanSocket {
     pub fn open(interface: &str) -> CanSocket {
         let index = sysfs::read(format!("/sys/class/net/{interface}/ifindex"));
-        // SAFETY: a plain system call; the descriptor it returns is ours.
+        // SAFETY: a plain system call. The descriptor that it returns is ours.
         let socket = unsafe {
             let fd = libc::socket(libc::PF_CAN, libc::SOCK_RAW | libc::SOCK_CLOEXEC, libc::CAN_RAW);
             assert!(fd >= 0, "CAN socket: {}", io::Error::last_os_error());

@@ -16,7 +16,7 @@ pub fn raw(name: &str, channel: u32) -> PathBuf {
     device(name).join(format!("in_voltage{channel}_raw"))
 }
 
-/// An ADC that is taken away from under its users, until this is dropped.
+/// An ADC that is removed while it is in use, until this is dropped.
 pub struct Gone(&'static str);
 
 impl Gone {

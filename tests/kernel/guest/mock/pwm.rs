@@ -5,19 +5,19 @@ use crate::sysfs;
 
 const MOCK: &str = "/sys/devices/platform/mock-pwm";
 
-/// The channel's line of what the pins would do, without the count of writes.
+/// The channel's line with the state of its output, without the count of writes.
 pub fn output(channel: usize) -> String {
     let outputs = sysfs::read(format!("{MOCK}/outputs"));
     let line = outputs.lines().nth(channel).expect("a channel");
     line.rsplit_once(' ').expect("a count").0.to_owned()
 }
 
-/// Forgets what the outputs did.
+/// Forgets the history of the outputs.
 pub fn forget() {
     sysfs::write(format!("{MOCK}/history"), "0");
 }
 
-/// What the channel did since then: period and duty cycle in ns, and whether it is enabled.
+/// The changes of the channel since then: period and duty cycle in ns, and whether it is enabled.
 pub fn history(channel: u64) -> Vec<(u64, u64, bool)> {
     let changes = sysfs::read(format!("{MOCK}/history"));
     let numbers = |line: &str| line.split(' ').map(|word| word.parse().expect("a number")).collect::<Vec<u64>>();

@@ -37,7 +37,7 @@ fn reading(client: &mut Client, oid: u8) -> u16 {
 
 #[test]
 fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
-    // Raw readings, and what the host is told of them.
+    // Raw readings, and the values that the host gets for them.
     let channels: [(&str, [(i32, u16); 3]); 7] = [
         ("mock-adc12", [(0, 0), (2048, 2048), (4095, 4095)]),
         ("mock-adc8", [(1, 16), (128, 2056), (255, 4095)]),
@@ -51,7 +51,7 @@ fn channels_are_found_by_name_and_scaled_to_twelve_bits() {
     let client = &mut program.connect();
     let mut config: Vec<String> =
         channels.iter().enumerate().map(|(oid, (name, _))| input(oid, &format!("{name}/voltage5"))).collect();
-    // The first device's channels have the C program's names, too.
+    // The first device's channels also have the C program's names.
     config.push(input(7, "analog6"));
     configure(client, 8, &config);
     program.wait_for_line(&["does not tell its resolution: 12 bits are assumed"]);

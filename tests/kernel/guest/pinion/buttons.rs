@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Buttons, whose lines are claimed after `finalize_config`.
+//! Buttons with lines that are claimed after `finalize_config`.
 
 use std::time::{Duration, Instant};
 

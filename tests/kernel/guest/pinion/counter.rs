@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Counters, whose edges the kernel counts.
+//! Counters with edges that the kernel counts.
 
 use std::fs::File;
 use std::io::{Seek, SeekFrom, Write};
@@ -16,34 +16,34 @@ use crate::sysfs;
 const TACHO: u32 = 3;
 const COUNTER: &str = "config_counter oid=0 pin=lab/gpio3 pull_up=0";
 
-/// Where the pin is polled, a level is looked at every 50 ms.
+/// A polled pin is read every 50 ms.
 const SLOW: u32 = 2_500_000;
 /// klippy's default, 1.5 ms.
 const USUAL: u32 = 75_000;
 /// The shortest level counts.
 const FAST: u32 = 1;
 
-/// Has the count told every 0.1 s.
+/// Requests a report of the count every 0.1 s.
 fn query(client: &mut Client, poll_ticks: u32) {
     let at = client.clock_in(0.02).expect("the clock").wire();
     run(client, &format!("query_counter oid=0 clock={at} poll_ticks={poll_ticks} sample_ticks=5000000"));
 }
 
-/// The next count that is told, and the clock of its last edge.
+/// The next reported count, and the clock of its last edge.
 fn next(client: &mut Client) -> (u32, u32) {
     let until = Instant::now() + Duration::from_secs(10);
     let state = client.wait("counter_state", Some(0), until).expect("a session").expect("a state");
     (state.u32("count").expect("a count"), state.u32("count_clock").expect("a clock"))
 }
 
-/// Waits for a count that was told after now, and all edges so far are in.
+/// Waits for a count that was reported after now. It includes all edges so far.
 fn settled(client: &mut Client) -> (u32, u32) {
     client.drain();
     next(client);
     next(client)
 }
 
-/// Makes so many edges, as fast as it goes, and tells how long the last one took in CLOCK_MONOTONIC.
+/// Makes this number of edges as fast as possible. Returns the times before and after the last one in CLOCK_MONOTONIC.
 fn edges(sim: &GpioSim, count: u32) -> (Duration, Duration) {
     let mut pull = sim.pull_file(TACHO);
     let mut last = (Duration::ZERO, Duration::ZERO);
@@ -69,7 +69,7 @@ fn all_edges_are_counted_and_the_last_one_dated() {
     query(client, FAST);
     assert_eq!(settled(client).0, 0);
     let mut expected = 0;
-    // An even number: each time the line ends low.
+    // An even number, so the line ends low each time.
     for count in [2, 16, 18, 400] {
         let (before, after) = edges(&sim, count);
         expected += count;
@@ -93,7 +93,7 @@ fn a_fan_of_20_000_rpm_is_measured() {
     query(client, USUAL);
     settled(client);
     let told: Vec<(u32, u32)> = thread::scope(|scope| {
-        // Two pulses a turn are 1333 edges a second.
+        // Two pulses per turn give 1333 edges per second.
         scope.spawn(|| {
             let began = Instant::now();
             for edge in 1..1000 {
@@ -106,19 +106,19 @@ fn a_fan_of_20_000_rpm_is_measured() {
     for pair in told[1..].windows(2) {
         let (count, ticks) = (pair[1].0 - pair[0].0, pair[1].1 - pair[0].1);
         let rpm = f64::from(count) / 4.0 * 60.0 * 50e6 / f64::from(ticks);
-        // As exact as the test's own sleep is.
+        // As exact as the test's own sleep.
         assert!((rpm - 20_000.0).abs() < 400.0, "{rpm}: {told:?}");
     }
 }
 
-/// At the slowest `poll_ticks`, so that what the emulated computer takes for a level is no matter.
+/// At the slowest `poll_ticks`, so that the speed of the emulated computer does not matter.
 #[test]
 fn glitches_are_not_counted_and_pulses_are_exactly() {
     let sim = GpioSim::new("lab", 8);
     let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &[COUNTER]);
-    // A level counts that lasts 50 ms.
+    // A level counts if it lasts 50 ms.
     query(client, 4 * SLOW);
     let (before, _) = settled(client);
     let mut pull = sim.pull_file(TACHO);
@@ -145,7 +145,7 @@ fn a_pin_that_floats_is_polled_and_can_be_an_output_after_a_restart() {
     let client = &mut program.connect();
     configure(client, 1, &[COUNTER]);
     query(client, SLOW);
-    // The kernel lists who asked for interrupts.
+    // The kernel lists the consumers of interrupts.
     let has_interrupt = || sysfs::read("/proc/interrupts").lines().any(|line| line.ends_with("pinion"));
     assert!(has_interrupt());
     let mut pull = sim.pull_file(TACHO);
@@ -156,7 +156,7 @@ fn a_pin_that_floats_is_polled_and_can_be_an_output_after_a_restart() {
     }
     assert!(!has_interrupt());
     let (before, _) = settled(client);
-    // Shorter than the polling, of which one look may meet the pin high; and longer.
+    // First shorter than the polling interval, so that one read may see the pin high; then longer.
     edges(&sim, 100);
     let (low, _) = settled(client);
     assert!(low - before <= 2, "{}", low - before);

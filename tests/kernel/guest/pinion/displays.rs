@@ -13,7 +13,7 @@ const D4: u32 = 2;
 const SCLK: u32 = 1;
 const SID: u32 = 2;
 
-/// Goes through the writes to the chip's lines: `see` is told each, by its offset, and the levels before.
+/// Replays the writes to the chip's lines. `see` gets each write with its offset and the levels before it.
 fn replay(sim: &GpioSim, trace: &Trace, mut see: impl FnMut(u32, Write, &HashMap<u32, Write>)) {
     let first = sim.kernel_number(0);
     let mut levels = HashMap::new();

@@ -10,7 +10,7 @@ use crate::sysfs;
 
 const MOCK: &str = "/sys/devices/platform/mock-w1";
 
-/// As klippy asks for it: the name in hexadecimal.
+/// klippy's request: the name in hexadecimal.
 fn config(oid: usize, name: &str) -> String {
     let serial: String = name.bytes().map(|byte| format!("{byte:02x}")).collect();
     format!("config_ds18b20 oid={oid} serial={serial} max_error_count=1")
@@ -51,7 +51,7 @@ fn sensors_are_read_by_name_and_one_that_is_taken_away_stops_the_mcu() {
     assert_eq!(reading(client, 0), (85_500, 0));
     assert_eq!(reading(client, 1), (-10_250, 0));
     sysfs::write(format!("{MOCK}/present"), "1 0");
-    // One failure is let pass.
+    // One failure is allowed.
     let failed = reading(client, 1);
     let text = shutdown_of(client);
     sysfs::write(format!("{MOCK}/present"), "1 1");

@@ -31,7 +31,7 @@ fn sees_high(client: &mut Client, oid: u8) -> bool {
     state.flag("pin_value").expect("a level")
 }
 
-/// The program dies, and its guardian has done what it does. Returns the log.
+/// Kills the program, waits for its guardian to finish, and returns the log.
 fn kill(mut program: Program) -> String {
     let guardian = program.guardian();
     program.kill();
@@ -39,7 +39,7 @@ fn kill(mut program: Program) -> String {
     program.log()
 }
 
-/// Another node of a chip; it goes when dropped.
+/// Another node of a chip. It is removed when dropped.
 struct Alias(PathBuf);
 
 impl Alias {
@@ -52,7 +52,7 @@ impl Alias {
         Alias(path)
     }
 
-    /// The number of a line by this node: it has no name.
+    /// The number of a line at this node. The line has no name.
     fn pin(offset: u32) -> String {
         (Alias::CHIP * 288 + offset).to_string()
     }
@@ -77,7 +77,7 @@ fn two_outputs_drive_one_line_by_turns_and_the_guardian_knows_the_last_shutdown_
             set(client, oid, value);
             assert_eq!(sim.level(1), value == 1);
         }
-        // A stop, and all of it again.
+        // A stop, and then all of it again.
         client.reset().expect("a reset");
         configure(client, 2, &[output(0, "FAN", defaults[0]), output(1, "lab/gpio1", defaults[1])]);
         set(client, 1, u8::from(!last));

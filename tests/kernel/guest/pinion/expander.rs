@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Lines of an I/O expander: a chip on I2C, whose driver sleeps while it talks to the chip.
+//! Lines of an I/O expander: an I2C chip with a driver that sleeps during a transfer.
 
 use std::fs;
 use std::os::unix::process::ExitStatusExt;
@@ -25,16 +25,16 @@ use crate::uapi;
 const MOCK: &str = "/sys/devices/platform/mock-i2c";
 const ADDRESS: u16 = 0x50;
 const LINES: u32 = 8;
-/// The registers of a PCA9554, and what they hold after its reset.
+/// The registers of a PCA9554, and their values after its reset.
 const INPUT: u8 = 0;
 const OUTPUT: u8 = 1;
 const RESET: [u8; 4] = [0x00, 0xff, 0x00, 0xff];
-/// What the guardian promises.
+/// The guardian's promise.
 const WITHIN_US: u64 = 600_000;
-/// A chip that hangs does so for this long, in milliseconds: far longer than anybody waits for it.
+/// How long a chip hangs, in milliseconds: far longer than any timeout.
 const HANGS_MS: u64 = 12_000;
 
-/// A PCA9554 on the mocked bus. It goes when dropped.
+/// A PCA9554 on the mocked bus. It is removed when dropped.
 struct Expander {
     adapter: PathBuf,
     chip_name: String,
@@ -61,18 +61,18 @@ impl Expander {
         format!("{} line {offset}", self.chip_name)
     }
 
-    /// The level that the chip gives the line. Waits for what is under way on the bus.
+    /// The level that the chip gives the line. Waits for the current transfer on the bus.
     fn level(&self, offset: u32) -> bool {
         let output = uapi::i2c_transfer(&i2c::bus(), ADDRESS, &[OUTPUT], 1).expect("the output register");
         output[0] >> offset & 1 != 0
     }
 
-    /// What is at the chip's inputs from outside.
+    /// Sets the levels at the chip's inputs from outside.
     fn set_inputs(&self, levels: u8) {
         sysfs::write(format!("{MOCK}/change"), format!("{ADDRESS:x} {INPUT:x} {levels:x}"));
     }
 
-    /// From now on each of its transfers takes so long.
+    /// From now on each of its transfers takes this long.
     fn slow_down(&self, delay_ms: u64) -> sysfs::Setting {
         sysfs::set(format!("{MOCK}/delay_ms"), delay_ms.to_string(), "0")
     }
@@ -92,8 +92,8 @@ impl Expander {
         (0..LINES).any(|offset| !uapi::line_info(&chip, offset).consumer.is_empty())
     }
 
-    /// Waits until no process is in its driver any more: one that was killed amid a transfer stays
-    /// there until that is over.
+    /// Waits until no process is in its driver any more. A process that was killed during a transfer stays there until
+    /// the transfer is over.
     fn wait_until_free(&self) {
         let until = Instant::now() + Duration::from_millis(2 * HANGS_MS);
         while self.is_held() && Instant::now() < until {
@@ -104,7 +104,7 @@ impl Expander {
 
 impl Drop for Expander {
     fn drop(&mut self) {
-        // The kernel would go on with a chip that is gone.
+        // The kernel would continue with a removed chip.
         self.wait_until_free();
         let _ = fs::write(self.adapter.join("delete_device"), format!("{ADDRESS:#x}"));
     }
@@ -114,13 +114,13 @@ fn output(oid: usize, pin: &str) -> String {
     format!("config_digital_out oid={oid} pin={pin} value=0 default_value=0 max_duration=0")
 }
 
-/// A heater on a line of the processor's and a fan on the expander, both on.
+/// A heater on a line of the processor and a fan on the expander, both on.
 struct Setup {
-    /// First, as it is dropped first.
+    /// The first field, because it is dropped first.
     expander: Expander,
     sim: GpioSim,
-    /// The kernel's number of the heater's line. It can not be had while the chip hangs: the kernel
-    /// reads every line for it.
+    /// The kernel's number of the heater's line. It cannot be read while the chip hangs, because the kernel then reads
+    /// every line.
     heater: u32,
 }
 
@@ -137,8 +137,7 @@ impl Setup {
         assert!(self.sim.level(0) && self.expander.level(3));
     }
 
-    /// Waits until the heater, which was on, was switched off, and returns when (CLOCK_MONOTONIC,
-    /// microseconds).
+    /// Waits until the heater, which was on, is switched off. Returns the time (CLOCK_MONOTONIC, microseconds).
     fn heater_off_us(&self, trace: &Trace) -> u64 {
         let first = || trace.writes_to(self.heater).first().copied();
         sysfs::wait_until("the heater is switched off", || first().is_some());
@@ -147,7 +146,7 @@ impl Setup {
         at_ns / 1000
     }
 
-    /// A program that is started anew has it all, once the chip's driver is free.
+    /// A restarted program gets all lines when the chip's driver is free.
     fn assert_starts_anew(&self) {
         self.expander.wait_until_free();
         let program = Program::start();
@@ -159,7 +158,7 @@ fn now_us() -> u64 {
     monotonic().as_micros() as u64
 }
 
-/// The name under which the log knows the fan.
+/// The fan's name in the log.
 fn fan(setup: &Setup) -> String {
     format!("digital output oid 1 ({})", setup.expander.pin(3))
 }
@@ -187,7 +186,7 @@ fn steps_beside_a_slow_output_are_in_time() {
     ] {
         run(client, &line);
     }
-    // A command for which the host waits.
+    // A command that makes the host wait.
     thread::sleep(Duration::from_millis(800));
     let began_us = now_us();
     run(client, "update_digital_out oid=1 value=1");
@@ -244,7 +243,7 @@ fn an_axis_homes_to_an_endstop_on_it() {
     });
     let homed = homed.expect("a homing");
     assert_eq!(homed.reason, HomingEnd::Endstop);
-    // Dated by the end of the look: one that was due before the switch closed has seen it, too.
+    // Dated by the end of the read: a read that was due before the switch closed has also seen it.
     let dated = client.instant_of(homed.trigger.expect("a trigger"));
     let after = dated + Duration::from_micros(200) - closed.expect("a switch that closed");
     println!("dated {after:?} after the switch closed");
@@ -268,9 +267,9 @@ fn an_emergency_stop_waits_for_no_chip_that_hangs() {
     client.send_line("emergency_stop").expect("a session");
     let off_us = setup.heater_off_us(&trace);
     assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
-    // Nothing more than the fan's shutdown value is missing, and the guardian sees to that.
+    // Only the fan's shutdown value is missing, and the guardian handles it.
     program.wait_for_line(&["guardian: ", &fan(&setup), "is not at its shutdown value within 1000 ms"]);
-    // The second that a shutdown value may take, two for the program's end, two for the chip.
+    // One second for a shutdown value, two for the program's end, two for the chip.
     let acted_us = now_us() - began_us;
     assert!((4_900_000..5_500_000).contains(&acted_us), "{acted_us} us");
     program.wait_for_line(&["only 1 of 2 outputs", &setup.expander.line(3), "its driver hangs"]);
@@ -279,7 +278,7 @@ fn an_emergency_stop_waits_for_no_chip_that_hangs() {
     assert!(now_us() - began_us < 1000 * HANGS_MS);
     drop(hangs);
     assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
-    // The write that hung is done in the end.
+    // The write that hung completes in the end.
     setup.expander.wait_until_free();
     assert!(!setup.expander.level(3));
     drop(trace);
@@ -295,7 +294,7 @@ fn a_killed_program_s_heater_waits_for_no_chip_that_hangs() {
     let trace = Trace::start();
     let guardian = program.guardian();
     let hangs = setup.expander.slow_down(HANGS_MS);
-    // A worker is at it, while the MCU runs on.
+    // A worker is in the driver while the MCU continues to run.
     let at = client.clock_in(0.1).expect("the clock").wire();
     run(client, &format!("queue_digital_out oid=1 clock={at} on_ticks=0"));
     thread::sleep(Duration::from_secs(2));
@@ -329,7 +328,7 @@ fn a_chip_that_does_not_acknowledge_stops_the_mcu_and_is_tried_again() {
     drop(silent);
     program.wait_for_line(&[&fan(&setup), "is at its shutdown value after all"]);
     assert!(!setup.expander.level(3));
-    // Nobody had to help.
+    // No help was necessary.
     thread::sleep(Duration::from_secs(2));
     assert!(program.is_running());
     assert!(!program.log().contains("guardian"), "{}", program.log());
@@ -368,7 +367,7 @@ fn a_program_that_ends_with_a_shutdown_value_owed_says_no_goodbye() {
     let off_us = setup.heater_off_us(&trace);
     assert!(off_us - began_us < 50_000, "{} us", off_us - began_us);
     assert!(!program.wait().success());
-    // The chip is back while the guardian tries.
+    // The chip is back while the guardian retries.
     drop(silent);
     sysfs::wait_until("the guardian ends", || !exists(guardian));
     program.wait_for_line(&["guardian: ", &fan(&setup), "all 2 outputs are driven to their shutdown values"]);
@@ -385,7 +384,7 @@ fn pulses_at_an_expander_are_polled() {
     configure(client, 1, &[format!("config_counter oid=0 pin={} pull_up=0", expander.pin(2))]);
     program.wait_for_line(&["WARN", "its chip is behind a bus, so it is polled"]);
     let at = client.clock_in(0.02).expect("the clock").wire();
-    // Every 20 ms, told every 0.1 s.
+    // Polled every 20 ms, reported every 0.1 s.
     run(client, &format!("query_counter oid=0 clock={at} poll_ticks=1000000 sample_ticks=5000000"));
     let mut count = |expected: i64| {
         client.drain();
@@ -419,12 +418,12 @@ fn configure_inputs(client: &mut Client, expander: &Expander) {
     );
     run(client, &format!("buttons_add oid=0 pos=0 pin={} pull_up=0", pin(0)));
     let at = client.clock_in(0.05).expect("the clock").wire();
-    // Each 2 ms.
+    // Every 2 ms.
     run(client, &format!("buttons_query oid=0 clock={at} rest_ticks=100000 retransmit_count=50 invert=0"));
     run(client, &format!("query_counter oid=3 clock={at} poll_ticks=100000 sample_ticks=5000000"));
 }
 
-/// Calls of the expander's lines that failed and that were made again.
+/// Failed calls of the expander's lines, and their retries.
 fn missed(program: &Program) -> (u64, u64) {
     let link = program.link().to_str().expect("a path");
     let told = Command::new("pinion").args(["status", "--json", "-I", link]).output().expect("pinion");
@@ -495,7 +494,7 @@ fn homing_stops_at_once_if_its_endstop_can_not_be_read() {
     configure_inputs(client, &expander);
     let start = client.clock_in(0.05).expect("the clock").wire();
     run(client, &format!("trsync_start oid=2 report_clock={start} report_ticks=0 expire_reason=4"));
-    // Each 2 ms.
+    // Every 2 ms.
     run(
         client,
         &format!(

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The guardian: whatever becomes of the program, its outputs go to their shutdown values, and
-//! a restart claims them.
+//! The guardian: in every kind of end of the program, its outputs go to their shutdown values, and a restart claims
+//! them.
 
 use std::fs;
 use std::os::unix::process::ExitStatusExt;
@@ -19,10 +19,10 @@ use crate::program::{Program, configure, exists, run, shutdown_of};
 use crate::sysfs;
 use crate::trace::Trace;
 
-/// What the guardian promises.
+/// The guardian's promise.
 const WITHIN_US: u64 = 600_000;
 
-/// Starts a program whose outputs are on, ends it by a signal, and returns its log.
+/// Starts a program with its outputs on, ends it with a signal, and returns its log.
 fn end_by(outputs: &Outputs, signal: Signal) -> String {
     let mut program = Program::with(&["-r"], &[("PINION_TEST_HANG", "1")]);
     let mut client = program.connect();
@@ -33,14 +33,13 @@ fn end_by(outputs: &Outputs, signal: Signal) -> String {
     let began_us = monotonic().as_micros() as u64;
     program.signal(signal);
     if signal == Signal::SIGSEGV {
-        // Rust's handler takes the first for a stack that may have overflown, and waits for
-        // the access to fail again.
+        // Rust's handler treats the first signal as a possible stack overflow, and waits for the access to fail again.
         program.signal(signal);
     }
     let safe_us = outputs.assert_safe(&trace);
     assert!(safe_us - began_us < WITHIN_US, "{signal}: it took {} us", safe_us - began_us);
     sysfs::wait_until("the guardian is gone", || !exists(guardian));
-    // SIGUSR2 makes the core hang and SIGSTOP the whole program, for which the guardian kills it.
+    // SIGUSR2 makes the core hang, and SIGSTOP the whole program. The guardian then kills it.
     let hangs = [Signal::SIGUSR2, Signal::SIGSTOP].contains(&signal);
     let death = if hangs { Signal::SIGKILL } else { signal };
     assert_eq!(program.wait().signal(), Some(death as i32));
@@ -56,7 +55,7 @@ fn killed_crashed_or_aborted_the_outputs_are_safe_and_free() {
         assert!(log.contains("guardian: "), "{signal}: {log}");
         assert!(log.contains("outputs are driven to their shutdown values"), "{signal}: {log}");
     }
-    // Each program after the first one had to claim what the one before had held.
+    // Each program after the first one had to claim the lines of the program before.
 }
 
 #[test]
@@ -107,7 +106,7 @@ fn a_guardian_that_is_stopped_counts_as_lost() {
     kill(guardian, Signal::SIGSTOP).expect("a guardian");
     assert_eq!(shutdown_of(&mut client), "Guardian process lost");
     let safe_us = outputs.assert_safe(&trace);
-    // It had listened 550 ms before at most.
+    // Its last check was at most 550 ms before.
     let after_ms = (safe_us - began_us) / 1000;
     assert!((1400..2100).contains(&after_ms), "{after_ms} ms");
     assert_eq!(program.wait().code(), Some(1));
@@ -117,8 +116,7 @@ fn a_guardian_that_is_stopped_counts_as_lost() {
     outputs.switch_on(&mut program.connect(), 0);
 }
 
-/// A line that is on, without a limit (`max_duration`) and with nothing else that would notice
-/// that time was lost.
+/// A line that is on, without a limit (`max_duration`). Nothing else would notice lost time.
 struct Heater {
     sim: GpioSim,
 }
@@ -140,13 +138,13 @@ impl Heater {
         self.sim.level(0)
     }
 
-    /// The MCU is stopped, and the program lives: nobody took it for one that hangs.
+    /// The MCU is stopped and the program lives: the guardian did not treat it as hanging.
     fn assert_stopped_in_order(&self, mut program: Program, mut client: pinion_client::Client) {
         assert_eq!(shutdown_of(&mut client), "Rescheduled timer in the past");
         sysfs::wait_until("the heater is off", || !self.is_on());
         program.wait_for_line(&["Pinion stood still for"]);
         assert!(exists(program.guardian()));
-        // Longer than any of the two is patient with the other.
+        // Longer than both processes wait for each other.
         thread::sleep(Duration::from_secs(3));
         assert!(program.is_running());
         program.signal(Signal::SIGTERM);
@@ -177,7 +175,7 @@ fn an_mcu_that_was_stopped_with_its_guardian_stops_when_both_go_on() {
     }
 }
 
-/// A control group (version 2) of its own.
+/// A separate control group (version 2).
 struct ControlGroup;
 
 impl ControlGroup {
@@ -206,7 +204,7 @@ impl ControlGroup {
 
 impl Drop for ControlGroup {
     fn drop(&mut self) {
-        // Thawed, or what is in it could not even be killed.
+        // Thaw it, or its processes could not even be killed.
         let _ = fs::write(Path::new(Self::GROUP).join("cgroup.freeze"), "0");
         let processes = fs::read_to_string(Path::new(Self::GROUP).join("cgroup.procs")).unwrap_or_default();
         for process in processes.lines() {
@@ -225,7 +223,7 @@ fn an_mcu_whose_control_group_was_frozen_stops_when_it_is_thawed() {
     group.add(program.pid());
     group.add(program.guardian());
     let client = heater.switch_on(&program);
-    // A moment in which nothing is noticed, and no longer than what is noticed anyway.
+    // A freeze that is too short to be noticed.
     group.freeze(true);
     thread::sleep(Duration::from_millis(300));
     group.freeze(false);

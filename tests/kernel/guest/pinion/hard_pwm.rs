@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Hardware PWM. (What becomes of it at a shutdown is in `safe_state` and `guardian`.)
+//! Hardware PWM. (`safe_state` and `guardian` test its shutdown.)
 
 use std::os::unix::process::ExitStatusExt;
 use std::thread;
@@ -43,12 +43,12 @@ fn a_channel_is_exported_and_driven() {
     sysfs::write(format!("{CHIP}/unexport"), "6");
 }
 
-/// A fan or heater that runs is neither switched off nor driven harder for a moment.
+/// A running fan or heater is neither switched off nor driven harder, not even for a moment.
 #[test]
 fn a_channel_that_runs_is_configured_anew_without_a_moment_off() {
     let part = |(period, duty, enabled): (u64, u64, bool)| if enabled { duty as f64 / period as f64 } else { 0.0 };
     for (before, after) in [(50_000, 50_000), (50_000, 5_000), (5_000, 50_000), (50_000, 40_000), (40_000, 50_000)] {
-        // In an instance of its own, as after an upgrade.
+        // In a separate instance, as after an upgrade.
         let first = Program::start();
         configure(&mut first.connect(), 1, &[config("pwmchip0/pwm6", before)]);
         drop(first);

@@ -13,7 +13,7 @@ use crate::trace::Trace;
 
 const SWITCH: u32 = 2;
 const STEPS_PER_S: f64 = 2000.0;
-/// Closer than this, steps and the switch can not be told apart in the trace.
+/// Shortest time at which steps and the switch can be distinguished in the trace.
 const JITTER_NS: u64 = 200_000;
 
 #[test]
@@ -74,7 +74,7 @@ fn a_host_that_falls_silent_while_homing_stops_the_axis() {
     let (trsync, oid) = (endstop.trsync, stepper.oid);
     let start = client.clock_in(0.2).expect("the clock").wire();
     let expire = start.wrapping_add(client.ticks(0.25));
-    // Ten seconds of steps, and news for a quarter of one.
+    // Ten seconds of steps, and news for a quarter of a second.
     for line in [
         format!("trsync_start oid={trsync} report_clock={start} report_ticks=0 expire_reason=4"),
         format!("stepper_stop_on_trigger oid={oid} trsync_oid={trsync}"),

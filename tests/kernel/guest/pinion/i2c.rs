@@ -14,14 +14,14 @@ use crate::trace::Trace;
 
 const MOCK: &str = "/sys/devices/platform/mock-i2c";
 
-/// A transfer's status, and what was read.
+/// A transfer's status and the bytes read.
 fn transfer(client: &mut Client, oid: u8, write: &[u8], read_len: u8) -> (String, Vec<u8>) {
     let args = [("oid", oid.into()), ("write", write.into()), ("read_len", read_len.into())];
     let response = client.query("i2c_transfer", &args, "i2c_response", Some(oid)).expect("a response");
     (response.text("i2c_bus_status").expect("a status"), response.bytes("response").expect("bytes").to_vec())
 }
 
-/// The mocked bus as the dictionary has it.
+/// The mocked bus's name in the dictionary.
 fn bus_name() -> String {
     let node = i2c::bus();
     let name = node.file_name().and_then(|name| name.to_str()).expect("a name");
@@ -47,7 +47,7 @@ fn registers_are_written_and_read_with_one_message_each_way() {
     assert_eq!(transfer(client, 1, &[0x20, 0xbe], 0), ("SUCCESS".into(), vec![]));
     assert_eq!(transfer(client, 0, &[0x20], 2), ("SUCCESS".into(), vec![0xde, 0xad]));
     assert_eq!(transfer(client, 1, &[0x20], 1), ("SUCCESS".into(), vec![0xbe]));
-    // Nothing is written: it reads on.
+    // Without a write it reads on.
     assert_eq!(transfer(client, 0, &[0x20], 1), ("SUCCESS".into(), vec![0xde]));
     assert_eq!(transfer(client, 0, &[], 1), ("SUCCESS".into(), vec![0xad]));
     assert_eq!(sent(), ["51 20 de ad", "52 20 be", "51 20", "52 20", "51 20"]);
@@ -73,7 +73,7 @@ fn what_the_kernel_says_becomes_a_status_and_the_mcu_goes_on() {
         assert_eq!(transfer(client, 0, &[7, 1], 0), ("SUCCESS".into(), vec![]));
     }
     program.wait_for_line(&["I2C NACK", "refuses a transfer of 2 bytes written and 0 read"]);
-    // What only reads is tried again.
+    // A transfer that only reads is retried.
     sysfs::write(format!("{MOCK}/fail"), format!("{} 2", Errno::ENXIO as i32));
     assert_eq!(transfer(client, 0, &[], 1).0, "SUCCESS");
 }
@@ -106,7 +106,7 @@ fn a_slow_bus_keeps_no_step() {
     let profile = Profile::trapezoid(700, 4000.0, 40_000.0, 50e6).expect("a profile");
     let _slow = sysfs::set(format!("{MOCK}/delay_ms"), "60", "0");
     let trace = Trace::start();
-    // A display that is refreshed meanwhile: nobody waits for the answers.
+    // A display that is refreshed at the same time. The test does not wait for the answers.
     let args = [("oid", oid.into()), ("write", [0_u8, 1][..].into()), ("read_len", 0_u8.into())];
     client.send("i2c_transfer", &args).expect("a session");
     queue.run(client, stepper, true, &profile, None).expect("a move");
@@ -115,7 +115,7 @@ fn a_slow_bus_keeps_no_step() {
     assert_eq!(transfer(client, oid, &[0], 1), ("SUCCESS".into(), vec![1]));
 }
 
-/// gpio-sim has no chip that answers; how bits go over the wires is tested in `crates/firmware/src/board/soft_i2c.rs`.
+/// gpio-sim has no chip that answers. `crates/firmware/src/board/soft_i2c.rs` tests the bits on the wires.
 #[test]
 fn a_software_bus_pulls_low_or_lets_go_and_never_drives_high() {
     let sim = GpioSim::builder("lab", 8).name(2, "SDA").name(3, "SCL").build();
@@ -127,7 +127,7 @@ fn a_software_bus_pulls_low_or_lets_go_and_never_drives_high() {
         &["config_i2c oid=0", "i2c_set_sw_bus oid=0 scl_pin=SCL sda_pin=SDA pulse_ticks=250 address=80"],
     );
     assert!([2, 3].iter().all(|offset| sim.is_pulled_up(*offset)));
-    // As a chip does that hangs. A line that drove high would read high.
+    // As with a chip that hangs. A line that is driven high would read high.
     sim.pull(3, false);
     assert_eq!(transfer(client, 0, &[0x10], 0), ("BUS_TIMEOUT".into(), vec![]));
     program.wait_for_line(&["I2C Timeout", "SCL stays low", "check the wiring"]);
@@ -144,7 +144,7 @@ fn a_software_spi_clocks_its_bits_on_lines() {
         1,
         &[
             "config_spi oid=0 pin=SELECT cs_active_high=0",
-            // One line is both, as a Dotstar's.
+            // One line is both, as with a Dotstar.
             "spi_set_sw_bus oid=0 miso_pin=DATA mosi_pin=DATA sclk_pin=CLOCK mode=0 pulse_ticks=1000",
         ],
     );
@@ -153,13 +153,13 @@ fn a_software_spi_clocks_its_bits_on_lines() {
     let response = client.query("spi_transfer", &args, "spi_transfer_response", Some(0)).expect("a response");
     assert_eq!(response.bytes("response").expect("bytes"), [0xa5, 0x3c]);
     let [clock, select] = [3, 4].map(|offset| trace.writes_to(sim.kernel_number(offset)));
-    // It idles first.
+    // The clock idles first.
     let edges = &clock[1..];
     assert!(
         edges.len() == 32
             && edges.iter().zip([true, false].into_iter().cycle()).all(|(edge, level)| edge.level == level)
     );
-    // 20 us are a bit at the least.
+    // A bit takes at least 20 us.
     assert!(edges.windows(3).all(|three| three[2].at_ns - three[0].at_ns >= 20_000), "{edges:?}");
     assert_eq!(select.iter().map(|write| write.level).collect::<Vec<_>>(), [false, true]);
     assert!(select[0].at_ns < edges[0].at_ns && edges[31].at_ns < select[1].at_ns);

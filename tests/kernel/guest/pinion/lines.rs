@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Pinion's outputs and inputs on GPIO chips, and why it refuses some.
+//! Pinion's outputs and inputs on GPIO chips, and the reasons for refusing some.
 
 use std::os::unix::process::ExitStatusExt;
 use std::process::Command;
@@ -85,13 +85,13 @@ fn inputs_have_the_bias_that_was_asked_for() {
     }
 }
 
-/// The kernel offers no way to change a held line: it is let go and requested anew.
+/// The kernel cannot change a held line: Pinion releases it and requests it again.
 #[test]
 fn a_line_is_set_up_again_on_linux_before_5_5() {
     let sim = GpioSim::new("lab", 8);
     let mut program = Program::without_ioctl(uapi::GPIOHANDLE_SET_CONFIG, Errno::EINVAL);
     let client = &mut program.connect();
-    // An input that becomes an output, an output that becomes an input, and one that stays one.
+    // An input that becomes an output, an output that becomes an input, and an output that stays an output.
     let high = |oid, pin| format!("config_digital_out oid={oid} pin={pin} value=1 default_value=0 max_duration=0");
     configure(
         client,
@@ -113,7 +113,7 @@ fn a_line_is_set_up_again_on_linux_before_5_5() {
     run(client, "update_digital_out oid=4 value=0");
     run(client, "update_digital_out oid=4 value=1");
     assert!(sim.level(2));
-    // The guardian has the outputs as they are now.
+    // The guardian has the present outputs.
     let guardian = program.guardian();
     program.kill();
     sysfs::wait_until("the guardian ends", || !exists(guardian));
@@ -191,7 +191,7 @@ fn a_chip_that_goes_away_stops_the_mcu_and_a_restart_starts_anew() {
     assert_eq!(shutdown_of(client), "GPIO line write failed");
     program.wait_for_line(&["GPIO line write failed", first.chip_name(), "line 2 (FAN) can no longer be written"]);
     assert!(!kept.level(0), "the other chip's output is at its default");
-    // Where the fan's output is now, nobody knows: that is the guardian's business.
+    // The state of the fan's output is unknown: only the guardian handles it.
     assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
     program.wait_for_line(&["only 1 of 2 outputs", first.chip_name(), "line 2: No such device"]);
 
@@ -228,7 +228,7 @@ fn after_a_kill_a_restart_claims_the_lines() {
 
 #[test]
 fn of_a_chip_that_came_after_the_start_the_status_knows_the_names() {
-    // Only a tenth chip's lines have no names that every computer has.
+    // Every computer has names for the lines of nine chips, but not for the lines of a tenth chip.
     let before: Vec<GpioSim> = (0..9).map(|n| GpioSim::new(&format!("before{n}"), 1)).collect();
     let program = Program::start();
     let late = GpioSim::builder("late", 8).name(3, "LAMP").build();

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Pinion itself at work on these drivers: `pinion run`, and a host on its pty.
+//! Pinion itself on these drivers: `pinion run`, and a host on its pty.
 
-// What tests share.
+// Shared by the tests.
 mod outputs;
 
 mod analog;

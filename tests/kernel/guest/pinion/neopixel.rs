@@ -21,14 +21,14 @@ fn a_chain_is_sent_in_one_message() {
     run(client, "neopixel_update oid=0 pos=0 data=ff0093");
     let result = client.query("neopixel_send", &[("oid", 0_u8.into())], "neopixel_result", Some(0)).expect("a result");
     assert!(result.flag("success").expect("a flag"));
-    // 300 us, as newer LEDs need more than the 50 us that are asked for.
+    // 300 us, because newer LEDs need more than the requested 50 us.
     let low = " 00".repeat(120);
     let colours = " ee ee ee ee 88 88 88 88 e8 8e 88 ee";
     assert_eq!(sysfs::read(format!("{MOCK}/sent")).trim(), format!("cs1 0 3200000{low}{colours}{low}"));
 
     assert_eq!(refusal(client, 1, &[config("lab/gpio1", 3)]), "Not an output pin");
     program.wait_for_line(&["can not drive LEDs", "pin: spidev0.0"]);
-    // klippy's longest chain fits, and what is longer than the driver's buffer is refused.
+    // klippy's longest chain fits. A message longer than the driver's buffer is refused.
     configure(client, 1, &[config("spidev0.1", 500)]);
     configure(client, 1, &[config("spidev0.1", 964)]);
     assert_eq!(refusal(client, 1, &[config("spidev0.1", 965)]), "Invalid neopixel data_size");

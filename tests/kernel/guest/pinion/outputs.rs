@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Outputs of every kind, switched on: where do they go when something goes wrong?
+//! Outputs of every kind, switched on: their values after a failure.
 
 use std::path::Path;
 
@@ -15,7 +15,7 @@ const PWM_CHIP: &str = "/sys/class/pwm/pwmchip0";
 /// A duty cycle of a quarter, of 32768.
 const QUARTER: u16 = 8192;
 
-/// A GPIO output: its object, its shutdown value, its cycle in milliseconds if it is pulsed.
+/// A GPIO output: its object, its shutdown value, and its cycle in milliseconds if it is pulsed.
 struct Line {
     offset: u32,
     default: bool,
@@ -44,8 +44,8 @@ impl Outputs {
         Outputs { sim: GpioSim::new("lab", 8) }
     }
 
-    /// Configures them, and switches them on. The host has to say something of each again
-    /// within `max_duration_ms`, unless that is 0.
+    /// Configures the outputs, and switches them on. The host must refresh each of them within `max_duration_ms`,
+    /// unless that is 0.
     pub fn switch_on(&self, client: &mut Client, max_duration_ms: u32) {
         let max_duration = 50_000 * max_duration_ms;
         let mut config = Vec::new();
@@ -78,14 +78,14 @@ impl Outputs {
         self.wait_until_on();
     }
 
-    /// Waits until no line is at its shutdown value, where those that are pulsed are half of the
-    /// time: what is stopped now has to be driven there.
+    /// Waits until no line is at its shutdown value. The pulsed lines are there half of the time. So a stop now must
+    /// drive all lines.
     pub fn wait_until_on(&self) {
         sysfs::wait_until("the lines are on", || LINES.iter().all(|line| self.sim.level(line.offset) != line.default));
     }
 
     fn safe_channels() -> [String; 2] {
-        // A channel whose value is zero is switched off, whatever its duty cycle.
+        // A channel with the value zero is switched off, whatever its duty cycle.
         CHANNELS.map(|(channel, default)| match default {
             0 => {
                 let present = pwm::output(channel);
@@ -96,9 +96,8 @@ impl Outputs {
         })
     }
 
-    /// Waits until every output was driven to its shutdown value and stayed there. The clock
-    /// (CLOCK_MONOTONIC, microseconds) at which the last of the lines was. By the trace of
-    /// writes: a line that nobody holds any more falls back by itself.
+    /// Waits until every output was driven to its shutdown value and stayed there. Returns the time (CLOCK_MONOTONIC,
+    /// microseconds) of the last line. It uses the trace of writes, because a released line falls back by itself.
     pub fn assert_safe(&self, trace: &Trace) -> u64 {
         let last = |line: &Line| trace.writes_to(self.sim.kernel_number(line.offset)).pop();
         let is_safe = || LINES.iter().all(|line| last(line).is_some_and(|write| write.level == line.default));

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! PCA9685 outputs on i2c-dev: a file of registers stands for the chip.
+//! PCA9685 outputs on i2c-dev. A file of registers replaces the chip.
 
 use std::thread;
 use std::time::Duration;
@@ -22,7 +22,7 @@ fn output(value: u16) -> String {
     )
 }
 
-/// What the chip was told since the last call.
+/// The messages to the chip since the last call.
 fn sent() -> Vec<String> {
     let sent = sysfs::read(format!("{MOCK}/sent")).lines().map(str::to_owned).collect();
     sysfs::write(format!("{MOCK}/sent"), "0");

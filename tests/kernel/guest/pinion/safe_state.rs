@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Outputs go to their shutdown values however the MCU is stopped.
+//! Outputs go to their shutdown values in every kind of stop of the MCU.
 
 use std::fs;
 use std::path::Path;

@@ -37,7 +37,7 @@ fn transfers_come_back_in_order_from_two_devices_of_a_bus() {
     assert_eq!(transfer(client, 0, &[0xde, 0xad]), [0xde, 0xad]);
     sysfs::write(format!("{MOCK}/replies"), "0102");
     assert_eq!(transfer(client, 1, &[0xbe, 0xef]), [1, 2]);
-    // Many under way at once.
+    // Many transfers at once.
     for number in 0..40_u8 {
         let data = [number, 1, 2, 3];
         let args = [("oid", (number % 2).into()), ("data", data[..].into())];
@@ -86,7 +86,7 @@ fn chip_selects_of_either_sense_and_modes_of_chips_on_one_node() {
     let writes = || trace.writes().iter().map(|write| (write.line, write.level)).collect::<Vec<_>>();
     sysfs::wait_until("five transfers are over", || writes().len() == expected.len());
     assert_eq!(writes(), expected);
-    // Before a chip of the other polarity is selected, a byte goes to nobody, which moves the clock.
+    // Before a chip of the other polarity is selected, a byte without a chip select moves the clock.
     let expected = [
         "cs0 1 1000000 00",
         "cs0 1 1000000 01",

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Steps as they are seen in the lines.
+//! Steps as seen on the lines.
 
 use pinion_client::config::Config;
 use pinion_client::motion::{MoveQueue, Profile, Stepper};
@@ -39,7 +39,7 @@ fn steppers_of_every_kind_step_at_once_on_several_chips() {
     let program = Program::start();
     let client = &mut program.connect();
     let mut config = Config::default();
-    // Plain, inverted, and one that steps on both edges; rates that meet and part.
+    // Plain, inverted, and with steps on both edges; the rates meet and part.
     let steppers = [(0, 10_000), (1, 15_000), (-1, 20_000)];
     for (sim, (invert, _)) in sims.iter().zip(steppers) {
         let [step, dir] = [62, 63].map(|offset| format!("{}/gpio{offset}", sim.label()));

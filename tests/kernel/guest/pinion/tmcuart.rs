@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The UART of stepper drivers on one wire, which is an output by turns.
+//! The UART of stepper drivers on one wire, which is an output only part of the time.
 
 use std::time::{Duration, Instant};
 
@@ -11,14 +11,14 @@ use crate::trace::{Trace, Write};
 use crate::uapi;
 
 const WIRE: u32 = 3;
-/// 10 kbaud: this is about the line's direction and levels, not about how exact an emulated computer is.
+/// 10 kbaud: the test is about the line's direction and levels, not about the accuracy of an emulated computer.
 const BIT_NS: u64 = 100_000;
 const CONFIG: &str = "config_tmcuart oid=0 rx_pin=lab/gpio3 pull_up=1 tx_pin=lab/gpio3 bit_time=5000";
 /// A read of register 2 of driver 0 (f5 00 02 c8), with start and stop bits.
 const SENT: [u8; 5] = [0xea, 0x03, 0x48, 0x20, 0xe4];
 const HEARD: [u8; 4] = [0xf5, 0x00, 0x02, 0xc8];
 
-/// What a UART hears: from a falling edge on it looks at each bit's middle.
+/// The bytes that a UART receives: after a falling edge it samples the middle of each bit.
 fn hear(writes: &[Write]) -> Vec<u8> {
     let level = |at: u64| writes.iter().rev().find(|write| write.at_ns <= at).is_none_or(|write| write.level);
     let (mut heard, mut from) = (Vec::new(), 0);
@@ -49,7 +49,7 @@ fn message_and_reply(program: &Program) {
     assert!(is_output() && sim.level(WIRE));
     // Twice: the second message finds the wire driven again.
     for _ in 0..2 {
-        // An output does not heed this. As an input it has the pull-up switched on, which gpio-sim shows.
+        // An output ignores this. As an input it has the pull-up, which gpio-sim shows.
         sim.pull(WIRE, false);
         let trace = Trace::start();
         let args = [("oid", 0_u8.into()), ("write", SENT[..].into()), ("read", 10_u8.into())];
@@ -60,7 +60,7 @@ fn message_and_reply(program: &Program) {
         let writes = trace.writes_to(sim.kernel_number(WIRE));
         assert_eq!(hear(&writes), HEARD);
         assert!(sim.is_pulled_up(WIRE), "it never was an input: {writes:?}");
-        // The last one makes it an output once more, after the time that a driver has to answer.
+        // The last write makes it an output again, after the driver's time to answer.
         let [.., before, last] = &writes[..] else { panic!("{writes:?}") };
         assert!(last.level && last.at_ns - before.at_ns > 10 * BIT_NS, "{writes:?}");
         assert!(is_output() && sim.level(WIRE));

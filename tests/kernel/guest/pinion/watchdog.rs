@@ -12,9 +12,9 @@ use nix::sys::signal::Signal;
 use crate::program::{Program, configure};
 use crate::{sysfs, uapi};
 
-/// Unfed for so long it would reset the computer.
+/// How long the watchdog waits before it would reset the computer.
 const LIMIT_S: u32 = 10;
-/// Time costs nothing here: it jumps while nobody has anything to do.
+/// A long wait costs nothing here: the time jumps while the guest is idle.
 const LONGER: Duration = Duration::from_secs(15);
 
 fn is_active() -> bool {
@@ -27,7 +27,7 @@ fn has_fired() -> bool {
     String::from_utf8_lossy(&log).contains("Triggered - Reboot ignored")
 }
 
-/// The watchdog, stopped in the end if nobody did.
+/// The watchdog. It is stopped at the end if it still runs.
 struct Watchdog;
 
 impl Watchdog {
@@ -74,7 +74,7 @@ fn it_is_fed_while_the_program_gets_on_and_stopped_when_that_ends() {
 fn a_core_that_hangs_and_a_program_that_dies_do_not_feed_it() {
     let _watchdog = Watchdog::new();
     let mut program = Program::with(&["-r", "-w"], &[("PINION_TEST_HANG", "1")]);
-    // Without outputs the guardian lets it live.
+    // Without outputs the guardian does not kill it.
     configure(&mut program.connect(), 0, &[""; 0]);
     program.signal(Signal::SIGUSR2);
     thread::sleep(LONGER);

@@ -11,7 +11,7 @@ use nix::errno::Errno;
 use crate::mock::adc::{Gone, raw};
 use crate::sysfs;
 
-/// The kinds that `mock_adc.c` makes, in the order of their instances.
+/// The kinds of `mock_adc.c`, in the order of their instances.
 const ADCS: [Adc; 7] = [
     Adc { name: "mock-adc12", bits: 12, is_signed: false, has_scan_type: true },
     Adc { name: "mock-adc8", bits: 8, is_signed: false, has_scan_type: true },

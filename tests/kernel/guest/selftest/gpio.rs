@@ -138,8 +138,8 @@ fn every_write_is_traced_with_its_time() {
     assert!(before_ns <= writes[0].at_ns && writes[99].at_ns <= after_ns);
 }
 
-/// Why Pinion tells glitches from edges itself: the kernel debounces by a timer in jiffies where the chip
-/// can not, and a fan of 10,000 rpm with two pulses a turn is still for it.
+/// The reason why Pinion itself filters glitches. If the chip cannot debounce, the kernel debounces with a timer in
+/// jiffies. A fan at 10,000 rpm with two pulses per turn then appears to stand still.
 #[test]
 fn the_kernel_s_debouncing_loses_the_pulses_of_a_fan() {
     let sim = GpioSim::new("lab", 8);

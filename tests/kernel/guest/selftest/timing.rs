@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Costs and lateness where time counts instructions: 1 ns for each, on every
-//! host. The thresholds leave room for another kernel, not for another computer.
+//! Costs and lateness with a time that counts instructions: 1 ns for each, on every computer. The thresholds leave room
+//! for another kernel, not for another computer.
 
 use std::hint::black_box;
 use std::time::{Duration, Instant};

@@ -12,6 +12,6 @@ fn it_is_fed_and_closed() {
     sysfs::assert_in_guest();
     let mut watchdog = File::create("/dev/watchdog").expect("the watchdog");
     watchdog.write_all(b".").expect("feeding");
-    // The letter that stops it when it is closed.
+    // This letter stops it when it is closed.
     watchdog.write_all(b"V").expect("closing");
 }
