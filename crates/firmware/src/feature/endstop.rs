@@ -36,8 +36,8 @@ struct Endstop {
     homing: Option<Homing>,
     /// When sampling continues if the samples after the last match do not confirm it.
     next_wake: Clock,
-    /// Due time of the sample that the chip's worker is taking. Meanwhile the timer is for a sample that takes too long.
-    /// `None`: the worker takes none.
+    /// Due time of the sample that the chip's worker is taking. Meanwhile the timer watches that it does not take too
+    /// long. `None`: the worker takes none.
     due: Option<Clock>,
     /// A query also waits for the worker to read the line. Further commands wait with it.
     asked: Option<Hold>,

@@ -3,8 +3,8 @@
 //! the start and stop bits itself, checks those of the reply, and asks again.
 //!
 //! The firmware has a timer for each bit. Here an errand times a whole message on a worker. At 40 kbaud a message is up
-//! to 5 ms of edges 25 us apart, which would keep the core awake. `bits_on_time` below measures how late bits are in
-//! both cases (docs/develop/performance.md).
+//! to 5 ms of edges 25 us apart, which would keep the core awake. `benches/bits.rs` measures how late bits are
+//! in both cases (docs/develop/performance.md).
 //!
 //! The firmware samples a reply anywhere within a bit, wherever its timer happens to be. Here the start bit of each
 //! byte is found, and bits are read in their middle. So half a bit of lateness does no harm. A start bit that is high
