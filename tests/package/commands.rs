@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The commands of the pages, as the VM is given them, and which check tries which page.
+//! The pages' commands for the VM, and the check that tries each page.
 
 use std::fs;
 use std::path::Path;
@@ -7,9 +7,9 @@ use std::path::Path;
 use super::Check;
 use pinion_testkit::markdown::{COMMANDS, Page, pages};
 
-/// How a check begins the line that has a page tried: `page docs/guide/install.md`.
+/// The start of a check's line that tries a page: `page docs/guide/install.md`.
 const WORD: &str = "page ";
-/// The page of a check that is run once for each page that no other check tries.
+/// The page of a check that runs once for each page without another check.
 const ANY: &str = "\"$PAGE\"";
 
 /// The pages with commands.
@@ -18,8 +18,8 @@ fn with_commands() -> Vec<Page> {
     pages().into_iter().filter(has_commands).collect()
 }
 
-/// Puts each block of commands into a file of its own, in the folder that the VM sees as /share:
-/// `pages/README.md/0042.sh`, or `.not-tried`, for the one that begins at line 42.
+/// Writes each block of commands into a file in the folder that the VM sees as /share: `pages/README.md/0042.sh`, or
+/// `.not-tried`, for the block at line 42.
 pub fn share(folder: &Path) -> Result<(), String> {
     for page in with_commands() {
         let folder = folder.join("pages").join(&page.name);
@@ -43,7 +43,7 @@ pub fn tries_any(check: &Check) -> bool {
     tried(check).next().is_some()
 }
 
-/// The checks, with the one for any page repeated for each page that no other one tries.
+/// The checks. The check for any page is repeated for each page without another check.
 ///
 /// # Errors
 ///
@@ -70,7 +70,7 @@ pub fn each_page(checks: Vec<Check>) -> Result<Vec<Check>, String> {
     }
 }
 
-/// A line for each block that is not tried in the pages of this check.
+/// A line for each untried block in the pages of this check.
 pub fn not_tried(check: &Check) -> Vec<String> {
     let mut lines = Vec::new();
     for page in pages().iter().filter(|page| tried(check).any(|name| name == page.name)) {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A host in the booted system, started by the checks as klippy's user:
+//! A host in the booted system. The checks start it as klippy's user:
 //!
 //! ```text
 //! host identify LINK [PIN]   tells the version, and fails if there is no such pin
@@ -21,12 +21,12 @@ use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 use pinion_client::{Client, Error};
 use serde_json::{Value, json};
 
-/// How long the client waits for Pinion.
+/// Timeout of the client.
 const CLIENT_TIMEOUT: Duration = Duration::from_secs(10);
-/// A heater that is not refreshed for so long shuts the MCU down.
+/// How long a heater may stay without a refresh before the MCU shuts down.
 const MAX_DURATION_S: f64 = 3.0;
 const REFRESH: Duration = Duration::from_millis(300);
-/// How long the host takes to answer: it answers G-code when it has ended, and an emulated computer homes slowly.
+/// Timeout of the host. It answers G-code when the G-code has ended, and an emulated computer homes slowly.
 const HOST_TIMEOUT: Duration = Duration::from_secs(120);
 
 fn main() -> ExitCode {
@@ -38,7 +38,7 @@ fn main() -> ExitCode {
         ["light", link, pin] => light(link, pin),
         ["home", link] => home(link),
         ["ask", socket, method, params, pointer] => return asked(ask(socket, method, params, pointer)),
-        // As cargo and the like may start it.
+        // cargo and similar programs may start it in this way.
         _ => return ExitCode::SUCCESS,
     };
     match done {
@@ -92,7 +92,7 @@ fn home(link: &str) -> Result<(), Error> {
     let stepper = Stepper::configure(&mut config, "STEP", 0, "DIR", false, pulse)?;
     let endstop = Endstop::configure(&mut config, "ENDSTOP", 0, false)?;
     let status = config.apply(&mut client)?;
-    // Ten seconds of it: the check closes the endstop after a second.
+    // A move of ten seconds. The check closes the endstop after one second.
     let profile = Profile::trapezoid(1000, 100.0, 400.0, client.frequency_hz())?;
     println!("homing");
     let homed = MoveQueue::new(status.move_count).home(&mut client, stepper, endstop, true, &profile, &mut |_| ())?;
@@ -116,7 +116,7 @@ fn asked(answer: Result<String, String>) -> ExitCode {
     }
 }
 
-/// The error is klippy's own text, where there is one.
+/// The error is klippy's own text, if there is one.
 fn ask(socket: &str, method: &str, params: &str, pointer: &str) -> Result<String, String> {
     let params: Value = serde_json::from_str(params).map_err(|error| format!("{params}: {error}"))?;
     let answer = request(socket, &json!({ "id": 1, "method": method, "params": params }))

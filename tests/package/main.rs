@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The package, installed in a Debian 12 that was booted with systemd in the emulator: the scripts
-//! of `tests/package/checks`, in their order, and in some of them the commands of the pages.
-//! docs/develop/test-package.md tells how to use it.
+//! The package, installed in a Debian 12 that was booted with systemd in the emulator. It runs the scripts of
+//! `tests/package/checks` in order. Some of them try the commands of the pages. docs/develop/test-package.md explains
+//! its use.
 //!
-//! This is the computer's side, a test harness of its own.
+//! This is the computer's side, a separate test harness.
 
 mod commands;
 mod packages;
@@ -33,11 +33,11 @@ Options:
   --run FILE         Run this script in the VM after the checks, and print its output
   --list             Name the checks";
 
-/// A check that can not be run ends so, and prints why.
+/// Exit status of a check that cannot run. The check prints the reason.
 const NOT_RUN: i32 = 78;
-/// The first check installs the package for all that follow.
+/// The first check installs the package for all later checks.
 const INSTALLS: &str = "10-install";
-/// A failed run exits as libtest's do.
+/// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
 #[derive(Default)]
@@ -49,7 +49,7 @@ struct Options {
 }
 
 impl Options {
-    /// Exits on a mistake, and for `--help`.
+    /// Exits after an error, and for `--help`.
     fn from_args() -> Options {
         let mut options = Options::default();
         let mut args = env::args().skip(1);
@@ -77,13 +77,13 @@ impl Options {
     }
 }
 
-/// A script, and what those before it leave to it.
+/// A script, with the things that earlier scripts prepare for it.
 struct Check {
     name: String,
     script: String,
 }
 
-/// The scripts in the order of their numbers, each with the words that all of them share before it.
+/// The scripts in the order of their numbers, each after the common script.
 fn checks() -> Result<Vec<Check>, String> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
     let read = |path: &Path| fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()));
@@ -118,8 +118,8 @@ fn run(options: &Options) -> Result<bool, String> {
     commands::share(&share)?;
     println!("prepared in {:.1} s", began.elapsed().as_secs_f64());
 
-    // The checks of pages each make what their page finds. So they are run beside the others by a second VM,
-    // and by that of the others once those are done.
+    // Each check of pages makes everything that its page needs. So a second VM runs these checks in parallel. The first
+    // VM helps when its own checks are done.
     let (mut of_pages, mut others): (Vec<_>, Vec<_>) = checks.into_iter().partition(commands::tries_any);
     of_pages.retain(|check| options.chosen(check));
     if options.run.is_some() || others.iter().any(|check| options.chosen(check)) {
@@ -162,8 +162,8 @@ struct Tally {
     not_run: Vec<String>,
 }
 
-/// Runs the checks in a VM, if there are any, `then` the script that this path names, and of the shared ones
-/// as many as other VMs leave.
+/// Runs the checks in a VM, if there are any, and `then` the script at this path. It also runs the shared checks that
+/// the other VMs leave.
 fn in_a_vm(
     boot: impl FnOnce() -> Result<Vm, String>,
     checks: Vec<Check>,
@@ -196,7 +196,7 @@ fn in_a_vm(
         if status != 0 || options.show_output {
             said.push_str(&output);
         }
-        // At once, as another VM's lines may come between.
+        // Print at once, because another VM's lines may come between.
         print!("{said}");
         match status {
             0 => tally.passed += 1,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! What the VM is given: the package of the tree as it stands, a later one, the host, the tree, and klippy.
+//! The VM's files: the package of the present tree, a later package, the host, the tree, and klippy.
 
 use std::env;
 use std::fs;
@@ -15,7 +15,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
     let strip = |program: &Path, name: &str| {
         process::run(Command::new("strip").arg("--strip-debug").arg("-o").arg(folder.join(name)).arg(program))
     };
-    // The one that cargo has built for all tests.
+    // The program that cargo has built for all tests.
     strip(Path::new(env!("CARGO_BIN_EXE_pinion")), "pinion")?;
     strip(&host(tree)?, "host")?;
     process::run(
@@ -25,7 +25,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
             .arg(folder)
             // An emulated processor unpacks this in a third of the time.
             .env("DPKG_DEB_COMPRESSOR_TYPE", "zstd")
-            // dpkg-buildpackage is to run as in a shell of its own, not as in make's.
+            // dpkg-buildpackage must run as in a separate shell, not as in make's.
             .env_remove("MAKEFLAGS")
             .env_remove("MAKELEVEL"),
     )?;
@@ -42,7 +42,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
            rm -r later"#,
         &[&folder.display().to_string()],
     )?;
-    // What `make install` takes: the program was built before.
+    // The files for `make install`, with the program that is already built.
     process::pipeline(
         r#"cd "$1"; tar -c Makefile systemd udev man | tar -x -C "$2" --one-top-level=tree
            install -D "$2/pinion" "$2/tree/target/release/pinion""#,
@@ -50,8 +50,8 @@ pub fn share(folder: &Path) -> Result<(), String> {
     )
 }
 
-/// klippy of the checkout that KLIPPER_DIR names, if it names one: for its own checks, see
-/// `guest/klippy.sh`. Its C library is compiled here, by klippy itself: this is a Debian 12 for x86-64, too.
+/// klippy from the checkout in KLIPPER_DIR, if it is set. It is for klippy's own checks: see `guest/klippy.sh`. klippy
+/// compiles its C library here, because this is also a Debian 12 for x86-64.
 pub fn share_klippy(folder: &Path) -> Result<(), String> {
     let words = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package/guest/klippy.sh");
     process::run(Command::new("cp").arg(words).arg(folder))?;
@@ -65,7 +65,7 @@ pub fn share_klippy(folder: &Path) -> Result<(), String> {
     process::run(Command::new(python).arg(copy.join("klippy/chelper/__init__.py")))
 }
 
-/// Has cargo build the host, and returns its program.
+/// Builds the host with cargo, and returns its program.
 fn host(tree: &Path) -> Result<PathBuf, String> {
     let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
     cargo.current_dir(tree).args(["build", "--locked", "--message-format", "json", "--test", "package_host"]);

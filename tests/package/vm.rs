@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A Debian with systemd under QEMU, and the agent in it that runs scripts.
+//! A Debian with systemd under QEMU. Its agent runs scripts.
 
 use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
@@ -14,27 +14,27 @@ use pinion_testkit::cache::Cache;
 use pinion_testkit::kernel::{Flavour, Kernel, Offers, remove_others};
 use pinion_testkit::{process, tools};
 
-/// Longer than the agent lets a script run, which it measures by the guest's clock: on a busy computer that
-/// takes several seconds for one.
+/// Longest silence: more than the agent's limit for a script. The agent measures by the guest's clock. On a busy
+/// computer one second of that clock takes several seconds.
 const SILENCE_MAX: Duration = Duration::from_secs(1800);
-/// The guest's time: while it works, an instruction takes 1 ns; while it sleeps, time is the computer's. On a
-/// busy computer the VM is then slow, and nothing in it is late, which klippy and a watchdog would mind.
+/// The guest's time. While the guest works, an instruction takes 1 ns. While it sleeps, the time is the computer's. So
+/// on a busy computer the VM is slow, but nothing in it is late. klippy and a watchdog would notice lateness.
 const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];
-/// After a script that ends with this status the agent reboots the VM: the next one waits for it.
+/// After a script with this exit status the agent reboots the VM. The next script waits for the reboot.
 const REBOOTS: i32 = 77;
 
-/// Program and the Debian package that has it.
+/// Programs with their Debian packages.
 const TOOLS: [(&str, &str); 3] =
     [("mmdebstrap", "mmdebstrap"), ("dpkg-scanpackages", "dpkg-dev"), ("mke2fs", "e2fsprogs")];
 
-/// What the VM boots.
+/// The boot files of the VM.
 pub struct Root {
     kernel: PathBuf,
     folder: PathBuf,
 }
 
 impl Root {
-    /// Makes what the cache does not hold yet.
+    /// Makes everything that the cache does not contain yet.
     pub fn prepare(cache: &Cache) -> Result<Root, String> {
         tools::ensure()?;
         tools::install(&TOOLS)?;
@@ -62,7 +62,7 @@ impl Root {
     }
 }
 
-/// Changes with everything that the root is made of, save the versions of Debian's packages.
+/// Changes with everything that makes the root, except the versions of Debian's packages.
 fn key(kernel: &Kernel) -> u64 {
     let mut hasher = DefaultHasher::new();
     kernel.vmlinux.hash(&mut hasher);
@@ -78,7 +78,7 @@ fn key(kernel: &Kernel) -> u64 {
     hasher.finish()
 }
 
-/// A running VM; it ends when this is dropped.
+/// A running VM. It ends when this is dropped.
 pub struct Vm {
     kernel: PathBuf,
     initrd: PathBuf,
@@ -91,9 +91,9 @@ pub struct Vm {
 }
 
 impl Vm {
-    /// Boots a copy of the root, which is put into `folder`. The VM sees `share` as /share.
+    /// Boots a copy of the root in `folder`. The VM sees `share` as /share.
     pub fn boot(root: &Root, folder: &Path, share: &Path) -> Result<Vm, String> {
-        // The holes stay holes.
+        // Holes in the file stay holes.
         process::run(Command::new("cp").arg("--sparse=always").arg(root.folder.join("root.img")).arg(folder))?;
         let (kernel, initrd) = (root.kernel.clone(), root.folder.join("initrd"));
         let (qemu, input, lines) = start(&kernel, &initrd, folder, share)?;
@@ -110,7 +110,7 @@ impl Vm {
         Ok(())
     }
 
-    /// The exit status and the output of a script that is run by bash in the VM.
+    /// Runs a script with bash in the VM, and returns its exit status and its output.
     pub fn run(&mut self, script: &str) -> Result<(i32, String), String> {
         let line = format!("{}\n", base64(script.as_bytes()));
         self.input.write_all(line.as_bytes()).map_err(|error| self.failed(&error.to_string()))?;

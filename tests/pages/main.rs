@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Checks the form of all pages and their links. Other tests check their content: `tests/package` runs their
-//! commands, and `tests/klippy/printer_cfg.rs` gives their configurations to klippy.
+//! Checks the form of all pages and their links. Other tests check the content. `tests/package` runs the commands, and
+//! `tests/klippy/printer_cfg.rs` gives the configurations to klippy.
 
 use std::fs;
 use std::path::{Path, PathBuf};
 
 use pinion_testkit::markdown::{COMMANDS, Page, pages, reason};
 
-/// What a block may be.
+/// The allowed kinds of blocks.
 const KINDS: [&str; 6] = [COMMANDS, "ini", "toml", "text", "diff", "rust"];
-/// Where the pages for developers are. Their commands stand in indented blocks, and no test runs them.
+/// The pages for developers. Their commands are in indented blocks, and no test runs them.
 const FOR_DEVELOPERS: [&str; 2] = ["CONTRIBUTING.md", "docs/develop/"];
 
-/// The lines outside of fenced blocks, each with its number counted from 1.
+/// The lines outside fenced blocks, each with its number, counted from 1.
 fn prose(page: &Page) -> Vec<(usize, &str)> {
     let mut fenced = false;
     let mut prose = Vec::new();
@@ -26,7 +26,7 @@ fn prose(page: &Page) -> Vec<(usize, &str)> {
     prose
 }
 
-/// As GitHub and its like make it of a heading.
+/// The anchor that GitHub and similar sites make from a heading.
 fn anchor(heading: &str) -> String {
     let heading = heading.trim_start_matches('#').trim().to_lowercase().replace(' ', "-");
     heading.chars().filter(|c| c.is_alphanumeric() || "-_".contains(*c)).collect()
@@ -51,7 +51,7 @@ fn every_block_says_what_it_is() {
     }
 }
 
-/// A word that is not right, or a line between it and the block, would have commands tried that can not be.
+/// A wrong word, or a line between it and the block, would make the test try commands that cannot work.
 #[test]
 fn what_is_not_tried_is_said_in_the_right_place() {
     for page in pages() {
@@ -112,7 +112,7 @@ fn links_lead_somewhere() {
     assert!(count > 20, "only {count} links were seen");
 }
 
-/// A path from the project's folder, as pages name files of ours.
+/// A path from the project's folder, in the pages' form for our files.
 fn is_path(text: &str) -> bool {
     let folders =
         ["src/", "crates/", "tests/", "benches/", "systemd/", "udev/", "debian/", "docs/guide/", "docs/develop/"];
@@ -151,7 +151,7 @@ fn without_indentation(text: &str) -> String {
     text.lines().map(|line| format!("{}\n", line.trim())).collect()
 }
 
-/// So it compiles, and follows the code.
+/// So the Rust compiles, and follows the code.
 #[test]
 fn rust_on_a_page_is_part_of_a_source() {
     let sources = sources(&Path::new(env!("CARGO_MANIFEST_DIR")).join("crates"));

@@ -14,15 +14,14 @@ use pinion_testkit::process;
 
 const TARGET: &str = "aarch64-unknown-linux-gnu";
 const TESTS: &str = "raspberry_pi_guest";
-/// Where the kernel finds it, by the name in each program.
+/// The kernel finds it by the name in each program.
 const LOADER: &str = "ld-linux-aarch64.so.1";
 
 /// The programs, each with its name in the guest.
 pub struct Programs(Vec<(&'static str, PathBuf)>);
 
 impl Programs {
-    /// Has cargo build them, in a target folder of their own: this rustc is not the
-    /// one that built what is in the usual one.
+    /// Builds them with cargo in a separate target folder, because this rustc differs from the usual one.
     pub fn build(sysroot: &Sysroot) -> Result<Programs, String> {
         eprintln!("building for arm64");
         let mut cargo = Command::new(env::var_os("CARGO").unwrap_or("cargo".into()));
@@ -78,8 +77,8 @@ impl Programs {
     }
 }
 
-/// The standard library is the sysroot's, and so are the other libraries; the C
-/// library to link to comes with the cross compiler.
+/// The standard library and the other libraries come from the sysroot. The C library for linking comes with the cross
+/// compiler.
 fn flags(sysroot: &Sysroot) -> OsString {
     let mut flags = OsString::from("--sysroot=");
     flags.push(sysroot.path().join("usr"));
@@ -92,7 +91,7 @@ fn flags(sysroot: &Sysroot) -> OsString {
     flags
 }
 
-/// Adds what the program needs, and what that needs. `ldd` would have to run it.
+/// Adds the libraries that the program needs, and the libraries that those need. `ldd` would have to run the program.
 fn find_libraries(program: &Path, sysroot: &Sysroot, found: &mut BTreeMap<String, PathBuf>) -> Result<(), String> {
     let dynamic = process::output(Command::new(format!("{TOOL_PREFIX}readelf")).args(["-dW"]).arg(program))?;
     // 0x0000000000000001 (NEEDED)  Shared library: [libiio.so.0]

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The world outside of the Pi's GPIO chip, by QEMU's qtest: it tells each change of
-//! an output as it happens, and reads and writes the chip's registers.
+//! The world outside the Pi's GPIO chip, simulated with QEMU's qtest. qtest reports each change of an output at once,
+//! and reads and writes the chip's registers.
 //!
-//! The emulated chip keeps one level for each line. What the outside drives is
-//! written there as the driver would write it: to the registers that set and clear.
+//! The emulated chip keeps one level for each line. The outside drives a line as the driver would: it writes to the
+//! registers that set and clear.
 
 use std::collections::VecDeque;
 use std::io::{self, BufRead, BufReader, Write};
@@ -22,7 +22,7 @@ const LEVEL: u32 = 0x3f20_0034;
 const START_TIMEOUT: Duration = Duration::from_secs(20);
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// Drives a line once another one has risen so many times.
+/// Drives a line after another line has risen this many times.
 #[derive(Clone, Copy)]
 pub struct Trigger {
     pub line: usize,
@@ -31,7 +31,7 @@ pub struct Trigger {
     pub watched: usize,
 }
 
-/// The chip, from outside.
+/// The chip, seen from outside.
 pub struct Gpio {
     state: Arc<Mutex<State>>,
     answers: Receiver<String>,
@@ -39,16 +39,16 @@ pub struct Gpio {
 
 struct State {
     socket: UnixStream,
-    /// For each command without its answer yet: whether somebody wants that.
+    /// For each command without an answer yet: whether the answer is needed.
     asked: VecDeque<bool>,
-    /// Every level that each output took on, in order.
+    /// All levels of each output, in order.
     edges: Vec<Vec<bool>>,
     trigger: Option<Trigger>,
 }
 
 impl Gpio {
-    /// Meets an emulator that is starting. Its messages have to be read all the time:
-    /// it waits while they are not.
+    /// Connects to an emulator that is starting. Its messages must be read all the time, because it waits for the
+    /// reader.
     pub fn connect(path: &Path) -> Result<Gpio, String> {
         let until = Instant::now() + START_TIMEOUT;
         let socket = loop {
@@ -69,7 +69,7 @@ impl Gpio {
         Ok(gpio)
     }
 
-    /// The level of a line, whoever drives it.
+    /// The level of a line, whatever drives it.
     pub fn level(&self, line: usize) -> Result<bool, String> {
         let answer = self.ask(&format!("readl {:#x}", register(LEVEL, line)))?;
         let levels = answer.trim().trim_start_matches("0x");
@@ -82,9 +82,9 @@ impl Gpio {
         self.ask(&write_command(line, level)).map(drop)
     }
 
-    /// Forgets edges and trigger.
+    /// Forgets the edges and the trigger.
     pub fn clear(&self) -> Result<(), String> {
-        // An answer comes after every edge before it.
+        // An answer comes after all edges before it.
         self.level(0)?;
         let mut state = self.lock();
         state.edges.iter_mut().for_each(Vec::clear);
@@ -92,13 +92,13 @@ impl Gpio {
         Ok(())
     }
 
-    /// The levels that an output took on since they were cleared.
+    /// The levels of an output since the last clear.
     pub fn edges(&self, line: usize) -> Result<Vec<bool>, String> {
         self.level(0)?;
         Ok(self.lock().edges[line].clone())
     }
 
-    /// From now on, until it has happened.
+    /// Sets the trigger. It works once.
     pub fn set_trigger(&self, trigger: Trigger) {
         self.lock().trigger = Some(trigger);
     }
@@ -138,7 +138,7 @@ impl State {
     }
 }
 
-/// Until the emulator ends.
+/// Reads until the emulator ends.
 fn drain(messages: BufReader<UnixStream>, state: &Mutex<State>, answers: &Sender<String>) {
     for message in messages.lines() {
         let Ok(message) = message else { return };
@@ -163,7 +163,7 @@ fn write_command(line: usize, level: bool) -> String {
     format!("writel {:#x} {:#x}", register(first, line), 1u32 << (line % 32))
 }
 
-/// Each register has 32 lines; the next one has the rest.
+/// Each register has 32 lines. The next register has the remaining lines.
 fn register(first: u32, line: usize) -> u32 {
     if line < 32 { first } else { first + 4 }
 }

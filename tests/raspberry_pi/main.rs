@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Pinion on a Raspberry Pi 3: the tests of `tests/raspberry_pi/guest`, run against the real
-//! driver of its GPIO chip on an emulated Pi. docs/develop/test-raspberry-pi.md tells how to use it.
+//! Pinion on a Raspberry Pi 3. It runs the tests of `tests/raspberry_pi/guest` against the real driver of the GPIO chip
+//! on an emulated Pi. docs/develop/test-raspberry-pi.md explains its use.
 //!
-//! This is the host's side, a test harness of its own. It builds for arm64 and plays
-//! the world outside of the pins, as the tests ask for it over the console.
+//! This is the computer's side, a separate test harness. It builds for arm64. It simulates the world outside the pins,
+//! as the tests request over the console.
 
 mod cross;
 mod debian;
@@ -33,19 +33,19 @@ Options:
   --nocapture        Show the output of tests that pass, too
   --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
 
-/// A failed run exits as libtest's do.
+/// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
 #[derive(Default)]
 struct Options {
-    /// For libtest in the guest.
+    /// Filters for libtest in the guest.
     filters: Vec<String>,
     show_output: bool,
     shell: bool,
 }
 
 impl Options {
-    /// Exits on a mistake, and for `--help`.
+    /// Exits after an error, and for `--help`.
     fn from_args() -> Options {
         let mut options = Options::default();
         let mut args = env::args().skip(1);
@@ -80,7 +80,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Whether every test passed; an error is the suite's own failure.
+/// Whether every test passed. An error is the suite's own failure.
 fn run(options: &Options) -> Result<bool, String> {
     let cache = Cache::open()?;
     let sysroot = Sysroot::prepare(&cache)?;
@@ -104,13 +104,13 @@ fn add_filters(archive: &mut Archive, filters: &[String]) {
     archive.file("/tests/filters", lines.as_bytes());
 }
 
-/// Until the last test has ended. An error says what became of the VM.
+/// Runs until the last test has ended. An error describes the end of the VM.
 fn follow(vm: &mut Vm, report: &mut Report, show_output: bool) -> Result<(), String> {
     loop {
         match vm.next()? {
             News::Planned(tests) => report.plan(tests),
             News::Ended { test, status, output } => {
-                // A name that the program does not know is a success to libtest.
+                // libtest reports success for a name that the program does not know.
                 let passed = status == "0" && output.contains("test result: ok. 1 passed;");
                 report.test(test, passed, &output, show_output)?;
             }
@@ -119,7 +119,7 @@ fn follow(vm: &mut Vm, report: &mut Report, show_output: bool) -> Result<(), Str
     }
 }
 
-/// What the run prints, in libtest's form.
+/// The output of the run, in libtest's form.
 struct Report {
     started: Instant,
     planned: Vec<String>,
@@ -150,7 +150,7 @@ impl Report {
         Ok(())
     }
 
-    /// Prints the rest. Whether there were tests and all have passed.
+    /// Prints the rest. Returns whether there were tests and all have passed.
     fn finish(mut self, outcome: Result<(), String>, vm: &Vm) -> bool {
         let ended = self.passed + self.failures.len();
         let cause = match outcome {

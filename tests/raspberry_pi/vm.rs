@@ -16,42 +16,41 @@ use super::gpio::{Gpio, LINES, Trigger};
 use pinion_testkit::cache::Cache;
 use pinion_testkit::process;
 
-/// Longer than a test may take, and longer than a boot on a busy computer.
+/// Longest silence: more than a test, or a boot on a busy computer, takes.
 const SILENCE_MAX: Duration = Duration::from_secs(240);
 
-/// The guest's time: an instruction takes 4 ns, and `init.sh` keeps the guest from idling,
-/// so that nothing else passes the time. When the host stops the emulator, the guest's time
-/// stops, too. By the host's clock, steps would often be too late, and homing would end for
-/// want of news.
+/// The guest's time: an instruction takes 4 ns. `init.sh` keeps the guest from idling, so nothing else advances the
+/// time. When the computer stops the emulator, the guest's time stops too. By the computer's clock, steps would often
+/// be too late, and homing would end because no news arrives.
 const TIME: [&str; 2] = ["-icount", "shift=2"];
 
-/// What the guest's init and tests write begins with it: see `init.sh` and
-/// `guest/outside.rs`. Everything else on the console is somebody's output.
+/// The start of each message from the guest's init and tests: see `init.sh` and `guest/outside.rs`. Everything else on
+/// the console is other output.
 const MARK: &str = "raspberry-pi: ";
 
-/// A panic is not followed by silence. The kernel keeps quiet otherwise: its words
-/// would stand in the middle of the tests'.
+/// A panic is not followed by silence. Otherwise the kernel prints nothing: its messages would be in the middle of the
+/// tests' messages.
 const COMMAND_LINE: &str = "console=ttyS1,115200 loglevel=1 panic=-1 cryptomgr.notests";
 
-/// What the guest has come to.
+/// The progress of the guest.
 pub enum News {
-    /// The tests that it is going to run.
+    /// The tests that it will run.
     Planned(Vec<String>),
-    /// A test's exit status, and what it printed.
+    /// A test's exit status, and its output.
     Ended { test: String, status: String, output: String },
     /// The last test has ended.
     Done,
 }
 
-/// A running VM; it ends when this is dropped.
+/// A running VM. It ends when this is dropped.
 pub struct Vm {
     qemu: Child,
     gpio: Gpio,
     input: ChildStdin,
     lines: Receiver<String>,
-    /// All that it has printed.
+    /// The whole console output.
     console: String,
-    /// Since the test began.
+    /// The output since the test began.
     output: String,
     folder: TempDir,
 }
@@ -89,8 +88,7 @@ impl Vm {
         }
     }
 
-    /// Does what the guest asks for until it has news. An error says what became of
-    /// the VM.
+    /// Carries out the guest's requests until there is news. An error describes the end of the VM.
     pub fn next(&mut self) -> Result<News, String> {
         loop {
             let line = self.lines.recv_timeout(SILENCE_MAX).map_err(|error| match error {
@@ -99,7 +97,7 @@ impl Vm {
             })?;
             self.console += &line;
             self.console.push('\n');
-            // A test may have printed something before that ends without a new line.
+            // A test may have printed text before this without a new line.
             let Some((before, words)) = line.split_once(MARK) else {
                 self.output += &line;
                 self.output.push('\n');
@@ -128,13 +126,13 @@ impl Vm {
         }
     }
 
-    /// All that the guest and the emulator have said.
+    /// The whole output of the guest and the emulator.
     pub fn console(&self) -> String {
         let emulator = fs::read_to_string(self.folder.path().join("qemu")).unwrap_or_default();
         format!("--- console\n{}--- emulator\n{emulator}", self.console)
     }
 
-    /// A wish of a test, and the answer to it.
+    /// Carries out a test's request, and returns the answer.
     fn obey(&self, words: &[&str]) -> Result<String, String> {
         let misunderstood = || format!("the guest asked for {words:?}");
         let number = |word: &str| word.parse::<usize>().map_err(|_| misunderstood());
@@ -179,7 +177,7 @@ pub fn shell(sysroot: &Sysroot, initramfs: &[u8], cache: &Cache) -> Result<(), S
     qemu.wait().map(drop).map_err(|error| error.to_string())
 }
 
-/// The VM that every run has, save for its console: the second serial port.
+/// The common VM of all runs, without its console: the second serial port.
 fn command(sysroot: &Sysroot, initramfs: &[u8], folder: &Path, more: &str) -> Result<Command, String> {
     let root = folder.join("initramfs");
     fs::write(&root, initramfs).map_err(|error| format!("cannot write {}: {error}", root.display()))?;
@@ -198,7 +196,7 @@ fn command(sysroot: &Sysroot, initramfs: &[u8], folder: &Path, more: &str) -> Re
     Ok(command)
 }
 
-/// The console's lines, read as they come.
+/// The console's lines, read when they arrive.
 fn follow(output: ChildStdout) -> Receiver<String> {
     let (sender, lines) = channel();
     thread::spawn(move || -> io::Result<()> {

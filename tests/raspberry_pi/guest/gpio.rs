@@ -15,7 +15,7 @@ use super::program::Pinion;
 const OUTPUT: u32 = 22;
 const INPUT: u32 = 24;
 
-/// Waits for what another process does.
+/// Waits for the result of another process.
 fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let end = Instant::now() + Duration::from_secs(10);
     while !condition() {
@@ -24,7 +24,7 @@ fn until(what: &str, mut condition: impl FnMut() -> bool) {
     }
 }
 
-/// One output with these levels at its beginning and in a shutdown.
+/// One output with these initial and shutdown levels.
 fn configure(client: &mut Client, value: u8, default_value: u8) -> u8 {
     let mut config = Config::default();
     let oid = config.oid().unwrap();

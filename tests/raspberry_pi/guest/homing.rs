@@ -12,12 +12,12 @@ const STEP: u32 = 17;
 const DIR: u32 = 18;
 const ENDSTOP: u32 = 24;
 
-/// Slow enough for the outside to close the endstop between two steps.
+/// Slow enough that the outside can close the endstop between two steps.
 const STEPS_PER_S: f64 = 100.0;
-/// Puts the steps in the middle between the endstop's samples, which begin with the move:
-/// the n-th step comes after n + 12.5 of their intervals.
+/// Puts the steps in the middle between the endstop's samples, which begin with the move. The n-th step comes after n +
+/// 12.5 of their intervals.
 const STEPS_PER_S2: f64 = 400.0;
-/// Steps by which the outside may be late where other programs keep the processor.
+/// Highest number of steps by which the outside may be late when other programs use the processor.
 const LATE_MAX: i64 = 10;
 const PULSE_S: f64 = 0.000_002;
 

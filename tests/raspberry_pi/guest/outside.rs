@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The world outside of the Pi's pins, which the host plays: it sees outputs change
-//! and drives inputs. It is asked over the console, one line for each wish and one for
-//! the answer.
+//! The world outside the Pi's pins, simulated by the computer: it sees outputs change and drives inputs. Requests go
+//! over the console, with one line for each request and one for the answer.
 
 use std::fs::{File, OpenOptions};
 use std::io::{BufRead, BufReader, Write};
@@ -9,7 +8,7 @@ use std::path::Path;
 
 const CONSOLE: &str = "/dev/ttyS1";
 
-/// The host's end of every line.
+/// The computer's end of every line.
 pub struct Outside {
     to: File,
     from: BufReader<File>,
@@ -22,7 +21,7 @@ impl Outside {
         Outside { to: open(), from: BufReader::new(open()) }
     }
 
-    /// The level of a line, whoever drives it.
+    /// The level of a line, whatever drives it.
     pub fn level(&mut self, line: u32) -> bool {
         match self.ask(&format!("level {line}")).as_str() {
             "0" => false,
@@ -37,16 +36,14 @@ impl Outside {
         assert_eq!(answer, "ok");
     }
 
-    /// Drives an input as soon as an output has risen so many times, counted from the
-    /// test's beginning.
+    /// Drives an input as soon as an output has risen this many times since the test's beginning.
     pub fn drive_after(&mut self, line: u32, level: bool, count: usize, watched: u32) {
         let level = u8::from(level);
         let answer = self.ask(&format!("drive {line} {level} after {count} rises of {watched}"));
         assert_eq!(answer, "ok");
     }
 
-    /// Every level that an output took on since the test began, as digits. The level
-    /// that it was given while it became an output is not among them.
+    /// All levels of an output since the test began, as digits, without its level when it became an output.
     pub fn edges(&mut self, line: u32) -> String {
         self.ask(&format!("edges {line}"))
     }

@@ -10,14 +10,14 @@ use pinion_client::Client;
 
 const LINK: &str = "/tmp/tty";
 const LOG: &str = "/tmp/log";
-/// How long the client waits for Pinion.
+/// Timeout of the client.
 const CLIENT_TIMEOUT: Duration = Duration::from_secs(20);
 
-/// A running `pinion`, ended on drop. What it logged is printed then.
+/// A running `pinion`, ended on drop. Its log is printed then.
 pub struct Pinion(Child);
 
 impl Pinion {
-    /// As it runs on a printer: in real time.
+    /// Starts it in real time, as on a printer.
     pub fn start() -> Pinion {
         let _ = fs::remove_file(LINK);
         let log = File::create(LOG).expect("the log");
@@ -29,7 +29,7 @@ impl Pinion {
         Client::connect(Path::new(LINK), CLIENT_TIMEOUT).expect("a micro-controller")
     }
 
-    /// With SIGKILL.
+    /// Kills it with SIGKILL.
     pub fn kill(&mut self) {
         self.0.kill().expect("a running program");
         self.0.wait().expect("its end");
