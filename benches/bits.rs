@@ -231,8 +231,8 @@ struct Core {
     messages: [u64; 2],
 }
 
-/// Runs `steppers` steppers of 10,000 steps a second each as the core runs them. Each step takes 2 us. With `with_bits` there
-/// is a timer for each bit too, as in the firmware.
+/// Runs `steppers` steppers of 10,000 steps a second each as the core runs them. Each step takes 2 us. With `with_bits`
+/// there is a timer for each bit too, as in the firmware.
 fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> Core {
     let scheduling = realtime::enter(Role::Core);
     let processors = Processors::new(None).expect("the processors");

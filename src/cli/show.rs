@@ -210,8 +210,8 @@ fn picture(items: &[Item], paint: bool) -> Vec<String> {
     lines
 }
 
-/// The lowest rows of a terminal, outside the part that scrolls (DECSTBM of the VT100, which every terminal of today
-/// has).
+/// The lowest rows of a terminal, outside the part that scrolls. Every terminal of today has DECSTBM of the VT100 for
+/// that.
 #[derive(Default)]
 struct Screen {
     /// The terminal's rows, and how many of them are the picture's. Both are 0 before the first picture.

@@ -22,8 +22,8 @@ pub(super) enum Class {
 }
 
 /// The SCHED_FIFO running time that the core has left on a processor, kept as a bucket. It fills at a share of real
-/// time, and drains while the core runs as SCHED_FIFO. So in any period of the kernel the core runs for at most that
-/// share and one full bucket, wherever the period begins.
+/// time, and drains while the core runs as SCHED_FIFO. So the core runs for at most that share and one full bucket in
+/// any period of the kernel. It does not matter when the period begins.
 #[derive(Debug)]
 pub(super) struct Budget {
     class: Class,

@@ -66,8 +66,8 @@ const FAR_TICKS: i64 = (BEAT.as_nanos() / NS_PER_TICK as u128) as i64;
 /// Work that can wait is done only if no timer is due within this span. To wake the link takes some microseconds. To
 /// tell a part of the status takes one, or several if nothing of it is in the cache.
 const SOON: Ticks = Ticks::from_us(30);
-/// A core that waits for a bus wakes the link for the finished blocks only if at most this many requests wait. To
-/// acknowledge each block costs as much as to run it.
+/// Highest number of waiting requests at which a core held by a bus wakes the link for finished blocks. To acknowledge
+/// each block costs as much as to run it.
 const FEW: usize = 3;
 /// How long the core polls for the next command before it sleeps. Hosts send in bursts. A wake-up takes as long: 20 to
 /// 50 us on the computers measured.

@@ -15,7 +15,7 @@ use super::core::Payload;
 use super::pty::Pty;
 use super::status::HostBoard;
 
-/// What a shell writes to the pty to stop the MCU, as in Klipper's service file.
+/// The text that a shell writes to the pty to stop the MCU, as in Klipper's service file.
 const FORCE_SHUTDOWN: &[u8] = b"FORCE_SHUTDOWN\n";
 /// Highest number of bytes read from the pty and not yet taken in.
 const INPUT_BYTES: usize = 4096;

@@ -289,8 +289,8 @@ impl Link {
         self.request(Request::Speak(dialect));
     }
 
-    /// Takes in the blocks that were read. True if they have to wait for the host's dialect, or because the core has no
-    /// room for all of them.
+    /// Takes in the blocks that were read. True if they have to wait: for the host's dialect, or for room in the core's
+    /// ring.
     fn take_in(&mut self) -> bool {
         if self.is_finding() {
             return true;

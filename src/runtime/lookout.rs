@@ -3,7 +3,7 @@
 //!
 //! A wake-up takes 20 to 50 us on the computers measured. Most answers of a bus take less. So the core polls for an
 //! answer, and a worker polls for the next question. With a single processor nothing polls, because the other thread
-//! needs that processor. Polling is rationed. So an endless conversation takes no processor from the host, and does not
+//! needs that processor. Polling is rationed. So an endless conversation takes no processor from the host. Nor does it
 //! use up the time that the kernel allows real-time threads.
 
 #![forbid(unsafe_code)]
@@ -92,7 +92,7 @@ mod tests {
 
     proptest! {
         #![proptest_config(ProptestConfig::with_cases(64))]
-        /// In any second, it polls for at most a quarter of the time and one ration, whatever the conversation is like.
+        /// In any second, any conversation polls for at most a quarter of the time and one ration.
         #[test]
         fn polling_is_rationed(turns in proptest::collection::vec((0u64..20_000, 1u64..20_000), 1..20)) {
             let mut lookout = Lookout::new(true, Clock::from_ticks(0));

@@ -57,8 +57,8 @@ impl LinkWake {
     /// Then no wake-up is lost. If this swap comes first, the core's swap in [`LinkWake::wake`] finds the link asleep
     /// and wakes it. If the core's swap comes first, this swap reads the value that it left. So the look that follows
     /// sees all that the core wrote before its swap. A plain store would read nothing, and the second case would not
-    /// hold. The link could then look before the core's response becomes visible, and go to sleep although the core
-    /// found it awake.
+    /// hold. The link could then look before the core's response becomes visible. It would go to sleep although the
+    /// core found it awake.
     pub(super) fn sleeping(&self) {
         self.asleep.swap(true, Ordering::SeqCst);
     }
@@ -76,12 +76,13 @@ impl LinkWake {
     }
 }
 
-/// How many of the host's blocks the core has begun and finished, and how many stop requests the link has handed to it.
-/// The counts wrap around.
+/// How many of the host's blocks the core has begun and finished. Also how many stop requests the link has handed to
+/// it. The counts wrap around.
 ///
-/// They give a response the sequence number of the block that it answers. klippy takes a response for the answer to a
-/// query only if its number says that the query had been received (`#sent_time` in serialhdl.py). If numbers ran ahead
-/// of the core, a late answer to an earlier query of the same name would pass for the present answer.
+/// They give a response the sequence number of the block that it answers. klippy checks the number of a response before
+/// it takes it for the answer to a query. The number must say that the query had been received (`#sent_time` in
+/// serialhdl.py). Numbers must not run ahead of the core. Otherwise a late answer to an earlier query of the same name
+/// would pass for the present answer.
 #[derive(Debug, Default)]
 pub(super) struct Progress {
     begun: AtomicU32,

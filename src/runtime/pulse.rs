@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Signs of life, in a page of memory that the program and the guardian share. The page has the core's heartbeat, the
-//! shutdown values that the MCU owes, each worker's present job, and the guardian's own sign.
+//! Signs of life, in a page of memory that the program and the guardian share. The page has the core's heartbeat, and
+//! the guardian's own sign. It also has the shutdown values that the MCU owes, and each worker's present job.
 //!
 //! A beat is the instant at which it was given. So a listener knows when silence began, and need not look more often
 //! than silence may last. The core sets that limit with each beat. It is about half a second while the MCU runs
-//! ([`RUNNING`]), and half a minute otherwise ([`IDLE`]). Then opening a device or ending a worker may take its time,
-//! and the outputs are at their start or shutdown values.
+//! ([`RUNNING`]), and half a minute otherwise ([`IDLE`]). Otherwise the outputs are at their start or shutdown values.
+//! Opening a device or ending a worker may then take its time.
 //!
 //! At a shutdown, workers write some of the outputs. Until they have done so, the MCU owes these shutdown values
 //! ([`Pulse::owe`]). Meanwhile its beats do not count. After [`STOPPING`] the guardian takes over, as it does for a
@@ -38,8 +38,8 @@ const STOPPING: Duration = Duration::from_secs(1);
 pub(super) const BEAT: Duration = Duration::from_millis(300);
 /// How long the guardian may be silent while it holds outputs. It leaves a sign every [`RUNNING`].
 const GUARDIAN: Duration = Duration::from_secs(2);
-/// Shortest standstill after which a running MCU is stopped. Shorter ones are left to the limits that the host set
-/// (max_duration) and to the limits of late timers and steps.
+/// Shortest standstill after which a running MCU is stopped. The host's limits (max_duration) and the limits of late
+/// timers and steps handle shorter ones.
 const STANDSTILL: Duration = Duration::from_secs(1);
 
 /// Instants in the page are counted in 2^16 ticks, 1.3 ms: they wrap after 65 days.

@@ -52,7 +52,7 @@ const NICE: i32 = -20;
 /// The guardian stands above the core, so that it still runs if the core takes all of the processor.
 const GUARDIAN_PRIORITY: i32 = 50;
 /// MCL_ONFAULT (linux/mman.h): pages are locked when they are touched. Without it all pages of the libraries that
-/// libiio needs would be locked, which are 40 MB.
+/// libiio needs would be locked: 40 MB.
 const MCL_ONFAULT: i32 = 4;
 /// How much stack is touched: more than any of our threads uses.
 const STACK_BYTES: usize = 256 * 1024;

@@ -33,8 +33,8 @@ pub(super) struct Signals(SignalDelivery<UnixStream, SignalOnly>);
 impl Signals {
     /// Catches the signals that the program knows, so that they do not end it.
     pub(super) fn new() -> io::Result<Signals> {
-        // These would stop the program and leave heaters as they are. Ctrl-Z does that. So does a background program
-        // that reads from its terminal, or writes a log line to a terminal that allows none.
+        // These would stop the program and leave heaters as they are. Ctrl-Z sends one. A background program gets one
+        // if it reads from its terminal, or writes to a terminal that allows no output.
         for stop in [SIGTSTP, SIGTTIN, SIGTTOU] {
             sys::ignore(stop)?;
         }
@@ -65,8 +65,8 @@ impl Signals {
     }
 }
 
-/// SIGHUP, unless the program was started with it ignored, as by nohup(1). A program that registers it anyway would be
-/// ended by it. This is true only while nobody has registered it since the start.
+/// SIGHUP, unless the program was started with it ignored, as by nohup(1). Registering an ignored SIGHUP would let it
+/// end the program. The answer is right as long as nobody has done so.
 ///
 /// # Errors
 ///

@@ -76,8 +76,8 @@ impl Margin {
         Ticks((self.fine / FINE) as u32)
     }
 
-    /// Learns from a wake-up that came `late` after its time. The margin grows by a step if it did not cover the
-    /// wake-up, and shrinks by a fiftieth of a step if it did. The two balance where one wake-up in fifty is later.
+    /// Learns from a wake-up that came `late` after its time. If the margin did not cover it, the margin grows by a
+    /// step. Otherwise it shrinks by a fiftieth of a step. The two balance where one wake-up in fifty is later.
     pub fn learn(&mut self, late: i64) {
         let present = self.fine / FINE;
         // Steps are in proportion to the margin: quick to follow a load, fine without one.

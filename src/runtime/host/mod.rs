@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Finds the dialect that the host speaks, from the process that has the pty open and the sources that it runs from.
+//! Finds the dialect that the host speaks. It looks for the process that has the pty open, and for its sources.
 //!
-//! That takes capabilities that open every file and every process of the computer, and it reads files that a host has
+//! That takes capabilities that open every file and every process of the computer. And it reads files that a host has
 //! written. So a process of its own does it, forked before the program has threads. That process keeps only these
 //! capabilities. Its only descriptor is the socket to the program. The kernel lets it read files and nothing more
 //! (`sys/filter.rs`). It gets a terminal's number. It answers with a dialect, the host that it found, and lines for the

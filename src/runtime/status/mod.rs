@@ -2,7 +2,7 @@
 //! Answers `pinion status` on a socket in the file system.
 //!
 //! A thread of its own serves the socket (`socket.rs`). It sends one JSON document (`crate::status`) to each client and
-//! reads nothing. For the MCU's part it sends the core an empty [`Snapshot`] through a ring, and looks for its return
+//! reads nothing. For the MCU's part it sends the core an empty [`Snapshot`] through a ring. It looks for its return
 //! every few milliseconds. The core is not woken. It fills in the snapshot when it next passes by with no timer near.
 //! So an answer may take as long as the core's nap. It costs the core one look at the ring each time that it is idle
 //! anyway.
