@@ -2,8 +2,8 @@
 //! A host in the booted system. The checks start it as klippy's user:
 //!
 //! ```text
-//! host identify LINK [PIN]   tells the version, and fails if there is no such pin
-//! host light LINK PIN        switches a heater on, says "lit" and refreshes it until it is killed
+//! host identify LINK [PIN]   prints the version, and fails if there is no such pin
+//! host light LINK PIN        switches a heater on, prints "lit" and refreshes it until it is killed
 //! host home LINK             homes an axis until the endstop, which the check closes, triggers
 //! host ask SOCKET METHOD PARAMS POINTER
 //!                            asks klippy over its API socket (docs/API_Server.md of Klipper), and prints

@@ -98,8 +98,8 @@ impl Console {
     ///
     /// # Errors
     ///
-    /// An error in the line, a shutdown of the MCU, a command that the MCU refuses because it is shut down, or an MCU
-    /// that no longer answers.
+    /// An error in the line, or a shutdown of the MCU. Also a command that the stopped MCU refuses, or an MCU that no
+    /// longer answers.
     pub fn line(&mut self, line: &str, print: &mut dyn FnMut(&str)) -> Result<Next, String> {
         let line = line.trim();
         let mut words = line.split_ascii_whitespace();

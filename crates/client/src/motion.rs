@@ -529,7 +529,7 @@ fn no_news() -> Error {
 }
 
 /// Starts a trsync that stops a stepper when it is triggered. It reports every `report_ticks` from `start` on. It
-/// triggers by itself at `expire`, unless the host sets `expire` anew.
+/// triggers by itself at `expire`, unless the host sets `expire` again.
 fn arm(
     client: &mut Client,
     stepper: Stepper,

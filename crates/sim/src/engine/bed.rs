@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The bed, and where the head is over it.
+//! The bed, and the position of the head over it.
 //!
 //! Motors hold a cartesian printer's gantry, or its bed, each at its own place. A delta's nozzle hangs on three
 //! carriages. In both cases the distance to the bed follows from the positions of the motors.

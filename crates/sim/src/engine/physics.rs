@@ -17,7 +17,7 @@ use crate::description::heater::{FanConfig, HeaterConfig};
 use crate::description::thermistor::Thermistor;
 use pinion_firmware::time::Clock;
 
-/// A stepper motor and what it moves.
+/// A stepper motor and its axis.
 #[derive(Debug)]
 pub struct Axis {
     pub name: String,
@@ -360,12 +360,11 @@ impl Fan {
     }
 }
 
-/// A light, or anything else that is on or off.
+/// A light, or another output that is on or off.
 #[derive(Debug)]
 pub struct Lamp {
     pub name: String,
-    /// The time of the last change, whether it is on, the time when it was last switched on, and the share of time that
-    /// it is on.
+    /// The time of the last change, whether it is on, when it was last switched on, and its share of time on.
     state: Together<4>,
 }
 

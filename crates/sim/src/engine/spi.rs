@@ -101,7 +101,7 @@ struct Socket {
 struct Trace {
     path: PathBuf,
     file: File,
-    /// Outputs whose levels are recorded at each byte.
+    /// Outputs with levels that are recorded at each byte.
     pins: Vec<(String, Arc<Lamp>, bool)>,
 }
 

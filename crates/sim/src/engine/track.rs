@@ -67,7 +67,7 @@ impl Track {
     }
 }
 
-/// The track's answer for one step. As far behind as possible, at the place where the writer works.
+/// The track's answer for one step.
 pub(crate) enum Recorded {
     Step(Clock, i64),
     NotYet,
@@ -95,7 +95,7 @@ mod tests {
                             assert_eq!((at.ticks(), position), (next, -(next as i64)));
                             (next, read) = (next + 1, read + 1);
                         }
-                        // As far behind as can be, where the writer is at work.
+                        // As far behind as possible, at the place where the writer works.
                         Recorded::Overwritten => {
                             next = track.next().saturating_sub(KEPT as u64);
                             lost += 1;

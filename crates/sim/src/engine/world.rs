@@ -9,7 +9,7 @@ use super::physics::{Axis, Fan, Heater, Lamp};
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::Clock;
 
-/// What a person would see of a part.
+/// A person's view of a part.
 pub(crate) trait Sight: Send + Sync {
     /// The name of the part.
     fn name(&self) -> &str;

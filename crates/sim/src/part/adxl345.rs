@@ -284,7 +284,7 @@ impl Adxl345 {
         let due = (elapsed / sampling.period_ticks) as u64;
         let (room, replaces) = self.room();
         if due - sampling.taken > 2 * room as u64 && replaces {
-            // Skip the samples that nobody will see.
+            // Skip the samples that the host will never read.
             sampling.taken = due - room as u64 - 1;
             self.overrun = true;
             self.feel(sampling.instant(sampling.taken));
@@ -584,7 +584,7 @@ mod tests {
             // Full resolution.
             (0x08, 256),
             (0x0b, 256),
-            // Justified to the left: 10 and 13 bits of 16.
+            // Left-justified: 10 and 13 bits of 16.
             (0x04, 256 << 6),
             (0x0f, 256 << 3),
         ] {
@@ -602,7 +602,7 @@ mod tests {
         bench.measure(0x90);
         bench.wait(TURN_ON_S);
         let start = bench.clock.now().ticks();
-        // Twenty steps at the pace of 4000 a second, a rest, and back.
+        // Twenty steps at 4000 steps per second, a rest, and back.
         let steps: Vec<f64> = (0..40).map(|n| f64::from(n) / 4000.0 + if n < 20 { 0.01 } else { 0.1 }).collect();
         let delay_s = DELAY_TICKS as f64 / f64::from(CLOCK_FREQ);
         // Euler's method in small steps. The mean acceleration of each period is the difference of the speeds.

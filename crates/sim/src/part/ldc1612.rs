@@ -219,7 +219,7 @@ struct Ldc1612 {
     clock: Arc<dyn TimeSource>,
     intb: Arc<ReadyLine>,
     conversions: Conversions,
-    /// Number of conversions whose data was read.
+    /// Number of conversions that were read.
     read: u64,
     /// By address.
     registers: [u16; 128],

@@ -46,7 +46,7 @@ impl CellConfig {
         Ok(())
     }
 
-    /// The keys of a section whose cell is calibrated.
+    /// The keys of a section with a calibrated cell.
     pub(crate) fn calibration(&self, cfg: &mut Sections) {
         cfg.key("counts_per_gram", self.counts_per_gram);
         let tare = self.zero_counts + self.weight_g * self.counts_per_gram;

@@ -105,7 +105,7 @@ pub struct Tmc2209Config {
     /// Its address, 0 to 3, by MS1 and MS2.
     #[serde(default)]
     pub address: u8,
-    /// The axis whose motor it drives.
+    /// The axis with the motor that it drives.
     pub axis: String,
     /// DIAG: high while the motor is stalled.
     pub diag_pin: Option<PinName>,
@@ -448,7 +448,7 @@ mod tests {
             let next = (u32::from(whole[(place / 10) as usize]) << 1 | 0x200) >> (place % 10) & 1 != 0;
             if next != level {
                 edges += 1;
-                // A start bit sets the clock anew. Each edge of a byte is at most this far off relative to it.
+                // A start bit restarts the clock. Each edge of a byte is at most this far off relative to it.
                 let off = if place < 5 || place % 10 == 0 { 0 } else { [40i64, -40, 20][(edges % 3) as usize] };
                 let at = (begin + place * BIT).wrapping_add_signed(off * BIT as i64 / 100);
                 bench.pin.drive(next, Clock::from_ticks(at));

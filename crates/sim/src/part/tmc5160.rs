@@ -152,7 +152,7 @@ pub struct Tmc5160Config {
     pub bus: String,
     /// Low selects the chip. Without this pin it is the only chip on its bus.
     pub select_pin: Option<PinName>,
-    /// The axis whose motor it drives.
+    /// The axis with the motor that it drives.
     pub axis: String,
     /// DIAG1, an open drain with a pull-up resistor: low while the motor is stalled.
     pub diag1_pin: Option<PinName>,

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! GPIO chips as the kernel simulates them.
+//! GPIO chips, simulated by the kernel.
 
 use std::io::Read;
 use std::thread;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Tests of the suite itself: each kernel driver and mock does the things that the tests of Pinion need.
+//! Tests of the suite itself: each kernel driver and mock does what the tests of Pinion need.
 
 mod adc;
 mod can;
