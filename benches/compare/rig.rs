@@ -222,5 +222,5 @@ fn separate(dir: &Path) -> Result<(), String> {
         mount(Some(&sys), "/sys/bus", none, MsFlags::MS_BIND, none)?;
         Ok(())
     };
-    done().map_err(|error| format!("a private /dev and /sys can not be made: {error}"))
+    done().map_err(|error| format!("a private /dev and /sys cannot be made: {error}"))
 }

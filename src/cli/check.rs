@@ -146,11 +146,11 @@ fn group(name: Option<&str>) -> Finding {
         0 => "choose another group, such as tty".to_owned(),
         _ => format!("sudo usermod -aG {wanted} {}, and log in anew", user_name()),
     };
-    let what = format!("the terminal can not be given to the group {wanted}, of which this user is no member");
+    let what = format!("the terminal cannot be given to the group {wanted}, of which this user is no member");
     match name {
         Some(_) => Finding::error("group", what, remedy),
         // The program then continues with the user's own group.
-        None => Finding::warning("group", format!("{what}: a klippy of another user can not open it"), remedy),
+        None => Finding::warning("group", format!("{what}: a klippy of another user cannot open it"), remedy),
     }
 }
 

@@ -116,7 +116,7 @@ fn free(pty: &Path) -> Result<(), String> {
             pty.display()
         )),
         Ok(Search::Nobody) => Ok(()),
-        Err(error) => Err(format!("who has {} open can not be found out: {error}", pty.display())),
+        Err(error) => Err(format!("who has {} open cannot be found out: {error}", pty.display())),
     }
 }
 
@@ -130,7 +130,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     let hang_up = runtime::hang_up().map_err(|error| error.to_string())?;
     for ending in [SIGINT, SIGTERM].into_iter().chain(hang_up) {
         signal_hook::flag::register_usize(ending, signal.clone(), ending.unsigned_abs() as usize)
-            .map_err(|error| format!("signals can not be taken in: {error}"))?;
+            .map_err(|error| format!("signals cannot be taken in: {error}"))?;
     }
     // The lines about each event are for a service.
     log::set_max_level(log::max_level().min(LevelFilter::Warn));
@@ -167,7 +167,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
                 }
             });
             if let Err(error) = speaking {
-                log::error!("the console can not be started: {error}");
+                log::error!("the console cannot be started: {error}");
             }
         }
     };
@@ -179,7 +179,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     said.unwrap_or_else(|| {
         logging::finish();
         let signal = signal.load(Ordering::Relaxed).try_into().unwrap_or_default();
-        Err(format!("a signal ended it, which can not be passed on: {:?}", emulate_default_handler(signal)))
+        Err(format!("a signal ended it, which cannot be passed on: {:?}", emulate_default_handler(signal)))
     })
 }
 
@@ -213,7 +213,7 @@ fn speak(args: &ConsoleArgs, pty: &Path) -> Result<(), String> {
 /// Carries the lines out, up to the first that fails.
 fn script(mut console: Console, lines: impl BufRead) -> Result<(), String> {
     for (number, line) in (1..).zip(lines.lines()) {
-        let line = line.map_err(|error| format!("line {number} can not be read: {error}"))?;
+        let line = line.map_err(|error| format!("line {number} cannot be read: {error}"))?;
         let told = &mut |line: &str| drop(print(&one(line)));
         if !line.trim().is_empty() {
             told(&format!("{PROMPT}{}", line.trim()));

@@ -52,7 +52,7 @@ fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
 
 fn put(args: &DictArgs, json: &[u8]) -> Result<(), String> {
     match &args.output {
-        Some(path) => fs::write(path, json).map_err(|error| format!("{} can not be written: {error}", path.display())),
+        Some(path) => fs::write(path, json).map_err(|error| format!("{} cannot be written: {error}", path.display())),
         None => print(&Page::json(&String::from_utf8_lossy(json))),
     }
 }

@@ -43,7 +43,7 @@ pub(super) fn run(args: &LatencyArgs) -> ExitCode {
     let verdict = judge(&halves, scheduling);
     let drawn = args.svg.as_ref().map_or(Ok(()), |path| {
         fs::write(path, draw(&halves, verdict.fitness))
-            .map_err(|error| format!("{} can not be written: {error}", path.display()))
+            .map_err(|error| format!("{} cannot be written: {error}", path.display()))
     });
     print(&Page::text(&report(&halves, &verdict))).and(drawn).map_or_else(failed, |()| ExitCode::SUCCESS)
 }

@@ -70,7 +70,7 @@ pub(super) fn aligned(rows: &[Vec<String>]) -> Vec<String> {
 /// work.
 pub(super) fn print(page: &Page) -> Result<(), String> {
     match draw(&page.0) {
-        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout can not be written: {error}")),
+        Err(error) if error.kind() != io::ErrorKind::BrokenPipe => Err(format!("stdout cannot be written: {error}")),
         _ => Ok(()),
     }
 }

@@ -278,7 +278,7 @@ impl Show {
             if let Err(error) = shown {
                 // A reader that went away, such as `head`, is no failure. The printer continues to serve.
                 if error.kind() != io::ErrorKind::BrokenPipe {
-                    log::warn!("the printer is shown no longer: stdout can not be written: {error}");
+                    log::warn!("the printer is shown no longer: stdout cannot be written: {error}");
                 }
             }
             let _ = finished.send(());

@@ -105,7 +105,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     let ended = Arc::new(AtomicBool::new(false));
     for signal in [SIGINT, SIGTERM] {
         if let Err(error) = signal_hook::flag::register(signal, ended.clone()) {
-            return failed(format!("signals can not be taken in: {error}"));
+            return failed(format!("signals cannot be taken in: {error}"));
         }
     }
     let ready = {
@@ -114,7 +114,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
             let shown =
                 thread::Builder::new().name("demo".into()).spawn(move || show(&args, &plan, &probe, &right, &ended));
             if let Err(error) = shown {
-                log::error!("the demonstration can not be started: {error}");
+                log::error!("the demonstration cannot be started: {error}");
             }
         }
     };
@@ -137,7 +137,7 @@ fn show_as_it_changes(
 ) -> ExitCode {
     let show = match Show::prepare(probe) {
         Ok(show) => show,
-        Err(error) => return failed(format!("the printer can not be shown: {error}")),
+        Err(error) => return failed(format!("the printer cannot be shown: {error}")),
     };
     let ready = || {
         if io::stdout().is_terminal() {
@@ -211,7 +211,7 @@ fn tell(line: impl Display) {
 
 fn draw(path: &Path, report: &Report) -> Result<(), String> {
     fs::write(path, picture::homing(report))
-        .map_err(|error| format!("{} can not be written: {error}", path.display()))?;
+        .map_err(|error| format!("{} cannot be written: {error}", path.display()))?;
     tell(format_args!("drawn: {}", path.display()));
     Ok(())
 }

@@ -40,7 +40,7 @@ impl Helpers {
         let guardian = guarded.map(|(clock, realtime)| Guardian::start(clock, realtime)).transpose()?;
         if let Err(error) = sys::keep_only(sys::SERVE) {
             warn!(
-                "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH can not be given up: {error}: Pinion works, with more rights than it needs"
+                "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH cannot be given up: {error}: Pinion works, with more rights than it needs"
             );
         }
         Ok(Helpers { guardian, search })

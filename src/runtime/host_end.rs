@@ -163,7 +163,7 @@ impl HostEnd {
             Ok(written) => drop(self.output.drain(..written)),
             Err(error) => {
                 warn!(
-                    "{} can not be written: {error}: what the host should have read is lost, and the host asks again or gives up",
+                    "{} cannot be written: {error}: what the host should have read is lost, and the host asks again or gives up",
                     self.pty.device().display()
                 );
                 self.output.clear();

@@ -33,7 +33,7 @@ pub(crate) struct Half {
 
 /// Measures for `span` while idle, then as long under load.
 pub(crate) fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), String> {
-    let processors = Processors::new(None).map_err(|error| format!("the processors can not be told: {error}"))?;
+    let processors = Processors::new(None).map_err(|error| format!("the processors cannot be told: {error}"))?;
     in_thread(move || {
         realtime::lock_memory();
         let scheduling = realtime::enter(Role::Core);
@@ -49,7 +49,7 @@ pub(crate) fn measure_both(span: Duration) -> Result<(Scheduling, [Half; 2]), St
 /// Measures for `span` while Pinion serves a host. It runs below Pinion's priority, without load or spinning. So it
 /// does not delay Pinion.
 fn measure_beside(span: Duration) -> Result<(Scheduling, Half), String> {
-    let processors = Processors::new(None).map_err(|error| format!("the processors can not be told: {error}"))?;
+    let processors = Processors::new(None).map_err(|error| format!("the processors cannot be told: {error}"))?;
     in_thread(move || {
         let scheduling = realtime::enter(Role::Worker);
         let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
@@ -66,7 +66,7 @@ fn in_thread<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> Re
     let thread = thread::Builder::new().name("core".into()).spawn(work);
     match thread.map(thread::JoinHandle::join) {
         Ok(Ok(done)) => Ok(done),
-        _ => Err("the measuring thread can not be started: raise TasksMax or ulimit -u".into()),
+        _ => Err("the measuring thread cannot be started: raise TasksMax or ulimit -u".into()),
     }
 }
 

@@ -167,7 +167,7 @@ fn end(mut link: Link, core: JoinHandle<Left>, guardian: Option<Guardian>, serve
         Ok(Left::Safe) => {}
         Ok(Left::Owing(debtor)) => {
             return Err(io::Error::other(format!(
-                "{debtor} can not be driven to its shutdown value: the guardian tries that now"
+                "{debtor} cannot be driven to its shutdown value: the guardian tries that now"
             )));
         }
         Err(_) => return Err(io::Error::other("the core ended by a panic: please report it with the lines above")),

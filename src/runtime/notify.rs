@@ -38,7 +38,7 @@ impl Notify {
             Ok(Notify(Some(socket)))
         };
         connect().map_err(|error: io::Error| {
-            let text = format!("the service manager can not be told anything: NOTIFY_SOCKET {name:?}: {error}");
+            let text = format!("the service manager cannot be told anything: NOTIFY_SOCKET {name:?}: {error}");
             io::Error::new(error.kind(), text)
         })
     }

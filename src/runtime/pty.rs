@@ -158,7 +158,7 @@ fn grant(device: &Path, access: &Access) -> io::Result<()> {
         // to `tty`. (The C program leaves the group as it is.)
         None => give(device, USUAL_GROUP).or_else(|error| {
             let gid = fs::metadata(device)?.gid();
-            warn!("{error}: it stays with group {gid}; a klippy of another user can not open it");
+            warn!("{error}: it stays with group {gid}; a klippy of another user cannot open it");
             Ok(())
         }),
     }
@@ -196,7 +196,7 @@ fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
     let what =
-        format!("the link {} can not be made (does the directory exist, and may we write there?)", symlink.display());
+        format!("the link {} cannot be made (does the directory exist, and may we write there?)", symlink.display());
     said(std::os::unix::fs::symlink(device, &fresh), &what)?;
     said(fs::rename(&fresh, symlink), &what).inspect_err(|_| drop(fs::remove_file(&fresh)))
 }

@@ -100,7 +100,7 @@ pub fn enter(role: Role) -> Scheduling {
     // Before Linux 6.13 a futex wait ends up to 50 us late (the default timer slack), even under SCHED_FIFO. Setting
     // the slack prevents that.
     if let Err(error) = prctl::set_timerslack(1) {
-        warn!("the timer slack can not be set: {error}; steps may be late by 50 us, before Linux 6.13");
+        warn!("the timer slack cannot be set: {error}; steps may be late by 50 us, before Linux 6.13");
     }
     match sys::set_fifo(priority(role)) {
         Ok(()) => {

@@ -48,7 +48,7 @@ impl Surveyor {
                 });
                 let found = found.transpose().unwrap_or_else(|error| {
                     error!(
-                        "what the board has now can not be told to a host: {error}: it gets the names of before; restart Pinion"
+                        "what the board has now cannot be told to a host: {error}: it gets the names of before; restart Pinion"
                     );
                     None
                 });

@@ -46,7 +46,7 @@ impl Watchdog {
 
     fn feed(&mut self) {
         if let Err(error) = self.file.write_all(b"\0") {
-            warn!("the watchdog can not be fed: {error}: this computer is about to be reset");
+            warn!("the watchdog cannot be fed: {error}: this computer is about to be reset");
         }
     }
 
@@ -54,7 +54,7 @@ impl Watchdog {
     /// (Documentation/watchdog/watchdog-api.rst, "magic close").
     fn close(mut self) {
         if let Err(error) = self.file.write_all(b"V") {
-            warn!("the watchdog can not be stopped: {error}: this computer is about to be reset");
+            warn!("the watchdog cannot be stopped: {error}: this computer is about to be reset");
         }
     }
 }
@@ -72,7 +72,7 @@ fn cannot_open(path: &Path, error: &io::Error) -> io::Error {
         }
         _ => "look at the kernel's log (dmesg), or leave out -w",
     };
-    io::Error::new(error.kind(), format!("-w: {} can not be opened: {error}: {remedy}", path.display()))
+    io::Error::new(error.kind(), format!("-w: {} cannot be opened: {error}: {remedy}", path.display()))
 }
 
 /// Feeds the watchdogs as long as nothing hangs.
@@ -239,7 +239,7 @@ mod tests {
     fn a_watchdog_that_can_not_be_opened() {
         let path = Path::new("/nowhere/watchdog");
         let error = Watchdog::open(path).err().unwrap();
-        assert!(error.to_string().starts_with("-w: /nowhere/watchdog can not be opened:"), "{error}");
+        assert!(error.to_string().starts_with("-w: /nowhere/watchdog cannot be opened:"), "{error}");
         let text = |code| cannot_open(path, &io::Error::from_raw_os_error(code)).to_string();
         assert!(text(libc::ENOENT).contains("modprobe softdog"));
         assert!(text(libc::EBUSY).contains("RuntimeWatchdogSec"));

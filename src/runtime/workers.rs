@@ -82,7 +82,7 @@ impl Threads {
                 server.run();
             })
             .map_err(|error| {
-                let trouble = Trouble::new(format!("its thread can not be started ({error})"));
+                let trouble = Trouble::new(format!("its thread cannot be started ({error})"));
                 overflow(bus, trouble.remedy("raise TasksMax or ulimit -u"))
             })?;
         Ok(Worker { bus: bus.into(), jobs, done, quit, thread, left_behind: false })

@@ -153,8 +153,8 @@ fn each_instance_and_each_klippy_is_judged() {
         "for klippy's user pi (process 54321)\n",
         "  error    other, klippy's user (process 54322), may not open it: /tmp/klipper_host_second leads to /dev/pts/4",
         "\n           -> sudo usermod -aG tty other && sudo systemctl restart klipper-2\n",
-        "klippy's sources in /home/pi/klipper/klippy (process 54321) can not be read",
-        "klippy's sources in /home/other/klipper/klippy (process 54322) can not be read",
+        "klippy's sources in /home/pi/klipper/klippy (process 54321) cannot be read",
+        "klippy's sources in /home/other/klipper/klippy (process 54322) cannot be read",
         "\n1 error, ",
     ] {
         assert!(text.contains(line), "{line}\n{text}");

@@ -83,7 +83,7 @@ pub(super) fn context(devices: &Path) -> Result<Option<Context>, Trouble> {
         return Ok(None);
     }
     Context::with_backend(Backend::Local).map(Some).map_err(|error| {
-        Trouble::new(format!("the IIO devices in {} can not be read: {error}", devices.display())).remedy(LOOK_AT_LOG)
+        Trouble::new(format!("the IIO devices in {} cannot be read: {error}", devices.display())).remedy(LOOK_AT_LOG)
     })
 }
 
@@ -197,7 +197,7 @@ fn read_failure(subject: &str, error: &str) -> Trouble {
     } else {
         "check the chip's wiring and supply, and the kernel's log (dmesg)"
     };
-    Trouble::new(format!("{subject} can not be read: {error}")).remedy(remedy)
+    Trouble::new(format!("{subject} cannot be read: {error}")).remedy(remedy)
 }
 
 /// Says that a channel is missing, and lists those that exist.
@@ -260,7 +260,7 @@ mod tests {
     fn texts() {
         assert_eq!(
             read_failure("iio:device0 (ads1115) voltage3", "EIO: I/O error").to_string(),
-            "iio:device0 (ads1115) voltage3 can not be read: EIO: I/O error: check the chip's \
+            "iio:device0 (ads1115) voltage3 cannot be read: EIO: I/O error: check the chip's \
              wiring and supply, and the kernel's log (dmesg)"
         );
         let adc = IioDevice {

@@ -127,7 +127,7 @@ fn cannot_open(path: &Path, name: &str, error: &io::Error, buses: &[u32]) -> Tro
         libc::EACCES | libc::EPERM => not_permitted(path),
         libc::EBUSY => Trouble::new(format!("{name} is in use by a driver of the kernel"))
             .remedy("remove its overlay from the device tree, or choose another chip"),
-        _ => Trouble::new(format!("{name} can not be opened: {error}")).remedy(LOOK_AT_LOG),
+        _ => Trouble::new(format!("{name} cannot be opened: {error}")).remedy(LOOK_AT_LOG),
     }
 }
 
@@ -158,7 +158,7 @@ mod tests {
         assert!(error.to_string().contains("this computer has i2c.20: enable the bus"), "{error}");
         fs::write(dev.path().join("i2c-1"), "").unwrap();
         let error = I2c::open(dev.path(), CONFIG).err().unwrap();
-        assert!(error.to_string().contains("i2c-1 address 0x48 can not be opened: "), "{error}");
+        assert!(error.to_string().contains("i2c-1 address 0x48 cannot be opened: "), "{error}");
     }
 
     #[test]

@@ -176,7 +176,7 @@ impl LinuxBoard {
             Direction::Input(_) => ("an input", reason::NOT_INPUT, reason::INPUT_LINE),
         };
         let Target::Line { chip, offset } = Target::of(pin) else {
-            let cause = format!("{} can not be {wanted}", Target::of(pin));
+            let cause = format!("{} cannot be {wanted}", Target::of(pin));
             return Err(Shutdown::because(no_line, cause).remedy("choose a GPIO pin (pinion pins lists them)"));
         };
         gpio::open(&self.dev, chip, offset, refused)
@@ -368,7 +368,7 @@ mod tests {
         let error = board.line(Pin(4097), ON).err().unwrap();
         assert_eq!(
             error.to_string(),
-            "Not an output pin: analog1 (an ADC channel) can not be an output: choose a GPIO pin \
+            "Not an output pin: analog1 (an ADC channel) cannot be an output: choose a GPIO pin \
              (pinion pins lists them)"
         );
         let error = board.line(Pin(3000), Direction::Input(Bias::None)).err().unwrap();
@@ -384,7 +384,7 @@ mod tests {
         let mut board = board(dev.path());
         let error = board.mosi(Pin(17), 3_200_000).err().unwrap();
         assert_eq!(error.reason, reason::NOT_OUTPUT);
-        assert!(error.trouble.cause.starts_with("gpiochip0 line 17 can not drive LEDs"), "{error}");
+        assert!(error.trouble.cause.starts_with("gpiochip0 line 17 cannot drive LEDs"), "{error}");
         assert!(error.to_string().contains("\"pin: spidev0.0\""), "{error}");
         let names = Names::of(&Inventory { spi: vec![spi::Node::of(256), spi::Node::of(257)], ..Inventory::default() });
         let range = names.ranges().into_iter().find(|range| range.name == "spidev1.0").unwrap();
@@ -395,7 +395,7 @@ mod tests {
         assert!(error.trouble.cause.contains("spidev1.1"), "{error}");
         let error = board.line(Pin(range.first), ON).err().unwrap();
         assert!(
-            error.trouble.cause.starts_with("spidev1.0 (an SPI device's data output) can not be an output"),
+            error.trouble.cause.starts_with("spidev1.0 (an SPI device's data output) cannot be an output"),
             "{error}"
         );
     }

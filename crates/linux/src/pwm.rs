@@ -172,7 +172,7 @@ fn trouble(error: &io::Error, cause: String) -> Trouble {
         (_, Some(libc::EBUSY)) => {
             Trouble::new(format!("{cause}: a driver of the kernel uses it")).remedy("choose another channel")
         }
-        (_, Some(libc::EINVAL | libc::ERANGE)) => Trouble::new(format!("{cause}: the chip can not do that"))
+        (_, Some(libc::EINVAL | libc::ERANGE)) => Trouble::new(format!("{cause}: the chip cannot do that"))
             .remedy("choose another cycle_time or another channel"),
         _ => Trouble::new(cause),
     }

@@ -200,7 +200,7 @@ impl<N: SpiNode> Spi<N> {
     fn set_mode(&mut self) -> Result<(), Trouble> {
         self.device.set_mode(self.mode).map_err(|error| {
             Trouble::new(format!(
-                "/dev/{} refuses SPI mode {}: {error}: its controller can not serve this chip",
+                "/dev/{} refuses SPI mode {}: {error}: its controller cannot serve this chip",
                 self.node, self.mode
             ))
             .remedy("choose another bus")
@@ -284,7 +284,7 @@ fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> Trouble {
                 .remedy("enable the bus (on a Raspberry Pi \"dtparam=spi=on\" in config.txt), or change spi_bus")
         }
         io::ErrorKind::PermissionDenied => not_permitted(path),
-        _ => Trouble::new(format!("{shown} can not be opened: {error}")).remedy(LOOK_AT_LOG),
+        _ => Trouble::new(format!("{shown} cannot be opened: {error}")).remedy(LOOK_AT_LOG),
     }
 }
 

@@ -48,7 +48,7 @@ impl Thermometer for Ds18b20 {
         let path = self.file.display();
         // Opened each time, because a sensor that was unplugged and is back has a new file.
         let text = fs::read_to_string(&self.file).map_err(|error| {
-            Trouble::new(format!("{path} can not be read: {error}")).remedy("is the sensor plugged in?")
+            Trouble::new(format!("{path} cannot be read: {error}")).remedy("is the sensor plugged in?")
         })?;
         parse(&text)
             .map_err(|what| Trouble::new(what).remedy("check the wires and the pull-up resistor (4.7 kOhm)").of(path))
@@ -78,7 +78,7 @@ fn parse(text: &str) -> Result<i32, &'static str> {
 fn cannot_open(devices: &Path, file: &Path, error: &io::Error) -> Trouble {
     let path = file.display();
     if error.kind() != io::ErrorKind::NotFound {
-        return Trouble::new(format!("{path} can not be opened: {error}"))
+        return Trouble::new(format!("{path} cannot be opened: {error}"))
             .remedy("look at its permissions and at the kernel's log (dmesg)");
     }
     let sensors = scan(devices);
@@ -125,7 +125,7 @@ mod tests {
         let folder = devices.path().join("28-00000000100f");
         fs::remove_dir_all(&folder).unwrap();
         let error = sensor.read().unwrap_err();
-        assert!(error.cause.contains("28-00000000100f/w1_slave can not be read: No such file"), "{error}");
+        assert!(error.cause.contains("28-00000000100f/w1_slave cannot be read: No such file"), "{error}");
         fs::create_dir(&folder).unwrap();
         fs::write(folder.join("w1_slave"), GOOD.replace("3062", "4000")).unwrap();
         assert_eq!(sensor.read(), Ok(4000));

@@ -140,7 +140,7 @@ fn dialect(machine: &Machine, instances: &[Instance], klippy: &Klippy) -> Vec<Fi
     let checkout = match Checkout::read(folder, FEATURES) {
         Ok(checkout) => checkout,
         Err(error) => {
-            let found = format!("klippy's sources in {} ({found_by}) can not be read: {error}", shown.display());
+            let found = format!("klippy's sources in {} ({found_by}) cannot be read: {error}", shown.display());
             return vec![Finding::warning(DIALECT, found, "sudo pinion doctor, or pinion doctor --klipper DIR")];
         }
     };
@@ -225,7 +225,7 @@ mod tests {
         told(&look(), "dialect", Ok, "which host comes is unknown");
         let command = "ExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\n";
         tree.put("lib/systemd/system/klipper.service", command);
-        told(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) can not be read");
+        told(&look(), "dialect", Warning, "/home/pi/klipper/klippy (klipper.service) cannot be read");
         let forms: Vec<String> = crate::klippy::tests::forms(Generation::V0_12)
             .iter()
             .map(|form| {

@@ -33,7 +33,7 @@ fn version(machine: &Machine) -> Finding {
         () if lacks(BIAS_SINCE) => Finding::warning(
             CHECK,
             format!(
-                "Linux {release} can not switch pull-up and pull-down resistors on (5.5 can), and tachometers are polled (5.10 counts)"
+                "Linux {release} cannot switch pull-up and pull-down resistors on (5.5 can), and tachometers are polled (5.10 counts)"
             ),
             REMEDY,
         ),

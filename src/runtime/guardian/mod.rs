@@ -78,7 +78,7 @@ impl Guardian {
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
     pub fn start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
         Guardian::try_start(clock, realtime)
-            .map_err(|error| io::Error::new(error.kind(), format!("the guardian can not be started: {error}")))
+            .map_err(|error| io::Error::new(error.kind(), format!("the guardian cannot be started: {error}")))
     }
 
     fn try_start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
@@ -474,7 +474,7 @@ mod tests {
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         let other = thread::spawn(move || stopped.recv());
         let error = Guardian::start(Monotonic::start(), false).err().unwrap();
-        assert_eq!(error.to_string(), "the guardian can not be started: threads have been started already");
+        assert_eq!(error.to_string(), "the guardian cannot be started: threads have been started already");
         drop(stop);
         let _ = other.join();
     }

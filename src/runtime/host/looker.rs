@@ -141,7 +141,7 @@ impl Looker {
                 return unknown;
             }
             Err(error) => {
-                say.warn(format!("the host can not be looked for: {error}: {}", union(REMEDY)));
+                say.warn(format!("the host cannot be looked for: {error}: {}", union(REMEDY)));
                 return unknown;
             }
         };
@@ -183,7 +183,7 @@ fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) 
         Ok(checkout) => checkout,
         Err(error) => {
             say.warn(format!(
-                "the sources of the host, process {pid}, can not be read in {}: {error}: {}",
+                "the sources of the host, process {pid}, cannot be read in {}: {error}: {}",
                 folder.display(),
                 union(REMEDY)
             ));

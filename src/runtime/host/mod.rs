@@ -48,7 +48,7 @@ impl HostSearch {
     pub(super) fn start() -> io::Result<HostSearch> {
         let started = HostSearch::try_start();
         started.map_err(|error| {
-            io::Error::new(error.kind(), format!("the search for the host can not be started: {error}"))
+            io::Error::new(error.kind(), format!("the search for the host cannot be started: {error}"))
         })
     }
 

@@ -101,7 +101,7 @@ page() {
         esac
     done
 }
-# What commands would have left that can not be tried: `make deb` a package, and after `git pull` a later one.
+# What commands would have left that cannot be tried: `make deb` a package, and after `git pull` a later one.
 instead() {
     local deb=/home/pi/pinion/target/deb
     case $1 in

@@ -494,7 +494,7 @@ pub trait Board: Send {
 
 /// The error of [`Board::mosi`] for a pin that is not an SPI data output.
 pub fn not_mosi(name: &str) -> Shutdown {
-    let cause = format!("{name} can not drive LEDs: their pulses are too short for a program on Linux");
+    let cause = format!("{name} cannot drive LEDs: their pulses are too short for a program on Linux");
     Shutdown::because(reason::NOT_OUTPUT, cause).remedy(
         "connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\" (pinion pins lists them)",
     )

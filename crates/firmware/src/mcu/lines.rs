@@ -428,7 +428,7 @@ impl Mcu {
                 _ => reason::OUTPUT_LINE,
             };
             let cause = format!(
-                "{name} can not be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds"
+                "{name} cannot be a {use_} pin: its chip is behind a bus (I2C, SPI, USB) or a firmware call, so an edge would be late by milliseconds"
             );
             return Err(Shutdown::because(refused, cause).remedy("choose a pin of the processor itself"));
         }

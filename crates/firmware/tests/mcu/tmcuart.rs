@@ -288,6 +288,6 @@ fn a_line_of_an_expander_is_refused() {
         rig.send_all(&["allocate_oids count=1", config]);
         let text = rig.shutdown().unwrap();
         assert!(text.starts_with("Unable to open"), "{text}");
-        assert!(rig.notes().iter().any(|note| note.contains("can not be a UART pin")));
+        assert!(rig.notes().iter().any(|note| note.contains("cannot be a UART pin")));
     }
 }

@@ -116,7 +116,7 @@ impl Line for EdgeLine {
 
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
         let Direction::Input(bias) = direction else {
-            let cause = format!("{} counts pulses and can not be an output as well", self.0.subject);
+            let cause = format!("{} counts pulses and cannot be an output as well", self.0.subject);
             return Err(Shutdown::because(reason::OUTPUT_LINE, cause).remedy("choose another pin for one of the two"));
         };
         self.0.subject.setting(direction)?;

@@ -83,7 +83,7 @@ impl Subject {
                     .remedy("free it or choose another pin (pinion pins lists them)")
             }
             libc::EINVAL if bias != Bias::None && is_before(release, BIAS_SINCE) => Trouble::new(format!(
-                "{self} can not have a {pull} resistor: Linux {} knows none before 5.5",
+                "{self} cannot have a {pull} resistor: Linux {} knows none before 5.5",
                 release.trim_end()
             ))
             .remedy("update the kernel, or solder one"),
@@ -93,10 +93,10 @@ impl Subject {
             ))
             .remedy("free it in the device tree, or choose another pin"),
             libc::EIO | libc::EPERM | ENOTSUPP | libc::EOPNOTSUPP => {
-                Trouble::new(format!("{self} can not be {action}: {}: the chip {label} does not offer it", text(code)))
+                Trouble::new(format!("{self} cannot be {action}: {}: the chip {label} does not offer it", text(code)))
                     .remedy("choose another pin")
             }
-            _ => Trouble::new(format!("{self} can not be had as {action}: {}", text(code)))
+            _ => Trouble::new(format!("{self} cannot be had as {action}: {}", text(code)))
                 .remedy("look at the kernel's log (dmesg), or choose another pin"),
         }
     }
@@ -131,7 +131,7 @@ pub(super) fn cannot_open(path: &Path, code: i32) -> Trouble {
         libc::ENOTTY => {
             Trouble::new(format!("{shown} is not a GPIO chip")).remedy("remove it and let the kernel make the node")
         }
-        _ => Trouble::new(format!("{shown} can not be opened: {}", text(code))).remedy(LOOK_AT_LOG),
+        _ => Trouble::new(format!("{shown} cannot be opened: {}", text(code))).remedy(LOOK_AT_LOG),
     }
 }
 
@@ -230,7 +230,7 @@ mod tests {
     fn a_refused_resistor_says_why() {
         assert_eq!(
             refusal(libc::EINVAL, Bias::PullUp, None, "5.4.83-v7l+\n"),
-            "gpiochip0 line 17 (GPIO17) can not have a pull-up resistor: Linux 5.4.83-v7l+ knows \
+            "gpiochip0 line 17 (GPIO17) cannot have a pull-up resistor: Linux 5.4.83-v7l+ knows \
              none before 5.5: update the kernel, or solder one"
         );
         let driver = refusal(ENOTSUPP, Bias::PullDown, None, "6.6.0");

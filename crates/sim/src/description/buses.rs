@@ -49,7 +49,7 @@ impl SpiBusConfig {
         fault(
             &format!("spi_bus `{}`", self.name),
             "trace_file",
-            &format!("it can not be made: {error}"),
+            &format!("it cannot be made: {error}"),
             "name a file in a folder that may be written",
         )
     }

@@ -129,7 +129,7 @@ impl Trace {
         line.push('\n');
         // In one write, so that a reader never sees half a line.
         self.file.write_all(line.as_bytes()).map_err(|error| {
-            let trouble = Trouble::new(format!("{} can not be written: {error}", self.path.display()));
+            let trouble = Trouble::new(format!("{} cannot be written: {error}", self.path.display()));
             BusError::new(BusStatus::Nack, trouble.remedy("choose another trace_file"))
         })
     }

@@ -196,5 +196,5 @@ fn a_counter_shares_its_pin_with_inputs_and_is_polled_if_it_comes_second() {
     }
     let output = "config_digital_out oid=1 pin=lab/gpio3 value=0 default_value=0 max_duration=0";
     assert_eq!(refusal(client, 2, &[COUNTER, output]), "Unable to open out GPIO chip line");
-    program.wait_for_line(&["line 3 counts pulses and can not be an output as well"]);
+    program.wait_for_line(&["line 3 counts pulses and cannot be an output as well"]);
 }

@@ -158,9 +158,9 @@ fn pins_that_can_not_be_are_refused_and_the_log_says_why() {
     assert_eq!(refusal(client, 1, &[input(0, &beyond, 0)]), "Unable to open in GPIO chip line");
     program.wait_for_line(&[chip, "(lab) has no line 8, its lines are 0 to 7"]);
     assert_eq!(refusal(client, 1, &[output(0, "analog1")]), "Not an output pin");
-    program.wait_for_line(&["analog1 (an ADC channel) can not be an output"]);
+    program.wait_for_line(&["analog1 (an ADC channel) cannot be an output"]);
     assert_eq!(refusal(client, 1, &[input(0, "pwmchip0/pwm1", 0)]), "Not an input pin");
-    program.wait_for_line(&["pwmchip0/pwm1 (hardware PWM) can not be an input"]);
+    program.wait_for_line(&["pwmchip0/pwm1 (hardware PWM) cannot be an input"]);
     assert_eq!(
         refusal(client, 1, &["config_digital_out oid=0 pin=3000 value=0 default_value=0 max_duration=0"]),
         "Not an output pin"

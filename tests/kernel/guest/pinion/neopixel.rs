@@ -27,7 +27,7 @@ fn a_chain_is_sent_in_one_message() {
     assert_eq!(sysfs::read(format!("{MOCK}/sent")).trim(), format!("cs1 0 3200000{low}{colours}{low}"));
 
     assert_eq!(refusal(client, 1, &[config("lab/gpio1", 3)]), "Not an output pin");
-    program.wait_for_line(&["can not drive LEDs", "pin: spidev0.0"]);
+    program.wait_for_line(&["cannot drive LEDs", "pin: spidev0.0"]);
     // klippy's longest chain fits. A message longer than the driver's buffer is refused.
     configure(client, 1, &[config("spidev0.1", 500)]);
     configure(client, 1, &[config("spidev0.1", 964)]);

@@ -92,5 +92,5 @@ fn a_watchdog_that_is_taken_is_refused() {
     drop(held);
     let log = String::from_utf8_lossy(&output.stderr);
     assert_eq!(output.status.code(), Some(1), "{log}");
-    assert!(log.contains("-w: /dev/watchdog can not be opened") && log.contains("another program feeds it"), "{log}");
+    assert!(log.contains("-w: /dev/watchdog cannot be opened") && log.contains("another program feeds it"), "{log}");
 }

@@ -101,7 +101,7 @@ fn the_data_output_of_a_bus_drives_lights_and_nothing_else() {
     let led = bench.pin("led");
     let error = bench.board.mosi(led, 3_200_000).err().unwrap();
     assert_eq!(error.reason, reason::NOT_OUTPUT);
-    assert!(error.trouble.cause.starts_with("led can not drive LEDs"), "{error}");
+    assert!(error.trouble.cause.starts_with("led cannot drive LEDs"), "{error}");
 }
 
 #[test]
