@@ -1,17 +1,15 @@
 #!/bin/busybox sh
 # SPDX-License-Identifier: GPL-3.0-or-later
-# The guest's first process. The kernel's command line gives GUEST_SHELL for a shell
-# instead of tests.
+# The guest's first process. With GUEST_SHELL on the kernel's command line it starts a shell instead of the tests.
 #
-# The tests of the plan run one by one, each in a process of its own: one that
-# dies takes no other with it. A line of the plan may have a command after the test,
-# whose program that is to measure instead of pinion. Results go to the 9p share: "NAME STATUS" lines in
-# results, and what each test printed in output/NAME. Each test's name goes to the
-# console as it begins.
+# The tests of the plan run one by one, each in its own process. So a test that dies does not end the others. A line of
+# the plan may have a command after the test: the program to measure instead of pinion. Results go to the 9p share:
+# lines "NAME STATUS" in results, and each test's output in output/NAME. Each test's name goes to the console when it
+# starts.
 . /tests/start.sh
 
 while read -r module options; do
-	# $options are words.
+	# $options is split into words.
 	insmod "$module" $options || echo "cannot load $module"
 done </tests/modules
 mount -t configfs configfs /sys/kernel/config
@@ -24,13 +22,13 @@ mount_share() {
 	mount -t 9p -o trans=virtio,version=9p2000.L,msize=262144 tests /tests/share
 }
 
-# Writes one byte, octal, to a port.
+# Writes one byte, in octal, to a port.
 out() {
 	printf "\\$2" | dd of=/dev/port bs=1 seek=$(($1)) count=1 2>/dev/null
 }
 
-# Prints what the kernel has logged since the last call, and fails if it found a
-# fault in itself: our mocks are kernel code, too.
+# Prints the kernel's log since the last call. Fails if the kernel reported its own fault, because our mocks are also
+# kernel code.
 kernel_log() {
 	dmesg -c >/tmp/kernel_log
 	[ -s /tmp/kernel_log ] && { echo "kernel log:"; cat /tmp/kernel_log; }
@@ -54,15 +52,15 @@ if [ -n "$GUEST_SHELL" ]; then
 	poweroff -f
 fi
 
-# What the kernel leaves for later at its start is then behind it: the last of it is the
-# choice of the processor's counter as its clock, two seconds after boot.
+# The kernel's delayed start is then over. Its last part is the choice of the processor's counter as its clock, two
+# seconds after boot.
 sleep 10
-# QEMU's pvpanic stops the machine here, at this very instruction. The host takes a
-# snapshot, and each run goes on from that, with a plan of its own.
+# QEMU's pvpanic stops the VM here, at exactly this instruction. The computer takes a snapshot. Each run continues from
+# the snapshot with its own plan.
 out 0x505 001
-# This driver lists the host's files as it is loaded: not before.
+# This driver lists the computer's files when it is loaded, so it must not be loaded earlier.
 insmod /tests/plan.ko
-# A file of which each read begins at the start.
+# Each read of this file begins at the start.
 cat /sys/firmware/qemu_fw_cfg/by_name/opt/pinion/plan/raw >/tmp/plan
 mkdir -p /tmp/tests/output
 dmesg -c >/tmp/tests/output/boot
@@ -71,13 +69,11 @@ while read -r test program; do
 	run_test "$test" "$program" >"/tmp/tests/output/$test" 2>&1
 	echo "$test $?" >>/tmp/tests/results
 done </tmp/plan
-# Nothing of the host is to be met before the tests are over: its answers take a
-# time that is not the same twice.
+# Do not use the computer before the tests are over: the time of its answers is never the same twice.
 mount_share
 cp -r /tmp/tests/output /tests/share
 cp /tmp/tests/results /tests/share
 sync
-# QEMU's isa-debug-exit: writing 16 ends it with status 33, which none of its own
-# failures has.
+# QEMU's isa-debug-exit: writing 16 ends it with status 33. None of QEMU's own failures has this status.
 out 0xf4 020
 poweroff -f

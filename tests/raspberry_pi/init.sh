@@ -1,7 +1,7 @@
 #!/bin/busybox sh
 # SPDX-License-Identifier: GPL-3.0-or-later
-# The first process of the emulated Pi. It speaks to the host by lines on the console
-# that begin with "raspberry-pi: "; tests do the same (guest/outside.rs).
+# The first process of the emulated Pi. It sends lines that begin with "raspberry-pi: " to the computer over the
+# console. Tests do the same (guest/outside.rs).
 . /tests/start.sh
 echo 'tty:x:5:' >/etc/group
 
@@ -18,12 +18,12 @@ if [ -n "$GUEST_SHELL" ]; then
 fi
 
 stty raw -echo
-# Keeps the processor from idling, in which time would pass at the host's pace: see TIME
-# in vm.rs. Everything is on one processor; two would take turns of milliseconds.
+# Keeps the processor from idling. While it idles, time would pass at the computer's pace: see TIME in vm.rs. Everything
+# is on one processor. Two would take turns of milliseconds.
 taskset -p 1 $$ >/dev/null
 (while :; do :; done) &
 renice -n 19 -p $!
-# What was asked for, as libtest's words, one on each line.
+# The requested filters, as libtest's words, one per line.
 set --
 while read -r word; do
 	set -- "$@" "$word"
@@ -35,14 +35,14 @@ while read -r test <&3; do
 	timeout -s KILL 30 raspberry_pi_guest --exact "$test" --nocapture </dev/null 2>&1
 	status=$?
 	[ $status = 137 ] && echo "killed: it took longer than 30 s"
-	# A fault of the driver's.
+	# A fault of the driver.
 	if dmesg -c | grep -E 'BUG:|WARNING:|Oops|Internal error'; then
 		status=99
 	fi
 	say end "$test" $status
 done 3</tmp/plan
 say done
-# The host ends the machine, which cannot do that itself.
+# The computer ends the VM, because the VM cannot do that itself.
 while :; do
 	sleep 60
 done

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-# What the first process of every VM begins with.
+# The first part of every VM's init.
 export PATH=/bin HOME=/root TERM=vt100
 /bin/busybox --install -s /bin
 mount -t proc proc /proc
@@ -11,5 +11,5 @@ mount -t tmpfs tmpfs /dev/shm
 mount -t tmpfs tmpfs /tmp
 mount -t tmpfs tmpfs /run
 exec </dev/console >/dev/console 2>&1
-# Tests write to hardware as root; they look for this before they do.
+# Tests write to hardware as root. They check for this file first.
 : >/run/pinion-tests

@@ -1,4 +1,4 @@
-# The package installs, and starts and enables nothing. Its user has its groups, and the devices theirs.
+# The package installs, and starts and enables nothing. Its user has its groups, and the devices have theirs.
 systemctl is-system-running --wait || true
 until_true 30 test -c /dev/gpiochip0
 until_true 30 is_active test-chips

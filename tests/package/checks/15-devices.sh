@@ -1,4 +1,4 @@
-# Without a reboot each device belongs to the group that the rules give it.
+# Without a reboot each device belongs to the group in the rules.
 owner() { stat -c '%G %a' "$1"; }
 is "$(owner /dev/gpiochip0)" "gpio 660" gpiochip0
 is "$(owner /dev/watchdog)" "pinion 660" watchdog

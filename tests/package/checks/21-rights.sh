@@ -1,4 +1,4 @@
-# The program has no capabilities. The process that looks for the host has two, and may only read.
+# The program has no capabilities. The process that searches for the host has two, and may only read.
 fresh
 systemctl start pinion-mcu
 sets() { sed -n 's/^Cap\(Inh\|Prm\|Eff\|Amb\):\t//p' "$@" | sort -u; }
@@ -7,19 +7,19 @@ is "$(sets "/proc/$(guardian)/status")" 0000000000000000 "the guardian's"
 search=$(pgrep -P "$(pid)" -x pinion-search)
 is "$(sed -n 's/^Cap\(Prm\|Eff\):\t//p' "/proc/$search/status" | sort -u)" 0000000000080004 "those of the search"
 is "$(sed -n 's/^Seccomp:\t//p' "/proc/$search/status")" 2 "its seccomp mode"
-# Of what the kernel can be tuned by, it may write to devices only. (So may root, where the service is.)
+# Of the kernel's settings, it may write only to devices. (Root has the same limits in the service.)
 inside() { nsenter -t "$(pid)" -m -- sh -c "$1"; }
 inside 'echo 2 >/sys/class/pwm/pwmchip0/export'
 inside 'echo 2 >/sys/class/pwm/pwmchip0/unexport'
 not inside ': >>/proc/sys/kernel/printk'
 not inside ': >>/sys/module/printk/parameters/time'
 not inside 'test -L /tmp/klipper_host_mcu'
-# A host of klippy's user is looked into.
+# The search examines a host of klippy's user.
 mark
 identifies
 looked() { said | grep 'is no klippy'; }
 until_true 10 looked
-# One that is killed is told of, and the service serves on.
+# A killed search is reported, and the service continues.
 before=$(pid)
 kill -9 "$search"
 identifies

@@ -1,5 +1,5 @@
-# Stopped, started, and restarted five times quickly it serves the same link; it stops without a warning
-# with outputs in use, too.
+# After a stop, a start, and five quick restarts it serves the same link. It also stops without a warning while outputs
+# are in use.
 light
 mark
 systemctl stop pinion-mcu

@@ -1,4 +1,5 @@
-# A second program does not take the link of one that runs, whoever starts it; nor does the service.
+# A second program does not take the link of a running one, whatever user starts it. The service does not take it
+# either.
 fresh
 systemctl start pinion-mcu
 words="$LINK leads to /dev/pts/.*, which Pinion serves (process $(pid)): stop it (sudo systemctl stop pinion-mcu), or"
@@ -8,7 +9,7 @@ refused() {
 }
 refused pinion run --board sim
 refused pinion sim --show
-# Nor one who may not ask the service, and may not look into its process.
+# The same is true for a user who may neither query the service nor inspect its process.
 refused runuser -u klippy -- pinion run --board sim
 refused runuser -u stranger -- pinion run --board sim
 is "$(readlink $LINK)" /run/pinion/klipper_host_mcu "the link"

@@ -1,10 +1,10 @@
-# A real klippy, whose only micro-controller is Pinion: everything that it has answers, and it homes.
+# A real klippy with Pinion as its only MCU: all its devices answer, and it homes.
 . /share/klippy.sh
 mark
 printf '01900000%.0s' {1..400} >/run/replies
 cat /run/replies >$MOCKS/mock-spi/replies
 klippy_is_ready
-# Its sources are read through its own root, as the service sees no homes: the dialect is its own.
+# Its sources are read through its own root, because the service sees no homes. So it gets its own dialect.
 said | grep 'the host is klippy of /home/klippy/klipper.*: dialect '
 is "$(said pinion-mcu -p warning)" "" "a warning in the log"
 until_true 20 measures heater_bed 24 26

@@ -1,5 +1,5 @@
-# Pinion is restarted, and killed, while klippy runs and has the heater and a light on: they go off, klippy
-# says what happened, and FIRMWARE_RESTART is all that it takes.
+# Pinion is restarted, and killed, while klippy runs with the heater and a light on. They go off, klippy reports the
+# cause, and FIRMWARE_RESTART is enough to continue.
 . /share/klippy.sh
 lit() {
     gcode 'SET_PIN PIN=light VALUE=1'

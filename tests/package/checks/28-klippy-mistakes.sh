@@ -1,6 +1,6 @@
-# Mistakes of a user: klippy shows them, and the journal and `pinion doctor` say what to do.
+# Errors of a user: klippy shows them, and the journal and `pinion doctor` give the remedy.
 . /share/klippy.sh
-# klippy's user is not in the group: doctor names the command, which is tried here by its letter.
+# klippy's user is not in the group. doctor prints the command, which this check runs unchanged.
 sudo() { "$@"; }
 install_klippy
 configure
@@ -17,7 +17,7 @@ remedy=$(sed -n "/klippy, klippy's user/{n;s/^ *-> //p}" /run/doctor)
 eval "$remedy"
 until_state ready
 
-# A chip that is not there: the journal tells which there are.
+# A chip that does not exist: the journal lists the chips that exist.
 mark
 sed -i 's|^pin: lab/gpio14|pin: gpiochip7/gpio3|' $CONFIG
 gcode RESTART || true
@@ -26,7 +26,7 @@ why
 said | grep -i 'gpiochip7'
 configure
 firmware_restart
-# A pin that klippy itself does not take.
+# A pin that klippy itself does not accept.
 sed -i 's|^pin: lab/gpio14|pin: lab/gpio99|' $CONFIG
 gcode RESTART || true
 until_true $START says "'lab/gpio99' is not a valid pin name"

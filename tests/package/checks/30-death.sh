@@ -1,6 +1,6 @@
-# However the program or its guardian dies or hangs, the heater goes off, and the service comes back.
-# dies SECONDS SIGNAL WHOM: for so long, at most, the heater stays on. (Eight, as systemd would end a program
-# that hangs after ten. How fast the guardian is to the millisecond, tests/kernel shows.)
+# If the program or its guardian dies or hangs in any way, the heater goes off, and the service comes back.
+# dies SECONDS SIGNAL WHOM: the heater stays on for at most SECONDS. (Eight, because systemd would end a hanging program
+# after ten. tests/kernel measures the guardian's time to the millisecond.)
 dies() {
     light
     before=$(pid)
@@ -17,7 +17,7 @@ dies 8 KILL pid
 dies 8 STOP pid
 dies 8 KILL guardian
 dies 8 STOP guardian
-# Its core hangs: by a signal that only a program under test takes.
+# Its core hangs: by a signal that only a program under test accepts.
 mkdir -p /run/systemd/system/pinion-mcu.service.d
 printf '[Service]\nEnvironment=PINION_TEST_HANG=1\n' >/run/systemd/system/pinion-mcu.service.d/hang.conf
 systemctl daemon-reload

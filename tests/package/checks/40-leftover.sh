@@ -1,5 +1,5 @@
-# A file in the link's place: what Klipper's own service leaves there is taken away, anything else is not,
-# and once somebody has removed that the service comes up by itself, however long it took.
+# A file in the link's place. The leftover of Klipper's own service is removed, but nothing else is. When somebody has
+# removed another file, the service starts by itself, however long that takes.
 fresh
 systemctl stop pinion-mcu
 for content in '' FORCE_SHUTDOWN; do
@@ -18,7 +18,7 @@ is "$(cat $LINK)" 'a letter'
 rm $LINK
 until_true 10 is_active pinion-mcu
 identifies
-# Nobody else has files removed that they put there.
+# Files of other users are not removed.
 systemctl stop pinion-mcu
 runuser -u stranger -- sh -c "echo FORCE_SHUTDOWN >$LINK"
 not systemctl start pinion-mcu

@@ -1,4 +1,4 @@
-# A chip that appears after Pinion has started is there for the next host, without a restart.
+# A chip that appears after Pinion's start is available to the next host, without a restart.
 fresh
 systemctl start pinion-mcu
 before=$(pid)

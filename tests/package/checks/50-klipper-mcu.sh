@@ -1,5 +1,5 @@
-# Beside Klipper's own service: to start one stops the other, either way. And that service with nothing
-# but its binary changed: Pinion takes its place, through stops and restarts at once.
+# With Klipper's own service: starting one of them stops the other. Then that service with only its binary changed:
+# Pinion takes its place, also through immediate stops and restarts.
 cat >/etc/systemd/system/klipper-mcu.service <<'END'
 [Unit]
 Description=stands for Klipper's own
@@ -17,8 +17,8 @@ systemctl start pinion-mcu
 is "$(systemctl is-active klipper-mcu || true)" inactive
 identifies
 
-# Klipper's `make flash` starts its unit though it is disabled, which stops Pinion; not once the unit was moved away as
-# docs/guide/migrate.md says. doctor tells.
+# Klipper's `make flash` starts its unit even if the unit is disabled, which stops Pinion. It does not if the unit was
+# moved away as in docs/guide/migrate.md. doctor reports the unit.
 systemctl enable pinion-mcu
 flash() {
     install -D -m 755 /bin/sleep /run/flashed/klipper.elf
@@ -61,7 +61,7 @@ END
 systemctl daemon-reload
 systemctl start klipper-mcu
 until_true 10 identifies
-# A start and a restart at once: the stop writes before a link is there.
+# A start with an immediate restart: the stop writes before a link exists.
 systemctl stop klipper-mcu
 
 systemctl start klipper-mcu; systemctl restart klipper-mcu

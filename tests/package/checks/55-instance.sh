@@ -1,4 +1,4 @@
-# A further instance beside the first one, with a configuration of its own.
+# Another instance in addition to the first one, with its own configuration.
 pinion run --help | grep -e --config >/dev/null || { echo 'NOT RUN: this pinion takes no --config'; exit 0; }
 fresh
 systemctl start pinion-mcu

@@ -1,4 +1,4 @@
-# The package is upgraded under a klippy that heats: nothing changes until the service is restarted.
+# The package is upgraded while klippy heats: nothing changes until the service is restarted.
 . /share/klippy.sh
 klippy_is_ready
 gcode 'M140 S60'
@@ -13,6 +13,6 @@ until_true 10 is_low 3
 systemctl restart pinion-mcu
 firmware_restart
 systemctl stop klipper
-# What comes after this has the package of before.
+# The next checks need the former package.
 apt-get install -y --allow-downgrades /share/pinion-mcu.deb
 systemctl restart pinion-mcu

@@ -1,4 +1,4 @@
-# An upgrade leaves the print that runs, and what was edited; nobody has to answer it. A restart then runs the new unit.
+# An upgrade keeps a running print and edited files, and asks no questions. A restart then runs the new unit.
 export DEBIAN_FRONTEND=noninteractive
 CONFIG=/etc/pinion/pinion.toml
 light
@@ -10,9 +10,9 @@ is "$(pid)" "$before" "the process"
 is_high 3
 is "$(systemctl show -P NeedDaemonReload pinion-mcu)" no NeedDaemonReload
 grep -q 'log-level debug' /etc/default/pinion-mcu
-# It was as the package before delivered it.
+# The file was as the former package had delivered it, so it was replaced.
 grep -q '^# of the later package' $CONFIG
-# It is still refreshed, by the same host.
+# The same host still refreshes the heater.
 sleep 4
 is_high 3
 dark
@@ -21,7 +21,7 @@ is "$(systemctl show -P Description pinion-mcu)" 'The later unit' "the unit"
 identifies
 rm /etc/default/pinion-mcu
 
-# One that was edited stays; one that is missing is there again.
+# An edited file stays. A missing file is created again.
 echo '# edited' >>$CONFIG
 apt-get install -y --allow-downgrades /share/pinion-mcu.deb </dev/null
 grep -q '^# edited' $CONFIG
@@ -29,7 +29,7 @@ rm $CONFIG
 apt-get install -y /share/later.deb </dev/null
 cmp $CONFIG /usr/share/pinion-mcu/pinion.toml
 
-# A package of before, which had them as conffiles: what was edited stays, and nobody is asked.
+# An older package that had the files as conffiles: edited files stay, and no question is asked.
 dpkg-deb -R /share/pinion-mcu.deb /run/before
 sed -i 's/^Version: /&0~/' /run/before/DEBIAN/control
 rm /run/before/DEBIAN/postinst /run/before/DEBIAN/postrm
@@ -47,7 +47,7 @@ grep -q '^log_level = "debug"' $CONFIG
 grep -q 'margin 300' /etc/default/pinion-mcu
 systemctl start pinion-mcu
 identifies
-# What comes after this has the package as it is delivered.
+# The next checks need the package as delivered.
 apt-get purge -y pinion-mcu </dev/null
 [ ! -e $CONFIG ]
 [ ! -e /etc/default/pinion-mcu ]

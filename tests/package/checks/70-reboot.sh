@@ -1,3 +1,3 @@
-# It is enabled, and the computer boots.
+# The service is enabled, and the computer boots.
 systemctl enable --now pinion-mcu
 exit 77

@@ -1,4 +1,4 @@
-# klippy is there before Pinion: it waits. Then both are enabled, and the computer boots.
+# klippy starts before Pinion, and waits. Then both are enabled, and the computer boots.
 . /share/klippy.sh
 install_klippy
 configure
@@ -9,7 +9,7 @@ systemctl start klipper
 until_true $START grep 'Unable to open .*port: ' $LOG
 systemctl start pinion-mcu
 until_state ready
-# What the mocks are told is forgotten when the computer boots: without sensors.
+# The mocks lose their settings when the computer boots, so this configuration has no sensors.
 cat >$CONFIG <<END
 [mcu]
 serial: $LINK

@@ -1,4 +1,4 @@
-# Both have come up by themselves.
+# Both have started by themselves.
 . /share/klippy.sh
 until_state ready
 pull 8 up

@@ -1,4 +1,4 @@
-# Removed, it is stopped and disabled; purged, it leaves its user and groups, as the README says.
+# After the removal the service is stopped and disabled. The purge leaves its user and groups, as the README says.
 fresh
 systemctl enable --now pinion-mcu
 apt-get remove -y pinion-mcu
@@ -9,7 +9,7 @@ not is_active pinion-mcu
 [ ! -e /run/pinion ]
 is "$(systemctl list-units --all --plain --no-legend 'pinion-mcu*')" "" "the units that are there"
 [ ! -L /etc/systemd/system/multi-user.target.wants/pinion-mcu.service ]
-# An instance's configuration is who made it to remove.
+# The user must remove the configuration of an instance.
 rm -f /etc/pinion/second.toml
 apt-get purge -y pinion-mcu
 [ ! -e /etc/pinion ]

@@ -1,4 +1,4 @@
-# The README, from the installation to the purge, on a machine that has nothing of it yet.
+# The README, from the installation to the purge, on a system without any part of it.
 bare
 page README.md
 not dpkg -s pinion-mcu

@@ -1,5 +1,5 @@
-# Klipper's own service runs, by something that stands for its program; its user is in the group that it takes, too.
-# And the package was built.
+# Klipper's own service runs, with a replacement for its program. Its user is also in the group tty. The package is
+# already built.
 bare
 usermod -aG tty pi
 instead 'make deb'

@@ -1,4 +1,4 @@
-# later N: the folder that apt takes packages from has a later one, whose configuration file is another.
+# later N: adds a later package with another configuration file to apt's folder.
 later() {
     rm -rf /run/later
     dpkg-deb -R /share/later.deb /run/later
@@ -12,20 +12,20 @@ version() { dpkg-query -W -f '${Version}' pinion-mcu; }
 
 installed
 install -d -o pi /home/pi/printer_data /srv/pinion
-# Moonraker's own has an end of its last line; who has edited it may have taken that away.
+# Moonraker's own file has a newline at its end. A user's edit may have removed it.
 printf 'klipper_mcu\nwebcamd' >/home/pi/printer_data/moonraker.asvc
 chown pi: /home/pi/printer_data/moonraker.asvc
 echo 'deb [trusted=yes] file:/srv/pinion ./' >/etc/apt/sources.list.d/pinion.list
 later 1
 page docs/guide/moonraker.md
 is "$(cat /home/pi/printer_data/moonraker.asvc)" "$(printf 'klipper_mcu\nwebcamd\npinion-mcu')" "Moonraker's services"
-# Before Moonraker's first start there is none, and none is made: it would lack what Moonraker puts there.
+# Before Moonraker's first start there is no file, and none is made: it would lack Moonraker's entries.
 mkdir -p /run/fresh
 not sed -i '$a pinion-mcu' /run/fresh/moonraker.asvc
 [ ! -e /run/fresh/moonraker.asvc ]
 case $(version) in *later1) ;; *) fail "the version is $(version)" ;; esac
 
-# A changed configuration, and nobody to answer.
+# A changed configuration, and no answers to questions.
 echo '# edited' >>/etc/pinion/pinion.toml
 later 2
 DEBIAN_FRONTEND=noninteractive apt-get upgrade --yes </dev/null

@@ -1,3 +1,3 @@
-# Any page that no other check tries.
+# Any page without another check.
 installed
 page "$PAGE"

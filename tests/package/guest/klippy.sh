@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-# The words of the checks with a real klippy, which a check takes by `. /share/klippy.sh`. klippy lives in
-# klippy's home and is run by a unit of the shape that KIAUH writes.
+# The functions of the checks with a real klippy. A check reads them with `. /share/klippy.sh`. klippy lives in klippy's
+# home. A unit in KIAUH's form runs it.
 [ -d /share/klipper ] || { echo 'KLIPPER_DIR names no checkout of Klipper'; exit 78; }
 trap 'echo "failed: line $LINENO: $BASH_COMMAND"
     journalctl -n 25 --no-pager -u "pinion-mcu*" -u klipper 2>/dev/null
@@ -11,7 +11,7 @@ API=$DATA/comms/klippy.sock
 LOG=$DATA/logs/klippy.log
 CONFIG=$DATA/config/printer.cfg
 MOCKS=/sys/devices/platform
-# Python in the emulator takes many times as long to start as on a Raspberry Pi.
+# Python in the emulator starts many times slower than on a Raspberry Pi.
 START=90
 
 pull() { echo "pull-$2" >"$CHIP/sim_gpio$1/pull"; }
@@ -21,13 +21,13 @@ gcode() { ask gcode/script "{ \"script\": \"$1\" }" "" >/dev/null; }
 # of OBJECT FIELD
 of() { ask objects/query "{ \"objects\": { \"$1\": null } }" "/status/$1/$2"; }
 state() { ask info '{}' /state; }
-# What klippy says of its state, as Mainsail and Fluidd show it.
+# klippy's message about its state, as Mainsail and Fluidd show it.
 why() { ask info '{}' /state_message; }
 says() { why | grep "$1" >/dev/null; }
 # between VALUE LEAST MOST
 between() { awk -v value="$1" -v least="$2" -v most="$3" 'BEGIN { exit !(value >= least && value <= most) }'; }
 measures() { between "$(of "$1" temperature)" "$2" "$3"; }
-# until_state STATE: asked seldom, as klippy has one slow processor to start on.
+# until_state STATE: polls rarely, because klippy starts on one slow processor.
 until_state() {
     local end=$((SECONDS + START))
     until [ "$(state 2>/dev/null)" = "$1" ]; do
@@ -35,15 +35,15 @@ until_state() {
         sleep 1
     done
 }
-# Its user's cure for everything. (klippy hangs up on who says it.)
+# A user's usual remedy. (klippy closes the connection of the sender.)
 firmware_restart() {
     gcode FIRMWARE_RESTART || true
     until_state ready
 }
 
-# A printer whose only micro-controller is Pinion, and the surroundings of the computer's pins.
+# A printer with Pinion as its only MCU, and the environment of the computer's pins.
 configure() {
-    # 25 and 82 degrees, by a resistor of 4.7 kOhm.
+    # 25 and 82 degrees, with a resistor of 4.7 kOhm.
     echo 3911 >"$MOCKS/mock-adc.0/iio:device0/in_voltage0_raw"
     echo 2786 >"$MOCKS/mock-adc.0/iio:device0/in_voltage1_raw"
     # 27.5 degrees in an LM75's register.
@@ -147,7 +147,7 @@ press_gcode:
 END
 }
 
-# Once in a machine.
+# Once per VM.
 install_klippy() {
     [ ! -e /etc/systemd/system/klipper.service ] || return 0
     mkdir -p $DATA/config $DATA/logs $DATA/comms $DATA/systemd
@@ -178,8 +178,8 @@ END
     systemctl daemon-reload
 }
 
-# klippy is installed, and ready on the configuration above. A machine that a check before has left shut
-# down, as by a heater that nobody refreshed any more, klippy does not take without a FIRMWARE_RESTART.
+# klippy is installed, and ready with the configuration above. An earlier check may have left the MCU shut down, for
+# example because nobody refreshed a heater. klippy then needs a FIRMWARE_RESTART.
 klippy_is_ready() {
     fresh
     install_klippy

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-# The words that the checks are written with. A check ends at the first command that fails.
+# The functions of the checks. A check ends at the first command that fails.
 set -Eeuo pipefail
 trap 'echo "failed: line $LINENO: $BASH_COMMAND"; journalctl -n 25 --no-pager -u "pinion-mcu*" -u klipper-mcu 2>/dev/null' ERR
 export PATH=$PATH:/share
@@ -7,7 +7,7 @@ export PATH=$PATH:/share
 LINK=/tmp/klipper_host_mcu
 CHIP=/sys/devices/platform/gpio-sim.0/gpiochip0
 
-# bash goes on after a "!" command that fails its check, and after an "a && b" whose a fails: neither is used.
+# bash continues after a "!" command that fails its check, and after "a && b" when a fails. So the checks use neither.
 not() { if "$@"; then fail "it succeeded: $*"; fi; }
 fail() { echo "$*"; false; }
 # is VALUE WANTED [OF WHAT]
@@ -38,27 +38,27 @@ light() {
     until_true 5 is_high 3
 }
 dark() { pkill -f '/share/host light' || true; }
-# What the journal has of the service, since the mark that `mark` sets.
-# (Not by a cursor: with a filter journalctl --after-cursor leaves out the first line that the filter lets through.)
+# The journal of the service since the mark that `mark` sets.
+# (Not by a cursor: with a filter, journalctl --after-cursor omits the first line that the filter passes.)
 mark() { date +@%s.%6N >/run/mark; }
 said() { journalctl --sync; journalctl -q --since="$(cat /run/mark)" -o cat -u "${1:-pinion-mcu}" "${@:2}"; }
 
-# What somebody types who takes whatever is proposed.
+# The input of a user who accepts all defaults.
 ENTERS=/run/enters
 printf '\n%.0s' {1..200} >$ENTERS
 
-# pi, a new user who may do anything by sudo, with a clone.
+# pi, a new user with a clone, who may do anything with sudo.
 new_user() {
     if id pi >/dev/null 2>&1; then userdel -rf pi; fi
     useradd -m -s /bin/bash pi
-    # What any system has, and this one does not: sudo looks its own computer up.
+    # Any system has these, but this one does not: sudo looks up the name of its computer.
     mkdir -p /etc/apt/sources.list.d
     grep -q guest /etc/hosts || echo 127.0.1.1 guest >>/etc/hosts
     echo 'pi ALL=(ALL) NOPASSWD: ALL' >/etc/sudoers.d/pi
     cp -r /share/tree /home/pi/pinion
     chown -R pi: /home/pi/pinion
 }
-# A machine without the package, and a new user.
+# A system without the package, and a new user.
 bare() {
     until_true 60 is_active test-chips
     apt-get -qq update
@@ -67,7 +67,7 @@ bare() {
     apt-get -qq autoremove -y --purge libiio0
     new_user
 }
-# What docs/guide/install.md leaves a new user: the package is installed, its service runs, and he is in the group tty.
+# The result of docs/guide/install.md: the package is installed, its service runs, and the user is in the group tty.
 installed() {
     fresh
     if is_as_delivered; then
@@ -85,8 +85,8 @@ is_as_delivered() {
         [ -z "$(dpkg --verify pinion-mcu)" ] && [ ! -e /etc/default/pinion-mcu ] &&
         cmp -s /etc/pinion/pinion.toml /usr/share/pinion-mcu/pinion.toml
 }
-# page NAME: tries its commands, block by block, each in a session of its own, in the folder of the clone.
-# Whatever asks something, as apt does, is answered by Enter.
+# page NAME: tries its commands, block by block, each in its own session, in the folder of the clone. Every question,
+# for example of apt, is answered with Enter.
 page() {
     local block status
     for block in /share/pages/"$1"/*; do
@@ -101,7 +101,7 @@ page() {
         esac
     done
 }
-# What commands would have left that cannot be tried: `make deb` a package, and after `git pull` a later one.
+# The results of commands that cannot be tried: `make deb` makes a package, and after `git pull` a later one.
 instead() {
     local deb=/home/pi/pinion/target/deb
     case $1 in
