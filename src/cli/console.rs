@@ -56,13 +56,13 @@ const PROMPT: &str = "> ";
 /// Options of `pinion console`.
 #[derive(Args, Clone, Debug)]
 pub(super) struct ConsoleArgs {
-    /// The machine's terminal
+    /// The MCU's terminal
     #[arg(value_name = "PTY", default_value = "/tmp/klipper_host_mcu")]
     pty: PathBuf,
-    /// Run the lines of FILE, up to the first that fails, and end
+    /// Run the lines of FILE until one fails, and end
     #[arg(short = 'f', value_name = "FILE")]
     file: Option<PathBuf>,
-    /// Speak to a simulated machine of its own: sim, or sim:FILE.toml
+    /// Start a simulated MCU and talk to it: sim, or sim:FILE.toml
     #[arg(long, value_name = "BOARD", conflicts_with = "pty", value_parser = offering::<BoardName>(SIMULATED),
         hide_possible_values = true)]
     board: Option<BoardName>,
@@ -80,7 +80,7 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
             ready.and_then(|_terminal| speak(args, &args.pty))
         }
         Some(BoardName::Sim(file)) => simulate(args, file.as_deref()),
-        Some(BoardName::Linux) => Err("--board is sim or sim:FILE.toml here; for this machine's pins start pinion run, and name its link to pinion console".into()),
+        Some(BoardName::Linux) => Err("--board is sim or sim:FILE.toml here; for this computer's pins start pinion run, then give pinion console its link".into()),
     };
     done.map_or_else(failed, |()| ExitCode::SUCCESS)
 }
@@ -287,7 +287,7 @@ fn read_lines(
                     // Its answer comes before the next prompt. None: the session has ended.
                     match answers.recv() {
                         Ok(Some(vocabulary)) if !is_gone => editor.set_helper(Some(Words(vocabulary))),
-                        _ if gone.load(Ordering::Relaxed) => return Err("the machine is gone".into()),
+                        _ if gone.load(Ordering::Relaxed) => return Err("the MCU is gone".into()),
                         _ => return Ok(()),
                     }
                 }

@@ -29,8 +29,8 @@ pub(super) struct DictArgs {
     #[arg(long, value_name = "BOARD", default_value = "linux", value_parser = offering::<BoardName>(BOARDS),
         hide_possible_values = true)]
     board: BoardName,
-    /// The hosts that it is for: v0.11, v0.12, v0.13 or master (of Klipper), kalico, or union (of the
-    /// last three, as far as they agree)
+    /// The hosts of the dictionary: v0.11, v0.12, v0.13 or master of Klipper, kalico, or union (what v0.13,
+    /// master and kalico agree on)
     #[arg(long, value_name = "NAME", default_value = "master", value_parser = offering::<DialectName>(DIALECTS),
         hide_possible_values = true)]
     dialect: DialectName,

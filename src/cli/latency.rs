@@ -22,7 +22,7 @@ use super::page::{Page, print};
 /// Options of `pinion latency`.
 #[derive(Args, Clone, Debug)]
 pub(super) struct LatencyArgs {
-    /// How long to measure, half of it idle and half under load
+    /// How long to measure, in seconds: half of it idle, half under load
     #[arg(long, value_name = "N", default_value_t = 10, value_hint = clap::ValueHint::Other, value_parser = clap::value_parser!(u32).range(2..=3600))]
     seconds: u32,
     /// Draw the histograms
@@ -73,7 +73,7 @@ fn draw(halves: &[Half; 2], fitness: Fitness) -> String {
     let mut svg = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"{WIDTH}\" height=\"{height}\" font-family=\"sans-serif\" font-size=\"12\">\n\
          <rect width=\"100%\" height=\"100%\" fill=\"#ffffff\"/>\n\
-         <text x=\"{LEFT}\" y=\"22\" font-size=\"15\">Lateness of this machine: {}</text>\n",
+         <text x=\"{LEFT}\" y=\"22\" font-size=\"15\">Lateness of this computer: {}</text>\n",
         match fitness {
             Fitness::Steppers => "fit for steppers",
             Fitness::SlowOutputs => "fit for heaters and fans",

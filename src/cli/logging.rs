@@ -210,7 +210,7 @@ pub(super) fn start(level: LevelFilter) {
 pub(super) fn detach() {
     match thread::Builder::new().name("log".into()).spawn(|| STDERR.write_on()) {
         Ok(_) => STDERR.queue().has_writer = true,
-        Err(error) => log::warn!("a log that nobody reads will stop the machine: no thread can be started: {error}"),
+        Err(error) => log::warn!("a log that nobody reads will stop Pinion: no thread can be started: {error}"),
     }
 }
 

@@ -62,21 +62,21 @@ struct LogArgs {
 enum Command {
     /// Serve a Klipper host on a pty (the default)
     Run(run::RunArgs),
-    /// List this machine's GPIO lines, ADCs, PWM channels and buses by their names
+    /// List this computer's GPIO lines, ADCs, PWM channels and buses by name
     Pins(pins::PinsArgs),
-    /// Print the data dictionary, as klippy's batch mode takes it with -d
+    /// Print the data dictionary for klippy's batch mode (-d)
     Dict(dict::DictArgs),
-    /// Measure how late this machine wakes up, and say what that is good for
+    /// Measure how late this computer wakes up, and say which uses that allows
     Latency(latency::LatencyArgs),
-    /// Say what works on this machine and what does not, and what mends it
+    /// Check this computer, and print the command that fixes each problem
     Doctor(doctor::DoctorArgs),
     /// Ask a running Pinion for its state, host, pins, queues and lateness
     Status(status::StatusArgs),
-    /// Speak to a running or a simulated machine by hand, without klippy
+    /// Send commands to a running or simulated MCU by hand, without klippy
     Console(console::ConsoleArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
-    /// Print a script that has a shell complete the command lines of pinion
+    /// Print a script with which a shell completes pinion's command lines
     Completions {
         /// The shell
         shell: clap_complete::Shell,

@@ -25,13 +25,13 @@ use super::page::{Page, aligned, print};
 /// Options of `pinion pins`.
 #[derive(Args, Clone, Debug, Default)]
 pub(super) struct PinsArgs {
-    /// Show only GPIO lines that nobody holds
+    /// Show only GPIO lines that no program holds
     #[arg(long)]
     pub free: bool,
     /// Print JSON
     #[arg(long)]
     pub json: bool,
-    /// Show only what has this in a name, in any case (such as gpio17, pinctrl, voltage)
+    /// Show only entries with this text in a name, in any case (for example gpio17, pinctrl, voltage)
     #[arg(value_name = "NAME", value_hint = clap::ValueHint::Other)]
     pub filter: Option<String>,
 }

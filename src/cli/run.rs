@@ -25,10 +25,10 @@ use super::{check, config, end_by_panic, failed, logging};
 pub(super) struct RunArgs {
     #[command(flatten)]
     given: Given,
-    /// Read options from FILE, such as /etc/pinion/pinion.toml; the command line goes before it
+    /// Read options from FILE, for example /etc/pinion/pinion.toml. The command line overrides it
     #[arg(long, value_name = "FILE")]
     config: Option<PathBuf>,
-    /// Check the configuration against this machine, and end: status 0 if it can be served
+    /// Check the configuration on this computer, and end. The exit status is 0 if Pinion can serve it
     #[arg(long)]
     check: bool,
 }

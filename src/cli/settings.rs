@@ -31,7 +31,7 @@ pub(super) const MARGIN_MAX_US: u32 = 10_000;
 /// What the command line or the configuration file says, as far as it says anything.
 #[derive(Args, Clone, Debug, Default, PartialEq)]
 pub(super) struct Given {
-    /// Where to put the symbolic link to the pty that the host opens [default: /tmp/klipper_host_mcu]
+    /// Path of the symbolic link that the host opens; it leads to the pty [default: /tmp/klipper_host_mcu]
     #[arg(short = 'I', value_name = "PATH")]
     pub(super) symlink: Option<PathBuf>,
     /// Run in real time: SCHED_FIFO and locked memory
@@ -40,8 +40,8 @@ pub(super) struct Given {
     /// Run the core on this processor only
     #[arg(long, value_name = "N", value_hint = ValueHint::Other)]
     pub(super) cpu: Option<usize>,
-    /// How early, at most, the core may wake for a timer and spin the rest: it learns how early
-    /// it has to. 0 saves power and makes steps late [default: 200]
+    /// Longest time that the core wakes early for a timer and then spins, in microseconds. It learns the
+    /// time it needs. 0 saves power and makes steps late [default: 200]
     #[arg(long, value_name = "US", value_hint = ValueHint::Other, value_parser = clap::value_parser!(u32).range(0..=i64::from(MARGIN_MAX_US)))]
     pub(super) margin: Option<u32>,
     /// Feed the hardware watchdog /dev/watchdog
@@ -50,17 +50,17 @@ pub(super) struct Given {
     /// Permission bits of the pty, octal [default: 0660]
     #[arg(short = 'm', value_name = "MODE", value_hint = ValueHint::Other, value_parser = mode)]
     pub(super) mode: Option<u32>,
-    /// Group of the pty, by name or number [default: tty, where that is permitted]
+    /// Group of the pty, by name or number [default: tty, if permitted]
     #[arg(short = 'g', value_name = "GROUP", value_hint = ValueHint::Other)]
     pub(super) group: Option<String>,
-    /// The board: linux (this machine's pins), sim (a simulated printer) or sim:FILE.toml [default: linux]
+    /// The board: linux (this computer's pins), sim (a simulated printer) or sim:FILE.toml [default: linux]
     #[arg(long, value_name = "BOARD", value_parser = offering::<BoardName>(BOARDS), hide_possible_values = true)]
     pub(super) board: Option<BoardName>,
-    /// The hosts to serve: auto (whichever comes), v0.11, v0.12, v0.13 or master (of Klipper), kalico,
-    /// or union (of the last three, as far as they agree) [default: auto]
+    /// The hosts to serve: auto (recognizes the host), v0.11, v0.12, v0.13 or master of Klipper, kalico, or
+    /// union (what v0.13, master and kalico agree on) [default: auto]
     #[arg(long, value_name = "NAME", value_parser = offering::<Spoken>(SPOKEN), hide_possible_values = true)]
     pub(super) dialect: Option<Spoken>,
-    /// Where to put the socket for `pinion status` [default: named for the link, in /run/pinion or beside it]
+    /// Path of the socket for `pinion status` [default: named after the link, in /run/pinion or beside the link]
     #[arg(long, value_name = "PATH")]
     pub(super) socket: Option<PathBuf>,
     /// The command line's level is an option of all subcommands.

@@ -41,14 +41,14 @@ pub(super) struct SimArgs {
     /// Print the printer.cfg that matches the printer, and end
     #[arg(long)]
     print_config: bool,
-    /// Print the built-in printer's description, a start for one's own, and end
+    /// Print the description of the built-in printer, and end. Start from it to write your own
     #[arg(long, conflicts_with = "print_config")]
     print_board: bool,
-    /// End after the demonstration, with status 0 if all that it showed was right
+    /// End after the demonstration. The exit status is 0 if everything in it was right
     #[arg(long)]
     demo: bool,
-    /// Instead of the demonstration show the printer as it changes, while a host drives it: a live
-    /// picture on a terminal, a line for each change elsewhere
+    /// Show the printer while a host drives it, instead of the demonstration: a live picture on a terminal,
+    /// one line for each change elsewhere
     #[arg(long, conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
     show: bool,
     /// Draw the homing: position, endstop and step rate over time
@@ -57,7 +57,7 @@ pub(super) struct SimArgs {
     /// Run in real time: SCHED_FIFO and locked memory
     #[arg(short = 'r')]
     realtime: bool,
-    /// Where to put the symbolic link to the pty that the host opens
+    /// Path of the symbolic link that the host opens; it leads to the pty
     #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
     symlink: PathBuf,
 }

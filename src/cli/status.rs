@@ -27,14 +27,14 @@ pub(super) struct StatusArgs {
     /// Print metrics for a Prometheus scraper
     #[arg(long, conflicts_with = "json")]
     prometheus: bool,
-    /// Print it anew each second: in place on a terminal, where arrows and page keys scroll, until q or Ctrl-C;
-    /// elsewhere one after the other
+    /// Print the state every second, until q or Ctrl-C. On a terminal it stays in place, and arrows and page keys
+    /// scroll
     #[arg(long)]
     watch: bool,
     /// The link of the instance to ask
     #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
     symlink: PathBuf,
-    /// Its socket, if that is not where the link's name says
+    /// The socket of the instance, if its path does not follow from the link's name
     #[arg(long, value_name = "PATH")]
     socket: Option<PathBuf>,
 }

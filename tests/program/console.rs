@@ -83,7 +83,7 @@ fn a_shutdown_is_told_with_its_text_and_reset_ends_it() {
     let output = console(&["--board", "sim"], script);
     let (out, log) = (text(&output.stdout), text(&output.stderr));
     assert_eq!(output.status.code(), Some(1), "{out}\n{log}");
-    assert!(log.contains("line 2: the machine shut down: oids already allocated"), "{log}");
+    assert!(log.contains("line 2: the MCU shut down: oids already allocated"), "{log}");
     assert!(!out.contains("] clock "), "{out}");
     // A requested stop is not an error.
     let script = format!("{OUTPUT}emergency_stop\nreset\n{OUTPUT}get_config\n");
@@ -102,7 +102,7 @@ fn an_output_follows_an_instant_that_is_given_from_now() {
     let output = console(&["--board", "sim"], &script);
     let (out, log) = (text(&output.stdout), text(&output.stderr));
     assert!(out.contains("] config is_config=1 crc=1 is_shutdown=0"), "{out}\n{log}");
-    assert!(log.contains("line 8: the machine shut down: Missed scheduling of next digital out event"), "{log}");
+    assert!(log.contains("line 8: the MCU shut down: Missed scheduling of next digital out event"), "{log}");
 }
 
 #[test]
@@ -319,7 +319,7 @@ fn what_the_mcu_says_meanwhile_is_printed_at_once() {
     }
     person.types("update_digital_out oid=0 value=1\r");
     // Nobody refreshes the output, and nobody types.
-    person.until("!! the machine shut down: Missed scheduling of next digital out event");
+    person.until("!! the MCU shut down: Missed scheduling of next digital out event");
     person.types("\x04");
     assert!(person.child.wait().unwrap().success(), "{}", person.text());
 }

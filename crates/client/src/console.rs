@@ -24,7 +24,7 @@ const OWN: &[(&str, &str)] = &[
     ("help", "help [COMMAND]: what there is, or the parameters of a command"),
     ("delay", "delay SECONDS: wait, and print what comes meanwhile"),
     ("reset", "reset: drop the configuration and start anew, as FIRMWARE_RESTART does"),
-    ("stats", "stats: from now on print the machine's statistics, too; or no longer"),
+    ("stats", "stats: turn the MCU's statistics on or off"),
     ("quit", "quit: end (also Ctrl-D)"),
 ];
 
@@ -119,7 +119,7 @@ impl Console {
                 self.client.reset().map_err(told)?;
                 self.client.drain();
                 self.vocabulary = Vocabulary::new(self.client.dictionary(), self.client.messages());
-                print("the machine waits for a new configuration");
+                print("the MCU waits for a new configuration");
             }
             ("stats", []) => self.shows_stats = !self.shows_stats,
             ("quit" | "exit", []) => return Ok(Next::End),
@@ -189,7 +189,7 @@ impl Console {
                 _ => continue,
             };
             let reason = response.text("static_string_id").unwrap_or_default();
-            stopped.get_or_insert(format!("the machine {verb}: {reason} (its log says more; reset starts it anew)"));
+            stopped.get_or_insert(format!("the MCU {verb}: {reason} (its log says more; reset restarts it)"));
         }
         Ok(stopped)
     }

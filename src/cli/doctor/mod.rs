@@ -39,14 +39,14 @@ const UPGRADE: &str =
 /// Options of `pinion doctor`.
 #[derive(Args, Clone, Debug)]
 pub(super) struct DoctorArgs {
-    /// Look at a checkout of Klipper or Kalico as well: whether this Pinion serves that host, before you
-    /// restart it
+    /// Also check a checkout of Klipper or Kalico: does this Pinion serve that host? Ask before you restart
+    /// the host
     #[arg(long, value_name = "DIR", value_hint = ValueHint::DirPath)]
     klipper: Option<PathBuf>,
     /// Print JSON
     #[arg(long)]
     json: bool,
-    /// Look at the system whose files are below DIR, such as a card's that is mounted there
+    /// Check the system whose files are below DIR, for example a mounted card
     #[arg(long, value_name = "DIR", default_value = "/", value_hint = ValueHint::DirPath)]
     root: PathBuf,
 }

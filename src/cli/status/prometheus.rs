@@ -23,12 +23,12 @@ pub(super) fn page(status: &Status) -> Page {
         1.0,
     );
     out.one("pinion_uptime_seconds", "gauge", "Time since the start", status.uptime_s);
-    out.head("pinion_state", "gauge", "1 for the state that the machine is in");
+    out.head("pinion_state", "gauge", "1 for the present state of the MCU");
     for state in State::ALL {
         out.sample("pinion_state", &[("state", text(state.name()))], yes(status.state == state));
     }
     if let Some(stop) = mcu.and_then(|mcu| mcu.shutdown.as_ref()) {
-        out.head("pinion_shutdown_info", "gauge", "Why the machine is shut down");
+        out.head("pinion_shutdown_info", "gauge", "Why the MCU is shut down");
         out.sample("pinion_shutdown_info", &[("reason", text(&stop.reason))], 1.0);
     }
     out.one("pinion_host_attached", "gauge", "Whether a host is there", yes(status.host.attached));

@@ -114,7 +114,7 @@ impl Errand for Shift {
 fn too_slow(name: &str, ticks: i64) -> String {
     let us = ticks / i64::from(Ticks::from_us(1).0);
     format!(
-        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this machine is too slow or too busy for it; run Pinion with -r, or use a load cell ADC on SPI (ADS1220, ADS131M0x); said once"
+        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or use a load cell ADC on SPI (ADS1220, ADS131M0x); said once"
     )
 }
 
