@@ -17,7 +17,7 @@ fn configure(config: String) -> String {
     )
 }
 
-/// The bed's diagonals AC and BD and its side AD, measured on a printed square that is askew by 0.6 degrees.
+/// The bed's diagonals AC and BD and its side AD, measured on a printed square. The square is askew by 0.6 degrees.
 const SKEW: [f64; 3] = [140.7, 142.1, 100.0];
 
 /// How far x must move for each mm of y (`calc_skew_factor` of extras/skew_correction.py): the cotangent of the angle

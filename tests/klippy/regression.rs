@@ -128,7 +128,7 @@ fn add_foreign(dictionary: &mut Value, buses: &BTreeMap<&str, BTreeSet<String>>)
     }
 }
 
-/// The firmware's dictionary. Messages that are also in our dictionary get the same ids, so that klippy's output can be
+/// The firmware's dictionary. Messages that are also in our dictionary get the same ids. So klippy's output can be
 /// compared byte by byte.
 fn firmware(ours: &Value) -> Value {
     let firmware: Value = serde_json::from_str(FIRMWARE).unwrap();

@@ -266,8 +266,8 @@ impl Messages {
         enumeration.map_or_else(Vec::new, Enumeration::all)
     }
 
-    /// The bytes of a command. Fails if the dictionary has no such command, if the parameters are not exactly the
-    /// command's own, or if a value does not fit.
+    /// The bytes of a command. Fails if the dictionary has no such command, or if a value does not fit. Also fails if
+    /// the parameters are not exactly the command's own.
     pub fn encode(&self, command: &str, args: &[(&str, Arg<'_>)]) -> Result<Vec<u8>, Error> {
         let wrong = |why: String| Error::Message { message: command.to_owned(), why };
         let message = self.commands.get(command).ok_or_else(|| wrong("the MCU has no such command".to_owned()))?;

@@ -120,8 +120,8 @@ pub struct Profile {
 }
 
 impl Profile {
-    /// A move of `steps` steps at up to `speed` steps/s with `acceleration` steps/s² (infinity for no limit), on a
-    /// clock of `frequency_hz`. Fails if a number is not positive. Also fails if the speed is below a step in about 20
+    /// A move of `steps` steps at up to `speed` steps/s with `acceleration` steps/s² (infinity for no limit). The clock
+    /// runs at `frequency_hz`. Fails if a number is not positive. Also fails if the speed is below a step in about 20
     /// seconds or above a step per tick.
     pub fn trapezoid(steps: u32, speed: f64, acceleration: f64, frequency_hz: f64) -> Result<Profile, Error> {
         let cruise = (frequency_hz / speed).ceil();

@@ -36,8 +36,8 @@ const SYNC: u8 = 0x7e;
 const RTO_MIN: Duration = Duration::from_millis(25);
 const RTO_MAX: Duration = Duration::from_secs(5);
 
-/// Carries bytes over a tty, pty, socket or any other pollable file, and finds the blocks in the input, in any order.
-/// Tests send bytes through it that a [`BlockLink`] would never send.
+/// Carries bytes over a tty, pty, socket or any other pollable file. Finds the blocks in the input, in any order. Tests
+/// send bytes through it that a [`BlockLink`] would never send.
 #[derive(Debug)]
 pub struct Port {
     file: File,

@@ -182,7 +182,7 @@ impl SimConfig {
 /// The key with the value that contains the byte `at` of the text.
 fn key(text: &str, at: usize) -> Option<&str> {
     let (keys, value) = text.get(..at)?.rsplit_once('=')?;
-    // If there are lines between the key and that byte, the byte belongs to the value only in an unclosed list.
+    // After a line break the byte belongs to the value only if the value is an unclosed list.
     let open = value.matches('[').count() > value.matches(']').count();
     let goes_on = value.trim_start().starts_with('[') && open;
     if value.contains('\n') && !goes_on {

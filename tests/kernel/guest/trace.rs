@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The real events on the lines with their times, and the system calls of a program, from the kernel's own trace
-//! points.
+//! The real events on the lines with their times, and the system calls of a program. Both come from the kernel's own
+//! trace points.
 
 use std::cell::RefCell;
 use std::collections::BTreeMap;

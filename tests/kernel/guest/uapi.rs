@@ -102,7 +102,7 @@ pub fn debounced_input(chip: &Path, offset: u32, period_us: u64) -> File {
 /// GPIOHANDLE_SET_CONFIG_IOCTL, which Linux has had since 5.5.
 pub const GPIOHANDLE_SET_CONFIG: u32 = 0xc054_b40a;
 
-/// Makes an ioctl fail in the program that will be started, as in a kernel that does not know the ioctl.
+/// Makes an ioctl fail in the program of `command`, as in a kernel that does not know the ioctl.
 pub fn without_ioctl(command: &mut Command, request: u32, errno: i32) {
     let load = |at: u32| (libc::BPF_LD | libc::BPF_W | libc::BPF_ABS, 0, 0, at);
     let is = |value: u32, otherwise: u8| (libc::BPF_JMP | libc::BPF_JEQ | libc::BPF_K, 0, otherwise, value);

@@ -14,7 +14,7 @@ use crate::description::axes::{BedConfig, DeltaConfig};
 /// A plane that motors hold up, each at a place: a gantry over the bed, or the bed under it.
 ///
 /// The plane is stiff. Three motors define it. Two leave it level across their line, and one leaves it level. More than
-/// three pull at it like springs, and it settles as near to all of them as it can (least squares).
+/// three pull at it like springs. It then settles as near to all of them as possible (least squares).
 pub struct Plane {
     /// The middle of the motors.
     middle: [f64; 2],

@@ -9,7 +9,7 @@ use std::sync::atomic::{AtomicU64, Ordering, fence};
 ///
 /// They alternate between two places. So a writer that was stopped in the middle of a store delays no reader: the words
 /// before are still whole. The writer may be a worker that the core preempted. It continues only when the core is done.
-/// A reader reads again only if a whole `store` happened meanwhile, because the next store writes to the place that it
+/// A reader reads again only if a whole `store` happened during its read. The next store writes to the place that it
 /// reads.
 #[derive(Debug)]
 pub struct Together<const N: usize> {
@@ -42,7 +42,7 @@ impl<const N: usize> Together<N> {
     /// Only one thread may store.
     pub fn store(&self, words: [u64; N]) {
         let stores = self.stores.load(Ordering::Relaxed).wrapping_add(1);
-        // A reader that sees one of these words also sees that the words of two stores ago are no longer the last.
+        // A reader that sees one of these words also sees that the former words in this place are outdated.
         fence(Ordering::Release);
         for (word, value) in self.place(stores).iter().zip(words) {
             word.store(value, Ordering::Relaxed);

@@ -8,8 +8,9 @@
 //! releases it.
 //!
 //! Simulated: pin down, touch mode, pin up, self-test, reset, the pin's time to move, the touch, the alarm. Not
-//! simulated: the modes of the output's voltage, the heat of a pin that is held for long, the lights. A touch is
-//! noticed only when the sensor line is read, as a host does at each step of a probing move.
+//! simulated: the modes of the output's voltage, the heat of a pin that is held for long, the lights.
+//!
+//! A touch is noticed only when the sensor line is read. A host reads it at each step of a probing move.
 
 #![forbid(unsafe_code)]
 
