@@ -143,13 +143,7 @@ fn draw_scale(svg: &mut String, base: f64) {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use pinion_firmware::time::Ticks;
-
-    fn half(name: &'static str, late: &[i64]) -> Half {
-        let mut edge = Lateness::default();
-        late.iter().for_each(|late| edge.record(*late));
-        Half { name, wakeup: edge.clone(), edge, margin: Ticks(0) }
-    }
+    use crate::runtime::latency::tests::half;
 
     #[test]
     fn the_picture_shows_both_halves() {

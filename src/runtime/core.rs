@@ -319,7 +319,7 @@ impl Core {
         self.yielded = 0;
         if self.mcu.is_held() {
             match next_commands(self.block.as_ref(), &self.requests) {
-                Some(commands) if self.mcu.joins(commands) => {}
+                Some(commands) if self.mcu.may_run(commands) => {}
                 next => {
                     // The blocks behind it can wait as well.
                     self.progress.hold(next.is_some());
@@ -342,7 +342,7 @@ impl Core {
         let bytes = payload.as_slice();
         let mut reader = Reader::new(&bytes[at..]);
         for _ in 0..if one { 1 } else { self.room() } {
-            if reader.is_empty() || self.mcu.is_held() && !self.mcu.joins(reader.rest()) {
+            if reader.is_empty() || !self.mcu.may_run(reader.rest()) {
                 break;
             }
             self.mcu.execute(&mut reader);
@@ -423,7 +423,7 @@ impl Calls<'_> {
                 false => self.block.is_some() || !self.requests.is_empty(),
                 true => {
                     !self.mcu.is_shutdown() && self.core.stops_handed() != self.stops_taken
-                        || next_commands(self.block, self.requests).is_some_and(|commands| self.mcu.joins(commands))
+                        || next_commands(self.block, self.requests).is_some_and(|commands| self.mcu.may_run(commands))
                 }
             }
     }

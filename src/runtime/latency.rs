@@ -223,10 +223,11 @@ fn remedy(fitness: Fitness, scheduling: Scheduling) -> Option<String> {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
 
-    fn half(name: &'static str, late: &[i64]) -> Half {
+    /// A half in which the events were this late, in ticks.
+    pub(crate) fn half(name: &'static str, late: &[i64]) -> Half {
         let mut edge = Lateness::default();
         late.iter().for_each(|late| edge.record(*late));
         Half { name, wakeup: edge.clone(), edge, margin: Ticks(0) }

@@ -110,8 +110,11 @@ impl Progress {
     /// Notes whether a bus holds the core's block back from now on. After this the core looks for further blocks before
     /// it sleeps.
     pub(super) fn hold(&self, held: bool) {
-        self.held.store(held, Ordering::Relaxed);
-        fence(Ordering::SeqCst);
+        // The core alone changes it, and calls this in each of its turns. Only a change needs the fence.
+        if self.held.load(Ordering::Relaxed) != held {
+            self.held.store(held, Ordering::Relaxed);
+            fence(Ordering::SeqCst);
+        }
     }
 
     /// Whether a bus holds the core's block back. Then the core need not be unparked for a block that it was handed

@@ -250,7 +250,7 @@ impl Rig {
         let mut reader = Reader::new(payload);
         while !reader.is_empty() {
             self.mcu.execute(&mut reader);
-            while self.mcu.is_held() && !self.mcu.joins(reader.rest()) {
+            while !self.mcu.may_run(reader.rest()) {
                 let next = self.turn();
                 self.clock.set(next.filter(|_| self.mcu.is_held()).unwrap_or(self.clock.now()));
             }

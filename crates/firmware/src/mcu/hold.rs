@@ -6,7 +6,7 @@
 //! until the errand is back, and does not acknowledge the block ([`Mcu::is_held`]). Timers go on, and errands that they
 //! send hold nothing. A stopped MCU is not held.
 //!
-//! A command without an answer (`spi_send`) lets other commands to its object join ([`Mcu::joins`]). Their errands
+//! A command without an answer (`spi_send`) lets other commands to its object join ([`Mcu::may_run`]). Their errands
 //! follow its own on the same bus, in their order. Its block is finished at once. All other commands wait for the last
 //! of these errands. So a display costs one wake-up for several messages.
 
@@ -98,8 +98,14 @@ impl Mcu {
         self.is_held() && (self.holds.join_limit == 0 || self.configuration.reset_due)
     }
 
-    /// Whether the first command of this payload may run although [others wait](Mcu::is_held).
-    pub fn joins(&self, payload: &[u8]) -> bool {
+    /// Whether the first command of this payload may run now: commands do not [wait](Mcu::is_held), or it joins the
+    /// command that they wait for.
+    #[inline]
+    pub fn may_run(&self, payload: &[u8]) -> bool {
+        !self.is_held() || self.joins(payload)
+    }
+
+    fn joins(&self, payload: &[u8]) -> bool {
         if self.keeps_block() || self.holds.count >= self.holds.join_limit {
             return false;
         }

@@ -55,18 +55,18 @@ fn what_is_only_sent_does_not_wait_for_what_was_sent_before_to_the_same_device()
     rig.begin("spi_send oid=0 data=00");
     assert!(!rig.mcu.keeps_block(), "nobody waits for an answer");
     for n in 1..8 {
-        assert!(!rig.mcu.joins(&[]));
+        assert!(!rig.mcu.may_run(&[]));
         for other in ["spi_send oid=2 data=01", "spi_transfer oid=0 data=01", "update_digital_out oid=1 value=1"] {
-            assert!(rig.mcu.is_held() && !rig.mcu.joins(&rig.encode(other)), "{other}");
+            assert!(rig.mcu.is_held() && !rig.mcu.may_run(&rig.encode(other)), "{other}");
         }
         let next = format!("spi_send oid=0 data={n:02x}");
-        assert!(rig.mcu.joins(&rig.encode(&next)), "{next}");
+        assert!(rig.mcu.may_run(&rig.encode(&next)), "{next}");
         rig.begin(&next);
     }
     let next = rig.encode("spi_send oid=0 data=08");
-    assert!(!rig.mcu.joins(&next), "as many as can be are under way");
+    assert!(!rig.mcu.may_run(&next), "as many as can be are under way");
     rig.run_until(1000);
-    assert!(rig.mcu.joins(&next));
+    assert!(rig.mcu.may_run(&next));
     rig.begin("spi_send oid=0 data=08");
     rig.run_until(8999);
     assert!(rig.mcu.is_held());
@@ -75,7 +75,7 @@ fn what_is_only_sent_does_not_wait_for_what_was_sent_before_to_the_same_device()
     assert_eq!(sent(&rig), (0..9).map(|n| vec![n]).collect::<Vec<_>>());
     // A command with an answer keeps its block, and nothing joins it.
     rig.begin("spi_transfer oid=0 data=01");
-    assert!(rig.mcu.keeps_block() && !rig.mcu.joins(&next));
+    assert!(rig.mcu.keeps_block() && !rig.mcu.may_run(&next));
 }
 
 #[test]
