@@ -72,11 +72,13 @@ impl Mcu {
         self.schedule.timers.insert(limit, TimerId::HOLD);
     }
 
-    /// Ends this hold. Commands run again if no other hold is left.
+    /// Ends this hold. Commands run again if no other hold is left. Errands that the object sends from now on hold
+    /// nothing: they belong to its own work.
     pub fn release(&mut self, Hold(waits): Hold) {
         if !waits {
             return;
         }
+        self.holds.is_commanded = false;
         self.holds.count = self.holds.count.saturating_sub(1);
         if self.holds.count == 0 {
             self.schedule.timers.remove(TimerId::HOLD);

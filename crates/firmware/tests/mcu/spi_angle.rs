@@ -203,6 +203,22 @@ fn a_transfer_waits_for_the_measurement_under_way() {
     assert_eq!(lengths, [0, 4, 0, 10]);
 }
 
+/// A bus that is too slow for its measurements is never free. Commands wait for the host's transfer alone.
+#[test]
+fn measurements_without_a_pause_hold_no_commands() {
+    let mut rig = rig(TLE5012B, 0, 10_000);
+    plug(&rig, TLE5012B);
+    rig.send("query_spi_angle oid=1 clock=@15000 rest_ticks=12000 time_shift=0");
+    rig.begin("spi_angle_transfer oid=1 data=84420000");
+    rig.run_until(19_000);
+    assert!(rig.mcu.is_held());
+    rig.run_until(21_000);
+    assert_eq!(rig.responses().len(), 1);
+    assert!(!rig.mcu.is_held());
+    rig.run_until(200_000);
+    assert_eq!(rig.bench.transfers().len(), 19, "the bus was busy all the time");
+}
+
 #[test]
 fn an_mcu_that_stops_amid_everything_is_there_for_the_next_configuration() {
     for chip in [A1333, AS5047D, TLE5012B] {
