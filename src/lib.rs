@@ -19,6 +19,7 @@ pub mod klippy;
 mod proc;
 pub mod runtime;
 mod status;
+pub mod trace;
 
 use pinion_firmware::feature::FEATURES;
 use pinion_firmware::mcu::Firmware;
