@@ -1,10 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The command line: the useful part of libtest's options, and the suite's own.
-
-use std::env;
-use std::process;
+//! The command line.
 
 use super::guest_program::OtherProgram;
+use pinion_testkit::arguments::Arguments;
 use pinion_testkit::kernel::Flavour;
 
 const USAGE: &str = "\
@@ -25,12 +23,8 @@ Options:
   --shell            A shell in the guest instead of tests; Ctrl-A X ends it";
 
 /// The selected tests and the way to run them.
-#[derive(Default)]
 pub struct Options {
-    filters: Vec<String>,
-    skips: Vec<String>,
-    exact: bool,
-    only_ignored: bool,
+    arguments: Arguments,
     pub flavour: Option<Flavour>,
     pub programs: Vec<OtherProgram>,
     pub list: bool,
@@ -41,55 +35,22 @@ pub struct Options {
 impl Options {
     /// Exits after an error, and for `--help`.
     pub fn from_args() -> Options {
-        Options::parse(env::args().skip(1)).unwrap_or_else(|mistake| {
-            eprintln!("{mistake}\n\n{USAGE}");
-            process::exit(2)
-        })
-    }
-
-    fn parse(args: impl Iterator<Item = String>) -> Result<Options, String> {
-        let mut options = Options::default();
-        // `--name=value` and `--name value` mean the same.
-        let mut args = args.flat_map(|arg| match arg.split_once('=') {
-            Some((name, value)) if name.starts_with("--") => vec![name.into(), value.into()],
-            _ => vec![arg],
-        });
-        while let Some(arg) = args.next() {
-            let mut value = || args.next().ok_or_else(|| format!("{arg} needs a value"));
-            match arg.as_str() {
-                "-h" | "--help" => {
-                    println!("{USAGE}");
-                    process::exit(0)
-                }
-                "--exact" => options.exact = true,
-                "--skip" => options.skips.push(value()?),
-                "--list" => options.list = true,
-                "--nocapture" | "--no-capture" | "--show-output" => options.show_output = true,
-                "--flavour" => options.flavour = Some(value()?.parse()?),
-                "--program" => options.programs.push(value()?.parse()?),
-                "--shell" => options.shell = true,
-                "--ignored" => options.only_ignored = true,
-                // `cargo test -- ...` passes the same words to every test program.
-                "--include-ignored" | "-q" | "--quiet" => {}
-                "--test-threads" | "--color" | "--format" => drop(value()?),
-                unknown if unknown.starts_with('-') => {
-                    return Err(format!("unknown option {unknown}"));
-                }
-                filter => options.filters.push(filter.into()),
+        let (mut flavour, mut programs, mut list, mut shell) = (None, Vec::new(), false, false);
+        let arguments = Arguments::read(USAGE, |option, value| {
+            match option {
+                "--list" => list = true,
+                "--flavour" => flavour = Some(value()?.parse()?),
+                "--program" => programs.push(value()?.parse()?),
+                "--shell" => shell = true,
+                _ => return Ok(false),
             }
-        }
-        Ok(options)
+            Ok(true)
+        });
+        Options { show_output: arguments.show_output, arguments, flavour, programs, list, shell }
     }
 
     /// Whether the test runs on this flavor. The name is the test's name in the report.
     pub fn selects(&self, flavour: Flavour, name: &str) -> bool {
-        let matches = |filter: &String| match self.exact {
-            true => name == *filter,
-            false => name.contains(filter),
-        };
-        !self.only_ignored
-            && self.flavour.is_none_or(|only| only == flavour)
-            && (self.filters.is_empty() || self.filters.iter().any(matches))
-            && !self.skips.iter().any(matches)
+        self.flavour.is_none_or(|only| only == flavour) && self.arguments.selects(name)
     }
 }

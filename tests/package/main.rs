@@ -10,7 +10,6 @@ mod packages;
 mod vm;
 
 use std::collections::VecDeque;
-use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -18,6 +17,7 @@ use std::sync::{Mutex, PoisonError};
 use std::thread;
 use std::time::Instant;
 
+use pinion_testkit::arguments::Arguments;
 use pinion_testkit::cache::Cache;
 use vm::{Root, Vm};
 
@@ -29,6 +29,8 @@ as in reboot; before any but those of the pages the first one, which installs it
 emulator if it is missing, and downloads a Debian the first time.
 
 Options:
+  --exact            A filter is a whole name
+  --skip FILTER      Leave out the checks whose name contains this
   --nocapture        Show the output of checks that pass, too
   --run FILE         Run this script in the VM after the checks, and print its output
   --list             Name the checks";
@@ -40,10 +42,8 @@ const INSTALLS: &str = "10-install";
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
-#[derive(Default)]
 struct Options {
-    filters: Vec<String>,
-    show_output: bool,
+    arguments: Arguments,
     list: bool,
     run: Option<PathBuf>,
 }
@@ -51,29 +51,20 @@ struct Options {
 impl Options {
     /// Exits after an error, and for `--help`.
     fn from_args() -> Options {
-        let mut options = Options::default();
-        let mut args = env::args().skip(1);
-        while let Some(arg) = args.next() {
-            match arg.as_str() {
-                "-h" | "--help" => {
-                    println!("{USAGE}");
-                    std::process::exit(0)
-                }
-                "--nocapture" | "--no-capture" | "--show-output" => options.show_output = true,
-                "--list" => options.list = true,
-                "--run" => options.run = args.next().map(PathBuf::from),
-                unknown if unknown.starts_with('-') => {
-                    eprintln!("unknown option {unknown}\n\n{USAGE}");
-                    std::process::exit(2)
-                }
-                _ => options.filters.push(arg),
+        let (mut list, mut run) = (false, None);
+        let arguments = Arguments::read(USAGE, |option, value| {
+            match option {
+                "--list" => list = true,
+                "--run" => run = Some(value()?.into()),
+                _ => return Ok(false),
             }
-        }
-        options
+            Ok(true)
+        });
+        Options { arguments, list, run }
     }
 
     fn chosen(&self, check: &Check) -> bool {
-        self.filters.is_empty() || self.filters.iter().any(|part| check.name.contains(part))
+        self.arguments.selects(&check.name)
     }
 }
 
@@ -102,7 +93,7 @@ fn checks() -> Result<Vec<Check>, String> {
 fn run(options: &Options) -> Result<bool, String> {
     let checks = checks()?;
     if options.list {
-        checks.iter().for_each(|check| println!("{}: test", check.name));
+        checks.iter().filter(|check| options.chosen(check)).for_each(|check| println!("{}: test", check.name));
         return Ok(true);
     }
     if !nix::unistd::geteuid().is_root() {
@@ -193,7 +184,7 @@ fn in_a_vm(
         let verdict = if status == 0 { "ok" } else { "FAILED" };
         let mut said = format!("check {} ... {verdict} ({:.1} s)\n", check.name, began.elapsed().as_secs_f64());
         said.extend(commands::not_tried(&check).iter().map(|line| format!("{line}\n")));
-        if status != 0 || options.show_output {
+        if status != 0 || options.arguments.show_output {
             said.push_str(&output);
         }
         // Print at once, because another VM's lines may come between.

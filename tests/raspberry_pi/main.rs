@@ -10,14 +10,13 @@ mod debian;
 mod gpio;
 mod vm;
 
-use std::env;
 use std::process::ExitCode;
 use std::time::Instant;
 
 use cross::Programs;
 use debian::Sysroot;
+use pinion_testkit::arguments::Arguments;
 use pinion_testkit::cache::Cache;
-use pinion_testkit::initramfs::Archive;
 use vm::{News, Vm};
 
 const USAGE: &str = "\
@@ -36,41 +35,13 @@ Options:
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
-#[derive(Default)]
-struct Options {
-    /// Filters for libtest in the guest.
-    filters: Vec<String>,
-    show_output: bool,
-    shell: bool,
-}
-
-impl Options {
-    /// Exits after an error, and for `--help`.
-    fn from_args() -> Options {
-        let mut options = Options::default();
-        let mut args = env::args().skip(1);
-        while let Some(arg) = args.next() {
-            match arg.as_str() {
-                "-h" | "--help" => {
-                    println!("{USAGE}");
-                    std::process::exit(0)
-                }
-                "--nocapture" | "--no-capture" | "--show-output" => options.show_output = true,
-                "--shell" => options.shell = true,
-                "--skip" => options.filters.extend([arg].into_iter().chain(args.next())),
-                unknown if unknown.starts_with('-') && unknown != "--exact" => {
-                    eprintln!("unknown option {unknown}\n\n{USAGE}");
-                    std::process::exit(2)
-                }
-                _ => options.filters.push(arg),
-            }
-        }
-        options
-    }
-}
-
 fn main() -> ExitCode {
-    match run(&Options::from_args()) {
+    let mut shell = false;
+    let arguments = Arguments::read(USAGE, |option, _| {
+        shell |= option == "--shell";
+        Ok(option == "--shell")
+    });
+    match run(&arguments, shell) {
         Ok(true) => ExitCode::SUCCESS,
         Ok(false) => ExitCode::from(FAILED),
         Err(cause) => {
@@ -81,27 +52,23 @@ fn main() -> ExitCode {
 }
 
 /// Whether every test passed. An error is the suite's own failure.
-fn run(options: &Options) -> Result<bool, String> {
+fn run(arguments: &Arguments, shell: bool) -> Result<bool, String> {
     let cache = Cache::open()?;
     let sysroot = Sysroot::prepare(&cache)?;
     let programs = Programs::build(&sysroot)?;
     let mut archive = programs.initramfs(&sysroot)?;
-    add_filters(&mut archive, &options.filters);
+    let filters: String = arguments.for_libtest().iter().map(|word| format!("{word}\n")).collect();
+    archive.file("/tests/filters", filters.as_bytes());
     let initramfs = archive.finish();
-    if options.shell {
+    if shell {
         vm::shell(&sysroot, &initramfs, &cache)?;
         return Ok(true);
     }
     println!("a Raspberry Pi 3 with Linux {}", sysroot.release);
     let mut vm = Vm::boot(&sysroot, &initramfs, &cache)?;
     let mut report = Report { started: Instant::now(), planned: Vec::new(), failures: Vec::new(), passed: 0 };
-    let outcome = follow(&mut vm, &mut report, options.show_output);
+    let outcome = follow(&mut vm, &mut report, arguments.show_output);
     Ok(report.finish(outcome, &vm))
-}
-
-fn add_filters(archive: &mut Archive, filters: &[String]) {
-    let lines: String = filters.iter().map(|filter| format!("{filter}\n")).collect();
-    archive.file("/tests/filters", lines.as_bytes());
 }
 
 /// Runs until the last test has ended. An error describes the end of the VM.

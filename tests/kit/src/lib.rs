@@ -1,12 +1,14 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The code that several test suites share.
 //!
+//! - [`arguments`]: the command line of a suite
 //! - [`cache`], [`tools`], [`process`]: the folder for a suite's downloads, and the programs that it runs
 //! - [`kernel`], [`initramfs`]: the boot files of a virtual machine
 //! - [`markdown`]: the pages for users, and the blocks in them
 
 #![forbid(unsafe_code)]
 
+pub mod arguments;
 pub mod cache;
 pub mod initramfs;
 pub mod kernel;
