@@ -34,6 +34,7 @@ use termina::escape::csi::DecPrivateModeCode;
 use crate::klippy::process::{Search, Terminal as Device, find};
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Helpers, Options};
+use crate::trace::folder::user_state;
 use pinion_client::console::{Console, Next, Vocabulary};
 use pinion_client::{self, Client};
 use pinion_linux::clock::Monotonic;
@@ -334,11 +335,9 @@ fn attend(
     }
 }
 
-/// The file of the remembered lines (XDG Base Directory Specification).
+/// The file of the remembered lines.
 fn history_file() -> Option<PathBuf> {
-    let folder = |name| std::env::var_os(name).map(PathBuf::from).filter(|folder| folder.is_absolute());
-    let state = folder("XDG_STATE_HOME").or_else(|| Some(folder("HOME")?.join(".local/state")))?;
-    Some(state.join("pinion/console_history"))
+    Some(user_state()?.join("pinion/console_history"))
 }
 
 /// Completes the words of the dictionary.

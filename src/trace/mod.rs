@@ -4,10 +4,12 @@
 //! - `event`: what is recorded, 16 bytes each
 //! - `ring`: the memory that a thread records into
 //! - `file`: a trace, from the rings to a file and back
+//! - `folder`: where the files are, and their names
 //! - `verdict`: who was late
 
 #![forbid(unsafe_code)]
 
 pub mod event;
 pub mod file;
+pub mod folder;
 pub mod ring;

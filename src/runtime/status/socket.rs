@@ -18,6 +18,7 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::sys::socket::{AddressFamily, SockFlag, SockType, UnixAddr, socket};
 
 use crate::foreign::plain_json;
+use crate::trace::folder::name_of;
 
 use super::Asker;
 use super::document::{Facts, HostBoard, Reporter};
@@ -78,8 +79,7 @@ impl Drop for StatusSocket {
 /// `/run/pinion` it stands in `/run/pinion`, the service's folder. If that folder is missing or another user's, it is
 /// `pinion-NAME.sock` in `$XDG_RUNTIME_DIR`, or else in `/tmp`. For a link anywhere else it stands beside the link.
 pub fn socket_paths(link: &Path) -> Vec<PathBuf> {
-    let file = link.file_name().unwrap_or_default().to_string_lossy();
-    let name = file.strip_prefix("klipper_host_").unwrap_or(&file);
+    let name = name_of(link);
     let folder = link.parent().unwrap_or(Path::new(""));
     if folder != Path::new("/tmp") && folder != Path::new("/run/pinion") {
         return vec![folder.join(format!("{name}.sock"))];

@@ -1,0 +1,144 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The folders that hold the files of traces, and the names of these files.
+
+#![forbid(unsafe_code)]
+
+use std::env;
+use std::fs;
+use std::path::{Path, PathBuf};
+
+/// The service's folder.
+const SERVICE: &str = "/var/lib/pinion";
+/// The end of a file's name.
+const SUFFIX: &str = ".trace";
+/// Length of the time in a file's name, such as `20261122T142614Z`.
+const TIME_LEN: usize = 16;
+/// The last millisecond with a year of four digits, since 1970.
+const UTC_MS_MAX: u64 = 253_402_300_799_999;
+
+/// The folders where traces are kept, the best first. A trace goes into the first one that takes it.
+///
+/// A service has `$STATE_DIRECTORY`. The next folder is the packaged service's, and the last one is the user's own.
+pub fn folders() -> Vec<PathBuf> {
+    let service = env::var("STATE_DIRECTORY").unwrap_or_default();
+    let service = service.split(':').map(PathBuf::from).filter(|folder| folder.is_absolute());
+    let mut folders: Vec<PathBuf> = service.collect();
+    if !folders.iter().any(|folder| folder == Path::new(SERVICE)) {
+        folders.push(SERVICE.into());
+    }
+    folders.extend(user_state().map(|state| state.join("pinion")));
+    folders
+}
+
+/// The folder for the state of this user's programs, if there is one (XDG Base Directory Specification).
+pub(crate) fn user_state() -> Option<PathBuf> {
+    let folder = |variable| env::var_os(variable).map(PathBuf::from).filter(|folder: &PathBuf| folder.is_absolute());
+    folder("XDG_STATE_HOME").or_else(|| Some(folder("HOME")?.join(".local/state")))
+}
+
+/// The name of the instance with this link: the file's name without `klipper_host_`.
+pub fn name_of(link: &Path) -> String {
+    let file = link.file_name().unwrap_or_default().to_string_lossy();
+    file.strip_prefix("klipper_host_").unwrap_or(&file).to_owned()
+}
+
+/// The file's name for a trace of this instance that ended then, in milliseconds since 1970 (UTC). It is
+/// `NAME-YYYYMMDDTHHMMSSZ.trace`.
+pub fn file_name(name: &str, utc_ms: u64) -> String {
+    let seconds = utc_ms.min(UTC_MS_MAX) / 1000;
+    let (days, second) = (seconds / 86_400, seconds % 86_400);
+    let (year, month, day) = date(days);
+    let (hour, minute, second) = (second / 3600, second / 60 % 60, second % 60);
+    format!("{name}-{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}Z{SUFFIX}")
+}
+
+/// The year, month and day of a day since 1970-01-01 (`civil_from_days` of howardhinnant.github.io/date_algorithms).
+fn date(days: u64) -> (u64, u64, u64) {
+    // Years begin in March here, so that the leap day is the last one. An era is 400 years.
+    let days = days + 719_468;
+    let (era, day) = (days / 146_097, days % 146_097);
+    let year = (day - day / 1460 + day / 36_524 - day / 146_096) / 365;
+    let day = day - (365 * year + year / 4 - year / 100);
+    let month = (5 * day + 2) / 153;
+    let day = day - (153 * month + 2) / 5 + 1;
+    let month = if month < 10 { month + 3 } else { month - 9 };
+    (era * 400 + year + u64::from(month <= 2), month, day)
+}
+
+/// The kept traces of the instance with this name, the newest first.
+pub fn kept(folder: &Path, name: &str) -> Vec<PathBuf> {
+    newest_first(in_folder(folder).filter(|(_, its, _)| its == name))
+}
+
+/// The kept traces of all instances in all folders, the newest first.
+pub fn all() -> Vec<PathBuf> {
+    newest_first(folders().iter().flat_map(|folder| in_folder(folder)))
+}
+
+fn newest_first(files: impl Iterator<Item = (String, String, PathBuf)>) -> Vec<PathBuf> {
+    let mut files: Vec<_> = files.collect();
+    files.sort_by(|a, b| b.cmp(a));
+    files.into_iter().map(|(_, _, path)| path).collect()
+}
+
+/// The traces in a folder: their times, the names of their instances, their paths.
+fn in_folder(folder: &Path) -> impl Iterator<Item = (String, String, PathBuf)> + use<> {
+    let entries = fs::read_dir(folder).into_iter().flatten().flatten();
+    entries.filter_map(|entry| {
+        let file = entry.file_name();
+        let stem = file.to_str()?.strip_suffix(SUFFIX)?;
+        let (name, time) = stem.split_at_checked(stem.len().checked_sub(TIME_LEN)?)?;
+        let name = name.strip_suffix('-')?;
+        let fits = |(at, byte): (usize, u8)| match at {
+            8 => byte == b'T',
+            15 => byte == b'Z',
+            _ => byte.is_ascii_digit(),
+        };
+        time.bytes().enumerate().all(fits).then(|| (time.to_owned(), name.to_owned(), entry.path()))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_has_the_names_of_its_instance_and_of_its_time() {
+        for (utc_ms, time) in [
+            (0, "19700101T000000Z"),
+            (951_782_399_999, "20000228T235959Z"),
+            (951_782_400_000, "20000229T000000Z"),
+            (951_868_800_000, "20000301T000000Z"),
+            (1_795_357_574_321, "20261122T142614Z"),
+            (4_107_542_399_000, "21000228T235959Z"),
+            (4_107_542_400_000, "21000301T000000Z"),
+            (u64::MAX, "99991231T235959Z"),
+        ] {
+            assert_eq!(file_name("mcu", utc_ms), format!("mcu-{time}.trace"));
+        }
+        for (link, name) in [("/tmp/klipper_host_mcu", "mcu"), ("/run/pinion/b", "b"), ("/", "")] {
+            assert_eq!(name_of(Path::new(link)), name);
+        }
+    }
+
+    #[test]
+    fn the_newest_of_an_instance_come_first_and_other_files_are_not_traces() {
+        let folder = tempfile::tempdir().unwrap();
+        let times = [1_795_357_574_321, 951_782_400_000, 1_795_357_575_000];
+        for (name, utc_ms) in times.iter().flat_map(|at| [("mcu", at), ("mcu-2", at), ("", at)]) {
+            fs::write(folder.path().join(file_name(name, *utc_ms)), "").unwrap();
+        }
+        for other in
+            ["mcu.trace", "mcu-20261122T142614Z.trace.1", "mcu-2026112T142614ZZ.trace", "ä-0261122T142614Z.trace"]
+        {
+            fs::write(folder.path().join(other), "").unwrap();
+        }
+        for name in ["mcu", "mcu-2", ""] {
+            let newest = ["20261122T142615Z", "20261122T142614Z", "20000229T000000Z"];
+            let newest = newest.map(|time| folder.path().join(format!("{name}-{time}.trace")));
+            assert_eq!(kept(folder.path(), name), newest);
+        }
+        assert!(kept(folder.path(), "other").is_empty());
+        assert!(kept(&folder.path().join("missing"), "mcu").is_empty());
+    }
+}
