@@ -578,7 +578,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn whatever_a_machine_names_stays_in_its_line(name in any_name()) {
+        fn whatever_an_mcu_names_stays_in_its_line(name in any_name()) {
             let shown = |live| {
                 let mut out = Vec::new();
                 let mut lines = ProgressLines::new(&mut out, live);

@@ -14,7 +14,7 @@ use clap::Args;
 use crate::runtime::latency::{Fitness, Half, Verdict, judge, measure_both};
 use pinion_firmware::lateness::{Lateness, us};
 
-use super::computer::Machine;
+use super::computer::Computer;
 use super::computer::running::print_at_risk;
 use super::failed;
 use super::page::{Page, print};
@@ -32,7 +32,7 @@ pub(super) struct LatencyArgs {
 
 /// Measures, prints and judges.
 pub(super) fn run(args: &LatencyArgs) -> ExitCode {
-    if let Some(why) = print_at_risk(&Machine::at(Path::new("/"))) {
+    if let Some(why) = print_at_risk(&Computer::at(Path::new("/"))) {
         return failed(format!("the latency is not measured: {why}"));
     }
     let span = Duration::from_secs(args.seconds.into()) / 2;

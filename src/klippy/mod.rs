@@ -189,7 +189,7 @@ pub(crate) mod tests {
     }
 
     #[test]
-    fn a_host_may_look_up_what_older_machines_have_too() {
+    fn a_host_may_look_up_what_older_mcus_have_too() {
         let older = forms(Generation::V0_13);
         let (_folder, klippy) = checkout(forms(Generation::Master).into_iter().chain(older));
         let checkout = Checkout::read(&klippy, FEATURES).unwrap();

@@ -154,8 +154,8 @@ fn converters_read_what_the_heater_has() {
 }
 
 #[test]
-fn a_broken_sensor_stops_the_machine_at_its_third_bad_value() {
-    let Some(checkout) = checkout("a_broken_sensor_stops_the_machine_at_its_third_bad_value") else { return };
+fn a_broken_sensor_stops_the_mcu_at_its_third_bad_value() {
+    let Some(checkout) = checkout("a_broken_sensor_stops_the_mcu_at_its_third_bad_value") else { return };
     for (chip, fault, told) in [
         ("max31855", "open", "MAX31855 : Open Circuit"),
         ("max31855", "short_to_supply", "MAX31855 : Short to Vcc"),

@@ -1,6 +1,6 @@
 #!/bin/sh
 # SPDX-License-Identifier: GPL-3.0-or-later
-# Makes the machine that the package is installed in: a Debian 12 with systemd.
+# Makes the VM that the package is installed in: a Debian 12 with systemd.
 #
 #   root.sh FOLDER TREE INITRAMFS RELEASE HERE
 #
@@ -11,9 +11,9 @@ cd "$1"
 tree=$2 initramfs=$3 release=$4 here=$5
 busybox=$tree/bin/busybox
 
-# As apt is told where this machine's packages come from. What the package depends on waits in the machine,
-# in a folder that its apt takes packages from: it has no network. Only libiio itself waits there: to install ICU, which it needs
-# by way of libxml2, takes the emulated processor half a minute. The packages of Python are klippy's.
+# The packages come from the sources of this computer's apt. Pinion's dependencies wait in a folder of the VM, and its apt
+# installs from there: the VM has no network. Only libiio itself waits there. It needs ICU (by way of libxml2), and the
+# emulated processor takes half a minute to install that. The packages of Python are klippy's.
 find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/sources.list*.sources' \
     -o -path '*/sources.list' \) -exec \
     mmdebstrap --quiet --mode=root --variant=minbase \

@@ -165,7 +165,7 @@ mod tests {
     }
 
     #[test]
-    fn a_machine_is_configured_and_one_in_use_is_reset_first() {
+    fn an_mcu_is_configured_and_one_in_use_is_reset_first() {
         let (peer, link) = FakeMcu::default().start();
         let mut client = Client::new(link).unwrap();
         let mut config = Config::default();

@@ -283,7 +283,7 @@ impl Vocabulary {
     fn overview(&self) -> Vec<String> {
         let mut lines = vec!["The console's own:".to_owned()];
         lines.extend(OWN.iter().map(|(_, help)| format!("  {help}")));
-        lines.push("The machine's:".to_owned());
+        lines.push("The MCU's:".to_owned());
         lines.extend(self.commands.iter().map(|format| format!("  {format}")));
         lines.extend(VALUES.lines().map(str::to_owned));
         lines

@@ -29,7 +29,7 @@ const LIKE_A_SHELL: MatchOptions =
     MatchOptions { case_sensitive: true, require_literal_separator: false, require_literal_leading_dot: true };
 
 /// The computer that the program looks at.
-pub(in crate::cli) struct Machine {
+pub(in crate::cli) struct Computer {
     root: PathBuf,
 }
 
@@ -70,9 +70,9 @@ impl Who {
     }
 }
 
-impl Machine {
-    pub(in crate::cli) fn at(root: &Path) -> Machine {
-        Machine { root: root.to_owned() }
+impl Computer {
+    pub(in crate::cli) fn at(root: &Path) -> Computer {
+        Computer { root: root.to_owned() }
     }
 
     /// True for the live system (root is `/`). Its kernel can be asked more than its files tell.
@@ -235,8 +235,8 @@ pub(super) mod tests {
             Tree(tempfile::tempdir().unwrap())
         }
 
-        pub(in crate::cli) fn machine(&self) -> Machine {
-            Machine::at(self.0.path())
+        pub(in crate::cli) fn computer(&self) -> Computer {
+            Computer::at(self.0.path())
         }
 
         pub(in crate::cli) fn put(&self, path: &str, text: &str) {
@@ -277,10 +277,10 @@ pub(super) mod tests {
         for file in ["a/x.cfg", "a/.x.cfg", "b/y.cfg", "b/y.cfg.bak", "b/z1.cfg"] {
             tree.put(file, "");
         }
-        let machine = tree.machine();
+        let computer = tree.computer();
         let matching = |pattern: &str| -> Vec<String> {
-            let paths = machine.matching(pattern);
-            paths.iter().map(|path| machine.name(path).display().to_string()).collect()
+            let paths = computer.matching(pattern);
+            paths.iter().map(|path| computer.name(path).display().to_string()).collect()
         };
         assert_eq!(matching("/*/*.cfg"), ["/a/x.cfg", "/b/y.cfg", "/b/z1.cfg"]);
         assert_eq!(matching("/a/.*"), ["/a/.x.cfg"]);

@@ -13,7 +13,7 @@ use crate::proc::status_field;
 use crate::runtime::helpers;
 
 use super::units::{self, setting};
-use super::{Machine, Who};
+use super::{Computer, Who};
 
 /// A Pinion process that serves hosts.
 pub(in crate::cli) struct Running {
@@ -26,7 +26,7 @@ pub(in crate::cli) struct Running {
     pub(in crate::cli) settings: Option<Settings>,
 }
 
-impl Machine {
+impl Computer {
     /// The user of a process, with the process's groups. A process has the groups of the time when it was started.
     pub(in crate::cli) fn user_of(&self, pid: u32) -> Option<Who> {
         let status = self.text(format!("/proc/{pid}/status"))?;
@@ -106,10 +106,10 @@ pub(in crate::cli) fn named_config<'a>(mut words: impl Iterator<Item = &'a str>)
 
 /// Why this computer must not be kept busy: a host may be printing through a Pinion on its pins. A simulated printer
 /// has nothing to spoil.
-pub(in crate::cli) fn print_at_risk(machine: &Machine) -> Option<String> {
-    let proc = machine.path("/proc");
+pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
+    let proc = computer.path("/proc");
     let is_simulated = |pinion: &Running| matches!(&pinion.settings, Some(by) if matches!(by.board, BoardName::Sim(_)));
-    machine.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {
+    computer.running().into_iter().filter(|pinion| !is_simulated(pinion)).find_map(|pinion| {
         let who = match &pinion.unit {
             Some(unit) => format!("Pinion (process {}, {unit})", pinion.pid),
             None => format!("Pinion (process {})", pinion.pid),
@@ -131,7 +131,7 @@ pub(in crate::cli) fn print_at_risk(machine: &Machine) -> Option<String> {
             }
         };
         let name = if host.is_klippy() { "klippy" } else { "a host" };
-        let stop = match machine.unit_of(host.pid).filter(|_| host.is_klippy()) {
+        let stop = match computer.unit_of(host.pid).filter(|_| host.is_klippy()) {
             Some(unit) => format!("sudo systemctl stop {unit}"),
             None => format!("end process {}", host.pid),
         };
@@ -151,7 +151,7 @@ mod tests {
         let tree = Tree::new();
         let unit = |group: &str| {
             tree.put("proc/7/cgroup", &format!("0::{group}\n"));
-            tree.machine().unit_of(7)
+            tree.computer().unit_of(7)
         };
         assert_eq!(unit("/system.slice/system-pinion.slice/pinion-mcu@b.service").as_deref(), Some("pinion-mcu@b"));
         assert_eq!(unit("/user.slice/user-1000.slice/session-2.scope"), None);

@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 
 use glob::Pattern;
 
-use super::Machine;
+use super::Computer;
 
 /// The folders of units, the administrator's first (systemd.unit(5)).
 const FOLDERS: [&str; 4] =
@@ -18,29 +18,29 @@ pub(in crate::cli) const ADMINISTRATOR_S: &str = "/etc/systemd/system";
 const ENDING: &str = ".service";
 
 /// Whether a unit is installed and not masked. An instance of a template is installed if the template is.
-pub(in crate::cli) fn is_installed(machine: &Machine, unit: &str) -> bool {
+pub(in crate::cli) fn is_installed(computer: &Computer, unit: &str) -> bool {
     let template = unit.split_once('@').map(|(name, _)| format!("{name}@"));
-    file(machine, unit).or_else(|| file(machine, &template?)).is_some()
+    file(computer, unit).or_else(|| file(computer, &template?)).is_some()
 }
 
 /// The file of a unit that is not masked.
-pub(in crate::cli) fn file(machine: &Machine, unit: &str) -> Option<String> {
+pub(in crate::cli) fn file(computer: &Computer, unit: &str) -> Option<String> {
     let mut files = FOLDERS.iter().map(|folder| format!("{folder}/{unit}{ENDING}"));
-    let file = files.find(|file| fs::symlink_metadata(machine.path(file)).is_ok())?;
-    let is_masked = fs::read_link(machine.path(&file)).is_ok_and(|target| target == Path::new("/dev/null"));
+    let file = files.find(|file| fs::symlink_metadata(computer.path(file)).is_ok())?;
+    let is_masked = fs::read_link(computer.path(&file)).is_ok_and(|target| target == Path::new("/dev/null"));
     (!is_masked).then_some(file)
 }
 
 /// The units that a target starts at boot, in order, if they are `wanted`.
-pub(in crate::cli) fn enabled(machine: &Machine, wanted: impl Fn(&str) -> bool) -> Vec<String> {
+pub(in crate::cli) fn enabled(computer: &Computer, wanted: impl Fn(&str) -> bool) -> Vec<String> {
     let kinds = ["wants", "requires"].into_iter();
-    let units = named(kinds.flat_map(|kind| machine.matching(format!("{ADMINISTRATOR_S}/*.{kind}/*{ENDING}"))));
+    let units = named(kinds.flat_map(|kind| computer.matching(format!("{ADMINISTRATOR_S}/*.{kind}/*{ENDING}"))));
     units.into_iter().filter(|unit| wanted(unit)).collect()
 }
 
 /// All installed units, in order.
-pub(in crate::cli) fn all(machine: &Machine) -> BTreeSet<String> {
-    named(FOLDERS.iter().flat_map(|folder| machine.matching(format!("{folder}/*{ENDING}"))))
+pub(in crate::cli) fn all(computer: &Computer) -> BTreeSet<String> {
+    named(FOLDERS.iter().flat_map(|folder| computer.matching(format!("{folder}/*{ENDING}"))))
 }
 
 /// The units that these files are named after.
@@ -49,12 +49,12 @@ fn named(files: impl Iterator<Item = PathBuf>) -> BTreeSet<String> {
 }
 
 /// The text of a unit, with the texts of the files that add to it.
-pub(in crate::cli) fn text(machine: &Machine, unit: &str) -> Option<String> {
-    let file = FOLDERS.iter().find_map(|folder| machine.text(format!("{folder}/{unit}{ENDING}")))?;
+pub(in crate::cli) fn text(computer: &Computer, unit: &str) -> Option<String> {
+    let file = FOLDERS.iter().find_map(|folder| computer.text(format!("{folder}/{unit}{ENDING}")))?;
     // The administrator's files come last.
     let unit = Pattern::escape(unit);
-    let added = FOLDERS.iter().rev().flat_map(|folder| machine.matching(format!("{folder}/{unit}{ENDING}.d/*.conf")));
-    let added = added.filter_map(|file| machine.text(machine.name(&file)));
+    let added = FOLDERS.iter().rev().flat_map(|folder| computer.matching(format!("{folder}/{unit}{ENDING}.d/*.conf")));
+    let added = added.filter_map(|file| computer.text(computer.name(&file)));
     Some(std::iter::once(file).chain(added).collect::<Vec<_>>().join("\n"))
 }
 
@@ -77,7 +77,7 @@ mod tests {
     #[test]
     fn what_is_installed_masked_or_an_instance() {
         let tree = Tree::new();
-        let is = |unit: &str| is_installed(&tree.machine(), unit);
+        let is = |unit: &str| is_installed(&tree.computer(), unit);
         ["pinion-mcu@", "pinion-mcu"]
             .iter()
             .for_each(|unit| tree.put(&format!("usr/lib/systemd/system/{unit}.service"), ""));
@@ -89,12 +89,12 @@ mod tests {
     #[test]
     fn what_is_added_to_a_unit_counts() {
         let tree = Tree::new();
-        assert_eq!(text(&tree.machine(), "a"), None);
+        assert_eq!(text(&tree.computer(), "a"), None);
         tree.put("lib/systemd/system/a.service", "User=lib\nGroup=lib\n");
         tree.put("lib/systemd/system/a.service.d/z.conf", "User=lib.d\n");
         tree.put("etc/systemd/system/a.service.d/a.conf", "User = etc.d\n");
         tree.put("etc/systemd/system/a.service.d/b.conf~", "User=backup\n");
-        let text = text(&tree.machine(), "a").unwrap();
+        let text = text(&tree.computer(), "a").unwrap();
         assert_eq!((setting(&text, "User"), setting(&text, "Group")), (Some("etc.d"), Some("lib")));
         assert_eq!(setting(&text, "ExecStart"), None);
     }

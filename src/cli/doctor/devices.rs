@@ -13,7 +13,7 @@ use std::process::{Command, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use crate::cli::computer::{Access, Machine, Who};
+use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use pinion_linux::gpio::Chip;
@@ -86,33 +86,33 @@ const CLASSES: [Class; 6] = [
 ];
 
 /// Whether the users that Pinion runs as may open the devices. Without a service it judges the caller.
-pub(super) fn permissions(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+pub(super) fn permissions(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     let on_pins = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
     let mut users: Vec<(Who, Vec<&Instance>)> = Vec::new();
-    for (who, instance) in on_pins.filter_map(|instance| Some((instance.user(machine)?, instance))) {
+    for (who, instance) in on_pins.filter_map(|instance| Some((instance.user(computer)?, instance))) {
         match users.iter_mut().find(|(user, _)| *user == who) {
             Some((_, instances)) => instances.push(instance),
             None => users.push((who, vec![instance])),
         }
     }
     if users.is_empty() {
-        users.extend(machine.caller().map(|caller| (caller, Vec::new())));
+        users.extend(computer.caller().map(|caller| (caller, Vec::new())));
     }
     if users.is_empty() {
         let found = "there is no user pinion: the service is not installed, and what it may open is unknown";
         return vec![Finding::warning("user", found, INSTALL)];
     }
-    users.iter().flat_map(|(user, instances)| permissions_of(machine, instances, user)).collect()
+    users.iter().flat_map(|(user, instances)| permissions_of(computer, instances, user)).collect()
 }
 
 /// Whether `user` may open the devices. These instances run as `user`.
-fn permissions_of(machine: &Machine, instances: &[&Instance], user: &Who) -> Vec<Finding> {
+fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who) -> Vec<Finding> {
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
     let anew = match &units[..] {
         [] => "log in anew, and start Pinion anew".to_owned(),
         units => format!("sudo systemctl restart {}", units.join(" ")),
     };
-    let permission = |class: &Class| permission(machine, user, &anew, class, &machine.matching(class.nodes));
+    let permission = |class: &Class| permission(computer, user, &anew, class, &computer.matching(class.nodes));
     let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
     if instances.iter().any(|instance| instance.settings.watchdog) {
         const WATCHDOG: Class = Class {
@@ -129,26 +129,26 @@ fn permissions_of(machine: &Machine, instances: &[&Instance], user: &Who) -> Vec
 }
 
 /// `None` if there is nothing to open. `anew` is the remedy that makes the user's new groups count.
-fn permission(machine: &Machine, user: &Who, anew: &str, class: &Class, nodes: &[PathBuf]) -> Option<Finding> {
+fn permission(computer: &Computer, user: &Who, anew: &str, class: &Class, nodes: &[PathBuf]) -> Option<Finding> {
     // A node that vanishes meanwhile does not count.
     let nodes: Vec<_> = nodes.iter().filter_map(|node| Some((node, fs::metadata(node).ok()?))).collect();
     let refused: Vec<_> = nodes.iter().filter(|(_, about)| !user.may(class.access, about)).collect();
     let (name, who) = (class.name, &user.name);
     let Some((node, about)) = refused.first() else {
-        let first = machine.name(nodes.first()?.0);
+        let first = computer.name(nodes.first()?.0);
         return Some(Finding::ok(class.check, format!("{name}: {who} may open {}", with_others(&first, nodes.len()))));
     };
     let found = format!(
         "{name}: {who} may not open {}, which is {} ({} of {} refused)",
-        machine.name(node).display(),
-        machine.ownership(about),
+        computer.name(node).display(),
+        computer.ownership(about),
         refused.len(),
         nodes.len()
     );
-    let group = machine.common_group(about).filter(|_| class.access.is_given_to_group(about));
+    let group = computer.common_group(about).filter(|_| class.access.is_given_to_group(about));
     let remedy = if let Some(group) = group {
         format!("sudo usermod -aG {group} {who}, then {anew}")
-    } else if rules_are_there(machine) {
+    } else if rules_are_there(computer) {
         format!(
             "sudo udevadm control --reload && sudo udevadm trigger --action=add --subsystem-match={}",
             class.subsystem
@@ -165,34 +165,34 @@ fn with_others(first: &Path, count: usize) -> String {
     format!("{}{more}", first.display())
 }
 
-fn rules_are_there(machine: &Machine) -> bool {
+fn rules_are_there(computer: &Computer) -> bool {
     let folders = ["/etc/udev/rules.d", "/usr/lib/udev/rules.d", "/lib/udev/rules.d"];
-    folders.iter().any(|folder| !machine.matching(format!("{folder}/*pinion-mcu.rules")).is_empty())
+    folders.iter().any(|folder| !computer.matching(format!("{folder}/*pinion-mcu.rules")).is_empty())
 }
 
 /// Which pins and buses there are, and how to enable the missing ones.
-pub(super) fn presence(machine: &Machine) -> Vec<Finding> {
-    CLASSES.iter().map(|class| present(machine, class)).collect()
+pub(super) fn presence(computer: &Computer) -> Vec<Finding> {
+    CLASSES.iter().map(|class| present(computer, class)).collect()
 }
 
-fn present(machine: &Machine, class: &Class) -> Finding {
+fn present(computer: &Computer, class: &Class) -> Finding {
     let Class { check, name, .. } = *class;
-    let nodes = machine.matching(class.nodes);
-    if let Some((node, other)) = nodes.iter().find_map(|node| Some((node, other_subsystem(machine, class, node)?))) {
-        let node = machine.name(node);
+    let nodes = computer.matching(class.nodes);
+    if let Some((node, other)) = nodes.iter().find_map(|node| Some((node, other_subsystem(computer, class, node)?))) {
+        let node = computer.name(node);
         let (shown, subsystem) = (node.display(), class.subsystem);
         let found = format!("{name}: {shown} is no {subsystem} device, but one of {other}");
         let remedy = format!("sudo rm {shown} && sudo udevadm trigger --action=add --subsystem-match={subsystem}");
         return Finding::error(check, found, remedy);
     }
     if let Some(first) = nodes.first() {
-        return Finding::ok(check, format!("{name}: {}", with_others(&machine.name(first), nodes.len())));
+        return Finding::ok(check, format!("{name}: {}", with_others(&computer.name(first), nodes.len())));
     }
     if check == "gpio" {
         let remedy = "connect an I/O board that the kernel knows, or try pinion run --board sim";
         return Finding::warning(check, "GPIO: this computer has no GPIO chip", remedy);
     }
-    if check == "i2c" && !machine.matching("/sys/bus/i2c/devices/i2c-*").is_empty() {
+    if check == "i2c" && !computer.matching("/sys/bus/i2c/devices/i2c-*").is_empty() {
         let remedy = "echo i2c-dev | sudo tee /etc/modules-load.d/i2c-dev.conf && sudo modprobe i2c-dev";
         return Finding::warning(check, "I2C: there are buses, and no /dev/i2c-*: i2c-dev is not loaded", remedy);
     }
@@ -200,10 +200,10 @@ fn present(machine: &Machine, class: &Class) -> Finding {
     let Some((line, beginnings)) = class.enabled_by else {
         return Finding::ok(check, off).or("if there is one, load its driver (a device tree overlay, as a rule)");
     };
-    let Some(config) = is_pi(machine).then(|| pi_config(machine)).flatten() else {
+    let Some(config) = is_pi(computer).then(|| pi_config(computer)).flatten() else {
         return Finding::ok(check, off).or("if it is wanted, enable it in the device tree, and reboot");
     };
-    let text = machine.text(config).unwrap_or_default();
+    let text = computer.text(config).unwrap_or_default();
     let is_on = |line: &str| {
         let line = line.trim();
         let off = ["=off", "=0", "=false"].iter().any(|end| line.ends_with(end));
@@ -221,27 +221,27 @@ fn present(machine: &Machine, class: &Class) -> Finding {
     }
 }
 
-fn model(machine: &Machine) -> String {
-    machine.text("/proc/device-tree/model").unwrap_or_default()
+fn model(computer: &Computer) -> String {
+    computer.text("/proc/device-tree/model").unwrap_or_default()
 }
 
 /// The subsystem of a node in /dev that is another device than its name says, such as a null device.
-fn other_subsystem(machine: &Machine, class: &Class, node: &Path) -> Option<String> {
+fn other_subsystem(computer: &Computer, class: &Class, node: &Path) -> Option<String> {
     let about = fs::metadata(node).ok().filter(|about| about.file_type().is_char_device())?;
     let (major, minor) = (nix::sys::stat::major(about.rdev()), nix::sys::stat::minor(about.rdev()));
     // If the kernel does not tell, the node counts as right.
-    let subsystem = fs::read_link(machine.path(format!("/sys/dev/char/{major}:{minor}/subsystem"))).ok()?;
+    let subsystem = fs::read_link(computer.path(format!("/sys/dev/char/{major}:{minor}/subsystem"))).ok()?;
     let subsystem = subsystem.file_name()?.to_string_lossy().into_owned();
     (subsystem != class.subsystem).then_some(subsystem)
 }
 
-fn is_pi(machine: &Machine) -> bool {
-    model(machine).contains("Raspberry Pi")
+fn is_pi(computer: &Computer) -> bool {
+    model(computer).contains("Raspberry Pi")
 }
 
 /// A Raspberry Pi's config.txt.
-fn pi_config(machine: &Machine) -> Option<&'static str> {
-    machine.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
+fn pi_config(computer: &Computer) -> Option<&'static str> {
+    computer.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
 }
 
 /// How the VPU's clock of some Raspberry Pis is held. The SPI clock is made from it.
@@ -297,13 +297,13 @@ impl Vpu {
 }
 
 /// Whether the SPI clock of a Raspberry Pi can drive LEDs on these pins.
-pub(super) fn leds(machine: &Machine, pins: &BTreeSet<&str>) -> Vec<Finding> {
+pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
     const CHECK: &str = "leds";
-    let model = model(machine);
+    let model = model(computer);
     let of = |vpu: &&Vpu| vpu.models.iter().any(|name| model.contains(name));
-    let Some(vpu) = VPUS.iter().find(of).filter(|_| is_pi(machine)) else { return Vec::new() };
+    let Some(vpu) = VPUS.iter().find(of).filter(|_| is_pi(computer)) else { return Vec::new() };
     let Some(first) = pins.first() else { return Vec::new() };
-    let text = pi_config(machine).and_then(|config| Some((config, machine.text(config)?)));
+    let text = pi_config(computer).and_then(|config| Some((config, computer.text(config)?)));
     let Some((config, text)) = text else { return Vec::new() };
     let lines = vpu.lines;
     let clock = match vpu.is_held(&text) {
@@ -323,7 +323,7 @@ pub(super) fn leds(machine: &Machine, pins: &BTreeSet<&str>) -> Vec<Finding> {
 }
 
 /// The holders of GPIO lines.
-pub(super) fn holders(machine: &Machine, chips: &[Chip]) -> Vec<Finding> {
+pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
     const CHECK: &str = "gpio_lines";
     /// `pinion pins` lists more.
     const SHOWN: usize = 8;
@@ -341,11 +341,11 @@ pub(super) fn holders(machine: &Machine, chips: &[Chip]) -> Vec<Finding> {
         Finding::ok(CHECK, format!("gpiochip{number} {label}: {count} of {lines} lines are held{colon}{list}{more}"))
     };
     let mut findings: Vec<Finding> = chips.iter().map(chip).collect();
-    let programs: Vec<String> = machine
+    let programs: Vec<String> = computer
         .processes()
         .iter()
         .filter(|process| {
-            let folder = machine.path(format!("/proc/{}/fd", process.pid));
+            let folder = computer.path(format!("/proc/{}/fd", process.pid));
             let files = fs::read_dir(folder).into_iter().flatten().flatten();
             let mut targets = files.filter_map(|file| fs::read_link(file.path()).ok());
             // The target is of one line, of several lines, or of a line with edges (drivers/gpio/gpiolib-cdev.c).
@@ -364,10 +364,10 @@ pub(super) fn holders(machine: &Machine, chips: &[Chip]) -> Vec<Finding> {
 
 /// The report of a Raspberry Pi's firmware about its power and temperature. `vcgencmd` is the program that asks the
 /// firmware, if it may be started.
-pub(super) fn power(machine: &Machine, vcgencmd: Option<&Path>) -> Vec<Finding> {
+pub(super) fn power(computer: &Computer, vcgencmd: Option<&Path>) -> Vec<Finding> {
     const CHECK: &str = "power";
-    let Some(bits) = throttled(machine, vcgencmd) else {
-        return match is_pi(machine) {
+    let Some(bits) = throttled(computer, vcgencmd) else {
+        return match is_pi(computer) {
             true => {
                 vec![Finding::warning(CHECK, "whether the power is good is unknown", "sudo vcgencmd get_throttled")]
             }
@@ -397,10 +397,10 @@ pub(super) fn power(machine: &Machine, vcgencmd: Option<&Path>) -> Vec<Finding> 
 }
 
 /// The firmware's bits, from sysfs or from vcgencmd.
-fn throttled(machine: &Machine, vcgencmd: Option<&Path>) -> Option<u32> {
+fn throttled(computer: &Computer, vcgencmd: Option<&Path>) -> Option<u32> {
     let hex = |text: &str| u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok();
-    let files = machine.matching("/sys/devices/platform/*/*firmware/get_throttled");
-    if let Some(bits) = files.iter().find_map(|file| machine.text(machine.name(file))) {
+    let files = computer.matching("/sys/devices/platform/*/*firmware/get_throttled");
+    if let Some(bits) = files.iter().find_map(|file| computer.text(computer.name(file))) {
         return hex(&bits);
     }
     let told = output(Command::new(vcgencmd?).arg("get_throttled"))?;
@@ -439,8 +439,8 @@ mod tests {
     use pinion_linux::gpio::LineInfo;
 
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
-        let instances = instances(&tree.machine()).0;
-        permissions_of(&tree.machine(), &instances.iter().collect::<Vec<_>>(), user)
+        let instances = instances(&tree.computer()).0;
+        permissions_of(&tree.computer(), &instances.iter().collect::<Vec<_>>(), user)
     }
 
     /// A user other than root and other than the one that runs the tests.
@@ -462,7 +462,7 @@ mod tests {
     fn devices_that_the_group_has_may_be_opened_by_its_members() {
         let tree = Tree::new();
         NODES.iter().for_each(|(_, path)| tree.put_mode(path, "", 0o660));
-        let gid = fs::metadata(tree.machine().path("/dev/gpiochip0")).unwrap().gid();
+        let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();
         tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
         tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
         let findings = permitted(&tree, &stranger(vec![gid]));
@@ -478,10 +478,10 @@ mod tests {
     #[test]
     fn the_users_are_judged_that_pinion_runs_as() {
         let tree = Tree::new();
-        let look = || permissions(&tree.machine(), &instances(&tree.machine()).0);
+        let look = || permissions(&tree.computer(), &instances(&tree.computer()).0);
         assert_eq!(told(&look(), "user", Warning, "there is no user pinion"), INSTALL);
         tree.put_mode("dev/gpiochip0", "", 0o660);
-        let gid = fs::metadata(tree.machine().path("/dev/gpiochip0")).unwrap().gid();
+        let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();
         let passwd = "root:x:0:0:::\npinion:x:54321:54321:::\npi:x:54322:54322:::\n";
         tree.put("etc/passwd", passwd);
         tree.put("etc/group", &format!("gpio:x:{gid}:pi\n"));
@@ -505,7 +505,7 @@ mod tests {
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/bin/pinion -r\n");
         told(&look(), "gpio", Fine, "root may open");
         // The simulated printer opens nothing.
-        fs::remove_file(tree.machine().path("/etc/systemd/system/multi-user.target.wants/klipper-mcu.service"))
+        fs::remove_file(tree.computer().path("/etc/systemd/system/multi-user.target.wants/klipper-mcu.service"))
             .unwrap();
         tree.process(10, &["/usr/bin/pinion", "run", "--board", "sim"], 54_322, &[]);
         told(&look(), "user", Warning, "there is no user pinion");
@@ -516,14 +516,14 @@ mod tests {
     fn a_node_of_another_kind_is_no_chip() {
         let tree = Tree::new();
         tree.link("dev/gpiochip0", "/dev/null");
-        told(&presence(&tree.machine()), "gpio", Fine, "GPIO: /dev/gpiochip0");
+        told(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
         tree.link("sys/dev/char/1:3/subsystem", "../../../../class/mem");
         let remedy =
-            told(&presence(&tree.machine()), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
+            told(&presence(&tree.computer()), "gpio", Error, "/dev/gpiochip0 is no gpio device, but one of mem");
         assert!(remedy.starts_with("sudo rm /dev/gpiochip0 && sudo udevadm trigger"), "{remedy}");
-        fs::remove_file(tree.machine().path("/sys/dev/char/1:3/subsystem")).unwrap();
+        fs::remove_file(tree.computer().path("/sys/dev/char/1:3/subsystem")).unwrap();
         tree.link("sys/dev/char/1:3/subsystem", "../../../../bus/gpio");
-        told(&presence(&tree.machine()), "gpio", Fine, "GPIO: /dev/gpiochip0");
+        told(&presence(&tree.computer()), "gpio", Fine, "GPIO: /dev/gpiochip0");
     }
 
     #[test]
@@ -540,21 +540,21 @@ mod tests {
     #[test]
     fn what_is_there_and_how_to_enable_the_rest() {
         let tree = Tree::new();
-        let findings = presence(&tree.machine());
+        let findings = presence(&tree.computer());
         told(&findings, "gpio", Warning, "no GPIO chip");
         assert!(told(&findings, "spi", Fine, "SPI: none").contains("device tree"));
         tree.put("proc/device-tree/model", "Raspberry Pi 4 Model B Rev 1.4\0");
         tree.put("boot/firmware/config.txt", "#dtparam=spi=on\ndtparam=i2c_arm=on\ndtoverlay=w1-gpio\n");
-        let findings = presence(&tree.machine());
+        let findings = presence(&tree.computer());
         let remedy = told(&findings, "spi", Fine, "SPI: off");
         assert!(remedy.contains("dtparam=spi=on") && remedy.contains("/boot/firmware/config.txt"), "{remedy}");
         assert_eq!(told(&findings, "i2c", Warning, "on in /boot/firmware/config.txt, and not there"), "sudo reboot");
         told(&findings, "w1", Warning, "no DS18B20 answers");
         assert!(told(&findings, "pwm", Fine, "PWM: off").contains("dtoverlay=pwm-2chan"));
         tree.put("sys/bus/i2c/devices/i2c-1/name", "");
-        assert!(told(&presence(&tree.machine()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
+        assert!(told(&presence(&tree.computer()), "i2c", Warning, "not loaded").contains("modprobe i2c-dev"));
         NODES.iter().for_each(|(_, path)| tree.put(path, ""));
-        let findings = presence(&tree.machine());
+        let findings = presence(&tree.computer());
         assert!(findings.iter().all(|finding| finding.status == Fine && finding.told.remedy.is_none()), "{findings:?}");
         told(&findings, "i2c", Fine, "I2C: /dev/i2c-1");
     }
@@ -565,7 +565,7 @@ mod tests {
             let tree = Tree::new();
             tree.put("proc/device-tree/model", model);
             tree.put("boot/firmware/config.txt", config);
-            leds(&tree.machine(), &[pin].into())
+            leds(&tree.computer(), &[pin].into())
         };
         for (model, held, loose, remedy) in [
             (
@@ -608,7 +608,7 @@ mod tests {
         let tree = Tree::new();
         tree.put("proc/device-tree/model", "Raspberry Pi 4");
         tree.put("boot/config.txt", "");
-        assert!(leds(&tree.machine(), &BTreeSet::new()).is_empty(), "there are no LEDs");
+        assert!(leds(&tree.computer(), &BTreeSet::new()).is_empty(), "there are no LEDs");
     }
 
     #[test]
@@ -625,7 +625,7 @@ mod tests {
             sleeps: false,
             lines: vec![line(Some("spi0 CS0"), true), line(None, false), line(None, true)],
         };
-        let findings = holders(&tree.machine(), std::slice::from_ref(&chip));
+        let findings = holders(&tree.computer(), std::slice::from_ref(&chip));
         told(
             &findings,
             "gpio_lines",
@@ -637,22 +637,22 @@ mod tests {
         tree.link("proc/77/fd/3", "anon_inode:gpio-line");
         tree.process(78, &["/usr/bin/other"], 1000, &[]);
         tree.link("proc/78/fd/3", "/dev/null");
-        told(&holders(&tree.machine(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
+        told(&holders(&tree.computer(), &[]), "gpio_lines", Fine, "programs that hold lines: gpiomon (process 77)");
         let many = Chip { lines: vec![line(Some("a"), true); 20], ..chip };
-        told(&holders(&tree.machine(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
+        told(&holders(&tree.computer(), &[many]), "gpio_lines", Fine, "20 of 20 lines are held: 0 by \"a\"");
     }
 
     #[test]
     fn a_pi_tells_of_its_power() {
         let tree = Tree::new();
-        told(&power(&tree.machine(), None), "power", Fine, "unknown: this is no Raspberry Pi");
+        told(&power(&tree.computer(), None), "power", Fine, "unknown: this is no Raspberry Pi");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
-        told(&power(&tree.machine(), None), "power", Warning, "unknown");
+        told(&power(&tree.computer(), None), "power", Warning, "unknown");
         let file = "sys/devices/platform/soc/soc:firmware/get_throttled";
         tree.put(file, "0\n");
-        told(&power(&tree.machine(), None), "power", Fine, "were good");
+        told(&power(&tree.computer(), None), "power", Fine, "were good");
         tree.put(file, "50001\n");
-        let findings = power(&tree.machine(), None);
+        let findings = power(&tree.computer(), None);
         told(&findings, "power", Error, "the voltage is too low");
         told(&findings, "power", Warning, "at times the processors are throttled");
         assert_eq!(findings.len(), 2);
@@ -661,7 +661,7 @@ mod tests {
     /// A program made from this script.
     fn program(tree: &Tree, script: &str) -> PathBuf {
         tree.put_mode("vcgencmd", script, 0o755);
-        let path = tree.machine().path("/vcgencmd");
+        let path = tree.computer().path("/vcgencmd");
         // A process that another test forked meanwhile may have it open for writing, until it becomes another program.
         loop {
             match Command::new(&path).stdout(Stdio::null()).spawn() {
@@ -681,13 +681,13 @@ mod tests {
     #[test]
     fn a_pi_s_program_is_asked_where_the_kernel_does_not_tell_and_not_waited_for() {
         let tree = Tree::new();
-        let told_by = |script: &str| power(&tree.machine(), Some(&program(&tree, script)));
+        let told_by = |script: &str| power(&tree.computer(), Some(&program(&tree, script)));
         let good = told_by("#!/bin/sh\necho throttled=0x80000\n");
         told(&good, "power", Warning, "at times the processors are at their temperature limit");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
         for script in ["#!/bin/sh\nexec sleep 1000\n", "#!/bin/sh\necho nonsense\n", "not a program"] {
             told(&told_by(script), "power", Warning, "unknown");
         }
-        told(&power(&tree.machine(), Some(Path::new("/nonexistent"))), "power", Warning, "unknown");
+        told(&power(&tree.computer(), Some(Path::new("/nonexistent"))), "power", Warning, "unknown");
     }
 }

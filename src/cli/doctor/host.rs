@@ -7,7 +7,7 @@ use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
 use crate::cli::computer::units::{self, setting};
-use crate::cli::computer::{Machine, Who};
+use crate::cli::computer::{Computer, Who};
 use crate::cli::finding::Finding;
 use crate::klippy::Checkout;
 use crate::klippy::process::{self, Process};
@@ -45,46 +45,46 @@ impl Klippy {
 }
 
 /// Each klippy: the running ones, and those whose units are enabled. If there is none: the installed ones.
-pub(super) fn klippys(machine: &Machine) -> Vec<Klippy> {
-    let processes = machine.processes().into_iter().filter(Process::is_klippy);
-    let mut klippys: Vec<Klippy> = processes.filter_map(|process| running(machine, &process)).collect();
+pub(super) fn klippys(computer: &Computer) -> Vec<Klippy> {
+    let processes = computer.processes().into_iter().filter(Process::is_klippy);
+    let mut klippys: Vec<Klippy> = processes.filter_map(|process| running(computer, &process)).collect();
     let runs: BTreeSet<String> = klippys.iter().filter_map(|klippy| klippy.unit.clone()).collect();
-    let units = units::enabled(machine, |unit| !runs.contains(unit));
-    klippys.extend(units.iter().filter_map(|unit| set_up(machine, unit)));
+    let units = units::enabled(computer, |unit| !runs.contains(unit));
+    klippys.extend(units.iter().filter_map(|unit| set_up(computer, unit)));
     if klippys.is_empty() {
-        klippys.extend(units::all(machine).iter().filter_map(|unit| set_up(machine, unit)));
+        klippys.extend(units::all(computer).iter().filter_map(|unit| set_up(computer, unit)));
     }
     klippys
 }
 
-fn running(machine: &Machine, process: &Process) -> Option<Klippy> {
-    let proc = machine.path("/proc");
-    let config = process.klippy_config(&proc).map(|config| machine.name(&config));
+fn running(computer: &Computer, process: &Process) -> Option<Klippy> {
+    let proc = computer.path("/proc");
+    let config = process.klippy_config(&proc).map(|config| computer.name(&config));
     Some(Klippy {
-        who: machine.user_of(process.pid)?,
-        folder: process.klippy_folder(&proc).map(|folder| reachable(machine, folder)),
-        printer: config.and_then(|config| printer::read(machine, &config)),
+        who: computer.user_of(process.pid)?,
+        folder: process.klippy_folder(&proc).map(|folder| reachable(computer, folder)),
+        printer: config.and_then(|config| printer::read(computer, &config)),
         found_by: format!("process {}", process.pid),
-        unit: machine.unit_of(process.pid),
+        unit: computer.unit_of(process.pid),
         is_running: true,
     })
 }
 
 /// The klippy that a unit starts. `None` if it starts something else.
-fn set_up(machine: &Machine, unit: &str) -> Option<Klippy> {
-    let text = units::text(machine, unit)?;
-    let arguments = arguments(machine, &text)?;
+fn set_up(computer: &Computer, unit: &str) -> Option<Klippy> {
+    let text = units::text(computer, unit)?;
+    let arguments = arguments(computer, &text)?;
     let folder = process::klippy(&arguments).filter(|folder| folder.is_absolute())?;
     let user = setting(&text, "User").unwrap_or("root");
-    let who = machine.user(user).unwrap_or_else(|| match user {
+    let who = computer.user(user).unwrap_or_else(|| match user {
         "root" => Who { name: "root".into(), uid: 0, gids: vec![0] },
         // Nothing is known about this user.
         _ => Who { name: user.to_owned(), uid: u32::MAX, gids: vec![] },
     });
     Some(Klippy {
         who,
-        folder: Some(machine.path(folder)),
-        printer: process::klippy_config(&arguments).and_then(|config| printer::read(machine, config)),
+        folder: Some(computer.path(folder)),
+        printer: process::klippy_config(&arguments).and_then(|config| printer::read(computer, config)),
         found_by: format!("{unit}.service"),
         unit: Some(unit.to_owned()),
         is_running: false,
@@ -92,14 +92,14 @@ fn set_up(machine: &Machine, unit: &str) -> Option<Klippy> {
 }
 
 /// Where this program finds a folder that the process names.
-fn reachable(machine: &Machine, folder: PathBuf) -> PathBuf {
-    if folder.starts_with(machine.path("/proc")) { folder } else { machine.path(folder) }
+fn reachable(computer: &Computer, folder: PathBuf) -> PathBuf {
+    if folder.starts_with(computer.path("/proc")) { folder } else { computer.path(folder) }
 }
 
 /// klippy's command line, from a unit's command or from the file with its arguments.
-fn arguments(machine: &Machine, unit: &str) -> Option<Vec<PathBuf>> {
+fn arguments(computer: &Computer, unit: &str) -> Option<Vec<PathBuf>> {
     let file = setting(unit, "EnvironmentFile").map(|file| file.trim_start_matches('-'));
-    let texts = [setting(unit, "ExecStart").map(str::to_owned), file.and_then(|file| machine.text(file))];
+    let texts = [setting(unit, "ExecStart").map(str::to_owned), file.and_then(|file| computer.text(file))];
     texts.into_iter().flatten().find_map(|text| {
         let words = text.split([' ', '\t', '\n', '"', '\'', '=']).filter(|word| !word.is_empty());
         let words: Vec<PathBuf> = words.map(PathBuf::from).collect();
@@ -117,23 +117,23 @@ pub(super) fn leds(klippys: &[Klippy]) -> BTreeSet<&str> {
 }
 
 /// Whether Pinion speaks the messages of each host.
-pub(super) fn dialects(machine: &Machine, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
+pub(super) fn dialects(computer: &Computer, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
     if klippys.is_empty() {
         let found = "which host comes is unknown: no klippy runs, and no unit starts one";
         return vec![Finding::ok(DIALECT, found).or("pinion doctor --klipper DIR looks at a checkout")];
     }
-    klippys.iter().flat_map(|klippy| dialect(machine, instances, klippy)).collect()
+    klippys.iter().flat_map(|klippy| dialect(computer, instances, klippy)).collect()
 }
 
 const DIALECT: &str = "dialect";
 
-fn dialect(machine: &Machine, instances: &[Instance], klippy: &Klippy) -> Vec<Finding> {
+fn dialect(computer: &Computer, instances: &[Instance], klippy: &Klippy) -> Vec<Finding> {
     let Klippy { folder, found_by, .. } = klippy;
     let Some(folder) = folder else {
         let found = format!("klippy's sources ({found_by}) are not known: its folder may not be looked into");
         return vec![Finding::warning(DIALECT, found, "sudo pinion doctor")];
     };
-    let shown = machine.name(folder);
+    let shown = computer.name(folder);
     // /proc/PID/root is the process's own root.
     let own: PathBuf = shown.components().skip(4).collect();
     let shown = if shown.starts_with("/proc") { Path::new("/").join(own) } else { shown };
@@ -185,33 +185,33 @@ mod tests {
     #[test]
     fn klippy_is_found_by_its_unit() {
         let tree = Tree::new();
-        assert!(klippys(&tree.machine()).is_empty());
+        assert!(klippys(&tree.computer()).is_empty());
         tree.put("etc/passwd", &format!("pi:x:{PI}:{PI}::/home/pi:/bin/sh\n"));
         tree.put("etc/systemd/system/klipper-mcu.service", "ExecStart=/usr/local/bin/klipper_mcu -r\n");
         let unit = "[Service]\nUser=pi\nEnvironmentFile=-/home/pi/klipper.env\nExecStart=/home/pi/env/bin/python $KLIPPER_ARGS\n";
         tree.put("etc/systemd/system/klipper.service", unit);
-        assert!(klippys(&tree.machine()).is_empty(), "no program is named");
+        assert!(klippys(&tree.computer()).is_empty(), "no program is named");
         tree.put(
             "home/pi/klipper.env",
             "KLIPPER_ARGS=\"/home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg -l /home/pi/k.log\"\n",
         );
-        let found = klippys(&tree.machine()).remove(0);
+        let found = klippys(&tree.computer()).remove(0);
         assert_eq!((found.who.uid, found.found_by.as_str(), &found.printer), (PI, "klipper.service", &None));
-        assert_eq!(found.folder.unwrap(), tree.machine().path("/home/pi/klipper/klippy"));
+        assert_eq!(found.folder.unwrap(), tree.computer().path("/home/pi/klipper/klippy"));
         tree.put("home/pi/printer.cfg", "[mcu]\nserial: /tmp/klipper_host_mcu\n");
-        let printer = klippys(&tree.machine()).remove(0).printer;
+        let printer = klippys(&tree.computer()).remove(0).printer;
         assert_eq!(printer.unwrap().serials, [PathBuf::from("/tmp/klipper_host_mcu")].into());
         // An enabled unit counts, and a klippy that runs is not counted twice.
         tree.put(
             "etc/systemd/system/klipper-2.service",
             "ExecStart=/usr/bin/python3 /home/b/klipper/klippy/klippy.py b.cfg\n",
         );
-        assert_eq!(klippys(&tree.machine()).len(), 2);
+        assert_eq!(klippys(&tree.computer()).len(), 2);
         tree.link("etc/systemd/system/multi-user.target.wants/klipper.service", "../klipper.service");
-        assert_eq!(klippys(&tree.machine()).len(), 1);
+        assert_eq!(klippys(&tree.computer()).len(), 1);
         tree.process(8, &["/home/pi/env/bin/python", "/home/pi/klipper/klippy/klippy.py"], PI, &[]);
         tree.put("proc/8/cgroup", "0::/system.slice/klipper.service\n");
-        let found: Vec<String> = klippys(&tree.machine()).into_iter().map(|klippy| klippy.found_by).collect();
+        let found: Vec<String> = klippys(&tree.computer()).into_iter().map(|klippy| klippy.found_by).collect();
         assert_eq!(found, ["process 8"]);
     }
 
@@ -219,8 +219,8 @@ mod tests {
     fn the_host_s_dialect() {
         let tree = Tree::new();
         let look = || {
-            let machine = tree.machine();
-            dialects(&machine, &instances(&machine).0, &klippys(&machine))
+            let computer = tree.computer();
+            dialects(&computer, &instances(&computer).0, &klippys(&computer))
         };
         told(&look(), "dialect", Ok, "which host comes is unknown");
         let command = "ExecStart=/usr/bin/python3 /home/pi/klipper/klippy/klippy.py /home/pi/printer.cfg\n";

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 
 use crate::cli::computer::running::{Running, named_config};
 use crate::cli::computer::units::{self, setting};
-use crate::cli::computer::{Machine, Who};
+use crate::cli::computer::{Computer, Who};
 use crate::cli::config::{self, SYSTEM_FILE};
 use crate::cli::finding::Finding;
 use crate::cli::run_args;
@@ -84,17 +84,17 @@ impl Instance {
     }
 
     /// The user that it runs as, or will run as. `None` if unknown.
-    pub(super) fn user(&self, machine: &Machine) -> Option<Who> {
-        if let Some(who) = self.pid.and_then(|pid| machine.user_of(pid)) {
+    pub(super) fn user(&self, computer: &Computer) -> Option<Who> {
+        if let Some(who) = self.pid.and_then(|pid| computer.user_of(pid)) {
             return Some(who);
         }
         let unit = self.unit.as_deref()?;
         // An instance of a template has no text of its own.
         let text =
-            units::text(machine, unit).filter(|_| Files::of(unit).is_none()).unwrap_or_else(|| "User=pinion".into());
-        let mut who = machine.user(setting(&text, "User").unwrap_or("root"))?;
+            units::text(computer, unit).filter(|_| Files::of(unit).is_none()).unwrap_or_else(|| "User=pinion".into());
+        let mut who = computer.user(setting(&text, "User").unwrap_or("root"))?;
         let groups = setting(&text, "SupplementaryGroups").unwrap_or_default().split_whitespace();
-        who.gids.extend(groups.filter_map(|group| machine.gid_of(group)));
+        who.gids.extend(groups.filter_map(|group| computer.gid_of(group)));
         Some(who)
     }
 
@@ -106,9 +106,9 @@ impl Instance {
 
 /// All instances, or, if there are none, the one that the service would be. Also the errors in the files with their
 /// settings.
-pub(super) fn instances(machine: &Machine) -> (Vec<Instance>, Vec<Finding>) {
-    let running = machine.running();
-    let mut units = units::enabled(machine, |unit| is_ours(machine, unit));
+pub(super) fn instances(computer: &Computer) -> (Vec<Instance>, Vec<Finding>) {
+    let running = computer.running();
+    let mut units = units::enabled(computer, |unit| is_ours(computer, unit));
     units.retain(|unit| !running.iter().any(|running| running.unit.as_ref() == Some(unit)));
     if running.is_empty() && units.is_empty() {
         units.push(UNIT.to_owned());
@@ -117,18 +117,18 @@ pub(super) fn instances(machine: &Machine) -> (Vec<Instance>, Vec<Finding>) {
     let mut instances = Vec::new();
     for mut running in running {
         let unit = running.unit.take();
-        instances.push(instance(machine, unit, Some(running), &mut findings));
+        instances.push(instance(computer, unit, Some(running), &mut findings));
     }
     for unit in units {
-        instances.push(instance(machine, Some(unit), None, &mut findings));
+        instances.push(instance(computer, Some(unit), None, &mut findings));
     }
     (instances, findings)
 }
 
 /// Whether a unit starts Pinion: one of ours, or the one of Klipper's own program with Pinion in its place.
-fn is_ours(machine: &Machine, unit: &str) -> bool {
+fn is_ours(computer: &Computer, unit: &str) -> bool {
     let is_pinion = || {
-        let text = units::text(machine, unit).unwrap_or_default();
+        let text = units::text(computer, unit).unwrap_or_default();
         let program = setting(&text, "ExecStart").and_then(|command| command.split_whitespace().next());
         program.is_some_and(|program| Path::new(program).file_name().is_some_and(|name| name == "pinion"))
     };
@@ -136,12 +136,12 @@ fn is_ours(machine: &Machine, unit: &str) -> bool {
 }
 
 /// Whether a unit starts Klipper's own program.
-pub(super) fn is_klipper_s(machine: &Machine, unit: &str) -> bool {
-    units::of_klipper_mcu(unit) && !is_ours(machine, unit)
+pub(super) fn is_klipper_s(computer: &Computer, unit: &str) -> bool {
+    units::of_klipper_mcu(unit) && !is_ours(computer, unit)
 }
 
 fn instance(
-    machine: &Machine,
+    computer: &Computer,
     unit: Option<String>,
     running: Option<Running>,
     findings: &mut Vec<Finding>,
@@ -149,10 +149,10 @@ fn instance(
     let files = unit.as_deref().and_then(Files::of);
     let (pid, config, settings) = match running {
         Some(Running { pid, config, settings, .. }) => (Some(pid), config, settings),
-        None => (None, unit.as_deref().and_then(|unit| config_of(machine, unit)), None),
+        None => (None, unit.as_deref().and_then(|unit| config_of(computer, unit)), None),
     };
     let given = match (&unit, &files) {
-        (Some(unit), Some(files)) => given(machine, unit, files, config.as_deref(), findings),
+        (Some(unit), Some(files)) => given(computer, unit, files, config.as_deref(), findings),
         _ => Given::default(),
     };
     // The running process knows best. If its command line is another version's and not understood, real time is
@@ -162,14 +162,14 @@ fn instance(
         Some(settings.symlink.clone())
     } else {
         // The unit's own link, or one that somebody has made.
-        files.map(|files| files.link).or_else(|| link_to(machine, &settings.symlink))
+        files.map(|files| files.link).or_else(|| link_to(computer, &settings.symlink))
     };
     Instance { unit, pid, config, settings, link }
 }
 
 /// The configuration file that a unit's program reads.
-fn config_of(machine: &Machine, unit: &str) -> Option<String> {
-    match setting(&units::text(machine, unit).unwrap_or_default(), "ExecStart") {
+fn config_of(computer: &Computer, unit: &str) -> Option<String> {
+    match setting(&units::text(computer, unit).unwrap_or_default(), "ExecStart") {
         Some(command) => named_config(command.split_whitespace()),
         // The unit is not installed, or it is an instance of a template.
         None => Files::of(unit).map(|files| files.config),
@@ -177,17 +177,17 @@ fn config_of(machine: &Machine, unit: &str) -> Option<String> {
 }
 
 /// A link that klippy takes and that leads to this path.
-fn link_to(machine: &Machine, path: &Path) -> Option<PathBuf> {
-    let mut links = machine.matching(format!("{HOST_PATHS}*")).into_iter().map(|link| machine.name(&link));
-    links.find(|link| machine.follow(link).is_ok_and(|way| way.contains(&machine.path(path))))
+fn link_to(computer: &Computer, path: &Path) -> Option<PathBuf> {
+    let mut links = computer.matching(format!("{HOST_PATHS}*")).into_iter().map(|link| computer.name(&link));
+    links.find(|link| computer.follow(link).is_ok_and(|way| way.contains(&computer.path(path))))
 }
 
 /// The settings in the files of a unit.
-fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, findings: &mut Vec<Finding>) -> Given {
+fn given(computer: &Computer, unit: &str, files: &Files, config: Option<&str>, findings: &mut Vec<Finding>) -> Given {
     let Files { options: options_name, symlink, .. } = files;
     let restart = format!("sudo systemctl restart {unit}");
     let mut given = Given::default();
-    match options(machine, options_name) {
+    match options(computer, options_name) {
         Ok(options) => given = given.or(options),
         Err(error) => findings.push(Finding::error(
             "options",
@@ -198,7 +198,7 @@ fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, fin
     // This is on the unit's command line, before the options.
     given.symlink.get_or_insert_with(|| symlink.clone());
     let Some(config_name) = config else { return given };
-    let file = machine.path(config_name);
+    let file = computer.path(config_name);
     if file.exists() {
         match config::load_foreign(&file, config_name) {
             Ok(file) => {
@@ -210,9 +210,9 @@ fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, fin
                 findings.push(Finding::error("config", error.to_string(), remedy));
             }
         }
-    } else if units::is_installed(machine, unit) {
+    } else if units::is_installed(computer, unit) {
         let remedy = match config_name {
-            SYSTEM_FILE if machine.path(DELIVERED).exists() => {
+            SYSTEM_FILE if computer.path(DELIVERED).exists() => {
                 format!("sudo install -D -m 644 {DELIVERED} {SYSTEM_FILE}, then {restart}")
             }
             SYSTEM_FILE => "sudo make install".into(),
@@ -228,8 +228,8 @@ fn given(machine: &Machine, unit: &str, files: &Files, config: Option<&str>, fin
 }
 
 /// The options that the unit takes from the environment.
-fn options(machine: &Machine, file: &str) -> Result<Given, String> {
-    let text = machine.text(file).unwrap_or_default();
+fn options(computer: &Computer, file: &str) -> Result<Given, String> {
+    let text = computer.text(file).unwrap_or_default();
     // The last one counts (systemd.exec(5)).
     let Some(value) = text.lines().rev().find_map(|line| line.trim().strip_prefix("PINION_OPTIONS=")) else {
         return Ok(Given::default());
@@ -256,7 +256,7 @@ mod tests {
     fn what_the_service_runs_by() {
         let tree = Tree::new();
         let read = || {
-            let (mut instances, findings) = instances(&tree.machine());
+            let (mut instances, findings) = instances(&tree.computer());
             assert_eq!(instances.len(), 1);
             (instances.remove(0), findings)
         };
@@ -286,15 +286,15 @@ mod tests {
         }
         tree.put("etc/pinion/second.toml", "cpu = 3\nmargn_us = 1\n");
         tree.put("usr/lib/systemd/system/pinion-mcu@.service", "");
-        let (found, findings) = instances(&tree.machine());
+        let (found, findings) = instances(&tree.computer());
         let names: Vec<String> = found.iter().map(Instance::name).collect();
         assert_eq!(names, ["pinion-mcu", "pinion-mcu@second"]);
         assert_eq!(found[0].link.as_deref(), Some(Path::new("/tmp/klipper_host_mcu")));
         assert_eq!(found[1].link.as_deref(), Some(Path::new("/tmp/klipper_host_second")));
         let remedy = told(&findings, "config", Error, "/etc/pinion/second.toml:2:1: margn_us");
         assert_eq!(remedy, "sudo nano /etc/pinion/second.toml, then sudo systemctl restart pinion-mcu@second");
-        fs::remove_file(tree.machine().path("/etc/pinion/second.toml")).unwrap();
-        let (_, findings) = instances(&tree.machine());
+        fs::remove_file(tree.computer().path("/etc/pinion/second.toml")).unwrap();
+        let (_, findings) = instances(&tree.computer());
         let remedy = told(&findings, "config", Error, "there is no /etc/pinion/second.toml");
         assert!(remedy.starts_with("sudo cp /etc/pinion/pinion.toml /etc/pinion/second.toml"), "{remedy}");
         // For a running instance the process counts. Its guardian is no instance.
@@ -306,7 +306,7 @@ mod tests {
             tree.put(&format!("proc/{pid}/cgroup"), "0::/system.slice/system-pinion.slice/pinion-mcu@second.service\n");
         }
         tree.put("proc/21/comm", "pinion-guardian\n");
-        let (found, _) = instances(&tree.machine());
+        let (found, _) = instances(&tree.computer());
         let facts: Vec<_> = found.iter().map(|it| (it.name(), it.pid, it.settings.cpu)).collect();
         assert_eq!(facts, [("pinion-mcu@second".to_owned(), Some(20), Some(3)), ("pinion-mcu".to_owned(), None, None)]);
         assert_eq!(found[0].link.as_deref(), Some(Path::new("/tmp/klipper_host_second")));
@@ -316,7 +316,7 @@ mod tests {
     fn an_instance_that_was_started_by_hand_may_have_a_link_that_klippy_does_not_take() {
         let tree = Tree::new();
         tree.process(30, &["pinion", "run", "--board", "sim", "-I", "/home/pi/sim"], 1000, &[]);
-        let link = || instances(&tree.machine()).0[0].link.clone();
+        let link = || instances(&tree.computer()).0[0].link.clone();
         assert_eq!(link(), None);
         tree.put("dev/pts/4", "");
         tree.link("home/pi/sim", "/dev/pts/4");
@@ -327,7 +327,7 @@ mod tests {
     #[test]
     fn the_file_to_change_is_the_one_that_the_instance_reads() {
         let tree = Tree::new();
-        let config = || instances(&tree.machine()).0[0].config().to_owned();
+        let config = || instances(&tree.computer()).0[0].config().to_owned();
         assert_eq!(config(), "/etc/pinion/pinion.toml");
         // A unit that the user has written.
         tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
@@ -343,7 +343,7 @@ mod tests {
         tree.put("proc/9/cgroup", "0::/system.slice/pinion-mcu.service\n");
         tree.put("etc/pinion/pinion.toml", "cpus = 3\n");
         assert_eq!(config(), "its command line");
-        assert!(instances(&tree.machine()).1.is_empty(), "nobody reads that file");
+        assert!(instances(&tree.computer()).1.is_empty(), "nobody reads that file");
     }
 
     #[test]
@@ -351,14 +351,14 @@ mod tests {
         let tree = Tree::new();
         tree.link("etc/systemd/system/multi-user.target.wants/klipper-mcu.service", "../klipper-mcu.service");
         tree.put("etc/systemd/system/klipper-mcu.service", "[Service]\nExecStart=/usr/local/bin/klipper_mcu -r\n");
-        assert!(is_klipper_s(&tree.machine(), "klipper-mcu"));
-        assert_eq!(instances(&tree.machine()).0[0].name(), "pinion-mcu");
+        assert!(is_klipper_s(&tree.computer(), "klipper-mcu"));
+        assert_eq!(instances(&tree.computer()).0[0].name(), "pinion-mcu");
         tree.put(
             "etc/systemd/system/klipper-mcu.service.d/override.conf",
             "[Service]\nExecStart=\nExecStart=/usr/bin/pinion -r\n",
         );
-        assert!(!is_klipper_s(&tree.machine(), "klipper-mcu"));
-        let (found, _) = instances(&tree.machine());
+        assert!(!is_klipper_s(&tree.computer(), "klipper-mcu"));
+        let (found, _) = instances(&tree.computer());
         assert_eq!((found.len(), found[0].name().as_str()), (1, "klipper-mcu"));
         assert_eq!(found[0].link.as_deref(), Some(Path::new("/tmp/klipper_host_mcu")));
     }

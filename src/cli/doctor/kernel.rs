@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::cli::computer::Machine;
+use crate::cli::computer::Computer;
 use crate::cli::finding::Finding;
 use crate::runtime::realtime::is_preempt_rt;
 use pinion_linux::gpio::{BIAS_SINCE, EDGES_SINCE, is_before};
@@ -13,16 +13,16 @@ use super::instance::Instance;
 /// The oldest supported kernel: it opens a terminal whatever the terminal's permissions are (TIOCGPTPEER).
 const OLDEST: (u32, u32) = (4, 13);
 
-pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
-    let kernel = [version(machine), preempt_rt(machine), throttle(machine)].into_iter();
-    kernel.chain(isolation(machine, instances)).chain(governor(machine)).collect()
+pub(super) fn findings(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
+    let kernel = [version(computer), preempt_rt(computer), throttle(computer)].into_iter();
+    kernel.chain(isolation(computer, instances)).chain(governor(computer)).collect()
 }
 
 /// Whether the kernel has everything that Pinion needs.
-fn version(machine: &Machine) -> Finding {
+fn version(computer: &Computer) -> Finding {
     const CHECK: &str = "kernel_version";
     const REMEDY: &str = "update the system, or install a newer kernel";
-    let release = machine.text("/proc/sys/kernel/osrelease").unwrap_or_default();
+    let release = computer.text("/proc/sys/kernel/osrelease").unwrap_or_default();
     let lacks = |version| is_before(&release, version);
     match () {
         () if lacks(OLDEST) => {
@@ -46,16 +46,16 @@ fn version(machine: &Machine) -> Finding {
     }
 }
 
-fn preempt_rt(machine: &Machine) -> Finding {
+fn preempt_rt(computer: &Computer) -> Finding {
     const CHECK: &str = "preempt_rt";
-    let release = machine.text("/proc/sys/kernel/osrelease").unwrap_or_else(|| "of unknown version".into());
+    let release = computer.text("/proc/sys/kernel/osrelease").unwrap_or_else(|| "of unknown version".into());
     let package = match () {
         () if release.contains("rpi") => "linux-image-rpi-v8-rt",
         () if cfg!(target_arch = "x86_64") => "linux-image-rt-amd64",
         () if cfg!(target_arch = "aarch64") => "linux-image-rt-arm64",
         () => "linux-image-rt-armmp",
     };
-    match is_preempt_rt(&machine.path("/")) {
+    match is_preempt_rt(&computer.path("/")) {
         Some(true) => Finding::ok(CHECK, format!("kernel {release} is PREEMPT_RT")),
         Some(false) => Finding::warning(
             CHECK,
@@ -68,11 +68,11 @@ fn preempt_rt(machine: &Machine) -> Finding {
     }
 }
 
-fn throttle(machine: &Machine) -> Finding {
+fn throttle(computer: &Computer) -> Finding {
     const CHECK: &str = "rt_throttling";
     const REMEDY: &str = "sudo sysctl kernel.sched_rt_runtime_us=950000";
     let number =
-        |name: &str| -> Option<i64> { machine.text(format!("/proc/sys/kernel/sched_rt_{name}_us"))?.parse().ok() };
+        |name: &str| -> Option<i64> { computer.text(format!("/proc/sys/kernel/sched_rt_{name}_us"))?.parse().ok() };
     let (Some(runtime), Some(period)) = (number("runtime"), number("period")) else {
         return Finding::ok(CHECK, "whether the kernel throttles real time is unknown: it does not tell");
     };
@@ -85,13 +85,13 @@ fn throttle(machine: &Machine) -> Finding {
     }
 }
 
-fn isolation(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+fn isolation(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "isolated_cpus";
-    let Some(isolated) = machine.text("/sys/devices/system/cpu/isolated") else {
+    let Some(isolated) = computer.text("/sys/devices/system/cpu/isolated") else {
         return vec![Finding::ok(CHECK, "which processors are isolated is unknown: the kernel does not tell")];
     };
     // If the kernel does not tell, any processor may be there.
-    let present = machine.text("/sys/devices/system/cpu/present").filter(|present| !present.is_empty());
+    let present = computer.text("/sys/devices/system/cpu/present").filter(|present| !present.is_empty());
     let mut findings = Vec::new();
     let mut taken: Vec<usize> = Vec::new();
     for instance in instances {
@@ -156,11 +156,11 @@ fn first(range: &str) -> &str {
     range.split([',', '-']).next().unwrap_or(range)
 }
 
-/// `None` if processors have only one frequency, as in a virtual machine.
-fn governor(machine: &Machine) -> Option<Finding> {
+/// `None` if processors have only one frequency, as in a virtual computer.
+fn governor(computer: &Computer) -> Option<Finding> {
     const CHECK: &str = "governor";
-    let files = machine.matching("/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor");
-    let mut governors: Vec<String> = files.iter().filter_map(|file| machine.text(machine.name(file))).collect();
+    let files = computer.matching("/sys/devices/system/cpu/cpu*/cpufreq/scaling_governor");
+    let mut governors: Vec<String> = files.iter().filter_map(|file| computer.text(computer.name(file))).collect();
     governors.sort();
     governors.dedup();
     let slow: Vec<&str> = governors.iter().map(String::as_str).filter(|name| *name != "performance").collect();
@@ -185,7 +185,7 @@ mod tests {
 
     fn found(tree: &Tree, cpu: Option<usize>) -> Vec<Finding> {
         tree.put("etc/pinion/pinion.toml", &cpu.map_or(String::new(), |cpu| format!("cpu = {cpu}\n")));
-        findings(&tree.machine(), &instances(&tree.machine()).0)
+        findings(&tree.computer(), &instances(&tree.computer()).0)
     }
 
     #[test]

@@ -14,7 +14,7 @@ use clap::{Args, ValueHint};
 use crate::runtime::latency::{self, Fitness, Verdict};
 use pinion_linux::Inventory;
 
-use super::computer::Machine;
+use super::computer::Computer;
 use super::finding::{self, Finding, Group};
 use super::page::Page;
 use super::{failed, quietly};
@@ -63,7 +63,7 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
             args.root.display()
         ));
     }
-    let mut groups = quietly(|| examine(&Machine::at(&args.root)));
+    let mut groups = quietly(|| examine(&Computer::at(&args.root)));
     if let Some(checkout) = &checkout {
         groups.push(Group::new("checkout", vec![klipper::finding(checkout)]));
     }
@@ -79,25 +79,25 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
     finding::finish(&page, &groups)
 }
 
-fn examine(machine: &Machine) -> Vec<Group> {
-    let (instances, configurations) = instance::instances(machine);
-    let klippys = host::klippys(machine);
+fn examine(computer: &Computer) -> Vec<Group> {
+    let (instances, configurations) = instance::instances(computer);
+    let klippys = host::klippys(computer);
     let mut groups = vec![
-        Group::new("kernel", kernel::findings(machine, &instances)),
-        Group::new("service", [configurations, service::findings(machine, &instances)].concat()),
-        Group::new("watchdog", service::watchdog(machine, &instances)),
-        Group::new("terminal", terminal::terminals(machine, &instances, &klippys)),
-        Group::new("host", host::dialects(machine, &instances, &klippys)),
+        Group::new("kernel", kernel::findings(computer, &instances)),
+        Group::new("service", [configurations, service::findings(computer, &instances)].concat()),
+        Group::new("watchdog", service::watchdog(computer, &instances)),
+        Group::new("terminal", terminal::terminals(computer, &instances, &klippys)),
+        Group::new("host", host::dialects(computer, &instances, &klippys)),
         Group::new(
             "pins and buses",
-            [devices::presence(machine), devices::leds(machine, &host::leds(&klippys))].concat(),
+            [devices::presence(computer), devices::leds(computer, &host::leds(&klippys))].concat(),
         ),
-        Group::new("permissions", devices::permissions(machine, &instances)),
-        Group::new("power", devices::power(machine, machine.is_this().then_some(Path::new("/usr/bin/vcgencmd")))),
+        Group::new("permissions", devices::permissions(computer, &instances)),
+        Group::new("power", devices::power(computer, computer.is_this().then_some(Path::new("/usr/bin/vcgencmd")))),
     ];
-    if machine.is_this() {
+    if computer.is_this() {
         let is_serving = instances.iter().any(|instance| instance.pid.is_some());
-        groups.insert(6, Group::new("lines", devices::holders(machine, &Inventory::scan().chips)));
+        groups.insert(6, Group::new("lines", devices::holders(computer, &Inventory::scan().chips)));
         groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
     }
     groups
@@ -137,9 +137,9 @@ mod tests {
     }
 
     #[test]
-    fn of_a_machine_of_which_nothing_is_known_nothing_is_wrong() {
+    fn a_computer_without_any_files_has_no_errors() {
         let tree = Tree::new();
-        let groups = examine(&tree.machine());
+        let groups = examine(&tree.computer());
         let errors: Vec<&Finding> =
             groups.iter().flat_map(|group| &group.findings).filter(|finding| finding.status == Level::Error).collect();
         assert!(errors.is_empty(), "{errors:?}");
@@ -168,16 +168,16 @@ mod tests {
         ] {
             tree.put(path, text);
         }
-        examine(&tree.machine());
+        examine(&tree.computer());
         // A pipe without a writer, and a folder in a file's place.
-        let pipe = tree.machine().path("/sys/kernel/realtime");
+        let pipe = tree.computer().path("/sys/kernel/realtime");
         fs::create_dir_all(pipe.parent().unwrap()).unwrap();
         nix::unistd::mkfifo(&pipe, nix::sys::stat::Mode::S_IRWXU).unwrap();
-        fs::create_dir_all(tree.machine().path("/etc/pinion/pinion.toml")).unwrap();
+        fs::create_dir_all(tree.computer().path("/etc/pinion/pinion.toml")).unwrap();
         // Processes that call themselves Pinion and klippy, and name the pipe.
         tree.process(7, &["/tmp/pinion", "run", "--config", "/sys/kernel/realtime"], 65534, &[]);
         tree.process(8, &["python3", "/tmp/klippy.py", "/sys/kernel/realtime"], 65534, &[]);
-        examine(&tree.machine());
+        examine(&tree.computer());
     }
 
     #[test]
@@ -199,7 +199,7 @@ mod tests {
         tree.put("proc/device-tree/model", name);
         tree.put("sys/devices/system/cpu/isolated", name);
         tree.link("tmp/klipper_host_mcu", &format!("/dev/{name}"));
-        let groups = examine(&tree.machine());
+        let groups = examine(&tree.computer());
         let page = finding::text(&groups);
         super::super::page::tests::assert_plain(&page.to_string(), page.lines().count());
         let is_ours = |line: &str| {

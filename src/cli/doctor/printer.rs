@@ -6,7 +6,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::{Path, PathBuf};
 
-use crate::cli::computer::Machine;
+use crate::cli::computer::Computer;
 
 /// Highest number of files in a configuration. No configuration has as many.
 const FILES_MAX: usize = 500;
@@ -22,8 +22,8 @@ pub(super) struct Printer {
 
 /// Reads a configuration, with the files that it includes. `None` if one of them cannot be read. As in
 /// klippy/configfile.py the last entry of a section counts.
-pub(super) fn read(machine: &Machine, config: &Path) -> Option<Printer> {
-    let mut reader = Reader { machine, serials: BTreeMap::new(), led_pins: BTreeMap::new(), files: 0 };
+pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
+    let mut reader = Reader { computer, serials: BTreeMap::new(), led_pins: BTreeMap::new(), files: 0 };
     reader.file(config, &mut Vec::new())?;
     let is_spi = |pin: &String| pin.rsplit(':').next().is_some_and(|name| name.trim().starts_with("spidev"));
     Some(Printer {
@@ -33,7 +33,7 @@ pub(super) fn read(machine: &Machine, config: &Path) -> Option<Printer> {
 }
 
 struct Reader<'a> {
-    machine: &'a Machine,
+    computer: &'a Computer,
     /// Indexed by the section's name.
     serials: BTreeMap<String, PathBuf>,
     led_pins: BTreeMap<String, String>,
@@ -48,8 +48,8 @@ impl Reader<'_> {
             return None;
         }
         // A link leads where it leads on the computer that is looked at.
-        let target = self.machine.follow(path).ok()?.pop()?;
-        let text = self.machine.text(self.machine.name(&target))?;
+        let target = self.computer.follow(path).ok()?.pop()?;
+        let text = self.computer.text(self.computer.name(&target))?;
         within.push(path.to_owned());
         let mut section = String::new();
         for line in text.lines() {
@@ -58,8 +58,8 @@ impl Reader<'_> {
                 section = header.trim().to_owned();
                 if let Some(pattern) = section.strip_prefix("include ") {
                     let folder = path.parent().unwrap_or(Path::new("/"));
-                    for file in self.machine.matching(folder.join(pattern.trim())) {
-                        self.file(&self.machine.name(&file), within)?;
+                    for file in self.computer.matching(folder.join(pattern.trim())) {
+                        self.file(&self.computer.name(&file), within)?;
                     }
                 }
                 continue;
@@ -94,7 +94,7 @@ mod tests {
     const CONFIG: &str = "/home/pi/config/printer.cfg";
 
     fn serials(tree: &Tree) -> Option<Vec<String>> {
-        let printer = read(&tree.machine(), Path::new(CONFIG))?;
+        let printer = read(&tree.computer(), Path::new(CONFIG))?;
         Some(printer.serials.iter().map(|path| path.display().to_string()).collect())
     }
 
@@ -103,7 +103,7 @@ mod tests {
         let tree = Tree::new();
         let leds = |text: &str| {
             tree.put("home/pi/config/printer.cfg", text);
-            read(&tree.machine(), Path::new(CONFIG)).unwrap().leds.into_iter().collect::<Vec<_>>()
+            read(&tree.computer(), Path::new(CONFIG)).unwrap().leds.into_iter().collect::<Vec<_>>()
         };
         let strip =
             "[neopixel strip]\npin: host:spidev0.0 # MOSI\n[neopixel other]\npin: PA1\n[dotstar x]\npin: spidev1.0\n";

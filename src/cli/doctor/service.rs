@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use crate::cli::computer::{Machine, units};
+use crate::cli::computer::{Computer, units};
 use crate::cli::finding::Finding;
 use crate::cli::settings::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
 use crate::proc::stat_field;
@@ -16,24 +16,24 @@ const POLICY: usize = 41;
 /// SCHED_FIFO (linux/sched.h).
 const SCHED_FIFO: &str = "1";
 
-pub(super) fn findings(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+pub(super) fn findings(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     let of_each = instances
         .iter()
-        .flat_map(|instance| [Some(state(machine, instance)), board(instance), real_time(machine, instance)])
+        .flat_map(|instance| [Some(state(computer, instance)), board(instance), real_time(computer, instance)])
         .flatten();
-    of_each.chain(c_program(machine, instances)).collect()
+    of_each.chain(c_program(computer, instances)).collect()
 }
 
 /// Whether an instance runs, and is started at boot.
-fn state(machine: &Machine, instance: &Instance) -> Finding {
+fn state(computer: &Computer, instance: &Instance) -> Finding {
     const CHECK: &str = "service";
     let runs = |pid: u32| format!("Pinion runs as process {pid}");
     let Some(unit) = &instance.unit else {
         let by_hand = "no service has started it, and none starts it at boot";
         return Finding::ok(CHECK, format!("{}: {by_hand}", runs(instance.pid.unwrap_or_default())));
     };
-    let is_enabled = !units::enabled(machine, |name| name == unit).is_empty();
-    let is_installed = units::is_installed(machine, unit);
+    let is_enabled = !units::enabled(computer, |name| name == unit).is_empty();
+    let is_installed = units::is_installed(computer, unit);
     let enable = format!("sudo systemctl enable --now {unit}");
     match (instance.pid, is_enabled) {
         (Some(pid), true) => Finding::ok(CHECK, format!("{} ({unit})", runs(pid))),
@@ -70,16 +70,16 @@ fn board(instance: &Instance) -> Option<Finding> {
 }
 
 /// Whether a running instance got the real time that it asked for. `None` if it does not run.
-fn real_time(machine: &Machine, instance: &Instance) -> Option<Finding> {
+fn real_time(computer: &Computer, instance: &Instance) -> Option<Finding> {
     const CHECK: &str = "realtime";
     let pid = instance.pid?;
     if !instance.settings.realtime {
         let found = format!("Pinion (process {pid}) was not asked to run in real time");
         return Some(Finding::warning(CHECK, found, "use the service, or pinion run -r"));
     }
-    let threads = machine.matching(format!("/proc/{pid}/task/*/stat"));
+    let threads = computer.matching(format!("/proc/{pid}/task/*/stat"));
     let policies = threads.iter().filter_map(|thread| {
-        let stat = machine.text(machine.name(thread))?;
+        let stat = computer.text(computer.name(thread))?;
         Some(stat_field(stat.as_bytes(), POLICY)? == SCHED_FIFO)
     });
     let policies: Vec<bool> = policies.collect();
@@ -96,7 +96,7 @@ fn real_time(machine: &Machine, instance: &Instance) -> Option<Finding> {
 }
 
 /// Klipper's own program. It wants the same link and the same pins.
-fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+fn c_program(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "klipper_mcu";
     const STOP: &str = "sudo systemctl disable --now klipper-mcu";
     const SCRIPT: &str = "/etc/init.d/klipper_mcu";
@@ -104,7 +104,7 @@ fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
     const STARTED_BY_FLASH: &str = "Klipper's make flash starts it, which stops Pinion, while printing, too";
     let mut findings = Vec::new();
     let is_it = |name: &std::ffi::OsStr| name == "klipper_mcu";
-    let process = machine
+    let process = computer
         .processes()
         .into_iter()
         .find(|process| process.arguments.first().and_then(|program| program.file_name()).is_some_and(is_it));
@@ -113,13 +113,13 @@ fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
         findings.push(Finding::error(CHECK, found, STOP));
     }
     let is_enabled = |unit: &str| instances.iter().any(|instance| instance.unit.as_deref() == Some(unit));
-    let is_pinion_enabled = !units::enabled(machine, is_enabled).is_empty();
-    if let Some(unit) = units::enabled(machine, |unit| is_klipper_s(machine, unit)).first() {
+    let is_pinion_enabled = !units::enabled(computer, is_enabled).is_empty();
+    if let Some(unit) = units::enabled(computer, |unit| is_klipper_s(computer, unit)).first() {
         let found = format!("{unit}.service is enabled: at boot it is started beside Pinion, and stops it");
         findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {unit}.service")));
     } else if is_pinion_enabled
-        && let Some((unit, file)) = units::all(machine).into_iter().find_map(|unit| {
-            let file = units::file(machine, &unit).filter(|_| is_klipper_s(machine, &unit))?;
+        && let Some((unit, file)) = units::all(computer).into_iter().find_map(|unit| {
+            let file = units::file(computer, &unit).filter(|_| is_klipper_s(computer, &unit))?;
             Some((unit, file))
         })
     {
@@ -131,8 +131,8 @@ fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
         findings.push(Finding::warning(CHECK, format!("{file} is still there: {STARTED_BY_FLASH}"), remedy));
     }
     // A System V script, as Klipper's documentation once had it.
-    let is_started_at_boot = !machine.matching("/etc/rc*/S*klipper_mcu").is_empty();
-    if !is_started_at_boot && is_pinion_enabled && machine.path(SCRIPT).exists() {
+    let is_started_at_boot = !computer.matching("/etc/rc*/S*klipper_mcu").is_empty();
+    if !is_started_at_boot && is_pinion_enabled && computer.path(SCRIPT).exists() {
         let found = format!("{SCRIPT} is still there: {STARTED_BY_FLASH}");
         findings.push(Finding::warning(CHECK, found, format!("sudo mv {SCRIPT} /etc/klipper_mcu.before-pinion")));
     }
@@ -147,9 +147,9 @@ fn c_program(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
 }
 
 /// The hardware watchdog, except for its permissions.
-pub(super) fn watchdog(machine: &Machine, instances: &[Instance]) -> Vec<Finding> {
+pub(super) fn watchdog(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     const CHECK: &str = "watchdog_device";
-    let is_there = machine.path(WATCHDOG).exists();
+    let is_there = computer.path(WATCHDOG).exists();
     let feeding: Vec<&Instance> = instances.iter().filter(|instance| instance.settings.watchdog).collect();
     if feeding.is_empty() {
         let found = "Pinion does not feed the hardware watchdog";
@@ -171,10 +171,10 @@ pub(super) fn watchdog(machine: &Machine, instances: &[Instance]) -> Vec<Finding
         let remedy = format!("watchdog = false in {}, then {}", second.config(), second.restart());
         return vec![Finding::error(CHECK, found, remedy)];
     }
-    let drop_ins = machine.matching("/etc/systemd/system.conf.d/*.conf").into_iter();
-    let files = drop_ins.map(|file| machine.name(&file).display().to_string());
+    let drop_ins = computer.matching("/etc/systemd/system.conf.d/*.conf").into_iter();
+    let files = drop_ins.map(|file| computer.name(&file).display().to_string());
     let other = std::iter::once("/etc/systemd/system.conf".to_owned()).chain(files).find(|file| {
-        let text = machine.text(file).unwrap_or_default();
+        let text = computer.text(file).unwrap_or_default();
         let mut values = text.lines().filter_map(|line| line.trim().strip_prefix("RuntimeWatchdogSec="));
         values.next_back().is_some_and(|value| !["", "0", "off"].contains(&value.trim()))
     });
@@ -198,8 +198,8 @@ mod tests {
     use std::fs;
 
     fn found(tree: &Tree) -> Vec<Finding> {
-        let machine = tree.machine();
-        findings(&machine, &instances(&machine).0)
+        let computer = tree.computer();
+        findings(&computer, &instances(&computer).0)
     }
 
     #[test]
@@ -220,7 +220,7 @@ mod tests {
         tree.put("proc/10/cgroup", "0::/user.slice/user-1000.slice/session-1.scope\n");
         told(&found(&tree), "service", Ok, "Pinion runs as process 10: no service has started it");
         told(&found(&tree), "service", Error, "though its service is enabled");
-        fs::remove_dir_all(tree.machine().path("/proc/10")).unwrap();
+        fs::remove_dir_all(tree.computer().path("/proc/10")).unwrap();
         tree.process(9, &["pinion", "doctor"], 0, &[]);
         let findings = found(&tree);
         told(&findings, "service", Error, "does not run, though its service is enabled (pinion-mcu)");
@@ -299,7 +299,7 @@ mod tests {
             told(&found(&tree), "klipper_mcu", Warning, &format!("/{UNIT} is still there")),
             format!("sudo mv /{UNIT} /{UNIT}.before-pinion && sudo systemctl daemon-reload")
         );
-        fs::remove_file(tree.machine().path(UNIT)).unwrap();
+        fs::remove_file(tree.computer().path(UNIT)).unwrap();
         tree.put("lib/systemd/system/klipper-mcu.service", "");
         let remedy = told(&found(&tree), "klipper_mcu", Warning, "/lib/systemd/system/klipper-mcu.service is still");
         assert_eq!(remedy, "sudo systemctl mask klipper-mcu");
@@ -312,7 +312,7 @@ mod tests {
     #[test]
     fn a_watchdog_that_is_fed() {
         let tree = Tree::new();
-        let look = || watchdog(&tree.machine(), &instances(&tree.machine()).0);
+        let look = || watchdog(&tree.computer(), &instances(&tree.computer()).0);
         told(&look(), "watchdog_device", Ok, "there is none");
         tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
         told(&look(), "watchdog_device", Error, "there is no /dev/watchdog");

@@ -8,7 +8,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
-use crate::cli::computer::{Access, Machine, Who};
+use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::{Finding, Level};
 use crate::klippy::{HOST_PATHS, is_host_path};
 use crate::runtime::Place;
@@ -19,7 +19,7 @@ use super::instance::{Instance, unit_for};
 const CHECK: &str = "terminal";
 
 /// For each terminal: whether its klippy finds it and may open it.
-pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
+pub(super) fn terminals(computer: &Computer, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
     let mut findings = Vec::new();
     let mut links: Vec<&Path> = Vec::new();
     for instance in instances {
@@ -36,13 +36,13 @@ pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Kl
             continue;
         }
         links.push(link);
-        findings.extend(terminal(machine, link, Some(instance), klippys));
+        findings.extend(terminal(computer, link, Some(instance), klippys));
     }
     let named = printers(klippys).flat_map(|printer| &printer.serials).map(PathBuf::as_path);
     let others: BTreeSet<&Path> = named.filter(|path| !links.contains(path)).collect();
     for path in others {
         if is_host_path(path) {
-            findings.extend(terminal(machine, path, None, klippys));
+            findings.extend(terminal(computer, path, None, klippys));
         } else if let Some(instance) = instances.iter().find(|instance| instance.settings.symlink == path) {
             let found = format!("klippy's configuration names {}, which it takes for a serial port", path.display());
             let link = instance.link.as_ref().map_or(Path::new("/tmp/klipper_host_NAME"), PathBuf::as_path);
@@ -54,11 +54,11 @@ pub(super) fn terminals(machine: &Machine, instances: &[Instance], klippys: &[Kl
 
 /// Whether the klippys that open a link find a terminal there, and may open it. The link is `instance`'s, or one that a
 /// klippy's configuration names and no instance has.
-fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys: &[Klippy]) -> Vec<Finding> {
+fn terminal(computer: &Computer, path: &Path, instance: Option<&Instance>, klippys: &[Klippy]) -> Vec<Finding> {
     let shown = path.display();
     let opening: Vec<&Klippy> = klippys.iter().filter(|klippy| klippy.opens(path)).collect();
     let restart = instance.map_or_else(|| format!("sudo systemctl restart {}", unit_for(path)), Instance::restart);
-    let place = Place::of(&machine.path(path));
+    let place = Place::of(&computer.path(path));
     if let Some(obstacle) = place.obstacle(path) {
         let clear = match place {
             // The folder may have something in it.
@@ -67,23 +67,23 @@ fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys
         };
         return vec![Finding::error(CHECK, obstacle, format!("{clear} && {restart}"))];
     }
-    let Ok(link) = fs::symlink_metadata(machine.path(path)) else {
+    let Ok(link) = fs::symlink_metadata(computer.path(path)) else {
         return vec![no_link(path, instance, &opening)];
     };
     let pid = instance.and_then(|instance| instance.pid);
-    let Ok(way) = machine.follow(path) else {
-        let target = fs::read_link(machine.path(path)).unwrap_or_default();
+    let Ok(way) = computer.follow(path) else {
+        let target = fs::read_link(computer.path(path)).unwrap_or_default();
         let found = format!("{shown} leads to {}, which is not there", target.display());
         return vec![match pid {
             None => Finding::warning(CHECK, found, format!("sudo systemctl start {}", unit_for(path))),
             Some(_) => Finding::error(CHECK, found, restart),
         }];
     };
-    let (device, about) = match way.last().map(|device| (machine.name(device), fs::metadata(device))) {
+    let (device, about) = match way.last().map(|device| (computer.name(device), fs::metadata(device))) {
         Some((device, Ok(about))) => (device, about),
         _ => return vec![Finding::error(CHECK, format!("{shown} leads nowhere"), restart)],
     };
-    let told = format!("{shown} leads to {}, which is {}", device.display(), machine.ownership(&about));
+    let told = format!("{shown} leads to {}, which is {}", device.display(), computer.ownership(&about));
     if opening.is_empty() {
         let unknown = match klippys {
             [] => Finding::ok(CHECK, "who klippy is, is unknown: none runs, and no unit starts one"),
@@ -93,7 +93,7 @@ fn terminal(machine: &Machine, path: &Path, instance: Option<&Instance>, klippys
         return vec![Finding::ok(CHECK, told), unknown];
     }
     let terminal = Terminal { path, link: &link, way: &way, about: &about, told: &told };
-    let opened = opening.iter().map(|klippy| access(machine, &terminal, instance, klippy));
+    let opened = opening.iter().map(|klippy| access(computer, &terminal, instance, klippy));
     opened.chain(wanted_by_several(path, &opening)).collect()
 }
 
@@ -151,19 +151,19 @@ struct Terminal<'a> {
 const STRANGER: &str = "no service has started that process: if it is your klippy, have a service start it";
 
 /// Whether a klippy's user may open a terminal. Only a service's klippy gets advice about users.
-fn access(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
-    let judged = judged(machine, terminal, instance, klippy);
+fn access(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
+    let judged = judged(computer, terminal, instance, klippy);
     if klippy.unit.is_some() || judged.status == Level::Ok {
         return judged;
     }
     Finding::warning(CHECK, judged.told, STRANGER)
 }
 
-fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
+fn judged(computer: &Computer, terminal: &Terminal<'_>, instance: Option<&Instance>, klippy: &Klippy) -> Finding {
     let Klippy { who, found_by, is_running, .. } = klippy;
     let Terminal { path, link, way, about, told } = *terminal;
     let (name, told) = (&who.name, format!("{told}, for klippy's user {} ({found_by})", who.name));
-    if let Some(owner) = link_is_refused(machine, path, link, who) {
+    if let Some(owner) = link_is_refused(computer, path, link, who) {
         let shown = path.display();
         let found = format!("the kernel lets {name} not follow {shown}, a link of {owner}'s (fs.protected_symlinks)");
         let remedy = format!("use the service, or run Pinion as {name}");
@@ -171,7 +171,7 @@ fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance
     }
     let closed = way.iter().filter_map(|path| path.parent()).find_map(|folder| {
         let about = fs::metadata(folder).ok()?;
-        (!who.may(Access::SEARCH, &about)).then(|| (machine.name(folder), machine.ownership(&about)))
+        (!who.may(Access::SEARCH, &about)).then(|| (computer.name(folder), computer.ownership(&about)))
     });
     if let Some((folder, ownership)) = closed {
         let found = format!("{name} may not enter {}, which is {ownership}", folder.display());
@@ -180,8 +180,8 @@ fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance
     if who.may(Access::READ_WRITE, about) {
         return Finding::ok(CHECK, told);
     }
-    let group = machine.common_group(about);
-    let is_member = machine.user(name).is_some_and(|user| user.gids.contains(&about.gid()));
+    let group = computer.common_group(about);
+    let is_member = computer.user(name).is_some_and(|user| user.gids.contains(&about.gid()));
     let remedy = match (instance, group) {
         (Some(instance), group) if group.is_none() || !Access::READ_WRITE.is_given_to_group(about) => {
             format!("mode = \"0660\" and group = \"tty\" in {}, then {}", instance.config(), instance.restart())
@@ -196,11 +196,11 @@ fn judged(machine: &Machine, terminal: &Terminal<'_>, instance: Option<&Instance
 }
 
 /// The owner of a link that the kernel refuses to follow.
-fn link_is_refused(machine: &Machine, path: &Path, link: &fs::Metadata, who: &Who) -> Option<String> {
-    let is_on = machine.text("/proc/sys/fs/protected_symlinks").is_some_and(|text| text == "1");
-    let folder = fs::metadata(machine.path(path.parent()?)).ok()?;
+fn link_is_refused(computer: &Computer, path: &Path, link: &fs::Metadata, who: &Who) -> Option<String> {
+    let is_on = computer.text("/proc/sys/fs/protected_symlinks").is_some_and(|text| text == "1");
+    let folder = fs::metadata(computer.path(path.parent()?)).ok()?;
     let refused = is_on && is_protected(folder.mode(), folder.uid(), link.uid(), who.uid);
-    refused.then(|| machine.ownership(link).split(':').next().unwrap_or_default().to_owned())
+    refused.then(|| computer.ownership(link).split(':').next().unwrap_or_default().to_owned())
 }
 
 /// Whether this user may not follow a link in a folder of this mode and owner. In a sticky folder that all may write
@@ -228,15 +228,15 @@ mod tests {
         tree.link("run/pinion/klipper_host_mcu", "/dev/pts/3");
         tree.link("tmp/klipper_host_mcu", "/run/pinion/klipper_host_mcu");
         ["", "tmp", "run", "run/pinion", "dev/pts"].iter().for_each(|folder| tree.mode(folder, 0o755));
-        let gid = fs::metadata(tree.machine().path("/dev/pts/3")).unwrap().gid();
+        let gid = fs::metadata(tree.computer().path("/dev/pts/3")).unwrap().gid();
         tree.put("etc/group", &format!("tty:x:{gid}:\n"));
         tree.put("etc/passwd", &format!("root:x:0:0::/root:/bin/sh\npi:x:{PI}:{PI}::/home/pi:/bin/sh\n"));
         (tree, gid)
     }
 
     fn looked(tree: &Tree) -> Vec<Finding> {
-        let machine = tree.machine();
-        terminals(&machine, &instances(&machine).0, &klippys(&machine))
+        let computer = tree.computer();
+        terminals(&computer, &instances(&computer).0, &klippys(&computer))
     }
 
     const KLIPPY: [&str; 2] = ["/home/pi/klippy-env/bin/python", "/home/pi/klipper/klippy/klippy.py"];

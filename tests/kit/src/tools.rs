@@ -19,7 +19,7 @@ const TOOLS: [(&str, &str); 6] = [
 /// Makes sure that every program is installed.
 pub fn ensure() -> Result<(), String> {
     if !cfg!(target_arch = "x86_64") {
-        return Err("the guest is an x86-64 machine and runs the host's own programs: \
+        return Err("the VM is x86-64 and runs this computer's own programs: \
              build for x86_64 to run the tests in it"
             .into());
     }

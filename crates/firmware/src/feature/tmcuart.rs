@@ -491,7 +491,7 @@ mod tests {
 
     /// A register is read again if its reply came while the worker had no processor. A write is not repeated.
     #[test]
-    fn a_register_is_asked_for_again_where_this_machine_was_late() {
+    fn a_register_is_read_again_if_this_computer_was_late() {
         for (read_len, messages) in [(REPLY.len(), 2), (0, 1)] {
             let clock = VirtualClock::at(Clock::EPOCH);
             let late = clock.clone();

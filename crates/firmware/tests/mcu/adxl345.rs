@@ -250,7 +250,7 @@ fn a_bus_that_fails_stops_the_mcu_and_the_next_configuration_measures() {
         assert!(rig.notes().iter().any(|note| note.contains("ADXL345 oid 1")));
         rig.bench.state().broken.clear();
         rig.run_until(100_000);
-        assert_eq!(rig.responses(), [""; 0], "a stopped machine does not measure");
+        assert_eq!(rig.responses(), [""; 0], "a stopped MCU does not measure");
         rig.send("config_reset");
         rig.configure(CONFIG);
         let start = rig.now();

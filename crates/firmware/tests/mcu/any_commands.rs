@@ -646,11 +646,11 @@ impl<'a> Trial<'a> {
             // The last user of a shared line decides its level, so only lines with one user are checked.
             let alone = |pin: &u32| self.named.get(pin) == Some(&1);
             for (pin, default) in self.outputs.iter().filter(|(pin, _)| alone(pin)) {
-                assert_eq!(self.rig.bench.level(*pin), *default, "pin {pin} of a stopped machine");
+                assert_eq!(self.rig.bench.level(*pin), *default, "pin {pin} of a stopped MCU");
                 LOOKED_AT.fetch_add(1, Ordering::Relaxed);
             }
             for pin in self.step_pins.iter().filter(|pin| alone(pin)) {
-                assert_eq!(self.rig.edges(*pin), [], "stepper pin {pin} of a stopped machine");
+                assert_eq!(self.rig.edges(*pin), [], "stepper pin {pin} of a stopped MCU");
             }
         }
         self.stopped = stopped && !broken;

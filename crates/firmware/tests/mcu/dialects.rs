@@ -79,7 +79,7 @@ fn another_host_is_not_told_what_the_objects_say() {
 }
 
 #[test]
-fn the_machines_own_messages_have_the_same_ids_in_every_dialect() {
+fn the_mcus_own_messages_have_the_same_ids_in_every_dialect() {
     let own = ["emergency_stop", "get_config", "config_reset", "get_clock", "clear_shutdown"];
     let ids = |generation| own.map(|command| Rig::of(generation).dialect().command_id(command));
     for generation in Generation::ALL {
@@ -103,6 +103,6 @@ fn an_emergency_stop_is_found_among_others_and_not_in_their_parameters() {
     assert!(!contains(&[step, stop, stop, stop, stop]));
     assert!(!contains(&[step, 1, 2, 3, 4]));
     assert!(!contains(&[]));
-    assert!(!contains(&[4711, stop]), "the machine stops at a command that there is not");
+    assert!(!contains(&[4711, stop]), "the MCU stops at an unknown command");
     assert!(!contains(&[step, stop]), "and at one that is cut short");
 }
