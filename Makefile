@@ -33,7 +33,7 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test test-kernel test-raspberry-pi test-package bench check build install install-program
+.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak bench check build install install-program
 .PHONY: install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
@@ -50,6 +50,7 @@ help:
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
 	@echo 'make test-raspberry-pi'
 	@echo '                   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
+	@echo 'make soak          a day of printing with faults, in virtual time: five minutes (SECONDS=86400 SEED=)'
 	@echo 'make bench         the benchmarks'
 	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
 	@echo 'make build         the program: $(PINION)'
@@ -84,6 +85,12 @@ test-raspberry-pi: system-packages-build
 
 test-package: system-packages-system
 	$(CARGO) test --locked --test package
+
+SECONDS ?= 86400
+# Each run has its own faults. The test prints its seed if it fails.
+SEED ?= $(shell date +%s)
+soak: system-packages-build
+	PINION_SOAK_SECONDS=$(SECONDS) PINION_SOAK_SEED=$(SEED) $(CARGO) test --locked --test soak -- --nocapture
 
 bench: system-packages-build
 	$(CARGO) bench --locked

@@ -2,62 +2,14 @@
 //! After configuration, the core allocates nothing in a whole print. An allocation may wait for a lock or for the
 //! kernel, and a step would wait with it.
 
-use std::alloc::{GlobalAlloc, Layout, System};
-use std::cell::Cell;
-
 use pinion_firmware::mcu::Generation::{Kalico, V0_12};
 use pinion_firmware::mcu::Snapshot;
 use pinion_testbench::board::ANALOG;
+use pinion_testbench::memory::{Counting, allocations};
 use pinion_testbench::rig::Rig;
-
-/// The system's allocator. It counts allocations of a thread that sets `COUNTS`.
-struct Counting;
-
-thread_local! {
-    static COUNTS: Cell<bool> = const { Cell::new(false) };
-    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
-}
-
-fn count() {
-    if COUNTS.get() {
-        ALLOCATIONS.set(ALLOCATIONS.get() + 1);
-    }
-}
-
-// SAFETY: every call goes unchanged to the system's allocator. The counters are plain cells of the thread. They need no
-// allocation and have no destructor.
-#[allow(unsafe_code)]
-unsafe impl GlobalAlloc for Counting {
-    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
-        count();
-        // SAFETY: the caller keeps the contract of `alloc`.
-        unsafe { System.alloc(layout) }
-    }
-
-    unsafe fn dealloc(&self, ptr: *mut u8, layout: Layout) {
-        count();
-        // SAFETY: the caller keeps the contract of `dealloc`.
-        unsafe { System.dealloc(ptr, layout) }
-    }
-
-    unsafe fn realloc(&self, ptr: *mut u8, layout: Layout, new_size: usize) -> *mut u8 {
-        count();
-        // SAFETY: the caller keeps the contract of `realloc`.
-        unsafe { System.realloc(ptr, layout, new_size) }
-    }
-}
 
 #[global_allocator]
 static ALLOCATOR: Counting = Counting;
-
-/// Runs `core` and counts its allocations and frees.
-fn allocations(core: impl FnOnce()) -> u64 {
-    ALLOCATIONS.set(0);
-    COUNTS.set(true);
-    core();
-    COUNTS.set(false);
-    ALLOCATIONS.get()
-}
 
 /// Sends commands ahead of their time, as a host does.
 struct Print {

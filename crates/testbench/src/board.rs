@@ -184,6 +184,11 @@ impl Bench {
         Bench { state: Arc::new(Mutex::new(state)), gate: Arc::default(), clock, ago: Arc::default(), origin }
     }
 
+    /// The clock.
+    pub fn clock(&self) -> VirtualClock {
+        self.clock.clone()
+    }
+
     fn ticks(&self) -> u64 {
         let now = self.clock.now() - Ticks(self.ago.load(Ordering::Relaxed));
         now.since(self.origin) as u64

@@ -3,8 +3,12 @@
 //!
 //! - [`board`]: a board that records what the MCU does to its pins; a test plays the devices
 //! - [`rig`]: an MCU on that board, and the host's side of its wire
+//! - [`dice`]: random numbers from a seed
+//! - [`memory`]: an allocator that counts
 
-#![forbid(unsafe_code)]
+#![deny(unsafe_code)]
 
 pub mod board;
+pub mod dice;
+pub mod memory;
 pub mod rig;

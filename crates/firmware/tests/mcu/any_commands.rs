@@ -19,6 +19,7 @@ use proptest::prelude::*;
 use proptest::test_runner::TestRunner;
 
 use pinion_testbench::board::{ANALOG, GPIOS, MOSI, PWM, SPI_CHIPS};
+use pinion_testbench::dice::Dice;
 use pinion_testbench::rig::Rig;
 
 /// Commands that always stop a running MCU, for all hosts or for some.
@@ -61,24 +62,6 @@ const OBJECTS_OF_A_KIND: usize = 3;
 /// Highest number of errands on their way. No object has more than 32 boxes for them, except PCA9685, which has one for
 /// each output.
 const ERRANDS_MAX: usize = 1024;
-
-/// A small generator of numbers, with the same sequence each time.
-struct Dice(u64);
-
-impl Dice {
-    fn roll(&mut self) -> u32 {
-        self.0 = self.0.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
-        (self.0 >> 33) as u32
-    }
-
-    fn below(&mut self, end: usize) -> usize {
-        self.roll() as usize % end.max(1)
-    }
-
-    fn of<T: Clone>(&mut self, values: &[T]) -> T {
-        values[self.below(values.len())].clone()
-    }
-}
 
 /// An argument that can be sent at any time.
 #[derive(Clone, Debug)]
