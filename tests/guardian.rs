@@ -126,6 +126,6 @@ fn a_guardian_that_is_stopped_does_not_outlive_the_program() {
     kill(program.pid(), Signal::SIGTERM).unwrap();
     let (status, log) = program.end();
     assert!(status.success(), "{log}");
-    assert!(log.contains("is stopped or hangs: it is killed"), "{log}");
+    assert!(log.contains("is stopped or hangs, and would keep the lines: Pinion kills it"), "{log}");
     wait_until("the guardian is gone", || !exists(guardian));
 }

@@ -10,11 +10,11 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use nix::unistd::{AccessFlags, Gid, Group as UserGroup, access, getegid, geteuid, getgroups};
+use nix::unistd::{AccessFlags, access, geteuid};
 
 use crate::FIRMWARE;
 use crate::runtime::realtime::{self, Processors};
-use crate::runtime::{self, Place};
+use crate::runtime::{self, CLOSED, Place, TerminalGroup};
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::Inventory;
 use pinion_linux::clock::Monotonic;
@@ -125,38 +125,16 @@ fn is_one_of(owners: &[u32]) -> bool {
 
 /// Whether the terminal may be given to the group.
 fn group(name: Option<&str>) -> Finding {
-    let wanted = name.unwrap_or("tty");
-    let found = match wanted.parse() {
-        Ok(gid) => Some(Gid::from_raw(gid)),
-        Err(_) => UserGroup::from_name(wanted).ok().flatten().map(|group| group.gid),
+    let trouble = match TerminalGroup::find(name) {
+        Ok(group) if group.is_ours() => return Finding::ok("group", format!("the terminal goes to the group {group}")),
+        Ok(group) => group.refusal("this user is not a member"),
+        Err(missing) => missing,
     };
-    let Some(gid) = found else {
-        return Finding::error(
-            "group",
-            format!("there is no group {wanted}"),
-            format!("sudo groupadd --system {wanted}"),
-        );
-    };
-    let is_ours = geteuid().is_root() || gid == getegid() || getgroups().is_ok_and(|groups| groups.contains(&gid));
-    if is_ours {
-        return Finding::ok("group", format!("the terminal goes to the group {wanted}"));
-    }
-    let remedy = match gid.as_raw() {
-        // Members of this group could do more than open a terminal.
-        0 => "choose another group, such as tty".to_owned(),
-        _ => format!("sudo usermod -aG {wanted} {}, and log in anew", user_name()),
-    };
-    let what = format!("the terminal cannot be given to the group {wanted}, of which this user is no member");
     match name {
-        Some(_) => Finding::error("group", what, remedy),
+        Some(_) => Finding::of("group", Level::Error, trouble),
         // The program then continues with the user's own group.
-        None => Finding::warning("group", format!("{what}: a klippy of another user cannot open it"), remedy),
+        None => Finding::of("group", Level::Warning, trouble.of(CLOSED)),
     }
-}
-
-fn user_name() -> String {
-    let user = nix::unistd::User::from_uid(geteuid()).ok().flatten();
-    user.map_or_else(|| geteuid().to_string(), |user| user.name)
 }
 
 /// Whether the processor is there. If real time is asked for, whether it is permitted.
@@ -170,7 +148,9 @@ fn real_time(settings: &Settings) -> Vec<Finding> {
     if settings.realtime {
         findings.push(match realtime::is_permitted() {
             Ok(()) => Finding::ok("realtime", "real time is permitted"),
-            Err(why) => Finding::of("realtime", Level::Warning, why.of("no real-time scheduling")),
+            Err(why) => {
+                Finding::of("realtime", Level::Warning, why.of("no real-time scheduling, so steps may be late"))
+            }
         });
     }
     findings
@@ -195,6 +175,7 @@ fn watchdog(device: &Path) -> Finding {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use nix::unistd::getegid;
 
     #[test]
     fn a_link_can_be_made_where_nothing_else_stands() {

@@ -88,8 +88,8 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
 
 /// Fails if a host has the terminal open. Two hosts would take each other's answers.
 fn free(pty: &Path) -> Result<(), String> {
-    let device = fs::canonicalize(pty)
-        .map_err(|error| format!("{}: {error}: is Pinion running, and with this link?", pty.display()))?;
+    let device =
+        fs::canonicalize(pty).map_err(|error| format!("{}: {error}: start Pinion, or name its link", pty.display()))?;
     let flags = (OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits();
     match fs::OpenOptions::new().read(true).write(true).custom_flags(flags).open(&device) {
         // A file that is no terminal may be open in many processes.
@@ -117,7 +117,7 @@ fn free(pty: &Path) -> Result<(), String> {
             pty.display()
         )),
         Ok(Search::Nobody) => Ok(()),
-        Err(error) => Err(format!("who has {} open cannot be found out: {error}", pty.display())),
+        Err(error) => Err(format!("the programs with {} open cannot be found: {error}: use sudo", pty.display())),
     }
 }
 
@@ -164,11 +164,11 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
                 *said.lock().unwrap_or_else(PoisonError::into_inner) = Some(done);
                 // SIGTERM to ourselves: the MCU ends in order.
                 if let Err(error) = kill(getpid(), Signal::SIGTERM) {
-                    log::error!("ending: {error}");
+                    log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
                 }
             });
-            if let Err(error) = speaking {
-                log::error!("the console cannot be started: {error}");
+            if let Err(trouble) = runtime::started(speaking) {
+                log::error!("the console cannot be started: {trouble}");
             }
         }
     };
@@ -261,7 +261,7 @@ fn converse(console: Console) -> Result<(), String> {
         let gone = gone.clone();
         thread::Builder::new().name("session".into()).spawn(move || attend(console, printer, &inbox, &outbox, &gone))
     };
-    session.map_err(|error| format!("no thread can be started: {error}"))?;
+    runtime::started(session).map_err(|trouble| trouble.to_string())?;
     let ended = read_lines(&mut editor, &lines, &answers, &gone);
     if let Some(path) = history {
         let kept = path.parent().map_or(Ok(()), fs::create_dir_all).map_err(|error| error.to_string());

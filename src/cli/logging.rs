@@ -24,6 +24,7 @@ use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 use nix::unistd::write;
 
 use crate::foreign::plain;
+use crate::runtime::started;
 
 /// Highest number of lines that may wait to be written. Further ones are dropped and counted.
 const LINES_MAX: usize = 512;
@@ -208,9 +209,9 @@ pub(super) fn start(level: LevelFilter) {
 /// Starts the thread that writes, so that no other thread waits for a reader of stderr. Call it after the guardian is
 /// forked, because a process with threads cannot be forked.
 pub(super) fn detach() {
-    match thread::Builder::new().name("log".into()).spawn(|| STDERR.write_on()) {
+    match started(thread::Builder::new().name("log".into()).spawn(|| STDERR.write_on())) {
         Ok(_) => STDERR.queue().has_writer = true,
-        Err(error) => log::warn!("a log that nobody reads will stop Pinion: no thread can be started: {error}"),
+        Err(trouble) => log::warn!("a log that nobody reads will stop Pinion: {trouble}"),
     }
 }
 

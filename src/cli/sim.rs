@@ -111,10 +111,9 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     let ready = {
         let (args, right) = (args.clone(), right.clone());
         move || {
-            let shown =
-                thread::Builder::new().name("demo".into()).spawn(move || show(&args, &plan, &probe, &right, &ended));
-            if let Err(error) = shown {
-                log::error!("the demonstration cannot be started: {error}");
+            let demo = thread::Builder::new().name("demo".into());
+            if let Err(trouble) = runtime::started(demo.spawn(move || show(&args, &plan, &probe, &right, &ended))) {
+                log::error!("the demonstration cannot be started: {trouble}");
             }
         }
     };
@@ -161,7 +160,7 @@ fn show(args: &SimArgs, plan: &Plan, probe: &SimProbe, right: &AtomicBool, ended
     if args.demo {
         // SIGTERM to ourselves: the program ends in order, as by Ctrl-C.
         if let Err(error) = kill(getpid(), Signal::SIGTERM) {
-            log::error!("ending: {error}");
+            log::error!("Pinion cannot end itself: {error}: press Ctrl-C");
         }
         return;
     }

@@ -26,6 +26,8 @@ use termina::event::{KeyCode, Modifiers};
 use termina::{Event, OneBased, Parser};
 use terminal_size::{Height, terminal_size_of};
 
+use crate::runtime::started;
+
 use super::page::draw;
 
 /// Rows of a terminal that does not report its size: the rows of the VT100.
@@ -144,7 +146,7 @@ pub(super) fn give_back_at(signals: &[i32], grace: Duration) -> Result<(), Strin
         }
     };
     let waiting = thread::Builder::new().name("signals".into()).spawn(wait);
-    waiting.map(drop).map_err(|error| format!("no thread can be started: {error}"))
+    started(waiting).map(drop).map_err(|trouble| trouble.to_string())
 }
 
 /// Whether the shell has this program in the foreground. Without job control this is unknown and counts as true.

@@ -3,7 +3,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::io;
 use std::sync::Arc;
 use std::thread::{self, JoinHandle};
 
@@ -13,6 +12,7 @@ use rtrb::RingBuffer;
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{Dialect, Mcu};
 use pinion_firmware::time::Timing;
+use pinion_firmware::trouble::Trouble;
 
 use super::core::{Core, Left, Parts};
 use super::core_end::CoreEnd;
@@ -44,7 +44,7 @@ pub(super) struct CoreThread {
 
 impl CoreThread {
     /// Starts the thread, and returns the link's end of it.
-    pub(super) fn start(self) -> io::Result<(JoinHandle<Left>, CoreEnd)> {
+    pub(super) fn start(self) -> Result<(JoinHandle<Left>, CoreEnd), Trouble> {
         let (wake, progress) = (self.wake.clone(), Arc::new(Progress::default()));
         let (outlet, inlet) = outlet::outlet(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);
@@ -55,7 +55,7 @@ impl CoreThread {
             let CoreThread { board, timing, dialect, wake, pulse, teller, processors, margin, realtime } = self;
             if let Err(error) = processors.confine() {
                 warn!(
-                    "--cpu: the core is not bound to its processor: {error}: it runs on any; choose another processor"
+                    "--cpu: the core is not bound to its processor, and runs on any: {error}: choose another processor"
                 );
             }
             let scheduling = if realtime { realtime::enter(Role::Core) } else { Scheduling::Ordinary };

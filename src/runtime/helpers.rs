@@ -5,10 +5,10 @@
 #![forbid(unsafe_code)]
 
 use std::ffi::CStr;
-use std::io;
 
 use log::warn;
 
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
 
@@ -34,13 +34,13 @@ impl Helpers {
     /// # Errors
     ///
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
-    pub fn start(guarded: Option<(Monotonic, bool)>, searches: bool) -> io::Result<Helpers> {
+    pub fn start(guarded: Option<(Monotonic, bool)>, searches: bool) -> Result<Helpers, Trouble> {
         // The search comes first, because it must share nothing with the guardian.
         let search = searches.then(HostSearch::start).transpose()?;
         let guardian = guarded.map(|(clock, realtime)| Guardian::start(clock, realtime)).transpose()?;
         if let Err(error) = sys::keep_only(sys::SERVE) {
             warn!(
-                "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH cannot be given up: {error}: Pinion works, with more rights than it needs"
+                "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH cannot be given up: {error}: Pinion keeps more rights than it needs"
             );
         }
         Ok(Helpers { guardian, search })

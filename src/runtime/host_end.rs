@@ -9,6 +9,7 @@ use std::sync::Arc;
 
 use log::{info, warn};
 
+use pinion_linux::LOOK_AT_LOG;
 use pinion_protocol::block::{Received, Receiver, Sequence, frame};
 
 use super::core::Payload;
@@ -163,7 +164,7 @@ impl HostEnd {
             Ok(written) => drop(self.output.drain(..written)),
             Err(error) => {
                 warn!(
-                    "{} cannot be written: {error}: what the host should have read is lost, and the host asks again or gives up",
+                    "{} cannot be written, and answers to the host are lost: {error}: {LOOK_AT_LOG}",
                     self.pty.device().display()
                 );
                 self.output.clear();

@@ -3,7 +3,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::io;
 use std::iter;
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,6 +11,7 @@ use log::warn;
 
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{Dialect, DialectName, Generation};
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
 use super::host::{HostFinder, HostSearch};
@@ -63,7 +63,7 @@ impl Introduction {
         pty: &Pty,
         wake: &Arc<LinkWake>,
         shown: &Arc<HostBoard>,
-    ) -> io::Result<Introduction> {
+    ) -> Result<Introduction, Trouble> {
         let names = match only {
             Some(name) => vec![name],
             None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
@@ -124,7 +124,7 @@ impl Introduction {
             Some(name) => name,
             None if is_late => {
                 warn!(
-                    "the host's dialect was not found within {FIND_LIMIT:?}: served as Klipper v0.13, master and Kalico"
+                    "the host's dialect was not found within {FIND_LIMIT:?}, so it gets the union of v0.13, master and Kalico: send RESTART, or set its dialect"
                 );
                 self.is_overdue = true;
                 DialectName::Union
@@ -146,7 +146,7 @@ impl Introduction {
         let Some(name) = answer else { return };
         self.is_overdue = false;
         if name != DialectName::Union {
-            warn!("the host's dialect, {name}, was found too late: it is spoken from the host's RESTART on");
+            warn!("the host's dialect {name} was found too late: send RESTART to use it");
         }
     }
 }

@@ -8,6 +8,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::fmt;
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
@@ -18,6 +19,8 @@ use log::{error, info};
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::Timing;
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::LOOK_AT_LOG;
 use pinion_linux::clock::Monotonic;
 
 mod budget;
@@ -45,6 +48,7 @@ mod served;
 mod signals;
 pub(crate) mod status;
 mod survey;
+mod terminal_group;
 pub mod wakeup;
 mod watchdog;
 mod workers;
@@ -57,6 +61,7 @@ pub use pty::Access;
 pub use served::{Served, served};
 pub(crate) use signals::hang_up;
 pub use status::socket_paths;
+pub use terminal_group::{CLOSED, TerminalGroup};
 
 use self::core::{Left, Request};
 use core_thread::{CoreThread, REQUESTS};
@@ -105,16 +110,17 @@ pub fn run(
     clock: Monotonic,
     helpers: Helpers,
     ready: impl FnOnce(),
-) -> io::Result<()> {
+) -> Result<(), Trouble> {
     let Helpers { guardian, search } = helpers;
-    let pulse = guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse()))?;
-    let processors = Processors::new(options.cpu).map_err(io::Error::other)?;
+    let pulse =
+        guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse())).map_err(no_room)?;
+    let processors = Processors::new(options.cpu)?;
     // This comes first: a process that sees the link may send a signal, and the signal must not leave the link behind.
-    let signals = Signals::new()?;
+    let signals = Signals::new().map_err(no_room)?;
     let pty = Pty::open(&options.symlink, &options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
-    let (wake, shown) = (Arc::new(LinkWake::new()?), Arc::new(HostBoard::default()));
+    let (wake, shown) = (Arc::new(LinkWake::new().map_err(no_room)?), Arc::new(HostBoard::default()));
     let introduction = Introduction::start(options.dialect, &*board, search, &pty, &wake, &shown)?;
     let (teller, asker) = status::ends();
     let facts = Facts {
@@ -150,27 +156,34 @@ pub fn run(
     };
     let served = watched.and_then(|()| {
         ready();
-        link.run()
-            .inspect_err(|error| error!("the terminal failed: {error}: Pinion ends; look at the kernel's log (dmesg)"))
+        link.run().map_err(|error| refused("the terminal failed, so Pinion ends", error).remedy(LOOK_AT_LOG))
     });
     end(link, core, guardian, served)
 }
 
 /// Ends the threads and processes in order. `served` is how the link ended.
-fn end(mut link: Link, core: JoinHandle<Left>, guardian: Option<Guardian>, served: io::Result<End>) -> io::Result<()> {
+fn end(
+    mut link: Link,
+    core: JoinHandle<Left>,
+    guardian: Option<Guardian>,
+    served: Result<End, Trouble>,
+) -> Result<(), Trouble> {
     link.stopping();
     link.request(Request::Quit);
     let left = core.join();
     link.finish();
-    // Without a goodbye the guardian drives the outputs.
-    match left {
-        Ok(Left::Safe) => {}
-        Ok(Left::Owing(debtor)) => {
-            return Err(io::Error::other(format!(
-                "{debtor} cannot be driven to its shutdown value: the guardian tries that now"
-            )));
-        }
-        Err(_) => return Err(io::Error::other("the core ended by a panic: please report it with the lines above")),
+    let failure = match left {
+        Ok(Left::Safe) => None,
+        Ok(Left::Owing(debtor)) => Some(
+            Trouble::new(format!("{debtor} cannot be driven to its shutdown value: the guardian tries that now"))
+                .remedy("read its next line"),
+        ),
+        Err(_) => Some(Trouble::new("the core ended by a panic").remedy("please report it with the lines above")),
+    };
+    if let Some(failure) = failure {
+        let _ = served.inspect_err(|trouble| error!("{trouble}"));
+        // Without a goodbye the guardian drives the outputs.
+        return Err(failure);
     }
     if let Some(guardian) = guardian {
         guardian.goodbye();
@@ -183,14 +196,26 @@ fn end(mut link: Link, core: JoinHandle<Left>, guardian: Option<Guardian>, serve
     match served? {
         End::Asked => Ok(()),
         End::GuardianLost => {
-            Err(io::Error::other("the guardian is gone: Pinion ends; start it anew, as the service does by itself"))
+            Err(Trouble::new("the guardian is gone, so Pinion ends")
+                .remedy("start it anew, as the service does by itself"))
         }
     }
 }
 
-/// Adds the remedy to the error of a thread that cannot be started.
-fn started<T>(thread: io::Result<T>) -> io::Result<T> {
-    thread.map_err(|error| {
-        io::Error::new(error.kind(), format!("no thread can be started: {error}: raise TasksMax or ulimit -u"))
-    })
+/// What to do if there can be no further process or thread.
+const NO_PROCESS: &str = "raise TasksMax or ulimit -u";
+
+/// That the kernel refuses something, in its words.
+fn refused(what: impl fmt::Display, error: impl fmt::Display) -> Trouble {
+    Trouble::new(error.to_string()).of(what)
+}
+
+/// That there is no memory or descriptor for a part of the program.
+fn no_room(error: io::Error) -> Trouble {
+    refused("Pinion cannot be started", error).remedy("raise LimitNOFILE, or free memory")
+}
+
+/// Adds what to do about a thread that cannot be started.
+pub(crate) fn started<T>(thread: io::Result<T>) -> Result<T, Trouble> {
+    thread.map_err(|error| refused("no thread can be started", error).remedy(NO_PROCESS))
 }

@@ -12,20 +12,23 @@ use std::os::unix::net::{SocketAddr, UnixDatagram};
 use std::time::Duration;
 
 use crate::foreign::plain;
+use pinion_firmware::trouble::Trouble;
+
+use super::refused;
 
 /// A socket to the service manager, if there is one.
 pub(super) struct Notify(Option<UnixDatagram>);
 
 impl Notify {
     /// Connects to the socket that the environment names in `NOTIFY_SOCKET`, if it names one.
-    pub(super) fn from_env() -> io::Result<Notify> {
+    pub(super) fn from_env() -> Result<Notify, Trouble> {
         match env::var_os("NOTIFY_SOCKET") {
             Some(name) => Notify::to(&name),
             None => Ok(Notify(None)),
         }
     }
 
-    fn to(name: &OsStr) -> io::Result<Notify> {
+    fn to(name: &OsStr) -> Result<Notify, Trouble> {
         let connect = || {
             let address = match name.as_bytes() {
                 [b'@', rest @ ..] => SocketAddr::from_abstract_name(rest)?,
@@ -38,8 +41,8 @@ impl Notify {
             Ok(Notify(Some(socket)))
         };
         connect().map_err(|error: io::Error| {
-            let text = format!("the service manager cannot be told anything: NOTIFY_SOCKET {name:?}: {error}");
-            io::Error::new(error.kind(), text)
+            refused(format_args!("the service manager cannot be told anything: NOTIFY_SOCKET {name:?}"), error)
+                .remedy("let the service see /run/systemd")
         })
     }
 

@@ -6,24 +6,25 @@
 use std::fs::{self, OpenOptions};
 use std::io::{self, Read as _};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt, chown, symlink};
 use std::path::{Path, PathBuf};
 
 use log::{info, warn};
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, FdFlag, OFlag, fcntl};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
-use nix::pty::openpty;
+use nix::pty::{OpenptyResult, openpty};
 use nix::sys::termios::{FlushArg, SetArg, cfmakeraw, tcflush, tcgetattr, tcsetattr};
-use nix::unistd::{Gid, Group, chown, geteuid, read, ttyname, write};
+use nix::unistd::{geteuid, read, ttyname, write};
 
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::sys;
 
 use super::place::Place;
+use super::refused;
 use super::served::served;
+use super::terminal_group::{CLOSED, TerminalGroup};
 
-/// The terminal's group, if the command line names none.
-const USUAL_GROUP: &str = "tty";
 /// The folder where others leave files in the link's place.
 const TMP: &str = "/tmp";
 /// The stop command of Klipper's own service writes this to the link's path, even if no program serves there.
@@ -52,35 +53,37 @@ pub struct Access {
     pub group: Option<String>,
 }
 
-fn said<T>(result: Result<T, impl Into<io::Error>>, what: &str) -> io::Result<T> {
-    result.map_err(|error| {
-        let error = error.into();
-        io::Error::new(error.kind(), format!("{what}: {error}"))
-    })
-}
-
 impl Pty {
     /// Opens a terminal and puts the symbolic link in place.
     ///
     /// # Errors
     ///
-    /// One line with the cause and the remedy.
-    pub(super) fn open(symlink: &Path, access: &Access) -> io::Result<Pty> {
+    /// The path is taken, the group is not this user's, or the kernel has no terminal.
+    pub(super) fn open(symlink: &Path, access: &Access) -> Result<Pty, Trouble> {
         if let Some(served) = served(symlink) {
-            return Err(io::Error::other(format!("{served}, or choose another path with -I")));
+            return Err(format!("{served}, or choose another path with -I").into());
         }
-        let pty = said(openpty(None, None), "no pseudo terminal can be opened (is /dev/pts mounted?)")?;
-        let mut raw = said(tcgetattr(&pty.slave), "the terminal's settings")?;
-        cfmakeraw(&mut raw);
-        said(tcsetattr(&pty.slave, SetArg::TCSANOW, &raw), "the terminal's settings")?;
-        for fd in [&pty.master, &pty.slave] {
-            said(fcntl(fd, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC)), "the terminal's descriptor")?;
-        }
-        said(fcntl(&pty.master, FcntlArg::F_SETFL(OFlag::O_NONBLOCK)), "the terminal's descriptor")?;
-        let device = said(ttyname(&pty.slave), "the terminal's name")?;
+        let opened = Pty::opened().map_err(|error| {
+            refused("no pseudo terminal can be opened", error).remedy("mount /dev/pts, or raise LimitNOFILE")
+        });
+        let (pty, device) = opened?;
         grant(&device, access)?;
         place_symlink(&device, symlink)?;
         Ok(Pty { master: pty.master, slave: Some(pty.slave), device, symlink: symlink.to_owned() })
+    }
+
+    /// A raw terminal and the path of its slave end.
+    fn opened() -> nix::Result<(OpenptyResult, PathBuf)> {
+        let pty = openpty(None, None)?;
+        let mut raw = tcgetattr(&pty.slave)?;
+        cfmakeraw(&mut raw);
+        tcsetattr(&pty.slave, SetArg::TCSANOW, &raw)?;
+        for fd in [&pty.master, &pty.slave] {
+            fcntl(fd, FcntlArg::F_SETFD(FdFlag::FD_CLOEXEC))?;
+        }
+        fcntl(&pty.master, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
+        let device = ttyname(&pty.slave)?;
+        Ok((pty, device))
     }
 
     /// The path of the slave end, such as `/dev/pts/3`.
@@ -117,7 +120,7 @@ impl Pty {
     pub(super) fn meet_host(&mut self) -> io::Result<bool> {
         self.slave = None;
         let mut fds = [PollFd::new(self.master.as_fd(), PollFlags::empty())];
-        said(poll(&mut fds, PollTimeout::ZERO), "the terminal")?;
+        poll(&mut fds, PollTimeout::ZERO)?;
         let is_there = !fds[0].revents().is_some_and(|events| events.contains(PollFlags::POLLHUP));
         if !is_there {
             self.part_from_host()?;
@@ -128,7 +131,7 @@ impl Pty {
     /// Call this when the master has hung up because the host has gone. It opens our slave end again, and drops the
     /// bytes that the host did not read.
     pub(super) fn part_from_host(&mut self) -> io::Result<()> {
-        let slave = said(sys::pty_slave(self.master.as_fd()), "opening the terminal anew")?;
+        let slave = sys::pty_slave(self.master.as_fd())?;
         // If this fails, the next host reads some blocks that were meant for this one, and skips them.
         let _ = tcflush(&slave, FlushArg::TCIFLUSH);
         self.slave = Some(slave);
@@ -149,56 +152,46 @@ impl Drop for Pty {
     }
 }
 
-fn grant(device: &Path, access: &Access) -> io::Result<()> {
-    let about = |what: &str| format!("{what} of {}", device.display());
-    said(fs::set_permissions(device, fs::Permissions::from_mode(access.mode)), &about("the mode"))?;
-    match &access.group {
-        Some(name) => give(device, name),
-        // The user has not asked for this group, so the program runs without it. Only root or a member may give a file
-        // to `tty`. (The C program leaves the group as it is.)
-        None => give(device, USUAL_GROUP).or_else(|error| {
-            let gid = fs::metadata(device)?.gid();
-            warn!("{error}: it stays with group {gid}; a klippy of another user cannot open it");
+fn grant(device: &Path, access: &Access) -> Result<(), Trouble> {
+    fs::set_permissions(device, fs::Permissions::from_mode(access.mode))
+        .map_err(|error| refused(format_args!("the mode of {} cannot be set", device.display()), error))?;
+    give(device, access.group.as_deref()).or_else(|trouble| match access.group {
+        Some(_) => Err(trouble),
+        // The user has not asked for the usual group, so the program runs without it. Only root or a member may give a
+        // file to it. (The C program leaves the group as it is.)
+        None => {
+            warn!("{}", trouble.of(CLOSED));
             Ok(())
-        }),
-    }
+        }
+    })
 }
 
-fn give(device: &Path, name: &str) -> io::Result<()> {
-    let gid = match name.parse() {
-        Ok(gid) => Gid::from_raw(gid),
-        Err(_) => {
-            let group = said(Group::from_name(name), &format!("looking for the group {name}"))?;
-            let missing = || io::Error::other(format!("there is no group {name}: create it or choose another with -g"));
-            group.ok_or_else(missing)?.gid
-        }
-    };
-    if fs::metadata(device)?.gid() == gid.as_raw() {
+fn give(device: &Path, group: Option<&str>) -> Result<(), Trouble> {
+    let group = TerminalGroup::find(group)?;
+    if fs::metadata(device).is_ok_and(|about| about.gid() == group.gid()) {
         return Ok(());
     }
-    let what = format!(
-        "giving {} to the group {name} (only root or a member may: add the user to it, or choose another with -g)",
-        device.display()
-    );
-    said(chown(device, None, Some(gid)), &what)
+    chown(device, None, Some(group.gid())).map_err(|error| group.refusal(error))
 }
 
-fn place_symlink(device: &Path, symlink: &Path) -> io::Result<()> {
-    let place = Place::of(symlink);
-    if place == Place::File && is_left_over(symlink) {
-        info!("{} was a file that holds nothing but {FORCE_SHUTDOWN}: removed", symlink.display());
-        said(fs::remove_file(symlink), &format!("removing {}", symlink.display()))?;
-    } else if let Some(obstacle) = place.obstacle(symlink) {
-        return Err(io::Error::other(obstacle));
+fn place_symlink(device: &Path, link: &Path) -> Result<(), Trouble> {
+    let place = Place::of(link);
+    let what = format!("the link {} cannot be made", link.display());
+    let cannot = |error: io::Error| {
+        refused(&what, error).remedy("make its folder, let this user write there, or choose another path with -I")
+    };
+    if place == Place::File && is_left_over(link) {
+        fs::remove_file(link).map_err(cannot)?;
+        info!("a file with nothing but {FORCE_SHUTDOWN} was in the link's place: removed {}", link.display());
+    } else if let Some(obstacle) = place.obstacle(link) {
+        return Err(obstacle);
     }
     // A rename replaces a stale link in one step. So a host finds a link at any time.
-    let mut fresh = symlink.as_os_str().to_owned();
+    let mut fresh = link.as_os_str().to_owned();
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
-    let what =
-        format!("the link {} cannot be made (does the directory exist, and may we write there?)", symlink.display());
-    said(std::os::unix::fs::symlink(device, &fresh), &what)?;
-    said(fs::rename(&fresh, symlink), &what).inspect_err(|_| drop(fs::remove_file(&fresh)))
+    symlink(device, &fresh).map_err(cannot)?;
+    fs::rename(&fresh, link).inspect_err(|_| drop(fs::remove_file(&fresh))).map_err(cannot)
 }
 
 /// Whether a service's stop command left this file in /tmp because there was no link. The file is root's or our own,

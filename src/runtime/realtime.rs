@@ -76,7 +76,7 @@ pub fn lock_memory() {
         false => mlockall(lock_flags()).map_err(|error| Trouble::new(error.to_string())),
     };
     if let Err(why) = locked {
-        warn!("memory is not locked: {why}; steps may be late when memory is short");
+        warn!("memory is not locked, so steps may be late when memory is short: {why}");
     }
 }
 
@@ -100,7 +100,7 @@ pub fn enter(role: Role) -> Scheduling {
     // Before Linux 6.13 a futex wait ends up to 50 us late (the default timer slack), even under SCHED_FIFO. Setting
     // the slack prevents that.
     if let Err(error) = prctl::set_timerslack(1) {
-        warn!("the timer slack cannot be set: {error}; steps may be late by 50 us, before Linux 6.13");
+        warn!("the timer slack cannot be set, so steps may be 50 us later before Linux 6.13: {error}");
     }
     match sys::set_fifo(priority(role)) {
         Ok(()) => {
@@ -116,7 +116,7 @@ pub fn enter(role: Role) -> Scheduling {
         Err(error) => {
             // The other threads are refused for the same reason: one warning is enough.
             if role == Role::Core {
-                warn!("no real-time scheduling: {}; steps may be late", refusal(&error));
+                warn!("no real-time scheduling, so steps may be late: {}", refusal(&error));
             }
             Scheduling::Ordinary
         }

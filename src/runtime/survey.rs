@@ -14,12 +14,17 @@ use log::{error, info};
 use crate::FIRMWARE;
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{Dialect, DialectName};
+use pinion_firmware::trouble::Trouble;
 
 use super::outlet::LinkWake;
+use super::refused;
 
 /// The dialects of these names, for the board as it is now.
-pub(super) fn dialects(board: &dyn Board, names: &[DialectName]) -> io::Result<Vec<Arc<Dialect>>> {
-    names.iter().map(|name| Dialect::new(&FIRMWARE, board, *name).map(Arc::new)).collect()
+pub(super) fn dialects(board: &dyn Board, names: &[DialectName]) -> Result<Vec<Arc<Dialect>>, Trouble> {
+    let made = names.iter().map(|name| Dialect::new(&FIRMWARE, board, *name).map(Arc::new)).collect::<io::Result<_>>();
+    made.map_err(|error| {
+        refused("a host cannot be told what the board has", error).remedy("report it, and restart Pinion")
+    })
 }
 
 /// The thread that looks at the board. It opens devices, and the link must not wait for them without an end.
@@ -46,10 +51,8 @@ impl Surveyor {
                     info!("the board has changed: {}", view.describe());
                     dialects(&*view, &names)
                 });
-                let found = found.transpose().unwrap_or_else(|error| {
-                    error!(
-                        "what the board has now cannot be told to a host: {error}: it gets the names of before; restart Pinion"
-                    );
+                let found = found.transpose().unwrap_or_else(|trouble| {
+                    error!("the host gets the board's former names: {trouble}");
                     None
                 });
                 let told = replies.send(found);

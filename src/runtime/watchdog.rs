@@ -15,6 +15,8 @@ use std::time::Duration;
 
 use log::{error, info, warn};
 
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::LOOK_AT_LOG;
 use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 
@@ -34,7 +36,7 @@ pub(super) struct Watchdog {
 
 impl Watchdog {
     /// Opens the device, which starts it.
-    pub(super) fn open(path: &Path) -> io::Result<Watchdog> {
+    pub(super) fn open(path: &Path) -> Result<Watchdog, Trouble> {
         let file = File::options().write(true).open(path).map_err(|error| cannot_open(path, &error))?;
         let limit = match sys::watchdog_timeout_s(file.as_fd()) {
             Ok(seconds) if seconds > 0 => Duration::from_secs(seconds.unsigned_abs().into()),
@@ -46,7 +48,7 @@ impl Watchdog {
 
     fn feed(&mut self) {
         if let Err(error) = self.file.write_all(b"\0") {
-            warn!("the watchdog cannot be fed: {error}: this computer is about to be reset");
+            warn!("the watchdog cannot be fed, and is about to reset this computer: {error}: {LOOK_AT_LOG}");
         }
     }
 
@@ -54,12 +56,12 @@ impl Watchdog {
     /// (Documentation/watchdog/watchdog-api.rst, "magic close").
     fn close(mut self) {
         if let Err(error) = self.file.write_all(b"V") {
-            warn!("the watchdog cannot be stopped: {error}: this computer is about to be reset");
+            warn!("the watchdog cannot be stopped, and is about to reset this computer: {error}: {LOOK_AT_LOG}");
         }
     }
 }
 
-fn cannot_open(path: &Path, error: &io::Error) -> io::Error {
+fn cannot_open(path: &Path, error: &io::Error) -> Trouble {
     let remedy = match error.raw_os_error() {
         Some(libc::ENOENT) => {
             "this computer has no watchdog, or its driver is not loaded: on a Raspberry Pi set \"dtparam=watchdog=on\" in config.txt, elsewhere modprobe softdog, or leave out -w"
@@ -72,7 +74,7 @@ fn cannot_open(path: &Path, error: &io::Error) -> io::Error {
         }
         _ => "look at the kernel's log (dmesg), or leave out -w",
     };
-    io::Error::new(error.kind(), format!("-w: {} cannot be opened: {error}: {remedy}", path.display()))
+    Trouble::new(format!("{} cannot be opened: {error}", path.display())).remedy(remedy).of("-w")
 }
 
 /// Feeds the watchdogs as long as nothing hangs.
@@ -115,7 +117,7 @@ impl Vigil {
         let stuck = self.pulse.stuck(clock, JOB_LIMIT);
         if !silent && stuck.is_none() {
             if std::mem::take(&mut self.starving) {
-                warn!("Pinion gets on: the watchdogs are fed again");
+                warn!("Pinion hangs no longer: the watchdogs are fed again");
             }
             if let Some(watchdog) = &mut self.watchdog {
                 watchdog.feed();
@@ -124,11 +126,11 @@ impl Vigil {
         } else if !std::mem::replace(&mut self.starving, true) {
             match stuck {
                 Some(bus) => error!(
-                    "a transfer on {bus} takes more than {} s: the watchdogs are not fed; check the chip's wiring",
+                    "a transfer on {bus} takes more than {} s, so the watchdogs are not fed: check the chip's wiring",
                     JOB_LIMIT.as_secs()
                 ),
                 None => error!(
-                    "the core hangs: the watchdogs are not fed; the guardian or the service manager ends Pinion, unless it gets on"
+                    "the core hangs, so the watchdogs are not fed, and the guardian or the service manager may end Pinion: report it with the lines above"
                 ),
             }
         }

@@ -153,7 +153,7 @@ impl Workers for Threads {
                 let _ = worker.thread.join();
             } else {
                 error!(
-                    "{} does not answer: its driver or chip hangs (dmesg), and what it holds stays in use until it answers, or Pinion is restarted",
+                    "{} does not answer, and its pins and devices stay in use: its driver or chip hangs: look at the kernel's log (dmesg), then restart Pinion",
                     worker.bus
                 );
             }

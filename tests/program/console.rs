@@ -122,7 +122,7 @@ fn a_running_mcu_is_spoken_to_and_one_with_a_host_is_not() {
     assert!(log.contains(&format!("process {} (", std::process::id())) && log.contains("stop it first"), "{log}");
     assert!(!client.status().unwrap().is_shutdown);
     let missing = console(&["/tmp/no-such-link"], "");
-    assert!(text(&missing.stderr).contains("is Pinion running"), "{missing:?}");
+    assert!(text(&missing.stderr).contains("start Pinion, or name its link"), "{missing:?}");
 }
 
 #[test]

@@ -263,7 +263,10 @@ fn a_crowd_is_waited_for_and_then_named() {
     };
     let refused = ask().wait_with_output().unwrap();
     let log = String::from_utf8_lossy(&refused.stderr);
-    assert!(!refused.status.success() && log.contains("mcu.sock is asked by too many at once: end those"), "{log}");
+    assert!(
+        !refused.status.success() && log.contains("mcu.sock is asked by too many at once: end the programs"),
+        "{log}"
+    );
     let waiting = ask();
     thread::sleep(std::time::Duration::from_millis(200));
     for _ in 0..=crowd.len() {

@@ -486,7 +486,7 @@ mod tests {
         let reason = client.emergency_stop().unwrap();
         assert_eq!(reason.as_deref(), Some("Command request"));
         let error = client.check().unwrap_err();
-        assert!(error.to_string().starts_with("the MCU shut down: Command request;"), "{error}");
+        assert!(error.to_string().starts_with("the MCU shut down: Command request:"), "{error}");
         assert!(client.wait("nothing", None, Instant::now()).is_err());
         drop(client);
         peer.join().unwrap();

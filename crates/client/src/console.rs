@@ -189,7 +189,7 @@ impl Console {
                 _ => continue,
             };
             let reason = response.text("static_string_id").unwrap_or_default();
-            stopped.get_or_insert(format!("the MCU {verb}: {reason} (its log says more; reset restarts it)"));
+            stopped.get_or_insert(format!("the MCU {verb}: {reason} (look at its log, then type reset)"));
         }
         Ok(stopped)
     }

@@ -91,28 +91,27 @@ impl fmt::Display for Error {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Error::Io { doing, port, source } => {
-                write!(f, "cannot {doing} {port}: {source}; is the MCU program running, and may you open it?")
+                write!(f, "cannot {doing} {port}: {source}: check that the MCU program runs and that you may open it")
             }
             Error::NoTerminal { port } => {
                 write!(f, "{port} is no terminal: name the link of a Pinion that runs, such as /tmp/klipper_host_mcu")
             }
             Error::Closed { port } => {
-                write!(f, "{port} was closed by the other end; look at its log")
+                write!(f, "{port} was closed by the other end: look at its log")
             }
             Error::Timeout { waiting_for, after } => write!(
                 f,
-                "no {waiting_for} within {:.1} s; is the MCU program running, and is no other host \
-                 on its tty?",
+                "no {waiting_for} within {:.1} s: check that the MCU program runs, and no other host on its tty",
                 after.as_secs_f64()
             ),
             Error::Shutdown { reason } => {
-                write!(f, "the MCU shut down: {reason}; its log says more, a reset makes it usable again")
+                write!(f, "the MCU shut down: {reason}: look at its log, then reset it")
             }
             Error::Dictionary { why } => {
-                write!(f, "the MCU's data dictionary is unusable: {why}; is a micro-controller on this tty?")
+                write!(f, "the MCU's data dictionary is unusable: {why}: check that this tty is an MCU's")
             }
             Error::Message { message, why } => {
-                write!(f, "{message}: {why}; `pinion dict` lists what the MCU takes")
+                write!(f, "{message}: {why}: look it up with `pinion dict`")
             }
             Error::Plan { subject, why } => write!(f, "{subject}: {why}"),
         }

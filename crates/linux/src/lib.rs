@@ -324,8 +324,8 @@ impl Board for LinuxBoard {
         let device = self.open_spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?.with_mosi_idle_low();
         if let Some(driver) = spi::driver_without_dma(Path::new(SPI_MASTERS), node) {
             log::warn!(
-                "/dev/{node}: its controller ({driver}) has no DMA and may pause amid a frame, which LEDs take for \
-                 other colours: use another controller (on a Raspberry Pi SPI0)"
+                "/dev/{node}: its controller ({driver}) has no DMA and may pause within a frame, so LEDs may show wrong \
+                 colors: use another controller (on a Raspberry Pi SPI0)"
             );
         }
         let line = OnWorker { bus: device.worker(), device: Box::new(device) as Box<dyn BusDevice> };
@@ -340,7 +340,7 @@ impl Board for LinuxBoard {
 
     fn reset(&mut self) {
         if let Err(error) = self.guard.release() {
-            log::error!("the guardian does not give back the lines: {error}: restart Pinion");
+            log::error!("the guardian does not give the lines back: {error}: restart Pinion");
         }
         self.spi_controllers.clear();
     }

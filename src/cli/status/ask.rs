@@ -46,17 +46,17 @@ pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
             }
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                 return Err(format!(
-                    "{} is asked by too many at once: end those who ask it again and again (sudo ss -xp tells who they are)",
+                    "{} is asked by too many at once: end the programs that ask it all the time (sudo ss -xp names them)",
                     path.display()
                 ));
             }
             Err(error) => {
-                return Err(format!("{} gives no answer: {error}; does Pinion hang? (its log)", path.display()));
+                return Err(format!("{} gives no answer: {error}: look at Pinion's log", path.display()));
             }
         }
     }
     Err(format!(
-        "no Pinion answers on {}: is it running (systemctl status pinion-mcu), and with the link {}?",
+        "no Pinion answers on {}: start it (sudo systemctl start pinion-mcu), or name its link with -I if that is not {}",
         missing.join(" or "),
         args.symlink.display()
     ))

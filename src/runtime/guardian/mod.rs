@@ -46,12 +46,14 @@ use nix::sys::time::{TimeVal, TimeValLike as _};
 use nix::sys::wait::{WaitPidFlag, WaitStatus, waitpid};
 use nix::unistd::{Pid, getpid};
 
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::Guard;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys;
 
 use super::forked::THREADS_MAX;
 use super::pulse::{GuardianEar, Pulse};
+use super::{NO_PROCESS, refused};
 
 use message::{Message, TAKEN};
 use watcher::{END_LIMIT, Program, Watcher};
@@ -76,9 +78,9 @@ impl Guardian {
     /// # Errors
     ///
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
-    pub fn start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
+    pub fn start(clock: Monotonic, realtime: bool) -> Result<Guardian, Trouble> {
         Guardian::try_start(clock, realtime)
-            .map_err(|error| io::Error::new(error.kind(), format!("the guardian cannot be started: {error}")))
+            .map_err(|error| refused("the guardian cannot be started", error).remedy(NO_PROCESS))
     }
 
     fn try_start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
@@ -124,7 +126,7 @@ impl Guardian {
         while let Ok(WaitStatus::StillAlive) = waitpid(self.pid, Some(WaitPidFlag::WNOHANG)) {
             if monotonic() > until {
                 warn!(
-                    "the guardian (process {}) is stopped or hangs: it is killed, as it would keep the lines",
+                    "the guardian (process {}) is stopped or hangs, and would keep the lines: Pinion kills it",
                     self.pid
                 );
                 // The guardian is our child and was not waited for yet. So the kernel cannot have given its process
@@ -384,7 +386,7 @@ mod tests {
         wait_until("the guardian ends", || is_gone(guardian));
         let log = content(&log_of(&file));
         assert!(
-            log.contains("pwmchip7/pwm0: Bad file descriptor (os error 9): it is not at its shutdown value"),
+            log.contains("still not at its shutdown value: pwmchip7/pwm0: Bad file descriptor (os error 9)"),
             "{log}"
         );
         assert!(log.contains("only 0 of 1 outputs are driven") && log.contains("switch the power off"), "{log}");
@@ -474,7 +476,7 @@ mod tests {
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         let other = thread::spawn(move || stopped.recv());
         let error = Guardian::start(Monotonic::start(), false).err().unwrap();
-        assert_eq!(error.to_string(), "the guardian cannot be started: threads have been started already");
+        assert_eq!(error.found(), "the guardian cannot be started: threads have been started already");
         drop(stop);
         let _ = other.join();
     }

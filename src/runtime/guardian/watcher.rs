@@ -343,7 +343,7 @@ impl Watcher {
         alarm::set(2 * TRY_FOR.as_secs() as u32 + LOG_S);
         let of_crew = crew.wait(TRY_FOR, |outcome| {
             let seconds = TRY_FOR.as_secs();
-            error!("guardian: {}: it is not at its shutdown value yet, and tried for {seconds} s", outcome.complaint());
+            error!("guardian: after {seconds} s still not at its shutdown value: {}", outcome.complaint());
         });
         alarm::set(LOG_S);
         let pid = program.pid;

@@ -28,11 +28,13 @@ use nix::sys::time::{TimeVal, TimeValLike as _};
 
 use crate::klippy::process::Terminal;
 use pinion_firmware::mcu::DialectName;
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::sys;
 
 use super::forked::THREADS_MAX;
 use super::outlet::LinkWake;
 use super::status::HostBoard;
+use super::{NO_PROCESS, refused};
 use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
 
 pub(crate) use looker::NAME;
@@ -45,11 +47,9 @@ pub struct HostSearch(OwnedFd);
 
 impl HostSearch {
     /// Forks the process. Call it before any thread starts.
-    pub(super) fn start() -> io::Result<HostSearch> {
+    pub(super) fn start() -> Result<HostSearch, Trouble> {
         let started = HostSearch::try_start();
-        started.map_err(|error| {
-            io::Error::new(error.kind(), format!("the search for the host cannot be started: {error}"))
-        })
+        started.map_err(|error| refused("the search for the host cannot be started", error).remedy(NO_PROCESS))
     }
 
     fn try_start() -> io::Result<HostSearch> {
@@ -67,7 +67,7 @@ impl HostSearch {
         };
         if let Some(why) = hello.unconfined {
             warn!(
-                "the kernel does not confine the search for the host: {why}: Pinion works, and that process may do more than it needs to"
+                "the search for the host is not confined, and may do more than it needs: {why}: use a kernel with seccomp filters"
             );
         }
         setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(0))?;
@@ -126,7 +126,7 @@ impl HostFinder {
                     return;
                 }
             }
-            warn!("the search for the host has ended, or says what makes no sense: every host is served as Klipper v0.13, master and Kalico; restart Pinion when no print is going on");
+            warn!("the search for the host has ended, or sent nonsense, so every host gets the union of v0.13, master and Kalico: restart Pinion when no print runs");
             drop(tell);
             wake.wake();
         })?;

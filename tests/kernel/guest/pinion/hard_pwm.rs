@@ -127,7 +127,7 @@ fn a_channel_that_goes_on_failing_is_left_to_the_guardian() {
     client.send_line("emergency_stop").expect("a session");
     assert_eq!(shutdown_of(client), "Command request");
     assert_eq!(program.wait().signal(), Some(Signal::SIGKILL as i32));
-    program.wait_for_line(&["guardian: ", "pwmchip0/pwm6: Input/output error", "it is not at its shutdown value yet"]);
+    program.wait_for_line(&["guardian: ", "still not at its shutdown value: pwmchip0/pwm6: Input/output error"]);
     drop(failing);
     sysfs::wait_until("the guardian ends", || !exists(guardian));
     program.wait_for_line(&["is not at its shutdown value within 1000 ms", "all 1 outputs are driven"]);

@@ -60,7 +60,7 @@ fn it_is_fed_while_the_program_gets_on_and_stopped_when_that_ends() {
     client.send_line("spi_send oid=0 data=01").expect("a session");
     thread::sleep(LONGER);
     drop(delay);
-    program.wait_for_line(&["a transfer on spi0 takes more than 10 s: the watchdogs are not fed"]);
+    program.wait_for_line(&["a transfer on spi0 takes more than 10 s, so the watchdogs are not fed"]);
     thread::sleep(LONGER);
     program.wait_for_line(&["the watchdogs are fed again"]);
     assert!(has_fired());
@@ -78,7 +78,7 @@ fn a_core_that_hangs_and_a_program_that_dies_do_not_feed_it() {
     configure(&mut program.connect(), 0, &[""; 0]);
     program.signal(Signal::SIGUSR2);
     thread::sleep(LONGER);
-    program.wait_for_line(&["the core hangs: the watchdogs are not fed"]);
+    program.wait_for_line(&["the core hangs, so the watchdogs are not fed"]);
     assert!(has_fired());
     program.kill();
     assert!(is_active(), "nobody stopped it");
