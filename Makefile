@@ -33,11 +33,11 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak bench check build install install-program
+.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real bench check build install install-program
 .PHONY: install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
-PACKAGES = $(addprefix system-packages-,build vm deb system check)
+PACKAGES = $(addprefix system-packages-,build vm deb system stress check)
 .PHONY: $(PACKAGES)
 $(PACKAGES): system-packages-%:
 	@CARGO='$(CARGO)' scripts/system-packages $*
@@ -50,7 +50,8 @@ help:
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
 	@echo 'make test-raspberry-pi'
 	@echo '                   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
-	@echo 'make soak          a day of printing with faults, in virtual time: five minutes (SECONDS=86400 SEED=)'
+	@echo 'make soak          a day of printing with faults, in virtual time: ten minutes (SECONDS=86400 SEED=)'
+	@echo 'make soak-real     an hour of the real program on a busy computer (MINUTES=60 WORKERS=1)'
 	@echo 'make bench         the benchmarks'
 	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
 	@echo 'make build         the program: $(PINION)'
@@ -91,6 +92,13 @@ SECONDS ?= 86400
 SEED ?= $(shell date +%s)
 soak: system-packages-build
 	PINION_SOAK_SECONDS=$(SECONDS) PINION_SOAK_SEED=$(SEED) $(CARGO) test --locked --test soak -- --nocapture
+
+MINUTES ?= 60
+# Workers of stress-ng for each kind of load.
+WORKERS ?= 1
+soak-real: system-packages-stress
+	PINION_SOAK_MINUTES=$(MINUTES) PINION_SOAK_WORKERS=$(WORKERS) \
+	    $(CARGO) test --locked --test program soak:: -- --ignored --nocapture
 
 bench: system-packages-build
 	$(CARGO) bench --locked

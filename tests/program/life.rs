@@ -300,7 +300,7 @@ fn a_host_that_never_reads_neither_blocks_the_mcu_nor_makes_it_grow() {
     for query in ["get_uptime", "get_clock", "identify offset=0 count=40"] {
         let pinion = Pinion::simulated(&[]);
         let payload = pinion.client().messages().encode_line(query).unwrap();
-        let before = pinion.anonymous_kb();
+        let before = pinion.memory_kib("RssAnon");
         let mut tty = fs::OpenOptions::new().write(true).open(pinion.link()).unwrap();
         let (done, finished) = std::sync::mpsc::channel();
         std::thread::spawn(move || {
@@ -318,7 +318,7 @@ fn a_host_that_never_reads_neither_blocks_the_mcu_nor_makes_it_grow() {
             std::thread::park();
         });
         finished.recv_timeout(WAIT_MAX).expect("the MCU takes commands in");
-        let grown = pinion.anonymous_kb().saturating_sub(before);
+        let grown = pinion.memory_kib("RssAnon").saturating_sub(before);
         assert!(grown < 2048, "{query}: grew by {grown} kB; the log:\n{}", pinion.log());
         // The reason for the MCU's stop is in the log anyway. (It counts only if it is read separately from the
         // blocks.)

@@ -12,5 +12,6 @@ mod one_order;
 mod process;
 mod search;
 mod show;
+mod soak;
 mod status;
 mod troubleshooting;

@@ -146,11 +146,12 @@ impl Pinion {
         }
     }
 
-    /// Memory of the process itself, without files, in kB. It counts pages shared with a forked process. Their number
-    /// does not grow when that process writes to its copies or ends.
-    pub fn anonymous_kb(&self) -> u64 {
+    /// Memory of the process in KiB, by its name in `/proc/PID/status`. `RssAnon` is its own memory, without files. It
+    /// counts pages shared with a forked process. Their number does not grow when that process writes to its copies or
+    /// ends.
+    pub fn memory_kib(&self, name: &str) -> u64 {
         let status = fs::read_to_string(format!("/proc/{}/status", self.pid())).unwrap();
-        let line = status.lines().find_map(|line| line.strip_prefix("RssAnon:")).unwrap();
+        let line = status.lines().find_map(|line| line.strip_prefix(name)?.strip_prefix(':')).unwrap();
         line.split_whitespace().next().unwrap().parse().unwrap()
     }
 }
