@@ -6,17 +6,14 @@ use std::io::{Read, Write};
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{Command, ExitStatus, Output, Stdio};
-use std::sync::{Arc, Mutex};
-use std::thread;
-use std::time::{Duration, Instant};
 
-use nix::pty::{Winsize, openpty};
+use nix::pty::openpty;
 use nix::sys::signal::{Signal, kill};
-use nix::sys::termios::{LocalFlags, tcgetattr};
 use nix::unistd::Pid;
 use pinion_client::config::Config;
 
-use crate::process::{Pinion, WAIT_MAX, folder_with};
+use crate::process::{Pinion, folder_with};
+use crate::terminal::AtTerminal;
 
 fn console(args: &[&str], script: &str) -> Output {
     let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
@@ -138,65 +135,10 @@ fn what_is_no_terminal_is_left_as_it_is() {
 }
 
 /// A console at a terminal.
-struct Person {
-    master: File,
-    slave: std::os::fd::OwnedFd,
-    seen: Arc<Mutex<Vec<u8>>>,
-    child: std::process::Child,
-}
-
-impl Person {
-    fn new(args: &[&str], state: &Path) -> Person {
-        let size = Winsize { ws_row: 40, ws_col: 120, ws_xpixel: 0, ws_ypixel: 0 };
-        let terminal = openpty(Some(&size), None).unwrap();
-        let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
-        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
-            .arg("console")
-            .args(args)
-            .env("XDG_STATE_HOME", state)
-            .env("TERM", "xterm")
-            .stdin(dup())
-            .stdout(dup())
-            .stderr(dup())
-            .spawn()
-            .unwrap();
-        let seen = Arc::new(Mutex::new(Vec::new()));
-        let mut master = File::from(terminal.master);
-        thread::spawn({
-            let (seen, mut master) = (seen.clone(), master.try_clone().unwrap());
-            move || {
-                let mut piece = [0; 4096];
-                while let Ok(read @ 1..) = master.read(&mut piece) {
-                    seen.lock().unwrap().extend(&piece[..read]);
-                }
-            }
-        });
-        master.flush().unwrap();
-        Person { master, slave: terminal.slave, seen, child }
-    }
-
-    fn text(&self) -> String {
-        text(&self.seen.lock().unwrap())
-    }
-
-    fn until(&mut self, what: &str) {
-        let end = Instant::now() + WAIT_MAX;
-        while !self.text().contains(what) {
-            assert!(Instant::now() < end, "waited in vain for {what:?}:\n{}", self.text());
-            thread::sleep(Duration::from_millis(10));
-        }
-    }
-
-    fn types(&mut self, keys: &str) {
-        self.master.write_all(keys.as_bytes()).unwrap();
-    }
-}
-
-impl Drop for Person {
-    fn drop(&mut self) {
-        let _ = self.child.kill();
-        let _ = self.child.wait();
-    }
+fn person(args: &[&str], state: &Path) -> AtTerminal {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    command.arg("console").args(args).env("XDG_STATE_HOME", state).env("TERM", "xterm");
+    AtTerminal::start(&mut command, 40, None)
 }
 
 #[test]
@@ -205,23 +147,20 @@ fn at_a_terminal_tab_completes_and_lines_are_remembered() {
     let state = tempfile::tempdir().unwrap();
     let link = pinion.link();
     for times in [1, 2] {
-        let mut person = Person::new(&[link.to_str().unwrap()], state.path());
-        let before = tcgetattr(&person.slave).unwrap().local_flags;
+        let mut person = person(&[link.to_str().unwrap()], state.path());
         person.until("help tells of them");
         person.until("> ");
         if times == 1 {
-            person.types("get_up\t\r");
+            person.press("get_up\t\r");
         } else {
             // The line before, by the up key.
-            person.types("\x1b[A\x1b[A\r");
+            person.press("\x1b[A\x1b[A\r");
         }
         person.until("] uptime high=");
-        person.types("helo\r");
+        person.press("helo\r");
         person.until("!! there is no command helo; did you mean help?");
-        person.types("quit\r");
-        assert!(person.child.wait().unwrap().success(), "{}", person.text());
-        let after = tcgetattr(&person.slave).unwrap().local_flags;
-        assert!(after.contains(LocalFlags::ICANON | LocalFlags::ECHO) || after == before);
+        person.press("quit\r");
+        assert!(person.ended().success() && person.is_given_back(), "{}", person.shown());
         let kept = fs::read_to_string(state.path().join("pinion/console_history")).unwrap();
         assert!(kept.lines().any(|line| line == "get_uptime"), "{kept}");
         // The second time, the up key goes past "quit" and "helo".
@@ -236,18 +175,17 @@ fn a_signal_ends_it_and_the_terminal_is_as_it_was() {
     let state = tempfile::tempdir().unwrap();
     for args in [&[link.to_str().unwrap()] as &[&str], &["--board", "sim"]] {
         for signal in [Signal::SIGTERM, Signal::SIGHUP, Signal::SIGQUIT] {
-            let mut person = Person::new(args, state.path());
-            let before = tcgetattr(&person.slave).unwrap();
+            let mut person = person(args, state.path());
             person.until("help tells of them");
             // The line editor has the terminal, and the person has begun a line.
             person.until("> ");
-            person.types("get_upt");
+            person.press("get_upt");
             person.until("get_upt");
-            assert_ne!(tcgetattr(&person.slave).unwrap(), before);
-            kill(Pid::from_raw(person.child.id() as i32), signal).unwrap();
-            let status = person.child.wait().unwrap();
+            assert!(!person.is_given_back());
+            person.signal(signal);
+            let status = person.ended();
             assert_eq!(status.signal(), Some(signal as i32), "{args:?} {signal}: {status}");
-            assert_eq!(tcgetattr(&person.slave).unwrap(), before, "{args:?} {signal}");
+            assert!(person.is_given_back(), "{args:?} {signal}");
             // Pastes are no longer marked.
             person.until("\x1b[?2004l");
         }
@@ -312,14 +250,14 @@ fn lines_are_taken_from_a_terminal_while_the_output_goes_elsewhere() {
 #[test]
 fn what_the_mcu_says_meanwhile_is_printed_at_once() {
     let state = tempfile::tempdir().unwrap();
-    let mut person = Person::new(&["--board", "sim"], state.path());
+    let mut person = person(&["--board", "sim"], state.path());
     person.until("help tells of them");
     for line in OUTPUT.lines() {
-        person.types(&format!("{line}\r"));
+        person.press(&format!("{line}\r"));
     }
-    person.types("update_digital_out oid=0 value=1\r");
+    person.press("update_digital_out oid=0 value=1\r");
     // Nobody refreshes the output, and nobody types.
     person.until("!! the MCU shut down: Missed scheduling of next digital out event");
-    person.types("\x04");
-    assert!(person.child.wait().unwrap().success(), "{}", person.text());
+    person.press("\x04");
+    assert!(person.ended().success(), "{}", person.shown());
 }

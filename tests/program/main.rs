@@ -14,4 +14,5 @@ mod search;
 mod show;
 mod soak;
 mod status;
+mod terminal;
 mod troubleshooting;

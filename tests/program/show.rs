@@ -2,21 +2,17 @@
 //! `pinion sim --show`: the output while a host drives the printer.
 
 use std::fs::{self, File};
-use std::io::{Read, Write};
+use std::io::Write;
 use std::os::unix::process::ExitStatusExt;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
-use std::sync::{Arc, Mutex};
-use std::thread;
-use std::time::{Duration, Instant};
 
-use nix::pty::{Winsize, openpty};
-use nix::sys::signal::{Signal, kill};
-use nix::sys::termios::{LocalFlags, tcgetattr};
-use nix::unistd::Pid;
+use nix::sys::signal::Signal;
 use pinion_client::Client;
+use tempfile::TempDir;
 
 use crate::process::{Pinion, WAIT_MAX, closed_pipe, exists, output};
+use crate::terminal::AtTerminal;
 
 const STRIP: &[&str] = &[
     "allocate_oids count=2",
@@ -26,8 +22,8 @@ const STRIP: &[&str] = &[
 ];
 
 /// Switches the light on, and the strip's first two lights to red and a dark blue.
-fn drive(pinion: &Pinion) -> Client {
-    let mut client = pinion.client();
+fn drive(link: &Path) -> Client {
+    let mut client = Client::connect(link, WAIT_MAX).unwrap();
     for line in STRIP {
         client.send_line(line).unwrap();
     }
@@ -65,7 +61,7 @@ fn each_change_is_a_line() {
         assert_eq!(first.lines().filter(|shown| shown.ends_with(&format!("] {line}"))).count(), 1, "{line}\n{first}");
     }
     assert_eq!(policy(&pinion, "show"), 0, "to show something is no hurry (SCHED_OTHER)");
-    let mut client = drive(&pinion);
+    let mut client = drive(&pinion.link());
     pinion.until("the light", || pinion.out().contains("] light: on\n"));
     let strip = "] strip: red#ff0000 blue#000020 off off off off off off\n";
     pinion.until("the strip", || pinion.out().contains(strip));
@@ -78,109 +74,56 @@ fn each_change_is_a_line() {
     assert!(!exists(&pinion.link()));
 }
 
+/// `pinion sim --show` at a terminal, with its link in this folder.
+fn show(folder: &TempDir) -> (AtTerminal, PathBuf) {
+    let link = folder.path().join("tty");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    (AtTerminal::start(command.args(["sim", "--show", "-I"]).arg(&link), 40, Some(Stdio::null())), link)
+}
+
 #[test]
 fn on_a_terminal_there_is_a_picture_and_the_terminal_is_given_back() {
-    let size = Winsize { ws_row: 40, ws_col: 100, ws_xpixel: 0, ws_ypixel: 0 };
-    let terminal = openpty(Some(&size), None).unwrap();
     let folder = tempfile::tempdir().unwrap();
-    let log = File::create(folder.path().join("log")).unwrap();
-    let mut pinion = Pinion::start_to(folder, &["sim", "--show"], Stdio::from(terminal.slave), log);
-    let seen = Arc::new(Mutex::new(Vec::new()));
-    let reader = thread::spawn({
-        let seen = seen.clone();
-        let mut master = File::from(terminal.master);
-        move || {
-            let mut piece = [0; 4096];
-            // Fails when the program is gone, which is the last user of the terminal.
-            while let Ok(count @ 1..) = master.read(&mut piece) {
-                seen.lock().unwrap().extend(&piece[..count]);
-            }
-        }
-    });
-    let text = || String::from_utf8_lossy(&seen.lock().unwrap()).into_owned();
-    pinion.wait_for_link();
-    let client = drive(&pinion);
+    let (mut pinion, link) = show(&folder);
+    // A host is told how to connect as soon as it can.
+    pinion.until("--print-config > printer.cfg");
+    let client = drive(&link);
     // The colors themselves.
     let (red, blue) = ("\x1b[48;2;255;0;0m   \x1b[m", "\x1b[48;2;0;0;32m   \x1b[m");
-    pinion.until("the strip", || text().contains(&format!("{red} {blue} off off")));
-    pinion.until("the light", || text().contains("light on"));
-    assert!(text().contains("--print-config > printer.cfg"), "how to connect a host");
+    pinion.until(&format!("{red} {blue} off off"));
+    pinion.until("light on");
     // The picture has its own rows below the rows that scroll.
-    let regions: Vec<String> = text().split("\x1b[1;").skip(1).map(|rest| rest[..2].to_owned()).collect();
+    let regions: Vec<String> = pinion.shown().split("\x1b[1;").skip(1).map(|rest| rest[..2].to_owned()).collect();
     assert_eq!(regions.len(), 1, "{regions:?}");
     drop(client);
     pinion.signal(Signal::SIGINT);
-    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
-    reader.join().unwrap();
-    let text = text();
+    assert_eq!(pinion.ended().code(), Some(0));
+    let text = pinion.shown();
     assert!(text.ends_with("\x1b[r\x1b[999;1H\r\n"), "{:?}", &text[text.len() - 200..]);
 }
 
 #[test]
 fn q_ends_the_program_and_gives_the_keys_back() {
-    let terminal = openpty(None, None).unwrap();
     let folder = tempfile::tempdir().unwrap();
-    let keys = || tcgetattr(&terminal.master).unwrap().local_flags.contains(LocalFlags::ICANON | LocalFlags::ECHO);
-    assert!(keys());
-    let mut pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-        .args(["sim", "--show", "-I"])
-        .arg(folder.path().join("tty"))
-        .stdin(terminal.slave.try_clone().unwrap())
-        .stdout(terminal.slave)
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    // Unread output fills the terminal.
-    let mut master = File::from(terminal.master.try_clone().unwrap());
-    let reader = thread::spawn(move || std::io::copy(&mut master, &mut std::io::sink()));
-    let end = Instant::now() + WAIT_MAX;
-    while keys() {
-        assert!(Instant::now() < end, "the program takes no keys");
-        thread::sleep(Duration::from_millis(20));
-    }
-    File::from(terminal.master.try_clone().unwrap()).write_all(b"xq").unwrap();
-    let end = Instant::now() + WAIT_MAX;
-    let status = loop {
-        if let Some(status) = pinion.try_wait().unwrap() {
-            break status;
-        }
-        assert!(Instant::now() < end, "the program does not end");
-        thread::sleep(Duration::from_millis(20));
-    };
-    assert_eq!(status.code(), Some(0));
-    assert!(!exists(&folder.path().join("tty")));
-    assert!(keys(), "the terminal is as before");
-    let _ = reader.join();
+    let (mut pinion, link) = show(&folder);
+    pinion.wait_for("keys", |pinion| pinion.gives_keys().then_some(()));
+    pinion.press("xq");
+    assert_eq!(pinion.ended().code(), Some(0));
+    assert!(!exists(&link));
+    assert!(pinion.is_given_back());
 }
 
 /// As with Ctrl-\\, or with a service manager when a program hangs.
 #[test]
 fn a_signal_that_kills_the_program_gives_the_terminal_back() {
-    let terminal = openpty(None, None).unwrap();
-    let before = tcgetattr(&terminal.master).unwrap();
     let folder = tempfile::tempdir().unwrap();
-    let mut pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-        .args(["sim", "--show", "-I"])
-        .arg(folder.path().join("tty"))
-        .stdin(terminal.slave.try_clone().unwrap())
-        .stdout(terminal.slave)
-        .stderr(Stdio::null())
-        .spawn()
-        .unwrap();
-    let mut master = File::from(terminal.master);
-    let (mut shown, mut piece) = (String::new(), [0; 4096]);
-    let mut until = |wanted: &str| {
-        while !shown.contains(wanted) {
-            let read = master.read(&mut piece).unwrap();
-            shown += &String::from_utf8_lossy(&piece[..read]);
-        }
-    };
+    let (mut pinion, _) = show(&folder);
     // The picture has its rows.
-    until("\x1b[1;");
-    kill(Pid::from_raw(pinion.id() as i32), Signal::SIGQUIT).unwrap();
-    until("\x1b[r\x1b[999;1H");
-    assert_eq!(pinion.wait().unwrap().signal(), Some(Signal::SIGQUIT as i32));
-    assert_eq!(tcgetattr(&master).unwrap().local_flags, before.local_flags);
+    pinion.until("\x1b[1;");
+    pinion.signal(Signal::SIGQUIT);
+    pinion.until("\x1b[r\x1b[999;1H");
+    assert_eq!(pinion.ended().signal(), Some(Signal::SIGQUIT as i32));
+    assert!(pinion.is_given_back());
 }
 
 #[test]
@@ -189,7 +132,7 @@ fn a_reader_that_goes_away_leaves_the_printer_serving() {
     let log = File::create(folder.path().join("log")).unwrap();
     let mut pinion = Pinion::start_to(folder, &["sim", "--show"], closed_pipe(), log);
     pinion.wait_for_link();
-    let mut client = drive(&pinion);
+    let mut client = drive(&pinion.link());
     assert!(!client.status().unwrap().is_shutdown);
     drop(client);
     pinion.signal(Signal::SIGTERM);
@@ -206,7 +149,7 @@ fn a_terminal_that_takes_nothing_does_not_keep_the_program() {
     let log = File::create(folder.path().join("log")).unwrap();
     let mut pinion = Pinion::start_to(folder, &["sim", "--show"], writer, log);
     pinion.wait_for_link();
-    let client = drive(&pinion);
+    let client = drive(&pinion.link());
     drop(client);
     pinion.signal(Signal::SIGINT);
     assert_eq!(pinion.end().code(), Some(0));

@@ -1,26 +1,24 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion status`: the state of a running MCU. A request does not disturb the MCU.
 
-use std::fs::{self, File};
+use std::fs;
 use std::io::{Read, Write};
 use std::os::fd::AsRawFd;
-use std::os::unix::fs::{FileTypeExt, OpenOptionsExt, PermissionsExt};
+use std::os::unix::fs::{FileTypeExt, PermissionsExt};
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::os::unix::process::ExitStatusExt;
 use std::path::PathBuf;
-use std::process::{Child, Command, Stdio};
+use std::process::{Command, Stdio};
 use std::thread;
 use std::time::Instant;
 
-use nix::fcntl::OFlag;
-use nix::pty::{Winsize, grantpt, openpty, posix_openpt, ptsname_r, unlockpt};
-use nix::sys::signal::{Signal, kill};
+use nix::sys::signal::Signal;
 use nix::sys::socket::{AddressFamily, Backlog, SockFlag, SockType, UnixAddr};
-use nix::sys::termios::{FlowArg, LocalFlags, tcflow, tcgetattr};
-use nix::unistd::Pid;
+use nix::sys::termios::{FlowArg, tcflow};
 use serde_json::{Value, json};
 
 use crate::process::{Pinion, WAIT_MAX, exists, output};
+use crate::terminal::AtTerminal;
 
 fn socket(pinion: &Pinion) -> PathBuf {
     pinion.link().with_file_name("tty.sock")
@@ -185,60 +183,47 @@ fn clients_that_do_not_read_or_talk_rubbish_or_are_many_disturb_nobody() {
     assert!(last.is_empty() || serde_json::from_str::<Value>(&last).is_ok(), "{last}");
 }
 
-fn watch(pinion: &Pinion, stdin: Stdio, stdout: Stdio) -> Child {
+fn watch(pinion: &Pinion) -> Command {
+    pinion.until("the socket", || exists(&socket(pinion)));
     let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
-    command.args(["status", "--watch", "-I"]).arg(pinion.link()).stdin(stdin).stdout(stdout).spawn().unwrap()
+    command.args(["status", "--watch", "-I"]).arg(pinion.link());
+    command
+}
+
+/// `pinion status --watch` at a terminal, as soon as it shows a page.
+fn watch_at_terminal(pinion: &Pinion) -> AtTerminal {
+    let mut terminal = AtTerminal::start(&mut watch(pinion), 40, None);
+    terminal.until("q ends");
+    terminal
 }
 
 #[test]
 fn watching_goes_on_until_q_and_gives_the_terminal_back() {
     let pinion = Pinion::simulated(&[]);
-    pinion.until("the socket", || exists(&socket(&pinion)));
-    let size = Winsize { ws_row: 40, ws_col: 100, ws_xpixel: 0, ws_ypixel: 0 };
-    let terminal = openpty(Some(&size), None).unwrap();
-    let before = tcgetattr(&terminal.slave).unwrap();
-    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
-    let mut watch = watch(&pinion, dup(), dup());
-    let mut master = File::from(terminal.master);
-    let mut shown = String::new();
-    let mut piece = [0; 4096];
-    while !shown.contains("waiting for a host's configuration") || !shown.contains("q ends") {
-        let read = master.read(&mut piece).unwrap();
-        shown += &String::from_utf8_lossy(&piece[..read]);
-    }
-    assert!(!tcgetattr(&terminal.slave).unwrap().local_flags.contains(LocalFlags::ICANON));
-    master.write_all(b"q").unwrap();
-    assert!(watch.wait().unwrap().success());
-    assert_eq!(tcgetattr(&terminal.slave).unwrap().local_flags, before.local_flags);
-    let read = master.read(&mut piece).unwrap();
-    shown += &String::from_utf8_lossy(&piece[..read]);
-    assert!(shown.ends_with("\x1b[?7h\x1b[?25h\x1b[?1049l"), "{shown:?}");
+    let mut watch = watch_at_terminal(&pinion);
+    watch.until("waiting for a host's configuration");
+    assert!(watch.gives_keys());
+    watch.press("q");
+    assert!(watch.ended().success() && watch.is_given_back());
+    assert!(watch.shown().ends_with("\x1b[?7h\x1b[?25h\x1b[?1049l"), "{:?}", watch.shown());
 }
 
 #[test]
 fn a_page_that_is_longer_than_the_terminal_is_scrolled_by_keys() {
     let pinion = Pinion::simulated(&[]);
-    pinion.until("the socket", || exists(&socket(&pinion)));
-    let size = Winsize { ws_row: 5, ws_col: 80, ws_xpixel: 0, ws_ypixel: 0 };
-    let terminal = openpty(Some(&size), None).unwrap();
-    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
-    let mut watch = watch(&pinion, dup(), dup());
-    let mut master = File::from(terminal.master);
-    let mut until_shown = |key: &[u8], wanted: &str| {
-        master.write_all(key).unwrap();
-        let (mut shown, mut piece) = (String::new(), [0; 4096]);
-        while !shown.contains(wanted) {
-            let read = master.read(&mut piece).unwrap();
-            shown += &String::from_utf8_lossy(&piece[..read]);
-        }
-    };
-    until_shown(b"", "lines 1 to 4 of ");
-    until_shown(b"\x1b[B", "lines 2 to 5 of ");
-    until_shown(b"\x1b[A", "lines 1 to 4 of ");
-    until_shown(b"\x1b[6~", "lines 4 to 7 of ");
-    until_shown(b"\x1b[H", "lines 1 to 4 of ");
-    until_shown(b"q", "\x1b[?1049l");
-    assert!(watch.wait().unwrap().success());
+    let mut watch = AtTerminal::start(&mut watch(&pinion), 5, None);
+    watch.until("lines 1 to 4 of ");
+    for (key, shown) in [
+        ("\x1b[B", "lines 2 to 5 of "),
+        ("\x1b[A", "lines 1 to 4 of "),
+        ("\x1b[6~", "lines 4 to 7 of "),
+        ("\x1b[H", "lines 1 to 4 of "),
+        ("q", "\x1b[?1049l"),
+    ] {
+        watch.press(key);
+        watch.until(shown);
+    }
+    assert!(watch.ended().success());
 }
 
 /// Other clients also ask, more than fit into the socket's queue.
@@ -282,126 +267,60 @@ fn a_crowd_is_waited_for_and_then_named() {
 #[test]
 fn keys_that_the_kernel_makes_signals_of_leave_no_terminal_behind() {
     let pinion = Pinion::simulated(&[]);
-    pinion.until("the socket", || exists(&socket(&pinion)));
     // Ctrl-C, and Ctrl-\\, which kills a program by default.
-    for key in [b"\x03", b"\x1c"] {
-        let terminal = openpty(None, None).unwrap();
-        let before = tcgetattr(&terminal.slave).unwrap();
-        let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
-        let mut watch = watch(&pinion, dup(), dup());
-        let mut master = File::from(terminal.master);
-        let (mut shown, mut piece) = (String::new(), [0; 4096]);
-        while !shown.contains("q ends") {
-            let read = master.read(&mut piece).unwrap();
-            shown += &String::from_utf8_lossy(&piece[..read]);
-        }
-        master.write_all(key).unwrap();
-        assert!(watch.wait().unwrap().success());
-        assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
+    for key in ["\x03", "\x1c"] {
+        let mut watch = watch_at_terminal(&pinion);
+        watch.press(key);
+        assert!(watch.ended().success() && watch.is_given_back());
     }
 }
 
 #[test]
 fn a_key_that_stops_it_gives_the_terminal_back_until_it_goes_on() {
     let pinion = Pinion::simulated(&[]);
-    pinion.until("the socket", || exists(&socket(&pinion)));
-    let terminal = openpty(None, None).unwrap();
-    let before = tcgetattr(&terminal.slave).unwrap();
-    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
-    let mut watch = watch(&pinion, dup(), dup());
-    let pid = Pid::from_raw(watch.id() as i32);
-    let mut master = File::from(terminal.master);
-    let keys = master.try_clone().unwrap();
-    let (mut shown, mut piece) = (String::new(), [0; 4096]);
-    let mut until = |wanted: &str, times: usize| {
-        while shown.matches(wanted).count() < times {
-            let read = master.read(&mut piece).unwrap();
-            shown += &String::from_utf8_lossy(&piece[..read]);
-        }
-    };
-    until("q ends", 1);
-    let press = |key: &[u8]| (&keys).write_all(key).unwrap();
-    press(b"\x1a");
-    until("\x1b[?1049l", 1);
-    let stat = || fs::read_to_string(format!("/proc/{pid}/stat")).unwrap();
-    let is_stopped = || stat().rsplit_once(") ").unwrap().1.starts_with('T');
+    let mut watch = watch_at_terminal(&pinion);
+    watch.press("\x1a");
+    watch.until("\x1b[?1049l");
+    let stat = format!("/proc/{}/stat", watch.pid());
+    let is_stopped = || fs::read_to_string(&stat).unwrap().rsplit_once(") ").unwrap().1.starts_with('T');
     let end = Instant::now() + WAIT_MAX;
     while !is_stopped() && Instant::now() < end {
         thread::sleep(std::time::Duration::from_millis(10));
     }
     // In a process group without a shell the kernel does not stop it.
     if is_stopped() {
-        assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
+        assert!(watch.is_given_back());
     }
-    kill(pid, Signal::SIGCONT).unwrap();
-    until("\x1b[?1049h", 2);
-    press(b"q");
-    assert!(watch.wait().unwrap().success());
-    assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
+    watch.signal(Signal::SIGCONT);
+    watch.until("\x1b[?1049h");
+    watch.press("q");
+    assert!(watch.ended().success() && watch.is_given_back());
 }
 
 #[test]
 fn a_terminal_that_is_gone_ends_it() {
     let pinion = Pinion::simulated(&[]);
-    pinion.until("the socket", || exists(&socket(&pinion)));
-    // No child may inherit the master end, because it would keep the terminal open.
-    let mut master = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).unwrap();
-    grantpt(&master).unwrap();
-    unlockpt(&master).unwrap();
-    let slave = || {
-        let mut options = File::options();
-        options.read(true).write(true).custom_flags(OFlag::O_NOCTTY.bits());
-        Stdio::from(options.open(ptsname_r(&master).unwrap()).unwrap())
-    };
-    let mut watch = watch(&pinion, slave(), slave());
-    let (mut shown, mut piece) = (String::new(), [0; 4096]);
-    while !shown.contains("q ends") {
-        let read = master.read(&mut piece).unwrap();
-        shown += &String::from_utf8_lossy(&piece[..read]);
-    }
-    drop(master);
-    let end = Instant::now() + WAIT_MAX;
-    while watch.try_wait().unwrap().is_none() {
-        assert!(Instant::now() < end, "it goes on without a terminal");
-        thread::sleep(std::time::Duration::from_millis(20));
-    }
+    let mut watch = watch_at_terminal(&pinion);
+    watch.hang_up();
+    watch.ended();
 }
 
 #[test]
 fn a_terminal_that_takes_no_output_does_not_keep_it_from_its_end() {
     let pinion = Pinion::simulated(&[]);
-    pinion.until("the socket", || exists(&socket(&pinion)));
-    let terminal = openpty(None, None).unwrap();
-    let before = tcgetattr(&terminal.slave).unwrap();
-    let dup = || Stdio::from(terminal.slave.try_clone().unwrap());
-    let mut watch = watch(&pinion, dup(), dup());
-    let mut master = File::from(terminal.master);
-    let (mut shown, mut piece) = (String::new(), [0; 4096]);
-    while !shown.contains("q ends") {
-        let read = master.read(&mut piece).unwrap();
-        shown += &String::from_utf8_lossy(&piece[..read]);
-    }
+    let mut watch = watch_at_terminal(&pinion);
     // As with Ctrl-S. The next page, a second later, finds no room.
-    tcflow(&terminal.slave, FlowArg::TCOOFF).unwrap();
+    tcflow(watch.slave(), FlowArg::TCOOFF).unwrap();
     thread::sleep(std::time::Duration::from_millis(1500));
-    kill(Pid::from_raw(watch.id() as i32), Signal::SIGTERM).unwrap();
-    let end = Instant::now() + WAIT_MAX;
-    let status = loop {
-        if let Some(status) = watch.try_wait().unwrap() {
-            break status;
-        }
-        assert!(Instant::now() < end, "it does not end");
-        thread::sleep(std::time::Duration::from_millis(20));
-    };
-    assert_eq!(status.signal(), Some(Signal::SIGTERM as i32));
-    assert_eq!(tcgetattr(&terminal.slave).unwrap(), before);
+    watch.signal(Signal::SIGTERM);
+    assert_eq!(watch.ended().signal(), Some(Signal::SIGTERM as i32));
+    assert!(watch.is_given_back());
 }
 
 #[test]
 fn watching_into_a_pipe_is_a_page_each_second() {
     let pinion = Pinion::simulated(&[]);
-    pinion.until("the socket", || exists(&socket(&pinion)));
-    let mut watch = watch(&pinion, Stdio::null(), Stdio::piped());
+    let mut watch = watch(&pinion).stdin(Stdio::null()).stdout(Stdio::piped()).spawn().unwrap();
     let mut out = watch.stdout.take().unwrap();
     let (mut shown, mut piece) = (String::new(), [0; 4096]);
     while shown.matches("\nstate ").count() < 2 {
