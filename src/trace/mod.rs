@@ -13,3 +13,4 @@ pub mod event;
 pub mod file;
 pub mod folder;
 pub mod ring;
+pub mod verdict;

@@ -13,7 +13,7 @@ use super::event::{EVENT_WORDS, Event};
 /// How long a [`Writer`] with a quota makes its ring last at least: ten seconds, and a second more for the reader.
 const LASTS: Ticks = Ticks::from_ms(11_000);
 /// A quota is for this span.
-const WINDOW: Ticks = Ticks::from_ms(100);
+pub(super) const WINDOW: Ticks = Ticks::from_ms(100);
 /// Number of windows in [`LASTS`].
 const WINDOWS: usize = (LASTS.0 / WINDOW.0) as usize;
 

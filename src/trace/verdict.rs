@@ -1,0 +1,1046 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The verdict over a trace: who was late, by how much, and what to do about it.
+//!
+//! A stop that is about a time has a span in which it went wrong. It begins when the work was due, or when the host's
+//! block came, and ends with the stop. Whoever took at least half of this span is the culprit. Without evidence against
+//! anybody the verdict says what is known, and accuses nobody.
+
+#![forbid(unsafe_code)]
+
+use pinion_firmware::shutdown::reason;
+use pinion_firmware::time::Ticks;
+
+use evidence::{Arrival, Errand, MS, Record, Span};
+
+use super::event::{PowerFault, Watched};
+use super::file::{End, Trace};
+
+mod evidence;
+
+/// Longest time that the core needs for a block that waits for nothing.
+const PROMPT: i64 = MS;
+/// Shortest silence of a host that is worth telling. A host that works asks for the clock each second.
+const SILENCE: i64 = 1500 * MS;
+/// Shortest errand under way that is worth telling while the program works.
+const HANGS: i64 = 1000 * MS;
+/// How late a timer may be while nobody complains.
+const LATE: i64 = MS;
+/// How late a timer has to be to be told of with a stop for another reason.
+const VERY_LATE: i64 = 10 * MS;
+/// Fewest events of a core that works all the time.
+const FLOOD: usize = 4;
+/// Shortest silence of a core that hangs. An idle core beats more often.
+const SILENT: i64 = 500 * MS;
+/// Longest time that a core works without an event.
+const QUIET: i64 = 15 * MS;
+/// Shortest time that counts as lost in the kernel's account. Each sleep costs a little.
+const LOST: i64 = 5 * MS;
+/// Beginnings of the texts for outputs that the host did not refresh.
+const MISSED: &str = "Missed scheduling of next";
+
+/// Who was late.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Culprit {
+    /// Nobody. If the MCU stopped, it had another reason.
+    Nobody,
+    /// The host.
+    Host,
+    /// A bus, or a device on it.
+    Bus,
+    /// Other programs, which had the processors.
+    Processors,
+    /// A call of the core to a driver or the kernel took long.
+    Driver,
+    /// There was more to do than this computer can do.
+    Work,
+    /// Nothing ran: the program was stopped, or the whole computer.
+    Standstill,
+    /// The power supply, or heat.
+    Power,
+    /// Somebody who killed the program, or a fault in it.
+    Death,
+    /// It is not known.
+    Unknown,
+}
+
+/// A verdict.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Verdict {
+    /// Who was late.
+    pub culprit: Culprit,
+    /// One line: who was late and by how much, and the remedy as an imperative.
+    pub text: String,
+}
+
+/// A verdict in the making.
+struct Finding {
+    culprit: Culprit,
+    what: String,
+    remedy: String,
+}
+
+impl Finding {
+    fn new(culprit: Culprit, what: impl Into<String>, remedy: impl Into<String>) -> Finding {
+        Finding { culprit, what: what.into(), remedy: remedy.into() }
+    }
+}
+
+/// Judges a trace.
+pub fn verdict(trace: &Trace) -> Verdict {
+    let record = Record::of(trace, matches!(trace.head.end, End::Shutdown { .. }));
+    let Finding { culprit, what, remedy } = match &trace.head.end {
+        End::Shutdown { reason, trouble } => stopped(&record, reason, trouble),
+        End::Died => died(&record),
+        End::Hung { diagnosis } => hung(&record, diagnosis),
+        End::Asked => asked(&record),
+    };
+    Verdict { culprit, text: if remedy.is_empty() { what } else { format!("{what}: {remedy}") } }
+}
+
+/// Why the MCU stopped.
+fn stopped(record: &Record, text: &str, trouble: &str) -> Finding {
+    if text == reason::BUS_HANGS.text() {
+        return of_hanging(record)
+            .unwrap_or_else(|| Finding::new(Culprit::Bus, format!("a bus did not answer: {trouble}"), ""));
+    }
+    let Some(due) = record.stop.due.filter(|due| *due <= 0) else {
+        return match text {
+            _ if text == reason::TIMER_PAST.text() => stood_still(record, trouble),
+            _ if text == reason::TIMER_TOO_CLOSE.text() || text.starts_with(MISSED) => {
+                Finding::new(Culprit::Unknown, format!("not known who was late: {trouble}"), "")
+            }
+            _ => other_reason(record, trouble),
+        };
+    };
+    if text == reason::TIMER_TOO_CLOSE.text() {
+        too_close(record, due)
+    } else if text.starts_with(MISSED) {
+        not_refreshed(record, due, trouble)
+    } else {
+        late_step(record, due, trouble)
+    }
+}
+
+/// A stop that was not about a time.
+fn other_reason(record: &Record, trouble: &str) -> Finding {
+    match record.latest_timer().filter(|(_, late)| *late >= VERY_LATE) {
+        Some((at, late)) => {
+            let what = of_core(record, (at - late, at))
+                .map_or_else(|| format!("a timer was {} late", span_text(late)), |finding| finding.what);
+            let before = span_text(-at);
+            Finding::new(Culprit::Nobody, format!("{trouble}; {before} before, {what}, which did not stop it"), "")
+        }
+        None => Finding::new(Culprit::Nobody, format!("nobody was late: {trouble}"), ""),
+    }
+}
+
+/// The host asked for an event whose time had passed.
+fn too_close(record: &Record, due: i64) -> Finding {
+    let in_time = |came: i64| came - due <= -PROMPT;
+    let came = record.stop.block.and_then(|block| record.arrived(block));
+    // A time that is not the block's own proves only that the block came in time.
+    let Some(Arrival { at: came, .. }) = came.filter(|came| came.is_exact || in_time(came.at)) else {
+        let what = format!("an event was asked for {} after its time", span_text(-due));
+        let unknown = Finding::new(Culprit::Unknown, format!("{what}; not known when its block came"), "");
+        return of_core(record, (due, 0)).unwrap_or(unknown);
+    };
+    let late = came - due;
+    // The link leaves blocks in the terminal while the core has no room for them.
+    let full = record.full((due - SILENCE, came)).filter(|full| in_time(*full));
+    if in_time(came) || full.is_some() {
+        let from = if in_time(came) { came } else { full.unwrap_or(came) };
+        return of_bus(record, (from, 0)).or_else(|| of_core(record, (from, 0))).unwrap_or_else(|| {
+            let what = format!(
+                "not known who was late: the host's block came {} before its event, and the core ran it {} after the event",
+                span_text(-late),
+                span_text(-due)
+            );
+            Finding::new(Culprit::Unknown, what, "")
+        });
+    }
+    if late > 0
+        && let Some(finding) = of_link(record, (due, came))
+    {
+        return finding;
+    }
+    let event = if record.last_command() == Some("queue_step") { "step" } else { "event" };
+    let mut what = match late {
+        0.. => format!("the host's block came {} after the {event} it was for", span_text(late)),
+        _ => format!("the host's block came only {} before the {event} it was for", span_text(-late)),
+    };
+    if let Some(silence) = record.block_before(came).map(|before| came - before).filter(|silence| *silence > SILENCE) {
+        what += &format!(", and the host had sent nothing for {}", span_text(silence));
+    }
+    what += &on_time(record);
+    with_power(record, (due, 0), Finding::new(Culprit::Host, what, HOST_REMEDY))
+}
+
+const HOST_REMEDY: &str = "look at the host's load";
+
+/// The host did not refresh an output before `due`.
+fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
+    // A block may have come in time and wait.
+    if let Some(came) = record.pending().filter(|came| *came < due - PROMPT) {
+        let found = of_bus(record, (came, 0)).or_else(|| of_core(record, (came, 0)));
+        if let Some(found) = found {
+            return found;
+        }
+    }
+    if let Some(gone) = record.host_gone() {
+        let what = format!("the host closed the terminal {} before the stop", span_text(-gone));
+        return Finding::new(Culprit::Host, what, "its log tells why it ended");
+    }
+    let Some(before) = record.block_before(0) else {
+        return Finding::new(Culprit::Unknown, format!("not known when the host sent something: {trouble}"), "");
+    };
+    if -before < SILENCE {
+        let what = format!(
+            "the host sent its last block {} before the stop, but did not refresh an output in time{}: {trouble}",
+            span_text(-before),
+            on_time(record)
+        );
+        return with_power(record, (before, 0), Finding::new(Culprit::Host, what, ""));
+    }
+    if let Some(finding) = of_link(record, (before, 0)) {
+        return finding;
+    }
+    let what = format!("the host sent nothing for {}{}", span_text(-before), on_time(record));
+    with_power(record, (before, 0), Finding::new(Culprit::Host, what, "look at its log, and at its load"))
+}
+
+/// A timer ran so long after `due` that the MCU stopped.
+fn late_step(record: &Record, due: i64, trouble: &str) -> Finding {
+    let span = (due, 0);
+    if let Some(finding) = of_core(record, span) {
+        return finding;
+    }
+    let what = match record.latest_timer() {
+        // Each of its steps waited for the pulse of the one before.
+        Some((_, worst)) if worst < -due / 2 => {
+            let what = format!("steps were closer together than their pulses{}: {trouble}", on_time(record));
+            return Finding::new(Culprit::Work, what, "");
+        }
+        _ => format!("not known why an event was {} late: {trouble}", span_text(-due)),
+    };
+    with_power(record, span, Finding::new(Culprit::Unknown, what, ""))
+}
+
+/// The core noticed that it gave no beat for a second or more, or that the computer was suspended.
+fn stood_still(record: &Record, trouble: &str) -> Finding {
+    let gap = record.gap((record.first_of_core().unwrap_or(0).min(0), 0));
+    // The clock of the events stands still while the computer is suspended.
+    let found = if gap.1 - gap.0 > SILENT && gap.1 > -PROMPT { of_core(record, gap) } else { None };
+    found.unwrap_or_else(|| Finding::new(Culprit::Standstill, format!("everything stood still: {trouble}"), ""))
+}
+
+/// The program is gone.
+fn died(record: &Record) -> Finding {
+    let last = record.last_of_core();
+    let what = match last {
+        Some(last) => {
+            format!("Pinion died at most {} after the core's last event{}", span_text((-last).max(0)), doing(record))
+        }
+        None => "Pinion died".to_owned(),
+    };
+    Finding::new(Culprit::Death, what, "look for a panic in its log, and for who killed it (dmesg: out of memory)")
+}
+
+/// The guardian killed a program that gave no sign of life.
+fn hung(record: &Record, diagnosis: &str) -> Finding {
+    // Without a silent core, an output is not at its shutdown value.
+    let silent = record.last_of_core().filter(|last| -last > SILENT);
+    let found = of_hanging(record).or_else(|| of_core(record, (silent?, 0)));
+    if let Some(finding) = found {
+        return Finding { what: format!("Pinion hung: {}", finding.what), ..finding };
+    }
+    let last = silent.map_or_else(String::new, |last| {
+        format!("; the core's last event was {} before{}", span_text(-last), doing(record))
+    });
+    Finding::new(Culprit::Death, format!("Pinion hung: {diagnosis}{last}"), "report it with its log")
+}
+
+/// The recording of a program that works.
+fn asked(record: &Record) -> Finding {
+    if let Some(finding) = of_hanging(record) {
+        return finding;
+    }
+    let Some((at, late)) = record.latest_timer() else {
+        return Finding::new(Culprit::Unknown, "no timer is in the recording: nobody can have been late", "");
+    };
+    if late < LATE {
+        return Finding::new(Culprit::Nobody, format!("nobody was late{}", on_time(record)), "");
+    }
+    let mut finding = of_core(record, (at - late, at)).unwrap_or_else(|| {
+        Finding::new(Culprit::Unknown, format!("not known why a timer was {} late", span_text(late)), "")
+    });
+    finding.what += &format!(" ({} before the end of the recording)", span_text(-at));
+    finding
+}
+
+/// A command waited for a bus for half of this span.
+fn of_bus(record: &Record, span: Span) -> Option<Finding> {
+    let held = record.held(span);
+    if held * 2 < span.1 - span.0 {
+        return None;
+    }
+    let what = match record.longest_errand(span) {
+        Some(errand) if errand.is_open => return Some(hanging(record, &errand)),
+        Some(errand) if (errand.span.1 - errand.span.0) * 2 >= held => format!(
+            "{} took {} for one errand{}, and the host's commands waited for it",
+            errand.bus,
+            span_text(errand.span.1 - errand.span.0),
+            sender(record, errand.oid)
+        ),
+        Some(errand) => {
+            format!("the host's commands waited {} for {}{}", span_text(held), errand.bus, sender(record, errand.oid))
+        }
+        None => format!("the host's commands waited {} for a bus", span_text(held)),
+    };
+    Some(Finding::new(Culprit::Bus, what, "use a higher rate, or another bus for the device"))
+}
+
+/// A bus hangs.
+fn of_hanging(record: &Record) -> Option<Finding> {
+    record.hanging().filter(|errand| -errand.span.0 > HANGS).map(|errand| hanging(record, &errand))
+}
+
+fn hanging(record: &Record, errand: &Errand) -> Finding {
+    let what =
+        format!("{} has not answered for {}{}", errand.bus, span_text(-errand.span.0), sender(record, errand.oid));
+    Finding::new(Culprit::Bus, what, "check the power and the wires of its devices, and dmesg")
+}
+
+/// The host's block waited in the terminal for half of this span, because the link did not run.
+fn of_link(record: &Record, span: Span) -> Option<Finding> {
+    let half = (span.1 - span.0) / 2;
+    let waited = record.account(Watched::Link, span).map_or(0, |account| account.waited);
+    if waited >= half && waited > PROMPT {
+        return Some(starved(record, span, "the link to the host", waited));
+    }
+    // The core stood still as well.
+    let core = record.latest_within((span.0, 0)).max(record.latest_wake(span));
+    if core >= half && core > PROMPT { of_core(record, span) } else { None }
+}
+
+/// The core did not do its work for half of this span.
+fn of_core(record: &Record, span: Span) -> Option<Finding> {
+    let late = span.1 - span.0;
+    let half = late / 2;
+    let account = record.account(Watched::Core, span);
+    let waited = account.as_ref().map_or(0, |account| account.waited);
+    let stolen = record.stolen(span);
+    if stolen >= half && stolen > waited && stolen > 0 {
+        let what = format!("a hypervisor took {} of processor time while an event waited", span_text(stolen));
+        return Some(Finding::new(Culprit::Standstill, what, "give this virtual machine processors of its own"));
+    }
+    if waited >= half && waited > 0 {
+        return Some(with_power(record, span, starved(record, span, "the core", waited.min(late))));
+    }
+    let gap = record.gap(span);
+    let gap_long = gap.1 - gap.0;
+    if gap_long < half.max(1) {
+        let ran = account.map(|account| account.ran);
+        let is_flood =
+            !record.did_sleep(span) && record.events_of_core(span) >= FLOOD && ran.is_none_or(|ran| ran >= half);
+        let what = format!("the core worked all the time and was {} late", span_text(late));
+        let remedy = "fewer steps a second: lower the speed or the microsteps";
+        return is_flood.then(|| with_power(record, span, Finding::new(Culprit::Work, what, remedy)));
+    }
+    let others = record.others_went_on(gap);
+    let woke_late = record.latest_wake((gap.0, span.1 + PROMPT)) >= half;
+    // A core that works writes nothing for so long, if it is on time.
+    if gap_long <= QUIET && !woke_late && record.latest_within((span.0, span.1 + QUIET)) < half {
+        return None;
+    }
+    let lost = account.as_ref().and_then(|account| account.lost);
+    let ran = account.as_ref().is_some_and(|account| account.ran >= half);
+    if ran && lost.is_some_and(|lost| lost < half) && !woke_late {
+        return Some(driver(record, span, gap_long));
+    }
+    if !others && (record.sampler_missed(gap) || record.guardian_went_on(gap) == Some(false)) {
+        return Some(standstill(record, gap, account.is_some()));
+    }
+    account?;
+    if woke_late {
+        let what = format!("the kernel woke the core {} late, though it did not wait for a processor", span_text(late));
+        let remedy = "use a PREEMPT_RT kernel, and look for what blocks interrupts, such as a hypervisor";
+        return Some(with_power(record, span, Finding::new(Culprit::Driver, what, remedy)));
+    }
+    if others {
+        return Some(driver(record, span, gap_long));
+    }
+    lost.filter(|lost| *lost >= half.max(LOST)).map(|_| {
+        let what = format!(
+            "not known why the core did nothing for {}: it did not wait for a processor, so that a call blocked it, or everything stood still",
+            span_text(gap_long)
+        );
+        with_power(record, span, Finding::new(Culprit::Unknown, what, ""))
+    })
+}
+
+fn driver(record: &Record, span: Span, took: i64) -> Finding {
+    let what = format!("one call to a driver or the kernel kept the core for {}", span_text(took));
+    with_power(record, span, Finding::new(Culprit::Driver, what, "look for its device in dmesg"))
+}
+
+fn starved(record: &Record, span: Span, who: &str, waited: i64) -> Finding {
+    let what = format!("{who} waited {} for a processor", span_text(waited));
+    let (why, remedy) = if record.was_out_of_budget(span) {
+        (
+            ": it had used up its real-time share",
+            "lower the speed, or free it of the limit (sysctl kernel.sched_rt_runtime_us=-1)",
+        )
+    } else if !record.trace.head.realtime {
+        (": it does not run in real time", "run Pinion in real time (-r, as the service does)")
+    } else {
+        (
+            ": other real-time work had it",
+            "look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+        )
+    };
+    Finding::new(Culprit::Processors, what + why, remedy)
+}
+
+/// Nothing of the program ran in a span. `is_counted`: the kernel's account says that it did not wait for a processor.
+fn standstill(record: &Record, gap: Span, is_counted: bool) -> Finding {
+    let long = span_text(gap.1 - gap.0);
+    let (what, remedy) = match record.guardian_went_on(gap) {
+        Some(true) => (
+            format!("Pinion stood still for {long}, and the guardian went on"),
+            "find out who stopped it (SIGSTOP, a frozen control group)",
+        ),
+        Some(false) => (
+            format!("the whole computer stood still for {long}"),
+            "find out who suspended it, or paused its virtual machine",
+        ),
+        None => (
+            format!("everything stood still for {long}"),
+            "find out who stopped Pinion, or paused or suspended the computer",
+        ),
+    };
+    let other = if is_counted { "" } else { ", or which real-time work had all processors" };
+    Finding::new(Culprit::Standstill, what, format!("{remedy}{other}"))
+}
+
+/// The same finding, if the computer's power was good in that span. Otherwise the power comes first.
+fn with_power(record: &Record, span: Span, finding: Finding) -> Finding {
+    let (what, remedy) = match record.power_fault(span) {
+        Some(PowerFault::Undervoltage) => {
+            ("the power supply's voltage was too low", "use a better power supply and a short, thick cable")
+        }
+        Some(PowerFault::Hot) => ("the processor was slowed down by heat", "cool it"),
+        None => match record.low_frequency(span) {
+            Some((mhz, max)) if matches!(finding.culprit, Culprit::Work | Culprit::Driver) => {
+                let what = format!("{}, at {mhz} MHz of {max} MHz", finding.what);
+                return Finding::new(Culprit::Power, what, "set the frequency governor to performance");
+            }
+            _ => return finding,
+        },
+    };
+    Finding::new(Culprit::Power, format!("{what} then; {}", finding.what), remedy)
+}
+
+/// How late the core was, as a clause behind others.
+fn on_time(record: &Record) -> String {
+    record.latest_timer().map_or_else(String::new, |(_, late)| {
+        format!("; the core was never later than {}", span_text(late.max(MS / 10)))
+    })
+}
+
+/// What the core did last, as a clause behind others.
+fn doing(record: &Record) -> String {
+    record.last_command().map_or_else(String::new, |command| format!(" (the last command was {command})"))
+}
+
+/// The sender of an errand, as a clause behind others.
+fn sender(record: &Record, oid: u8) -> String {
+    record.trace.head.names.objects.get(&oid).map_or_else(String::new, |object| format!(" ({object})"))
+}
+
+/// A span in ticks for people.
+fn span_text(ticks: i64) -> String {
+    let ms = ticks as f64 / f64::from(Ticks::from_ms(1).0);
+    if ms < 1000.0 { format!("{ms:.1} ms") } else { format!("{:.1} s", ms / 1000.0) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::ops::Range;
+
+    use pinion_firmware::time::Clock;
+    use proptest::prelude::*;
+
+    use super::super::event::Event;
+    use super::super::file::tests::trace;
+    use super::*;
+
+    /// When the MCU stops, in microseconds.
+    const STOP: u64 = 10_000_000;
+    const LATEST: u64 = 11_000_000;
+    const SECOND: u64 = 1_000_000;
+    /// The number of the block that the core runs then.
+    const BLOCK: u32 = 500;
+    const STEP: Event = Event::Command { id: 5, more: 0 };
+    const TOO_CLOSE: &str = "Timer too close";
+    const MISSED_PWM: &str = "Missed scheduling of next hard pwm event";
+    const TROUBLE: &str = "stepper oid 3: some trouble: do something";
+
+    fn ms(ms: u32) -> Ticks {
+        Ticks::from_ms(ms)
+    }
+
+    fn late(ms: u32) -> Event {
+        Event::Late { oid: Some(3), late: Ticks::from_ms(ms) }
+    }
+
+    fn woke(slept: u32, late: u32) -> Event {
+        Event::Woke { slept: ms(slept), late: ms(late) }
+    }
+
+    fn due(us: u64) -> Event {
+        Event::Due(Clock::from_ticks(us * 50))
+    }
+
+    fn processor(thread: Watched, ran: u32, waited: u32) -> Event {
+        Event::Processor { thread, ran: ms(ran), waited: ms(waited) }
+    }
+
+    /// The recording of a program that works, with a host that is there.
+    #[derive(Clone, Default)]
+    struct Scene(Vec<(&'static str, u64, Event)>);
+
+    impl Scene {
+        fn calm() -> Scene {
+            let mut scene = Scene::default();
+            for at in (50_000..LATEST).step_by(100_000) {
+                scene.0.push(("core", at, woke(100, 0)));
+                scene.0.push(("core", at, Event::Pace { worst: Ticks::from_us(80), margin: 500, wakes: 1 }));
+            }
+            for at in (60_000..LATEST).step_by(250_000) {
+                scene.0.push(("sampler", at, processor(Watched::Core, 3, 0)));
+                scene.0.push(("sampler", at, processor(Watched::Link, 1, 0)));
+            }
+            for at in (550_000..LATEST).step_by(550_000) {
+                scene.0.push(("guardian", at, Event::Listened));
+            }
+            // A host asks for the clock.
+            for (number, at) in (600_000..STOP - SECOND / 2).step_by(SECOND as usize).enumerate() {
+                scene.0.push(("link", at, Event::BlockIn(number as u32)));
+                scene.0.push(("core", at, Event::Block(number as u32)));
+            }
+            scene
+        }
+
+        /// The same without the events of these threads in this span.
+        fn silent(mut self, threads: &[&str], span: Range<u64>) -> Scene {
+            self.0.retain(|(thread, at, _)| !threads.contains(thread) || !span.contains(at));
+            self
+        }
+
+        fn and(mut self, thread: &'static str, at: u64, event: Event) -> Scene {
+            self.0.push((thread, at, event));
+            self
+        }
+
+        /// The kernel's account of a thread in the first sample after a time.
+        fn account_at(mut self, time: u64, thread: Watched, ran: u32, waited: u32) -> Scene {
+            let is_sample = |event: &Event| matches!(event, Event::Processor { thread: of, .. } if *of == thread);
+            let mut samples = self.0.iter_mut().filter(|(_, at, event)| *at >= time && is_sample(event));
+            samples.next().unwrap().2 = processor(thread, ran, waited);
+            self
+        }
+
+        /// The same in the sample that covers the stop.
+        fn account(self, thread: Watched, ran: u32, waited: u32) -> Scene {
+            self.account_at(STOP, thread, ran, waited)
+        }
+
+        /// The MCU stops because of an event that was due then.
+        fn stop(self, block: u32, at: u64) -> Scene {
+            let mut scene = self.and("core", STOP, Event::Stopped { block }).and("core", STOP, due(at));
+            scene.0.retain(|(thread, at, _)| *at <= STOP || ["sampler", "guardian"].contains(thread));
+            scene
+        }
+
+        /// The block came, and the core began it and ran a step of it.
+        fn block(self, came: u64, begun: u64) -> Scene {
+            self.and("link", came, Event::BlockIn(BLOCK))
+                .and("core", begun, Event::Block(BLOCK))
+                .and("core", begun, STEP)
+        }
+
+        fn trace(mut self, end: End) -> Trace {
+            self.0.sort_by_key(|(_, at, _)| *at);
+            let mut threads: Vec<(&str, Vec<(u64, Event)>)> = Vec::new();
+            for (thread, at, event) in self.0 {
+                match threads.iter_mut().find(|(name, _)| *name == thread) {
+                    Some((_, events)) => events.push((at, event)),
+                    None => threads.push((thread, vec![(at, event)])),
+                }
+            }
+            let threads: Vec<(&str, &[(u64, Event)])> =
+                threads.iter().map(|(name, events)| (*name, events.as_slice())).collect();
+            trace(end, &threads)
+        }
+
+        #[track_caller]
+        fn judged(self, reason: &str, culprit: Culprit, text: &str) {
+            let end = End::Shutdown { reason: reason.into(), trouble: TROUBLE.into() };
+            self.told(end, culprit, text);
+        }
+
+        #[track_caller]
+        fn told(self, end: End, culprit: Culprit, text: &str) {
+            let told = verdict(&self.trace(end));
+            assert_eq!((told.culprit, told.text.as_str()), (culprit, text));
+        }
+    }
+
+    #[test]
+    fn a_host_that_is_late_is_accused() {
+        let came = |came: u64, at: u64| Scene::calm().block(came, STOP - 100).stop(BLOCK, at);
+        came(STOP - 200, STOP - 38_200).judged(
+            TOO_CLOSE,
+            Culprit::Host,
+            "the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load",
+        );
+        // It came before its time, but the core needs some time, too.
+        came(STOP - 900, STOP - 400).judged(
+            TOO_CLOSE,
+            Culprit::Host,
+            "the host's block came only 0.5 ms before the step it was for; the core was never later than 0.1 ms: look at the host's load",
+        );
+        // The host was silent before.
+        came(STOP - 200, STOP - 38_200).silent(&["link"], STOP - 5 * SECOND..STOP - 1000).judged(
+            TOO_CLOSE,
+            Culprit::Host,
+            "the host's block came 38.0 ms after the step it was for, and the host had sent nothing for 5.4 s; the core was never later than 0.1 ms: look at the host's load",
+        );
+    }
+
+    #[test]
+    fn a_link_that_waits_for_a_processor_makes_a_block_late() {
+        let scene =
+            || Scene::calm().block(STOP - 200, STOP - 100).account(Watched::Core, 2, 1).stop(BLOCK, STOP - 38_200);
+        scene().account(Watched::Link, 1, 37).judged(
+            TOO_CLOSE,
+            Culprit::Processors,
+            "the link to the host waited 37.0 ms for a processor: other real-time work had it: look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+        );
+        scene().account(Watched::Link, 1, 5).judged(
+            TOO_CLOSE,
+            Culprit::Host,
+            "the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load",
+        );
+    }
+
+    #[test]
+    fn a_block_that_waits_for_a_bus_is_told_with_the_bus() {
+        let scene = |came: u64| {
+            Scene::calm()
+                .and("link", came, Event::BlockIn(BLOCK))
+                .and("core", STOP - 50_000, Event::Held)
+                .and("spi0", STOP - 50_000, Event::ErrandBegan { oid: 3, waited: Ticks(0) })
+                .and("core", STOP - 9_000, Event::Released)
+                .and("spi0", STOP - 9_000, Event::ErrandEnded { oid: 3, took: ms(41) })
+                .and("core", STOP - 100, Event::Block(BLOCK))
+                .stop(BLOCK, STOP - 20_000)
+        };
+        scene(STOP - 60_000).judged(
+            TOO_CLOSE,
+            Culprit::Bus,
+            "spi0 took 41.0 ms for one errand (stepper oid 3), and the host's commands waited for it: use a higher rate, or another bus for the device",
+        );
+        // The core had no room for the block, because it was held: the host had sent it in time.
+        scene(STOP - 8_000).and("link", STOP - 45_000, Event::Full).judged(
+            TOO_CLOSE,
+            Culprit::Bus,
+            "spi0 took 41.0 ms for one errand (stepper oid 3), and the host's commands waited for it: use a higher rate, or another bus for the device",
+        );
+        // It is the host who was late when the bus was free again.
+        scene(STOP - 8_000).judged(
+            TOO_CLOSE,
+            Culprit::Host,
+            "the host's block came 12.0 ms after the event it was for; the core was never later than 0.1 ms: look at the host's load",
+        );
+    }
+
+    #[test]
+    fn a_core_that_waits_for_a_processor_is_told_with_the_reason() {
+        let scene = || {
+            Scene::calm()
+                .and("core", STOP - 1, woke(50, 12))
+                .and("core", STOP - 1, late(12))
+                .account(Watched::Core, 3, 12)
+                .stop(7, STOP - 12_000)
+        };
+        let past = "Stepper too far in past";
+        scene().judged(
+            past,
+            Culprit::Processors,
+            "the core waited 12.0 ms for a processor: other real-time work had it: look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+        );
+        scene().and("core", STOP - 30_000, Event::Scheduling { fifo: false }).judged(
+            past,
+            Culprit::Processors,
+            "the core waited 12.0 ms for a processor: it had used up its real-time share: lower the speed, or free it of the limit (sysctl kernel.sched_rt_runtime_us=-1)",
+        );
+        // Back in time.
+        scene()
+            .and("core", STOP - 40_000, Event::Scheduling { fifo: false })
+            .and("core", STOP - 30_000, Event::Scheduling { fifo: true })
+            .judged(
+                past,
+                Culprit::Processors,
+                "the core waited 12.0 ms for a processor: other real-time work had it: look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+            );
+        let mut ordinary = scene().trace(End::Shutdown { reason: past.into(), trouble: TROUBLE.into() });
+        ordinary.head.realtime = false;
+        let told = verdict(&ordinary);
+        assert_eq!(
+            told.text,
+            "the core waited 12.0 ms for a processor: it does not run in real time: run Pinion in real time (-r, as the service does)"
+        );
+        // A block that came in time waits as well.
+        scene().block(STOP - 13_000, STOP - 1).stop(BLOCK, STOP - 11_000).judged(
+            TOO_CLOSE,
+            Culprit::Processors,
+            "the core waited 12.0 ms for a processor: other real-time work had it: look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+        );
+    }
+
+    #[test]
+    fn a_kernel_that_wakes_the_core_late_is_told_from_a_busy_processor() {
+        Scene::calm()
+            .and("core", STOP - 1, woke(50, 12))
+            .account(Watched::Core, 3, 0)
+            .stop(7, STOP - 12_000)
+            .judged(
+                "Stepper too far in past",
+                Culprit::Driver,
+                "the kernel woke the core 12.0 ms late, though it did not wait for a processor: use a PREEMPT_RT kernel, and look for what blocks interrupts, such as a hypervisor",
+            );
+    }
+
+    #[test]
+    fn a_call_that_takes_long_is_told_from_a_flood_of_work() {
+        let past = "Rescheduled timer in the past";
+        let busy = |ran| Scene::calm().silent(&["core"], STOP - 149_999..STOP).account(Watched::Core, ran, 1);
+        busy(150).and("core", STOP - 150_000, STEP).and("core", STOP - 1, late(120)).stop(7, STOP - 120_000).judged(
+            past,
+            Culprit::Driver,
+            "one call to a driver or the kernel kept the core for 120.0 ms: look for its device in dmesg",
+        );
+        // A call that sleeps, while the link goes on.
+        busy(2)
+            .and("core", STOP - 150_000, STEP)
+            .and("link", STOP - 80_000, Event::Out(9))
+            .stop(7, STOP - 120_000)
+            .judged(
+                past,
+                Culprit::Driver,
+                "one call to a driver or the kernel kept the core for 120.0 ms: look for its device in dmesg",
+            );
+        let mut flood = busy(240);
+        for at in (0..150_000).step_by(1000) {
+            flood = flood.and("core", STOP - 150_000 + at, late(at as u32 / 1250));
+        }
+        flood.stop(7, STOP - 120_000).judged(
+            past,
+            Culprit::Work,
+            "the core worked all the time and was 120.0 ms late: fewer steps a second: lower the speed or the microsteps",
+        );
+        // Steps closer together than their pulses, on a core that is on time.
+        let steps = Scene::calm().account(Watched::Core, 240, 0).and("link", STOP - 600, Event::Out(9));
+        steps.stop(7, STOP - 1_200).judged(
+            "Stepper too far in past",
+            Culprit::Work,
+            "steps were closer together than their pulses; the core was never later than 0.1 ms: stepper oid 3: some trouble: do something",
+        );
+    }
+
+    #[test]
+    fn a_standstill_is_told_with_what_went_on() {
+        const OURS: [&str; 3] = ["core", "link", "sampler"];
+        let past = "Rescheduled timer in the past";
+        let stood = |threads: &[&str]| {
+            Scene::calm()
+                .silent(threads, STOP - 900_000..STOP)
+                .and("core", STOP - 1, woke(950, 850))
+                .account(Watched::Core, 3, 0)
+                .stop(7, STOP - 850_000)
+        };
+        stood(&OURS).judged(
+            past,
+            Culprit::Standstill,
+            "Pinion stood still for 850.0 ms, and the guardian went on: find out who stopped it (SIGSTOP, a frozen control group)",
+        );
+        stood(&["core", "link", "sampler", "guardian"]).judged(
+            past,
+            Culprit::Standstill,
+            "the whole computer stood still for 850.0 ms: find out who suspended it, or paused its virtual machine",
+        );
+        // The guardian would not have listened in so short a time.
+        Scene::calm()
+            .silent(&["core", "link", "sampler", "guardian"], STOP - 400_000..STOP)
+            .and("core", STOP - 1, woke(400, 400))
+            .account(Watched::Core, 3, 0)
+            .stop(7, STOP - 380_000)
+            .judged(
+                past,
+                Culprit::Standstill,
+                "everything stood still for 380.0 ms: find out who stopped Pinion, or paused or suspended the computer",
+            );
+        // The core notices it by itself: then no event is the cause.
+        let end = |trouble: &str| End::Shutdown { reason: past.into(), trouble: trouble.into() };
+        let noticed = |from: u64, threads: &[&str]| {
+            let scene = Scene::calm().silent(threads, from..STOP).and("core", STOP - 1, woke(5000, 4900));
+            let scene = scene.account(Watched::Core, 3, 0).and("core", STOP, Event::Stopped { block: 7 });
+            scene.silent(&["core"], STOP + 1..LATEST)
+        };
+        noticed(STOP - 5 * SECOND, &OURS).told(
+            end("Pinion stood still for 5000 ms"),
+            Culprit::Standstill,
+            "Pinion stood still for 4.9 s, and the guardian went on: find out who stopped it (SIGSTOP, a frozen control group)",
+        );
+        // The clock stood still, too.
+        noticed(STOP - 1, &[]).told(
+            end("the computer was suspended for 60000 ms with outputs in use: keep it from that"),
+            Culprit::Standstill,
+            "everything stood still: the computer was suspended for 60000 ms with outputs in use: keep it from that",
+        );
+        // A virtual machine that did not get a processor.
+        let stolen = Scene::calm().and("core", STOP - 1, woke(50, 12)).account(Watched::Core, 3, 1);
+        stolen.and("sampler", STOP + 10_000, Event::Stolen(ms(14))).stop(7, STOP - 12_000).judged(
+            "Stepper too far in past",
+            Culprit::Standstill,
+            "a hypervisor took 14.0 ms of processor time while an event waited: give this virtual machine processors of its own",
+        );
+    }
+
+    #[test]
+    fn a_bus_that_hangs_is_named() {
+        let hangs = Scene::calm()
+            .and("core", STOP - 5 * SECOND, Event::Held)
+            .and("spi0", STOP - 5 * SECOND, Event::ErrandBegan { oid: 3, waited: Ticks(0) })
+            .and("i2c1", STOP - 6 * SECOND, Event::ErrandBegan { oid: 4, waited: Ticks(0) })
+            .and("i2c1", STOP - 5 * SECOND, Event::ErrandEnded { oid: 4, took: ms(1000) });
+        let text =
+            "spi0 has not answered for 5.0 s (stepper oid 3): check the power and the wires of its devices, and dmesg";
+        let stopped = hangs.clone().and("core", STOP, Event::Stopped { block: 7 });
+        stopped.judged("Bus does not answer", Culprit::Bus, text);
+        hangs.clone().silent(&["core", "sampler", "guardian"], STOP + 1..LATEST).told(End::Asked, Culprit::Bus, text);
+        // An output waits for its refresh behind it.
+        hangs.and("link", STOP - 4 * SECOND, Event::BlockIn(8)).stop(7, STOP - 1000).judged(
+            MISSED_PWM,
+            Culprit::Bus,
+            text,
+        );
+        let told = Scene::calm().and("core", STOP, Event::Stopped { block: 7 });
+        told.judged("Bus does not answer", Culprit::Bus, &format!("a bus did not answer: {TROUBLE}"));
+    }
+
+    #[test]
+    fn the_power_comes_first_if_it_was_bad_then() {
+        let scene = |fault, at| {
+            let scene = Scene::calm().block(STOP - 200, STOP - 100).and("sampler", at, Event::Power(Some(fault)));
+            scene.stop(BLOCK, STOP - 38_200)
+        };
+        scene(PowerFault::Undervoltage, STOP - SECOND).judged(
+            TOO_CLOSE,
+            Culprit::Power,
+            "the power supply's voltage was too low then; the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms: use a better power supply and a short, thick cable",
+        );
+        scene(PowerFault::Hot, STOP - 10_000).judged(
+            TOO_CLOSE,
+            Culprit::Power,
+            "the processor was slowed down by heat then; the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms: cool it",
+        );
+        let over = scene(PowerFault::Undervoltage, STOP - 5 * SECOND).and("sampler", STOP - SECOND, Event::Power(None));
+        over.judged(
+            TOO_CLOSE,
+            Culprit::Host,
+            "the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load",
+        );
+        let mut slow = Scene::calm().and("sampler", STOP - SECOND, Event::Frequency { mhz: 600, max_mhz: 1500 });
+        for at in (0..20_000).step_by(500) {
+            slow = slow.and("core", STOP - 20_000 + at, late(1));
+        }
+        slow.account(Watched::Core, 240, 0).stop(7, STOP - 15_000).judged(
+            "Stepper too far in past",
+            Culprit::Power,
+            "the core worked all the time and was 15.0 ms late, at 600 MHz of 1500 MHz: set the frequency governor to performance",
+        );
+    }
+
+    #[test]
+    fn a_host_that_is_silent_or_gone_is_told() {
+        let missed = |scene: Scene| scene.stop(9, STOP - 100);
+        missed(Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP)).judged(
+            MISSED_PWM,
+            Culprit::Host,
+            "the host sent nothing for 4.4 s; the core was never later than 0.1 ms: look at its log, and at its load",
+        );
+        missed(Scene::calm().and("link", STOP - 3 * SECOND, Event::HostGone)).judged(
+            MISSED_PWM,
+            Culprit::Host,
+            "the host closed the terminal 3.0 s before the stop: its log tells why it ended",
+        );
+        missed(Scene::calm().and("link", STOP - 40_000, Event::BlockIn(9))).judged(
+            MISSED_PWM,
+            Culprit::Host,
+            "the host sent its last block 40.0 ms before the stop, but did not refresh an output in time; the core was never later than 0.1 ms: stepper oid 3: some trouble: do something",
+        );
+        // The link did not run.
+        let starved = Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP).account(Watched::Link, 1, 3900);
+        missed(starved).judged(
+            MISSED_PWM,
+            Culprit::Processors,
+            "the link to the host waited 3.9 s for a processor: other real-time work had it: look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+        );
+    }
+
+    #[test]
+    fn a_stop_for_another_reason_accuses_nobody() {
+        let stop = |scene: Scene| scene.and("core", STOP, Event::Stopped { block: 7 });
+        for reason in ["Command request", "ADC out of range", "Not an output pin"] {
+            stop(Scene::calm()).judged(reason, Culprit::Nobody, &format!("nobody was late: {TROUBLE}"));
+        }
+        let before =
+            Scene::calm().and("core", STOP - 2 * SECOND, woke(50, 12)).and("core", STOP - 2 * SECOND, late(12));
+        let before = before.account_at(STOP - 2 * SECOND, Watched::Core, 3, 12);
+        stop(before).judged(
+            "Command request",
+            Culprit::Nobody,
+            &format!("{TROUBLE}; 2.0 s before, the core waited 12.0 ms for a processor: other real-time work had it, which did not stop it"),
+        );
+    }
+
+    #[test]
+    fn a_program_that_is_gone_is_told_with_what_it_did_last() {
+        let scene = |from: u64| {
+            let scene = Scene::calm().and("core", STOP - SECOND, STEP);
+            scene.silent(&["core", "link", "sampler"], from..LATEST).silent(&["guardian"], STOP + 1..LATEST)
+        };
+        scene(STOP - 1).and("guardian", STOP, Event::Listened).told(
+            End::Died,
+            Culprit::Death,
+            "Pinion died at most 50.0 ms after the core's last event (the last command was queue_step): look for a panic in its log, and for who killed it (dmesg: out of memory)",
+        );
+        let hung = |scene: Scene, culprit, text: &str| {
+            let diagnosis = "the core gave no sign of life for 1000 ms".to_owned();
+            scene.and("guardian", STOP, Event::Listened).told(End::Hung { diagnosis }, culprit, text);
+        };
+        // It was stopped, and so was everything of it.
+        hung(
+            scene(STOP - 900_000),
+            Culprit::Standstill,
+            "Pinion hung: Pinion stood still for 950.0 ms, and the guardian went on: find out who stopped it (SIGSTOP, a frozen control group), or which real-time work had all processors",
+        );
+        let core_only = Scene::calm().and("core", STOP - SECOND, STEP).silent(&["core"], STOP - 990_000..LATEST);
+        let core_only = core_only.silent(&["link", "sampler", "guardian"], STOP + 1..LATEST);
+        hung(
+            core_only,
+            Culprit::Driver,
+            "Pinion hung: one call to a driver or the kernel kept the core for 1.0 s: look for its device in dmesg",
+        );
+        let owing = Scene::calm().silent(&["core", "link", "sampler", "guardian"], STOP + 1..LATEST);
+        hung(owing, Culprit::Death, "Pinion hung: the core gave no sign of life for 1000 ms: report it with its log");
+    }
+
+    #[test]
+    fn a_program_that_works_is_told_with_its_latest_timer() {
+        let asked = |scene: Scene, culprit, text: &str| {
+            scene.silent(&["core", "link", "sampler", "guardian"], STOP + 1..LATEST).told(End::Asked, culprit, text);
+        };
+        asked(Scene::calm(), Culprit::Nobody, "nobody was late; the core was never later than 0.1 ms");
+        let late = Scene::calm().and("core", 5 * SECOND, woke(50, 12)).and("core", 5 * SECOND, late(12));
+        asked(
+            late.clone().account_at(5 * SECOND, Watched::Core, 3, 12),
+            Culprit::Processors,
+            "the core waited 12.0 ms for a processor: other real-time work had it (5.0 s before the end of the recording): look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+        );
+        asked(
+            late.silent(&["sampler"], 0..LATEST),
+            Culprit::Unknown,
+            "not known why a timer was 12.0 ms late (5.0 s before the end of the recording)",
+        );
+        asked(Scene::default(), Culprit::Unknown, "no timer is in the recording: nobody can have been late");
+    }
+
+    /// Without what proves it, nobody is accused.
+    #[test]
+    fn a_verdict_needs_evidence() {
+        let bare = |at: u64| Scene::default().stop(BLOCK, at);
+        bare(STOP - 12_000).judged(
+            TOO_CLOSE,
+            Culprit::Unknown,
+            "an event was asked for 12.0 ms after its time; not known when its block came",
+        );
+        // Only a later block is known: it proves that this one came in time, but not that it came late.
+        let later = |came| bare(STOP - 12_000).and("link", came, Event::BlockIn(BLOCK + 1));
+        later(STOP - 1_000).judged(
+            TOO_CLOSE,
+            Culprit::Unknown,
+            "an event was asked for 12.0 ms after its time; not known when its block came",
+        );
+        later(STOP - 30_000).judged(
+            TOO_CLOSE,
+            Culprit::Unknown,
+            "not known who was late: the host's block came 18.0 ms before its event, and the core ran it 12.0 ms after the event",
+        );
+        for reason in ["Stepper too far in past", "Rescheduled timer in the past"] {
+            bare(STOP - 12_000).judged(
+                reason,
+                Culprit::Unknown,
+                &format!("not known why an event was 12.0 ms late: {TROUBLE}"),
+            );
+        }
+        bare(STOP - 100).judged(
+            MISSED_PWM,
+            Culprit::Unknown,
+            &format!("not known when the host sent something: {TROUBLE}"),
+        );
+        // The events of the rings' beginnings are lost, and with them the time.
+        for reason in [TOO_CLOSE, MISSED_PWM] {
+            Scene::calm().judged(reason, Culprit::Unknown, &format!("not known who was late: {TROUBLE}"));
+        }
+    }
+
+    fn any_end() -> impl Strategy<Value = End> {
+        let texts = ["Timer too close", MISSED_PWM, "Rescheduled timer in the past", "Bus does not answer", "x"];
+        let shutdown = proptest::sample::select(texts.to_vec())
+            .prop_map(|reason| End::Shutdown { reason: reason.into(), trouble: "t".into() });
+        prop_oneof![shutdown, Just(End::Died), Just(End::Hung { diagnosis: "d".into() }), Just(End::Asked)]
+    }
+
+    fn any_events() -> impl Strategy<Value = Vec<(Clock, Event)>> {
+        let near = (1u64 << 32)..(1 << 32) + 2_000_000_000;
+        let at = prop_oneof![3 => near.clone(), 1 => 0u64..1 << 56];
+        let payload =
+            prop_oneof![any::<u64>(), near, (0u64..3, 0u64..100_000_000).prop_map(|(low, high)| low | high << 32)];
+        let event = (at, 0u64..61, payload).prop_map(|(at, kind, payload)| Event::decode([at << 8 | kind, payload]));
+        prop::collection::vec(event, 0..60).prop_map(|events| events.into_iter().flatten().collect())
+    }
+
+    proptest! {
+        /// Any events get a verdict of one line.
+        #[test]
+        fn no_events_make_it_panic(
+            end in any_end(),
+            ended_at in prop_oneof![any::<u64>(), (1u64 << 32)..(1 << 33)],
+            threads in prop::collection::vec(
+                (proptest::sample::select(vec!["core", "link", "sampler", "guardian", "spi0"]), any_events()),
+                0..6,
+            ),
+        ) {
+            let mut trace = trace(end, &[]);
+            trace.head.ended_at = ended_at;
+            trace.threads = threads.into_iter()
+                .map(|(name, events)| crate::trace::file::Thread { name: name.into(), events })
+                .collect();
+            let verdict = verdict(&trace);
+            prop_assert!(!verdict.text.is_empty() && !verdict.text.contains('\n'));
+        }
+    }
+}
