@@ -2,7 +2,7 @@
 //! Data of others: files that may be anything, and names that may contain anything.
 //!
 //! A host, its checkout, other processes and devices choose their own names. Their files are read with [`read`]. Their
-//! names leave the program only after [`plain`] or [`plain_json`].
+//! names leave the program only after [`plain`], [`plain_json`] or [`plain_xml`].
 
 #![forbid(unsafe_code)]
 
@@ -66,6 +66,24 @@ pub(crate) fn plain_json(json: &str) -> String {
     plain
 }
 
+/// The same for the text and the attributes of XML.
+pub(crate) fn plain_xml(text: &str) -> String {
+    let mut plain = String::with_capacity(text.len());
+    for c in text.chars() {
+        match c {
+            '&' => plain.push_str("&amp;"),
+            '<' => plain.push_str("&lt;"),
+            '>' => plain.push_str("&gt;"),
+            '"' => plain.push_str("&quot;"),
+            // XML has no place for these two.
+            '\u{fffe}' | '\u{ffff}' => plain.push(' '),
+            c if c.is_control() => plain.push(' '),
+            c => plain.push(c),
+        }
+    }
+    plain
+}
+
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
@@ -106,6 +124,9 @@ pub(crate) mod tests {
             prop_assert_eq!(shown.chars().count(), text.chars().count());
             let json = plain_json(&serde_json::json!({ &text: [&text] }).to_string());
             prop_assert!(!json.contains(char::is_control));
+            let xml = format!("<a>{}</a>", plain_xml(&text));
+            prop_assert!(!xml.contains(char::is_control));
+            prop_assert_eq!(roxmltree::Document::parse(&xml).unwrap().descendants().count(), 2 + usize::from(!text.is_empty()));
             prop_assert_eq!(&serde_json::from_str::<serde_json::Value>(&json).unwrap()[&text][0], &text);
         }
     }

@@ -6,11 +6,18 @@
 //! - `file`: a trace, from the rings to a file and back
 //! - `folder`: where the files are, and their names
 //! - `verdict`: who was late
+//! - `history`: what each thread did, in words and from when to when
+//! - `timeline`, `vcd`, `perfetto`, `svg`: exports of a history
 
 #![forbid(unsafe_code)]
 
 pub mod event;
 pub mod file;
 pub mod folder;
+mod history;
+pub mod perfetto;
 pub mod ring;
+pub mod svg;
+pub mod timeline;
+pub mod vcd;
 pub mod verdict;

@@ -1,0 +1,341 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A trace as text for a person: one line for each thing of note. Between them, one line for all else that a thread did.
+
+#![forbid(unsafe_code)]
+
+use std::cmp::Reverse;
+use std::collections::BTreeMap;
+use std::io::{self, Write};
+use std::time::Duration;
+
+use pinion_firmware::time::{NS_PER_TICK, Ticks};
+
+use super::event::Event;
+use super::file::Trace;
+use super::history::{Deed, History, at_ms, ms, short};
+
+/// Highest number of lines below the title.
+const LINES_MAX: usize = 60;
+/// A wait at least this long is of note.
+const LONG_WAIT: Ticks = Ticks::from_ms(1);
+/// Work of a bus at least this long is of note. A transfer to a display takes some ms.
+const LONG_WORK: Ticks = Ticks::from_ms(5);
+/// Highest number of kinds of commands that a line names.
+const COMMANDS_MAX: usize = 4;
+/// Widest name of a thread that moves its column.
+const THREAD_WIDTH_MAX: usize = 12;
+
+/// Writes the timeline of the recording's last part, at most about 60 lines. Times are in ms, relative to the end of
+/// the recording. If there is too much of note, the most important things have lines of their own.
+///
+/// # Errors
+///
+/// Those of `out`.
+pub fn write(trace: &Trace, last: Duration, out: &mut impl Write) -> io::Result<()> {
+    let history = History::of(trace);
+    let start = i64::try_from(last.as_nanos() / u128::from(NS_PER_TICK)).map_or(i64::MIN, |ticks| -ticks);
+    let mut deeds: Vec<(usize, Deed)> =
+        history.deeds().filter(|(_, deed)| deed.to >= start).map(|(lane, deed)| (lane, *deed)).collect();
+    deeds.sort_by_key(|(_, deed)| place(deed));
+    let mut of_note: Vec<usize> = (0..deeds.len()).filter(|index| weight(&deeds[*index].1) > 0).collect();
+    of_note.sort_by_key(|index| Reverse((weight(&deeds[*index].1), *index)));
+    let mut chosen = LINES_MAX;
+    let rows = loop {
+        let mut alone = vec![false; deeds.len()];
+        of_note.iter().take(chosen).for_each(|index| alone[*index] = true);
+        let rows = rows(&history, &deeds, &alone);
+        if rows.len() <= LINES_MAX || chosen == 0 {
+            break rows;
+        }
+        chosen = chosen * 3 / 4;
+    };
+    let widest = |texts: &mut dyn Iterator<Item = &String>| texts.map(|text| text.chars().count()).max().unwrap_or(0);
+    let from_width = widest(&mut rows.iter().map(|row| &row.from));
+    let to_width = widest(&mut rows.iter().map(|row| &row.to));
+    let thread_width = widest(&mut rows.iter().map(|row| &row.thread)).min(THREAD_WIDTH_MAX);
+    writeln!(out, "Times are in ms. Zero is the end of the recording: {}.", history.end())?;
+    for Row { from, to, thread, text } in rows.iter().take(LINES_MAX) {
+        let dots = if to.is_empty() { "  " } else { ".." };
+        writeln!(out, "{from:>from_width$} {dots} {to:>to_width$}  {thread:thread_width$}  {text}")?;
+    }
+    if rows.is_empty() {
+        writeln!(out, "Nothing is recorded.")?;
+    }
+    Ok(())
+}
+
+/// Where a deed stands in the timeline: those that a line tells with their end stand at their beginning.
+fn place(deed: &Deed) -> i64 {
+    if is_range(deed) { deed.from } else { deed.to }
+}
+
+fn is_range(deed: &Deed) -> bool {
+    matches!(deed.event, Event::Held | Event::Released | Event::ErrandBegan { .. } | Event::ErrandEnded { .. })
+}
+
+/// How much a deed is of note; zero if it is routine. Being late weighs more than waiting, which weighs more than work.
+fn weight(deed: &Deed) -> u64 {
+    let over = |ticks: u64, limit: Ticks, factor: u64| {
+        if ticks >= limit.0.into() { ticks.saturating_mul(factor) } else { 0 }
+    };
+    match deed.event {
+        Event::Stopped { .. } | Event::Due(_) => u64::MAX,
+        Event::Held | Event::ErrandBegan { .. } => over(deed.ticks(), LONG_WAIT, 1000),
+        Event::Configured
+        | Event::Reset
+        | Event::HostCame
+        | Event::HostGone
+        | Event::Scheduling { .. }
+        | Event::Power(_) => 1 << 40,
+        Event::Refused | Event::Full | Event::Omitted(_) => 1 << 32,
+        Event::Late { late, .. } => u64::from(late.0.max(1)) * 100,
+        Event::Woke { late, .. } => over(late.0.into(), LONG_WAIT, 100),
+        Event::Processor { waited, .. } => over(waited.0.into(), LONG_WAIT, 100),
+        Event::Stolen(ticks) => over(ticks.0.into(), LONG_WAIT, 100),
+        Event::Released => over(deed.ticks(), LONG_WAIT, 10),
+        Event::ErrandEnded { .. } => over(deed.ticks(), LONG_WORK, 1),
+        Event::Pace { .. }
+        | Event::Block(_)
+        | Event::Command { .. }
+        | Event::BlockIn(_)
+        | Event::Out(_)
+        | Event::Frequency { .. }
+        | Event::Listened
+        | Event::Edge { .. } => 0,
+    }
+}
+
+/// A line.
+struct Row {
+    from: String,
+    /// Empty: it is at one time.
+    to: String,
+    thread: String,
+    text: String,
+}
+
+impl Row {
+    fn new(history: &History<'_>, lane: usize, from: i64, to: Option<i64>, text: String) -> Row {
+        let thread = short(history.lanes[lane].thread);
+        Row { from: at_ms(from), to: to.map_or_else(String::new, at_ms), thread, text }
+    }
+}
+
+/// The lines, with these deeds alone and the others folded.
+fn rows(history: &History<'_>, deeds: &[(usize, Deed)], alone: &[bool]) -> Vec<Row> {
+    let mut rows = Vec::new();
+    let mut folds: BTreeMap<usize, Fold> = BTreeMap::new();
+    for ((lane, deed), alone) in deeds.iter().zip(alone) {
+        if !alone {
+            folds.entry(*lane).or_insert_with(|| Fold::at(place(deed))).add(deed);
+            continue;
+        }
+        flush(history, &mut folds, &mut rows);
+        let to = (is_range(deed) && !deed.is_open()).then_some(deed.to);
+        rows.push(Row::new(history, *lane, place(deed), to, history.words(deed)));
+        if rows.len() > LINES_MAX {
+            return rows;
+        }
+    }
+    flush(history, &mut folds, &mut rows);
+    rows
+}
+
+fn flush(history: &History<'_>, folds: &mut BTreeMap<usize, Fold>, rows: &mut Vec<Row>) {
+    let mut folds: Vec<(usize, Fold)> = std::mem::take(folds).into_iter().collect();
+    folds.sort_by_key(|(_, fold)| fold.from);
+    for (lane, fold) in folds {
+        let to = (at_ms(fold.to) != at_ms(fold.from)).then_some(fold.to);
+        rows.push(Row::new(history, lane, fold.from, to, fold.words(history)));
+    }
+}
+
+/// Deeds of a thread in one line.
+#[derive(Default)]
+struct Fold {
+    from: i64,
+    to: i64,
+    /// By the order of their kinds in the line.
+    kinds: BTreeMap<Kind, Sum>,
+    /// How often each command came, and how many came right behind those.
+    commands: BTreeMap<u16, u64>,
+    behind: u64,
+}
+
+/// Kinds of deeds in a line, in their order.
+#[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+enum Kind {
+    Wakes,
+    Timers,
+    Late,
+    Blocks,
+    Waits,
+    Came,
+    Wrote,
+    Work,
+    Processor,
+    Stolen,
+    Frequency,
+    Listened,
+    Edges,
+    Other,
+}
+
+#[derive(Default)]
+struct Sum {
+    count: u64,
+    /// The most ticks, bytes or MHz of one, and of all.
+    most: u64,
+    all: u64,
+}
+
+impl Fold {
+    fn at(from: i64) -> Fold {
+        Fold { from, to: from, ..Fold::default() }
+    }
+
+    fn add(&mut self, deed: &Deed) {
+        self.to = self.to.max(deed.to);
+        let (kind, amount) = match deed.event {
+            Event::Command { id, more } => {
+                *self.commands.entry(id).or_default() += 1;
+                self.behind += u64::from(more);
+                return;
+            }
+            Event::Woke { late, .. } => (Kind::Wakes, late.0.into()),
+            Event::Pace { worst, .. } => (Kind::Timers, worst.0.into()),
+            Event::Late { late, .. } => (Kind::Late, late.0.into()),
+            Event::Block(_) => (Kind::Blocks, deed.ticks()),
+            Event::Held | Event::Released => (Kind::Waits, deed.ticks()),
+            Event::BlockIn(_) => (Kind::Came, 0),
+            Event::Out(bytes) => (Kind::Wrote, bytes.into()),
+            Event::ErrandBegan { .. } | Event::ErrandEnded { .. } => (Kind::Work, deed.ticks()),
+            Event::Processor { waited, .. } => (Kind::Processor, waited.0.into()),
+            Event::Stolen(ticks) => (Kind::Stolen, ticks.0.into()),
+            Event::Frequency { mhz, .. } => (Kind::Frequency, mhz.into()),
+            Event::Listened => (Kind::Listened, 0),
+            Event::Edge { .. } => (Kind::Edges, 0),
+            Event::Omitted(_)
+            | Event::Configured
+            | Event::Reset
+            | Event::Stopped { .. }
+            | Event::Due(_)
+            | Event::Scheduling { .. }
+            | Event::HostCame
+            | Event::HostGone
+            | Event::Refused
+            | Event::Full
+            | Event::Power(_) => (Kind::Other, 0),
+        };
+        let sum = self.kinds.entry(kind).or_default();
+        sum.count += 1;
+        sum.most = sum.most.max(amount);
+        sum.all = sum.all.saturating_add(amount);
+    }
+
+    fn words(&self, history: &History<'_>) -> String {
+        let parts = self.kinds.iter().map(|(kind, sum)| {
+            let (most, all) = (ms(sum.most), ms(sum.all));
+            match kind {
+                Kind::Wakes => format!("{}, latest {most} ms", count(sum.count, "wake-up")),
+                Kind::Timers => format!("no timer later than {most} ms"),
+                Kind::Late => format!("{}, at most {most} ms", count(sum.count, "late timer")),
+                Kind::Blocks => format!("{} begun, longest in the queue {most} ms", count(sum.count, "block")),
+                Kind::Waits => format!("{} for a bus, longest {most} ms", count(sum.count, "wait")),
+                Kind::Came => format!("{} from the host", count(sum.count, "block")),
+                Kind::Wrote => format!("{} to the host", count(sum.all, "byte")),
+                Kind::Work => format!("{}, longest {most} ms", count(sum.count, "transfer")),
+                Kind::Processor => format!("waited {all} ms for a processor"),
+                Kind::Stolen => format!("a hypervisor took {all} ms"),
+                Kind::Frequency => format!("the processor runs at up to {} MHz", sum.most),
+                Kind::Listened => format!("listened {}", count(sum.count, "time")),
+                Kind::Edges => count(sum.count, "edge"),
+                Kind::Other => format!("{} of note", count(sum.count, "other event")),
+            }
+        });
+        parts.chain(self.commands(history)).collect::<Vec<_>>().join("; ")
+    }
+
+    fn commands(&self, history: &History<'_>) -> Option<String> {
+        let all = self.commands.values().sum::<u64>() + self.behind;
+        let mut commands: Vec<(&u16, &u64)> = self.commands.iter().collect();
+        commands.sort_by_key(|(_, count)| Reverse(**count));
+        let named = commands.iter().take(COMMANDS_MAX);
+        let mut names: Vec<String> = named.map(|(id, count)| format!("{} {count}", history.command(**id))).collect();
+        let others = commands.iter().skip(COMMANDS_MAX).map(|(_, count)| **count).sum::<u64>() + self.behind;
+        if others > 0 {
+            names.push(format!("others {others}"));
+        }
+        (all > 0).then(|| format!("{} ({})", count(all, "command"), names.join(", ")))
+    }
+}
+
+fn count(count: u64, thing: &str) -> String {
+    format!("{count} {thing}{}", if count == 1 { "" } else { "s" })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::file::End;
+    use super::super::file::tests::trace;
+    use super::super::history::tests::{any_trace, late_host};
+    use super::*;
+    use proptest::prelude::*;
+
+    fn text(trace: &Trace, last: Duration) -> String {
+        let mut text = Vec::new();
+        write(trace, last, &mut text).unwrap();
+        String::from_utf8(text).unwrap()
+    }
+
+    #[test]
+    fn what_is_of_note_stands_alone_and_all_else_is_folded() {
+        let text = text(&late_host(), Duration::MAX);
+        assert_eq!(
+            text.lines().next(),
+            Some("Times are in ms. Zero is the end of the recording: the MCU stopped: Timer too close.")
+        );
+        for line in [
+            "-1000.00             link      a host opened the terminal",
+            " -998.00 .. -517.60  spi0      25 transfers, longest 0.400 ms",
+            " -995.00 .. -504.91  link      50 blocks from the host; 350 bytes to the host",
+            " -500.00             sampler   the core ran 9.0 ms and waited 3.0 ms for a processor",
+            " -118.00 .. -106.00  core      commands waited 12.0 ms for a bus",
+            " -118.00 .. -106.00  spi0      worked 12.0 ms for adxl345 oid 7, after 0.020 ms in the queue",
+            "  -90.00             core      stepper oid 3 ran 0.310 ms late",
+            "  -85.00 ..  -74.91  link      2 blocks from the host; 14 bytes to the host",
+            "  -10.00             spi0      works for adxl345 oid 7. It did not end within 10.0 ms, when the recording ended",
+            "   -4.90             core      the stop was about an event that was due at -43.00 ms",
+        ] {
+            assert!(text.contains(&format!("\n{line}\n")), "{line}\n{text}");
+        }
+        assert!(text.contains("8 commands (queue_step 2, set_next_step_dir 2, others 4)\n"), "{text}");
+        assert_eq!(text.lines().count(), 28);
+    }
+
+    #[test]
+    fn only_the_last_part_is_told() {
+        let text = text(&late_host(), Duration::from_millis(20));
+        assert_eq!(text.lines().nth(1).map(|line| &line[..6]), Some("-20.00"));
+        assert!(text.contains("the MCU stopped in block 93"), "{text}");
+    }
+
+    /// The worst of many stand alone.
+    #[test]
+    fn a_flood_does_not_hide_the_worst() {
+        let late = |number: u64| Event::Late { oid: Some(3), late: Ticks(if number == 777 { 90_000 } else { 500 }) };
+        let flood: Vec<(u64, Event)> = (0..2000).map(|number| (number * 100, late(number))).collect();
+        let text = text(&trace(End::Asked, &[("core", &flood)]), Duration::MAX);
+        assert!(text.contains("stepper oid 3 ran 1.8 ms late\n"), "{text}");
+        assert!(text.contains(" late timers, at most 0.010 ms\n"), "{text}");
+    }
+
+    proptest! {
+        #[test]
+        fn it_has_few_lines_whatever_happened(trace in any_trace(), last_ms: u64) {
+            let text = text(&trace, Duration::from_millis(last_ms));
+            prop_assert!(text.lines().count() <= LINES_MAX + 1);
+            prop_assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{text:?}");
+        }
+    }
+}
