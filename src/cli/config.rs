@@ -22,6 +22,9 @@ pub(super) const SYSTEM_FILE: &str = "/etc/pinion/pinion.toml";
 /// Longest configuration that is read because another process names it.
 const FOREIGN_BYTES_MAX: u64 = 1 << 20;
 
+/// What to do about a line that is no TOML.
+const LINE: &str = "write a key, = and its value, such as realtime = true";
+
 /// A key of the file.
 struct Key {
     name: &'static str,
@@ -137,6 +140,11 @@ fn of_file(file: &dyn fmt::Display, bytes: io::Result<Vec<u8>>) -> Result<Given,
         trouble.remedy("name a configuration that can be read, or leave out --config")
     })?;
     match std::str::from_utf8(&bytes) {
+        Ok(text) if text.contains('\0') => {
+            let trouble =
+                Trouble::new("there are zero bytes, as a power cut leaves them").remedy("write the file anew");
+            Err(trouble.at(file, text, text.find('\0').unwrap_or(0)))
+        }
         Ok(text) => parse(text, file),
         Err(error) => {
             let good = String::from_utf8_lossy(&bytes[..error.valid_up_to()]);
@@ -152,7 +160,7 @@ fn parse(text: &str, file: &dyn fmt::Display) -> Result<Given, Trouble> {
         .map_err(|error| {
             let what = match key_at(text, error.span()) {
                 Some(key) => key.wrong(None),
-                None => Trouble::new(error.message().trim().replace('\n', ": ")),
+                None => Trouble::new(error.message().trim().replace('\n', ": ")).remedy(LINE),
             };
             wrong(error.span(), what)
         })?

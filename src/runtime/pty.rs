@@ -178,7 +178,11 @@ fn place_symlink(device: &Path, link: &Path) -> Result<(), Trouble> {
     let place = Place::of(link);
     let what = format!("the link {} cannot be made", link.display());
     let cannot = |error: io::Error| {
-        refused(&what, error).remedy("make its folder, let this user write there, or choose another path with -I")
+        let remedy = match is_full(&error) {
+            true => "free space or remove files there (df, df -i), or choose another path with -I",
+            false => "make its folder, let this user write there, or choose another path with -I",
+        };
+        refused(&what, error).remedy(remedy)
     };
     if place == Place::File && is_left_over(link) {
         fs::remove_file(link).map_err(cannot)?;
@@ -190,8 +194,20 @@ fn place_symlink(device: &Path, link: &Path) -> Result<(), Trouble> {
     let mut fresh = link.as_os_str().to_owned();
     fresh.push(format!(".{}", std::process::id()));
     let fresh = PathBuf::from(fresh);
-    symlink(device, &fresh).map_err(cannot)?;
-    fs::rename(&fresh, link).inspect_err(|_| drop(fs::remove_file(&fresh))).map_err(cannot)
+    // A process with our number may have left it there, in a power cut.
+    let _ = fs::remove_file(&fresh);
+    let renamed = || fs::rename(&fresh, link).inspect_err(|_| drop(fs::remove_file(&fresh)));
+    match symlink(device, &fresh).and_then(|()| renamed()) {
+        // There is no room for two links, but the stale one makes room.
+        Err(error) if is_full(&error) && place == Place::Link => {
+            fs::remove_file(link).and_then(|()| symlink(device, link)).map_err(cannot)
+        }
+        placed => placed.map_err(cannot),
+    }
+}
+
+fn is_full(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded)
 }
 
 /// Whether a service's stop command left this file in /tmp because there was no link. The file is root's or our own,
@@ -279,6 +295,17 @@ mod tests {
             let error = Pty::open(folder, &access).err().unwrap().to_string();
             assert!(error.contains("is a folder: choose another path with -I"), "{error}");
         }
+    }
+
+    #[test]
+    fn a_link_that_was_half_made_when_the_power_went_does_not_prevent_the_next_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let link = folder.path().join("tty");
+        let half_made = folder.path().join(format!("tty.{}", std::process::id()));
+        symlink("/dev/pts/no-longer-there", &half_made).unwrap();
+        let pty = Pty::open(&link, &Access { mode: 0o600, group: None }).unwrap();
+        assert_eq!(fs::read_link(&link).unwrap(), pty.device());
+        assert!(fs::symlink_metadata(&half_made).is_err(), "it is left");
     }
 
     #[test]

@@ -6,6 +6,7 @@ mod commands;
 mod configuration;
 mod console;
 mod dialects;
+mod disk;
 mod doctor;
 mod life;
 mod one_order;

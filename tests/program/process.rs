@@ -59,6 +59,23 @@ impl Pinion {
         Pinion { child, folder }
     }
 
+    /// `pinion` with its own view of the file system. A shell prepares it, in the program's folder. Needs root.
+    pub fn start_mounted(folder: TempDir, prepare: &str, args: &[&str]) -> Pinion {
+        let log = File::create(folder.path().join("log")).unwrap();
+        let script = format!("cd \"$1\"; {prepare}; shift; exec \"$@\"");
+        let child = Command::new("unshare")
+            .args(["--mount", "sh", "-ec", &script, "sh"])
+            .arg(folder.path())
+            .arg(env!("CARGO_BIN_EXE_pinion"))
+            .args(args)
+            .env_remove("JOURNAL_STREAM")
+            .stdout(Stdio::null())
+            .stderr(log)
+            .spawn()
+            .unwrap();
+        Pinion { child, folder }
+    }
+
     /// Runs another `pinion` at the same link to its end. Returns its status and its log. `as_nobody` runs it as that
     /// user.
     pub fn beside(&self, args: &[&str], as_nobody: bool) -> (Option<i32>, String) {
