@@ -312,7 +312,7 @@ impl<'a> Axis<'a> {
         if let Some((what, value)) = positive.iter().find(|(_, v)| *v <= 0.0 || v.is_nan()) {
             return Err(Error::Plan {
                 subject: format!("axis {}", plan.name),
-                why: format!("its {what} is {value}; give it one above zero"),
+                why: format!("its {what} is {value}: give it one above zero"),
             });
         }
         let invert_step = if plan.both_edges { -1 } else { i8::from(plan.step.invert) };

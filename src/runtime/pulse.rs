@@ -183,7 +183,7 @@ impl Pulse {
         match self.owes() {
             false => format!("the core gave no sign of life for {ms} ms"),
             true => format!(
-                "{} is not at its shutdown value within {ms} ms: does its driver or chip hang, or fail (dmesg)?",
+                "{} is not at its shutdown value within {ms} ms: check its power and wiring, and look at the kernel's log (dmesg)",
                 self.subject().get()
             ),
         }

@@ -42,7 +42,7 @@ impl Config {
         let oid = self.oids;
         self.oids = oid.checked_add(1).ok_or_else(|| Error::Plan {
             subject: "configuration".to_owned(),
-            why: "it has more than 255 objects; leave some out".to_owned(),
+            why: "it has more than 255 objects: leave some out".to_owned(),
         })?;
         Ok(oid)
     }
@@ -83,7 +83,7 @@ impl Config {
         if !status.is_config || status.crc != self.crc() {
             return Err(Error::Plan {
                 subject: "configuration".to_owned(),
-                why: "the MCU did not take it over; is another host at work on it?".to_owned(),
+                why: "the MCU did not take it over: stop any other host on its tty".to_owned(),
             });
         }
         Ok(status)
@@ -120,7 +120,7 @@ impl Client {
             ["config_reset", "reset"].into_iter().find(|name| self.messages().has_command(name)).ok_or_else(|| {
                 Error::Plan {
                     subject: "reset".to_owned(),
-                    why: "the MCU has no reset command; start it anew".to_owned(),
+                    why: "the MCU has no reset command: start it anew".to_owned(),
                 }
             })?;
         let until = Instant::now() + RESET_TIMEOUT;

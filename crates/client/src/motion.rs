@@ -370,7 +370,7 @@ impl MoveQueue {
         if went != u64::from(profile.steps) {
             return Err(Error::Plan {
                 subject: format!("stepper oid {}", stepper.oid),
-                why: format!("it went {went} steps instead of {}; look at the MCU's log", profile.steps),
+                why: format!("it went {went} steps instead of {}: look at the MCU's log", profile.steps),
             });
         }
         Ok(())

@@ -128,7 +128,8 @@ impl Pwm {
 impl board::Pwm for Pwm {
     fn set(&mut self, value: u16) -> Result<(), Shutdown> {
         self.write(value).map_err(|error| {
-            let trouble = Trouble::new(error.to_string()).remedy("did its driver go away? (ls /sys/class/pwm)");
+            let trouble =
+                Trouble::new(error.to_string()).remedy("check that its driver is still there (ls /sys/class/pwm)");
             Shutdown::because(reason::PWM_WRITE, trouble.of(self.channel))
         })
     }

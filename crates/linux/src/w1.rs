@@ -48,7 +48,7 @@ impl Thermometer for Ds18b20 {
         let path = self.file.display();
         // Opened each time, because a sensor that was unplugged and is back has a new file.
         let text = fs::read_to_string(&self.file).map_err(|error| {
-            Trouble::new(format!("{path} cannot be read: {error}")).remedy("is the sensor plugged in?")
+            Trouble::new(format!("{path} cannot be read: {error}")).remedy("check that the sensor is plugged in")
         })?;
         parse(&text)
             .map_err(|what| Trouble::new(what).remedy("check the wires and the pull-up resistor (4.7 kOhm)").of(path))

@@ -212,7 +212,7 @@ fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) 
         let more = unknown.len().saturating_sub(UNKNOWN_SHOWN);
         let more = if more == 0 { String::new() } else { format!("; and {more} more") };
         say.warn(format!(
-            "the host is newer than Pinion, which does not know these forms of messages: {}{more}: what needs them will not work; update Pinion (pinion doctor --klipper DIR says more)",
+            "the host is newer than Pinion, and does not work where it needs these forms of messages: {}{more}: update Pinion (pinion doctor --klipper DIR says more)",
             unknown[..unknown.len().min(UNKNOWN_SHOWN)].join("; ")
         ));
     }

@@ -157,7 +157,7 @@ impl SoftI2c {
             for byte in write {
                 self.send(*byte)?.map_err(|_| {
                     let trouble = Trouble::new("the chip does not acknowledge a byte");
-                    BusError::new(BusStatus::Nack, trouble.remedy("is it the chip of this section?"))
+                    BusError::new(BusStatus::Nack, trouble.remedy("check that it is the chip of this section"))
                 })?;
             }
         }

@@ -110,7 +110,7 @@ impl Object for Ds18b20 {
             turn.try_shut_down(Shutdown::because(
                 TOO_SLOW,
                 Trouble::new("its reading is under way for more than 5 s")
-                    .remedy("does the bus or its driver hang (dmesg), or do too many sensors share it?"),
+                    .remedy("look at the kernel's log (dmesg), or connect fewer sensors to one wire"),
             ))?;
         }
         Ok(Next::At(next))

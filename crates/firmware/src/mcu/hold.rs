@@ -134,7 +134,7 @@ impl Mcu {
             let what = holder.map_or_else(|| "a device".to_owned(), |(oid, kind)| self.name_object(kind, oid));
             let cause = format!("{what} has not answered for {} s", HOLD_LIMIT.0 / crate::time::CLOCK_FREQ);
             let stop = Shutdown::because(reason::BUS_HANGS, cause);
-            self.shut_down(stop.remedy("does its bus or its driver hang (dmesg)?"));
+            self.shut_down(stop.remedy("check its power and wiring, and look at the kernel's log (dmesg)"));
         }
     }
 }

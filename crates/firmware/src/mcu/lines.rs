@@ -326,9 +326,9 @@ impl InputLine {
         }
         let (name, ms) = (turn.name(self.pin), UNREAD_LIMIT.as_ms());
         let stop = Shutdown::because(reason::LINE_READ, format!("{name} has not answered for {ms} ms"));
-        turn.try_shut_down(stop.remedy(
-            "does its chip or its bus hang? Check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART",
-        ))
+        turn.try_shut_down(
+            stop.remedy("check its power and wiring, look at the kernel's log (dmesg), then FIRMWARE_RESTART"),
+        )
     }
 }
 
