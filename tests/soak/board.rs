@@ -5,11 +5,12 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
 
 use pinion_firmware::board::{
-    Adc, Board, BusDevice, BusError, BusStatus, ClaimedLine, Direction, I2cConfig, Line, Mosi, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SpiConfig,
+    Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, I2cConfig, Line, Mosi,
+    OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig, Thermometer,
 };
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Ticks, TimeSource, VirtualClock};
+use pinion_firmware::trouble::Trouble;
 use pinion_sim::SimBoard;
 use pinion_testbench::memory::uncounted;
 
@@ -44,6 +45,8 @@ pub struct Faults {
     pub expander: Failing,
     pub i2c: Failing,
     pub spi: Failing,
+    pub pwm: Failing,
+    pub thermometer: Failing,
     pub i2c_hangs: AtomicBool,
     /// The wires of the thermistors are broken.
     pub open_circuit: AtomicBool,
@@ -52,13 +55,15 @@ pub struct Faults {
 impl Faults {
     pub fn none() -> Arc<Faults> {
         let none = Failing::none;
+        let (adc, expander, i2c, spi, pwm, thermometer) = (none(), none(), none(), none(), none(), none());
         let (i2c_hangs, open_circuit) = (AtomicBool::new(false), AtomicBool::new(false));
-        Arc::new(Faults { adc: none(), expander: none(), i2c: none(), spi: none(), i2c_hangs, open_circuit })
+        Arc::new(Faults { adc, expander, i2c, spi, pwm, thermometer, i2c_hangs, open_circuit })
     }
 
     /// Everything works again.
     pub fn mend(&self) {
-        [&self.adc, &self.expander, &self.i2c, &self.spi].into_iter().for_each(|failing| failing.set(0));
+        let Faults { adc, expander, i2c, spi, pwm, thermometer, .. } = self;
+        [adc, expander, i2c, spi, pwm, thermometer].into_iter().for_each(|failing| failing.set(0));
         self.i2c_hangs.store(false, Ordering::Relaxed);
         self.open_circuit.store(false, Ordering::Relaxed);
     }
@@ -112,6 +117,28 @@ impl Adc for Faulty<dyn Adc> {
         }
         let counts = uncounted(|| self.device.read())?;
         Ok(if self.faults.open_circuit.load(Ordering::Relaxed) { 4095 } else { counts })
+    }
+}
+
+impl Pwm for Faulty<dyn Pwm> {
+    fn set(&mut self, value: u16) -> Result<(), Shutdown> {
+        if self.faults.pwm.now() {
+            return Err(Shutdown::because(reason::PWM_WRITE, "the controller is gone").remedy("load its driver"));
+        }
+        self.device.set(value)
+    }
+
+    fn set_cycle(&mut self, cycle: Ticks, value: u16) -> Result<(), Shutdown> {
+        self.device.set_cycle(cycle, value)
+    }
+}
+
+impl Thermometer for Faulty<dyn Thermometer> {
+    fn read(&mut self) -> Result<i32, Trouble> {
+        if self.faults.thermometer.now() {
+            return Err(Trouble::new("the sensor is gone").remedy("plug it in"));
+        }
+        self.device.read()
     }
 }
 
@@ -185,18 +212,21 @@ impl Board for FaultyBoard {
     }
 
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown> {
-        self.board.pwm(config)
+        let OnWorker { bus, device } = self.board.pwm(config)?;
+        Ok(OnWorker { bus, device: Box::new(self.faulty(device)) })
+    }
+
+    fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
+        let OnWorker { bus, device } = self.board.ds18b20(serial)?;
+        Ok(OnWorker { bus, device: Box::new(self.faulty(device)) })
     }
 
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
-        self.board.mosi(pin, rate_hz)
+        let Mosi { line: OnWorker { bus, device }, message_max } = self.board.mosi(pin, rate_hz)?;
+        Ok(Mosi { line: OnWorker { bus, device: Box::new(self.faulty(device)) }, message_max })
     }
 
-    fn counted_line(
-        &mut self,
-        pin: Pin,
-        bias: pinion_firmware::board::Bias,
-    ) -> Result<pinion_firmware::board::CountedLine, Shutdown> {
+    fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {
         self.board.counted_line(pin, bias)
     }
 

@@ -37,7 +37,15 @@ const FAN: u8 = 16;
 const NOZZLE: u8 = 19;
 const THERMOCOUPLE: u8 = 20;
 const TACHOMETER: u8 = 22;
-const OIDS: u8 = 23;
+const LASER: u8 = 23;
+const ACCELEROMETER: u8 = 24;
+const ADXL345: u8 = 25;
+const THERMOMETER: u8 = 26;
+const BUTTONS: u8 = 27;
+const STRIP: u8 = 28;
+const OIDS: u8 = 29;
+/// The thermometer under the bed.
+const SERIAL: &[u8] = b"28-0316b5f6a2ff";
 
 const STEP_PINS: [(&str, &str, &str); 4] = [
     ("x_step", "x_dir", "x_enable"),
@@ -128,7 +136,7 @@ impl Host {
             printer.send("config_i2c", &[oid(DISPLAY)]);
             printer.send("i2c_set_bus", &[&[oid(DISPLAY)], &bus[..]].concat());
         }
-        for (chip, pin, mode) in [(NOZZLE, "nozzle_cs", 0), (DRIVER, "z_cs", 3)] {
+        for (chip, pin, mode) in [(NOZZLE, "nozzle_cs", 0), (DRIVER, "z_cs", 3), (ACCELEROMETER, "accel_cs", 3)] {
             printer.send("config_spi", &[oid(chip), ("pin", pin.into()), ("cs_active_high", 0.into())]);
             let bus = [("spi_bus", "spidev1.0".into()), ("mode", mode.into()), ("rate", 4_000_000.into())];
             printer.send("spi_set_bus", &[&[oid(chip)], &bus[..]].concat());
@@ -136,9 +144,25 @@ impl Host {
         let kind = [("spi_oid", NOZZLE.into()), ("thermocouple_type", "MAX31855".into())];
         printer.send("config_thermocouple", &[&[oid(THERMOCOUPLE)], &kind[..]].concat());
         printer.send("config_counter", &[oid(TACHOMETER), ("pin", "fan_tachometer".into()), ("pull_up", 1.into())]);
+        printer.send("config_adxl345", &[oid(ADXL345), ("spi_oid", ACCELEROMETER.into())]);
+        let limits = [("serial", SERIAL.into()), ("max_error_count", 4.into())];
+        let ignore = printer.has_parameter("config_ds18b20", "ignore_limits");
+        let ignore = if ignore { &[("ignore_limits", 0.into())][..] } else { &[] };
+        printer.send("config_ds18b20", &[&[oid(THERMOMETER)], &limits[..], ignore].concat());
+        printer.send("config_buttons", &[oid(BUTTONS), ("button_count", 1.into())]);
+        let times = [("bit_max_ticks", 200.into()), ("reset_min_ticks", 2500.into())];
+        printer.send(
+            "config_neopixel",
+            &[&[oid(STRIP), ("pin", "spidev3.0".into()), ("data_size", 24.into())], &times[..]].concat(),
+        );
+        let values = [("value", 0.into()), ("default_value", 0.into()), ("max_duration", MAX_DURATION.into())];
+        let channel = [oid(LASER), ("pin", "pwm0".into()), ("cycle_ticks", 50_000.into())];
+        printer.send("config_pwm_out", &[&channel[..], &values].concat());
         printer.send("finalize_config", &[("crc", 7.into())]);
         let config = printer.ask("get_config", &[], "config");
         assert_eq!((config.int("is_config").unwrap(), config.int("is_shutdown").unwrap()), (1, 0));
+        let button = [("pos", 0.into()), ("pin", "filament_switch".into()), ("pull_up", 1.into())];
+        printer.send("buttons_add", &[&[oid(BUTTONS)], &button[..]].concat());
         printer.is_strict = true;
         Host::begin(printer)
     }
@@ -172,6 +196,18 @@ impl Host {
         printer.send("query_thermocouple", &[&times[..], &limits].concat());
         let times = [("clock", soon.into()), ("poll_ticks", 75_000.into()), ("sample_ticks", (SECOND as u32).into())];
         printer.send("query_counter", &[&[oid(TACHOMETER)], &times[..]].concat());
+        let times = [oid(BUTTONS), ("clock", soon.into()), ("rest_ticks", ((2 * MS) as u32).into())];
+        printer.send("buttons_query", &[&times[..], &[("retransmit_count", 50.into()), ("invert", 0.into())]].concat());
+        let times = [oid(THERMOMETER), ("clock", soon.into()), ("rest_ticks", (SECOND as u32 / 2).into())];
+        let limits = [("min_value", 0.into()), ("max_value", 125_000.into())];
+        printer.send("query_ds18b20", &[&times[..], &limits].concat());
+        // The chip measures into its FIFO, a hundred times a second.
+        for register in [[0x2c, 0x0a], [0x31, 0x0b], [0x38, 0x80], [0x2d, 0x08]] {
+            printer.send("spi_send", &[oid(ACCELEROMETER), ("data", (&register[..]).into())]);
+        }
+        let clock = printer.has_parameter("query_adxl345", "clock");
+        let clock = if clock { &[("clock", soon.into())][..] } else { &[] };
+        printer.send("query_adxl345", &[&[oid(ADXL345), ("rest_ticks", (SECOND as u32 / 50).into())], clock].concat());
         for (axis, enable) in (0u8..).zip(ENABLES) {
             printer.send("update_digital_out", &[oid(enable), ("value", 0.into())]);
             printer.send("reset_step_clock", &[oid(axis), ("clock", printer.wire(now).into())]);
@@ -210,8 +246,11 @@ impl Host {
         }
     }
 
-    /// Writes to the display.
+    /// Writes to the display and the lights.
     fn show(&mut self, printer: &mut Printer) {
+        let colors = [self.turns as u8; 6];
+        printer.send("neopixel_update", &[oid(STRIP), ("pos", 3.into()), ("data", (&colors[..]).into())]);
+        printer.send("neopixel_send", &[oid(STRIP)]);
         let line = [0x40, self.turns as u8, 0x55, 0xaa];
         if printer.has_parameter("i2c_transfer", "write") {
             printer.send("i2c_transfer", &[oid(DISPLAY), ("write", (&line[..]).into()), ("read_len", 0.into())]);
@@ -236,12 +275,14 @@ impl Host {
                 "trsync_state" if response.int("can_trigger").unwrap() == 0 && self.homing == Some(Homing::Waits) => {
                     self.homing = Some(Homing::Over(response.int("trigger_reason").unwrap()));
                 }
+                "buttons_state" => printer.send("buttons_ack", &[oid(BUTTONS), ("count", 1.into())]),
+                "sensor_bulk_data" | "adxl345_data" => printer.tally.measurements += 1,
                 _ => {}
             }
         }
     }
 
-    /// Sets the power of the heaters and the fan.
+    /// Sets the power of the heaters, the fan and the laser.
     fn heat(&mut self, printer: &mut Printer) {
         let at = self.next_heat.max(printer.rig.now()) + LEAD;
         self.next_heat = at - LEAD + HEAT_EVERY;
@@ -258,6 +299,9 @@ impl Host {
         for (output, power) in [HEATERS[0], HEATERS[1], FAN].into_iter().zip(powers) {
             self.set(printer, output, at, (power * f64::from(CYCLE_TICKS)) as u32);
         }
+        let value = 1000 + printer.dice.below(30_000) as u32;
+        let laser = [oid(LASER), ("clock", printer.wire(at).into()), ("value", value.into())];
+        printer.send("queue_pwm_out", &laser);
     }
 
     /// Sets an output at a time.

@@ -33,6 +33,9 @@ const GROWTH_BYTES: i64 = 1024;
 /// How long a stopped MCU is watched. A chip that hangs answers within this time.
 const AFTER_STOP: u64 = 4 * SECOND;
 
+const MISSED_OUTPUT: &str = "Missed scheduling of next digital out event";
+const MISSED_PWM: &str = "Missed scheduling of next hard pwm event";
+
 /// Something that goes wrong.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 enum Fault {
@@ -52,13 +55,15 @@ enum Fault {
     I2cChipGone,
     I2cChipHangs,
     SpiChipGone,
+    PwmGone,
+    ThermometerGone,
     ShortStall,
     LongStall,
 }
 
 use Fault::*;
 
-const FAULTS: [Fault; 18] = [
+const FAULTS: [Fault; 20] = [
     LateOutput,
     LateSteps,
     SilentHost,
@@ -75,6 +80,8 @@ const FAULTS: [Fault; 18] = [
     I2cChipGone,
     I2cChipHangs,
     SpiChipGone,
+    PwmGone,
+    ThermometerGone,
     ShortStall,
     LongStall,
 ];
@@ -94,7 +101,7 @@ impl Fault {
         use Effect::*;
         match self {
             LateOutput | LateSteps => Stops(&["Timer too close"]),
-            SilentHost => Stops(&["Missed scheduling of next digital out event"]),
+            SilentHost => Stops(&[MISSED_OUTPUT, MISSED_PWM]),
             EmergencyStop => Stops(&["Command request"]),
             // The next host stops the MCU.
             KilledHost => GoesOn,
@@ -107,8 +114,10 @@ impl Fault {
             I2cChipGone if i2c_has_status => GoesOn,
             I2cChipGone => Stops(&["I2C NACK", "Unable write i2c device"]),
             // Commands wait for the chip, so no output is refreshed meanwhile. Both limits are five seconds.
-            I2cChipHangs => Stops(&["Bus does not answer", "Missed scheduling of next digital out event"]),
+            I2cChipHangs => Stops(&["Bus does not answer", MISSED_OUTPUT, MISSED_PWM]),
             SpiChipGone => Stops(&["Unable to issue spi ioctl"]),
+            PwmGone => Stops(&["PWM write failed"]),
+            ThermometerGone => Stops(&["Error reading DS18B20 sensor"]),
             AdcGlitch | ExpanderGlitch => GoesOn,
             // Steps that come too late stop the MCU. Without steps the pause does no harm.
             ShortStall => MayStop(&["Stepper too far in past"]),
@@ -154,6 +163,8 @@ impl Fault {
             I2cChipGone => faults.i2c.set(u32::MAX),
             I2cChipHangs => faults.i2c_hangs.store(true, Ordering::Relaxed),
             SpiChipGone => faults.spi.set(u32::MAX),
+            PwmGone => faults.pwm.set(u32::MAX),
+            ThermometerGone => faults.thermometer.set(u32::MAX),
             ShortStall | LongStall => {
                 let ms = if self == ShortStall { 1 + printer.dice.below(50) } else { 100 + printer.dice.below(900) };
                 printer.rig.stall_until(now + ms as u64 * MS);
@@ -256,7 +267,8 @@ impl Day {
         assert!(!printer.heats(), "a heater is on after {fault:?}");
         printer.pass(200 * MS);
         // An output that cannot be set is owed as long as its chip is gone.
-        assert_eq!(printer.rig.mcu.owes(), fault == ExpanderGone, "{:?}", printer.rig.mcu.debtor());
+        let is_owed = matches!(fault, ExpanderGone | PwmGone);
+        assert_eq!(printer.rig.mcu.owes(), is_owed, "{:?}", printer.rig.mcu.debtor());
         printer.faults.mend();
         self.check_stopped();
         let printer = &mut self.printer;
@@ -276,6 +288,7 @@ impl Day {
         assert!(printer.probe.fan(EXPANDED).unwrap().rpm < 10.0, "the fan turns in a stopped MCU");
         assert!(printer.probe.axes().all(|axis| !axis.enabled), "a motor is on in a stopped MCU");
         assert!(!printer.probe.output("light").unwrap().on, "the light is on in a stopped MCU");
+        assert!(printer.probe.sights().any(|sight| sight == ("laser", "0 %".to_owned())), "the laser is on");
         // The MCU still samples the thermistors.
         assert!(printer.rig.errands() <= 2, "{} errands are on their way in a stopped MCU", printer.rig.errands());
         assert_eq!(printer.look().moves.0, 0, "moves are queued in a stopped MCU");

@@ -37,6 +37,8 @@ pub struct Tally {
     pub hosts: u64,
     pub steps: u64,
     pub homings: u64,
+    /// Messages with accelerations.
+    pub measurements: u64,
     /// How often every position was compared.
     pub comparisons: u64,
 }
@@ -82,7 +84,10 @@ impl Printer {
         let rig = Rig::on_board(start, |bench| {
             let clock = bench.clock();
             bench.state().answer_ticks = ANSWER_TICKS;
-            let board = SimBoard::new(SimConfig::default_printer(), Arc::new(clock.clone())).unwrap();
+            // The thermometer would wait for its conversion in real time.
+            let printer = SimConfig::default_toml().replace("conversion_ms = 750", "conversion_ms = 0");
+            let printer = SimConfig::parse(&printer, "the default printer").unwrap();
+            let board = SimBoard::new(printer, Arc::new(clock.clone())).unwrap();
             probe = Some(board.probe());
             let dialect = |of: &Generation| Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(*of)).unwrap());
             dialects = Generation::ALL.iter().map(dialect).collect();
