@@ -101,9 +101,9 @@ impl<'a> History<'a> {
         self.core().iter().rev().find_map(due)
     }
 
-    /// The name of an object, for one line.
-    pub fn object(&self, oid: u8) -> String {
-        named(self.head.names.objects.get(&oid), "oid", oid.into())
+    /// The name of an object, for one line. `None`: the MCU itself.
+    pub fn object(&self, oid: Option<u8>) -> String {
+        oid.map_or_else(|| "the MCU".to_owned(), |oid| named(self.head.names.objects.get(&oid), "oid", oid.into()))
     }
 
     /// The name of a command, for one line.
@@ -119,9 +119,9 @@ impl<'a> History<'a> {
     /// What ended the recording, in one line.
     pub fn end(&self) -> String {
         match &self.head.end {
-            End::Shutdown { reason, .. } => format!("the MCU stopped: {}", plain(reason)),
+            End::Shutdown { reason, .. } => format!("the MCU stopped: {}", cut(reason, REASON_MAX)),
             End::Died => "the program died".to_owned(),
-            End::Hung { diagnosis } => format!("the core hung: {}", plain(diagnosis)),
+            End::Hung { diagnosis } => format!("the core hung: {}", cut(diagnosis, REASON_MAX)),
             End::Asked => "the recording was asked for".to_owned(),
         }
     }
@@ -134,8 +134,7 @@ impl<'a> History<'a> {
             Event::Woke { slept, late } => {
                 format!("slept {} ms, woke {} ms late", ms(slept.0.into()), ms(late.0.into()))
             }
-            Event::Late { oid: Some(oid), late } => format!("{} ran {} ms late", self.object(oid), ms(late.0.into())),
-            Event::Late { oid: None, late } => format!("a timer ran {} ms late", ms(late.0.into())),
+            Event::Late { oid, late } => format!("{} ran {} ms late", self.object(oid), ms(late.0.into())),
             Event::Pace { worst, .. } => format!("no timer was later than {} ms", ms(worst.0.into())),
             Event::Block(number) if deed.ticks() == 0 => format!("began block {number}"),
             Event::Block(number) => format!("began block {number}, which waited {span} ms"),
@@ -159,14 +158,17 @@ impl<'a> History<'a> {
             Event::Refused => "a block was damaged or out of order".to_owned(),
             Event::Full => "the core has no room for the host's blocks".to_owned(),
             Event::ErrandBegan { oid, .. } => {
-                format!("works for {}. It did not end within {span} ms, when the recording ended", self.object(oid))
+                format!(
+                    "works for {}. It did not end within {span} ms, when the recording ended",
+                    self.object(Some(oid))
+                )
             }
             Event::ErrandEnded { oid, .. } => {
                 let waited = match deed.waited {
                     Ticks(0) => String::new(),
                     Ticks(ticks) => format!(", after {} ms in the queue", ms(ticks.into())),
                 };
-                format!("worked {span} ms for {}{waited}", self.object(oid))
+                format!("worked {span} ms for {}{waited}", self.object(Some(oid)))
             }
             Event::Processor { thread, ran, waited } => {
                 let thread = match thread {
@@ -190,12 +192,17 @@ impl<'a> History<'a> {
     }
 }
 
-/// Longest name of a thing in letters. Names come from files.
+/// Longest name of a thing, and longest reason of a stop, in letters. They come from files.
 const NAME_MAX: usize = 60;
+const REASON_MAX: usize = 200;
 
 /// A name for one line of text.
 pub(super) fn short(name: &str) -> String {
-    plain(name).chars().take(NAME_MAX).collect()
+    cut(name, NAME_MAX)
+}
+
+fn cut(text: &str, letters: usize) -> String {
+    plain(text).chars().take(letters).collect()
 }
 
 fn named(name: Option<&String>, kind: &str, number: u32) -> String {

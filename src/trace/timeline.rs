@@ -245,7 +245,7 @@ impl Fold {
                 Kind::Came => format!("{} from the host", count(sum.count, "block")),
                 Kind::Wrote => format!("{} to the host", count(sum.all, "byte")),
                 Kind::Work => format!("{}, longest {most} ms", count(sum.count, "transfer")),
-                Kind::Processor => format!("waited {all} ms for a processor"),
+                Kind::Processor => format!("threads waited {all} ms for a processor"),
                 Kind::Stolen => format!("a hypervisor took {all} ms"),
                 Kind::Frequency => format!("the processor runs at up to {} MHz", sum.most),
                 Kind::Listened => format!("listened {}", count(sum.count, "time")),
