@@ -8,6 +8,7 @@
 //! - [`klippy`]: facts about a host, found from outside
 //! - `foreign`: data of others: files that may be anything, and names that may contain anything
 //! - `status`: the status of a running Pinion, as `pinion status` prints it
+//! - [`trace`]: recordings of the last seconds: events, files, who was late, and exports
 
 // Printing panics when nobody reads. The others panic when an assumption is wrong. Tests may use all of them.
 #![cfg_attr(not(test), warn(clippy::print_stdout, clippy::print_stderr))]

@@ -32,6 +32,7 @@ mod show;
 pub mod sim;
 mod status;
 mod terminal;
+mod trace;
 
 use page::{Page, print};
 
@@ -72,6 +73,8 @@ enum Command {
     Doctor(doctor::DoctorArgs),
     /// Ask a running Pinion for its state, host, pins, queues and lateness
     Status(status::StatusArgs),
+    /// Say why the MCU stopped and who was late, from the recording of its last seconds
+    Trace(trace::TraceArgs),
     /// Send commands to a running or simulated MCU by hand, without klippy
     Console(console::ConsoleArgs),
     /// Show the simulated printer at work, or print its printer.cfg
@@ -95,6 +98,7 @@ pub fn main() -> ExitCode {
         Some(Command::Latency(args)) => latency::run(&args),
         Some(Command::Doctor(args)) => doctor::run(&args),
         Some(Command::Status(args)) => status::run(&args),
+        Some(Command::Trace(args)) => trace::run(&args),
         Some(Command::Console(args)) => console::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
         Some(Command::Completions { shell }) => completions(shell),

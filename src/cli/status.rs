@@ -13,7 +13,7 @@ use crate::status::Status;
 use super::failed;
 use super::page::{Page, print};
 
-mod ask;
+pub(super) mod ask;
 mod prometheus;
 mod text;
 mod watch;

@@ -45,15 +45,24 @@ pub fn name_of(link: &Path) -> String {
 /// The file's name for a trace of this instance that ended then, in milliseconds since 1970 (UTC). It is
 /// `NAME-YYYYMMDDTHHMMSSZ.trace`.
 pub fn file_name(name: &str, utc_ms: u64) -> String {
-    let seconds = utc_ms.min(UTC_MS_MAX) / 1000;
-    let (days, second) = (seconds / 86_400, seconds % 86_400);
-    let (year, month, day) = date(days);
-    let (hour, minute, second) = (second / 3600, second / 60 % 60, second % 60);
+    let ([year, month, day], [hour, minute, second]) = utc(utc_ms);
     format!("{name}-{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}Z{SUFFIX}")
 }
 
+/// A time for people, from milliseconds since 1970.
+pub fn utc_text(utc_ms: u64) -> String {
+    let ([year, month, day], [hour, minute, second]) = utc(utc_ms);
+    format!("{year:04}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02} UTC")
+}
+
+/// The year, month and day, and the hour, minute and second.
+fn utc(utc_ms: u64) -> ([u64; 3], [u64; 3]) {
+    let seconds = utc_ms.min(UTC_MS_MAX) / 1000;
+    (date(seconds / 86_400), [seconds / 3600 % 24, seconds / 60 % 60, seconds % 60])
+}
+
 /// The year, month and day of a day since 1970-01-01 (`civil_from_days` of howardhinnant.github.io/date_algorithms).
-fn date(days: u64) -> (u64, u64, u64) {
+fn date(days: u64) -> [u64; 3] {
     // Years begin in March here, so that the leap day is the last one. An era is 400 years.
     let days = days + 719_468;
     let (era, day) = (days / 146_097, days % 146_097);
@@ -62,7 +71,7 @@ fn date(days: u64) -> (u64, u64, u64) {
     let month = (5 * day + 2) / 153;
     let day = day - (153 * month + 2) / 5 + 1;
     let month = if month < 10 { month + 3 } else { month - 9 };
-    (era * 400 + year + u64::from(month <= 2), month, day)
+    [era * 400 + year + u64::from(month <= 2), month, day]
 }
 
 /// The kept traces of the instance with this name, the newest first.
@@ -70,9 +79,9 @@ pub fn kept(folder: &Path, name: &str) -> Vec<PathBuf> {
     newest_first(in_folder(folder).filter(|(_, its, _)| its == name))
 }
 
-/// The kept traces of all instances in all folders, the newest first.
-pub fn all() -> Vec<PathBuf> {
-    newest_first(folders().iter().flat_map(|folder| in_folder(folder)))
+/// The kept traces of all instances in these folders, the newest first.
+pub fn all(folders: &[PathBuf]) -> Vec<PathBuf> {
+    newest_first(folders.iter().flat_map(|folder| in_folder(folder)))
 }
 
 fn newest_first(files: impl Iterator<Item = (String, String, PathBuf)>) -> Vec<PathBuf> {
@@ -116,6 +125,7 @@ mod tests {
         ] {
             assert_eq!(file_name("mcu", utc_ms), format!("mcu-{time}.trace"));
         }
+        assert_eq!(utc_text(1_795_357_574_321), "2026-11-22 14:26:14 UTC");
         for (link, name) in [("/tmp/klipper_host_mcu", "mcu"), ("/run/pinion/b", "b"), ("/", "")] {
             assert_eq!(name_of(Path::new(link)), name);
         }
@@ -139,6 +149,9 @@ mod tests {
             assert_eq!(kept(folder.path(), name), newest);
         }
         assert!(kept(folder.path(), "other").is_empty());
+        let newest = all(&[folder.path().join("missing"), folder.path().to_owned()]);
+        assert_eq!(newest.len(), 9);
+        assert!(newest[..3].iter().all(|path| path.to_string_lossy().ends_with("20261122T142615Z.trace")));
         assert!(kept(&folder.path().join("missing"), "mcu").is_empty());
     }
 }

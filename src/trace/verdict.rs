@@ -10,7 +10,7 @@
 use pinion_firmware::shutdown::reason;
 use pinion_firmware::time::Ticks;
 
-use evidence::{Arrival, Errand, MS, Record, Span};
+use evidence::{Arrival, Errand, MS, QUIET, Record, Span};
 
 use super::event::{PowerFault, Watched};
 use super::file::{End, Trace};
@@ -19,7 +19,7 @@ mod evidence;
 
 /// Longest time that the core needs for a block that waits for nothing.
 const PROMPT: i64 = MS;
-/// Shortest silence of a host that is worth telling. A host that works asks for the clock each second.
+/// Shortest time without commands of a host that is worth telling.
 const SILENCE: i64 = 1500 * MS;
 /// Shortest errand under way that is worth telling while the program works.
 const HANGS: i64 = 1000 * MS;
@@ -31,8 +31,6 @@ const VERY_LATE: i64 = 10 * MS;
 const FLOOD: usize = 4;
 /// Shortest silence of a core that hangs. An idle core beats more often.
 const SILENT: i64 = 500 * MS;
-/// Longest time that a core works without an event.
-const QUIET: i64 = 15 * MS;
 /// Shortest time that counts as lost in the kernel's account. Each sleep costs a little.
 const LOST: i64 = 5 * MS;
 /// Beginnings of the texts for outputs that the host did not refresh.
@@ -113,7 +111,7 @@ fn stopped(record: &Record, text: &str, trouble: &str) -> Finding {
         };
     };
     if text == reason::TIMER_TOO_CLOSE.text() {
-        too_close(record, due)
+        too_close(record, due, trouble)
     } else if text.starts_with(MISSED) {
         not_refreshed(record, due, trouble)
     } else {
@@ -127,7 +125,7 @@ fn other_reason(record: &Record, trouble: &str) -> Finding {
         Some((at, late)) => {
             let what = of_core(record, (at - late, at))
                 .map_or_else(|| format!("a timer was {} late", span_text(late)), |finding| finding.what);
-            let before = span_text(-at);
+            let before = span_text((-at).max(0));
             Finding::new(Culprit::Nobody, format!("{trouble}; {before} before, {what}, which did not stop it"), "")
         }
         None => Finding::new(Culprit::Nobody, format!("nobody was late: {trouble}"), ""),
@@ -135,7 +133,7 @@ fn other_reason(record: &Record, trouble: &str) -> Finding {
 }
 
 /// The host asked for an event whose time had passed.
-fn too_close(record: &Record, due: i64) -> Finding {
+fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
     let in_time = |came: i64| came - due <= -PROMPT;
     let came = record.stop.block.and_then(|block| record.arrived(block));
     // A time that is not the block's own proves only that the block came in time.
@@ -163,14 +161,11 @@ fn too_close(record: &Record, due: i64) -> Finding {
     {
         return finding;
     }
-    let event = if record.last_command() == Some("queue_step") { "step" } else { "event" };
+    let event = if trouble.starts_with("stepper ") { "step" } else { "event" };
     let mut what = match late {
         0.. => format!("the host's block came {} after the {event} it was for", span_text(late)),
         _ => format!("the host's block came only {} before the {event} it was for", span_text(-late)),
     };
-    if let Some(silence) = record.block_before(came).map(|before| came - before).filter(|silence| *silence > SILENCE) {
-        what += &format!(", and the host had sent nothing for {}", span_text(silence));
-    }
     what += &on_time(record);
     with_power(record, (due, 0), Finding::new(Culprit::Host, what, HOST_REMEDY))
 }
@@ -190,7 +185,7 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
         let what = format!("the host closed the terminal {} before the stop", span_text(-gone));
         return Finding::new(Culprit::Host, what, "its log tells why it ended");
     }
-    let Some(before) = record.block_before(0) else {
+    let Some(before) = record.last_block() else {
         return Finding::new(Culprit::Unknown, format!("not known when the host sent something: {trouble}"), "");
     };
     if -before < SILENCE {
@@ -204,7 +199,7 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
     if let Some(finding) = of_link(record, (before, 0)) {
         return finding;
     }
-    let what = format!("the host sent nothing for {}{}", span_text(-before), on_time(record));
+    let what = format!("the host sent no commands for {}{}", span_text(-before), on_time(record));
     with_power(record, (before, 0), Finding::new(Culprit::Host, what, "look at its log, and at its load"))
 }
 
@@ -273,7 +268,7 @@ fn asked(record: &Record) -> Finding {
     let mut finding = of_core(record, (at - late, at)).unwrap_or_else(|| {
         Finding::new(Culprit::Unknown, format!("not known why a timer was {} late", span_text(late)), "")
     });
-    finding.what += &format!(" ({} before the end of the recording)", span_text(-at));
+    finding.what += &format!(" ({} before the end of the recording)", span_text((-at).max(0)));
     finding
 }
 
@@ -610,12 +605,6 @@ mod tests {
             Culprit::Host,
             "the host's block came only 0.5 ms before the step it was for; the core was never later than 0.1 ms: look at the host's load",
         );
-        // The host was silent before.
-        came(STOP - 200, STOP - 38_200).silent(&["link"], STOP - 5 * SECOND..STOP - 1000).judged(
-            TOO_CLOSE,
-            Culprit::Host,
-            "the host's block came 38.0 ms after the step it was for, and the host had sent nothing for 5.4 s; the core was never later than 0.1 ms: look at the host's load",
-        );
     }
 
     #[test]
@@ -661,7 +650,7 @@ mod tests {
         scene(STOP - 8_000).judged(
             TOO_CLOSE,
             Culprit::Host,
-            "the host's block came 12.0 ms after the event it was for; the core was never later than 0.1 ms: look at the host's load",
+            "the host's block came 12.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load",
         );
     }
 
@@ -879,7 +868,7 @@ mod tests {
         missed(Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP)).judged(
             MISSED_PWM,
             Culprit::Host,
-            "the host sent nothing for 4.4 s; the core was never later than 0.1 ms: look at its log, and at its load",
+            "the host sent no commands for 4.4 s; the core was never later than 0.1 ms: look at its log, and at its load",
         );
         missed(Scene::calm().and("link", STOP - 3 * SECOND, Event::HostGone)).judged(
             MISSED_PWM,

@@ -16,4 +16,5 @@ mod show;
 mod soak;
 mod status;
 mod terminal;
+mod trace;
 mod troubleshooting;

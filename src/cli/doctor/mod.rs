@@ -8,6 +8,7 @@
 
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
+use std::time::SystemTime;
 
 use clap::{Args, ValueHint};
 
@@ -24,6 +25,7 @@ mod host;
 mod instance;
 mod kernel;
 mod klipper;
+mod last_stop;
 mod printer;
 mod service;
 mod terminal;
@@ -83,6 +85,7 @@ fn examine(computer: &Computer) -> Vec<Group> {
     let (instances, configurations) = instance::instances(computer);
     let klippys = host::klippys(computer);
     let mut groups = vec![
+        Group::new("last stop", vec![last_stop::finding(computer, SystemTime::now())]),
         Group::new("kernel", kernel::findings(computer, &instances)),
         Group::new("service", [configurations, service::findings(computer, &instances)].concat()),
         Group::new("watchdog", service::watchdog(computer, &instances)),
@@ -97,7 +100,7 @@ fn examine(computer: &Computer) -> Vec<Group> {
     ];
     if computer.is_this() {
         let is_serving = instances.iter().any(|instance| instance.pid.is_some());
-        groups.insert(6, Group::new("lines", devices::holders(computer, &Inventory::scan().chips)));
+        groups.insert(7, Group::new("lines", devices::holders(computer, &Inventory::scan().chips)));
         groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
     }
     groups

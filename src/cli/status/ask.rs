@@ -5,7 +5,7 @@
 
 use std::io::{self, Read};
 use std::os::fd::AsFd;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::thread;
 use std::time::{Duration, Instant};
 
@@ -34,10 +34,16 @@ pub(super) struct Answer {
 /// Asks the first socket that answers.
 pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
     let paths = args.socket.clone().map_or_else(|| socket_paths(&args.symlink), |path| vec![path]);
+    let (path, document) = fetch(&paths, &args.symlink, ANSWER_MAX)?;
+    answer(&path, &document)
+}
+
+/// What the first of these sockets that answers says, and its path. They are of the instance with this link.
+pub(in crate::cli) fn fetch(paths: &[PathBuf], link: &Path, bytes_max: usize) -> Result<(PathBuf, Vec<u8>), String> {
     let mut missing = Vec::new();
-    for path in &paths {
-        match document_at(path) {
-            Ok(document) => return answer(path, &document),
+    for path in paths {
+        match document_at(path, bytes_max) {
+            Ok(document) => return Ok((path.clone(), document)),
             Err(error) if matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::ConnectionRefused) => {
                 missing.push(path.display().to_string());
             }
@@ -58,7 +64,7 @@ pub(super) fn ask(args: &StatusArgs) -> Result<Answer, String> {
     Err(format!(
         "no Pinion answers on {}: start it (sudo systemctl start pinion-mcu), or name its link with -I if that is not {}",
         missing.join(" or "),
-        args.symlink.display()
+        link.display()
     ))
 }
 
@@ -92,7 +98,7 @@ fn answer(path: &Path, document: &[u8]) -> Result<Answer, String> {
 }
 
 /// The document from a socket.
-fn document_at(path: &Path) -> io::Result<Vec<u8>> {
+fn document_at(path: &Path, bytes_max: usize) -> io::Result<Vec<u8>> {
     let until = Instant::now() + ANSWER_WAIT_MAX;
     // Other clients may ask as well. Then it takes a while until there is room for one more.
     let mut socket = loop {
@@ -107,7 +113,7 @@ fn document_at(path: &Path) -> io::Result<Vec<u8>> {
     loop {
         match socket.read(&mut piece) {
             Ok(0) => return Ok(document),
-            Ok(read) if document.len() + read <= ANSWER_MAX => document.extend_from_slice(&piece[..read]),
+            Ok(read) if document.len() + read <= bytes_max => document.extend_from_slice(&piece[..read]),
             Ok(_) => return Err(io::Error::other("what it says has no end")),
             Err(error) if error.kind() == io::ErrorKind::WouldBlock => {
                 let left = until.saturating_duration_since(Instant::now());

@@ -16,9 +16,11 @@ pub(super) const MS: i64 = Ticks::from_ms(1).0 as i64;
 /// Time between two samples of the sampler.
 const SAMPLE: i64 = 250 * MS;
 /// How late a sample may be while nothing is wrong.
-const SAMPLE_LATE: i64 = 50 * MS;
+const SAMPLE_LATE: i64 = 100 * MS;
 /// Longest time between two signs of the guardian, and a little more.
 const LISTENS: i64 = 700 * MS;
+/// Longest time that a core works without an event. The lateness of a turn is recorded at the turn's end.
+pub(super) const QUIET: i64 = 15 * MS;
 /// A time farther away is taken for this one. The difference of any two fits into 64 bits.
 const FAR: i64 = 1 << 56;
 /// How far back the lateness of the timers is of interest.
@@ -125,10 +127,10 @@ impl<'a> Record<'a> {
         read.map(|(at, _)| at).filter(|at| *at < 0)
     }
 
-    /// When the link last read a block before a time.
-    pub(super) fn block_before(&self, time: i64) -> Option<i64> {
-        let mut blocks = self.thread("link").filter(|(_, event)| matches!(event, Event::BlockIn(_)));
-        blocks.rfind(|(at, _)| *at < time).map(|(at, _)| at)
+    /// When the link last read a block for the core before the stop.
+    pub(super) fn last_block(&self) -> Option<i64> {
+        let mut blocks = self.within("link", (-FAR, 0));
+        blocks.rfind(|(_, event)| matches!(event, Event::BlockIn(_))).map(|(at, _)| at)
     }
 
     /// When the last host closed the terminal, if none has opened it since.
@@ -323,7 +325,7 @@ impl<'a> Record<'a> {
     /// The latest timer: when it ran, and how late. `None` if nothing of timers is recorded. `Late` alone tells its own
     /// time. `Pace` is about the time since the one before.
     pub(super) fn latest_timer(&self) -> Option<Span> {
-        let timers = self.within("core", (-RECENT, 0)).filter_map(|(at, event)| match event {
+        let timers = self.within("core", (-RECENT, QUIET)).filter_map(|(at, event)| match event {
             Event::Late { late, .. } | Event::Pace { worst: late, .. } => Some((at, i64::from(late.0))),
             _ => None,
         });
