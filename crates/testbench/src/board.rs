@@ -15,6 +15,8 @@ use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
 
+use crate::memory::uncounted;
+
 /// Number of GPIO lines. Their pins begin at 0.
 pub const GPIOS: u32 = 300;
 /// ADC channels: this pin and the seven after it.
@@ -240,6 +242,15 @@ impl Bench {
         self.state().edges.clear();
     }
 
+    /// Forgets everything that it has recorded.
+    pub(crate) fn forget(&self) {
+        let mut state = self.state();
+        state.edges.clear();
+        state.transfers.clear();
+        state.pwm_values.clear();
+        state.turns.clear();
+    }
+
     /// The level of an output.
     pub fn level(&self, pin: u32) -> bool {
         self.state().levels[&pin]
@@ -457,7 +468,7 @@ impl Pwm for FakePwm {
     fn set(&mut self, value: u16) -> Result<(), Shutdown> {
         self.bench.broken(self.pin, reason::PWM_WRITE)?;
         let at = self.bench.ticks();
-        self.bench.state().pwm_values.push((self.pin, at, value));
+        uncounted(|| self.bench.state().pwm_values.push((self.pin, at, value)));
         Ok(())
     }
 
@@ -489,7 +500,7 @@ impl Line for FakeLine {
         }
         if state.levels.insert(self.pin, level) != Some(level) {
             let at = self.bench.ticks();
-            state.edges.push((self.pin, (at, level.into())));
+            uncounted(|| state.edges.push((self.pin, (at, level.into()))));
             for chip in state.line_chips.values_mut() {
                 chip(at, Some((self.pin, level)));
             }
@@ -517,7 +528,7 @@ impl Line for FakeLine {
             let was = state.levels.insert(self.pin, level);
             let at = self.bench.ticks();
             if before.is_some() && was != Some(level) {
-                state.edges.push((self.pin, (at, level.into())));
+                uncounted(|| state.edges.push((self.pin, (at, level.into()))));
             }
             for chip in state.line_chips.values_mut() {
                 chip(at, Some((self.pin, level)));
@@ -529,7 +540,7 @@ impl Line for FakeLine {
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.bench.may_call(self.pin);
         self.bench.broken(self.pin, reason::LINE_WRITE)?;
-        self.bench.state().turns.push((self.pin, direction));
+        uncounted(|| self.bench.state().turns.push((self.pin, direction)));
         self.set_direction(direction)
     }
 }
@@ -625,7 +636,7 @@ impl FakeSpi {
         let mut message = ([0; MESSAGE_MAX], bytes.len());
         message.0[..bytes.len()].copy_from_slice(bytes);
         let at = self.bench.bus_ticks(bytes.len());
-        self.bench.state().transfers.push((at, bus, mode, rate_hz, message, read));
+        uncounted(|| self.bench.state().transfers.push((at, bus, mode, rate_hz, message, read)));
         let chip = self.bench.state().spi_chips.remove(&bus);
         match chip {
             Some(mut chip) => {
@@ -691,7 +702,7 @@ impl Shop {
 
     fn insert(&mut self, new: UnderWay) {
         let place = self.under_way.partition_point(|other| other.end <= new.end);
-        self.under_way.insert(place, new);
+        uncounted(|| self.under_way.insert(place, new));
     }
 
     /// Delays the errands after one that ran for a time of its own on this worker.

@@ -5,6 +5,7 @@
 //! - [`rig`]: an MCU on that board, and the host's side of its wire
 //! - [`dice`]: random numbers from a seed
 //! - [`memory`]: an allocator that counts
+//! - [`trial`]: an MCU under any commands, and what must hold
 
 #![deny(unsafe_code)]
 
@@ -12,3 +13,4 @@ pub mod board;
 pub mod dice;
 pub mod memory;
 pub mod rig;
+pub mod trial;
