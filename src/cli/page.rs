@@ -60,7 +60,10 @@ pub(super) fn aligned(rows: &[Vec<String>]) -> Vec<String> {
     let width = |column: usize| rows.iter().filter_map(|row| row.get(column)).map(|cell| cell.chars().count()).max();
     let widths: Vec<usize> = (0..columns).map(|column| width(column).unwrap_or(0)).collect();
     let line = |row: &Vec<String>| -> String {
-        let cells: Vec<String> = row.iter().zip(&widths).map(|(cell, width)| format!("{cell:width$}")).collect();
+        // A width in a format may be 65535 at most, and a cell may be longer.
+        let pad = |cell: &String, width: &usize| " ".repeat(width - cell.chars().count());
+        let cells: Vec<String> =
+            row.iter().zip(&widths).map(|(cell, width)| cell.clone() + &pad(cell, width)).collect();
         cells.join("  ").trim_end().to_owned()
     };
     rows.iter().map(line).collect()
@@ -94,6 +97,13 @@ pub(in crate::cli) mod tests {
         let control = text.chars().find(|c| c.is_control() && *c != '\n');
         assert_eq!(control, None, "{text:?}");
         assert_eq!(text.matches('\n').count(), lines, "{text:?}");
+    }
+
+    #[test]
+    fn a_table_has_room_for_the_longest_cell() {
+        let long = "x".repeat(70_000);
+        let rows = [vec!["a".to_owned(), "b".to_owned()], vec![long.clone(), "d".to_owned()]];
+        assert_eq!(aligned(&rows), [format!("a{}b", " ".repeat(70_001)), format!("{long}  d")]);
     }
 
     proptest! {

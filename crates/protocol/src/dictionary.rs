@@ -12,6 +12,9 @@ use flate2::write::ZlibEncoder;
 use serde::{Deserialize, Serialize};
 use serde_json::{Map, Value};
 
+/// Longest JSON that is read, in bytes. Klipper's has some 30,000.
+const JSON_MAX: u64 = 4 << 20;
+
 /// The id of `identify_response`. Every host knows it.
 pub const IDENTIFY_RESPONSE_ID: i32 = 0;
 /// The id of `identify`. Every host knows it.
@@ -56,9 +59,33 @@ impl Dictionary {
     }
 
     /// Reads a dictionary from the data of `identify`.
+    ///
+    /// # Errors
+    ///
+    /// It is no dictionary, or its JSON has over 4 MiB. A few bytes can be the compressed form of many.
     pub fn decompress(bytes: &[u8]) -> io::Result<Dictionary> {
         let mut json = Vec::new();
-        ZlibDecoder::new(bytes).read_to_end(&mut json)?;
+        ZlibDecoder::new(bytes).take(JSON_MAX + 1).read_to_end(&mut json)?;
+        if json.len() as u64 > JSON_MAX {
+            return Err(io::Error::other(format!("its JSON has over {JSON_MAX} bytes")));
+        }
         Ok(serde_json::from_slice(&json)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_dictionary_without_end_is_refused() {
+        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
+        for _ in 0..=JSON_MAX >> 16 {
+            encoder.write_all(&[b' '; 1 << 16]).unwrap();
+        }
+        let compressed = encoder.finish().unwrap();
+        assert!(compressed.len() < 10_000);
+        let error = Dictionary::decompress(&compressed).unwrap_err();
+        assert_eq!(error.to_string(), "its JSON has over 4194304 bytes");
     }
 }
