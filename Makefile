@@ -33,11 +33,11 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real bench check build install install-program
-.PHONY: install-system uninstall deb release clean
+.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz bench check build install
+.PHONY: install-program install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
-PACKAGES = $(addprefix system-packages-,build vm deb system stress check)
+PACKAGES = $(addprefix system-packages-,build vm deb system stress check fuzz)
 .PHONY: $(PACKAGES)
 $(PACKAGES): system-packages-%:
 	@CARGO='$(CARGO)' scripts/system-packages $*
@@ -52,6 +52,8 @@ help:
 	@echo '                   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
 	@echo 'make soak          a day of printing with faults, in virtual time: ten minutes (SECONDS=86400 SEED=)'
 	@echo 'make soak-real     an hour of the real program on a busy computer (MINUTES=60 WORKERS=1)'
+	@echo 'make fuzz          random bytes for everything that reads what others wrote: each target for'
+	@echo '                   SECONDS=60, or all for TOTAL=600; only one with TARGET=link'
 	@echo 'make bench         the benchmarks'
 	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
 	@echo 'make build         the program: $(PINION)'
@@ -99,6 +101,13 @@ WORKERS ?= 1
 soak-real: system-packages-stress
 	PINION_SOAK_MINUTES=$(MINUTES) PINION_SOAK_WORKERS=$(WORKERS) \
 	    $(CARGO) test --locked --test program soak:: -- --ignored --nocapture
+
+# Seconds for each target, unless TOTAL says how long all targets together may take.
+fuzz: SECONDS = 60
+TOTAL ?=
+TARGET ?=
+fuzz: system-packages-fuzz
+	@CARGO='$(CARGO)' scripts/fuzz $(if $(TOTAL),--total $(TOTAL),$(SECONDS)) $(TARGET)
 
 bench: system-packages-build
 	$(CARGO) bench --locked

@@ -195,6 +195,14 @@ fn unknown(name: &str) -> Trouble {
     Trouble::new("there is no such key").remedy(meant).of(name)
 }
 
+/// For `fuzz/`: any bytes as a file. An error is one that a person can read.
+#[cfg(fuzzing)]
+pub fn config(bytes: &[u8]) {
+    if let Err(trouble) = of_file(&"f.toml", Ok(bytes.to_vec())) {
+        assert!(trouble.to_string().starts_with("f.toml:"), "{trouble}");
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

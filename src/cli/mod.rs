@@ -36,6 +36,14 @@ mod trace;
 
 use page::{Page, print};
 
+/// What the targets in `fuzz/` call.
+#[cfg(fuzzing)]
+pub mod fuzz {
+    pub use super::config::config;
+    pub use super::doctor::printer_cfg;
+    pub use super::status::status;
+}
+
 /// Lets Klipper use this computer's GPIO pins and buses. A drop-in replacement for klipper_mcu.
 ///
 /// Without a subcommand it does the same as `pinion run`. It has the command line of klipper_mcu: -r -w -I PATH.

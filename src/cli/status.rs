@@ -68,6 +68,19 @@ fn json(status: &Status) -> Page {
     }
 }
 
+/// For `fuzz/`: any bytes from a socket, and what is printed of them.
+#[cfg(fuzzing)]
+pub fn status(bytes: &[u8]) {
+    let Ok((status, _)) = crate::status::read(bytes) else { return };
+    for show in [text::page, prometheus::page, json] {
+        let page = show(&status).to_string();
+        assert!(!page.contains(|c: char| c.is_control() && c != '\n'), "{page:?}");
+    }
+    // What is read is written, and read as the same.
+    let again = crate::status::read(json(&status).to_string().as_bytes());
+    assert_eq!(again.map(|(again, _)| again).ok(), Some(status));
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -205,6 +205,17 @@ fn literal(source: &[u8], at: usize, string: &mut Vec<u8>) -> usize {
     end
 }
 
+/// For `fuzz/`: any bytes as a source. Each shape is one that its own text makes.
+#[cfg(fuzzing)]
+pub fn fuzz(bytes: &[u8]) {
+    strings(bytes, |string| {
+        if let Some(shape) = Shape::of(string) {
+            let format: Vec<String> = shape.0.split(' ').skip(1).map(|name| format!("{name}=%u")).collect();
+            assert_eq!(Shape::of(&format!("{} {}", shape.name(), format.join(" "))), Some(shape));
+        }
+    });
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -29,6 +29,9 @@ use super::oversight::{FAREWELL, Oversight};
 use super::signals::Signal;
 use super::watchdog::Watchdog;
 
+#[cfg(fuzzing)]
+pub(crate) mod fuzz;
+
 /// The messages that the link answers itself.
 struct Known {
     dialect: Arc<Dialect>,

@@ -53,6 +53,14 @@ pub mod wakeup;
 mod watchdog;
 mod workers;
 
+/// What the targets in `fuzz/` call.
+#[cfg(fuzzing)]
+pub mod fuzz {
+    pub use super::guardian::fuzz::guardian;
+    pub use super::host::search;
+    pub use super::link::fuzz::link;
+}
+
 pub use guardian::Guardian;
 pub use helpers::Helpers;
 pub use host::HostSearch;

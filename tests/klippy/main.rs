@@ -16,6 +16,7 @@ mod probes;
 mod regression;
 mod rings;
 mod sections;
+mod seeds;
 mod servo;
 mod shown;
 mod tools;

@@ -30,6 +30,9 @@ mod printer;
 mod service;
 mod terminal;
 
+#[cfg(fuzzing)]
+pub use printer::printer_cfg;
+
 /// How to get the package, which is in no distribution's repository.
 const INSTALL: &str = "in a folder with Pinion's sources: make deb && sudo apt install ./target/deb/pinion-mcu_*.deb (or sudo make install)";
 /// How to install its files again.

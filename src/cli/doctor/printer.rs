@@ -86,6 +86,21 @@ fn without_comment(line: &str) -> &str {
     &line[..comment.unwrap_or(line.len())]
 }
 
+/// For `fuzz/`: files of klippy that include each other. A byte 0 separates them.
+#[cfg(fuzzing)]
+pub fn printer_cfg(bytes: &[u8]) {
+    let folder = std::env::temp_dir().join(format!("pinion-fuzz-{}", std::process::id()));
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).expect("a folder");
+    let names = ["printer.cfg", "a.cfg", "b.cfg", "c.txt", "d", "e.cfg"];
+    for (text, name) in bytes.split(|byte| *byte == 0).zip(names) {
+        std::fs::write(folder.join(name), text).expect("a file");
+    }
+    if let Some(printer) = read(&Machine::at(&folder), Path::new("/printer.cfg")) {
+        assert!(printer.leds.iter().all(|pin| pin.contains("spidev")));
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -59,6 +59,8 @@ use message::{Message, TAKEN};
 use watcher::{END_LIMIT, Program, Watcher};
 
 pub(crate) use watcher::NAME;
+#[cfg(fuzzing)]
+pub(crate) use watcher::fuzz;
 
 /// How long the program waits for the guardian's answer, in seconds.
 const ANSWER_S: i64 = 5;

@@ -27,6 +27,9 @@ use super::super::pulse::{Ear, Pulse};
 use super::super::realtime;
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
 
+#[cfg(fuzzing)]
+pub(crate) mod fuzz;
+
 /// The kernel's name of the guardian's process (proc_pid_comm(5)). Its command line is the program's.
 pub(crate) const NAME: &CStr = c"pinion-guardian";
 /// How long to wait for the end of a process that was asked to end, or was killed.

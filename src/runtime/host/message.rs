@@ -92,6 +92,32 @@ impl Answer {
     }
 }
 
+#[cfg(any(test, fuzzing))]
+impl Answer {
+    /// Asserts that nothing in it is too long or may not be shown.
+    fn assert_bounded(&self) {
+        assert!(self.lines.len() <= LINES_MAX);
+        let checkout = self.host.iter().filter_map(|host| host.checkout.as_ref());
+        for text in self.lines.iter().map(|line| &line.text).chain(checkout) {
+            assert!(!text.contains(char::is_control) && text.chars().count() <= LINE_CHARS_MAX);
+        }
+        let commit = self.host.iter().find_map(|host| host.commit.as_ref());
+        assert!(commit.is_none_or(|commit| commit.len() <= 40 && commit.bytes().all(|b| b.is_ascii_hexdigit())));
+        assert!(serde_json::to_vec(self).is_ok_and(|bytes| bytes.len() <= MESSAGE_BYTES_MAX));
+    }
+}
+
+/// For `fuzz/`: any bytes over the socket, in either direction.
+#[cfg(fuzzing)]
+pub fn search(bytes: &[u8]) {
+    if let Some(answer) = Answer::decode(bytes) {
+        answer.assert_bounded();
+        let _ = answer.dialect();
+    }
+    let _ = serde_json::from_slice::<Question>(bytes);
+    let _ = serde_json::from_slice::<Hello>(bytes);
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -111,13 +137,7 @@ mod tests {
             // Anything may come over the socket.
             let heard = Answer::decode(&serde_json::to_vec(&told).unwrap()).unwrap();
             prop_assert_eq!(heard.dialect(), DialectName::Union);
-            prop_assert!(heard.lines.len() <= LINES_MAX);
-            let host = heard.host.as_ref().unwrap();
-            for text in heard.lines.iter().map(|line| &line.text).chain(&host.checkout) {
-                prop_assert!(!text.contains(char::is_control) && text.chars().count() <= LINE_CHARS_MAX);
-            }
-            prop_assert!(host.commit.as_ref().is_none_or(|commit| commit.bytes().all(|b| b.is_ascii_hexdigit())));
-            prop_assert!(serde_json::to_vec(&heard).unwrap().len() <= MESSAGE_BYTES_MAX);
+            heard.assert_bounded();
         }
 
         #[test]

@@ -38,6 +38,8 @@ use super::{NO_PROCESS, refused};
 use message::{Answer, Hello, MESSAGE_BYTES_MAX, Question};
 
 pub(crate) use looker::NAME;
+#[cfg(fuzzing)]
+pub use message::search;
 
 /// How long the new process may take to be ready, in seconds.
 const START_S: i64 = 5;

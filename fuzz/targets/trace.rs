@@ -1,0 +1,23 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A file of the flight recorder: as it is, and as the contents of a file with a good check sum.
+#![no_main]
+
+use std::io::Write as _;
+
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use pinion::trace::file::Trace;
+
+pinion_fuzz::target!(run);
+
+fn run(bytes: &[u8]) {
+    let _ = Trace::read(bytes);
+    let mut file = GzEncoder::new(Vec::new(), Compression::none());
+    file.write_all(bytes).expect("room");
+    let Ok(trace) = Trace::read(file.finish().expect("room").as_slice()) else { return };
+    let timeline = trace.timeline();
+    assert!(timeline.is_sorted_by_key(|(at, ..)| *at));
+    let mut again = Vec::new();
+    trace.write(&mut again).expect("room");
+    assert_eq!(Trace::read(again.as_slice()).ok(), Some(trace));
+}
