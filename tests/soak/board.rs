@@ -202,6 +202,9 @@ impl Board for FaultyBoard {
     }
 
     fn spi(&mut self, config: SpiConfig) -> Result<OnWorker<dyn BusDevice>, Shutdown> {
+        if self.faults.spi.now() {
+            return Err(Shutdown::because(reason::SPI_OPEN, "the bus is gone").remedy("load its driver"));
+        }
         let OnWorker { bus, device } = self.board.spi(config)?;
         Ok(OnWorker { bus, device: Box::new(self.faulty(device)) })
     }

@@ -105,8 +105,27 @@ enum Homing {
 }
 
 impl Host {
+    /// Sends the configuration to an MCU that lacks a device. Returns the text of its shutdown.
+    pub fn configure_in_vain(printer: &mut Printer) -> Option<String> {
+        Host::send_objects(printer);
+        let responses = printer.responses();
+        let stop = responses.iter().find(|response| response.name == "shutdown");
+        stop.map(|stop| stop.text("static_string_id").unwrap())
+    }
+
     /// Configures the MCU, which has no configuration.
     pub fn configure(printer: &mut Printer) -> Host {
+        Host::send_objects(printer);
+        printer.send("finalize_config", &[("crc", 7.into())]);
+        let config = printer.ask("get_config", &[], "config");
+        assert_eq!((config.int("is_config").unwrap(), config.int("is_shutdown").unwrap()), (1, 0));
+        let button = [("pos", 0.into()), ("pin", "filament_switch".into()), ("pull_up", 1.into())];
+        printer.send("buttons_add", &[&[oid(BUTTONS)], &button[..]].concat());
+        printer.is_strict = true;
+        Host::begin(printer)
+    }
+
+    fn send_objects(printer: &mut Printer) {
         printer.send("allocate_oids", &[("count", OIDS.into())]);
         for (axis, (step, dir, enable)) in (0u8..).zip(STEP_PINS) {
             let pins = [("step_pin", step.into()), ("dir_pin", dir.into())];
@@ -158,13 +177,6 @@ impl Host {
         let values = [("value", 0.into()), ("default_value", 0.into()), ("max_duration", MAX_DURATION.into())];
         let channel = [oid(LASER), ("pin", "pwm0".into()), ("cycle_ticks", 50_000.into())];
         printer.send("config_pwm_out", &[&channel[..], &values].concat());
-        printer.send("finalize_config", &[("crc", 7.into())]);
-        let config = printer.ask("get_config", &[], "config");
-        assert_eq!((config.int("is_config").unwrap(), config.int("is_shutdown").unwrap()), (1, 0));
-        let button = [("pos", 0.into()), ("pin", "filament_switch".into()), ("pull_up", 1.into())];
-        printer.send("buttons_add", &[&[oid(BUTTONS)], &button[..]].concat());
-        printer.is_strict = true;
-        Host::begin(printer)
     }
 
     /// Starts everything that a print needs.

@@ -200,6 +200,9 @@ impl Day {
         let generation = printer.generation();
         printer.meet(generation);
         self.reset();
+        if self.printer.dice.below(4) == 0 {
+            self.miss_a_bus();
+        }
         let mut host = Host::configure(&mut self.printer);
         while self.printer.rig.now() < end {
             // Most faults come soon. Some hosts live for several wraps of the clock.
@@ -220,6 +223,18 @@ impl Day {
                 return;
             }
         }
+    }
+
+    /// A host comes while a bus is gone. Its configuration ends there, and nothing of it stays.
+    fn miss_a_bus(&mut self) {
+        let printer = &mut self.printer;
+        printer.note("a bus is missing");
+        printer.faults.spi.set(u32::MAX);
+        let stopped = Host::configure_in_vain(printer);
+        assert_eq!(stopped.as_deref(), Some("Unable to open spi device"));
+        printer.faults.mend();
+        printer.send("config_reset", &[]);
+        self.reset();
     }
 
     /// Lets something go wrong. Returns whether the host ended, because the MCU stopped or somebody killed the host.
