@@ -10,7 +10,7 @@
 use pinion_firmware::shutdown::reason;
 use pinion_firmware::time::Ticks;
 
-use evidence::{Arrival, Errand, MS, QUIET, Record, Span};
+use evidence::{Arrival, Errand, MS, QUIET, Record, Scheduling, Span};
 
 use super::event::{PowerFault, Watched};
 use super::file::{End, Trace};
@@ -380,18 +380,19 @@ fn driver(record: &Record, span: Span, took: i64) -> Finding {
 
 fn starved(record: &Record, span: Span, who: &str, waited: i64) -> Finding {
     let what = format!("{who} waited {} for a processor", span_text(waited));
-    let (why, remedy) = if record.was_out_of_budget(span) {
-        (
+    let (why, remedy) = match record.scheduling(span) {
+        _ if !record.trace.head.realtime => {
+            (": it does not run in real time", "run Pinion in real time (-r, as the service does)")
+        }
+        Scheduling::Refused => (": it may not run in real time", "do what the log's warning about real time says"),
+        Scheduling::UsedUp => (
             ": it had used up its real-time share",
             "lower the speed, or free it of the limit (sysctl kernel.sched_rt_runtime_us=-1)",
-        )
-    } else if !record.trace.head.realtime {
-        (": it does not run in real time", "run Pinion in real time (-r, as the service does)")
-    } else {
-        (
+        ),
+        Scheduling::RealTime => (
             ": other real-time work had it",
             "look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
-        )
+        ),
     };
     Finding::new(Culprit::Processors, what + why, remedy)
 }
@@ -683,7 +684,13 @@ mod tests {
                 Culprit::Processors,
                 "the core waited 12.0 ms for a processor: other real-time work had it: look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
             );
-        let mut ordinary = scene().trace(End::Shutdown { reason: past.into(), trouble: TROUBLE.into() });
+        scene().and("core", SECOND, Event::Scheduling { fifo: false }).judged(
+            past,
+            Culprit::Processors,
+            "the core waited 12.0 ms for a processor: it may not run in real time: do what the log's warning about real time says",
+        );
+        let ordinary = scene().and("core", STOP - 30_000, Event::Scheduling { fifo: false });
+        let mut ordinary = ordinary.trace(End::Shutdown { reason: past.into(), trouble: TROUBLE.into() });
         ordinary.head.realtime = false;
         let told = verdict(&ordinary);
         assert_eq!(

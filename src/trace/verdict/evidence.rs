@@ -21,6 +21,8 @@ const SAMPLE_LATE: i64 = 100 * MS;
 const LISTENS: i64 = 700 * MS;
 /// Longest time that a core works without an event. The lateness of a turn is recorded at the turn's end.
 pub(super) const QUIET: i64 = 15 * MS;
+/// The core is within its budget again after a shorter time.
+const UNUSED: i64 = 3000 * MS;
 /// A time farther away is taken for this one. The difference of any two fits into 64 bits.
 const FAR: i64 = 1 << 56;
 /// How far back the lateness of the timers is of interest.
@@ -55,6 +57,15 @@ pub(super) struct Arrival {
     pub(super) at: i64,
     /// Whether this is the block's own time. Otherwise a later block came then.
     pub(super) is_exact: bool,
+}
+
+/// How the core was scheduled.
+pub(super) enum Scheduling {
+    RealTime,
+    /// As SCHED_OTHER for a moment, to stay within the kernel's budget.
+    UsedUp,
+    /// As SCHED_OTHER all the time.
+    Refused,
 }
 
 /// The stop of the MCU.
@@ -339,12 +350,16 @@ impl<'a> Record<'a> {
         late.max().unwrap_or(0).into()
     }
 
-    /// Whether the core ran as SCHED_OTHER at a time to stay within the kernel's budget.
-    pub(super) fn was_out_of_budget(&self, span: Span) -> bool {
-        let before = self.within("core", (-FAR, span.0)).rev();
-        let before = before.filter(|(_, event)| matches!(event, Event::Scheduling { .. })).take(1);
-        let mut events = before.chain(self.within("core", span));
-        events.any(|(_, event)| event == Event::Scheduling { fifo: false })
+    /// How the core was scheduled in a span.
+    pub(super) fn scheduling(&self, span: Span) -> Scheduling {
+        let classes = |(at, event)| if let Event::Scheduling { fifo } = event { Some((at, fifo)) } else { None };
+        let before = self.within("core", (-FAR, span.0)).rev().find_map(classes);
+        let mut classes = before.into_iter().chain(self.within("core", span).filter_map(classes));
+        match classes.find(|(_, fifo)| !fifo) {
+            None => Scheduling::RealTime,
+            Some((since, _)) if span.1 - since < UNUSED => Scheduling::UsedUp,
+            Some(_) => Scheduling::Refused,
+        }
     }
 
     /// The fault of the computer's power supply or temperature in a span.
