@@ -23,6 +23,9 @@ const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];
 /// After a script with this exit status the agent reboots the VM. The next script waits for the reboot.
 const REBOOTS: i32 = 77;
 
+/// Each process has a program at the same addresses. So the emulator translates it once, not for each process.
+const COMMAND_LINE: &str = "console=ttyS0 quiet mitigations=off cryptomgr.notests lsm= audit=0 norandmaps panic=-1";
+
 /// Programs with their Debian packages.
 const TOOLS: [(&str, &str); 3] =
     [("mmdebstrap", "mmdebstrap"), ("dpkg-scanpackages", "dpkg-dev"), ("mke2fs", "e2fsprogs")];
@@ -171,7 +174,7 @@ fn start(
         .arg(kernel)
         .arg("-initrd")
         .arg(initrd)
-        .args(["-append", "console=ttyS0 quiet mitigations=off cryptomgr.notests lsm= audit=0 panic=-1"])
+        .args(["-append", COMMAND_LINE])
         .args(["-drive", &format!("file={},if=virtio,format=raw,cache=unsafe", file("root.img"))])
         .args(["-virtfs", &format!("local,path={},mount_tag=share,security_model=none,readonly=on", share.display())])
         .args(["-device", "virtio-serial-pci", "-chardev", "stdio,id=agent,signal=off"])
