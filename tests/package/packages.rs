@@ -25,6 +25,7 @@ pub fn share(folder: &Path) -> Result<(), String> {
             .arg(folder)
             // An emulated processor unpacks this in a third of the time.
             .env("DPKG_DEB_COMPRESSOR_TYPE", "zstd")
+            .env("DEB_BUILD_OPTIONS", "noautodbgsym")
             // dpkg-buildpackage must run as in a separate shell, not as in make's.
             .env_remove("MAKEFLAGS")
             .env_remove("MAKELEVEL"),
