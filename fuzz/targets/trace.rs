@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! A file of the flight recorder: as it is, and as the contents of a file with a good check sum.
+//! A file of the flight recorder: as it is, and as the contents of a file with a good check sum. What is read is judged,
+//! shown and exported.
 #![no_main]
 
-use std::io::Write as _;
+use std::io::{self, Write as _};
+use std::time::Duration;
 
 use flate2::Compression;
 use flate2::write::GzEncoder;
 use pinion::trace::file::Trace;
+use pinion::trace::{perfetto, svg, timeline, vcd, verdict};
 
 pinion_fuzz::target!(run);
 
@@ -17,6 +20,12 @@ fn run(bytes: &[u8]) {
     let Ok(trace) = Trace::read(file.finish().expect("room").as_slice()) else { return };
     let timeline = trace.timeline();
     assert!(timeline.is_sorted_by_key(|(at, ..)| *at));
+    let _ = verdict::verdict(&trace);
+    let all = Duration::from_secs(3600);
+    timeline::write(&trace, all, &mut io::sink()).expect("room");
+    for write in [perfetto::write, svg::write, vcd::write] {
+        write(&trace, &mut io::sink()).expect("room");
+    }
     let mut again = Vec::new();
     trace.write(&mut again).expect("room");
     assert_eq!(Trace::read(again.as_slice()).ok(), Some(trace));

@@ -713,7 +713,7 @@ impl Shop {
             other.end = other.end + by;
             self.buses[worker].1 = self.buses[worker].1.max(other.end);
         }
-        self.under_way.make_contiguous().sort_by_key(|other| other.end);
+        uncounted(|| self.under_way.make_contiguous().sort_by_key(|other| other.end));
     }
 }
 
@@ -798,9 +798,9 @@ impl Workers for FakeWorkers {
         let now = self.bench.clock.now();
         let mut shop = self.shop.lock().unwrap();
         // A worker that hung returns and ends.
-        let back: Vec<UnderWay> = shop.left_behind.extract_if(.., |hung| hung.end <= now).collect();
+        let back: Vec<UnderWay> = uncounted(|| shop.left_behind.extract_if(.., |hung| hung.end <= now).collect());
         drop(shop);
-        drop(back);
+        uncounted(|| drop(back));
         self.next_end().is_some_and(|end| end <= now)
     }
 

@@ -96,7 +96,7 @@ pub fn printer_cfg(bytes: &[u8]) {
     for (text, name) in bytes.split(|byte| *byte == 0).zip(names) {
         std::fs::write(folder.join(name), text).expect("a file");
     }
-    if let Some(printer) = read(&Machine::at(&folder), Path::new("/printer.cfg")) {
+    if let Some(printer) = read(&Computer::at(&folder), Path::new("/printer.cfg")) {
         assert!(printer.leds.iter().all(|pin| pin.contains("spidev")));
     }
 }
