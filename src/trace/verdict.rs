@@ -807,6 +807,15 @@ mod tests {
         );
         // A virtual machine that did not get a processor.
         let stolen = Scene::calm().and("core", STOP - 1, woke(50, 12)).account(Watched::Core, 3, 1);
+        let mut often = stolen.clone();
+        for at in (60_000..STOP + SECOND / 2).step_by(250_000) {
+            often = often.and("sampler", at, Event::Stolen(ms(14)));
+        }
+        often.stop(7, STOP - 12_000).judged(
+            "Stepper too far in past",
+            Culprit::Driver,
+            "the kernel woke the core 12.0 ms late, though it did not wait for a processor: use a PREEMPT_RT kernel, and look for what blocks interrupts, such as a hypervisor",
+        );
         stolen.and("sampler", STOP + 10_000, Event::Stolen(ms(14))).stop(7, STOP - 12_000).judged(
             "Stepper too far in past",
             Culprit::Standstill,

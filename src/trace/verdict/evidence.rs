@@ -265,13 +265,21 @@ impl<'a> Record<'a> {
         Some(slept + since.max(0))
     }
 
-    /// How much processor time a hypervisor took in the samples that cover a span.
+    /// How much more processor time than usual a hypervisor took in the samples that cover a span.
     pub(super) fn stolen(&self, span: Span) -> i64 {
-        let stolen = self.within("sampler", (span.0, span.1 + SAMPLE)).map(|(_, event)| match event {
-            Event::Stolen(ticks) => i64::from(ticks.0),
-            _ => 0,
-        });
-        stolen.sum()
+        let samples = (span.0, span.1 + SAMPLE);
+        let (mut stolen, mut elsewhere) = (0, 0);
+        for (at, event) in self.thread("sampler") {
+            if let Event::Stolen(ticks) = event {
+                let is_here = (samples.0..=samples.1).contains(&at);
+                *if is_here { &mut stolen } else { &mut elsewhere } += i64::from(ticks.0);
+            }
+        }
+        // The usual share of all processors' time may be the share of a single one.
+        let recorded =
+            self.events.last().map_or(0, |last| last.0).saturating_sub(self.events.first().map_or(0, |first| first.0));
+        let times = (recorded / (samples.1 - samples.0).max(1)).max(1);
+        (stolen - elsewhere / times).max(0)
     }
 
     /// The longest time within a span without anything of the core.
