@@ -17,6 +17,8 @@ use super::file::{End, Trace};
 
 mod evidence;
 
+/// How long a host may take to send the next block after an acknowledgement.
+const REACTION: i64 = 20 * MS;
 /// Longest time that the core needs for a block that waits for nothing.
 const PROMPT: i64 = MS;
 /// Shortest time without commands of a host that is worth telling.
@@ -156,10 +158,13 @@ fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
             Finding::new(Culprit::Unknown, what, "")
         });
     }
-    if late > 0
-        && let Some(finding) = of_link(record, (due, came))
-    {
-        return finding;
+    if late > 0 {
+        // A host that waits for acknowledgements cannot send while a bus holds the commands before.
+        let held =
+            if record.was_released((came - REACTION, came + PROMPT)) { of_bus(record, (due, came)) } else { None };
+        if let Some(finding) = held.or_else(|| of_link(record, (due, came))) {
+            return finding;
+        }
     }
     let event = if trouble.starts_with("stepper ") { "step" } else { "event" };
     let mut what = match late {
@@ -188,6 +193,12 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
     let Some(before) = record.last_block() else {
         return Finding::new(Culprit::Unknown, format!("not known when the host sent something: {trouble}"), "");
     };
+    // The host waits for an acknowledgement.
+    if -before > SILENT
+        && let Some(finding) = of_bus(record, (before, 0))
+    {
+        return finding;
+    }
     if -before < SILENCE {
         let what = format!(
             "the host sent its last block {} before the stop, but did not refresh an output in time{}: {trouble}",
@@ -647,11 +658,17 @@ mod tests {
             Culprit::Bus,
             "spi0 took 41.0 ms for one errand (stepper oid 3), and the host's commands waited for it: use a higher rate, or another bus for the device",
         );
-        // It is the host who was late when the bus was free again.
+        // The host sent it when the bus was free again, because it had waited for an acknowledgement.
         scene(STOP - 8_000).judged(
             TOO_CLOSE,
+            Culprit::Bus,
+            "spi0 took 41.0 ms for one errand (stepper oid 3), and the host's commands waited for it: use a higher rate, or another bus for the device",
+        );
+        // It could have sent it earlier, as it did while the bus was busy.
+        scene(STOP - 12_000).judged(
+            TOO_CLOSE,
             Culprit::Host,
-            "the host's block came 12.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load",
+            "the host's block came 8.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load",
         );
     }
 

@@ -192,6 +192,11 @@ impl<'a> Record<'a> {
         held + since.map_or(0, |since| common((since, FAR), span).max(0))
     }
 
+    /// Whether commands no longer had to wait for a bus within a span.
+    pub(super) fn was_released(&self, span: Span) -> bool {
+        self.within("core", span).any(|(_, event)| event == Event::Released)
+    }
+
     /// All errands.
     fn errands(&self) -> Vec<Errand<'a>> {
         let mut open: Vec<Errand> = Vec::new();
