@@ -5,6 +5,7 @@
 
 use std::fmt;
 
+use crate::time::Clock;
 use crate::trouble::Trouble;
 
 /// A shutdown text of the firmware, as the host sees it. The wording is Klipper's own: klippy shows the text to the
@@ -123,19 +124,27 @@ pub struct Shutdown {
     pub reason: ShutdownReason,
     /// The text for the log. It is boxed, because every handler's result has room for a stop.
     pub trouble: Box<Trouble>,
+    /// The time that the stop is about: an event came too late for it.
+    pub due: Option<Clock>,
 }
 
 impl Shutdown {
     /// A stop with this reason. A text alone is its cause.
     #[cold]
     pub fn because(reason: ShutdownReason, trouble: impl Into<Trouble>) -> Shutdown {
-        Shutdown { reason, trouble: Box::new(trouble.into()) }
+        Shutdown { reason, trouble: Box::new(trouble.into()), due: None }
     }
 
     /// The same stop, with this remedy.
     #[cold]
     pub fn remedy(self, remedy: impl Into<Box<str>>) -> Shutdown {
-        Shutdown::because(self.reason, self.trouble.remedy(remedy))
+        Shutdown { trouble: Box::new(self.trouble.remedy(remedy)), ..self }
+    }
+
+    /// The same stop, for an event that came too late for its time.
+    #[cold]
+    pub fn late_for(self, due: impl Into<Option<Clock>>) -> Shutdown {
+        Shutdown { due: due.into(), ..self }
     }
 
     /// A stop for a command that no correct host would send at that point.
@@ -148,7 +157,7 @@ impl Shutdown {
     /// The same stop, with this object as its subject.
     #[cold]
     pub fn of(self, object: &str) -> Shutdown {
-        Shutdown::because(self.reason, self.trouble.of(object))
+        Shutdown { trouble: Box::new(self.trouble.of(object)), ..self }
     }
 }
 

@@ -70,7 +70,7 @@ impl DigitalOut {
     /// Applies the oldest change of the queue, which was due at `at`.
     fn load(&mut self, turn: &mut Turn, at: Clock) -> Result<Next, Shutdown> {
         let Some(Move { on_ticks, .. }) = self.queue.pop(&mut turn.moves) else {
-            return Err(not_refreshed(MISSED_DIGITAL, self.max_duration));
+            return Err(not_refreshed(MISSED_DIGITAL, self.max_duration).late_for(at));
         };
         let on = on_ticks.0 != 0;
         self.line.write(turn, on)?;

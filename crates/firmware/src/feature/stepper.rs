@@ -128,7 +128,9 @@ impl Stepper {
                 self.pulse_ticks.0
             );
             return Err(
-                Shutdown::because(STEPPER_PAST, cause).remedy("lower the speed, the microsteps or step_pulse_duration")
+                Shutdown::because(STEPPER_PAST, cause)
+                    .remedy("lower the speed, the microsteps or step_pulse_duration")
+                    .late_for(self.next_step)
             );
         }
         if reverses {

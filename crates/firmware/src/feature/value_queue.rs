@@ -67,7 +67,7 @@ impl ValueQueue {
     /// Takes the value that is due.
     pub(super) fn pop(&mut self, mcu: &mut Mcu) -> Result<u16, Shutdown> {
         let due = self.queue.pop(&mut mcu.moves);
-        due.map(|due| due.value).ok_or_else(|| not_refreshed(self.texts.missed, self.max_duration))
+        due.map(|due| due.value).ok_or_else(|| not_refreshed(self.texts.missed, self.max_duration).late_for(self.end))
     }
 
     /// When the timer runs next, after the output got a value that was due at `at`.

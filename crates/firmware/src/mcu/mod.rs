@@ -49,7 +49,7 @@ pub use object::{Next, Object, Safe};
 pub use outbox::{Note, Outbox};
 pub use parameters::{Oid, WireClock};
 pub use remote::{Remote, Settable};
-pub use schedule::SPIN_MAX;
+pub use schedule::{Latest, SPIN_MAX};
 pub use slot::{Back, Slot};
 pub use snapshot::{BusCounts, LineState, LineUse, ObjectState, Present, QueueState, Report, Snapshot};
 pub use stop::RETRY_TICKS;

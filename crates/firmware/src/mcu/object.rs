@@ -222,6 +222,13 @@ impl Mcu {
         stop.of(&self.name_object(kind, oid))
     }
 
+    /// The objects with an oid, and the log's names for them. This allocates.
+    pub fn object_names(&self) -> Vec<(u8, String)> {
+        let objects = self.configuration.objects.iter().enumerate().take(usize::from(u8::MAX) + 1);
+        let named = objects.filter_map(|(index, object)| Some((u8::try_from(index).ok()?, object.as_ref()?.kind())));
+        named.map(|(oid, kind)| (oid, self.name_object(kind, Oid::new(oid)))).collect()
+    }
+
     /// The log's name for an object.
     pub(super) fn name_object(&self, kind: &str, oid: Oid) -> String {
         match self.configuration.pins.iter().find(|(of, _)| *of == oid) {

@@ -11,7 +11,7 @@ use crate::time::{Clock, Ticks, TimeSource, Timing};
 
 use super::stats::Stats;
 use super::timers::Timers;
-use super::{Mcu, Next, Note, OBJECTS_MAX, TimerId, Turn, WireClock, base};
+use super::{Mcu, Next, Note, OBJECTS_MAX, Oid, TimerId, Turn, WireClock, base};
 
 /// Longest delay of a timer before the MCU stops: 100 ms, as in the firmware.
 const LATE_LIMIT: Ticks = Ticks::from_ms(100);
@@ -36,8 +36,19 @@ pub(super) struct Schedule {
     pub(super) is_behind: bool,
     /// How late the timers were.
     pub(super) lateness: Lateness,
+    /// The latest of them since somebody asked.
+    latest: Latest,
     /// How busy the core was.
     stats: Stats,
+}
+
+/// A timer that ran late.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Latest {
+    /// How late it was, in ticks; 0 without one.
+    pub late: i64,
+    /// Its object; `None` for the MCU's own.
+    pub oid: Option<Oid>,
 }
 
 impl Schedule {
@@ -46,8 +57,8 @@ impl Schedule {
         let now = timing.clock.now();
         let mut timers = Timers::with_capacity(TIMERS_MAX);
         timers.insert(now + STATS_TICKS, TimerId::STATS);
-        let (lateness, stats) = (Lateness::default(), Stats::default());
-        Schedule { timing, timers, last_read: now, is_behind: false, lateness, stats }
+        let (lateness, latest, stats) = (Lateness::default(), Latest::default(), Stats::default());
+        Schedule { timing, timers, last_read: now, is_behind: false, lateness, latest, stats }
     }
 
     /// Makes room for all timers that an MCU can have.
@@ -108,7 +119,8 @@ impl Mcu {
                         "the host asked for an event {} us after its time: the host or this computer is overloaded",
                         late as u64 / u64::from(Ticks::from_us(1).0)
                     ),
-                ));
+                )
+                .late_for(at));
             }
         }
         Ok(())
@@ -150,13 +162,14 @@ impl Mcu {
             }
             self.run_timer();
         }
-        let late = self.schedule.timers.next().map_or(0, |at| self.now().since(at));
-        if late > i64::from(LATE_LIMIT.0) && self.stop.reason.is_none() {
+        let next = self.schedule.timers.next();
+        let late = next.map_or(0, |at| self.now().since(at));
+        if let Some(next) = next.filter(|_| late > i64::from(LATE_LIMIT.0)) && self.stop.reason.is_none() {
             let cause = format!(
                 "events are {} ms late: more steps are asked for than this computer can do, or something kept it from running",
                 late as u64 / u64::from(Ticks::from_ms(1).0)
             );
-            let stop = Shutdown::because(reason::TIMER_PAST, cause);
+            let stop = Shutdown::because(reason::TIMER_PAST, cause).late_for(next);
             self.shut_down(stop.remedy("run Pinion in real time (-r, as the service does), or move more slowly"));
         }
         self.schedule.is_behind = self.schedule.timers.next().is_some_and(|at| at <= self.schedule.last_read);
@@ -167,7 +180,11 @@ impl Mcu {
     fn run_timer(&mut self) {
         let Some((at, timer)) = self.schedule.timers.pop() else { return };
         if timer.is_exact() {
-            self.schedule.lateness.record(self.schedule.last_read.since(at));
+            let late = self.schedule.last_read.since(at);
+            self.schedule.lateness.record(late);
+            if late > self.schedule.latest.late {
+                self.schedule.latest = Latest { late, oid: timer.oid() };
+            }
         }
         self.schedule.timing.due.set(Some(at));
         let result = match timer.oid() {
@@ -204,6 +221,12 @@ impl Mcu {
     #[inline]
     pub fn account(&mut self, busy: Ticks) {
         self.schedule.stats.add(busy);
+    }
+
+    /// The latest timer with a margin since the last call.
+    #[inline]
+    pub fn take_latest(&mut self) -> Latest {
+        std::mem::take(&mut self.schedule.latest)
     }
 
     /// Reports in the log how late timers were. `margin` is how long before a timer the core wakes.

@@ -256,11 +256,11 @@ impl Mcu {
         to.is_configured = self.is_finalized();
         to.oids_allocated = self.is_allocated();
         to.dialect = Some(self.spoken.dialect.name());
-        let last = self.stop.last.as_ref().filter(|_| self.is_shutdown());
-        let at = last.map_or(self.schedule.last_read, |(_, at)| *at);
+        let last = self.last_stop();
+        let at = last.map_or(self.schedule.last_read, |(_, at)| at);
         to.stopped = self.stop.reason.map(|reason| (reason, at));
         match last {
-            Some((trouble, _)) => put(&mut to.detail, trouble),
+            Some((stop, _)) => put(&mut to.detail, &stop.trouble),
             None => to.detail.clear(),
         }
         put(&mut to.debtor, self.debtor().unwrap_or_default());

@@ -11,7 +11,6 @@
 
 use crate::shutdown::{Shutdown, ShutdownReason, reason};
 use crate::time::{Clock, Ticks};
-use crate::trouble::Trouble;
 
 use super::{Mcu, Note, Oid, Safe, TimerId, Turn, base};
 
@@ -30,8 +29,8 @@ const UNGUARDED_LIMIT: Ticks = Ticks::from_ms(500);
 pub(super) struct Stop {
     /// Why the MCU is stopped; `None` while it is not.
     pub(super) reason: Option<ShutdownReason>,
-    /// The log's text for the last stop, and the time of that stop.
-    pub(super) last: Option<(Box<Trouble>, Clock)>,
+    /// The last stop, and its time.
+    pub(super) last: Option<(Shutdown, Clock)>,
     /// Whether `shut_down` is running. A failure meanwhile must not start it again.
     under_way: bool,
     owed: Vec<Debt>,
@@ -55,6 +54,11 @@ impl Mcu {
     /// Whether the MCU is stopped.
     pub fn is_shutdown(&self) -> bool {
         self.stop.reason.is_some()
+    }
+
+    /// Why and when the MCU stopped; `None` while it is not stopped.
+    pub fn last_stop(&self) -> Option<(&Shutdown, Clock)> {
+        self.stop.last.as_ref().filter(|_| self.is_shutdown()).map(|(stop, at)| (stop, *at))
     }
 
     /// Stops the MCU. It removes all timers, drives the outputs to their shutdown values, and informs the host. An MCU
@@ -87,7 +91,7 @@ impl Mcu {
         self.send(base::ShutdownReport { clock, static_string_id });
         if first {
             self.outbox.note(Note::Shutdown(&shutdown));
-            self.stop.last = Some((shutdown.trouble, clock));
+            self.stop.last = Some((shutdown, clock));
         } else if shutdown.reason != reason {
             // The same reason again, for example a second `emergency_stop`, gives the log nothing new.
             self.outbox.note(Note::Trouble(&shutdown));
