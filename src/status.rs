@@ -33,9 +33,21 @@ pub(crate) struct Status {
     pub(crate) state: State,
     pub(crate) host: Host,
     pub(crate) guardian: Guardian,
+    /// The flight recorder. An older Pinion has none.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub(crate) recorder: Option<Recorder>,
     /// `None` if the core has not answered in time. Then `state` is [`State::Unknown`].
     #[serde(flatten)]
     pub(crate) mcu: Option<McuStatus>,
+}
+
+/// The flight recorder.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub(crate) struct Recorder {
+    /// Highest number of bytes of memory that it takes.
+    pub(crate) bytes: usize,
+    /// Where the traces are kept, if that is possible there; `None` if none are kept.
+    pub(crate) folder: Option<String>,
 }
 
 /// State of the MCU.

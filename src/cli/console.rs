@@ -33,7 +33,7 @@ use termina::escape::csi::DecPrivateModeCode;
 
 use crate::klippy::process::{Search, Terminal as Device, find};
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Helpers, Options};
+use crate::runtime::{self, Access, Helpers, Options, Recording};
 use crate::trace::folder::user_state;
 use pinion_client::console::{Console, Next, Vocabulary};
 use pinion_client::{self, Client};
@@ -140,6 +140,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     let board = sim_config(file).and_then(|config| SimBoard::new(config, Arc::new(clock)));
     let board = board.map_err(|error| error.to_string())?;
     let symlink = std::env::temp_dir().join(format!("pinion_console_{}", std::process::id()));
+    let recording = Recording::new(clock, &symlink, false, Vec::new()).map_err(|error| error.to_string())?;
     let options = Options {
         symlink: symlink.clone(),
         dialect: None,
@@ -148,6 +149,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
         cpu: None,
         margin: MarginLimits::default(),
         watchdog: None,
+        trace_edges: false,
         sockets: Vec::new(),
     };
     // The console's result. `None` until the console has ended.
@@ -173,7 +175,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
         }
     };
     let timing = board.timing();
-    let ended = runtime::run(&options, Box::new(board), timing, clock, helpers, ready);
+    let ended = runtime::run(&options, Box::new(board), timing, recording, helpers, ready);
     drop(terminal);
     ended.map_err(|error| error.to_string())?;
     let said = said.lock().unwrap_or_else(PoisonError::into_inner).take();

@@ -11,7 +11,8 @@ use clap::Args;
 use log::LevelFilter;
 
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Guardian, Helpers, Options};
+use crate::runtime::{self, Guardian, Helpers, Options, Recording};
+use crate::trace::folder::folders;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
 
@@ -44,6 +45,7 @@ impl Settings {
             cpu: self.cpu,
             margin: MarginLimits::up_to_us(self.margin_us),
             watchdog: self.watchdog.then(|| WATCHDOG.into()),
+            trace_edges: self.trace_edges,
             sockets: self.socket.clone().map_or_else(|| runtime::socket_paths(&self.symlink), |path| vec![path]),
         }
     }
@@ -80,9 +82,12 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     end_by_panic();
     let clock = Monotonic::start();
     // A simulated printer needs no guardian.
-    let guarded = (settings.board == BoardName::Linux).then_some((clock, settings.realtime));
-    let helpers = match Helpers::start(guarded, settings.dialect.is_none()) {
-        Ok(helpers) => helpers,
+    let guarded = settings.board == BoardName::Linux;
+    let recording = Recording::new(clock, &settings.symlink, settings.realtime, folders());
+    let helpers = recording
+        .and_then(|recording| Ok((Helpers::start(&recording, guarded, settings.dialect.is_none())?, recording)));
+    let (helpers, recording) = match helpers {
+        Ok(started) => started,
         Err(error) => return failed(error),
     };
     logging::detach();
@@ -94,7 +99,7 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
         Ok(opened) => opened,
         Err(error) => return failed(error),
     };
-    match runtime::run(&settings.options(), board, timing, clock, helpers, || ()) {
+    match runtime::run(&settings.options(), board, timing, recording, helpers, || ()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
     }

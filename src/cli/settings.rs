@@ -60,6 +60,9 @@ pub(super) struct Given {
     /// union (what v0.13, master and kalico agree on) [default: auto]
     #[arg(long, value_name = "NAME", value_parser = offering::<Spoken>(SPOKEN), hide_possible_values = true)]
     pub(super) dialect: Option<Spoken>,
+    /// Let the flight recorder note each edge of each output, for `pinion trace --vcd`. It costs time
+    #[arg(long, num_args = 0, default_missing_value = "true")]
+    pub(super) trace_edges: Option<bool>,
     /// Path of the socket for `pinion status` [default: named after the link, in /run/pinion or beside the link]
     #[arg(long, value_name = "PATH")]
     pub(super) socket: Option<PathBuf>,
@@ -79,6 +82,7 @@ pub(super) struct Settings {
     pub(super) access: Access,
     pub(super) board: BoardName,
     pub(super) dialect: Option<DialectName>,
+    pub(super) trace_edges: bool,
     pub(super) socket: Option<PathBuf>,
     pub(super) log_level: LevelFilter,
 }
@@ -96,6 +100,7 @@ impl Given {
             group: self.group.or(other.group),
             board: self.board.or(other.board),
             dialect: self.dialect.or(other.dialect),
+            trace_edges: self.trace_edges.or(other.trace_edges),
             socket: self.socket.or(other.socket),
             log_level: self.log_level.or(other.log_level),
         }
@@ -112,6 +117,7 @@ impl Given {
             access: Access { mode: self.mode.unwrap_or(0o660), group: self.group },
             board: self.board.unwrap_or(BoardName::Linux),
             dialect: self.dialect.and_then(|Spoken(name)| name),
+            trace_edges: self.trace_edges.unwrap_or(false),
             socket: self.socket,
             log_level: self.log_level.unwrap_or(LevelFilter::Info),
         }

@@ -22,7 +22,8 @@ use super::demo::heater::Goal;
 use super::demo::picture;
 use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Helpers, Options};
+use crate::runtime::{self, Access, Helpers, Options, Recording};
+use crate::trace::folder::folders;
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
@@ -57,6 +58,9 @@ pub(super) struct SimArgs {
     /// Run in real time: SCHED_FIFO and locked memory
     #[arg(short = 'r')]
     realtime: bool,
+    /// Let the flight recorder note each edge of each output, for `pinion trace --vcd`
+    #[arg(long)]
+    trace_edges: bool,
     /// Path of the symbolic link that the host opens; it leads to the pty
     #[arg(short = 'I', value_name = "PATH", default_value = "/tmp/klipper_host_mcu")]
     symlink: PathBuf,
@@ -75,13 +79,15 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
         return print(&Page::text(&printer_cfg)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
-    let helpers = match Helpers::start(None, true) {
-        Ok(helpers) => helpers,
+    let clock = Monotonic::start();
+    let recording = Recording::new(clock, &args.symlink, args.realtime, folders());
+    let helpers = recording.and_then(|recording| Ok((Helpers::start(&recording, false, true)?, recording)));
+    let (helpers, recording) = match helpers {
+        Ok(started) => started,
         Err(error) => return failed(error),
     };
     logging::detach();
     let plan = plan(&config);
-    let clock = Monotonic::start();
     let board = match SimBoard::new(config, Arc::new(clock)) {
         Ok(board) => board,
         Err(error) => return failed(error),
@@ -95,10 +101,11 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         cpu: None,
         margin: MarginLimits::default(),
         watchdog: None,
+        trace_edges: args.trace_edges,
         sockets: runtime::socket_paths(&args.symlink),
     };
     if args.show {
-        return show_as_it_changes(args, board, probe, &options, clock, helpers);
+        return show_as_it_changes(args, board, probe, &options, recording, helpers);
     }
     let right = Arc::new(AtomicBool::new(false));
     // Set when the program is asked to end. A demonstration that this interrupts has not failed.
@@ -118,7 +125,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         }
     };
     let timing = board.timing();
-    match runtime::run(&options, Box::new(board), timing, clock, helpers, ready) {
+    match runtime::run(&options, Box::new(board), timing, recording, helpers, ready) {
         Ok(()) if args.demo && !right.load(Ordering::SeqCst) => ExitCode::FAILURE,
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => failed(error),
@@ -131,7 +138,7 @@ fn show_as_it_changes(
     board: SimBoard,
     probe: SimProbe,
     options: &Options,
-    clock: Monotonic,
+    recording: Recording,
     helpers: Helpers,
 ) -> ExitCode {
     let show = match Show::prepare(probe) {
@@ -145,7 +152,7 @@ fn show_as_it_changes(
         show.begin();
     };
     let timing = board.timing();
-    let ended = runtime::run(options, Box::new(board), timing, clock, helpers, ready);
+    let ended = runtime::run(options, Box::new(board), timing, recording, helpers, ready);
     show.end();
     ended.map_or_else(failed, |()| ExitCode::SUCCESS)
 }

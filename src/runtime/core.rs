@@ -19,6 +19,7 @@ use pinion_protocol::vlq::Reader;
 use super::lookout::Lookout;
 use super::outlet::{LinkWake, Progress};
 use super::pulse::{BEAT, Pulse};
+use super::recorder::Tape;
 use super::status::Teller;
 use super::wakeup::{Waiter, Woken};
 
@@ -100,6 +101,7 @@ pub(super) struct Core {
     /// The output that the guardian knows to be owed its shutdown value.
     debtor: Option<String>,
     teller: Teller,
+    tape: Tape,
 }
 
 /// The parts of the core.
@@ -112,6 +114,7 @@ pub(super) struct Parts {
     pub(super) progress: Arc<Progress>,
     pub(super) wake: Arc<LinkWake>,
     pub(super) teller: Teller,
+    pub(super) tape: Tape,
     /// There is a second processor, so that the core may poll.
     pub(super) may_poll: bool,
 }
@@ -134,7 +137,7 @@ pub(super) enum Left {
 
 impl Core {
     pub(super) fn new(parts: Parts) -> Core {
-        let Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, may_poll } = parts;
+        let Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, tape, may_poll } = parts;
         Core {
             untold: false,
             lookout: Lookout::new(may_poll, clock.now()),
@@ -150,11 +153,13 @@ impl Core {
             stops_taken: 0,
             debtor: None,
             teller,
+            tape,
         }
     }
 
     /// Runs until it is asked to quit.
     pub(super) fn run(mut self) -> Left {
+        self.tape.start();
         let mut busy_since = self.clock.now();
         let mut was_shutdown = false;
         loop {
@@ -172,6 +177,7 @@ impl Core {
             self.mcu.run_workers();
             self.tell_debts();
             self.waiter.ran(self.mcu.last_read());
+            self.tape.turn(&mut self.mcu, self.waiter.margin(), !self.waiter.is_realtime());
             if self.mcu.is_held() && !self.mcu.is_shutdown() && self.progress.stops_handed() != self.stops_taken {
                 self.stop_ahead();
             }
@@ -220,6 +226,7 @@ impl Core {
                 // Sleep half the way: this leaves room for a late wake-up.
                 self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));
                 busy_since = self.clock.now();
+                self.record_sleep();
                 continue;
             };
             let exact = self.mcu.next_exact_timer();
@@ -228,6 +235,7 @@ impl Core {
             // Near a timer, calls have to wait.
             let woken = waiter.wait(deadline, exact, || !near && calls.any());
             busy_since = self.clock.now();
+            self.record_sleep();
             if woken == Woken::Due {
                 self.yielded += 1;
             }
@@ -241,6 +249,12 @@ impl Core {
         let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
         if !calls.any() {
             self.waiter.nap(longest);
+        }
+    }
+
+    fn record_sleep(&mut self) {
+        if let Some(sleep) = self.waiter.take_sleep() {
+            self.tape.woke(sleep);
         }
     }
 
@@ -332,7 +346,7 @@ impl Core {
             Some(block) => block,
             None => match self.requests.pop() {
                 Ok(Request::Run(payload)) => {
-                    self.progress.begin();
+                    self.tape.began(self.mcu.last_read(), self.progress.begin());
                     (payload, 0)
                 }
                 Ok(request) => return self.serve(request),
@@ -341,12 +355,15 @@ impl Core {
         };
         let bytes = payload.as_slice();
         let mut reader = Reader::new(&bytes[at..]);
+        let (began, mut count) = (self.mcu.last_read(), 0);
         for _ in 0..if one { 1 } else { self.room() } {
             if reader.is_empty() || !self.mcu.may_run(reader.rest()) {
                 break;
             }
             self.mcu.execute(&mut reader);
+            count += 1;
         }
+        self.tape.ran(began, &bytes[at..], count);
         at = bytes.len() - reader.rest().len();
         if at < bytes.len() || self.mcu.keeps_block() {
             self.progress.hold(self.mcu.is_held());
@@ -442,6 +459,7 @@ fn may_yield(realtime: bool, now: Clock, deadline: Option<Clock>) -> bool {
 
 #[cfg(test)]
 mod tests {
+    use super::super::recorder::{Recorder, Recording};
     use super::*;
     use std::sync::Mutex;
     use std::sync::atomic::{AtomicUsize, Ordering};
@@ -521,7 +539,10 @@ mod tests {
             let core_wake = wake.clone();
             let thread = thread::spawn(move || {
                 let pulse = Pulse::new(monotonic).unwrap();
-                let workers = Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), pulse, true);
+                let recording = Recording::of_a_test();
+                let (_recorder, tape) = Recorder::new(recording.clone()).unwrap();
+                let workers =
+                    Threads::new(thread::current(), Arc::new(|| ()), core_clock.clone(), pulse, recording, true);
                 let mcu = Mcu::new(
                     core_dialect,
                     Box::new(board),
@@ -535,7 +556,8 @@ mod tests {
                 let (clock, progress, wake) = (core_clock, core_progress, core_wake);
                 let teller = status::ends().0;
                 let may_poll = true;
-                Core::new(Parts { mcu, clock, requests: inbox, waiter, pulse, progress, wake, teller, may_poll }).run()
+                let requests = inbox;
+                Core::new(Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, tape, may_poll }).run()
             });
             let mut rig = Rig { thread, dialect, clock, requests, progress, wake, heard, bench };
             rig.run("allocate_oids count=%c", &[3]);

@@ -20,6 +20,7 @@ use super::ledger::Ledger;
 use super::outlet::{self, LinkWake, Progress};
 use super::pulse::Pulse;
 use super::realtime::{self, Processors, Role, Scheduling};
+use super::recorder::{Recording, Tape};
 use super::started;
 use super::status::Teller;
 use super::wakeup::{MarginLimits, Waiter};
@@ -37,6 +38,8 @@ pub(super) struct CoreThread {
     pub(super) wake: Arc<LinkWake>,
     pub(super) pulse: Pulse,
     pub(super) teller: Teller,
+    pub(super) recording: Recording,
+    pub(super) tape: Tape,
     pub(super) processors: Processors,
     pub(super) margin: MarginLimits,
     pub(super) realtime: bool,
@@ -52,7 +55,19 @@ impl CoreThread {
         let may_poll = thread::available_parallelism().is_ok_and(|count| count.get() > 1);
         let core_progress = progress.clone();
         let core = started(thread::Builder::new().name("core".into()).spawn(move || {
-            let CoreThread { board, timing, dialect, wake, pulse, teller, processors, margin, realtime } = self;
+            let CoreThread {
+                board,
+                timing,
+                dialect,
+                wake,
+                pulse,
+                teller,
+                recording,
+                tape,
+                processors,
+                margin,
+                realtime,
+            } = self;
             if let Err(error) = processors.confine() {
                 warn!(
                     "--cpu: the core is not bound to its processor, and runs on any: {error}: choose another processor"
@@ -67,11 +82,11 @@ impl CoreThread {
                 }
             });
             let clock = timing.clock.clone();
-            let workers = Box::new(Threads::new(thread::current(), prepare, clock.clone(), pulse, may_poll));
-            let mcu = Mcu::new(dialect, board, timing, workers, Box::new(outlet));
+            let workers = Threads::new(thread::current(), prepare, clock.clone(), pulse, recording, may_poll);
+            let mcu = Mcu::new(dialect, board, timing, Box::new(workers), Box::new(outlet));
             let waiter = Waiter::new(clock.clone(), margin, scheduling, processors);
             let (requests, progress) = (inbox, core_progress);
-            Core::new(Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, may_poll }).run()
+            Core::new(Parts { mcu, clock, requests, waiter, pulse, progress, wake, teller, tape, may_poll }).run()
         }))?;
         let thread = core.thread().clone();
         let ledger = Ledger::default();

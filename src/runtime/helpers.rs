@@ -9,11 +9,11 @@ use std::ffi::CStr;
 use log::warn;
 
 use pinion_firmware::trouble::Trouble;
-use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
 
 use super::guardian::{self, Guardian};
 use super::host::{self, HostSearch};
+use super::recorder::Recording;
 
 /// The kernel's names of these processes. Their command lines are the program's.
 pub(crate) const NAMES: [&CStr; 2] = [guardian::NAME, host::NAME];
@@ -29,15 +29,15 @@ pub struct Helpers {
 
 impl Helpers {
     /// Forks them, then gives up the rights that this process does not need. Call it before any thread starts.
-    /// `guarded` asks for a guardian. It has the core's clock and whether the core runs in real time.
+    /// `guarded` asks for a guardian.
     ///
     /// # Errors
     ///
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
-    pub fn start(guarded: Option<(Monotonic, bool)>, searches: bool) -> Result<Helpers, Trouble> {
+    pub fn start(recording: &Recording, guarded: bool, searches: bool) -> Result<Helpers, Trouble> {
         // The search comes first, because it must share nothing with the guardian.
         let search = searches.then(HostSearch::start).transpose()?;
-        let guardian = guarded.map(|(clock, realtime)| Guardian::start(clock, realtime)).transpose()?;
+        let guardian = guarded.then(|| Guardian::start(recording)).transpose()?;
         if let Err(error) = sys::keep_only(sys::SERVE) {
             warn!(
                 "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH cannot be given up: {error}: Pinion keeps more rights than it needs"

@@ -152,22 +152,26 @@ impl HostEnd {
         frame(payload, Sequence::after(number), &mut self.output);
     }
 
-    /// Writes as much as the terminal has room for.
-    pub(super) fn write(&mut self) {
+    /// Writes as much as the terminal has room for. Returns the number of bytes.
+    pub(super) fn write(&mut self) -> u32 {
         if !self.is_attached {
             self.output.clear();
         }
         if self.output.is_empty() {
-            return;
+            return 0;
         }
         match self.pty.write(&self.output) {
-            Ok(written) => drop(self.output.drain(..written)),
+            Ok(written) => {
+                self.output.drain(..written);
+                written as u32
+            }
             Err(error) => {
                 warn!(
                     "{} cannot be written, and answers to the host are lost: {error}: {LOOK_AT_LOG}",
                     self.pty.device().display()
                 );
                 self.output.clear();
+                0
             }
         }
     }

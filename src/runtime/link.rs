@@ -26,8 +26,11 @@ use super::host_end::{HostEnd, Next};
 use super::introduction::{Introduction, Step};
 use super::ledger::is_after;
 use super::oversight::{FAREWELL, Oversight};
+use super::recorder::Recorder;
 use super::signals::Signal;
 use super::watchdog::Watchdog;
+use crate::trace::event::Event;
+use crate::trace::ring;
 
 #[cfg(fuzzing)]
 pub(crate) mod fuzz;
@@ -85,6 +88,8 @@ pub(super) struct Link {
     /// How many blocks the core had been handed when the host's dialect changed. It is kept until the core begins the
     /// next block. Earlier responses may be in the dialect of the previous host.
     changed_at: Option<u32>,
+    recorder: Recorder,
+    tape: Option<ring::Writer>,
 }
 
 /// What ended the link's sleep. The link looks only there, because each look is a system call.
@@ -112,9 +117,12 @@ impl Link {
         introduction: Introduction,
         oversight: Oversight,
         clock: Arc<dyn TimeSource>,
+        recorder: Recorder,
     ) -> Link {
         let known = Known::new(introduction.first_dialect());
-        Link { host, core, introduction, oversight, clock, known, changed_at: None }
+        recorder.speak(&known.dialect);
+        let tape = recorder.link();
+        Link { host, core, introduction, oversight, clock, known, changed_at: None, recorder, tape }
     }
 
     /// Feeds a hardware watchdog from now on.
@@ -151,6 +159,7 @@ impl Link {
                 self.host.part()?;
                 self.introduction.end();
                 self.tell_status();
+                self.record(Event::HostGone);
             }
             if woken.by_input {
                 self.read()?;
@@ -184,8 +193,8 @@ impl Link {
 
     /// Closes the terminal, then stops the watchdogs.
     pub(super) fn close(self) {
-        let Link { host, core, introduction, oversight, .. } = self;
-        drop((host, core, introduction));
+        let Link { host, core, introduction, oversight, recorder, .. } = self;
+        drop((host, core, introduction, recorder));
         oversight.end();
     }
 
@@ -261,6 +270,7 @@ impl Link {
         if read.is_new_host {
             self.tell_status();
             self.introduction.begin();
+            self.record(Event::HostCame);
         }
         if read.is_forced {
             let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
@@ -289,6 +299,7 @@ impl Link {
             self.changed_at = Some(self.core.ledger.handed());
         }
         self.known = Known::new(dialect.clone());
+        self.recorder.speak(&dialect);
         self.request(Request::Speak(dialect));
     }
 
@@ -299,17 +310,25 @@ impl Link {
             return true;
         }
         let before = self.core.handed();
+        let mut read_at = None;
         let stalled = loop {
             if !self.core.has_room() {
+                self.record(Event::Full);
                 break true;
             }
             match self.host.next() {
                 Next::Nothing => break false,
-                Next::Nak => self.core.ledger.refuse(),
+                Next::Nak => {
+                    self.core.ledger.refuse();
+                    self.record(Event::Refused);
+                }
                 Next::Block(payload) => {
                     if !self.answer(&payload) {
                         let stops = self.known.dialect.is_emergency(payload.as_slice());
                         self.core.hand(payload, stops);
+                        let at = *read_at.get_or_insert_with(|| self.clock.now());
+                        let block = self.core.ledger.handed();
+                        self.tape.iter_mut().for_each(|tape| tape.write(at, Event::BlockIn(block)));
                     }
                 }
             }
@@ -358,6 +377,15 @@ impl Link {
                 self.host.frame(&[], number);
             }
         }
-        self.host.write();
+        let bytes = self.host.write();
+        if bytes > 0 {
+            self.record(Event::Out(bytes));
+        }
+    }
+
+    fn record(&mut self, event: Event) {
+        if let Some(tape) = &mut self.tape {
+            tape.write(self.clock.now(), event);
+        }
     }
 }

@@ -21,7 +21,6 @@ use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::LOOK_AT_LOG;
-use pinion_linux::clock::Monotonic;
 
 mod budget;
 mod core;
@@ -44,6 +43,7 @@ mod place;
 mod pty;
 mod pulse;
 pub mod realtime;
+mod recorder;
 mod served;
 mod signals;
 pub(crate) mod status;
@@ -66,6 +66,7 @@ pub use helpers::Helpers;
 pub use host::HostSearch;
 pub use place::Place;
 pub use pty::Access;
+pub use recorder::Recording;
 pub use served::{Served, served};
 pub(crate) use signals::hang_up;
 pub use status::socket_paths;
@@ -82,6 +83,7 @@ use oversight::Oversight;
 use pty::Pty;
 use pulse::Pulse;
 use realtime::{Processors, Role};
+use recorder::Recorder;
 use signals::Signals;
 use status::{Facts, HostBoard, StatusSocket};
 use wakeup::MarginLimits;
@@ -104,24 +106,28 @@ pub struct Options {
     pub watchdog: Option<PathBuf>,
     /// The only processor that the core runs on.
     pub cpu: Option<usize>,
+    /// Whether the flight recorder notes each edge of each output.
+    pub trace_edges: bool,
     /// Possible paths of the status socket: the first one that works is used. Without any there is no socket.
     pub sockets: Vec<PathBuf>,
 }
 
 /// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP. It calls `ready` once a host may come. The MCU drives
-/// `board` by `timing`, and the instants of `timing` are those of `clock`. `helpers` has the guardian of the board's
-/// outputs.
+/// `board` by `timing`, and the instants of `timing` are those of the recording's clock. `helpers` has the guardian of
+/// the board's outputs.
 pub fn run(
     options: &Options,
     board: Box<dyn Board>,
     timing: Timing,
-    clock: Monotonic,
+    recording: Recording,
     helpers: Helpers,
     ready: impl FnOnce(),
 ) -> Result<(), Trouble> {
     let Helpers { guardian, search } = helpers;
-    let pulse =
-        guardian.as_ref().map_or_else(|| Pulse::new(clock), |guardian| Ok(guardian.pulse())).map_err(no_room)?;
+    let pulse = guardian
+        .as_ref()
+        .map_or_else(|| Pulse::new(recording.clock()), |guardian| Ok(guardian.pulse()))
+        .map_err(no_room)?;
     let processors = Processors::new(options.cpu)?;
     // This comes first: a process that sees the link may send a signal, and the signal must not leave the link behind.
     let signals = Signals::new().map_err(no_room)?;
@@ -139,20 +145,27 @@ pub fn run(
         view: board.view(),
         guardian: guardian.as_ref().map(Guardian::pid),
         requests: REQUESTS,
+        recorder: recording.status(),
     };
     let _status = StatusSocket::start(&options.sockets, facts, shown.clone(), asker);
+    let (mut recorder, tape) = Recorder::new(recording.clone()).map_err(no_room)?;
+    let board = if options.trace_edges { recorder.with_edges(board) } else { board };
+    let trace_sockets: Vec<_> = options.sockets.iter().map(|path| path.with_extension("trace")).collect();
+    let trace_socket = status::open_socket(&trace_sockets, pty.device());
     let (realtime, margin) = (options.realtime, options.margin);
     if realtime {
         realtime::lock_memory();
     }
     let (clock, dialect) = (timing.clock.clone(), introduction.first_dialect());
-    let core = CoreThread { board, timing, dialect, wake, pulse, teller, processors, margin, realtime };
+    let core =
+        CoreThread { board, timing, dialect, wake, pulse, teller, recording, tape, processors, margin, realtime };
     let (core, core_end) = core.start()?;
+    started(recorder.start(trace_socket))?;
 
     info!("serving on {} ({})", options.symlink.display(), pty.device().display());
     let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
     let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil);
-    let mut link = Link::new(HostEnd::new(pty, shown), core_end, introduction, oversight, clock);
+    let mut link = Link::new(HostEnd::new(pty, shown), core_end, introduction, oversight, clock, recorder);
     if realtime {
         realtime::enter(Role::Link);
     }

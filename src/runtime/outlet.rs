@@ -92,9 +92,9 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    /// The core begins the next block.
-    pub(super) fn begin(&self) {
-        self.begun.fetch_add(1, Ordering::Relaxed);
+    /// The core begins the next block. Returns how many it has begun.
+    pub(super) fn begin(&self) -> u32 {
+        self.begun.fetch_add(1, Ordering::Relaxed).wrapping_add(1)
     }
 
     /// The core has finished the block, and has sent all its responses to it.

@@ -17,6 +17,7 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 
 use super::budget::{Budget, Class, Throttle};
 use super::realtime::{self, Processors, Scheduling};
+use super::recorder::Sleep;
 
 /// The margin's bounds.
 #[derive(Clone, Copy, Debug)]
@@ -135,6 +136,8 @@ pub struct Waiter {
     scheduling: Scheduling,
     /// For a thread that runs as SCHED_FIFO under a throttle.
     budget: Option<Budget>,
+    /// The last sleep.
+    sleep: Option<Sleep>,
 }
 
 impl Waiter {
@@ -149,7 +152,7 @@ impl Waiter {
         let throttle = if scheduling == Scheduling::RealTime { Throttle::read() } else { None };
         let budget = throttle.map(|throttle| Budget::new(throttle, clock.now(), running_time()));
         let margin = Margin::new(limits, try_wake_ups(&*clock));
-        Waiter { clock, margin, processors, scheduling, budget }
+        Waiter { clock, margin, processors, scheduling, budget, sleep: None }
     }
 
     /// The learned margin.
@@ -181,8 +184,17 @@ impl Waiter {
 
     /// Sleeps for `span` or until the thread is unparked, without spinning.
     pub fn nap(&mut self, span: Duration) {
-        self.ran(self.clock.now());
+        let from = self.clock.now();
+        self.ran(from);
         thread::park_timeout(span);
+        let until = from + Ticks(u32::try_from(span.as_nanos() / u128::from(NS_PER_TICK)).unwrap_or(u32::MAX));
+        self.sleep = Some(Sleep { from, to: self.clock.now(), until });
+    }
+
+    /// The last sleep, unless it was taken.
+    #[inline]
+    pub(super) fn take_sleep(&mut self) -> Option<Sleep> {
+        self.sleep.take()
     }
 
     /// Waits for `deadline`, or until `called` says that there is something to do. A thread that changes what `called`
@@ -202,8 +214,10 @@ impl Waiter {
             }
             slept = true;
             self.ran(now);
+            let from = now;
             thread::park_timeout(Duration::from_nanos(asleep as u64 * NS_PER_TICK));
             now = self.clock.now();
+            self.sleep = Some(Sleep { from, to: now, until: wake_at });
             let late = now.since(wake_at);
             // A call woke the thread before its time. That says nothing about the margin.
             if late >= 0 {

@@ -14,12 +14,16 @@ use rtrb::{Consumer, Producer, PushError, RingBuffer};
 
 use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
-use pinion_firmware::time::{Ticks, TimeSource};
+use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
+use crate::trace::event::Event;
+use crate::trace::ring::Writer;
+
 use super::lookout::Lookout;
 use super::pulse::{JobClock, Pulse};
+use super::recorder::{Recording, span};
 
 /// Highest number of errands that may wait for one bus. There are at most 256 objects, with one or two errands each.
 const QUEUE_JOBS: usize = 1024;
@@ -31,7 +35,8 @@ const END_LIMIT: Duration = Duration::from_secs(2);
 
 struct Worker {
     bus: String,
-    jobs: Producer<Job>,
+    /// The jobs, and when they were submitted.
+    jobs: Producer<(Job, Clock)>,
     done: Consumer<Completion>,
     quit: Arc<AtomicBool>,
     thread: JoinHandle<()>,
@@ -48,21 +53,23 @@ pub(super) struct Threads {
     prepare: Prepare,
     clock: Arc<dyn TimeSource>,
     pulse: Pulse,
+    recording: Recording,
     may_poll: bool,
     workers: Vec<Worker>,
 }
 
 impl Threads {
     /// No workers yet. A worker unparks `core` when an errand is done, and notes in `pulse` since when it runs the
-    /// errand. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
+    /// errand. It records its errands in `recording`. It paces itself by `clock`. `may_poll`: there is a second processor, so that workers may poll.
     pub(super) fn new(
         core: Thread,
         prepare: Prepare,
         clock: Arc<dyn TimeSource>,
         pulse: Pulse,
+        recording: Recording,
         may_poll: bool,
     ) -> Threads {
-        Threads { core, prepare, clock, pulse, may_poll, workers: Vec::new() }
+        Threads { core, prepare, clock, pulse, recording, may_poll, workers: Vec::new() }
     }
 
     fn spawn(&self, bus: &str) -> Result<Worker, Shutdown> {
@@ -73,7 +80,8 @@ impl Threads {
         let core = self.core.clone();
         let clock = self.clock.clone();
         let lookout = Lookout::new(self.may_poll, clock.now());
-        let server = Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, lookout };
+        let tape = self.recording.worker(bus);
+        let server = Server { jobs: inbox, done: outbox, quit: quit.clone(), core, clock, shown, lookout, tape };
         let prepare = self.prepare.clone();
         let thread = thread::Builder::new()
             .name(bus.into())
@@ -116,7 +124,7 @@ impl Workers for Threads {
             let why = overflow("a bus", Trouble::new("it is not there").remedy(REPORT));
             return Err(Refused { job, why });
         };
-        if let Err(PushError::Full(job)) = worker.jobs.push(job) {
+        if let Err(PushError::Full((job, _))) = worker.jobs.push((job, self.clock.now())) {
             let trouble = Trouble::new("more is asked of it at once than there are devices");
             let why = overflow(&worker.bus, trouble.remedy(REPORT));
             return Err(Refused { job, why });
@@ -169,13 +177,14 @@ impl Drop for Threads {
 
 /// A worker's thread.
 struct Server {
-    jobs: Consumer<Job>,
+    jobs: Consumer<(Job, Clock)>,
     done: Producer<Completion>,
     quit: Arc<AtomicBool>,
     core: Thread,
     clock: Arc<dyn TimeSource>,
     shown: JobClock,
     lookout: Lookout,
+    tape: Option<Writer>,
 }
 
 impl Server {
@@ -189,7 +198,7 @@ impl Server {
                 return;
             }
             match self.jobs.pop() {
-                Ok(job) => self.serve(job),
+                Ok((job, submitted)) => self.serve(job, submitted),
                 Err(_) if ending => return,
                 Err(_) if self.lookout.goes_on(self.clock.now()) => thread::yield_now(),
                 Err(_) => thread::park(),
@@ -197,21 +206,30 @@ impl Server {
         }
     }
 
-    fn serve(&mut self, job: Job) {
+    fn serve(&mut self, job: Job, submitted: Clock) {
         let Job { oid, mut parcel, holds } = job;
         self.shown.begin();
         let began = self.clock.now();
+        let number = oid.number();
+        self.record(began, Event::ErrandBegan { oid: number, waited: span(submitted, began) });
         let ended = self.clock.errand(&mut || parcel.run());
         self.shown.end();
+        self.record(ended, Event::ErrandEnded { oid: number, took: span(began, ended) });
         // This does not fail: there are no more errands under way than boxes, and both queues have the same length.
         let _ = self.done.push(Completion { oid, parcel, holds, began, ended });
         // Commands that wait for this job also wait for the next one. The core is woken for the last of these jobs.
-        if !(holds && self.jobs.peek().is_ok_and(|next| next.holds)) {
+        if !(holds && self.jobs.peek().is_ok_and(|(next, _)| next.holds)) {
             self.core.unpark();
         }
         // Samples, which timers ask for, come at their own pace.
         if holds {
             self.lookout.expect(ended, NEXT_JOB);
+        }
+    }
+
+    fn record(&mut self, at: Clock, event: Event) {
+        if let Some(tape) = &mut self.tape {
+            tape.write(at, event);
         }
     }
 }
@@ -220,7 +238,6 @@ impl Server {
 mod tests {
     use super::*;
     use pinion_firmware::mcu::{Oid, Parcel};
-    use pinion_firmware::time::Clock;
     use pinion_linux::clock::Monotonic;
     use std::sync::atomic::AtomicU64;
     use std::sync::mpsc::{self, Receiver, Sender};
@@ -272,7 +289,8 @@ mod tests {
     fn looks_after_a_job(holds: bool, may_poll: bool) -> u64 {
         let clock = Arc::new(Looks::default());
         let pulse = Pulse::new(Monotonic::start()).unwrap();
-        let mut threads = Threads::new(thread::current(), Arc::new(|| ()), clock.clone(), pulse, may_poll);
+        let mut threads =
+            Threads::new(thread::current(), Arc::new(|| ()), clock.clone(), pulse, Recording::of_a_test(), may_poll);
         let worker = threads.start("spi0").unwrap();
         // It reads the clock once when it falls asleep.
         let asleep = || {
@@ -296,15 +314,18 @@ mod tests {
 
     #[test]
     fn a_worker_polls_for_the_next_job_of_a_conversation_only() {
-        // One look when the job begins, one when it ends, and one before the worker sleeps.
-        assert_eq!(looks_after_a_job(false, true), 3);
-        assert_eq!(looks_after_a_job(true, false), 3);
-        assert_eq!(looks_after_a_job(true, true), 2 + u64::from(NEXT_JOB.0 / Ticks::from_us(1).0));
+        // One look when the job is submitted, one when it begins, one when it ends, and one before the worker sleeps.
+        assert_eq!(looks_after_a_job(false, true), 4);
+        assert_eq!(looks_after_a_job(true, false), 4);
+        assert_eq!(looks_after_a_job(true, true), 3 + u64::from(NEXT_JOB.0 / Ticks::from_us(1).0));
     }
 
     fn threads() -> Threads {
         let clock = Monotonic::start();
-        Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), Pulse::new(clock).unwrap(), true)
+        {
+            let pulse = Pulse::new(clock).unwrap();
+            Threads::new(thread::current(), Arc::new(|| ()), Arc::new(clock), pulse, Recording::of_a_test(), true)
+        }
     }
 
     #[test]

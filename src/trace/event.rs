@@ -85,15 +85,15 @@ pub enum Event {
 
     /// A worker began an errand.
     ErrandBegan {
-        /// The object that sent it.
-        oid: u8,
+        /// The object that sent it; `None` for one without an oid.
+        oid: Option<u8>,
         /// How long it waited for the worker.
         waited: Ticks,
     },
     /// A worker finished its errand.
     ErrandEnded {
-        /// The object that sent it.
-        oid: u8,
+        /// The object that sent it; `None` for one without an oid.
+        oid: Option<u8>,
         /// How long it took.
         took: Ticks,
     },
@@ -153,6 +153,11 @@ fn pair(low: u32, high: u32) -> u64 {
     u64::from(low) | u64::from(high) << 32
 }
 
+/// An oid, or no oid.
+fn number(oid: Option<u8>) -> u32 {
+    oid.map_or(u32::MAX, u32::from)
+}
+
 impl Event {
     /// The event at this time as words. Times need 56 bits: they last for 45 years.
     #[inline]
@@ -166,7 +171,7 @@ impl Event {
         match self {
             Event::Omitted(count) => (1, count.into()),
             Event::Woke { slept, late } => (2, pair(slept.0, late.0)),
-            Event::Late { oid, late } => (3, pair(late.0, oid.map_or(u32::MAX, u32::from))),
+            Event::Late { oid, late } => (3, pair(late.0, number(oid))),
             Event::Pace { worst, margin, wakes } => (4, pair(worst.0, u32::from(margin) | u32::from(wakes) << 16)),
             Event::Block(number) => (5, number.into()),
             Event::Command { id, more } => (6, pair(id.into(), more.into())),
@@ -183,8 +188,8 @@ impl Event {
             Event::HostGone => (23, 0),
             Event::Refused => (24, 0),
             Event::Full => (25, 0),
-            Event::ErrandBegan { oid, waited } => (30, pair(waited.0, oid.into())),
-            Event::ErrandEnded { oid, took } => (31, pair(took.0, oid.into())),
+            Event::ErrandBegan { oid, waited } => (30, pair(waited.0, number(oid))),
+            Event::ErrandEnded { oid, took } => (31, pair(took.0, number(oid))),
             Event::Processor { thread: Watched::Core, ran, waited } => (40, pair(ran.0, waited.0)),
             Event::Processor { thread: Watched::Link, ran, waited } => (41, pair(ran.0, waited.0)),
             Event::Stolen(ticks) => (42, ticks.0.into()),
@@ -220,8 +225,8 @@ impl Event {
             23 => Event::HostGone,
             24 => Event::Refused,
             25 => Event::Full,
-            30 => Event::ErrandBegan { oid: high as u8, waited: Ticks(low) },
-            31 => Event::ErrandEnded { oid: high as u8, took: Ticks(low) },
+            30 => Event::ErrandBegan { oid: u8::try_from(high).ok(), waited: Ticks(low) },
+            31 => Event::ErrandEnded { oid: u8::try_from(high).ok(), took: Ticks(low) },
             40 => Event::Processor { thread: Watched::Core, ran: Ticks(low), waited: Ticks(high) },
             41 => Event::Processor { thread: Watched::Link, ran: Ticks(low), waited: Ticks(high) },
             42 => Event::Stolen(Ticks(low)),

@@ -158,17 +158,14 @@ impl<'a> History<'a> {
             Event::Refused => "a block was damaged or out of order".to_owned(),
             Event::Full => "the core has no room for the host's blocks".to_owned(),
             Event::ErrandBegan { oid, .. } => {
-                format!(
-                    "works for {}. It did not end within {span} ms, when the recording ended",
-                    self.object(Some(oid))
-                )
+                format!("works for {}. It did not end within {span} ms, when the recording ended", self.object(oid))
             }
             Event::ErrandEnded { oid, .. } => {
                 let waited = match deed.waited {
                     Ticks(0) => String::new(),
                     Ticks(ticks) => format!(", after {} ms in the queue", ms(ticks.into())),
                 };
-                format!("worked {span} ms for {}{waited}", self.object(Some(oid)))
+                format!("worked {span} ms for {}{waited}", self.object(oid))
             }
             Event::Processor { thread, ran, waited } => {
                 let thread = match thread {
@@ -299,12 +296,12 @@ pub(super) mod tests {
         }
         for at in (2..900).step_by(20) {
             let took = if at == 882 { 12_000 } else { 400 };
-            bus.push((ms(at), Event::ErrandBegan { oid: 7, waited: Ticks::from_us(20) }));
-            bus.push((ms(at) + took, Event::ErrandEnded { oid: 7, took: Ticks::from_us(took as u32) }));
+            bus.push((ms(at), Event::ErrandBegan { oid: Some(7), waited: Ticks::from_us(20) }));
+            bus.push((ms(at) + took, Event::ErrandEnded { oid: Some(7), took: Ticks::from_us(took as u32) }));
             lasting.push((ms(at), Event::Held));
             lasting.push((ms(at) + took, Event::Released));
         }
-        bus.push((ms(990), Event::ErrandBegan { oid: 7, waited: Ticks(0) }));
+        bus.push((ms(990), Event::ErrandBegan { oid: Some(7), waited: Ticks(0) }));
         lasting.insert(0, (10, Event::Configured));
         lasting.insert(1, (20, Event::Scheduling { fifo: true }));
         lasting.push((ms(910), Event::Late { oid: Some(3), late: Ticks::from_us(310) }));
@@ -368,8 +365,10 @@ pub(super) mod tests {
 
     #[test]
     fn a_deed_lasts_from_its_cause_to_its_end() {
-        let (began, ended) =
-            (Event::ErrandBegan { oid: 1, waited: Ticks(7) }, Event::ErrandEnded { oid: 1, took: Ticks::from_us(3) });
+        let (began, ended) = (
+            Event::ErrandBegan { oid: Some(1), waited: Ticks(7) },
+            Event::ErrandEnded { oid: Some(1), took: Ticks::from_us(3) },
+        );
         let woke = Event::Woke { slept: Ticks::from_us(40), late: Ticks(0) };
         let core = [(100, woke), (110, Event::Block(1)), (200, Event::Held)];
         let lasting = [(120, Event::Held), (130, Event::Released)];

@@ -82,9 +82,11 @@ impl Ring {
     /// The same with a quota: the ring lasts ten seconds. It leaves out events that come faster, and counts them.
     pub fn lasting_writer(self, name: &str) -> Option<Writer> {
         // Each window may have one more event, which tells how many were left out.
-        let each = (self.capacity() / WINDOWS).saturating_sub(1);
+        let each = (self.capacity() / WINDOWS).saturating_sub(1).max(1);
         let quota = Quota { each: each as u32, until: Clock::from_bits(0), left: 0, omitted: 0 };
-        self.writer(name).map(|writer| Writer { quota: Some(quota), ..writer })
+        let mut writer = self.writer(name)?;
+        writer.quota = Some(quota);
+        Some(writer)
     }
 
     /// The events, the oldest first. An event that its writer overwrites meanwhile is left out.
@@ -197,7 +199,7 @@ mod tests {
     #[test]
     fn a_ring_has_one_writer_at_a_time_and_keeps_the_events_of_the_last() {
         let ring = ring(8);
-        let mut writer = ring.writer("spi0").unwrap();
+        let mut writer = ring.lasting_writer("spi0").unwrap();
         assert!(ring.writer("spi1").is_none());
         writer.write(Clock::EPOCH, Event::Block(1));
         drop(writer);

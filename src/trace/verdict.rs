@@ -460,8 +460,9 @@ fn doing(record: &Record) -> String {
 }
 
 /// The sender of an errand, as a clause behind others.
-fn sender(record: &Record, oid: u8) -> String {
-    record.trace.head.names.objects.get(&oid).map_or_else(String::new, |object| format!(" ({object})"))
+fn sender(record: &Record, oid: Option<u8>) -> String {
+    oid.and_then(|oid| record.trace.head.names.objects.get(&oid))
+        .map_or_else(String::new, |object| format!(" ({object})"))
 }
 
 /// A span in ticks for people.
@@ -641,9 +642,9 @@ mod tests {
             Scene::calm()
                 .and("link", came, Event::BlockIn(BLOCK))
                 .and("core", STOP - 50_000, Event::Held)
-                .and("spi0", STOP - 50_000, Event::ErrandBegan { oid: 3, waited: Ticks(0) })
+                .and("spi0", STOP - 50_000, Event::ErrandBegan { oid: Some(3), waited: Ticks(0) })
                 .and("core", STOP - 9_000, Event::Released)
-                .and("spi0", STOP - 9_000, Event::ErrandEnded { oid: 3, took: ms(41) })
+                .and("spi0", STOP - 9_000, Event::ErrandEnded { oid: Some(3), took: ms(41) })
                 .and("core", STOP - 100, Event::Block(BLOCK))
                 .stop(BLOCK, STOP - 20_000)
         };
@@ -844,9 +845,9 @@ mod tests {
     fn a_bus_that_hangs_is_named() {
         let hangs = Scene::calm()
             .and("core", STOP - 5 * SECOND, Event::Held)
-            .and("spi0", STOP - 5 * SECOND, Event::ErrandBegan { oid: 3, waited: Ticks(0) })
-            .and("i2c1", STOP - 6 * SECOND, Event::ErrandBegan { oid: 4, waited: Ticks(0) })
-            .and("i2c1", STOP - 5 * SECOND, Event::ErrandEnded { oid: 4, took: ms(1000) });
+            .and("spi0", STOP - 5 * SECOND, Event::ErrandBegan { oid: Some(3), waited: Ticks(0) })
+            .and("i2c1", STOP - 6 * SECOND, Event::ErrandBegan { oid: Some(4), waited: Ticks(0) })
+            .and("i2c1", STOP - 5 * SECOND, Event::ErrandEnded { oid: Some(4), took: ms(1000) });
         let text =
             "spi0 has not answered for 5.0 s (stepper oid 3): check the power and the wires of its devices, and dmesg";
         let stopped = hangs.clone().and("core", STOP, Event::Stopped { block: 7 });

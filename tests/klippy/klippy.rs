@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, raise};
 use nix::unistd::geteuid;
 use pinion::runtime::wakeup::MarginLimits;
-use pinion::runtime::{self, Access, Helpers, Options};
+use pinion::runtime::{self, Access, Helpers, Options, Recording};
 use pinion_linux::clock::Monotonic;
 use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use serde_json::{Value, json};
@@ -127,11 +127,13 @@ impl Printer {
                 cpu: None,
                 margin: MarginLimits::default(),
                 watchdog: None,
+                trace_edges: false,
                 sockets: Vec::new(),
                 dialect: None,
             };
+            let recording = Recording::new(clock, &options.symlink, true, Vec::new()).unwrap();
             let run =
-                move || runtime::run(&options, Box::new(board), timing, clock, Helpers::default(), || {}).unwrap();
+                move || runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), || {}).unwrap();
             Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }
         });
         printer.until_state("ready");

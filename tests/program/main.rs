@@ -11,6 +11,7 @@ mod doctor;
 mod life;
 mod one_order;
 mod process;
+mod recorder;
 mod search;
 mod show;
 mod soak;

@@ -52,6 +52,7 @@ impl Pinion {
             .arg("-I")
             .arg(folder.path().join("tty"))
             .env_remove("JOURNAL_STREAM")
+            .env("STATE_DIRECTORY", folder.path().join("state"))
             .stdout(out)
             .stderr(log)
             .spawn()
@@ -112,6 +113,11 @@ impl Pinion {
 
     pub fn out(&self) -> String {
         fs::read_to_string(self.folder.path().join("out")).unwrap()
+    }
+
+    /// Where it keeps its traces.
+    pub fn state(&self) -> PathBuf {
+        self.folder.path().join("state")
     }
 
     pub fn pid(&self) -> u32 {

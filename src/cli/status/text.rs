@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use crate::cli::page::{Page, aligned};
-use crate::status::{BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, State, Status};
+use crate::status::{BusCounts, Host, Lateness, Line, McuStatus, Object, Present, Queues, Recorder, State, Status};
 
 /// Writes the page.
 pub(super) fn page(status: &Status) -> Page {
@@ -23,6 +23,11 @@ pub(super) fn page(status: &Status) -> Page {
         "guardian",
         status.guardian.pid.map_or("none, as this board needs none".into(), |pid| format!("process {pid}")),
     );
+    if let Some(Recorder { bytes, folder }) = &status.recorder {
+        let memory = format!("up to {:.1} MB for the last ten seconds", *bytes as f64 / 1e6);
+        let traces = folder.as_ref().map_or(String::new(), |folder| format!("; traces of stops in {folder}"));
+        row("recorder", memory + &traces);
+    }
     let Some(mcu) = mcu else { return page };
     if mcu.lateness.timers > 0 {
         row("timers", lateness(&mcu.lateness));

@@ -48,11 +48,12 @@ use nix::unistd::{Pid, getpid};
 
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::Guard;
-use pinion_linux::clock::{Monotonic, monotonic};
+use pinion_linux::clock::monotonic;
 use pinion_linux::sys;
 
 use super::forked::THREADS_MAX;
 use super::pulse::{GuardianEar, Pulse};
+use super::recorder::Recording;
 use super::{NO_PROCESS, refused};
 
 use message::{Message, TAKEN};
@@ -74,25 +75,25 @@ pub struct Guardian {
 }
 
 impl Guardian {
-    /// Forks the guardian. Call it before any thread starts. `clock` is the core's. With `realtime` the guardian's
-    /// priority is above the core's.
+    /// Forks the guardian. Call it before any thread starts. In real time the guardian's priority is above the core's.
+    /// It keeps the recording if the program cannot.
     ///
     /// # Errors
     ///
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
-    pub fn start(clock: Monotonic, realtime: bool) -> Result<Guardian, Trouble> {
-        Guardian::try_start(clock, realtime)
+    pub fn start(recording: &Recording) -> Result<Guardian, Trouble> {
+        Guardian::try_start(recording)
             .map_err(|error| refused("the guardian cannot be started", error).remedy(NO_PROCESS))
     }
 
-    fn try_start(clock: Monotonic, realtime: bool) -> io::Result<Guardian> {
-        let pulse = Pulse::new(clock)?;
+    fn try_start(recording: &Recording) -> io::Result<Guardian> {
+        let pulse = Pulse::new(recording.clock())?;
         let (socket, theirs) = socketpair(AddressFamily::Unix, SockType::SeqPacket, None, SockFlag::SOCK_CLOEXEC)?;
         setsockopt(&socket, sockopt::ReceiveTimeout, &TimeVal::seconds(ANSWER_S))?;
         let program = Program::new(getpid());
         let pid = sys::fork(THREADS_MAX, move || {
-            watcher::settle(realtime, &theirs, &program);
-            Watcher::new(theirs, program, pulse).watch();
+            watcher::settle(recording.is_realtime(), &theirs, &program);
+            Watcher::new(theirs, program, pulse, recording.clone()).watch();
             0
         })?;
         // The guardian answers once it ignores the signals that end a program.
@@ -295,6 +296,7 @@ mod tests {
     fn guarded_program() {
         let (Ok(script), Ok(path)) = (std::env::var("GUARDED_SCRIPT"), std::env::var("GUARDED_FILE")) else { return };
         env_logger::Builder::new().filter_level(log::LevelFilter::Info).init();
+        let recording = Recording::of_a_test();
         if script == "cramped" {
             // Less than the stack of one more thread.
             let pages: nix::sys::resource::rlim_t =
@@ -302,7 +304,7 @@ mod tests {
             let limit = pages * 4096 + (1 << 20);
             setrlimit(Resource::RLIMIT_AS, limit, limit).unwrap();
         }
-        let guardian = Guardian::start(Monotonic::start(), false).unwrap();
+        let guardian = Guardian::start(&recording).unwrap();
         let pulse = guardian.pulse();
         let mut guard = guardian.guard();
         let file = File::options().read(true).write(script != "readonly").open(path).unwrap();
@@ -477,7 +479,7 @@ mod tests {
         // libtest runs tests in threads, unless told otherwise.
         let (stop, stopped) = std::sync::mpsc::channel::<()>();
         let other = thread::spawn(move || stopped.recv());
-        let error = Guardian::start(Monotonic::start(), false).err().unwrap();
+        let error = Guardian::start(&Recording::of_a_test()).err().unwrap();
         assert_eq!(error.found(), "the guardian cannot be started: threads have been started already");
         drop(stop);
         let _ = other.join();

@@ -25,7 +25,10 @@ use pinion_linux::sys;
 use super::super::forked;
 use super::super::pulse::{Ear, Pulse};
 use super::super::realtime;
+use super::super::recorder::Recording;
 use super::message::{MESSAGE_BYTES, Message, REFUSED, TAKEN};
+use crate::trace::event::Event;
+use crate::trace::file::End;
 
 #[cfg(fuzzing)]
 pub(crate) mod fuzz;
@@ -40,6 +43,8 @@ const TRY_FOR: Duration = Duration::from_secs(2);
 const TRY_EVERY: Duration = Duration::from_millis(50);
 /// How long writing to the log may take, in seconds.
 const LOG_S: u32 = 2;
+/// How long it may take to keep the recording, in seconds.
+const KEEP_S: u32 = 10;
 
 /// Gives the new process its name, session, signals, rights and priority.
 pub(super) fn settle(realtime: bool, socket: &OwnedFd, program: &Program) {
@@ -219,14 +224,15 @@ pub(super) struct Watcher {
     socket: OwnedFd,
     program: Program,
     pulse: Pulse,
+    recording: Recording,
     held: HeldOutputs,
     /// The files so far of an output whose last file has not come yet.
     files: Vec<(OwnedFd, Box<[u8]>)>,
 }
 
 impl Watcher {
-    pub(super) fn new(socket: OwnedFd, program: Program, pulse: Pulse) -> Watcher {
-        Watcher { socket, program, pulse, held: HeldOutputs::default(), files: Vec::new() }
+    pub(super) fn new(socket: OwnedFd, program: Program, pulse: Pulse, recording: Recording) -> Watcher {
+        Watcher { socket, program, pulse, recording, held: HeldOutputs::default(), files: Vec::new() }
     }
 
     /// Reports to the program that it is ready. It watches until the program says goodbye, dies or hangs. In the last
@@ -235,6 +241,7 @@ impl Watcher {
         self.answer(TAKEN);
         // This listens to the core's heartbeat. It exists only while outputs are held.
         let mut ear: Option<Ear> = None;
+        let mut tape = self.recording.guardian();
         let cause = loop {
             let pause = match &mut ear {
                 Some(ear) => match ear.listen(self.pulse.now()) {
@@ -243,6 +250,9 @@ impl Watcher {
                 },
                 None => None,
             };
+            if let Some(tape) = &mut tape {
+                tape.write(self.pulse.now(), Event::Listened);
+            }
             let (message, ended) = self.wait(pause);
             if message {
                 match self.take_message() {
@@ -255,9 +265,17 @@ impl Watcher {
                 break Cause::Died;
             }
         };
+        let recording = self.recording.clone();
+        let end = match cause {
+            Cause::Died => End::Died,
+            Cause::Hangs => End::Hung { diagnosis: self.pulse.diagnosis() },
+        };
         if !self.held.is_empty() {
             self.rescue(&cause);
         }
+        // The lines are free. If the disk or the log hangs, the alarm ends this process.
+        alarm::set(KEEP_S);
+        recording.keep_of_the_dead(end);
     }
 
     /// Waits for up to `timeout`. Returns whether a message has come, and whether the program has ended.

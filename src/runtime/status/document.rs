@@ -73,6 +73,8 @@ pub(in crate::runtime) struct Facts {
     pub(in crate::runtime) guardian: Option<u32>,
     /// How many requests to the core there is room for.
     pub(in crate::runtime) requests: usize,
+    /// The flight recorder.
+    pub(in crate::runtime) recorder: status::Recorder,
 }
 
 /// Writes the status.
@@ -107,6 +109,7 @@ impl Reporter {
             host: self.host.host(),
             // If the guardian is lost, the program ends.
             guardian: Guardian { present: facts.guardian.is_some(), pid: facts.guardian },
+            recorder: Some(facts.recorder.clone()),
             mcu: answer.map(|answer| mcu(answer, facts)),
         }
     }

@@ -28,49 +28,63 @@ const PAUSE: Duration = Duration::from_millis(50);
 /// Highest number of clients that are answered at once. Others wait in the kernel's queue.
 const CLIENTS_MAX: usize = 32;
 
-/// The socket in the file system. When this is dropped, the socket is removed and its thread ends.
+/// The status's socket. When this is dropped, the socket is removed and its thread ends.
 pub(in crate::runtime) struct StatusSocket {
-    path: PathBuf,
-    /// Device and inode of our own socket.
-    id: (u64, u64),
+    _place: Place,
     _thread: PipeWriter,
 }
 
+/// A socket's place in the file system. When this is dropped, the socket is removed.
+pub(in crate::runtime) struct Place {
+    path: PathBuf,
+    /// Device and inode of our own socket.
+    id: (u64, u64),
+}
+
 impl StatusSocket {
-    /// Opens the socket at the first of these paths where that is possible, and serves it. Users who may open the
-    /// terminal may ask: the socket gets the terminal's group. A path where another instance answers is not taken over.
+    /// Opens the socket at the first of these paths where that is possible, and serves it.
     pub(in crate::runtime) fn start(
         paths: &[PathBuf],
         facts: Facts,
         host: Arc<HostBoard>,
         asker: Asker,
     ) -> Option<StatusSocket> {
-        let mut errors = Vec::new();
-        for path in paths {
-            match open(path, &facts.device) {
-                Ok((listener, id)) => {
-                    info!("status on {}", path.display());
-                    let served = serve_on(listener, Reporter::new(asker, facts, host));
-                    let started =
-                        served.inspect_err(|error| warn!("pinion status will not be answered: no thread can be started: {error}: raise TasksMax or ulimit -u"));
-                    return Some(StatusSocket { path: path.clone(), id, _thread: started.ok()? });
-                }
-                Err(error) => errors.push(format!("{}: {error}", path.display())),
+        let (listener, place) = match open(paths, &facts.device)? {
+            Ok(opened) => opened,
+            Err(errors) => {
+                warn!("pinion status will not be answered: {errors}");
+                return None;
             }
-        }
-        if !paths.is_empty() {
-            warn!("pinion status will not be answered: {}", errors.join("; "));
-        }
-        None
+        };
+        info!("status on {}", place.path.display());
+        let served = serve_on(listener, Reporter::new(asker, facts, host));
+        let started = served.inspect_err(|error| {
+            warn!("pinion status will not be answered: no thread can be started: {error}: raise TasksMax or ulimit -u")
+        });
+        Some(StatusSocket { _place: place, _thread: started.ok()? })
     }
 }
 
-impl Drop for StatusSocket {
+impl Drop for Place {
     fn drop(&mut self) {
         if fs::symlink_metadata(&self.path).is_ok_and(|found| (found.dev(), found.ino()) == self.id) {
             let _ = fs::remove_file(&self.path);
         }
     }
+}
+
+/// Opens a socket at the first of these paths where that is possible. Users who may open the terminal `device` may
+/// connect: the socket gets the terminal's group. A path where another instance answers is not taken over. `None`:
+/// there are no paths.
+pub(in crate::runtime) fn open(paths: &[PathBuf], device: &Path) -> Option<Result<(UnixListener, Place), String>> {
+    let mut errors = Vec::new();
+    for path in paths {
+        match open_at(path, device) {
+            Ok((listener, id)) => return Some(Ok((listener, Place { path: path.clone(), id }))),
+            Err(error) => errors.push(format!("{}: {error}", path.display())),
+        }
+    }
+    (!errors.is_empty()).then(|| Err(errors.join("; ")))
 }
 
 /// The possible paths of the socket of the instance with this link, the best first.
@@ -90,7 +104,7 @@ pub fn socket_paths(link: &Path) -> Vec<PathBuf> {
 }
 
 /// Opens the socket at a path, and returns it with its device and inode.
-fn open(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
+fn open_at(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
     match fs::symlink_metadata(path) {
         Ok(found) if !found.file_type().is_socket() => {
             return Err(io::Error::other("there is something else: remove it, or choose another --socket"));
@@ -190,6 +204,7 @@ mod tests {
             view: None,
             guardian: None,
             requests: 256,
+            recorder: status::Recorder { bytes: 0, folder: None },
         }
     }
 

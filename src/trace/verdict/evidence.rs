@@ -47,7 +47,7 @@ pub(super) struct Account {
 /// An errand of a worker.
 pub(super) struct Errand<'a> {
     pub(super) bus: &'a str,
-    pub(super) oid: u8,
+    pub(super) oid: Option<u8>,
     pub(super) span: Span,
     pub(super) is_open: bool,
 }

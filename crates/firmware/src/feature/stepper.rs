@@ -127,11 +127,9 @@ impl Stepper {
                 early / i64::from(Ticks::from_us(1).0),
                 self.pulse_ticks.0
             );
-            return Err(
-                Shutdown::because(STEPPER_PAST, cause)
-                    .remedy("lower the speed, the microsteps or step_pulse_duration")
-                    .late_for(self.next_step)
-            );
+            return Err(Shutdown::because(STEPPER_PAST, cause)
+                .remedy("lower the speed, the microsteps or step_pulse_duration")
+                .late_for(self.next_step));
         }
         if reverses {
             if self.both_edges {

@@ -32,6 +32,11 @@ impl Oid {
         Oid(u16::try_from(index).unwrap_or(u16::MAX))
     }
 
+    /// The number on the wire; `None` for a feature's own object.
+    pub fn number(self) -> Option<u8> {
+        u8::try_from(self.0).ok()
+    }
+
     /// The object's place in the table.
     #[inline]
     pub(super) fn index(self) -> usize {

@@ -45,10 +45,10 @@ pub(super) struct Schedule {
 /// A timer that ran late.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Latest {
-    /// How late it was, in ticks; 0 without one.
-    pub late: i64,
+    /// How late it was; zero without one.
+    pub late: Ticks,
     /// Its object; `None` for the MCU's own.
-    pub oid: Option<Oid>,
+    pub oid: Option<u8>,
 }
 
 impl Schedule {
@@ -164,7 +164,9 @@ impl Mcu {
         }
         let next = self.schedule.timers.next();
         let late = next.map_or(0, |at| self.now().since(at));
-        if let Some(next) = next.filter(|_| late > i64::from(LATE_LIMIT.0)) && self.stop.reason.is_none() {
+        if let Some(next) = next.filter(|_| late > i64::from(LATE_LIMIT.0))
+            && self.stop.reason.is_none()
+        {
             let cause = format!(
                 "events are {} ms late: more steps are asked for than this computer can do, or something kept it from running",
                 late as u64 / u64::from(Ticks::from_ms(1).0)
@@ -182,8 +184,10 @@ impl Mcu {
         if timer.is_exact() {
             let late = self.schedule.last_read.since(at);
             self.schedule.lateness.record(late);
-            if late > self.schedule.latest.late {
-                self.schedule.latest = Latest { late, oid: timer.oid() };
+            if late > i64::from(self.schedule.latest.late.0) {
+                let late = Ticks(u32::try_from(late).unwrap_or(u32::MAX));
+                let oid = timer.oid().and_then(Oid::number);
+                self.schedule.latest = Latest { late, oid };
             }
         }
         self.schedule.timing.due.set(Some(at));

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! All `unsafe` code of the project: system calls that none of our crates wraps.
 
+use std::ffi::c_void;
 use std::fs;
 use std::io::{self, IoSliceMut};
 use std::num::NonZeroUsize;
 use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
 use std::panic::{AssertUnwindSafe, catch_unwind};
-use std::sync::atomic::AtomicU32;
+use std::ptr::NonNull;
+use std::slice;
+use std::sync::atomic::{AtomicU32, AtomicU64};
 
 use nix::cmsg_space;
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
@@ -91,14 +94,26 @@ pub const SHARED_WORDS: usize = 1024;
 
 /// A page of zeros that this process shares with the processes that it forks. It is never given back.
 pub fn shared_words() -> io::Result<&'static [AtomicU32; SHARED_WORDS]> {
-    let length = NonZeroUsize::MIN.saturating_add(size_of::<[AtomicU32; SHARED_WORDS]>() - 1);
-    // SAFETY: a new anonymous mapping at an address of the kernel's choice touches no memory
-    // that is in use.
-    let page =
-        unsafe { mmap_anonymous(None, length, ProtFlags::PROT_READ | ProtFlags::PROT_WRITE, MapFlags::MAP_SHARED) }?;
+    let page = shared(size_of::<[AtomicU32; SHARED_WORDS]>())?;
     // SAFETY: the mapping is long enough, aligned to a page, zeroed (a valid value of the
     // atomics) and never unmapped; other processes change it through atomics only.
     Ok(unsafe { page.cast::<[AtomicU32; SHARED_WORDS]>().as_ref() })
+}
+
+/// This many words of zeros that this process shares with the processes that it forks. They are never given back. The
+/// kernel provides a page when it is first touched.
+pub fn shared_memory(words: usize) -> io::Result<&'static [AtomicU64]> {
+    let start = shared(words * size_of::<AtomicU64>())?;
+    // SAFETY: as above.
+    Ok(unsafe { slice::from_raw_parts(start.cast::<AtomicU64>().as_ptr(), words) })
+}
+
+/// A new mapping of zeros.
+fn shared(bytes: usize) -> io::Result<NonNull<c_void>> {
+    let length = NonZeroUsize::new(bytes).ok_or(io::ErrorKind::InvalidInput)?;
+    // SAFETY: a new anonymous mapping at an address of the kernel's choice touches no memory
+    // that is in use.
+    Ok(unsafe { mmap_anonymous(None, length, ProtFlags::PROT_READ | ProtFlags::PROT_WRITE, MapFlags::MAP_SHARED) }?)
 }
 
 /// Forks a process that runs `child` and ends with the status that it returns. Fails if this process has more than

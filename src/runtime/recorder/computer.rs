@@ -1,0 +1,208 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What the kernel tells about this computer: how long threads waited for a processor, and what slows the computer
+//! down. Not every computer tells everything.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::path::PathBuf;
+
+use nix::unistd::{Pid, SysconfVar, sysconf};
+
+use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
+
+use crate::foreign;
+use crate::trace::event::{Event, PowerFault, Watched};
+use crate::trace::ring::Writer;
+
+/// Longest file of sysfs or procfs that is read.
+const FILE_BYTES: u64 = 1 << 16;
+/// The Raspberry Pi firmware's account of faults (raspberrypi-hwmon.c and `vcgencmd get_throttled`).
+const PI_THROTTLED: &str = "/sys/devices/platform/soc/soc:firmware/get_throttled";
+/// Bits of it: undervoltage, and slowed down for its temperature.
+const PI_UNDERVOLTAGE: u64 = 1 << 0;
+const PI_HOT: u64 = 1 << 2 | 1 << 3;
+
+/// Reads it all, and records what has changed.
+pub(super) struct Computer {
+    root: PathBuf,
+    writer: Writer,
+    accounts: Vec<(Watched, PathBuf, Option<Times>)>,
+    stolen: Option<u64>,
+    power: Option<PowerFault>,
+    frequency: (u16, u16),
+    /// Ticks of /proc/stat in a second.
+    hz: u64,
+}
+
+/// The kernel's account of a thread (Documentation/scheduler/sched-stats.rst), in nanoseconds.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+struct Times {
+    ran: u64,
+    waited: u64,
+}
+
+impl Computer {
+    /// The computer with this root folder, `/` unless a test has made one.
+    pub(super) fn new(root: PathBuf, writer: Writer) -> Computer {
+        let hz = sysconf(SysconfVar::CLK_TCK).ok().flatten().and_then(|hz| u64::try_from(hz).ok()).unwrap_or(100);
+        Computer { root, writer, accounts: Vec::new(), stolen: None, power: None, frequency: (0, 0), hz }
+    }
+
+    /// Reads the kernel's account of this thread, too.
+    pub(super) fn watch(&mut self, thread: Watched, tid: Pid) {
+        self.accounts.push((thread, self.root.join(format!("proc/self/task/{tid}/schedstat")), None));
+    }
+
+    fn read(&self, path: &str) -> Option<String> {
+        let bytes = foreign::read(&self.root.join(path.trim_start_matches('/')), FILE_BYTES).ok()?;
+        String::from_utf8(bytes).ok()
+    }
+
+    /// Records what has changed since the last call.
+    pub(super) fn look(&mut self, at: Clock) {
+        self.look_at_threads(at);
+        self.look_at_stolen_time(at);
+        let power = self.power_fault();
+        if power != self.power {
+            self.power = power;
+            self.writer.write(at, Event::Power(power));
+        }
+        let frequency = self.frequency();
+        if frequency != self.frequency {
+            self.frequency = frequency;
+            self.writer.write(at, Event::Frequency { mhz: frequency.0, max_mhz: frequency.1 });
+        }
+    }
+
+    fn look_at_threads(&mut self, at: Clock) {
+        for (thread, path, before) in &mut self.accounts {
+            let text = fs::read_to_string(path).unwrap_or_default();
+            let Some(now) = times(&text) else { continue };
+            if let Some(Times { ran, waited }) = before.replace(now) {
+                let span = |ns: u64| Ticks(u32::try_from(ns / NS_PER_TICK).unwrap_or(u32::MAX));
+                let (ran, waited) = (span(now.ran.saturating_sub(ran)), span(now.waited.saturating_sub(waited)));
+                self.writer.write(at, Event::Processor { thread: *thread, ran, waited });
+            }
+        }
+    }
+
+    fn look_at_stolen_time(&mut self, at: Clock) {
+        let Some(now) = self.read("/proc/stat").and_then(|stat| stolen(&stat)) else { return };
+        if let Some(before) = self.stolen.replace(now).filter(|before| *before < now) {
+            let seconds = u64::from(pinion_firmware::time::CLOCK_FREQ);
+            let ticks = (now - before).saturating_mul(seconds) / self.hz.max(1);
+            self.writer.write(at, Event::Stolen(Ticks(u32::try_from(ticks).unwrap_or(u32::MAX))));
+        }
+    }
+
+    fn power_fault(&self) -> Option<PowerFault> {
+        // The Pi's own kernel has the first file, Linux's own driver the second.
+        let bits =
+            self.read(PI_THROTTLED).and_then(|text| u64::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok());
+        let alarm = || {
+            let alarms = fs::read_dir(self.root.join("sys/class/hwmon")).ok()?.filter_map(Result::ok);
+            alarms
+                .filter(|entry| {
+                    fs::read_to_string(entry.path().join("name")).is_ok_and(|name| name.trim() == "rpi_volt")
+                })
+                .find_map(|entry| fs::read_to_string(entry.path().join("in0_lcrit_alarm")).ok())
+        };
+        match bits {
+            Some(bits) if bits & PI_UNDERVOLTAGE != 0 => Some(PowerFault::Undervoltage),
+            Some(bits) if bits & PI_HOT != 0 => Some(PowerFault::Hot),
+            Some(_) => None,
+            None => alarm().filter(|text| text.trim() == "1").map(|_| PowerFault::Undervoltage),
+        }
+    }
+
+    /// The first processor's frequency, and its highest one, in MHz; 0 if it is unknown.
+    fn frequency(&self) -> (u16, u16) {
+        let mhz = |name: &str| {
+            let khz = self.read(&format!("/sys/devices/system/cpu/cpu0/cpufreq/{name}"));
+            khz.and_then(|khz| u16::try_from(khz.trim().parse::<u32>().ok()? / 1000).ok()).unwrap_or(0)
+        };
+        (mhz("scaling_cur_freq"), mhz("cpuinfo_max_freq"))
+    }
+}
+
+/// The first two fields of a schedstat.
+fn times(text: &str) -> Option<Times> {
+    let mut fields = text.split_whitespace().map_while(|field| field.parse().ok());
+    Some(Times { ran: fields.next()?, waited: fields.next()? })
+}
+
+/// The time that a hypervisor took from all processors (proc_stat(5), the eighth number).
+fn stolen(stat: &str) -> Option<u64> {
+    stat.lines().next()?.strip_prefix("cpu ")?.split_whitespace().nth(7)?.parse().ok()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::trace::ring::ring;
+    use std::path::Path;
+
+    fn put(root: &Path, path: &str, text: &str) {
+        let path = root.join(path.trim_start_matches('/'));
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, text).unwrap();
+    }
+
+    #[test]
+    fn what_has_changed_is_recorded() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path();
+        let ring = ring(256);
+        let mut computer = Computer::new(root.into(), ring.writer("sampler").unwrap());
+        computer.watch(Watched::Core, Pid::from_raw(7));
+        let mut seen = 0;
+        let mut look = || {
+            computer.look(Clock::EPOCH);
+            let events: Vec<Event> =
+                ring.events().into_iter().filter_map(Event::decode).map(|(_, event)| event).collect();
+            let new = events[seen..].to_vec();
+            seen = events.len();
+            new
+        };
+        assert_eq!(look(), []);
+        put(root, "/proc/self/task/7/schedstat", "1000000 5000 12\n");
+        put(root, "/proc/stat", "cpu  1 2 3 4 5 6 7 100 0 0\ncpu0 1 2\n");
+        put(root, "/sys/devices/system/cpu/cpu0/cpufreq/scaling_cur_freq", "600000\n");
+        put(root, "/sys/devices/system/cpu/cpu0/cpufreq/cpuinfo_max_freq", "1500000\n");
+        assert_eq!(look(), [Event::Frequency { mhz: 600, max_mhz: 1500 }]);
+        put(root, "/proc/self/task/7/schedstat", "3000000 12005000 15\n");
+        put(root, "/proc/stat", "cpu  1 2 3 4 5 6 7 103 0 0\n");
+        put(root, PI_THROTTLED, "50005\n");
+        let processor = Event::Processor { thread: Watched::Core, ran: Ticks::from_ms(2), waited: Ticks::from_ms(12) };
+        let power = Event::Power(Some(PowerFault::Undervoltage));
+        assert_eq!(look(), [processor, Event::Stolen(Ticks(3 * 50_000_000 / 100)), power]);
+        put(root, PI_THROTTLED, "50004\n");
+        let still = Event::Processor { thread: Watched::Core, ran: Ticks(0), waited: Ticks(0) };
+        assert_eq!(look(), [still, Event::Power(Some(PowerFault::Hot))]);
+        put(root, PI_THROTTLED, "50000\n");
+        assert_eq!(look(), [still, Event::Power(None)]);
+        fs::remove_file(root.join(PI_THROTTLED.trim_start_matches('/'))).unwrap();
+        put(root, "/sys/class/hwmon/hwmon1/name", "rpi_volt\n");
+        put(root, "/sys/class/hwmon/hwmon1/in0_lcrit_alarm", "1\n");
+        assert_eq!(look(), [still, power]);
+    }
+
+    #[test]
+    fn this_computer_tells_how_long_a_thread_ran() {
+        let ring = ring(256);
+        let mut computer = Computer::new("/".into(), ring.writer("sampler").unwrap());
+        computer.watch(Watched::Core, nix::unistd::gettid());
+        computer.look(Clock::EPOCH);
+        let until = std::time::Instant::now() + std::time::Duration::from_millis(20);
+        while std::time::Instant::now() < until {}
+        computer.look(Clock::EPOCH);
+        let events = ring.events().into_iter().filter_map(Event::decode);
+        let ran =
+            events.filter_map(|(_, event)| if let Event::Processor { ran, .. } = event { Some(ran) } else { None });
+        let ran: Vec<Ticks> = ran.collect();
+        if Path::new("/proc/self/schedstat").exists() {
+            assert!(ran.len() == 1 && ran[0] > Ticks(0), "{ran:?}");
+        }
+    }
+}

@@ -1,0 +1,149 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The flight recorder: each stop leaves a trace and a verdict.
+
+use std::fs::{self, File};
+use std::os::unix::fs::PermissionsExt;
+use std::os::unix::net::UnixStream;
+use std::path::PathBuf;
+use std::process::Command;
+use std::thread;
+use std::time::Duration;
+
+use nix::sys::signal::Signal;
+use pinion::trace::event::Event;
+use pinion::trace::file::{End, Trace};
+use pinion_client::Client;
+
+use crate::process::{Pinion, WAIT_MAX};
+
+/// The traces that the program has kept.
+fn kept(pinion: &Pinion) -> Vec<PathBuf> {
+    let entries = fs::read_dir(pinion.state()).into_iter().flatten();
+    entries.map(|entry| entry.unwrap().path()).collect()
+}
+
+fn read(path: &PathBuf) -> Trace {
+    Trace::read(File::open(path).unwrap()).unwrap()
+}
+
+fn configure(client: &mut Client, lines: &[&str]) {
+    client.send_line("allocate_oids count=8").unwrap();
+    lines.iter().for_each(|line| client.send_line(line).unwrap());
+    client.send_line("finalize_config crc=1").unwrap();
+    assert!(client.status().unwrap().is_config);
+}
+
+const OUTPUT: &str = "config_digital_out oid=0 pin=led value=0 default_value=0 max_duration=0";
+
+/// Waits for the verdict with these words, and reads the trace that it names.
+#[track_caller]
+fn verdict(pinion: &Pinion, words: &str) -> Trace {
+    let line = pinion.logged(words);
+    let (_, file) = line.split_once("(pinion trace ").unwrap_or_else(|| panic!("{line}"));
+    let file = PathBuf::from(file.trim_end_matches(')'));
+    assert_eq!(kept(pinion), [file.clone()]);
+    assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o644);
+    read(&file)
+}
+
+#[test]
+fn a_host_that_is_late_is_named() {
+    let pinion = Pinion::simulated(&["--trace-edges"]);
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    client.send_line("update_digital_out oid=0 value=1").unwrap();
+    let late = client.clock_in(-0.25).unwrap().wire();
+    client.send_line(&format!("queue_digital_out oid=0 clock={late} on_ticks=1")).unwrap();
+    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Timer too close"));
+    let trace = verdict(&pinion, "look at the host's load");
+    let line = pinion.logged("look at the host's load");
+    let (_, ms) = line.split_once("the host's block came ").unwrap_or_else(|| panic!("{line}"));
+    let ms: f64 = ms.split(' ').next().unwrap().parse().unwrap();
+    assert!((200.0..20_000.0).contains(&ms), "{line}");
+    assert!(matches!(&trace.head.end, End::Shutdown { reason, .. } if reason == "Timer too close"));
+    assert_eq!(trace.head.names.objects[&0], "digital output oid 0 (led)");
+    assert!(trace.head.names.commands.values().any(|name| name == "queue_digital_out"));
+    for thread in ["core", "link", "sampler"] {
+        assert!(trace.of(thread).count() > 0, "{thread}");
+    }
+    let levels: Vec<bool> = trace
+        .of("edges")
+        .filter_map(|(_, event)| if let Event::Edge { level, .. } = event { Some(level) } else { None })
+        .collect();
+    assert_eq!(levels, [false, true, false], "off, on, and its shutdown value");
+    assert_eq!(trace.head.names.pins.values().next().map(String::as_str), Some("led"));
+}
+
+/// SIGSTOP stops all threads, as a frozen control group does.
+#[test]
+fn a_program_that_was_stopped_is_told_from_a_late_host() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    pinion.signal(Signal::SIGSTOP);
+    thread::sleep(Duration::from_millis(1500));
+    pinion.signal(Signal::SIGCONT);
+    assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Rescheduled timer in the past"));
+    verdict(&pinion, "stood still");
+    assert!(!pinion.log().contains("look at the host's load"));
+}
+
+/// The guardian keeps what the program has recorded.
+#[test]
+fn a_program_that_was_killed_leaves_its_trace() {
+    let pinion = Pinion::start(&["run"]);
+    pinion.wait_for_link();
+    configure(&mut pinion.client(), &[]);
+    pinion.signal(Signal::SIGKILL);
+    let trace = verdict(&pinion, "Pinion died");
+    assert_eq!(trace.head.end, End::Died);
+    assert!(trace.of("core").any(|(_, event)| event == Event::Configured));
+    assert!(trace.of("guardian").count() > 0);
+    assert!(trace.head.names.commands.values().any(|name| name == "finalize_config"));
+}
+
+#[test]
+fn a_normal_end_and_an_unused_program_leave_no_trace() {
+    let mut pinion = Pinion::simulated(&[]);
+    configure(&mut pinion.client(), &[OUTPUT]);
+    pinion.signal(Signal::SIGTERM);
+    pinion.end();
+    assert!(kept(&pinion).is_empty());
+    let mut pinion = Pinion::start(&["run"]);
+    pinion.wait_for_link();
+    pinion.signal(Signal::SIGKILL);
+    pinion.end();
+    thread::sleep(Duration::from_millis(300));
+    assert!(kept(&pinion).is_empty());
+}
+
+#[test]
+fn a_running_program_gives_its_recording() {
+    let pinion = Pinion::simulated(&[]);
+    configure(&mut pinion.client(), &[OUTPUT]);
+    pinion.until("the MCU's names", || {
+        let live = UnixStream::connect(pinion.link().with_extension("trace")).unwrap();
+        let trace = Trace::read(live).unwrap();
+        assert_eq!(trace.head.end, End::Asked);
+        trace.head.names.objects.contains_key(&0)
+    });
+    let status = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["status"]).arg(pinion.link()).output().unwrap();
+    let page = String::from_utf8(status.stdout).unwrap();
+    assert!(page.contains("\nrecorder  up to "), "{page}");
+}
+
+/// A disk that takes no file keeps neither the verdict from the log nor the program from its work.
+#[test]
+fn a_folder_that_takes_no_file_is_a_warning() {
+    let folder = tempfile::tempdir().unwrap();
+    fs::write(folder.path().join("state"), "no folder").unwrap();
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim"]);
+    pinion.wait_for_link();
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    client.send_line("emergency_stop").unwrap();
+    pinion.logged("nobody was late");
+    // Another of the folders may have taken it: the user's own.
+    client.reset().unwrap();
+    assert!(!client.status().unwrap().is_shutdown);
+}
