@@ -296,7 +296,7 @@ impl Keeper {
         let Some(writer) = self.recording.memory.sampler() else { return };
         let mut computer = Computer::new("/".into(), writer);
         computer.watch(Watched::Link, link);
-        let mut next = monotonic();
+        let (mut next, mut has_news) = (monotonic(), true);
         loop {
             if monotonic() >= next {
                 next = monotonic() + LOOK_EVERY;
@@ -314,6 +314,10 @@ impl Keeper {
                     }
                 }
             }
+            if std::mem::take(&mut has_news) {
+                let names = self.names().clone();
+                self.recording.memory.set_names(&names);
+            }
             let listener = self.listener.as_ref().map_or(self.end.as_fd(), AsFd::as_fd);
             let mut fds = [
                 PollFd::new(self.end.as_fd(), PollFlags::empty()),
@@ -324,8 +328,7 @@ impl Keeper {
             let [ended, woken, asked] = fds.map(|fd| fd.any().unwrap_or(true));
             if woken {
                 let _ = self.wake.read();
-                let names = self.names().clone();
-                self.recording.memory.set_names(&names);
+                has_news = true;
             }
             if ended && self.news.is_empty() {
                 return;
