@@ -4,7 +4,10 @@
 #![forbid(unsafe_code)]
 
 use std::env;
-use std::fs;
+use std::fs::{self, DirBuilder};
+use std::io;
+use std::iter;
+use std::os::unix::fs::DirBuilderExt;
 use std::path::{Path, PathBuf};
 
 /// The service's folder.
@@ -18,16 +21,30 @@ const UTC_MS_MAX: u64 = 253_402_300_799_999;
 
 /// The folders where traces are kept, the best first. A trace goes into the first one that takes it.
 ///
-/// A service has `$STATE_DIRECTORY`. The next folder is the packaged service's, and the last one is the user's own.
+/// A service has only `$STATE_DIRECTORY`. Otherwise the first folder is the packaged service's, and the second one is
+/// the user's own.
 pub fn folders() -> Vec<PathBuf> {
     let service = env::var("STATE_DIRECTORY").unwrap_or_default();
     let service = service.split(':').map(PathBuf::from).filter(|folder| folder.is_absolute());
-    let mut folders: Vec<PathBuf> = service.collect();
-    if !folders.iter().any(|folder| folder == Path::new(SERVICE)) {
-        folders.push(SERVICE.into());
+    let folders: Vec<PathBuf> = service.collect();
+    if folders.is_empty() { iter::once(SERVICE.into()).chain(own()).collect() } else { folders }
+}
+
+/// The user's own folder, which may be missing.
+fn own() -> Option<PathBuf> {
+    Some(user_state()?.join("pinion"))
+}
+
+/// Makes a folder for traces, if it is missing. Only systemd or a package makes the service's folder.
+///
+/// # Errors
+///
+/// It cannot be made.
+pub fn make(folder: &Path) -> io::Result<()> {
+    if folder == Path::new(SERVICE) {
+        return Ok(());
     }
-    folders.extend(user_state().map(|state| state.join("pinion")));
-    folders
+    DirBuilder::new().recursive(true).mode(0o755).create(folder)
 }
 
 /// The folder for the state of this user's programs, if there is one (XDG Base Directory Specification).

@@ -14,7 +14,7 @@ use std::collections::BTreeMap;
 use std::fs::{self, File, Permissions};
 use std::io::{self, BufWriter, PipeReader, PipeWriter};
 use std::os::fd::AsFd;
-use std::os::unix::fs::{DirBuilderExt, PermissionsExt};
+use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{UnixListener, UnixStream};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -152,7 +152,7 @@ impl Recording {
             Ok(path) => info!("{} (pinion trace {})", found.text, path.display()),
             Err(error) => {
                 info!("{}", found.text);
-                warn!("the trace of this stop is not kept: {error}");
+                warn!("the trace of this stop is not kept: {error}: make room on the disk, or the folder");
             }
         }
     }
@@ -178,7 +178,7 @@ impl Recording {
     }
 
     fn write_into(&self, folder: &Path, trace: &Trace) -> io::Result<PathBuf> {
-        fs::DirBuilder::new().recursive(true).mode(0o755).create(folder)?;
+        folder::make(folder)?;
         let name = folder::name_of(&self.link);
         let path = folder.join(folder::file_name(&name, trace.head.utc_ms));
         // A rename puts only a whole file in place. A full disk or a power cut leaves none.
