@@ -11,8 +11,8 @@ use tempfile::TempDir;
 
 use crate::process::output;
 
-const GROUPS: [&str; 8] =
-    ["kernel", "service", "watchdog", "terminal", "host", "pins and buses", "permissions", "power"];
+const GROUPS: [&str; 9] =
+    ["last stop", "kernel", "service", "watchdog", "terminal", "host", "pins and buses", "permissions", "power"];
 
 fn stdout(output: &Output) -> String {
     String::from_utf8(output.stdout.clone()).unwrap()

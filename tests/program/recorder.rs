@@ -42,7 +42,7 @@ fn verdict(pinion: &Pinion, words: &str) -> Trace {
     assert!(line.contains(words), "{line}");
     let (_, file) = line.split_once("(pinion trace ").unwrap_or_else(|| panic!("{line}"));
     let file = PathBuf::from(file.trim_end_matches(')'));
-    assert_eq!(kept(pinion), [file.clone()]);
+    assert_eq!(kept(pinion), std::slice::from_ref(&file));
     assert_eq!(fs::metadata(&file).unwrap().permissions().mode() & 0o777, 0o644);
     read(&file)
 }
