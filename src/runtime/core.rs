@@ -177,7 +177,9 @@ impl Core {
             self.mcu.run_workers();
             self.tell_debts();
             self.waiter.ran(self.mcu.last_read());
-            self.tape.turn(&mut self.mcu, self.waiter.margin(), !self.waiter.is_realtime());
+            if behind {
+                self.record();
+            }
             if self.mcu.is_held() && !self.mcu.is_shutdown() && self.progress.stops_handed() != self.stops_taken {
                 self.stop_ahead();
             }
@@ -220,13 +222,13 @@ impl Core {
                 thread::yield_now();
                 continue;
             }
+            self.record();
             self.mcu.account(Ticks(now.since(busy_since) as u32));
             let to_go = deadline.map_or(2 * FAR_TICKS, |deadline| deadline.since(now));
             let Some(deadline) = deadline.filter(|_| to_go <= FAR_TICKS) else {
                 // Sleep half the way: this leaves room for a late wake-up.
                 self.nap(BEAT.min(Duration::from_nanos(to_go as u64 / 2 * NS_PER_TICK)));
                 busy_since = self.clock.now();
-                self.record_sleep();
                 continue;
             };
             let exact = self.mcu.next_exact_timer();
@@ -235,7 +237,6 @@ impl Core {
             // Near a timer, calls have to wait.
             let woken = waiter.wait(deadline, exact, || !near && calls.any());
             busy_since = self.clock.now();
-            self.record_sleep();
             if woken == Woken::Due {
                 self.yielded += 1;
             }
@@ -252,10 +253,13 @@ impl Core {
         }
     }
 
-    fn record_sleep(&mut self) {
+    /// Records the last sleep, and what has changed. The core does this once before each sleep, when no timer is due.
+    #[inline]
+    fn record(&mut self) {
         if let Some(sleep) = self.waiter.take_sleep() {
             self.tape.woke(sleep);
         }
+        self.tape.turn(&mut self.mcu, self.waiter.margin(), !self.waiter.is_realtime());
     }
 
     /// Tells the guardian which output is owed its shutdown value.

@@ -4,7 +4,8 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs;
+use std::fs::{self, File};
+use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
 
 use nix::unistd::{Pid, SysconfVar, sysconf};
@@ -15,6 +16,8 @@ use crate::foreign;
 use crate::trace::event::{Event, PowerFault, Watched};
 use crate::trace::ring::Writer;
 
+/// One look in this many is at everything. The kernel needs long for some of it.
+const RARELY: u32 = 16;
 /// Longest file of sysfs or procfs that is read.
 const FILE_BYTES: u64 = 1 << 16;
 /// The Raspberry Pi firmware's account of faults (raspberrypi-hwmon.c and `vcgencmd get_throttled`).
@@ -27,7 +30,9 @@ const PI_HOT: u64 = 1 << 2 | 1 << 3;
 pub(super) struct Computer {
     root: PathBuf,
     writer: Writer,
-    accounts: Vec<(Watched, PathBuf, Option<Times>)>,
+    accounts: Vec<(Watched, File, Option<Times>)>,
+    /// Number of looks so far.
+    looks: u32,
     stolen: Option<u64>,
     power: Option<PowerFault>,
     frequency: (u16, u16),
@@ -46,12 +51,15 @@ impl Computer {
     /// The computer with this root folder, `/` unless a test has made one.
     pub(super) fn new(root: PathBuf, writer: Writer) -> Computer {
         let hz = sysconf(SysconfVar::CLK_TCK).ok().flatten().and_then(|hz| u64::try_from(hz).ok()).unwrap_or(100);
-        Computer { root, writer, accounts: Vec::new(), stolen: None, power: None, frequency: (0, 0), hz }
+        Computer { root, writer, accounts: Vec::new(), looks: 0, stolen: None, power: None, frequency: (0, 0), hz }
     }
 
     /// Reads the kernel's account of this thread, too.
     pub(super) fn watch(&mut self, thread: Watched, tid: Pid) {
-        self.accounts.push((thread, self.root.join(format!("proc/self/task/{tid}/schedstat")), None));
+        // The file stays open: opening it takes longer than reading it. A kernel without the account has no file.
+        if let Ok(file) = File::open(self.root.join(format!("proc/self/task/{tid}/schedstat"))) {
+            self.accounts.push((thread, file, None));
+        }
     }
 
     fn read(&self, path: &str) -> Option<String> {
@@ -59,9 +67,17 @@ impl Computer {
         String::from_utf8(bytes).ok()
     }
 
-    /// Records what has changed since the last call.
+    /// Records what has changed since the last call. It looks at most things only at some of the calls.
     pub(super) fn look(&mut self, at: Clock) {
         self.look_at_threads(at);
+        if self.looks.is_multiple_of(RARELY) {
+            self.look_at_all(at);
+        }
+        self.looks = self.looks.wrapping_add(1);
+    }
+
+    /// Records what has changed, all of it.
+    pub(super) fn look_at_all(&mut self, at: Clock) {
         self.look_at_stolen_time(at);
         let power = self.power_fault();
         if power != self.power {
@@ -76,9 +92,10 @@ impl Computer {
     }
 
     fn look_at_threads(&mut self, at: Clock) {
-        for (thread, path, before) in &mut self.accounts {
-            let text = fs::read_to_string(path).unwrap_or_default();
-            let Some(now) = times(&text) else { continue };
+        for (thread, file, before) in &mut self.accounts {
+            let mut text = [0; 64];
+            let length = file.read_at(&mut text, 0).unwrap_or(0);
+            let Some(now) = str::from_utf8(&text[..length]).ok().and_then(times) else { continue };
             if let Some(Times { ran, waited }) = before.replace(now) {
                 let span = |ns: u64| Ticks(u32::try_from(ns / NS_PER_TICK).unwrap_or(u32::MAX));
                 let (ran, waited) = (span(now.ran.saturating_sub(ran)), span(now.waited.saturating_sub(waited)));
@@ -155,10 +172,12 @@ mod tests {
         let root = folder.path();
         let ring = ring(256);
         let mut computer = Computer::new(root.into(), ring.writer("sampler").unwrap());
+        put(root, "/proc/self/task/7/schedstat", "");
         computer.watch(Watched::Core, Pid::from_raw(7));
         let mut seen = 0;
         let mut look = || {
-            computer.look(Clock::EPOCH);
+            computer.look_at_threads(Clock::EPOCH);
+            computer.look_at_all(Clock::EPOCH);
             let events: Vec<Event> =
                 ring.events().into_iter().filter_map(Event::decode).map(|(_, event)| event).collect();
             let new = events[seen..].to_vec();

@@ -309,7 +309,9 @@ impl Keeper {
                     News::Stopped { at, reason, trouble } => {
                         thread::sleep(SETTLE);
                         // The accounts at the stop tell more than those before it.
-                        computer.look(self.recording.clock.now());
+                        let now = self.recording.clock.now();
+                        computer.look(now);
+                        computer.look_at_all(now);
                         self.recording.keep(End::Shutdown { reason: reason.to_owned(), trouble }, at);
                     }
                 }

@@ -111,11 +111,11 @@ impl Tape {
         self.recent.write(at, Event::Command { id, more: (count - 1).min(u8::MAX.into()) as u8 });
     }
 
-    /// The core has run the due timers. It is called in each turn.
+    /// Records what has changed since the last call. The core calls it before each sleep, and while it is behind.
     #[inline]
     pub(in crate::runtime) fn turn(&mut self, mcu: &mut Mcu, margin: Ticks, is_ordinary: bool) {
         let at = mcu.last_read();
-        let latest = mcu.take_latest();
+        let latest = mcu.latest();
         if latest.late > self.worst {
             self.is_later(at, latest);
         }
@@ -130,9 +130,11 @@ impl Tape {
         }
         if at >= self.pace_at {
             self.pace(at, margin);
+            mcu.forget_latest();
         }
     }
 
+    #[cold]
     fn is_later(&mut self, at: Clock, Latest { late, oid }: Latest) {
         self.worst = late;
         if late > LATE {
@@ -141,6 +143,7 @@ impl Tape {
         }
     }
 
+    #[cold]
     fn pace(&mut self, at: Clock, margin: Ticks) {
         let (worst, wakes) = (std::mem::take(&mut self.worst), std::mem::take(&mut self.wakes));
         self.pace_at = at + PACE;

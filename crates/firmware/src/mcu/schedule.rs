@@ -227,10 +227,15 @@ impl Mcu {
         self.schedule.stats.add(busy);
     }
 
-    /// The latest timer with a margin since the last call.
+    /// The latest timer with a margin since [`Mcu::forget_latest`].
     #[inline]
-    pub fn take_latest(&mut self) -> Latest {
-        std::mem::take(&mut self.schedule.latest)
+    pub fn latest(&self) -> Latest {
+        self.schedule.latest
+    }
+
+    /// Looks for the latest timer anew.
+    pub fn forget_latest(&mut self) {
+        self.schedule.latest = Latest::default();
     }
 
     /// Reports in the log how late timers were. `margin` is how long before a timer the core wakes.
