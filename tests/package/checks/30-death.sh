@@ -25,3 +25,8 @@ systemctl restart pinion-mcu
 dies 8 USR2 pid
 rm -r /run/systemd/system/pinion-mcu.service.d
 systemctl daemon-reload
+# Each death left a recording, which everybody may read.
+says() { klippy pinion trace --list | grep -q "$1"; }
+until_true 10 says 'Pinion died'
+until_true 10 says 'Pinion hung'
+is "$(stat -c '%U %a' /var/lib/pinion)" "pinion 755" "the folder of recordings"
