@@ -25,10 +25,14 @@ use super::super::notify::Notify;
 use super::super::outlet::{LinkWake, Outlet, Progress, outlet};
 use super::super::pty::{Access, Pty};
 use super::super::pulse::Pulse;
+use super::super::recorder::Recording;
 use super::super::signals::Signals;
 use super::super::status::HostBoard;
 use super::super::watchdog::Vigil;
 use super::*;
+
+/// Memory that is shared with a guardian is never freed, so there is only one recording.
+static RECORDING: LazyLock<Recording> = LazyLock::new(Recording::of_a_test);
 
 /// Blocks that klippy sends before it waits for an acknowledgement (`MAX_PENDING_BLOCKS` in chelper/serialqueue.c).
 const PENDING_MAX: u32 = 12;
@@ -145,8 +149,9 @@ impl Bench {
         let oversight = Oversight::new(Signals::new().expect("signals"), None, vigil);
         let introduction = Introduction::of(dialect.clone());
         let host = HostEnd::new(pty, Arc::new(HostBoard::default()));
+        let (recorder, _) = Recorder::new(RECORDING.clone()).expect("one recorder at a time");
         Bench {
-            link: Link::new(host, end, introduction, oversight, clock()),
+            link: Link::new(host, end, introduction, oversight, clock(), recorder),
             core: Core { requests: inbox, progress, outlet, is_busy: false, blocks: Vec::new() },
             device,
             host: None,

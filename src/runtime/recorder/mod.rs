@@ -86,9 +86,9 @@ impl Recording {
         Ok(Recording { memory, clock, link: link.to_owned(), realtime, folders })
     }
 
-    #[cfg(test)]
+    #[cfg(any(test, fuzzing))]
     pub(super) fn of_a_test() -> Recording {
-        Recording::new(Monotonic::start(), Path::new("/tmp/klipper_host_test"), false, Vec::new()).unwrap()
+        Recording::new(Monotonic::start(), Path::new("/tmp/klipper_host_test"), false, Vec::new()).expect("memory")
     }
 
     /// The clock of the core and of the events.

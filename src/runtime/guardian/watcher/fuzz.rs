@@ -15,6 +15,8 @@ use super::*;
 
 /// A page that is shared with the guardian is never freed, so there is only one.
 static PULSE: LazyLock<Pulse> = LazyLock::new(|| Pulse::new(Monotonic::start()).expect("a page"));
+/// The same for the memory of a recording.
+static RECORDING: LazyLock<Recording> = LazyLock::new(Recording::of_a_test);
 
 /// Gives a guardian messages. Each has two bytes before it: whether a descriptor comes with it, and its length. The
 /// guardian answers each as the messages' description says, and holds the outputs with these names.
@@ -22,7 +24,7 @@ pub fn guardian(mut bytes: &[u8]) {
     let kind = SockType::SeqPacket;
     let (ours, theirs) = socketpair(AddressFamily::Unix, kind, None, SockFlag::SOCK_CLOEXEC).expect("sockets");
     let file = File::open("/dev/null").expect("a file");
-    let mut watcher = Watcher::new(theirs, Program { pid: getppid(), pidfd: None }, *PULSE);
+    let mut watcher = Watcher::new(theirs, Program { pid: getppid(), pidfd: None }, *PULSE, RECORDING.clone());
     let (mut names, mut files) = (BTreeSet::new(), 0);
     while let Some((&[head, len], rest)) = bytes.split_first_chunk() {
         let (message, rest) = rest.split_at(usize::from(len).min(rest.len()));
