@@ -180,7 +180,7 @@ endif
 	test ! -d $(DESTDIR)/etc/pinion || rmdir --ignore-fail-on-non-empty $(DESTDIR)/etc/pinion
 	-rmdir $(DESTDIR)$(LIBDIR)
 ifeq ($(DESTDIR),)
-	rm -rf /run/pinion
+	rm -rf /run/pinion /var/lib/pinion
 	-systemctl daemon-reload
 	-udevadm control --reload
 endif
