@@ -24,7 +24,7 @@ const MAGIC: &str = "pinion trace 1\n";
 const EVENT_BYTES: usize = EVENT_WORDS * 8;
 /// Longest line of JSON.
 const LINE_MAX: u64 = 1 << 20;
-/// Highest number of events of a thread.
+/// Highest number of events of all threads: more than all rings have.
 const EVENTS_MAX: usize = 1 << 20;
 /// Highest number of threads.
 const THREADS_MAX: usize = 64;
@@ -171,15 +171,16 @@ impl Trace {
         }
         let head: Head = serde_json::from_str(&line(&mut file)?)
             .map_err(|error| io::Error::other(format!("its head does not fit this Pinion: {error}")))?;
-        let mut threads = Vec::new();
+        let (mut threads, mut room) = (Vec::new(), EVENTS_MAX);
         while threads.len() < THREADS_MAX {
             let Ok(part) = line(&mut file).and_then(|line| Ok(serde_json::from_str::<Part>(&line)?)) else { break };
             let mut events = Vec::new();
             let mut bytes = [0; EVENT_BYTES];
-            for _ in 0..part.events.min(EVENTS_MAX) {
-                if file.read_exact(&mut bytes).is_err() {
+            for _ in 0..part.events {
+                if room == 0 || file.read_exact(&mut bytes).is_err() {
                     break;
                 }
+                room -= 1;
                 let word = |at: usize| u64::from_le_bytes(std::array::from_fn(|byte| bytes[at + byte]));
                 events.extend(Event::decode([word(0), word(8)]));
             }
@@ -267,6 +268,19 @@ pub(crate) mod tests {
             assert_eq!(cut.head, some().head);
             assert!(cut.threads.len() <= 3);
         }
+    }
+
+    #[test]
+    fn a_file_without_end_takes_bounded_memory() {
+        let events = vec![(1, Event::Held); EVENTS_MAX / 2 + 1];
+        let endless = trace(End::Asked, &[("core", &events), ("link", &events), ("spi0", &events)]);
+        let lengths: Vec<usize> = Trace::read(written(&endless).as_slice())
+            .unwrap()
+            .threads
+            .iter()
+            .map(|thread| thread.events.len())
+            .collect();
+        assert_eq!(lengths.iter().sum::<usize>(), EVENTS_MAX, "{lengths:?}");
     }
 
     proptest! {
