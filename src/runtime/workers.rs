@@ -16,7 +16,7 @@ use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
-use pinion_linux::clock::monotonic;
+use pinion_linux::clock::{monotonic, wait_until};
 
 use crate::trace::event::Event;
 use crate::trace::ring::Writer;
@@ -154,10 +154,7 @@ impl Workers for Threads {
         }
         let end = monotonic() + END_LIMIT;
         for worker in self.workers.drain(..).filter(|worker| !worker.left_behind) {
-            while !worker.thread.is_finished() && monotonic() < end {
-                thread::sleep(Duration::from_millis(1));
-            }
-            if worker.thread.is_finished() {
+            if wait_until(end, || worker.thread.is_finished()) {
                 let _ = worker.thread.join();
             } else {
                 error!(

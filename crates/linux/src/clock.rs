@@ -3,6 +3,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::thread;
 use std::time::Duration;
 
 use nix::poll::PollTimeout;
@@ -44,6 +45,19 @@ impl TimeSource for Monotonic {
 pub fn monotonic() -> Duration {
     // clock_gettime(2) fails only for an unknown clock or a bad pointer.
     clock_gettime(ClockId::CLOCK_MONOTONIC).map_or(Duration::ZERO, Duration::from)
+}
+
+/// Looks every millisecond whether something is done, until `deadline` (CLOCK_MONOTONIC). Returns whether it is done.
+pub fn wait_until(deadline: Duration, mut is_done: impl FnMut() -> bool) -> bool {
+    loop {
+        if is_done() {
+            return true;
+        }
+        if monotonic() >= deadline {
+            return false;
+        }
+        thread::sleep(Duration::from_millis(1));
+    }
 }
 
 /// A timeout for poll(2), rounded up to whole milliseconds. Without an end if it is longer than poll(2) can wait.

@@ -33,7 +33,6 @@ mod watcher;
 use std::io::{self, IoSlice};
 use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
 use std::sync::Arc;
-use std::thread;
 use std::time::Duration;
 
 use log::warn;
@@ -48,7 +47,7 @@ use nix::unistd::{Pid, getpid};
 
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::Guard;
-use pinion_linux::clock::monotonic;
+use pinion_linux::clock::{monotonic, wait_until};
 use pinion_linux::sys;
 
 use super::forked::THREADS_MAX;
@@ -125,19 +124,12 @@ impl Guardian {
         if self.tell_goodbye().is_err() {
             return;
         }
-        let until = monotonic() + END_LIMIT;
-        while let Ok(WaitStatus::StillAlive) = waitpid(self.pid, Some(WaitPidFlag::WNOHANG)) {
-            if monotonic() > until {
-                warn!(
-                    "the guardian (process {}) is stopped or hangs, and would keep the lines: Pinion kills it",
-                    self.pid
-                );
-                // The guardian is our child and was not waited for yet. So the kernel cannot have given its process
-                // number to another process.
-                let _ = kill(self.pid, Signal::SIGKILL);
-                return;
-            }
-            thread::sleep(Duration::from_millis(1));
+        let has_ended = || !matches!(waitpid(self.pid, Some(WaitPidFlag::WNOHANG)), Ok(WaitStatus::StillAlive));
+        if !wait_until(monotonic() + END_LIMIT, has_ended) {
+            warn!("the guardian (process {}) is stopped or hangs, and would keep the lines: Pinion kills it", self.pid);
+            // The guardian is our child and was not waited for yet. So the kernel cannot have given its process number
+            // to another process.
+            let _ = kill(self.pid, Signal::SIGKILL);
         }
     }
 
@@ -249,6 +241,7 @@ mod tests {
     use std::io::{BufRead, BufReader};
     use std::path::{Path, PathBuf};
     use std::process::{Child, Command, Stdio};
+    use std::thread;
 
     const MS: Duration = Duration::from_millis(1);
 

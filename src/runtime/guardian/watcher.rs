@@ -19,7 +19,7 @@ use nix::sys::socket::{MsgFlags, send};
 use nix::sys::uio::pwrite;
 use nix::unistd::{Pid, alarm, getppid};
 
-use pinion_linux::clock::{monotonic, poll_timeout};
+use pinion_linux::clock::{monotonic, poll_timeout, wait_until};
 use pinion_linux::sys;
 
 use super::super::forked;
@@ -197,10 +197,7 @@ impl Program {
     }
 
     fn wait_for_end(&self) {
-        let until = monotonic() + END_LIMIT;
-        while !self.has_ended() && monotonic() < until {
-            thread::sleep(Duration::from_millis(1));
-        }
+        wait_until(monotonic() + END_LIMIT, || self.has_ended());
     }
 }
 

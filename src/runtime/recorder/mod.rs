@@ -32,7 +32,7 @@ use pinion_firmware::board::Board;
 use pinion_firmware::mcu::Dialect;
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
-use pinion_linux::clock::{Monotonic, monotonic, poll_timeout};
+use pinion_linux::clock::{Monotonic, monotonic, poll_timeout, wait_until};
 use pinion_protocol::format;
 
 use crate::trace::event::{Event, Watched};
@@ -274,10 +274,7 @@ impl Drop for Recorder {
     fn drop(&mut self) {
         let Some((alive, thread, _place)) = self.thread.take() else { return };
         drop(alive);
-        let until = monotonic() + END_LIMIT;
-        while !thread.is_finished() && monotonic() < until {
-            thread::sleep(Duration::from_millis(1));
-        }
+        wait_until(monotonic() + END_LIMIT, || thread.is_finished());
     }
 }
 
