@@ -15,7 +15,7 @@ use clap::{Args, ValueHint};
 use pinion_firmware::time::NS_PER_TICK;
 
 use crate::foreign;
-use crate::runtime::socket_paths;
+use crate::runtime::{socket_paths, trace_socket_paths};
 use crate::trace::event::Event;
 use crate::trace::file::Trace;
 use crate::trace::folder::{all, folders, kept, name_of, utc_text};
@@ -177,7 +177,7 @@ pub(super) fn read(path: &Path) -> io::Result<Trace> {
 fn live(args: &TraceArgs, span: Duration) -> Result<(PathBuf, Trace), String> {
     let link = args.symlink.as_deref().unwrap_or(Path::new(LINK));
     let status = args.socket.clone().map_or_else(|| socket_paths(link), |socket| vec![socket]);
-    let sockets: Vec<PathBuf> = status.iter().map(|socket| socket.with_extension("trace")).collect();
+    let sockets = trace_socket_paths(&status);
     // Without a Pinion, nobody has to wait for the message.
     if sockets.iter().any(|socket| socket.exists()) {
         thread::sleep(span);

@@ -14,7 +14,7 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 
-use log::{error, info};
+use log::{error, info, warn};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
@@ -69,7 +69,7 @@ pub use pty::Access;
 pub use recorder::Recording;
 pub use served::{Served, served};
 pub(crate) use signals::hang_up;
-pub use status::socket_paths;
+pub use status::{socket_paths, trace_socket_paths};
 pub use terminal_group::{CLOSED, TerminalGroup};
 
 use self::core::{Left, Request};
@@ -150,8 +150,10 @@ pub fn run(
     let _status = StatusSocket::start(&options.sockets, facts, shown.clone(), asker);
     let (mut recorder, tape) = Recorder::new(recording.clone()).map_err(no_room)?;
     let board = if options.trace_edges { recorder.with_edges(board) } else { board };
-    let trace_sockets: Vec<_> = options.sockets.iter().map(|path| path.with_extension("trace")).collect();
-    let trace_socket = status::open_socket(&trace_sockets, pty.device());
+    let trace_sockets = trace_socket_paths(&options.sockets);
+    let trace_socket = status::open_socket(&trace_sockets, pty.device(), |errors| {
+        warn!("pinion trace --live will not be answered: {errors}");
+    });
     let (realtime, margin) = (options.realtime, options.margin);
     if realtime {
         realtime::lock_memory();

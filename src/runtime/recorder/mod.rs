@@ -248,16 +248,10 @@ impl Recorder {
     }
 
     /// Starts the thread. The calling thread is the link. `socket` is where `pinion trace --live` asks.
-    pub(super) fn start(&mut self, socket: Option<Result<(UnixListener, Place), String>>) -> io::Result<()> {
+    pub(super) fn start(&mut self, socket: Option<(UnixListener, Place)>) -> io::Result<()> {
         let Some(news) = self.news.take() else { return Ok(()) };
         let (end, alive) = io::pipe()?;
-        let (listener, place) = match socket.transpose() {
-            Ok(opened) => opened.unzip(),
-            Err(errors) => {
-                warn!("pinion trace --live will not be answered: {errors}");
-                (None, None)
-            }
-        };
+        let (listener, place) = socket.unzip();
         let link = gettid();
         let (recording, names, wake) = (self.recording.clone(), self.names.clone(), self.wake.clone());
         let thread = thread::Builder::new().name("recorder".into()).spawn(move || {

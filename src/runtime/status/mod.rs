@@ -22,8 +22,8 @@ mod socket;
 
 pub(super) use document::{Facts, FoundHost, HostBoard};
 pub(crate) use socket::connect;
-pub use socket::socket_paths;
 pub(super) use socket::{Place, StatusSocket, open as open_socket};
+pub use socket::{socket_paths, trace_socket_paths};
 
 /// Longest wait for the core's answer. It is longer than the core's longest nap.
 const ANSWER_WAIT_MAX: Duration = Duration::from_millis(1000);

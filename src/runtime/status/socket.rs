@@ -49,13 +49,8 @@ impl StatusSocket {
         host: Arc<HostBoard>,
         asker: Asker,
     ) -> Option<StatusSocket> {
-        let (listener, place) = match open(paths, &facts.device)? {
-            Ok(opened) => opened,
-            Err(errors) => {
-                warn!("pinion status will not be answered: {errors}");
-                return None;
-            }
-        };
+        let (listener, place) =
+            open(paths, &facts.device, |errors| warn!("pinion status will not be answered: {errors}"))?;
         info!("status on {}", place.path.display());
         let served = serve_on(listener, Reporter::new(asker, facts, host));
         let started = served.inspect_err(|error| {
@@ -74,17 +69,24 @@ impl Drop for Place {
 }
 
 /// Opens a socket at the first of these paths where that is possible. Users who may open the terminal `device` may
-/// connect: the socket gets the terminal's group. A path where another instance answers is not taken over. `None`:
-/// there are no paths.
-pub(in crate::runtime) fn open(paths: &[PathBuf], device: &Path) -> Option<Result<(UnixListener, Place), String>> {
+/// connect: the socket gets the terminal's group. A path where another instance answers is not taken over. If it
+/// is possible nowhere, `complain` gets the errors.
+pub(in crate::runtime) fn open(
+    paths: &[PathBuf],
+    device: &Path,
+    complain: impl FnOnce(&str),
+) -> Option<(UnixListener, Place)> {
     let mut errors = Vec::new();
     for path in paths {
         match open_at(path, device) {
-            Ok((listener, id)) => return Some(Ok((listener, Place { path: path.clone(), id }))),
+            Ok((listener, id)) => return Some((listener, Place { path: path.clone(), id })),
             Err(error) => errors.push(format!("{}: {error}", path.display())),
         }
     }
-    (!errors.is_empty()).then(|| Err(errors.join("; ")))
+    if !errors.is_empty() {
+        complain(&errors.join("; "));
+    }
+    None
 }
 
 /// The possible paths of the socket of the instance with this link, the best first.
@@ -101,6 +103,11 @@ pub fn socket_paths(link: &Path) -> Vec<PathBuf> {
     let own = std::env::var_os("XDG_RUNTIME_DIR").map(PathBuf::from).filter(|folder| folder.is_absolute());
     let own = own.unwrap_or_else(|| "/tmp".into());
     vec![Path::new("/run/pinion").join(format!("{name}.sock")), own.join(format!("pinion-{name}.sock"))]
+}
+
+/// The paths of the socket of `pinion trace --live`, beside those of the status.
+pub fn trace_socket_paths(status: &[PathBuf]) -> Vec<PathBuf> {
+    status.iter().map(|path| path.with_extension("trace")).collect()
 }
 
 /// Opens the socket at a path, and returns it with its device and inode.
