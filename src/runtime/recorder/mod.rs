@@ -287,7 +287,8 @@ impl Keeper {
         let Some(writer) = self.recording.memory.sampler() else { return };
         let mut computer = Computer::new("/".into(), writer);
         computer.watch(Watched::Link, link);
-        let (mut next, mut has_news) = (monotonic(), true);
+        let mut next = monotonic();
+        self.publish();
         loop {
             if monotonic() >= next {
                 next = monotonic() + LOOK_EVERY;
@@ -296,7 +297,11 @@ impl Keeper {
             while let Ok(news) = self.news.pop() {
                 match news {
                     News::Started(thread) => computer.watch(Watched::Core, thread),
-                    News::Configured(objects) => self.names().objects = objects.into_iter().collect(),
+                    News::Configured(objects) => {
+                        self.names().objects = objects.into_iter().collect();
+                        // At once: a stop may be the next news.
+                        self.publish();
+                    }
                     News::Stopped { at, reason, trouble } => {
                         thread::sleep(SETTLE);
                         // The accounts at the stop tell more than those before it.
@@ -306,10 +311,6 @@ impl Keeper {
                         self.recording.keep(End::Shutdown { reason: reason.to_owned(), trouble }, at);
                     }
                 }
-            }
-            if std::mem::take(&mut has_news) {
-                let names = self.names().clone();
-                self.recording.memory.set_names(&names);
             }
             let listener = self.listener.as_ref().map_or(self.end.as_fd(), AsFd::as_fd);
             let mut fds = [
@@ -321,7 +322,7 @@ impl Keeper {
             let [ended, woken, asked] = fds.map(|fd| fd.any().unwrap_or(true));
             if woken {
                 let _ = self.wake.read();
-                has_news = true;
+                self.publish();
             }
             if ended && self.news.is_empty() {
                 return;
@@ -334,6 +335,12 @@ impl Keeper {
 
     fn names(&self) -> MutexGuard<'_, Names> {
         self.names.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Puts the names where the guardian finds them, too.
+    fn publish(&self) {
+        let names = self.names().clone();
+        self.recording.memory.set_names(&names);
     }
 
     /// Gives a client what is recorded.
