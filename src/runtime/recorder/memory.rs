@@ -40,7 +40,9 @@ const RINGS: usize = WORKERS + WORKERS_MAX;
 
 /// Bytes for the names.
 const NAMES_BYTES: usize = 1 << 16;
-const NAMES_WORDS: usize = 1 + NAMES_BYTES / 8;
+/// Words before the rings: the length of the names and where they are, and two places. New names go into the place that
+/// the present ones do not use. So a program that is killed meanwhile leaves the present ones.
+const NAMES_WORDS: usize = 1 + 2 * (NAMES_BYTES / 8);
 /// Words of a page. A store to one of them makes the kernel provide the page.
 const PAGE_WORDS: usize = 4096 / 8;
 
@@ -123,19 +125,23 @@ impl Memory {
     pub(super) fn set_names(self, names: &Names) {
         let json = [serde_json::to_string(names), serde_json::to_string(&Names::default())];
         let Some(json) = json.into_iter().flatten().find(|json| json.len() <= NAMES_BYTES) else { return };
-        // Without a length there are no names. A program that is killed here leaves none.
-        self.0[0].store(0, Ordering::Release);
+        let place = 1 - self.0[0].load(Ordering::Relaxed) % 2;
         let mut bytes = json.bytes();
-        for word in &self.0[1..=json.len().div_ceil(8)] {
+        for word in &self.names_at(place)[..json.len().div_ceil(8)] {
             word.store(u64::from_le_bytes(std::array::from_fn(|_| bytes.next().unwrap_or(0))), Ordering::Relaxed);
         }
-        self.0[0].store(json.len() as u64, Ordering::Release);
+        self.0[0].store((json.len() as u64) << 1 | place, Ordering::Release);
+    }
+
+    fn names_at(self, place: u64) -> &'static [AtomicU64] {
+        let words = NAMES_BYTES / 8;
+        &self.0[1 + place as usize * words..][..words]
     }
 
     pub(super) fn names(self) -> Names {
-        let length = (self.0[0].load(Ordering::Acquire) as usize).min(NAMES_BYTES);
-        let words = self.0[1..NAMES_WORDS].iter().flat_map(|word| word.load(Ordering::Relaxed).to_le_bytes());
-        let json: Vec<u8> = words.take(length).collect();
+        let head = self.0[0].load(Ordering::Acquire);
+        let words = self.names_at(head % 2).iter().flat_map(|word| word.load(Ordering::Relaxed).to_le_bytes());
+        let json: Vec<u8> = words.take((head >> 1) as usize).collect();
         serde_json::from_slice(&json).unwrap_or_default()
     }
 }
