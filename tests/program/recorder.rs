@@ -53,7 +53,7 @@ fn a_host_that_is_late_is_named() {
     let mut client = pinion.client();
     configure(&mut client, &[OUTPUT]);
     client.send_line("update_digital_out oid=0 value=1").unwrap();
-    let late = client.clock_in(-0.25).unwrap().wire();
+    let late = client.clock_in(-2.0).unwrap().wire();
     client.send_line(&format!("queue_digital_out oid=0 clock={late} on_ticks=1")).unwrap();
     assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Timer too close"));
     let trace = verdict(&pinion, "look at the host's load");
