@@ -206,6 +206,7 @@ impl Core {
                 self.yielded += 1;
                 continue;
             }
+            self.record();
             if self.teller.is_asked() && !soon(deadline, now) {
                 self.teller.tell(&self.mcu, self.requests.slots(), self.waiter.margin());
                 continue;
@@ -222,7 +223,6 @@ impl Core {
                 thread::yield_now();
                 continue;
             }
-            self.record();
             self.mcu.account(Ticks(now.since(busy_since) as u32));
             let to_go = deadline.map_or(2 * FAR_TICKS, |deadline| deadline.since(now));
             let Some(deadline) = deadline.filter(|_| to_go <= FAR_TICKS) else {
@@ -253,7 +253,7 @@ impl Core {
         }
     }
 
-    /// Records the last sleep, and what has changed. The core does this once before each sleep, when no timer is due.
+    /// Records the last sleep, and what has changed. The core does this when no timer is due: before it polls or sleeps.
     #[inline]
     fn record(&mut self) {
         if let Some(sleep) = self.waiter.take_sleep() {

@@ -111,7 +111,7 @@ impl Tape {
         self.recent.write(at, Event::Command { id, more: (count - 1).min(u8::MAX.into()) as u8 });
     }
 
-    /// Records what has changed since the last call. The core calls it before each sleep, and while it is behind.
+    /// Records what has changed since the last call. The core calls it when no timer is due, and while it is behind.
     #[inline]
     pub(in crate::runtime) fn turn(&mut self, mcu: &mut Mcu, margin: Ticks, is_ordinary: bool) {
         let at = mcu.last_read();
