@@ -69,15 +69,17 @@ impl Computer {
 
     /// Records what has changed since the last call. It looks at most things only at some of the calls.
     pub(super) fn look(&mut self, at: Clock) {
-        self.look_at_threads(at);
         if self.looks.is_multiple_of(RARELY) {
             self.look_at_all(at);
+        } else {
+            self.look_at_threads(at);
         }
         self.looks = self.looks.wrapping_add(1);
     }
 
     /// Records what has changed, all of it.
     pub(super) fn look_at_all(&mut self, at: Clock) {
+        self.look_at_threads(at);
         self.look_at_stolen_time(at);
         let power = self.power_fault();
         if power != self.power {
@@ -176,7 +178,6 @@ mod tests {
         computer.watch(Watched::Core, Pid::from_raw(7));
         let mut seen = 0;
         let mut look = || {
-            computer.look_at_threads(Clock::EPOCH);
             computer.look_at_all(Clock::EPOCH);
             let events: Vec<Event> =
                 ring.events().into_iter().filter_map(Event::decode).map(|(_, event)| event).collect();

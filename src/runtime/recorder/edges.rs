@@ -4,7 +4,7 @@
 #![forbid(unsafe_code)]
 
 use std::sync::atomic::{AtomicU8, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex};
 
 use pinion_firmware::board::{
     Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, I2cConfig, Line, Mosi, OnWorker, Pin, Pwm,
@@ -17,6 +17,8 @@ use pinion_linux::clock::Monotonic;
 use crate::trace::event::Event;
 use crate::trace::file::Names;
 use crate::trace::ring::Writer;
+
+use super::locked;
 
 /// A board that records the edges of its outputs. All else is the board's own.
 pub(super) struct EdgeBoard {
@@ -98,7 +100,7 @@ impl EdgeLine {
 impl EdgeBoard {
     fn recorded(&self, pin: Pin, line: Arc<dyn Line>) -> Arc<EdgeLine> {
         let name = pin.name_in(&self.board.pins());
-        self.names.lock().unwrap_or_else(PoisonError::into_inner).pins.insert(pin.0, name);
+        locked(&self.names).pins.insert(pin.0, name);
         Arc::new(EdgeLine { line, tape: self.tape.clone(), pin: pin.0, level: AtomicU8::new(UNKNOWN) })
     }
 }

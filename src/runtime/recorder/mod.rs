@@ -38,7 +38,7 @@ use pinion_protocol::format;
 use crate::trace::event::{Event, Watched};
 use crate::trace::file::{End, Head, Names, Thread, Trace};
 use crate::trace::folder;
-use crate::trace::ring::Writer;
+use crate::trace::ring::{Ring, Writer};
 use crate::trace::verdict::verdict;
 use crate::{FIRMWARE, status};
 
@@ -121,7 +121,7 @@ impl Recording {
 
     /// What the recording says now.
     fn trace(&self, end: End, ended_at: Clock) -> Trace {
-        let thread = |ring: crate::trace::ring::Ring| Thread {
+        let thread = |ring: Ring| Thread {
             name: ring.name(),
             events: ring.events().into_iter().filter_map(Event::decode).collect(),
         };
@@ -141,14 +141,13 @@ impl Recording {
         Trace { head, threads: self.memory.rings().map(thread).collect() }
     }
 
-    /// Keeps what is recorded in a file, and logs who was late.
-    pub(super) fn keep(&self, end: End, ended_at: Clock) {
+    /// Keeps a trace in a file, and logs who was late.
+    fn keep(&self, trace: &Trace) {
         if self.folders.is_empty() {
             return;
         }
-        let trace = self.trace(end, ended_at);
-        let found = verdict(&trace);
-        match self.write(&trace) {
+        let found = verdict(trace);
+        match self.write(trace) {
             Ok(path) => info!("{} (pinion trace {})", found.text, path.display()),
             Err(error) => {
                 info!("{}", found.text);
@@ -159,10 +158,10 @@ impl Recording {
 
     /// Keeps the recording of a program that died or hung. It leaves out a program that no host had configured.
     pub(super) fn keep_of_the_dead(&self, end: End) {
-        let was_used = |(_, event)| matches!(event, Event::Configured | Event::BlockIn(_));
-        let words = self.memory.rings().flat_map(|ring| ring.events());
-        if words.filter_map(Event::decode).any(was_used) {
-            self.keep(end, self.clock.now());
+        let trace = self.trace(end, self.clock.now());
+        let mut events = trace.threads.iter().flat_map(|thread| &thread.events);
+        if events.any(|(_, event)| matches!(event, Event::Configured | Event::BlockIn(_))) {
+            self.keep(&trace);
         }
     }
 
@@ -201,6 +200,11 @@ pub(super) fn span(from: Clock, to: Clock) -> Ticks {
     Ticks(u32::try_from(to.since(from).max(0)).unwrap_or(u32::MAX))
 }
 
+/// The names, for a moment.
+fn locked(names: &Mutex<Names>) -> MutexGuard<'_, Names> {
+    names.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
 /// The names of the host's commands.
 fn commands(dialect: &Dialect) -> BTreeMap<u16, String> {
     let commands = dialect.dictionary().commands.iter();
@@ -230,8 +234,7 @@ impl Recorder {
 
     /// Names the commands of the host's dialect.
     pub(super) fn speak(&self, dialect: &Dialect) {
-        let mut names = self.names.lock().unwrap_or_else(PoisonError::into_inner);
-        names.commands = commands(dialect);
+        locked(&self.names).commands = commands(dialect);
         let _ = self.wake.write(1);
     }
 
@@ -298,17 +301,16 @@ impl Keeper {
                 match news {
                     News::Started(thread) => computer.watch(Watched::Core, thread),
                     News::Configured(objects) => {
-                        self.names().objects = objects.into_iter().collect();
+                        locked(&self.names).objects = objects.into_iter().collect();
                         // At once: a stop may be the next news.
                         self.publish();
                     }
                     News::Stopped { at, reason, trouble } => {
                         thread::sleep(SETTLE);
                         // The accounts at the stop tell more than those before it.
-                        let now = self.recording.clock.now();
-                        computer.look(now);
-                        computer.look_at_all(now);
-                        self.recording.keep(End::Shutdown { reason: reason.to_owned(), trouble }, at);
+                        computer.look_at_all(self.recording.clock.now());
+                        let end = End::Shutdown { reason: reason.to_owned(), trouble };
+                        self.recording.keep(&self.recording.trace(end, at));
                     }
                 }
             }
@@ -333,13 +335,9 @@ impl Keeper {
         }
     }
 
-    fn names(&self) -> MutexGuard<'_, Names> {
-        self.names.lock().unwrap_or_else(PoisonError::into_inner)
-    }
-
     /// Puts the names where the guardian finds them, too.
     fn publish(&self) {
-        let names = self.names().clone();
+        let names = locked(&self.names).clone();
         self.recording.memory.set_names(&names);
     }
 
