@@ -7,6 +7,7 @@
 //! - [`runtime`]: threads, pty, real time, signals
 //! - [`klippy`]: facts about a host, found from outside
 //! - `foreign`: data of others: files that may be anything, and names that may contain anything
+//! - `throttled`: a Raspberry Pi's power and temperature
 //! - `status`: the status of a running Pinion, as `pinion status` prints it
 //! - [`trace`]: recordings of the last seconds: events, files, who was late, and exports
 
@@ -20,6 +21,7 @@ pub mod klippy;
 mod proc;
 pub mod runtime;
 mod status;
+mod throttled;
 pub mod trace;
 
 use pinion_firmware::feature::FEATURES;

@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
+use crate::throttled;
 use pinion_linux::gpio::Chip;
 
 use super::instance::Instance;
@@ -366,7 +367,7 @@ pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
 /// firmware, if it may be started.
 pub(super) fn power(computer: &Computer, vcgencmd: Option<&Path>) -> Vec<Finding> {
     const CHECK: &str = "power";
-    let Some(bits) = throttled(computer, vcgencmd) else {
+    let Some(bits) = throttled_bits(computer, vcgencmd) else {
         return match is_pi(computer) {
             true => {
                 vec![Finding::warning(CHECK, "whether the power is good is unknown", "sudo vcgencmd get_throttled")]
@@ -374,7 +375,6 @@ pub(super) fn power(computer: &Computer, vcgencmd: Option<&Path>) -> Vec<Finding
             false => vec![Finding::ok(CHECK, "whether the power is good is unknown: this is no Raspberry Pi")],
         };
     };
-    // https://www.raspberrypi.com/documentation/computers/os.html#get_throttled
     let states = [
         (0, "the voltage is too low", "use a better power supply and a short, thick cable"),
         (1, "the processors' frequency is capped", "use a better power supply, or cool the computer"),
@@ -397,14 +397,13 @@ pub(super) fn power(computer: &Computer, vcgencmd: Option<&Path>) -> Vec<Finding
 }
 
 /// The firmware's bits, from sysfs or from vcgencmd.
-fn throttled(computer: &Computer, vcgencmd: Option<&Path>) -> Option<u32> {
-    let hex = |text: &str| u32::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok();
-    let files = computer.matching("/sys/devices/platform/*/*firmware/get_throttled");
+fn throttled_bits(computer: &Computer, vcgencmd: Option<&Path>) -> Option<u32> {
+    let files = computer.matching(throttled::FILES);
     if let Some(bits) = files.iter().find_map(|file| computer.text(computer.name(file))) {
-        return hex(&bits);
+        return throttled::bits(&bits);
     }
     let told = output(Command::new(vcgencmd?).arg("get_throttled"))?;
-    hex(told.trim().strip_prefix("throttled=")?)
+    throttled::bits(told.trim().strip_prefix("throttled=")?)
 }
 
 /// The output of a program. `None` if the program does not end within two seconds.

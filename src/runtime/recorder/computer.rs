@@ -12,25 +12,22 @@ use nix::unistd::{Pid, SysconfVar, sysconf};
 
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
 
-use crate::foreign;
 use crate::trace::event::{Event, PowerFault, Watched};
 use crate::trace::ring::Writer;
+use crate::{foreign, throttled};
 
 /// One look in this many is at everything. The kernel needs long for some of it.
 const RARELY: u32 = 16;
 /// Longest file of sysfs or procfs that is read.
 const FILE_BYTES: u64 = 1 << 16;
-/// The Raspberry Pi firmware's account of faults (raspberrypi-hwmon.c and `vcgencmd get_throttled`).
-const PI_THROTTLED: &str = "/sys/devices/platform/soc/soc:firmware/get_throttled";
-/// Bits of it: undervoltage, and slowed down for its temperature.
-const PI_UNDERVOLTAGE: u64 = 1 << 0;
-const PI_HOT: u64 = 1 << 2 | 1 << 3;
 
 /// Reads it all, and records what has changed.
 pub(super) struct Computer {
     root: PathBuf,
     writer: Writer,
     accounts: Vec<(Watched, File, Option<Times>)>,
+    /// A Raspberry Pi's file with the firmware's bits.
+    throttled: Option<PathBuf>,
     /// Number of looks so far.
     looks: u32,
     stolen: Option<u64>,
@@ -51,7 +48,20 @@ impl Computer {
     /// The computer with this root folder, `/` unless a test has made one.
     pub(super) fn new(root: PathBuf, writer: Writer) -> Computer {
         let hz = sysconf(SysconfVar::CLK_TCK).ok().flatten().and_then(|hz| u64::try_from(hz).ok()).unwrap_or(100);
-        Computer { root, writer, accounts: Vec::new(), looks: 0, stolen: None, power: None, frequency: (0, 0), hz }
+        let pattern = root.join(throttled::FILES.trim_start_matches('/'));
+        // The search goes through many folders, so it is done once.
+        let throttled = glob::glob(&pattern.to_string_lossy()).ok().and_then(|files| files.flatten().next());
+        Computer {
+            root,
+            writer,
+            accounts: Vec::new(),
+            throttled,
+            looks: 0,
+            stolen: None,
+            power: None,
+            frequency: (0, 0),
+            hz,
+        }
     }
 
     /// Reads the kernel's account of this thread, too.
@@ -117,8 +127,8 @@ impl Computer {
 
     fn power_fault(&self) -> Option<PowerFault> {
         // The Pi's own kernel has the first file, Linux's own driver the second.
-        let bits =
-            self.read(PI_THROTTLED).and_then(|text| u64::from_str_radix(text.trim().trim_start_matches("0x"), 16).ok());
+        let text = self.throttled.as_ref().and_then(|file| fs::read_to_string(file).ok());
+        let bits = text.and_then(|text| throttled::bits(&text));
         let alarm = || {
             let alarms = fs::read_dir(self.root.join("sys/class/hwmon")).ok()?.filter_map(Result::ok);
             alarms
@@ -128,8 +138,8 @@ impl Computer {
                 .find_map(|entry| fs::read_to_string(entry.path().join("in0_lcrit_alarm")).ok())
         };
         match bits {
-            Some(bits) if bits & PI_UNDERVOLTAGE != 0 => Some(PowerFault::Undervoltage),
-            Some(bits) if bits & PI_HOT != 0 => Some(PowerFault::Hot),
+            Some(bits) if bits & throttled::UNDERVOLTAGE != 0 => Some(PowerFault::Undervoltage),
+            Some(bits) if bits & throttled::HOT != 0 => Some(PowerFault::Hot),
             Some(_) => None,
             None => alarm().filter(|text| text.trim() == "1").map(|_| PowerFault::Undervoltage),
         }
@@ -162,6 +172,8 @@ mod tests {
     use crate::trace::ring::ring;
     use std::path::Path;
 
+    const PI_THROTTLED: &str = "/sys/devices/platform/soc/soc:firmware/get_throttled";
+
     fn put(root: &Path, path: &str, text: &str) {
         let path = root.join(path.trim_start_matches('/'));
         fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -173,6 +185,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path();
         let ring = ring(256);
+        put(root, PI_THROTTLED, "0\n");
         let mut computer = Computer::new(root.into(), ring.writer("sampler").unwrap());
         put(root, "/proc/self/task/7/schedstat", "");
         computer.watch(Watched::Core, Pid::from_raw(7));
