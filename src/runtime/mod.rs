@@ -20,7 +20,7 @@ use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
-use pinion_linux::LOOK_AT_LOG;
+use pinion_linux::{LOOK_AT_LOG, sys};
 
 mod budget;
 mod core;
@@ -123,6 +123,7 @@ pub fn run(
     helpers: Helpers,
     ready: impl FnOnce(),
 ) -> Result<(), Trouble> {
+    sys::return_large_blocks();
     let Helpers { guardian, search } = helpers;
     let pulse = guardian
         .as_ref()

@@ -95,13 +95,14 @@ impl Ring {
         let end = self.head[WRITTEN].load(Ordering::Acquire);
         let start = end.saturating_sub(capacity);
         let word = |number: u64, word: usize| self.events[self.place(number) + word].load(Ordering::Relaxed);
-        let copied: Vec<_> = (start..end).map(|number| [word(number, 0), word(number, 1)]).collect();
+        let mut copied: Vec<_> = (start..end).map(|number| [word(number, 0), word(number, 1)]).collect();
         // Pairs with the fence of the writer: whoever saw a word of event N here sees `WRITTEN` at N or above.
         fence(Ordering::Acquire);
         let now = self.head[WRITTEN].load(Ordering::Relaxed);
         // The event `now` may be half written over the event `now - capacity`.
         let first_whole = (now + 1).saturating_sub(capacity).max(start).min(end);
-        copied[(first_whole - start) as usize..].to_vec()
+        copied.drain(..(first_whole - start) as usize);
+        copied
     }
 }
 

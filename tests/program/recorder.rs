@@ -77,6 +77,19 @@ fn a_host_that_is_late_is_named() {
 
 /// SIGSTOP stops all threads, as a frozen control group does.
 #[test]
+fn a_stop_leaves_no_memory_behind() {
+    let pinion = Pinion::simulated(&[]);
+    let mut client = pinion.client();
+    configure(&mut client, &[OUTPUT]);
+    (0..20_000).for_each(|_| client.send_line("debug_nop").unwrap());
+    client.status().unwrap();
+    let before = pinion.memory_kib("RssAnon");
+    client.send_line("emergency_stop").unwrap();
+    pinion.logged("(pinion trace ");
+    pinion.until("its memory again", || pinion.memory_kib("RssAnon") <= before + 1024);
+}
+
+#[test]
 fn a_program_that_was_stopped_is_told_from_a_late_host() {
     let pinion = Pinion::simulated(&[]);
     let mut client = pinion.client();

@@ -116,6 +116,13 @@ fn shared(bytes: usize) -> io::Result<NonNull<c_void>> {
     Ok(unsafe { mmap_anonymous(None, length, ProtFlags::PROT_READ | ProtFlags::PROT_WRITE, MapFlags::MAP_SHARED) }?)
 }
 
+/// Has the allocator return each large block to the kernel when it is freed. By default it raises its limit with each
+/// one (mallopt(3), M_MMAP_THRESHOLD), and what the flight recorder needs at a stop would stay with the program.
+pub fn return_large_blocks() {
+    // SAFETY: takes numbers.
+    unsafe { libc::mallopt(libc::M_MMAP_THRESHOLD, 128 * 1024) };
+}
+
 /// Forks a process that runs `child` and ends with the status that it returns. Fails if this process has more than
 /// `threads_max` threads: the child would miss them, and the locks that they hold. A program allows one. A test runs in
 /// a second thread while the first one waits and holds no lock.
