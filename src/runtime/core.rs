@@ -643,6 +643,36 @@ mod tests {
     }
 
     #[test]
+    fn the_core_is_called_for_work_that_it_can_do_and_for_a_stop() {
+        let config = ["config_spi_without_cs oid=0", "spi_set_bus oid=0 spi_bus=0 mode=0 rate=1000000"];
+        let mut rig = pinion_testbench::rig::Rig::with_workers(50_000, &config);
+        let progress = Progress::default();
+        let (mut inlet, requests) = RingBuffer::new(1);
+        let called = |mcu: &Mcu, block: Option<&(Payload, usize)>| {
+            Calls { core: &progress, stops_taken: 0, mcu, block, requests: &requests }.any()
+        };
+        let other = (Payload::new(&rig.encode("get_config")), 0);
+        let joining = (Payload::new(&rig.encode("spi_send oid=0 data=01")), 0);
+
+        assert!(!called(&rig.mcu, None));
+        assert!(called(&rig.mcu, Some(&other)), "the rest of a block");
+        inlet.push(Request::Run(other.0)).ok().unwrap();
+        assert!(called(&rig.mcu, None), "another block");
+
+        rig.begin("spi_send oid=0 data=00");
+        assert!(!called(&rig.mcu, None) && !called(&rig.mcu, Some(&other)), "they wait for the bus");
+        assert!(called(&rig.mcu, Some(&joining)), "it does not wait");
+        rig.stall_until(rig.now() + 50_000);
+        assert!(called(&rig.mcu, None), "the bus has answered");
+        rig.turn();
+
+        rig.begin("spi_send oid=0 data=00");
+        assert!(!called(&rig.mcu, None));
+        progress.stop_handed();
+        assert!(called(&rig.mcu, None), "a stop does not wait");
+    }
+
+    #[test]
     fn a_transfer_holds_its_block_and_the_commands_behind_it_back() {
         let mut rig = Rig::held();
         let turns = rig.clock.1.load(Ordering::Relaxed);

@@ -389,3 +389,55 @@ impl Link {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::FIRMWARE;
+    use pinion_firmware::mcu::{DialectName, Generation};
+    use pinion_firmware::time::VirtualClock;
+    use pinion_testbench::board::{Bench, FakeBoard};
+
+    #[test]
+    fn the_link_answers_get_clock_and_identify_that_are_alone_in_their_block() {
+        let board = FakeBoard(Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH));
+        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master)).unwrap());
+        let known = Known::new(dialect.clone());
+        let answer = |commands: &[(&str, &[u32])]| {
+            let mut block = Writer::default();
+            for (format, parameters) in commands {
+                block.int(dialect.command_id(format).unwrap());
+                parameters.iter().for_each(|parameter| block.int(*parameter));
+            }
+            let answer = known.answer(block.payload().unwrap(), || Clock::from_ticks(1234))?;
+            Some(answer.payload().unwrap().to_vec())
+        };
+        let get_clock: (&str, &[u32]) = ("get_clock", &[]);
+        let identify: (&str, &[u32]) = ("identify offset=%u count=%c", &[40, 20]);
+
+        let clock = answer(&[get_clock]).unwrap();
+        let mut reader = Reader::new(&clock);
+        assert_eq!(reader.int().ok(), dialect.response_id::<ClockResponse>());
+        assert_eq!((reader.int(), reader.is_empty()), (Ok(1234), true));
+
+        let piece = answer(&[identify]).unwrap();
+        let mut reader = Reader::new(&piece);
+        assert_eq!(reader.int().ok(), dialect.response_id::<IdentifyResponse<'_>>());
+        assert_eq!((reader.int(), reader.bytes()), (Ok(40), Ok(&dialect.compressed()[40..60])));
+        assert!(reader.is_empty());
+
+        // What needs the core, or the order of a block.
+        let others: [&[(&str, &[u32])]; 7] = [
+            &[],
+            &[("get_config", &[])],
+            &[("update_digital_out oid=%c value=%c", &[1, 1])],
+            &[get_clock, get_clock],
+            &[get_clock, identify],
+            &[identify, get_clock],
+            &[("identify offset=%u count=%c", &[40])],
+        ];
+        for commands in others {
+            assert_eq!(answer(commands), None, "{commands:?}");
+        }
+    }
+}

@@ -51,9 +51,10 @@ fn priority(role: Role) -> i32 {
 const NICE: i32 = -20;
 /// The guardian stands above the core, so that it still runs if the core takes all of the processor.
 const GUARDIAN_PRIORITY: i32 = 50;
-/// MCL_ONFAULT (linux/mman.h): pages are locked when they are touched. Without it all pages of the libraries that
-/// libiio needs would be locked: 40 MB.
-const MCL_ONFAULT: i32 = 4;
+/// Which pages are locked: the touched ones, and others when they are touched (MCL_ONFAULT, linux/mman.h). Without that
+/// flag all pages of the libraries that libiio needs would be locked: 40 MB.
+const LOCKED: MlockAllFlags =
+    MlockAllFlags::MCL_CURRENT.union(MlockAllFlags::MCL_FUTURE).union(MlockAllFlags::from_bits_retain(4));
 /// How much stack is touched: more than any of our threads uses.
 const STACK_BYTES: usize = 256 * 1024;
 /// The calling thread, for the scheduling calls.
@@ -62,10 +63,6 @@ const MYSELF: Pid = Pid::from_raw(0);
 const CAP_IPC_LOCK: u32 = 14;
 const CAP_SYS_NICE: u32 = 23;
 
-fn lock_flags() -> MlockAllFlags {
-    MlockAllFlags::MCL_CURRENT | MlockAllFlags::MCL_FUTURE | MlockAllFlags::from_bits_retain(MCL_ONFAULT)
-}
-
 /// Locks every page in memory that was touched, or is touched from now on. If that is not permitted, the log says so.
 pub fn lock_memory() {
     let limit = limit(Resource::RLIMIT_MEMLOCK);
@@ -73,7 +70,7 @@ pub fn lock_memory() {
     // any more. So memory is locked only where there is no limit.
     let locked = match limit != RLIM_INFINITY && !has_capability(CAP_IPC_LOCK) {
         true => Err(memory_refusal(limit)),
-        false => mlockall(lock_flags()).map_err(|error| Trouble::new(error.to_string())),
+        false => mlockall(LOCKED).map_err(|error| Trouble::new(error.to_string())),
     };
     if let Err(why) = locked {
         warn!("memory is not locked, so steps may be late when memory is short: {why}");
@@ -153,7 +150,7 @@ pub(super) fn change(class: Class) {
 /// core meets the same ones, and the program logs those.
 pub(super) fn enter_guardian() {
     touch_stack();
-    let _ = mlockall(lock_flags());
+    let _ = mlockall(LOCKED);
     let _ = sys::set_fifo(GUARDIAN_PRIORITY).or_else(|_| sys::set_fifo(priority(Role::Core)));
 }
 

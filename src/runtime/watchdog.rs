@@ -38,10 +38,7 @@ impl Watchdog {
     /// Opens the device, which starts it.
     pub(super) fn open(path: &Path) -> Result<Watchdog, Trouble> {
         let file = File::options().write(true).open(path).map_err(|error| cannot_open(path, &error))?;
-        let limit = match sys::watchdog_timeout_s(file.as_fd()) {
-            Ok(seconds) if seconds > 0 => Duration::from_secs(seconds.unsigned_abs().into()),
-            _ => USUAL_LIMIT,
-        };
+        let limit = limit(sys::watchdog_timeout_s(file.as_fd()));
         info!("{} resets this computer {} s after Pinion hangs", path.display(), limit.as_secs());
         Ok(Watchdog { file, limit })
     }
@@ -58,6 +55,14 @@ impl Watchdog {
         if let Err(error) = self.file.write_all(b"V") {
             warn!("the watchdog cannot be stopped, and is about to reset this computer: {error}: {LOOK_AT_LOG}");
         }
+    }
+}
+
+/// The limit of a hardware watchdog, from the seconds that it reports.
+fn limit(reported: io::Result<i32>) -> Duration {
+    match reported {
+        Ok(seconds @ 1..) => Duration::from_secs(seconds.unsigned_abs().into()),
+        _ => USUAL_LIMIT,
     }
 }
 
@@ -235,6 +240,15 @@ mod tests {
         }
         // The first is before the beat, and 30 seconds are nine intervals.
         assert_eq!(food(file.path()), "..........");
+    }
+
+    #[test]
+    fn the_limit_that_a_watchdog_reports_counts_if_it_is_one() {
+        assert_eq!(limit(Ok(60)), Duration::from_secs(60));
+        assert_eq!(limit(Ok(1)), Duration::from_secs(1));
+        assert_eq!(limit(Ok(0)), USUAL_LIMIT);
+        assert_eq!(limit(Ok(-1)), USUAL_LIMIT);
+        assert_eq!(limit(Err(io::ErrorKind::Unsupported.into())), USUAL_LIMIT);
     }
 
     #[test]

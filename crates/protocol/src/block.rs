@@ -267,6 +267,34 @@ mod tests {
     }
 
     #[test]
+    fn an_acknowledgement_is_found_without_more_bytes() {
+        assert_eq!(Resync::default().next(&block(&[], 3)), (BLOCK_MIN, Found::Block(Sequence(3), &[])));
+    }
+
+    #[test]
+    fn a_block_for_another_destination_is_garbage() {
+        let mut other = vec![BLOCK_MIN as u8, 0x20];
+        other.extend_from_slice(&crc16_ccitt(&other).to_be_bytes());
+        other.push(SYNC);
+        assert_eq!(Resync::default().next(&other), (BLOCK_MIN, Found::Garbage { first: true }));
+    }
+
+    #[test]
+    fn garbage_ends_with_the_next_sync_byte() {
+        let mut resync = Resync::default();
+        assert_eq!(resync.next(b"garbage\x7e\x7e"), (8, Found::Garbage { first: true }));
+        assert_eq!(resync.next(b"\x7e\x10\0\0\0"), (1, Found::Garbage { first: false }));
+        assert_eq!(resync.next(b"no end"), (6, Found::Garbage { first: false }));
+        assert_eq!(resync.next(b""), (0, Found::Nothing));
+        assert_eq!(resync.next(b"\x06\x10 of it\x7e"), (9, Found::Garbage { first: false }));
+    }
+
+    #[test]
+    fn sequence_numbers_are_counted_modulo_16() {
+        assert_eq!([0, 7, 16, 35].map(Sequence::after), [0, 7, 0, 3].map(Sequence));
+    }
+
+    #[test]
     fn the_bytes_of_a_block_are_those_of_klippy() {
         // An ack and `identify offset=0 count=40`, encoded by klippy's msgproto.
         assert_eq!(block(&[], 1), [0x05, 0x11, 0x8f, 0x08, 0x7e]);

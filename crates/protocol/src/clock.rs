@@ -94,5 +94,24 @@ mod tests {
             let instant = Clock(near.wrapping_add_signed(offset));
             prop_assert_eq!(Clock::widen(instant.wire(), Clock(near)), instant);
         }
+
+        #[test]
+        fn a_span_is_the_distance_between_its_ends(start in 0u64..1 << 60, span in 0u64..1 << 60) {
+            let start = Clock::from_ticks(start);
+            let end = start.later(span);
+            prop_assert_eq!(end.ticks() - start.ticks(), span);
+            prop_assert_eq!(end.since(start), span as i64);
+            prop_assert_eq!(start.since(end), -(span as i64));
+            prop_assert_eq!(end.earlier(span), start);
+            prop_assert_eq!(Clock::from_bits(end.to_bits()), end);
+        }
+    }
+
+    #[test]
+    fn times_before_tick_zero_have_no_ticks_but_a_distance() {
+        assert_eq!((Clock::EPOCH.ticks(), Clock::EPOCH.wire(), Clock::EPOCH.to_bits()), (0, 0, 1 << 32));
+        let before = Clock::EPOCH.earlier(3);
+        assert_eq!((before.ticks(), before.wire(), before.since(Clock::EPOCH)), (0, u32::MAX - 2, -3));
+        assert_eq!(format!("{before:?} {:?}", Clock::from_ticks(12)), "Clock(-3) Clock(12)");
     }
 }

@@ -77,13 +77,42 @@ impl Dictionary {
 mod tests {
     use super::*;
 
-    #[test]
-    fn a_dictionary_without_end_is_refused() {
-        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
-        for _ in 0..=JSON_MAX >> 16 {
-            encoder.write_all(&[b' '; 1 << 16]).unwrap();
+    fn dictionary() -> Dictionary {
+        let of = |key: &str, value: Value| Map::from_iter([(key.to_owned(), value)]);
+        Dictionary {
+            app: "Pinion".into(),
+            commands: of("identify offset=%u count=%c", IDENTIFY_ID.into()),
+            enumerations: of("pin", vec![0, 8].into()),
+            responses: of("identify_response offset=%u data=%.*s", IDENTIFY_RESPONSE_ID.into()),
+            ..Dictionary::default()
         }
-        let compressed = encoder.finish().unwrap();
+    }
+
+    fn compressed(json: &[u8]) -> Vec<u8> {
+        let mut encoder = ZlibEncoder::new(Vec::new(), Compression::best());
+        encoder.write_all(json).unwrap();
+        encoder.finish().unwrap()
+    }
+
+    #[test]
+    fn a_dictionary_comes_back_from_its_compressed_form() {
+        let json = dictionary().json().unwrap();
+        let compressed = dictionary().compress().unwrap();
+        assert!(compressed.len() < json.len());
+        assert_eq!(Dictionary::decompress(&compressed).unwrap().json().unwrap(), json);
+        assert_eq!(
+            String::from_utf8(json).unwrap(),
+            r#"{"app":"Pinion","build_versions":"","commands":{"identify offset=%u count=%c":1},"config":{},"enumerations":{"pin":[0,8]},"responses":{"identify_response offset=%u data=%.*s":0},"version":""}"#
+        );
+    }
+
+    #[test]
+    fn a_dictionary_over_4_mib_is_refused() {
+        let mut json = dictionary().json().unwrap();
+        json.resize(4 << 20, b' ');
+        assert!(Dictionary::decompress(&compressed(&json)).is_ok());
+        json.push(b' ');
+        let compressed = compressed(&json);
         assert!(compressed.len() < 10_000);
         let error = Dictionary::decompress(&compressed).unwrap_err();
         assert_eq!(error.to_string(), "its JSON has over 4194304 bytes");

@@ -223,6 +223,20 @@ mod tests {
         assert!(!agrees("reset_step_clock oid=%c clock=%hu", &[OID, CLOCK]));
         assert!(!agrees("reset_step_clock oid=%c clock=%u ", &[OID, CLOCK]));
         assert!(agrees("get_clock", &[]));
+        const COUNT: Spec = Spec { name: "count", conversions: &["%c", "%hu"] };
+        assert!(agrees("get count=%hu oid=%c", &[COUNT, OID]));
+        assert!(agrees("get count=%c oid=%c", &[COUNT, OID]));
+        for format in
+            ["get", "get count", "get count=", "get count=%h", "get count=%cx", "get count=%c oid", "get_count=%c"]
+        {
+            assert!(!agrees(format, &[COUNT]), "{format}");
+        }
+    }
+
+    #[test]
+    fn texts_are_the_same_only_if_they_are_equal() {
+        assert!(same("", "") && same("%c", "%c"));
+        assert!(!same("%c", "%u") && !same("%c", "%cc") && !same("%cc", "%c"));
     }
 
     #[test]
@@ -232,5 +246,54 @@ mod tests {
         assert_eq!(parameters(format), Some(vec![("oid", Conversion::Byte), ("data", Conversion::Bytes)]));
         assert_eq!(parameters("get_clock"), Some(vec![]));
         assert_eq!(parameters("broken oid"), None);
+        assert_eq!(parameters("broken oid=%d"), None);
+    }
+
+    #[test]
+    fn every_conversion_is_known_and_skipped() {
+        for (text, conversion, bytes) in [
+            ("%u", Conversion::U32, &[0x81, 0x00][..]),
+            ("%i", Conversion::I32, &[0x7f]),
+            ("%hu", Conversion::U16, &[0x81, 0x00]),
+            ("%hi", Conversion::I16, &[0x7f]),
+            ("%c", Conversion::Byte, &[0x05]),
+            ("%*s", Conversion::Bytes, &[2, 0x81, 0x82]),
+            ("%.*s", Conversion::Bytes, &[0]),
+            ("%s", Conversion::Bytes, &[1, 0x81]),
+        ] {
+            assert_eq!(Conversion::parse(text), Some(conversion));
+            let bytes = [bytes, b"rest"].concat();
+            let mut reader = Reader::new(&bytes);
+            assert_eq!(conversion.skip(&mut reader), Ok(()), "{text}");
+            assert_eq!(reader.rest(), b"rest", "{text}");
+            assert_eq!(conversion.skip(&mut Reader::new(&[])), Err(Malformed), "{text}");
+        }
+    }
+
+    #[test]
+    fn values_are_written_as_the_types_of_their_parameters_and_read_back() {
+        let mut writer = Writer::default();
+        200u8.encode(&mut writer);
+        (-100i8).encode(&mut writer);
+        60_000u16.encode(&mut writer);
+        (-30_000i16).encode(&mut writer);
+        u32::MAX.encode(&mut writer);
+        i32::MIN.encode(&mut writer);
+        true.encode(&mut writer);
+        b"bytes".as_slice().encode(&mut writer);
+        Clock::from_ticks((1 << 32) + 9).encode(&mut writer);
+        let mut reader = Reader::new(writer.payload().unwrap());
+        assert_eq!(u8::decode(&mut reader), Ok(200));
+        assert_eq!(i8::decode(&mut reader), Ok(-100));
+        assert_eq!(u16::decode(&mut reader), Ok(60_000));
+        assert_eq!(i16::decode(&mut reader), Ok(-30_000));
+        assert_eq!(u32::decode(&mut reader), Ok(u32::MAX));
+        assert_eq!(i32::decode(&mut reader), Ok(i32::MIN));
+        assert_eq!(bool::decode(&mut reader), Ok(true));
+        assert_eq!(<&[u8]>::decode(&mut reader), Ok(b"bytes".as_slice()));
+        assert_eq!(u32::decode(&mut reader), Ok(9));
+        assert!(reader.is_empty());
+        assert_eq!(bool::decode(&mut Reader::new(&[0])), Ok(false));
+        assert_eq!(u8::decode(&mut Reader::new(&[0x82, 0x01])), Ok(1), "the low bits");
     }
 }

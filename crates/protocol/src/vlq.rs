@@ -174,8 +174,19 @@ mod tests {
             (-2147483648, 5),
             (4294967295, 1),
         ] {
-            assert_eq!(encoded(value as u32).len(), len, "{value}");
+            let bytes = encoded(value as u32);
+            assert_eq!(bytes.len(), len, "{value}");
+            assert_eq!(Reader::new(&bytes).int(), Ok(value as u32), "{value}");
         }
+    }
+
+    #[test]
+    fn what_is_read_is_no_longer_there() {
+        let mut reader = Reader::new(&[5, 2, 7, 8, 9]);
+        assert_eq!((reader.int(), reader.rest()), (Ok(5), &[2, 7, 8, 9][..]));
+        assert_eq!((reader.bytes(), reader.rest()), (Ok(&[7, 8][..]), &[9][..]));
+        assert!(!reader.is_empty());
+        assert_eq!((reader.bytes(), reader.is_empty()), (Err(Malformed), true));
     }
 
     #[test]

@@ -80,11 +80,9 @@ impl Mcu {
     #[inline]
     pub fn spin_until(&mut self, end: Clock) {
         if self.schedule.last_read < end {
-            let now = self.now();
-            if now < end {
-                self.schedule.timing.clock.spin_until(end.min(now + SPIN_MAX));
-                self.now();
-            }
+            let limit = self.now() + SPIN_MAX;
+            self.schedule.timing.clock.spin_until(end.min(limit));
+            self.now();
         }
     }
 

@@ -73,6 +73,9 @@ fn a_temperature_out_of_its_range_is_told_and_stops_the_mcu() {
         assert_eq!(responses.len() == 2, ends, "{value}");
         if ends {
             assert!(responses[1].ends_with("static_string_id=DS18B20 out of range"), "{responses:?}");
+            let note = rig.notes().pop().unwrap();
+            let celsius = f64::from(value) / 1000.;
+            assert!(note.contains(&format!("it read {celsius} C where 5 C to 30 C is allowed")), "{note}");
         }
     }
 }
