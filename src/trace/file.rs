@@ -7,7 +7,7 @@
 #![forbid(unsafe_code)]
 
 use std::collections::BTreeMap;
-use std::io::{self, BufRead, BufReader, Read, Write};
+use std::io::{self, BufRead, BufReader, BufWriter, Read, Write};
 
 use flate2::Compression;
 use flate2::read::GzDecoder;
@@ -138,7 +138,8 @@ impl Trace {
     ///
     /// Those of `file`.
     pub fn write(&self, file: impl Write) -> io::Result<()> {
-        let mut file = GzEncoder::new(file, Compression::fast());
+        // The encoder clears its whole output buffer at each write.
+        let mut file = BufWriter::new(GzEncoder::new(file, Compression::fast()));
         file.write_all(MAGIC.as_bytes())?;
         serde_json::to_writer(&mut file, &self.head)?;
         file.write_all(b"\n")?;
@@ -151,7 +152,7 @@ impl Trace {
                 }
             }
         }
-        file.finish()?.flush()
+        file.into_inner()?.finish()?.flush()
     }
 
     /// Reads a file. Events of unknown kinds are left out: they are a later Pinion's. A file that was cut off has the

@@ -12,7 +12,7 @@ mod tape;
 
 use std::collections::BTreeMap;
 use std::fs::{self, File, Permissions};
-use std::io::{self, BufWriter, PipeReader, PipeWriter};
+use std::io::{self, PipeReader, PipeWriter};
 use std::os::fd::AsFd;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -185,7 +185,7 @@ impl Recording {
         let written = File::create(&fresh).and_then(|file| {
             // Everybody may read when the MCU moved which line.
             file.set_permissions(Permissions::from_mode(0o644))?;
-            trace.write(BufWriter::new(file))
+            trace.write(file)
         });
         written.and_then(|()| fs::rename(&fresh, &path)).inspect_err(|_| drop(fs::remove_file(&fresh)))?;
         for old in folder::kept(folder, &name).into_iter().skip(KEPT_MAX) {
@@ -346,6 +346,6 @@ impl Keeper {
         let trace = self.recording.trace(End::Asked, self.recording.clock.now());
         // A client that does not read must not keep the thread.
         let limited = client.set_nonblocking(false).and_then(|()| client.set_write_timeout(Some(CLIENT_LIMIT)));
-        let _ = limited.and_then(|()| trace.write(BufWriter::new(client)));
+        let _ = limited.and_then(|()| trace.write(client));
     }
 }
