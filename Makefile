@@ -114,12 +114,10 @@ bench: system-packages-build
 
 check: system-packages-check
 	$(CARGO) fmt --all --check
-	$(CARGO) fmt --manifest-path fuzz/Cargo.toml --check
-	$(CARGO) clippy --locked --all-targets -- -D warnings
-	@# The parts of the fuzz targets in the program.
-	$(CARGO) clippy --locked --lib -- -D warnings --cfg fuzzing
+	@# With the parts of the fuzz targets in the program.
+	$(CARGO) clippy --locked --workspace --all-targets -- -D warnings --cfg fuzzing
 	@if rustup target list --installed 2>/dev/null | grep -qx $(SMALL); then \
-	    echo '$(CARGO) check --target $(SMALL)'; $(CARGO) check --locked --all-targets --quiet --target $(SMALL); \
+	    echo '$(CARGO) check --target $(SMALL)'; $(CARGO) check --locked --quiet --target $(SMALL); \
 	else echo 'NOT RUN: the check for 32 bits, which needs: rustup target add $(SMALL)' >&2; fi
 	RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links' $(CARGO) doc --locked --no-deps --document-private-items --quiet
 	@# The program of the tests: one built for itself would have other features of some crates.

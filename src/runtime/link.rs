@@ -33,6 +33,7 @@ use crate::trace::event::Event;
 use crate::trace::ring;
 
 #[cfg(fuzzing)]
+#[allow(clippy::expect_used)]
 pub(crate) mod fuzz;
 
 /// The messages that the link answers itself.

@@ -92,12 +92,25 @@ impl Rig {
         Rig::that_speaks(DialectName::Of(generation), ORIGIN, FakeBoard)
     }
 
+    /// An MCU with a dialect that was made before.
+    pub fn with_dialect(dialect: Arc<Dialect>) -> Rig {
+        Rig::made(ORIGIN, FakeBoard, |_| dialect)
+    }
+
     fn that_speaks<B: Board + 'static>(name: DialectName, start: u64, board: impl FnOnce(Bench) -> B) -> Rig {
+        Rig::made(start, board, |board| Arc::new(Dialect::new(&FIRMWARE, board, name).unwrap()))
+    }
+
+    fn made<B: Board + 'static>(
+        start: u64,
+        board: impl FnOnce(Bench) -> B,
+        dialect: impl FnOnce(&B) -> Arc<Dialect>,
+    ) -> Rig {
         let origin = Clock::from_ticks(start);
         let clock = VirtualClock::at(origin);
         let bench = Bench::new(clock.clone(), origin);
         let board = board(bench.clone());
-        let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, name).unwrap());
+        let dialect = dialect(&board);
         let workers = FakeWorkers::new(bench.clone());
         let outbox =
             FakeOutbox { payloads: Arc::new(Mutex::new(Vec::with_capacity(RESPONSE_BYTES))), notes: Arc::default() };

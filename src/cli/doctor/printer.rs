@@ -88,6 +88,7 @@ fn without_comment(line: &str) -> &str {
 
 /// For `fuzz/`: files of klippy that include each other. A byte 0 separates them.
 #[cfg(fuzzing)]
+#[allow(clippy::expect_used)]
 pub fn printer_cfg(bytes: &[u8]) {
     let folder = std::env::temp_dir().join(format!("pinion-fuzz-{}", std::process::id()));
     let _ = std::fs::remove_dir_all(&folder);

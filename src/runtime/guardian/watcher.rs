@@ -31,6 +31,7 @@ use crate::trace::event::Event;
 use crate::trace::file::End;
 
 #[cfg(fuzzing)]
+#[allow(clippy::expect_used)]
 pub(crate) mod fuzz;
 
 /// The kernel's name of the guardian's process (proc_pid_comm(5)). Its command line is the program's.

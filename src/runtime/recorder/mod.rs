@@ -87,6 +87,7 @@ impl Recording {
     }
 
     #[cfg(any(test, fuzzing))]
+    #[allow(clippy::expect_used)]
     pub(super) fn of_a_test() -> Recording {
         Recording::new(Monotonic::start(), Path::new("/tmp/klipper_host_test"), false, Vec::new()).expect("memory")
     }

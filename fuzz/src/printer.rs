@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The description of a simulated printer: the printer that it makes, and its printer.cfg.
-#![no_main]
 
 use std::sync::Arc;
 
@@ -8,9 +7,7 @@ use pinion_firmware::board::Board as _;
 use pinion_firmware::time::{Clock, VirtualClock};
 use pinion_sim::{SimBoard, SimConfig, printer_cfg};
 
-pinion_fuzz::target!(run);
-
-fn run(bytes: &[u8]) {
+pub fn run(bytes: &[u8]) {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
     match SimConfig::parse(text, "f.toml") {
         Ok(config) => {

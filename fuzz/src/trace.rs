@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A file of the flight recorder: as it is, and as the contents of a file with a good check sum. What is read is judged,
 //! shown and exported.
-#![no_main]
 
 use std::io::{self, Write as _};
 use std::time::Duration;
@@ -11,9 +10,7 @@ use flate2::write::GzEncoder;
 use pinion::trace::file::Trace;
 use pinion::trace::{perfetto, svg, timeline, vcd, verdict};
 
-pinion_fuzz::target!(run);
-
-fn run(bytes: &[u8]) {
+pub fn run(bytes: &[u8]) {
     let _ = Trace::read(bytes);
     let mut file = GzEncoder::new(Vec::new(), Compression::none());
     file.write_all(bytes).expect("room");

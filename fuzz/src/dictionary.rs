@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! A micro-controller's dictionary, as the client reads it: compressed, or its JSON. A line with a command and bytes of
 //! a response may follow it; a byte 0 separates them.
-#![no_main]
 
 use std::time::Instant;
 
@@ -10,9 +9,7 @@ use pinion_client::serial::Received;
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_protocol::dictionary::Dictionary;
 
-pinion_fuzz::target!(run);
-
-fn run(bytes: &[u8]) {
+pub fn run(bytes: &[u8]) {
     let _ = Dictionary::decompress(bytes);
     let mut parts = bytes.splitn(3, |byte| *byte == 0);
     let mut part = || parts.next().unwrap_or_default();

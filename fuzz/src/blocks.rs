@@ -1,14 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Blocks, messages and integers of the wire.
-#![no_main]
 
 use pinion_protocol::block::{BLOCK_MAX, BLOCK_MIN, Found, PAYLOAD_MAX, Received, Receiver, Resync, frame};
 use pinion_protocol::format;
 use pinion_protocol::vlq::{Reader, Writer};
 
-pinion_fuzz::target!(run);
-
-fn run(bytes: &[u8]) {
+pub fn run(bytes: &[u8]) {
     let Some((piece, stream)) = bytes.split_first() else { return };
     let whole = blocks(stream, stream.len());
     assert_eq!(whole, blocks(stream, usize::from(*piece).max(1)), "the stream was cut elsewhere");

@@ -1,0 +1,81 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The fuzz targets, in one program. `PINION_FUZZ_TARGET` chooses the target. Without it the program prints their names.
+//! docs/develop/fuzzing.md describes them.
+#![no_main]
+
+mod blocks;
+mod dictionary;
+mod printer;
+mod trace;
+
+use std::cell::Cell;
+use std::sync::OnceLock;
+
+use libfuzzer_sys::fuzz_target;
+use pinion_testbench::memory::Counting;
+use pinion_testbench::trial;
+
+#[global_allocator]
+static ALLOCATOR: Counting = Counting;
+
+type Target = (&'static str, fn(&[u8]));
+
+const TARGETS: &[Target] = &[
+    ("blocks", blocks::run),
+    ("commands", commands),
+    ("config", pinion::cli::fuzz::config),
+    ("dictionary", dictionary::run),
+    ("guardian", pinion::runtime::fuzz::guardian),
+    ("link", pinion::runtime::fuzz::link),
+    ("printer", printer::run),
+    ("printer_cfg", pinion::cli::fuzz::printer_cfg),
+    ("search", pinion::runtime::fuzz::search),
+    ("sources", pinion::klippy::sources::fuzz),
+    ("status", pinion::cli::fuzz::status),
+    ("trace", trace::run),
+];
+
+/// Any commands to an MCU in virtual time, for hosts of each generation.
+fn commands(bytes: &[u8]) {
+    trial::play(bytes);
+}
+
+static TARGET: OnceLock<fn(&[u8])> = OnceLock::new();
+
+fuzz_target!(init: choose(), |bytes: &[u8]| {
+    FED.with(|fed| {
+        fed.runs.set(fed.runs.get() + 1);
+        fed.bytes.set(fed.bytes.get() + bytes.len() as u64);
+    });
+    if let Some(run) = TARGET.get() {
+        run(bytes);
+    }
+});
+
+fn choose() {
+    let name = std::env::var("PINION_FUZZ_TARGET").unwrap_or_default();
+    match TARGETS.iter().find(|(target, _)| *target == name) {
+        Some((_, run)) => _ = TARGET.set(*run),
+        None => {
+            TARGETS.iter().for_each(|(target, _)| println!("{target}"));
+            std::process::exit(i32::from(!name.is_empty()));
+        }
+    }
+}
+
+/// How much the target was fed. It is printed when the process exits in order.
+#[derive(Default)]
+struct Fed {
+    runs: Cell<u64>,
+    bytes: Cell<u64>,
+}
+
+impl Drop for Fed {
+    fn drop(&mut self) {
+        eprintln!("fed: {} runs, {} bytes", self.runs.get(), self.bytes.get());
+    }
+}
+
+thread_local! {
+    static FED: Fed = Fed::default();
+}
