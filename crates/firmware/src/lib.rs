@@ -30,7 +30,7 @@
 //!     use pinion_firmware::time::Clock;
 //!
 //!     pub const FEATURE: Feature =
-//!         Feature { name: "echo", commands: &[ECHO], responses: &[Echoed::FORM], ..Feature::EMPTY };
+//!         Feature { commands: &[ECHO], responses: &[Echoed::FORM], ..Feature::EMPTY };
 //!
 //!     response! {
 //!         /// What was sent, and when it came.

@@ -80,3 +80,17 @@ impl fmt::Display for Trouble {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_place_in_a_file_is_counted_from_one() {
+        let text = "first\nsecönd here\n";
+        for (byte, place) in [(0, "1:1"), (4, "1:5"), (6, "2:1"), (text.find("here").unwrap(), "2:8"), (99, "3:1")] {
+            let trouble = Trouble::new("wrong").at("a.toml", text, byte);
+            assert_eq!(trouble.to_string(), format!("a.toml:{place}: wrong"));
+        }
+    }
+}

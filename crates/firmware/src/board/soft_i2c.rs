@@ -214,6 +214,8 @@ mod tests {
         register: u8,
         registers: Vec<u8>,
         writes: Vec<u8>,
+        /// How many bytes the master has read and not acknowledged.
+        last_bytes: u32,
         /// Clocks until it releases SDA at the beginning.
         stuck_clocks: u32,
         log: Vec<&'static str>,
@@ -280,6 +282,7 @@ mod tests {
                     self.register = self.register.wrapping_add(1);
                     // The master did not acknowledge, so it was the last byte.
                     if self.bits[8] {
+                        self.last_bytes += 1;
                         self.state = State::Idle;
                         return;
                     }
@@ -394,6 +397,7 @@ mod tests {
                 if read_len == 0 { &["start", "stop"] } else { &["start", "start", "stop"] };
             prop_assert_eq!(&wires.log[..], expected);
             prop_assert_eq!((wires.scl, wires.sda), (true, true), "the bus is free");
+            prop_assert_eq!(wires.last_bytes, u32::from(read_len > 0), "the last byte is not acknowledged");
         }
     }
 

@@ -19,7 +19,6 @@ use super::spi::spi_shutdown;
 use crate::board::BusError;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "ads1220",
     commands: &[
         CONFIG_ADS1220,
         ADS1220_ATTACH_TRIGGER_ANALOG,

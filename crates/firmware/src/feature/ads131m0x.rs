@@ -20,7 +20,6 @@ use super::spi::spi_shutdown;
 use crate::board::BusError;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "ads131m0x",
     commands: &[
         CONFIG_ADS131M0X,
         CONFIG_ADS131M0X_OF_KALICO,

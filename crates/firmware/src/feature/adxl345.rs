@@ -17,7 +17,6 @@ use super::fifo_sensor::{BusType, FifoChip, FifoSensor, Fill, Reading, configure
 use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "adxl345",
     commands: &[CONFIG_ADXL345, QUERY_ADXL345_AT, QUERY_ADXL345, QUERY_ADXL345_STATUS],
     responses: &[OwnData::FORM, OwnStatus::FORM],
     ..Feature::EMPTY

@@ -18,7 +18,6 @@ use crate::time::{Clock, Ticks};
 use super::trigger_analog::Attached;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "analog_in",
     commands: &[CONFIG_ANALOG_IN, QUERY_ANALOG_IN, QUERY_ANALOG_IN_FOR_BATCHES, ANALOG_IN_ATTACH_TRIGGER_ANALOG],
     responses: &[State::FORM, Batch::FORM],
     constants: &[Constant::number("ADC_MAX", ADC_MAX as u32)],

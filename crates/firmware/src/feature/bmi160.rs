@@ -13,7 +13,7 @@ use crate::time::Ticks;
 use super::fifo_sensor::{BusType, FifoChip, FifoSensor, Fill, Reading, configure};
 
 pub(super) const FEATURE: Feature =
-    Feature { name: "bmi160", commands: &[CONFIG_BMI160, QUERY_BMI160, QUERY_BMI160_STATUS], ..Feature::EMPTY };
+    Feature { commands: &[CONFIG_BMI160, QUERY_BMI160, QUERY_BMI160_STATUS], ..Feature::EMPTY };
 
 #[derive(Clone, Copy)]
 enum Register {

@@ -13,7 +13,6 @@ use crate::time::{Clock, Ticks};
 use super::bias;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "buttons",
     commands: &[CONFIG_BUTTONS, BUTTONS_ADD, BUTTONS_QUERY, BUTTONS_ACK],
     responses: &[State::FORM],
     shutdowns: SHUTDOWNS,

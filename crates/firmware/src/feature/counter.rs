@@ -24,12 +24,8 @@ use crate::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 
 use super::bias;
 
-pub(super) const FEATURE: Feature = Feature {
-    name: "counter",
-    commands: &[CONFIG_COUNTER, QUERY_COUNTER],
-    responses: &[State::FORM],
-    ..Feature::EMPTY
-};
+pub(super) const FEATURE: Feature =
+    Feature { commands: &[CONFIG_COUNTER, QUERY_COUNTER], responses: &[State::FORM], ..Feature::EMPTY };
 
 response! {
     /// The edges so far, the time of the next look, and the time of the last edge. klippy assumes that the count was

@@ -17,7 +17,6 @@ use crate::time::{CLOCK_FREQ, Clock, Ticks};
 use crate::trouble::Trouble;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "ds18b20",
     commands: &[CONFIG_DS18B20, CONFIG_DS18B20_OF_KALICO, QUERY_DS18B20],
     responses: &[Reading::FORM],
     shutdowns: SHUTDOWNS,

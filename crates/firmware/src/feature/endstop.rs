@@ -15,7 +15,6 @@ use super::bias;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "endstop",
     commands: &[CONFIG_ENDSTOP, ENDSTOP_HOME, ENDSTOP_QUERY_STATE],
     responses: &[State::FORM],
     ..Feature::EMPTY

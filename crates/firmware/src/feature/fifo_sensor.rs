@@ -23,7 +23,6 @@ use super::sensor_bulk::{BulkData, DATA_MAX, SensorBulk, Words};
 use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "fifo_sensor",
     enumerations: &[Enumeration::new("bus_oid_type", |_| named(&[("spi", 0), ("i2c", 1)])).of(since(V0_13))],
     shutdowns: SHUTDOWNS,
     ..Feature::EMPTY

@@ -15,7 +15,7 @@ use super::display::{Busy, Display, Panel, Register, Wire, hold};
 use super::pace::Pace;
 
 pub(super) const FEATURE: Feature =
-    Feature { name: "hd44780", commands: &[CONFIG_HD44780, HD44780_SEND_CMDS, HD44780_SEND_DATA], ..Feature::EMPTY };
+    Feature { commands: &[CONFIG_HD44780, HD44780_SEND_CMDS, HD44780_SEND_DATA], ..Feature::EMPTY };
 
 /// Shortest time that E is high: 230 ns, rounded up to ticks of 20 ns.
 const PULSE: Ticks = Ticks(12);

@@ -25,7 +25,6 @@ use crate::time::{Ticks, TimeSource};
 use super::ready_adc::{ReadyAdc, ReadyChip, Sample};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "hx71x",
     commands: &[
         CONFIG_HX71X,
         HX71X_ATTACH_TRIGGER_ANALOG,
@@ -239,6 +238,12 @@ const QUERY_HX71X_STATUS: Command =
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn the_log_says_which_clock_line_was_too_slow_and_for_how_long() {
+        let line = too_slow("gpio11", i64::from(Ticks::from_us(75).0));
+        assert!(line.contains("(gpio11)") && line.contains("up to 75 us") && line.contains("-r"), "{line}");
+    }
 
     #[test]
     fn samples_are_those_of_the_data_sheet() {

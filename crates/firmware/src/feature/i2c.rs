@@ -20,7 +20,6 @@ use crate::time::Ticks;
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "i2c",
     commands: &[
         CONFIG_I2C,
         CONFIG_I2C_WITH_BUS,

@@ -25,7 +25,6 @@ use super::trigger_analog::Attached;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "ldc1612",
     commands: &[
         CONFIG_LDC1612,
         CONFIG_LDC1612_WITH_INTB,

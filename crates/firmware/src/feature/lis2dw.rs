@@ -18,7 +18,6 @@ use super::named;
 use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "lis2dw",
     commands: &[CONFIG_LIS2DW_ON_SPI, CONFIG_LIS2DW, QUERY_LIS2DW_AT, QUERY_LIS2DW, QUERY_LIS2DW_STATUS],
     responses: &[OwnData::FORM, OwnStatus::FORM],
     enumerations: &[Enumeration::new("lis_chip_type", |_| named(&[("LIS2DW", 0), ("LIS3DH", 1)])).of(since(V0_13))],

@@ -16,7 +16,6 @@ use super::sos_filter::SosFilter;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "load_cell_probe",
     commands: &[CONFIG_LOAD_CELL_PROBE, LOAD_CELL_PROBE_SET_RANGE, LOAD_CELL_PROBE_HOME, LOAD_CELL_PROBE_QUERY_STATE],
     responses: &[State::FORM],
     shutdowns: SHUTDOWNS,

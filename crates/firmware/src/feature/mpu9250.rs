@@ -16,14 +16,13 @@ use super::fifo_sensor::{BLOCK_BYTES, BusType, FifoChip, FifoSensor, Fill, Readi
 use super::sensor_bulk::{Words, own_words};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "mpu9250",
     commands: &[CONFIG_MPU9250, QUERY_MPU9250_AT, QUERY_MPU9250, QUERY_MPU9250_STATUS],
     responses: &[OwnData::FORM, OwnStatus::FORM],
     ..Feature::EMPTY
 };
 
 pub(super) const ICM20948: Feature =
-    Feature { name: "icm20948", commands: &[CONFIG_ICM20948, QUERY_ICM20948, QUERY_ICM20948_STATUS], ..Feature::EMPTY };
+    Feature { commands: &[CONFIG_ICM20948, QUERY_ICM20948, QUERY_ICM20948_STATUS], ..Feature::EMPTY };
 
 own_words! {
     "mpu9250_data oid=%c sequence=%hu data=%*s",

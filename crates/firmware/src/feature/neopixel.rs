@@ -25,7 +25,6 @@ use crate::time::{CLOCK_FREQ, Ticks};
 use super::spi::spi_shutdown;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "neopixel",
     commands: &[CONFIG_NEOPIXEL, NEOPIXEL_UPDATE, NEOPIXEL_SEND],
     responses: &[Sent::FORM],
     shutdowns: SHUTDOWNS,

@@ -20,7 +20,6 @@ use crate::time::{CLOCK_FREQ, Clock, Ticks};
 use super::value_queue::{Texts, ValueQueue};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "pca9685",
     commands: &[CONFIG_PCA9685, QUEUE_PCA9685_OUT, SET_PCA9685_OUT],
     constants: &[Constant::number("PCA9685_MAX", VALUE_MAX as u32)],
     shutdowns: SHUTDOWNS,

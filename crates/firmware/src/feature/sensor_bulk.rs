@@ -14,8 +14,7 @@
 use crate::mcu::{Feature, Generation::V0_13, Mcu, Oid, Response, Turn, response, since};
 use crate::time::Clock;
 
-pub(super) const FEATURE: Feature =
-    Feature { name: "sensor_bulk", responses: &[BulkData::FORM, BulkStatus::FORM], ..Feature::EMPTY };
+pub(super) const FEATURE: Feature = Feature { responses: &[BulkData::FORM, BulkStatus::FORM], ..Feature::EMPTY };
 
 response! {
     /// Samples, packed in the format of the sensor's klippy module.

@@ -10,7 +10,6 @@ use crate::mcu::{Command, Feature, Generation::Kalico, Generation::Master, Objec
 use crate::shutdown::{Shutdown, shutdowns};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "sos_filter",
     commands: &[
         CONFIG_SOS_FILTER,
         SOS_FILTER_SET_SECTION,

@@ -23,7 +23,6 @@ use crate::time::{CLOCK_FREQ, Ticks};
 use pinion_protocol::block::PAYLOAD_MAX;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "spi",
     commands: &[
         CONFIG_SPI,
         CONFIG_SPI_WITHOUT_CS,

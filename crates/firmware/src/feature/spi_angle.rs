@@ -19,7 +19,6 @@ use super::sensor_bulk::{BulkData, SensorBulk, Status, Words};
 use super::spi::{Spi, Transfer, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "spi_angle",
     commands: &[CONFIG_SPI_ANGLE, QUERY_SPI_ANGLE, SPI_ANGLE_TRANSFER],
     responses: &[OwnData::FORM, OwnEnd::FORM, TransferResponse::FORM],
     enumerations: &[

@@ -16,7 +16,7 @@ use super::display::{Busy, Display, Panel, Register, Wire, hold};
 use super::pace::Pace;
 
 pub(super) const FEATURE: Feature =
-    Feature { name: "st7920", commands: &[CONFIG_ST7920, ST7920_SEND_CMDS, ST7920_SEND_DATA], ..Feature::EMPTY };
+    Feature { commands: &[CONFIG_ST7920, ST7920_SEND_CMDS, ST7920_SEND_DATA], ..Feature::EMPTY };
 
 /// Shortest time that SCLK is high, and low: 200 ns.
 const HALF_CLOCK: Ticks = Ticks(10);

@@ -17,7 +17,6 @@ use crate::time::{Clock, Ticks};
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "stepper",
     commands: &[
         CONFIG_STEPPER,
         QUEUE_STEP,

@@ -17,7 +17,6 @@ use crate::trouble::Trouble;
 use super::spi::{Spi, spi_shutdown};
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "thermocouple",
     commands: &[CONFIG_THERMOCOUPLE, QUERY_THERMOCOUPLE],
     responses: &[Reading::FORM],
     enumerations: &[Enumeration::new("thermocouple_type", types)],

@@ -25,7 +25,6 @@ use crate::time::{Clock, Ticks};
 use super::pace::Pace;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "tmcuart",
     commands: &[CONFIG_TMCUART, TMCUART_SEND],
     responses: &[UartResponse::FORM],
     shutdowns: SHUTDOWNS,
@@ -154,7 +153,7 @@ impl Exchange {
     fn send(&mut self, mut at: Clock) -> Result<Option<(Clock, Ticks)>, Shutdown> {
         let mut bit = self.bit;
         let mut first_late = 0;
-        let synced = self.write_len > 0 && self.data[0] & SYNC_MASK == SYNC;
+        let synced = self.data[..self.write_len].first().is_some_and(|first| first & SYNC_MASK == SYNC);
         let mut line = true;
         // The first bit is a start bit, whatever the host says.
         for place in 0..(8 * self.write_len).max(1) {

@@ -18,7 +18,6 @@ use super::sos_filter::SosFilter;
 use super::trsync::Trsync;
 
 pub(super) const FEATURE: Feature = Feature {
-    name: "trigger_analog",
     commands: &[
         CONFIG_TRIGGER_ANALOG,
         TRIGGER_ANALOG_SET_RAW_RANGE,

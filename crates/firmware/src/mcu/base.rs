@@ -11,7 +11,6 @@ use super::{Command, Constant, Enumeration, Feature, Form, Generations, Response
 
 /// This file's entries in the dictionary.
 pub const FEATURE: Feature = Feature {
-    name: "base",
     commands: &[
         IDENTIFY,
         GET_CLOCK,

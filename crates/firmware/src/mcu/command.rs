@@ -143,8 +143,6 @@ impl Enumeration {
 
 /// A feature's entries in the dictionary. [`Feature::EMPTY`] provides the fields that a feature does not need.
 pub struct Feature {
-    /// Its name.
-    pub name: &'static str,
     /// Its commands.
     pub commands: &'static [Command],
     /// Its responses.
@@ -160,7 +158,7 @@ pub struct Feature {
 impl Feature {
     /// A feature that adds nothing.
     pub const EMPTY: Feature =
-        Feature { name: "", commands: &[], responses: &[], constants: &[], enumerations: &[], shutdowns: &[] };
+        Feature { commands: &[], responses: &[], constants: &[], enumerations: &[], shutdowns: &[] };
 }
 
 /// Declares a command: its format, and a closure with the MCU and the typed parameters.

@@ -110,9 +110,7 @@ pub trait Workers: Send {
     fn has_completion(&self) -> bool;
 
     /// Calls `each` with the name of each worker's bus and its number of jobs.
-    fn tell(&self, each: &mut dyn FnMut(&str, usize)) {
-        let _ = each;
-    }
+    fn tell(&self, _each: &mut dyn FnMut(&str, usize)) {}
 
     /// Ends every worker. No completion of an earlier job comes after this.
     fn reset(&mut self);

@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Behavior of every MCU: identify, clock, configuration, shutdown, bad input.
 
+use pinion_firmware::board::{Pin, Range};
 use pinion_firmware::mcu::MOVE_COUNT;
+use pinion_firmware::time::Ticks;
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_protocol::dictionary::Dictionary;
 
@@ -351,6 +353,31 @@ fn a_timer_in_the_past_is_too_close_only_if_it_would_be_the_next() {
     assert_eq!(rig.shutdown(), None);
     rig.run_until(6000);
     assert_eq!(rig.edges(5), [(3200, 1)]);
+}
+
+#[test]
+fn the_latest_of_the_late_timers_is_kept_until_it_is_forgotten() {
+    let output =
+        |oid: u32| format!("config_digital_out oid={oid} pin={} value=0 default_value=0 max_duration=0", oid + 1);
+    let mut rig = Rig::configured(&[&output(0), &output(1), &output(2)]);
+    rig.send_all(&[
+        "queue_digital_out oid=0 clock=@3000 on_ticks=1",
+        "queue_digital_out oid=1 clock=@1000 on_ticks=1",
+        "queue_digital_out oid=2 clock=@2000 on_ticks=1",
+    ]);
+    rig.stall_until(5000);
+    rig.run_until(6000);
+    let latest = rig.mcu.latest();
+    assert_eq!((latest.late, latest.oid), (Ticks(4000), Some(1)));
+    rig.mcu.forget_latest();
+    assert_eq!((rig.mcu.latest().late, rig.mcu.latest().oid), (Ticks(0), None));
+}
+
+#[test]
+fn a_name_counts_up_within_its_range_only() {
+    let range = Range { name: "gpiochip1/gpio8".into(), first: 288, count: 3 };
+    let names = [287, 288, 290, 291].map(|pin| Pin(pin).name_in(std::slice::from_ref(&range)));
+    assert_eq!(names, ["pin number 287", "gpiochip1/gpio8", "gpiochip1/gpio10", "pin number 291"]);
 }
 
 #[test]

@@ -284,6 +284,20 @@ fn a_pin_that_is_set_once_stays_and_may_be_set_again() {
     rig.send("set_digital_out pin=31 value=0");
     assert_eq!(rig.shutdown(), None);
     assert!(!rig.bench.level(31));
+    rig.bench.state().broken.insert(31);
+    rig.send("set_digital_out pin=31 value=1");
+    expect_shutdown(&rig, "GPIO line write failed");
+    let note = rig.notes().pop().unwrap();
+    assert!(note.contains("set_digital_out"), "{note}");
+}
+
+#[test]
+fn as_many_pins_may_be_set_once_as_the_mcu_promises() {
+    let mut rig = Rig::new();
+    (0..256).for_each(|pin| rig.send(&format!("set_digital_out pin={pin} value=1")));
+    assert_eq!(rig.shutdown(), None);
+    rig.send("set_digital_out pin=256 value=1");
+    expect_shutdown(&rig, "Unable to open out GPIO chip line");
 }
 
 #[test]

@@ -163,6 +163,17 @@ fn the_chip_is_off_while_nothing_is_measured() {
 }
 
 #[test]
+fn a_chip_that_cannot_be_switched_stops_the_mcu() {
+    for command in [QUERY, END] {
+        let (mut rig, _chip) = rig(0, 1, 500);
+        rig.bench.state().broken.insert(SCLK);
+        rig.send(command);
+        rig.run_until(PERIOD);
+        assert_eq!(rig.shutdown().as_deref(), Some("GPIO line write failed"), "{command}");
+    }
+}
+
+#[test]
 fn a_status_counts_what_was_read_what_is_being_read_and_what_is_in_the_chip() {
     let (mut rig, _chip) = rig(0, 1, 1000);
     rig.send(QUERY);

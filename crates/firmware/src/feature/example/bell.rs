@@ -10,13 +10,8 @@ use crate::mcu::{
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
 
-pub(super) const FEATURE: Feature = Feature {
-    name: "bell",
-    commands: &[CONFIG_BELL, RING_BELL],
-    responses: &[Rung::FORM],
-    shutdowns: SHUTDOWNS,
-    ..Feature::EMPTY
-};
+pub(super) const FEATURE: Feature =
+    Feature { commands: &[CONFIG_BELL, RING_BELL], responses: &[Rung::FORM], shutdowns: SHUTDOWNS, ..Feature::EMPTY };
 
 shutdowns! {
     /// `ring_bell` while the bell still swings.

@@ -13,7 +13,7 @@ use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks};
 
 pub(super) const FEATURE: Feature =
-    Feature { name: "ear", commands: &[CONFIG_EAR, QUERY_EAR], responses: &[Heard::FORM], ..Feature::EMPTY };
+    Feature { commands: &[CONFIG_EAR, QUERY_EAR], responses: &[Heard::FORM], ..Feature::EMPTY };
 
 response! {
     /// What the ear heard.
