@@ -259,7 +259,7 @@ impl Core {
         if let Some(sleep) = self.waiter.take_sleep() {
             self.tape.woke(sleep);
         }
-        self.tape.turn(&mut self.mcu, self.waiter.margin(), !self.waiter.is_realtime());
+        self.tape.turn(&mut self.mcu, !self.waiter.is_realtime());
     }
 
     /// Tells the guardian which output is owed its shutdown value.

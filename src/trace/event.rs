@@ -31,14 +31,10 @@ pub enum Event {
         /// How late.
         late: Ticks,
     },
-    /// The core since the last event of this kind.
+    /// The core ran timers since the last event of this kind.
     Pace {
-        /// The latest timer.
+        /// The latest one.
         worst: Ticks,
-        /// How early the core wakes for a timer, in ticks.
-        margin: u16,
-        /// How often it woke.
-        wakes: u16,
     },
     /// The core began a block of the host. Blocks are counted from the start of the program.
     Block(u32),
@@ -107,7 +103,14 @@ pub enum Event {
         /// How long it waited for a processor.
         waited: Ticks,
     },
-    /// A hypervisor took this much processor time since the last event of this kind.
+    /// The recorder has looked at the kernel's accounts. It comes behind the events of what it saw.
+    Looked {
+        /// It looks again within this time.
+        again: Ticks,
+        /// Whether it looked at everything, and not only at the threads.
+        all: bool,
+    },
+    /// A hypervisor took this much processor time since the recorder last looked at everything.
     Stolen(Ticks),
     /// The computer's power supply or temperature has this fault; `None`: no more.
     Power(Option<PowerFault>),
@@ -172,7 +175,7 @@ impl Event {
             Event::Omitted(count) => (1, count.into()),
             Event::Woke { slept, late } => (2, pair(slept.0, late.0)),
             Event::Late { oid, late } => (3, pair(late.0, number(oid))),
-            Event::Pace { worst, margin, wakes } => (4, pair(worst.0, u32::from(margin) | u32::from(wakes) << 16)),
+            Event::Pace { worst } => (4, worst.0.into()),
             Event::Block(number) => (5, number.into()),
             Event::Command { id, more } => (6, pair(id.into(), more.into())),
             Event::Held => (7, 0),
@@ -197,6 +200,7 @@ impl Event {
             Event::Power(Some(PowerFault::Undervoltage)) => (43, 1),
             Event::Power(Some(PowerFault::Hot)) => (43, 2),
             Event::Frequency { mhz, max_mhz } => (44, pair(mhz.into(), max_mhz.into())),
+            Event::Looked { again, all } => (45, pair(again.0, all.into())),
             Event::Listened => (50, 0),
             Event::Edge { pin, level } => (60, pair(pin, level.into())),
         }
@@ -209,7 +213,7 @@ impl Event {
             1 => Event::Omitted(low),
             2 => Event::Woke { slept: Ticks(low), late: Ticks(high) },
             3 => Event::Late { oid: u8::try_from(high).ok(), late: Ticks(low) },
-            4 => Event::Pace { worst: Ticks(low), margin: high as u16, wakes: (high >> 16) as u16 },
+            4 => Event::Pace { worst: Ticks(low) },
             5 => Event::Block(low),
             6 => Event::Command { id: low as u16, more: high as u8 },
             7 => Event::Held,
@@ -237,6 +241,7 @@ impl Event {
                 _ => return None,
             }),
             44 => Event::Frequency { mhz: low as u16, max_mhz: high as u16 },
+            45 => Event::Looked { again: Ticks(low), all: high != 0 },
             50 => Event::Listened,
             60 => Event::Edge { pin: low, level: high != 0 },
             _ => return None,

@@ -178,6 +178,7 @@ impl<'a> History<'a> {
                     ms(waited.0.into())
                 )
             }
+            Event::Looked { .. } => "looked at the kernel's accounts".to_owned(),
             Event::Stolen(ticks) => format!("a hypervisor took {} ms", ms(ticks.0.into())),
             Event::Power(Some(PowerFault::Undervoltage)) => "the supply's voltage is too low".to_owned(),
             Event::Power(Some(PowerFault::Hot)) => "the processor is too hot and slowed down".to_owned(),

@@ -28,7 +28,7 @@ const NAME_BYTES: usize = (HEAD_WORDS - NAME) * 8;
 #[derive(Clone, Copy)]
 pub struct Ring {
     head: &'static [AtomicU64],
-    events: &'static [AtomicU64],
+    events: &'static [[AtomicU64; EVENT_WORDS]],
     /// The capacity less one. The capacity is a power of two.
     mask: usize,
 }
@@ -42,7 +42,8 @@ impl Ring {
     /// A ring in these words. They are zero, or another process's ring of the same size.
     pub fn new(words: &'static [AtomicU64]) -> Ring {
         let (head, events) = words.split_at(HEAD_WORDS);
-        let capacity = 1 << (events.len() / EVENT_WORDS).ilog2();
+        let (events, _) = events.as_chunks();
+        let capacity = 1 << events.len().ilog2();
         Ring { head, events, mask: capacity - 1 }
     }
 
@@ -50,10 +51,14 @@ impl Ring {
         self.mask + 1
     }
 
-    /// The first word of an event.
     #[inline]
-    fn place(self, number: u64) -> usize {
-        (number as usize & self.mask) * EVENT_WORDS
+    fn event(self, number: u64) -> &'static [AtomicU64; EVENT_WORDS] {
+        &self.events[number as usize & self.mask]
+    }
+
+    /// How many events were written so far.
+    pub fn written(self) -> u64 {
+        self.head[WRITTEN].load(Ordering::Relaxed)
     }
 
     /// The name of its present or last writer. Empty without one.
@@ -76,7 +81,7 @@ impl Ring {
             return None;
         }
         self.set_name(name);
-        Some(Writer { ring: self, at: self.head[WRITTEN].load(Ordering::Relaxed), quota: None })
+        Some(Writer { ring: self, written: &self.head[WRITTEN], at: self.written(), quota: None })
     }
 
     /// The same with a quota: the ring lasts ten seconds. It leaves out events that come faster, and counts them.
@@ -94,11 +99,11 @@ impl Ring {
         let capacity = self.capacity() as u64;
         let end = self.head[WRITTEN].load(Ordering::Acquire);
         let start = end.saturating_sub(capacity);
-        let word = |number: u64, word: usize| self.events[self.place(number) + word].load(Ordering::Relaxed);
-        let mut copied: Vec<_> = (start..end).map(|number| [word(number, 0), word(number, 1)]).collect();
+        let copy = |number| self.event(number).each_ref().map(|word| word.load(Ordering::Relaxed));
+        let mut copied: Vec<_> = (start..end).map(copy).collect();
         // Pairs with the fence of the writer: whoever saw a word of event N here sees `WRITTEN` at N or above.
         fence(Ordering::Acquire);
-        let now = self.head[WRITTEN].load(Ordering::Relaxed);
+        let now = self.written();
         // The event `now` may be half written over the event `now - capacity`.
         let first_whole = (now + 1).saturating_sub(capacity).max(start).min(end);
         copied.drain(..(first_whole - start) as usize);
@@ -109,6 +114,8 @@ impl Ring {
 /// The one thread that writes a ring.
 pub struct Writer {
     ring: Ring,
+    /// Where the ring counts its events.
+    written: &'static AtomicU64,
     /// The number of the next event.
     at: u64,
     quota: Option<Quota>,
@@ -148,14 +155,14 @@ impl Writer {
 
     #[inline]
     fn put(&mut self, at: Clock, event: Event) {
-        let [first, second] = event.encode(at);
-        let place = self.ring.place(self.at);
+        let words = event.encode(at);
+        let place = self.ring.event(self.at);
         // A reader that sees one of the two words below also sees the count above it, from the event before.
         fence(Ordering::Release);
-        self.ring.events[place].store(first, Ordering::Relaxed);
-        self.ring.events[place + 1].store(second, Ordering::Relaxed);
+        place[0].store(words[0], Ordering::Relaxed);
+        place[1].store(words[1], Ordering::Relaxed);
         self.at += 1;
-        self.ring.head[WRITTEN].store(self.at, Ordering::Release);
+        self.written.store(self.at, Ordering::Release);
     }
 }
 

@@ -99,6 +99,7 @@ fn weight(deed: &Deed) -> u64 {
         | Event::Command { .. }
         | Event::BlockIn(_)
         | Event::Out(_)
+        | Event::Looked { .. }
         | Event::Frequency { .. }
         | Event::Listened
         | Event::Edge { .. } => 0,
@@ -174,6 +175,7 @@ enum Kind {
     Wrote,
     Work,
     Processor,
+    Looked,
     Stolen,
     Frequency,
     Listened,
@@ -211,6 +213,7 @@ impl Fold {
             Event::Out(bytes) => (Kind::Wrote, bytes.into()),
             Event::ErrandBegan { .. } | Event::ErrandEnded { .. } => (Kind::Work, deed.ticks()),
             Event::Processor { waited, .. } => (Kind::Processor, waited.0.into()),
+            Event::Looked { .. } => (Kind::Looked, 0),
             Event::Stolen(ticks) => (Kind::Stolen, ticks.0.into()),
             Event::Frequency { mhz, .. } => (Kind::Frequency, mhz.into()),
             Event::Listened => (Kind::Listened, 0),
@@ -246,6 +249,7 @@ impl Fold {
                 Kind::Wrote => format!("{} to the host", count(sum.all, "byte")),
                 Kind::Work => format!("{}, longest {most} ms", count(sum.count, "transfer")),
                 Kind::Processor => format!("threads waited {all} ms for a processor"),
+                Kind::Looked => format!("looked {} at the kernel's accounts", count(sum.count, "time")),
                 Kind::Stolen => format!("a hypervisor took {all} ms"),
                 Kind::Frequency => format!("the processor runs at up to {} MHz", sum.most),
                 Kind::Listened => format!("listened {}", count(sum.count, "time")),

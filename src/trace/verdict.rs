@@ -33,6 +33,8 @@ const VERY_LATE: i64 = 10 * MS;
 const FLOOD: usize = 4;
 /// Shortest silence of a core that hangs. An idle core beats more often.
 const SILENT: i64 = 500 * MS;
+/// A kernel does not wake a thread that late, unless everything stood still.
+const ASLEEP: i64 = 300 * MS;
 /// Shortest time that counts as lost in the kernel's account. Each sleep costs a little.
 const LOST: i64 = 5 * MS;
 /// Beginnings of the texts for outputs that the host did not refresh.
@@ -363,7 +365,8 @@ fn of_core(record: &Record, span: Span) -> Option<Finding> {
     if ran && lost.is_some_and(|lost| lost < half) && !woke_late {
         return Some(driver(record, span, gap_long));
     }
-    if !others && (record.sampler_missed(gap) || record.guardian_went_on(gap) == Some(false)) {
+    let overslept = woke_late && gap_long > ASLEEP;
+    if !others && (overslept || record.sampler_missed(gap) || record.guardian_went_on(gap) == Some(false)) {
         return Some(standstill(record, gap, account.is_some()));
     }
     account?;
@@ -513,6 +516,10 @@ mod tests {
         Event::Processor { thread, ran: ms(ran), waited: ms(waited) }
     }
 
+    fn looked(again: u32) -> Event {
+        Event::Looked { again: ms(again), all: true }
+    }
+
     /// The recording of a program that works, with a host that is there.
     #[derive(Clone, Default)]
     struct Scene(Vec<(&'static str, u64, Event)>);
@@ -522,11 +529,12 @@ mod tests {
             let mut scene = Scene::default();
             for at in (50_000..LATEST).step_by(100_000) {
                 scene.0.push(("core", at, woke(100, 0)));
-                scene.0.push(("core", at, Event::Pace { worst: Ticks::from_us(80), margin: 500, wakes: 1 }));
+                scene.0.push(("core", at, Event::Pace { worst: Ticks::from_us(80) }));
             }
             for at in (60_000..LATEST).step_by(250_000) {
                 scene.0.push(("sampler", at, processor(Watched::Core, 3, 0)));
                 scene.0.push(("sampler", at, processor(Watched::Link, 1, 0)));
+                scene.0.push(("sampler", at, looked(250)));
             }
             for at in (550_000..LATEST).step_by(550_000) {
                 scene.0.push(("guardian", at, Event::Listened));

@@ -29,7 +29,7 @@ fn at(before_ms: u64) -> Clock {
 fn late_host() -> Trace {
     let core = vec![
         (at(5000), Event::Late { oid: Some(3), late: Ticks::from_ms(12) }),
-        (at(20), Event::Pace { worst: Ticks(2000), margin: 500, wakes: 1 }),
+        (at(20), Event::Pace { worst: Ticks(2000) }),
         (at(0), Event::Block(7)),
         (at(0), Event::Command { id: 5, more: 0 }),
         (at(0), Event::Stopped { block: 7 }),

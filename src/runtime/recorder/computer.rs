@@ -7,15 +7,22 @@
 use std::fs::{self, File};
 use std::os::unix::fs::FileExt;
 use std::path::PathBuf;
+use std::time::Duration;
 
 use nix::unistd::{Pid, SysconfVar, sysconf};
 
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
 
 use crate::trace::event::{Event, PowerFault, Watched};
-use crate::trace::ring::Writer;
+use crate::trace::ring::{Ring, Writer};
 use crate::{foreign, throttled};
 
+/// Time between two looks while something happens. The verdict finds a standstill that is somewhat longer.
+const OFTEN: Duration = Duration::from_millis(250);
+/// Time between two looks while nothing happens. A hang of the core takes a second to be found: looks cover half of it.
+const SELDOM: Duration = Duration::from_millis(500);
+/// After this many looks without anything new, nothing happens. A host asks for the clock each second.
+const CALM: u32 = 8;
 /// One look in this many is at everything. The kernel needs long for some of it.
 const RARELY: u32 = 16;
 /// Longest file of sysfs or procfs that is read.
@@ -25,19 +32,29 @@ const FILE_BYTES: u64 = 1 << 16;
 pub(super) struct Computer {
     root: PathBuf,
     writer: Writer,
-    accounts: Vec<(Watched, File, Option<Times>)>,
+    accounts: Vec<Account>,
     /// A Raspberry Pi's file with the firmware's bits.
     throttled: Option<PathBuf>,
-    /// Number of looks so far.
+    /// Number of looks so far, and since something happened.
     looks: u32,
+    calm: u32,
     stolen: Option<u64>,
     power: Option<PowerFault>,
-    frequency: (u16, u16),
     /// Ticks of /proc/stat in a second.
     hz: u64,
 }
 
-/// The kernel's account of a thread (Documentation/scheduler/sched-stats.rst), in nanoseconds.
+/// The kernel's account of a thread.
+struct Account {
+    thread: Watched,
+    file: File,
+    /// Where the thread writes what it does, and how many events it had at the last look.
+    ring: Ring,
+    written: u64,
+    before: Option<Times>,
+}
+
+/// The times of an account (Documentation/scheduler/sched-stats.rst), in nanoseconds.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 struct Times {
     ran: u64,
@@ -51,24 +68,14 @@ impl Computer {
         let pattern = root.join(throttled::FILES.trim_start_matches('/'));
         // The search goes through many folders, so it is done once.
         let throttled = glob::glob(&pattern.to_string_lossy()).ok().and_then(|files| files.flatten().next());
-        Computer {
-            root,
-            writer,
-            accounts: Vec::new(),
-            throttled,
-            looks: 0,
-            stolen: None,
-            power: None,
-            frequency: (0, 0),
-            hz,
-        }
+        Computer { root, writer, accounts: Vec::new(), throttled, looks: 0, calm: 0, stolen: None, power: None, hz }
     }
 
-    /// Reads the kernel's account of this thread, too.
-    pub(super) fn watch(&mut self, thread: Watched, tid: Pid) {
+    /// Reads the kernel's account of this thread, too. It writes what it does into this ring.
+    pub(super) fn watch(&mut self, thread: Watched, tid: Pid, ring: Ring) {
         // The file stays open: opening it takes longer than reading it. A kernel without the account has no file.
         if let Ok(file) = File::open(self.root.join(format!("proc/self/task/{tid}/schedstat"))) {
-            self.accounts.push((thread, file, None));
+            self.accounts.push(Account { thread, file, ring, written: 0, before: None });
         }
     }
 
@@ -77,43 +84,54 @@ impl Computer {
         String::from_utf8(bytes).ok()
     }
 
-    /// Records what has changed since the last call. It looks at most things only at some of the calls.
-    pub(super) fn look(&mut self, at: Clock) {
-        if self.looks.is_multiple_of(RARELY) {
-            self.look_at_all(at);
-        } else {
-            self.look_at_threads(at);
-        }
+    /// Records what has changed since the last call. It looks at most things only if `all`, and at some other calls.
+    /// Returns when to look again.
+    pub(super) fn look(&mut self, at: Clock, all: bool) -> Duration {
+        let all = all || self.looks.is_multiple_of(RARELY);
         self.looks = self.looks.wrapping_add(1);
+        self.calm = if self.look_at_threads(at, all) { 0 } else { self.calm.saturating_add(1) };
+        if all {
+            self.look_at_all(at);
+        }
+        let again = if self.calm < CALM { OFTEN } else { SELDOM };
+        self.writer.write(at, Event::Looked { again: ticks(again.as_nanos() as u64), all });
+        again
     }
 
-    /// Records what has changed, all of it.
-    pub(super) fn look_at_all(&mut self, at: Clock) {
-        self.look_at_threads(at);
+    fn look_at_all(&mut self, at: Clock) {
         self.look_at_stolen_time(at);
         let power = self.power_fault();
-        if power != self.power {
+        // What lasts is told each time, as the ring forgets.
+        if power != self.power || power.is_some() {
             self.power = power;
             self.writer.write(at, Event::Power(power));
         }
-        let frequency = self.frequency();
-        if frequency != self.frequency {
-            self.frequency = frequency;
-            self.writer.write(at, Event::Frequency { mhz: frequency.0, max_mhz: frequency.1 });
+        let (mhz, max_mhz) = self.frequency();
+        if mhz > 0 {
+            self.writer.write(at, Event::Frequency { mhz, max_mhz });
         }
     }
 
-    fn look_at_threads(&mut self, at: Clock) {
-        for (thread, file, before) in &mut self.accounts {
+    /// Whether a thread has written something.
+    fn look_at_threads(&mut self, at: Clock, all: bool) -> bool {
+        let mut has_news = false;
+        for Account { thread, file, ring, written, before } in &mut self.accounts {
+            let old = std::mem::replace(written, ring.written());
+            let is_new = *written != old;
+            has_news |= is_new;
+            // A link without events did nothing. A core without events may hang.
+            if !is_new && !all && *thread == Watched::Link {
+                continue;
+            }
             let mut text = [0; 64];
             let length = file.read_at(&mut text, 0).unwrap_or(0);
             let Some(now) = str::from_utf8(&text[..length]).ok().and_then(times) else { continue };
-            if let Some(Times { ran, waited }) = before.replace(now) {
-                let span = |ns: u64| Ticks(u32::try_from(ns / NS_PER_TICK).unwrap_or(u32::MAX));
-                let (ran, waited) = (span(now.ran.saturating_sub(ran)), span(now.waited.saturating_sub(waited)));
-                self.writer.write(at, Event::Processor { thread: *thread, ran, waited });
-            }
+            // The first one says since when.
+            let Times { ran, waited } = before.replace(now).unwrap_or(now);
+            let (ran, waited) = (ticks(now.ran.saturating_sub(ran)), ticks(now.waited.saturating_sub(waited)));
+            self.writer.write(at, Event::Processor { thread: *thread, ran, waited });
         }
+        has_news
     }
 
     fn look_at_stolen_time(&mut self, at: Clock) {
@@ -155,6 +173,10 @@ impl Computer {
     }
 }
 
+fn ticks(ns: u64) -> Ticks {
+    Ticks(u32::try_from(ns / NS_PER_TICK).unwrap_or(u32::MAX))
+}
+
 /// The first two fields of a schedstat.
 fn times(text: &str) -> Option<Times> {
     let mut fields = text.split_whitespace().map_while(|field| field.parse().ok());
@@ -180,6 +202,10 @@ mod tests {
         fs::write(path, text).unwrap();
     }
 
+    fn events(ring: Ring) -> Vec<Event> {
+        ring.events().into_iter().filter_map(Event::decode).map(|(_, event)| event).collect()
+    }
+
     #[test]
     fn what_has_changed_is_recorded() {
         let folder = tempfile::tempdir().unwrap();
@@ -188,14 +214,14 @@ mod tests {
         put(root, PI_THROTTLED, "0\n");
         let mut computer = Computer::new(root.into(), ring.writer("sampler").unwrap());
         put(root, "/proc/self/task/7/schedstat", "");
-        computer.watch(Watched::Core, Pid::from_raw(7));
+        computer.watch(Watched::Core, Pid::from_raw(7), crate::trace::ring::ring(8));
         let mut seen = 0;
         let mut look = || {
-            computer.look_at_all(Clock::EPOCH);
-            let events: Vec<Event> =
-                ring.events().into_iter().filter_map(Event::decode).map(|(_, event)| event).collect();
+            computer.look(Clock::EPOCH, true);
+            let mut events = events(ring);
+            assert!(matches!(events.pop(), Some(Event::Looked { all: true, .. })));
             let new = events[seen..].to_vec();
-            seen = events.len();
+            seen = events.len() + 1;
             new
         };
         assert_eq!(look(), []);
@@ -203,39 +229,79 @@ mod tests {
         put(root, "/proc/stat", "cpu  1 2 3 4 5 6 7 100 0 0\ncpu0 1 2\n");
         put(root, "/sys/devices/system/cpu/cpu0/cpufreq/scaling_cur_freq", "600000\n");
         put(root, "/sys/devices/system/cpu/cpu0/cpufreq/cpuinfo_max_freq", "1500000\n");
-        assert_eq!(look(), [Event::Frequency { mhz: 600, max_mhz: 1500 }]);
+        let still = Event::Processor { thread: Watched::Core, ran: Ticks(0), waited: Ticks(0) };
+        let frequency = Event::Frequency { mhz: 600, max_mhz: 1500 };
+        assert_eq!(look(), [still, frequency]);
         put(root, "/proc/self/task/7/schedstat", "3000000 12005000 15\n");
         put(root, "/proc/stat", "cpu  1 2 3 4 5 6 7 103 0 0\n");
         put(root, PI_THROTTLED, "50005\n");
         let processor = Event::Processor { thread: Watched::Core, ran: Ticks::from_ms(2), waited: Ticks::from_ms(12) };
         let power = Event::Power(Some(PowerFault::Undervoltage));
-        assert_eq!(look(), [processor, Event::Stolen(Ticks(3 * 50_000_000 / 100)), power]);
+        assert_eq!(look(), [processor, Event::Stolen(Ticks(3 * 50_000_000 / 100)), power, frequency]);
         put(root, PI_THROTTLED, "50004\n");
-        let still = Event::Processor { thread: Watched::Core, ran: Ticks(0), waited: Ticks(0) };
-        assert_eq!(look(), [still, Event::Power(Some(PowerFault::Hot))]);
+        let hot = Event::Power(Some(PowerFault::Hot));
+        assert_eq!(look(), [still, hot, frequency]);
+        assert_eq!(look(), [still, hot, frequency], "the ring forgets");
         put(root, PI_THROTTLED, "50000\n");
-        assert_eq!(look(), [still, Event::Power(None)]);
+        assert_eq!(look(), [still, Event::Power(None), frequency]);
+        assert_eq!(look(), [still, frequency]);
         fs::remove_file(root.join(PI_THROTTLED.trim_start_matches('/'))).unwrap();
         put(root, "/sys/class/hwmon/hwmon1/name", "rpi_volt\n");
         put(root, "/sys/class/hwmon/hwmon1/in0_lcrit_alarm", "1\n");
-        assert_eq!(look(), [still, power]);
+        assert_eq!(look(), [still, power, frequency]);
+    }
+
+    #[test]
+    fn a_calm_program_is_looked_at_less_often() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path();
+        let (ring, core, link) = (ring(256), crate::trace::ring::ring(8), crate::trace::ring::ring(8));
+        let mut computer = Computer::new(root.into(), ring.writer("sampler").unwrap());
+        for (thread, tid, of) in [(Watched::Core, 7, core), (Watched::Link, 8, link)] {
+            put(root, &format!("/proc/self/task/{tid}/schedstat"), "1000000 5000 12\n");
+            computer.watch(thread, Pid::from_raw(tid), of);
+        }
+        let (mut core, mut link) = (core.writer("core").unwrap(), link.writer("link").unwrap());
+        let mut look = |all| {
+            let before = events(ring).len();
+            let again = computer.look(Clock::EPOCH, all);
+            let looked = events(ring)[before..].to_vec();
+            let is_of = |thread| {
+                looked.iter().any(|event| matches!(event, Event::Processor { thread: of, .. } if *of == thread))
+            };
+            (again, is_of(Watched::Core), is_of(Watched::Link))
+        };
+        assert_eq!(look(false), (OFTEN, true, true), "the first look is at everything");
+        for _ in 2..CALM {
+            // A core that hangs writes nothing.
+            assert_eq!(look(false), (OFTEN, true, false));
+        }
+        assert_eq!(look(false), (SELDOM, true, false));
+        link.write(Clock::EPOCH, Event::Out(1));
+        assert_eq!(look(false), (OFTEN, true, true));
+        for _ in 1..CALM {
+            look(false);
+        }
+        assert_eq!(look(false).0, SELDOM);
+        core.write(Clock::EPOCH, Event::Pace { worst: Ticks(1) });
+        assert_eq!(look(false), (OFTEN, true, false));
+        assert_eq!(look(true), (OFTEN, true, true));
     }
 
     #[test]
     fn this_computer_tells_how_long_a_thread_ran() {
         let ring = ring(256);
         let mut computer = Computer::new("/".into(), ring.writer("sampler").unwrap());
-        computer.watch(Watched::Core, nix::unistd::gettid());
-        computer.look(Clock::EPOCH);
+        computer.watch(Watched::Core, nix::unistd::gettid(), crate::trace::ring::ring(8));
+        computer.look(Clock::EPOCH, false);
         let until = std::time::Instant::now() + std::time::Duration::from_millis(20);
         while std::time::Instant::now() < until {}
-        computer.look(Clock::EPOCH);
-        let events = ring.events().into_iter().filter_map(Event::decode);
-        let ran =
-            events.filter_map(|(_, event)| if let Event::Processor { ran, .. } = event { Some(ran) } else { None });
+        computer.look(Clock::EPOCH, false);
+        let events = events(ring).into_iter();
+        let ran = events.filter_map(|event| if let Event::Processor { ran, .. } = event { Some(ran) } else { None });
         let ran: Vec<Ticks> = ran.collect();
         if Path::new("/proc/self/schedstat").exists() {
-            assert!(ran.len() == 1 && ran[0] > Ticks(0), "{ran:?}");
+            assert!(ran.len() == 2 && ran[0] == Ticks(0) && ran[1] > Ticks(0), "{ran:?}");
         }
     }
 }

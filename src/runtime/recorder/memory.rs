@@ -11,6 +11,7 @@ use log::debug;
 
 use pinion_linux::sys;
 
+use crate::trace::event::Watched;
 use crate::trace::file::Names;
 use crate::trace::ring::{Ring, Writer};
 
@@ -80,6 +81,14 @@ impl Memory {
 
     fn ring(self, ring: usize) -> Ring {
         Ring::new(&self.0[start(ring)..start(ring + 1)])
+    }
+
+    /// The ring with the important events of a thread.
+    pub(super) fn thread(self, thread: Watched) -> Ring {
+        self.ring(match thread {
+            Watched::Core => CORE,
+            Watched::Link => LINK,
+        })
     }
 
     /// The core's writers: of all its events, and of the important ones.

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The flight recorder. Each thread writes 16-byte events into a ring of its own (`memory.rs`, `tape.rs`). A thread of
-//! low priority reads the kernel's accounts four times a second (`computer.rs`). At each stop of the MCU it keeps the
+//! low priority reads the kernel's accounts some times a second (`computer.rs`). At each stop of the MCU it keeps the
 //! rings in a file, and logs who was late. If the program dies or hangs, the guardian does that.
 
 #![forbid(unsafe_code)]
@@ -51,8 +51,6 @@ use tape::News;
 pub use tape::Sleep;
 pub(super) use tape::Tape;
 
-/// How often the kernel's accounts are read.
-const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// How long the recorder waits after a stop, so that the events of all threads are there.
 const SETTLE: Duration = Duration::from_millis(20);
 /// Highest number of files that are kept for an instance.
@@ -198,7 +196,7 @@ impl Recording {
 
 /// The span from a time to a later one.
 pub(super) fn span(from: Clock, to: Clock) -> Ticks {
-    Ticks(u32::try_from(to.since(from).max(0)).unwrap_or(u32::MAX))
+    Ticks(to.since(from).clamp(0, u32::MAX.into()) as u32)
 }
 
 /// The names, for a moment.
@@ -290,17 +288,18 @@ impl Keeper {
     fn run(mut self, link: Pid) {
         let Some(writer) = self.recording.memory.sampler() else { return };
         let mut computer = Computer::new("/".into(), writer);
-        computer.watch(Watched::Link, link);
+        computer.watch(Watched::Link, link, self.recording.memory.thread(Watched::Link));
         let mut next = monotonic();
         self.publish();
         loop {
             if monotonic() >= next {
-                next = monotonic() + LOOK_EVERY;
-                computer.look(self.recording.clock.now());
+                next = monotonic() + computer.look(self.recording.clock.now(), false);
             }
             while let Ok(news) = self.news.pop() {
                 match news {
-                    News::Started(thread) => computer.watch(Watched::Core, thread),
+                    News::Started(thread) => {
+                        computer.watch(Watched::Core, thread, self.recording.memory.thread(Watched::Core));
+                    }
                     News::Configured(objects) => {
                         locked(&self.names).objects = objects.into_iter().collect();
                         // At once: a stop may be the next news.
@@ -309,7 +308,7 @@ impl Keeper {
                     News::Stopped { at, reason, trouble } => {
                         thread::sleep(SETTLE);
                         // The accounts at the stop tell more than those before it.
-                        computer.look_at_all(self.recording.clock.now());
+                        next = monotonic() + computer.look(self.recording.clock.now(), true);
                         let end = End::Shutdown { reason: reason.to_owned(), trouble };
                         self.recording.keep(&self.recording.trace(end, at));
                     }

@@ -50,19 +50,34 @@ pub(in crate::runtime) struct Tape {
     before: State,
     /// How many blocks the core has begun.
     block: u32,
-    /// The latest timer since `pace_at`.
+    /// The latest timer until `pace_at`.
     worst: Ticks,
-    wakes: u16,
     pace_at: Clock,
 }
 
-/// The state that the core had when it was last looked at.
+/// The state that the core had when it was last looked at: a bit for each of these. So one comparison finds a change.
 #[derive(Clone, Copy, Default, PartialEq, Eq)]
-struct State {
-    held: bool,
-    configured: bool,
-    stopped: bool,
-    ordinary: bool,
+struct State(u8);
+
+impl State {
+    const HELD: u8 = 1;
+    const CONFIGURED: u8 = 2;
+    const STOPPED: u8 = 4;
+    const ORDINARY: u8 = 8;
+
+    #[inline]
+    fn of(mcu: &Mcu, is_ordinary: bool) -> State {
+        State(
+            u8::from(mcu.is_held())
+                | u8::from(mcu.is_finalized()) << 1
+                | u8::from(mcu.is_shutdown()) << 2
+                | u8::from(is_ordinary) << 3,
+        )
+    }
+
+    fn is(self, bit: u8) -> bool {
+        self.0 & bit != 0
+    }
 }
 
 /// A sleep of the core.
@@ -79,7 +94,7 @@ pub struct Sleep {
 impl Tape {
     pub(super) fn new((recent, lasting): (Writer, Writer), news: Producer<News>, wake: Arc<EventFd>) -> Tape {
         let (before, pace_at) = (State::default(), Clock::EPOCH);
-        Tape { recent, lasting, news, wake, before, block: 0, worst: Ticks(0), wakes: 0, pace_at }
+        Tape { recent, lasting, news, wake, before, block: 0, worst: Ticks(0), pace_at }
     }
 
     /// The core's thread, which calls this, has started.
@@ -90,7 +105,6 @@ impl Tape {
     /// The core has slept.
     #[inline]
     pub(in crate::runtime) fn woke(&mut self, Sleep { from, to, until }: Sleep) {
-        self.wakes = self.wakes.saturating_add(1);
         self.recent.write(to, Event::Woke { slept: span(from, to), late: span(until, to) });
     }
 
@@ -113,23 +127,18 @@ impl Tape {
 
     /// Records what has changed since the last call. The core calls it when no timer is due, and while it is behind.
     #[inline]
-    pub(in crate::runtime) fn turn(&mut self, mcu: &mut Mcu, margin: Ticks, is_ordinary: bool) {
+    pub(in crate::runtime) fn turn(&mut self, mcu: &mut Mcu, is_ordinary: bool) {
         let at = mcu.last_read();
         let latest = mcu.latest();
         if latest.late > self.worst {
             self.is_later(at, latest);
         }
-        let state = State {
-            held: mcu.is_held(),
-            configured: mcu.is_finalized(),
-            stopped: mcu.is_shutdown(),
-            ordinary: is_ordinary,
-        };
+        let state = State::of(mcu, is_ordinary);
         if state != self.before {
             self.changed(at, state, mcu);
         }
         if at >= self.pace_at {
-            self.pace(at, margin);
+            self.pace(at);
             mcu.forget_latest();
         }
     }
@@ -144,32 +153,33 @@ impl Tape {
     }
 
     #[cold]
-    fn pace(&mut self, at: Clock, margin: Ticks) {
-        let (worst, wakes) = (std::mem::take(&mut self.worst), std::mem::take(&mut self.wakes));
+    fn pace(&mut self, at: Clock) {
+        let worst = std::mem::take(&mut self.worst);
         self.pace_at = at + PACE;
-        if worst.0 > 0 || wakes > 0 {
-            let margin = margin.0.min(u16::MAX.into()) as u16;
-            self.lasting.write(at, Event::Pace { worst, margin, wakes });
+        // Each timer is a little late. Without one, nothing is written: the recorder looks less often at a calm core.
+        if worst.0 > 0 {
+            self.lasting.write(at, Event::Pace { worst });
         }
     }
 
     #[cold]
     fn changed(&mut self, at: Clock, state: State, mcu: &Mcu) {
         let before = std::mem::replace(&mut self.before, state);
-        if state.held != before.held {
-            self.lasting.write(at, if state.held { Event::Held } else { Event::Released });
+        let changed = State(state.0 ^ before.0);
+        if changed.is(State::HELD) {
+            self.lasting.write(at, if state.is(State::HELD) { Event::Held } else { Event::Released });
         }
-        if state.ordinary != before.ordinary {
-            self.lasting.write(at, Event::Scheduling { fifo: !state.ordinary });
+        if changed.is(State::ORDINARY) {
+            self.lasting.write(at, Event::Scheduling { fifo: !state.is(State::ORDINARY) });
         }
-        if state.configured != before.configured {
-            self.lasting.write(at, if state.configured { Event::Configured } else { Event::Reset });
-            if state.configured {
+        if changed.is(State::CONFIGURED) {
+            let configured = state.is(State::CONFIGURED);
+            self.lasting.write(at, if configured { Event::Configured } else { Event::Reset });
+            if configured {
                 self.tell(News::Configured(mcu.object_names()));
             }
         }
-        if state.stopped
-            && !before.stopped
+        if changed.is(State::STOPPED)
             && let Some((stop, stopped_at)) = mcu.last_stop()
         {
             self.lasting.write(stopped_at, Event::Stopped { block: self.block });

@@ -13,10 +13,8 @@ use crate::trace::ring::WINDOW;
 
 /// Ticks in a millisecond.
 pub(super) const MS: i64 = Ticks::from_ms(1).0 as i64;
-/// Time between two samples of the sampler.
-const SAMPLE: i64 = 250 * MS;
-/// How late a sample may be while nothing is wrong.
-const SAMPLE_LATE: i64 = 100 * MS;
+/// How late the sampler may look while nothing is wrong.
+const LOOK_LATE: i64 = 100 * MS;
 /// Longest time between two signs of the guardian, and a little more.
 const LISTENS: i64 = 700 * MS;
 /// Longest time that a core works without an event. The lateness of a turn is recorded at the turn's end.
@@ -241,7 +239,8 @@ impl<'a> Record<'a> {
             if thread != watched {
                 continue;
             }
-            let sample = (before.replace(at).unwrap_or(at - SAMPLE), at);
+            let Some(before) = before.replace(at) else { continue };
+            let sample = (before, at);
             if common(sample, span) > 0 {
                 covered += common(sample, span);
                 ran_sum += i64::from(ran.0);
@@ -272,19 +271,24 @@ impl<'a> Record<'a> {
 
     /// How much more processor time than usual a hypervisor took in the samples that cover a span.
     pub(super) fn stolen(&self, span: Span) -> i64 {
-        let samples = (span.0, span.1 + SAMPLE);
-        let (mut stolen, mut elsewhere) = (0, 0);
+        // What was taken, and of how long a time, in these samples and in the others.
+        let (mut here, mut elsewhere) = ((0, 0), (0, 0));
+        let (mut before, mut stolen) = (None, 0);
         for (at, event) in self.thread("sampler") {
-            if let Event::Stolen(ticks) = event {
-                let is_here = (samples.0..=samples.1).contains(&at);
-                *if is_here { &mut stolen } else { &mut elsewhere } += i64::from(ticks.0);
+            match event {
+                Event::Stolen(ticks) => stolen += i64::from(ticks.0),
+                Event::Looked { all: true, .. } => {
+                    let stolen = std::mem::take(&mut stolen);
+                    let Some(before) = before.replace(at) else { continue };
+                    let sum = if common((before, at), span) > 0 { &mut here } else { &mut elsewhere };
+                    *sum = (sum.0 + stolen, sum.1 + (at - before));
+                }
+                _ => {}
             }
         }
         // The usual share of all processors' time may be the share of a single one.
-        let recorded =
-            self.events.last().map_or(0, |last| last.0).saturating_sub(self.events.first().map_or(0, |first| first.0));
-        let times = (recorded / (samples.1 - samples.0).max(1)).max(1);
-        (stolen - elsewhere / times).max(0)
+        let usual = elsewhere.0 as f64 / elsewhere.1.max(1) as f64 * here.1 as f64;
+        (here.0 - usual as i64).max(0)
     }
 
     /// The longest time within a span without anything of the core.
@@ -307,12 +311,15 @@ impl<'a> Record<'a> {
         self.events.iter().any(|(at, thread, _)| inner.contains(at) && !["core", "guardian"].contains(thread))
     }
 
-    /// Whether the sampler missed its time in a span, because it did not run either.
+    /// Whether the sampler missed its time in a span, because it did not run either. It says when it looks again.
     pub(super) fn sampler_missed(&self, span: Span) -> bool {
         // It may have been the last one to stop.
         let start = span.0 + (span.1 - span.0) / 8;
-        let before = self.within("sampler", (-FAR, start)).next_back().map(|(at, _)| at);
-        before.is_some_and(|before| span.1 - before > SAMPLE + SAMPLE_LATE)
+        let due = self.within("sampler", (-FAR, start)).rev().find_map(|(at, event)| match event {
+            Event::Looked { again, .. } => Some(at + i64::from(again.0)),
+            _ => None,
+        });
+        due.is_some_and(|due| span.1 - due > LOOK_LATE)
             && self.within("sampler", (start + 1, span.1 - 1)).next().is_none()
     }
 
@@ -379,7 +386,10 @@ impl<'a> Record<'a> {
     pub(super) fn power_fault(&self, span: Span) -> Option<PowerFault> {
         let faults = |(_, event)| if let Event::Power(fault) = event { Some(fault) } else { None };
         let before = self.within("sampler", (-FAR, span.0)).rev().find_map(faults);
-        before.into_iter().chain(self.within("sampler", (span.0, span.1 + SAMPLE)).filter_map(faults)).flatten().next()
+        let mut looks = self.within("sampler", (span.1, FAR));
+        let seen =
+            looks.find(|(_, event)| matches!(event, Event::Looked { all: true, .. })).map_or(span.1, |(at, _)| at);
+        before.into_iter().chain(self.within("sampler", (span.0, seen)).filter_map(faults)).flatten().next()
     }
 
     /// The processors' frequency in a span, and the highest possible one, if it was less than half of that.

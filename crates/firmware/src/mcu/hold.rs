@@ -91,7 +91,8 @@ impl Mcu {
     /// the outputs.
     #[inline]
     pub fn is_held(&self) -> bool {
-        self.holds.count > 0 && self.stop.reason.is_none() || self.configuration.reset_due
+        // The core asks in each of its turns: without branches this takes half the time.
+        (self.holds.count > 0) & self.stop.reason.is_none() | self.configuration.reset_due
     }
 
     /// Whether the last command keeps its block unacknowledged until commands may run again.
