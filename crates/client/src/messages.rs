@@ -15,8 +15,8 @@ use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::{Reader, Writer};
 
-/// Highest number of names of a run that are listed.
-const NAMES_MAX: u32 = 4096;
+/// Most memory for the names of an enumeration that are listed. A few bytes of a dictionary can stand for many names.
+const NAMES_BYTES: usize = 1 << 20;
 
 /// An argument for a command's parameter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -193,12 +193,18 @@ impl Enumeration {
         })
     }
 
-    /// All names, sorted. A very long run is cut at `NAMES_MAX` names.
+    /// The names, sorted: as many as [`NAMES_BYTES`] have room for.
     fn all(&self) -> Vec<String> {
         let runs = self.runs.iter().flat_map(|(root, start, _, count)| {
-            (0..(*count).min(NAMES_MAX)).map(move |at| format!("{root}{}", u64::from(*start) + u64::from(at)))
+            (0..*count).map(move |at| format!("{root}{}", u64::from(*start) + u64::from(at)))
         });
-        let mut names: Vec<String> = self.values.keys().cloned().chain(runs).collect();
+        let mut room = NAMES_BYTES;
+        let has_room = |name: &String| {
+            let left = room.checked_sub(size_of::<String>() + name.len());
+            room = left.unwrap_or(0);
+            left.is_some()
+        };
+        let mut names: Vec<String> = self.values.keys().cloned().chain(runs).take_while(has_room).collect();
         names.sort();
         names
     }
@@ -475,6 +481,20 @@ mod tests {
             prop_assert_eq!(runs.value(&name), (at < count).then_some(value));
             prop_assert_eq!(runs.name_of(value), (at < count).then_some(name));
         }
+    }
+
+    #[test]
+    fn the_names_of_a_dictionary_without_end_take_bounded_memory() {
+        let mut runs = Map::new();
+        for run in 0..2000 {
+            runs.insert(format!("{run}{}", "x".repeat(1000)), json!([0, u32::MAX]));
+        }
+        let names = Enumeration::new("pin", &runs).all();
+        let bytes: usize = names.iter().map(|name| size_of::<String>() + name.len()).sum();
+        assert!(names.len() > 900 && bytes <= NAMES_BYTES, "{} names, {bytes} bytes", names.len());
+        // The widest real chips have some hundred lines.
+        let chips = json!({ "gpio0": [0, 288], "gpiochip1/gpio0": [288, 5000], "led": 9000 });
+        assert_eq!(Enumeration::new("pin", chips.as_object().unwrap()).all().len(), 5289);
     }
 
     #[test]
