@@ -36,6 +36,8 @@ const DRAW_PERIOD: Duration = Duration::from_millis(100);
 const LOOK_PERIOD: Duration = Duration::from_millis(200);
 /// How long the program's end waits for a terminal that takes no output.
 const FAREWELL: Duration = Duration::from_secs(1);
+/// Most letters of a name that has the others' column moved.
+const HEAD_MAX: usize = 20;
 /// Rows of a terminal that the log keeps.
 const LOG_ROWS: usize = 3;
 
@@ -185,8 +187,14 @@ fn paint_colours(text: &str) -> String {
 
 /// The picture's lines.
 fn picture(items: &[Item], paint: bool) -> Vec<String> {
-    let heads = items.iter().map(|item| item.kind.names().map_or(item.name.as_str(), |(many, _)| many));
-    let width = heads.map(str::len).max().unwrap_or(0) + 2;
+    let head = |item: &Item| item.kind.names().map_or(item.name.clone(), |(many, _)| many.to_owned());
+    let widths = items.iter().map(|item| head(item).chars().count()).filter(|width| *width <= HEAD_MAX);
+    let width = widths.max().unwrap_or(0);
+    let begin = |item| {
+        let head = head(item);
+        let space = width.saturating_sub(head.chars().count()) + 2;
+        head + &" ".repeat(space)
+    };
     let mut lines: Vec<String> = Vec::new();
     let mut kind = Kind::Part;
     for item in items {
@@ -196,14 +204,14 @@ fn picture(items: &[Item], paint: bool) -> Vec<String> {
                 lines.push(item.name.clone());
                 lines.extend(text.lines().map(str::to_owned));
             }
-            None => lines.push(format!("{:width$}{text}", item.name)),
+            None => lines.push(begin(item) + &text),
             // The last line is of the same kind.
             Some(_) if item.kind == kind => {
                 if let Some(line) = lines.last_mut() {
                     *line += &format!("   {} {text}", item.name);
                 }
             }
-            Some((many, _)) => lines.push(format!("{many:width$}{} {text}", item.name)),
+            Some(_) => lines.push(format!("{}{} {text}", begin(item), item.name)),
         }
         kind = item.kind;
     }
@@ -389,6 +397,20 @@ mod tests {
         ];
         let lines = ["axes     x 1 mm   y 2 mm", "fans     fan 0 rpm", "strip    off", "display", "⠁", "⠂"];
         assert_eq!(picture(&items, true), lines);
+    }
+
+    #[test]
+    fn a_long_name_moves_only_its_own_line() {
+        let long = "x".repeat(70_000);
+        let items = [
+            item(Kind::Fan, "fan", None, "0 rpm"),
+            item(Kind::Part, "größer", None, "on"),
+            item(Kind::Part, &long, None, "off"),
+        ];
+        assert_eq!(
+            picture(&items, true),
+            ["fans    fan 0 rpm".to_owned(), "größer  on".to_owned(), format!("{long}  off")]
+        );
     }
 
     /// The display of a terminal of 10 rows, as far as the sequences here need it.
