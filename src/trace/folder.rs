@@ -14,8 +14,10 @@ use std::path::{Path, PathBuf};
 const SERVICE: &str = "/var/lib/pinion";
 /// The end of a file's name.
 const SUFFIX: &str = ".trace";
-/// Length of the time in a file's name, such as `20261122T142614Z`.
-const TIME_LEN: usize = 16;
+/// Length of the time in a file's name, such as `20261122T142614.321Z`.
+const TIME_LEN: usize = 20;
+/// The clock may stand still for a moment, or be set back by this much.
+const SET_BACK_MS: u64 = 10_000;
 /// The last millisecond with a year of four digits, since 1970.
 const UTC_MS_MAX: u64 = 253_402_300_799_999;
 
@@ -60,10 +62,19 @@ pub fn name_of(link: &Path) -> String {
 }
 
 /// The file's name for a trace of this instance that ended then, in milliseconds since 1970 (UTC). It is
-/// `NAME-YYYYMMDDTHHMMSSZ.trace`.
+/// `NAME-YYYYMMDDTHHMMSS.mmmZ.trace`.
 pub fn file_name(name: &str, utc_ms: u64) -> String {
     let ([year, month, day], [hour, minute, second]) = utc(utc_ms);
-    format!("{name}-{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}Z{SUFFIX}")
+    let ms = utc_ms.min(UTC_MS_MAX) % 1000;
+    format!("{name}-{year:04}{month:02}{day:02}T{hour:02}{minute:02}{second:02}.{ms:03}Z{SUFFIX}")
+}
+
+/// The path of a new file in this folder. Its time may be a little later, so that it is the newest.
+pub fn new_file(folder: &Path, name: &str, utc_ms: u64) -> PathBuf {
+    let newest = kept(folder, name).into_iter().next();
+    let path = |utc_ms| folder.join(file_name(name, utc_ms));
+    let mut later = (utc_ms..utc_ms.saturating_add(SET_BACK_MS)).map(path);
+    later.find(|path| newest.as_ref().is_none_or(|newest| path > newest)).unwrap_or_else(|| path(utc_ms))
 }
 
 /// A time for people, from milliseconds since 1970.
@@ -117,7 +128,8 @@ fn in_folder(folder: &Path) -> impl Iterator<Item = (String, String, PathBuf)> +
         let name = name.strip_suffix('-')?;
         let fits = |(at, byte): (usize, u8)| match at {
             8 => byte == b'T',
-            15 => byte == b'Z',
+            15 => byte == b'.',
+            19 => byte == b'Z',
             _ => byte.is_ascii_digit(),
         };
         time.bytes().enumerate().all(fits).then(|| (time.to_owned(), name.to_owned(), entry.path()))
@@ -131,14 +143,14 @@ mod tests {
     #[test]
     fn a_file_has_the_names_of_its_instance_and_of_its_time() {
         for (utc_ms, time) in [
-            (0, "19700101T000000Z"),
-            (951_782_399_999, "20000228T235959Z"),
-            (951_782_400_000, "20000229T000000Z"),
-            (951_868_800_000, "20000301T000000Z"),
-            (1_795_357_574_321, "20261122T142614Z"),
-            (4_107_542_399_000, "21000228T235959Z"),
-            (4_107_542_400_000, "21000301T000000Z"),
-            (u64::MAX, "99991231T235959Z"),
+            (0, "19700101T000000.000Z"),
+            (951_782_399_999, "20000228T235959.999Z"),
+            (951_782_400_000, "20000229T000000.000Z"),
+            (951_868_800_000, "20000301T000000.000Z"),
+            (1_795_357_574_321, "20261122T142614.321Z"),
+            (4_107_542_399_000, "21000228T235959.000Z"),
+            (4_107_542_400_000, "21000301T000000.000Z"),
+            (u64::MAX, "99991231T235959.999Z"),
         ] {
             assert_eq!(file_name("mcu", utc_ms), format!("mcu-{time}.trace"));
         }
@@ -151,24 +163,29 @@ mod tests {
     #[test]
     fn the_newest_of_an_instance_come_first_and_other_files_are_not_traces() {
         let folder = tempfile::tempdir().unwrap();
-        let times = [1_795_357_574_321, 951_782_400_000, 1_795_357_575_000];
+        // The last two are in the same second.
+        let times = [1_795_357_574_321, 951_782_400_000, 1_795_357_574_999];
         for (name, utc_ms) in times.iter().flat_map(|at| [("mcu", at), ("mcu-2", at), ("", at)]) {
             fs::write(folder.path().join(file_name(name, *utc_ms)), "").unwrap();
         }
-        for other in
-            ["mcu.trace", "mcu-20261122T142614Z.trace.1", "mcu-2026112T142614ZZ.trace", "ä-0261122T142614Z.trace"]
-        {
+        for other in [
+            "mcu.trace",
+            "mcu-20261122T142614.321Z.trace.1",
+            "mcu-2026112T142614.321ZZ.trace",
+            "mcu-20261122T142614Z.trace",
+            "ä-0261122T142614.321Z.trace",
+        ] {
             fs::write(folder.path().join(other), "").unwrap();
         }
         for name in ["mcu", "mcu-2", ""] {
-            let newest = ["20261122T142615Z", "20261122T142614Z", "20000229T000000Z"];
+            let newest = ["20261122T142614.999Z", "20261122T142614.321Z", "20000229T000000.000Z"];
             let newest = newest.map(|time| folder.path().join(format!("{name}-{time}.trace")));
             assert_eq!(kept(folder.path(), name), newest);
         }
         assert!(kept(folder.path(), "other").is_empty());
         let newest = all(&[folder.path().join("missing"), folder.path().to_owned()]);
         assert_eq!(newest.len(), 9);
-        assert!(newest[..3].iter().all(|path| path.to_string_lossy().ends_with("20261122T142615Z.trace")));
+        assert!(newest[..3].iter().all(|path| path.to_string_lossy().ends_with("20261122T142614.999Z.trace")));
         assert!(kept(&folder.path().join("missing"), "mcu").is_empty());
     }
 }

@@ -104,15 +104,15 @@ fn a_recording_is_judged_and_shown() {
 
 #[test]
 fn the_newest_recording_is_found_and_all_are_listed() {
-    let (folder, _) = kept("mcu-20261122T142614Z.trace", &late_host());
+    let (folder, _) = kept("mcu-20261122T142614.000Z.trace", &late_host());
     let mut other = working();
     other.head.utc_ms += 60_000;
-    fs::write(folder.path().join("b-20261122T142714Z.trace"), bytes(&other)).unwrap();
-    fs::write(folder.path().join("b-20261122T142514Z.trace"), "x").unwrap();
+    fs::write(folder.path().join("b-20261122T142714.000Z.trace"), bytes(&other)).unwrap();
+    fs::write(folder.path().join("b-20261122T142514.000Z.trace"), "x").unwrap();
     for args in [&["-I", "/tmp/klipper_host_mcu"][..], &["--last", "-I", "/run/pinion/mcu"]] {
         assert!(out(&trace(folder.path(), args)).starts_with(&format!("verdict: {VERDICT}\n")));
     }
-    assert!(out(&trace(folder.path(), &[])).contains("b-20261122T142714Z.trace"));
+    assert!(out(&trace(folder.path(), &[])).contains("b-20261122T142714.000Z.trace"));
     let listed = out(&trace(folder.path(), &["--list"]));
     let lines: Vec<&str> = listed.lines().collect();
     assert_eq!(lines.len(), 3, "{listed}");
@@ -163,7 +163,7 @@ fn names_from_a_recording_stay_in_their_lines() {
     hostile.head.names.commands = [(5, name.to_owned())].into();
     hostile.threads[1].name = name.into();
     hostile.threads[0].events.truncate(4);
-    let (folder, path) = kept("mcu-20261122T142614Z.trace", &hostile);
+    let (folder, path) = kept("mcu-20261122T142614.000Z.trace", &hostile);
     for args in [&[path.to_str().unwrap()][..], &["--list"]] {
         let shown = out(&trace(folder.path(), args));
         assert_eq!(shown.chars().find(|c| c.is_control() && *c != '\n'), None, "{shown:?}");

@@ -65,7 +65,7 @@ mod tests {
         let mut newest = trace(End::Died, &[]);
         let ended = UNIX_EPOCH + Duration::from_millis(newest.head.utc_ms);
         assert_eq!(finding(ended).told.found(), "no stop of the MCU is recorded");
-        let path = tree.computer().path("/var/lib/pinion/mcu-20261122T142614Z.trace");
+        let path = tree.computer().path("/var/lib/pinion/mcu-20261122T142614.000Z.trace");
         let put = |trace: &crate::trace::file::Trace| {
             let mut file = Vec::new();
             trace.write(&mut file).unwrap();
@@ -81,7 +81,7 @@ mod tests {
             ),
             "{found:?}"
         );
-        assert_eq!(found.told.remedy.as_deref(), Some("pinion trace /var/lib/pinion/mcu-20261122T142614Z.trace"));
+        assert_eq!(found.told.remedy.as_deref(), Some("pinion trace /var/lib/pinion/mcu-20261122T142614.000Z.trace"));
         assert_eq!(finding(ended + 8 * 24 * hour).status, Level::Ok, "it is old");
         newest.head.end = End::Shutdown { reason: "Command request".into(), trouble: "the host asked for it".into() };
         put(&newest);
@@ -89,7 +89,7 @@ mod tests {
         assert_eq!(found.status, Level::Ok);
         assert!(found.told.found().contains("nobody was late: the host asked for it"), "{found:?}");
         // A newer file, which cannot be read.
-        tree.put("var/lib/pinion/mcu-20261123T142614Z.trace", "x");
+        tree.put("var/lib/pinion/mcu-20261123T142614.000Z.trace", "x");
         assert!(finding(ended).told.found().contains("unknown: "));
     }
 }

@@ -178,7 +178,7 @@ impl Recording {
     fn write_into(&self, folder: &Path, trace: &Trace) -> io::Result<PathBuf> {
         folder::make(folder)?;
         let name = folder::name_of(&self.link);
-        let path = folder.join(folder::file_name(&name, trace.head.utc_ms));
+        let path = folder::new_file(folder, &name, trace.head.utc_ms);
         // A rename puts only a whole file in place. A full disk or a power cut leaves none.
         let fresh = folder.join(format!(".{name}.{}", std::process::id()));
         let written = File::create(&fresh).and_then(|file| {
@@ -187,7 +187,9 @@ impl Recording {
             trace.write(file)
         });
         written.and_then(|()| fs::rename(&fresh, &path)).inspect_err(|_| drop(fs::remove_file(&fresh)))?;
-        for old in folder::kept(folder, &name).into_iter().skip(KEPT_MAX) {
+        // After the clock was set back, the others seem newer.
+        let others = folder::kept(folder, &name).into_iter().filter(|other| *other != path);
+        for old in others.skip(KEPT_MAX - 1) {
             let _ = fs::remove_file(old);
         }
         Ok(path)
@@ -347,5 +349,30 @@ impl Keeper {
         // A client that does not read must not keep the thread.
         let limited = client.set_nonblocking(false).and_then(|()| client.set_write_timeout(Some(CLIENT_LIMIT)));
         let _ = limited.and_then(|()| trace.write(client));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The clock of a computer may stand still, or be set back.
+    #[test]
+    fn each_stop_keeps_its_file_and_the_last_ten_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let link = Path::new("/tmp/klipper_host_test");
+        let recording = Recording::new(Monotonic::start(), link, false, vec![folder.path().to_owned()]).unwrap();
+        let mut trace = recording.trace(End::Died, Clock::EPOCH);
+        trace.head.utc_ms = 1_795_357_574_999;
+        let mut written: Vec<PathBuf> = (0..KEPT_MAX + 2).map(|_| recording.write(&trace).unwrap()).collect();
+        written.reverse();
+        written.truncate(KEPT_MAX);
+        assert_eq!(folder::kept(folder.path(), "test"), written);
+        trace.head.utc_ms -= 3_600_000;
+        let back = recording.write(&trace).unwrap();
+        written.truncate(KEPT_MAX - 1);
+        written.push(back);
+        assert_eq!(folder::kept(folder.path(), "test"), written);
+        assert_eq!(fs::read_dir(folder.path()).unwrap().count(), KEPT_MAX);
     }
 }
