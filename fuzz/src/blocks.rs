@@ -54,7 +54,7 @@ fn payloads(stream: &[u8], piece: usize) -> (Vec<Vec<u8>>, u32) {
             let (len, received) = receiver.next(&buffer);
             match received {
                 Received::Nothing => break,
-                Received::Nak => naks += 1,
+                Received::Nak(_) => naks += 1,
                 Received::Skip => {}
                 Received::Payload(payload) => {
                     assert_eq!((payload.len() + BLOCK_MIN, receiver.expected()), (len, expected.next()));

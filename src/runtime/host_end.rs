@@ -10,7 +10,7 @@ use std::sync::Arc;
 use log::{info, warn};
 
 use pinion_linux::LOOK_AT_LOG;
-use pinion_protocol::block::{Received, Receiver, Sequence, frame};
+use pinion_protocol::block::{Received, Receiver, Refusal, Sequence, frame};
 
 use super::core::Payload;
 use super::pty::Pty;
@@ -49,8 +49,8 @@ pub(super) struct Read {
 pub(super) enum Next {
     /// No complete block.
     Nothing,
-    /// Damaged bytes.
-    Nak,
+    /// Something to refuse.
+    Nak(Refusal),
     /// A block.
     Block(Payload),
 }
@@ -125,7 +125,7 @@ impl HostEnd {
             match received {
                 Received::Nothing => return Next::Nothing,
                 Received::Skip => {}
-                Received::Nak => return Next::Nak,
+                Received::Nak(why) => return Next::Nak(why),
                 Received::Payload(payload) => return Next::Block(Payload::new(payload)),
             }
         }

@@ -319,9 +319,9 @@ impl Link {
             }
             match self.host.next() {
                 Next::Nothing => break false,
-                Next::Nak => {
+                Next::Nak(why) => {
                     self.core.ledger.refuse();
-                    self.record(Event::Refused);
+                    self.record(Event::Refused(why));
                 }
                 Next::Block(payload) => {
                     if !self.answer(&payload) {
@@ -348,9 +348,11 @@ impl Link {
             return false;
         }
         let Some(number) = self.core.ledger.answer(core_done) else { return false };
-        if let Some(payload) = answer.payload() {
-            self.host.frame(payload, number);
+        if let Some(answer) = answer.payload() {
+            self.host.frame(answer, number);
         }
+        let id = Reader::new(payload.as_slice()).int().unwrap_or(0) as u16;
+        self.record(Event::Answered { id });
         true
     }
 
@@ -374,8 +376,12 @@ impl Link {
         let core_done = self.core.progress.done();
         self.frame_responses();
         if !self.host.is_full() {
-            for number in self.core.ledger.acknowledge(core_done).into_iter().flatten() {
+            let [news, nak] = self.core.ledger.acknowledge(core_done);
+            for number in news.into_iter().chain(nak) {
                 self.host.frame(&[], number);
+            }
+            if nak.is_some() {
+                self.record(Event::Nak);
             }
         }
         let bytes = self.host.write();

@@ -4,6 +4,7 @@
 #![forbid(unsafe_code)]
 
 use pinion_firmware::time::{Clock, Ticks};
+use pinion_protocol::block::Refusal;
 
 /// Number of words of an encoded event.
 pub const EVENT_WORDS: usize = 2;
@@ -74,8 +75,15 @@ pub enum Event {
     HostCame,
     /// The last host closed the terminal.
     HostGone,
-    /// A block was damaged or came out of order.
-    Refused,
+    /// The link refused what came from the host.
+    Refused(Refusal),
+    /// The link told the host that it had refused something, and from where on to send again.
+    Nak,
+    /// The link answered a block with this command by itself.
+    Answered {
+        /// Its id in the dictionary.
+        id: u16,
+    },
     /// The core has no room for the host's blocks.
     Full,
 
@@ -189,8 +197,12 @@ impl Event {
             Event::Out(bytes) => (21, bytes.into()),
             Event::HostCame => (22, 0),
             Event::HostGone => (23, 0),
-            Event::Refused => (24, 0),
+            Event::Refused(Refusal::Garbage) => (24, 0),
+            Event::Refused(Refusal::Lost) => (24, 1),
+            Event::Refused(Refusal::Repeated) => (24, 2),
             Event::Full => (25, 0),
+            Event::Nak => (26, 0),
+            Event::Answered { id } => (27, id.into()),
             Event::ErrandBegan { oid, waited } => (30, pair(waited.0, number(oid))),
             Event::ErrandEnded { oid, took } => (31, pair(took.0, number(oid))),
             Event::Processor { thread: Watched::Core, ran, waited } => (40, pair(ran.0, waited.0)),
@@ -227,8 +239,15 @@ impl Event {
             21 => Event::Out(low),
             22 => Event::HostCame,
             23 => Event::HostGone,
-            24 => Event::Refused,
+            24 => Event::Refused(match low {
+                0 => Refusal::Garbage,
+                1 => Refusal::Lost,
+                2 => Refusal::Repeated,
+                _ => return None,
+            }),
             25 => Event::Full,
+            26 => Event::Nak,
+            27 => Event::Answered { id: low as u16 },
             30 => Event::ErrandBegan { oid: u8::try_from(high).ok(), waited: Ticks(low) },
             31 => Event::ErrandEnded { oid: u8::try_from(high).ok(), took: Ticks(low) },
             40 => Event::Processor { thread: Watched::Core, ran: Ticks(low), waited: Ticks(high) },

@@ -6,6 +6,7 @@
 use std::collections::HashMap;
 
 use pinion_firmware::time::{CLOCK_FREQ, Ticks};
+use pinion_protocol::block::Refusal;
 
 use super::event::{Event, PowerFault, Watched};
 use super::file::{End, Head, Trace};
@@ -155,7 +156,13 @@ impl<'a> History<'a> {
             Event::Out(bytes) => format!("wrote {bytes} bytes to the host"),
             Event::HostCame => "a host opened the terminal".to_owned(),
             Event::HostGone => "the host closed the terminal".to_owned(),
-            Event::Refused => "a block was damaged or out of order".to_owned(),
+            Event::Refused(Refusal::Garbage) => "garbage came from the host".to_owned(),
+            Event::Refused(Refusal::Lost) => "a block came behind one that was lost in garbage".to_owned(),
+            Event::Refused(Refusal::Repeated) => {
+                "the host sent a block again, without an acknowledgement of it in time".to_owned()
+            }
+            Event::Nak => "asked the host to send again what it had refused (NAK)".to_owned(),
+            Event::Answered { id } => format!("answered {} without the core", self.command(id)),
             Event::Full => "the core has no room for the host's blocks".to_owned(),
             Event::ErrandBegan { oid, .. } => {
                 format!("works for {}. It did not end within {span} ms, when the recording ended", self.object(oid))
@@ -270,6 +277,7 @@ pub(super) mod tests {
     use crate::foreign::tests::any_name;
     use pinion_firmware::time::Clock;
     use proptest::prelude::*;
+    use std::io;
 
     /// A host's pause of 60 ms: a block comes 38 ms after the step that it is for. Before it a bus is busy for 12 ms.
     /// The recording ends at 1 s.
@@ -327,6 +335,13 @@ pub(super) mod tests {
         trace.head.names.objects.insert(7, "adxl345 oid 7".to_owned());
         trace.head.names.commands.insert(9, "set_next_step_dir".to_owned());
         trace
+    }
+
+    /// What an export writes.
+    pub(in crate::trace) fn text(write: impl FnOnce(&mut Vec<u8>) -> io::Result<()>) -> String {
+        let mut text = Vec::new();
+        write(&mut text).unwrap();
+        String::from_utf8(text).unwrap()
     }
 
     /// A trace as a file may contain it: any names, times and numbers.

@@ -180,10 +180,22 @@ fn us(ticks: u64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::history::tests::{any_trace, late_host};
+    use super::super::history::tests::{any_trace, late_host, text};
     use super::*;
     use proptest::prelude::*;
     use std::collections::{HashMap, HashSet};
+
+    /// The keys that the "Trace Event Format" wants in an element of each kind.
+    const REQUIRED: [(&str, &[&str]); 6] = [
+        ("X", &["name", "cat", "ts", "dur", "pid", "tid"]),
+        ("i", &["name", "cat", "ts", "pid", "tid", "s"]),
+        ("C", &["name", "ts", "pid", "args"]),
+        ("b", &["name", "cat", "ts", "pid", "tid", "id"]),
+        ("e", &["name", "cat", "ts", "pid", "tid", "id"]),
+        ("M", &["name", "pid", "tid", "args"]),
+    ];
+    /// Its names of metadata that are used.
+    const NAMES: [&str; 3] = ["process_name", "thread_name", "thread_sort_index"];
 
     /// An element, as the format's description has it.
     #[derive(serde::Deserialize)]
@@ -203,19 +215,33 @@ mod tests {
 
     /// Reads the file by the rules of its format.
     fn read(trace: &Trace) -> Vec<Read> {
-        let mut text = Vec::new();
-        write(trace, &mut text).unwrap();
-        let text = String::from_utf8(text).unwrap();
+        let text = text(|out| write(trace, out));
         assert!(!text.contains(|c: char| c.is_control() && c != '\n'));
         let mut file: Value = serde_json::from_str(&text).unwrap();
+        assert!(["ms", "ns"].contains(&file["displayTimeUnit"].as_str().unwrap()));
+        for item in file["traceEvents"].as_array().unwrap() {
+            let (_, required) = REQUIRED.iter().find(|(kind, _)| item["ph"] == *kind).unwrap();
+            assert!(required.iter().all(|key| item.get(key).is_some()), "{item}");
+            assert!(item["ph"] != "M" || NAMES.contains(&item["name"].as_str().unwrap()), "{item}");
+        }
         let items: Vec<Read> = serde_json::from_value(file["traceEvents"].take()).unwrap();
         let mut free: HashMap<u32, f64> = HashMap::new();
-        let mut open = HashSet::new();
+        let mut open = HashMap::new();
+        let mut last: HashMap<(u32, &str), f64> = HashMap::new();
         let mut named = HashSet::new();
         for item in &items {
             assert!(item.ts >= 0.0 && !item.cat.is_empty() && !item.name.is_empty());
             assert_eq!(item.pid, PROCESS);
             assert!(item.ph == "M" || named.contains(&item.tid), "track {} has no name", item.tid);
+            // Items of one kind come in the order of their times on each track. Counters are tracks by their names. A
+            // late timer's value lasts a microsecond.
+            let counter = if item.ph == "C" { item.name.as_str() } else { item.ph.as_str() };
+            let before = last.insert((item.tid, counter), item.ts).unwrap_or(0.0);
+            assert!(
+                ["b", "e", "M"].contains(&&*item.ph) || item.ts * (1.0 + 1e-9) + 1.01 >= before,
+                "{} goes back",
+                item.name
+            );
             assert_eq!(item.s.as_deref(), (item.ph == "i").then_some("t"));
             assert_eq!(item.dur.is_some(), item.ph == "X");
             match item.ph.as_str() {
@@ -229,8 +255,8 @@ mod tests {
                     assert!(dur >= 0.0 && item.ts * (1.0 + 1e-9) + 0.01 >= *free, "{} overlaps", item.name);
                     *free = item.ts + dur;
                 }
-                "b" => assert!(open.insert((item.id.unwrap(), item.name.clone()))),
-                "e" => assert!(open.remove(&(item.id.unwrap(), item.name.clone()))),
+                "b" => assert!(open.insert((item.id.unwrap(), item.name.clone()), item.ts).is_none()),
+                "e" => assert!(open.remove(&(item.id.unwrap(), item.name.clone())).unwrap() <= item.ts),
                 "C" => assert!(item.args.as_ref().unwrap().values().all(Value::is_number)),
                 "i" => {}
                 kind => panic!("{kind}"),

@@ -300,19 +300,13 @@ impl Svg {
 
 #[cfg(test)]
 mod tests {
-    use super::super::history::tests::{any_trace, late_host};
+    use super::super::history::tests::{any_trace, late_host, text};
     use super::*;
     use proptest::prelude::*;
 
-    fn text(trace: &Trace) -> String {
-        let mut text = Vec::new();
-        write(trace, &mut text).unwrap();
-        String::from_utf8(text).unwrap()
-    }
-
     #[test]
     fn it_shows_the_stop_what_it_was_about_and_what_each_thread_did() {
-        let svg = text(&late_host());
+        let svg = text(|out| write(&late_host(), out));
         let document = roxmltree::Document::parse(&svg).unwrap();
         let texts: Vec<&str> = document.descendants().filter_map(|node| node.text()).collect();
         for text in ["the MCU stopped: Timer too close", "stopped", "due 38.1 ms before the stop", "spi0", "gpio17"] {
@@ -333,7 +327,7 @@ mod tests {
     proptest! {
         #[test]
         fn any_trace_makes_a_small_picture(trace in any_trace()) {
-            let svg = text(&trace);
+            let svg = text(|out| write(&trace, out));
             let document = roxmltree::Document::parse(&svg).unwrap();
             prop_assert!(document.descendants().count() < 20_000);
             prop_assert!(!svg.contains("NaN") && !svg.contains("inf"));

@@ -87,7 +87,7 @@ fn weight(deed: &Deed) -> u64 {
         | Event::HostGone
         | Event::Scheduling { .. }
         | Event::Power(_) => 1 << 40,
-        Event::Refused | Event::Full | Event::Omitted(_) => 1 << 32,
+        Event::Refused(_) | Event::Full | Event::Omitted(_) => 1 << 32,
         Event::Late { late, .. } => u64::from(late.0.max(1)) * 100,
         Event::Woke { late, .. } => over(late.0.into(), LONG_WAIT, 100),
         Event::Processor { waited, .. } => over(waited.0.into(), LONG_WAIT, 100),
@@ -99,6 +99,8 @@ fn weight(deed: &Deed) -> u64 {
         | Event::Command { .. }
         | Event::BlockIn(_)
         | Event::Out(_)
+        | Event::Nak
+        | Event::Answered { .. }
         | Event::Looked { .. }
         | Event::Frequency { .. }
         | Event::Listened
@@ -172,6 +174,9 @@ enum Kind {
     Blocks,
     Waits,
     Came,
+    Answered,
+    Refused,
+    Naks,
     Wrote,
     Work,
     Processor,
@@ -210,6 +215,9 @@ impl Fold {
             Event::Block(_) => (Kind::Blocks, deed.ticks()),
             Event::Held | Event::Released => (Kind::Waits, deed.ticks()),
             Event::BlockIn(_) => (Kind::Came, 0),
+            Event::Answered { .. } => (Kind::Answered, 0),
+            Event::Refused(_) => (Kind::Refused, 0),
+            Event::Nak => (Kind::Naks, 0),
             Event::Out(bytes) => (Kind::Wrote, bytes.into()),
             Event::ErrandBegan { .. } | Event::ErrandEnded { .. } => (Kind::Work, deed.ticks()),
             Event::Processor { waited, .. } => (Kind::Processor, waited.0.into()),
@@ -226,7 +234,6 @@ impl Fold {
             | Event::Scheduling { .. }
             | Event::HostCame
             | Event::HostGone
-            | Event::Refused
             | Event::Full
             | Event::Power(_) => (Kind::Other, 0),
         };
@@ -246,6 +253,9 @@ impl Fold {
                 Kind::Blocks => format!("{} begun, longest in the queue {most} ms", count(sum.count, "block")),
                 Kind::Waits => format!("{} for a bus, longest {most} ms", count(sum.count, "wait")),
                 Kind::Came => format!("{} from the host", count(sum.count, "block")),
+                Kind::Answered => format!("{} answered without the core", count(sum.count, "block")),
+                Kind::Refused => format!("{} of garbage or of blocks sent again", count(sum.count, "refusal")),
+                Kind::Naks => count(sum.count, "NAK"),
                 Kind::Wrote => format!("{} to the host", count(sum.all, "byte")),
                 Kind::Work => format!("{}, longest {most} ms", count(sum.count, "transfer")),
                 Kind::Processor => format!("threads waited {all} ms for a processor"),
@@ -282,19 +292,13 @@ fn count(count: u64, thing: &str) -> String {
 mod tests {
     use super::super::file::End;
     use super::super::file::tests::trace;
-    use super::super::history::tests::{any_trace, late_host};
+    use super::super::history::tests::{any_trace, late_host, text};
     use super::*;
     use proptest::prelude::*;
 
-    fn text(trace: &Trace, last: Duration) -> String {
-        let mut text = Vec::new();
-        write(trace, last, &mut text).unwrap();
-        String::from_utf8(text).unwrap()
-    }
-
     #[test]
     fn what_is_of_note_stands_alone_and_all_else_is_folded() {
-        let text = text(&late_host(), Duration::MAX);
+        let text = text(|out| write(&late_host(), Duration::MAX, out));
         assert_eq!(
             text.lines().next(),
             Some("Times are in ms. Zero is the end of the recording: the MCU stopped: Timer too close.")
@@ -319,7 +323,7 @@ mod tests {
 
     #[test]
     fn only_the_last_part_is_told() {
-        let text = text(&late_host(), Duration::from_millis(20));
+        let text = text(|out| write(&late_host(), Duration::from_millis(20), out));
         assert_eq!(text.lines().nth(1).map(|line| &line[..6]), Some("-20.00"));
         assert!(text.contains("the MCU stopped in block 93"), "{text}");
     }
@@ -329,7 +333,8 @@ mod tests {
     fn a_flood_does_not_hide_the_worst() {
         let late = |number: u64| Event::Late { oid: Some(3), late: Ticks(if number == 777 { 90_000 } else { 500 }) };
         let flood: Vec<(u64, Event)> = (0..2000).map(|number| (number * 100, late(number))).collect();
-        let text = text(&trace(End::Asked, &[("core", &flood)]), Duration::MAX);
+        let trace = trace(End::Asked, &[("core", &flood)]);
+        let text = text(|out| write(&trace, Duration::MAX, out));
         assert!(text.contains("stepper oid 3 ran 1.8 ms late\n"), "{text}");
         assert!(text.contains(" late timers, at most 0.010 ms\n"), "{text}");
     }
@@ -337,7 +342,7 @@ mod tests {
     proptest! {
         #[test]
         fn it_has_few_lines_whatever_happened(trace in any_trace(), last_ms: u64) {
-            let text = text(&trace, Duration::from_millis(last_ms));
+            let text = text(|out| write(&trace, Duration::from_millis(last_ms), out));
             prop_assert!(text.lines().count() <= LINES_MAX + 1);
             prop_assert!(!text.contains(|c: char| c.is_control() && c != '\n'), "{text:?}");
         }

@@ -264,16 +264,10 @@ fn identifier(number: usize) -> String {
 
 #[cfg(test)]
 mod tests {
-    use super::super::history::tests::{any_trace, late_host};
+    use super::super::history::tests::{any_trace, late_host, text};
     use super::*;
     use proptest::prelude::*;
     use std::process::Command;
-
-    fn text(trace: &Trace) -> String {
-        let mut text = Vec::new();
-        write(trace, &mut text).unwrap();
-        String::from_utf8(text).unwrap()
-    }
 
     /// What sigrok reads: the changes of each wire by its name, with their times in units of 100 ns.
     fn read_by_sigrok(vcd: &str) -> Option<HashMap<String, Vec<(u64, char)>>> {
@@ -309,7 +303,7 @@ mod tests {
 
     #[test]
     fn sigrok_reads_the_signals_as_they_were() {
-        let Some(signals) = read_by_sigrok(&text(&late_host())) else { return };
+        let Some(signals) = read_by_sigrok(&text(|out| write(&late_host(), out))) else { return };
         // The file begins with the first event, at 5 us.
         let at = |us: u64| (us - 5) * 10;
         for (signal, transitions, first, second) in [
@@ -331,7 +325,7 @@ mod tests {
 
     #[test]
     fn the_value_of_a_late_timer_is_how_late_it_was() {
-        let text = text(&late_host());
+        let text = text(|out| write(&late_host(), out));
         let (_, id) = text.split_once("$var real 64 ").unwrap();
         let (id, _) = id.split_once(" late_us").unwrap();
         let changes: Vec<&str> = text.lines().filter(|line| line.ends_with(&format!(" {id}"))).collect();
@@ -342,7 +336,7 @@ mod tests {
         /// Times rise, and each change is of a signal that the head declares under a name of its own.
         #[test]
         fn any_trace_has_the_syntax(trace in any_trace()) {
-            let text = text(&trace);
+            let text = text(|out| write(&trace, out));
             let (head, changes) = text.split_once("$enddefinitions $end\n").unwrap();
             let mut names = HashSet::new();
             let mut declared = HashMap::new();

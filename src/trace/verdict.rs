@@ -173,6 +173,7 @@ fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
         0.. => format!("the host's block came {} after the {event} it was for", span_text(late)),
         _ => format!("the host's block came only {} before the {event} it was for", span_text(-late)),
     };
+    what += &resent(record, (due.min(came) - SILENCE, 0));
     what += &on_time(record);
     with_power(record, (due, 0), Finding::new(Culprit::Host, what, HOST_REMEDY))
 }
@@ -212,7 +213,11 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
     if let Some(finding) = of_link(record, (before, 0)) {
         return finding;
     }
-    let what = format!("the host sent no commands for {}{}", span_text(-before), on_time(record));
+    let alive = match record.signs_of_host((before + PROMPT, 0)) {
+        (0, true) => ", but it still asked for the clock".to_owned(),
+        _ => resent(record, (before, 0)),
+    };
+    let what = format!("the host sent no commands for {}{alive}{}", span_text(-before), on_time(record));
     with_power(record, (before, 0), Finding::new(Culprit::Host, what, "look at its log, and at its load"))
 }
 
@@ -450,6 +455,15 @@ fn with_power(record: &Record, span: Span, finding: Finding) -> Finding {
     Finding::new(Culprit::Power, format!("{what} then; {}", finding.what), remedy)
 }
 
+/// How often the host sent again what it had sent, as a clause behind others.
+fn resent(record: &Record, span: Span) -> String {
+    match record.signs_of_host(span).0 {
+        0 => String::new(),
+        1 => "; it sent a block again, without an acknowledgement in time".to_owned(),
+        blocks => format!("; it sent {blocks} blocks again, without acknowledgements in time"),
+    }
+}
+
 /// How late the core was, as a clause behind others.
 fn on_time(record: &Record) -> String {
     record.latest_timer().map_or_else(String::new, |(_, late)| {
@@ -479,6 +493,7 @@ mod tests {
     use std::ops::Range;
 
     use pinion_firmware::time::Clock;
+    use pinion_protocol::block::Refusal;
     use proptest::prelude::*;
 
     use super::super::event::Event;
@@ -619,6 +634,12 @@ mod tests {
             TOO_CLOSE,
             Culprit::Host,
             "the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms: look at the host's load",
+        );
+        let again = Scene::calm().block(STOP - 200, STOP - 100);
+        again.and("link", STOP - 50_000, Event::Refused(Refusal::Repeated)).stop(BLOCK, STOP - 38_200).judged(
+            TOO_CLOSE,
+            Culprit::Host,
+            "the host's block came 38.0 ms after the step it was for; it sent a block again, without an acknowledgement in time; the core was never later than 0.1 ms: look at the host's load",
         );
         // It came before its time, but the core needs some time, too.
         came(STOP - 900, STOP - 400).judged(
@@ -813,6 +834,25 @@ mod tests {
                 Culprit::Standstill,
                 "everything stood still for 380.0 ms: find out who stopped Pinion, or paused or suspended the computer",
             );
+        // The sampler looks less often at a calm program, and does not miss its time.
+        let calm = |stood_from: u64| {
+            let scene = Scene::calm().silent(&["sampler"], STOP - 1_200_000..STOP);
+            let scene = scene.and("sampler", STOP - 400_000, processor(Watched::Core, 3, 0));
+            let scene = scene.and("sampler", STOP - 400_000, looked(500));
+            scene.silent(&["core", "link", "guardian"], stood_from..STOP).account(Watched::Core, 3, 0)
+        };
+        calm(STOP - 390_000).and("core", STOP - 1, woke(390, 380)).stop(7, STOP - 380_000).judged(
+            past,
+            Culprit::Standstill,
+            "everything stood still for 380.0 ms: find out who stopped Pinion, or paused or suspended the computer",
+        );
+        // Something went on meanwhile.
+        let late = calm(STOP - 390_000).and("core", STOP - 1, woke(390, 380));
+        late.and("link", STOP - 200_000, Event::Out(9)).stop(7, STOP - 380_000).judged(
+            past,
+            Culprit::Driver,
+            "the kernel woke the core 380.0 ms late, though it did not wait for a processor: use a PREEMPT_RT kernel, and look for what blocks interrupts, such as a hypervisor",
+        );
         // The core notices it by itself: then no event is the cause.
         let end = |trouble: &str| End::Shutdown { reason: past.into(), trouble: trouble.into() };
         let noticed = |from: u64, threads: &[&str]| {
@@ -911,6 +951,18 @@ mod tests {
             MISSED_PWM,
             Culprit::Host,
             "the host sent no commands for 4.4 s; the core was never later than 0.1 ms: look at its log, and at its load",
+        );
+        let silent = || Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP);
+        missed(silent().and("link", STOP - SECOND, Event::Answered { id: 4 })).judged(
+            MISSED_PWM,
+            Culprit::Host,
+            "the host sent no commands for 4.4 s, but it still asked for the clock; the core was never later than 0.1 ms: look at its log, and at its load",
+        );
+        let again = Event::Refused(Refusal::Repeated);
+        missed(silent().and("link", STOP - 2 * SECOND, again).and("link", STOP - SECOND, again)).judged(
+            MISSED_PWM,
+            Culprit::Host,
+            "the host sent no commands for 4.4 s; it sent 2 blocks again, without acknowledgements in time; the core was never later than 0.1 ms: look at its log, and at its load",
         );
         missed(Scene::calm().and("link", STOP - 3 * SECOND, Event::HostGone)).judged(
             MISSED_PWM,

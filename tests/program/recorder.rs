@@ -2,6 +2,7 @@
 //! The flight recorder: each stop leaves a trace and a verdict.
 
 use std::fs::{self, File};
+use std::io::Write;
 use std::os::unix::fs::PermissionsExt;
 use std::os::unix::net::UnixStream;
 use std::path::PathBuf;
@@ -13,6 +14,7 @@ use nix::sys::signal::Signal;
 use pinion::trace::event::Event;
 use pinion::trace::file::{End, Trace};
 use pinion_client::Client;
+use pinion_protocol::block::{Refusal, Sequence, frame};
 
 use crate::process::{Pinion, WAIT_MAX};
 
@@ -144,6 +146,33 @@ fn a_running_program_gives_its_recording() {
     let status = Command::new(env!("CARGO_BIN_EXE_pinion")).args(["status", "-I"]).arg(pinion.link()).output().unwrap();
     let page = String::from_utf8(status.stdout).unwrap();
     assert!(page.contains("\nrecorder  up to "), "{page}");
+}
+
+/// What explains a host's "retransmit" and "Lost communication".
+#[test]
+fn the_links_answers_and_what_it_refuses_are_recorded() {
+    let pinion = Pinion::simulated(&[]);
+    let client = pinion.client();
+    // Of two blocks with one number, the second came before. Of two blocks behind garbage, one is the expected one at most.
+    let mut bytes = Vec::new();
+    (0..2).for_each(|_| frame(&[], Sequence::after(0), &mut bytes));
+    for number in [9, 3] {
+        bytes.extend(b"garbage\x7e");
+        frame(&[], Sequence::after(number), &mut bytes);
+    }
+    fs::OpenOptions::new().write(true).open(pinion.link()).unwrap().write_all(&bytes).unwrap();
+    let wanted = [Refusal::Repeated, Refusal::Garbage, Refusal::Lost].map(Event::Refused);
+    pinion.until("the refused blocks", || {
+        let trace = Trace::read(UnixStream::connect(pinion.link().with_extension("trace")).unwrap()).unwrap();
+        let events: Vec<Event> = trace.of("link").map(|(_, event)| event).collect();
+        let answered = |name: &str| {
+            let is_named = |id| trace.head.names.commands.get(&id).is_some_and(|its| its == name);
+            events.iter().any(|event| matches!(event, Event::Answered { id } if is_named(*id)))
+        };
+        assert!(answered("identify") && answered("get_clock"), "{events:?}");
+        events.contains(&Event::Nak) && wanted.iter().all(|event| events.contains(event))
+    });
+    drop(client);
 }
 
 /// A disk that takes no file keeps neither the verdict from the log nor the program from its work.

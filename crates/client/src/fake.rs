@@ -126,7 +126,7 @@ fn receive(
         match received {
             Received::Nothing => break,
             Received::Skip => {}
-            Received::Nak => acknowledge(receiver.expected(), output),
+            Received::Nak(_) => acknowledge(receiver.expected(), output),
             Received::Payload(payload) => {
                 for response in answer(payload) {
                     frame(&response, receiver.expected(), output);

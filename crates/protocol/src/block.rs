@@ -134,11 +134,21 @@ pub enum Received<'a> {
     Nothing,
     /// The expected block's payload. Run and acknowledge it.
     Payload(&'a [u8]),
-    /// A block out of order, or the first garbage. Answer with a NAK: an empty block that repeats the expected sequence
-    /// number.
-    Nak,
+    /// Something to refuse. Answer with a NAK: an empty block that repeats the expected sequence number.
+    Nak(Refusal),
     /// Nothing to answer.
     Skip,
+}
+
+/// Why a NAK is due.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Refusal {
+    /// The first bytes that belong to no block.
+    Garbage,
+    /// An intact block that does not follow the garbage before it: what was expected got lost.
+    Lost,
+    /// An intact block that came before: the host sent it again, because it had no acknowledgement in time.
+    Repeated,
 }
 
 /// The micro-controller's end of the wire. It accepts blocks in order only.
@@ -146,6 +156,8 @@ pub enum Received<'a> {
 pub struct Receiver {
     resync: Resync,
     expected: Sequence,
+    /// Garbage came since the last block in order, so that blocks may be lost.
+    is_damaged: bool,
 }
 
 impl Receiver {
@@ -156,10 +168,15 @@ impl Receiver {
             Found::Nothing => Received::Nothing,
             Found::Block(sequence, payload) if sequence == self.expected => {
                 self.expected = sequence.next();
+                self.is_damaged = false;
                 Received::Payload(payload)
             }
-            Found::Block(..) | Found::Garbage { first: true } => Received::Nak,
+            Found::Block(..) => Received::Nak(if self.is_damaged { Refusal::Lost } else { Refusal::Repeated }),
             Found::Garbage { first: false } => Received::Skip,
+            Found::Garbage { first: true } => {
+                self.is_damaged = true;
+                Received::Nak(Refusal::Garbage)
+            }
         };
         (taken, received)
     }
@@ -196,7 +213,7 @@ mod tests {
                 match received {
                     Received::Nothing => break,
                     Received::Payload(payload) => payloads.push(payload.to_vec()),
-                    Received::Nak => naks += 1,
+                    Received::Nak(_) => naks += 1,
                     Received::Skip => {}
                 }
                 buffer.drain(..taken);
@@ -249,6 +266,23 @@ mod tests {
         assert_eq!(got, [b"a".to_vec(), b"b".to_vec()]);
         assert_eq!(naks, 2);
         assert_eq!(receiver.expected(), Sequence(2));
+    }
+
+    #[test]
+    fn a_block_that_came_before_is_told_from_one_behind_garbage() {
+        let mut receiver = Receiver::default();
+        let mut refused = |bytes: &[u8]| match receiver.next(bytes) {
+            (_, Received::Nak(why)) => Some(why),
+            (_, Received::Payload(_)) => None,
+            (_, other) => panic!("{other:?}"),
+        };
+        assert_eq!(refused(&block(b"a", 0)), None);
+        assert_eq!(refused(&block(b"a", 0)), Some(Refusal::Repeated));
+        // The next block is damaged.
+        assert_eq!(refused(b"damaged\x7e"), Some(Refusal::Garbage));
+        assert_eq!(refused(&block(b"c", 2)), Some(Refusal::Lost));
+        assert_eq!(refused(&block(b"b", 1)), None);
+        assert_eq!(refused(&block(b"b", 1)), Some(Refusal::Repeated));
     }
 
     #[test]

@@ -179,7 +179,7 @@ impl Bench {
             match received {
                 Received::Nothing => break,
                 Received::Payload(payload) => self.taken.push(payload.to_vec()),
-                Received::Nak | Received::Skip => {}
+                Received::Nak(_) | Received::Skip => {}
             }
             self.written.drain(..len);
         }

@@ -22,9 +22,9 @@ const OFTEN: Duration = Duration::from_millis(250);
 /// Time between two looks while nothing happens. A hang of the core takes a second to be found: looks cover half of it.
 const SELDOM: Duration = Duration::from_millis(500);
 /// After this many looks without anything new, nothing happens. A host asks for the clock each second.
-const CALM: u32 = 8;
+const CALM: u32 = 5;
 /// One look in this many is at everything. The kernel needs long for some of it.
-const RARELY: u32 = 16;
+const RARELY: u32 = 32;
 /// Longest file of sysfs or procfs that is read.
 const FILE_BYTES: u64 = 1 << 16;
 

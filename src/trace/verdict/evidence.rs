@@ -6,6 +6,7 @@
 #![forbid(unsafe_code)]
 
 use pinion_firmware::time::{Clock, Ticks};
+use pinion_protocol::block::Refusal;
 
 use crate::trace::event::{Event, PowerFault, Watched};
 use crate::trace::file::Trace;
@@ -140,6 +141,13 @@ impl<'a> Record<'a> {
     pub(super) fn last_block(&self) -> Option<i64> {
         let mut blocks = self.within("link", (-FAR, 0));
         blocks.rfind(|(_, event)| matches!(event, Event::BlockIn(_))).map(|(at, _)| at)
+    }
+
+    /// How many blocks the host sent again within a span, and whether it asked for something that the link answers.
+    pub(super) fn signs_of_host(&self, span: Span) -> (usize, bool) {
+        let events = || self.within("link", span).map(|(_, event)| event);
+        let repeated = events().filter(|event| *event == Event::Refused(Refusal::Repeated)).count();
+        (repeated, events().any(|event| matches!(event, Event::Answered { .. })))
     }
 
     /// When the last host closed the terminal, if none has opened it since.
