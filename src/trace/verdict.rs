@@ -425,8 +425,8 @@ fn standstill(record: &Record, gap: Span, is_counted: bool) -> Finding {
             "find out who stopped it (SIGSTOP, a frozen control group)",
         ),
         Some(false) => (
-            format!("the whole computer stood still for {long}"),
-            "find out who suspended it, or paused its virtual machine",
+            format!("Pinion and its guardian stood still for {long}"),
+            "find out who stopped both (a frozen control group), or paused or suspended the computer",
         ),
         None => (
             format!("everything stood still for {long}"),
@@ -821,7 +821,7 @@ mod tests {
         stood(&["core", "link", "sampler", "guardian"]).judged(
             past,
             Culprit::Standstill,
-            "the whole computer stood still for 850.0 ms: find out who suspended it, or paused its virtual machine",
+            "Pinion and its guardian stood still for 850.0 ms: find out who stopped both (a frozen control group), or paused or suspended the computer",
         );
         // The guardian would not have listened in so short a time.
         Scene::calm()

@@ -5,15 +5,14 @@
 
 #![forbid(unsafe_code)]
 
-use pinion_firmware::time::{Clock, Ticks};
+use pinion_firmware::time::Clock;
 use pinion_protocol::block::Refusal;
 
 use crate::trace::event::{Event, PowerFault, Watched};
 use crate::trace::file::Trace;
+pub(super) use crate::trace::history::TICKS_PER_MS as MS;
 use crate::trace::ring::WINDOW;
 
-/// Ticks in a millisecond.
-pub(super) const MS: i64 = Ticks::from_ms(1).0 as i64;
 /// How late the sampler may look while nothing is wrong.
 const LOOK_LATE: i64 = 100 * MS;
 /// Longest time between two signs of the guardian, and a little more.

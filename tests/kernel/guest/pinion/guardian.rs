@@ -143,13 +143,15 @@ impl Heater {
         assert_eq!(shutdown_of(&mut client), "Rescheduled timer in the past");
         sysfs::wait_until("the heater is off", || !self.is_on());
         program.wait_for_line(&["Pinion stood still for"]);
+        // The verdict cannot tell a control group from a virtual machine.
+        let verdict = program.wait_for_line(&["Pinion and its guardian stood still for ", "a frozen control group"]);
         assert!(exists(program.guardian()));
         // Longer than both processes wait for each other.
         thread::sleep(Duration::from_secs(3));
         assert!(program.is_running());
         program.signal(Signal::SIGTERM);
         assert!(program.wait().success());
-        assert!(!program.log().contains("guardian"), "{}", program.log());
+        assert!(!program.log().replace(&verdict, "").contains("guardian"), "{}", program.log());
     }
 }
 
