@@ -23,6 +23,7 @@ mod neopixel;
 mod older_hosts;
 mod one_order;
 mod pca9685;
+mod plain_board;
 mod pwm_out;
 mod ready_adc;
 mod remedies;
