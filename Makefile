@@ -33,11 +33,11 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz bench check build install
-.PHONY: install-program install-system uninstall deb release clean
+.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage bench check build
+.PHONY: install install-program install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
-PACKAGES = $(addprefix system-packages-,build vm deb system stress check fuzz)
+PACKAGES = $(addprefix system-packages-,build vm deb system stress check fuzz coverage)
 .PHONY: $(PACKAGES)
 $(PACKAGES): system-packages-%:
 	@CARGO='$(CARGO)' scripts/system-packages $*
@@ -54,6 +54,7 @@ help:
 	@echo 'make soak-real     an hour of the real program on a busy computer (MINUTES=60 WORKERS=1)'
 	@echo 'make fuzz          random bytes for everything that reads what others wrote: each target for'
 	@echo '                   SECONDS=60, or all for TOTAL=600; only one with TARGET=link'
+	@echo 'make coverage      how many lines the tests reach (ARGS="-p pinion-firmware" for some of them)'
 	@echo 'make bench         the benchmarks'
 	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
 	@echo 'make build         the program: $(PINION)'
@@ -108,6 +109,9 @@ TOTAL ?=
 TARGET ?=
 fuzz: system-packages-fuzz
 	@CARGO='$(CARGO)' scripts/fuzz $(if $(TOTAL),--total $(TOTAL),$(SECONDS)) $(TARGET)
+
+coverage: system-packages-coverage
+	@CARGO='$(CARGO)' scripts/coverage $(ARGS)
 
 bench: system-packages-build
 	$(CARGO) bench --locked
