@@ -33,8 +33,8 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage bench check build
-.PHONY: install install-program install-system uninstall deb release clean
+.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage mutants bench check
+.PHONY: build install install-program install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
 PACKAGES = $(addprefix system-packages-,build vm deb system stress check fuzz coverage)
@@ -55,6 +55,7 @@ help:
 	@echo 'make fuzz          random bytes for everything that reads what others wrote: each target for'
 	@echo '                   SECONDS=60, or all for TOTAL=600; only one with TARGET=link'
 	@echo 'make coverage      how many lines the tests reach (ARGS="-p pinion-firmware" for some of them)'
+	@echo 'make mutants       do the tests notice if the code is changed? (PACKAGE=pinion-firmware SHARD=7/30)'
 	@echo 'make bench         the benchmarks'
 	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
 	@echo 'make build         the program: $(PINION)'
@@ -112,6 +113,21 @@ fuzz: system-packages-fuzz
 
 coverage: system-packages-coverage
 	@CARGO='$(CARGO)' scripts/coverage $(ARGS)
+
+PACKAGE ?= pinion-firmware
+# A part of the mutants, such as 7/30: each 30th of them.
+SHARD ?=
+# More options of cargo-mutants, such as MUTANTS='-f src/runtime/**', and those of cargo test. any_commands is slow.
+MUTANTS ?=
+TESTS ?= -- --skip any_commands
+# Random tests have the same few cases for each mutant, and leave no files.
+mutants: system-packages-build
+	@$(CARGO) mutants --version >/dev/null 2>&1 || \
+	    { echo 'There is no cargo-mutants. Install it: cargo install --locked cargo-mutants' >&2; exit 1; }
+	@mkdir -p $(CARGO_TARGET_DIR)
+	env -u CARGO_TARGET_DIR PROPTEST_CASES=16 PROPTEST_RNG_SEED=1 PROPTEST_MAX_SHRINK_ITERS=0 \
+	    PROPTEST_DISABLE_FAILURE_PERSISTENCE=1 $(CARGO) mutants --package $(PACKAGE) --output $(CARGO_TARGET_DIR) \
+	    $(if $(SHARD),--sharding round-robin --shard $(SHARD)) $(MUTANTS) -- $(TESTS)
 
 bench: system-packages-build
 	$(CARGO) bench --locked

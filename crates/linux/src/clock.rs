@@ -71,6 +71,19 @@ mod tests {
     use super::*;
 
     #[test]
+    fn a_wait_ends_when_it_is_done_or_at_its_deadline() {
+        let mut looks = 0;
+        let third = || {
+            looks += 1;
+            looks == 3
+        };
+        assert!(wait_until(monotonic() + Duration::from_secs(60), third));
+        assert_eq!(looks, 3);
+        let deadline = monotonic() + Duration::from_millis(3);
+        assert!(!wait_until(deadline, || false) && monotonic() >= deadline);
+    }
+
+    #[test]
     fn tick_zero_is_a_whole_second() {
         let clock = Monotonic::start();
         assert_eq!(clock.duration_of(Clock::EPOCH).subsec_nanos(), 0);

@@ -329,6 +329,27 @@ mod tests {
     }
 
     #[test]
+    fn what_a_range_has_no_room_for_has_another_number_or_none() {
+        assert_eq!(
+            [line_number(8, 288), line_number(9, 0)],
+            [Some((1 << 24) + 8 * 4096 + 288), Some((1 << 24) + 9 * 4096)]
+        );
+        assert_eq!(
+            [line_number(4095, 4095), line_number(4096, 0), line_number(0, 4096)],
+            [Some((2 << 24) - 1), None, None]
+        );
+        assert_eq!(
+            [channel_number(0, 0, "voltage7"), channel_number(0, 3, "voltage8")],
+            [Some(4103), Some((1 << 25) + 3)]
+        );
+        assert_eq!(channel_number(1, 2, "voltage0"), Some((1 << 25) + 256 + 2));
+        assert_eq!(channel_number(4095, 255, "temp"), Some((1 << 25) + (1 << 20) - 1));
+        assert_eq!([channel_number(4096, 0, "temp"), channel_number(1, 256, "temp")], [None, None]);
+        assert_eq!([pwm_number(0, 0), pwm_number(2, 3), pwm_number(7, 15)], [65536, 65536 + 35, 65536 + 127].map(Some));
+        assert_eq!([pwm_number(8, 0), pwm_number(0, 16)], [None, None]);
+    }
+
+    #[test]
     fn a_line_s_names() {
         let chips = vec![chip(4, "pinctrl-rp1", &["ID_SDA", "GPIO1", ""])];
         let found = names(chips, vec![]);

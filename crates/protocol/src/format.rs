@@ -226,9 +226,16 @@ mod tests {
         const COUNT: Spec = Spec { name: "count", conversions: &["%c", "%hu"] };
         assert!(agrees("get count=%hu oid=%c", &[COUNT, OID]));
         assert!(agrees("get count=%c oid=%c", &[COUNT, OID]));
-        for format in
-            ["get", "get count", "get count=", "get count=%h", "get count=%cx", "get count=%c oid", "get_count=%c"]
-        {
+        for format in [
+            "get",
+            "get count",
+            "get count=",
+            "get count=%h",
+            "get count=%cx",
+            "get count=%c oid",
+            "get_count=%c",
+            "get total=%c",
+        ] {
             assert!(!agrees(format, &[COUNT]), "{format}");
         }
     }
