@@ -78,6 +78,8 @@ pub mod reason {
         pub SPI_MODE = "Unable to set SPI mode";
         /// An I2C bus is missing or not permitted.
         pub I2C_OPEN = "Unable to open i2c device";
+        /// A serial port is missing, in use or not permitted (Pinion's own text).
+        pub SERIAL_OPEN = "Unable to open serial port";
         /// A DS18B20 is missing or not permitted.
         pub DS18B20_OPEN = "Invalid DS18B20 serial id, could not open for reading";
         /// A hardware PWM channel is missing, not permitted, or refuses its period.

@@ -8,11 +8,11 @@ use std::time::Duration;
 
 use pinion_firmware::board::{
     self, Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges, I2cConfig,
-    Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SpiConfig, Thermometer,
+    Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
 use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
-use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks, TimeSource, VirtualClock};
 use pinion_firmware::trouble::Trouble;
 
 use crate::memory::uncounted;
@@ -31,6 +31,9 @@ const SPI_BUSES: u32 = 2;
 const I2C_BUSES: u32 = 2;
 /// The pin of the data output of SPI bus 0; the next pin is the one of bus 1.
 pub const MOSI: u32 = 700;
+/// A serial port; the next pin is another one.
+pub const SERIAL: u32 = 800;
+const SERIALS: u32 = 2;
 /// A number for [`State::broken`] and [`State::nacks`]: the chips of SPI bus 0; the next number is for bus 1.
 pub const SPI_CHIPS: u32 = 600;
 /// How long a reset waits for the workers.
@@ -70,6 +73,10 @@ pub type SpiChip = Box<dyn FnMut(u64, &mut [u8]) + Send>;
 /// A chip at an I2C address. It gets the time in ticks and the written bytes, and fills in the bytes to read.
 pub type I2cChip = Box<dyn FnMut(u64, &[u8], &mut [u8]) -> Result<(), BusStatus> + Send>;
 
+/// The other end of a serial port. It gets the time in ticks at which the bytes are complete, and the bytes. It returns
+/// everything that the port then receives.
+pub type SerialEnd = Box<dyn FnMut(u64, &[u8]) -> Vec<u8> + Send>;
+
 /// A chip behind an input. It gets the time in ticks. It also gets an output and its new level, or `None` when its
 /// input is read. It returns the input's level.
 pub type LineChip = Box<dyn FnMut(u64, Option<(u32, bool)>) -> bool + Send>;
@@ -81,6 +88,8 @@ pub struct State {
     line_chips: HashMap<u32, LineChip>,
     /// By bus.
     spi_chips: HashMap<u32, SpiChip>,
+    /// By pin.
+    serial_ends: HashMap<u32, SerialEnd>,
     /// By bus and address.
     i2c_chips: HashMap<(u32, u8), I2cChip>,
     /// The last direction of each claimed pin.
@@ -269,6 +278,11 @@ impl Bench {
         self.state().spi_chips.insert(bus, Box::new(chip));
     }
 
+    /// Connects a serial port.
+    pub fn plug_serial(&self, pin: u32, end: impl FnMut(u64, &[u8]) -> Vec<u8> + Send + 'static) {
+        self.state().serial_ends.insert(pin, Box::new(end));
+    }
+
     /// Puts a chip at an address of I2C bus 0 or 1.
     pub fn plug_i2c(
         &self,
@@ -348,6 +362,7 @@ impl Board for FakeBoard {
             Range { name: "analog0".into(), first: ANALOG, count: ANALOGS },
             Range { name: "pwm0".into(), first: PWM, count: PWMS },
             Range { name: "spidev0".into(), first: MOSI, count: SPI_BUSES },
+            Range { name: "ttyS0".into(), first: SERIAL, count: SERIALS },
         ]
     }
 
@@ -409,6 +424,15 @@ impl Board for FakeBoard {
         Ok(Mosi { line, message_max: MESSAGE_MAX })
     }
 
+    fn serial(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<OnWorker<dyn SerialPort>>, Shutdown> {
+        if !(SERIAL..SERIAL + SERIALS).contains(&pin.0) {
+            return Ok(None);
+        }
+        self.0.broken(pin.0, reason::SERIAL_OPEN)?;
+        let port = FakeSerial { bench: self.0.clone(), pin: pin.0, rate_hz, received: Vec::new() };
+        Ok(Some(OnWorker { bus: format!("ttyS{}", pin.0 - SERIAL), device: Box::new(port) }))
+    }
+
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {
         if !self.0.state().thermometers.contains_key(serial) {
             let cause = format!("the bench has no {}", String::from_utf8_lossy(serial));
@@ -442,6 +466,39 @@ impl Board for FakeBoard {
         let mut state = self.0.state();
         state.claimed.clear();
         state.directions.clear();
+    }
+}
+
+struct FakeSerial {
+    bench: Bench,
+    pin: u32,
+    rate_hz: u32,
+    received: Vec<u8>,
+}
+
+impl SerialPort for FakeSerial {
+    fn send(&mut self, bytes: &[u8]) -> Result<(), Trouble> {
+        self.bench.broken(self.pin, reason::SERIAL_OPEN).map_err(|stop| *stop.trouble)?;
+        self.bench.pass(Ticks(CLOCK_FREQ / self.rate_hz * 10 * bytes.len() as u32));
+        // The state is not locked while the other end answers, because it may read the bench.
+        let end = self.bench.state().serial_ends.remove(&self.pin);
+        self.received.clear();
+        if let Some(mut end) = end {
+            self.received = end(self.bench.ticks(), bytes);
+            self.bench.state().serial_ends.insert(self.pin, end);
+        }
+        Ok(())
+    }
+
+    fn receive(&mut self, bytes: &mut [u8], limit: Duration) -> Result<usize, Trouble> {
+        let count = bytes.len().min(self.received.len());
+        if count == 0 {
+            self.bench.pass(Ticks((limit.as_nanos() as u64 / NS_PER_TICK) as u32));
+        }
+        self.bench.pass(Ticks(CLOCK_FREQ / self.rate_hz * 10 * count as u32));
+        bytes[..count].copy_from_slice(&self.received[..count]);
+        self.received.drain(..count);
+        Ok(count)
     }
 }
 

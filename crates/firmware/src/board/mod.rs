@@ -203,6 +203,31 @@ pub trait Thermometer: Send {
     fn read(&mut self) -> Result<i32, Trouble>;
 }
 
+/// A serial port. Its controller times the bits of each byte: a start bit, eight data bits, a stop bit. A worker makes
+/// these calls.
+pub trait SerialPort: Send {
+    /// Drops the bytes that have been received, and sends others. Returns when they have been sent.
+    ///
+    /// # Errors
+    ///
+    /// The text for the log.
+    fn send(&mut self, bytes: &[u8]) -> Result<(), Trouble>;
+
+    /// Reads bytes that have been received. Waits up to `limit` for the first one. Returns how many there were: 0 if
+    /// none came.
+    ///
+    /// # Errors
+    ///
+    /// The text for the log.
+    fn receive(&mut self, bytes: &mut [u8], limit: Duration) -> Result<usize, Trouble>;
+
+    /// The faults that the port has counted since the last call, for example "2 framing errors". `None` without faults,
+    /// or if it does not count them.
+    fn faults(&mut self) -> Option<String> {
+        None
+    }
+}
+
 /// The data output of an SPI controller without a chip. The controller's clock times the data.
 pub struct Mosi {
     /// The output. Nothing answers there.
@@ -475,6 +500,16 @@ pub trait Board: Send {
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
         let _ = rate_hz;
         Err(not_mosi(&pin.name_in(&self.pins())))
+    }
+
+    /// Opens the serial port with the name `pin`. `None`: this pin is no serial port.
+    ///
+    /// # Errors
+    ///
+    /// "Unable to open serial port".
+    fn serial(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<OnWorker<dyn SerialPort>>, Shutdown> {
+        let _ = (pin, rate_hz);
+        Ok(None)
     }
 
     /// Opens the DS18B20 thermometer that the kernel names `serial`, for example `28-0123456789ab`.

@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The UART of stepper drivers, on one wire and on two. The test plays the driver.
+//! The UART of stepper drivers, on one wire, on two, and on a serial port. The test plays the driver.
 
 use pinion_firmware::board::{Bias, Direction};
 use proptest::prelude::*;
 
-use pinion_testbench::board::Edge;
+use pinion_testbench::board::{Edge, SERIAL};
 use pinion_testbench::rig::{Rig, hex};
+use std::sync::{Arc, Mutex};
 
 const TX: u32 = 10;
 const RX: u32 = 11;
@@ -289,5 +290,139 @@ fn a_line_of_an_expander_is_refused() {
         let text = rig.shutdown().unwrap();
         assert!(text.starts_with("Unable to open"), "{text}");
         assert!(rig.notes().iter().any(|note| note.contains("cannot be a UART pin")));
+    }
+}
+
+/// How long a port waits for a byte: 79 bits and 50 ms.
+const PORT_LIMIT: u64 = 79 * BIT + 2_500_000;
+
+/// An MCU with a serial port, the messages that it sent, and what it receives after each of them.
+fn port(mut answer: impl FnMut(&[u8]) -> Vec<u8> + Send + 'static) -> (Rig, Arc<Mutex<Vec<Vec<u8>>>>) {
+    let mut rig = Rig::new();
+    let sent: Arc<Mutex<Vec<Vec<u8>>>> = Arc::default();
+    let log = sent.clone();
+    rig.bench.plug_serial(SERIAL, move |_, bytes| {
+        log.lock().unwrap().push(bytes.into());
+        answer(bytes)
+    });
+    rig.configure(&["config_tmcuart oid=0 rx_pin=800 pull_up=1 tx_pin=800 bit_time=1250"]);
+    (rig, sent)
+}
+
+proptest! {
+    /// A reply arrives unchanged, with and without an echo. So does the message.
+    #[test]
+    fn any_bytes_arrive_over_a_port(
+        message in proptest::collection::vec(any::<u8>(), 2..=8), data: [u8; 6], echoes: bool, replies: bool,
+    ) {
+        prop_assume!(message[1] != 0xff);
+        let reply: Vec<u8> = if replies { [&[0x05, 0xff][..], &data].concat() } else { Vec::new() };
+        let comes = reply.clone();
+        let (mut rig, sent) = port(move |bytes| [if echoes { bytes } else { &[] }, &comes[..]].concat());
+        // The second time it has learned whether there is an echo.
+        for _ in 0..2 {
+            rig.send(&send(&message, if replies { 10 } else { 0 }));
+            rig.run_until(rig.now() + 10_000_000);
+            prop_assert_eq!(rig.responses(), [response(&with_serial_bits(&reply))]);
+            prop_assert_eq!(sent.lock().unwrap().pop(), Some(message.clone()));
+        }
+    }
+
+    /// Whatever a port receives, the host gets an answer, and no more bytes than it wants.
+    #[test]
+    fn anything_may_come_from_a_port(comes in proptest::collection::vec(any::<u8>(), 0..200), echoes: bool, read in 0u8..=10) {
+        let (mut rig, _) = port(move |bytes| [if echoes { bytes } else { &[] }, &comes[..]].concat());
+        rig.send(&send(READ_IFCNT, read));
+        rig.run_until(100_000_000);
+        let responses = rig.responses();
+        prop_assert_eq!(responses.len(), 1);
+        let bytes = responses[0].strip_prefix("tmcuart_response oid=0 read=").unwrap().len() / 2;
+        prop_assert!(bytes == 0 || bytes == usize::from(read), "{:?}", responses);
+        prop_assert!(rig.shutdown().is_none());
+    }
+}
+
+#[test]
+fn a_port_has_its_answer_as_soon_as_the_last_byte_came() {
+    let (mut rig, _) = port(|bytes| [bytes, IFCNT].concat());
+    rig.send(&send(READ_IFCNT, 10));
+    // Four bytes, their echo, and eight bytes.
+    let end = QUIET + (4 + 4 + 8) * 10 * BIT;
+    rig.run_until(end - 1);
+    assert_eq!(rig.responses(), [""; 0]);
+    rig.run_until(end);
+    assert_eq!(rig.responses(), [response(&with_serial_bits(IFCNT))]);
+}
+
+/// Neither a silent driver, nor a missing wire, nor half of a reply is an answer. The next one is.
+#[test]
+fn without_a_whole_reply_a_port_answers_nothing() {
+    for comes in [&[][..], READ_IFCNT, &[READ_IFCNT, &IFCNT[..7]].concat(), &IFCNT[..7], &READ_IFCNT[..3]] {
+        let mut next = [comes.to_vec(), [READ_IFCNT, IFCNT].concat()].into_iter();
+        let (mut rig, _) = port(move |_| next.next().unwrap());
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(QUIET + PORT_LIMIT);
+        assert_eq!(rig.responses(), [""; 0]);
+        rig.run_until(QUIET + 2 * PORT_LIMIT + 600 * BIT);
+        assert_eq!(rig.responses(), [response(&[])], "{comes:x?}");
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(20_000_000);
+        assert_eq!(rig.responses(), [response(&with_serial_bits(IFCNT))]);
+    }
+}
+
+#[test]
+fn a_wrong_check_sum_and_garbage_are_klippys_to_refuse() {
+    let mut spoilt = IFCNT.to_vec();
+    spoilt[6] ^= 1;
+    for (comes, read) in [(spoilt.clone(), &spoilt[..]), ([0; 9].to_vec(), &[0; 8])] {
+        let (mut rig, sent) = port(move |bytes| [bytes, &comes].concat());
+        rig.send(&send(READ_IFCNT, 10));
+        rig.run_until(20_000_000);
+        assert_eq!(rig.responses(), [response(&with_serial_bits(read))]);
+        assert_eq!(sent.lock().unwrap().len(), 1, "klippy asks again");
+    }
+}
+
+#[test]
+fn a_port_that_is_gone_does_not_answer_and_stops_nothing() {
+    let (mut rig, _) = port(|bytes| [bytes, IFCNT].concat());
+    rig.bench.state().broken.insert(SERIAL);
+    rig.send(&send(READ_IFCNT, 10));
+    rig.run_until(1_000_000);
+    assert_eq!(rig.responses(), [response(&[])]);
+    rig.bench.state().broken.clear();
+    rig.send(&send(READ_IFCNT, 10));
+    rig.run_until(2_000_000);
+    assert_eq!(rig.responses(), [response(&with_serial_bits(IFCNT))]);
+}
+
+#[test]
+fn a_shutdown_amid_a_message_of_a_port_says_nothing_more() {
+    let (mut rig, _) = port(|bytes| [bytes, IFCNT].concat());
+    rig.send(&send(READ_IFCNT, 10));
+    rig.run_until(QUIET + 5 * BIT);
+    rig.send("emergency_stop");
+    assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
+    rig.run_until(10_000_000);
+    assert_eq!(rig.responses(), [""; 0]);
+    assert!(!rig.mcu.owes());
+}
+
+#[test]
+fn a_port_that_cannot_be_used_is_refused() {
+    for (config, broken, reason, told) in [
+        ("rx_pin=800 pull_up=1 tx_pin=800", true, "Unable to open serial port", "pin 800 is gone"),
+        ("rx_pin=800 pull_up=1 tx_pin=10", false, "Unable to open serial port", "cannot receive on ttyS0 and send on gpio10"),
+        ("rx_pin=10 pull_up=1 tx_pin=800", false, "Not an output pin", "no pin 800"),
+    ] {
+        let mut rig = Rig::new();
+        if broken {
+            rig.bench.state().broken.insert(SERIAL);
+        }
+        rig.send_all(&["allocate_oids count=1", &format!("config_tmcuart oid=0 {config} bit_time=1250")]);
+        assert_eq!(rig.shutdown().as_deref(), Some(reason));
+        let notes = rig.notes();
+        assert!(notes.iter().any(|note| note.contains(told)), "{notes:?}");
     }
 }
