@@ -18,6 +18,7 @@ use pinion_linux::gpio::Chip;
 use pinion_linux::pins::{Names, channel_number, line_number, pwm_number};
 use pinion_linux::spi::Node;
 use pinion_linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
+use pinion_linux::uart::Uart;
 
 use super::failed;
 use super::page::{Page, aligned, print};
@@ -64,7 +65,7 @@ fn nothing(args: &PinsArgs) -> String {
     match &args.filter {
         Some(filter) => format!("nothing here has \"{filter}\" in a name: pinion pins lists all"),
         None if args.free => "no GPIO line is free: pinion pins lists who holds them".to_owned(),
-        None => "no GPIO chip, ADC, PWM, SPI, I2C or 1-Wire device is to be seen: enable them in the device tree \
+        None => "no GPIO chip, ADC, PWM, SPI, I2C, 1-Wire device or serial port is to be seen: enable them in the device tree \
                  (pinion doctor says how), or try \"pinion run --board sim\""
             .to_owned(),
     }
@@ -113,6 +114,7 @@ struct List {
     spi: Vec<SpiDevice>,
     i2c: Vec<I2cEntry>,
     w1: Vec<W1Sensor>,
+    serial: Vec<SerialEntry>,
     /// Devices that are there and cannot be used.
     problems: Vec<String>,
 }
@@ -218,6 +220,16 @@ struct W1Sensor {
     serial_no: String,
 }
 
+#[derive(Debug, Serialize)]
+struct SerialEntry {
+    device: String,
+    /// Whether the kernel writes its messages there. Then it is of no use for printer.cfg.
+    console: bool,
+    uart_pin: String,
+    /// Other names of the port, also for printer.cfg.
+    links: Vec<String>,
+}
+
 impl List {
     /// The wanted part of everything that was found. `reading` reads a channel (its driver's name) of a device (its
     /// number).
@@ -230,6 +242,7 @@ impl List {
             spi: vec![],
             i2c: vec![],
             w1: vec![],
+            serial: vec![],
             problems: inventory.problems.iter().map(ToString::to_string).collect(),
         };
         if !args.free {
@@ -239,6 +252,7 @@ impl List {
             list.i2c = sysfs.i2c.iter().filter_map(|bus| i2c(bus, args)).collect();
             let sensors = sysfs.thermometers.iter().filter(|serial| wanted(args, [serial.as_str(), "w1", "ds18b20"]));
             list.w1 = sensors.map(|serial| W1Sensor { serial_no: serial.clone() }).collect();
+            list.serial = inventory.uarts.iter().filter_map(|uart| serial(uart, args)).collect();
         }
         list.gpio.retain(|chip| !chip.lines.is_empty());
         list.adc.retain(|device| !device.channels.is_empty());
@@ -257,8 +271,8 @@ impl List {
         let gpio = self.gpio.iter().map(gpio_section);
         let adc = self.adc.iter().map(adc_section);
         let pwm = self.pwm.iter().map(pwm_section);
-        let sections =
-            gpio.chain(adc).chain(pwm).chain([spi_section(&self.spi), i2c_section(&self.i2c), w1_section(&self.w1)]);
+        let buses = [spi_section(&self.spi), i2c_section(&self.i2c), w1_section(&self.w1)];
+        let sections = gpio.chain(adc).chain(pwm).chain(buses).chain([serial_section(&self.serial)]);
         let mut page = Page::default();
         for section in sections.filter(|section| !section.is_empty()) {
             if !page.is_empty() {
@@ -384,6 +398,16 @@ fn i2c(bus: &I2cBus, args: &PinsArgs) -> Option<I2cEntry> {
     })
 }
 
+fn serial(uart: &Uart, args: &PinsArgs) -> Option<SerialEntry> {
+    let names = [uart.name.as_str(), "serial", "uart"].into_iter().chain(uart.links.iter().map(String::as_str));
+    wanted(args, names).then(|| SerialEntry {
+        device: format!("/dev/{}", uart.name),
+        console: uart.is_console,
+        uart_pin: uart.name.clone(),
+        links: uart.links.clone(),
+    })
+}
+
 /// A heading and a table. Nothing if there are no rows.
 fn section(heading: &str, titles: &[&str], rows: &[Vec<String>]) -> Page {
     let mut page = Page::default();
@@ -481,6 +505,21 @@ fn w1_section(sensors: &[W1Sensor]) -> Page {
     section("1-Wire", &["sensor", "in printer.cfg"], &sensors.iter().map(row).collect::<Vec<_>>())
 }
 
+fn serial_section(ports: &[SerialEntry]) -> Page {
+    let row = |port: &SerialEntry| {
+        let use_ = match port.console {
+            true => "none: the kernel writes its messages there".to_owned(),
+            false => {
+                let names: Vec<&str> =
+                    iter::once(&port.uart_pin).chain(&port.links).map(String::as_str).take(2).collect();
+                format!("for TMC drivers uart_pin: {}", names.join(", or "))
+            }
+        };
+        vec![port.device.clone(), use_]
+    };
+    section("Serial ports", &["device", "in printer.cfg"], &ports.iter().map(row).collect::<Vec<_>>())
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -520,6 +559,10 @@ mod tests {
                 ],
             }],
             spi: vec![Node::of(1)],
+            uarts: vec![
+                Uart { name: "ttyAMA1".into(), device: (204, 65), links: vec!["serial0".into()], is_console: false },
+                Uart { name: "ttyS0".into(), device: (4, 64), links: vec![], is_console: true },
+            ],
             ..Inventory::default()
         }
     }
@@ -586,6 +629,11 @@ I2C
 1-Wire
   sensor           in printer.cfg
   28-0316a4f1ff27  sensor_type: DS18B20, with serial_no: 28-0316a4f1ff27
+
+Serial ports
+  device        in printer.cfg
+  /dev/ttyAMA1  for TMC drivers uart_pin: ttyAMA1, or serial0
+  /dev/ttyS0    none: the kernel writes its messages there
 "
         );
     }
@@ -608,6 +656,7 @@ I2C
                 let chip = &mut sysfs.i2c[0].chips[0];
                 (chip.name, chip.driver) = (name.to_owned(), Some(name.to_owned()));
                 sysfs.thermometers = vec![name.to_owned()];
+                inventory.uarts[0].links = vec![name.to_owned()];
                 let error = || Reading::Failed { error: name.to_owned() };
                 let list = List::new(&inventory, &sysfs, &PinsArgs::default(), &|_, _| error());
                 (list.page().to_string(), Page::json(&list.json()).to_string())
@@ -644,6 +693,7 @@ I2C
         assert!(filtered("spidev0.1").starts_with("SPI"));
         assert!(filtered("PWM0").contains("pwmchip0/pwm0") && !filtered("pwm0").contains("pwm1"));
         assert!(filtered("i2c.1").starts_with("I2C") && filtered("28-03").starts_with("1-Wire"));
+        assert!(filtered("serial0").starts_with("Serial ports") && !filtered("ttyama").contains("ttyS0"));
         assert_eq!(filtered("nonesuch"), "");
     }
 
@@ -682,6 +732,10 @@ I2C
             })
         );
         assert_eq!(value["w1"], json!([{ "serial_no": "28-0316a4f1ff27" }]));
+        assert_eq!(
+            value["serial"][0],
+            json!({ "device": "/dev/ttyAMA1", "console": false, "uart_pin": "ttyAMA1", "links": ["serial0"] })
+        );
         assert_eq!(value["problems"], json!([]));
         let failed = serde_json::to_value(Reading::Failed { error: "EIO".into() }).unwrap();
         assert_eq!(failed, json!({ "error": "EIO" }));

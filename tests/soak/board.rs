@@ -225,8 +225,8 @@ impl Board for FaultyBoard {
     }
 
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
-        let Mosi { line: OnWorker { bus, device }, message_max } = self.board.mosi(pin, rate_hz)?;
-        Ok(Mosi { line: OnWorker { bus, device: Box::new(self.faulty(device)) }, message_max })
+        let Mosi { line: OnWorker { bus, device }, message_max, pauses } = self.board.mosi(pin, rate_hz)?;
+        Ok(Mosi { line: OnWorker { bus, device: Box::new(self.faulty(device)) }, message_max, pauses })
     }
 
     fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {

@@ -14,7 +14,7 @@ pub use guard::Guard;
 use guard::SharedGuard;
 use pinion_firmware::board::{
     Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
+    PwmConfig, Range, SerialPort, SpiConfig, Thermometer, not_mosi,
 };
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::trouble::Trouble;
@@ -31,6 +31,7 @@ pub mod spi;
 #[allow(unsafe_code)]
 pub mod sys;
 pub mod sysfs;
+pub mod uart;
 mod w1;
 
 const DEV: &str = "/dev";
@@ -39,6 +40,7 @@ pub const LOOK_AT_LOG: &str = "look at the kernel's log (dmesg)";
 const GPIO: &str = "/sys/bus/gpio/devices";
 const PWM: &str = "/sys/class/pwm";
 const SPI_MASTERS: &str = "/sys/class/spi_master";
+const TTY: &str = "/sys/class/tty";
 const W1: &str = "/sys/bus/w1/devices";
 /// The worker that reads the edges of all lines.
 const EDGE_WORKER: &str = "edges";
@@ -55,6 +57,8 @@ pub struct Inventory {
     pub spi: Vec<spi::Node>,
     /// Numbers of I2C buses.
     pub i2c: Vec<u32>,
+    /// Serial ports.
+    pub uarts: Vec<uart::Uart>,
     /// Each thing that exists but cannot be used.
     pub problems: Vec<Trouble>,
     /// libiio's view of this computer. `None` without IIO devices.
@@ -66,8 +70,8 @@ impl Inventory {
     pub fn scan() -> Inventory {
         let dev = Path::new(DEV);
         let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
-        let mut inventory =
-            Inventory { chips, spi: spi::scan(dev), i2c: i2c::scan(dev), problems, ..Inventory::default() };
+        let (spi, i2c, uarts) = (spi::scan(dev), i2c::scan(dev), uart::scan(dev, Path::new(TTY)));
+        let mut inventory = Inventory { chips, spi, i2c, uarts, problems, ..Inventory::default() };
         match adc::context(Path::new(IIO)) {
             Ok(context) => {
                 inventory.adcs = context.as_ref().map(adc::scan).unwrap_or_default();
@@ -96,10 +100,11 @@ impl Inventory {
         let nodes: Vec<String> = self.spi.iter().map(spi::Node::to_string).collect();
         let buses: Vec<String> = self.i2c.iter().map(|bus| format!("i2c.{bus}")).collect();
         let (chips, adcs) = (chips.collect::<Vec<_>>().join(", "), adcs.collect::<Vec<_>>().join(", "));
-        let parts = [chips, adcs, nodes.join(" "), buses.join(" ")];
+        let ports: Vec<&str> = self.uarts.iter().map(|uart| uart.name.as_str()).collect();
+        let parts = [chips, adcs, nodes.join(" "), buses.join(" "), ports.join(" ")];
         let parts: Vec<String> = parts.into_iter().filter(|part| !part.is_empty()).collect();
         match parts.is_empty() {
-            true => "linux: no GPIO chip, ADC, SPI device or I2C bus is to be seen".to_owned(),
+            true => "linux: no GPIO chip, ADC, SPI device, I2C bus or serial port is to be seen".to_owned(),
             false => format!("linux: {}", parts.join("; ")),
         }
     }
@@ -322,14 +327,28 @@ impl Board for LinuxBoard {
         };
         let bus = node.number().unwrap_or(u32::MAX);
         let device = self.open_spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?.with_mosi_idle_low();
-        if let Some(driver) = spi::driver_without_dma(Path::new(SPI_MASTERS), node) {
-            log::warn!(
-                "/dev/{node}: its controller ({driver}) has no DMA and may pause within a frame, so LEDs may show wrong \
-                 colors: use another controller (on a Raspberry Pi SPI0)"
-            );
-        }
+        let pauses = spi::driver_without_dma(Path::new(SPI_MASTERS), node).map(|driver| {
+            Trouble::new(format!(
+                "its controller ({driver}) has no DMA and may pause within a frame, so LEDs may show wrong colors"
+            ))
+            .remedy("use another controller (on a Raspberry Pi SPI0)")
+            .of(format_args!("/dev/{node}"))
+        });
         let line = OnWorker { bus: device.worker(), device: Box::new(device) as Box<dyn BusDevice> };
-        Ok(Mosi { line, message_max: spi::message_max() })
+        Ok(Mosi { line, message_max: spi::message_max(), pauses })
+    }
+
+    fn mosi_of(&self, miso: Pin) -> Option<Pin> {
+        pins::mosi_of(miso)
+    }
+
+    /// Each port has its own worker.
+    fn serial(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<OnWorker<dyn SerialPort>>, Shutdown> {
+        let Target::Serial(major, minor) = Target::of(pin) else { return Ok(None) };
+        let found = self.seen().inventory.uarts.iter().find(|uart| uart.device == (major, minor)).cloned();
+        let uart = found.ok_or_else(uart::gone)?;
+        let port = uart::Port::open(&self.dev, &uart, rate_hz)?;
+        Ok(Some(OnWorker { bus: uart.name, device: Box::new(port) }))
     }
 
     /// Each sensor has its own worker: the kernel lets others use the bus while one measures.
@@ -445,12 +464,18 @@ mod tests {
             adcs: vec![adc::IioDevice { number: 0, name: "ads1115".into(), label: None, channels: vec![] }],
             spi: vec![spi::Node::of(0), spi::Node::of(1)],
             i2c: vec![1],
+            uarts: vec![uart::Uart {
+                name: "ttyAMA1".into(),
+                device: (204, 65),
+                links: vec!["serial0".into()],
+                is_console: false,
+            }],
             ..Inventory::default()
         };
         assert_eq!(
             inventory.describe(),
             "linux: gpiochip0 pinctrl-bcm2835 (54 lines); iio ads1115 (0 channels); spidev0.0 \
-             spidev0.1; i2c.1"
+             spidev0.1; i2c.1; ttyAMA1"
         );
     }
 }

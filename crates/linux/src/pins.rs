@@ -8,10 +8,13 @@
 //! | 65536..65664 | 16 channels of each of pwmchip0 to 7, as the C program | `pwmchip0/pwm1` |
 //! | 2^24.. | every other line: 4096 numbers for each chip | `gpiochip9/gpio0` |
 //! | 2^25.. | every other ADC channel: 256 numbers for each device | |
-//! | 2^26.. | the data outputs (MOSI) of SPI devices, which LEDs may be connected to | `spidev0.0` |
+//! | 2^26.. | the data outputs (MOSI) of SPI devices, for chips without SPI: LEDs, HX711 | `spidev0.0` |
+//! | 2^26 + 2^16.. | the data inputs (MISO) of the same devices | `spidev0.0/miso` |
+//! | 2^27.. | serial ports, for drivers with a UART: 2^15 numbers for each driver of ports | `ttyAMA1` |
 //!
 //! `gpio17` stands for `gpiochip0/gpio17`. The computer's own names are also published: `GPIO17` (the device tree's
-//! name for a line), `pinctrl-rp1/gpio17` (with the chip's label) and `mcp3208/voltage3`. A name is left out if two
+//! name for a line), `pinctrl-rp1/gpio17` (with the chip's label) and `mcp3208/voltage3`. So are the
+//! links to serial ports: `serial0`. A name is left out if two
 //! things share it, or if it looks like a numeric name. A name that klippy cannot read from a configuration is also
 //! left out.
 
@@ -47,6 +50,13 @@ const FURTHER_DEVICE_CHANNELS: u32 = 1 << 8;
 /// Data outputs of SPI devices, by the device's number on the wire.
 const MOSI: u32 = 1 << 26;
 const MOSI_NODES: u32 = 1 << 16;
+/// Data inputs of the same devices.
+const MISO: u32 = MOSI + MOSI_NODES;
+
+/// Serial ports, by the numbers of their devices (major and minor).
+const SERIAL: u32 = 1 << 27;
+const SERIAL_DRIVERS: u32 = 1 << 12;
+const SERIAL_DRIVER_PORTS: u32 = 1 << 15;
 
 /// The thing that a pin's number stands for.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -76,6 +86,10 @@ pub enum Target {
     },
     /// The data output of an SPI device.
     Mosi(Node),
+    /// The data input of an SPI device.
+    Miso(Node),
+    /// A serial port, by the numbers of its device.
+    Serial(u32, u32),
     /// No pin has this number.
     Nothing(u32),
 }
@@ -96,6 +110,10 @@ impl Target {
             Target::Channel { device: at / FURTHER_DEVICE_CHANNELS, position: at % FURTHER_DEVICE_CHANNELS }
         } else if let Some(at) = within(MOSI, MOSI_NODES) {
             Target::Mosi(Node::of(at))
+        } else if let Some(at) = within(MISO, MOSI_NODES) {
+            Target::Miso(Node::of(at))
+        } else if let Some(at) = within(SERIAL, SERIAL_DRIVERS * SERIAL_DRIVER_PORTS) {
+            Target::Serial(at / SERIAL_DRIVER_PORTS, at % SERIAL_DRIVER_PORTS)
         } else {
             Target::Nothing(pin.0)
         }
@@ -112,6 +130,8 @@ impl fmt::Display for Target {
             }
             Target::Pwm { chip, channel } => write!(f, "pwmchip{chip}/pwm{channel} (hardware PWM)"),
             Target::Mosi(node) => write!(f, "{node} (an SPI device's data output)"),
+            Target::Miso(node) => write!(f, "{node}/miso (an SPI device's data input)"),
+            Target::Serial(major, minor) => write!(f, "/dev/char/{major}:{minor} (a serial port)"),
             Target::Nothing(pin) => write!(f, "pin number {pin} (no pin has it)"),
         }
     }
@@ -145,6 +165,18 @@ pub fn channel_number(device: u32, position: usize, id: &str) -> Option<u32> {
 /// The number of a hardware PWM channel, if it has one.
 pub fn pwm_number(chip: u32, channel: u32) -> Option<u32> {
     (chip < PWM_CHIPS && channel < PWM_CHIP_CHANNELS).then_some(PWM + chip * PWM_CHIP_CHANNELS + channel)
+}
+
+/// The data output of the SPI device with this data input.
+pub(super) fn mosi_of(miso: Pin) -> Option<Pin> {
+    let node = miso.0.checked_sub(MISO).filter(|node| *node < MOSI_NODES)?;
+    Some(Pin(MOSI + node))
+}
+
+/// The number of a serial port, if it has one.
+pub fn serial_number((major, minor): (u32, u32)) -> Option<u32> {
+    let fits = major < SERIAL_DRIVERS && minor < SERIAL_DRIVER_PORTS;
+    fits.then_some(SERIAL + major * SERIAL_DRIVER_PORTS + minor)
 }
 
 /// The names of this computer that the C program does not have, each with its number.
@@ -184,7 +216,15 @@ impl Names {
         for node in &inventory.spi {
             if let Some(number) = node.number().filter(|number| *number < MOSI_NODES) {
                 numeric.push((node.to_string(), MOSI + number));
+                numeric.push((format!("{node}/miso"), MISO + number));
             }
+        }
+        for uart in &inventory.uarts {
+            let Some(number) = serial_number(uart.device) else {
+                continue;
+            };
+            own.push((uart.name.clone(), number));
+            own.extend(uart.links.iter().map(|link| (link.clone(), number)));
         }
         own.retain(|(name, _)| writable(name) && !numeric_name(name));
         let mut names = unshared(own);
@@ -280,6 +320,7 @@ fn runs(names: &[(String, u32)]) -> Vec<Range> {
 mod tests {
     use super::super::adc::{Channel, IioDevice};
     use super::super::gpio::{Chip, LineInfo};
+    use super::super::uart::Uart;
     use super::*;
     use proptest::prelude::*;
 
@@ -421,6 +462,23 @@ mod tests {
     }
 
     #[test]
+    fn a_serial_port_has_the_number_of_its_device() {
+        let port = |name: &str, device, links: &[&str]| Uart {
+            name: name.into(),
+            device,
+            links: links.iter().map(|link| (*link).to_owned()).collect(),
+            is_console: false,
+        };
+        let links = ["serial0", "serial/by-id/usb-port0", "serial/by-id/usb:1"];
+        let uarts = vec![port("ttyAMA1", (204, 65), &links), port("ttyUSB9", (4096, 0), &[])];
+        let names = Names::of(&Inventory { uarts, ..Inventory::default() });
+        let number = serial_number((204, 65)).unwrap();
+        assert_eq!(Target::of(Pin(number)), Target::Serial(204, 65));
+        assert_eq!(names.of_pin(number), ["ttyAMA1", "serial0", "serial/by-id/usb-port0"]);
+        assert_eq!(names.0.len(), 3, "there is no room for the other one");
+    }
+
+    #[test]
     fn hardware_pwm_keeps_its_numbers() {
         assert_eq!(Target::of(Pin(65536)), Target::Pwm { chip: 0, channel: 0 });
         assert_eq!(Target::of(Pin(65663)), Target::Pwm { chip: 7, channel: 15 });
@@ -470,6 +528,11 @@ mod tests {
                 Target::Analog(n) => prop_assert_eq!(n + ANALOG, pin),
                 Target::Channel { .. } => prop_assert!((FURTHER_CHANNELS..MOSI).contains(&pin)),
                 Target::Mosi(node) => prop_assert_eq!(node.number().map(|number| MOSI + number), Some(pin)),
+                Target::Miso(node) => {
+                    prop_assert_eq!(node.number().map(|number| MISO + number), Some(pin));
+                    prop_assert_eq!(mosi_of(Pin(pin)).map(Target::of), Some(Target::Mosi(node)));
+                }
+                Target::Serial(major, minor) => prop_assert_eq!(serial_number((major, minor)), Some(pin)),
             }
         }
     }

@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use pinion_firmware::board::{
     Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SpiConfig, Thermometer, not_mosi,
+    PwmConfig, Range, SerialPort, SpiConfig, Thermometer, not_mosi,
 };
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{TimeSource, Timing};
@@ -19,7 +19,8 @@ use super::engine::i2c::{I2cBus, I2cDevice};
 use super::engine::led::ColouredLed;
 use super::engine::noise::Noise;
 use super::engine::physics::{Axis, Fan, Heater, Lamp, Switch};
-use super::engine::spi::{MosiPin, SpiBus, SpiDevice};
+use super::engine::serial::{SerialDevice, SerialWire};
+use super::engine::spi::{MISO, MosiPin, SpiBus, SpiDevice};
 use super::engine::time::{PrinterTime, STEP_LATE_LIMIT};
 use super::engine::wire::{
     DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges, SimLine,
@@ -51,6 +52,7 @@ pub struct SimBoard {
     spi_buses: Vec<Arc<SpiBus>>,
     /// By number.
     i2c_buses: Vec<Arc<I2cBus>>,
+    serial_wires: Vec<Arc<SerialWire>>,
 }
 
 impl SimBoard {
@@ -66,6 +68,7 @@ impl SimBoard {
             pins: Vec::new(),
             spi_buses: Vec::new(),
             i2c_buses: config.i2c_buses.iter().map(I2cBus::new).collect(),
+            serial_wires: Vec::new(),
         };
         for part in &config.axes {
             let axis = Arc::new(Axis::new(part));
@@ -124,7 +127,7 @@ impl SimBoard {
         for bus in &config.spi_buses {
             workshop.wire(Some(&bus.mosi_pin()), MosiPin { bus: bus.name.clone() });
         }
-        let Workshop { world, pins, spi_buses, i2c_buses, .. } = workshop;
+        let Workshop { world, pins, spi_buses, i2c_buses, serial_wires, .. } = workshop;
         Ok(SimBoard {
             time: Arc::new(PrinterTime::new(clock.clone())),
             clock,
@@ -133,6 +136,7 @@ impl SimBoard {
             pins,
             spi_buses: spi_buses.into_iter().map(Arc::new).collect(),
             i2c_buses: i2c_buses.into_iter().map(Arc::new).collect(),
+            serial_wires: serial_wires.into_iter().map(Arc::new).collect(),
         })
     }
 
@@ -271,7 +275,23 @@ impl Board for SimBoard {
         let bus = self.spi_buses().into_iter().find(|bus| wired.wire.kind() == Kind::Mosi && bus.name == wired.name);
         let bus = bus.ok_or_else(|| not_mosi(&wired.name))?.first;
         let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
-        Ok(Mosi { line, message_max: MESSAGE_MAX })
+        Ok(Mosi { line, message_max: MESSAGE_MAX, pauses: None })
+    }
+
+    fn mosi_of(&self, miso: Pin) -> Option<Pin> {
+        let wired = self.pin(miso, reason::NOT_INPUT).ok().filter(|wired| wired.wire.kind() == Kind::Miso)?;
+        let name = wired.name.strip_suffix(MISO)?;
+        (0..).zip(&self.pins).find(|(_, pin)| pin.name == name).map(|(number, _)| Pin(number))
+    }
+
+    fn serial(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<OnWorker<dyn SerialPort>>, Shutdown> {
+        // Another error names a pin that is not there.
+        let Ok(wired) = self.pin(pin, reason::SERIAL_OPEN) else { return Ok(None) };
+        let is_it = |wire: &&Arc<SerialWire>| wired.wire.kind() == Kind::Serial && wire.name == wired.name;
+        let Some(wire) = self.serial_wires.iter().find(is_it) else { return Ok(None) };
+        let (wire, clock) = (wire.clone(), self.clock.clone());
+        let bus = wire.name.clone();
+        Ok(Some(OnWorker { bus, device: Box::new(SerialDevice { wire, clock, rate_hz, received: Vec::new() }) }))
     }
 
     /// No claim is permanent: the parts exist independent of the MCU.

@@ -167,6 +167,18 @@ impl SimConfig {
                 }
             }
             Some(Socket::Mosi { bus }) => printer.check_spi_bus(whose, bus)?,
+            Some(Socket::Serial { port, address }) => {
+                let shares = |other: &Socket<'_>| matches!(other, Socket::Serial { port: its, .. } if *its == port);
+                let mut chips = self.parts.iter().map(PartConfig::part);
+                let first = chips.find(|chip| chip.socket().as_ref().is_some_and(shares));
+                // The chips of a port share its name.
+                if first.is_some_and(|first| first.name() == part.name()) {
+                    pins.claim(whose, "uart_port", Some(port))?;
+                }
+                if neighbours.any(|other| Some(other) == socket) {
+                    return wrong(whose, "address", &format!("{address} is taken on this port"), "give another");
+                }
+            }
             None => {}
         }
         part.validate(whose, printer)?;

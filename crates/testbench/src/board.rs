@@ -31,6 +31,8 @@ const SPI_BUSES: u32 = 2;
 const I2C_BUSES: u32 = 2;
 /// The pin of the data output of SPI bus 0; the next pin is the one of bus 1.
 pub const MOSI: u32 = 700;
+/// The pin of the data input of SPI bus 0; the next pin is the one of bus 1.
+pub const MISO: u32 = 710;
 /// A serial port; the next pin is another one.
 pub const SERIAL: u32 = 800;
 const SERIALS: u32 = 2;
@@ -362,6 +364,7 @@ impl Board for FakeBoard {
             Range { name: "analog0".into(), first: ANALOG, count: ANALOGS },
             Range { name: "pwm0".into(), first: PWM, count: PWMS },
             Range { name: "spidev0".into(), first: MOSI, count: SPI_BUSES },
+            Range { name: "miso0".into(), first: MISO, count: SPI_BUSES },
             Range { name: "ttyS0".into(), first: SERIAL, count: SERIALS },
         ]
     }
@@ -421,7 +424,12 @@ impl Board for FakeBoard {
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose spidev0"));
         };
         let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
-        Ok(Mosi { line, message_max: MESSAGE_MAX })
+        Ok(Mosi { line, message_max: MESSAGE_MAX, pauses: None })
+    }
+
+    fn mosi_of(&self, miso: Pin) -> Option<Pin> {
+        let bus = miso.0.checked_sub(MISO).filter(|bus| *bus < SPI_BUSES)?;
+        Some(Pin(MOSI + bus))
     }
 
     fn serial(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<OnWorker<dyn SerialPort>>, Shutdown> {

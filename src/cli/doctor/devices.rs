@@ -86,8 +86,9 @@ const CLASSES: [Class; 6] = [
     },
 ];
 
-/// Whether the users that Pinion runs as may open the devices. Without a service it judges the caller.
-pub(super) fn permissions(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
+/// Whether the users that Pinion runs as may open the devices, and these serial ports. Without a service it judges the
+/// caller.
+pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &BTreeSet<&str>) -> Vec<Finding> {
     let on_pins = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
     let mut users: Vec<(Who, Vec<&Instance>)> = Vec::new();
     for (who, instance) in on_pins.filter_map(|instance| Some((instance.user(computer)?, instance))) {
@@ -103,11 +104,16 @@ pub(super) fn permissions(computer: &Computer, instances: &[Instance]) -> Vec<Fi
         let found = "there is no user pinion: the service is not installed, and what it may open is unknown";
         return vec![Finding::warning("user", found, INSTALL)];
     }
-    users.iter().flat_map(|(user, instances)| permissions_of(computer, instances, user)).collect()
+    users.iter().flat_map(|(user, instances)| permissions_of(computer, instances, user, ports)).collect()
 }
 
 /// Whether `user` may open the devices. These instances run as `user`.
-fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who) -> Vec<Finding> {
+fn permissions_of(
+    computer: &Computer,
+    instances: &[&Instance],
+    user: &Who,
+    ports: &BTreeSet<&str>,
+) -> Vec<Finding> {
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
     let anew = match &units[..] {
         [] => "log in anew, and start Pinion anew".to_owned(),
@@ -115,6 +121,16 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who) -> V
     };
     let permission = |class: &Class| permission(computer, user, &anew, class, &computer.matching(class.nodes));
     let mut findings: Vec<Finding> = CLASSES.iter().filter_map(permission).collect();
+    const SERIAL: Class = Class {
+        check: "serial",
+        name: "serial port",
+        access: Access::READ_WRITE,
+        subsystem: "tty",
+        enabled_by: None,
+        nodes: "/dev",
+    };
+    let ports: Vec<PathBuf> = ports.iter().map(|port| computer.path(format!("/dev/{port}"))).collect();
+    findings.extend(self::permission(computer, user, &anew, &SERIAL, &ports));
     if instances.iter().any(|instance| instance.settings.watchdog) {
         const WATCHDOG: Class = Class {
             check: "watchdog",
@@ -236,12 +252,12 @@ fn other_subsystem(computer: &Computer, class: &Class, node: &Path) -> Option<St
     (subsystem != class.subsystem).then_some(subsystem)
 }
 
-fn is_pi(computer: &Computer) -> bool {
+pub(super) fn is_pi(computer: &Computer) -> bool {
     model(computer).contains("Raspberry Pi")
 }
 
 /// A Raspberry Pi's config.txt.
-fn pi_config(computer: &Computer) -> Option<&'static str> {
+pub(super) fn pi_config(computer: &Computer) -> Option<&'static str> {
     computer.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
 }
 
@@ -439,7 +455,7 @@ mod tests {
 
     fn permitted(tree: &Tree, user: &Who) -> Vec<Finding> {
         let instances = instances(&tree.computer()).0;
-        permissions_of(&tree.computer(), &instances.iter().collect::<Vec<_>>(), user)
+        permissions_of(&tree.computer(), &instances.iter().collect::<Vec<_>>(), user, &["ttyAMA1"].into())
     }
 
     /// A user other than root and other than the one that runs the tests.
@@ -447,13 +463,14 @@ mod tests {
         Who { name: "pinion".into(), uid: 54_321, gids }
     }
 
-    const NODES: [(&str, &str); 7] = [
+    const NODES: [(&str, &str); 8] = [
         ("gpio", "dev/gpiochip0"),
         ("adc", "sys/bus/iio/devices/iio:device0/in_voltage3_raw"),
         ("pwm", "sys/class/pwm/pwmchip0/export"),
         ("spi", "dev/spidev0.0"),
         ("i2c", "dev/i2c-1"),
         ("w1", "sys/bus/w1/devices/28-01/w1_slave"),
+        ("serial", "dev/ttyAMA1"),
         ("watchdog", "dev/watchdog"),
     ];
 
@@ -477,7 +494,7 @@ mod tests {
     #[test]
     fn the_users_are_judged_that_pinion_runs_as() {
         let tree = Tree::new();
-        let look = || permissions(&tree.computer(), &instances(&tree.computer()).0);
+        let look = || permissions(&tree.computer(), &instances(&tree.computer()).0, &BTreeSet::new());
         assert_eq!(told(&look(), "user", Warning, "there is no user pinion"), INSTALL);
         tree.put_mode("dev/gpiochip0", "", 0o660);
         let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();

@@ -116,6 +116,11 @@ pub(super) fn leds(klippys: &[Klippy]) -> BTreeSet<&str> {
     printers(klippys).flat_map(|printer| &printer.leds).map(String::as_str).collect()
 }
 
+/// The serial ports of drivers in the klippys' configurations.
+pub(super) fn uarts(klippys: &[Klippy]) -> BTreeSet<&str> {
+    printers(klippys).flat_map(|printer| &printer.uarts).map(|pin| printer::name_of(pin)).collect()
+}
+
 /// Whether Pinion speaks the messages of each host.
 pub(super) fn dialects(computer: &Computer, instances: &[Instance], klippys: &[Klippy]) -> Vec<Finding> {
     if klippys.is_empty() {

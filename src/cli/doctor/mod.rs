@@ -27,6 +27,7 @@ mod kernel;
 mod klipper;
 mod last_stop;
 mod printer;
+mod serial;
 mod service;
 mod terminal;
 
@@ -96,9 +97,14 @@ fn examine(computer: &Computer) -> Vec<Group> {
         Group::new("host", host::dialects(computer, &instances, &klippys)),
         Group::new(
             "pins and buses",
-            [devices::presence(computer), devices::leds(computer, &host::leds(&klippys))].concat(),
+            [
+                devices::presence(computer),
+                devices::leds(computer, &host::leds(&klippys)),
+                serial::ports(computer, &host::uarts(&klippys)),
+            ]
+            .concat(),
         ),
-        Group::new("permissions", devices::permissions(computer, &instances)),
+        Group::new("permissions", devices::permissions(computer, &instances, &host::uarts(&klippys))),
         Group::new("power", devices::power(computer, computer.is_this().then_some(Path::new("/usr/bin/vcgencmd")))),
     ];
     if computer.is_this() {

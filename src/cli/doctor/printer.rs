@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Reads klippy's configuration: its pseudo terminals, and its LEDs on SPI buses.
+//! Reads klippy's configuration: its pseudo terminals, its LEDs on SPI buses, and its
+//! drivers on serial ports.
 
 #![forbid(unsafe_code)]
 
@@ -18,18 +19,33 @@ pub(super) struct Printer {
     pub(super) serials: BTreeSet<PathBuf>,
     /// The `pin` of each `[neopixel]` section that names an SPI device, such as `host:spidev0.0`.
     pub(super) leds: BTreeSet<String>,
+    /// The `uart_pin` of each `[tmc...]` section that names a serial port, such as `host:ttyAMA1`.
+    pub(super) uarts: BTreeSet<String>,
 }
 
 /// Reads a configuration, with the files that it includes. `None` if one of them cannot be read. As in
 /// klippy/configfile.py the last entry of a section counts.
 pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
-    let mut reader = Reader { computer, serials: BTreeMap::new(), led_pins: BTreeMap::new(), files: 0 };
+    let mut reader = Reader {
+        computer,
+        serials: BTreeMap::new(),
+        led_pins: BTreeMap::new(),
+        uart_pins: BTreeMap::new(),
+        files: 0,
+    };
     reader.file(config, &mut Vec::new())?;
-    let is_spi = |pin: &String| pin.rsplit(':').next().is_some_and(|name| name.trim().starts_with("spidev"));
+    let is_spi = |pin: &String| name_of(pin).starts_with("spidev");
+    let is_port = |pin: &String| ["tty", "serial"].iter().any(|kind| name_of(pin).starts_with(kind));
     Some(Printer {
         serials: reader.serials.into_values().collect(),
         leds: reader.led_pins.into_values().filter(is_spi).collect(),
+        uarts: reader.uart_pins.into_values().filter(is_port).collect(),
     })
+}
+
+/// A pin's name without the MCU before it.
+pub(super) fn name_of(pin: &str) -> &str {
+    pin.rsplit(':').next().unwrap_or_default().trim()
 }
 
 struct Reader<'a> {
@@ -37,6 +53,7 @@ struct Reader<'a> {
     /// Indexed by the section's name.
     serials: BTreeMap<String, PathBuf>,
     led_pins: BTreeMap<String, String>,
+    uart_pins: BTreeMap<String, String>,
     files: usize,
 }
 
@@ -69,6 +86,9 @@ impl Reader<'_> {
             match (section.split(' ').next(), key.trim_end()) {
                 (Some("mcu"), "serial") => drop(self.serials.insert(section.clone(), value.into())),
                 (Some("neopixel"), "pin") => drop(self.led_pins.insert(section.clone(), value.into())),
+                (Some(kind), "uart_pin") if kind.starts_with("tmc") => {
+                    drop(self.uart_pins.insert(section.clone(), value.into()));
+                }
                 _ => {}
             }
         }
@@ -126,6 +146,15 @@ mod tests {
         assert_eq!(leds(strip), ["host:spidev0.0"]);
         assert_eq!(leds(&format!("{strip}[neopixel strip]\npin = host: spidev0.1\n")), ["host: spidev0.1"]);
         assert!(leds("[mcu host]\npin: spidev0.0\n#[neopixel a]\n#pin: spidev0.0\n").is_empty());
+    }
+
+    #[test]
+    fn drivers_on_serial_ports() {
+        let tree = Tree::new();
+        let text = "[tmc2209 stepper_x]\nuart_pin: ^host:ttyAMA1\n[tmc2209 stepper_y]\nuart_pin: ^host:ttyAMA1\n[tmc2208 extruder]\nuart_pin: host: serial0 # a link\n[tmc2209 stepper_z]\nuart_pin: PC11\n";
+        tree.put("home/pi/config/printer.cfg", text);
+        let uarts = read(&tree.computer(), Path::new(CONFIG)).unwrap().uarts;
+        assert_eq!(uarts.iter().map(|pin| name_of(pin)).collect::<Vec<_>>(), ["ttyAMA1", "serial0"]);
     }
 
     #[test]

@@ -8,7 +8,7 @@ use std::sync::{Arc, Mutex};
 
 use pinion_firmware::board::{
     Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, I2cConfig, Line, Mosi, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SpiConfig, Thermometer,
+    PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::TimeSource;
@@ -163,6 +163,14 @@ impl Board for EdgeBoard {
 
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
         self.board.mosi(pin, rate_hz)
+    }
+
+    fn mosi_of(&self, miso: Pin) -> Option<Pin> {
+        self.board.mosi_of(miso)
+    }
+
+    fn serial(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<OnWorker<dyn SerialPort>>, Shutdown> {
+        self.board.serial(pin, rate_hz)
     }
 
     fn ds18b20(&mut self, serial: &[u8]) -> Result<OnWorker<dyn Thermometer>, Shutdown> {

@@ -228,12 +228,14 @@ pub trait SerialPort: Send {
     }
 }
 
-/// The data output of an SPI controller without a chip. The controller's clock times the data.
+/// The data lines of an SPI controller, without a chip that knows SPI. The controller's clock times the data.
 pub struct Mosi {
-    /// The output. Nothing answers there.
+    /// The output, and the input if something is connected to it.
     pub line: OnWorker<dyn BusDevice>,
     /// Highest number of bytes in one transfer.
     pub message_max: usize,
+    /// A warning for the log, if the controller is known to pause within a transfer.
+    pub pauses: Option<Trouble>,
 }
 
 /// How a bus answered, in the words of the dictionary's `i2c_bus_status`.
@@ -500,6 +502,12 @@ pub trait Board: Send {
     fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
         let _ = rate_hz;
         Err(not_mosi(&pin.name_in(&self.pins())))
+    }
+
+    /// The data output of the SPI device whose data input has the name `pin`. `None`: this pin is no SPI data input.
+    fn mosi_of(&self, miso: Pin) -> Option<Pin> {
+        let _ = miso;
+        None
     }
 
     /// Opens the serial port with the name `pin`. `None`: this pin is no serial port.

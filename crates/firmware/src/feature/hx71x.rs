@@ -1,28 +1,33 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The ADCs HX711 and HX717 for load cells, on two lines (Avia Semiconductor's data sheets).
+//! The ADCs HX711 and HX717 for load cells (Avia Semiconductor's data sheets), on two lines or on the data lines of an
+//! SPI controller (`spi.rs`).
 //!
 //! 24 pulses on the chip's clock shift out a sample. One to four more pulses choose gain and channel of the next
-//! sample. A clock that stays high for over 60 us switches the chip off. The chip starts again when the clock falls. A
-//! worker drives the clock, and two system calls make a pulse. So this may happen on a slow or busy computer. The bits
+//! sample. A clock that stays high for over 60 us switches the chip off. The chip starts again when the clock falls.
+//!
+//! On lines a worker drives the clock, and two system calls make a pulse. So this may happen on a slow or busy computer. The bits
 //! that follow are then all ones, and no check of the protocol would notice. So the worker measures every pulse. If one
 //! may have been too long, its sample is sent as the error "read too long". klippy then restarts the sensor.
 
 #![forbid(unsafe_code)]
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use log::warn;
 
-use crate::board::{Bias, Direction, Line, Pin};
+use crate::board::{Bias, Direction, Line, OnWorker, Pin};
 use crate::mcu::{
     Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
     Settable, Slot, Turn, WorkerId, command, since,
 };
-use crate::shutdown::{Shutdown, shutdowns};
+use crate::shutdown::{Shutdown, reason, shutdowns};
 use crate::time::{Ticks, TimeSource};
 
-use super::ready_adc::{ReadyAdc, ReadyChip, Sample};
+use super::ready_adc::{Ready, ReadyAdc, ReadyChip, Sample};
+use spi::{Shared, Waves};
+
+mod spi;
 
 pub(super) const FEATURE: Feature = Feature {
     commands: &[
@@ -84,10 +89,7 @@ struct Shifted {
     too_long: bool,
 }
 
-impl Errand for Shift {
-    type Answer = Shifted;
-    type Failure = Shutdown;
-
+impl Shift {
     fn run(&mut self) -> Result<Shifted, Shutdown> {
         let mut raw = 0;
         let mut longest = 0;
@@ -113,7 +115,7 @@ impl Errand for Shift {
 fn too_slow(name: &str, ticks: i64) -> String {
     let us = ticks / i64::from(Ticks::from_us(1).0);
     format!(
-        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or use a load cell ADC on SPI (ADS1220, ADS131M0x); said once"
+        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
     )
 }
 
@@ -124,14 +126,39 @@ fn wait() {
     }
 }
 
+/// Reads a sample on a worker.
+enum Reading {
+    Lines(Shift),
+    Spi(Waves),
+}
+
+impl Errand for Reading {
+    /// `None`: no sample is ready.
+    type Answer = Option<Shifted>;
+    type Failure = Shutdown;
+
+    fn run(&mut self) -> Result<Option<Shifted>, Shutdown> {
+        match self {
+            Reading::Lines(shift) => shift.run().map(Some),
+            Reading::Spi(waves) => waves.run(),
+        }
+    }
+}
+
 /// The clock line while no sample is shifted out. High switches the chip off.
-struct PowerDown(Arc<dyn Line>);
+enum PowerDown {
+    Line(Arc<dyn Line>),
+    Spi(Shared),
+}
 
 impl Settable for PowerDown {
     type Value = bool;
 
     fn set(&mut self, down: bool) -> Result<(), Shutdown> {
-        self.0.write(down)
+        match self {
+            PowerDown::Line(line) => line.write(down),
+            PowerDown::Spi(device) => spi::power_down(device, down),
+        }
     }
 }
 
@@ -145,9 +172,9 @@ struct Hx71x {
 
 impl ReadyChip for Hx71x {
     const NAME: &'static str = "HX71x";
-    type Reading = Shift;
+    type Reading = Reading;
 
-    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Shift>) -> Result<(), Shutdown> {
+    fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Reading>) -> Result<(), Shutdown> {
         reading.send(turn, self.worker)
     }
 
@@ -155,7 +182,8 @@ impl ReadyChip for Hx71x {
         failure.clone()
     }
 
-    fn sample(&mut self, Shifted { raw, too_long }: Shifted, late: bool) -> Sample {
+    fn sample(&mut self, answer: Option<Shifted>, late: bool) -> Sample {
+        let Some(Shifted { raw, too_long }) = answer else { return Sample::NotReady };
         match decode(raw, self.gain_channel) {
             Err(error) => self.last_error = Some(error),
             Ok(_) if late || too_long => self.last_error = Some(ERROR_READ_TOO_LONG),
@@ -186,6 +214,21 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
             format_args!("{gain_channel} pulses are to choose gain and channel"),
         ));
     }
+    let pulses = SAMPLE_BITS + gain_channel;
+    if let Some(mosi) = mcu.board()?.mosi_of(dout_pin) {
+        let (dout, sclk) = (mcu.name(dout_pin), mcu.name(sclk_pin));
+        if mosi != sclk_pin {
+            let (remedy, cause) = (format!("write sclk_pin: {}", mcu.name(mosi)), format!("{dout} has another clock than {sclk}"));
+            return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy(remedy));
+        }
+        let OnWorker { bus, device } = mcu.board()?.mosi(mosi, spi::RATE_HZ)?.line;
+        let worker = mcu.worker(&bus)?;
+        let device: Shared = Arc::new(Mutex::new(device));
+        let power_down = Remote::new(worker, PowerDown::Spi(device.clone()), true);
+        let chip = Hx71x { worker, gain_channel, power_down, last_error: None };
+        let waves = Slot::new(Reading::Spi(Waves::new(device, pulses, sclk)));
+        return mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, waves));
+    }
     let dout = mcu.prompt_line(dout_pin, "dout", Direction::Input(Bias::PullUp))?;
     // High is off. The chip is off until measurements begin, and when the program dies.
     let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
@@ -193,14 +236,14 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
     let shift = Shift {
         sclk: sclk.clone(),
         dout: dout.clone(),
-        pulses: SAMPLE_BITS + gain_channel,
+        pulses,
         time: mcu.clock(),
         name: mcu.name(sclk_pin),
         told: false,
     };
-    let power_down = Remote::new(worker, PowerDown(sclk), true);
+    let power_down = Remote::new(worker, PowerDown::Line(sclk), true);
     let chip = Hx71x { worker, gain_channel, power_down, last_error: None };
-    mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, dout, Slot::new(shift)))
+    mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Slot::new(Reading::Lines(shift))))
 }
 
 type Sensor = ReadyAdc<Hx71x>;

@@ -10,7 +10,7 @@
 //! really need).
 //!
 //! The firmware gives up a frame if a bit comes more than `bit_max_ticks` after the one before. klippy then sends the
-//! frame again. Pinion cannot see whether a controller pauses during a message. The board logs a controller that is
+//! frame again. Pinion cannot see whether a controller pauses during a message. The log names a controller that is
 //! known to pause. A frame counts as sent if its driver took it.
 
 #![forbid(unsafe_code)]
@@ -146,7 +146,10 @@ const CONFIG_NEOPIXEL: Command = command!(
         if data_size >= SIZE_LIMIT {
             return Err(Shutdown::by_host(INVALID_SIZE, format_args!("a chain of {data_size} bytes")));
         }
-        let Mosi { line, message_max } = mcu.board()?.mosi(pin, RATE_HZ)?;
+        let Mosi { line, message_max, pauses } = mcu.board()?.mosi(pin, RATE_HZ)?;
+        if let Some(trouble) = pauses {
+            log::warn!("{trouble}");
+        }
         let size = usize::from(data_size);
         let low_bytes = low_bytes(reset_min_ticks.max(RESET_MIN));
         let len = low_bytes.saturating_mul(2).saturating_add(size * WIRE_BYTES);

@@ -5,6 +5,9 @@
 //! A timer reads the line every `rest_ticks` (klippy: ten times per sample). A worker reads a sample that is ready. The
 //! timer then leaves the chip alone for 8 `rest_ticks`. A reading that is not back by then may have cost the next
 //! sample. It is counted as a possible overflow.
+//!
+//! The core cannot read the line if it is the data input of an SPI controller. Then the worker looks as often, and reads
+//! the sample if there is one.
 
 #![forbid(unsafe_code)]
 
@@ -24,6 +27,8 @@ const TIMER: Timer = Timer::sampling(0);
 /// The result of a reading.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Sample {
+    /// There was none: the worker only looked.
+    NotReady,
     /// A value.
     Value(i32),
     /// An error, and the number in place of the value.
@@ -83,10 +88,29 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
 
 const VALUE_BYTES: usize = 4;
 
+/// How the sensor learns that a sample is ready.
+pub(super) enum Ready {
+    /// This line is low.
+    Line(Arc<dyn Line>),
+    /// The worker looks. `waits` counts the `rest_ticks` since the look began. `fresh`: it has just read a sample.
+    Look {
+        waits: u32,
+        fresh: bool,
+    },
+}
+
+impl Ready {
+    /// The worker looks.
+    pub(super) const LOOK: Ready = Ready::Look { waits: 0, fresh: false };
+}
+
+/// How many `rest_ticks` the timer leaves the chip alone after it has begun to read a sample.
+const READING_RESTS: u32 = 8;
+
 /// A sensor.
 pub(super) struct ReadyAdc<C: ReadyChip> {
     chip: C,
-    ready: Arc<dyn Line>,
+    ready: Ready,
     reading: Slot<C::Reading>,
     /// Whether the reading under way is late.
     late: bool,
@@ -97,8 +121,8 @@ pub(super) struct ReadyAdc<C: ReadyChip> {
 }
 
 impl<C: ReadyChip> ReadyAdc<C> {
-    /// A sensor whose line `ready` is low while a sample is ready.
-    pub(super) fn new(chip: C, ready: Arc<dyn Line>, reading: Slot<C::Reading>) -> ReadyAdc<C> {
+    /// A sensor.
+    pub(super) fn new(chip: C, ready: Ready, reading: Slot<C::Reading>) -> ReadyAdc<C> {
         ReadyAdc {
             chip,
             ready,
@@ -114,6 +138,9 @@ impl<C: ReadyChip> ReadyAdc<C> {
     fn restart(&mut self) {
         self.reading.drop_pending();
         self.late = false;
+        if let Ready::Look { fresh, .. } = &mut self.ready {
+            *fresh = false;
+        }
     }
 
     /// Begins measurements. `rest_ticks` of 0 ends them.
@@ -131,10 +158,14 @@ impl<C: ReadyChip> ReadyAdc<C> {
         turn.schedule(TIMER, at)
     }
 
-    /// Reports to the host how many samples there are. A sample that is being read counts as one in the chip.
+    /// Reports to the host how many samples there are. A sample that is being read counts as one in the chip. If the
+    /// worker has to look, a sample in the chip does not count yet.
     pub(super) fn query_status(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {
         let now = turn.now();
-        let ready = self.reading.is_pending() || !self.ready.read()?;
+        let ready = match &self.ready {
+            Ready::Line(line) => self.reading.is_pending() || !line.read()?,
+            Ready::Look { .. } => false,
+        };
         let bytes = (self.chip.channels() * VALUE_BYTES) as u32;
         self.bulk.send_status(turn, (now, now), if ready { bytes } else { 0 });
         Ok(())
@@ -147,18 +178,37 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
     }
 
     fn event(&mut self, turn: &mut Turn, _timer: Timer, at: Clock) -> Result<Next, Shutdown> {
-        let rests = if self.reading.is_pending() {
+        let is_pending = self.reading.is_pending();
+        let (reads, rests) = match &mut self.ready {
+            Ready::Line(_) if is_pending => (false, 4),
+            Ready::Line(line) if line.read()? => (false, 1),
+            Ready::Line(_) => (true, READING_RESTS),
+            Ready::Look { waits, .. } if is_pending => {
+                *waits += 1;
+                (false, if *waits < READING_RESTS { 1 } else { 4 })
+            }
+            // The next look begins 8 `rest_ticks` after the one that read a sample.
+            Ready::Look { waits, fresh } if *fresh && *waits + 1 < READING_RESTS => {
+                *fresh = false;
+                (false, READING_RESTS - 1 - *waits)
+            }
+            Ready::Look { waits, .. } => {
+                *waits = 0;
+                (true, 1)
+            }
+        };
+        if is_pending && rests > 1 {
             self.bulk.count_overflows(1);
             self.late = true;
-            4
-        } else if self.ready.read()? {
-            1
+        }
+        // Otherwise the reading of an earlier query is still under way.
+        let rests = if !reads {
+            rests
         } else if self.reading.is_here() {
             self.late = false;
             self.chip.read(turn, &mut self.reading)?;
-            8
+            rests
         } else {
-            // The reading of an earlier query is still under way.
             1
         };
         Ok(Next::At(at + Ticks(self.rest_ticks.0.wrapping_mul(rests))))
@@ -180,7 +230,12 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
             }
             values.len() * VALUE_BYTES
         };
-        let len = match self.chip.sample(answer, self.late) {
+        let sample = self.chip.sample(answer, self.late);
+        if let Ready::Look { fresh, .. } = &mut self.ready {
+            *fresh = sample != Sample::NotReady;
+        }
+        let len = match sample {
+            Sample::NotReady => return Ok(()),
             Sample::Value(value) => {
                 self.attached.update(turn, value, read_at)?;
                 put(&[value])
@@ -242,7 +297,7 @@ pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<
     mcu.vacant(oid)?;
     mcu.require::<Spi>(spi)?;
     let ready = mcu.prompt_line(ready_pin, "data_ready", Direction::Input(Bias::None))?;
-    mcu.assign_on(ready_pin, oid, ReadyAdc::new(chip, ready, Slot::talking(Frame { bytes: [0; N], len: len.min(N) })))
+    mcu.assign_on(ready_pin, oid, ReadyAdc::new(chip, Ready::Line(ready), Slot::talking(Frame { bytes: [0; N], len: len.min(N) })))
 }
 
 /// Converts 24 bits in two's complement, the highest byte first.

@@ -3,7 +3,7 @@
 
 use std::sync::{Arc, Mutex};
 
-use pinion_testbench::board::Bench;
+use pinion_testbench::board::{Bench, MISO, MOSI, SPI_CHIPS};
 use pinion_testbench::rig::Rig;
 
 const DOUT: u32 = 10;
@@ -88,6 +88,39 @@ fn plug(bench: &Bench, value: i32) -> Arc<Mutex<Hx711>> {
         true
     });
     chip
+}
+
+/// Puts the chip on the data lines of SPI bus 0. Its clock is the data output, whose bits last 2 us.
+fn plug_spi(bench: &Bench, value: i32) -> Arc<Mutex<Hx711>> {
+    const BIT: u64 = 100;
+    let chip = Arc::new(Mutex::new(Hx711 { value, high: true, ..Hx711::default() }));
+    let plugged = chip.clone();
+    bench.plug_spi(0, move |at, bytes| {
+        let mut chip = plugged.lock().unwrap();
+        for (byte, n) in bytes.iter_mut().zip(0u64..) {
+            let sent = *byte;
+            *byte = (0..8).fold(0, |received, place| {
+                let begin = at + (8 * n + place) * BIT;
+                let level = sent >> (7 - place) & 1 != 0;
+                if level != chip.high {
+                    chip.clock(begin, level);
+                }
+                received << 1 | u8::from(chip.data(begin + BIT / 2))
+            });
+        }
+    });
+    chip
+}
+
+/// An MCU with the chip on an SPI bus, whose worker takes so long to answer.
+fn spi_rig(value: i32, gain_channel: u8, answer_ticks: u32) -> (Rig, Arc<Mutex<Hx711>>) {
+    let mut rig = Rig::new();
+    let chip = plug_spi(&rig.bench, value);
+    rig.bench.state().answer_ticks = answer_ticks;
+    let pins = format!("dout_pin={MISO} sclk_pin={MOSI}");
+    let objects = objects(gain_channel).map(|object| object.replace("dout_pin=10 sclk_pin=11", &pins));
+    rig.configure(&objects.each_ref().map(String::as_str));
+    (rig, chip)
 }
 
 fn objects(gain_channel: u8) -> [String; 5] {
@@ -336,4 +369,119 @@ fn a_shutdown_amid_a_reading_ends_the_samples() {
     rig.send("emergency_stop");
     rig.run_until(60 * PERIOD);
     assert_eq!(rig.responses(), ["shutdown clock=@2580000 static_string_id=Command request"]);
+}
+
+#[test]
+fn samples_arrive_over_spi_with_pulses_of_one_bit() {
+    for (first, gain_channel, answer_ticks) in [(-8_388_608, 1, 0), (-5, 2, 1000), (8_388_607 - 30, 3, 30_000), (0, 4, 0)] {
+        let (mut rig, chip) = spi_rig(first, gain_channel, answer_ticks);
+        rig.send(QUERY);
+        rig.run_until(4 * PERIOD + 25 * PERIOD);
+        assert_eq!(samples(&rig, 0), (first..first + 24).collect::<Vec<_>>());
+        let counts = chip.lock().unwrap().counts.clone();
+        assert!(counts.iter().all(|count| *count == 24 + u32::from(gain_channel)), "{counts:?}");
+        let transfers = rig.bench.transfers();
+        assert!(transfers.iter().all(|transfer| (transfer.mode, transfer.rate_hz) == (0, 500_000)));
+        // The first one starts the chip. All others are looks and waves, and each byte ends low.
+        assert_eq!(transfers[0].data, [&[0xff; 8][..], &[0]].concat());
+        for transfer in &transfers[1..] {
+            assert!(matches!(transfer.data.len(), 1 | 7) && transfer.data.iter().all(|byte| byte & 1 == 0), "{transfer:?}");
+        }
+        let looks = transfers.iter().filter(|transfer| transfer.data.len() == 1).count();
+        assert!(looks < 40 + 25 * 5, "{looks}");
+    }
+}
+
+/// A worker that is late by a part of a sample loses none. One that is late by more is noticed.
+#[test]
+fn a_late_worker_on_spi_is_an_error_only_if_it_may_have_lost_a_sample() {
+    for (answer_ticks, good) in [(200_000, true), (600_000, false)] {
+        let (mut rig, _chip) = spi_rig(7, 1, answer_ticks);
+        rig.send(QUERY);
+        rig.run_until(40 * PERIOD);
+        let samples = samples(&rig, 0);
+        let status = rig.ask(STATUS);
+        if good {
+            assert_eq!(samples[..24], (7..31).collect::<Vec<_>>());
+        } else {
+            assert!(samples.iter().all(|sample| *sample == 1 << 30), "{samples:?}");
+        }
+        assert_eq!(status.ends_with("possible_overflows=0"), good, "{status}");
+    }
+}
+
+#[test]
+fn a_disturbed_bit_on_spi_is_an_error_until_it_is_asked_anew() {
+    let (mut rig, _chip) = spi_rig(7, 1, 0);
+    rig.send(QUERY);
+    rig.run_until(6 * PERIOD);
+    let plugged = plug_spi(&rig.bench, 7);
+    plugged.lock().unwrap().next = Some(rig.now());
+    // Another chip on the wire pulls one reading of a bit low.
+    let disturbed = plugged.clone();
+    rig.bench.plug_spi(0, move |at, bytes| {
+        disturbed.lock().unwrap().pass(at);
+        let is_wave = bytes.len() == 7;
+        bytes.fill(if is_wave { 0xff } else { 0 });
+        if is_wave {
+            bytes[2] = 0b1111_0111;
+        }
+    });
+    rig.run_until(30 * PERIOD);
+    let samples = samples(&rig, 0);
+    let good = samples.iter().position(|sample| *sample == i32::MIN).unwrap();
+    assert!(samples[..good].iter().zip(7..).all(|(sample, value)| *sample == value), "{samples:?}");
+    assert!(samples[good..].iter().all(|sample| *sample == i32::MIN), "{samples:?}");
+    rig.bench.plug_spi(0, |_, bytes| bytes.fill(if bytes.len() == 7 { 0xff } else { 0 }));
+    rig.responses();
+    rig.send_all(&[END, QUERY]);
+    let from = rig.now();
+    rig.run_until(from + 20 * PERIOD);
+    assert_eq!(self::samples(&rig, 0)[..12], [-1; 12]);
+}
+
+/// The output stays high at the end. What the controller makes of it, the next start restarts the chip.
+#[test]
+fn the_chip_on_spi_is_switched_off_and_started_again() {
+    let (mut rig, chip) = spi_rig(7, 3, 0);
+    for _ in 0..2 {
+        rig.send(QUERY);
+        let from = rig.now();
+        rig.run_until(from + 8 * PERIOD);
+        rig.send(END);
+        assert_eq!(rig.bench.transfers().last().unwrap().data, [0xff; 8]);
+        rig.run_until(from + 20 * PERIOD);
+        let mut chip = chip.lock().unwrap();
+        chip.pass(from + 20 * PERIOD);
+        assert!(chip.high && chip.next.is_none(), "off");
+    }
+}
+
+#[test]
+fn a_shutdown_or_a_failure_of_the_bus_ends_the_samples() {
+    let (mut rig, _chip) = spi_rig(7, 1, 0);
+    rig.send(QUERY);
+    rig.run_until(6 * PERIOD);
+    rig.bench.state().broken.insert(SPI_CHIPS);
+    rig.run_until(8 * PERIOD);
+    assert_eq!(rig.shutdown().as_deref(), Some("Unable to issue spi ioctl"));
+    rig.bench.state().broken.clear();
+    rig.responses();
+    rig.run_until(30 * PERIOD);
+    assert_eq!(rig.responses(), [""; 0]);
+}
+
+#[test]
+fn the_two_pins_on_spi_belong_together() {
+    for (pins, told) in [
+        (format!("dout_pin={MISO} sclk_pin={}", MOSI + 1), "write sclk_pin: spidev0"),
+        (format!("dout_pin={MISO} sclk_pin=11"), "miso0 has another clock than gpio11"),
+        (format!("dout_pin=10 sclk_pin={MOSI}"), "no pin 700"),
+    ] {
+        let mut rig = Rig::new();
+        rig.send_all(&["allocate_oids count=1", &format!("config_hx71x oid=0 gain_channel=1 {pins}")]);
+        assert_eq!(rig.shutdown().as_deref(), Some("Not an output pin"));
+        let notes = rig.notes();
+        assert!(notes.iter().any(|note| note.contains(told)), "{notes:?}");
+    }
 }

@@ -236,8 +236,81 @@ mod request {
     nix::ioctl_readwrite!(gpiohandle_set_config, 0xB4, 0x0a, super::LineConfig);
     nix::ioctl_readwrite!(gpiohandle_set_line_values, 0xB4, 0x09, super::LineValues);
     nix::ioctl_read!(wdioc_gettimeout, b'W', 7, i32);
+    nix::ioctl_none_bad!(tiocexcl, libc::TIOCEXCL);
+    nix::ioctl_read_bad!(tcgets2, libc::TCGETS2, libc::termios2);
+    nix::ioctl_write_ptr_bad!(tcsets2, libc::TCSETS2, libc::termios2);
+    nix::ioctl_read_bad!(tiocgicount, libc::TIOCGICOUNT, super::LineCounts);
     // I2C_FUNCS (linux/i2c-dev.h).
     nix::ioctl_read_bad!(i2c_funcs, 0x0705, libc::c_ulong);
+}
+
+/// Makes every further open of a terminal fail, except by root.
+pub fn make_exclusive(terminal: &impl AsRawFd) -> io::Result<()> {
+    // SAFETY: the request takes nothing.
+    unsafe { request::tiocexcl(terminal.as_raw_fd()) }?;
+    Ok(())
+}
+
+/// The speed of CBAUD that stands for the number in `c_ospeed`, and the place of the same for input (CIBAUD).
+const OTHER_SPEED: u32 = libc::BOTHER;
+const INPUT_SPEED: u32 = libc::CBAUD << 16;
+
+fn settings(terminal: &impl AsRawFd) -> io::Result<libc::termios2> {
+    // SAFETY: all fields are numbers.
+    let mut settings: libc::termios2 = unsafe { std::mem::zeroed() };
+    // SAFETY: the request writes a `struct termios2`, which lives through the call.
+    unsafe { request::tcgets2(terminal.as_raw_fd(), &mut settings) }?;
+    Ok(settings)
+}
+
+/// Sets the rate of a terminal in baud, which need not be a standard one. Returns the rate that its driver then has.
+pub fn set_rate(terminal: &impl AsRawFd, rate_hz: u32) -> io::Result<u32> {
+    let mut settings = settings(terminal)?;
+    // Input has the speed of output.
+    settings.c_cflag = settings.c_cflag & !(libc::CBAUD | INPUT_SPEED) | OTHER_SPEED;
+    (settings.c_ispeed, settings.c_ospeed) = (rate_hz, rate_hz);
+    // SAFETY: the request reads a `struct termios2`, which lives through the call.
+    unsafe { request::tcsets2(terminal.as_raw_fd(), &settings) }?;
+    rate(terminal)
+}
+
+/// The rate of a terminal in baud.
+pub fn rate(terminal: &impl AsRawFd) -> io::Result<u32> {
+    Ok(settings(terminal)?.c_ospeed)
+}
+
+/// `struct serial_icounter_struct` (linux/serial.h).
+#[repr(C)]
+pub struct LineCounts {
+    modem_lines: [i32; 4],
+    bytes: [i32; 2],
+    frame: i32,
+    overrun: i32,
+    parity: i32,
+    brk: i32,
+    buf_overrun: i32,
+    reserved: [i32; 9],
+}
+
+/// The faults that a serial port has counted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LineFaults {
+    /// Bytes without a stop bit.
+    pub framing: i32,
+    /// Bytes that were lost, because the computer was too slow.
+    pub overrun: i32,
+    /// Times when the line was low for longer than a byte.
+    pub breaks: i32,
+}
+
+/// The faults that a serial port has counted. Not every driver counts them.
+pub fn line_faults(port: &impl AsRawFd) -> io::Result<LineFaults> {
+    // SAFETY: all fields are numbers.
+    let mut counts: LineCounts = unsafe { std::mem::zeroed() };
+    // SAFETY: the request writes a `struct serial_icounter_struct`, which lives through the call.
+    unsafe { request::tiocgicount(port.as_raw_fd(), &mut counts) }?;
+    let overrun = counts.overrun.wrapping_add(counts.buf_overrun);
+    Ok(LineFaults { framing: counts.frame, overrun, breaks: counts.brk })
 }
 
 /// Drives the only line of a handle of the GPIO character device.
@@ -364,6 +437,7 @@ mod tests {
     #[test]
     fn line_values_are_laid_out_as_the_kernel_has_them() {
         assert_eq!(size_of::<LineValues>(), 64);
+        assert_eq!(size_of::<LineCounts>(), 80);
         // GPIOHANDLE_SET_LINE_VALUES_IOCTL.
         assert_eq!(nix::request_code_readwrite!(0xB4, 0x09, size_of::<LineValues>()), 0xC040_B409);
         // GPIOHANDLE_SET_CONFIG_IOCTL.

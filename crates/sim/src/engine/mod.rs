@@ -10,6 +10,7 @@ pub(crate) mod i2c;
 pub(crate) mod led;
 pub(crate) mod noise;
 pub(crate) mod physics;
+pub(crate) mod serial;
 pub(crate) mod spi;
 pub(crate) mod time;
 pub(crate) mod together;

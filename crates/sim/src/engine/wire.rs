@@ -28,6 +28,10 @@ pub(crate) enum Kind {
     Pwm,
     /// Send on it with an SPI controller.
     Mosi,
+    /// Receive from it with an SPI controller.
+    Miso,
+    /// Send and receive with a serial port.
+    Serial,
 }
 
 /// A part's end of a pin. "On" has the description's meaning: a high level, unless the pin is inverted.
@@ -100,6 +104,8 @@ impl WiredPin {
             Kind::Analog => "an ADC channel",
             Kind::Pwm => "a hardware PWM channel",
             Kind::Mosi => "an SPI bus's data output",
+            Kind::Miso => "an SPI bus's data input",
+            Kind::Serial => "a serial port",
         };
         let (name, wire) = (&self.name, self.wire.describe());
         Shutdown::because(reason, format!("pin {name} of the simulated printer is {is} ({wire}), no {wanted}"))

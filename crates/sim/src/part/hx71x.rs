@@ -7,6 +7,9 @@
 //! for more than 60 us, the chip powers down. When the clock falls, the chip starts again with channel A and its
 //! highest gain. It is ready after it has settled for four conversions.
 //!
+//! On an SPI bus, the data output (MOSI) is the clock and the data input (MISO) the data. The bus's clock times the
+//! pulses.
+//!
 //! Simulated: all of this, by the clock. The chip shifts out the cell's load at the first pulse, not at the end of the
 //! conversion before. Channel B is not connected and reads noise. The settling after a change of the gain is omitted.
 
@@ -17,16 +20,17 @@ use std::sync::Arc;
 use serde::Deserialize;
 
 use super::load_cell::{Cell, CellConfig};
-use super::workshop::{Part, Workshop};
+use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
+use crate::engine::spi::{MISO, MisoPin, SpiChip};
 use crate::engine::time::seconds;
 use crate::engine::together::Together;
 use crate::engine::wire::{Kind, Wire};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
-use pinion_firmware::time::Clock;
+use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
 
 /// Longest high pulse of the clock before the chip powers down.
 const POWER_DOWN_S: f64 = 60e-6;
@@ -41,9 +45,11 @@ pub struct Hx71xConfig {
     /// Which of the two it is.
     pub chip: Hx71xChip,
     /// Its data line.
-    pub dout_pin: PinName,
+    pub dout_pin: Option<PinName>,
     /// Its clock line.
-    pub sclk_pin: PinName,
+    pub sclk_pin: Option<PinName>,
+    /// An SPI bus with data lines for it, in place of the two pins. It has no other chip.
+    pub bus: Option<String>,
     /// The rate that its pins are wired to.
     pub samples_per_s: u32,
     /// The load cell.
@@ -91,7 +97,11 @@ impl Part for Hx71xConfig {
     }
 
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
-        vec![("dout_pin", Some(&self.dout_pin)), ("sclk_pin", Some(&self.sclk_pin))]
+        vec![("dout_pin", self.dout_pin.as_ref()), ("sclk_pin", self.sclk_pin.as_ref())]
+    }
+
+    fn socket(&self) -> Option<Socket<'_>> {
+        self.bus.as_ref().map(|bus| Socket::Spi { bus, select_pin: None })
     }
 
     fn validate(&self, whose: &str, _printer: &Printer<'_>) -> Result<(), Trouble> {
@@ -99,22 +109,39 @@ impl Part for Hx71xConfig {
             let cause = format!("{} is none of the chip's rates", self.samples_per_s);
             return wrong(whose, "samples_per_s", &cause, &format!("give one of {:?}", self.chip.rates()));
         }
+        for (key, pin) in self.pins() {
+            match (pin, &self.bus) {
+                (None, None) => return wrong(whose, key, "it has none", "add it, or `bus`"),
+                (Some(_), Some(_)) => return wrong(whose, key, "it has a bus, too", "remove one of them"),
+                _ => {}
+            }
+        }
         self.cell.validate(whose)
     }
 
     fn build(&self, workshop: &mut Workshop<'_>) -> Result<(), Trouble> {
         let cell = Cell::new(&self.cell, workshop, self);
         let chip = Arc::new(Hx71x::new(self.chip, self.samples_per_s, cell));
-        workshop.wire(Some(&self.dout_pin), DoutPin(chip.clone()));
-        workshop.wire(Some(&self.sclk_pin), SclkPin(chip));
+        if let Some(bus) = &self.bus {
+            let pin = PinName { name: format!("{bus}{MISO}"), inverted: false };
+            workshop.wire(Some(&pin), MisoPin { bus: bus.clone() });
+            let clock = workshop.clock.clone();
+            let now = clock.now();
+            workshop.solder_spi(self, OnSpi { chip, clock, bit: 0.0, at: now });
+            return Ok(());
+        }
+        workshop.wire(self.dout_pin.as_ref(), DoutPin(chip.clone()));
+        workshop.wire(self.sclk_pin.as_ref(), SclkPin(chip));
         Ok(())
     }
 
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         let keys = |cfg: &mut Sections| {
             cfg.key("sensor_type", self.chip.name());
-            cfg.key("dout_pin", &self.dout_pin);
-            cfg.key("sclk_pin", &self.sclk_pin);
+            cfg.key_if("dout_pin", self.dout_pin.as_ref());
+            cfg.key_if("sclk_pin", self.sclk_pin.as_ref());
+            cfg.key_if("dout_pin", self.bus.as_ref().map(|bus| format!("{bus}{MISO}")));
+            cfg.key_if("sclk_pin", self.bus.as_ref());
             cfg.key("sample_rate", self.samples_per_s);
             self.cell.calibration(cfg);
         };
@@ -269,13 +296,45 @@ impl Wire for SclkPin {
     }
 }
 
+/// The chip on an SPI bus. The bus's bits have this length in ticks, and the next one begins `at` a time.
+struct OnSpi {
+    chip: Arc<Hx71x>,
+    clock: Arc<dyn TimeSource>,
+    bit: f64,
+    at: Clock,
+}
+
+impl SpiChip for OnSpi {
+    /// The clock line of the bus does not lead to the chip.
+    fn knows_mode(&self, _mode: u8) -> bool {
+        true
+    }
+
+    fn select(&mut self, rate_hz: u32) {
+        self.bit = f64::from(CLOCK_FREQ) / f64::from(rate_hz.max(1));
+        self.at = self.clock.now();
+    }
+
+    /// The output gets its level at the beginning of each bit. The input is read in its middle, as in mode 0.
+    fn exchange(&mut self, byte: u8) -> u8 {
+        let begin = self.at.ticks();
+        let at = |bits: f64| Clock::from_ticks(begin + (bits * self.bit) as u64);
+        let received = (0..8).fold(0, |received, place| {
+            self.chip.clock(byte >> (7 - place) & 1 != 0, at(f64::from(place)));
+            received << 1 | u8::from(self.chip.data(at(f64::from(place) + 0.5)))
+        });
+        self.at = at(8.0);
+        received
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
     use crate::description::default::DefaultPrinter;
     use crate::engine::bed::Bed;
     use crate::engine::physics::Axis;
-    use pinion_firmware::time::CLOCK_FREQ;
+    use pinion_firmware::time::VirtualClock;
 
     struct Bench {
         z: Arc<Axis>,
@@ -423,5 +482,30 @@ mod tests {
         let at = Clock::from_ticks;
         let state = State { high: true, rise: at(7), start: at(9), taken: 5, pulses: 28, gain: 4, sample: 0xff_1234 };
         assert_eq!(State::of(state.words()), state);
+    }
+
+    /// Pulses of one bit at 500 kHz, and a clock that stays high.
+    #[test]
+    fn on_an_spi_bus_the_data_output_is_its_clock() {
+        let Bench { chip, .. } = Bench::new(0.0, 0.0);
+        let clock = VirtualClock::at(Clock::from_ticks(0));
+        let time = Arc::new(clock.clone());
+        let mut spi = OnSpi { chip: Arc::new(chip), clock: time, bit: 0.0, at: Clock::from_ticks(0) };
+        let mut exchange = |ms: u64, sent: &[u8]| {
+            clock.set(Clock::from_ticks(ms * u64::from(CLOCK_FREQ) / 1000));
+            spi.select(500_000);
+            sent.iter().map(|byte| spi.exchange(*byte)).collect::<Vec<u8>>()
+        };
+        const WAVE: [u8; 7] = [0xaa, 0xaa, 0xaa, 0xaa, 0xaa, 0xaa, 0x80];
+        assert_eq!(exchange(49, &[0]), [0xff], "it settles");
+        assert_eq!(exchange(51, &[0]), [0]);
+        // -5000 is FFEC78. Each bit is there twice. The last bits are those behind the pulses.
+        assert_eq!(exchange(52, &WAVE), [0xff, 0xff, 0xfc, 0xf0, 0x3f, 0xc0, 0xff]);
+        assert_eq!(exchange(53, &[0]), [0xff]);
+        assert_eq!(exchange(64, &[0]), [0]);
+        exchange(65, &[0xff; 8]);
+        assert_eq!(exchange(66, &[0]), [0xff], "off, and started again");
+        assert_eq!(exchange(115, &[0]), [0xff]);
+        assert_eq!(exchange(117, &[0]), [0]);
     }
 }

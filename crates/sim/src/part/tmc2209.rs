@@ -21,8 +21,8 @@ use super::trinamic::{
     Access, FULL_LOAD, Motor, Register, Registers, STANDSTILL, StallOutput, StallRule, Wave, may_be_left_out,
     offer_sensorless_homing,
 };
-use super::uart::{HOST, Role, SYNC, Uart, UartChip, UartPin, WRITE, WRITE_LEN, crc8};
-use super::workshop::{Part, Workshop};
+use super::uart::{HOST, PortUart, Role, SYNC, Uart, UartChip, UartPin, WRITE, WRITE_LEN, crc8};
+use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
@@ -99,7 +99,9 @@ const REGISTERS: &[Register] = &[
 #[serde(deny_unknown_fields)]
 pub struct Tmc2209Config {
     /// PDN_UART, the wire for both directions; with `tx_pin` it is the board's receiving end.
-    pub uart_pin: PinName,
+    pub uart_pin: Option<PinName>,
+    /// The serial port at PDN_UART, in place of `uart_pin`. Drivers with other addresses may share it.
+    pub uart_port: Option<PinName>,
     /// The board's sending end, joined to the wire by a resistor.
     pub tx_pin: Option<PinName>,
     /// Its address, 0 to 3, by MS1 and MS2.
@@ -118,15 +120,28 @@ impl Part for Tmc2209Config {
 
     fn pins(&self) -> Vec<(&'static str, Option<&PinName>)> {
         let pins = [("tx_pin", self.tx_pin.as_ref()), ("diag_pin", self.diag_pin.as_ref())];
-        [("uart_pin", Some(&self.uart_pin))].into_iter().chain(pins).collect()
+        [("uart_pin", self.uart_pin.as_ref())].into_iter().chain(pins).collect()
+    }
+
+    fn socket(&self) -> Option<Socket<'_>> {
+        self.uart_port.as_ref().map(|port| Socket::Serial { port, address: self.address })
     }
 
     fn validate(&self, whose: &str, printer: &Printer<'_>) -> Result<(), Trouble> {
         if self.address > 3 {
             return wrong(whose, "address", &format!("{} is none", self.address), "give 0 to 3");
         }
-        for (key, pin) in [("uart_pin", Some(&self.uart_pin)), ("tx_pin", self.tx_pin.as_ref())] {
-            if pin.is_some_and(|pin| pin.inverted) {
+        match (&self.uart_pin, &self.uart_port) {
+            (None, None) => return wrong(whose, "uart_pin", "it has none", "add it, or `uart_port`"),
+            (Some(_), Some(_)) => return wrong(whose, "uart_port", "it has a uart_pin, too", "remove one of them"),
+            _ => {}
+        }
+        if self.uart_port.is_some() && self.tx_pin.is_some() {
+            return wrong(whose, "tx_pin", "a serial port sends and receives", "remove it");
+        }
+        let pins = [("uart_pin", &self.uart_pin), ("tx_pin", &self.tx_pin), ("uart_port", &self.uart_port)];
+        for (key, pin) in pins {
+            if pin.as_ref().is_some_and(|pin| pin.inverted) {
                 return wrong(whose, key, "klippy inverts no UART", "remove the `!`");
             }
         }
@@ -137,12 +152,16 @@ impl Part for Tmc2209Config {
         let Some(axis) = workshop.axis(&self.axis) else { return Ok(()) };
         let chip = Tmc2209::new(&self.name(), self.address, axis);
         workshop.wire_shared(self.diag_pin.as_ref(), chip.diag.clone());
+        if self.uart_port.is_some() {
+            workshop.solder_serial(self, PortUart(Box::new(chip)));
+            return Ok(());
+        }
         let uart = Arc::new(Mutex::new(Uart::new(Box::new(chip))));
         let end = |role| UartPin { name: self.name(), role, uart: uart.clone() };
         match &self.tx_pin {
-            None => workshop.wire(Some(&self.uart_pin), end(Role::Both)),
+            None => workshop.wire(self.uart_pin.as_ref(), end(Role::Both)),
             Some(tx_pin) => {
-                workshop.wire(Some(&self.uart_pin), end(Role::Receiver));
+                workshop.wire(self.uart_pin.as_ref(), end(Role::Receiver));
                 workshop.wire(Some(tx_pin), end(Role::Sender));
             }
         }
@@ -152,7 +171,8 @@ impl Part for Tmc2209Config {
     fn printer_cfg(&self, cfg: &mut Sections, layout: &Layout<'_>) {
         cfg.section(format_args!("tmc2209 {}", layout.stepper(&self.axis)));
         may_be_left_out(cfg);
-        cfg.key("uart_pin", &self.uart_pin);
+        cfg.key_if("uart_pin", self.uart_pin.as_ref());
+        cfg.key_if("uart_pin", self.uart_port.as_ref());
         cfg.key_if("tx_pin", self.tx_pin.as_ref());
         cfg.key("uart_address", self.address);
         cfg.key("run_current", 0.8);

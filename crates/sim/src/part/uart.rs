@@ -1,13 +1,15 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The UART of Trinamic's drivers on one wire, after the data sheet of the TMC2209 ("UART Single Wire
-//! Interface").
+//! Interface"). The other end is two lines or one, and the chip hears their edges. Or it is a serial port, and the chip
+//! hears bytes.
 
 #![forbid(unsafe_code)]
 
 use std::sync::{Arc, Mutex, TryLockError};
 
+use crate::engine::serial::SerialChip;
 use crate::engine::wire::{Kind, Wire};
-use pinion_firmware::time::Clock;
+use pinion_firmware::time::{CLOCK_FREQ, Clock};
 
 /// The low nibble of a message's first byte. The high nibble may have any value.
 pub(crate) const SYNC: u8 = 0x05;
@@ -23,7 +25,7 @@ const FRAME_BITS: u64 = 10;
 const PAUSE_BITS: u64 = 63;
 const RECOVERY_BITS: u64 = 12;
 /// The longest bit that the chip understands: its baud rates are 9000 to its clock / 16.
-const LONGEST_BIT: u64 = pinion_firmware::time::CLOCK_FREQ as u64 / 9000;
+const LONGEST_BIT: u64 = CLOCK_FREQ as u64 / 9000;
 
 /// CRC8-ATM, each byte from its lowest bit on ("CRC Calculation").
 pub(crate) fn crc8(bytes: &[u8]) -> u8 {
@@ -33,6 +35,33 @@ pub(crate) fn crc8(bytes: &[u8]) -> u8 {
             (crc << 1) ^ (carry * 0x07)
         })
     })
+}
+
+/// Whether these are all bytes of a message.
+fn is_whole(bytes: &[u8]) -> bool {
+    bytes.get(2).is_some_and(|register| bytes.len() >= if register & WRITE == 0 { READ_LEN } else { WRITE_LEN })
+}
+
+/// Whether the check sum of a message is right.
+fn is_sound(message: &[u8]) -> bool {
+    message.split_last().is_some_and(|(last, checked)| crc8(checked) == *last)
+}
+
+/// A chip's UART at the wire of a serial port.
+pub(crate) struct PortUart(pub(crate) Box<dyn UartChip>);
+
+impl SerialChip for PortUart {
+    /// After a fault the chip waits for silence, so the rest is not heard.
+    fn hear(&mut self, bytes: &[u8], rate_hz: u32, now: Clock) -> Vec<u8> {
+        let is_too_slow = u64::from(CLOCK_FREQ) > LONGEST_BIT * u64::from(rate_hz);
+        let len = (0..=bytes.len()).find(|len| is_whole(&bytes[..*len]));
+        match len.map(|len| &bytes[..len]) {
+            Some(message) if !is_too_slow && message[0] & 0x0f == SYNC && is_sound(message) => {
+                self.0.hear(message, now).map_or_else(Vec::new, Vec::from)
+            }
+            _ => Vec::new(),
+        }
+    }
 }
 
 /// The event that the chip's receiver waits for.
@@ -182,13 +211,11 @@ impl Uart {
     fn byte(&mut self, now: Clock) {
         self.len += 1;
         self.expects = Expects::Byte;
-        let len = if self.bytes[2] & WRITE == 0 { READ_LEN } else { WRITE_LEN };
-        if self.len < 3 || self.len < len {
+        let message = &self.bytes[..self.len];
+        if !is_whole(message) {
             return;
         }
-        let message = &self.bytes[..self.len];
-        let (last, checked) = message.split_last().unwrap_or((&0, &[]));
-        if crc8(checked) != *last {
+        if !is_sound(message) {
             self.expects = Expects::Silence;
             return;
         }

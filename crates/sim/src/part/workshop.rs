@@ -13,6 +13,7 @@ use crate::engine::bed::{Bed, Delta, Head, Plane};
 use crate::engine::i2c::{I2cBus, I2cChip};
 use crate::engine::noise::Noise;
 use crate::engine::physics::{Axis, Heater};
+use crate::engine::serial::{SerialChip, SerialPin, SerialWire};
 use crate::engine::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
 use crate::engine::wire::{Wire, WiredPin};
 use crate::engine::world::{Sight, World};
@@ -29,6 +30,8 @@ pub(crate) enum Socket<'a> {
     I2c { bus: &'a str, address: u8 },
     /// A listener on the data output of an SPI bus alone.
     Mosi { bus: &'a str },
+    /// A chip on the wire of a serial port. The port is there because a chip names it.
+    Serial { port: &'a PinName, address: u8 },
 }
 
 /// A part's description.
@@ -69,6 +72,7 @@ pub(crate) struct Workshop<'a> {
     pub(crate) pins: Vec<WiredPin>,
     pub(crate) spi_buses: Vec<SpiBus>,
     pub(crate) i2c_buses: Vec<I2cBus>,
+    pub(crate) serial_wires: Vec<SerialWire>,
 }
 
 impl Workshop<'_> {
@@ -136,6 +140,18 @@ impl Workshop<'_> {
         if let Some(bus) = self.spi_buses.iter_mut().find(|other| other.name == bus) {
             bus.listen(Box::new(listener));
         }
+    }
+
+    /// Puts a chip on the wire of its serial port.
+    pub(crate) fn solder_serial(&mut self, part: &dyn Part, chip: impl SerialChip + 'static) {
+        let Some(Socket::Serial { port, .. }) = part.socket() else { return };
+        let known = self.serial_wires.iter().position(|wire| wire.name == port.name);
+        let place = known.unwrap_or_else(|| {
+            self.wire(Some(port), SerialPin { port: port.name.clone() });
+            self.serial_wires.push(SerialWire::new(&port.name));
+            self.serial_wires.len() - 1
+        });
+        self.serial_wires[place].solder(Box::new(chip));
     }
 
     /// Puts a chip on its I2C bus.

@@ -5,7 +5,10 @@
 
 use super::*;
 use crate::catalog::PartConfig;
+use crate::part::tmc2209::Tmc2209Config;
 use crate::part::tmc5160::Tmc5160Config;
+use pinion_firmware::board::SerialPort;
+use std::time::Duration;
 
 impl Bench {
     fn chip_select(&mut self, pin: &str) -> ChipSelect {
@@ -115,4 +118,53 @@ fn a_thermometer_is_found_by_its_serial_and_reads_in_sixteenths() {
     let error = board.ds18b20(b"28-000000000000").err().unwrap();
     assert_eq!(error.reason, reason::DS18B20_OPEN);
     assert!(error.to_string().contains("28-0316b5f6a2ff"), "{error}");
+}
+
+/// Everything that the port receives after a message, with its echo.
+fn heard(port: &mut dyn SerialPort, message: &[u8]) -> Vec<u8> {
+    port.send(message).unwrap();
+    let mut bytes = [0; 32];
+    let mut len = 0;
+    while let count @ 1.. = port.receive(&mut bytes[len..], Duration::from_millis(1)).unwrap() {
+        len += count;
+    }
+    bytes[..len].to_vec()
+}
+
+#[test]
+fn drivers_share_the_wire_of_a_serial_port() {
+    let mut config = SimConfig::default_printer();
+    let pin = |name: &str| PinName::try_from(name.to_owned()).ok();
+    let driver = |axis: &str, address| {
+        PartConfig::Tmc2209(Tmc2209Config {
+            uart_pin: None,
+            uart_port: pin("ttyAMA1"),
+            tx_pin: None,
+            address,
+            axis: axis.into(),
+            diag_pin: None,
+        })
+    };
+    config.parts = vec![driver("x", 0), driver("y", 3)];
+    let mut bench = Bench::new(config);
+    let (port, led) = (bench.pin("ttyAMA1"), bench.pin("led"));
+    assert!(bench.board.serial(led, 40_000).unwrap().is_none());
+    let mut port = bench.board.serial(port, 40_000).unwrap().unwrap();
+    assert_eq!(port.bus, "ttyAMA1");
+    let port = &mut *port.device;
+    // IFCNT of each, before and after a write to one of them (IHOLD_IRUN).
+    let reads = [[0xf5, 0, 2, 0xc8], [0xf5, 3, 2, 0x25]];
+    let write = [0xf5, 3, 0x90, 0, 0x08, 0x1f, 0x08, 0x5d];
+    let count = |heard: &[u8], read: &[u8]| {
+        assert_eq!((&heard[..4], &heard[4..7], heard.len()), (read, &[0x05, 0xff, 2][..], 12));
+        heard[10]
+    };
+    assert_eq!(reads.map(|read| count(&heard(port, &read), &read)), [0, 0]);
+    assert_eq!(heard(port, &write), write, "the echo alone");
+    assert_eq!(reads.map(|read| count(&heard(port, &read), &read)), [0, 1]);
+    // A wrong check sum, another address, no sync nibble, a half message.
+    let faults = [&[0xf5, 0, 2, 0xc9][..], &[0xf5, 1, 2, 0x7e], &[0xf4, 0, 2, 0xc3], &[0xf5, 0, 2]];
+    faults.iter().for_each(|fault| assert_eq!(heard(port, fault), *fault));
+    let error = bench.board.line(bench.pin("ttyAMA1"), Direction::Input(Bias::None)).err().unwrap();
+    assert!(error.trouble.cause.contains("ttyAMA1 of the simulated printer is a serial port"), "{error}");
 }
