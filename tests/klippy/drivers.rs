@@ -92,6 +92,55 @@ fn klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two() {
     }
 }
 
+/// The x axis gets a driver, too, with another address at the same port.
+fn on_a_port(board: String, _: &std::path::Path) -> String {
+    let board = board.replace("uart_pin = \"y_uart\"", "uart_port = \"ttyAMA1\"\naddress = 3");
+    board + "\n[[part]]\nkind = \"tmc2209\"\naxis = \"x\"\nuart_port = \"ttyAMA1\"\naddress = 1\n"
+}
+
+#[test]
+fn klippy_sets_up_two_drivers_on_one_serial_port() {
+    let Some(checkout) = checkout("klippy_sets_up_two_drivers_on_one_serial_port") else { return };
+    let mut printer = Printer::start_on(&checkout, on_a_port, |config| {
+        assert_eq!(config.matches("\nuart_pin: ttyAMA1\n").count(), 2, "{config}");
+        // As in many configurations from elsewhere.
+        config.replace("uart_pin: ttyAMA1", "uart_pin: ^ttyAMA1")
+    });
+    printer.until_state("ready");
+    for (stepper, address) in [("stepper_y", 3), ("stepper_x", 1)] {
+        let dumped = dump(&mut printer, stepper);
+        for (name, value) in TMC2209 {
+            assert_eq!(dumped[name], value, "{stepper} {name}: {:08x}", dumped[name]);
+        }
+        assert_eq!(dumped["IOIN"] >> 2 & 3, address);
+        let count = dumped["IFCNT"];
+        printer.gcode(&format!("SET_TMC_CURRENT STEPPER={stepper} CURRENT=0.4 HOLDCURRENT=0.2"));
+        let dumped = dump(&mut printer, stepper);
+        assert_eq!(dumped["IHOLD_IRUN"] & 0x1f1f, 0x0c06);
+        assert_eq!(dumped["IFCNT"], (count + 1) & 0xff, "one message for one write");
+    }
+    // Hundreds of registers, while the steppers move. No message is repeated, so nothing waited for an answer.
+    printer.gcode("G28 X Y\nG1 X100 Y100 F6000\nG1 X20 Y20");
+    for _ in 0..10 {
+        dump(&mut printer, "stepper_x");
+        dump(&mut printer, "stepper_y");
+    }
+    let log = printer.log();
+    assert!(!log.contains("TMC UART ttyAMA1"), "{log}");
+    assert!(!printer.host_log("", 0).contains("Unable to"));
+}
+
+#[test]
+fn klippy_tells_of_a_driver_that_is_not_on_the_serial_port() {
+    let Some(checkout) = checkout("klippy_tells_of_a_driver_that_is_not_on_the_serial_port") else { return };
+    let mut printer = Printer::start_on(&checkout, on_a_port, |config| config.replace("uart_address: 1", "uart_address: 2"));
+    printer.until_state("ready");
+    printer.host_log("TMC stepper_x failed to init: Unable to read tmc uart 'stepper_x' register IFCNT", 1);
+    printer.until_logged("TMC UART ttyAMA1: no driver answers at address 2: check uart_address");
+    dump(&mut printer, "stepper_y");
+    assert_eq!(printer.log().matches("no driver answers").count(), 1, "said once");
+}
+
 #[test]
 fn klippy_tells_of_a_driver_that_is_not_there() {
     let Some(checkout) = checkout("klippy_tells_of_a_driver_that_is_not_there") else { return };

@@ -232,6 +232,33 @@ fn klippy_calibrates_a_load_cell() {
     assert!(grams.abs() < 1.0, "{grams}");
 }
 
+/// Puts the default printer's load cell on an SPI bus of its own.
+fn on_spi(board: String, _: &std::path::Path) -> String {
+    let lines = "dout_pin = \"load_cell_dout\"\nsclk_pin = \"load_cell_sclk\"\n";
+    assert!(board.contains(lines));
+    board.replace(lines, "bus = \"spidev4.0\"\n") + "\n[[spi_bus]]\nname = \"spidev4.0\"\n"
+}
+
+#[test]
+fn klippy_reads_a_load_cell_on_an_spi_bus() {
+    let Some(checkout) = checkout("klippy_reads_a_load_cell_on_an_spi_bus") else { return };
+    let mut printer = Printer::start_on(&checkout, on_spi, |config| {
+        assert!(config.contains("\ndout_pin: spidev4.0/miso\nsclk_pin: spidev4.0\n"), "{config}");
+        config
+    });
+    printer.until_state("ready");
+    // Twice: klippy ends the measurements, and begins them anew.
+    for _ in 0..2 {
+        let (restarts, said) = diagnostic(&mut printer);
+        let rate = number(&said, "Measured samples per second: ");
+        assert!(restarts == 0 && (79.0..81.0).contains(&rate), "{restarts} restarts: {said}");
+        assert!(said.contains("reported no errors") && said.contains("Saturated samples: 0"), "{said}");
+        assert!(number(&said, "Unique values: ") > 100.0, "{said}");
+    }
+    let tare = number(&read_in_time(&mut printer, "TARE"), "% (");
+    assert!((tare - TARE_COUNTS).abs() < 60.0, "{tare}");
+}
+
 #[test]
 fn klippy_probes_by_a_tap_of_the_nozzle_on_the_load_cell() {
     let Some(checkout) = checkout("klippy_probes_by_a_tap_of_the_nozzle_on_the_load_cell") else { return };
