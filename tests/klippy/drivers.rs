@@ -133,7 +133,8 @@ fn klippy_sets_up_two_drivers_on_one_serial_port() {
 #[test]
 fn klippy_tells_of_a_driver_that_is_not_on_the_serial_port() {
     let Some(checkout) = checkout("klippy_tells_of_a_driver_that_is_not_on_the_serial_port") else { return };
-    let mut printer = Printer::start_on(&checkout, on_a_port, |config| config.replace("uart_address: 1", "uart_address: 2"));
+    let mut printer =
+        Printer::start_on(&checkout, on_a_port, |config| config.replace("uart_address: 1", "uart_address: 2"));
     printer.until_state("ready");
     printer.host_log("TMC stepper_x failed to init: Unable to read tmc uart 'stepper_x' register IFCNT", 1);
     printer.until_logged("TMC UART ttyAMA1: no driver answers at address 2: check uart_address");

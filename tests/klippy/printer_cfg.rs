@@ -14,7 +14,7 @@ use pinion_testkit::markdown::{Page, pages};
 /// The other sections that a printer needs.
 const PRINTER: &str = "[mcu]\nserial: /dev/null\n[printer]\nkinematics: none\nmax_velocity: 1\nmax_accel: 1\n";
 /// The pages' names of a computer's pins. This computer does not have them.
-const PINS: [(&str, u32); 15] = [
+const PINS: [(&str, u32); 18] = [
     ("GPIO5", 5),
     ("GPIO6", 6),
     ("GPIO12", 12),
@@ -30,6 +30,9 @@ const PINS: [(&str, u32); 15] = [
     ("ads1015/voltage0", 4096),
     ("mcp3208/voltage0", 4097),
     ("spidev0.0", 1 << 26),
+    ("spidev0.1", (1 << 26) + 1),
+    ("spidev0.1/miso", (1 << 26) + (1 << 16) + 1),
+    ("ttyAMA3", 1 << 27),
 ];
 
 /// A configuration and its place in the pages.

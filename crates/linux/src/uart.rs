@@ -84,9 +84,8 @@ pub(super) struct Port {
 impl Port {
     /// Opens a port at this rate, or at another one that it has.
     pub(super) fn open(dev: &Path, uart: &Uart, rate_hz: u32) -> Result<Port, Shutdown> {
-        Port::try_open(dev, uart, rate_hz).map_err(|trouble| {
-            Shutdown::because(reason::SERIAL_OPEN, trouble.of(dev.join(&uart.name).display()))
-        })
+        Port::try_open(dev, uart, rate_hz)
+            .map_err(|trouble| Shutdown::because(reason::SERIAL_OPEN, trouble.of(dev.join(&uart.name).display())))
     }
 
     fn try_open(dev: &Path, uart: &Uart, rate_hz: u32) -> Result<Port, Trouble> {
@@ -237,8 +236,8 @@ pub(super) fn gone() -> Shutdown {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
     use nix::fcntl::OFlag;
+    use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
     use std::fs;
     use std::os::unix::fs::symlink;
     use std::thread;

@@ -108,12 +108,7 @@ pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &B
 }
 
 /// Whether `user` may open the devices. These instances run as `user`.
-fn permissions_of(
-    computer: &Computer,
-    instances: &[&Instance],
-    user: &Who,
-    ports: &BTreeSet<&str>,
-) -> Vec<Finding> {
+fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, ports: &BTreeSet<&str>) -> Vec<Finding> {
     let units: Vec<&str> = instances.iter().filter_map(|instance| instance.unit.as_deref()).collect();
     let anew = match &units[..] {
         [] => "log in anew, and start Pinion anew".to_owned(),

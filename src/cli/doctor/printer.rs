@@ -26,13 +26,8 @@ pub(super) struct Printer {
 /// Reads a configuration, with the files that it includes. `None` if one of them cannot be read. As in
 /// klippy/configfile.py the last entry of a section counts.
 pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
-    let mut reader = Reader {
-        computer,
-        serials: BTreeMap::new(),
-        led_pins: BTreeMap::new(),
-        uart_pins: BTreeMap::new(),
-        files: 0,
-    };
+    let mut reader =
+        Reader { computer, serials: BTreeMap::new(), led_pins: BTreeMap::new(), uart_pins: BTreeMap::new(), files: 0 };
     reader.file(config, &mut Vec::new())?;
     let is_spi = |pin: &String| name_of(pin).starts_with("spidev");
     let is_port = |pin: &String| ["tty", "serial"].iter().any(|kind| name_of(pin).starts_with(kind));

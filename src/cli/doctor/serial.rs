@@ -95,7 +95,9 @@ fn missing(computer: &Computer, named: &str) -> String {
 
 fn no_bluetooth(computer: &Computer) -> String {
     let config = pi_config(computer).unwrap_or("config.txt");
-    format!("choose another UART, or do without Bluetooth: printf '[all]\\ndtoverlay=disable-bt\\n' | sudo tee -a {config} && sudo systemctl disable hciuart, and reboot")
+    format!(
+        "choose another UART, or do without Bluetooth: printf '[all]\\ndtoverlay=disable-bt\\n' | sudo tee -a {config} && sudo systemctl disable hciuart, and reboot"
+    )
 }
 
 #[cfg(test)]

@@ -218,7 +218,8 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
     if let Some(mosi) = mcu.board()?.mosi_of(dout_pin) {
         let (dout, sclk) = (mcu.name(dout_pin), mcu.name(sclk_pin));
         if mosi != sclk_pin {
-            let (remedy, cause) = (format!("write sclk_pin: {}", mcu.name(mosi)), format!("{dout} has another clock than {sclk}"));
+            let (remedy, cause) =
+                (format!("write sclk_pin: {}", mcu.name(mosi)), format!("{dout} has another clock than {sclk}"));
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy(remedy));
         }
         let OnWorker { bus, device } = mcu.board()?.mosi(mosi, spi::RATE_HZ)?.line;

@@ -93,10 +93,7 @@ pub(super) enum Ready {
     /// This line is low.
     Line(Arc<dyn Line>),
     /// The worker looks. `waits` counts the `rest_ticks` since the look began. `fresh`: it has just read a sample.
-    Look {
-        waits: u32,
-        fresh: bool,
-    },
+    Look { waits: u32, fresh: bool },
 }
 
 impl Ready {
@@ -297,7 +294,11 @@ pub(super) fn configure_spi<const N: usize, C: ReadyChip<Reading = Conversation<
     mcu.vacant(oid)?;
     mcu.require::<Spi>(spi)?;
     let ready = mcu.prompt_line(ready_pin, "data_ready", Direction::Input(Bias::None))?;
-    mcu.assign_on(ready_pin, oid, ReadyAdc::new(chip, Ready::Line(ready), Slot::talking(Frame { bytes: [0; N], len: len.min(N) })))
+    mcu.assign_on(
+        ready_pin,
+        oid,
+        ReadyAdc::new(chip, Ready::Line(ready), Slot::talking(Frame { bytes: [0; N], len: len.min(N) })),
+    )
 }
 
 /// Converts 24 bits in two's complement, the highest byte first.

@@ -373,7 +373,9 @@ fn a_shutdown_amid_a_reading_ends_the_samples() {
 
 #[test]
 fn samples_arrive_over_spi_with_pulses_of_one_bit() {
-    for (first, gain_channel, answer_ticks) in [(-8_388_608, 1, 0), (-5, 2, 1000), (8_388_607 - 30, 3, 30_000), (0, 4, 0)] {
+    for (first, gain_channel, answer_ticks) in
+        [(-8_388_608, 1, 0), (-5, 2, 1000), (8_388_607 - 30, 3, 30_000), (0, 4, 0)]
+    {
         let (mut rig, chip) = spi_rig(first, gain_channel, answer_ticks);
         rig.send(QUERY);
         rig.run_until(4 * PERIOD + 25 * PERIOD);
@@ -385,7 +387,10 @@ fn samples_arrive_over_spi_with_pulses_of_one_bit() {
         // The first one starts the chip. All others are looks and waves, and each byte ends low.
         assert_eq!(transfers[0].data, [&[0xff; 8][..], &[0]].concat());
         for transfer in &transfers[1..] {
-            assert!(matches!(transfer.data.len(), 1 | 7) && transfer.data.iter().all(|byte| byte & 1 == 0), "{transfer:?}");
+            assert!(
+                matches!(transfer.data.len(), 1 | 7) && transfer.data.iter().all(|byte| byte & 1 == 0),
+                "{transfer:?}"
+            );
         }
         let looks = transfers.iter().filter(|transfer| transfer.data.len() == 1).count();
         assert!(looks < 40 + 25 * 5, "{looks}");

@@ -413,7 +413,12 @@ fn a_shutdown_amid_a_message_of_a_port_says_nothing_more() {
 fn a_port_that_cannot_be_used_is_refused() {
     for (config, broken, reason, told) in [
         ("rx_pin=800 pull_up=1 tx_pin=800", true, "Unable to open serial port", "pin 800 is gone"),
-        ("rx_pin=800 pull_up=1 tx_pin=10", false, "Unable to open serial port", "cannot receive on ttyS0 and send on gpio10"),
+        (
+            "rx_pin=800 pull_up=1 tx_pin=10",
+            false,
+            "Unable to open serial port",
+            "cannot receive on ttyS0 and send on gpio10",
+        ),
         ("rx_pin=10 pull_up=1 tx_pin=800", false, "Not an output pin", "no pin 800"),
     ] {
         let mut rig = Rig::new();

@@ -260,14 +260,8 @@ mod tests {
             reply: REPLY.into(),
             at_edge: Box::new(at_edge),
         });
-        let lines = Lines {
-            tx: wire.clone(),
-            rx: wire.clone(),
-            single: None,
-            pace: Pace::of(clock),
-            bit: BIT,
-            spoilt: false,
-        };
+        let lines =
+            Lines { tx: wire.clone(), rx: wire.clone(), single: None, pace: Pace::of(clock), bit: BIT, spoilt: false };
         let mut message = Message::default();
         message.data[..MESSAGE.len()].copy_from_slice(&MESSAGE);
         message.write_len = MESSAGE.len();

@@ -92,7 +92,8 @@ impl Port {
             let is_echo = buffer[..len].iter().zip(sent).all(|(received, sent)| received == sent);
             let from = if is_echo { sent.len() } else { 0 };
             let missing = (from + reply_len).saturating_sub(len);
-            let came = if missing == 0 { 0 } else { self.device.receive(&mut buffer[len..len + missing], self.limit)? };
+            let came =
+                if missing == 0 { 0 } else { self.device.receive(&mut buffer[len..len + missing], self.limit)? };
             if came == 0 {
                 break (is_echo, from);
             }
