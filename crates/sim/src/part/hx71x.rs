@@ -296,7 +296,7 @@ impl Wire for SclkPin {
     }
 }
 
-/// The chip on an SPI bus. The bus's bits have this length in ticks, and the next one begins `at` a time.
+/// The chip on an SPI bus. The bus's bits have this length in ticks. The next bit begins at or after `at`.
 struct OnSpi {
     chip: Arc<Hx71x>,
     clock: Arc<dyn TimeSource>,
@@ -312,7 +312,8 @@ impl SpiChip for OnSpi {
 
     fn select(&mut self, rate_hz: u32) {
         self.bit = f64::from(CLOCK_FREQ) / f64::from(rate_hz.max(1));
-        self.at = self.clock.now();
+        // The simulated bus needs no time for its bits, but a real one does.
+        self.at = self.at.max(self.clock.now());
     }
 
     /// The output gets its level at the beginning of each bit. The input is read in its middle, as in mode 0.
