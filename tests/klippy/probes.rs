@@ -255,8 +255,9 @@ fn klippy_reads_a_load_cell_on_an_spi_bus() {
         assert!(said.contains("reported no errors") && said.contains("Saturated samples: 0"), "{said}");
         assert!(number(&said, "Unique values: ") > 100.0, "{said}");
     }
-    let tare = number(&read_in_time(&mut printer, "TARE"), "% (");
-    assert!((tare - TARE_COUNTS).abs() < 60.0, "{tare}");
+    let said = read_in_time(&mut printer, "LOAD_CELL_READ");
+    let percent = 100.0 * TARE_COUNTS / f64::from(1 << 23);
+    assert!((number(&said, "g (") - percent).abs() < 0.01, "{said}");
 }
 
 #[test]
