@@ -33,8 +33,8 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage mutants bench check
-.PHONY: build install install-program install-system uninstall deb release clean
+.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage mutants
+.PHONY: sanitize bench check build install install-program install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
 PACKAGES = $(addprefix system-packages-,build vm deb system stress check fuzz coverage)
@@ -56,6 +56,7 @@ help:
 	@echo '                   SECONDS=60, or all for TOTAL=600; only one with TARGET=link'
 	@echo 'make coverage      how many lines the tests reach (ARGS="-p pinion-firmware" for some of them)'
 	@echo 'make mutants       do the tests notice if the code is changed? (PACKAGE=pinion-firmware SHARD=7/30)'
+	@echo 'make sanitize      what threads share, in all orders; tests with sanitizers'
 	@echo 'make bench         the benchmarks'
 	@echo 'make check         formatting, lints, documentation, man pages, licenses, what the package has'
 	@echo 'make build         the program: $(PINION)'
@@ -128,6 +129,9 @@ mutants: system-packages-build
 	env -u CARGO_TARGET_DIR PROPTEST_CASES=16 PROPTEST_RNG_SEED=1 PROPTEST_MAX_SHRINK_ITERS=0 \
 	    PROPTEST_DISABLE_FAILURE_PERSISTENCE=1 $(CARGO) mutants --package $(PACKAGE) --output $(CARGO_TARGET_DIR) \
 	    $(if $(SHARD),--sharding round-robin --shard $(SHARD)) $(MUTANTS) -- $(TESTS)
+
+sanitize: system-packages-build
+	@CARGO='$(CARGO)' scripts/sanitize
 
 bench: system-packages-build
 	$(CARGO) bench --locked

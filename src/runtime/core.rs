@@ -15,9 +15,10 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use pinion_linux::clock::monotonic;
 use pinion_protocol::block::PAYLOAD_MAX;
 use pinion_protocol::vlq::Reader;
+use pinion_shared::calls::Progress;
 
 use super::lookout::Lookout;
-use super::outlet::{LinkWake, Progress};
+use super::outlet::LinkWake;
 use super::pulse::{BEAT, Pulse};
 use super::recorder::Tape;
 use super::status::Teller;
@@ -266,7 +267,7 @@ impl Core {
     fn tell_debts(&mut self) {
         if !self.mcu.owes() {
             if self.debtor.take().is_some() {
-                self.pulse.paid();
+                self.pulse.paid(self.mcu.last_read());
             }
             return;
         }

@@ -12,10 +12,11 @@ use log::log;
 use rtrb::{Producer, PushError};
 
 use pinion_linux::clock::monotonic;
+use pinion_shared::calls::Progress;
 
 use super::core::{Payload, Request};
 use super::ledger::Ledger;
-use super::outlet::{Inlet, LinkWake, Progress};
+use super::outlet::{Inlet, LinkWake};
 
 /// How long to poll until the core has finished the blocks that it was handed.
 const AWAIT_CORE: Duration = Duration::from_micros(100);

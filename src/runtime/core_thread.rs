@@ -13,11 +13,12 @@ use pinion_firmware::board::Board;
 use pinion_firmware::mcu::{Dialect, Mcu};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
+use pinion_shared::calls::Progress;
 
 use super::core::{Core, Left, Parts};
 use super::core_end::CoreEnd;
 use super::ledger::Ledger;
-use super::outlet::{self, LinkWake, Progress};
+use super::outlet::{self, LinkWake};
 use super::pulse::Pulse;
 use super::realtime::{self, Processors, Role, Scheduling};
 use super::recorder::{Recording, Tape};

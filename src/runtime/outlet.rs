@@ -8,7 +8,6 @@
 use std::io::{self, Write};
 use std::os::fd::{AsFd, BorrowedFd};
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU32, Ordering, fence};
 
 use log::Level;
 use nix::sys::eventfd::{EfdFlags, EventFd};
@@ -17,6 +16,7 @@ use rtrb::{Consumer, Producer, RingBuffer};
 use pinion_firmware::lateness::us;
 use pinion_firmware::mcu::{Note, Outbox};
 use pinion_firmware::shutdown::{Shutdown, reason};
+use pinion_shared::calls::{Doze, Progress};
 
 /// Size of the ring of responses. Some 1,000 responses fit.
 const RING_BYTES: usize = 1 << 16;
@@ -34,38 +34,32 @@ const LINES_SPARE: usize = 2 * (LINE_HEAD_BYTES + LINE_BYTES);
 
 /// Wakes the link. Costs a system call only if the link sleeps.
 pub(super) struct LinkWake {
-    asleep: AtomicBool,
+    doze: Doze,
     event: EventFd,
 }
 
 impl LinkWake {
     pub(super) fn new() -> io::Result<LinkWake> {
         let event = EventFd::from_flags(EfdFlags::EFD_CLOEXEC | EfdFlags::EFD_NONBLOCK)?;
-        Ok(LinkWake { asleep: AtomicBool::new(false), event })
+        Ok(LinkWake { doze: Doze::default(), event })
     }
 
     /// The core calls this after it has put something into a ring.
     pub(super) fn wake(&self) {
-        if self.asleep.swap(false, Ordering::SeqCst) {
+        if self.doze.is_to_be_woken() {
             // The write can fail only if the counter is full of wake-ups, and then the link wakes, too.
             let _ = self.event.write(1);
         }
     }
 
     /// The link calls this before it sleeps. After this it must look at the rings once more.
-    ///
-    /// Then no wake-up is lost. If this swap comes first, the core's swap in [`LinkWake::wake`] finds the link asleep
-    /// and wakes it. If the core's swap comes first, this swap reads the value that it left. So the look that follows
-    /// sees all that the core wrote before its swap. A plain store would read nothing, and the second case would not
-    /// hold. The link could then look before the core's response becomes visible. It would go to sleep although the
-    /// core found it awake.
     pub(super) fn sleeping(&self) {
-        self.asleep.swap(true, Ordering::SeqCst);
+        self.doze.begin();
     }
 
     /// The link calls this after its sleep. `called`: its event was readable.
     pub(super) fn awake(&self, called: bool) {
-        self.asleep.store(false, Ordering::SeqCst);
+        self.doze.end();
         if called {
             let _ = self.event.read();
         }
@@ -73,68 +67,6 @@ impl LinkWake {
 
     pub(super) fn event(&self) -> BorrowedFd<'_> {
         self.event.as_fd()
-    }
-}
-
-/// How many of the host's blocks the core has begun and finished. Also how many stop requests the link has handed to
-/// it. The counts wrap around.
-///
-/// They give a response the sequence number of the block that it answers. klippy checks the number of a response before
-/// it takes it for the answer to a query. The number must say that the query had been received (`#sent_time` in
-/// serialhdl.py). Numbers must not run ahead of the core. Otherwise a late answer to an earlier query of the same name
-/// would pass for the present answer.
-#[derive(Debug, Default)]
-pub(super) struct Progress {
-    begun: AtomicU32,
-    done: AtomicU32,
-    held: AtomicBool,
-    stops_handed: AtomicU32,
-}
-
-impl Progress {
-    /// The core begins the next block. Returns how many it has begun.
-    pub(super) fn begin(&self) -> u32 {
-        self.begun.fetch_add(1, Ordering::Relaxed).wrapping_add(1)
-    }
-
-    /// The core has finished the block, and has sent all its responses to it.
-    pub(super) fn finish(&self) {
-        self.done.fetch_add(1, Ordering::Release);
-    }
-
-    /// How many blocks are done.
-    pub(super) fn done(&self) -> u32 {
-        self.done.load(Ordering::Acquire)
-    }
-
-    /// Notes whether a bus holds the core's block back from now on. After this the core looks for further blocks before
-    /// it sleeps.
-    pub(super) fn hold(&self, held: bool) {
-        // The core alone changes it, and calls this in each of its turns. Only a change needs the fence.
-        if self.held.load(Ordering::Relaxed) != held {
-            self.held.store(held, Ordering::Relaxed);
-            fence(Ordering::SeqCst);
-        }
-    }
-
-    /// Whether a bus holds the core's block back. Then the core need not be unparked for a block that it was handed
-    /// before. One of the two fences comes first. So either this call sees that the core is no longer held, or the core
-    /// sees the block.
-    pub(super) fn is_held(&self) -> bool {
-        fence(Ordering::SeqCst);
-        self.held.load(Ordering::Relaxed)
-    }
-
-    /// The link is about to hand the core a stop request: a block with `emergency_stop`, `Request::Shutdown` or
-    /// `Request::Quit`.
-    pub(super) fn stop_handed(&self) {
-        self.stops_handed.fetch_add(1, Ordering::Release);
-    }
-
-    /// How many stop requests the link has handed to the core, or is about to. The core counts those that it has taken
-    /// out of its ring. While its count is lower, one is still to come.
-    pub(super) fn stops_handed(&self) -> u32 {
-        self.stops_handed.load(Ordering::Acquire)
     }
 }
 
@@ -197,7 +129,7 @@ impl Outbox for Outlet {
     fn send(&mut self, payload: &[u8]) {
         let mut head = [0; HEAD_BYTES];
         head[..2].copy_from_slice(&(payload.len() as u16).to_le_bytes());
-        head[2..].copy_from_slice(&self.progress.begun.load(Ordering::Relaxed).to_le_bytes());
+        head[2..].copy_from_slice(&self.progress.begun().to_le_bytes());
         // If the host does not read, the ring fills up, and responses are dropped, as in the firmware.
         push(&mut self.responses, &head, payload);
         self.wake.wake();

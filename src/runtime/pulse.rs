@@ -27,6 +27,7 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_linux::sys::{self, SHARED_WORDS};
+use pinion_shared::life::{Heard, Heart, Slot};
 
 /// How long the core may be silent while the MCU runs.
 pub(super) const RUNNING: Duration = Duration::from_millis(550);
@@ -47,20 +48,14 @@ const STAMP_SHIFT: u32 = 16;
 const STANDSTILL_STAMPS: i32 = (STANDSTILL.as_nanos() / (NS_PER_TICK << STAMP_SHIFT) as u128) as i32;
 
 // The page's words.
-/// When the core gave its last beat.
-const BEAT_AT: usize = 0;
-/// How long the core may be silent.
-const SILENCE_MAX_MS: usize = 1;
-/// Whether the MCU owes a shutdown value.
-const OWES: usize = 2;
 /// When the guardian last listened; 0 while it holds no outputs.
-const LISTENED_AT: usize = 3;
+const LISTENED_AT: usize = 0;
 /// Whether the guardian did not answer.
-const UNANSWERED: usize = 4;
+const UNANSWERED: usize = 1;
 /// How long the computer was suspended. The core clears it when it has seen it.
-const SUSPENDED_MS: usize = 5;
-/// The name of the output that is owed its shutdown value: a text.
-const SUBJECT: usize = 8;
+const SUSPENDED_MS: usize = 2;
+/// The first word of the core's heartbeat. It owes shutdown values.
+const HEART: usize = 5;
 /// The first word of the workers.
 const WORKERS: usize = 24;
 /// How many words a worker has: the start of its present job (0 without one), and the name of its bus.
@@ -84,12 +79,12 @@ impl Pulse {
     /// The core is alive at `now`. `running`: its MCU is configured and not shut down. Only the core calls this.
     #[inline]
     pub(super) fn beat(&self, now: Clock, running: bool) {
-        if self.page[OWES].load(Ordering::Relaxed) == 0 {
-            self.page[BEAT_AT].store(stamp(now), Ordering::Relaxed);
-        }
         let silence_max = if running { RUNNING } else { IDLE };
-        // Release: a listener that reads this limit also reads this beat, and no older one.
-        self.page[SILENCE_MAX_MS].store(silence_max.as_millis() as u32, Ordering::Release);
+        self.heart().beat(stamp(now), silence_max.as_millis() as u32);
+    }
+
+    fn heart(&self) -> Heart<'static> {
+        Heart::new(&self.page[HEART..WORKERS])
     }
 
     /// Why a running MCU has to be stopped, if it stood still since the last beat. Its control group was frozen, or the
@@ -97,7 +92,7 @@ impl Pulse {
     /// or move. The core asks before each beat.
     #[inline]
     pub(super) fn standstill(&self, now: Clock) -> Option<Shutdown> {
-        let stamps = stamp(now).wrapping_sub(self.page[BEAT_AT].load(Ordering::Relaxed)) as i32;
+        let stamps = stamp(now).wrapping_sub(self.heart().own_beat()) as i32;
         let stood_still = stamps >= STANDSTILL_STAMPS;
         let suspended = self.page[SUSPENDED_MS].load(Ordering::Relaxed) != 0;
         if stood_still || suspended { self.explain_standstill(now) } else { None }
@@ -106,8 +101,8 @@ impl Pulse {
     #[cold]
     fn explain_standstill(&self, now: Clock) -> Option<Shutdown> {
         let suspended_ms = self.page[SUSPENDED_MS].swap(0, Ordering::Relaxed);
-        let ms = elapsed(self.page[BEAT_AT].load(Ordering::Relaxed), now).as_millis();
-        if self.page[SILENCE_MAX_MS].load(Ordering::Relaxed) != RUNNING.as_millis() as u32 {
+        let ms = elapsed(self.heart().own_beat(), now).as_millis();
+        if self.heart().own_limit_ms() != RUNNING.as_millis() as u32 {
             return None;
         }
         let trouble = match suspended_ms {
@@ -128,24 +123,12 @@ impl Pulse {
     /// life at `now`. So earlier work of the core does not count, such as opening a device for seconds. A further call
     /// replaces the subject, not the time. Only the core calls this.
     pub(super) fn owe(&self, subject: &str, now: Clock) {
-        if self.page[OWES].load(Ordering::Relaxed) == 0 {
-            self.page[BEAT_AT].store(stamp(now), Ordering::Relaxed);
-        }
-        self.subject().set(subject);
-        self.page[OWES].store(1, Ordering::Release);
+        self.heart().owe(subject, stamp(now));
     }
 
-    /// Every output is at its shutdown value. Only the core calls this.
-    pub(super) fn paid(&self) {
-        self.page[OWES].store(0, Ordering::Release);
-    }
-
-    fn owes(&self) -> bool {
-        self.page[OWES].load(Ordering::Acquire) != 0
-    }
-
-    fn subject(&self) -> Text {
-        Text(&self.page[SUBJECT..WORKERS])
+    /// Every output is at its shutdown value. This is a sign of life at `now`. Only the core calls this.
+    pub(super) fn paid(&self, now: Clock) {
+        self.heart().paid(stamp(now));
     }
 
     /// The guardian did not answer the program, and counts as lost.
@@ -164,27 +147,26 @@ impl Pulse {
         Clock::from_ticks(since.as_nanos() as u64 / NS_PER_TICK)
     }
 
-    fn silence_max(&self) -> Duration {
-        if self.owes() {
-            return STOPPING;
-        }
-        Duration::from_millis(self.page[SILENCE_MAX_MS].load(Ordering::Acquire).into())
+    /// How long the core may be silent, and the time of its last beat.
+    fn listen(&self) -> (Duration, u32) {
+        let Heard { silence_max_ms, beat_at } = self.heart().listen();
+        (silence_max_ms.map_or(STOPPING, |ms| Duration::from_millis(ms.into())), beat_at)
     }
 
     /// Whether the heartbeat is missing at `now`.
     pub(super) fn is_silent(&self, now: Clock) -> bool {
-        let silence_max = self.silence_max();
-        elapsed(self.page[BEAT_AT].load(Ordering::Relaxed), now) >= silence_max
+        let (silence_max, beat_at) = self.listen();
+        elapsed(beat_at, now) >= silence_max
     }
 
     /// For the log: the fault of a program that gave no sign of life.
     pub(super) fn diagnosis(&self) -> String {
-        let ms = self.silence_max().as_millis();
-        match self.owes() {
-            false => format!("the core gave no sign of life for {ms} ms"),
-            true => format!(
+        let (silence_max, ms) = (self.heart().listen().silence_max_ms, self.listen().0.as_millis());
+        match silence_max {
+            Some(_) => format!("the core gave no sign of life for {ms} ms"),
+            None => format!(
                 "{} is not at its shutdown value within {ms} ms: check its power and wiring, and look at the kernel's log (dmesg)",
-                self.subject().get()
+                self.heart().subject().get()
             ),
         }
     }
@@ -198,12 +180,12 @@ impl Pulse {
 
     /// The bus of a worker whose present job takes longer than `limit` at `now`.
     pub(super) fn stuck(&self, now: Clock, limit: Duration) -> Option<String> {
-        let mut workers = self.slots().filter(|slot| slot.name().is_set());
-        workers.find(|slot| slot.busy_for(now) > limit).map(|slot| slot.name().get())
+        let is_stuck = |slot: &Slot| slot.busy_since().is_some_and(|since| elapsed(since, now) > limit);
+        self.slots().find(is_stuck).map(|slot| slot.name().get())
     }
 
-    fn slots(&self) -> impl Iterator<Item = Slot> {
-        self.page[WORKERS..].chunks_exact(SLOT_WORDS).map(Slot)
+    fn slots(&self) -> impl Iterator<Item = Slot<'static>> {
+        self.page[WORKERS..].chunks_exact(SLOT_WORDS).map(Slot::new)
     }
 }
 
@@ -217,78 +199,27 @@ fn elapsed(since: u32, now: Clock) -> Duration {
     Duration::from_nanos(((stamps as u64) << STAMP_SHIFT) * NS_PER_TICK)
 }
 
-/// Words that hold a text, or as much of it as fits.
-#[derive(Clone, Copy)]
-struct Text(&'static [AtomicU32]);
-
-impl Text {
-    fn is_set(self) -> bool {
-        self.0[0].load(Ordering::Acquire) != 0
-    }
-
-    /// Does not allocate.
-    fn set(self, text: &str) {
-        let mut bytes = text.bytes();
-        let mut word = || u32::from_le_bytes(std::array::from_fn(|_| bytes.next().unwrap_or(0)));
-        let first = word();
-        for place in &self.0[1..] {
-            place.store(word(), Ordering::Relaxed);
-        }
-        // The first word is written last, because `is_set` looks at it. A reader that sees it also sees the others.
-        self.0[0].store(first, Ordering::Release);
-    }
-
-    fn get(self) -> String {
-        let bytes = self.0.iter().flat_map(|word| word.load(Ordering::Acquire).to_le_bytes());
-        let bytes: Vec<u8> = bytes.take_while(|byte| *byte != 0).collect();
-        String::from_utf8_lossy(&bytes).into_owned()
-    }
-}
-
-/// A worker's words.
-#[derive(Clone, Copy)]
-struct Slot(&'static [AtomicU32]);
-
-impl Slot {
-    fn since(&self) -> &'static AtomicU32 {
-        &self.0[0]
-    }
-
-    /// A slot without a name is free.
-    fn name(&self) -> Text {
-        Text(&self.0[1..])
-    }
-
-    fn busy_for(&self, now: Clock) -> Duration {
-        match self.since().load(Ordering::Relaxed) {
-            0 => Duration::ZERO,
-            since => elapsed(since, now),
-        }
-    }
-}
-
 /// Shows others since when a worker is at its present job.
 pub(super) struct JobClock {
-    slot: Slot,
+    slot: Slot<'static>,
     pulse: Pulse,
 }
 
 impl JobClock {
     /// A job begins.
     pub(super) fn begin(&self) {
-        self.slot.since().store(stamp(self.pulse.now()).max(1), Ordering::Relaxed);
+        self.slot.begin(stamp(self.pulse.now()));
     }
 
     /// The job ends.
     pub(super) fn end(&self) {
-        self.slot.since().store(0, Ordering::Relaxed);
+        self.slot.end();
     }
 }
 
 impl Drop for JobClock {
     fn drop(&mut self) {
-        self.end();
-        self.slot.name().set("");
+        self.slot.free();
     }
 }
 
@@ -336,8 +267,8 @@ pub(super) struct Ear {
 impl Ear {
     /// Listens from `now` on.
     pub(super) fn new(pulse: Pulse, now: Clock) -> Ear {
-        let beat = pulse.page[BEAT_AT].load(Ordering::Relaxed);
-        Ear { pulse, silence: Silence::new(beat, now), suspensions: Suspensions::new() }
+        let (_, beat_at) = pulse.listen();
+        Ear { pulse, silence: Silence::new(beat_at, now), suspensions: Suspensions::new() }
     }
 
     /// How long not to look again. `None` if the heartbeat is missing at `now`.
@@ -346,10 +277,9 @@ impl Ear {
         if let Some(suspended) = self.suspensions.newest() {
             self.pulse.tell_suspension(suspended);
         }
-        let silence_max = self.pulse.silence_max();
-        let beat = self.pulse.page[BEAT_AT].load(Ordering::Relaxed);
+        let (silence_max, beat_at) = self.pulse.listen();
         // No longer than the limit of a running MCU: by then the core may have begun to run.
-        self.silence.listen(beat, now, silence_max, RUNNING)
+        self.silence.listen(beat_at, now, silence_max, RUNNING)
     }
 }
 
@@ -556,10 +486,9 @@ mod tests {
         let diagnosis = "pwmchip10/pwm1 is not at its shutdown value within 1000 ms: ";
         assert!(pulse.diagnosis().starts_with(diagnosis), "{}", pulse.diagnosis());
         // It was only slow.
-        pulse.paid();
-        pulse.beat(at(1010), false);
+        pulse.paid(at(1010));
         assert!(ear.listen(at(1010)).is_some());
-        assert_eq!(pulse.silence_max(), IDLE);
+        assert_eq!(pulse.listen().0, IDLE);
     }
 
     #[test]

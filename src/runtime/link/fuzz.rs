@@ -17,12 +17,13 @@ use pinion_firmware::mcu::{DialectName, Generation, Note, Outbox as _};
 use pinion_firmware::time::VirtualClock;
 use pinion_linux::clock::Monotonic;
 use pinion_protocol::block::{BLOCK_MAX, Found, PAYLOAD_MAX, Received, Receiver, Resync, Sequence, frame};
+use pinion_shared::calls::Progress;
 use pinion_sim::{SimBoard, SimConfig};
 
 use super::super::core_thread::REQUESTS;
 use super::super::ledger::Ledger;
 use super::super::notify::Notify;
-use super::super::outlet::{LinkWake, Outlet, Progress, outlet};
+use super::super::outlet::{LinkWake, Outlet, outlet};
 use super::super::pty::{Access, Pty};
 use super::super::pulse::Pulse;
 use super::super::recorder::Recording;

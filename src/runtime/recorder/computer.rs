@@ -12,9 +12,10 @@ use std::time::Duration;
 use nix::unistd::{Pid, SysconfVar, sysconf};
 
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
+use pinion_shared::ring::Ring;
 
 use crate::trace::event::{Event, PowerFault, Watched};
-use crate::trace::ring::{Ring, Writer};
+use crate::trace::ring::Writer;
 use crate::{foreign, throttled};
 
 /// Time between two looks while something happens. The verdict finds a standstill that is somewhat longer.
@@ -49,7 +50,7 @@ struct Account {
     thread: Watched,
     file: File,
     /// Where the thread writes what it does, and how many events it had at the last look.
-    ring: Ring,
+    ring: Ring<'static>,
     written: u64,
     before: Option<Times>,
 }
@@ -72,7 +73,7 @@ impl Computer {
     }
 
     /// Reads the kernel's account of this thread, too. It writes what it does into this ring.
-    pub(super) fn watch(&mut self, thread: Watched, tid: Pid, ring: Ring) {
+    pub(super) fn watch(&mut self, thread: Watched, tid: Pid, ring: Ring<'static>) {
         // The file stays open: opening it takes longer than reading it. A kernel without the account has no file.
         if let Ok(file) = File::open(self.root.join(format!("proc/self/task/{tid}/schedstat"))) {
             self.accounts.push(Account { thread, file, ring, written: 0, before: None });
@@ -116,7 +117,7 @@ impl Computer {
     fn look_at_threads(&mut self, at: Clock, all: bool) -> bool {
         let mut has_news = false;
         for Account { thread, file, ring, written, before } in &mut self.accounts {
-            let old = std::mem::replace(written, ring.written());
+            let old = std::mem::replace(written, ring.next());
             let is_new = *written != old;
             has_news |= is_new;
             // A link without events did nothing. A core without events may hang.
@@ -202,8 +203,8 @@ mod tests {
         fs::write(path, text).unwrap();
     }
 
-    fn events(ring: Ring) -> Vec<Event> {
-        ring.events().into_iter().filter_map(Event::decode).map(|(_, event)| event).collect()
+    fn events(ring: Ring<'static>) -> Vec<Event> {
+        ring.newest().into_iter().filter_map(Event::decode).map(|(_, event)| event).collect()
     }
 
     #[test]
@@ -212,7 +213,7 @@ mod tests {
         let root = folder.path();
         let ring = ring(256);
         put(root, PI_THROTTLED, "0\n");
-        let mut computer = Computer::new(root.into(), ring.writer("sampler").unwrap());
+        let mut computer = Computer::new(root.into(), Writer::new(ring, "sampler").unwrap());
         put(root, "/proc/self/task/7/schedstat", "");
         computer.watch(Watched::Core, Pid::from_raw(7), crate::trace::ring::ring(8));
         let mut seen = 0;
@@ -256,12 +257,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let root = folder.path();
         let (ring, core, link) = (ring(256), crate::trace::ring::ring(8), crate::trace::ring::ring(8));
-        let mut computer = Computer::new(root.into(), ring.writer("sampler").unwrap());
+        let mut computer = Computer::new(root.into(), Writer::new(ring, "sampler").unwrap());
         for (thread, tid, of) in [(Watched::Core, 7, core), (Watched::Link, 8, link)] {
             put(root, &format!("/proc/self/task/{tid}/schedstat"), "1000000 5000 12\n");
             computer.watch(thread, Pid::from_raw(tid), of);
         }
-        let (mut core, mut link) = (core.writer("core").unwrap(), link.writer("link").unwrap());
+        let (mut core, mut link) = (Writer::new(core, "core").unwrap(), Writer::new(link, "link").unwrap());
         let mut look = |all| {
             let before = events(ring).len();
             let again = computer.look(Clock::EPOCH, all);
@@ -291,7 +292,7 @@ mod tests {
     #[test]
     fn this_computer_tells_how_long_a_thread_ran() {
         let ring = ring(256);
-        let mut computer = Computer::new("/".into(), ring.writer("sampler").unwrap());
+        let mut computer = Computer::new("/".into(), Writer::new(ring, "sampler").unwrap());
         computer.watch(Watched::Core, nix::unistd::gettid(), crate::trace::ring::ring(8));
         computer.look(Clock::EPOCH, false);
         let until = std::time::Instant::now() + std::time::Duration::from_millis(20);

@@ -205,7 +205,7 @@ mod tests {
         assert!(bench.level(3));
         line.set_direction(Direction::Input(Bias::None)).unwrap();
         line.turn(direction).unwrap();
-        let events = recording.memory.rings().next().unwrap().events();
+        let events = recording.memory.rings().next().unwrap().newest();
         let levels: Vec<bool> = events
             .into_iter()
             .map(|words| match Event::decode(words) {

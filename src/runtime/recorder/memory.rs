@@ -5,17 +5,20 @@
 #![forbid(unsafe_code)]
 
 use std::io;
+use std::iter;
 use std::sync::atomic::{AtomicU64, Ordering};
 
 use log::debug;
 
 use pinion_linux::sys;
+use pinion_shared::ring::{self, Ring};
+use pinion_shared::together::{self, Together};
 
 use crate::trace::event::Watched;
 use crate::trace::file::Names;
-use crate::trace::ring::{Ring, Writer};
+use crate::trace::ring::Writer;
 
-/// Numbers of events of the rings. The lasting ones hold the last ten seconds (`Ring::lasting_writer`).
+/// Numbers of events of the rings. The lasting ones hold the last ten seconds (`Writer::lasting`).
 const SIZES: [usize; RINGS] = {
     let mut sizes = [1 << 14; RINGS];
     sizes[CORE_RECENT] = 1 << 16;
@@ -41,17 +44,18 @@ const RINGS: usize = WORKERS + WORKERS_MAX;
 
 /// Bytes for the names.
 const NAMES_BYTES: usize = 1 << 16;
-/// Words before the rings: the length of the names and where they are, and two places. New names go into the place that
-/// the present ones do not use. So a program that is killed meanwhile leaves the present ones.
-const NAMES_WORDS: usize = 1 + 2 * (NAMES_BYTES / 8);
+/// Words of the names: their length in bytes, and the bytes.
+const NAMES_WORDS: usize = 1 + NAMES_BYTES / 8;
+/// Words before the rings. A program that is killed while it stores new names leaves the present ones.
+const HEAD_WORDS: usize = together::words(NAMES_WORDS);
 /// Words of a page. A store to one of them makes the kernel provide the page.
 const PAGE_WORDS: usize = 4096 / 8;
 
 /// The first word of a ring.
 const fn start(ring: usize) -> usize {
-    let (mut at, mut before) = (NAMES_WORDS, 0);
+    let (mut at, mut before) = (HEAD_WORDS, 0);
     while before < ring {
-        at += Ring::words(SIZES[before]);
+        at += ring::words(SIZES[before]);
         before += 1;
     }
     at
@@ -79,12 +83,12 @@ impl Memory {
         size_of_val(self.0)
     }
 
-    fn ring(self, ring: usize) -> Ring {
+    fn ring(self, ring: usize) -> Ring<'static> {
         Ring::new(&self.0[start(ring)..start(ring + 1)])
     }
 
     /// The ring with the important events of a thread.
-    pub(super) fn thread(self, thread: Watched) -> Ring {
+    pub(super) fn thread(self, thread: Watched) -> Ring<'static> {
         self.ring(match thread {
             Watched::Core => CORE,
             Watched::Link => LINK,
@@ -93,24 +97,24 @@ impl Memory {
 
     /// The core's writers: of all its events, and of the important ones.
     pub(super) fn core(self) -> Option<(Writer, Writer)> {
-        Some((self.ring(CORE_RECENT).writer("core")?, self.ring(CORE).lasting_writer("core")?))
+        Some((Writer::new(self.ring(CORE_RECENT), "core")?, Writer::lasting(self.ring(CORE), "core")?))
     }
 
     pub(super) fn link(self) -> Option<Writer> {
-        self.ring(LINK).lasting_writer("link")
+        Writer::lasting(self.ring(LINK), "link")
     }
 
     pub(super) fn sampler(self) -> Option<Writer> {
-        self.ring(SAMPLER).lasting_writer("sampler")
+        Writer::lasting(self.ring(SAMPLER), "sampler")
     }
 
     pub(super) fn guardian(self) -> Option<Writer> {
-        self.ring(GUARDIAN).lasting_writer("guardian")
+        Writer::lasting(self.ring(GUARDIAN), "guardian")
     }
 
     /// The writer of changes of outputs. They need room only if they are asked for.
     pub(super) fn edges(self) -> Option<Writer> {
-        self.ring(EDGES).writer("edges")
+        Writer::new(self.ring(EDGES), "edges")
     }
 
     /// The writer of a worker. A bus gets its earlier ring again. `None`: all rings are in use, and this worker's
@@ -118,7 +122,7 @@ impl Memory {
     pub(super) fn worker(self, bus: &str) -> Option<Writer> {
         let rings = || (WORKERS..RINGS).map(|ring| self.ring(ring));
         let (own, unused) = (rings().filter(|ring| ring.name() == bus), rings().filter(|ring| ring.name().is_empty()));
-        let writer = own.chain(unused).chain(rings()).find_map(|ring| ring.lasting_writer(bus));
+        let writer = own.chain(unused).chain(rings()).find_map(|ring| Writer::lasting(ring, bus));
         if writer.is_none() {
             debug!("the errands of {bus} are not recorded: there is room for {WORKERS_MAX} buses");
         }
@@ -126,7 +130,7 @@ impl Memory {
     }
 
     /// All rings that somebody has written.
-    pub(super) fn rings(self) -> impl Iterator<Item = Ring> {
+    pub(super) fn rings(self) -> impl Iterator<Item = Ring<'static>> {
         (0..RINGS).map(move |ring| self.ring(ring)).filter(|ring| !ring.name().is_empty())
     }
 
@@ -134,23 +138,21 @@ impl Memory {
     pub(super) fn set_names(self, names: &Names) {
         let json = [serde_json::to_string(names), serde_json::to_string(&Names::default())];
         let Some(json) = json.into_iter().flatten().find(|json| json.len() <= NAMES_BYTES) else { return };
-        let place = 1 - self.0[0].load(Ordering::Relaxed) % 2;
         let mut bytes = json.bytes();
-        for word in &self.names_at(place)[..json.len().div_ceil(8)] {
-            word.store(u64::from_le_bytes(std::array::from_fn(|_| bytes.next().unwrap_or(0))), Ordering::Relaxed);
-        }
-        self.0[0].store((json.len() as u64) << 1 | place, Ordering::Release);
+        let words =
+            (0..json.len().div_ceil(8)).map(|_| u64::from_le_bytes(std::array::from_fn(|_| bytes.next().unwrap_or(0))));
+        self.kept_names().store(iter::once(json.len() as u64).chain(words));
     }
 
-    fn names_at(self, place: u64) -> &'static [AtomicU64] {
-        let words = NAMES_BYTES / 8;
-        &self.0[1 + place as usize * words..][..words]
+    fn kept_names(self) -> Together {
+        Together::new(&self.0[..HEAD_WORDS])
     }
 
     pub(super) fn names(self) -> Names {
-        let head = self.0[0].load(Ordering::Acquire);
-        let words = self.names_at(head % 2).iter().flat_map(|word| word.load(Ordering::Relaxed).to_le_bytes());
-        let json: Vec<u8> = words.take((head >> 1) as usize).collect();
+        let json: Vec<u8> = self.kept_names().load(|words| {
+            let length = words.next().unwrap_or(0) as usize;
+            words.flat_map(u64::to_le_bytes).take(length).collect()
+        });
         serde_json::from_slice(&json).unwrap_or_default()
     }
 }
@@ -174,9 +176,9 @@ mod tests {
         {
             writer.write(Clock::EPOCH, Event::Held);
         }
-        let names: Vec<String> = memory.rings().map(Ring::name).collect();
+        let names: Vec<String> = memory.rings().map(|ring| ring.name()).collect();
         assert_eq!(names, ["core", "core", "link", "sampler", "guardian", "edges"]);
-        assert!(memory.rings().all(|ring| ring.events().len() == 1));
+        assert!(memory.rings().all(|ring| ring.newest().len() == 1));
     }
 
     #[test]
@@ -189,7 +191,7 @@ mod tests {
         assert_eq!(memory.rings().count(), 2);
         drop((first, second));
         let again = memory.worker("spi0").unwrap();
-        assert_eq!(memory.rings().next().unwrap().events().len(), 1);
+        assert_eq!(memory.rings().next().unwrap().newest().len(), 1);
         let others: Vec<Writer> = (1..WORKERS_MAX).map(|bus| memory.worker(&format!("i2c{bus}")).unwrap()).collect();
         assert!(memory.worker("one more").is_none());
         drop((again, others));

@@ -34,11 +34,12 @@ use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::{Monotonic, monotonic, poll_timeout, wait_until};
 use pinion_protocol::format;
+use pinion_shared::ring::Ring;
 
 use crate::trace::event::{Event, Watched};
 use crate::trace::file::{End, Head, Names, Thread, Trace};
 use crate::trace::folder;
-use crate::trace::ring::{Ring, Writer};
+use crate::trace::ring::Writer;
 use crate::trace::verdict::verdict;
 use crate::{FIRMWARE, status};
 
@@ -120,9 +121,9 @@ impl Recording {
 
     /// What the recording says now.
     fn trace(&self, end: End, ended_at: Clock) -> Trace {
-        let thread = |ring: Ring| Thread {
+        let thread = |ring: Ring<'_>| Thread {
             name: ring.name(),
-            events: ring.events().into_iter().filter_map(Event::decode).collect(),
+            events: ring.newest().into_iter().filter_map(Event::decode).collect(),
         };
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let ago = Duration::from_nanos(self.clock.now().since(ended_at).max(0).unsigned_abs() * NS_PER_TICK);

@@ -1,0 +1,332 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Models for loom. Each one runs two threads in all orders, with all values that the orderings allow a load to return.
+//! Each one asserts what the users of a structure rely on (docs/develop/sanitizers.md).
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering::Relaxed as Std};
+
+use crate::atomic::{AtomicU32, AtomicU64, Ordering};
+use crate::calls::{Doze, Progress};
+use crate::life::{Heart, Slot};
+use crate::ring::{self, Found, Ring};
+use crate::together::Together;
+
+/// Runs a model, and prints in how many orders. `one` and `other` share what `start` makes, and `check` sees what both
+/// return.
+///
+/// Loom tries other orders only for the latest access to a word. If a thread loads a word and then stores to it, loom
+/// forgets that another thread may have loaded the word before. So each side is the first one once.
+fn model<S: Send + Sync + 'static, A: Send + 'static, B: Send + 'static>(
+    name: &str,
+    start: impl Fn() -> S + Copy + Send + Sync + 'static,
+    one: impl Fn(&S) -> A + Copy + Send + Sync + 'static,
+    other: impl Fn(&S) -> B + Copy + Send + Sync + 'static,
+    check: impl Fn(&S, A, B) + Copy + Send + Sync + 'static,
+) {
+    let orders = Arc::new(AtomicUsize::new(0));
+    for is_swapped in [false, true] {
+        let orders = orders.clone();
+        loom::model(move || {
+            orders.fetch_add(1, Std);
+            let shared = Arc::new(start());
+            let theirs = shared.clone();
+            if is_swapped {
+                let one = loom::thread::spawn(move || one(&theirs));
+                let other = other(&shared);
+                check(&shared, one.join().unwrap(), other);
+            } else {
+                let other = loom::thread::spawn(move || other(&theirs));
+                let one = one(&shared);
+                check(&shared, one, other.join().unwrap());
+            }
+        });
+    }
+    println!("{name}: {} orders", orders.load(Std));
+}
+
+fn words<const N: usize>() -> [AtomicU32; N] {
+    std::array::from_fn(|_| AtomicU32::new(0))
+}
+
+/// The words of a ring with the records 0 to `records` less one.
+fn ring(capacity: usize, records: u64) -> Box<[AtomicU64]> {
+    let words: Box<[AtomicU64]> = (0..ring::words(capacity)).map(|_| AtomicU64::new(0)).collect();
+    (0..records).for_each(|number| Ring::new(&words).push([number; 2]));
+    words
+}
+
+#[test]
+fn a_reader_beside_a_writer_sees_whole_records_in_order_and_misses_only_overwritten_ones() {
+    for (capacity, pushes) in [(2, 2), (4, 1)] {
+        model(
+            "ring: newest",
+            move || ring(capacity as usize, capacity),
+            move |words| (0..pushes).for_each(|number| Ring::new(words).push([capacity + number; 2])),
+            |words| Ring::new(words).newest(),
+            move |_, (), newest| {
+                assert!(newest.iter().all(|[one, other]| one == other), "torn: {newest:?}");
+                assert!(newest.windows(2).all(|two| two[0][0] + 1 == two[1][0]), "out of order: {newest:?}");
+                for number in (pushes + 1)..capacity {
+                    assert!(newest.contains(&[number; 2]), "{number} is missing: {newest:?}");
+                }
+            },
+        );
+    }
+}
+
+#[test]
+fn a_record_is_itself_or_overwritten() {
+    model(
+        "ring: get",
+        || ring(2, 1),
+        |words| (1..4).for_each(|number| Ring::new(words).push([number; 2])),
+        |words| {
+            let ring = Ring::new(words);
+            (ring.next(), ring.get(1), ring.next())
+        },
+        |_, (), (before, found, after)| match found {
+            Found::Record(record) => assert_eq!(record, [1; 2]),
+            Found::NotYet => assert!(before < 2),
+            Found::Overwritten => assert!(after > 2),
+        },
+    );
+}
+
+#[test]
+fn a_writer_goes_on_after_the_last_one() {
+    let write = |words: &[AtomicU64], name: &str| {
+        let ring = Ring::new(words);
+        let pen = ring.pen(name).map(|mut pen| {
+            pen.push([7; 2]);
+            assert_eq!(ring.name(), name);
+        });
+        pen.map_or(0, |()| 1)
+    };
+    model(
+        "ring: two writers in turn",
+        || ring(4, 0),
+        move |words| write(words, "one"),
+        move |words| write(words, "two"),
+        |words, one, two| {
+            assert!(one + two > 0, "each found the other");
+            assert_eq!(Ring::new(words).newest().len(), one + two, "one has overwritten the other");
+        },
+    );
+}
+
+#[test]
+fn a_first_name_is_whole() {
+    const NAME: &str = "iio:device12";
+    model(
+        "ring: name",
+        || ring(1, 0),
+        |words| drop(Ring::new(words).pen(NAME).unwrap()),
+        |words| Ring::new(words).name(),
+        |_, (), name| assert!(name.is_empty() || name == NAME, "{name}"),
+    );
+}
+
+#[test]
+fn words_are_together() {
+    model(
+        "together",
+        || Together::of(&[0; 2]),
+        |words| (1..=2).for_each(|word| words.store([word; 2])),
+        |words| words.load(|words| words.collect::<Vec<_>>()),
+        |_, (), words| assert_eq!(words[0], words[1], "torn"),
+    );
+}
+
+/// Words are not older than a message about them.
+#[test]
+fn words_are_as_new_as_the_message_about_them() {
+    model(
+        "together: a message",
+        || (Together::of(&[0; 2]), words::<1>()),
+        |(words, told)| {
+            words.store([1; 2]);
+            told[0].store(1, Ordering::Release);
+        },
+        |(words, told)| (told[0].load(Ordering::Acquire), words.load(|words| words.collect::<Vec<_>>())),
+        |_, (), (told, words)| assert!(told == 0 || words == [1; 2], "{words:?}"),
+    );
+}
+
+const IDLE: u32 = 30_000;
+const RUNNING: u32 = 550;
+
+#[test]
+fn a_beat_is_as_new_as_its_limit() {
+    let start = || {
+        let words = words::<4>();
+        Heart::new(&words).beat(1, IDLE);
+        words
+    };
+    model(
+        "heart: beats",
+        start,
+        |words| (2..=3).for_each(|at| Heart::new(words).beat(at, RUNNING)),
+        |words| Heart::new(words).listen(),
+        |_, (), heard| assert!(heard.silence_max_ms == Some(IDLE) || heard.beat_at >= 2, "{heard:?}"),
+    );
+}
+
+#[test]
+fn a_debt_has_its_subject_and_begins_and_ends_with_a_sign_of_life() {
+    let start = || {
+        let words = words::<5>();
+        Heart::new(&words).beat(1, RUNNING);
+        words
+    };
+    model(
+        "heart: a debt begins",
+        start,
+        |words| {
+            Heart::new(words).owe("pwmchip0", 5);
+            // The core goes on, and this does not count.
+            Heart::new(words).beat(6, RUNNING);
+        },
+        |words| (Heart::new(words).listen(), Heart::new(words).subject().get()),
+        |_, (), (heard, subject)| {
+            assert!(
+                heard.silence_max_ms.is_some() || (heard.beat_at == 5 && subject == "pwmchip0"),
+                "{heard:?} {subject}"
+            );
+        },
+    );
+    model(
+        "heart: a debt ends",
+        move || {
+            let words = start();
+            Heart::new(&words).owe("pwmchip0", 5);
+            words
+        },
+        |words| Heart::new(words).paid(9),
+        |words| Heart::new(words).listen(),
+        |_, (), heard| assert!(heard.silence_max_ms.is_none() || heard.beat_at == 9, "{heard:?}"),
+    );
+}
+
+#[test]
+fn a_worker_is_not_blamed_for_the_job_of_the_one_before() {
+    let start = || {
+        let words = words::<3>();
+        Slot::new(&words).name().set("old");
+        Slot::new(&words).begin(1);
+        words
+    };
+    // A third thread, the old worker, frees the slot.
+    let replace = |words: &[AtomicU32; 3]| {
+        if !Slot::new(words).name().is_set() {
+            Slot::new(words).name().set("new one");
+        }
+    };
+    let check = |name: String, busy: Option<u32>| {
+        assert!(!name.starts_with("new ") || (name == "new one" && busy.is_none()), "{name} {busy:?}");
+    };
+    model(
+        "slot: a worker ends, another begins",
+        start,
+        |words| Slot::new(words).free(),
+        replace,
+        move |words, (), ()| check(Slot::new(words).name().get(), Slot::new(words).busy_since()),
+    );
+    model(
+        "slot: a look at it",
+        start,
+        move |words| {
+            Slot::new(words).free();
+            replace(words);
+        },
+        |words| (Slot::new(words).name().get(), Slot::new(words).busy_since()),
+        move |_, (), (name, busy)| check(name, busy),
+    );
+}
+
+/// The link sleeps and wakes up, while the core puts something where it looks.
+#[test]
+fn no_wake_up_is_lost() {
+    let put = |(doze, put, event): &(Doze, [AtomicU32; 1], [AtomicU32; 1])| {
+        for number in 1..=2 {
+            put[0].store(number, Ordering::Release);
+            if doze.is_to_be_woken() {
+                event[0].fetch_add(1, Ordering::AcqRel);
+            }
+        }
+    };
+    model(
+        "doze",
+        || (Doze::default(), words::<1>(), words::<1>()),
+        put,
+        |(doze, put, event)| {
+            // It goes to sleep, as it has nothing to do. It wakes up for a call, or because it wants to.
+            doze.begin();
+            put[0].load(Ordering::Acquire);
+            let is_called = event[0].load(Ordering::Acquire) != 0;
+            doze.end();
+            if is_called {
+                event[0].swap(0, Ordering::AcqRel);
+            }
+            // This time it wakes up only for a call.
+            doze.begin();
+            put[0].load(Ordering::Acquire) == 2
+        },
+        |(_, _, event), (), has_seen_all| {
+            assert!(has_seen_all || event[0].load(Ordering::Acquire) != 0, "it sleeps, and something is there");
+        },
+    );
+}
+
+#[test]
+fn a_block_that_a_freed_core_does_not_see_wakes_it() {
+    let start = || {
+        let progress = Progress::default();
+        progress.hold(true);
+        (progress, words::<1>())
+    };
+    model(
+        "hold",
+        start,
+        |(progress, blocks)| {
+            progress.hold(false);
+            blocks[0].load(Ordering::Acquire) == 1
+        },
+        |(progress, blocks)| {
+            blocks[0].store(1, Ordering::Release);
+            !progress.is_held()
+        },
+        |_, sees_it, is_woken| assert!(sees_it || is_woken, "the core sleeps, and a block is there"),
+    );
+}
+
+#[test]
+fn a_finished_block_has_its_responses() {
+    model(
+        "done",
+        || (Progress::default(), words::<1>()),
+        |(progress, responses)| {
+            for _ in 0..2 {
+                responses[0].store(progress.begin(), Ordering::Release);
+                progress.finish();
+            }
+        },
+        |(progress, responses)| (progress.done(), responses[0].load(Ordering::Acquire)),
+        |_, (), (done, responses)| assert!(responses >= done, "an acknowledgement is ahead of its response"),
+    );
+}
+
+#[test]
+fn a_stop_request_in_the_ring_is_counted() {
+    model(
+        "stops",
+        || (Progress::default(), words::<1>()),
+        |(progress, requests)| {
+            for request in 1..=2 {
+                progress.stop_handed();
+                requests[0].store(request, Ordering::Release);
+            }
+        },
+        |(progress, requests)| (requests[0].load(Ordering::Acquire), progress.stops_handed()),
+        |_, (), (taken, handed)| assert!(handed >= taken, "the core has taken more than it was handed"),
+    );
+}
