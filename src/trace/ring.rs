@@ -42,7 +42,9 @@ impl Writer {
         // Each window may have one more event, which tells how many were left out.
         let each = (ring.capacity() / WINDOWS).saturating_sub(1).max(1);
         let quota = Quota { each: each as u32, until: Clock::from_bits(0), left: 0, omitted: 0 };
-        Some(Writer { quota: Some(quota), ..Writer::new(ring, name)? })
+        let mut writer = Writer::new(ring, name)?;
+        writer.quota = Some(quota);
+        Some(writer)
     }
 
     /// Writes an event. It does not allocate, lock or call the kernel.

@@ -133,7 +133,9 @@ pub fn allow_only_reading() -> io::Result<()> {
     let mut filter = program(architecture);
     let program = sock_fprog { len: filter.len() as u16, filter: filter.as_mut_ptr() };
     // SAFETY: the kernel reads the program, which lives through the call, and copies it.
-    match unsafe { libc::prctl(libc::PR_SET_SECCOMP, libc::SECCOMP_MODE_FILTER, &program) } {
+    match unsafe {
+        libc::prctl(libc::PR_SET_SECCOMP, libc::c_ulong::from(libc::SECCOMP_MODE_FILTER), &raw const program)
+    } {
         0 => Ok(()),
         _ => Err(io::Error::last_os_error()),
     }

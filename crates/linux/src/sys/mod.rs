@@ -5,7 +5,7 @@ use std::ffi::c_void;
 use std::fs;
 use std::io::{self, IoSliceMut};
 use std::num::NonZeroUsize;
-use std::os::fd::{AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd, FromRawFd, OwnedFd, RawFd};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::ptr::NonNull;
 use std::slice;
@@ -62,8 +62,8 @@ pub const SERVE: u32 = 1 << 14 | 1 << 23 | 1 << 0 | 1 << 1 | 1 << 3;
 /// Drops all capabilities except these. `capabilities` has a bit for each of the first 32. The calling thread loses the
 /// others, and so do the threads that it starts from now on. Programs that it may become lose them as far as permitted.
 pub fn keep_only(capabilities: u32) -> io::Result<()> {
-    /// _LINUX_CAPABILITY_VERSION_3, for the calling thread (capset(2)).
-    const HEADER: [u32; 2] = [0x2008_0522, 0];
+    // _LINUX_CAPABILITY_VERSION_3, for the calling thread (capset(2)).
+    let mut header = [0x2008_0522u32, 0];
     let dropped = (0..).filter(|number| *number >= u32::BITS || capabilities >> number & 1 == 0);
     for number in dropped {
         // SAFETY: takes a number. The loop ends after the last capability, or if CAP_SETPCAP is missing.
@@ -71,19 +71,21 @@ pub fn keep_only(capabilities: u32) -> io::Result<()> {
             break;
         }
     }
-    // Linux before 4.3 has no ambient capabilities.
+    // Linux before 4.3 has no ambient capabilities. The kernel compares all bits of these numbers with 0.
+    let [all, none] = [libc::PR_CAP_AMBIENT_CLEAR_ALL as libc::c_ulong, 0];
     // SAFETY: takes numbers.
-    unsafe { libc::prctl(libc::PR_CAP_AMBIENT, libc::PR_CAP_AMBIENT_CLEAR_ALL as libc::c_ulong, 0, 0, 0) };
+    unsafe { libc::prctl(libc::PR_CAP_AMBIENT, all, none, none, none) };
     // Effective, permitted and inheritable of the first 32 capabilities, then of the rest.
     let mut sets = [0u32; 6];
-    // SAFETY: with this version the kernel writes two structures of three words.
-    if unsafe { libc::syscall(libc::SYS_capget, HEADER.as_ptr(), sets.as_mut_ptr()) } != 0 {
+    // SAFETY: with this version the kernel writes two structures of three words. If it does not know the version, it
+    // writes its own version into the header and fails.
+    if unsafe { libc::syscall(libc::SYS_capget, header.as_mut_ptr(), sets.as_mut_ptr()) } != 0 {
         return Err(io::Error::last_os_error());
     }
     sets[..3].iter_mut().for_each(|set| *set &= capabilities);
     sets[3..].fill(0);
-    // SAFETY: the kernel reads the same two structures.
-    match unsafe { libc::syscall(libc::SYS_capset, HEADER.as_ptr(), sets.as_ptr()) } {
+    // SAFETY: the kernel reads the same two structures. It may write into the header as above.
+    match unsafe { libc::syscall(libc::SYS_capset, header.as_mut_ptr(), sets.as_ptr()) } {
         0 => Ok(()),
         _ => Err(io::Error::last_os_error()),
     }
@@ -103,8 +105,9 @@ pub fn shared_words() -> io::Result<&'static [AtomicU32; SHARED_WORDS]> {
 /// This many words of zeros that this process shares with the processes that it forks. They are never given back. The
 /// kernel provides a page when it is first touched.
 pub fn shared_memory(words: usize) -> io::Result<&'static [AtomicU64]> {
-    let start = shared(words * size_of::<AtomicU64>())?;
-    // SAFETY: as above.
+    let start = shared(words.checked_mul(size_of::<AtomicU64>()).ok_or(io::ErrorKind::OutOfMemory)?)?;
+    // SAFETY: the mapping has this many words, and is aligned to a page, zeroed and never unmapped. Other processes
+    // change it through atomics only.
     Ok(unsafe { slice::from_raw_parts(start.cast::<AtomicU64>().as_ptr(), words) })
 }
 
@@ -364,7 +367,7 @@ fn line_request_config(flags: u64) -> LineRequestConfig {
 
 /// Requests one line of an open GPIO chip with `GPIO_V2_LINE_FLAG_` flags. If the flags ask for edges, the file reads
 /// as the line's edges. A read without any does not wait. The kernel keeps `events` edges.
-pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, events: u32, consumer: &str) -> io::Result<fs::File> {
+pub fn request_line(chip: impl AsFd, offset: u32, flags: u64, events: u32, consumer: &str) -> io::Result<fs::File> {
     let mut request = LineRequest {
         offsets: [0; 64],
         consumer: [0; 32],
@@ -378,7 +381,7 @@ pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, events: u32, c
     // The last byte stays 0.
     request.consumer.iter_mut().zip(consumer.bytes().take(31)).for_each(|(to, from)| *to = from);
     // SAFETY: the request takes a `struct gpio_v2_line_request`, which lives through the call.
-    unsafe { request::gpio_v2_get_line(chip.as_raw_fd(), &mut request) }?;
+    unsafe { request::gpio_v2_get_line(chip.as_fd().as_raw_fd(), &mut request) }?;
     // SAFETY: the kernel has just made this descriptor for us.
     let line = unsafe { OwnedFd::from_raw_fd(request.fd) };
     fcntl(&line, FcntlArg::F_SETFL(OFlag::O_NONBLOCK))?;
@@ -386,18 +389,18 @@ pub fn request_line(chip: &impl AsRawFd, offset: u32, flags: u64, events: u32, c
 }
 
 /// Changes the flags of a line of [`request_line`].
-pub fn set_line_flags(line: &impl AsRawFd, flags: u64) -> io::Result<()> {
+pub fn set_line_flags(line: impl AsFd, flags: u64) -> io::Result<()> {
     let mut config = line_request_config(flags);
     // SAFETY: the request takes a `struct gpio_v2_line_config`, which lives through the call.
-    unsafe { request::gpio_v2_line_set_config(line.as_raw_fd(), &mut config) }?;
+    unsafe { request::gpio_v2_line_set_config(line.as_fd().as_raw_fd(), &mut config) }?;
     Ok(())
 }
 
 /// The level of a line of [`request_line`].
-pub fn line_level(line: &impl AsRawFd) -> io::Result<bool> {
+pub fn line_level(line: impl AsFd) -> io::Result<bool> {
     let mut values = LineRequestValues { bits: 0, mask: 1 };
     // SAFETY: the request takes a `struct gpio_v2_line_values`, which lives through the call.
-    unsafe { request::gpio_v2_line_get_values(line.as_raw_fd(), &mut values) }?;
+    unsafe { request::gpio_v2_line_get_values(line.as_fd().as_raw_fd(), &mut values) }?;
     Ok(values.bits & 1 != 0)
 }
 
@@ -433,6 +436,15 @@ pub fn pty_slave(master: BorrowedFd<'_>) -> io::Result<OwnedFd> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn more_shared_memory_than_there_is_is_refused() {
+        // So many words that their number of bytes wraps around to eight.
+        let too_many = usize::MAX / size_of::<AtomicU64>() + 2;
+        assert_eq!(shared_memory(too_many).unwrap_err().kind(), io::ErrorKind::OutOfMemory);
+        assert!(shared_memory(0).is_err());
+        assert_eq!(shared_memory(1000).unwrap().len(), 1000);
+    }
 
     #[test]
     fn line_values_are_laid_out_as_the_kernel_has_them() {
