@@ -478,7 +478,8 @@ fn pwm_section(chip: &PwmEntry) -> Page {
 
 fn spi_section(devices: &[SpiDevice]) -> Page {
     let row = |SpiDevice { device, spi_bus }: &SpiDevice| {
-        vec![device.clone(), format!("spi_bus: {spi_bus}, or for LEDs pin: {spi_bus}")]
+        let use_ = format!("spi_bus: {spi_bus}, for LEDs pin: {spi_bus}, for an HX711 dout_pin: {spi_bus}/miso");
+        vec![device.clone(), use_]
     };
     section("SPI", &["device", "in printer.cfg"], &devices.iter().map(row).collect::<Vec<_>>())
 }
@@ -620,7 +621,7 @@ pwmchip0 fe20c000.pwm
 
 SPI
   device          in printer.cfg
-  /dev/spidev0.1  spi_bus: spidev0.1, or for LEDs pin: spidev0.1
+  /dev/spidev0.1  spi_bus: spidev0.1, for LEDs pin: spidev0.1, for an HX711 dout_pin: spidev0.1/miso
 
 I2C
   device      adapter               used by the kernel       in printer.cfg

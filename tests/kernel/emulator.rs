@@ -25,9 +25,12 @@ pub struct Emulator {
 }
 
 impl Emulator {
-    /// Runs the command. The output of the command and of the VM goes to files of the folder.
+    /// Runs the command. The output of the command and of the VM goes to files of the folder. The VM's first serial port
+    /// is its console. Nothing is connected to the second.
     pub fn start(mut vm: Command, folder: &Path) -> Result<Emulator, String> {
-        vm.arg("-serial").arg(format!("file:{}", folder.join("console").display())).args(["-qmp", "stdio"]);
+        vm.arg("-serial")
+            .arg(format!("file:{}", folder.join("console").display()))
+            .args(["-serial", "null", "-qmp", "stdio"]);
         let (qemu, input, output) = process::start_emulator(&mut vm, folder)?;
         let mut emulator = Emulator { qemu, input, output: BufReader::new(output), folder: folder.to_owned() };
         emulator.ask(json!({"execute": "qmp_capabilities"}))?;

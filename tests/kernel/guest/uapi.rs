@@ -99,6 +99,19 @@ pub fn debounced_input(chip: &Path, offset: u32, period_us: u64) -> File {
     }
 }
 
+nix::ioctl_write_ptr_bad!(tiocmbis, libc::TIOCMBIS, libc::c_int);
+nix::ioctl_write_ptr_bad!(tiocmbic, libc::TIOCMBIC, libc::c_int);
+
+/// TIOCM_LOOP of asm-generic/termios.h: a serial port receives what it sends.
+const TIOCM_LOOP: libc::c_int = 0x8000;
+
+/// Makes a serial port receive what it sends, or ends that.
+pub fn loop_back(port: &File, on: bool) {
+    let change = if on { tiocmbis } else { tiocmbic };
+    // SAFETY: this ioctl reads an int.
+    unsafe { change(port.as_raw_fd(), &TIOCM_LOOP) }.expect("a serial port that can loop");
+}
+
 /// GPIOHANDLE_SET_CONFIG_IOCTL, which Linux has had since 5.5.
 pub const GPIOHANDLE_SET_CONFIG: u32 = 0xc054_b40a;
 
