@@ -8,4 +8,4 @@ apt-get -qq update
 apt-get install -y /share/pinion-mcu.deb
 is "$(systemctl is-enabled pinion-mcu || true)" disabled
 is "$(systemctl is-active pinion-mcu || true)" inactive
-is "$(id -nG pinion | tr ' ' '\n' | sort | xargs)" "gpio i2c pinion spi tty"
+is "$(id -nG pinion | tr ' ' '\n' | sort | xargs)" "dialout gpio i2c pinion spi tty"
