@@ -179,7 +179,7 @@ install-system:
 ifeq ($(DESTDIR),)
 	systemd-sysusers $(SYSUSERSDIR)/pinion-mcu.conf
 	-systemctl daemon-reload
-	-udevadm control --reload && udevadm trigger --action=change --subsystem-match=gpio \
+	-udevadm control --reload && udevadm trigger --action=change --subsystem-match=gpio --subsystem-match='*gpiomem*' \
 	    --subsystem-match=spidev --subsystem-match=i2c-dev --subsystem-match=iio --subsystem-match=pwm \
 	    --subsystem-match=w1 && udevadm trigger --action=change --sysname-match='watchdog*'
 	@echo 'Installed. Start it, now and at every boot: systemctl enable --now pinion-mcu'

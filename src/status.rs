@@ -139,6 +139,9 @@ pub(crate) struct Line {
     pub(crate) use_: Use,
     /// 0 or 1, as last driven or sampled; `None` before the first sample.
     pub(crate) level: Option<u8>,
+    /// Whether it is written and read through the chip's registers.
+    #[serde(default)]
+    pub(crate) fast: bool,
     /// Transfers of its chip, if it is a line of an expander.
     pub(crate) bus: Option<BusCounts>,
 }

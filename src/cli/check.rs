@@ -18,6 +18,7 @@ use crate::runtime::{self, CLOSED, Place, TerminalGroup};
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::Inventory;
 use pinion_linux::clock::Monotonic;
+use pinion_linux::gpio::{Chip, FastGpio};
 
 use super::finding::{self, Finding, Group, Level};
 use super::quietly;
@@ -45,11 +46,12 @@ fn board(settings: &Settings) -> Vec<Finding> {
     let mut findings = Vec::new();
     if settings.board == BoardName::Linux {
         // The board would log these problems, and serve the rest.
-        let problems = Inventory::scan().problems;
+        let Inventory { problems, chips, .. } = Inventory::scan();
         findings.extend(problems.into_iter().map(|problem| Finding::of("devices", Level::Error, problem)));
+        findings.extend(fast_gpio(settings.fast_gpio, &chips));
     }
     // Its problems are among the findings already.
-    let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None));
+    let board = quietly(|| settings.board.open(Arc::new(Monotonic::start()), None, FastGpio::Off));
     let board = match board {
         Ok((board, _)) => board,
         Err(error) => {
@@ -67,6 +69,22 @@ fn board(settings: &Settings) -> Vec<Finding> {
         Err(error) => Finding::error("dialect", format!("dialect {name}: {error}"), "choose another"),
     });
     findings
+}
+
+/// Whether the chips that never sleep have registers for fast lines. With `auto` only those that have some are told.
+fn fast_gpio(wish: FastGpio, chips: &[Chip]) -> Vec<Finding> {
+    let native = chips.iter().filter(|chip| !chip.sleeps);
+    let found = native.filter_map(|chip| match (wish, chip.registers(wish)) {
+        (FastGpio::Off, _) | (FastGpio::Auto, Err(_)) => None,
+        (_, Ok(registers)) => {
+            let node = registers.node();
+            Some(Finding::ok("fast_gpio", format!("gpiochip{}: fast lines, through {node}", chip.number)))
+        }
+        (_, Err(why)) => {
+            Some(Finding::of("fast_gpio", Level::Warning, why.of(format_args!("gpiochip{}", chip.number))))
+        }
+    });
+    found.collect()
 }
 
 /// Whether the link can be put in place.

@@ -10,6 +10,8 @@ use std::str::FromStr;
 use clap::builder::{PossibleValue, TypedValueParser};
 use clap::{Arg, Command};
 
+use pinion_linux::gpio::FastGpio;
+
 /// Names of boards.
 pub(super) const BOARDS: &[&str] = &["linux", "sim"];
 /// The board that `pinion console` takes.
@@ -18,6 +20,8 @@ pub(super) const SIMULATED: &[&str] = &["sim"];
 pub(super) const DIALECTS: &[&str] = &["v0.11", "v0.12", "v0.13", "master", "kalico", "union"];
 /// The same, with the one that is found from the host.
 pub(super) const SPOKEN: &[&str] = &["auto", "v0.11", "v0.12", "v0.13", "master", "kalico", "union"];
+/// Ways to write GPIO lines.
+pub(super) const FAST: &[&str] = &FastGpio::WORDS;
 /// The levels of the log.
 pub(super) const LEVELS: &[&str] = &["error", "warn", "info", "debug", "trace", "off"];
 
@@ -64,6 +68,7 @@ mod tests {
         offered.sort_unstable();
         assert_eq!(offered, dialects);
         assert_eq!(&SPOKEN[1..], DIALECTS);
+        assert!(FAST.iter().all(|name| name.parse::<FastGpio>().is_ok()));
         assert!(LEVELS.iter().all(|name| name.parse::<log::LevelFilter>().is_ok()));
         assert_eq!(LEVELS.len(), log::LevelFilter::iter().count());
     }

@@ -55,7 +55,7 @@ fn key_at(text: &str, mistake: Option<Range<usize>>) -> Option<&'static Key> {
 }
 
 /// Every option of `pinion run`, in the order of its `--help`.
-const KEYS: [Key; 12] = [
+const KEYS: [Key; 13] = [
     Key {
         name: "symlink",
         example: "\"/tmp/klipper_host_mcu\"",
@@ -80,6 +80,7 @@ const KEYS: [Key; 12] = [
     Key { name: "group", example: "\"tty\"", set: |given, value| put(&mut given.group, text(value)?.to_owned()) },
     Key { name: "board", example: "\"linux\"", set: |given, value| put(&mut given.board, word(value)?) },
     Key { name: "dialect", example: "\"auto\"", set: |given, value| put(&mut given.dialect, word(value)?) },
+    Key { name: "fast_gpio", example: "\"auto\"", set: |given, value| put(&mut given.fast_gpio, word(value)?) },
     Key { name: "trace_edges", example: "true", set: |given, value| put(&mut given.trace_edges, flag(value)?) },
     Key {
         name: "socket",

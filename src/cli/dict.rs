@@ -13,6 +13,7 @@ use clap::Args;
 use crate::FIRMWARE;
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::clock::Monotonic;
+use pinion_linux::gpio::FastGpio;
 
 use super::complete::{BOARDS, DIALECTS, offering};
 use super::failed;
@@ -45,7 +46,7 @@ pub(super) fn run(args: &DictArgs) -> ExitCode {
 }
 
 fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
-    let (board, _) = args.board.open(Arc::new(Monotonic::start()), None).map_err(|trouble| trouble.to_string())?;
+    let (board, _) = args.board.open(Arc::new(Monotonic::start()), None, FastGpio::Off).map_err(|trouble| trouble.to_string())?;
     let dialect = Dialect::new(&FIRMWARE, &*board, args.dialect).map_err(|error| error.to_string())?;
     dialect.dictionary().json().map_err(|error| error.to_string())
 }

@@ -14,7 +14,7 @@ use serde::Serialize;
 
 use pinion_linux::Inventory;
 use pinion_linux::adc::IioDevice;
-use pinion_linux::gpio::Chip;
+use pinion_linux::gpio::{Chip, FastGpio};
 use pinion_linux::pins::{Names, channel_number, line_number, pwm_number};
 use pinion_linux::spi::Node;
 use pinion_linux::sysfs::{I2cBus, I2cChip, PwmChip, Sysfs};
@@ -41,7 +41,8 @@ pub(super) struct PinsArgs {
 pub(super) fn run(args: &PinsArgs) -> ExitCode {
     let inventory = Inventory::scan();
     let sysfs = Sysfs::scan(Path::new("/"));
-    let list = List::new(&inventory, &sysfs, args, &|device, id| reading(&inventory, device, id));
+    let fast = |chip: &Chip| chip.registers(FastGpio::Auto).ok().map(|registers| registers.node().to_owned());
+    let list = List::new(&inventory, &sysfs, args, &|device, id| reading(&inventory, device, id), &fast);
     let page = list.page();
     let is_nothing = !args.json && page.is_empty();
     for problem in &inventory.problems {
@@ -126,6 +127,8 @@ struct GpioChip {
     line_count: usize,
     /// An expander: its lines are not for steps or other timed edges.
     behind_bus: bool,
+    /// The node of the registers by which its lines are written and read, unless fast_gpio is off.
+    fast: Option<String>,
     lines: Vec<GpioLine>,
 }
 
@@ -232,11 +235,17 @@ struct SerialEntry {
 
 impl List {
     /// The wanted part of everything that was found. `reading` reads a channel (its driver's name) of a device (its
-    /// number).
-    fn new(inventory: &Inventory, sysfs: &Sysfs, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> Reading) -> List {
+    /// number). `fast` tells the node of a chip's registers.
+    fn new(
+        inventory: &Inventory,
+        sysfs: &Sysfs,
+        args: &PinsArgs,
+        reading: &dyn Fn(u32, &str) -> Reading,
+        fast: &dyn Fn(&Chip) -> Option<String>,
+    ) -> List {
         let names = Names::of(inventory);
         let mut list = List {
-            gpio: inventory.chips.iter().map(|chip| gpio(chip, sysfs, &names, args)).collect(),
+            gpio: inventory.chips.iter().map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, sysfs, &names, args) }).collect(),
             adc: vec![],
             pwm: vec![],
             spi: vec![],
@@ -324,7 +333,7 @@ fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip 
             lines.push(line);
         }
     }
-    GpioChip { chip: path, label: chip.label.clone(), line_count: chip.lines.len(), behind_bus: chip.sleeps, lines }
+    GpioChip { chip: path, label: chip.label.clone(), line_count: chip.lines.len(), behind_bus: chip.sleeps, fast: None, lines }
 }
 
 fn adc(device: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> Reading) -> AdcDevice {
@@ -441,8 +450,12 @@ fn gpio_section(chip: &GpioChip) -> Page {
         ]
     };
     let rows: Vec<Vec<String>> = chip.lines.iter().map(row).collect();
-    let behind = if chip.behind_bus { ", behind a bus: not for steps or other timed edges" } else { "" };
-    let heading = format!("{} {}, {} lines{behind}", chip.chip, chip.label, chip.line_count);
+    let way = match &chip.fast {
+        _ if chip.behind_bus => ", behind a bus: not for steps or other timed edges".to_owned(),
+        Some(node) => format!(", fast (registers, {node})"),
+        None => String::new(),
+    };
+    let heading = format!("{} {}, {} lines{way}", chip.chip, chip.label, chip.line_count);
     section(&heading, &["line", "name", "dir", "used by", "in printer.cfg"], &rows)
 }
 
@@ -587,7 +600,8 @@ mod tests {
     }
 
     fn of(inventory: &Inventory, args: &PinsArgs) -> List {
-        List::new(inventory, &sysfs(), args, &|_, _| Reading::Good { raw: 1200, counts: 150 })
+        let fast = |chip: &Chip| (chip.label == "pinctrl-bcm2835").then(|| "/dev/gpiomem".to_owned());
+        List::new(inventory, &sysfs(), args, &|_, _| Reading::Good { raw: 1200, counts: 150 }, &fast)
     }
 
     fn printed(args: &PinsArgs) -> String {
@@ -659,7 +673,7 @@ Serial ports
                 sysfs.thermometers = vec![name.to_owned()];
                 inventory.uarts[0].links = vec![name.to_owned()];
                 let error = || Reading::Failed { error: name.to_owned() };
-                let list = List::new(&inventory, &sysfs, &PinsArgs::default(), &|_, _| error());
+                let list = List::new(&inventory, &sysfs, &PinsArgs::default(), &|_, _| error(), &|_| None);
                 (list.page().to_string(), Page::json(&list.json()).to_string())
             };
             let (text, json) = page(&name);

@@ -15,6 +15,8 @@ use crate::runtime::{self, Guardian, Helpers, Options, Recording};
 use crate::trace::folder::folders;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::Monotonic;
+use pinion_linux::gpio::FastGpio;
+use pinion_linux::sys;
 
 use super::settings::{BoardName, Given, Settings, WATCHDOG};
 use super::{check, config, end_by_panic, failed, logging};
@@ -84,8 +86,10 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     // A simulated printer needs no guardian.
     let guarded = settings.board == BoardName::Linux;
     let recording = Recording::new(clock, &settings.symlink, settings.realtime, folders());
+    // /dev/mem is opened later, when a line of its chip is claimed.
+    let rights = sys::SERVE | if settings.fast_gpio == FastGpio::DevMem { sys::RAW_MEMORY } else { 0 };
     let helpers = recording
-        .and_then(|recording| Ok((Helpers::start(&recording, guarded, settings.dialect.is_none())?, recording)));
+        .and_then(|recording| Ok((Helpers::start(&recording, guarded, settings.dialect.is_none(), rights)?, recording)));
     let (helpers, recording) = match helpers {
         Ok(started) => started,
         Err(error) => return failed(error),
@@ -95,7 +99,7 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
         log::info!("configuration {}", file.display());
     }
     let guard = helpers.guardian.as_ref().map(Guardian::guard);
-    let (board, timing) = match settings.board.open(Arc::new(clock), guard) {
+    let (board, timing) = match settings.board.open(Arc::new(clock), guard, settings.fast_gpio) {
         Ok(opened) => opened,
         Err(error) => return failed(error),
     };

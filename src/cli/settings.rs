@@ -15,10 +15,11 @@ use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::{TimeSource, Timing};
 use pinion_firmware::trouble::Trouble;
+use pinion_linux::gpio::FastGpio;
 use pinion_linux::{Guard, LinuxBoard};
 use pinion_sim::{SimBoard, SimConfig};
 
-use super::complete::{BOARDS, SPOKEN, offering};
+use super::complete::{BOARDS, FAST, SPOKEN, offering};
 
 /// The device of the watchdog that -w feeds.
 pub(super) const WATCHDOG: &str = "/dev/watchdog";
@@ -60,6 +61,10 @@ pub(super) struct Given {
     /// union (what v0.13, master and kalico agree on) [default: auto]
     #[arg(long, value_name = "NAME", value_parser = offering::<Spoken>(SPOKEN), hide_possible_values = true)]
     pub(super) dialect: Option<Spoken>,
+    /// Write and read GPIO lines through the chip's registers: off, auto (where tests cover the chip), on, or
+    /// /dev/mem (as root, through this file) [default: auto]
+    #[arg(long, value_name = "HOW", value_parser = offering::<FastGpio>(FAST), hide_possible_values = true)]
+    pub(super) fast_gpio: Option<FastGpio>,
     /// Let the flight recorder note each edge of each output, for `pinion trace --vcd`. It costs time
     #[arg(long, num_args = 0, default_missing_value = "true")]
     pub(super) trace_edges: Option<bool>,
@@ -82,6 +87,7 @@ pub(super) struct Settings {
     pub(super) access: Access,
     pub(super) board: BoardName,
     pub(super) dialect: Option<DialectName>,
+    pub(super) fast_gpio: FastGpio,
     pub(super) trace_edges: bool,
     pub(super) socket: Option<PathBuf>,
     pub(super) log_level: LevelFilter,
@@ -100,6 +106,7 @@ impl Given {
             group: self.group.or(other.group),
             board: self.board.or(other.board),
             dialect: self.dialect.or(other.dialect),
+            fast_gpio: self.fast_gpio.or(other.fast_gpio),
             trace_edges: self.trace_edges.or(other.trace_edges),
             socket: self.socket.or(other.socket),
             log_level: self.log_level.or(other.log_level),
@@ -117,6 +124,7 @@ impl Given {
             access: Access { mode: self.mode.unwrap_or(0o660), group: self.group },
             board: self.board.unwrap_or(BoardName::Linux),
             dialect: self.dialect.and_then(|Spoken(name)| name),
+            fast_gpio: self.fast_gpio.unwrap_or_default(),
             trace_edges: self.trace_edges.unwrap_or(false),
             socket: self.socket,
             log_level: self.log_level.unwrap_or(LevelFilter::Info),
@@ -170,14 +178,16 @@ impl FromStr for Spoken {
 }
 
 impl BoardName {
-    /// Opens the board. Its outputs are given to `guard`. The timing is for its MCU.
+    /// Opens the board. Its outputs are given to `guard`. The timing is for its MCU. `fast_gpio` is for the computer's
+    /// pins.
     pub(super) fn open(
         &self,
         clock: Arc<dyn TimeSource>,
         guard: Option<Box<dyn Guard>>,
+        fast_gpio: FastGpio,
     ) -> Result<(Box<dyn Board>, Timing), Trouble> {
         match self {
-            BoardName::Linux => Ok((Box::new(LinuxBoard::new(guard)), Timing::of(clock))),
+            BoardName::Linux => Ok((Box::new(LinuxBoard::new(guard, fast_gpio)), Timing::of(clock))),
             BoardName::Sim(file) => {
                 let board = sim_config(file.as_deref()).and_then(|config| SimBoard::new(config, clock))?;
                 let timing = board.timing();

@@ -26,6 +26,7 @@ use crate::runtime::{self, Access, Helpers, Options, Recording};
 use crate::trace::folder::folders;
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
+use pinion_linux::sys;
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 
 use super::page::{Page, print};
@@ -81,7 +82,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     }
     let clock = Monotonic::start();
     let recording = Recording::new(clock, &args.symlink, args.realtime, folders());
-    let helpers = recording.and_then(|recording| Ok((Helpers::start(&recording, false, true)?, recording)));
+    let helpers = recording.and_then(|recording| Ok((Helpers::start(&recording, false, true, sys::SERVE)?, recording)));
     let (helpers, recording) = match helpers {
         Ok(started) => started,
         Err(error) => return failed(error),

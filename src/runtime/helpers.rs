@@ -29,16 +29,16 @@ pub struct Helpers {
 
 impl Helpers {
     /// Forks them, then gives up the rights that this process does not need. Call it before any thread starts.
-    /// `guarded` asks for a guardian.
+    /// `guarded` asks for a guardian. `rights` are the capabilities that this process keeps, if it has them.
     ///
     /// # Errors
     ///
     /// There are threads already, or the kernel has no room for a process, a socket or a page.
-    pub fn start(recording: &Recording, guarded: bool, searches: bool) -> Result<Helpers, Trouble> {
+    pub fn start(recording: &Recording, guarded: bool, searches: bool, rights: u32) -> Result<Helpers, Trouble> {
         // The search comes first, because it must share nothing with the guardian.
         let search = searches.then(HostSearch::start).transpose()?;
         let guardian = guarded.then(|| Guardian::start(recording)).transpose()?;
-        if let Err(error) = sys::keep_only(sys::SERVE) {
+        if let Err(error) = sys::keep_only(rights) {
             warn!(
                 "CAP_SYS_PTRACE and CAP_DAC_READ_SEARCH cannot be given up: {error}: Pinion keeps more rights than it needs"
             );

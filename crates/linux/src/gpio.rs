@@ -25,6 +25,7 @@ use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 mod chip;
 mod edges;
 mod refusal;
+mod registers;
 
 pub use chip::{Chip, LineInfo};
 use chip::{look_at, missing, node};
@@ -32,12 +33,17 @@ pub(super) use chip::{may_sleep, number_behind, scan};
 pub(super) use refusal::not_permitted;
 pub use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
 use refusal::{Subject, cannot_open, errno};
+pub(super) use registers::FastChips;
+use registers::LineRegisters;
+pub use registers::{ChipRegisters, FastGpio};
 
 /// The name that the kernel shows as the consumer of our lines.
 const CONSUMER: &str = "pinion";
 /// GPIOHANDLE_REQUEST_BIAS_PULL_UP and _DOWN (Linux 5.5), which gpio-cdev does not name.
 const PULL_UP: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 5);
 const PULL_DOWN: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 6);
+/// In [`HeldLine::flags`], next to the kernel's: the line's registers may be used.
+const FAST: u32 = 1 << 31;
 /// The beginnings of the labels of chips without certain resistors, and the resistors that these chips lack.
 const WITHOUT_BIAS: [(&str, &[Bias]); 4] = [
     ("raspberrypi-exp-gpio", &[Bias::PullUp, Bias::PullDown]),
@@ -101,7 +107,8 @@ impl Handle {
             .request(flags, level.into(), CONSUMER)
             .map_err(|error| self.subject.refused(refused, errno(&error), direction, &self.line))?;
         let (flags, watched) = (AtomicU32::new(bits), AtomicBool::new(false));
-        let line = HeldLine { handle, line: self.line, subject: self.subject, flags, guard, watched, sleeping };
+        let Handle { line, subject } = self;
+        let line = HeldLine { handle, line, subject, flags, registers: None, guard, watched, sleeping };
         line.watch_over(direction)?;
         Ok(line)
     }
@@ -120,8 +127,9 @@ pub(super) struct HeldLine {
     handle: LineHandle,
     line: gpio_cdev::Line,
     subject: Subject,
-    /// The flags of the last setup (`GPIOHANDLE_REQUEST_`).
+    /// The flags of the last setup (`GPIOHANDLE_REQUEST_`), and [`FAST`].
     flags: AtomicU32,
+    registers: Option<LineRegisters>,
     guard: SharedGuard,
     /// Whether the guardian has a copy of it.
     watched: AtomicBool,
@@ -157,6 +165,36 @@ impl HeldLine {
         }
     }
 
+    /// Uses these registers from now on. The line has just been requested with `direction`.
+    ///
+    /// # Errors
+    ///
+    /// The difference between what they and the kernel say about the line. It stays as it is.
+    fn trust(&mut self, registers: LineRegisters, direction: Direction) -> Result<(), &'static str> {
+        let output = match direction {
+            Direction::Output { level, .. } => Some(level),
+            // The kernel makes an input of an open drain that is released.
+            Direction::Input(_) | Direction::OpenDrain => None,
+        };
+        registers.check(output, || self.handle.get_value().map(|value| value != 0).map_err(io::Error::other))?;
+        *self.flags.get_mut() |= FAST;
+        self.registers = Some(registers);
+        Ok(())
+    }
+
+    /// The line's registers while `flags`, its own, let them be used.
+    #[inline]
+    fn registers(&self, flags: u32) -> Option<&LineRegisters> {
+        self.registers.as_ref().filter(|_| flags & FAST != 0)
+    }
+
+    /// [`FAST`], if the line has registers and they say that it has this direction now.
+    fn fast_after(&self, setup: &LineSetup) -> u32 {
+        let flags = &setup.flags;
+        let output = flags.contains(LineRequestFlags::OUTPUT) && !flags.contains(LineRequestFlags::OPEN_DRAIN);
+        if self.registers.as_ref().is_some_and(|registers| registers.is(output)) { FAST } else { 0 }
+    }
+
     fn guarded_name(&self) -> String {
         format!("{} line {}", self.subject.chip, self.subject.offset)
     }
@@ -164,7 +202,8 @@ impl HeldLine {
     /// Releases the line and requests it again, because Linux before 5.5 cannot change a held line. Klipper's C program
     /// always does this. If the request is refused, the line stays what it was.
     fn request_anew(&self, setup: &LineSetup) -> Result<i32, Shutdown> {
-        let before = LineRequestFlags::from_bits_retain(self.flags.load(Ordering::Relaxed));
+        // While nobody holds the line, it is not ours to write.
+        let before = LineRequestFlags::from_bits_retain(self.flags.fetch_and(!FAST, Ordering::Relaxed) & !FAST);
         let level = self.handle.get_value().unwrap_or_default();
         // The kernel keeps a line as long as anybody has a copy.
         self.watch_no_more()?;
@@ -191,6 +230,12 @@ impl Line for HeldLine {
         if flags & LineRequestFlags::OUTPUT.bits() == 0 {
             return Ok(());
         }
+        // The kernel turns an open drain with each level. User space cannot: ten lines share a direction's register.
+        let push_pull = flags & LineRequestFlags::OPEN_DRAIN.bits() == 0;
+        if let (true, Some(registers)) = (push_pull, self.registers(flags)) {
+            registers.write(level);
+            return Ok(());
+        }
         match &self.sleeping {
             None => self
                 .handle
@@ -202,6 +247,9 @@ impl Line for HeldLine {
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
+        if let Some(registers) = self.registers(self.flags.load(Ordering::Relaxed)) {
+            return Ok(registers.read());
+        }
         match self.handle.get_value() {
             Ok(value) => Ok(value != 0),
             Err(error) => Err(self.lost(reason::LINE_READ, "read", errno(&error))),
@@ -211,6 +259,10 @@ impl Line for HeldLine {
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown> {
         self.turn(direction)?;
         self.watch_over(direction)
+    }
+
+    fn is_fast(&self) -> bool {
+        self.registers(self.flags.load(Ordering::Relaxed)).is_some()
     }
 
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
@@ -223,7 +275,7 @@ impl Line for HeldLine {
         if code != 0 {
             return Err(self.subject.refused(setup.refused, code, direction, &self.line));
         }
-        self.flags.store(setup.flags.bits(), Ordering::Relaxed);
+        self.flags.store(setup.flags.bits() | self.fast_after(&setup), Ordering::Relaxed);
         Ok(())
     }
 }

@@ -10,6 +10,7 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use industrial_io::Context;
 
+use gpio::{FastChips, FastGpio};
 pub use guard::Guard;
 use guard::SharedGuard;
 use pinion_firmware::board::{
@@ -139,6 +140,7 @@ pub struct LinuxBoard {
     /// only for a moment: no search runs meanwhile.
     seen: Arc<Mutex<Seen>>,
     guard: SharedGuard,
+    fast: FastChips,
     /// The SPI controllers in use.
     spi_controllers: HashMap<u32, Arc<Mutex<spi::Controller>>>,
     /// The numbers of IIO devices that do not report a resolution, and that the log has already named.
@@ -150,18 +152,22 @@ pub struct LinuxBoard {
 
 impl LinuxBoard {
     /// Searches this computer and publishes the result. Every output is given to `guard`.
-    pub fn new(guard: Option<Box<dyn Guard>>) -> LinuxBoard {
+    pub fn new(guard: Option<Box<dyn Guard>>, fast: FastGpio) -> LinuxBoard {
         let seen = Seen::look();
         for problem in &seen.inventory.problems {
             log::warn!("{problem}");
         }
-        LinuxBoard::over(Arc::new(Mutex::new(seen)), SharedGuard::new(guard))
+        LinuxBoard {
+            fast: FastChips::new(fast),
+            ..LinuxBoard::over(Arc::new(Mutex::new(seen)), SharedGuard::new(guard))
+        }
     }
 
     fn over(seen: Arc<Mutex<Seen>>, guard: SharedGuard) -> LinuxBoard {
         LinuxBoard {
             seen,
             guard,
+            fast: FastChips::new(FastGpio::Off),
             spi_controllers: HashMap::new(),
             assumed: BTreeSet::new(),
             dev: DEV.into(),
@@ -253,7 +259,10 @@ impl Board for LinuxBoard {
         let handle = self.open_line(pin, direction)?;
         let sleeps = gpio::may_sleep(&self.gpio, handle.chip(), handle.label());
         let sleeps_on = sleeps.then(|| handle.chip().to_owned());
-        let line = handle.request(direction, self.guard.clone(), sleeps_on.clone())?;
+        let mut line = handle.request(direction, self.guard.clone(), sleeps_on.clone())?;
+        if !sleeps {
+            self.fast.equip(&mut line, direction, &self.dev, &self.gpio);
+        }
         Ok(ClaimedLine { line: Arc::new(line), sleeps_on })
     }
 

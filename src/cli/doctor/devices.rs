@@ -17,7 +17,7 @@ use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use crate::throttled;
-use pinion_linux::gpio::Chip;
+use pinion_linux::gpio::{Chip, FastGpio};
 
 use super::instance::Instance;
 use super::{INSTALL, REINSTALL};
@@ -136,6 +136,26 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
             nodes: "/dev/watchdog",
         };
         findings.extend(permission(&WATCHDOG));
+    }
+    let wants = |wish| instances.iter().any(|instance| instance.settings.fast_gpio == wish);
+    if wants(FastGpio::On) {
+        const FAST: Class = Class {
+            check: "fast_gpio",
+            name: "fast lines",
+            access: Access::READ_WRITE,
+            subsystem: "*gpiomem*",
+            enabled_by: None,
+            nodes: "/dev/gpiomem*",
+        };
+        findings.push(permission(&FAST).unwrap_or_else(|| {
+            let found = "fast lines: fast_gpio is on, and there is no /dev/gpiomem: lines go through the kernel";
+            let remedy = "only Raspberry Pi's own kernel has this node: install it, or set fast_gpio to auto";
+            Finding::warning("fast_gpio", found, remedy)
+        }));
+    }
+    if wants(FastGpio::DevMem) && user.uid != 0 {
+        let found = format!("fast lines: {} may not open /dev/mem: lines go through the kernel", user.name);
+        findings.push(Finding::warning("fast_gpio", found, "set fast_gpio to on, or run Pinion as root"));
     }
     findings
 }
@@ -467,6 +487,7 @@ mod tests {
         ("w1", "sys/bus/w1/devices/28-01/w1_slave"),
         ("serial", "dev/ttyAMA1"),
         ("watchdog", "dev/watchdog"),
+        ("fast_gpio", "dev/gpiomem"),
     ];
 
     #[test]
@@ -475,7 +496,7 @@ mod tests {
         NODES.iter().for_each(|(_, path)| tree.put_mode(path, "", 0o660));
         let gid = fs::metadata(tree.computer().path("/dev/gpiochip0")).unwrap().gid();
         tree.put("etc/group", &format!("gpio:x:{gid}:\n"));
-        tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
+        tree.put("etc/pinion/pinion.toml", "watchdog = true\nfast_gpio = \"on\"\n");
         let findings = permitted(&tree, &stranger(vec![gid]));
         assert_eq!(findings.len(), NODES.len());
         NODES.iter().for_each(|(check, _)| drop(told(&findings, check, Fine, "pinion may open /")));
@@ -484,6 +505,22 @@ mod tests {
             let remedy = told(&findings, check, Error, &format!("pinion may not open /{path}, which is "));
             assert_eq!(remedy, "sudo usermod -aG gpio pinion, then sudo systemctl restart pinion-mcu");
         }
+    }
+
+    #[test]
+    fn fast_lines_that_were_asked_for_and_cannot_be_had() {
+        let tree = Tree::new();
+        let wish = |wish: &str| {
+            tree.put("etc/pinion/pinion.toml", &format!("fast_gpio = \"{wish}\"\n"));
+            permitted(&tree, &stranger(vec![]))
+        };
+        let remedy = told(&wish("on"), "fast_gpio", Warning, "there is no /dev/gpiomem");
+        assert!(remedy.starts_with("only Raspberry Pi's own kernel has this node"), "{remedy}");
+        assert_eq!(
+            told(&wish("/dev/mem"), "fast_gpio", Warning, "pinion may not open /dev/mem"),
+            "set fast_gpio to on, or run Pinion as root"
+        );
+        assert_eq!(wish("auto"), [], "nobody asked for it");
     }
 
     #[test]

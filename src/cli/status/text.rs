@@ -98,7 +98,8 @@ fn line(line: &Line) -> Vec<String> {
         Some(_) => "high",
         None => "not looked at yet",
     };
-    vec![line.pin.clone(), line.use_.name().into(), level.into(), line.bus.map(transfers).unwrap_or_default()]
+    let way = line.bus.map(transfers).or(line.fast.then(|| "fast".to_owned())).unwrap_or_default();
+    vec![line.pin.clone(), line.use_.name().into(), level.into(), way]
 }
 
 fn object(object: &Object) -> Vec<String> {

@@ -79,6 +79,10 @@ impl Line for EdgeLine {
         Ok(())
     }
 
+    fn is_fast(&self) -> bool {
+        self.line.is_fast()
+    }
+
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.line.turn(direction)?;
         self.turned(direction);

@@ -163,6 +163,7 @@ fn line(state: &LineState, pins: &[Range]) -> status::Line {
             LineUse::OpenDrain => status::Use::OpenDrain,
         },
         level: state.level.map(u8::from),
+        fast: state.fast,
         bus: state.bus.map(bus),
     }
 }

@@ -113,6 +113,11 @@ pub trait Line: Send + Sync {
     /// an output pin" and "Not an input pin".
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
 
+    /// Whether the line is written and read without a call of the kernel.
+    fn is_fast(&self) -> bool {
+        false
+    }
+
     /// The same during a conversation on this line (single-wire UART, open-drain I2C). It is as fast as a write,
     /// because the guardian is not informed. Claim the line as an input, so that the guardian never drives it.
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {

@@ -38,7 +38,8 @@ pub(super) struct Claim {
 impl Claim {
     pub(super) fn state(&self) -> LineState {
         let bus = self.slow.as_ref().map(|(_, calls)| calls.counts());
-        LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get(), bus }
+        let fast = self.line.is_fast();
+        LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get(), fast, bus }
     }
 
     /// The line for a user that calls it directly, for example an errand.

@@ -71,6 +71,8 @@ pub struct LineState {
     pub use_: LineUse,
     /// The level that was last driven or read; `None` if it was never read.
     pub level: Option<bool>,
+    /// Whether it is written and read without a call of the kernel.
+    pub fast: bool,
     /// The calls of its worker, if its chip is an expander.
     pub bus: Option<BusCounts>,
 }

@@ -9,6 +9,8 @@ use std::path::{Path, PathBuf};
 use gpio_cdev::LineDirection;
 
 use super::refusal::{cannot_open, errno};
+use super::{ChipRegisters, FastGpio};
+use crate::{DEV, GPIO};
 use pinion_firmware::trouble::Trouble;
 
 /// Subsystems whose drivers send messages to their devices and sleep until the answer comes.
@@ -28,6 +30,17 @@ pub struct Chip {
     pub sleeps: bool,
     /// Its lines by offset.
     pub lines: Vec<LineInfo>,
+}
+
+impl Chip {
+    /// The registers of this chip, mapped as the program would do it.
+    ///
+    /// # Errors
+    ///
+    /// Why it has none, or they cannot be used, and what to do.
+    pub fn registers(&self, wish: FastGpio) -> Result<ChipRegisters, Trouble> {
+        ChipRegisters::open(Path::new(DEV), Path::new(GPIO), &format!("gpiochip{}", self.number), wish)
+    }
 }
 
 /// A line as it was found.

@@ -19,8 +19,10 @@ use nix::sys::socket::{ControlMessageOwned, MsgFlags, recvmsg};
 use nix::unistd::{ForkResult, Pid};
 
 mod filter;
+mod registers;
 
 pub use filter::allow_only_reading;
+pub use registers::{Register, Registers};
 
 /// Puts the calling thread into SCHED_FIFO at `priority` (1 to 99).
 pub fn set_fifo(priority: i32) -> io::Result<()> {
@@ -58,6 +60,9 @@ pub const LOOK_INTO_OTHERS: u32 = 1 << 2 | 1 << 19;
 /// the program, it may also need CAP_CHOWN, CAP_DAC_OVERRIDE and CAP_FOWNER. They are for the terminal's group, and for
 /// links and sockets in folders of other users.
 pub const SERVE: u32 = 1 << 14 | 1 << 23 | 1 << 0 | 1 << 1 | 1 << 3;
+
+/// CAP_SYS_RAWIO: to open `/dev/mem`.
+pub const RAW_MEMORY: u32 = 1 << 17;
 
 /// Drops all capabilities except these. `capabilities` has a bit for each of the first 32. The calling thread loses the
 /// others, and so do the threads that it starts from now on. Programs that it may become lose them as far as permitted.
