@@ -46,7 +46,8 @@ pub(super) fn run(args: &DictArgs) -> ExitCode {
 }
 
 fn dictionary(args: &DictArgs) -> Result<Vec<u8>, String> {
-    let (board, _) = args.board.open(Arc::new(Monotonic::start()), None, FastGpio::Off).map_err(|trouble| trouble.to_string())?;
+    let (board, _) =
+        args.board.open(Arc::new(Monotonic::start()), None, FastGpio::Off).map_err(|trouble| trouble.to_string())?;
     let dialect = Dialect::new(&FIRMWARE, &*board, args.dialect).map_err(|error| error.to_string())?;
     dialect.dictionary().json().map_err(|error| error.to_string())
 }

@@ -10,14 +10,18 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use clap::Args;
+use pinion_linux::gpio::FastGpio;
 
 use crate::runtime::latency::{Fitness, Half, Verdict, judge, measure_both};
 use pinion_firmware::lateness::{Lateness, us};
 
+use super::complete::offering;
 use super::computer::Computer;
 use super::computer::running::print_at_risk;
 use super::failed;
 use super::page::{Page, print};
+
+mod pin;
 
 /// Options of `pinion latency`.
 #[derive(Args, Clone, Debug)]
@@ -28,12 +32,23 @@ pub(super) struct LatencyArgs {
     /// Draw the histograms
     #[arg(long, value_name = "FILE")]
     svg: Option<PathBuf>,
+    /// Toggle this line, which nothing may be connected to and nobody may hold, for two seconds, and print what an edge
+    /// costs
+    #[arg(long, value_name = "NAME", conflicts_with_all = ["seconds", "svg"], value_hint = clap::ValueHint::Other)]
+    pin: Option<String>,
+    /// How the registers are reached for --pin: on, or /dev/mem
+    #[arg(long, value_name = "HOW", requires = "pin", default_value = "on", hide_possible_values = true, value_parser = offering::<FastGpio>(&FastGpio::WORDS))]
+    fast_gpio: FastGpio,
 }
 
 /// Measures, prints and judges.
 pub(super) fn run(args: &LatencyArgs) -> ExitCode {
     if let Some(why) = print_at_risk(&Computer::at(Path::new("/"))) {
         return failed(format!("the latency is not measured: {why}"));
+    }
+    if let Some(pin) = &args.pin {
+        let measured = pin::measure(pin, args.fast_gpio);
+        return measured.and_then(|text| print(&Page::text(&text))).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
     let span = Duration::from_secs(args.seconds.into()) / 2;
     let (scheduling, halves) = match measure_both(span) {

@@ -245,7 +245,11 @@ impl List {
     ) -> List {
         let names = Names::of(inventory);
         let mut list = List {
-            gpio: inventory.chips.iter().map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, sysfs, &names, args) }).collect(),
+            gpio: inventory
+                .chips
+                .iter()
+                .map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, sysfs, &names, args) })
+                .collect(),
             adc: vec![],
             pwm: vec![],
             spi: vec![],
@@ -333,7 +337,14 @@ fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip 
             lines.push(line);
         }
     }
-    GpioChip { chip: path, label: chip.label.clone(), line_count: chip.lines.len(), behind_bus: chip.sleeps, fast: None, lines }
+    GpioChip {
+        chip: path,
+        label: chip.label.clone(),
+        line_count: chip.lines.len(),
+        behind_bus: chip.sleeps,
+        fast: None,
+        lines,
+    }
 }
 
 fn adc(device: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32, &str) -> Reading) -> AdcDevice {

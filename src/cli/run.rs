@@ -88,8 +88,9 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     let recording = Recording::new(clock, &settings.symlink, settings.realtime, folders());
     // /dev/mem is opened later, when a line of its chip is claimed.
     let rights = sys::SERVE | if settings.fast_gpio == FastGpio::DevMem { sys::RAW_MEMORY } else { 0 };
-    let helpers = recording
-        .and_then(|recording| Ok((Helpers::start(&recording, guarded, settings.dialect.is_none(), rights)?, recording)));
+    let helpers = recording.and_then(|recording| {
+        Ok((Helpers::start(&recording, guarded, settings.dialect.is_none(), rights)?, recording))
+    });
     let (helpers, recording) = match helpers {
         Ok(started) => started,
         Err(error) => return failed(error),

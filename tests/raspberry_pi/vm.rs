@@ -28,9 +28,10 @@ const TIME: [&str; 2] = ["-icount", "shift=2"];
 /// the console is other output.
 const MARK: &str = "raspberry-pi: ";
 
+/// `/dev/mem` may map the registers of the GPIO chip although a driver uses them (`iomem`).
 /// A panic is not followed by silence. Otherwise the kernel prints nothing: its messages would be in the middle of the
 /// tests' messages.
-const COMMAND_LINE: &str = "console=ttyS1,115200 loglevel=1 panic=-1 cryptomgr.notests";
+const COMMAND_LINE: &str = "console=ttyS1,115200 loglevel=1 panic=-1 cryptomgr.notests iomem=relaxed";
 
 /// The progress of the guest.
 pub enum News {

@@ -4,19 +4,29 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
-use gpio_cdev::Chip;
+use gpio_cdev::{Chip, LineRequestFlags};
+use nix::sys::signal::Signal;
 use pinion_client::Client;
 use pinion_client::config::Config;
 use pinion_client::motion::Endstop;
 
 use super::outside::Outside;
-use super::program::Pinion;
+use super::program::{Pinion, Way, both_ways};
 
 const OUTPUT: u32 = 22;
 const INPUT: u32 = 24;
 
+both_ways!(
+    an_output_is_seen_from_outside,
+    a_stop_drives_an_output_to_its_shutdown_value,
+    the_guardian_drives_an_output_when_pinion_is_killed,
+    an_endstop_is_driven_from_outside,
+    the_last_setup_of_a_shared_line_counts,
+    a_stopped_program_is_killed_before_its_lines_are_free,
+);
+
 /// Waits for the result of another process.
-fn until(what: &str, mut condition: impl FnMut() -> bool) {
+pub fn until(what: &str, mut condition: impl FnMut() -> bool) {
     let end = Instant::now() + Duration::from_secs(10);
     while !condition() {
         assert!(Instant::now() < end, "waited in vain: {what}");
@@ -45,7 +55,7 @@ fn the_chip_is_the_real_driver() {
 
 #[test]
 fn lines_go_by_number_by_name_and_by_chip() {
-    let pinion = Pinion::start();
+    let pinion = Pinion::start(Way::Kernel);
     let client = pinion.client();
     let command = |pin: &str| {
         let line = format!("config_digital_out oid=0 pin={pin} value=0 default_value=0 max_duration=0");
@@ -56,10 +66,9 @@ fn lines_go_by_number_by_name_and_by_chip() {
     }
 }
 
-#[test]
-fn an_output_is_seen_from_outside() {
+fn an_output_is_seen_from_outside(way: Way) {
     let mut outside = Outside::new();
-    let pinion = Pinion::start();
+    let pinion = Pinion::start(way);
     let mut client = pinion.client();
     let oid = configure(&mut client, 1, 0);
     assert!(outside.level(OUTPUT), "its first level is the configured one");
@@ -70,10 +79,9 @@ fn an_output_is_seen_from_outside() {
     assert_eq!(outside.edges(OUTPUT), "0101");
 }
 
-#[test]
-fn a_stop_drives_an_output_to_its_shutdown_value() {
+fn a_stop_drives_an_output_to_its_shutdown_value(way: Way) {
     let mut outside = Outside::new();
-    let pinion = Pinion::start();
+    let pinion = Pinion::start(way);
     let mut client = pinion.client();
     configure(&mut client, 0, 1);
     assert!(!outside.level(OUTPUT));
@@ -82,10 +90,9 @@ fn a_stop_drives_an_output_to_its_shutdown_value() {
     assert_eq!(outside.edges(OUTPUT), "1");
 }
 
-#[test]
-fn the_guardian_drives_an_output_when_pinion_is_killed() {
+fn the_guardian_drives_an_output_when_pinion_is_killed(way: Way) {
     let mut outside = Outside::new();
-    let mut pinion = Pinion::start();
+    let mut pinion = Pinion::start(way);
     let mut client = pinion.client();
     configure(&mut client, 1, 0);
     assert!(outside.level(OUTPUT));
@@ -93,11 +100,10 @@ fn the_guardian_drives_an_output_when_pinion_is_killed() {
     until("the output falls", || !outside.level(OUTPUT));
 }
 
-#[test]
-fn an_endstop_is_driven_from_outside() {
+fn an_endstop_is_driven_from_outside(way: Way) {
     let mut outside = Outside::new();
     outside.drive(INPUT, false);
-    let pinion = Pinion::start();
+    let pinion = Pinion::start(way);
     let mut client = pinion.client();
     for pull in [0, 1, -1] {
         let mut config = Config::default();
@@ -108,4 +114,46 @@ fn an_endstop_is_driven_from_outside() {
             assert_eq!(endstop.triggered(&mut client).unwrap(), level, "pull {pull}");
         }
     }
+}
+
+fn the_last_setup_of_a_shared_line_counts(way: Way) {
+    let mut outside = Outside::new();
+    let pinion = Pinion::start(way);
+    let mut client = pinion.client();
+    let mut config = Config::default();
+    let oid = config.oid().unwrap();
+    config.add(format!("config_digital_out oid={oid} pin=gpio{OUTPUT} value=1 default_value=1 max_duration=0"));
+    let endstop = Endstop::configure(&mut config, &format!("gpio{OUTPUT}"), 0, false).unwrap();
+    config.apply(&mut client).expect("a configuration");
+    for level in [false, true, false] {
+        outside.drive(OUTPUT, level);
+        // The line is an input now, so this drives nothing.
+        client.send("update_digital_out", &[("oid", oid.into()), ("value", u8::from(!level).into())]).unwrap();
+        assert_eq!(endstop.triggered(&mut client).unwrap(), level);
+        assert_eq!(outside.level(OUTPUT), level);
+    }
+}
+
+/// While the program stands still it does not beat, so the guardian drives its outputs. When another program can have
+/// the lines, nobody writes them any more.
+fn a_stopped_program_is_killed_before_its_lines_are_free(way: Way) {
+    let mut outside = Outside::new();
+    let mut pinion = Pinion::start(way);
+    let mut client = pinion.client();
+    let mut config = Config::default();
+    let oid = config.oid().unwrap();
+    config.add(format!("config_digital_out oid={oid} pin=gpio{OUTPUT} value=0 default_value=0 max_duration=0"));
+    config.add(format!("set_digital_out_pwm_cycle oid={oid} cycle_ticks={}", client.ticks(0.001)));
+    config.apply(&mut client).expect("a configuration");
+    let (at, on) = (client.clock_in(0.2).unwrap().wire(), client.ticks(0.0005));
+    client.send("queue_digital_out", &[("oid", oid.into()), ("clock", at.into()), ("on_ticks", on.into())]).unwrap();
+    until("it toggles", || outside.edges(OUTPUT).len() > 20);
+    pinion.signal(Signal::SIGSTOP);
+    let line = Chip::new("/dev/gpiochip0").and_then(|mut chip| chip.get_line(OUTPUT)).expect("the line");
+    until("the line is free", || line.request(LineRequestFlags::INPUT, 0, "test").is_ok());
+    assert!(pinion.has_ended());
+    let edges = outside.edges(OUTPUT);
+    assert!(edges.ends_with('0'), "its shutdown value");
+    thread::sleep(Duration::from_millis(100));
+    assert_eq!(outside.edges(OUTPUT), edges);
 }

@@ -6,9 +6,9 @@ use pinion_client::config::Config;
 use pinion_client::motion::{Endstop, HomingEnd, MoveQueue, Profile, Stepper};
 
 use super::outside::Outside;
-use super::program::Pinion;
+use super::program::{Pinion, Way, both_ways};
 
-const STEP: u32 = 17;
+pub const STEP: u32 = 17;
 const DIR: u32 = 18;
 const ENDSTOP: u32 = 24;
 
@@ -21,7 +21,9 @@ const STEPS_PER_S2: f64 = 400.0;
 const LATE_MAX: i64 = 10;
 const PULSE_S: f64 = 0.000_002;
 
-fn axis(client: &mut Client) -> (Stepper, Endstop, MoveQueue) {
+both_ways!(every_step_is_a_pulse, homing_ends_where_the_outside_closes_the_endstop);
+
+pub fn axis(client: &mut Client) -> (Stepper, Endstop, MoveQueue) {
     let mut config = Config::default();
     let (step, dir) = (format!("gpio{STEP}"), format!("gpio{DIR}"));
     let stepper = Stepper::configure(&mut config, &step, 0, &dir, false, client.ticks(PULSE_S)).unwrap();
@@ -30,14 +32,13 @@ fn axis(client: &mut Client) -> (Stepper, Endstop, MoveQueue) {
     (stepper, endstop, MoveQueue::new(status.move_count))
 }
 
-fn profile(client: &Client, steps: u32) -> Profile {
+pub fn profile(client: &Client, steps: u32) -> Profile {
     Profile::trapezoid(steps, STEPS_PER_S, STEPS_PER_S2, client.frequency_hz()).unwrap()
 }
 
-#[test]
-fn every_step_is_a_pulse() {
+fn every_step_is_a_pulse(way: Way) {
     let mut outside = Outside::new();
-    let pinion = Pinion::start();
+    let pinion = Pinion::start(way);
     let mut client = pinion.client();
     let (stepper, _, mut queue) = axis(&mut client);
     let there = profile(&client, 40);
@@ -51,12 +52,11 @@ fn every_step_is_a_pulse() {
     assert_eq!(stepper.position(&mut client).unwrap(), 25);
 }
 
-#[test]
-fn homing_ends_where_the_outside_closes_the_endstop() {
+fn homing_ends_where_the_outside_closes_the_endstop(way: Way) {
     const CLOSES_AFTER: usize = 137;
     let mut outside = Outside::new();
     outside.drive(ENDSTOP, false);
-    let pinion = Pinion::start();
+    let pinion = Pinion::start(way);
     let mut client = pinion.client();
     let (stepper, endstop, mut queue) = axis(&mut client);
     let far = profile(&client, 1000);

@@ -7,3 +7,4 @@ mod program;
 
 mod gpio;
 mod homing;
+mod registers;

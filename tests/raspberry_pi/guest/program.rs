@@ -6,23 +6,75 @@ use std::path::Path;
 use std::process::{Child, Command};
 use std::time::Duration;
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
 use pinion_client::Client;
 
-const LINK: &str = "/tmp/tty";
+/// The link to its terminal.
+pub const LINK: &str = "/tmp/tty";
 const LOG: &str = "/tmp/log";
 /// Timeout of the client.
 const CLIENT_TIMEOUT: Duration = Duration::from_secs(20);
+
+/// How Pinion writes and reads the lines.
+#[derive(Clone, Copy, Debug)]
+pub enum Way {
+    Kernel,
+    /// The chip's registers. Debian's kernel has no `/dev/gpiomem`.
+    Registers,
+}
+
+/// Tests of both ways, as `kernel::name` and `registers::name`, from functions that take a [`Way`].
+macro_rules! both_ways {
+    ($($name:ident),+ $(,)?) => {
+        mod kernel {
+            $(#[test]
+            fn $name() {
+                super::$name(super::Way::Kernel);
+            })+
+        }
+        mod registers {
+            $(#[test]
+            fn $name() {
+                super::$name(super::Way::Registers);
+            })+
+        }
+    };
+}
+pub(super) use both_ways;
 
 /// A running `pinion`, ended on drop. Its log is printed then.
 pub struct Pinion(Child);
 
 impl Pinion {
     /// Starts it in real time, as on a printer.
-    pub fn start() -> Pinion {
+    pub fn start(way: Way) -> Pinion {
+        Pinion::with(match way {
+            Way::Kernel => "off",
+            Way::Registers => "/dev/mem",
+        })
+    }
+
+    /// The same with this value of `--fast-gpio`.
+    pub fn with(fast_gpio: &str) -> Pinion {
         let _ = fs::remove_file(LINK);
         let log = File::create(LOG).expect("the log");
-        let child = Command::new("pinion").args(["run", "-r", "-I", LINK]).stderr(log).spawn();
+        let child =
+            Command::new("pinion").args(["run", "-r", "-I", LINK, "--fast-gpio", fast_gpio]).stderr(log).spawn();
         Pinion(child.expect("pinion on the path"))
+    }
+
+    pub fn log(&self) -> String {
+        fs::read_to_string(LOG).expect("the log")
+    }
+
+    pub fn signal(&self, signal: Signal) {
+        kill(Pid::from_raw(self.0.id().cast_signed()), signal).expect("a process");
+    }
+
+    /// Whether it has ended.
+    pub fn has_ended(&mut self) -> bool {
+        self.0.try_wait().expect("our child").is_some()
     }
 
     pub fn client(&self) -> Client {

@@ -736,9 +736,8 @@ mod tests {
         fs::write(short.dev("gpiomem"), [0; 100]).unwrap();
         let why = short.open(FastGpio::Auto).err().unwrap();
         assert_eq!(why, "/dev/gpiomem: it is too short: look at the kernel's log (dmesg)");
-        let denied = |code, wish| {
-            refused(Path::new("/dev/gpiomem"), wish, &io::Error::from_raw_os_error(code)).to_string()
-        };
+        let denied =
+            |code, wish| refused(Path::new("/dev/gpiomem"), wish, &io::Error::from_raw_os_error(code)).to_string();
         assert!(denied(libc::EACCES, FastGpio::Auto).contains(" may not open /dev/gpiomem"));
         assert!(denied(libc::EPERM, FastGpio::On).ends_with("add DeviceAllow=char-gpiomem rw to the service"));
         assert!(denied(libc::EPERM, FastGpio::DevMem).contains("run Pinion as root"));
