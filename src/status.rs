@@ -139,8 +139,8 @@ pub(crate) struct Line {
     pub(crate) use_: Use,
     /// 0 or 1, as last driven or sampled; `None` before the first sample.
     pub(crate) level: Option<u8>,
-    /// Whether it is written and read through the chip's registers.
-    #[serde(default)]
+    /// Whether it is written and read through the chip's registers. Absent if it is not.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
     pub(crate) fast: bool,
     /// Transfers of its chip, if it is a line of an expander.
     pub(crate) bus: Option<BusCounts>,

@@ -628,7 +628,7 @@ mod tests {
         assert_eq!(
             printed(&PinsArgs::default()),
             "\
-gpiochip0 pinctrl-bcm2835, 3 lines
+gpiochip0 pinctrl-bcm2835, 3 lines, fast (registers, /dev/gpiomem)
   line  name       dir  used by              in printer.cfg
   0     ID_SDA     in   free                 ID_SDA, gpio0
   1     -          in   fe804000.i2c (i2c1)  pinctrl-bcm2835/gpio1, gpio1
