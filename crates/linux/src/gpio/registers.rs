@@ -587,7 +587,7 @@ mod tests {
     fn two_threads_write_neighbours_of_one_bank_in_both_ways() {
         for layout in LAYOUTS {
             let model = &Model::new(layout);
-            [16, 17, 18].map(|line| model.kernel_turns(line, Some(false)));
+            (16..19).for_each(|line| model.kernel_turns(line, Some(false)));
             thread::scope(|scope| {
                 scope.spawn(move || {
                     let line = model.line(17);
