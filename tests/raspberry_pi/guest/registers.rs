@@ -34,7 +34,7 @@ fn the_log_and_the_status_say_which_lines_are_fast() {
     let log = pinion.log();
     assert!(log.contains("gpiochip0: lines are written and read through /dev/mem"), "{log}");
     let status = printed(&["status", "-I", LINK]);
-    assert!(status.lines().any(|line| line.contains("GPIO22") && line.ends_with("fast")), "{status}");
+    assert!(status.lines().any(|line| line.contains("gpio22") && line.ends_with("fast")), "{status}");
 }
 
 #[test]
