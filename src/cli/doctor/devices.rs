@@ -478,7 +478,7 @@ mod tests {
         Who { name: "pinion".into(), uid: 54_321, gids }
     }
 
-    const NODES: [(&str, &str); 8] = [
+    const NODES: [(&str, &str); 9] = [
         ("gpio", "dev/gpiochip0"),
         ("adc", "sys/bus/iio/devices/iio:device0/in_voltage3_raw"),
         ("pwm", "sys/class/pwm/pwmchip0/export"),

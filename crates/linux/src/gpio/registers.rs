@@ -358,7 +358,7 @@ impl FastChips {
     /// The registers of a chip cannot be trusted. The lines that were checked already keep theirs.
     fn distrust(&mut self, chip: &str, offset: u32, why: &str) {
         self.chips.insert(chip.to_owned(), None);
-        let why = Trouble::new(why).of(&format!("line {offset}")).remedy("report this to the project");
+        let why = Trouble::new(why).of(format_args!("line {offset}")).remedy("report this to the project");
         log_slow(self.wish, chip, &why);
     }
 }
