@@ -48,7 +48,7 @@ fn a_message_its_echo_and_a_reply_go_over_the_port() {
     let program = Program::start();
     let client = &mut program.connect();
     configure(client, 1, &[config("ttyS1")]);
-    for _ in 0..20 {
+    for _ in 0..200 {
         assert_eq!(ask(client, Some(&mut port)), HEARD);
     }
     assert!(!program.log().contains("TMC UART ttyS1"), "{}", program.log());
