@@ -391,6 +391,17 @@ mod tests {
     }
 
     #[test]
+    fn an_spi_device_has_names_if_its_bus_has_a_number() {
+        let spi = vec![Node::of(0xffff), Node::of(0x1_0000)];
+        let names = Names::of(&Inventory { spi, ..Inventory::default() }).0;
+        let named = |name: &str, number| (name.to_string(), number);
+        assert_eq!(
+            names,
+            [named("spidev255.255", (1 << 26) + 0xffff), named("spidev255.255/miso", (1 << 26) + (1 << 16) + 0xffff)]
+        );
+    }
+
+    #[test]
     fn a_line_s_names() {
         let chips = vec![chip(4, "pinctrl-rp1", &["ID_SDA", "GPIO1", ""])];
         let found = names(chips, vec![]);

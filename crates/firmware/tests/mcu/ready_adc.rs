@@ -259,6 +259,17 @@ fn measurements_that_begin_anew_amid_a_reading_have_none_of_it() {
 }
 
 #[test]
+fn a_reading_that_a_stop_overtakes_sends_nothing() {
+    let (mut rig, _adc) = rig(ADS1220, ads1220, 2000);
+    rig.send(&query(ADS1220));
+    // The twelfth sample would fill a message.
+    rig.run_until(12 * PERIOD + 1000);
+    rig.send("emergency_stop");
+    rig.run_until(14 * PERIOD);
+    assert_eq!(samples(&rig), [0; 0]);
+}
+
+#[test]
 fn channels_that_no_chip_has_are_refused() {
     for (channel, num_channels) in [(0, 0), (0, 1), (2, 2), (0, 5), (4, 4), (255, 4)] {
         let mut rig = Rig::new();

@@ -452,6 +452,23 @@ mod tests {
     }
 
     #[test]
+    fn a_thread_that_serves_keeps_only_the_capabilities_that_it_may_need() {
+        let effective = || {
+            let status = std::fs::read_to_string("/proc/thread-self/status").unwrap();
+            let bits = status.lines().find_map(|line| line.strip_prefix("CapEff:")).unwrap();
+            u64::from_str_radix(bits.trim(), 16).unwrap()
+        };
+        std::thread::spawn(move || {
+            let before = effective();
+            keep_only(SERVE).unwrap();
+            // linux/capability.h: chown, dac_override, fowner, ipc_lock and sys_nice.
+            assert_eq!(effective(), before & 0x80_400b);
+        })
+        .join()
+        .unwrap();
+    }
+
+    #[test]
     fn line_values_are_laid_out_as_the_kernel_has_them() {
         assert_eq!(size_of::<LineValues>(), 64);
         assert_eq!(size_of::<LineCounts>(), 80);
