@@ -250,6 +250,8 @@ fn ranges_that_make_no_sense_are_refused() {
         let (mut rig, _) = rig(ADS1220, |_| vec![100]);
         rig.send(&range);
         assert_eq!(rig.shutdown().as_deref(), Some(text), "{range}");
+        let note = rig.notes().pop().unwrap();
+        assert!(note.contains("load cell probe oid 3"), "{note}");
     }
 }
 

@@ -352,6 +352,11 @@ fn a_port_has_its_answer_as_soon_as_the_last_byte_came() {
     assert_eq!(rig.responses(), [""; 0]);
     rig.run_until(end);
     assert_eq!(rig.responses(), [response(&with_serial_bits(IFCNT))]);
+    // A message without a reply has its answer with its echo.
+    let (mut rig, _) = port(<[u8]>::to_vec);
+    rig.send(&send(READ_IFCNT, 0));
+    rig.run_until(QUIET + (4 + 4) * 10 * BIT);
+    assert_eq!(rig.responses(), [response(&[])]);
 }
 
 /// Neither a silent driver, nor a missing wire, nor half of a reply is an answer. The next one is.
