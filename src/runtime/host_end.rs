@@ -27,8 +27,10 @@ const OUTPUT_BYTES: usize = 16 * 1024;
 pub(super) struct HostEnd {
     pty: Pty,
     receiver: Receiver,
-    input: Vec<u8>,
-    /// How many bytes of the input are taken in.
+    input: Box<[u8; INPUT_BYTES]>,
+    /// How many bytes of the input were read.
+    filled: usize,
+    /// How many of these are taken in.
     taken: usize,
     output: Vec<u8>,
     is_attached: bool,
@@ -61,7 +63,8 @@ impl HostEnd {
         HostEnd {
             pty,
             receiver: Receiver::default(),
-            input: Vec::with_capacity(INPUT_BYTES),
+            input: Box::new([0; INPUT_BYTES]),
+            filled: 0,
             taken: 0,
             output: Vec::with_capacity(2 * OUTPUT_BYTES),
             is_attached: false,
@@ -87,21 +90,20 @@ impl HostEnd {
 
     /// Reads the host's bytes.
     pub(super) fn read(&mut self) -> io::Result<Read> {
-        let filled = self.input.len();
         let mut read = Read::default();
-        if filled == INPUT_BYTES {
+        if self.filled == INPUT_BYTES {
             return Ok(read);
         }
-        self.input.resize(INPUT_BYTES, 0);
-        let bytes = self.pty.read(&mut self.input[filled..]);
-        self.input.truncate(filled + bytes.as_ref().copied().unwrap_or(0));
-        if bytes? > 0 && !self.is_attached && self.pty.meet_host()? {
+        let bytes = self.pty.read(&mut self.input[self.filled..])?;
+        let fresh = self.filled..self.filled + bytes;
+        self.filled = fresh.end;
+        if bytes > 0 && !self.is_attached && self.pty.meet_host()? {
             self.is_attached = true;
             read.is_new_host = true;
             info!("host attached");
         }
-        if self.input[filled..] == *FORCE_SHUTDOWN {
-            self.input.truncate(filled);
+        if self.input[fresh.clone()] == *FORCE_SHUTDOWN {
+            self.filled = fresh.start;
             read.is_forced = true;
             warn!("FORCE_SHUTDOWN was written to {}", self.pty.device().display());
         }
@@ -120,7 +122,7 @@ impl HostEnd {
     /// The next block of the input.
     pub(super) fn next(&mut self) -> Next {
         loop {
-            let (bytes, received) = self.receiver.next(&self.input[self.taken..]);
+            let (bytes, received) = self.receiver.next(&self.input[self.taken..self.filled]);
             self.taken += bytes;
             match received {
                 Received::Nothing => return Next::Nothing,
@@ -133,8 +135,10 @@ impl HostEnd {
 
     /// Drops the input that was taken in. True if some input is left.
     pub(super) fn forget_taken(&mut self) -> bool {
-        self.input.drain(..std::mem::take(&mut self.taken));
-        !self.input.is_empty()
+        let taken = std::mem::take(&mut self.taken);
+        self.input.copy_within(taken..self.filled, 0);
+        self.filled -= taken;
+        self.filled > 0
     }
 
     /// Whether the host has to read before it gets more.

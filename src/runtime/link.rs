@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! The link: takes blocks from the host to the core, and responses from the core to the host.
 //!
-//! The link itself answers `identify` and `get_clock` when they come alone in a block: they need no core. So the host's
-//! clock synchronization sees the shortest round trip, even while a bus holds earlier blocks back.
+//! The link itself answers `identify`, `get_clock` and `get_uptime` when they come alone in a block: they need no core.
+//! So the host's clock synchronization sees the shortest round trip, even while a bus holds earlier blocks back.
 
 #![forbid(unsafe_code)]
 
@@ -13,7 +13,7 @@ use std::time::Duration;
 use nix::errno::Errno;
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
 
-use pinion_firmware::mcu::base::{ClockResponse, IdentifyResponse, identify_response};
+use pinion_firmware::mcu::base::{ClockResponse, IdentifyResponse, Uptime, identify_response};
 use pinion_firmware::mcu::{Dialect, Response};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{Clock, TimeSource};
@@ -40,6 +40,7 @@ pub(crate) mod fuzz;
 struct Known {
     dialect: Arc<Dialect>,
     get_clock: Option<u32>,
+    get_uptime: Option<u32>,
     identify: Option<u32>,
 }
 
@@ -47,6 +48,7 @@ impl Known {
     fn new(dialect: Arc<Dialect>) -> Known {
         Known {
             get_clock: dialect.command_id("get_clock"),
+            get_uptime: dialect.command_id("get_uptime"),
             identify: dialect.command_id("identify offset=%u count=%c"),
             dialect,
         }
@@ -58,6 +60,9 @@ impl Known {
         let id = Some(reader.int().ok()?);
         if id == self.get_clock && reader.is_empty() {
             return self.encode(&ClockResponse::from(now()));
+        }
+        if id == self.get_uptime && reader.is_empty() {
+            return self.encode(&Uptime::from(now()));
         }
         if id != self.identify {
             return None;
@@ -406,7 +411,7 @@ mod tests {
     use pinion_testbench::board::{Bench, FakeBoard};
 
     #[test]
-    fn the_link_answers_get_clock_and_identify_that_are_alone_in_their_block() {
+    fn the_link_answers_a_question_that_is_alone_in_its_block() {
         let board = FakeBoard(Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH));
         let dialect = Arc::new(Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master)).unwrap());
         let known = Known::new(dialect.clone());
@@ -416,16 +421,22 @@ mod tests {
                 block.int(dialect.command_id(format).unwrap());
                 parameters.iter().for_each(|parameter| block.int(*parameter));
             }
-            let answer = known.answer(block.payload().unwrap(), || Clock::from_ticks(1234))?;
+            let answer = known.answer(block.payload().unwrap(), || Clock::from_ticks(7 << 32 | 1234))?;
             Some(answer.payload().unwrap().to_vec())
         };
         let get_clock: (&str, &[u32]) = ("get_clock", &[]);
+        let get_uptime: (&str, &[u32]) = ("get_uptime", &[]);
         let identify: (&str, &[u32]) = ("identify offset=%u count=%c", &[40, 20]);
 
         let clock = answer(&[get_clock]).unwrap();
         let mut reader = Reader::new(&clock);
         assert_eq!(reader.int().ok(), dialect.response_id::<ClockResponse>());
         assert_eq!((reader.int(), reader.is_empty()), (Ok(1234), true));
+
+        let uptime = answer(&[get_uptime]).unwrap();
+        let mut reader = Reader::new(&uptime);
+        assert_eq!(reader.int().ok(), dialect.response_id::<Uptime>());
+        assert_eq!((reader.int(), reader.int(), reader.is_empty()), (Ok(7), Ok(1234), true));
 
         let piece = answer(&[identify]).unwrap();
         let mut reader = Reader::new(&piece);
@@ -434,11 +445,12 @@ mod tests {
         assert!(reader.is_empty());
 
         // What needs the core, or the order of a block.
-        let others: [&[(&str, &[u32])]; 7] = [
+        let others: [&[(&str, &[u32])]; 8] = [
             &[],
             &[("get_config", &[])],
             &[("update_digital_out oid=%c value=%c", &[1, 1])],
             &[get_clock, get_clock],
+            &[get_clock, get_uptime],
             &[get_clock, identify],
             &[identify, get_clock],
             &[("identify offset=%u count=%c", &[40])],

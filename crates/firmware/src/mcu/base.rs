@@ -80,8 +80,15 @@ impl From<Clock> for ClockResponse {
 response! {
     /// The time now, in 64 bits.
     "uptime high=%u clock=%u"
-    pub(super) struct Uptime { high: u32, clock: Clock }
+    pub struct Uptime { high: u32, clock: Clock }
 }
+
+impl From<Clock> for Uptime {
+    fn from(clock: Clock) -> Uptime {
+        Uptime { high: (clock.ticks() >> 32) as u32, clock }
+    }
+}
+
 response! {
     /// Whether the MCU is configured, and the checksum of that configuration, as the host gave it.
     "config is_config=%c crc=%u is_shutdown=%c move_count=%hu"
@@ -138,8 +145,8 @@ const GET_CLOCK: Command = command!("get_clock", |mcu| {
 .allowed_in_shutdown();
 
 const GET_UPTIME: Command = command!("get_uptime", |mcu| {
-    let clock = mcu.now();
-    mcu.send(Uptime { high: (clock.ticks() >> 32) as u32, clock });
+    let uptime = Uptime::from(mcu.now());
+    mcu.send(uptime);
     Ok(())
 })
 .allowed_in_shutdown();
