@@ -55,14 +55,14 @@ impl Known {
     }
 
     /// The answer to a block that holds only one of these commands.
-    fn answer(&self, payload: &[u8], now: impl FnOnce() -> Clock) -> Option<Writer> {
+    fn answer(&self, payload: &[u8], now: Clock) -> Option<Writer> {
         let mut reader = Reader::new(payload);
         let id = Some(reader.int().ok()?);
         if id == self.get_clock && reader.is_empty() {
-            return self.encode(&ClockResponse::from(now()));
+            return self.encode(&ClockResponse::from(now));
         }
         if id == self.get_uptime && reader.is_empty() {
-            return self.encode(&Uptime::from(now()));
+            return self.encode(&Uptime::from(now));
         }
         if id != self.identify {
             return None;
@@ -101,7 +101,7 @@ pub(super) struct Link {
 /// What ended the link's sleep. The link looks only there, because each look is a system call.
 #[derive(Clone, Copy, Debug)]
 struct Woken {
-    by_signal: bool,
+    by_oversight: bool,
     by_input: bool,
     /// The host is gone.
     by_hangup: bool,
@@ -149,7 +149,10 @@ impl Link {
             self.core.await_done(before);
             self.give_out();
             let woken = self.wait(stalled)?;
-            if woken.by_signal {
+            if woken.by_oversight {
+                if self.oversight.has_lost_guardian() {
+                    self.lose_guardian("somebody killed the guardian");
+                }
                 while let Some(signal) = self.oversight.next_signal() {
                     match signal {
                         Signal::End => return Ok(End::Asked),
@@ -223,7 +226,7 @@ impl Link {
         self.core.wake.sleeping();
         if self.core.has_news() && !self.host.is_full() || self.core.inlet.has_line() {
             self.core.wake.awake(false);
-            return Ok(Woken { by_signal: false, by_input: true, by_hangup: false });
+            return Ok(Woken { by_oversight: false, by_input: true, by_hangup: false });
         }
         let mut events = PollFlags::empty();
         if !stalled {
@@ -232,13 +235,10 @@ impl Link {
         if !self.host.is_out() {
             events |= PollFlags::POLLOUT;
         }
-        // Without a guardian any other descriptor takes its place.
-        let guardian = self.oversight.guardian();
         let mut fds = [
             PollFd::new(self.host.event(), events),
             PollFd::new(self.core.wake.event(), PollFlags::POLLIN),
-            PollFd::new(self.oversight.signals(), PollFlags::POLLIN),
-            PollFd::new(guardian.unwrap_or(self.core.wake.event()), PollFlags::empty()),
+            PollFd::new(self.oversight.event(), PollFlags::POLLIN),
         ];
         match poll(&mut fds, self.timeout(stalled)) {
             Ok(_) | Err(Errno::EINTR) => {}
@@ -246,15 +246,12 @@ impl Link {
         }
         let events = |fd: &PollFd<'_>| fd.revents().unwrap_or(PollFlags::empty());
         let woken = Woken {
-            by_signal: !events(&fds[2]).is_empty(),
+            by_oversight: !events(&fds[2]).is_empty(),
             by_input: events(&fds[0]).contains(PollFlags::POLLIN),
             by_hangup: events(&fds[0]).contains(PollFlags::POLLHUP),
         };
-        let (called, lost) = (!events(&fds[1]).is_empty(), guardian.is_some() && !events(&fds[3]).is_empty());
+        let called = !events(&fds[1]).is_empty();
         self.core.wake.awake(called);
-        if lost {
-            self.lose_guardian("somebody killed the guardian");
-        }
         Ok(woken)
     }
 
@@ -316,7 +313,6 @@ impl Link {
             return true;
         }
         let before = self.core.handed();
-        let mut read_at = None;
         let stalled = loop {
             if !self.core.has_room() {
                 self.record(Event::Full);
@@ -329,13 +325,15 @@ impl Link {
                     self.record(Event::Refused(why));
                 }
                 Next::Block(payload) => {
-                    if !self.answer(&payload) {
+                    let at = self.clock.now();
+                    let event = if self.answer(&payload, at) {
+                        Event::Answered { id: Reader::new(payload.as_slice()).int().unwrap_or(0) as u16 }
+                    } else {
                         let stops = self.known.dialect.is_emergency(payload.as_slice());
                         self.core.hand(payload, stops);
-                        let at = *read_at.get_or_insert_with(|| self.clock.now());
-                        let block = self.core.ledger.handed();
-                        self.tape.iter_mut().for_each(|tape| tape.write(at, Event::BlockIn(block)));
-                    }
+                        Event::BlockIn(self.core.ledger.handed())
+                    };
+                    self.record_at(at, event);
                 }
             }
         };
@@ -345,8 +343,8 @@ impl Link {
 
     /// Answers a block here, if that is possible. A host that does not read gets its answers from the core, like all
     /// others. The core drops answers that find no room.
-    fn answer(&mut self, payload: &Payload) -> bool {
-        let Some(answer) = self.known.answer(payload.as_slice(), || self.clock.now()) else { return false };
+    fn answer(&mut self, payload: &Payload, now: Clock) -> bool {
+        let Some(answer) = self.known.answer(payload.as_slice(), now) else { return false };
         let core_done = self.core.progress.done();
         self.frame_responses();
         if self.host.is_full() {
@@ -356,8 +354,6 @@ impl Link {
         if let Some(answer) = answer.payload() {
             self.host.frame(answer, number);
         }
-        let id = Reader::new(payload.as_slice()).int().unwrap_or(0) as u16;
-        self.record(Event::Answered { id });
         true
     }
 
@@ -396,8 +392,12 @@ impl Link {
     }
 
     fn record(&mut self, event: Event) {
+        self.record_at(self.clock.now(), event);
+    }
+
+    fn record_at(&mut self, at: Clock, event: Event) {
         if let Some(tape) = &mut self.tape {
-            tape.write(self.clock.now(), event);
+            tape.write(at, event);
         }
     }
 }
@@ -421,7 +421,7 @@ mod tests {
                 block.int(dialect.command_id(format).unwrap());
                 parameters.iter().for_each(|parameter| block.int(*parameter));
             }
-            let answer = known.answer(block.payload().unwrap(), || Clock::from_ticks(7 << 32 | 1234))?;
+            let answer = known.answer(block.payload().unwrap(), Clock::from_ticks(7 << 32 | 1234))?;
             Some(answer.payload().unwrap().to_vec())
         };
         let get_clock: (&str, &[u32]) = ("get_clock", &[]);

@@ -167,7 +167,7 @@ pub fn run(
 
     info!("serving on {} ({})", options.symlink.display(), pty.device().display());
     let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
-    let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil);
+    let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil).map_err(no_room)?;
     let mut link = Link::new(HostEnd::new(pty, shown), core_end, introduction, oversight, clock, recorder);
     if realtime {
         realtime::enter(Role::Link);

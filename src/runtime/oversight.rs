@@ -3,8 +3,12 @@
 
 #![forbid(unsafe_code)]
 
-use std::os::fd::BorrowedFd;
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd};
 use std::time::Duration;
+
+use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::epoll::{Epoll, EpollCreateFlags, EpollEvent, EpollFlags};
 
 use pinion_linux::clock::monotonic;
 
@@ -17,6 +21,8 @@ pub(super) const FAREWELL: Duration = Duration::from_secs(1);
 
 /// Watches over the program: signals, the guardian and the watchdogs.
 pub(super) struct Oversight {
+    /// Signals and the guardian, both of which are rare. So the link has one descriptor less to wait for.
+    events: Epoll,
     signals: Signals,
     guardian: Option<GuardianWatch>,
     vigil: Vigil,
@@ -26,8 +32,18 @@ pub(super) struct Oversight {
 
 impl Oversight {
     /// `guardian` is `None` if the board has no outputs to guard.
-    pub(super) fn new(signals: Signals, guardian: Option<GuardianWatch>, vigil: Vigil) -> Oversight {
-        Oversight { signals, guardian, vigil, leave_at: None }
+    ///
+    /// # Errors
+    ///
+    /// The kernel has no room.
+    pub(super) fn new(signals: Signals, guardian: Option<GuardianWatch>, vigil: Vigil) -> io::Result<Oversight> {
+        let events = Epoll::new(EpollCreateFlags::EPOLL_CLOEXEC)?;
+        events.add(signals.event(), EpollEvent::new(EpollFlags::EPOLLIN, 0))?;
+        if let Some(guardian) = &guardian {
+            // The kernel tells of a hang-up in any case.
+            events.add(guardian.socket(), EpollEvent::new(EpollFlags::empty(), 0))?;
+        }
+        Ok(Oversight { events, signals, guardian, vigil, leave_at: None })
     }
 
     /// Feeds a hardware watchdog from now on.
@@ -71,25 +87,30 @@ impl Oversight {
         hangs.then_some("the guardian gives no sign of life: was it stopped? (a restart ends it)")
     }
 
-    /// A socket that hangs up once the guardian is gone; `None` if there is no guardian.
-    pub(super) fn guardian(&self) -> Option<BorrowedFd<'_>> {
-        self.guardian.as_ref().map(GuardianWatch::socket)
+    /// A descriptor that is readable when a signal has come or the guardian is gone.
+    pub(super) fn event(&self) -> BorrowedFd<'_> {
+        self.events.0.as_fd()
+    }
+
+    /// Whether there was a guardian, and its process has ended.
+    pub(super) fn has_lost_guardian(&self) -> bool {
+        self.guardian.as_ref().is_some_and(|guardian| {
+            let mut fds = [PollFd::new(guardian.socket(), PollFlags::empty())];
+            poll(&mut fds, PollTimeout::ZERO).is_ok_and(|gone| gone > 0)
+        })
     }
 
     /// The guardian is gone or of no use. The program ends when the host has had time to read why.
     pub(super) fn lose_guardian(&mut self) {
-        self.guardian = None;
+        if let Some(guardian) = self.guardian.take() {
+            let _ = self.events.delete(guardian.socket());
+        }
         self.leave_at = Some(monotonic() + FAREWELL);
     }
 
     /// Whether the host has had that time.
     pub(super) fn is_over(&self) -> bool {
         self.leave_at.is_some_and(|at| monotonic() >= at)
-    }
-
-    /// A descriptor that is readable when a signal has come.
-    pub(super) fn signals(&self) -> BorrowedFd<'_> {
-        self.signals.event()
     }
 
     /// The next signal that has come.

@@ -147,7 +147,7 @@ impl Bench {
         let (thread, ledger) = (thread::current(), Ledger::default());
         let end = CoreEnd { requests, thread, inlet, progress: progress.clone(), wake, ledger, may_poll: false };
         let vigil = Vigil::new(Notify::from_env().expect("no service manager"), None, *pulse);
-        let oversight = Oversight::new(Signals::new().expect("signals"), None, vigil);
+        let oversight = Oversight::new(Signals::new().expect("signals"), None, vigil).expect("epoll");
         let introduction = Introduction::of(dialect.clone());
         let host = HostEnd::new(pty, Arc::new(HostBoard::default()));
         let (recorder, _) = Recorder::new(RECORDING.clone()).expect("one recorder at a time");
