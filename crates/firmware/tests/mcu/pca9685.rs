@@ -200,6 +200,18 @@ fn a_value_that_is_not_acknowledged_is_written_again() {
 }
 
 #[test]
+fn a_chip_that_was_never_set_up_gets_nothing_from_a_stop() {
+    let mut rig = Rig::new();
+    rig.bench.plug_i2c(1, ADDRESS, |_, _, _| Err(BusStatus::Nack));
+    rig.send_all(&["allocate_oids count=1", OUTPUT, "finalize_config crc=1"]);
+    rig.run_until(1_000_000);
+    assert!(rig.shutdown().is_some());
+    let chip = plug(&rig);
+    rig.run_until(10_000_000);
+    assert_eq!(bytes(&chip), [[0; 0]; 0]);
+}
+
+#[test]
 fn a_chip_that_stays_silent_does_not_keep_the_mcu_from_the_next_configuration() {
     let says_nothing = |_: u64, _: &[u8], _: &mut [u8]| Err(BusStatus::Nack);
     let (mut rig, _) = rig(1000, &[OUTPUT, FREE]);
