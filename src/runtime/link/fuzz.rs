@@ -293,7 +293,7 @@ impl Bench {
         let mut blocks = self.core.blocks.iter().peekable();
         let mut is_for_core = |block: &&Vec<u8>| blocks.next_if(|next| next == block).is_some();
         for answered in self.taken.iter().filter(|block| !is_for_core(block)) {
-            assert!(self.link.known.answer(answered, || Clock::from_ticks(0)).is_some(), "{answered:?} is lost");
+            assert!(self.link.known.answer(answered, Clock::EPOCH).is_some(), "{answered:?} is lost");
         }
         assert_eq!(self.core.blocks.len(), self.core.progress.done() as usize);
     }
