@@ -253,9 +253,9 @@ mod request {
 }
 
 /// Makes every further open of a terminal fail, except by root.
-pub fn make_exclusive(terminal: &impl AsRawFd) -> io::Result<()> {
+pub fn make_exclusive(terminal: &impl AsFd) -> io::Result<()> {
     // SAFETY: the request takes nothing.
-    unsafe { request::tiocexcl(terminal.as_raw_fd()) }?;
+    unsafe { request::tiocexcl(terminal.as_fd().as_raw_fd()) }?;
     Ok(())
 }
 
@@ -263,27 +263,27 @@ pub fn make_exclusive(terminal: &impl AsRawFd) -> io::Result<()> {
 const OTHER_SPEED: u32 = libc::BOTHER;
 const INPUT_SPEED: u32 = libc::CBAUD << 16;
 
-fn settings(terminal: &impl AsRawFd) -> io::Result<libc::termios2> {
+fn settings(terminal: &impl AsFd) -> io::Result<libc::termios2> {
     // SAFETY: all fields are numbers.
     let mut settings: libc::termios2 = unsafe { std::mem::zeroed() };
     // SAFETY: the request writes a `struct termios2`, which lives through the call.
-    unsafe { request::tcgets2(terminal.as_raw_fd(), &mut settings) }?;
+    unsafe { request::tcgets2(terminal.as_fd().as_raw_fd(), &mut settings) }?;
     Ok(settings)
 }
 
 /// Sets the rate of a terminal in baud, which need not be a standard one. Returns the rate that its driver then has.
-pub fn set_rate(terminal: &impl AsRawFd, rate_hz: u32) -> io::Result<u32> {
+pub fn set_rate(terminal: &impl AsFd, rate_hz: u32) -> io::Result<u32> {
     let mut settings = settings(terminal)?;
     // Input has the speed of output.
     settings.c_cflag = settings.c_cflag & !(libc::CBAUD | INPUT_SPEED) | OTHER_SPEED;
     (settings.c_ispeed, settings.c_ospeed) = (rate_hz, rate_hz);
     // SAFETY: the request reads a `struct termios2`, which lives through the call.
-    unsafe { request::tcsets2(terminal.as_raw_fd(), &settings) }?;
+    unsafe { request::tcsets2(terminal.as_fd().as_raw_fd(), &settings) }?;
     rate(terminal)
 }
 
 /// The rate of a terminal in baud.
-pub fn rate(terminal: &impl AsRawFd) -> io::Result<u32> {
+pub fn rate(terminal: &impl AsFd) -> io::Result<u32> {
     Ok(settings(terminal)?.c_ospeed)
 }
 
@@ -312,11 +312,11 @@ pub struct LineFaults {
 }
 
 /// The faults that a serial port has counted. Not every driver counts them.
-pub fn line_faults(port: &impl AsRawFd) -> io::Result<LineFaults> {
+pub fn line_faults(port: &impl AsFd) -> io::Result<LineFaults> {
     // SAFETY: all fields are numbers.
     let mut counts: LineCounts = unsafe { std::mem::zeroed() };
     // SAFETY: the request writes a `struct serial_icounter_struct`, which lives through the call.
-    unsafe { request::tiocgicount(port.as_raw_fd(), &mut counts) }?;
+    unsafe { request::tiocgicount(port.as_fd().as_raw_fd(), &mut counts) }?;
     let overrun = counts.overrun.wrapping_add(counts.buf_overrun);
     Ok(LineFaults { framing: counts.frame, overrun, breaks: counts.brk })
 }
