@@ -20,11 +20,11 @@ use super::engine::led::ColouredLed;
 use super::engine::noise::Noise;
 use super::engine::physics::{Axis, Fan, Heater, Lamp, Switch};
 use super::engine::serial::{SerialDevice, SerialWire};
-use super::engine::spi::{MISO, MosiPin, SpiBus, SpiDevice};
+use super::engine::spi::{MISO, SpiBus, SpiDevice};
 use super::engine::time::{PrinterTime, STEP_LATE_LIMIT};
 use super::engine::wire::{
-    DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges, SimLine,
-    SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
+    ControllerPin, DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges,
+    SimLine, SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
 };
 use super::engine::world::World;
 use super::part::workshop::Workshop;
@@ -125,7 +125,7 @@ impl SimBoard {
             part.part().build(&mut workshop)?;
         }
         for bus in &config.spi_buses {
-            workshop.wire(Some(&bus.mosi_pin()), MosiPin { bus: bus.name.clone() });
+            workshop.wire(Some(&bus.mosi_pin()), ControllerPin { kind: Kind::Mosi, of: bus.name.clone() });
         }
         let Workshop { world, pins, spi_buses, i2c_buses, serial_wires, .. } = workshop;
         Ok(SimBoard {

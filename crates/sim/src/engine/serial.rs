@@ -7,7 +7,6 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use super::wire::{Kind, Wire};
 use pinion_firmware::board::SerialPort;
 use pinion_firmware::time::{Clock, TimeSource};
 use pinion_firmware::trouble::Trouble;
@@ -45,21 +44,6 @@ impl SerialWire {
             wire.iter_mut().zip(answer).for_each(|(wire, byte)| *wire &= byte);
             wire
         })
-    }
-}
-
-/// A port as a pin.
-pub(crate) struct SerialPin {
-    pub(crate) port: String,
-}
-
-impl Wire for SerialPin {
-    fn kind(&self) -> Kind {
-        Kind::Serial
-    }
-
-    fn describe(&self) -> String {
-        format!("of {}", self.port)
     }
 }
 

@@ -45,40 +45,8 @@ pub(crate) trait MosiListener: Send {
     fn hear(&mut self, rate_hz: u32, bytes: &[u8]);
 }
 
-/// The data output of a bus as a pin.
-pub(crate) struct MosiPin {
-    /// The bus's name.
-    pub(crate) bus: String,
-}
-
-impl Wire for MosiPin {
-    fn kind(&self) -> Kind {
-        Kind::Mosi
-    }
-
-    fn describe(&self) -> String {
-        format!("of {}", self.bus)
-    }
-}
-
 /// The end of the name of a bus's data input as a pin.
 pub(crate) const MISO: &str = "/miso";
-
-/// The data input of a bus as a pin.
-pub(crate) struct MisoPin {
-    /// The bus's name.
-    pub(crate) bus: String,
-}
-
-impl Wire for MisoPin {
-    fn kind(&self) -> Kind {
-        Kind::Miso
-    }
-
-    fn describe(&self) -> String {
-        format!("of {}", self.bus)
-    }
-}
 
 /// A line that selects a chip while the line is low.
 pub(crate) struct SelectLine {

@@ -82,6 +82,24 @@ pub(crate) trait Wire: Send + Sync {
     }
 }
 
+/// A pin that belongs to a controller: a bus's data output or input, or a serial port. The MCU does not drive it by
+/// itself.
+pub(crate) struct ControllerPin {
+    pub(crate) kind: Kind,
+    /// The name of the bus or port.
+    pub(crate) of: String,
+}
+
+impl Wire for ControllerPin {
+    fn kind(&self) -> Kind {
+        self.kind
+    }
+
+    fn describe(&self) -> String {
+        format!("of {}", self.of)
+    }
+}
+
 /// A pin of the board.
 #[derive(Clone)]
 pub(crate) struct WiredPin {

@@ -24,10 +24,10 @@ use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::spi::{MISO, MisoPin, SpiChip};
+use crate::engine::spi::{MISO, SpiChip};
 use crate::engine::time::seconds;
 use crate::engine::together::Together;
-use crate::engine::wire::{Kind, Wire};
+use crate::engine::wire::{ControllerPin, Kind, Wire};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
 use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
@@ -124,7 +124,7 @@ impl Part for Hx71xConfig {
         let chip = Arc::new(Hx71x::new(self.chip, self.samples_per_s, cell));
         if let Some(bus) = &self.bus {
             let pin = PinName { name: format!("{bus}{MISO}"), inverted: false };
-            workshop.wire(Some(&pin), MisoPin { bus: bus.clone() });
+            workshop.wire(Some(&pin), ControllerPin { kind: Kind::Miso, of: bus.clone() });
             let clock = workshop.clock.clone();
             let now = clock.now();
             workshop.solder_spi(self, OnSpi { chip, clock, bit: 0.0, at: now });

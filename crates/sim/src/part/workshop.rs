@@ -13,9 +13,9 @@ use crate::engine::bed::{Bed, Delta, Head, Plane};
 use crate::engine::i2c::{I2cBus, I2cChip};
 use crate::engine::noise::Noise;
 use crate::engine::physics::{Axis, Heater};
-use crate::engine::serial::{SerialChip, SerialPin, SerialWire};
+use crate::engine::serial::{SerialChip, SerialWire};
 use crate::engine::spi::{MosiListener, SelectLine, SpiBus, SpiChip};
-use crate::engine::wire::{Wire, WiredPin};
+use crate::engine::wire::{ControllerPin, Kind, Wire, WiredPin};
 use crate::engine::world::{Sight, World};
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -147,7 +147,7 @@ impl Workshop<'_> {
         let Some(Socket::Serial { port, .. }) = part.socket() else { return };
         let known = self.serial_wires.iter().position(|wire| wire.name == port.name);
         let place = known.unwrap_or_else(|| {
-            self.wire(Some(port), SerialPin { port: port.name.clone() });
+            self.wire(Some(port), ControllerPin { kind: Kind::Serial, of: port.name.clone() });
             self.serial_wires.push(SerialWire::new(&port.name));
             self.serial_wires.len() - 1
         });
