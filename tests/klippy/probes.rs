@@ -214,7 +214,9 @@ fn klippy_calibrates_a_load_cell() {
     // A kilogram of force: the nozzle is a quarter of a millimeter deep in the bed.
     let depth_mm = 0.25;
     let z = bed_mm(110.0, 110.0) - depth_mm;
-    printer.gcode(&format!("G1 Z{z} F60\nM400"));
+    // klippy's average has the samples of the last batch (0.1 s) before the command too: the nozzle rests first.
+    let rest = "G4 P500\nM400";
+    printer.gcode(&format!("G1 Z{z} F60\n{rest}"));
     read_in_time(&mut printer, &format!("CALIBRATE GRAMS={}", GRAMS_PER_MM * depth_mm));
     printer.gcode("ACCEPT");
     let cell = printer.object("load_cell");
@@ -227,7 +229,7 @@ fn klippy_calibrates_a_load_cell() {
     };
     let grams = read(&mut printer);
     assert!((grams - 1000.0).abs() < 1.0, "{grams}");
-    printer.gcode("G1 Z5 F600\nM400");
+    printer.gcode(&format!("G1 Z5 F600\n{rest}"));
     let grams = read(&mut printer);
     assert!(grams.abs() < 1.0, "{grams}");
 }
