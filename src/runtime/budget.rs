@@ -10,6 +10,7 @@
 #![forbid(unsafe_code)]
 
 use std::fs;
+use std::path::Path;
 use std::time::Duration;
 
 use pinion_firmware::time::{Clock, NS_PER_TICK, Ticks};
@@ -54,9 +55,9 @@ pub(super) struct Throttle {
 }
 
 impl Throttle {
-    /// The throttle in force. `None` if it is off, or if the kernel has none.
-    pub(super) fn read() -> Option<Throttle> {
-        let read = |name: &str| fs::read_to_string(format!("/proc/sys/kernel/{name}")).ok()?.trim().parse().ok();
+    /// The throttle in force, as the files in this folder say. `None` if it is off, or if the kernel has none.
+    pub(super) fn read(folder: &Path) -> Option<Throttle> {
+        let read = |name| fs::read_to_string(folder.join(name)).ok()?.trim().parse().ok();
         // A runtime of -1 switches the throttle off. It does not parse as a u32, so this returns none.
         let throttle = Throttle { runtime_us: read("sched_rt_runtime_us")?, period_us: read("sched_rt_period_us")? };
         (throttle.runtime_us < throttle.period_us).then_some(throttle)
@@ -133,6 +134,22 @@ mod tests {
 
     const THROTTLE: Throttle = Throttle { runtime_us: 950_000, period_us: 1_000_000 };
     const SECOND: u64 = 50_000_000;
+
+    #[test]
+    fn only_a_throttle_that_takes_time_away_counts() {
+        let folder = tempfile::tempdir().unwrap();
+        let read = |runtime_us: &str, period_us: &str| {
+            fs::write(folder.path().join("sched_rt_runtime_us"), runtime_us).unwrap();
+            fs::write(folder.path().join("sched_rt_period_us"), period_us).unwrap();
+            Throttle::read(folder.path())
+        };
+        assert_eq!(read("950000\n", "1000000\n"), Some(THROTTLE));
+        for off in ["-1\n", "1000000\n"] {
+            assert_eq!(read(off, "1000000\n"), None, "{off}");
+        }
+        fs::remove_file(folder.path().join("sched_rt_runtime_us")).unwrap();
+        assert_eq!(Throttle::read(folder.path()), None, "a kernel without one");
+    }
 
     /// When a core with these running and sleeping spans runs as SCHED_FIFO, for each processor.
     fn fifo_spans(spans: &[(u64, u64)], seconds: u64, processors: usize) -> Vec<Vec<(u64, u64)>> {

@@ -134,3 +134,31 @@ impl CoreEnd {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::super::outlet::outlet;
+    use super::*;
+    use pinion_firmware::mcu::Outbox as _;
+    use rtrb::RingBuffer;
+
+    #[test]
+    fn a_response_is_news_and_so_is_a_finished_block() {
+        let (wake, progress) = (Arc::new(LinkWake::new().unwrap()), Arc::new(Progress::default()));
+        let (mut outlet, inlet) = outlet(wake.clone(), progress.clone());
+        let (requests, _inbox) = RingBuffer::new(16);
+        let (thread, ledger) = (thread::current(), Ledger::default());
+        let mut end = CoreEnd { requests, thread, inlet, progress: progress.clone(), wake, ledger, may_poll: false };
+        assert!(!end.has_news());
+        end.hand(Payload::new(b""), false);
+        progress.begin();
+        assert!(!end.has_news(), "the block is under way");
+        progress.finish();
+        assert!(end.has_news(), "the host waits for its acknowledgement");
+        let done = progress.done();
+        end.ledger.acknowledge(done);
+        assert!(!end.has_news());
+        outlet.send(b"response");
+        assert!(end.has_news());
+    }
+}

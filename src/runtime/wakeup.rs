@@ -7,6 +7,7 @@
 #![forbid(unsafe_code)]
 
 use std::hint;
+use std::path::Path;
 use std::sync::Arc;
 use std::thread;
 use std::time::Duration;
@@ -149,7 +150,8 @@ impl Waiter {
         scheduling: Scheduling,
         processors: Processors,
     ) -> Waiter {
-        let throttle = if scheduling == Scheduling::RealTime { Throttle::read() } else { None };
+        let throttle =
+            if scheduling == Scheduling::RealTime { Throttle::read(Path::new("/proc/sys/kernel")) } else { None };
         let budget = throttle.map(|throttle| Budget::new(throttle, clock.now(), running_time()));
         let margin = Margin::new(limits, try_wake_ups(&*clock));
         Waiter { clock, margin, processors, scheduling, budget, sleep: None }

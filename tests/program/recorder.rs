@@ -79,7 +79,6 @@ fn a_host_that_is_late_is_named() {
     assert_eq!(trace.head.names.pins.values().next().map(String::as_str), Some("led"));
 }
 
-/// SIGSTOP stops all threads, as a frozen control group does.
 #[test]
 fn a_stop_leaves_no_memory_behind() {
     let pinion = Pinion::simulated(&[]);
@@ -93,6 +92,7 @@ fn a_stop_leaves_no_memory_behind() {
     pinion.until("its memory again", || pinion.memory_kib("RssAnon") <= before + 1024);
 }
 
+/// SIGSTOP stops all threads, as a frozen control group does.
 #[test]
 fn a_program_that_was_stopped_is_told_from_a_late_host() {
     let pinion = Pinion::simulated(&[]);

@@ -20,7 +20,8 @@ use crate::trace::ring::Writer;
 
 use super::locked;
 
-/// A board that records the edges of its outputs. All else is the board's own.
+/// A board that records the edges of its outputs. All else is the board's own. Who wants a view of the board takes it
+/// from the board itself.
 pub(super) struct EdgeBoard {
     pub(super) board: Box<dyn Board>,
     pub(super) tape: Arc<EdgeTape>,
@@ -135,14 +136,6 @@ impl Board for EdgeBoard {
 
     fn i2c_buses(&self) -> Vec<Range> {
         self.board.i2c_buses()
-    }
-
-    fn view(&self) -> Option<Box<dyn Board>> {
-        self.board.view()
-    }
-
-    fn look_again(&mut self) -> bool {
-        self.board.look_again()
     }
 
     fn canonical(&self, pin: Pin) -> Pin {
