@@ -36,9 +36,22 @@ const AFTER_STOP: u64 = 4 * SECOND;
 const MISSED_OUTPUT: &str = "Missed scheduling of next digital out event";
 const MISSED_PWM: &str = "Missed scheduling of next hard pwm event";
 
-/// Something that goes wrong.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-enum Fault {
+/// The faults, and the list of all of them.
+macro_rules! faults {
+    ($($fault:ident,)*) => {
+        /// Something that goes wrong.
+        #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+        enum Fault {
+            $($fault,)*
+        }
+
+        use Fault::*;
+
+        const FAULTS: &[Fault] = &[$($fault,)*];
+    };
+}
+
+faults! {
     LateOutput,
     LateSteps,
     SilentHost,
@@ -60,31 +73,6 @@ enum Fault {
     ShortStall,
     LongStall,
 }
-
-use Fault::*;
-
-const FAULTS: [Fault; 20] = [
-    LateOutput,
-    LateSteps,
-    SilentHost,
-    KilledHost,
-    EmergencyStop,
-    UnknownCommand,
-    WrongOid,
-    TooManyMoves,
-    AdcGone,
-    AdcGlitch,
-    SensorWireBroken,
-    ExpanderGone,
-    ExpanderGlitch,
-    I2cChipGone,
-    I2cChipHangs,
-    SpiChipGone,
-    PwmGone,
-    ThermometerGone,
-    ShortStall,
-    LongStall,
-];
 
 /// What a fault does to the MCU.
 enum Effect {
