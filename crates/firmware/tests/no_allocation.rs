@@ -139,15 +139,17 @@ impl Print {
 
 #[test]
 fn a_print_allocates_nothing_once_configured() {
-    for answer_ticks in [0, 40_000] {
+    for (answer_ticks, has_bank) in [(0, false), (40_000, true)] {
         let mut rig = Rig::new();
         rig.bench.state().answer_ticks = answer_ticks;
+        rig.bench.state().has_bank = has_bank;
         rig.bench.script_ds18b20("28", &[Some(20_000)]);
         rig.bench.state().counted.insert(13);
         rig.configure(OBJECTS);
         let print = print(rig);
         assert_eq!(print.rig.notes().len(), 1, "configured, and nothing else");
         assert_eq!(print.counted, 0);
+        assert_eq!(print.rig.bench.state().stores.is_empty(), !has_bank);
     }
 }
 

@@ -19,7 +19,7 @@ use gpio_cdev::{LineHandle, LineRequestFlags};
 use super::GPIO;
 use super::guard::SharedGuard;
 use crate::sys;
-use pinion_firmware::board::{Bias, Direction, Line};
+use pinion_firmware::board::{Bank, Bias, Direction, Line};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 
 mod chip;
@@ -34,8 +34,8 @@ pub(super) use refusal::not_permitted;
 pub use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
 use refusal::{Subject, cannot_open, errno};
 pub(super) use registers::FastChips;
-use registers::LineRegisters;
 pub use registers::{ChipRegisters, FastGpio};
+use registers::{LineRegisters, RegisterBank};
 
 /// The name that the kernel shows as the consumer of our lines.
 const CONSUMER: &str = "pinion";
@@ -44,6 +44,10 @@ const PULL_UP: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 5);
 const PULL_DOWN: LineRequestFlags = LineRequestFlags::from_bits_retain(1 << 6);
 /// In [`HeldLine::flags`], next to the kernel's: the line's registers may be used.
 const FAST: u32 = 1 << 31;
+/// The flags that decide if a line is written through registers. The kernel turns an open drain with each level. User
+/// space cannot: ten lines share a direction's register.
+const FAST_MASK: u32 = FAST | LineRequestFlags::OUTPUT.bits() | LineRequestFlags::OPEN_DRAIN.bits();
+const FAST_OUTPUT: u32 = FAST | LineRequestFlags::OUTPUT.bits();
 /// The beginnings of the labels of chips without certain resistors, and the resistors that these chips lack.
 const WITHOUT_BIAS: [(&str, &[Bias]); 4] = [
     ("raspberrypi-exp-gpio", &[Bias::PullUp, Bias::PullDown]),
@@ -129,7 +133,7 @@ pub(super) struct HeldLine {
     subject: Subject,
     /// The flags of the last setup (`GPIOHANDLE_REQUEST_`), and [`FAST`].
     flags: AtomicU32,
-    registers: Option<LineRegisters>,
+    registers: Option<(LineRegisters, &'static RegisterBank)>,
     guard: SharedGuard,
     /// Whether the guardian has a copy of it.
     watched: AtomicBool,
@@ -170,7 +174,12 @@ impl HeldLine {
     /// # Errors
     ///
     /// The difference between what they and the kernel say about the line. It stays as it is.
-    fn trust(&mut self, registers: LineRegisters, direction: Direction) -> Result<(), &'static str> {
+    fn trust(
+        &mut self,
+        registers: LineRegisters,
+        bank: &'static RegisterBank,
+        direction: Direction,
+    ) -> Result<(), &'static str> {
         let output = match direction {
             Direction::Output { level, .. } => Some(level),
             // The kernel makes an input of an open drain that is released.
@@ -178,21 +187,21 @@ impl HeldLine {
         };
         registers.check(output, || self.handle.get_value().map(|value| value != 0).map_err(io::Error::other))?;
         *self.flags.get_mut() |= FAST;
-        self.registers = Some(registers);
+        self.registers = Some((registers, bank));
         Ok(())
     }
 
     /// The line's registers while `flags`, its own, let them be used.
     #[inline]
     fn registers(&self, flags: u32) -> Option<&LineRegisters> {
-        self.registers.as_ref().filter(|_| flags & FAST != 0)
+        self.registers.as_ref().filter(|_| flags & FAST != 0).map(|(registers, _)| registers)
     }
 
     /// [`FAST`], if the line has registers and they say that it has this direction now.
     fn fast_after(&self, setup: &LineSetup) -> u32 {
         let flags = &setup.flags;
         let output = flags.contains(LineRequestFlags::OUTPUT) && !flags.contains(LineRequestFlags::OPEN_DRAIN);
-        if self.registers.as_ref().is_some_and(|registers| registers.is(output)) { FAST } else { 0 }
+        if self.registers.as_ref().is_some_and(|(registers, _)| registers.is(output)) { FAST } else { 0 }
     }
 
     fn guarded_name(&self) -> String {
@@ -230,9 +239,7 @@ impl Line for HeldLine {
         if flags & LineRequestFlags::OUTPUT.bits() == 0 {
             return Ok(());
         }
-        // The kernel turns an open drain with each level. User space cannot: ten lines share a direction's register.
-        let push_pull = flags & LineRequestFlags::OPEN_DRAIN.bits() == 0;
-        if let (true, Some(registers)) = (push_pull, self.registers(flags)) {
+        if let (FAST_OUTPUT, Some((registers, _))) = (flags & FAST_MASK, &self.registers) {
             registers.write(level);
             return Ok(());
         }
@@ -263,6 +270,13 @@ impl Line for HeldLine {
 
     fn is_fast(&self) -> bool {
         self.registers(self.flags.load(Ordering::Relaxed)).is_some()
+    }
+
+    fn bank(&self) -> Option<(&'static dyn Bank, u32)> {
+        match (self.flags.load(Ordering::Relaxed) & FAST_MASK, &self.registers) {
+            (FAST_OUTPUT, Some((registers, bank))) => Some((*bank, registers.mask())),
+            _ => None,
+        }
     }
 
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {

@@ -7,8 +7,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use pinion_firmware::board::{
-    self, Adc, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges, I2cConfig,
-    Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
+    self, Adc, Bank, Bias, Board, BusDevice, BusError, BusStatus, ClaimedLine, CountedLine, Direction, Edges,
+    I2cConfig, Line, Mosi, OnWorker, Pin, Pwm, PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
 use pinion_firmware::mcu::{Completion, Job, Refused, WorkerId, Workers};
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
@@ -130,6 +130,11 @@ pub struct State {
     pub pwm_values: Vec<(u32, u64, u16)>,
     /// The period of each PWM channel.
     pub pwm_cycles: HashMap<u32, u32>,
+    /// Whether pins 0 to 31 are in a bank ([`Bank`]). Set it before they are claimed.
+    pub has_bank: bool,
+    bank: Option<&'static FakeBank>,
+    /// Every store to the bank: the pins that went high, and those that went low.
+    pub stores: Vec<(u32, u32)>,
     /// How long a write to a line takes.
     pub write_ticks: u32,
     /// How long a device on a worker takes to answer; 0 by default.
@@ -192,6 +197,7 @@ impl Bench {
             transfers: Vec::with_capacity(256),
             pwm_values: Vec::with_capacity(256),
             turns: Vec::with_capacity(256),
+            stores: Vec::with_capacity(1 << 16),
             ..State::default()
         };
         Bench { state: Arc::new(Mutex::new(state)), gate: Arc::default(), clock, ago: Arc::default(), origin }
@@ -386,6 +392,11 @@ impl Board for FakeBoard {
         if !self.0.state().held.insert(number) {
             return Err(Shutdown::because(reason::INPUT_LINE, format!("pin {number} is in use")).remedy("free it"));
         }
+        let is_first = self.0.state().has_bank && self.0.state().bank.is_none();
+        if is_first {
+            let bank = Box::leak(Box::new(FakeBank(self.0.clone())));
+            self.0.state().bank = Some(bank);
+        }
         let line = FakeLine { bench: self.0.clone(), pin: number };
         line.set_direction(direction)?;
         let sleeps_on = self.0.state().sleeping.contains(&number).then(|| EXPANDER.to_owned());
@@ -555,23 +566,35 @@ impl Drop for FakeLine {
     }
 }
 
+impl FakeLine {
+    fn drive(bench: &Bench, pin: u32, level: bool) {
+        let mut state = bench.state();
+        if state.levels.insert(pin, level) != Some(level) {
+            let at = bench.ticks();
+            uncounted(|| state.edges.push((pin, (at, level.into()))));
+            for chip in state.line_chips.values_mut() {
+                chip(at, Some((pin, level)));
+            }
+        }
+    }
+}
+
 impl Line for FakeLine {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
         self.bench.may_call(self.pin);
         self.bench.broken(self.pin, reason::LINE_WRITE)?;
-        let mut state = self.bench.state();
-        if matches!(state.directions.get(&self.pin), Some(Direction::Input(_))) {
+        if matches!(self.bench.state().directions.get(&self.pin), Some(Direction::Input(_))) {
             return Ok(());
         }
-        if state.levels.insert(self.pin, level) != Some(level) {
-            let at = self.bench.ticks();
-            uncounted(|| state.edges.push((self.pin, (at, level.into()))));
-            for chip in state.line_chips.values_mut() {
-                chip(at, Some((self.pin, level)));
-            }
-        }
-        self.bench.clock.set(self.bench.clock.now() + Ticks(state.write_ticks));
+        FakeLine::drive(&self.bench, self.pin, level);
+        self.bench.clock.set(self.bench.clock.now() + Ticks(self.bench.state().write_ticks));
         Ok(())
+    }
+
+    fn bank(&self) -> Option<(&'static dyn Bank, u32)> {
+        let state = self.bench.state();
+        let is_output = matches!(state.directions.get(&self.pin), Some(Direction::Output { .. }));
+        state.bank.filter(|_| is_output && self.pin < u32::BITS).map(|bank| (bank as &dyn Bank, 1 << self.pin))
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
@@ -607,6 +630,19 @@ impl Line for FakeLine {
         self.bench.broken(self.pin, reason::LINE_WRITE)?;
         uncounted(|| self.bench.state().turns.push((self.pin, direction)));
         self.set_direction(direction)
+    }
+}
+
+/// The lines of pins 0 to 31.
+struct FakeBank(Bench);
+
+impl Bank for FakeBank {
+    fn change(&self, high: u32, low: u32) {
+        uncounted(|| self.0.state().stores.push((high, low)));
+        for (lines, level) in [(high, true), (low, false)] {
+            (0..u32::BITS).filter(|pin| lines >> pin & 1 != 0).for_each(|pin| FakeLine::drive(&self.0, pin, level));
+        }
+        self.0.clock.set(self.0.clock.now() + Ticks(self.0.state().write_ticks));
     }
 }
 

@@ -84,6 +84,12 @@ pub enum Direction {
     OpenDrain,
 }
 
+/// Lines whose levels one store can change together. A claimed line says if it is in one ([`Line::bank`]).
+pub trait Bank: Sync {
+    /// Drives the lines of these bits: first those of `high`, then those of `low`.
+    fn change(&self, high: u32, low: u32);
+}
+
 /// A claimed GPIO line. The objects and workers that share a line all hold this one value.
 ///
 /// No call may allocate or log. No call may block, unless the board said that the line
@@ -113,15 +119,20 @@ pub trait Line: Send + Sync {
     /// an output pin" and "Not an input pin".
     fn set_direction(&self, direction: Direction) -> Result<(), Shutdown>;
 
-    /// Whether the line is written and read without a call of the kernel.
-    fn is_fast(&self) -> bool {
-        false
-    }
-
     /// The same during a conversation on this line (single-wire UART, open-drain I2C). It is as fast as a write,
     /// because the guardian is not informed. Claim the line as an input, so that the guardian never drives it.
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.set_direction(direction)
+    }
+
+    /// The line's bank and its bit there, while the line is an output of a bank.
+    fn bank(&self) -> Option<(&'static dyn Bank, u32)> {
+        None
+    }
+
+    /// Whether the line is written and read without a call of the kernel.
+    fn is_fast(&self) -> bool {
+        false
     }
 }
 

@@ -8,8 +8,8 @@ use std::ops::Range;
 
 use crate::board::Pin;
 use crate::mcu::{
-    Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, Present, PromptLine, Report,
-    Response, SPIN_MAX, Safe, Timer, Turn, WireClock, command, response, since,
+    Batch, Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, Present, PromptLine,
+    Report, Response, SPIN_MAX, Safe, Timer, Turn, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -184,6 +184,8 @@ impl Stepper {
     }
 
     fn stop(&mut self, mcu: &mut Mcu) {
+        // Another stepper of the batch has stopped the MCU.
+        self.edges = self.edges.saturating_sub(u32::from(self.step.was_batched()));
         self.position = self.position().wrapping_neg();
         self.edges = 0;
         self.reverse_pending = false;
@@ -235,9 +237,12 @@ impl Object for Stepper {
             self.reverse_pending = false;
             return self.reverse(turn);
         }
-        self.step.toggle()?;
-        // Read the time after the edge was written, because a write may be slow.
-        let earliest = turn.now() + self.pulse_ticks;
+        if !self.step.was_batched() {
+            self.step.toggle()?;
+            // Read the time after the edge was written, because a write may be slow.
+            turn.now();
+        }
+        let earliest = turn.last_read() + self.pulse_ticks;
         let edges = self.edges.saturating_sub(1);
         if edges & 1 != 0 && !self.both_edges {
             self.edges = edges;
@@ -250,6 +255,11 @@ impl Object for Stepper {
             return Ok(self.edge_at(turn, self.next_step, earliest));
         }
         self.load(turn, Some(earliest))
+    }
+
+    fn join(&mut self, batch: &mut Batch) -> bool {
+        // Otherwise the event begins with a wait or a reversal.
+        !self.reverse_pending && self.earliest <= batch.now() && self.step.join(batch)
     }
 
     fn triggered(&mut self, turn: &mut Turn) -> Result<(), Shutdown> {

@@ -69,6 +69,7 @@ impl Mcu {
         self.configuration.crc = crc;
         // The core does not allocate after this.
         self.schedule.reserve();
+        self.schedule.has_banks = self.configuration.claims.iter().any(Claim::is_in_bank);
         let mut kinds: Vec<(&'static str, usize)> = Vec::new();
         for object in self.configuration.objects.iter().flatten() {
             match kinds.iter_mut().find(|(kind, _)| *kind == object.kind()) {

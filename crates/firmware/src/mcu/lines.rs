@@ -11,6 +11,7 @@
 
 #![forbid(unsafe_code)]
 
+use std::mem;
 use std::sync::Arc;
 
 use crate::board::{Bias, Board, ClaimedLine, CountedLine, Direction, Edges, Line, OnWorker, Pin};
@@ -19,7 +20,8 @@ use crate::time::Clock;
 
 use super::snapshot::Level;
 use super::{
-    Back, Calls, Done, Errand, LineState, Mcu, Remote, Safe, Settable, Slot, Turn, UNREAD_LIMIT, Unread, WorkerId,
+    Back, Batch, Calls, Done, Errand, LineState, Mcu, Remote, Safe, Settable, Slot, Turn, UNREAD_LIMIT, Unread,
+    WorkerId,
 };
 
 /// A line in use.
@@ -40,6 +42,10 @@ impl Claim {
         let bus = self.slow.as_ref().map(|(_, calls)| calls.counts());
         let fast = self.line.is_fast();
         LineState { pin: self.pin, use_: self.direction.into(), level: self.shown.get(), fast, bus }
+    }
+
+    pub(super) fn is_in_bank(&self) -> bool {
+        self.line.bank().is_some()
     }
 
     /// The line for a user that calls it directly, for example an errand.
@@ -109,6 +115,8 @@ pub struct PromptLine {
     line: Arc<dyn Line>,
     level: bool,
     shown: Arc<Level>,
+    /// A batch has made an edge that its user has not seen yet.
+    is_batched: bool,
 }
 
 impl PromptLine {
@@ -132,6 +140,23 @@ impl PromptLine {
     #[inline]
     pub fn toggle(&mut self) -> Result<(), Shutdown> {
         self.write(!self.level)
+    }
+
+    /// Inverts the line with a batch of edges, if the batch takes it.
+    pub fn join(&mut self, batch: &mut Batch) -> bool {
+        let level = !self.level;
+        self.is_batched = self.line.bank().is_some_and(|(bank, line)| batch.add(bank, line, level));
+        if self.is_batched {
+            self.level = level;
+            self.shown.set(level);
+        }
+        self.is_batched
+    }
+
+    /// Whether a batch has inverted the line since the last call.
+    #[inline]
+    pub fn was_batched(&mut self) -> bool {
+        mem::take(&mut self.is_batched)
     }
 }
 
@@ -408,7 +433,7 @@ impl Mcu {
         shutdown_value: bool,
     ) -> Result<PromptLine, Shutdown> {
         let claim = self.prompt_claim(pin, use_, Direction::Output { level, shutdown_value })?;
-        Ok(PromptLine { line: claim.line.clone(), level, shown: claim.shown.clone() })
+        Ok(PromptLine { line: claim.line.clone(), level, shown: claim.shown.clone(), is_batched: false })
     }
 
     /// Claims a line with exact edges, for an errand that drives or reads it. It refuses a chip that may sleep.

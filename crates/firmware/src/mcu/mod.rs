@@ -12,6 +12,7 @@ use crate::board::Board;
 use crate::time::Timing;
 
 pub mod base;
+mod batch;
 mod bus;
 mod calls;
 mod command;
@@ -36,6 +37,7 @@ mod timers;
 mod turn;
 
 pub use crate::{command, response};
+pub use batch::Batch;
 pub use bus::{Bus, Conversation, Talk};
 pub use calls::{Calls, UNREAD_LIMIT, Unread};
 pub use command::{Command, Constant, ConstantValue, Enumeration, Feature, Form, Handler, Response, place_of_response};

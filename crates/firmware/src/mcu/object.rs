@@ -9,7 +9,7 @@ use crate::board::Pin;
 use crate::shutdown::{Shutdown, reason};
 use crate::time::Clock;
 
-use super::{Bus, BusCounts, Done, Mcu, Oid, Report, Timer, Turn};
+use super::{Batch, Bus, BusCounts, Done, Mcu, Oid, Report, Timer, Turn};
 
 /// The result of an event: what happens to its timer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,6 +39,12 @@ pub trait Object: Any + Send {
     /// Runs when a timer of this object, due at `at`, fires. An error stops the MCU.
     fn event(&mut self, _turn: &mut Turn, _timer: Timer, _at: Clock) -> Result<Next, Shutdown> {
         Ok(Next::Done)
+    }
+
+    /// Adds the edge with which this object's next event begins to a batch, if other edges may go out at the same time.
+    /// True if it did: the edge is made before that event, and the time is read after it.
+    fn join(&mut self, _batch: &mut Batch) -> bool {
+        false
     }
 
     /// Runs when an errand of this object returns from its worker. An error stops the MCU.

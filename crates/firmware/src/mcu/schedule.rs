@@ -40,6 +40,8 @@ pub(super) struct Schedule {
     latest: Latest,
     /// How busy the core was.
     stats: Stats,
+    /// Whether a line of the configuration is in a bank.
+    pub(super) has_banks: bool,
 }
 
 /// A timer that ran late.
@@ -58,7 +60,7 @@ impl Schedule {
         let mut timers = Timers::with_capacity(TIMERS_MAX);
         timers.insert(now + STATS_TICKS, TimerId::STATS);
         let (lateness, latest, stats) = (Lateness::default(), Latest::default(), Stats::default());
-        Schedule { timing, timers, last_read: now, is_behind: false, lateness, latest, stats }
+        Schedule { timing, timers, last_read: now, is_behind: false, lateness, latest, stats, has_banks: false }
     }
 
     /// Makes room for all timers that an MCU can have.
@@ -151,14 +153,19 @@ impl Mcu {
     ///
     /// The firmware runs 20 timers and checks if they are 100 ms late. Then it lets commands run. If there are none, it
     /// runs 100 more timers before the next check. Pinion does the same, because the place of this check decides if the
-    /// MCU stops.
+    /// MCU stops. A batch counts as one timer.
     pub fn run_timers(&mut self) -> bool {
         for _ in 0..if self.schedule.is_behind { IDLE_REPEAT_COUNT } else { REPEAT_COUNT } {
             if self.schedule.timers.next().is_none_or(|at| at > self.schedule.last_read && at > self.now()) {
                 self.schedule.is_behind = false;
                 return false;
             }
-            self.run_timer();
+            // Almost all timers are alone.
+            if self.schedule.has_banks && self.schedule.timers.has_several_next() {
+                self.run_batch();
+            } else {
+                self.run_timer();
+            }
         }
         let next = self.schedule.timers.next();
         let late = next.map_or(0, |at| self.now().since(at));
@@ -177,7 +184,7 @@ impl Mcu {
     }
 
     #[inline]
-    fn run_timer(&mut self) {
+    pub(super) fn run_timer(&mut self) {
         let Some((at, timer)) = self.schedule.timers.pop() else { return };
         if timer.is_exact() {
             let late = self.schedule.last_read.since(at);

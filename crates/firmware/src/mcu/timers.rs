@@ -98,6 +98,17 @@ impl Timers {
         self.waiting.iter().rev().find(|(_, timer)| timer.is_exact()).map(|(at, _)| *at)
     }
 
+    /// Whether the next timer has the due time of the one after it.
+    #[inline]
+    pub(super) fn has_several_next(&self) -> bool {
+        matches!(self.waiting.as_slice(), [.., (other, _), (next, _)] if other == next)
+    }
+
+    /// The timers with this due time, if they are the next ones, in their order.
+    pub(super) fn of_instant(&self, at: Clock) -> impl Iterator<Item = TimerId> {
+        self.waiting.iter().rev().take_while(move |(of, _)| *of == at).map(|(_, timer)| *timer)
+    }
+
     #[inline]
     pub(super) fn pop(&mut self) -> Option<(Clock, TimerId)> {
         self.waiting.pop()

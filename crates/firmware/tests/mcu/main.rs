@@ -7,6 +7,7 @@ mod analog_in;
 mod any_bytes;
 mod any_commands;
 mod base;
+mod batch;
 mod buttons;
 mod counter;
 mod dialects;

@@ -19,7 +19,7 @@ use std::str::FromStr;
 use super::HeldLine;
 use super::refusal::{Subject, not_permitted};
 use crate::{LOOK_AT_LOG, sys};
-use pinion_firmware::board::Direction;
+use pinion_firmware::board::{Bank, Direction};
 use pinion_firmware::trouble::Trouble;
 
 /// When lines are written and read through registers.
@@ -107,8 +107,7 @@ impl Layout {
                 (offset < 58).then_some(())?;
                 Some(LineRegisters {
                     mask: 1 << (offset % 32),
-                    set: word(0x1c, 32)?,
-                    clear: word(0x28, 32)?,
+                    bank: RegisterBank { set: word(0x1c, 32)?, clear: word(0x28, 32)? },
                     level: word(0x34, 32)?,
                     direction: vec![function],
                 })
@@ -129,8 +128,7 @@ impl Layout {
                 Some(LineRegisters {
                     mask,
                     // RIO_OUT, by the addresses that set and clear bits, and RIO_IN.
-                    set: rio(0x2000)?,
-                    clear: rio(0x3000)?,
+                    bank: RegisterBank { set: rio(0x2000)?, clear: rio(0x3000)? },
                     level: rio(0x08)?,
                     direction: vec![control, enable],
                 })
@@ -165,23 +163,46 @@ struct Field<R> {
     output: u32,
 }
 
+/// The registers that drive the lines of a bank.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub(super) struct RegisterBank<R = sys::Register> {
+    /// A 1 makes its line high. A 0 changes nothing.
+    set: R,
+    /// A 1 makes its line low. A 0 changes nothing.
+    clear: R,
+}
+
+impl<R: Register + Sync> Bank for RegisterBank<R> {
+    #[inline]
+    fn change(&self, high: u32, low: u32) {
+        if high != 0 {
+            self.set.store(high);
+        }
+        if low != 0 {
+            self.clear.store(low);
+        }
+    }
+}
+
 /// The registers of one line.
 pub(super) struct LineRegisters<R = sys::Register> {
-    /// The line's bit in `set`, `clear` and `level`.
+    /// The line's bit in the registers of its bank, and in `level`.
     mask: u32,
-    /// A 1 makes the line high. A 0 changes nothing.
-    set: R,
-    /// A 1 makes the line low. A 0 changes nothing.
-    clear: R,
+    bank: RegisterBank<R>,
     level: R,
     direction: Vec<Field<R>>,
 }
 
 impl<R: Register> LineRegisters<R> {
+    /// The line's bit in its bank.
+    pub(super) fn mask(&self) -> u32 {
+        self.mask
+    }
+
     /// Drives the line, if it is an output. Otherwise this is its level when it becomes one.
     #[inline]
     pub(super) fn write(&self, level: bool) {
-        if level { self.set.store(self.mask) } else { self.clear.store(self.mask) }
+        if level { self.bank.set.store(self.mask) } else { self.bank.clear.store(self.mask) }
     }
 
     /// The line's level, whoever drives it.
@@ -240,6 +261,8 @@ pub struct ChipRegisters {
     mapped: sys::Registers,
     /// The node that they are mapped from.
     node: String,
+    /// The banks whose lines are in use. They stay as long as the mapping: until the program ends.
+    banks: Vec<&'static RegisterBank>,
 }
 
 impl ChipRegisters {
@@ -271,7 +294,7 @@ impl ChipRegisters {
         let file = OpenOptions::new().read(true).write(true).custom_flags(libc::O_SYNC).open(&node);
         let mapped = file.and_then(|file| sys::Registers::map(&file, start, bytes));
         let mapped = mapped.map_err(|error| refused(&node, wish, &error))?;
-        Ok(ChipRegisters { layout, mapped, node: node.display().to_string() })
+        Ok(ChipRegisters { layout, mapped, node: node.display().to_string(), banks: Vec::new() })
     }
 
     /// The node that they are mapped from, such as `/dev/gpiomem`.
@@ -282,6 +305,16 @@ impl ChipRegisters {
     /// The registers of one line.
     fn line(&self, offset: u32) -> Option<LineRegisters> {
         self.layout.line(offset, |at| self.mapped.at(at))
+    }
+
+    /// The bank of a line. The lines of one bank get the same.
+    fn bank(&mut self, line: &LineRegisters) -> &'static RegisterBank {
+        if let Some(bank) = self.banks.iter().find(|bank| ***bank == line.bank) {
+            return bank;
+        }
+        let bank: &'static RegisterBank = Box::leak(Box::new(line.bank));
+        self.banks.push(bank);
+        bank
     }
 }
 
@@ -329,14 +362,16 @@ impl FastChips {
     pub(crate) fn equip(&mut self, line: &mut HeldLine, direction: Direction, dev: &Path, devices: &Path) {
         let Subject { chip, offset, .. } = &line.subject;
         let (chip, offset) = (chip.clone(), *offset);
-        let Some(registers) = self.of(dev, devices, &chip).and_then(|chip| chip.line(offset)) else { return };
-        if let Err(why) = line.trust(registers, direction) {
+        let Some(registers) = self.of(dev, devices, &chip) else { return };
+        let Some(line_registers) = registers.line(offset) else { return };
+        let bank = registers.bank(&line_registers);
+        if let Err(why) = line.trust(line_registers, bank, direction) {
             self.distrust(&chip, offset, why);
         }
     }
 
     /// The registers of a chip. A chip without them is named in the log, with the reason.
-    fn of(&mut self, dev: &Path, devices: &Path, chip: &str) -> Option<&ChipRegisters> {
+    fn of(&mut self, dev: &Path, devices: &Path, chip: &str) -> Option<&mut ChipRegisters> {
         let wish = self.wish;
         if wish == FastGpio::Off {
             return None;
@@ -352,7 +387,7 @@ impl FastChips {
                     None
                 }
             });
-        opened.as_ref()
+        opened.as_mut()
     }
 
     /// The registers of a chip cannot be trusted. The lines that were checked already keep theirs.
@@ -392,6 +427,12 @@ mod tests {
 
     #[derive(Clone, Copy)]
     struct ModelRegister<'a>(&'a Model, usize);
+
+    impl PartialEq for ModelRegister<'_> {
+        fn eq(&self, other: &Self) -> bool {
+            self.1 == other.1
+        }
+    }
 
     impl Register for ModelRegister<'_> {
         fn load(self) -> u32 {
@@ -535,6 +576,8 @@ mod tests {
     #[derive(Clone, Copy, Debug)]
     enum Op {
         Registers(u32, bool),
+        /// One store for each level, if both lines are in one bank.
+        Together([(u32, bool); 2]),
         Kernel(u32, bool),
         Output(u32, bool),
         Input(u32),
@@ -545,6 +588,7 @@ mod tests {
         let line = 0..LINES;
         prop_oneof![
             4 => (line.clone(), any::<bool>()).prop_map(|(line, level)| Op::Registers(line, level)),
+            4 => [(line.clone(), any::<bool>()), (line.clone(), any::<bool>())].prop_map(Op::Together),
             4 => (line.clone(), any::<bool>()).prop_map(|(line, level)| Op::Kernel(line, level)),
             1 => (line.clone(), any::<bool>()).prop_map(|(line, level)| Op::Output(line, level)),
             1 => line.clone().prop_map(Op::Input),
@@ -565,6 +609,14 @@ mod tests {
             for op in ops {
                 match op {
                     Op::Registers(line, level) => { model.line(line).write(level); lines[line as usize].1 = level; }
+                    Op::Together([(line, _), (other, _)])
+                        if line == other || model.line(line).bank != model.line(other).bank => {}
+                    Op::Together(edges) => {
+                        let mask = |of| edges.iter().filter(|edge| edge.1 == of)
+                            .fold(0, |mask, edge| mask | model.line(edge.0).mask());
+                        model.line(edges[0].0).bank.change(mask(true), mask(false));
+                        edges.iter().for_each(|(line, level)| lines[*line as usize].1 = *level);
+                    }
                     Op::Kernel(line, level) => { model.kernel_sets(line, level); lines[line as usize].1 = level; }
                     Op::Output(line, level) => {
                         model.kernel_turns(line, Some(level));

@@ -48,7 +48,7 @@ impl Registers {
 }
 
 /// A 32-bit register of [`Registers`].
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, PartialEq, Eq)]
 pub struct Register(NonNull<u32>);
 
 // SAFETY: it is an address that stays mapped. Threads and other processes may use it at any time: a device's register
