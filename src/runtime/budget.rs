@@ -225,6 +225,16 @@ mod tests {
     }
 
     #[test]
+    fn a_core_without_budget_is_ordinary_until_half_of_it_is_back() {
+        let mut budget = Budget::new(THROTTLE, Clock::from_ticks(0), Duration::ZERO);
+        let mut look = |ms: u64| budget.look(Clock::from_ticks(ms * SECOND / 1000), Duration::from_secs(1));
+        assert_eq!(look(1000), Some(Class::Other));
+        // The bucket of 47.5 ms filled by 853 us in each of 1000 ms, so 99 ms are missing. It has to be half full.
+        let back = (1001..2000).find(|ms| look(*ms) == Some(Class::Fifo));
+        assert_eq!(back, Some(1144));
+    }
+
+    #[test]
     fn a_core_that_never_sleeps_is_fifo_for_most_of_the_time() {
         let fifo = fifo_spans(&[(SECOND, 0)], 6, 1);
         assert!(used(&fifo[0], 3 * SECOND) > SECOND * 80 / 100);

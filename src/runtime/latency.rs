@@ -234,6 +234,15 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn a_gentle_measurement_lasts_as_long_as_it_was_asked_to() {
+        let began = std::time::Instant::now();
+        let (_, half) = measure_beside(Duration::from_millis(100)).unwrap();
+        assert!(half.edge.samples() > 0);
+        let took = began.elapsed();
+        assert!(took > Duration::from_millis(50) && took < Duration::from_secs(20), "{took:?}");
+    }
+
+    #[test]
     fn the_verdict_follows_the_worse_half() {
         let judged =
             |loaded: &[i64]| judge(&[half("idle", &[1; 1000]), half("under load", loaded)], Scheduling::RealTime);

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! An MCU that gets the dialect of another host.
 
+use std::collections::BTreeMap;
+
 use pinion_firmware::mcu::{DialectName, Generation};
 use pinion_protocol::vlq::Writer;
 
@@ -30,6 +32,32 @@ fn an_mcu_speaks_as_it_is_told_at_once_or_after_its_reset() {
     assert_eq!(rig.dialect().name(), DialectName::Of(Generation::Kalico));
     rig.configure(&[]);
     assert_eq!(rig.ask("get_config"), "config is_config=1 crc=7 is_shutdown=0 move_count=1024");
+}
+
+/// While hosts change, the new one gets these of the MCU that still speaks with the former one.
+#[test]
+fn the_mcus_own_responses_have_one_id_in_every_dialect() {
+    let own = |generation| {
+        let rig = Rig::of(generation);
+        let dialect = rig.dialect();
+        let mut ids = BTreeMap::new();
+        for (format, id) in &dialect.dictionary().responses {
+            let id = id.as_i64().unwrap();
+            let mut payload = Writer::default();
+            payload.int(id as u32);
+            if dialect.is_own_response(payload.payload().unwrap()) {
+                ids.insert(format.split(' ').next().unwrap().to_owned(), id);
+            }
+        }
+        ids
+    };
+    let of_master = own(Generation::Master);
+    let named = |name: &str| of_master.contains_key(name);
+    assert!(["identify_response", "clock", "config", "shutdown"].iter().all(|name| named(name)), "{of_master:?}");
+    assert!(!["stepper_position", "spi_transfer_response", "trsync_state"].iter().any(|name| named(name)));
+    for generation in Generation::ALL {
+        assert_eq!(own(generation), of_master, "{generation:?}");
+    }
 }
 
 #[test]
