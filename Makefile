@@ -54,7 +54,8 @@ help:
 	@echo 'make soak-real     an hour of the real program on a busy computer (MINUTES=60 WORKERS=1)'
 	@echo 'make fuzz          random bytes for everything that reads what others wrote: each target for'
 	@echo '                   SECONDS=60, or all for TOTAL=600; only one with TARGET=link'
-	@echo 'make coverage      how many lines the tests reach (ARGS="-p pinion-firmware" for some of them)'
+	@echo 'make coverage      how many lines the tests reach (ARGS="-p pinion-firmware" for some of them;'
+	@echo '                   LAB=1 also those in the virtual machine)'
 	@echo 'make mutants       do the tests notice if the code is changed? (PACKAGE=pinion-firmware SHARD=7/30)'
 	@echo 'make sanitize      what threads share, in all orders; tests with sanitizers'
 	@echo 'make bench         the benchmarks'
@@ -112,8 +113,10 @@ TARGET ?=
 fuzz: system-packages-fuzz
 	@CARGO='$(CARGO)' scripts/fuzz $(if $(TOTAL),--total $(TOTAL),$(SECONDS)) $(TARGET)
 
-coverage: system-packages-coverage
-	@CARGO='$(CARGO)' scripts/coverage $(ARGS)
+# LAB=1 runs the tests in the virtual machine, too.
+LAB ?=
+coverage: system-packages-coverage $(if $(LAB),system-packages-vm)
+	@CARGO='$(CARGO)' scripts/coverage $(if $(LAB),--lab) $(ARGS)
 
 PACKAGE ?= pinion-firmware
 # A part of the mutants, such as 7/30: each 30th of them.

@@ -35,6 +35,9 @@ kernel_log() {
 	! grep -qE 'BUG:|WARNING:|Oops|general protection' /tmp/kernel_log
 }
 
+# Programs with counters (scripts/coverage) keep them there.
+export LLVM_PROFILE_FILE=/tmp/tests/output/%m%c.profraw
+
 run_test() {
 	MEASURED_PROGRAM=$2 timeout -s KILL 60 guest --exact "$1" --nocapture </dev/null
 	status=$?

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! One VM under QEMU, from its snapshot to the last result.
 
+use std::env;
 use std::fs;
 use std::path::Path;
 use std::process::Command;
@@ -85,6 +86,7 @@ impl Run<'_> {
         let cause = follow(&mut emulator)?;
         let share = folder.join("share");
         let count = self.report_results(&share, report)?;
+        keep_profiles(&share)?;
         if count < self.tests.len() {
             let console = emulator.console();
             let named = console.lines().rev().find_map(|line| line.strip_prefix(MARK));
@@ -121,6 +123,24 @@ impl Run<'_> {
         }
         Ok(reported)
     }
+}
+
+/// Copies the counters of the guest's programs to those of this program, if it has some (`scripts/coverage`).
+fn keep_profiles(share: &Path) -> Result<(), String> {
+    let file = env::var_os("LLVM_PROFILE_FILE");
+    let (Some(kept), Ok(outputs)) =
+        (file.as_deref().map(Path::new).and_then(Path::parent), share.join("output").read_dir())
+    else {
+        return Ok(());
+    };
+    let run = share.parent().and_then(Path::file_name).unwrap_or_default().to_string_lossy();
+    for path in outputs.flatten().map(|entry| entry.path()).filter(|path| path.extension() == Some("profraw".as_ref()))
+    {
+        let name = path.file_name().unwrap_or_default().to_string_lossy();
+        fs::copy(&path, kept.join(format!("vm-{run}-{name}")))
+            .map_err(|error| format!("cannot keep {}: {error}", path.display()))?;
+    }
+    Ok(())
 }
 
 /// Waits until the VM has ended. Returns how it ended, for the tests without a result.
