@@ -25,7 +25,7 @@ mod throttled;
 pub mod trace;
 
 use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::Firmware;
+use pinion_firmware::mcu::{Firmware, Wire};
 
 /// The program's description as an MCU.
 pub const FIRMWARE: Firmware = Firmware {
@@ -34,4 +34,5 @@ pub const FIRMWARE: Firmware = Firmware {
     version: concat!("pinion-", env!("PINION_VERSION")),
     build_versions: concat!("rustc: ", env!("PINION_COMPILER")),
     license: "GNU GPLv3",
+    wire: Wire::Terminal,
 };

@@ -55,12 +55,13 @@ fn key_at(text: &str, mistake: Option<Range<usize>>) -> Option<&'static Key> {
 }
 
 /// Every option of `pinion run`, in the order of its `--help`.
-const KEYS: [Key; 13] = [
+const KEYS: [Key; 14] = [
     Key {
         name: "symlink",
         example: "\"/tmp/klipper_host_mcu\"",
         set: |given, value| put(&mut given.symlink, text(value)?.into()),
     },
+    Key { name: "link", example: "\"serial:/dev/ttyGS0\"", set: |given, value| put(&mut given.link, word(value)?) },
     Key { name: "realtime", example: "true", set: |given, value| put(&mut given.realtime, flag(value)?) },
     Key { name: "cpu", example: "3", set: |given, value| put(&mut given.cpu, number(value)?) },
     Key {
@@ -233,6 +234,7 @@ mod tests {
         assert_eq!((given.cpu.take(), given.group.take().as_deref()), (Some(3), Some("tty")));
         // These are the service's own.
         assert_eq!(given.realtime.take(), Some(true));
+        assert_eq!(given.link.take().unwrap().to_string(), "pty:/run/pinion/klipper_host_mcu");
         assert_eq!(given.symlink.take().unwrap(), Path::new("/run/pinion/klipper_host_mcu"));
         assert_eq!(given.socket.take().unwrap(), Path::new("/run/pinion/mcu.sock"));
         assert_eq!(given.log_level.take(), Some(log::LevelFilter::Info));

@@ -33,7 +33,7 @@ use termina::escape::csi::DecPrivateModeCode;
 
 use crate::klippy::process::{Search, Terminal as Device, find};
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Helpers, Options, Recording};
+use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording};
 use crate::trace::folder::user_state;
 use pinion_client::console::{Console, Next, Vocabulary};
 use pinion_client::{self, Client};
@@ -142,7 +142,7 @@ fn simulate(args: &ConsoleArgs, file: Option<&Path>) -> Result<(), String> {
     let symlink = std::env::temp_dir().join(format!("pinion_console_{}", std::process::id()));
     let recording = Recording::new(clock, &symlink, false, Vec::new()).map_err(|error| error.to_string())?;
     let options = Options {
-        symlink: symlink.clone(),
+        link: LinkName::Pty(symlink.clone()),
         dialect: None,
         access: Access { mode: 0o600, group: Some(nix::unistd::getegid().to_string()) },
         realtime: false,

@@ -40,7 +40,7 @@ impl Settings {
     /// The options of the runtime.
     fn options(&self) -> Options {
         Options {
-            symlink: self.symlink.clone(),
+            link: self.link.clone(),
             dialect: self.dialect,
             access: self.access.clone(),
             realtime: self.realtime,
@@ -89,7 +89,10 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     // /dev/mem is opened later, when a line of its chip is claimed.
     let rights = sys::SERVE | if settings.fast_gpio == FastGpio::DevMem { sys::RAW_MEMORY } else { 0 };
     let helpers = recording.and_then(|recording| {
-        Ok((Helpers::start(&recording, guarded, settings.dialect.is_none(), rights)?, recording))
+        Ok((
+            Helpers::start(&recording, guarded, settings.dialect.is_none() && settings.link.is_local(), rights)?,
+            recording,
+        ))
     });
     let (helpers, recording) = match helpers {
         Ok(started) => started,

@@ -10,7 +10,7 @@ use std::sync::Arc;
 use clap::{Args, ValueHint};
 use log::LevelFilter;
 
-use crate::runtime::Access;
+use crate::runtime::{Access, LinkName};
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
 use pinion_firmware::time::{TimeSource, Timing};
@@ -35,6 +35,10 @@ pub(super) struct Given {
     /// Path of the symbolic link that the host opens; it leads to the pty [default: /tmp/klipper_host_mcu]
     #[arg(short = 'I', value_name = "PATH")]
     pub(super) symlink: Option<PathBuf>,
+    /// The way to the host: pty:PATH, or for a host on another computer serial:/dev/PORT[,BAUD] or stdio. The
+    /// status and the traces are still named after -I [default: pty, at the path of -I]
+    #[arg(long, value_name = "LINK", value_hint = ValueHint::Other, value_parser = clap::value_parser!(LinkName))]
+    pub(super) link: Option<LinkName>,
     /// Run in real time: SCHED_FIFO and locked memory
     #[arg(short = 'r', num_args = 0, default_missing_value = "true")]
     pub(super) realtime: Option<bool>,
@@ -79,7 +83,9 @@ pub(super) struct Given {
 /// The settings that the program runs by.
 #[derive(Clone, Debug)]
 pub(super) struct Settings {
+    /// The instance's name: the path of the symbolic link, even if the link to the host is another one.
     pub(super) symlink: PathBuf,
+    pub(super) link: LinkName,
     pub(super) realtime: bool,
     pub(super) cpu: Option<usize>,
     pub(super) margin_us: u32,
@@ -98,6 +104,7 @@ impl Given {
     pub(super) fn or(self, other: Given) -> Given {
         Given {
             symlink: self.symlink.or(other.symlink),
+            link: self.link.or(other.link),
             realtime: self.realtime.or(other.realtime),
             cpu: self.cpu.or(other.cpu),
             margin: self.margin.or(other.margin),
@@ -115,8 +122,13 @@ impl Given {
 
     /// The same, with the defaults for missing values.
     pub(super) fn settings(self) -> Settings {
+        let symlink = match &self.link {
+            Some(LinkName::Pty(path)) => path.clone(),
+            _ => self.symlink.unwrap_or_else(|| "/tmp/klipper_host_mcu".into()),
+        };
         Settings {
-            symlink: self.symlink.unwrap_or_else(|| "/tmp/klipper_host_mcu".into()),
+            link: self.link.unwrap_or_else(|| LinkName::Pty(symlink.clone())),
+            symlink,
             realtime: self.realtime.unwrap_or(false),
             cpu: self.cpu,
             margin_us: self.margin.unwrap_or(200),

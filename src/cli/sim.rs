@@ -22,7 +22,7 @@ use super::demo::heater::Goal;
 use super::demo::picture;
 use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Helpers, Options, Recording};
+use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording};
 use crate::trace::folder::folders;
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
@@ -95,7 +95,7 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     };
     let probe = board.probe();
     let options = Options {
-        symlink: args.symlink.clone(),
+        link: LinkName::Pty(args.symlink.clone()),
         dialect: None,
         access: Access { mode: 0o660, group: None },
         realtime: args.realtime,

@@ -1,31 +1,34 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The link's end of the terminal: whether a host is there, the blocks of its input, and the output for it.
+//! The host's end of the link thread: whether a host is there, the blocks of its input, and the output for it.
 
 #![forbid(unsafe_code)]
 
 use std::io;
 use std::os::fd::BorrowedFd;
 use std::sync::Arc;
+use std::time::Duration;
 
 use log::{info, warn};
 
+use pinion_firmware::shutdown::Shutdown;
 use pinion_linux::LOOK_AT_LOG;
+use pinion_linux::clock::monotonic;
 use pinion_protocol::block::{Received, Receiver, Refusal, Sequence, frame};
 
 use super::core::Payload;
-use super::pty::Pty;
+use super::link::{Heard, Link};
 use super::status::HostBoard;
 
-/// The text that a shell writes to the pty to stop the MCU, as in Klipper's service file.
+/// The text that a shell writes to a pty to stop the MCU, as in Klipper's service file.
 const FORCE_SHUTDOWN: &[u8] = b"FORCE_SHUTDOWN\n";
-/// Highest number of bytes read from the pty and not yet taken in.
+/// Highest number of bytes read from the link and not yet taken in.
 const INPUT_BYTES: usize = 4096;
 /// Highest number of bytes for a host that does not read. After that, responses wait in the ring; then they are lost.
 const OUTPUT_BYTES: usize = 16 * 1024;
 
-/// The terminal, with its input and its output.
+/// A link, with its input and its output.
 pub(super) struct HostEnd {
-    pty: Pty,
+    link: Box<dyn Link>,
     receiver: Receiver,
     input: Box<[u8; INPUT_BYTES]>,
     /// How many bytes of the input were read.
@@ -34,6 +37,8 @@ pub(super) struct HostEnd {
     taken: usize,
     output: Vec<u8>,
     is_attached: bool,
+    /// When a host that is silent counts as gone (CLOCK_MONOTONIC).
+    silent_until: Option<Duration>,
     /// Shows whether a host is there.
     shown: Arc<HostBoard>,
 }
@@ -43,6 +48,10 @@ pub(super) struct HostEnd {
 pub(super) struct Read {
     /// A host has come.
     pub(super) is_new_host: bool,
+    /// The host has gone.
+    pub(super) is_gone: bool,
+    /// No host can come any more.
+    pub(super) is_over: bool,
     /// Somebody wrote `FORCE_SHUTDOWN`.
     pub(super) is_forced: bool,
 }
@@ -58,23 +67,35 @@ pub(super) enum Next {
 }
 
 impl HostEnd {
-    /// The end of a terminal without a host.
-    pub(super) fn new(pty: Pty, shown: Arc<HostBoard>) -> HostEnd {
+    /// The end of a link without a host.
+    pub(super) fn new(link: Box<dyn Link>, shown: Arc<HostBoard>) -> HostEnd {
         HostEnd {
-            pty,
+            link,
             receiver: Receiver::default(),
             input: Box::new([0; INPUT_BYTES]),
             filled: 0,
             taken: 0,
             output: Vec::with_capacity(2 * OUTPUT_BYTES),
             is_attached: false,
+            silent_until: None,
             shown,
         }
     }
 
-    /// A descriptor: readable when the host has written, and hung up when the host is gone.
-    pub(super) fn event(&self) -> BorrowedFd<'_> {
-        self.pty.master()
+    /// A descriptor: readable when the host has written, and hung up when the host is gone. `None` while the link is
+    /// closed.
+    pub(super) fn event(&self) -> Option<BorrowedFd<'_>> {
+        self.link.event()
+    }
+
+    /// When to call [`HostEnd::read`] although the descriptor tells nothing (CLOCK_MONOTONIC).
+    pub(super) fn due(&self) -> Option<Duration> {
+        self.link.due().into_iter().chain(self.silent_until).min()
+    }
+
+    /// Whether the link's descriptor would tell of room for bytes.
+    pub(super) fn tells_of_room(&self) -> bool {
+        self.link.due().is_none()
     }
 
     pub(super) fn is_attached(&self) -> bool {
@@ -85,35 +106,55 @@ impl HostEnd {
     pub(super) fn tell(&self) -> String {
         self.shown.attach(self.is_attached);
         let host = if self.is_attached { "a host is attached" } else { "no host is attached" };
-        format!("serving on {}, {host}", self.pty.symlink().display())
+        format!("serving on {}, {host}", self.link.place())
     }
 
-    /// Reads the host's bytes.
-    pub(super) fn read(&mut self) -> io::Result<Read> {
+    /// Reads the host's bytes. `hung_up`: the descriptor has hung up.
+    pub(super) fn read(&mut self, hung_up: bool) -> io::Result<Read> {
         let mut read = Read::default();
-        if self.filled == INPUT_BYTES {
-            return Ok(read);
-        }
-        let bytes = self.pty.read(&mut self.input[self.filled..])?;
+        let bytes = match self.link.read(&mut self.input[self.filled..], hung_up)? {
+            Heard::Bytes(bytes) => bytes,
+            heard => {
+                read.is_over = heard == Heard::Over;
+                read.is_gone = true;
+                self.part()?;
+                return Ok(read);
+            }
+        };
         let fresh = self.filled..self.filled + bytes;
         self.filled = fresh.end;
-        if bytes > 0 && !self.is_attached && self.pty.meet_host()? {
+        if bytes > 0 && !self.is_attached && self.link.meet_host()? {
             self.is_attached = true;
             read.is_new_host = true;
             info!("host attached");
         }
+        if let Some(silence_max) = self.link.silence_max().filter(|_| self.is_attached) {
+            let now = monotonic();
+            if bytes > 0 {
+                self.silent_until = Some(now + silence_max);
+            } else if self.silent_until.is_some_and(|until| now >= until) {
+                read.is_gone = true;
+                self.part()?;
+            }
+        }
         if self.input[fresh.clone()] == *FORCE_SHUTDOWN {
             self.filled = fresh.start;
             read.is_forced = true;
-            warn!("FORCE_SHUTDOWN was written to {}", self.pty.device().display());
+            warn!("FORCE_SHUTDOWN was written to {}", self.link.detail());
         }
         Ok(read)
     }
 
+    /// What another program on the same wire has done, if it must stop the MCU.
+    pub(super) fn intrusion(&mut self) -> Option<Shutdown> {
+        self.link.intrusion()
+    }
+
     /// The host is gone.
-    pub(super) fn part(&mut self) -> io::Result<()> {
-        self.pty.part_from_host()?;
+    fn part(&mut self) -> io::Result<()> {
+        self.link.part_from_host()?;
         self.is_attached = false;
+        self.silent_until = None;
         self.output.clear();
         info!("host gone");
         Ok(())
@@ -146,7 +187,7 @@ impl HostEnd {
         self.output.len() >= OUTPUT_BYTES
     }
 
-    /// Whether the terminal has taken all framed bytes.
+    /// Whether the link has taken all framed bytes.
     pub(super) fn is_out(&self) -> bool {
         self.output.is_empty()
     }
@@ -156,7 +197,7 @@ impl HostEnd {
         frame(payload, Sequence::after(number), &mut self.output);
     }
 
-    /// Writes as much as the terminal has room for. Returns the number of bytes.
+    /// Writes as much as the link has room for. Returns the number of bytes.
     pub(super) fn write(&mut self) -> u32 {
         if !self.is_attached {
             self.output.clear();
@@ -164,7 +205,7 @@ impl HostEnd {
         if self.output.is_empty() {
             return 0;
         }
-        match self.pty.write(&self.output) {
+        match self.link.write(&self.output) {
             Ok(written) => {
                 self.output.drain(..written);
                 written as u32
@@ -172,7 +213,7 @@ impl HostEnd {
             Err(error) => {
                 warn!(
                     "{} cannot be written, and answers to the host are lost: {error}: {LOOK_AT_LOG}",
-                    self.pty.device().display()
+                    self.link.detail()
                 );
                 self.output.clear();
                 0

@@ -4,19 +4,21 @@
 #![forbid(unsafe_code)]
 
 use std::iter;
+use std::path::Path;
 use std::sync::Arc;
 use std::time::Duration;
 
 use log::warn;
 
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::{Dialect, DialectName, Generation};
+use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Generation, Wire};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::clock::monotonic;
 
+use crate::FIRMWARE;
+
 use super::host::{HostFinder, HostSearch};
 use super::outlet::LinkWake;
-use super::pty::Pty;
 use super::started;
 use super::status::HostBoard;
 use super::survey::{self, Surveyor};
@@ -55,12 +57,12 @@ pub(super) enum Step {
 
 impl Introduction {
     /// Starts the threads that search. Call it before the link gets real-time priority, or they inherit it. `only` is
-    /// the one dialect that is spoken, or `None`.
+    /// the one dialect that is spoken, or `None`. `wire` is the host's wire, and `terminal` is what it has open.
     pub(super) fn start(
         only: Option<DialectName>,
         board: &dyn Board,
         search: Option<HostSearch>,
-        pty: &Pty,
+        (wire, terminal): (Wire, Option<&Path>),
         wake: &Arc<LinkWake>,
         shown: &Arc<HostBoard>,
     ) -> Result<Introduction, Trouble> {
@@ -68,11 +70,13 @@ impl Introduction {
             Some(name) => vec![name],
             None => iter::once(DialectName::Union).chain(Generation::ALL.map(DialectName::Of)).collect(),
         };
-        let dialects = survey::dialects(board, &names)?;
-        let search = search.filter(|_| only.is_none());
-        let finder = search.map(|search| HostFinder::start(search, pty.device(), wake.clone(), shown.clone()));
+        let firmware = Firmware { wire, ..FIRMWARE };
+        let dialects = survey::dialects(&firmware, board, &names)?;
+        let search = search.filter(|_| only.is_none()).zip(terminal);
+        let finder = search.map(|(search, terminal)| HostFinder::start(search, terminal, wake.clone(), shown.clone()));
         let finder = finder.map(started).transpose()?;
-        let surveyor = board.view().map(|view| started(Surveyor::start(view, names, wake.clone()))).transpose()?;
+        let surveyor =
+            board.view().map(|view| started(Surveyor::start(firmware, view, names, wake.clone()))).transpose()?;
         Ok(Introduction { dialects, outdated: Vec::new(), finder, surveyor, until: None, is_overdue: false })
     }
 

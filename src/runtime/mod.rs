@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The program at work: threads, pty, real time, signals.
+//! The program at work: threads, links, real time, signals.
 //!
 //! ```text
 //! host <-pty-> link ==ring of blocks==> core ==ring of jobs==> one worker per bus
@@ -35,12 +35,12 @@ mod introduction;
 pub(crate) mod latency;
 mod ledger;
 mod link;
+mod link_thread;
 mod lookout;
 mod notify;
 mod outlet;
 mod oversight;
 mod place;
-mod pty;
 mod pulse;
 pub mod realtime;
 mod recorder;
@@ -58,14 +58,15 @@ mod workers;
 pub mod fuzz {
     pub use super::guardian::fuzz::guardian;
     pub use super::host::search;
-    pub use super::link::fuzz::link;
+    pub use super::link_thread::fuzz::link;
 }
 
 pub use guardian::Guardian;
 pub use helpers::Helpers;
 pub use host::HostSearch;
+pub use link::LinkName;
+pub use link::pty::Access;
 pub use place::Place;
-pub use pty::Access;
 pub use recorder::Recording;
 pub use served::{Served, served};
 pub(crate) use signals::hang_up;
@@ -76,11 +77,10 @@ use self::core::{Left, Request};
 use core_thread::{CoreThread, REQUESTS};
 use host_end::HostEnd;
 use introduction::Introduction;
-use link::{End, Link};
+use link_thread::{End, LinkThread};
 use notify::Notify;
 use outlet::LinkWake;
 use oversight::Oversight;
-use pty::Pty;
 use pulse::Pulse;
 use realtime::{Processors, Role};
 use recorder::Recorder;
@@ -92,9 +92,9 @@ use watchdog::{Vigil, Watchdog};
 /// How the program runs.
 #[derive(Clone, Debug)]
 pub struct Options {
-    /// Path of the symbolic link to the pty.
-    pub symlink: PathBuf,
-    /// Who may open the pty.
+    /// The way to the host.
+    pub link: LinkName,
+    /// Who may open a pseudo terminal.
     pub access: Access,
     /// Whether to ask for real-time scheduling.
     pub realtime: bool,
@@ -112,7 +112,7 @@ pub struct Options {
     pub sockets: Vec<PathBuf>,
 }
 
-/// Serves a host on a pty until SIGTERM, SIGINT or SIGHUP. It calls `ready` once a host may come. The MCU drives
+/// Serves a host until SIGTERM, SIGINT or SIGHUP. It calls `ready` once a host may come. The MCU drives
 /// `board` by `timing`, and the instants of `timing` are those of the recording's clock. `helpers` has the guardian of
 /// the board's outputs.
 pub fn run(
@@ -132,15 +132,17 @@ pub fn run(
     let processors = Processors::new(options.cpu)?;
     // This comes first: a process that sees the link may send a signal, and the signal must not leave the link behind.
     let signals = Signals::new().map_err(no_room)?;
-    let pty = Pty::open(&options.symlink, &options.access)?;
+    let link = options.link.open(&options.access)?;
     let notify = Notify::from_env()?;
     info!("board {}", board.describe());
     let (wake, shown) = (Arc::new(LinkWake::new().map_err(no_room)?), Arc::new(HostBoard::default()));
-    let introduction = Introduction::start(options.dialect, &*board, search, &pty, &wake, &shown)?;
+    let dialect = options.dialect.or_else(|| (!options.link.is_local()).then_some(DialectName::Union));
+    let place = (link.wire(), link.terminal());
+    let introduction = Introduction::start(dialect, &*board, search, place, &wake, &shown)?;
     let (teller, asker) = status::ends();
     let facts = Facts {
-        link: options.symlink.clone(),
-        device: pty.device().to_owned(),
+        link: link.place(),
+        terminal: link.detail(),
         board: board.describe(),
         pins: board.pins(),
         view: board.view(),
@@ -148,11 +150,11 @@ pub fn run(
         requests: REQUESTS,
         recorder: recording.status(),
     };
-    let _status = StatusSocket::start(&options.sockets, facts, shown.clone(), asker);
+    let _status = StatusSocket::start(&options.sockets, link.terminal(), facts, shown.clone(), asker);
     let (mut recorder, tape) = Recorder::new(recording.clone()).map_err(no_room)?;
     let board = if options.trace_edges { recorder.with_edges(board) } else { board };
     let trace_sockets = trace_socket_paths(&options.sockets);
-    let trace_socket = status::open_socket(&trace_sockets, pty.device(), |errors| {
+    let trace_socket = status::open_socket(&trace_sockets, link.terminal(), |errors| {
         warn!("pinion trace --live will not be answered: {errors}");
     });
     let (realtime, margin) = (options.realtime, options.margin);
@@ -165,10 +167,10 @@ pub fn run(
     let (core, core_end) = core.start()?;
     started(recorder.start(trace_socket))?;
 
-    info!("serving on {} ({})", options.symlink.display(), pty.device().display());
+    info!("serving on {} ({})", link.place(), link.detail());
     let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
     let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil).map_err(no_room)?;
-    let mut link = Link::new(HostEnd::new(pty, shown), core_end, introduction, oversight, clock, recorder);
+    let mut link = LinkThread::new(HostEnd::new(link, shown), core_end, introduction, oversight, clock, recorder);
     if realtime {
         realtime::enter(Role::Link);
     }
@@ -180,14 +182,14 @@ pub fn run(
     };
     let served = watched.and_then(|()| {
         ready();
-        link.run().map_err(|error| refused("the terminal failed, so Pinion ends", error).remedy(LOOK_AT_LOG))
+        link.run().map_err(|error| refused("the link failed, so Pinion ends", error).remedy(LOOK_AT_LOG))
     });
     end(link, core, guardian, served)
 }
 
 /// Ends the threads and processes in order. `served` is how the link ended.
 fn end(
-    mut link: Link,
+    mut link: LinkThread,
     core: JoinHandle<Left>,
     guardian: Option<Guardian>,
     served: Result<End, Trouble>,

@@ -11,17 +11,20 @@ use std::thread;
 
 use log::{error, info};
 
-use crate::FIRMWARE;
 use pinion_firmware::board::Board;
-use pinion_firmware::mcu::{Dialect, DialectName};
+use pinion_firmware::mcu::{Dialect, DialectName, Firmware};
 use pinion_firmware::trouble::Trouble;
 
 use super::outlet::LinkWake;
 use super::refused;
 
 /// The dialects of these names, for the board as it is now.
-pub(super) fn dialects(board: &dyn Board, names: &[DialectName]) -> Result<Vec<Arc<Dialect>>, Trouble> {
-    let made = names.iter().map(|name| Dialect::new(&FIRMWARE, board, *name).map(Arc::new)).collect::<io::Result<_>>();
+pub(super) fn dialects(
+    firmware: &Firmware,
+    board: &dyn Board,
+    names: &[DialectName],
+) -> Result<Vec<Arc<Dialect>>, Trouble> {
+    let made = names.iter().map(|name| Dialect::new(firmware, board, *name).map(Arc::new)).collect::<io::Result<_>>();
     made.map_err(|error| {
         refused("a host cannot be told what the board has", error).remedy("report it, and restart Pinion")
     })
@@ -39,6 +42,7 @@ pub(super) struct Surveyor {
 impl Surveyor {
     /// Starts the thread, on a view of the board. It wakes the link with each answer.
     pub(super) fn start(
+        firmware: Firmware,
         mut view: Box<dyn Board>,
         names: Vec<DialectName>,
         wake: Arc<LinkWake>,
@@ -49,7 +53,7 @@ impl Surveyor {
             for () in questions {
                 let found = view.look_again().then(|| {
                     info!("the board has changed: {}", view.describe());
-                    dialects(&*view, &names)
+                    dialects(&firmware, &*view, &names)
                 });
                 let found = found.transpose().unwrap_or_else(|trouble| {
                     error!("the host gets the board's former names: {trouble}");

@@ -13,7 +13,7 @@ use std::time::{Duration, Instant};
 use nix::sys::signal::{Signal, raise};
 use nix::unistd::geteuid;
 use pinion::runtime::wakeup::MarginLimits;
-use pinion::runtime::{self, Access, Helpers, Options, Recording};
+use pinion::runtime::{self, Access, Helpers, LinkName, Options, Recording};
 use pinion_linux::clock::Monotonic;
 use pinion_sim::{SimBoard, SimConfig, SimProbe};
 use serde_json::{Value, json};
@@ -121,7 +121,7 @@ impl Printer {
             let board = SimBoard::new(config, Arc::new(clock)).unwrap();
             let (probe, timing) = (board.probe(), board.timing());
             let options = Options {
-                symlink: folder.join("tty"),
+                link: LinkName::Pty(folder.join("tty")),
                 access: Access { mode: 0o660, group: None },
                 realtime: true,
                 cpu: None,
@@ -131,7 +131,7 @@ impl Printer {
                 sockets: Vec::new(),
                 dialect: None,
             };
-            let recording = Recording::new(clock, &options.symlink, true, Vec::new()).unwrap();
+            let recording = Recording::new(clock, &folder.join("tty"), true, Vec::new()).unwrap();
             let run =
                 move || runtime::run(&options, Box::new(board), timing, recording, Helpers::default(), || {}).unwrap();
             Server::Here { running: Some(thread::spawn(run)), probe, _alone: alone }

@@ -9,6 +9,7 @@ mod dialects;
 mod disk;
 mod doctor;
 mod life;
+mod links;
 mod one_order;
 mod process;
 mod recorder;

@@ -102,6 +102,11 @@ impl Pinion {
         (std::mem::replace(&mut self.folder, tempfile::tempdir().unwrap()), link)
     }
 
+    /// Its folder.
+    pub fn folder(&self) -> &TempDir {
+        &self.folder
+    }
+
     pub fn link(&self) -> PathBuf {
         self.folder.path().join("tty")
     }

@@ -66,7 +66,7 @@
 //!     let bench = Bench::new(clock.clone(), Clock::EPOCH);
 //!     let board = FakeBoard(bench.clone());
 //!     let firmware =
-//!         Firmware { features: FEATURES, app: "Echo", version: "1", build_versions: "", license: "GNU GPLv3" };
+//!         Firmware { features: FEATURES, app: "Echo", version: "1", build_versions: "", license: "GNU GPLv3", wire: Wire::Terminal };
 //!     let dialect = Dialect::new(&firmware, &board, DialectName::Of(Generation::Master)).unwrap();
 //!     let (dialect, said) = (Arc::new(dialect), Said::default());
 //!     let workers = Box::new(FakeWorkers::new(bench));

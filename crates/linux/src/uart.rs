@@ -3,7 +3,7 @@
 
 #![forbid(unsafe_code)]
 
-use std::fs::{File, OpenOptions};
+use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
 use std::os::fd::AsFd;
 use std::os::unix::fs::OpenOptionsExt;
@@ -71,6 +71,62 @@ pub(super) fn scan(dev: &Path, class: &Path) -> Vec<Uart> {
     sysfs::names(class).into_iter().filter_map(port).collect()
 }
 
+/// Opens the terminal at this path: raw, with eight data bits, no parity and one stop bit. No other program may open it
+/// meanwhile. The lock keeps out programs that ask for it, even those of root.
+fn open_raw(path: &Path) -> Result<Flock<File>, Trouble> {
+    let flags = libc::O_NOCTTY | libc::O_NONBLOCK;
+    let file = OpenOptions::new()
+        .read(true)
+        .write(true)
+        .custom_flags(flags)
+        .open(path)
+        .map_err(|error| cannot_open(path, &error))?;
+    let file = Flock::lock(file, FlockArg::LockExclusiveNonblock).map_err(|(_, errno)| match errno {
+        Errno::EWOULDBLOCK => in_use(),
+        errno => Trouble::new(format!("it cannot be locked: {errno}")).remedy(LOOK_AT_LOG),
+    })?;
+    sys::make_exclusive(&*file).map_err(no_port)?;
+    let mut settings = tcgetattr(&*file).map_err(no_port)?;
+    cfmakeraw(&mut settings);
+    settings.control_flags.remove(ControlFlags::CSTOPB | ControlFlags::CRTSCTS);
+    // No modem line matters.
+    settings.control_flags.insert(ControlFlags::CREAD | ControlFlags::CLOCAL);
+    tcsetattr(&*file, SetArg::TCSANOW, &settings).map_err(no_port)?;
+    Ok(file)
+}
+
+/// How far a port's real rate may be from the wanted one: a receiver still finds the tenth bit of a byte.
+const RATE_ERROR_MAX: f64 = 0.025;
+
+/// Opens a port as the line to a host, at this rate in baud. Without one it keeps its rate.
+///
+/// # Errors
+///
+/// It is gone, another program's or the kernel's console, or it does not have the rate.
+pub fn open_line(path: &Path, baud: Option<u32>) -> Result<Flock<File>, Trouble> {
+    let opened = || {
+        let target = fs::canonicalize(path).map_err(|error| cannot_open(path, &error))?;
+        let name = target.file_name().unwrap_or_default().to_string_lossy();
+        let consoles = sysfs::text(&Path::new(crate::TTY).join("console/active")).unwrap_or_default();
+        if consoles.split_whitespace().any(|console| console == name) {
+            return Err(console());
+        }
+        let file = open_raw(&target)?;
+        let Some(baud) = baud else { return Ok(file) };
+        let real = sys::set_rate(&*file, baud).map_err(|error| {
+            Trouble::new(format!("it does not have {baud} baud: {error}"))
+                .remedy("name another rate, in printer.cfg too")
+        })?;
+        if (f64::from(real) / f64::from(baud) - 1.0).abs() > RATE_ERROR_MAX {
+            return Err(
+                Trouble::new(format!("it makes {real} of {baud} baud")).remedy("name another rate, in printer.cfg too")
+            );
+        }
+        Ok(file)
+    };
+    opened().map_err(|trouble| trouble.of(path.display()))
+}
+
 /// An open serial port: eight data bits, no parity, one stop bit. No other program may open it.
 #[derive(Debug)]
 pub(super) struct Port {
@@ -90,29 +146,9 @@ impl Port {
 
     fn try_open(dev: &Path, uart: &Uart, rate_hz: u32) -> Result<Port, Trouble> {
         if uart.is_console {
-            return Err(Trouble::new("the kernel writes its messages to it").remedy(
-                "remove its console= from the kernel's command line (on a Raspberry Pi in cmdline.txt, or with raspi-config), and reboot",
-            ));
+            return Err(console());
         }
-        let path = dev.join(&uart.name);
-        let flags = libc::O_NOCTTY | libc::O_NONBLOCK;
-        let file = OpenOptions::new()
-            .read(true)
-            .write(true)
-            .custom_flags(flags)
-            .open(&path)
-            .map_err(|error| cannot_open(&path, &error))?;
-        let file = Flock::lock(file, FlockArg::LockExclusiveNonblock).map_err(|(_, errno)| match errno {
-            Errno::EWOULDBLOCK => in_use(),
-            errno => Trouble::new(format!("it cannot be locked: {errno}")).remedy(LOOK_AT_LOG),
-        })?;
-        sys::make_exclusive(&*file).map_err(no_port)?;
-        let mut settings = tcgetattr(&*file).map_err(no_port)?;
-        cfmakeraw(&mut settings);
-        settings.control_flags.remove(ControlFlags::CSTOPB | ControlFlags::CRTSCTS);
-        // No modem line matters.
-        settings.control_flags.insert(ControlFlags::CREAD | ControlFlags::CLOCAL);
-        tcsetattr(&*file, SetArg::TCSANOW, &settings).map_err(no_port)?;
+        let file = open_raw(&dev.join(&uart.name))?;
         set_rate(&file, rate_hz)?;
         let faults = sys::line_faults(&*file).ok();
         Ok(Port { file, name: uart.name.clone(), faults })
@@ -207,6 +243,12 @@ fn set_rate(port: &File, rate_hz: u32) -> Result<(), Trouble> {
         }
     }
     Err(Trouble::new(format!("it has neither {rate_hz} baud nor another rate: {refused}")).remedy("use another port"))
+}
+
+fn console() -> Trouble {
+    Trouble::new("the kernel writes its messages to it").remedy(
+        "remove its console= from the kernel's command line (on a Raspberry Pi in cmdline.txt, or with raspi-config), and reboot",
+    )
 }
 
 fn in_use() -> Trouble {

@@ -5,7 +5,7 @@ use std::sync::{Arc, Mutex};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::feature::FEATURES;
-use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Generation, Mcu, Note, Outbox};
+use pinion_firmware::mcu::{Dialect, DialectName, Firmware, Generation, Mcu, Note, Outbox, Wire};
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing, VirtualClock};
 use pinion_protocol::dictionary::Dictionary;
 use pinion_protocol::format::{self, Conversion};
@@ -16,7 +16,7 @@ use crate::memory::uncounted;
 
 /// The firmware of a rig's MCU.
 pub const FIRMWARE: Firmware =
-    Firmware { features: FEATURES, app: "Rig", version: "test", build_versions: "", license: "" };
+    Firmware { features: FEATURES, app: "Rig", version: "test", build_versions: "", license: "", wire: Wire::Terminal };
 
 /// The tick at which a rig is created, unless a test sets another.
 const ORIGIN: u64 = 10_000_000;

@@ -3,7 +3,6 @@
 
 #![forbid(unsafe_code)]
 
-use std::path::PathBuf;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
@@ -61,8 +60,10 @@ impl HostBoard {
 
 /// Facts that the program knows from its start.
 pub(in crate::runtime) struct Facts {
-    pub(in crate::runtime) link: PathBuf,
-    pub(in crate::runtime) device: PathBuf,
+    /// Where the host finds the MCU.
+    pub(in crate::runtime) link: String,
+    /// The terminal there, or more about that place.
+    pub(in crate::runtime) terminal: String,
     /// Description of the board.
     pub(in crate::runtime) board: String,
     /// Names of its pins.
@@ -102,8 +103,8 @@ impl Reporter {
             version: env!("PINION_VERSION").to_owned(),
             pid: std::process::id(),
             uptime_s: rounded(self.started.elapsed().as_secs_f64()),
-            link: facts.link.to_string_lossy().into_owned(),
-            terminal: facts.device.to_string_lossy().into_owned(),
+            link: facts.link.clone(),
+            terminal: facts.terminal.clone(),
             board: facts.board.clone(),
             state: answer.map_or(State::Unknown, |answer| state(&answer.mcu)),
             host: self.host.host(),

@@ -45,12 +45,12 @@ impl StatusSocket {
     /// Opens the socket at the first of these paths where that is possible, and serves it.
     pub(in crate::runtime) fn start(
         paths: &[PathBuf],
+        terminal: Option<&Path>,
         facts: Facts,
         host: Arc<HostBoard>,
         asker: Asker,
     ) -> Option<StatusSocket> {
-        let (listener, place) =
-            open(paths, &facts.device, |errors| warn!("pinion status will not be answered: {errors}"))?;
+        let (listener, place) = open(paths, terminal, |errors| warn!("pinion status will not be answered: {errors}"))?;
         info!("status on {}", place.path.display());
         let served = serve_on(listener, Reporter::new(asker, facts, host));
         let started = served.inspect_err(|error| {
@@ -68,17 +68,17 @@ impl Drop for Place {
     }
 }
 
-/// Opens a socket at the first of these paths where that is possible. Users who may open the terminal `device` may
-/// connect: the socket gets the terminal's group. A path where another instance answers is not taken over. If it
+/// Opens a socket at the first of these paths where that is possible. Users who may open the host's terminal may
+/// connect: the socket gets the terminal's group. Without a terminal it keeps our own group. A path where another instance answers is not taken over. If it
 /// is possible nowhere, `complain` gets the errors.
 pub(in crate::runtime) fn open(
     paths: &[PathBuf],
-    device: &Path,
+    terminal: Option<&Path>,
     complain: impl FnOnce(&str),
 ) -> Option<(UnixListener, Place)> {
     let mut errors = Vec::new();
     for path in paths {
-        match open_at(path, device) {
+        match open_at(path, terminal) {
             Ok((listener, id)) => return Some((listener, Place { path: path.clone(), id })),
             Err(error) => errors.push(format!("{}: {error}", path.display())),
         }
@@ -111,7 +111,7 @@ pub fn trace_socket_paths(status: &[PathBuf]) -> Vec<PathBuf> {
 }
 
 /// Opens the socket at a path, and returns it with its device and inode.
-fn open_at(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))> {
+fn open_at(path: &Path, terminal: Option<&Path>) -> io::Result<(UnixListener, (u64, u64))> {
     match fs::symlink_metadata(path) {
         Ok(found) if !found.file_type().is_socket() => {
             return Err(io::Error::other("there is something else: remove it, or choose another --socket"));
@@ -135,9 +135,11 @@ fn open_at(path: &Path, device: &Path) -> io::Result<(UnixListener, (u64, u64))>
     let listener = UnixListener::bind(&fresh)?;
     let placed = (|| {
         listener.set_nonblocking(true)?;
-        let gid = fs::metadata(device)?.gid();
-        // Only root and the group's members may do this. Without it only our own user and root may ask.
-        let _ = chown(&fresh, None, Some(gid));
+        if let Some(terminal) = terminal {
+            let gid = fs::metadata(terminal)?.gid();
+            // Only root and the group's members may do this. Without it only our own user and root may ask.
+            let _ = chown(&fresh, None, Some(gid));
+        }
         fs::set_permissions(&fresh, fs::Permissions::from_mode(0o660))?;
         let ours = fs::symlink_metadata(&fresh)?;
         fs::rename(&fresh, path)?;
@@ -202,10 +204,10 @@ mod tests {
     use crate::status::{self, State};
     use std::io::Read;
 
-    fn facts(device: &Path) -> Facts {
+    fn facts() -> Facts {
         Facts {
             link: "/tmp/klipper_host_mcu".into(),
-            device: device.to_owned(),
+            terminal: "/dev/pts/3".into(),
             board: "a board".into(),
             pins: Vec::new(),
             view: None,
@@ -231,8 +233,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mcu.sock");
         let (teller, asker) = ends();
-        let socket =
-            StatusSocket::start(std::slice::from_ref(&path), facts(folder.path()), Arc::default(), asker).unwrap();
+        let socket = StatusSocket::start(std::slice::from_ref(&path), None, facts(), Arc::default(), asker).unwrap();
         for _ in 0..2 {
             let mut text = String::new();
             UnixStream::connect(&path).unwrap().read_to_string(&mut text).unwrap();
@@ -248,7 +249,7 @@ mod tests {
     fn neither_a_live_socket_nor_another_file_is_taken_over() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("mcu.sock");
-        let start = || StatusSocket::start(std::slice::from_ref(&path), facts(folder.path()), Arc::default(), ends().1);
+        let start = || StatusSocket::start(std::slice::from_ref(&path), None, facts(), Arc::default(), ends().1);
         fs::write(&path, "mine").unwrap();
         assert!(start().is_none());
         assert_eq!(fs::read(&path).unwrap(), b"mine");

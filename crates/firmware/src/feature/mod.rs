@@ -14,6 +14,7 @@ mod adxl345;
 mod analog_in;
 mod bmi160;
 mod buttons;
+pub mod canbus;
 mod counter;
 mod digital_out;
 mod display;
@@ -64,6 +65,7 @@ pub const FEATURES: &[Feature] = &[
     adxl345::FEATURE,
     bmi160::FEATURE,
     buttons::FEATURE,
+    canbus::FEATURE,
     counter::FEATURE,
     ds18b20::FEATURE,
     fifo_sensor::FEATURE,

@@ -35,6 +35,7 @@ pub const FEATURE: Feature = Feature {
     ],
     enumerations: &[Enumeration::new("pin", |board| board.pins())],
     shutdowns: reason::SHUTDOWNS,
+    ..Feature::EMPTY
 };
 
 const RESPONSES: &[Form] = &[

@@ -10,7 +10,7 @@ use pinion_protocol::Malformed;
 use pinion_protocol::format::same;
 use pinion_protocol::vlq::{Reader, Writer};
 
-use super::{Generations, Mcu};
+use super::{Generations, Mcu, Wire};
 
 impl From<Malformed> for Shutdown {
     /// The cause is empty. [`Mcu::execute`] adds the name of the command.
@@ -153,12 +153,20 @@ pub struct Feature {
     pub enumerations: &'static [Enumeration],
     /// Its shutdown texts: the `SHUTDOWNS` that [`shutdowns!`](crate::shutdown::shutdowns) makes.
     pub shutdowns: &'static [ShutdownReason],
+    /// Whether the MCU has it on this wire.
+    pub is_on: fn(&Wire) -> bool,
 }
 
 impl Feature {
     /// A feature that adds nothing.
-    pub const EMPTY: Feature =
-        Feature { commands: &[], responses: &[], constants: &[], enumerations: &[], shutdowns: &[] };
+    pub const EMPTY: Feature = Feature {
+        commands: &[],
+        responses: &[],
+        constants: &[],
+        enumerations: &[],
+        shutdowns: &[],
+        is_on: |_wire| true,
+    };
 }
 
 /// Declares a command: its format, and a closure with the MCU and the typed parameters.

@@ -15,7 +15,7 @@ use pinion_protocol::format::{self, Conversion};
 use pinion_protocol::vlq::Reader;
 
 use super::command::{Command, ConstantValue, Feature, Handler};
-use super::{DialectName, Generation, Generations, base, since};
+use super::{DialectName, Generation, Generations, Wire, base, since};
 
 /// The remedy for a host with another dictionary.
 pub(super) const READ_ANEW: &str = "restart the host so that it reads the dictionary anew";
@@ -116,11 +116,14 @@ pub struct Firmware {
     pub build_versions: &'static str,
     /// The program's license.
     pub license: &'static str,
+    /// The wire that its host is on.
+    pub wire: Wire,
 }
 
 /// The messages that a host and the MCU may exchange, by their ids.
 pub struct Dialect {
     name: DialectName,
+    wire: Wire,
     /// Indexed by the [`place`] of the id.
     commands: Vec<Option<Entry>>,
     /// Indexed by [`super::Response::INDEX`].
@@ -132,6 +135,13 @@ pub struct Dialect {
     dictionary: Dictionary,
     /// The dictionary as `identify` serves it.
     compressed: Vec<u8>,
+}
+
+impl Firmware {
+    /// The entries of one kind of the features that it has on its wire.
+    fn all<T>(&self, of: fn(&'static Feature) -> &'static [T]) -> impl Iterator<Item = &'static T> + Clone {
+        self.features.iter().filter(|feature| (feature.is_on)(&self.wire)).flat_map(of)
+    }
 }
 
 /// A dictionary that describes the program and has no messages yet.
@@ -152,14 +162,15 @@ fn head(firmware: &Firmware, name: &DialectName) -> Dictionary {
 type Numbered = (Vec<Option<Entry>>, Vec<Option<u32>>);
 
 /// Gives ids to the messages of a dialect, and adds them to the dictionary.
-fn number(features: &'static [Feature], name: &DialectName, dictionary: &mut Dictionary) -> io::Result<Numbered> {
+fn number(firmware: &Firmware, name: &DialectName, dictionary: &mut Dictionary) -> io::Result<Numbered> {
+    let features = firmware.features;
     let mut ids = ids();
     let mut next_id = || ids.next().ok_or_else(|| io::Error::other("there are more messages than ids"));
     let (mut commands, mut response_ids) = (Vec::new(), Vec::new());
-    let responses = Choice::new(name, all(features, |feature| feature.responses), |form| {
+    let responses = Choice::new(name, firmware.all(|feature| feature.responses), |form| {
         (format::name(form.format), form.generations)
     });
-    let taken = Choice::new(name, all(features, |feature| feature.commands), |command| {
+    let taken = Choice::new(name, firmware.all(|feature| feature.commands), |command| {
         (format::name(command.format), command.generations)
     });
     // The MCU's own messages have the same ids in every dialect. The MCU may get another dialect after its host has
@@ -196,8 +207,8 @@ fn number(features: &'static [Feature], name: &DialectName, dictionary: &mut Dic
 }
 
 /// Adds the constants and enumerations of a dialect to the dictionary.
-fn publish_names(features: &'static [Feature], name: &DialectName, board: &dyn Board, dictionary: &mut Dictionary) {
-    let constants = all(features, |feature| feature.constants);
+fn publish_names(firmware: &Firmware, name: &DialectName, board: &dyn Board, dictionary: &mut Dictionary) {
+    let constants = firmware.all(|feature| feature.constants);
     let had = Choice::new(name, constants.clone(), |constant| (constant.name, constant.generations));
     for constant in constants.filter(|constant| had.has(constant)) {
         let value = match constant.value {
@@ -206,7 +217,10 @@ fn publish_names(features: &'static [Feature], name: &DialectName, board: &dyn B
         };
         dictionary.config.insert(constant.name.into(), value);
     }
-    let enumerations = all(features, |feature| feature.enumerations);
+    if let Some((name, value)) = firmware.wire.rate() {
+        dictionary.config.insert(name.into(), json!(value));
+    }
+    let enumerations = firmware.all(|feature| feature.enumerations);
     let had = Choice::new(name, enumerations.clone(), |enumeration| (enumeration.name, enumeration.generations));
     for enumeration in enumerations.filter(|enumeration| had.has(enumeration)) {
         let values = names((enumeration.values)(board));
@@ -217,16 +231,16 @@ fn publish_names(features: &'static [Feature], name: &DialectName, board: &dyn B
 impl Dialect {
     /// Gives ids to the messages that hosts of this dialect use, and makes the dictionary with the board's names.
     pub fn new(firmware: &Firmware, board: &dyn Board, name: DialectName) -> io::Result<Dialect> {
-        let features = firmware.features;
         let mut dictionary = head(firmware, &name);
-        let (commands, response_ids) = number(features, &name, &mut dictionary)?;
-        publish_names(features, &name, board, &mut dictionary);
-        let shutdowns: Vec<ShutdownReason> = features.iter().flat_map(|feature| feature.shutdowns).copied().collect();
+        let (commands, response_ids) = number(firmware, &name, &mut dictionary)?;
+        publish_names(firmware, &name, board, &mut dictionary);
+        let shutdowns: Vec<ShutdownReason> = firmware.all(|feature| feature.shutdowns).copied().collect();
         let texts = shutdowns.iter().zip(0..).map(|(reason, id)| (reason.text().into(), json!(id)));
         dictionary.enumerations.insert("static_string_id".into(), Value::Object(texts.collect()));
         let compressed = dictionary.compress()?;
+        let wire = firmware.wire.clone();
         let mut dialect =
-            Dialect { name, commands, response_ids, emergency_stop: None, shutdowns, dictionary, compressed };
+            Dialect { name, wire, commands, response_ids, emergency_stop: None, shutdowns, dictionary, compressed };
         dialect.emergency_stop = dialect.command_id(base::EMERGENCY_STOP.format);
         Ok(dialect)
     }
@@ -234,6 +248,11 @@ impl Dialect {
     /// Which dialect this is.
     pub fn name(&self) -> DialectName {
         self.name
+    }
+
+    /// The wire that its host is on.
+    pub fn wire(&self) -> &Wire {
+        &self.wire
     }
 
     /// Whether the MCU behaves as these hosts expect, where the form of a message does not say it.

@@ -35,6 +35,7 @@ mod stats;
 mod stop;
 mod timers;
 mod turn;
+mod wire;
 
 pub use crate::{command, response};
 pub use batch::Batch;
@@ -57,6 +58,7 @@ pub use snapshot::{BusCounts, LineState, LineUse, ObjectState, Present, QueueSta
 pub use stop::RETRY_TICKS;
 pub use timers::Timer;
 pub use turn::Turn;
+pub use wire::{CANBUS_UUID_BYTES, CanHealth, CanNode, CanState, Wire};
 
 use configuration::{Configuration, OBJECTS_MAX};
 use hold::Holds;

@@ -8,6 +8,7 @@ use std::io::{self, Read as _};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt, chown, symlink};
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use log::{info, warn};
 use nix::errno::Errno;
@@ -20,10 +21,11 @@ use nix::unistd::{geteuid, read, ttyname, write};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::sys;
 
-use super::place::Place;
-use super::refused;
-use super::served::served;
-use super::terminal_group::{CLOSED, TerminalGroup};
+use super::super::place::Place;
+use super::super::refused;
+use super::super::served::served;
+use super::super::terminal_group::{CLOSED, TerminalGroup};
+use super::{Heard, Link};
 
 /// The folder where others leave files in the link's place.
 const TMP: &str = "/tmp";
@@ -35,7 +37,7 @@ const FORCE_SHUTDOWN: &str = "FORCE_SHUTDOWN";
 /// The kernel reports that the host has gone: the master hangs up when the last process has closed the slave end. So
 /// our own slave end must be closed while a host is there. It is open while no host is there, or the master would be
 /// hung up all that time.
-pub(super) struct Pty {
+pub(in crate::runtime) struct Pty {
     master: OwnedFd,
     /// Our own slave end, open while no host is there.
     slave: Option<OwnedFd>,
@@ -59,7 +61,7 @@ impl Pty {
     /// # Errors
     ///
     /// The path is taken, the group is not this user's, or the kernel has no terminal.
-    pub(super) fn open(symlink: &Path, access: &Access) -> Result<Pty, Trouble> {
+    pub(in crate::runtime) fn open(symlink: &Path, access: &Access) -> Result<Pty, Trouble> {
         if let Some(served) = served(symlink) {
             return Err(format!("{served}, or choose another path with -I").into());
         }
@@ -85,29 +87,38 @@ impl Pty {
         let device = ttyname(&pty.slave)?;
         Ok((pty, device))
     }
+}
 
-    /// The path of the slave end, such as `/dev/pts/3`.
-    pub(super) fn device(&self) -> &Path {
-        &self.device
+impl Link for Pty {
+    fn place(&self) -> String {
+        self.symlink.display().to_string()
     }
 
-    /// The path of the symbolic link, by which the host finds the terminal.
-    pub(super) fn symlink(&self) -> &Path {
-        &self.symlink
+    fn detail(&self) -> String {
+        self.device.display().to_string()
     }
 
-    /// Reads the host's bytes, and returns how many; 0 if there are none.
-    pub(super) fn read(&self, buffer: &mut [u8]) -> io::Result<usize> {
+    fn terminal(&self) -> Option<&Path> {
+        Some(&self.device)
+    }
+
+    fn event(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.master.as_fd())
+    }
+
+    fn read(&mut self, buffer: &mut [u8], hung_up: bool) -> io::Result<Heard> {
+        if hung_up {
+            return Ok(Heard::Gone);
+        }
         match read(&self.master, buffer) {
-            Ok(len) => Ok(len),
+            Ok(len) => Ok(Heard::Bytes(len)),
             // The kernel answers EIO when the host has gone and all its bytes have been read.
-            Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(0),
+            Err(Errno::EAGAIN | Errno::EINTR | Errno::EIO) => Ok(Heard::Bytes(0)),
             Err(error) => Err(error.into()),
         }
     }
 
-    /// Writes as many bytes as the terminal has room for, and returns how many.
-    pub(super) fn write(&self, bytes: &[u8]) -> io::Result<usize> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
         match write(&self.master, bytes) {
             Ok(len) => Ok(len),
             Err(Errno::EAGAIN | Errno::EINTR) => Ok(0),
@@ -115,9 +126,9 @@ impl Pty {
         }
     }
 
-    /// Call this when bytes came while no host was there. It closes our slave end, so that the master hangs up when the
-    /// host goes. It returns false if the host has gone already, as `echo` in a shell does.
-    pub(super) fn meet_host(&mut self) -> io::Result<bool> {
+    /// It closes our slave end, so that the master hangs up when the host goes. It returns false if the host has gone
+    /// already, as `echo` in a shell does.
+    fn meet_host(&mut self) -> io::Result<bool> {
         self.slave = None;
         let mut fds = [PollFd::new(self.master.as_fd(), PollFlags::empty())];
         poll(&mut fds, PollTimeout::ZERO)?;
@@ -128,18 +139,17 @@ impl Pty {
         Ok(is_there)
     }
 
-    /// Call this when the master has hung up because the host has gone. It opens our slave end again, and drops the
-    /// bytes that the host did not read.
-    pub(super) fn part_from_host(&mut self) -> io::Result<()> {
+    fn silence_max(&self) -> Option<Duration> {
+        None
+    }
+
+    /// It opens our slave end again, so that the master no longer hangs up.
+    fn part_from_host(&mut self) -> io::Result<()> {
         let slave = sys::pty_slave(self.master.as_fd())?;
         // If this fails, the next host reads some blocks that were meant for this one, and skips them.
         let _ = tcflush(&slave, FlushArg::TCIFLUSH);
         self.slave = Some(slave);
         Ok(())
-    }
-
-    pub(super) fn master(&self) -> BorrowedFd<'_> {
-        self.master.as_fd()
     }
 }
 
@@ -240,12 +250,12 @@ mod tests {
     fn terminal() -> (tempfile::TempDir, Pty, impl Fn() -> File) {
         let folder = tempfile::tempdir().unwrap();
         let pty = Pty::open(&folder.path().join("tty"), &Access { mode: 0o600, group: None }).unwrap();
-        let device = pty.device().to_owned();
+        let device = pty.device.clone();
         (folder, pty, move || OpenOptions::new().read(true).write(true).open(&device).unwrap())
     }
 
     fn hangs_up(pty: &Pty) -> bool {
-        let mut fds = [PollFd::new(pty.master(), PollFlags::empty())];
+        let mut fds = [PollFd::new(pty.master.as_fd(), PollFlags::empty())];
         poll(&mut fds, PollTimeout::ZERO).unwrap() > 0
     }
 
@@ -278,7 +288,7 @@ mod tests {
         for content in ["", "\n", "FORCE_SHUTDOWN\n"] {
             let path = file(Path::new(TMP), content);
             let pty = Pty::open(&path, &access).unwrap();
-            assert_eq!(fs::read_link(&path).unwrap(), pty.device());
+            assert_eq!(fs::read_link(&path).unwrap(), pty.device);
         }
         let elsewhere = tempfile::tempdir().unwrap();
         for (folder, content) in [
@@ -304,7 +314,7 @@ mod tests {
         let half_made = folder.path().join(format!("tty.{}", std::process::id()));
         symlink("/dev/pts/no-longer-there", &half_made).unwrap();
         let pty = Pty::open(&link, &Access { mode: 0o600, group: None }).unwrap();
-        assert_eq!(fs::read_link(&link).unwrap(), pty.device());
+        assert_eq!(fs::read_link(&link).unwrap(), pty.device);
         assert!(fs::symlink_metadata(&half_made).is_err(), "it is left");
     }
 
@@ -314,7 +324,7 @@ mod tests {
         open().write_all(b"FORCE_SHUTDOWN\n").unwrap();
         assert!(!pty.meet_host().unwrap());
         let mut heard = [0; 64];
-        let len = pty.read(&mut heard).unwrap();
+        let Heard::Bytes(len) = pty.read(&mut heard, false).unwrap() else { panic!() };
         assert_eq!(heard[..len], *b"FORCE_SHUTDOWN\n");
         assert!(!hangs_up(&pty));
     }
@@ -328,8 +338,12 @@ mod tests {
         pty.write(b"for the last one").unwrap();
         drop(host);
         let mut heard = [0; 64];
-        assert_eq!(pty.read(&mut heard).unwrap(), 1);
-        assert_eq!(pty.read(&mut heard).unwrap(), 0, "a terminal that hung up has nothing to read");
+        assert_eq!(pty.read(&mut heard, false).unwrap(), Heard::Bytes(1));
+        assert_eq!(
+            pty.read(&mut heard, false).unwrap(),
+            Heard::Bytes(0),
+            "a terminal that hung up has nothing to read"
+        );
         pty.part_from_host().unwrap();
         host = open();
         pty.write(b"for this one").unwrap();

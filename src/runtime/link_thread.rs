@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The link: takes blocks from the host to the core, and responses from the core to the host.
+//! The link thread: takes blocks from the host to the core, and responses from the core to the host.
 //!
-//! The link itself answers `identify`, `get_clock` and `get_uptime` when they come alone in a block: they need no core.
+//! It answers `identify`, `get_clock` and `get_uptime` itself when they come alone in a block: they need no core.
 //! So the host's clock synchronization sees the shortest round trip, even while a bus holds earlier blocks back.
 
 #![forbid(unsafe_code)]
@@ -83,8 +83,8 @@ impl Known {
     }
 }
 
-/// The link.
-pub(super) struct Link {
+/// The link thread.
+pub(super) struct LinkThread {
     host: HostEnd,
     core: CoreEnd,
     introduction: Introduction,
@@ -110,13 +110,13 @@ struct Woken {
 /// Why the link ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum End {
-    /// A signal asked for it.
+    /// A signal asked for it, or no host can come any more.
     Asked,
     /// The guardian is gone. The program has to be started again.
     GuardianLost,
 }
 
-impl Link {
+impl LinkThread {
     pub(super) fn new(
         host: HostEnd,
         core: CoreEnd,
@@ -124,11 +124,11 @@ impl Link {
         oversight: Oversight,
         clock: Arc<dyn TimeSource>,
         recorder: Recorder,
-    ) -> Link {
+    ) -> LinkThread {
         let known = Known::new(introduction.first_dialect());
         recorder.speak(&known.dialect);
         let tape = recorder.link();
-        Link { host, core, introduction, oversight, clock, known, changed_at: None, recorder, tape }
+        LinkThread { host, core, introduction, oversight, clock, known, changed_at: None, recorder, tape }
     }
 
     /// Feeds a hardware watchdog from now on.
@@ -164,14 +164,8 @@ impl Link {
             if self.oversight.is_over() {
                 return Ok(End::GuardianLost);
             }
-            if woken.by_hangup {
-                self.host.part()?;
-                self.introduction.end();
-                self.tell_status();
-                self.record(Event::HostGone);
-            }
-            if woken.by_input {
-                self.read()?;
+            if (woken.by_hangup || woken.by_input) && self.read(woken.by_hangup)? {
+                return Ok(End::Asked);
             }
         }
     }
@@ -189,7 +183,8 @@ impl Link {
             // Bytes without room in the terminal go out as the host reads.
             let is_out = self.host.is_out() && !self.core.inlet.has_response();
             let events = if is_out { PollFlags::empty() } else { PollFlags::POLLOUT };
-            let mut fds = [PollFd::new(self.host.event(), events)];
+            let Some(event) = self.host.event() else { return };
+            let mut fds = [PollFd::new(event, events)];
             // A host that hangs up has read it. A further signal ends the wait.
             if poll(&mut fds, poll_timeout(end.saturating_sub(monotonic()))) != Ok(1)
                 || fds[0].revents() != Some(PollFlags::POLLOUT)
@@ -200,9 +195,9 @@ impl Link {
         }
     }
 
-    /// Closes the terminal, then stops the watchdogs.
+    /// Closes the link, then stops the watchdogs.
     pub(super) fn close(self) {
-        let Link { host, core, introduction, oversight, recorder, .. } = self;
+        let LinkThread { host, core, introduction, oversight, recorder, .. } = self;
         drop((host, core, introduction, recorder));
         oversight.end();
     }
@@ -232,31 +227,35 @@ impl Link {
         if !stalled {
             events |= PollFlags::POLLIN;
         }
-        if !self.host.is_out() {
+        if !self.host.is_out() && self.host.tells_of_room() {
             events |= PollFlags::POLLOUT;
         }
+        let (wake, event, due) = (self.core.wake.event(), self.host.event(), self.host.due());
         let mut fds = [
-            PollFd::new(self.host.event(), events),
-            PollFd::new(self.core.wake.event(), PollFlags::POLLIN),
+            PollFd::new(wake, PollFlags::POLLIN),
             PollFd::new(self.oversight.event(), PollFlags::POLLIN),
+            PollFd::new(event.unwrap_or(wake), events),
         ];
-        match poll(&mut fds, self.timeout(stalled)) {
+        let count = if event.is_some() { 3 } else { 2 };
+        match poll(&mut fds[..count], self.timeout(stalled, due)) {
             Ok(_) | Err(Errno::EINTR) => {}
             Err(error) => return Err(error.into()),
         }
         let events = |fd: &PollFd<'_>| fd.revents().unwrap_or(PollFlags::empty());
         let woken = Woken {
-            by_oversight: !events(&fds[2]).is_empty(),
-            by_input: events(&fds[0]).contains(PollFlags::POLLIN),
-            by_hangup: events(&fds[0]).contains(PollFlags::POLLHUP),
+            by_oversight: !events(&fds[1]).is_empty(),
+            by_input: events(&fds[2]).intersects(PollFlags::POLLIN | PollFlags::POLLERR)
+                || due.is_some_and(|due| monotonic() >= due),
+            by_hangup: events(&fds[2]).contains(PollFlags::POLLHUP),
         };
-        let called = !events(&fds[1]).is_empty();
+        let called = !events(&fds[0]).is_empty();
         self.core.wake.awake(called);
         Ok(woken)
     }
 
-    fn timeout(&self, stalled: bool) -> PollTimeout {
-        let due: Option<Duration> = self.oversight.due().map(|at| at.saturating_sub(monotonic()));
+    /// `due` is the link's own time.
+    fn timeout(&self, stalled: bool, due: Option<Duration>) -> PollTimeout {
+        let due = self.oversight.due().into_iter().chain(due).min().map(|at| at.saturating_sub(monotonic()));
         stalled.then_some(STALL).into_iter().chain(due).min().map_or(PollTimeout::NONE, poll_timeout)
     }
 
@@ -268,8 +267,17 @@ impl Link {
         self.oversight.lose_guardian();
     }
 
-    fn read(&mut self) -> io::Result<()> {
-        let read = self.host.read()?;
+    /// Reads what has come. True if no host can come any more.
+    fn read(&mut self, hung_up: bool) -> io::Result<bool> {
+        let read = self.host.read(hung_up)?;
+        if read.is_gone {
+            self.introduction.end();
+            self.tell_status();
+            self.record(Event::HostGone);
+        }
+        if let Some(stop) = self.host.intrusion() {
+            self.request(Request::Shutdown(stop));
+        }
         if read.is_new_host {
             self.tell_status();
             self.introduction.begin();
@@ -279,7 +287,7 @@ impl Link {
             let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
             self.request(Request::Shutdown(stop.remedy("FIRMWARE_RESTART starts anew")));
         }
-        Ok(())
+        Ok(read.is_over)
     }
 
     /// Whether the link still has to find out the host's dialect, or what the board has.
@@ -369,7 +377,7 @@ impl Link {
         }
     }
 
-    /// Frames the core's responses and acknowledgements, and writes as much as the pty has room for.
+    /// Frames the core's responses and acknowledgements, and writes as much as the link has room for.
     fn give_out(&mut self) {
         self.core.log_lines();
         // The order matters. The responses to finished blocks are already in the ring, and all are framed before these

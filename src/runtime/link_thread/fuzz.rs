@@ -22,9 +22,10 @@ use pinion_sim::{SimBoard, SimConfig};
 
 use super::super::core_thread::REQUESTS;
 use super::super::ledger::Ledger;
+use super::super::link::Link as _;
+use super::super::link::pty::{Access, Pty};
 use super::super::notify::Notify;
 use super::super::outlet::{LinkWake, Outlet, outlet};
-use super::super::pty::{Access, Pty};
 use super::super::pulse::Pulse;
 use super::super::recorder::Recording;
 use super::super::signals::Signals;
@@ -112,7 +113,7 @@ impl Core {
 }
 
 struct Bench {
-    link: Link,
+    link: LinkThread,
     core: Core,
     device: std::path::PathBuf,
     /// The host's end, while a host is there.
@@ -140,7 +141,7 @@ impl Bench {
         let symlink = std::env::temp_dir().join(format!("pinion-fuzz-{}", std::process::id()));
         let access = Access { mode: 0o600, group: Some(getegid().to_string()) };
         let pty = Pty::open(&symlink, &access).expect("a terminal");
-        let device = pty.device().to_owned();
+        let device = pty.terminal().expect("a terminal").to_owned();
         let (wake, progress) = (Arc::new(LinkWake::new().expect("an eventfd")), Arc::new(Progress::default()));
         let (outlet, inlet) = outlet(wake.clone(), progress.clone());
         let (requests, inbox) = RingBuffer::new(REQUESTS);
@@ -149,10 +150,10 @@ impl Bench {
         let vigil = Vigil::new(Notify::from_env().expect("no service manager"), None, *pulse);
         let oversight = Oversight::new(Signals::new().expect("signals"), None, vigil).expect("epoll");
         let introduction = Introduction::of(dialect.clone());
-        let host = HostEnd::new(pty, Arc::new(HostBoard::default()));
+        let host = HostEnd::new(Box::new(pty), Arc::new(HostBoard::default()));
         let (recorder, _) = Recorder::new(RECORDING.clone()).expect("one recorder at a time");
         Bench {
-            link: Link::new(host, end, introduction, oversight, clock(), recorder),
+            link: LinkThread::new(host, end, introduction, oversight, clock(), recorder),
             core: Core { requests: inbox, progress, outlet, is_busy: false, blocks: Vec::new() },
             device,
             host: None,

@@ -1,0 +1,107 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Standard input and output: the host, or what leads to it, has started the program. The program ends with the input.
+
+#![forbid(unsafe_code)]
+
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::time::Duration;
+
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
+use nix::unistd::{read, write};
+
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::clock::monotonic;
+
+use super::super::refused;
+use super::{Heard, Link};
+
+/// When to try again if the output has no room. A pipe has room for 64 KiB, so this is rare.
+const FULL_PAUSE: Duration = Duration::from_millis(1);
+
+/// Standard input and output.
+pub(super) struct Stdio {
+    input: OwnedFd,
+    output: OwnedFd,
+    /// The output had no room. When to try again.
+    full_until: Option<Duration>,
+}
+
+impl Stdio {
+    /// Takes both over.
+    pub(super) fn open() -> Result<Stdio, Trouble> {
+        let opened = || -> io::Result<Stdio> {
+            Ok(Stdio {
+                input: io::stdin().as_fd().try_clone_to_owned()?,
+                output: io::stdout().as_fd().try_clone_to_owned()?,
+                full_until: None,
+            })
+        };
+        let stdio = opened().and_then(|stdio| stdio.prepare().map(|()| stdio));
+        stdio.map_err(|error| {
+            refused("standard input and output cannot be used", error).remedy("let ssh or socat start Pinion")
+        })
+    }
+
+    fn prepare(&self) -> io::Result<()> {
+        for fd in [&self.input, &self.output] {
+            if let Ok(mut settings) = tcgetattr(fd) {
+                cfmakeraw(&mut settings);
+                tcsetattr(fd, SetArg::TCSANOW, &settings)?;
+            }
+            let flags = OFlag::from_bits_retain(fcntl(fd, FcntlArg::F_GETFL)?);
+            fcntl(fd, FcntlArg::F_SETFL(flags | OFlag::O_NONBLOCK))?;
+        }
+        Ok(())
+    }
+}
+
+impl Link for Stdio {
+    fn place(&self) -> String {
+        "standard input".into()
+    }
+
+    fn detail(&self) -> String {
+        "stdio".into()
+    }
+
+    fn event(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.input.as_fd())
+    }
+
+    fn due(&self) -> Option<Duration> {
+        self.full_until
+    }
+
+    fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Heard> {
+        // There may be bytes before the end.
+        match read(&self.input, buffer) {
+            Ok(0) if !buffer.is_empty() => Ok(Heard::Over),
+            Ok(len) => Ok(Heard::Bytes(len)),
+            Err(Errno::EAGAIN | Errno::EINTR) => Ok(Heard::Bytes(0)),
+            // A terminal or a socket whose other end is gone.
+            Err(Errno::EIO | Errno::ECONNRESET) => Ok(Heard::Over),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.full_until = None;
+        match write(&self.output, bytes) {
+            Ok(len) => Ok(len),
+            Err(Errno::EAGAIN | Errno::EINTR) => {
+                self.full_until = Some(monotonic() + FULL_PAUSE);
+                Ok(0)
+            }
+            // The input tells that the host is gone.
+            Err(Errno::EPIPE | Errno::EIO | Errno::ECONNRESET) => Ok(bytes.len()),
+            Err(error) => Err(error.into()),
+        }
+    }
+
+    fn silence_max(&self) -> Option<Duration> {
+        None
+    }
+}

@@ -1,0 +1,146 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The ways to a host on another computer: a serial line and standard input.
+
+use std::fs;
+use std::io::Read;
+use std::os::fd::OwnedFd;
+use std::os::unix::fs::symlink;
+use std::process::{Command, Stdio};
+
+use nix::fcntl::OFlag;
+use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
+use pinion_client::Client;
+use pinion_client::serial::{BlockLink, Port};
+use tempfile::TempDir;
+
+use crate::process::{Pinion, WAIT_MAX};
+
+/// A pseudo terminal in place of a serial port. The test has the host's end. The port's name is a link, so that the
+/// next one may have the same name.
+fn plug_in(folder: &TempDir) -> PtyMaster {
+    let host = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).unwrap();
+    grantpt(&host).unwrap();
+    unlockpt(&host).unwrap();
+    let port = folder.path().join("ttyPort");
+    let _ = fs::remove_file(&port);
+    symlink(ptsname_r(&host).unwrap(), port).unwrap();
+    host
+}
+
+fn client(host: impl Into<OwnedFd>) -> Client {
+    let port = Port::from_fd(host.into(), "the host's end").unwrap();
+    Client::new(BlockLink::new(port, WAIT_MAX).unwrap()).unwrap()
+}
+
+fn on_serial(folder: TempDir, more: &str) -> Pinion {
+    let link = format!("serial:{}{more}", folder.path().join("ttyPort").display());
+    Pinion::start_in(folder, &["run", "--board", "sim", "--link", &link])
+}
+
+fn uptime(client: &mut Client) {
+    client.query("get_uptime", &[], "uptime", None).unwrap();
+}
+
+#[test]
+fn a_host_at_the_other_end_of_a_serial_line_is_served() {
+    let folder = tempfile::tempdir().unwrap();
+    let host = plug_in(&folder);
+    let pinion = on_serial(folder, ",500000");
+    pinion.logged("ttyPort (500000 baud)");
+    let mut client = client(host);
+    assert_eq!(client.constant("SERIAL_BAUD").unwrap(), 500_000.0);
+    // Nothing of the host's computer can be read, so all get the union.
+    assert!(
+        client
+            .dictionary()
+            .commands
+            .contains_key("config_stepper oid=%c step_pin=%c dir_pin=%c invert_step=%c step_pulse_ticks=%u")
+    );
+    uptime(&mut client);
+    pinion.logged("host attached");
+    // There is no terminal of our own.
+    assert!(fs::symlink_metadata(pinion.link()).is_err());
+}
+
+#[test]
+fn a_serial_port_that_goes_and_comes_back_is_served_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let host = plug_in(&folder);
+    let pinion = on_serial(folder, "");
+    pinion.logged("ttyPort (250000 baud)");
+    let mut first = client(host);
+    uptime(&mut first);
+    drop(first);
+    pinion.logged("ttyPort is gone");
+    pinion.logged("host gone");
+    let host = plug_in(pinion.folder());
+    pinion.logged("ttyPort is back");
+    let mut second = client(host);
+    uptime(&mut second);
+}
+
+#[test]
+fn a_host_that_is_silent_counts_as_gone_and_may_go_on() {
+    let folder = tempfile::tempdir().unwrap();
+    let host = plug_in(&folder);
+    let pinion = on_serial(folder, "");
+    let mut client = client(host);
+    uptime(&mut client);
+    pinion.logged("host attached");
+    // It has the line open, and says nothing.
+    pinion.logged("host gone");
+    uptime(&mut client);
+    pinion.until("the host's return", || pinion.log().matches("host attached").count() == 2);
+}
+
+#[test]
+fn a_serial_port_that_is_not_there_or_taken_is_an_error_of_one_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut pinion = on_serial(folder, "");
+    assert_eq!(pinion.end().code(), Some(1));
+    let log = pinion.log();
+    assert!(log.contains("ttyPort: it is gone") && log.lines().count() == 1, "{log}");
+
+    let folder = tempfile::tempdir().unwrap();
+    let _host = plug_in(&folder);
+    let first = on_serial(folder, "");
+    first.logged("serving on");
+    let port = format!("serial:{}", first.folder().path().join("ttyPort").display());
+    let (status, log) = first.beside(&["run", "--board", "sim", "--link", &port], false);
+    assert_eq!(status, Some(1), "{log}");
+    assert!(log.contains("another program uses it"), "{log}");
+}
+
+#[test]
+fn standard_input_and_output_carry_a_host_until_they_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
+    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        .args(["run", "--board", "sim", "--link", "stdio", "-I"])
+        .arg(folder.path().join("tty"))
+        .stdin(OwnedFd::from(theirs.try_clone().unwrap()))
+        .stdout(OwnedFd::from(theirs))
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut client = client(ours);
+    uptime(&mut client);
+    drop(client);
+    // The input has ended: so does the program, in order.
+    let mut log = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
+    assert_eq!(child.wait().unwrap().code(), Some(0), "{log}");
+    assert!(log.contains("host gone"), "{log}");
+}
+
+#[test]
+fn an_older_host_on_another_computer_gets_the_dialect_that_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let host = plug_in(&folder);
+    let link = format!("serial:{}", folder.path().join("ttyPort").display());
+    let pinion = Pinion::start_in(folder, &["run", "--board", "sim", "--dialect", "v0.11", "--link", &link]);
+    pinion.logged("serving on");
+    let client = client(host);
+    // v0.11 knows no `app`.
+    assert_eq!(client.dictionary().app, "");
+}
