@@ -262,7 +262,7 @@ mod tests {
         );
         let all = error("[printer]\nx = 1");
         assert!(
-            all.starts_with("f.toml:1:2: printer: there is no such key: there are symlink, realtime, cpu"),
+            all.starts_with("f.toml:1:2: printer: there is no such key: there are symlink, link, realtime, cpu"),
             "{all}"
         );
         assert_eq!(error("# größe\ncpu = \"3\""), "f.toml:2:7: cpu: write it such as cpu = 3");

@@ -22,6 +22,7 @@ use pinion_firmware::trouble::Trouble;
 use pins::{Names, Target};
 
 pub mod adc;
+pub mod can;
 pub mod clock;
 pub mod gpio;
 mod guard;

@@ -13,10 +13,12 @@ use std::time::Duration;
 use pinion_firmware::mcu::Wire;
 use pinion_firmware::trouble::Trouble;
 
+pub mod can;
 pub(super) mod pty;
 mod serial;
 mod stdio;
 
+use can::{CanBus, CanbusUuid};
 use pty::{Access, Pty};
 use serial::SerialLine;
 use stdio::Stdio;
@@ -106,6 +108,8 @@ pub enum LinkName {
     Pty(PathBuf),
     /// A serial port or the port of a USB gadget, with its rate in baud.
     Serial(PathBuf, Option<u32>),
+    /// A CAN interface, and the node's UUID there. Without one it is this computer's.
+    Can(String, Option<CanbusUuid>),
     /// Standard input and output.
     Stdio,
 }
@@ -125,9 +129,15 @@ impl LinkName {
         Ok(match self {
             LinkName::Pty(path) => Box::new(Pty::open(path, access)?),
             LinkName::Serial(path, baud) => Box::new(SerialLine::open(path, *baud)?),
+            LinkName::Can(interface, uuid) => Box::new(CanBus::open(interface, *uuid)?),
             LinkName::Stdio => Box::new(Stdio::open()?),
         })
     }
+}
+
+/// Whether the kernel may have a network interface of this name.
+fn is_interface(name: &str) -> bool {
+    (1..libc::IFNAMSIZ).contains(&name.len()) && !name.contains(['/', ' ']) && !name.starts_with('.')
 }
 
 impl FromStr for LinkName {
@@ -148,8 +158,11 @@ impl FromStr for LinkName {
                 Ok(baud) if baud > 0 => Ok(LinkName::Serial(port.into(), Some(baud))),
                 _ => Err(format!("{baud} is no rate in baud, such as 250000")),
             },
+            ("can", interface, uuid) if is_interface(interface) => {
+                Ok(LinkName::Can(interface.into(), uuid.map(str::parse).transpose()?))
+            }
             ("stdio", "", None) => Ok(LinkName::Stdio),
-            _ => Err("there are the links pty:PATH, serial:/dev/PORT[,BAUD] and stdio".into()),
+            _ => Err("there are the links pty:PATH, serial:/dev/PORT[,BAUD], can:INTERFACE[,UUID] and stdio".into()),
         }
     }
 }
@@ -160,6 +173,8 @@ impl fmt::Display for LinkName {
             LinkName::Pty(path) => write!(f, "pty:{}", path.display()),
             LinkName::Serial(port, None) => write!(f, "serial:{}", port.display()),
             LinkName::Serial(port, Some(baud)) => write!(f, "serial:{},{baud}", port.display()),
+            LinkName::Can(interface, None) => write!(f, "can:{interface}"),
+            LinkName::Can(interface, Some(uuid)) => write!(f, "can:{interface},{uuid}"),
             LinkName::Stdio => f.write_str("stdio"),
         }
     }
@@ -176,13 +191,27 @@ mod tests {
             ("serial:/dev/ttyAMA0", "serial:/dev/ttyAMA0,250000"),
             ("serial:/dev/ttyAMA0,115200", "serial:/dev/ttyAMA0,115200"),
             ("serial:/dev/ttyGS0", "serial:/dev/ttyGS0"),
+            ("can:can0", "can:can0"),
+            ("can:can0,0123456789AB", "can:can0,0123456789ab"),
             ("stdio", "stdio"),
         ] {
             let link: LinkName = name.parse().unwrap();
             assert_eq!(link.to_string(), shown);
             assert_eq!(shown.parse(), Ok(link));
         }
-        for name in ["", "pty", "pty:", "serial:", "serial:,9600", "tcp:host", "stdio:x", "serial:/dev/ttyAMA0,fast"] {
+        for name in [
+            "",
+            "pty",
+            "pty:",
+            "serial:",
+            "serial:,9600",
+            "tcp:host",
+            "can:",
+            "can:../x",
+            "can:can0,1",
+            "stdio:x",
+            "serial:/dev/ttyAMA0,fast",
+        ] {
             assert!(name.parse::<LinkName>().is_err(), "{name}");
         }
     }

@@ -1,0 +1,414 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! A CAN bus, by the protocol of Klipper's own firmware. The frames of a host carry the bytes of its blocks, eight in
+//! each, and so do ours. `node.rs` has the protocol, and this file the socket.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::os::fd::{AsFd, BorrowedFd};
+use std::sync::Arc;
+use std::time::Duration;
+
+use log::{info, warn};
+use nix::sys::socket::{setsockopt, sockopt};
+use socketcan::{
+    CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanSocket, EmbeddedFrame as _, Frame as _, Socket as _,
+    SocketOptions as _, StandardId,
+};
+
+use pinion_firmware::feature::canbus::ID_CONFLICT;
+use pinion_firmware::mcu::{CanNode, CanState, Wire};
+use pinion_firmware::shutdown::Shutdown;
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::can;
+use pinion_linux::clock::monotonic;
+
+use super::super::refused;
+use super::{Heard, Link};
+
+mod node;
+
+pub use node::CanbusUuid;
+use node::{ADMIN_ANSWER_ID, FRAME_BYTES_MAX, Meaning, Node};
+
+/// The identity of this computer (machine-id(5)).
+const MACHINE_ID: &str = "/etc/machine-id";
+/// When to try again if the interface's queue is full. Eight frames take a millisecond at 1 Mbit/s.
+const FULL_PAUSE: Duration = Duration::from_millis(1);
+/// How long to wait before an interface that is gone is looked for again.
+const REOPEN: Duration = Duration::from_secs(1);
+/// A frame of another kind than 11-bit data never fits this.
+const FILTER_MASK: u32 = libc::CAN_SFF_MASK | libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG;
+/// Which errors the interface shall tell.
+const ERRORS: u32 =
+    libc::CAN_ERR_LOSTARB | CRTL | libc::CAN_ERR_ACK as u32 | BUSOFF | libc::CAN_ERR_BUSERROR as u32 | RESTARTED | CNT;
+const CRTL: u32 = libc::CAN_ERR_CRTL as u32;
+const BUSOFF: u32 = libc::CAN_ERR_BUSOFF as u32;
+const RESTARTED: u32 = libc::CAN_ERR_RESTARTED as u32;
+/// Counters are in the bytes 6 and 7 (linux/can/error.h).
+const CNT: u32 = 0x200;
+
+/// A CAN bus.
+pub(super) struct CanBus {
+    interface: String,
+    node: Node,
+    state: State,
+    /// The interface is up, as far as we know.
+    is_up: bool,
+    /// Our answer to a query has to go out.
+    owes_answer: bool,
+    /// The interface's queue was full. When to try again.
+    full_until: Option<Duration>,
+    /// A host has our nodeid, and has said something.
+    is_met: bool,
+    /// A host has assigned the nodeid anew.
+    is_renewed: bool,
+    intrusion: Option<Shutdown>,
+}
+
+enum State {
+    Open(CanSocket),
+    /// It is not there. When to look for it.
+    Gone(Duration),
+}
+
+/// The UUID of this computer.
+///
+/// # Errors
+///
+/// It has no identity.
+pub fn uuid() -> Result<CanbusUuid, Trouble> {
+    let id = fs::read_to_string(MACHINE_ID).map_err(|error| refused(MACHINE_ID, error));
+    let id = id.and_then(|id| match id.trim() {
+        "" | "uninitialized" => Err(Trouble::new("it is empty").of(MACHINE_ID)),
+        id => Ok(CanbusUuid::of(id.as_bytes())),
+    });
+    id.map_err(|trouble| trouble.remedy("sudo systemd-machine-id-setup, or name a UUID: can:can0,0123456789ab"))
+}
+
+impl CanBus {
+    /// Opens an interface. One that is not there is opened later. Without a `uuid` the node has this computer's.
+    pub(super) fn open(interface: &str, uuid: Option<CanbusUuid>) -> Result<CanBus, Trouble> {
+        let CanbusUuid(uuid) = uuid.map_or_else(self::uuid, Ok)?;
+        let about = can::interface(interface);
+        let bitrate = about.as_ref().ok().and_then(|about| about.bitrate);
+        let mut bus = CanBus {
+            interface: interface.to_owned(),
+            node: Node::new(Arc::new(CanNode::new(uuid, bitrate))),
+            state: State::Gone(monotonic()),
+            is_up: true,
+            owes_answer: false,
+            full_until: None,
+            is_met: false,
+            is_renewed: false,
+            intrusion: None,
+        };
+        match bus.bind() {
+            Ok(socket) => bus.state = State::Open(socket),
+            Err(error) if error.raw_os_error() == Some(libc::ENODEV) => {
+                warn!(
+                    "there is no CAN interface {interface}: plug in its adapter, or load its overlay (Pinion opens it when it is there)"
+                );
+                bus.state = State::Gone(monotonic() + REOPEN);
+            }
+            Err(error) => {
+                let remedy = match error.raw_os_error() {
+                    Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
+                        "load the module can_raw; in the service install its drop-in for CAN (docs/guide/another-computer.md)"
+                    }
+                    _ => "name a CAN interface (ip link show type can)",
+                };
+                return Err(
+                    refused(format_args!("the CAN interface {interface} cannot be opened"), error).remedy(remedy)
+                );
+            }
+        }
+        Ok(bus)
+    }
+
+    fn bind(&self) -> io::Result<CanSocket> {
+        let socket = CanSocket::open(&self.interface)?;
+        socket.set_nonblocking(true)?;
+        socket.set_error_filter(ERRORS)?;
+        self.filter(&socket)?;
+        // The kernel's smallest buffer holds fewer frames than an interface's queue. So the socket tells when there is
+        // room for more, and the queue is never full of ours.
+        setsockopt(&socket, sockopt::SndBuf, &0)?;
+        Ok(socket)
+    }
+
+    /// Lets the kernel drop the frames that are not for us.
+    fn filter(&self, socket: &CanSocket) -> io::Result<()> {
+        let filters: Vec<CanFilter> = self.node.ids().map(|id| CanFilter::new(id.into(), FILTER_MASK)).collect();
+        socket.set_filters(&filters)
+    }
+
+    /// Looks for the interface again.
+    fn reopen(&mut self) {
+        match self.bind() {
+            Ok(socket) => {
+                info!("the CAN interface {} is there", self.interface);
+                self.state = State::Open(socket);
+            }
+            Err(_) => self.state = State::Gone(monotonic() + REOPEN),
+        }
+    }
+
+    /// The socket has failed with this error.
+    fn failed(&mut self, error: &io::Error) -> Heard {
+        match error.raw_os_error() {
+            Some(libc::ENETDOWN) => {
+                if self.is_up {
+                    warn!("the CAN interface {} is down: sudo ip link set {} up", self.interface, self.interface);
+                }
+                self.is_up = false;
+                // The socket works again when the interface is up.
+                Heard::Bytes(0)
+            }
+            _ => {
+                warn!(
+                    "the CAN interface {} is gone: {error}: plug its adapter in again (Pinion opens it when it is there)",
+                    self.interface
+                );
+                self.state = State::Gone(monotonic() + REOPEN);
+                Heard::Gone
+            }
+        }
+    }
+
+    /// Takes a frame in. The number of bytes for the MCU.
+    fn take(&mut self, frame: &CanFrame, buffer: &mut [u8]) -> usize {
+        let (id, data) = match frame {
+            CanFrame::Data(frame) => (frame.raw_id() as u16, frame.data()),
+            CanFrame::Remote(_) => return 0,
+            CanFrame::Error(error) => {
+                self.note_error(error);
+                return 0;
+            }
+        };
+        if !self.is_up {
+            self.is_up = true;
+            info!("the CAN interface {} is up", self.interface);
+        }
+        match self.node.take(id, data) {
+            Meaning::Nothing => {}
+            Meaning::Query => self.owes_answer = true,
+            Meaning::Data => {
+                buffer[..data.len()].copy_from_slice(data);
+                return data.len();
+            }
+            Meaning::Assigned => self.is_renewed = true,
+            Meaning::Conflict => {
+                let cause = format!("another node of {} sends with our nodeid", self.interface);
+                let remedy = "give each node another canbus_uuid, and let one host only assign nodeids";
+                self.intrusion = Some(Shutdown::because(ID_CONFLICT, cause).remedy(remedy));
+            }
+        }
+        0
+    }
+
+    /// Frames about errors (linux/can/error.h).
+    fn note_error(&self, error: &CanErrorFrame) {
+        let (bits, data) = (error.error_bits(), error.data());
+        let before = self.node.shared().health();
+        let mut health = before;
+        let byte = |index: usize| data.get(index).copied().unwrap_or(0);
+        if bits & CNT != 0 {
+            (health.tx_error, health.rx_error) = (byte(6).into(), byte(7).into());
+        }
+        if bits & (libc::CAN_ERR_LOSTARB | libc::CAN_ERR_ACK as u32 | libc::CAN_ERR_BUSERROR as u32) != 0 {
+            health.tx_retries = health.tx_retries.wrapping_add(1);
+        }
+        health.state = state(bits, byte(1), before.state);
+        self.node.shared().report(health);
+        if health.state == before.state {
+            return;
+        }
+        let name = &self.interface;
+        match health.state {
+            CanState::Off => warn!(
+                "the CAN interface {name} is off the bus after too many errors: look at its wiring, its two resistors of 120 ohms and its bitrate; let it come back by itself: sudo ip link set {name} type can restart-ms 100"
+            ),
+            CanState::Passive => warn!(
+                "the CAN interface {name} sees many errors: look at its wiring, its two resistors of 120 ohms and its bitrate (ip -details -statistics link show {name})"
+            ),
+            _ => info!(
+                "the CAN interface {name} is {}",
+                if health.state == CanState::Active { "well" } else { "less well" }
+            ),
+        }
+    }
+
+    /// Sends our answer to a query.
+    fn answer(&mut self) {
+        let State::Open(socket) = &self.state else { return };
+        let Some(frame) = frame(ADMIN_ANSWER_ID, &self.node.need_nodeid()) else { return };
+        match socket.write_frame(&frame) {
+            Err(error) if is_full(&error) => self.full_until = Some(monotonic() + FULL_PAUSE),
+            // A read tells more. The host asks again.
+            _ => self.owes_answer = false,
+        }
+    }
+}
+
+/// The state after an error frame.
+fn state(bits: u32, controller: u8, before: CanState) -> CanState {
+    const WARNING: u8 = 0x04 | 0x08;
+    const PASSIVE: u8 = 0x10 | 0x20;
+    const ACTIVE: u8 = 0x40;
+    if bits & BUSOFF != 0 {
+        CanState::Off
+    } else if bits & RESTARTED != 0 {
+        CanState::Active
+    } else if bits & CRTL == 0 {
+        before
+    } else if controller & PASSIVE != 0 {
+        CanState::Passive
+    } else if controller & WARNING != 0 {
+        CanState::Warn
+    } else if controller & ACTIVE != 0 {
+        CanState::Active
+    } else {
+        before
+    }
+}
+
+fn frame(id: u16, data: &[u8]) -> Option<CanDataFrame> {
+    CanDataFrame::new(StandardId::new(id)?, data)
+}
+
+/// Whether the interface, or the socket, has no room.
+fn is_full(error: &io::Error) -> bool {
+    error.kind() == ErrorKind::WouldBlock || error.raw_os_error() == Some(libc::ENOBUFS)
+}
+
+impl Link for CanBus {
+    fn place(&self) -> String {
+        self.interface.clone()
+    }
+
+    fn detail(&self) -> String {
+        format!("canbus_uuid {}", CanbusUuid(self.node.shared().uuid))
+    }
+
+    fn wire(&self) -> Wire {
+        Wire::Can(self.node.shared().clone())
+    }
+
+    fn event(&self) -> Option<BorrowedFd<'_>> {
+        match &self.state {
+            State::Open(socket) => Some(socket.as_fd()),
+            State::Gone(_) => None,
+        }
+    }
+
+    fn due(&self) -> Option<Duration> {
+        let reopen = match self.state {
+            State::Open(_) => None,
+            State::Gone(until) => Some(until),
+        };
+        let renewed = (self.is_renewed && self.is_met).then_some(Duration::ZERO);
+        reopen.into_iter().chain(self.full_until).chain(renewed).min()
+    }
+
+    fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Heard> {
+        if std::mem::take(&mut self.is_renewed) && self.is_met {
+            return Ok(Heard::Gone);
+        }
+        let mut len = 0;
+        // A whole frame must fit.
+        while buffer.len() - len >= FRAME_BYTES_MAX && !self.is_renewed {
+            let State::Open(socket) = &self.state else {
+                if self.due().is_some_and(|due| monotonic() >= due) {
+                    self.reopen();
+                }
+                break;
+            };
+            match socket.read_frame() {
+                Ok(frame) => len += self.take(&frame, &mut buffer[len..]),
+                Err(error) if error.kind() == ErrorKind::WouldBlock => break,
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) if len == 0 => return Ok(self.failed(&error)),
+                // The next read finds it again, or the interface is back.
+                Err(error) => {
+                    let _ = self.failed(&error);
+                    break;
+                }
+            }
+        }
+        if self.is_renewed
+            && let State::Open(socket) = &self.state
+        {
+            self.filter(socket)?;
+            self.is_renewed = self.is_met;
+        }
+        if self.owes_answer {
+            self.answer();
+        }
+        Ok(Heard::Bytes(len))
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.full_until = None;
+        let (State::Open(socket), Some(id)) = (&self.state, self.node.answer_id()) else { return Ok(bytes.len()) };
+        let mut written = 0;
+        for data in bytes.chunks(FRAME_BYTES_MAX) {
+            let Some(frame) = frame(id, data) else { break };
+            match socket.write_frame(&frame) {
+                Ok(()) => written += data.len(),
+                Err(error) if error.raw_os_error() == Some(libc::ENOBUFS) => {
+                    // Frames of other programs fill the queue. The socket does not tell when there is room.
+                    self.full_until = Some(monotonic() + FULL_PAUSE);
+                    break;
+                }
+                Err(error) if is_full(&error) => break,
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                // A read tells that the interface is down or gone. The host asks again for what is lost.
+                Err(_) => return Ok(bytes.len()),
+            }
+        }
+        Ok(written)
+    }
+
+    fn meet_host(&mut self) -> io::Result<bool> {
+        self.is_met = true;
+        Ok(true)
+    }
+
+    fn part_from_host(&mut self) -> io::Result<()> {
+        self.is_met = false;
+        Ok(())
+    }
+
+    fn intrusion(&mut self) -> Option<Shutdown> {
+        self.intrusion.take()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn error_frames_tell_the_state_of_the_bus() {
+        let active = CanState::Active;
+        assert_eq!(state(CRTL, 0x08, active), CanState::Warn);
+        assert_eq!(state(CRTL, 0x04 | 0x10, active), CanState::Passive);
+        assert_eq!(state(CRTL, 0x40, CanState::Passive), CanState::Active);
+        assert_eq!(state(CNT, 0x20, active), CanState::Active, "it is not about the controller");
+        assert_eq!(state(BUSOFF, 0, active), CanState::Off);
+        assert_eq!(state(RESTARTED, 0, CanState::Off), CanState::Active);
+        // An overflow of the interface's buffer changes no state.
+        assert_eq!(state(CRTL, 0x01, CanState::Warn), CanState::Warn);
+    }
+
+    #[test]
+    fn an_interface_that_is_not_there_is_waited_for() {
+        // Without the kernel's CAN it is an error, and that is fine as well.
+        match CanBus::open("nocan7", Some("0123456789ab".parse().unwrap())) {
+            Ok(bus) => assert!(bus.event().is_none() && bus.due().is_some()),
+            Err(trouble) => assert!(trouble.to_string().contains("nocan7 cannot be opened"), "{trouble}"),
+        }
+    }
+}
