@@ -5,6 +5,7 @@
 #![forbid(unsafe_code)]
 
 use std::fs;
+use std::io::ErrorKind;
 use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::ExitCode;
@@ -14,9 +15,10 @@ use nix::unistd::{AccessFlags, access, geteuid};
 
 use crate::FIRMWARE;
 use crate::runtime::realtime::{self, Processors};
-use crate::runtime::{self, CLOSED, Place, TerminalGroup};
+use crate::runtime::{self, CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_uuid};
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_linux::Inventory;
+use pinion_linux::can;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::gpio::{Chip, FastGpio};
 
@@ -31,8 +33,13 @@ pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
         findings.push(Finding::ok("config", format!("{} can be read", file.display())));
     }
     findings.extend(board(settings));
-    findings.push(link(&settings.symlink));
-    findings.push(group(settings.access.group.as_deref()));
+    match &settings.link {
+        LinkName::Pty(symlink) => {
+            findings.push(link(symlink));
+            findings.push(group(settings.access.group.as_deref()));
+        }
+        other => findings.push(wire(other)),
+    }
     findings.extend(real_time(settings));
     if settings.watchdog {
         findings.push(watchdog(Path::new(WATCHDOG)));
@@ -85,6 +92,50 @@ fn fast_gpio(wish: FastGpio, chips: &[Chip]) -> Vec<Finding> {
         }
     });
     found.collect()
+}
+
+/// Whether the way to a host on another computer is there. If it is not yet, Pinion waits for it.
+fn wire(link: &LinkName) -> Finding {
+    match link {
+        LinkName::Serial(port, _) => {
+            let path = port.display();
+            if !port.exists() {
+                Finding::warning("link", format!("there is no {path}"), "plug it in, or load its driver")
+            } else if access(port.as_path(), AccessFlags::R_OK | AccessFlags::W_OK).is_err() {
+                let remedy = "run Pinion as another user, or add this one to the port's group (ls -l /dev tells it)";
+                Finding::error("link", format!("{path} may not be opened by this user"), remedy)
+            } else {
+                Finding::ok("link", format!("{link}: {path} is there"))
+            }
+        }
+        LinkName::Can(interface, uuid) => can_bus(interface, *uuid),
+        other => Finding::ok("link", other.to_string()),
+    }
+}
+
+/// Whether a CAN interface is up, and what a host calls the node.
+fn can_bus(interface: &str, uuid: Option<CanbusUuid>) -> Finding {
+    let uuid = match uuid.map_or_else(can_uuid, Ok) {
+        Ok(uuid) => uuid,
+        Err(trouble) => return Finding::of("link", Level::Error, trouble),
+    };
+    let up = format!("sudo ip link set {interface} up type can bitrate 1000000 restart-ms 100");
+    match can::interface(interface) {
+        Err(error) if error.kind() == ErrorKind::NotFound => {
+            let remedy = "plug in its adapter, or load its overlay";
+            Finding::warning("link", format!("there is no CAN interface {interface}"), remedy)
+        }
+        Err(error) => Finding::warning("link", format!("{interface}: {error}"), "look at ip -details link"),
+        Ok(found) if !found.is_up => Finding::warning("link", format!("{interface} is down"), up),
+        Ok(found) if found.is_off => {
+            let remedy = format!("look at its wiring, its two resistors of 120 ohms and its bitrate, then {up}");
+            Finding::warning("link", format!("{interface} is off the bus after too many errors"), remedy)
+        }
+        Ok(found) => {
+            let rate = found.bitrate.map_or_else(String::new, |bitrate| format!(" at {bitrate} bit/s"));
+            Finding::ok("link", format!("{interface} is up{rate}; printer.cfg: canbus_uuid: {uuid}"))
+        }
+    }
 }
 
 /// Whether the link can be put in place.
@@ -214,6 +265,22 @@ mod tests {
         );
         let refused = link(&folder.path().join("none/tty"));
         assert!(refused.status == Level::Error && refused.told.cause.contains("there is no folder"), "{refused:?}");
+    }
+
+    #[test]
+    fn a_wire_that_is_not_there_yet_is_a_warning() {
+        let told = |link: &str| wire(&link.parse().unwrap());
+        for (link, cause) in
+            [("serial:/dev/none", "there is no /dev/none"), ("can:none,0123456789ab", "there is no CAN interface none")]
+        {
+            let found = told(link);
+            assert!(found.status == Level::Warning && found.told.cause.contains(cause), "{found:?}");
+        }
+        let folder = tempfile::tempdir().unwrap();
+        let port = folder.path().join("tty");
+        fs::write(&port, "").unwrap();
+        assert_eq!(told(&format!("serial:{}", port.display())).status, Level::Ok);
+        assert_eq!(told("stdio").status, Level::Ok);
     }
 
     #[test]

@@ -65,6 +65,7 @@ pub use guardian::Guardian;
 pub use helpers::Helpers;
 pub use host::HostSearch;
 pub use link::LinkName;
+pub use link::can::{CanbusUuid, uuid as can_uuid};
 pub use link::pty::Access;
 pub use place::Place;
 pub use recorder::Recording;

@@ -74,7 +74,7 @@ fn a_serial_port_that_goes_and_comes_back_is_served_again() {
     pinion.logged("ttyPort is gone");
     pinion.logged("host gone");
     let host = plug_in(pinion.folder());
-    pinion.logged("ttyPort is back");
+    pinion.logged("ttyPort is there");
     let mut second = client(host);
     uptime(&mut second);
 }
@@ -94,13 +94,17 @@ fn a_host_that_is_silent_counts_as_gone_and_may_go_on() {
 }
 
 #[test]
-fn a_serial_port_that_is_not_there_or_taken_is_an_error_of_one_line() {
+fn a_serial_port_that_is_not_there_yet_is_waited_for() {
     let folder = tempfile::tempdir().unwrap();
-    let mut pinion = on_serial(folder, "");
-    assert_eq!(pinion.end().code(), Some(1));
-    let log = pinion.log();
-    assert!(log.contains("ttyPort: it is gone") && log.lines().count() == 1, "{log}");
+    let pinion = on_serial(folder, "");
+    pinion.logged("there is no ");
+    let host = plug_in(pinion.folder());
+    pinion.logged("ttyPort is there");
+    uptime(&mut client(host));
+}
 
+#[test]
+fn a_serial_port_that_another_program_uses_is_an_error_of_one_line() {
     let folder = tempfile::tempdir().unwrap();
     let _host = plug_in(&folder);
     let first = on_serial(folder, "");

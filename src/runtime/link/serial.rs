@@ -41,15 +41,20 @@ enum State {
 }
 
 impl SerialLine {
-    /// Opens a port.
+    /// Opens a port. One that is not there is opened later.
     pub(super) fn open(path: &Path, baud: Option<u32>) -> Result<SerialLine, Trouble> {
-        let file = uart::open_line(path, baud)?;
-        Ok(SerialLine { path: path.to_owned(), baud, state: State::Open(file) })
+        let state = if path.exists() {
+            State::Open(uart::open_line(path, baud)?)
+        } else {
+            warn!("there is no {}: plug it in, or load its driver (Pinion opens it when it is there)", path.display());
+            State::Gone(monotonic() + REOPEN)
+        };
+        Ok(SerialLine { path: path.to_owned(), baud, state })
     }
 
     fn lose(&mut self) -> Heard {
         warn!(
-            "{} is gone, and the host with it: plug it in again (pinion opens it when it is back)",
+            "{} is gone, and the host with it: plug it in again (Pinion opens it when it is there)",
             self.path.display()
         );
         self.state = State::Gone(monotonic() + REOPEN);
@@ -89,7 +94,7 @@ impl Link for SerialLine {
             State::Gone(until) if monotonic() < *until => {}
             State::Gone(_) => match uart::open_line(&self.path, self.baud) {
                 Ok(file) => {
-                    info!("{} is back", self.path.display());
+                    info!("{} is there", self.path.display());
                     self.state = State::Open(file);
                 }
                 Err(_) => self.state = State::Gone(monotonic() + REOPEN),

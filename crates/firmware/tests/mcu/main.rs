@@ -9,6 +9,7 @@ mod any_commands;
 mod base;
 mod batch;
 mod buttons;
+mod canbus;
 mod counter;
 mod dialects;
 mod digital_out;
