@@ -42,10 +42,10 @@ const REOPEN: Duration = Duration::from_secs(1);
 const FILTER_MASK: u32 = libc::CAN_SFF_MASK | libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG;
 /// Which errors the interface shall tell.
 const ERRORS: u32 =
-    libc::CAN_ERR_LOSTARB | CRTL | libc::CAN_ERR_ACK as u32 | BUSOFF | libc::CAN_ERR_BUSERROR as u32 | RESTARTED | CNT;
-const CRTL: u32 = libc::CAN_ERR_CRTL as u32;
-const BUSOFF: u32 = libc::CAN_ERR_BUSOFF as u32;
-const RESTARTED: u32 = libc::CAN_ERR_RESTARTED as u32;
+    libc::CAN_ERR_LOSTARB | CRTL | libc::CAN_ERR_ACK | BUSOFF | libc::CAN_ERR_BUSERROR | RESTARTED | CNT;
+const CRTL: u32 = libc::CAN_ERR_CRTL;
+const BUSOFF: u32 = libc::CAN_ERR_BUSOFF;
+const RESTARTED: u32 = libc::CAN_ERR_RESTARTED;
 /// Counters are in the bytes 6 and 7 (linux/can/error.h).
 const CNT: u32 = 0x200;
 
@@ -217,7 +217,7 @@ impl CanBus {
         if bits & CNT != 0 {
             (health.tx_error, health.rx_error) = (byte(6).into(), byte(7).into());
         }
-        if bits & (libc::CAN_ERR_LOSTARB | libc::CAN_ERR_ACK as u32 | libc::CAN_ERR_BUSERROR as u32) != 0 {
+        if bits & (libc::CAN_ERR_LOSTARB | libc::CAN_ERR_ACK | libc::CAN_ERR_BUSERROR) != 0 {
             health.tx_retries = health.tx_retries.wrapping_add(1);
         }
         health.state = state(bits, byte(1), before.state);
