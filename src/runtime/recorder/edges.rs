@@ -185,15 +185,47 @@ mod tests {
     use crate::runtime::recorder::Recording;
     use pinion_firmware::time::{Clock, VirtualClock};
     use pinion_testbench::board::{Bench, FakeBoard};
+    use pinion_testbench::rig::{Rig, hex};
+
+    fn edge_board(recording: &Recording, bench: Bench, names: &Arc<Mutex<Names>>) -> EdgeBoard {
+        let tape = EdgeTape { writer: Mutex::new(recording.memory.edges().unwrap()), clock: recording.clock };
+        EdgeBoard { board: Box::new(FakeBoard(bench)), tape: Arc::new(tape), names: names.clone() }
+    }
+
+    #[test]
+    fn a_host_configures_all_that_the_board_has() {
+        let names = Arc::default();
+        let mut rig = Rig::on_board(0, |bench| edge_board(&Recording::of_a_test(), bench, &names));
+        rig.bench.script_ds18b20("28-0000", &[Some(21_000)]);
+        rig.configure(&[
+            "config_digital_out oid=0 pin=3 value=1 default_value=0 max_duration=0",
+            "config_counter oid=1 pin=30 pull_up=1",
+            "config_analog_in oid=2 pin=400",
+            "config_spi_without_cs oid=3",
+            "spi_set_bus oid=3 spi_bus=0 mode=0 rate=1000000",
+            "config_i2c oid=4",
+            "i2c_set_bus oid=4 i2c_bus=1 rate=400000 address=72",
+            "config_pwm_out oid=5 pin=500 cycle_ticks=50000 value=0 default_value=0 max_duration=0",
+            "config_neopixel oid=6 pin=700 data_size=6 bit_max_ticks=200 reset_min_ticks=2500",
+            "config_hx71x oid=7 gain_channel=1 dout_pin=711 sclk_pin=701",
+            "config_tmcuart oid=8 rx_pin=800 pull_up=0 tx_pin=800 bit_time=1250",
+            &format!("config_ds18b20 oid=9 serial={} max_error_count=4", hex(b"28-0000")),
+        ]);
+        assert_eq!(rig.shutdown(), None);
+        let lines: Vec<String> = names.lock().unwrap().pins.values().cloned().collect();
+        assert_eq!(lines, ["gpio3"], "the kernel counts the edges of the other line");
+        rig.send_all(&["emergency_stop", "config_reset"]);
+        rig.responses();
+        rig.configure(&["config_digital_out oid=0 pin=3 value=1 default_value=0 max_duration=0"]);
+        assert_eq!(rig.shutdown(), None, "all lines were free again");
+    }
 
     #[test]
     fn each_change_of_an_output_is_recorded_once() {
         let recording = Recording::of_a_test();
         let bench = Bench::new(VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
-        let names = Arc::new(Mutex::new(Names::default()));
-        let tape = EdgeTape { writer: Mutex::new(recording.memory.edges().unwrap()), clock: recording.clock };
-        let mut board =
-            EdgeBoard { board: Box::new(FakeBoard(bench.clone())), tape: Arc::new(tape), names: names.clone() };
+        let names = Arc::default();
+        let mut board = edge_board(&recording, bench.clone(), &names);
         let direction = Direction::Output { level: true, shutdown_value: false };
         let line = board.line(Pin(3), direction).unwrap().line;
         for level in [true, false, false, true] {
