@@ -3,13 +3,15 @@
 
 use std::fs;
 use std::io::Read;
-use std::path::PathBuf;
+use std::os::unix::net::UnixDatagram;
+use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
+use pinion_client::Client;
 
 struct Program {
     child: Child,
@@ -19,12 +21,17 @@ struct Program {
 
 impl Program {
     fn start() -> Program {
+        Program::start_with(&[])
+    }
+
+    fn start_with(environment: &[(&str, &Path)]) -> Program {
         let folder = tempfile::tempdir().unwrap();
         let link = folder.path().join("pty");
         let group = nix::unistd::getgid().to_string();
         let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
             .args(["run", "-g", &group, "-I"])
             .arg(&link)
+            .envs(environment.iter().copied())
             .stderr(Stdio::piped())
             .spawn()
             .unwrap();
@@ -79,6 +86,53 @@ fn a_program_without_its_guardian_shuts_down_and_fails() {
     let (status, log) = program.end();
     assert_eq!(status.code(), Some(1), "{log}");
     assert!(log.contains("shutdown: Guardian process lost: somebody killed the guardian"), "{log}");
+}
+
+#[test]
+fn a_host_can_read_that_the_guardian_is_lost_even_if_it_is_busy_for_a_moment() {
+    let program = Program::start();
+    let mut client = Client::connect(&program.link, Duration::from_secs(20)).unwrap();
+    kill(program.guardian(), Signal::SIGKILL).unwrap();
+    thread::sleep(Duration::from_millis(300));
+    assert_eq!(client.wait_shutdown(Duration::from_secs(20)).unwrap().as_deref(), Some("Guardian process lost"));
+}
+
+/// As systemd reads it for `systemctl status`.
+#[test]
+fn the_service_manager_is_told_what_the_program_does() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("notify");
+    let manager = UnixDatagram::bind(&path).unwrap();
+    manager.set_read_timeout(Some(Duration::from_secs(20))).unwrap();
+    let program = Program::start_with(&[("NOTIFY_SOCKET", &path)]);
+    let hear = |words: &str| {
+        let mut heard = Vec::new();
+        while !heard.iter().any(|message: &String| message.contains(words)) {
+            let mut message = [0; 1024];
+            let length = manager.recv(&mut message).unwrap_or_else(|error| panic!("{words}: {error}: {heard:?}"));
+            heard.push(String::from_utf8_lossy(&message[..length]).into_owned());
+        }
+    };
+    hear("READY=1");
+    hear("no host is attached");
+    let client = Client::connect(&program.link, Duration::from_secs(20)).unwrap();
+    hear("a host is attached");
+    drop(client);
+    hear("no host is attached");
+    kill(program.pid(), Signal::SIGTERM).unwrap();
+    hear("STOPPING=1");
+}
+
+#[test]
+fn the_status_names_the_guardians_process() {
+    let program = Program::start();
+    let status = || {
+        let mut status = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        status.args(["status", "--json", "-I"]).arg(&program.link);
+        serde_json::from_slice::<serde_json::Value>(&status.output().unwrap().stdout).unwrap_or_default()
+    };
+    wait_until("the status", || !status().is_null());
+    assert_eq!(status()["guardian"]["pid"], program.guardian().as_raw());
 }
 
 #[test]

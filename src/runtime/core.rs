@@ -741,6 +741,30 @@ mod tests {
     }
 
     #[test]
+    fn the_link_is_told_of_a_block_without_a_response() {
+        let mut rig = Rig::new();
+        rig.wake.sleeping();
+        rig.run("update_digital_out oid=%c value=%c", &[1, 1]);
+        let mut fds = [PollFd::new(rig.wake.event(), PollFlags::POLLIN)];
+        assert_eq!(poll(&mut fds, 2000u16), Ok(1), "the host waits for its acknowledgement");
+        assert_eq!(rig.progress.done(), CONFIGURATION + 1);
+        assert_eq!(rig.quit(), Left::Safe);
+    }
+
+    #[test]
+    fn a_stop_comes_after_the_blocks_before_it_if_no_bus_holds_them() {
+        let mut rig = Rig::new();
+        rig.progress.stop_handed();
+        let on = rig.encode("update_digital_out oid=%c value=%c", &[1, 1]);
+        rig.requests.push(Request::Run(on)).ok().unwrap();
+        rig.request(Request::Shutdown(Shutdown::because(reason::FORCE_SHUTDOWN, "a test")));
+        rig.wait_until("the MCU stops", Rig::is_stopped);
+        let levels: Vec<u8> = rig.bench.edges(30).into_iter().map(|(_, level)| level).collect();
+        assert_eq!(levels, [1, 0], "on, and its shutdown value");
+        assert_eq!(rig.quit(), Left::Safe);
+    }
+
+    #[test]
     fn the_core_sleeps_until_a_sample_is_due_and_does_not_spin_before_it() {
         const REST: Ticks = Ticks::from_ms(2);
         let mut rig = Rig::new();

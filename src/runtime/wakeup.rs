@@ -315,6 +315,21 @@ mod tests {
     }
 
     #[test]
+    fn a_thread_is_in_real_time_while_its_budget_lasts() {
+        let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
+        let processors = Processors::new(None).unwrap();
+        let mut waiter = Waiter::new(clock.clone(), MarginLimits::default(), Scheduling::Ordinary, processors);
+        assert!(!waiter.is_realtime());
+        waiter.scheduling = Scheduling::RealTime;
+        assert!(waiter.is_realtime());
+        let meagre = Throttle { runtime_us: 100, period_us: 1_000_000 };
+        let mut budget = Budget::new(meagre, clock.now(), Duration::ZERO);
+        budget.look(clock.now(), Duration::from_secs(1));
+        waiter.budget = Some(budget);
+        assert!(!waiter.is_realtime());
+    }
+
+    #[test]
     fn the_margin_stays_within_its_bounds() {
         let limits = MarginLimits { min: Ticks(50), max: Ticks(500) };
         let mut margin = Margin::new(limits, 100);

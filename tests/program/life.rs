@@ -7,6 +7,7 @@ use std::os::unix::fs::{MetadataExt, PermissionsExt, symlink};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
+use std::thread;
 use std::time::{Duration, Instant};
 
 use nix::fcntl::{AT_FDCWD, FcntlArg, FdFlag, OFlag, fcntl};
@@ -230,7 +231,8 @@ fn sigterm_tells_the_host_and_drives_outputs_to_their_shutdown_values() {
     client.send_line("update_digital_out oid=0 value=1").unwrap();
     client.link().settle().unwrap();
     pinion.signal(Signal::SIGTERM);
-    // The terminal stays open until the host has read the news.
+    // The terminal stays open until the host has read the news, even if the host is busy for a moment.
+    thread::sleep(Duration::from_millis(300));
     assert_eq!(client.wait_shutdown(WAIT_MAX).unwrap().as_deref(), Some("Force shutdown command"));
     drop(client);
     assert_eq!(pinion.end().code(), Some(0));
