@@ -229,6 +229,12 @@ mod tests {
     }
 
     #[test]
+    fn the_kinds_of_objects_are_counted_in_words() {
+        assert_eq!(Kinds(&[("stepper", 2), ("heater", 1)]).to_string(), "2 steppers, 1 heater");
+        assert_eq!(Kinds(&[]).to_string(), "no objects");
+    }
+
+    #[test]
     fn what_the_host_does_not_read_is_dropped_and_the_reason_of_a_stop_is_not() {
         let (mut outlet, mut inlet, progress) = ends();
         progress.begin();

@@ -273,8 +273,7 @@ fn a_host_of_another_user_is_read_where_that_is_permitted_and_else_the_log_says_
         fs::set_permissions(checkout.0.path(), fs::Permissions::from_mode(0o700)).unwrap();
         let folder = tempfile::tempdir().unwrap();
         fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
-        let program = folder.path().join("pinion");
-        fs::copy(env!("CARGO_BIN_EXE_pinion"), &program).unwrap();
+        let program = crate::process::program_in(folder.path());
         let tty = folder.path().join("tty");
         let log = folder.path().join("log");
         let capabilities_given = if may_look { "+sys_ptrace,+dac_read_search" } else { "-all" };

@@ -21,7 +21,7 @@ use pinion_client::config::Config;
 use pinion_client::serial::Received;
 use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
 
-use crate::process::{Pinion, WAIT_MAX, exists};
+use crate::process::{Pinion, WAIT_MAX, exists, output, program_in};
 
 #[test]
 fn a_stale_link_is_replaced_and_ours_is_removed_at_the_end() {
@@ -176,11 +176,19 @@ fn mode_and_group_of_the_pty_are_as_asked() {
 }
 
 #[test]
-fn a_user_whom_tty_is_not_open_to_is_served_as_by_the_c_program() {
-    // Nobody else may read cargo's build folder.
+fn a_link_in_a_folder_that_does_not_exist_is_refused_with_the_remedy() {
     let folder = tempfile::tempdir().unwrap();
-    let program = folder.path().join("pinion");
-    fs::copy(env!("CARGO_BIN_EXE_pinion"), &program).unwrap();
+    let link = folder.path().join("none/tty");
+    let refused = output(&["run", "--board", "sim", "-I", link.to_str().unwrap()]);
+    assert_eq!(refused.status.code(), Some(1));
+    let log = String::from_utf8_lossy(&refused.stderr);
+    assert!(log.contains("cannot be made") && log.contains("make its folder"), "{log}");
+}
+
+#[test]
+fn a_user_whom_tty_is_not_open_to_is_served_as_by_the_c_program() {
+    let folder = tempfile::tempdir().unwrap();
+    let program = program_in(folder.path());
     let (link, log) = (folder.path().join("tty"), folder.path().join("log"));
     fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o777)).unwrap();
     let mut command = Command::new(&program);

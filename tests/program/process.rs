@@ -81,9 +81,7 @@ impl Pinion {
     /// user.
     pub fn beside(&self, args: &[&str], as_nobody: bool) -> (Option<i32>, String) {
         let folder = tempfile::tempdir().unwrap();
-        // Nobody else may read cargo's build folder.
-        let program = folder.path().join("pinion");
-        fs::copy(env!("CARGO_BIN_EXE_pinion"), &program).unwrap();
+        let program = program_in(folder.path());
         fs::set_permissions(folder.path(), fs::Permissions::from_mode(0o755)).unwrap();
         let log = folder.path().join("log");
         let mut command = Command::new(&program);
@@ -189,6 +187,14 @@ impl Drop for Pinion {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// A copy of the program in this folder, because nobody else may read cargo's. Another process copies it. A test that
+/// starts a program meanwhile would inherit our file, and a file that is open for writing cannot be run.
+pub fn program_in(folder: &Path) -> PathBuf {
+    let program = folder.join("pinion");
+    assert!(Command::new("cp").arg(env!("CARGO_BIN_EXE_pinion")).arg(&program).status().unwrap().success());
+    program
 }
 
 /// A folder with a file in it.
