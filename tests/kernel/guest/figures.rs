@@ -5,6 +5,7 @@
 //! Only Pinion's figures are asserted.
 
 use std::collections::BTreeMap;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 use pinion_client::config::Config;
@@ -14,6 +15,7 @@ use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Ticks};
 
 use crate::gpio_sim::GpioSim;
 use crate::program::{self, Program};
+use crate::register_file::RegisterFile;
 use crate::sysfs;
 use crate::trace::{Calls, Trace};
 
@@ -94,10 +96,19 @@ impl Load {
     }
 }
 
+/// How the program writes lines.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Way {
+    Kernel,
+    /// Through a file in place of a chip's registers. No line changes.
+    Registers,
+}
+
 /// A program that is configured for loads, and its host.
 struct Session {
     // Dropped before the chip with its lines: the next chip must have the same number.
     program: Program,
+    _registers: Option<RegisterFile>,
     sim: GpioSim,
     client: Client,
     steppers: Vec<Stepper>,
@@ -105,8 +116,9 @@ struct Session {
 }
 
 impl Session {
-    fn start() -> Session {
+    fn start(way: Way) -> Session {
         let sim = GpioSim::new("lab", LINES);
+        let registers = (way == Way::Registers).then(|| RegisterFile::of(&sim));
         let program = Program::measured();
         let mut client = program.connect();
         let mut config = Config::default();
@@ -119,7 +131,10 @@ impl Session {
         config.add(format!("config_spi_without_cs oid={spi_oid}"));
         config.add(format!("spi_set_bus oid={spi_oid} spi_bus=spidev0.0 mode=0 rate=4000000"));
         config.apply(&mut client).expect("a configuration that it takes");
-        Session { program, sim, client, steppers, spi_oid }
+        let log = if is_pinion() { program.log() } else { String::new() };
+        assert_eq!(log.contains("lines are written and read through /dev/gpiomem"), registers.is_some(), "{log}");
+        assert!(!log.contains("through the kernel, not through registers: line"), "{log}");
+        Session { program, _registers: registers, sim, client, steppers, spi_oid }
     }
 
     /// Runs a load. `look` is called at the beginning and at the end of the part in which all steppers move. Returns
@@ -208,11 +223,11 @@ impl Session {
 }
 
 /// Prints a figure for every case, or the reason for a shutdown of the MCU. Pinion must not shut down.
-fn figures(of: &str, transfers: bool, measure: impl Fn(&mut Session, &Load, &str) -> Result<String, String>) {
+fn figures(of: &str, way: Way, transfers: bool, measure: impl Fn(&mut Session, &Load, &str) -> Result<String, String>) {
     for &(thousands, moves, steppers) in CASES {
         let load = Load::steady(thousands, moves, steppers, transfers);
         let case = format!("{thousands} k/s, {}", count_of(steppers));
-        let text = measure(&mut Session::start(), &load, &case).unwrap_or_else(|reason| {
+        let text = measure(&mut Session::start(way), &load, &case).unwrap_or_else(|reason| {
             assert!(!is_pinion(), "{case}: {reason}");
             format!("stops: {reason}")
         });
@@ -240,29 +255,54 @@ fn lateness(session: &mut Session, load: &Load, case: &str) -> Result<String, St
 
 #[test]
 fn edges_are_late() {
-    figures("Edges late, us: p50 / p99 / max", false, lateness);
+    figures("Edges late, us: p50 / p99 / max", Way::Kernel, false, lateness);
+}
+
+/// By the program's own count: the time at which a timer runs. The store follows some 100 instructions later.
+#[test]
+fn timers_are_late_with_registers() {
+    if !is_pinion() {
+        return;
+    }
+    figures("Timers late with registers, us: p50 / p99", Way::Registers, false, |session, load, _| {
+        session.run(load, |_| ())?;
+        let link = session.program.link();
+        let status = Command::new("pinion").args(["status", "--json", "-I"]).arg(link).output().expect("a status");
+        let status: serde_json::Value = serde_json::from_slice(&status.stdout).expect("a status");
+        let us = |key: &str| status["lateness"][key].as_f64().expect("a time");
+        Ok(format!("{:.2} / {:.2}", us("p50_us"), us("p99_us")))
+    });
 }
 
 #[test]
 fn edges_are_late_beside_transfers() {
     let _delay = sysfs::set(DELAY_MS, "4", "0");
-    figures("Edges late beside SPI transfers of 4 ms, us: p50 / p99 / max", true, lateness);
+    figures("Edges late beside SPI transfers of 4 ms, us: p50 / p99 / max", Way::Kernel, true, lateness);
+}
+
+fn instructions_an_edge(session: &mut Session, load: &Load, _: &str) -> Result<String, String> {
+    let mut looks = Vec::new();
+    let start = session.run(load, |program| looks.push((Instant::now(), program.cpu_time())))?;
+    let [(from, cpu_from), (to, cpu_to)] = looks[..] else { panic!("{looks:?}") };
+    session.assert_within(load, start, to);
+    Ok(format!("{:.0}", instructions(cpu_to - cpu_from) / load.steps_in(to - from)))
 }
 
 #[test]
 fn edges_cost_instructions() {
-    figures("Instructions an edge", false, |session, load, _| {
-        let mut looks = Vec::new();
-        let start = session.run(load, |program| looks.push((Instant::now(), program.cpu_time())))?;
-        let [(from, cpu_from), (to, cpu_to)] = looks[..] else { panic!("{looks:?}") };
-        session.assert_within(load, start, to);
-        Ok(format!("{:.0}", instructions(cpu_to - cpu_from) / load.steps_in(to - from)))
-    });
+    figures("Instructions an edge", Way::Kernel, false, instructions_an_edge);
+}
+
+#[test]
+fn edges_cost_instructions_with_registers() {
+    if is_pinion() {
+        figures("Instructions an edge, with registers", Way::Registers, false, instructions_an_edge);
+    }
 }
 
 #[test]
 fn edges_cost_system_calls() {
-    figures("System calls an edge", false, |session, load, case| {
+    figures("System calls an edge", Way::Kernel, false, |session, load, case| {
         let calls = Calls::of(&session.program.threads());
         let mut looks: Vec<(Instant, BTreeMap<i64, u64>)> = Vec::new();
         let start = session.run(load, |_| looks.push((Instant::now(), calls.so_far())))?;
@@ -290,19 +330,30 @@ fn edges_cost_system_calls() {
 /// If the steps of a load take longer than their interval, the load ends in "Stepper too far in past" when a move
 /// begins a millisecond late. That is within 0.3 seconds if the steps take 0.4 % longer. The interval is found to
 /// within 0.5 %.
-#[test]
-fn smallest_interval() {
+fn smallest_interval_by(of: &str, way: Way) {
     for steppers in [1, 3] {
-        let holds = |interval: u32| Session::start().run(&Load::fast(interval, steppers), |_| ()).is_ok();
-        // 20 ticks are less than a system call takes, and 1000 are more than a step takes.
-        let (mut fails, mut least) = (20_u32, 1000);
+        let holds = |interval: u32| Session::start(way).run(&Load::fast(interval, steppers), |_| ()).is_ok();
+        // The pulse takes 5 ticks, and 1000 are more than a step takes.
+        let (mut fails, mut least) = (PULSE_TICKS - 1, 1000);
         assert!(holds(least));
         while least - fails > least.div_ceil(200) {
             let middle = (f64::from(least * fails).sqrt() as u32).max(fails + 1);
             *if holds(middle) { &mut least } else { &mut fails } = middle;
         }
-        figure("Smallest interval between edges that holds, ticks", &count_of(steppers), &least.to_string());
+        figure(of, &count_of(steppers), &least.to_string());
         assert!(!is_pinion() || least <= 500);
+    }
+}
+
+#[test]
+fn smallest_interval() {
+    smallest_interval_by("Smallest interval between edges that holds, ticks", Way::Kernel);
+}
+
+#[test]
+fn smallest_interval_with_registers() {
+    if is_pinion() {
+        smallest_interval_by("Smallest interval with registers, ticks", Way::Registers);
     }
 }
 
@@ -310,13 +361,15 @@ fn smallest_interval() {
 fn round_trip() {
     const ROUNDS: usize = 101;
     const PAUSE: Duration = Duration::from_millis(1);
-    let mut session = Session::start();
+    let mut session = Session::start(Way::Kernel);
     let (client, spi_oid) = (&mut session.client, session.spi_oid);
     let transfer = [("oid", spi_oid.into()), ("data", SPI_DATA)];
     let none: &[(&str, Arg<'_>)] = &[];
     for (command, args, response) in [
         ("get_clock", none, "clock"),
         ("get_uptime", none, "uptime"),
+        // In Pinion the link answers the two above, and the core answers this one.
+        ("get_config", none, "config"),
         ("spi_transfer", &transfer, "spi_transfer_response"),
     ] {
         let round_trip = |_| {
@@ -337,8 +390,9 @@ fn round_trip() {
 fn transfers_one_a_block() {
     const COUNT: u32 = 500;
     let _delay = sysfs::set(DELAY_US, "30", "0");
-    let mut session = Session::start();
+    let mut session = Session::start(Way::Kernel);
     let (client, spi_oid) = (&mut session.client, session.spi_oid);
+    let asleep = session.program.sleeps();
     let sent = Instant::now();
     for _ in 0..COUNT {
         client.send("spi_send", &[("oid", spi_oid.into()), ("data", Arg::Bytes(&[0x5a]))]).expect("a session");
@@ -346,13 +400,15 @@ fn transfers_one_a_block() {
     client.query("get_uptime", &[], "uptime", None).expect("an answer");
     let each = instructions(sent.elapsed()) / f64::from(COUNT);
     figure("SPI transfers of 30 us, instructions for each", "spi_send, one a block", &format!("{each:.0}"));
+    let sleeps = (session.program.sleeps() - asleep) as f64 / f64::from(COUNT);
+    figure("SPI transfers of 30 us, sleeps of all threads for each", "spi_send, one a block", &format!("{sleeps:.2}"));
     assert!(!is_pinion() || each <= 200_000.0);
 }
 
 #[test]
 fn idle() {
     const SPAN: Duration = Duration::from_secs(10);
-    let session = Session::start();
+    let session = Session::start(Way::Kernel);
     std::thread::sleep(Duration::from_secs(1));
     let (from, cpu_from) = (Instant::now(), session.program.cpu_time());
     std::thread::sleep(SPAN);

@@ -9,6 +9,7 @@
 mod gpio_sim;
 mod mock;
 mod program;
+mod register_file;
 mod sysfs;
 mod trace;
 mod uapi;

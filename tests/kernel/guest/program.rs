@@ -125,6 +125,16 @@ impl Program {
         self.processes().map(|process| Duration::from(of(process))).sum()
     }
 
+    /// How often its threads have gone to sleep so far. Each time, another thread or an interrupt wakes them.
+    pub fn sleeps(&self) -> u64 {
+        let of = |thread: Pid| {
+            let status = sysfs::read(format!("/proc/{thread}/status"));
+            let sleeps = status.lines().find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"));
+            sleeps.and_then(|number| number.trim().parse::<u64>().ok()).expect("a number of switches")
+        };
+        self.threads().into_iter().map(of).sum()
+    }
+
     pub fn signal(&self, signal: Signal) {
         kill(self.pid(), signal).expect("a running program");
     }

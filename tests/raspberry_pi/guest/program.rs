@@ -72,6 +72,16 @@ impl Pinion {
         kill(Pid::from_raw(self.0.id().cast_signed()), signal).expect("a process");
     }
 
+    /// How long its core has had the processor, in nanoseconds of the guest's time.
+    pub fn core_ns(&self) -> u64 {
+        let threads = fs::read_dir(format!("/proc/{}/task", self.0.id())).expect("its threads");
+        let read = |thread: &Path, file: &str| fs::read_to_string(thread.join(file)).unwrap_or_default();
+        let threads = threads.map(|thread| thread.expect("a thread").path());
+        let core = threads.into_iter().find(|thread| read(thread, "comm").trim() == "core").expect("a core");
+        // The first number of schedstat.
+        read(&core, "schedstat").split(' ').next().and_then(|ns| ns.parse().ok()).expect("a time")
+    }
+
     /// Whether it has ended.
     pub fn has_ended(&mut self) -> bool {
         self.0.try_wait().expect("our child").is_some()

@@ -5,6 +5,7 @@ use std::process::Command;
 
 use gpio_cdev::{Chip, LineRequestFlags};
 use pinion_client::config::Config;
+use pinion_firmware::time::CLOCK_FREQ;
 
 use super::homing::{STEP, axis, profile};
 use super::outside::Outside;
@@ -12,6 +13,8 @@ use super::program::{LINK, Pinion, Way};
 
 /// A line that no test gives to Pinion.
 const OTHER: u32 = 27;
+/// See `TIME` in `tests/raspberry_pi/vm.rs`.
+const NS_PER_INSTRUCTION: f64 = 4.0;
 
 fn configure(pinion: &Pinion) {
     let mut client = pinion.client();
@@ -79,7 +82,6 @@ fn registers_and_the_driver_write_neighbours_of_one_bank() {
     assert_eq!(stepper.position(&mut client).unwrap(), i64::from(STEPS));
 }
 
-/// An instruction takes 4 ns of the guest's time.
 #[test]
 fn an_edge_through_registers_costs_a_tenth() {
     let text = printed(&["latency", "--pin", "GPIO27", "--fast-gpio", "/dev/mem"]);
@@ -89,7 +91,11 @@ fn an_edge_through_registers_costs_a_tenth() {
         line.split_whitespace().next().and_then(|ns| ns.parse().ok()).expect("a number")
     };
     let (kernel, registers) = (ns("kernel"), ns("registers"));
-    println!("instructions an edge: {:.0} through the kernel, {:.0} through registers", kernel / 4.0, registers / 4.0);
+    println!(
+        "instructions an edge: {:.0} through the kernel, {:.0} through registers",
+        kernel / NS_PER_INSTRUCTION,
+        registers / NS_PER_INSTRUCTION
+    );
     assert!(registers < kernel / 10.0);
 }
 
@@ -102,4 +108,63 @@ fn the_cost_of_an_edge_is_not_measured_on_a_line_that_somebody_holds() {
     assert!(text.contains("GPIO27 is in use by heater: choose a free line"), "{text}");
     assert!(printed(&["latency", "--pin", "GPIO99"]).contains("there is no line GPIO99"));
     assert_eq!(outside.edges(OTHER), "");
+}
+
+/// What steps of three steppers cost the core.
+struct Cost {
+    /// Instructions of the core for each edge.
+    instructions: f64,
+    /// The status of its timers: how late they were, and the margin.
+    lateness: serde_json::Value,
+}
+
+impl Cost {
+    fn us(&self, key: &str) -> f64 {
+        self.lateness[key].as_f64().expect("a time")
+    }
+}
+
+/// For a second, each stepper makes a step on both edges every `interval` ticks.
+fn cost_of_steps(way: Way, interval: u32) -> Cost {
+    let steps = CLOCK_FREQ / interval;
+    let pinion = Pinion::start(way);
+    let mut client = pinion.client();
+    let mut config = Config::default();
+    let lines = [(5, 12), (6, 16), (13, 19)];
+    for (step, dir) in lines {
+        let oid = config.oid().unwrap();
+        config.add(format!(
+            "config_stepper oid={oid} step_pin=gpio{step} dir_pin=gpio{dir} invert_step=-1 step_pulse_ticks=100"
+        ));
+    }
+    config.apply(&mut client).expect("a configuration");
+    let start = client.clock_in(0.3).unwrap().wire();
+    for oid in 0..lines.len() {
+        client.send_line(&format!("reset_step_clock oid={oid} clock={start}")).unwrap();
+        client.send_line(&format!("queue_step oid={oid} interval={interval} count={steps} add=0")).unwrap();
+    }
+    let before = pinion.core_ns();
+    std::thread::sleep(std::time::Duration::from_millis(1500));
+    let spent = pinion.core_ns() - before;
+    let mut status: serde_json::Value =
+        serde_json::from_str(&printed(&["status", "--json", "-I", LINK])).expect("a status");
+    assert_eq!(status["shutdown"], serde_json::Value::Null);
+    let edges = steps * lines.len() as u32;
+    Cost { instructions: spent as f64 / NS_PER_INSTRUCTION / f64::from(edges), lateness: status["lateness"].take() }
+}
+
+/// The core sleeps and spins between steps, whatever way an edge goes.
+#[test]
+fn steps_through_registers_cost_less() {
+    println!("k/s  way        instructions an edge   late by p50 / p99, us   margin, us");
+    for interval in [50_000, 5_000] {
+        let costs = [Way::Kernel, Way::Registers].map(|way| {
+            let cost = cost_of_steps(way, interval);
+            let (p50, p99, margin) = (cost.us("p50_us"), cost.us("p99_us"), cost.us("margin_us"));
+            let rate = CLOCK_FREQ / interval / 1000;
+            println!("{rate:3}  {way:<10?} {:20.0}   {p50:8.2} / {p99:.2} {margin:18.1}", cost.instructions);
+            cost
+        });
+        assert!(costs[1].instructions < costs[0].instructions);
+    }
 }

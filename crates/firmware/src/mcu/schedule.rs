@@ -195,35 +195,35 @@ impl Mcu {
                 self.schedule.latest = Latest { late, oid };
             }
         }
+        let Some(oid) = timer.oid() else { return self.run_own_timer(timer, at) };
+        let Some(mut object) = self.take(oid) else { return };
         self.schedule.timing.due.set(Some(at));
-        let result = match timer.oid() {
-            Some(oid) => match self.take(oid) {
-                Some(mut object) => {
-                    let result = object
-                        .event(&mut Turn::new(self, oid), timer.timer(), at)
-                        .map_err(|stop| self.blame(stop, object.kind(), oid));
-                    self.put_back(oid, object);
-                    result
-                }
-                None => Ok(Next::Done),
-            },
-            None => Ok(self.run_own_timer(timer, at)),
-        };
+        let result = object.event(&mut Turn::new(self, oid), timer.timer(), at);
         self.schedule.timing.due.set(None);
         match result {
-            Ok(Next::At(at)) => self.schedule.timers.insert(at, timer),
-            Ok(Next::Done) => {}
-            Err(shutdown) => self.shut_down(shutdown),
+            Ok(next) => {
+                self.put_back(oid, object);
+                if let Next::At(at) = next {
+                    self.schedule.timers.insert(at, timer);
+                }
+            }
+            Err(stop) => {
+                let stop = self.blame(stop, object.kind(), oid);
+                self.put_back(oid, object);
+                self.shut_down(stop);
+            }
         }
     }
 
-    fn run_own_timer(&mut self, timer: TimerId, at: Clock) -> Next {
+    #[cold]
+    fn run_own_timer(&mut self, timer: TimerId, at: Clock) {
+        self.schedule.timing.due.set(Some(at));
         match timer {
             TimerId::RETRY => self.retry(),
             TimerId::HOLD => self.held_too_long(),
-            _ => return self.send_stats(at),
+            _ => self.send_stats(at),
         }
-        Next::Done
+        self.schedule.timing.due.set(None);
     }
 
     /// Counts a span in which the core was busy.
@@ -248,14 +248,14 @@ impl Mcu {
         self.outbox.note(Note::Lateness(&self.schedule.lateness, margin));
     }
 
-    fn send_stats(&mut self, at: Clock) -> Next {
+    fn send_stats(&mut self, at: Clock) {
         let Stats { count, sum, sumsq } = std::mem::take(&mut self.schedule.stats);
         // klippy divides by the count. It is 0 if the MCU stood still since the last `stats`.
         let count = count.max(1);
         self.send(base::Stats { count, sum, sumsq });
         // After a suspend, the MCU sends no `stats` for the time of the suspend.
         let next = at + STATS_TICKS;
-        Next::At(next.max(self.schedule.last_read))
+        self.go_on(TimerId::STATS, next.max(self.schedule.last_read));
     }
 
     /// Longest delay of a step before the MCU stops.
