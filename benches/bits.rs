@@ -247,7 +247,7 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
     while !end.load(Ordering::Relaxed) {
         let Some((at, every, is_bit)) = timers.iter_mut().min_by_key(|(at, ..)| *at) else { break };
         if clock.now() < *at {
-            waiter.wait(*at, Some(*at), || false);
+            waiter.wait(*at, Some(*at), |_| false);
         }
         let now = clock.now();
         let late = now.since(*at);

@@ -236,11 +236,15 @@ impl Core {
             let Core { waiter, progress, stops_taken, mcu, block, requests, .. } = &mut self;
             let calls = Calls { core: progress, stops_taken: *stops_taken, mcu, block: block.as_ref(), requests };
             // Near a timer, calls have to wait.
-            let woken = waiter.wait(deadline, exact, || !near && calls.any());
-            busy_since = self.clock.now();
-            if woken == Woken::Due {
-                self.yielded += 1;
-            }
+            busy_since = match waiter.wait(deadline, exact, |now| deadline >= now + NEAR && calls.any()) {
+                // The edge must not wait for another look at the clock.
+                Woken::Due(now) => {
+                    self.mcu.saw(now);
+                    self.yielded += 1;
+                    now
+                }
+                Woken::Called => self.clock.now(),
+            };
         }
     }
 

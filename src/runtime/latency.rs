@@ -100,7 +100,7 @@ fn measure(
 fn run_for(clock: &Arc<dyn TimeSource>, mut waiter: Waiter, end: u64, lateness: &mut Lateness) -> Ticks {
     let mut at = clock.now() + PERIOD;
     while at < Clock::from_ticks(end) {
-        waiter.wait(at, Some(at), || false);
+        waiter.wait(at, Some(at), |_| false);
         let now = clock.now();
         lateness.record(now.since(at));
         at = at + PERIOD;

@@ -123,8 +123,8 @@ fn try_wake_ups(clock: &dyn TimeSource) -> i64 {
 /// Why a wait ended.
 #[derive(Debug, PartialEq, Eq)]
 pub enum Woken {
-    /// The instant came.
-    Due,
+    /// The instant came. This is the time now.
+    Due(Clock),
     /// There is something else to do.
     Called,
 }
@@ -199,14 +199,14 @@ impl Waiter {
         self.sleep.take()
     }
 
-    /// Waits for `deadline`, or until `called` says that there is something to do. A thread that changes what `called`
-    /// looks at unparks this thread. `exact` is the deadline or a later one. This thread sleeps until a margin before
+    /// Waits for `deadline`, or until `called` says that there is something to do. It is asked with the time now. A
+    /// thread that changes what `called` looks at unparks this thread. `exact` is the deadline or a later one. This thread sleeps until a margin before
     /// `exact`, so that it is awake then. From there on it spins.
-    pub fn wait(&mut self, deadline: Clock, exact: Option<Clock>, mut called: impl FnMut() -> bool) -> Woken {
+    pub fn wait(&mut self, deadline: Clock, exact: Option<Clock>, mut called: impl FnMut(Clock) -> bool) -> Woken {
         let mut now = self.clock.now();
         let mut slept = deadline.since(now) < i64::from(self.margin.limits.min.0);
         loop {
-            if called() {
+            if called(now) {
                 return Woken::Called;
             }
             let wake_at = wake_at(deadline, exact, self.margin.get());
@@ -229,13 +229,16 @@ impl Waiter {
         if !slept {
             self.margin.unslept();
         }
-        while self.clock.now() < deadline {
-            if called() {
+        loop {
+            let now = self.clock.now();
+            if now >= deadline {
+                return Woken::Due(now);
+            }
+            if called(now) {
                 return Woken::Called;
             }
             hint::spin_loop();
         }
-        Woken::Due
     }
 }
 
@@ -327,6 +330,24 @@ mod tests {
         budget.look(clock.now(), Duration::from_secs(1));
         waiter.budget = Some(budget);
         assert!(!waiter.is_realtime());
+    }
+
+    #[test]
+    fn a_wait_ends_at_its_instant_or_by_a_call_with_the_time_now() {
+        let clock: Arc<dyn TimeSource> = Arc::new(Monotonic::start());
+        let processors = Processors::new(None).unwrap();
+        let mut waiter = Waiter::new(clock.clone(), MarginLimits::default(), Scheduling::Ordinary, processors);
+        let deadline = clock.now() + Ticks::from_ms(1);
+        let Woken::Due(now) = waiter.wait(deadline, Some(deadline), |_| false) else { panic!("nobody calls") };
+        assert!(deadline <= now && now <= clock.now());
+        let (begin, mut asked) = (clock.now(), Clock::EPOCH);
+        let far = begin + Ticks::from_ms(10_000);
+        let woken = waiter.wait(far, Some(far), |now| {
+            asked = now;
+            true
+        });
+        assert_eq!(woken, Woken::Called);
+        assert!(begin <= asked && asked < far);
     }
 
     #[test]

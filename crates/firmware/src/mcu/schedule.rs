@@ -77,6 +77,12 @@ impl Mcu {
         self.schedule.last_read
     }
 
+    /// Takes a time that the caller has just read.
+    #[inline]
+    pub fn saw(&mut self, now: Clock) {
+        self.schedule.last_read = now;
+    }
+
     /// Spins until `end`, for [`SPIN_MAX`] at most. No other timer or command runs meanwhile. So use it only for spans
     /// as short as a step's pulse.
     #[inline]
