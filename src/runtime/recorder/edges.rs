@@ -196,6 +196,10 @@ mod tests {
     fn a_host_configures_all_that_the_board_has() {
         let names = Arc::default();
         let mut rig = Rig::on_board(0, |bench| edge_board(&Recording::of_a_test(), bench, &names));
+        let (own, board) =
+            (FakeBoard(rig.bench.clone()), edge_board(&Recording::of_a_test(), rig.bench.clone(), &names));
+        assert_eq!((board.describe(), board.pins()), (own.describe(), own.pins()));
+        assert_eq!((board.spi_buses(), board.i2c_buses()), (own.spi_buses(), own.i2c_buses()));
         rig.bench.script_ds18b20("28-0000", &[Some(21_000)]);
         rig.configure(&[
             "config_digital_out oid=0 pin=3 value=1 default_value=0 max_duration=0",
