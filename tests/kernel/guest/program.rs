@@ -39,6 +39,13 @@ impl Program {
     pub fn with(args: &[&str], environment: &[(&str, &str)]) -> Program {
         let mut command = Command::new("pinion");
         command.args(["run", "-g", "0"]).args(args).envs(environment.iter().copied());
+        Program::spawn(command).ready()
+    }
+
+    /// Starts it with another link than a pty.
+    pub fn on_link(link: &str) -> Program {
+        let mut command = Command::new("pinion");
+        command.args(["run", "-r", "--link", link]);
         Program::spawn(command)
     }
 
@@ -47,7 +54,7 @@ impl Program {
         let mut command = Command::new("pinion");
         command.args(["run", "-g", "0", "-r"]);
         uapi::without_ioctl(&mut command, request, errno as i32);
-        Program::spawn(command)
+        Program::spawn(command).ready()
     }
 
     /// The measured program, in real time: Pinion, or the program from the computer's `--program`, which takes the
@@ -58,7 +65,7 @@ impl Program {
                 let mut words = words.split_whitespace();
                 let mut command = Command::new(words.next().expect("a program"));
                 command.args(words).arg("-r");
-                Program::spawn(command)
+                Program::spawn(command).ready()
             }
             None => Program::start(),
         }
@@ -76,9 +83,13 @@ impl Program {
             .stderr(File::create(&log).expect("a log"))
             .spawn()
             .unwrap_or_else(|error| panic!("{command:?}: {error}"));
-        let program = Program { child, link, log };
-        sysfs::wait_until("the link to the pty stands", || program.link.exists());
-        program
+        Program { child, link, log }
+    }
+
+    /// Waits until a host may connect to its pty.
+    fn ready(self) -> Program {
+        sysfs::wait_until("the link to the pty stands", || self.link.exists());
+        self
     }
 
     /// A host on its pty.

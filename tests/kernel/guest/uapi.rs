@@ -4,8 +4,7 @@
 
 use std::fs::File;
 use std::io;
-use std::mem;
-use std::os::fd::{AsRawFd, FromRawFd, OwnedFd};
+use std::os::fd::{AsRawFd, FromRawFd};
 use std::os::unix::process::CommandExt;
 use std::path::Path;
 use std::process::Command;
@@ -230,48 +229,6 @@ pub fn set_watchdog_timeout(watchdog: &File, seconds: u32) {
     let mut seconds = seconds.try_into().expect("not a century");
     // SAFETY: this ioctl takes and fills this integer.
     unsafe { watchdog_settimeout(watchdog.as_raw_fd(), &mut seconds) }.expect("a timeout that it takes");
-}
-
-/// A raw CAN socket on the interface.
-pub struct CanSocket(OwnedFd);
-
-impl CanSocket {
-    pub fn open(interface: &str) -> CanSocket {
-        let index = sysfs::read(format!("/sys/class/net/{interface}/ifindex"));
-        // SAFETY: a plain system call. The descriptor that it returns is ours.
-        let socket = unsafe {
-            let fd = libc::socket(libc::PF_CAN, libc::SOCK_RAW | libc::SOCK_CLOEXEC, libc::CAN_RAW);
-            assert!(fd >= 0, "CAN socket: {}", io::Error::last_os_error());
-            OwnedFd::from_raw_fd(fd)
-        };
-        // SAFETY: all zeros is a valid address, and it is passed with its size.
-        let status = unsafe {
-            let mut address: libc::sockaddr_can = mem::zeroed();
-            address.can_family = libc::AF_CAN as libc::sa_family_t;
-            address.can_ifindex = index.parse().expect("a number");
-            libc::bind(socket.as_raw_fd(), (&raw const address).cast(), mem::size_of_val(&address) as libc::socklen_t)
-        };
-        assert_eq!(status, 0, "binding a CAN socket: {}", io::Error::last_os_error());
-        CanSocket(socket)
-    }
-
-    pub fn send(&self, id: u32, data: &[u8]) {
-        // `struct can_frame`: identifier, length, three reserved bytes, data.
-        let mut frame = [0; 16];
-        frame[..4].copy_from_slice(&id.to_ne_bytes());
-        frame[4] = u8::try_from(data.len()).expect("eight bytes at most");
-        frame[8..8 + data.len()].copy_from_slice(data);
-        let count = nix::unistd::write(&self.0, &frame).expect("sending a frame");
-        assert_eq!(count, frame.len());
-    }
-
-    pub fn receive(&self) -> (u32, Vec<u8>) {
-        let mut frame = [0; 16];
-        let count = nix::unistd::read(&self.0, &mut frame).expect("receiving a frame");
-        assert_eq!(count, frame.len());
-        let [a, b, c, d, len, ..] = frame;
-        (u32::from_ne_bytes([a, b, c, d]), frame[8..8 + usize::from(len)].to_vec())
-    }
 }
 
 fn open(path: &Path) -> File {

@@ -6,6 +6,7 @@ mod outputs;
 
 mod analog;
 mod buttons;
+mod can;
 mod counter;
 mod displays;
 mod ds18b20;
