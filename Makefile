@@ -165,6 +165,8 @@ install-program:
 	install -D -m 644 man/pinion.1 $(DESTDIR)$(MANDIR)/man1/pinion.1
 	install -D -m 644 man/pinion-mcu.service.8 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
 	install -D -m 755 systemd/link $(DESTDIR)$(LIBDIR)/link
+	install -D -m 755 systemd/usb-gadget $(DESTDIR)$(LIBDIR)/usb-gadget
+	install -D -m 644 systemd/can.conf $(DESTDIR)$(PREFIX)/share/pinion-mcu/can.conf
 	install -d $(DESTDIR)$(BASHDIR) $(DESTDIR)$(ZSHDIR) $(DESTDIR)$(FISHDIR)
 	$(COMPLETER) completions bash >$(DESTDIR)$(BASHDIR)/pinion
 	$(COMPLETER) completions zsh >$(DESTDIR)$(ZSHDIR)/_pinion
@@ -173,7 +175,7 @@ install-program:
 
 install-system:
 	install -d $(DESTDIR)$(UNITDIR)
-	for unit in pinion-mcu.service pinion-mcu@.service; do \
+	for unit in pinion-mcu.service pinion-mcu@.service pinion-usb-gadget.service; do \
 	    sed 's|/usr/bin/pinion|$(PREFIX)/bin/pinion|; s|/usr/lib/pinion-mcu|$(LIBDIR)|' systemd/$$unit \
 	        >$(DESTDIR)$(UNITDIR)/$$unit && chmod 644 $(DESTDIR)$(UNITDIR)/$$unit || exit 1; \
 	done
@@ -193,20 +195,22 @@ endif
 
 uninstall:
 ifeq ($(DESTDIR),)
-	-systemctl disable --now pinion-mcu
+	-systemctl disable --now pinion-mcu pinion-usb-gadget
 	-for unit in $$(systemctl list-units --all --plain --no-legend 'pinion-mcu@*.service' | cut -d ' ' -f 1); do \
 	    systemctl disable --now $$unit; \
 	done
 endif
 	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
-	    $(DESTDIR)$(UNITDIR)/pinion-mcu@.service $(DESTDIR)$(LIBDIR)/link $(DESTDIR)$(BASHDIR)/pinion \
+	    $(DESTDIR)$(UNITDIR)/pinion-mcu@.service $(DESTDIR)$(UNITDIR)/pinion-usb-gadget.service \
+	    $(DESTDIR)$(LIBDIR)/link $(DESTDIR)$(LIBDIR)/usb-gadget $(DESTDIR)$(BASHDIR)/pinion \
+	    $(DESTDIR)$(PREFIX)/share/pinion-mcu/can.conf \
 	    $(DESTDIR)$(ZSHDIR)/_pinion $(DESTDIR)$(FISHDIR)/pinion.fish \
 	    $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf \
 	    $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules $(DESTDIR)/etc/default/pinion-mcu \
 	    $(DESTDIR)$(MANDIR)/man1/pinion.1 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8 \
 	    $(DESTDIR)/etc/pinion/pinion.toml
 	test ! -d $(DESTDIR)/etc/pinion || rmdir --ignore-fail-on-non-empty $(DESTDIR)/etc/pinion
-	-rmdir $(DESTDIR)$(LIBDIR)
+	-rmdir $(DESTDIR)$(LIBDIR) $(DESTDIR)$(PREFIX)/share/pinion-mcu
 ifeq ($(DESTDIR),)
 	rm -rf /run/pinion /var/lib/pinion
 	-systemctl daemon-reload

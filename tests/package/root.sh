@@ -20,7 +20,7 @@ find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/s
     --include=sudo,apt-utils \
     --include=systemd,systemd-sysv,udev,dbus,kmod,procps,make,libiio0- \
     --include=libavahi-client3,libserialport0,libusb-1.0-0,libxml2 \
-    --include=python3-cffi,python3-greenlet,python3-jinja2,python3-serial \
+    --include=iproute2,python3-can,python3-cffi,python3-greenlet,python3-jinja2,python3-serial \
     --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt='path-exclude=/usr/share/doc/*' \
     --dpkgopt='path-include=/usr/share/doc/pinion-mcu/*' --dpkgopt='path-exclude=/var/lib/dpkg/available' \
     --customize-hook='chroot "$1" apt-get clean' \

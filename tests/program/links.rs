@@ -148,3 +148,34 @@ fn an_older_host_on_another_computer_gets_the_dialect_that_is_named() {
     // v0.11 knows no `app`.
     assert_eq!(client.dictionary().app, "");
 }
+
+#[test]
+fn a_usb_gadget_has_the_name_that_a_host_looks_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let at = |path: &str| folder.path().join(path);
+    fs::create_dir_all(at("config/usb_gadget")).unwrap();
+    fs::write(at("machine-id"), "b08dfa6083e7567a1921a715000001fb\n").unwrap();
+    let up = || {
+        Command::new(concat!(env!("CARGO_MANIFEST_DIR"), "/systemd/usb-gadget"))
+            .arg("up")
+            .env("CONFIGFS", at("config"))
+            .env("UDCS", at("udc"))
+            .env("MACHINE_ID", at("machine-id"))
+            .output()
+            .unwrap()
+    };
+    let refused = up();
+    assert!(!refused.status.success());
+    assert!(String::from_utf8_lossy(&refused.stderr).contains("dtoverlay=dwc2,dr_mode=peripheral"));
+    fs::create_dir_all(at("udc/fe980000.usb")).unwrap();
+    let made = up();
+    assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    let text = |path: &str| fs::read_to_string(at("config/usb_gadget/pinion").join(path)).unwrap();
+    assert_eq!(text("UDC"), "fe980000.usb\n");
+    // /dev/serial/by-id/usb-Klipper_pinion_SERIAL-if00: the serial number is a hash, not the machine's id.
+    assert_eq!((&*text("strings/0x409/manufacturer"), &*text("strings/0x409/product")), ("Klipper\n", "pinion\n"));
+    let serial = text("strings/0x409/serialnumber");
+    assert!(serial.trim().len() == 12 && !"b08dfa6083e7567a1921a715000001fb".contains(serial.trim()), "{serial}");
+    let function = fs::read_link(at("config/usb_gadget/pinion/configs/c.1/acm.0")).unwrap();
+    assert_eq!(function, at("config/usb_gadget/pinion/functions/acm.0"));
+}
