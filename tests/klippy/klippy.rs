@@ -86,6 +86,26 @@ impl Printer {
         })
     }
 
+    /// A printer on another link. `at_host` is the terminal at klippy's end of it.
+    pub fn start_wired(checkout: &Path, at_host: &str, link: &str, change: impl FnOnce(String) -> String) -> Printer {
+        Printer::serve(
+            checkout,
+            |board, _| board,
+            change,
+            |folder| {
+                std::os::unix::fs::symlink(at_host, folder.join("tty")).unwrap();
+                let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
+                    .args(["run", "-r", "--link", link, "--board"])
+                    .arg(format!("sim:{}", folder.join("board.toml").display()))
+                    .arg("-I")
+                    .arg(folder.join("mcu"))
+                    .stderr(File::create(folder.join("pinion.log")).unwrap())
+                    .spawn();
+                Server::Program(pinion.unwrap())
+            },
+        )
+    }
+
     /// The same, with `pinion sim --show`.
     pub fn start_shown(
         checkout: &Path,

@@ -10,6 +10,7 @@ mod filament;
 mod hosts;
 mod klippy;
 mod leveling;
+mod links;
 mod print;
 mod printer_cfg;
 mod probes;

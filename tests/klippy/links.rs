@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! klippy at the other end of a serial line: two pseudo terminals, and a thread that carries the bytes between them. It
+//! loses some.
+
+use std::fs;
+use std::io::{ErrorKind, Read, Write};
+use std::path::Path;
+use std::thread;
+use std::time::Duration;
+
+use nix::fcntl::OFlag;
+use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
+
+use crate::checkout;
+use crate::klippy::Printer;
+
+/// One byte in so many is lost.
+const LOST: usize = 20_011;
+
+/// One end of the line, and the terminal of the program there.
+fn end() -> (PtyMaster, String) {
+    let flags = OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC | OFlag::O_NONBLOCK;
+    let end = posix_openpt(flags).unwrap();
+    grantpt(&end).unwrap();
+    unlockpt(&end).unwrap();
+    let terminal = ptsname_r(&end).unwrap();
+    (end, terminal)
+}
+
+/// Makes the line. The terminals of its two ends. It lives as long as the test's process.
+fn line() -> [String; 2] {
+    let ((mut host, at_host), (mut mcu, at_mcu)) = (end(), end());
+    thread::spawn(move || {
+        let mut carried = 0;
+        let mut carry = |from: &mut PtyMaster, to: &mut PtyMaster| {
+            let mut bytes = [0; 256];
+            match from.read(&mut bytes) {
+                Ok(len) => {
+                    for byte in &bytes[..len] {
+                        carried += 1;
+                        if carried % LOST != 0 {
+                            // A full line loses bytes, as a UART does.
+                            let _ = to.write(&[*byte]);
+                        }
+                    }
+                    len > 0
+                }
+                // Nobody has the terminal open.
+                Err(error) if error.raw_os_error() == Some(libc::EIO) => false,
+                Err(error) if error.kind() == ErrorKind::WouldBlock => false,
+                Err(error) => panic!("{error}"),
+            }
+        };
+        loop {
+            let is_busy = carry(&mut host, &mut mcu) | carry(&mut mcu, &mut host);
+            if !is_busy {
+                thread::sleep(Duration::from_micros(200));
+            }
+        }
+    });
+    [at_host, at_mcu]
+}
+
+/// klippy takes the line for a UART.
+fn as_uart(config: String) -> String {
+    let line = config.lines().find(|line| line.starts_with("serial: ")).unwrap().to_owned();
+    let terminal = fs::read_link(Path::new(line.strip_prefix("serial: ").unwrap())).unwrap();
+    config.replace(&line, &format!("serial: {}\nbaud: 250000\nrestart_method: command", terminal.display()))
+}
+
+#[test]
+fn klippy_homes_and_restarts_over_a_serial_line_that_loses_bytes() {
+    let Some(checkout) = checkout("klippy_homes_and_restarts_over_a_serial_line_that_loses_bytes") else { return };
+    let [at_host, at_mcu] = line();
+    let mut printer = Printer::start_wired(&checkout, &at_host, &format!("serial:{at_mcu}"), as_uart);
+    printer.until_state("ready");
+    printer.gcode("G28");
+    printer.gcode("G1 X60 Y60 F6000\nM400");
+    assert_eq!(printer.object("toolhead")["homed_axes"], "xyz");
+    printer.gcode("FIRMWARE_RESTART");
+    printer.until_state("ready");
+    printer.gcode("G28 X");
+    // The wire's rate is klippy's own.
+    assert!(printer.host_log("", 0).contains("SERIAL_BAUD=250000"));
+}
