@@ -95,7 +95,7 @@ fn fast_gpio(wish: FastGpio, chips: &[Chip]) -> Vec<Finding> {
 }
 
 /// Whether the way to a host on another computer is there. If it is not yet, Pinion waits for it.
-fn wire(link: &LinkName) -> Finding {
+pub(super) fn wire(link: &LinkName) -> Finding {
     match link {
         LinkName::Serial(port, _) => {
             let path = port.display();

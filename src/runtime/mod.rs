@@ -2,7 +2,7 @@
 //! The program at work: threads, links, real time, signals.
 //!
 //! ```text
-//! host <-pty-> link ==ring of blocks==> core ==ring of jobs==> one worker per bus
+//! host <-way-> link ==ring of blocks==> core ==ring of jobs==> one worker per bus
 //!                   <==ring of bytes===      <==ring of answers==
 //! ```
 
@@ -138,6 +138,11 @@ pub fn run(
     info!("board {}", board.describe());
     let (wake, shown) = (Arc::new(LinkWake::new().map_err(no_room)?), Arc::new(HostBoard::default()));
     let dialect = options.dialect.or_else(|| (!options.link.is_local()).then_some(DialectName::Union));
+    if options.dialect.is_none() && !options.link.is_local() {
+        info!(
+            "the host is on another computer, so its version cannot be found: it gets the union of v0.13, master and Kalico: for an older host set its dialect"
+        );
+    }
     let place = (link.wire(), link.terminal());
     let introduction = Introduction::start(dialect, &*board, search, place, &wake, &shown)?;
     let (teller, asker) = status::ends();

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Looks at the board again when a host comes. A chip may have appeared since the program started: its driver was
+//! Looks at the board and the wire again when a host comes. A chip may have appeared since the program started: its driver was
 //! loaded late at boot, or somebody has plugged it in. So the host reads the names that are true now.
 
 #![forbid(unsafe_code)]
@@ -50,11 +50,15 @@ impl Surveyor {
         let (asks, questions) = channel();
         let (replies, answers) = channel();
         thread::Builder::new().name("survey".into()).spawn(move || {
+            let mut rate = firmware.wire.rate();
             for () in questions {
-                let found = view.look_again().then(|| {
+                let is_other_board = view.look_again();
+                if is_other_board {
                     info!("the board has changed: {}", view.describe());
-                    dialects(&firmware, &*view, &names)
-                });
+                }
+                let is_other_rate = firmware.wire.rate() != rate;
+                rate = firmware.wire.rate();
+                let found = (is_other_board || is_other_rate).then(|| dialects(&firmware, &*view, &names));
                 let found = found.transpose().unwrap_or_else(|trouble| {
                     error!("the host gets the board's former names: {trouble}");
                     None

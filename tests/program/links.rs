@@ -47,6 +47,7 @@ fn a_host_at_the_other_end_of_a_serial_line_is_served() {
     let host = plug_in(&folder);
     let pinion = on_serial(folder, ",500000");
     pinion.logged("ttyPort (500000 baud)");
+    pinion.logged("it gets the union of v0.13, master and Kalico");
     let mut client = client(host);
     assert_eq!(client.constant("SERIAL_BAUD").unwrap(), 500_000.0);
     // Nothing of the host's computer can be read, so all get the union.

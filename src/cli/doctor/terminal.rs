@@ -8,6 +8,7 @@ use std::fs;
 use std::os::unix::fs::MetadataExt;
 use std::path::{Path, PathBuf};
 
+use crate::cli::check;
 use crate::cli::computer::{Access, Computer, Who};
 use crate::cli::finding::{Finding, Level};
 use crate::klippy::{HOST_PATHS, is_host_path};
@@ -23,6 +24,10 @@ pub(super) fn terminals(computer: &Computer, instances: &[Instance], klippys: &[
     let mut findings = Vec::new();
     let mut links: Vec<&Path> = Vec::new();
     for instance in instances {
+        if !instance.settings.link.is_local() {
+            findings.push(check::wire(&instance.settings.link));
+            continue;
+        }
         let Some(link) = &instance.link else {
             let found =
                 format!("{} is no path that klippy takes for a pseudo terminal's", instance.settings.symlink.display());

@@ -19,7 +19,7 @@ pull 6 up
 gcode 'G28 X'
 pull 6 down
 is "$(of toolhead homed_axes)" x "what is homed"
-is "$(of 'canbus_stats mcu' canbus_bus_state)" active "the state of the bus"
+is "$(of 'canbus_stats mcu' bus_state)" active "the state of the bus"
 gcode 'SET_PIN PIN=light VALUE=1'
 until_true 10 is_high 14
 firmware_restart

@@ -20,11 +20,11 @@ pub enum Wire {
 
 impl Wire {
     /// The constant that tells klippy the wire's rate, and its value.
-    pub(super) fn rate(&self) -> Option<(&'static str, u32)> {
+    pub fn rate(&self) -> Option<(&'static str, u32)> {
         match self {
             Wire::Terminal => None,
             Wire::Serial(baud) => Some(("SERIAL_BAUD", *baud)),
-            Wire::Can(node) => node.frequency.map(|frequency| ("CANBUS_FREQUENCY", frequency)),
+            Wire::Can(node) => node.frequency().map(|frequency| ("CANBUS_FREQUENCY", frequency)),
         }
     }
 }
@@ -37,8 +37,8 @@ pub const CANBUS_UUID_BYTES: usize = 6;
 pub struct CanNode {
     /// What klippy finds the MCU by: its `canbus_uuid`.
     pub uuid: [u8; CANBUS_UUID_BYTES],
-    /// Bits per second, if the interface tells. klippy does not send faster (`CANBUS_FREQUENCY`).
-    pub frequency: Option<u32>,
+    /// Bits per second, or 0.
+    frequency: AtomicU32,
     /// The nodeid that a host has assigned, or 0.
     node_id: AtomicU32,
     health: [AtomicU32; 4],
@@ -84,7 +84,18 @@ impl CanState {
 impl CanNode {
     /// A node without a nodeid, on a bus without errors.
     pub fn new(uuid: [u8; CANBUS_UUID_BYTES], frequency: Option<u32>) -> CanNode {
+        let frequency = AtomicU32::new(frequency.unwrap_or(0));
         CanNode { uuid, frequency, node_id: AtomicU32::new(0), health: Default::default() }
+    }
+
+    /// Bits per second, if the interface tells. klippy does not send faster (`CANBUS_FREQUENCY`).
+    pub fn frequency(&self) -> Option<u32> {
+        Some(self.frequency.load(Ordering::Relaxed)).filter(|frequency| *frequency > 0)
+    }
+
+    /// The interface has this bitrate now.
+    pub fn set_frequency(&self, frequency: Option<u32>) {
+        self.frequency.store(frequency.unwrap_or(0), Ordering::Relaxed);
     }
 
     /// The assigned nodeid, or 0.

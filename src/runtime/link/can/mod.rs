@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use log::{info, warn};
-use nix::sys::socket::{setsockopt, sockopt};
+use nix::sys::socket::{AddressFamily, SockFlag, SockType, setsockopt, socket, sockopt};
 use socketcan::{
     CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanSocket, EmbeddedFrame as _, Frame as _, Socket as _,
     SocketOptions as _, StandardId,
@@ -91,11 +91,23 @@ impl CanBus {
     /// Opens an interface. One that is not there is opened later. Without a `uuid` the node has this computer's.
     pub(super) fn open(interface: &str, uuid: Option<CanbusUuid>) -> Result<CanBus, Trouble> {
         let CanbusUuid(uuid) = uuid.map_or_else(self::uuid, Ok)?;
-        let about = can::interface(interface);
-        let bitrate = about.as_ref().ok().and_then(|about| about.bitrate);
+        let refusal = |error: io::Error| {
+            let remedy = match error.raw_os_error() {
+                Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
+                    "load the module can_raw; in the service install its drop-in for CAN (docs/guide/another-computer.md)"
+                }
+                _ => "name a CAN interface (ip link show type can)",
+            };
+            refused(format_args!("the CAN interface {interface} cannot be opened"), error).remedy(remedy)
+        };
+        // In the service without its drop-in there are no interfaces either. This error tells more.
+        drop(
+            socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, None)
+                .map_err(|error| refusal(error.into()))?,
+        );
         let mut bus = CanBus {
             interface: interface.to_owned(),
-            node: Node::new(Arc::new(CanNode::new(uuid, bitrate))),
+            node: Node::new(Arc::new(CanNode::new(uuid, bitrate(interface)))),
             state: State::Gone(monotonic()),
             is_up: true,
             owes_answer: false,
@@ -112,17 +124,7 @@ impl CanBus {
                 );
                 bus.state = State::Gone(monotonic() + REOPEN);
             }
-            Err(error) => {
-                let remedy = match error.raw_os_error() {
-                    Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
-                        "load the module can_raw; in the service install its drop-in for CAN (docs/guide/another-computer.md)"
-                    }
-                    _ => "name a CAN interface (ip link show type can)",
-                };
-                return Err(
-                    refused(format_args!("the CAN interface {interface} cannot be opened"), error).remedy(remedy)
-                );
-            }
+            Err(error) => return Err(refusal(error)),
         }
         Ok(bus)
     }
@@ -252,6 +254,10 @@ impl CanBus {
     }
 }
 
+fn bitrate(interface: &str) -> Option<u32> {
+    can::interface(interface).ok().and_then(|about| about.bitrate)
+}
+
 /// The state after an error frame.
 fn state(bits: u32, controller: u8, before: CanState) -> CanState {
     const WARNING: u8 = 0x04 | 0x08;
@@ -341,6 +347,8 @@ impl Link for CanBus {
             && let State::Open(socket) = &self.state
         {
             self.filter(socket)?;
+            // It may have been set since the start. The new host reads the dictionary after this.
+            self.node.shared().set_frequency(bitrate(&self.interface));
             self.is_renewed = self.is_met;
         }
         if self.owes_answer {
