@@ -114,6 +114,13 @@ pub(in crate::cli) fn print_at_risk(computer: &Computer) -> Option<String> {
             Some(unit) => format!("Pinion (process {}, {unit})", pinion.pid),
             None => format!("Pinion (process {})", pinion.pid),
         };
+        if let Some(by) = &pinion.settings
+            && !by.link.is_local()
+        {
+            return Some(format!(
+                "a host on another computer may print through {who}, and measuring keeps every processor busy, which makes steps late: stop this Pinion, when no print runs"
+            ));
+        }
         let link = pinion.settings.map_or_else(|| HOST_PATHS.to_owned() + "mcu", |by| by.symlink.display().to_string());
         // An absolute link replaces the folder before it.
         let link = proc.join(format!("{}/cwd", pinion.pid)).join(&link);
