@@ -86,26 +86,6 @@ impl Printer {
         })
     }
 
-    /// A printer on another link. `at_host` is the terminal at klippy's end of it.
-    pub fn start_wired(checkout: &Path, at_host: &str, link: &str, change: impl FnOnce(String) -> String) -> Printer {
-        Printer::serve(
-            checkout,
-            |board, _| board,
-            change,
-            |folder| {
-                std::os::unix::fs::symlink(at_host, folder.join("tty")).unwrap();
-                let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-                    .args(["run", "-r", "--link", link, "--board"])
-                    .arg(format!("sim:{}", folder.join("board.toml").display()))
-                    .arg("-I")
-                    .arg(folder.join("mcu"))
-                    .stderr(File::create(folder.join("pinion.log")).unwrap())
-                    .spawn();
-                Server::Program(pinion.unwrap())
-            },
-        )
-    }
-
     /// The same, with `pinion sim --show`.
     pub fn start_shown(
         checkout: &Path,
@@ -131,6 +111,16 @@ impl Printer {
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
+        Printer::start_here_on(checkout, describe, change, |folder| LinkName::Pty(folder.join("tty")))
+    }
+
+    /// The same on another link. `link` puts the terminal at klippy's end of it where the pty would be.
+    pub fn start_here_on(
+        checkout: &Path,
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+        link: impl FnOnce(&Path) -> LinkName,
+    ) -> Printer {
         // Another test may have started the logger.
         let _ = env_logger::try_init();
         // A failed test poisons the lock.
@@ -141,7 +131,7 @@ impl Printer {
             let board = SimBoard::new(config, Arc::new(clock)).unwrap();
             let (probe, timing) = (board.probe(), board.timing());
             let options = Options {
-                link: LinkName::Pty(folder.join("tty")),
+                link: link(folder),
                 access: Access { mode: 0o660, group: None },
                 realtime: true,
                 cpu: None,
