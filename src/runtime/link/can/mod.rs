@@ -11,7 +11,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use log::{info, warn};
-use nix::sys::socket::{AddressFamily, SockFlag, SockType, setsockopt, socket, sockopt};
+use nix::sys::socket::{AddressFamily, SockFlag, SockProtocol, SockType, setsockopt, socket, sockopt};
 use socketcan::{
     CanDataFrame, CanErrorFrame, CanFilter, CanFrame, CanSocket, EmbeddedFrame as _, Frame as _, Socket as _,
     SocketOptions as _, StandardId,
@@ -102,7 +102,7 @@ impl CanBus {
         };
         // In the service without its drop-in there are no interfaces either. This error tells more.
         drop(
-            socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, None)
+            socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, SockProtocol::CanRaw)
                 .map_err(|error| refusal(error.into()))?,
         );
         let mut bus = CanBus {
