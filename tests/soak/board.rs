@@ -224,9 +224,12 @@ impl Board for FaultyBoard {
         Ok(OnWorker { bus, device: Box::new(self.faulty(device)) })
     }
 
-    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
-        let Mosi { line: OnWorker { bus, device }, message_max, pauses } = self.board.mosi(pin, rate_hz)?;
-        Ok(Mosi { line: OnWorker { bus, device: Box::new(self.faulty(device)) }, message_max, pauses })
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<Mosi>, Shutdown> {
+        let mosi = self.board.mosi(pin, rate_hz)?;
+        Ok(mosi.map(|Mosi { line: OnWorker { bus, device }, message_max, pauses }| {
+            let line = OnWorker { bus, device: Box::new(self.faulty(device)) as Box<dyn BusDevice> };
+            Mosi { line, message_max, pauses }
+        }))
     }
 
     fn counted_line(&mut self, pin: Pin, bias: Bias) -> Result<CountedLine, Shutdown> {

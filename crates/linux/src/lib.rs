@@ -15,7 +15,7 @@ pub use guard::Guard;
 use guard::SharedGuard;
 use pinion_firmware::board::{
     Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SerialPort, SpiConfig, Thermometer, not_mosi,
+    PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::trouble::Trouble;
@@ -331,10 +331,8 @@ impl Board for LinuxBoard {
         Ok(OnWorker { bus: format!("pwmchip{chip}"), device: Box::new(device) })
     }
 
-    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
-        let Target::Mosi(node) = Target::of(pin) else {
-            return Err(not_mosi(&Target::of(pin).to_string()));
-        };
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<Mosi>, Shutdown> {
+        let Target::Mosi(node) = Target::of(pin) else { return Ok(None) };
         let bus = node.number().unwrap_or(u32::MAX);
         let device = self.open_spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?.with_mosi_idle_low();
         let pauses = spi::driver_without_dma(Path::new(SPI_MASTERS), node).map(|driver| {
@@ -345,7 +343,7 @@ impl Board for LinuxBoard {
             .of(format_args!("/dev/{node}"))
         });
         let line = OnWorker { bus: device.worker(), device: Box::new(device) as Box<dyn BusDevice> };
-        Ok(Mosi { line, message_max: spi::message_max(), pauses })
+        Ok(Some(Mosi { line, message_max: spi::message_max(), pauses }))
     }
 
     fn mosi_of(&self, miso: Pin) -> Option<Pin> {
@@ -408,13 +406,10 @@ mod tests {
     }
 
     #[test]
-    fn leds_need_the_data_output_of_an_spi_device() {
+    fn a_data_output_is_that_of_an_spi_device() {
         let dev = tempfile::tempdir().unwrap();
         let mut board = board(dev.path());
-        let error = board.mosi(Pin(17), 3_200_000).err().unwrap();
-        assert_eq!(error.reason, reason::NOT_OUTPUT);
-        assert!(error.trouble.cause.starts_with("gpiochip0 line 17 cannot drive LEDs"), "{error}");
-        assert!(error.to_string().contains("\"pin: spidev0.0\""), "{error}");
+        assert!(board.mosi(Pin(17), 3_200_000).unwrap().is_none(), "it is a GPIO line");
         let names = Names::of(&Inventory { spi: vec![spi::Node::of(256), spi::Node::of(257)], ..Inventory::default() });
         let range = names.ranges().into_iter().find(|range| range.name == "spidev1.0").unwrap();
         assert_eq!(range.count, 2);

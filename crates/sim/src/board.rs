@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use pinion_firmware::board::{
     Adc, Bias, Board, BusDevice, ClaimedLine, CountedLine, Direction, Edges, I2cConfig, Mosi, OnWorker, Pin, Pwm,
-    PwmConfig, Range, SerialPort, SpiConfig, Thermometer, not_mosi,
+    PwmConfig, Range, SerialPort, SpiConfig, Thermometer,
 };
 use pinion_firmware::shutdown::{Shutdown, ShutdownReason, reason};
 use pinion_firmware::time::{TimeSource, Timing};
@@ -270,12 +270,12 @@ impl Board for SimBoard {
         Ok(OnWorker { bus: format!("spi{}", config.bus), device: Box::new(device) })
     }
 
-    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<Mosi>, Shutdown> {
         let wired = self.pin(pin, reason::NOT_OUTPUT)?;
         let bus = self.spi_buses().into_iter().find(|bus| wired.wire.kind() == Kind::Mosi && bus.name == wired.name);
-        let bus = bus.ok_or_else(|| not_mosi(&wired.name))?.first;
+        let Some(Range { first: bus, .. }) = bus else { return Ok(None) };
         let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
-        Ok(Mosi { line, message_max: MESSAGE_MAX, pauses: None })
+        Ok(Some(Mosi { line, message_max: MESSAGE_MAX, pauses: None }))
     }
 
     fn mosi_of(&self, miso: Pin) -> Option<Pin> {

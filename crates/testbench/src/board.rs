@@ -102,6 +102,8 @@ pub struct State {
     pub counted: HashSet<u32>,
     /// Pins of chips that may sleep.
     pub sleeping: HashSet<u32>,
+    /// Lines that are written and read without a call of the kernel.
+    pub fast: HashSet<u32>,
     /// Whether an errand is running. Only then may lines that sleep be called.
     on_worker: bool,
     /// ADC and PWM channels in use.
@@ -429,13 +431,10 @@ impl Board for FakeBoard {
         Ok(OnWorker { bus, device: Box::new(FakeSpi { bench: self.0.clone(), config }) })
     }
 
-    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
-        let Some(bus) = pin.0.checked_sub(MOSI).filter(|bus| *bus < SPI_BUSES) else {
-            let cause = format!("pin {} is no SPI data output", pin.0);
-            return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose spidev0"));
-        };
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<Mosi>, Shutdown> {
+        let Some(bus) = pin.0.checked_sub(MOSI).filter(|bus| *bus < SPI_BUSES) else { return Ok(None) };
         let line = self.spi(SpiConfig { bus, mode: 0, rate_hz, chip_select: None })?;
-        Ok(Mosi { line, message_max: MESSAGE_MAX, pauses: None })
+        Ok(Some(Mosi { line, message_max: MESSAGE_MAX, pauses: None }))
     }
 
     fn mosi_of(&self, miso: Pin) -> Option<Pin> {
@@ -623,6 +622,10 @@ impl Line for FakeLine {
             }
         }
         Ok(())
+    }
+
+    fn is_fast(&self) -> bool {
+        self.bench.state().fast.contains(&self.pin)
     }
 
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {

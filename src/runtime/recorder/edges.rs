@@ -158,7 +158,7 @@ impl Board for EdgeBoard {
         self.board.pwm(config)
     }
 
-    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<Mosi>, Shutdown> {
         self.board.mosi(pin, rate_hz)
     }
 

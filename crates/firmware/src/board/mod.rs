@@ -510,14 +510,14 @@ pub trait Board: Send {
     /// "Unable to config pwm device", "PWM write failed", "Guardian process lost".
     fn pwm(&mut self, config: PwmConfig) -> Result<OnWorker<dyn Pwm>, Shutdown>;
 
-    /// Opens the SPI data output with the name `pin`, in mode 0.
+    /// Opens the SPI data output with the name `pin`, in mode 0. `None`: this pin is no SPI data output.
     ///
     /// # Errors
     ///
-    /// "Not an output pin" for any other pin, and the errors of [`Board::spi`].
-    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Mosi, Shutdown> {
-        let _ = rate_hz;
-        Err(not_mosi(&pin.name_in(&self.pins())))
+    /// The errors of [`Board::spi`].
+    fn mosi(&mut self, pin: Pin, rate_hz: u32) -> Result<Option<Mosi>, Shutdown> {
+        let _ = (pin, rate_hz);
+        Ok(None)
     }
 
     /// The data output of the SPI device whose data input has the name `pin`. `None`: this pin is no SPI data input.
@@ -549,12 +549,4 @@ pub trait Board: Send {
 
     /// Forgets all claims. The MCU has dropped the lines and devices before this.
     fn reset(&mut self);
-}
-
-/// The error of [`Board::mosi`] for a pin that is not an SPI data output.
-pub fn not_mosi(name: &str) -> Shutdown {
-    let cause = format!("{name} cannot drive LEDs: their pulses are too short for a program on Linux");
-    Shutdown::because(reason::NOT_OUTPUT, cause).remedy(
-        "connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\" (pinion pins lists them)",
-    )
 }

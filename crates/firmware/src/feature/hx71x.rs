@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use log::warn;
 
-use crate::board::{Bias, Direction, Line, OnWorker, Pin};
+use crate::board::{Bias, Direction, Line, Mosi, OnWorker, Pin};
 use crate::mcu::{
     Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
     Settable, Slot, Turn, WorkerId, command, since,
@@ -222,7 +222,10 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
                 (format!("write sclk_pin: {}", mcu.name(mosi)), format!("{dout} has another clock than {sclk}"));
             return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy(remedy));
         }
-        let OnWorker { bus, device } = mcu.board()?.mosi(mosi, spi::RATE_HZ)?.line;
+        let Some(Mosi { line: OnWorker { bus, device }, .. }) = mcu.board()?.mosi(mosi, spi::RATE_HZ)? else {
+            let cause = format!("{sclk} is no data output of an SPI device");
+            return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy("choose another SPI device"));
+        };
         let worker = mcu.worker(&bus)?;
         let device: Shared = Arc::new(Mutex::new(device));
         let power_down = Remote::new(worker, PowerDown::Spi(device.clone()), true);

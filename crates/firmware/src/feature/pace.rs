@@ -14,6 +14,12 @@ use crate::time::{Clock, Ticks, TimeSource};
 
 /// Longest time that a wait continues after a stop.
 const SLICE: Ticks = Ticks::from_us(1000);
+/// How long [`Pace::until_interrupted`] waits: a little longer than the kernel's tick at 250 Hz.
+const TICK_MAX: Ticks = Ticks::from_us(4100);
+/// How often it looks at the clock.
+const LOOK: Ticks = Ticks(25);
+/// Shortest time without the processor that counts as an interruption: 1 us.
+const INTERRUPTION: i64 = 50;
 
 /// Keeps time on a worker, until the core stops it. The errand and its object have a copy each.
 #[derive(Clone)]
@@ -48,6 +54,27 @@ impl Pace {
                 return true;
             }
             self.clock.spin_until(at.min(now + SLICE));
+        }
+    }
+
+    /// Waits until `at`, also if the MCU stopped. Only for times of microseconds.
+    #[inline]
+    pub(super) fn spin_until(&self, at: Clock) {
+        self.clock.spin_until(at);
+    }
+
+    /// Waits until this thread has been interrupted, at most [`TICK_MAX`]. Most interruptions are ticks of the kernel, at
+    /// equal distances. So it has the processor for itself for a while now.
+    pub(super) fn until_interrupted(&self) {
+        let mut last = self.clock.now();
+        let limit = last + TICK_MAX;
+        while last < limit && !self.stopped.load(Ordering::Relaxed) {
+            let look = last + LOOK;
+            self.clock.spin_until(look);
+            last = self.clock.now();
+            if last.since(look) > INTERRUPTION {
+                return;
+            }
         }
     }
 

@@ -83,6 +83,10 @@ impl Line for Watched {
         self.shown.begin(direction);
         self.line.turn(direction)
     }
+
+    fn is_fast(&self) -> bool {
+        self.line.is_fast()
+    }
 }
 
 /// A line of a chip that may sleep. Each call may be repeated.

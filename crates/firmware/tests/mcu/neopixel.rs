@@ -111,3 +111,49 @@ fn what_can_not_be_configured() {
     assert_eq!(refusal(MOSI, 0x8000, 2500).0, "Invalid neopixel data_size");
     assert_eq!(refusal(5, 6, 2500).0, "Not an output pin");
 }
+
+/// A GPIO line that is written through registers.
+const FAST: u32 = 18;
+const CHAIN_ON_A_LINE: &str = "config_neopixel oid=0 pin=18 data_size=3 bit_max_ticks=200 reset_min_ticks=2500";
+
+#[test]
+fn a_fast_line_drives_leds_without_an_spi_controller() {
+    let mut rig = Rig::new();
+    rig.bench.state().fast.insert(FAST);
+    rig.configure(&[CHAIN_ON_A_LINE]);
+    rig.send("neopixel_update oid=0 pos=0 data=ff00a5");
+    assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
+    let edges: Vec<_> = rig.bench.edges(FAST);
+    let high = edges.chunks(2).map(|pulse| pulse[1].0 - pulse[0].0);
+    let bits: Vec<u8> = high.map(|ticks| u8::from(ticks > 32)).collect();
+    let bytes = |bits: &[u8]| bits.chunks(8).map(|byte| byte.iter().fold(0, |value, bit| value << 1 | bit)).collect();
+    let bytes: Vec<u8> = bytes(&bits);
+    assert_eq!(bytes, [0xff, 0, 0xa5]);
+    assert!(rig.bench.transfers().is_empty());
+    // An edge of the kernel takes longer than a short pulse.
+    rig.bench.state().write_ticks = 50;
+    for _ in 0..8 {
+        assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=0");
+    }
+    rig.bench.state().write_ticks = 0;
+    assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
+    assert!(!rig.mcu.is_shutdown());
+}
+
+#[test]
+fn a_line_that_is_not_fast_or_a_chain_that_is_too_long_is_refused() {
+    for (fast, size, text, log) in [
+        (false, 3, "Not an output pin", "gpio18 cannot drive LEDs: their pulses are too short"),
+        (true, 501, "Invalid neopixel data_size", "a chain of 501 bytes is too long for a line, which takes 500"),
+    ] {
+        let mut rig = Rig::new();
+        if fast {
+            rig.bench.state().fast.insert(FAST);
+        }
+        rig.send("allocate_oids count=1");
+        rig.send(&CHAIN_ON_A_LINE.replace("data_size=3", &format!("data_size={size}")));
+        assert_eq!(rig.shutdown().as_deref(), Some(text));
+        let notes = rig.notes().join(" ");
+        assert!(notes.contains(log), "{notes}");
+    }
+}
