@@ -1,8 +1,11 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Measures how late bits are at 40 kbaud on this computer. A worker times them as Pinion does. The core times them
-//! with a timer for each bit, as the firmware does. Both run alone, and beside four steppers of 10,000 steps a second.
+//! Measures how well a worker times bits on lines on this computer: TMC UARTs at 40 kbaud, and WS2812 LEDs. The core
+//! times a UART's bits too, with a timer for each bit, as the firmware does. All run alone, and beside steppers of
+//! 10,000 steps a second.
+//!
+//! A line is a word of memory here, as registers would be. Another thread watches the line of the LEDs.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::sync::mpsc::{self, Receiver, Sender};
 use std::sync::{Arc, Mutex};
 use std::thread;
@@ -20,7 +23,7 @@ use pinion_firmware::mcu::{
 };
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
-use pinion_linux::clock::Monotonic;
+use pinion_linux::clock::{Monotonic, monotonic};
 use pinion_protocol::vlq::{Reader, Writer};
 use pinion_testbench::board::{Bench, FakeBoard};
 
@@ -32,11 +35,31 @@ const MESSAGES: u32 = 1000;
 const CORE_RUNS: Duration = Duration::from_secs(3);
 /// klippy's bytes to read a register (`_encode_read(0xf5, 0, 2)` of tmc_uart.py), and a reply.
 const MESSAGE: [u8; 5] = [0xea, 0x03, 0x48, 0x20, 0xe4];
+/// A message that writes a register: eight bytes (`_encode_write`).
+const WRITE: [u8; 8] = [0xf5, 0x00, 0x90, 0x00, 0x06, 0x1a, 0x08, 0x3c];
 const REPLY: [u8; 10] = [0x0a, 0xfa, 0x4f, 0x20, 0x80, 0x00, 0x02, 0xe8, 0x20, 0xf1];
-/// Edges of the message, and those back to idle.
-const EDGES: usize = 16;
 /// Time from the last edge of a message to its reply: the end of its last byte, eight bits and some.
 const REPLY_AFTER: i64 = 20 * BIT.0 as i64 + 333;
+
+/// The colors of eight LEDs.
+const COLORS: [u8; 24] = [
+    0x00, 0xff, 0xa5, 0x5a, 0x01, 0x80, 0x00, 0x00, 0x00, 0x10, 0x20, 0x40, 0x00, 0xff, 0xa5, 0x5a, 0x01, 0x80, 0x00,
+    0x00, 0x00, 0x10, 0x20, 0x41,
+];
+/// How many frames the LEDs get.
+const FRAMES: u32 = 1000;
+/// Shortest look away in which two edges may be hidden: each is 200 ns from the next, and another processor sees it some
+/// 100 ns earlier or later.
+const HIDES: Duration = Duration::from_nanos(100);
+/// How long the line of the LEDs is low between two frames, at least.
+const QUIET: Duration = Duration::from_micros(100);
+
+/// The bits of these bytes on the wire, as klippy sends them: the lowest bit of the first byte is the first.
+fn framed(bytes: &[u8]) -> Vec<u8> {
+    let bits = bytes.iter().flat_map(|byte| (0..10).map(move |n| (u16::from(*byte) << 1 | 0x200) >> n & 1));
+    let bits: Vec<u16> = bits.collect();
+    bits.chunks(8).map(|byte| byte.iter().rev().fold(0, |value, bit| value << 1 | *bit as u8)).collect()
+}
 
 fn bit_of(bytes: &[u8], place: usize) -> bool {
     bytes.get(place / 8).is_none_or(|byte| byte >> (place % 8) & 1 != 0)
@@ -65,11 +88,101 @@ impl Line for Wire {
     }
 }
 
-/// The bench's board. Each of its lines is the wire.
+/// A line that is written through registers.
+struct Fast(Arc<AtomicU32>);
+
+impl Line for Fast {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        // The processor does not wait until others see it. Some see a pulse that is up to 200 ns shorter or longer.
+        self.0.store(level.into(), Ordering::Release);
+        Ok(())
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        Ok(self.0.load(Ordering::Acquire) != 0)
+    }
+
+    fn set_direction(&self, _: Direction) -> Result<(), Shutdown> {
+        Ok(())
+    }
+
+    fn is_fast(&self) -> bool {
+        true
+    }
+}
+
+/// An HX711 on two lines that are written through registers: a sample every 12.5 ms, of ones only. It records how long
+/// its clock was high.
+#[derive(Default)]
+struct LoadCell {
+    /// When the clock rose, in nanoseconds.
+    rose: AtomicU64,
+    /// The sample that was read last, by its number.
+    read: AtomicU64,
+    pulses: AtomicU64,
+    /// Pulses over 50 us, which is the limit of the data sheet (T3), and over 60 us, which switches the chip off.
+    long: [AtomicU64; 2],
+    longest_ns: AtomicU64,
+}
+
+/// Nanoseconds between two samples.
+const SAMPLE_NS: u64 = 12_500_000;
+
+fn now_ns() -> u64 {
+    monotonic().as_nanos() as u64
+}
+
+/// The clock of the load cell, or its data.
+struct CellLine {
+    cell: Arc<LoadCell>,
+    is_clock: bool,
+}
+
+impl Line for CellLine {
+    fn write(&self, level: bool) -> Result<(), Shutdown> {
+        let cell = &self.cell;
+        if level {
+            cell.rose.store(now_ns(), Ordering::Relaxed);
+            return Ok(());
+        }
+        let (now, rose) = (now_ns(), cell.rose.swap(0, Ordering::Relaxed));
+        if rose != 0 {
+            cell.read.store(now / SAMPLE_NS, Ordering::Relaxed);
+            cell.pulses.fetch_add(1, Ordering::Relaxed);
+            cell.longest_ns.fetch_max(now - rose, Ordering::Relaxed);
+            for (count, limit) in cell.long.iter().zip([50_000, 60_000]) {
+                count.fetch_add(u64::from(now - rose > limit), Ordering::Relaxed);
+            }
+        }
+        Ok(())
+    }
+
+    fn read(&self) -> Result<bool, Shutdown> {
+        Ok(self.is_clock || self.cell.read.load(Ordering::Relaxed) == now_ns() / SAMPLE_NS)
+    }
+
+    fn set_direction(&self, _: Direction) -> Result<(), Shutdown> {
+        Ok(())
+    }
+
+    fn is_fast(&self) -> bool {
+        true
+    }
+}
+
+/// The pin of the LEDs.
+const LEDS: Pin = Pin(9);
+/// The data and the clock of the load cell.
+const DOUT: Pin = Pin(10);
+const SCLK: Pin = Pin(11);
+
+/// The bench's board. Each of its lines is the wire, except that of the LEDs.
 struct Wires {
     rest: FakeBoard,
     clock: Monotonic,
     edges: Arc<Mutex<Vec<(Clock, bool)>>>,
+    leds: Arc<AtomicU32>,
+    cell: Arc<LoadCell>,
 }
 
 impl Board for Wires {
@@ -82,9 +195,13 @@ impl Board for Wires {
     fn spi_buses(&self) -> Vec<Range> {
         self.rest.spi_buses()
     }
-    fn line(&mut self, _: Pin, _: Direction) -> Result<ClaimedLine, Shutdown> {
-        let line = Wire { clock: self.clock, edges: self.edges.clone() };
-        Ok(ClaimedLine { line: Arc::new(line), sleeps_on: None })
+    fn line(&mut self, pin: Pin, _: Direction) -> Result<ClaimedLine, Shutdown> {
+        let line: Arc<dyn Line> = match pin {
+            LEDS => Arc::new(Fast(self.leds.clone())),
+            DOUT | SCLK => Arc::new(CellLine { cell: self.cell.clone(), is_clock: pin == SCLK }),
+            _ => Arc::new(Wire { clock: self.clock, edges: self.edges.clone() }),
+        };
+        Ok(ClaimedLine { line, sleeps_on: None })
     }
     fn adc(&mut self, pin: Pin) -> Result<OnWorker<dyn Adc>, Shutdown> {
         self.rest.adc(pin)
@@ -149,16 +266,16 @@ impl Workers for Worker {
     fn reset(&mut self) {}
 }
 
-/// The UART's last response.
+/// The last response of the UART or the LEDs.
 #[derive(Clone)]
 struct Heard {
-    id: u32,
+    ids: [u32; 2],
     last: Arc<Mutex<Option<Vec<u8>>>>,
 }
 
 impl Outbox for Heard {
     fn send(&mut self, payload: &[u8]) {
-        if Reader::new(payload).int() == Ok(self.id) {
+        if Reader::new(payload).int().is_ok_and(|id| self.ids.contains(&id)) {
             *self.last.lock().unwrap() = Some(payload.to_vec());
         }
     }
@@ -167,32 +284,96 @@ impl Outbox for Heard {
     }
 }
 
-/// An MCU with one TMC UART.
-struct Uart {
+#[derive(PartialEq)]
+enum Reply {
+    Whole,
+    None,
+    Wrong,
+}
+
+/// The messages that a driver takes from these edges, as its data sheet says (TMC2209, section 4.1): it takes the
+/// length of a bit from the sync nibble, and counts the bits of each byte from its start bit. A pause of 63 bits ends a
+/// message that is not whole. Bits are read in their middle.
+fn messages(edges: &[(Clock, bool)]) -> Vec<Vec<bool>> {
+    let level = |at: Clock| edges.iter().rev().find(|(from, _)| *from <= at).is_none_or(|(_, level)| *level);
+    let edge = |from: Clock, to: bool| edges.iter().map(|(at, _)| *at).find(|at| *at >= from && level(*at) == to);
+    let pause = |from: Clock, to: Clock| to.since(from) > 63 * i64::from(BIT.0);
+    let mut messages: Vec<Vec<bool>> = vec![];
+    let (mut bit, mut last) = (BIT.0, None::<Clock>);
+    let mut next = edges.first().and_then(|(at, _)| edge(*at, false));
+    'bytes: while let Some(start) = next {
+        if last.is_none_or(|last| pause(last, start)) {
+            messages.push(vec![]);
+            let mut end = start;
+            for to in [true, false, true, false] {
+                let Some(at) = edge(end, to) else { break 'bytes };
+                if pause(end, at) {
+                    (next, last) = (edge(at, false), None);
+                    continue 'bytes;
+                }
+                end = at;
+            }
+            bit = (end.since(start) / 4) as u32;
+        }
+        let middle = |n: u32| start + Ticks(bit * n + bit / 2);
+        if let Some(message) = messages.last_mut() {
+            message.extend((0..10).map(|n| level(middle(n))));
+        }
+        last = Some(start);
+        next = edge(middle(9), false);
+    }
+    messages
+}
+
+/// An MCU with one TMC UART and one chain of LEDs.
+struct Printer {
     mcu: Mcu,
     dialect: Arc<Dialect>,
     edges: Arc<Mutex<Vec<(Clock, bool)>>>,
+    leds: Arc<AtomicU32>,
+    cell: Arc<LoadCell>,
     heard: Heard,
 }
 
-impl Uart {
-    fn new(clock: Monotonic) -> Uart {
+impl Printer {
+    fn new(clock: Monotonic) -> Printer {
         let edges = Arc::new(Mutex::new(Vec::with_capacity(100)));
         let bench = Bench::new(pinion_firmware::time::VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
-        let board = Wires { rest: FakeBoard(bench), clock, edges: edges.clone() };
+        let leds = Arc::new(AtomicU32::new(0));
+        let cell = Arc::new(LoadCell::default());
+        let board =
+            Wires { rest: FakeBoard(bench), clock, edges: edges.clone(), leds: leds.clone(), cell: cell.clone() };
         let dialect = Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master));
         let dialect = Arc::new(dialect.expect("a dialect"));
-        let id = dialect.dictionary().responses["tmcuart_response oid=%c read=%*s"].as_i64().unwrap_or(0) as u32;
-        let heard = Heard { id, last: Arc::default() };
+        let id = |format: &str| dialect.dictionary().responses[format].as_i64().unwrap_or(0) as u32;
+        let ids = [id("tmcuart_response oid=%c read=%*s"), id("neopixel_result oid=%c success=%c")];
+        let heard = Heard { ids, last: Arc::default() };
         let worker = Box::new(Worker::start(clock));
         let timing = Timing::of(Arc::new(clock));
         let mcu = Mcu::new(dialect.clone(), Box::new(board), timing, worker, Box::new(heard.clone()));
-        let mut uart = Uart { mcu, dialect, edges, heard };
-        uart.run("allocate_oids count=%c", &[1], None);
+        let mut printer = Printer { mcu, dialect, edges, leds, cell, heard };
+        printer.run("allocate_oids count=%c", &[3], None);
         let config = "config_tmcuart oid=%c rx_pin=%u pull_up=%c tx_pin=%u bit_time=%u";
-        uart.run(config, &[0, 1, 0, 2, BIT.0], None);
-        uart.run("finalize_config crc=%u", &[1], None);
-        uart
+        printer.run(config, &[0, 1, 0, 2, BIT.0], None);
+        let config = "config_neopixel oid=%c pin=%u data_size=%hu bit_max_ticks=%u reset_min_ticks=%u";
+        printer.run(config, &[1, LEDS.0, COLORS.len() as u32, 200, 2500], None);
+        let config = "config_hx71x oid=%c gain_channel=%c dout_pin=%u sclk_pin=%u";
+        printer.run(config, &[2, 1, DOUT.0, SCLK.0], None);
+        printer.run("finalize_config crc=%u", &[1], None);
+        let (first, rest) = COLORS.split_at(COLORS.len() / 2);
+        for (pos, data) in [(0, first), (first.len(), rest)] {
+            printer.update(pos as u32, data);
+        }
+        printer
+    }
+
+    fn update(&mut self, pos: u32, data: &[u8]) {
+        let mut command = Writer::default();
+        command.int(self.dialect.command_id("neopixel_update oid=%c pos=%hu data=%*s").expect("a command"));
+        command.int(1);
+        command.int(pos);
+        command.string(data);
+        self.mcu.execute(&mut Reader::new(command.payload().expect("it fits")));
     }
 
     fn run(&mut self, format: &str, before: &[u32], bytes: Option<(&[u8], u32)>) {
@@ -206,21 +387,112 @@ impl Uart {
         self.mcu.execute(&mut Reader::new(command.payload().expect("it fits")));
     }
 
-    /// Sends the message, and reads a reply of this length. Returns the edges, and whether the reply came whole.
-    fn exchange(&mut self, read: usize) -> (Vec<(Clock, bool)>, bool) {
+    /// Sends a message, and reads a reply of this length. Returns the edges, and the reply: whole, none or wrong.
+    fn exchange(&mut self, message: &[u8], read: usize) -> (Vec<(Clock, bool)>, Reply) {
         self.edges.lock().unwrap().clear();
-        *self.heard.last.lock().unwrap() = None;
-        self.run("tmcuart_send oid=%c write=%*s read=%c", &[0], Some((&MESSAGE, read as u32)));
+        self.run("tmcuart_send oid=%c write=%*s read=%c", &[0], Some((message, read as u32)));
+        let response = self.response();
+        let reply = match (response.ends_with(&REPLY), response.ends_with(&[0])) {
+            (true, _) => Reply::Whole,
+            (false, true) => Reply::None,
+            (false, false) => Reply::Wrong,
+        };
+        (self.edges.lock().unwrap().clone(), reply)
+    }
+
+    /// Sends the colors. Returns whether the frame was whole, as Pinion says.
+    fn light(&mut self) -> bool {
+        self.run("neopixel_send oid=%c", &[1], None);
+        self.response().ends_with(&[1])
+    }
+
+    /// Runs the MCU until its response to the last command.
+    fn response(&mut self) -> Vec<u8> {
         loop {
             self.mcu.run_timers();
             if self.mcu.has_completion() {
                 self.mcu.run_workers();
             }
-            if let Some(response) = &*self.heard.last.lock().unwrap() {
-                return (self.edges.lock().unwrap().clone(), response.ends_with(&REPLY));
+            if let Some(response) = self.heard.last.lock().unwrap().take() {
+                return response;
             }
         }
     }
+}
+
+/// An edge of the LEDs' line: the new level, the last look at the old level, the first look at the new one.
+type Seen = (bool, Duration, Duration);
+
+/// The edges of a frame, and the longest time between two looks.
+#[derive(Default)]
+struct Burst(Vec<Seen>, Duration);
+
+/// Watches the line of the LEDs until `end`. `seen` receives each frame when the line is quiet.
+fn watch(leds: &AtomicU32, end: &AtomicBool, seen: &Mutex<Vec<Burst>>) {
+    let mut burst = Burst::default();
+    let (mut was, mut last) = (false, monotonic());
+    while !end.load(Ordering::Relaxed) {
+        let level = leds.load(Ordering::Acquire) != 0;
+        let now = monotonic();
+        if !burst.0.is_empty() {
+            burst.1 = burst.1.max(now - last);
+        }
+        if level != was {
+            burst.0.push((level, last, now));
+        } else if burst.0.last().is_some_and(|(.., at)| now - *at > QUIET) {
+            seen.lock().unwrap().push(std::mem::take(&mut burst));
+        }
+        (was, last) = (level, now);
+    }
+}
+
+/// Whether a chain of LEDs understands a frame, by the limits that the firmware's src/neopixel.c names. An edge is
+/// somewhere between two looks: false only if a time was surely wrong. `None` if the watching thread looked away, and
+/// has not seen all edges.
+fn understood(Burst(edges, away): &Burst) -> Option<bool> {
+    let ns = |from: Duration, to: Duration| to.as_nanos() as i64 - from.as_nanos() as i64;
+    let bits = COLORS.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 == 1));
+    if edges.len() != 16 * COLORS.len() {
+        return (*away <= HIDES).then_some(false);
+    }
+    Some(edges.chunks(2).zip(bits).enumerate().all(|(n, (pulse, one))| {
+        let [(true, rises, risen), (false, falls, fallen)] = pulse else { return false };
+        let high = if one { ns(*rises, *fallen) >= 650 } else { ns(*risen, *falls) <= 500 };
+        high && edges.get(2 * n + 2).is_none_or(|(_, next, _)| ns(*risen, *next) <= 5000)
+    }))
+}
+
+/// Sends frames to the LEDs.
+fn leds(clock: Monotonic) {
+    let mut printer = Printer::new(clock);
+    let (leds, end, seen) = (printer.leds.clone(), AtomicBool::new(false), Mutex::new(Vec::new()));
+    let (mut whole, mut first, mut tries) = (0, 0, 0);
+    // Of the whole frames: as seen from outside.
+    let mut as_seen = [0; 3];
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            realtime::enter(Role::Worker);
+            watch(&leds, &end, &seen);
+        });
+        for _ in 0..FRAMES {
+            let is_whole = printer.light();
+            thread::sleep(Duration::from_millis(2));
+            let frames = std::mem::take(&mut *seen.lock().unwrap());
+            tries += frames.len();
+            whole += u32::from(is_whole);
+            first += u32::from(is_whole && frames.len() == 1);
+            if is_whole {
+                let last = frames.last().and_then(understood);
+                as_seen[last.map_or(2, |good| usize::from(!good))] += 1;
+            }
+        }
+        end.store(true, Ordering::Relaxed);
+    });
+    let [good, bad, unknown] = as_seen;
+    println!("  LEDs: of {FRAMES} frames {whole} whole, {first} at the first try; {tries} tries");
+    println!(
+        "  another thread saw {good} of the whole ones with all their times, {bad} without, and not all edges of {unknown}"
+    );
 }
 
 /// The results of the core.
@@ -268,39 +540,72 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
     core
 }
 
-/// How late the edges were, and how many messages and replies arrived whole.
-fn worker(clock: Monotonic) -> (Lateness, u32, u32) {
-    let mut uart = Uart::new(clock);
-    let (mut late, mut sent, mut read) = (Lateness::default(), 0, 0);
+/// Exchanges messages, and prints how many arrived.
+fn uart(clock: Monotonic) {
+    let mut printer = Printer::new(clock);
+    let write = framed(&WRITE);
+    let whole: Vec<bool> = (0..8 * write.len()).map(|n| bit_of(&write, n)).collect();
+    let (mut first, mut last, mut tries) = (0, 0, 0);
+    let (mut read, mut none, mut wrong) = (0, 0, 0);
     for _ in 0..MESSAGES {
-        let (edges, _) = uart.exchange(0);
-        let edges = &edges[1..=EDGES];
-        let start = edges[0].0;
-        // The bits that a driver reads. It measures the length of a bit, and looks at the middle of each.
-        let level = |at: Clock| edges.iter().rev().find(|(from, _)| *from <= at).is_none_or(|(_, level)| *level);
-        let bit = edges[4].0.since(start) / 4;
-        let middle = |n: usize| start + Ticks((bit * n as i64 + bit / 2) as u32);
-        sent += u32::from((0..40).all(|n| level(middle(n)) == bit_of(&MESSAGE, n)));
-        let nominal = (1..40).filter(|n| bit_of(&MESSAGE, *n) != bit_of(&MESSAGE, n - 1));
-        for (n, (at, _)) in nominal.zip(&edges[1..]) {
-            late.record((at.since(start) - i64::from(BIT.0) * n as i64).abs());
-        }
-        read += u32::from(uart.exchange(REPLY.len()).1);
+        let (edges, _) = printer.exchange(&write, 0);
+        // Without the first write, which only warms up.
+        let heard = messages(&edges[1..]);
+        tries += heard.len();
+        first += usize::from(heard.first() == Some(&whole));
+        last += usize::from(heard.last() == Some(&whole));
+        let count = match printer.exchange(&MESSAGE, REPLY.len()).1 {
+            Reply::Whole => &mut read,
+            Reply::None => &mut none,
+            Reply::Wrong => &mut wrong,
+        };
+        *count += 1;
         thread::sleep(Duration::from_millis(2));
     }
-    (late, sent, read)
+    println!("  UART: of {MESSAGES} messages {last} whole, {first} at the first try; {tries} tries");
+    println!("  of {MESSAGES} registers {read} read, {none} not, {wrong} wrong");
+}
+
+/// Reads the load cell for a while, and prints how long its clock was high.
+fn load_cell(clock: Monotonic, lasts: Duration) {
+    let mut printer = Printer::new(clock);
+    realtime::enter(Role::Core);
+    printer.run("query_hx71x oid=%c rest_ticks=%u", &[2, Ticks::from_us(1250).0], None);
+    let end = monotonic() + lasts;
+    while monotonic() < end {
+        printer.mcu.run_timers();
+        if printer.mcu.has_completion() {
+            printer.mcu.run_workers();
+        }
+        thread::sleep(Duration::from_micros(200));
+    }
+    let load = |count: &AtomicU64| count.load(Ordering::Relaxed);
+    let LoadCell { pulses, long: [over_50, over_60], longest_ns, .. } = &*printer.cell;
+    println!(
+        "HX711 for {} s: {} pulses, {} over 50 us, {} over 60 us, at most {} us",
+        lasts.as_secs(),
+        load(pulses),
+        load(over_50),
+        load(over_60),
+        load(longest_ns) as f64 / 1e3
+    );
 }
 
 fn main() {
+    // `cargo bench --bench bits -- hx711 3600`: only this, for so many seconds.
+    let mut words = std::env::args().skip_while(|word| word != "hx711").skip(1);
+    if let Some(seconds) = words.next().and_then(|word| word.parse().ok()) {
+        return load_cell(Monotonic::start(), Duration::from_secs(seconds));
+    }
     let clock = Monotonic::start();
-    for steppers in [0, 4] {
+    for steppers in [0, 3] {
         let end = AtomicBool::new(false);
         thread::scope(|scope| {
             let beside = scope.spawn(|| core(clock, steppers, false, &end));
-            let (late, sent, read) = worker(clock);
+            println!("worker, {steppers} steppers in the core:");
+            leds(clock);
+            uart(clock);
             end.store(true, Ordering::Relaxed);
-            println!("worker, {steppers} steppers in the core: edges {late}");
-            println!("  of {MESSAGES} messages {sent} arrive whole, of {MESSAGES} replies {read}");
             if let Ok(core) = beside.join() {
                 println!("  steps {}", core.steps);
             }

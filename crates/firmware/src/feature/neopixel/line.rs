@@ -113,6 +113,8 @@ impl Pulses {
     /// Sends the pulses until one misses its times. Returns whether none did.
     fn frame(&self, colors: &[u8]) -> Result<bool, Shutdown> {
         let bits = colors.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 == 1));
+        // The first call is slower than the others. Without this one, the first pulse would be longer.
+        self.line.write(false)?;
         let mut next = self.pace.now();
         let mut last = None;
         for one in bits {

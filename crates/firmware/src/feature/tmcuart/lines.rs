@@ -8,6 +8,14 @@
 //! The firmware samples a reply anywhere within a bit, wherever its timer happens to be. Here the start bit of each
 //! byte is found, and bits are read in their middle. So half a bit of lateness does no harm. A start bit that is high
 //! again in its middle is a glitch and does not count.
+//!
+//! A message begins after an interruption, because the next one is probably the kernel's next tick, in 4 ms.
+//!
+//! The bits of a message count from the start bit of their byte, as the driver counts them. So a late start bit does no
+//! harm. If another bit is late, the message is broken off. A driver forgets a message after a pause of 63 bits. It
+//! obeys a message only after its last byte, the checksum. So a write can be sent again too, unless the end of that byte
+//! was late. The answer to a read counts only if none of its bits was late: a register is never read wrong because this
+//! computer was late.
 
 #![forbid(unsafe_code)]
 
@@ -22,9 +30,12 @@ use super::{FRAME_BITS, Message, QUIET, REPLY_BITS, TURN_BITS, bit_of};
 
 /// How often the line is read in each bit while waiting for an edge.
 const LOOKS: u32 = 16;
-/// How often a register is read if a bit was late. klippy itself asks five times. It cannot know whether the driver or
+/// How often a message is sent if a bit was late. klippy itself asks five times. It cannot know whether the driver or
 /// this computer was late.
-const TRIES: u32 = 3;
+const TRIES: u32 = 16;
+/// How long the line is quiet after a message that was broken off: 63 bits until the driver gives it up, and 12 until it
+/// takes another (TMC2209 data sheet, section 4.1.1: "reset by a pause of longer than 63 bit times"), and some.
+const RECOVERY_BITS: u32 = 80;
 /// A message begins with a start bit and a sync nibble. The driver takes its rate from them.
 const SYNC: u8 = 0b10_1010;
 const SYNC_MASK: u8 = 0b11_1111;
@@ -42,6 +53,16 @@ pub(super) struct Lines {
     pub(super) bit: Ticks,
     /// Whether a bit was late enough to be taken for another.
     pub(super) spoilt: bool,
+}
+
+/// What was sent of a message.
+enum Sent {
+    /// All bits. The last one ended at `end`. A bit was this long.
+    All { end: Clock, bit: Ticks },
+    /// It was broken off before its last byte, because a bit was late.
+    Part,
+    /// The MCU stopped.
+    Stopped,
 }
 
 impl Lines {
@@ -63,34 +84,39 @@ impl Lines {
         exchanged.and(self.idle())
     }
 
-    /// Reading a register changes nothing in the driver, so it is retried here. klippy repeats a write, and counts the
-    /// writes that arrived.
     fn converse(&mut self, message: &mut Message) -> Result<(), Shutdown> {
         for _ in 0..TRIES {
             self.spoilt = false;
+            self.pace.until_interrupted();
             // The first call is slower than the others. Without this one, the first bit would be longer.
             self.tx.write(true)?;
-            let Some((end, bit)) = self.send(message.bits(), self.pace.now())? else { break };
-            if message.read_len == 0 {
-                break;
-            }
-            self.listen()?;
-            message.replied = self.receive(&mut message.reply[..message.read_len], end, bit)?;
-            if !self.spoilt {
-                break;
-            }
-            self.idle()?;
-            if !self.pace.until(self.pace.now() + QUIET) {
+            let pause = match self.send(message.bits(), self.pace.now())? {
+                Sent::All { .. } if message.read_len == 0 => break,
+                Sent::All { end, bit } => {
+                    self.listen()?;
+                    let replied = self.receive(&mut message.reply[..message.read_len], end, bit)?;
+                    message.replied = replied && !self.spoilt;
+                    if !self.spoilt {
+                        break;
+                    }
+                    self.idle()?;
+                    QUIET
+                }
+                Sent::Part => bits(self.bit, RECOVERY_BITS),
+                Sent::Stopped => break,
+            };
+            if !self.pace.until(self.pace.now() + pause) {
                 break;
             }
         }
         Ok(())
     }
 
-    /// Sends the bits, from `at` on. Returns when the last one ended, and the length of a bit. `None`: it was stopped.
-    fn send(&mut self, data: &[u8], mut at: Clock) -> Result<Option<(Clock, Ticks)>, Shutdown> {
+    /// Sends the bits, from `at` on, until one is late.
+    fn send(&mut self, data: &[u8], mut at: Clock) -> Result<Sent, Shutdown> {
         let mut bit = self.bit;
-        let mut first_late = 0;
+        // How long a write and a look at the clock take.
+        let mut cost = 0;
         let synced = data.first().is_some_and(|first| first & SYNC_MASK == SYNC);
         let mut line = true;
         // The first bit is a start bit, whatever the host says.
@@ -98,28 +124,57 @@ impl Lines {
             let level = place > 0 && bit_of(data, place);
             if level != line {
                 if !self.pace.until(at) {
-                    return Ok(None);
+                    return Ok(Sent::Stopped);
                 }
+                let begins = self.pace.now();
                 self.tx.write(level)?;
                 line = level;
-                let late = self.pace.now().since(at);
+                let ended = self.pace.now();
+                if place % FRAME_BITS == 0 {
+                    // The driver counts the bits of a byte from here.
+                    at = begins;
+                }
+                if place == 0 {
+                    cost = ended.since(begins);
+                }
+                let late = ended.since(at) - cost;
                 // A fault of the sync nibble's four bits is 2.5 times as large at the end of a byte.
                 let fault = bit.0 / if place == SYNC_BITS && synced { 16 } else { 4 };
-                self.spoilt |= place > 0 && (late - first_late).abs() > i64::from(fault);
-                match place {
-                    0 => first_late = late,
-                    // The driver has measured these bits, and expects the others to have the same length.
-                    SYNC_BITS if synced => {
-                        let longer = late - first_late;
-                        bit = longer_by(bit, div_round(longer, SYNC_BITS as i64));
-                        at = at.displaced(longer as u32);
+                if late.abs() > i64::from(fault) {
+                    self.spoilt = true;
+                    if self.break_off(data, place, at, bit)? {
+                        return Ok(Sent::Part);
                     }
-                    _ => {}
+                }
+                if place == SYNC_BITS && synced {
+                    // The driver has measured these bits, and expects the others to have the same length.
+                    bit = longer_by(bit, div_round(late, SYNC_BITS as i64));
+                    at = at.displaced(late as u32);
                 }
             }
             at = at + bit;
         }
-        Ok(self.pace.until(at).then_some((at, bit)))
+        Ok(if self.pace.until(at) { Sent::All { end: at, bit } } else { Sent::Stopped })
+    }
+
+    /// Breaks off a message after the edge of the bit at `place`, which was due `at` and late. Returns false if the driver
+    /// may have the whole message.
+    fn break_off(&self, data: &[u8], place: usize, at: Clock, bit: Ticks) -> Result<bool, Shutdown> {
+        if place + FRAME_BITS >= 8 * data.len() {
+            // The last byte is the checksum. One wrong bit makes the message void.
+            let begun = self.pace.now().since(at) / i64::from(bit.0.max(1));
+            let next = place + 1 + usize::try_from(begun).unwrap_or_default();
+            let begins = at + bits(bit, (next - place) as u32);
+            if next + 1 >= 8 * data.len() || !self.pace.until(begins) {
+                return Ok(false);
+            }
+            self.tx.write(!bit_of(data, next))?;
+            if self.pace.now().since(begins) > i64::from(bit.0 / 4) || !self.pace.until(begins + bit) {
+                return Ok(false);
+            }
+        }
+        self.tx.write(true)?;
+        Ok(true)
     }
 
     /// Reads the reply to a message that ended at `end`. Returns false if none came.
@@ -206,6 +261,8 @@ fn div_round(value: i64, by: i64) -> i64 {
 mod tests {
     use super::*;
     use std::sync::Mutex;
+    use std::sync::atomic::{AtomicUsize, Ordering::SeqCst};
+    use std::time::Duration;
 
     use crate::time::{TimeSource, VirtualClock};
 
@@ -289,10 +346,10 @@ mod tests {
     fn bits_are_as_long_as_the_driver_measured_them() {
         let clock = VirtualClock::at(Clock::EPOCH);
         let late = clock.clone();
-        // The last edge of the sync nibble comes 80 ticks late.
+        // The last edge of the sync nibble comes 60 ticks late.
         let (wire, mut lines, mut message) = uart(Arc::new(clock), move |edge| {
             if edge == 6 {
-                late.set(late.now() + Ticks(80));
+                late.set(late.now() + Ticks(60));
             }
         });
         message.read_len = 0;
@@ -301,8 +358,8 @@ mod tests {
         let edges: Vec<i64> = edges.iter().map(|(at, _)| at.since(edges[0].0)).collect();
         let bit = i64::from(BIT.0);
         assert_eq!(edges[..5], [0, bit, 2 * bit, 3 * bit, 4 * bit]);
-        assert_eq!(edges[5], 4 * bit + 80 + bit + 20);
-        assert!(edges[6..edges.len() - 1].iter().all(|at| (at - 4 * bit - 80) % (bit + 20) == 0), "{edges:?}");
+        assert_eq!(edges[5], 4 * bit + 60 + bit + 15);
+        assert!(edges[6..edges.len() - 1].iter().all(|at| (at - 4 * bit - 60) % (bit + 15) == 0), "{edges:?}");
     }
 
     #[test]
@@ -310,36 +367,88 @@ mod tests {
         assert_eq!([-6, -5, -2, -1, 0, 1, 2, 5, 6].map(|n| div_round(n, 4)), [-2, -1, -1, 0, 0, 0, 1, 1, 2]);
     }
 
-    /// A register is read again if its reply came while the worker had no processor. A write is not repeated.
-    #[test]
-    fn a_register_is_read_again_if_this_computer_was_late() {
-        for (read_len, messages) in [(REPLY.len(), 2), (0, 1)] {
-            let clock = VirtualClock::at(Clock::EPOCH);
-            let late = clock.clone();
-            let (wire, mut lines, mut message) = uart(Arc::new(clock), move |edge| {
-                if edge == 7 {
-                    late.set(late.now() + Ticks(BIT.0 / 2));
-                }
-            });
-            message.read_len = read_len;
-            lines.exchange(&mut message).unwrap();
-            assert_eq!(message.reply(), &REPLY[..read_len]);
-            let falls = wire.edges.lock().unwrap().windows(2).filter(|pair| pair[0].1 && !pair[1].1).count();
-            assert_eq!(falls, messages * EDGES / 2, "{read_len}");
+    /// A clock on which some waits end half a bit late. `is_late` gets the number of the wait and its length.
+    struct Late<F> {
+        clock: VirtualClock,
+        waits: AtomicUsize,
+        is_late: F,
+    }
+
+    impl<F: Fn(usize, i64) -> bool + Send + Sync> TimeSource for Late<F> {
+        fn now(&self) -> Clock {
+            self.clock.now()
+        }
+        fn instant_of(&self, monotonic: Duration) -> Clock {
+            self.clock.instant_of(monotonic)
+        }
+        fn duration_of(&self, clock: Clock) -> Duration {
+            self.clock.duration_of(clock)
+        }
+        fn spin_until(&self, end: Clock) {
+            let length = end.since(self.now());
+            // Looks for an interruption do not count.
+            let late = length > 25 && (self.is_late)(self.waits.fetch_add(1, SeqCst), length);
+            self.clock.set(if late { end + Ticks(BIT.0 / 2) } else { end });
         }
     }
 
-    #[test]
-    fn it_is_asked_for_three_times_at_most() {
-        let clock = VirtualClock::at(Clock::EPOCH);
-        let late = clock.clone();
-        let (wire, mut lines, mut message) = uart(Arc::new(clock), move |edge| {
-            if edge.is_multiple_of(7) {
-                late.set(late.now() + BIT);
-            }
-        });
+    /// The edges of an exchange and its reply.
+    fn exchange_with(
+        read_len: usize,
+        is_late: impl Fn(usize, i64) -> bool + Send + Sync + 'static,
+    ) -> (Vec<(Clock, bool)>, Vec<u8>) {
+        let clock = Late { clock: VirtualClock::at(Clock::EPOCH), waits: AtomicUsize::new(1), is_late };
+        let (wire, mut lines, mut message) = uart(Arc::new(clock), |_| ());
+        message.read_len = read_len;
         lines.exchange(&mut message).unwrap();
-        let falls = wire.edges.lock().unwrap().windows(2).filter(|pair| pair[0].1 && !pair[1].1).count();
-        assert_eq!(falls, 3 * EDGES / 2);
+        let edges = wire.edges.lock().unwrap()[1..].to_vec();
+        (edges, message.reply().to_vec())
+    }
+
+    fn falls(edges: &[(Clock, bool)]) -> usize {
+        edges.windows(2).filter(|pair| pair[0].1 && !pair[1].1).count() + 1
+    }
+
+    #[test]
+    fn a_message_with_a_late_bit_is_broken_off_and_sent_again() {
+        // The n-th wait is that for the n-th edge after the first one. Some are start bits: these only move their byte.
+        for (late, is_start) in [(1, false), (4, false), (6, true), (7, false), (8, true), (11, false), (12, true)] {
+            for read_len in [0, REPLY.len()] {
+                let (edges, reply) = exchange_with(read_len, move |wait, _| wait == late);
+                assert_eq!(reply, REPLY[..read_len]);
+                assert_eq!(falls(&edges) > EDGES / 2, !is_start, "edge {late}: {edges:?}");
+                let at = |n: usize| edges[n].0;
+                if is_start {
+                    assert_eq!(at(late + 1).since(at(late)) % i64::from(BIT.0), 0, "its bits are as long as others");
+                } else {
+                    // High, and high once more before the next one.
+                    let again = at(late + 2).since(at(late + 1));
+                    assert!(again >= 75 * i64::from(BIT.0), "the driver gives up the first one: {edges:?}");
+                }
+            }
+        }
+    }
+
+    /// A late bit of the checksum makes another bit of it wrong. If it was the last one, the driver may have the message.
+    #[test]
+    fn a_write_is_sent_again_if_its_checksum_was_late() {
+        // The last edges: bits 4, 5 and 7 of the last byte, whose bit 8 is the last before the stop bit.
+        for (late, again) in [(13, true), (14, true), (15, true)] {
+            let (edges, _) = exchange_with(0, move |wait, _| wait == late);
+            assert_eq!(falls(&edges) > EDGES / 2, again, "{edges:?}");
+            let level = |at: Clock| edges.iter().rev().find(|(from, _)| *from <= at).is_none_or(|(_, level)| *level);
+            let bit = |n: u32| level(edges[12].0 + Ticks(n * BIT.0 + BIT.0 / 2));
+            assert!((0..8).any(|n| bit(n + 1) != bit_of(&MESSAGE, 31 + n as usize)), "{edges:?}");
+        }
+    }
+
+    /// A reply that came while the worker had no processor counts as none.
+    #[test]
+    fn a_register_is_asked_for_sixteen_times_at_most_and_never_read_wrong() {
+        let half = i64::from(BIT.0 / 2);
+        // The waits for the middle of a start bit.
+        let (edges, reply) = exchange_with(REPLY.len(), move |_, length| (half - 100..=half).contains(&length));
+        assert!(reply.is_empty());
+        assert_eq!(falls(&edges), TRIES as usize * EDGES / 2);
     }
 }
