@@ -85,7 +85,7 @@ fn fast_gpio(wish: FastGpio, chips: &[Chip]) -> Vec<Finding> {
         (FastGpio::Off, _) | (FastGpio::Auto, Err(_)) => None,
         (_, Ok(registers)) => {
             let node = registers.node();
-            Some(Finding::ok("fast_gpio", format!("gpiochip{}: fast lines, through {node}", chip.number)))
+            Some(Finding::ok("fast_gpio", format!("gpiochip{}: fast lines, through {node}, for LEDs too", chip.number)))
         }
         (_, Err(why)) => {
             Some(Finding::of("fast_gpio", Level::Warning, why.of(format_args!("gpiochip{}", chip.number))))

@@ -463,7 +463,7 @@ fn gpio_section(chip: &GpioChip) -> Page {
     let rows: Vec<Vec<String>> = chip.lines.iter().map(row).collect();
     let way = match &chip.fast {
         _ if chip.behind_bus => ", behind a bus: not for steps or other timed edges".to_owned(),
-        Some(node) => format!(", fast (registers, {node})"),
+        Some(node) => format!(", fast (registers, {node}), for LEDs too"),
         None => String::new(),
     };
     let heading = format!("{} {}, {} lines{way}", chip.chip, chip.label, chip.line_count);
@@ -628,7 +628,7 @@ mod tests {
         assert_eq!(
             printed(&PinsArgs::default()),
             "\
-gpiochip0 pinctrl-bcm2835, 3 lines, fast (registers, /dev/gpiomem)
+gpiochip0 pinctrl-bcm2835, 3 lines, fast (registers, /dev/gpiomem), for LEDs too
   line  name       dir  used by              in printer.cfg
   0     ID_SDA     in   free                 ID_SDA, gpio0
   1     -          in   fe804000.i2c (i2c1)  pinctrl-bcm2835/gpio1, gpio1

@@ -103,7 +103,7 @@ impl Pulses {
         }
         if !std::mem::replace(&mut self.told, true) {
             warn!(
-                "LEDs at {}: a pulse missed its time in each of {TRIES} frames, and the host sends them again: this computer is too slow or too busy for them: run Pinion with -r, or connect them to an SPI controller (docs/guide/pins.md); said once",
+                "LEDs at {}: a pulse missed its time in every try to send a frame: this computer is too slow or too busy for them: run Pinion with -r, or connect them to an SPI controller (docs/guide/pins.md); said once",
                 self.name
             );
         }
