@@ -31,7 +31,7 @@ use signal_hook::consts::{SIGINT, SIGQUIT, SIGTERM};
 use signal_hook::low_level::emulate_default_handler;
 use termina::escape::csi::DecPrivateModeCode;
 
-use crate::klippy::process::{Search, Terminal as Device, find};
+use crate::klippy::process::{Process, Search, Terminal as Device, find};
 use crate::runtime::wakeup::MarginLimits;
 use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording};
 use crate::trace::folder::user_state;
@@ -88,6 +88,22 @@ pub(super) fn run(args: &ConsoleArgs) -> ExitCode {
 
 /// Fails if a host has the terminal open. Two hosts would take each other's answers.
 fn free(pty: &Path) -> Result<(), String> {
+    match &hosts(pty)?[..] {
+        [] => Ok(()),
+        hidden => Err(format!(
+            "{} may have {} open, and may not be looked into: stop it first, or use sudo",
+            names(hidden),
+            pty.display()
+        )),
+    }
+}
+
+/// The klippys that may have the terminal open, because this user may not look into them.
+///
+/// # Errors
+///
+/// A host has it open, or it cannot be used.
+pub(super) fn hosts(pty: &Path) -> Result<Vec<Process>, String> {
     let device =
         fs::canonicalize(pty).map_err(|error| format!("{}: {error}: start Pinion, or name its link", pty.display()))?;
     let flags = (OFlag::O_NOCTTY | OFlag::O_NONBLOCK).bits();
@@ -100,25 +116,23 @@ fn free(pty: &Path) -> Result<(), String> {
         // Other errors are reported later.
         Ok(_) | Err(_) => {}
     }
-    let name = |processes: &[crate::klippy::process::Process]| {
-        let names = processes.iter().map(|process| {
-            let command: Vec<String> = process.arguments.iter().map(|word| word.display().to_string()).collect();
-            format!("process {} ({})", process.pid, command.join(" "))
-        });
-        names.collect::<Vec<_>>().join(", ")
-    };
     match Device::of(&device).and_then(|device| find(Path::new("/proc"), device)) {
         Ok(Search::Found(host)) => {
-            Err(format!("{} has {} open: stop it first (sudo systemctl stop klipper)", name(&[host]), pty.display()))
+            let remedy = if host.is_klippy() { " (sudo systemctl stop klipper)" } else { "" };
+            Err(format!("{} has {} open: stop it first{remedy}", names(&[host]), pty.display()))
         }
-        Ok(Search::Hidden(hosts)) => Err(format!(
-            "{} may have {} open, and may not be looked into: stop it first, or use sudo",
-            name(&hosts),
-            pty.display()
-        )),
-        Ok(Search::Nobody) => Ok(()),
+        Ok(Search::Hidden(hosts)) => Ok(hosts),
+        Ok(Search::Nobody) => Ok(Vec::new()),
         Err(error) => Err(format!("the programs with {} open cannot be found: {error}: use sudo", pty.display())),
     }
+}
+
+fn names(processes: &[Process]) -> String {
+    let names = processes.iter().map(|process| {
+        let command: Vec<String> = process.arguments.iter().map(|word| word.display().to_string()).collect();
+        format!("process {} ({})", process.pid, command.join(" "))
+    });
+    names.collect::<Vec<_>>().join(", ")
 }
 
 /// Runs a simulated MCU, and talks to it.

@@ -13,6 +13,7 @@ use log::LevelFilter;
 use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
 
+mod attach;
 mod check;
 mod complete;
 mod computer;
@@ -23,6 +24,7 @@ mod dict;
 mod doctor;
 mod finding;
 pub mod latency;
+mod link;
 mod logging;
 mod page;
 pub mod pins;
@@ -85,6 +87,10 @@ enum Command {
     Trace(trace::TraceArgs),
     /// Send commands to a running or simulated MCU by hand, without klippy
     Console(console::ConsoleArgs),
+    /// Make a pty here for the Pinion on another computer, and carry it there over ssh
+    Link(link::LinkArgs),
+    /// Carry standard input and output to the running Pinion; `pinion link` starts it over ssh
+    Attach(attach::AttachArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
     /// Print a script with which a shell completes pinion's command lines
@@ -108,6 +114,8 @@ pub fn main() -> ExitCode {
         Some(Command::Status(args)) => status::run(&args),
         Some(Command::Trace(args)) => trace::run(&args),
         Some(Command::Console(args)) => console::run(&args),
+        Some(Command::Link(args)) => link::run(&args),
+        Some(Command::Attach(args)) => attach::run(&args),
         Some(Command::Sim(args)) => sim::run(&args),
         Some(Command::Completions { shell }) => completions(shell),
     };

@@ -153,6 +153,12 @@ impl Process {
         fs::read_dir(proc.join(self.pid.to_string()).join("fdinfo")).is_err()
     }
 
+    /// Whether it carries a host of another computer: `pinion attach`.
+    pub fn is_attach(&self) -> bool {
+        self.program().is_some_and(|program| program == "pinion")
+            && self.arguments.get(1).is_some_and(|command| command == Path::new("attach"))
+    }
+
     /// Whether it was started like klippy.
     pub fn is_klippy(&self) -> bool {
         klippy(&self.arguments).is_some()

@@ -22,6 +22,7 @@ use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
 
+mod bridge;
 mod budget;
 mod core;
 mod core_end;
@@ -61,6 +62,9 @@ pub mod fuzz {
     pub use super::link_thread::fuzz::link;
 }
 
+pub(crate) use bridge::attach::attach;
+pub(crate) use bridge::near::link as link_over_ssh;
+pub(crate) use bridge::ssh::Target;
 pub use guardian::Guardian;
 pub use helpers::Helpers;
 pub use host::HostSearch;

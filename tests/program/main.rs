@@ -16,6 +16,7 @@ mod recorder;
 mod search;
 mod show;
 mod soak;
+mod ssh;
 mod status;
 mod terminal;
 mod trace;

@@ -176,7 +176,14 @@ fn union(remedy: &str) -> String {
 fn tell(process: &Process, host: &mut FoundHost, began: Instant, say: &mut Say) -> Option<DialectName> {
     let pid = process.pid;
     let Some(folder) = process.klippy_folder(Path::new(PROC)) else {
-        say.info(format!("the host, process {pid}, is no klippy: {}", union("")));
+        let remedy = "for an older one name its --dialect";
+        say.info(match process.is_attach() {
+            true => format!(
+                "the host is on another computer (process {pid} is pinion attach), its sources cannot be read: {}",
+                union(remedy)
+            ),
+            false => format!("the host, process {pid}, is no klippy: {}", union("")),
+        });
         return None;
     };
     let checkout = match Checkout::read(&folder, FEATURES) {

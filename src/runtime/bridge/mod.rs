@@ -1,0 +1,175 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! Carries a host to an MCU on another computer, over ssh.
+//!
+//! ```text
+//! host <-pty-> pinion link <-pipes-> ssh <-network-> sshd <-pipes-> pinion attach <-pty-> pinion run
+//! ```
+//!
+//! The bytes between both ends are the host's and the MCU's, unchanged. An end that is silent sends a sync byte now and
+//! then. Klipper's protocol skips sync bytes between blocks, so they need no protocol of their own. The first one says
+//! that the far end has the terminal open.
+
+#![forbid(unsafe_code)]
+
+pub(crate) mod attach;
+pub(crate) mod near;
+mod round_trip;
+pub(crate) mod ssh;
+
+use std::io;
+use std::os::fd::{AsFd, OwnedFd};
+use std::time::Duration;
+
+use nix::errno::Errno;
+use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::poll::PollFlags;
+use nix::unistd::{read, write};
+
+use pinion_linux::clock::monotonic;
+
+/// How long an end may be silent before it sends a sync byte. klippy asks for the time each second.
+const SIGN_EVERY: Duration = Duration::from_secs(2);
+/// How long the other end may be silent. After that the connection is lost.
+const SILENCE_MAX: Duration = Duration::from_secs(5);
+/// Highest number of bytes on their way from one descriptor to another. Then the sender has to wait.
+const FLOW_BYTES: usize = 4096;
+const SYNC: u8 = 0x7e;
+
+/// The result of a read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Heard {
+    /// This many bytes came, or none.
+    Bytes(usize),
+    /// There will be no more.
+    Over,
+}
+
+/// Bytes in one direction.
+struct Flow(Vec<u8>);
+
+impl Flow {
+    fn new() -> Flow {
+        Flow(Vec::with_capacity(FLOW_BYTES))
+    }
+
+    fn has_room(&self) -> bool {
+        self.0.len() < FLOW_BYTES
+    }
+
+    fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    fn clear(&mut self) {
+        self.0.clear();
+    }
+
+    fn push(&mut self, bytes: &[u8]) {
+        self.0.extend_from_slice(bytes);
+    }
+
+    /// Takes in what `input` has, and returns these bytes.
+    fn fill(&mut self, input: impl FnOnce(&mut [u8]) -> io::Result<Heard>) -> io::Result<(Heard, &mut [u8])> {
+        let before = self.0.len();
+        self.0.resize(before.max(FLOW_BYTES), 0);
+        let heard = input(&mut self.0[before..]);
+        let bytes = match &heard {
+            Ok(Heard::Bytes(bytes)) => *bytes,
+            _ => 0,
+        };
+        self.0.truncate(before + bytes);
+        Ok((heard?, &mut self.0[before..]))
+    }
+
+    /// Writes what `output` has room for.
+    fn drain(&mut self, output: impl FnOnce(&[u8]) -> io::Result<usize>) -> io::Result<()> {
+        if !self.0.is_empty() {
+            let written = output(&self.0)?;
+            self.0.drain(..written);
+        }
+        Ok(())
+    }
+}
+
+/// The connection to the other end: two descriptors, and signs of life.
+struct Wire {
+    input: OwnedFd,
+    output: OwnedFd,
+    outward: Flow,
+    heard_at: Duration,
+    said_at: Duration,
+}
+
+impl Wire {
+    fn new(input: OwnedFd, output: OwnedFd) -> io::Result<Wire> {
+        for fd in [&input, &output] {
+            let flags = OFlag::from_bits_retain(fcntl(fd, FcntlArg::F_GETFL)?);
+            fcntl(fd, FcntlArg::F_SETFL(flags | OFlag::O_NONBLOCK))?;
+        }
+        let now = monotonic();
+        Ok(Wire { input, output, outward: Flow::new(), heard_at: now, said_at: now })
+    }
+
+    /// What to wait for at the output.
+    fn output_events(&self) -> PollFlags {
+        if self.outward.is_empty() { PollFlags::empty() } else { PollFlags::POLLOUT }
+    }
+
+    /// Reads what the other end has sent into `flow`, and returns these bytes.
+    fn read<'a>(&mut self, flow: &'a mut Flow) -> io::Result<(Heard, &'a mut [u8])> {
+        self.heard_at = monotonic();
+        flow.fill(|buffer| read_some(&self.input, buffer))
+    }
+
+    /// Writes what the pipe has room for.
+    fn write(&mut self) -> io::Result<()> {
+        if !self.outward.is_empty() {
+            self.said_at = monotonic();
+        }
+        self.outward.drain(|bytes| write_some(&self.output, bytes))
+    }
+
+    /// Sends a sign of life if one is due.
+    fn give_sign(&mut self) -> io::Result<()> {
+        if self.outward.is_empty() && monotonic() >= self.said_at + SIGN_EVERY {
+            self.outward.push(&[SYNC]);
+        }
+        self.write()
+    }
+
+    /// Whether the other end has been silent for too long.
+    fn is_silent(&self) -> bool {
+        monotonic() >= self.heard_at + SILENCE_MAX
+    }
+
+    /// Silence counts from now on: until now nobody listened.
+    fn forgive_silence(&mut self) {
+        self.heard_at = monotonic();
+    }
+
+    /// When to call [`Wire::give_sign`] and [`Wire::is_silent`] (CLOCK_MONOTONIC).
+    fn due(&self) -> Duration {
+        (self.said_at + SIGN_EVERY).min(self.heard_at + SILENCE_MAX)
+    }
+}
+
+fn read_some(fd: impl AsFd, buffer: &mut [u8]) -> io::Result<Heard> {
+    match read(fd, buffer) {
+        Ok(0) if !buffer.is_empty() => Ok(Heard::Over),
+        Ok(bytes) => Ok(Heard::Bytes(bytes)),
+        Err(Errno::EAGAIN | Errno::EINTR) => Ok(Heard::Bytes(0)),
+        // A terminal or a socket whose other end is gone.
+        Err(Errno::EIO | Errno::ECONNRESET) => Ok(Heard::Over),
+        Err(error) => Err(error.into()),
+    }
+}
+
+/// Bytes for a reader that is gone count as written. The next read tells that it is gone.
+fn write_some(fd: impl AsFd, bytes: &[u8]) -> io::Result<usize> {
+    match write(fd, bytes) {
+        Ok(written) => Ok(written),
+        Err(Errno::EAGAIN | Errno::EINTR) => Ok(0),
+        Err(Errno::EPIPE | Errno::EIO | Errno::ECONNRESET) => Ok(bytes.len()),
+        Err(error) => Err(error.into()),
+    }
+}
