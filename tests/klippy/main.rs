@@ -20,6 +20,7 @@ mod sections;
 mod seeds;
 mod servo;
 mod shown;
+mod ssh;
 mod tools;
 
 use std::io::Write;

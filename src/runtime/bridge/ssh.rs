@@ -63,7 +63,7 @@ impl Target {
     fn command(&self) -> Command {
         let (program, options) = self.ssh.split_first().map_or(("ssh", &[][..]), |(first, rest)| (first, rest));
         let mut command = Command::new(program);
-        command.args(OPTIONS).args(options).arg("--").arg(&self.host);
+        command.args(options).args(OPTIONS).arg("--").arg(&self.host);
         // A shell there reads the command.
         let remote = self.remote.display().to_string().replace('\'', r"'\''");
         command.arg(format!("exec pinion attach -I '{remote}'"));
@@ -217,8 +217,9 @@ mod tests {
         let ssh = ["ssh", "-p", "2222"].map(str::to_owned).into();
         let command = Target { ssh, host: "pi@toolhead".into(), remote: "/tmp/it's".into() }.command();
         let words: Vec<_> = command.get_args().map(|word| word.to_string_lossy()).collect();
-        assert_eq!(words[..3], ["-T", "-o", "BatchMode=yes"]);
-        assert_eq!(words[13..], ["-p", "2222", "--", "pi@toolhead", r"exec pinion attach -I '/tmp/it'\''s'"]);
+        // ssh takes the first value of an option, so the user's come first.
+        assert_eq!(words[..5], ["-p", "2222", "-T", "-o", "BatchMode=yes"]);
+        assert_eq!(words[15..], ["--", "pi@toolhead", r"exec pinion attach -I '/tmp/it'\''s'"]);
     }
 
     #[test]
