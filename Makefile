@@ -13,6 +13,7 @@ REALTIME = $(if $(filter 0,$(shell id -u)),-r)
 PREFIX ?= /usr/local
 DESTDIR ?=
 UNITDIR ?= $(PREFIX)/lib/systemd/system
+USERUNITDIR ?= $(PREFIX)/lib/systemd/user
 SYSUSERSDIR ?= $(PREFIX)/lib/sysusers.d
 TMPFILESDIR ?= $(PREFIX)/lib/tmpfiles.d
 # udev does not look below /usr/local.
@@ -179,6 +180,9 @@ install-system:
 	    sed 's|/usr/bin/pinion|$(PREFIX)/bin/pinion|; s|/usr/lib/pinion-mcu|$(LIBDIR)|' systemd/$$unit \
 	        >$(DESTDIR)$(UNITDIR)/$$unit && chmod 644 $(DESTDIR)$(UNITDIR)/$$unit || exit 1; \
 	done
+	install -d $(DESTDIR)$(USERUNITDIR)
+	sed 's|/usr/bin/pinion|$(PREFIX)/bin/pinion|' systemd/pinion-link@.service \
+	    >$(DESTDIR)$(USERUNITDIR)/pinion-link@.service && chmod 644 $(DESTDIR)$(USERUNITDIR)/pinion-link@.service
 	install -D -m 644 systemd/pinion-mcu.sysusers $(DESTDIR)$(SYSUSERSDIR)/pinion-mcu.conf
 	install -D -m 644 systemd/pinion-mcu.tmpfiles $(DESTDIR)$(TMPFILESDIR)/pinion-mcu.conf
 	install -D -m 644 udev/60-pinion-mcu.rules $(DESTDIR)$(UDEVDIR)/60-pinion-mcu.rules
@@ -202,6 +206,7 @@ ifeq ($(DESTDIR),)
 endif
 	rm -f $(DESTDIR)$(PREFIX)/bin/pinion $(DESTDIR)$(UNITDIR)/pinion-mcu.service \
 	    $(DESTDIR)$(UNITDIR)/pinion-mcu@.service $(DESTDIR)$(UNITDIR)/pinion-usb-gadget.service \
+	    $(DESTDIR)$(USERUNITDIR)/pinion-link@.service \
 	    $(DESTDIR)$(LIBDIR)/link $(DESTDIR)$(LIBDIR)/usb-gadget $(DESTDIR)$(BASHDIR)/pinion \
 	    $(DESTDIR)$(PREFIX)/share/pinion-mcu/can.conf \
 	    $(DESTDIR)$(ZSHDIR)/_pinion $(DESTDIR)$(FISHDIR)/pinion.fish \

@@ -117,7 +117,10 @@ fn no_link(path: &Path, instance: Option<&Instance>, opening: &[&Klippy]) -> Fin
                 format!("there is no {shown}, which klippy's configuration names{}: no Pinion has it", by(opening));
             match opening.iter().any(|klippy| klippy.unit.is_some()) {
                 true => {
-                    let remedy = format!("sudo systemctl enable --now {}, or another serial", unit_for(path));
+                    let remedy = format!(
+                        "sudo systemctl enable --now {} (on another computer: pinion link), or another serial",
+                        unit_for(path)
+                    );
                     Finding::error(CHECK, found, remedy)
                 }
                 false => Finding::warning(CHECK, found, STRANGER),
