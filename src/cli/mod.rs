@@ -87,9 +87,9 @@ enum Command {
     Trace(trace::TraceArgs),
     /// Send commands to a running or simulated MCU by hand, without klippy
     Console(console::ConsoleArgs),
-    /// Make a pty here for the Pinion on another computer, and carry it there over ssh
+    /// Make a pty here for the Pinion on another computer, over ssh
     Link(link::LinkArgs),
-    /// Carry standard input and output to the running Pinion; `pinion link` starts it over ssh
+    /// The far end of `pinion link`: carry standard input and output to the running Pinion
     Attach(attach::AttachArgs),
     /// Show the simulated printer at work, or print its printer.cfg
     Sim(sim::SimArgs),
