@@ -44,7 +44,7 @@ impl RoundTrips {
         let RoundTrips { from_mcu, sent, times, .. } = self;
         from_mcu.find(bytes, |expected| {
             let Some(last) = sent.iter().position(|(sequence, _)| sequence.next() == expected) else { return };
-            if let Some((_, at)) = sent.drain(..=last).last() {
+            if let Some((_, at)) = sent.drain(..=last).next_back() {
                 let ticks = now.saturating_sub(at).as_secs_f64() * f64::from(CLOCK_FREQ);
                 times.record(ticks as i64);
             }
