@@ -534,6 +534,18 @@ mod tests {
         outcome.result.as_ref()?.as_ref().err()?.raw_os_error()
     }
 
+    /// Its first attempt was made before the program was killed, which nobody complained of.
+    #[test]
+    fn an_output_that_failed_before_is_complained_of_when_it_fails_again() {
+        let mut failing = vec![output("gpiochip0 line 5", || Err(Errno::EIO.into()))];
+        drive(&mut failing);
+        let mut crew = Crew::default();
+        crew.employ(failing, None, Duration::ZERO);
+        let mut complaints = Vec::new();
+        crew.wait(LONG, |outcome| complaints.push(outcome.complaint()));
+        assert_eq!(complaints, ["gpiochip0 line 5: Input/output error (os error 5)"]);
+    }
+
     #[test]
     fn a_driver_that_hangs_keeps_nobody_else() {
         let (_release, hangs) = mpsc::channel::<()>();
