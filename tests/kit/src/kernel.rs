@@ -83,6 +83,9 @@ const MODULES: [(&str, &str); 18] = [
 /// Shows the plan to the guest. The guest loads it later than the others: see `init.sh`.
 const PLAN_READER: &str = "qemu_fw_cfg";
 
+/// Its driver asks every two seconds. So only its test loads it, and unloads it.
+const FIRMWARE: &str = "mock_firmware";
+
 /// The parts of an image package with these modules.
 const IMAGE_PARTS: [&str; 22] = [
     "*/modules.builtin*",
@@ -111,11 +114,12 @@ const IMAGE_PARTS: [&str; 22] = [
 ];
 
 /// Upstream's mocks and drivers, with their includes. A folder means all its files.
-const UPSTREAM: [&str; 7] = [
+const UPSTREAM: [&str; 8] = [
     "kernel/irq/irq_sim.c",
     "drivers/gpio/gpio-pca953x.c",
     "drivers/gpio/gpio-sim.c",
     "drivers/gpio/gpiolib.h",
+    "drivers/hwmon/raspberrypi-hwmon.c",
     "drivers/iio/dummy",
     "drivers/iio/industrialio-configfs.c",
     "drivers/iio/industrialio-sw-device.c",
@@ -401,9 +405,11 @@ fn archive_modules(image: &Path, ours: &Path, tree: &Path, to: &Path) -> Result<
     }
 
     let mut archive = Archive::with_busybox(&tree.join("bin/busybox"))?;
-    let plan_reader = loader.find(PLAN_READER)?;
-    process::run(Command::new("strip").arg("--strip-debug").arg(&plan_reader))?;
-    archive.copy("/tests/plan.ko", &plan_reader)?;
+    for (module, inside) in [(PLAN_READER, "/tests/plan.ko"), (FIRMWARE, "/tests/firmware.ko")] {
+        let path = loader.find(module)?;
+        process::run(Command::new("strip").arg("--strip-debug").arg(&path))?;
+        archive.copy(inside, &path)?;
+    }
     let mut list = String::new();
     for (path, options) in &loader.order {
         let inside = format!("/tests/modules.d/{}", file_name(path));

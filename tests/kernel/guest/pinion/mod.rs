@@ -21,6 +21,7 @@ mod lines;
 mod neopixel;
 mod pca9685;
 mod pins;
+mod power;
 mod safe_state;
 mod serial;
 mod spi;
