@@ -362,7 +362,7 @@ fn round_trip() {
     const ROUNDS: usize = 101;
     const PAUSE: Duration = Duration::from_millis(1);
     let mut session = Session::start(Way::Kernel);
-    let (client, spi_oid) = (&mut session.client, session.spi_oid);
+    let (program, client, spi_oid) = (&session.program, &mut session.client, session.spi_oid);
     let transfer = [("oid", spi_oid.into()), ("data", SPI_DATA)];
     let none: &[(&str, Arg<'_>)] = &[];
     for (command, args, response) in [
@@ -378,10 +378,13 @@ fn round_trip() {
             let answer = client.query(command, args, response, None).expect("an answer");
             answer.at.duration_since(sent)
         };
+        let asleep = program.sleeps();
         let mut times: Vec<Duration> = (0..ROUNDS).map(round_trip).collect();
+        let sleeps = (program.sleeps() - asleep) as f64 / ROUNDS as f64;
         times.sort_unstable();
         let median = instructions(times[ROUNDS / 2]);
         figure("Round trip of a command, instructions", command, &format!("{median:.0}"));
+        figure("Round trip of a command, sleeps of all threads", command, &format!("{sleeps:.2}"));
         assert!(!is_pinion() || median <= 200_000.0);
     }
 }
