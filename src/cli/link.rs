@@ -16,7 +16,7 @@ use super::{end_by_panic, failed, logging};
 /// Options of `pinion link`.
 #[derive(Args, Clone, Debug)]
 pub(super) struct LinkArgs {
-    /// The MCU's computer, as ssh knows it: [USER@]HOST or a name in ~/.ssh/config
+    /// The MCU's computer, as ssh knows it: HOST, USER@HOST or a name in ~/.ssh/config
     #[arg(value_name = "HOST", value_hint = ValueHint::Hostname, value_parser = host)]
     host: String,
     /// Path of the symbolic link that the host opens here; it leads to the pty [default: /tmp/klipper_host_ and HOST's

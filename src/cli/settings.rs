@@ -35,8 +35,8 @@ pub(super) struct Given {
     /// Path of the symbolic link that the host opens; it leads to the pty [default: /tmp/klipper_host_mcu]
     #[arg(short = 'I', value_name = "PATH")]
     pub(super) symlink: Option<PathBuf>,
-    /// The way to the host: pty:PATH, or for a host on another computer serial:/dev/PORT[,BAUD],
-    /// can:INTERFACE[,UUID] or stdio. The status and the traces are still named after -I [default: pty, at the path of -I]
+    /// The way to the host: pty:PATH, or for a host on another computer serial:/dev/PORT, serial:/dev/PORT,BAUD,
+    /// can:INTERFACE, can:INTERFACE,UUID or stdio. The status and the traces are still named after -I [default: pty, at the path of -I]
     #[arg(long, value_name = "LINK", value_hint = ValueHint::Other, value_parser = clap::value_parser!(LinkName))]
     pub(super) link: Option<LinkName>,
     /// Run in real time: SCHED_FIFO and locked memory

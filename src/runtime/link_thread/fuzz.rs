@@ -259,16 +259,15 @@ impl Bench {
             self.core.finish();
             self.core.begin();
         }
-        let mut fds = [PollFd::new(self.link.host.event(), PollFlags::POLLIN)];
+        let mut fds = [PollFd::new(self.link.host.event().expect("a terminal"), PollFlags::POLLIN)];
         poll(&mut fds, PollTimeout::ZERO).expect("the terminal");
         let events = fds[0].revents().unwrap_or(PollFlags::empty());
         if events.contains(PollFlags::POLLHUP) {
-            self.link.host.part().expect("the terminal");
-            self.link.introduction.end();
+            self.link.read(true).expect("the terminal");
         }
         if events.contains(PollFlags::POLLIN) {
             let before = self.link.core.requests.slots();
-            self.link.read().expect("the terminal");
+            self.link.read(false).expect("the terminal");
             if self.link.core.requests.slots() != before {
                 (self.is_forced, self.known) = (true, None);
             }
