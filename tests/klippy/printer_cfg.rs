@@ -70,7 +70,7 @@ fn pins(text: &str) -> HashSet<&str> {
 fn klippy_takes(checkout: &Path, config: &Config, dictionary: &Value) {
     let folder = tempfile::tempdir().unwrap();
     let path = |name: &str| folder.path().join(name);
-    let instance = if config.text.contains("[mcu sim]") { "sim" } else { "host" };
+    let instance = config.text.split("[mcu ").nth(1).and_then(|rest| rest.split(']').next()).unwrap_or("host");
     let own = if config.text.contains("[mcu ") { "" } else { "[mcu host]\nserial: /tmp/klipper_host_mcu\n" };
     fs::write(path("printer.cfg"), format!("{PRINTER}{own}{}", config.text)).unwrap();
     fs::write(path("dict"), dictionary.to_string()).unwrap();
