@@ -148,11 +148,11 @@ impl Faults {
         self.count += 1;
         match self.count {
             // This one comes after the next.
-            count if self.is_on && count % 31 == 0 => self.kept = Some(data.to_vec()),
-            count if self.is_on && count % 37 == 0 => {}
+            count if self.is_on && count % 211 == 0 => self.kept = Some(data.to_vec()),
+            count if self.is_on && count % 149 == 0 => {}
             count => {
                 send(data);
-                if self.is_on && count % 41 == 0 {
+                if self.is_on && count % 101 == 0 {
                     send(data);
                 }
                 if let Some(kept) = self.kept.take() {
