@@ -29,3 +29,5 @@ is "$(python3 /run/query.py)" "3f1 200123456789ab01" "the answer to a query"
 # No IP address can be reached.
 systemctl show -P IPAddressDeny pinion-mcu@toolhead | grep '0.0.0.0/0'
 systemctl stop pinion-mcu@toolhead
+rm -r /etc/pinion/toolhead.toml /etc/systemd/system/pinion-mcu@toolhead.service.d
+systemctl daemon-reload
