@@ -76,6 +76,8 @@ impl Link for Stdio {
     }
 
     fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Heard> {
+        // The pause is over, even if there is nothing to write any more.
+        self.full_until = None;
         // There may be bytes before the end.
         match read(&self.input, buffer) {
             Ok(0) if !buffer.is_empty() => Ok(Heard::Over),

@@ -319,6 +319,8 @@ impl Link for CanBus {
     }
 
     fn read(&mut self, buffer: &mut [u8], _hung_up: bool) -> io::Result<Heard> {
+        // The pause is over, even if there is nothing to write any more.
+        self.full_until = None;
         if std::mem::take(&mut self.is_renewed) && self.is_met {
             return Ok(Heard::Gone);
         }
