@@ -132,8 +132,8 @@ fn look(probe: &SimProbe) -> Vec<Item> {
         let number = Some(Number { value: output.brightness, step: 0.05, ripple: 0.0 });
         items.push(Item { kind: Kind::Output, name: output.name.into(), number, text });
     }
-    for (name, text) in probe.sights() {
-        items.push(Item { kind: Kind::Part, name: name.into(), number: None, text });
+    for (name, look) in probe.sights() {
+        items.push(Item { kind: Kind::Part, name: name.into(), number: None, text: look.to_string() });
     }
     items.into_iter().map(Item::plain).collect()
 }

@@ -6,12 +6,14 @@ use std::time::{Duration, Instant};
 
 use super::checkout;
 use super::klippy::Printer;
+use pinion_sim::Look;
 
 /// The servo's angle, after it has stopped turning.
 fn servo_degrees(printer: &Printer) -> f64 {
     let look = || {
         let sight = printer.probe().sights().find(|(name, _)| *name == "servo arm").unwrap().1;
-        sight.strip_suffix(" degrees").unwrap().parse().unwrap()
+        let Look::Angle { degrees } = sight else { panic!("{sight}") };
+        degrees
     };
     let (mut last, mut since): (f64, _) = (look(), Instant::now());
     while since.elapsed() < Duration::from_secs(1) {

@@ -15,6 +15,7 @@ use std::time::Instant;
 
 use pinion_client::Arg;
 use pinion_protocol::vlq::Writer;
+use pinion_sim::Look;
 use pinion_testbench::memory::Counting;
 
 use board::EXPANDED;
@@ -291,7 +292,7 @@ impl Day {
         assert!(printer.probe.fan(EXPANDED).unwrap().rpm < 10.0, "the fan turns in a stopped MCU");
         assert!(printer.probe.axes().all(|axis| !axis.enabled), "a motor is on in a stopped MCU");
         assert!(!printer.probe.output("light").unwrap().on, "the light is on in a stopped MCU");
-        assert!(printer.probe.sights().any(|sight| sight == ("laser", "0 %".to_owned())), "the laser is on");
+        assert!(printer.probe.sights().any(|sight| sight == ("laser", Look::Power { share: 0.0 })), "the laser is on");
         // The MCU still samples the thermistors.
         assert!(printer.rig.errands() <= 2, "{} errands are on their way in a stopped MCU", printer.rig.errands());
         assert_eq!(printer.look().moves.0, 0, "moves are queued in a stopped MCU");

@@ -15,6 +15,7 @@ use pinion_firmware::time::{TimeSource, Timing};
 use super::config::SimConfig;
 use super::description::check::Trouble;
 use super::description::pin::PinName;
+use super::engine::bed::Bed;
 use super::engine::i2c::{I2cBus, I2cDevice};
 use super::engine::led::ColouredLed;
 use super::engine::noise::Noise;
@@ -46,6 +47,7 @@ pub struct SimBoard {
     time: Arc<PrinterTime>,
     seed: u64,
     world: Arc<World>,
+    bed: Arc<Bed>,
     /// By pin number.
     pins: Vec<WiredPin>,
     /// By number.
@@ -127,12 +129,14 @@ impl SimBoard {
         for bus in &config.spi_buses {
             workshop.wire(Some(&bus.mosi_pin()), ControllerPin { kind: Kind::Mosi, of: bus.name.clone() });
         }
+        let bed = Arc::new(workshop.bed());
         let Workshop { world, pins, spi_buses, i2c_buses, serial_wires, .. } = workshop;
         Ok(SimBoard {
             time: Arc::new(PrinterTime::new(clock.clone())),
             clock,
             seed: config.seed,
             world: Arc::new(world),
+            bed,
             pins,
             spi_buses: spi_buses.into_iter().map(Arc::new).collect(),
             i2c_buses: i2c_buses.into_iter().map(Arc::new).collect(),
@@ -142,7 +146,7 @@ impl SimBoard {
 
     /// A view of the printer for demonstrations, drawings and tests.
     pub fn probe(&self) -> SimProbe {
-        SimProbe { world: self.world.clone(), clock: self.clock.clone() }
+        SimProbe { world: self.world.clone(), bed: self.bed.clone(), clock: self.clock.clone() }
     }
 
     /// The time of the MCU that drives the printer.

@@ -28,6 +28,8 @@ pub use description::heater::{FanConfig, HeaterConfig};
 pub use description::outputs::{InputConfig, LedConfig, OutputConfig};
 pub use description::pin::PinName;
 pub use description::thermistor::Thermistor;
+pub use engine::bed::{BedShape, Space};
+pub use engine::look::{Colour, Look};
 pub use part::ads1220::Ads1220Config;
 pub use part::adxl345::Adxl345Config;
 pub use part::angle::{AngleChip, AngleConfig};

@@ -5,6 +5,8 @@
 
 use std::sync::Arc;
 
+use super::engine::bed::{Bed, Space};
+use super::engine::look::Look;
 use super::engine::world::World;
 use pinion_firmware::time::{Clock, TimeSource};
 
@@ -12,6 +14,7 @@ use pinion_firmware::time::{Clock, TimeSource};
 #[derive(Clone)]
 pub struct SimProbe {
     pub(super) world: Arc<World>,
+    pub(super) bed: Arc<Bed>,
     pub(super) clock: Arc<dyn TimeSource>,
 }
 
@@ -105,8 +108,19 @@ impl SimProbe {
         lamps.map(move |lamp| OutputView { name: &lamp.name, on: lamp.is_on(), brightness: lamp.brightness(now) })
     }
 
-    /// A person's view of the other parts at this instant: the part's name, and a line or a picture of several lines.
-    pub fn sights(&self) -> impl Iterator<Item = (&str, String)> {
+    /// Where the steps have put the nozzle: x, y and z. klippy's place is the same if it has homed, lost no step, and
+    /// uses neither a bed mesh nor another transformation.
+    pub fn nozzle_mm(&self) -> [f64; 3] {
+        self.bed.nozzle_mm()
+    }
+
+    /// The space that the nozzle can reach, over the bed. It never changes. `None` if an axis is missing or has no end.
+    pub fn space(&self) -> Option<Space> {
+        self.bed.space()
+    }
+
+    /// A person's view of the other parts at this instant: the part's name, and what it looks like.
+    pub fn sights(&self) -> impl Iterator<Item = (&str, Look)> {
         let now = self.now();
         self.world.sights.iter().map(move |sight| (sight.name(), sight.look(now)))
     }

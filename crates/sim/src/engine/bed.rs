@@ -48,11 +48,11 @@ impl Plane {
         Plane { middle, motors: motors.into_iter().map(|(axis, at)| (axis, tilt(at))).collect() }
     }
 
-    /// The height of the plane at a place.
-    fn height_mm(&self, x_mm: f64, y_mm: f64) -> f64 {
+    /// The height of the plane at a place, while the motors are at these positions.
+    fn height_mm(&self, [x_mm, y_mm]: [f64; 2], position_mm: impl Fn(&Axis) -> f64) -> f64 {
         let mean = 1.0 / self.motors.len().max(1) as f64;
         let (x_mm, y_mm) = (x_mm - self.middle[0], y_mm - self.middle[1]);
-        self.motors.iter().map(|(axis, [x, y])| axis.position_mm() * (mean + x * x_mm + y * y_mm)).sum()
+        self.motors.iter().map(|(axis, [x, y])| position_mm(axis) * (mean + x * x_mm + y * y_mm)).sum()
     }
 }
 
@@ -70,10 +70,10 @@ impl Delta {
     }
 
     /// The nozzle's position: one arm's length from each carriage, and below them.
-    fn nozzle_mm(&self) -> [f64; 3] {
+    fn nozzle_mm(&self, position_mm: impl Fn(&Axis) -> f64) -> [f64; 3] {
         let [a, b, c] = [0, 1, 2].map(|tower| {
             let [x, y] = self.towers_mm[tower];
-            let z = self.carriages[tower].position_mm();
+            let z = position_mm(&self.carriages[tower]);
             ([x, y, z], x * x + y * y + z * z)
         });
         // The difference of two spheres is a plane: [x, y, z] · plane = level. Two planes leave x and y as lines of z:
@@ -105,19 +105,41 @@ pub enum Head {
 }
 
 impl Head {
-    /// The position of a point at this offset from the nozzle.
-    fn point_mm(&self, [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3]) -> [f64; 3] {
+    /// The position of a point at this offset from the nozzle, while the axes are at these positions.
+    fn point_mm(
+        &self,
+        [x_offset_mm, y_offset_mm, z_offset_mm]: [f64; 3],
+        position_mm: impl Fn(&Axis) -> f64,
+    ) -> [f64; 3] {
         match self {
             Head::Cartesian { x, y, z } => {
-                let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| axis.position_mm());
+                let position = |axis: &Option<Arc<Axis>>| axis.as_ref().map_or(0.0, |axis| position_mm(axis));
                 let (x_mm, y_mm) = (position(x) + x_offset_mm, position(y) + y_offset_mm);
                 // The head is tilted like the gantry. If the motors hold the bed, the bed is tilted instead.
-                [x_mm, y_mm, z.height_mm(x_mm, y_mm) + z_offset_mm]
+                [x_mm, y_mm, z.height_mm([x_mm, y_mm], &position_mm) + z_offset_mm]
             }
             Head::Delta(delta) => {
-                let [x_mm, y_mm, z_mm] = delta.nozzle_mm();
+                let [x_mm, y_mm, z_mm] = delta.nozzle_mm(position_mm);
                 [x_mm + x_offset_mm, y_mm + y_offset_mm, z_mm + z_offset_mm]
             }
+        }
+    }
+
+    /// The space that the nozzle can reach; `None` if it has no end.
+    fn space(&self) -> Option<Space> {
+        let travel = |axis: &Arc<Axis>| axis.travel_mm;
+        match self {
+            Head::Cartesian { x, y, z } => Some(Space {
+                bed: BedShape::Rectangle {
+                    min_mm: [0.0; 2],
+                    max_mm: [x.as_ref().and_then(travel)?, y.as_ref().and_then(travel)?],
+                },
+                height_mm: z.motors.iter().filter_map(|(motor, _)| motor.travel_mm).reduce(f64::min)?,
+            }),
+            Head::Delta(delta) => Some(Space {
+                bed: BedShape::Disc { radius_mm: delta.bed_radius_mm },
+                height_mm: delta.nozzle_mm(|axis| axis.travel_mm.unwrap_or(0.0))[2],
+            }),
         }
     }
 
@@ -130,6 +152,32 @@ impl Head {
             Head::Delta(delta) => [Some((-delta.bed_radius_mm, delta.bed_radius_mm)); 2],
         }
     }
+}
+
+/// The outline of the bed.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum BedShape {
+    /// From one corner to the opposite one: x and y. The travels of the axes are its sides.
+    Rectangle {
+        /// The corner in front, on the left.
+        min_mm: [f64; 2],
+        /// The corner behind, on the right.
+        max_mm: [f64; 2],
+    },
+    /// A delta's bed. Its middle is at 0.
+    Disc {
+        /// From the middle to the edge.
+        radius_mm: f64,
+    },
+}
+
+/// The space that the nozzle can reach.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Space {
+    /// The bed below it.
+    pub bed: BedShape,
+    /// How high it is above the bed. On a delta that is so in its middle.
+    pub height_mm: f64,
 }
 
 /// The bed under the nozzle.
@@ -165,8 +213,18 @@ impl Bed {
 
     /// How far the point at this offset from the nozzle is above the bed; negative if it presses into the bed.
     pub fn clearance_mm(&self, offset_mm: [f64; 3]) -> f64 {
-        let [x_mm, y_mm, z_mm] = self.head.point_mm(offset_mm);
+        let [x_mm, y_mm, z_mm] = self.head.point_mm(offset_mm, Axis::position_mm);
         z_mm - self.height_mm(x_mm, y_mm)
+    }
+
+    /// The nozzle's place now.
+    pub fn nozzle_mm(&self) -> [f64; 3] {
+        self.head.point_mm([0.0; 3], Axis::position_mm)
+    }
+
+    /// The space that the nozzle can reach; `None` if it has no end.
+    pub fn space(&self) -> Option<Space> {
+        self.head.space()
     }
 }
 
@@ -196,17 +254,17 @@ mod tests {
     #[test]
     fn one_motor_lifts_all_of_it_and_two_tilt_it_along_their_line() {
         let one = plane(&[([30.0, 40.0], 2.5)]);
-        assert_near(one.height_mm(-500.0, 900.0), 2.5);
+        assert_near(one.height_mm([-500.0, 900.0], Axis::position_mm), 2.5);
         let two = plane(&[([0.0, 100.0], 1.0), ([200.0, 100.0], 3.0)]);
         for y_mm in [-50.0, 100.0, 220.0] {
-            assert_near(two.height_mm(0.0, y_mm), 1.0);
-            assert_near(two.height_mm(50.0, y_mm), 1.5);
-            assert_near(two.height_mm(300.0, y_mm), 4.0);
+            assert_near(two.height_mm([0.0, y_mm], Axis::position_mm), 1.0);
+            assert_near(two.height_mm([50.0, y_mm], Axis::position_mm), 1.5);
+            assert_near(two.height_mm([300.0, y_mm], Axis::position_mm), 4.0);
         }
         // Without places all motors stand at one place.
         let nowhere = plane(&[([0.0, 0.0], 1.0), ([0.0, 0.0], 3.0)]);
-        assert_near(nowhere.height_mm(170.0, 20.0), 2.0);
-        assert_near(plane(&[]).height_mm(1.0, 1.0), 0.0);
+        assert_near(nowhere.height_mm([170.0, 20.0], Axis::position_mm), 2.0);
+        assert_near(plane(&[]).height_mm([1.0, 1.0], Axis::position_mm), 0.0);
     }
 
     #[test]
@@ -214,7 +272,7 @@ mod tests {
         let at = [[0.0, 0.0], [0.0, 200.0], [200.0, 200.0], [200.0, 0.0]];
         let twisted = plane(&[(at[0], 1.0), (at[1], 0.0), (at[2], 1.0), (at[3], 0.0)]);
         for [x_mm, y_mm] in at {
-            assert_near(twisted.height_mm(x_mm, y_mm), 0.5);
+            assert_near(twisted.height_mm([x_mm, y_mm], Axis::position_mm), 0.5);
         }
     }
 
@@ -228,7 +286,7 @@ mod tests {
             let height = |[x, y]: [f64; 2]| level + slopes[0] * x + slopes[1] * y;
             let at = [[-20.0, 10.0], [110.0, 260.0], [240.0, 15.0], [250.0, 280.0]];
             let motors: Vec<_> = at.iter().take(if four { 4 } else { 3 }).map(|at| (*at, height(*at))).collect();
-            assert_near(plane(&motors).height_mm(place[0], place[1]), height(place));
+            assert_near(plane(&motors).height_mm(place, Axis::position_mm), height(place));
         }
 
         /// The nozzle of a delta is where klippy's formula for its towers puts the carriages. Only places on the bed
@@ -251,7 +309,7 @@ mod tests {
             };
             let carriages = [0, 1, 2].map(|tower| axis_at(carriage(tower)));
             let head = Head::Delta(Delta::new(&config, carriages));
-            let point = head.point_mm([1.0, -2.0, -3.0]);
+            let point = head.point_mm([1.0, -2.0, -3.0], Axis::position_mm);
             for (value, expected) in point.into_iter().zip([x + 1.0, y - 2.0, z - 3.0]) {
                 assert_near(value, expected);
             }

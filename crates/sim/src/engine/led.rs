@@ -5,7 +5,7 @@
 
 use std::sync::Arc;
 
-use super::colour::Colour;
+use super::look::{Colour, Look};
 use super::physics::Lamp;
 use super::world::Sight;
 use pinion_firmware::time::Clock;
@@ -21,9 +21,9 @@ impl Sight for ColouredLed {
         &self.name
     }
 
-    fn look(&self, now: Clock) -> String {
+    fn look(&self, now: Clock) -> Look {
         let brightness = |lamp: &Arc<Lamp>| (lamp.brightness(now) * 255.0).round() as u8;
         let [red, green, blue, white] = self.lamps.each_ref().map(|lamp| lamp.as_ref().map_or(0, brightness));
-        Colour { red, green, blue, white }.to_string()
+        Look::Lights { colours: vec![Colour { red, green, blue, white }], odd_pulses: 0 }
     }
 }

@@ -4,10 +4,10 @@
 #![forbid(unsafe_code)]
 
 pub(crate) mod bed;
-pub(crate) mod colour;
 pub(crate) mod follower;
 pub(crate) mod i2c;
 pub(crate) mod led;
+pub(crate) mod look;
 pub(crate) mod noise;
 pub(crate) mod physics;
 pub(crate) mod serial;

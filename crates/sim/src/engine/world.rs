@@ -5,6 +5,7 @@
 
 use std::sync::Arc;
 
+use super::look::Look;
 use super::physics::{Axis, Fan, Heater, Lamp};
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::Clock;
@@ -14,9 +15,8 @@ pub(crate) trait Sight: Send + Sync {
     /// The name of the part.
     fn name(&self) -> &str;
 
-    /// What a person sees at this instant: a line, or several lines for a picture. A color is written as `#rrggbb`, and
-    /// `pinion sim --show` paints it where it can.
-    fn look(&self, now: Clock) -> String;
+    /// What a person sees at this instant.
+    fn look(&self, now: Clock) -> Look;
 }
 
 /// Opens a thermometer of the one-wire bus.

@@ -17,7 +17,7 @@ use super::workshop::{Part, Workshop};
 use crate::description::check::{Trouble, check_lights, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
-use crate::engine::colour::{self, Colour};
+use crate::engine::look::{Colour, Look};
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
@@ -135,12 +135,13 @@ impl Sight for Strip {
         &self.name
     }
 
-    fn look(&self, _now: Clock) -> String {
-        colour::list(self.lights.iter().map(|light| {
+    fn look(&self, _now: Clock) -> Look {
+        let lights = self.lights.iter().map(|light| {
             let [head, blue, green, red] = light.load(Ordering::Relaxed).to_be_bytes();
             let dimmed = |part: u8| (u32::from(part) * u32::from(head & 0x1f) / BRIGHTEST) as u8;
             Colour { red: dimmed(red), green: dimmed(green), blue: dimmed(blue), white: 0 }
-        }))
+        });
+        Look::Lights { colours: lights.collect(), odd_pulses: 0 }
     }
 }
 
@@ -204,7 +205,7 @@ mod tests {
     #[test]
     fn lights_take_their_frames_after_a_start_frame() {
         let strip = strip(3);
-        let look = || strip.look(Clock::from_ticks(0));
+        let look = || strip.look(Clock::from_ticks(0)).to_string();
         send(&strip, &[0xff03_0201, 0, 0xff03_0201, 0xff00_0000, 0xf0ff_00ff, 0xff44_4444, u32::MAX]);
         assert_eq!(look(), "#010203 off #830083", "the last one at 16 of 31, and a fourth that is not there");
         // Black at the lowest brightness is not a start frame. A frame without its mark is not a light's frame.
@@ -216,6 +217,6 @@ mod tests {
     fn a_start_frame_may_be_longer() {
         let strip = strip(1);
         send(&strip, &[0, 0, 0x0000_07f8, 0x0810_1807]);
-        assert_eq!(strip.look(Clock::from_ticks(0)), "#030201", "21 zeros more");
+        assert_eq!(strip.look(Clock::from_ticks(0)).to_string(), "#030201", "21 zeros more");
     }
 }

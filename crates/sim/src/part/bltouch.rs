@@ -23,6 +23,7 @@ use crate::description::check::{Bound, Trouble, check, check_offsets};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::bed::Bed;
+use crate::engine::look::Look;
 use crate::engine::time::seconds;
 use crate::engine::together::Together;
 use crate::engine::wire::{Kind, Wire};
@@ -325,10 +326,9 @@ impl Sight for Bltouch {
         "bltouch"
     }
 
-    fn look(&self, now: Clock) -> String {
+    fn look(&self, now: Clock) -> Look {
         let state = self.at(now);
-        let pin = if self.is_up(&state, now) { "up" } else { "down" };
-        format!("pin {pin}{}", if state.alarm { ", alarm" } else { "" })
+        Look::Pin { is_down: !self.is_up(&state, now), alarm: state.alarm }
     }
 }
 
@@ -426,7 +426,7 @@ mod tests {
         }
 
         fn seen(&self) -> String {
-            self.probe.look(self.now)
+            self.probe.look(self.now).to_string()
         }
 
         fn move_z(&mut self, mm: f64) {

@@ -12,6 +12,7 @@ use super::workshop::{Part, Workshop};
 use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
+use crate::engine::look::Look;
 use crate::engine::wire::{Kind, Wire};
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
@@ -86,9 +87,8 @@ impl Sight for PwmChannel {
         &self.name
     }
 
-    fn look(&self, _now: Clock) -> String {
-        let share = f64::from(self.value.load(Ordering::Relaxed)) / f64::from(PWM_MAX);
-        format!("{:.0} %", share * 100.0)
+    fn look(&self, _now: Clock) -> Look {
+        Look::Power { share: f64::from(self.value.load(Ordering::Relaxed)) / f64::from(PWM_MAX) }
     }
 }
 
@@ -102,7 +102,7 @@ mod tests {
         for percent in 0..=100 {
             // The value that klippy computes (klippy/mcu.py).
             channel.dim((f64::from(percent) / 100.0 * f64::from(PWM_MAX) + 0.5) as u16);
-            assert_eq!(channel.look(Clock::EPOCH), format!("{percent} %"));
+            assert_eq!(channel.look(Clock::EPOCH).to_string(), format!("{percent} %"));
         }
     }
 }

@@ -16,6 +16,7 @@ use super::workshop::{Part, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
+use crate::engine::look::Look;
 use crate::engine::time::seconds;
 use crate::engine::together::Together;
 use crate::engine::wire::{Kind, Wire};
@@ -151,8 +152,8 @@ impl Sight for Servo {
         &self.name
     }
 
-    fn look(&self, now: Clock) -> String {
-        format!("{:.1} degrees", self.degrees(now))
+    fn look(&self, now: Clock) -> Look {
+        Look::Angle { degrees: self.degrees(now) }
     }
 }
 
@@ -201,9 +202,9 @@ mod tests {
         };
         // The first level of a line is not a pulse.
         pin.settle(false, Clock::EPOCH);
-        assert_eq!(servo.look(at(1e6)), "0.0 degrees");
+        assert_eq!(servo.look(at(1e6)).to_string(), "0.0 degrees");
         let now = pulses(50, 1500.0);
-        assert_eq!(servo.look(now), "90.0 degrees");
+        assert_eq!(servo.look(now).to_string(), "90.0 degrees");
         assert_eq!(servo.degrees(at(50.0 * 20_000.0 + 1500.0 + 100_000.0)), 90.0, "there long ago");
         let now = pulses(100, 2500.0);
         assert_eq!(servo.degrees(now), 180.0);

@@ -22,6 +22,7 @@ use crate::description::check::{Trouble, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::i2c::I2cChip;
+use crate::engine::look::Look;
 use crate::engine::noise::Noise;
 use crate::engine::spi::SpiChip;
 use crate::engine::wire::{Kind, Wire};
@@ -315,30 +316,21 @@ impl Panel {
     }
 }
 
-/// The dots of a Braille character by column and row, as bits of its code point from U+2800 on (Unicode, "Braille
-/// Patterns").
-const DOTS: [[u32; 4]; 2] = [[0x01, 0x02, 0x04, 0x40], [0x08, 0x10, 0x20, 0x80]];
-
 impl Sight for Panel {
     fn name(&self) -> &str {
         &self.name
     }
 
-    /// The picture, with 2 x 4 pixels in a character.
-    fn look(&self, _now: Clock) -> String {
+    fn look(&self, _now: Clock) -> Look {
         // A copy: the drawing thread may lose the processor at any time, and the bus must not wait for it.
         let chip = self.chip().clone();
-        if !chip.is_lit() {
-            return "dark".into();
+        let places = (0..ROWS).flat_map(|y| (0..COLUMNS).map(move |x| (x, y)));
+        Look::Pixels {
+            width: COLUMNS.into(),
+            height: ROWS.into(),
+            is_on: chip.is_lit(),
+            lit: places.map(|(x, y)| chip.pixel(x, y)).collect(),
         }
-        let character = |x: u8, y: u8| {
-            let dots = (0u8..2).flat_map(|dx| (0u8..4).map(move |dy| (dx, dy)));
-            let bright = dots.filter(|(dx, dy)| chip.pixel(x + dx, y + dy));
-            let bits: u32 = bright.map(|(dx, dy)| DOTS[usize::from(dx)][usize::from(dy)]).sum();
-            char::from_u32(0x2800 + bits).unwrap_or(' ')
-        };
-        let line = |y: u8| (0..COLUMNS).step_by(2).map(|x| character(x, y)).collect::<String>();
-        (0..ROWS).step_by(4).map(line).collect::<Vec<_>>().join("\n")
     }
 }
 
@@ -465,7 +457,7 @@ mod tests {
         }
 
         fn look(&self) -> String {
-            self.panel.look(Clock::from_ticks(0))
+            self.panel.look(Clock::from_ticks(0)).to_string()
         }
     }
 

@@ -18,7 +18,7 @@ use serde::Deserialize;
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Trouble, check_lights, wrong};
 use crate::description::printer::Printer;
-use crate::engine::colour::{self, Colour};
+use crate::engine::look::{Colour, Look};
 use crate::engine::spi::MosiListener;
 use crate::engine::world::Sight;
 use crate::klippy::layout::Layout;
@@ -205,17 +205,9 @@ impl Sight for Strip {
         &self.name
     }
 
-    fn look(&self, now: Clock) -> String {
-        // The bus must not wait for the formatting.
-        let (lights, odd_pulses) = {
-            let state = self.at(now);
-            (state.lights.clone(), state.odd_pulses)
-        };
-        let lights = colour::list(lights.into_iter());
-        match odd_pulses {
-            0 => lights,
-            count => format!("{lights} ({count} pulses are not the data sheet's)"),
-        }
+    fn look(&self, now: Clock) -> Look {
+        let state = self.at(now);
+        Look::Lights { colours: state.lights.clone(), odd_pulses: state.odd_pulses }
     }
 }
 
@@ -278,7 +270,7 @@ mod tests {
         }
 
         fn look(&self) -> String {
-            self.input.strip.look(self.clock.now())
+            self.input.strip.look(self.clock.now()).to_string()
         }
     }
 

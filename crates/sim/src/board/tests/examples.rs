@@ -5,6 +5,7 @@
 
 use super::*;
 use crate::config::tests::example;
+use crate::engine::bed::{BedShape, Space};
 
 /// The printer of an example.
 fn bench(heading: &str) -> Bench {
@@ -97,7 +98,7 @@ fn a_chamber_is_warm_by_itself_and_its_fan_cools_it() {
 fn a_light_of_four_colours_mixes_them() {
     let mut bench = bench("An RGBW strip");
     let [red, _green, white] = ["shelf_red", "shelf_green", "shelf_white"].map(|pin| bench.output(pin, false));
-    let shown = |bench: &Bench| bench.probe.sights().find(|(name, _)| *name == "shelf").unwrap().1;
+    let shown = |bench: &Bench| bench.probe.sights().find(|(name, _)| *name == "shelf").unwrap().1.to_string();
     assert_eq!(shown(&bench), "off");
     white.write(true).unwrap();
     let mut seen = Vec::new();
@@ -183,4 +184,18 @@ fn the_edges_of_a_tachometer_are_counted_and_dated() {
     let pin = bench.pin("x_endstop");
     let endstop = bench.board.counted_line(pin, Bias::PullUp).unwrap();
     assert_eq!(endstop.edges.err().unwrap(), "nobody counts the edges of endstop of axis x".into());
+}
+
+#[test]
+fn the_nozzle_is_over_its_bed() {
+    let default = Bench::new(SimConfig::default_printer());
+    assert_eq!(default.probe.nozzle_mm(), [60.0, 45.0, 12.0]);
+    let bed = BedShape::Rectangle { min_mm: [0.0; 2], max_mm: [220.0, 220.0] };
+    assert_eq!(default.probe.space(), Some(Space { bed, height_mm: 240.0 }));
+    let delta = bench("A delta printer");
+    let Space { bed, height_mm } = delta.probe.space().unwrap();
+    assert_eq!(bed, BedShape::Disc { radius_mm: 90.0 });
+    let [x, y, z] = delta.probe.nozzle_mm();
+    assert!(x.hypot(y) < 90.0 && z > 0.0 && z < height_mm, "{x} {y} {z} of {height_mm}");
+    assert_eq!(Bench::new(SimConfig::parse("", "empty").unwrap()).probe.space(), None, "no axis");
 }
