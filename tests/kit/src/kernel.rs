@@ -87,7 +87,7 @@ const PLAN_READER: &str = "qemu_fw_cfg";
 const FIRMWARE: &str = "mock_firmware";
 
 /// The parts of an image package with these modules.
-const IMAGE_PARTS: [&str; 22] = [
+const IMAGE_PARTS: [&str; 30] = [
     "*/modules.builtin*",
     // The last parts are for the system that `tests/package` boots from a disk.
     "*/drivers/firmware/qemu_fw_cfg.ko",
@@ -106,6 +106,14 @@ const IMAGE_PARTS: [&str; 22] = [
     "*/crypto/crc32c_generic.ko",
     "*/drivers/block/virtio_blk.ko",
     "*/drivers/char/virtio_console.ko",
+    "*/drivers/usb/class/cdc-acm.ko",
+    "*/drivers/usb/common/usb-common.ko",
+    "*/drivers/usb/core/usbcore.ko",
+    "*/drivers/usb/gadget/function/u_serial.ko",
+    "*/drivers/usb/gadget/function/usb_f_acm.ko",
+    "*/drivers/usb/gadget/libcomposite.ko",
+    "*/drivers/usb/gadget/udc/dummy_hcd.ko",
+    "*/drivers/usb/gadget/udc/udc-core.ko",
     "*/fs/autofs/*",
     "*/fs/ext4/*",
     "*/fs/jbd2/*",
