@@ -10,12 +10,13 @@ mod packages;
 mod vm;
 
 use std::collections::VecDeque;
+use std::env;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::{Mutex, PoisonError};
 use std::thread;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use pinion_testkit::arguments::Arguments;
 use pinion_testkit::cache::Cache;
@@ -39,6 +40,8 @@ Options:
 const NOT_RUN: i32 = 78;
 /// The first check installs the package for all later checks.
 const INSTALLS: &str = "10-install";
+/// How long the prints of the checks last, in minutes.
+const MINUTES: &str = "PINION_PRINT_MINUTES";
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
@@ -74,8 +77,15 @@ struct Check {
     script: String,
 }
 
+/// How long a print lasts.
+fn print_time() -> Result<Duration, String> {
+    let Some(minutes) = env::var_os(MINUTES) else { return Ok(Duration::from_secs(10)) };
+    let minutes = minutes.to_str().and_then(|minutes| minutes.parse().ok());
+    minutes.map(|minutes: u64| Duration::from_secs(60 * minutes)).ok_or_else(|| format!("{MINUTES} is no number"))
+}
+
 /// The scripts in the order of their numbers, each after the common script.
-fn checks() -> Result<Vec<Check>, String> {
+fn checks(print: Duration) -> Result<Vec<Check>, String> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
     let read = |path: &Path| fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()));
     let shared = read(&here.join("guest/words.sh"))?;
@@ -85,13 +95,14 @@ fn checks() -> Result<Vec<Check>, String> {
     paths.sort();
     let check = |path: &PathBuf| {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(Check { name, script: format!("{shared}\n{}", read(path)?) })
+        Ok(Check { name, script: format!("PRINT_S={}\n{shared}\n{}", print.as_secs(), read(path)?) })
     };
     commands::each_page(paths.iter().map(check).collect::<Result<_, String>>()?)
 }
 
 fn run(options: &Options) -> Result<bool, String> {
-    let checks = checks()?;
+    let print = print_time()?;
+    let checks = checks(print)?;
     if options.list {
         checks.iter().filter(|check| options.chosen(check)).for_each(|check| println!("{}: test", check.name));
         return Ok(true);
@@ -123,7 +134,7 @@ fn run(options: &Options) -> Result<bool, String> {
     let run = |(name, checks, then): (&str, Vec<Check>, _)| {
         let folder = folder.path().join(name);
         fs::create_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        in_a_vm(|| Vm::boot(&root, &folder, &share), checks, &of_pages, options, then)
+        in_a_vm(|| Vm::boot(&root, &folder, &share, print), checks, &of_pages, options, then)
     };
     let tallies: Vec<Result<Tally, String>> = thread::scope(|scope| {
         let started = vms.map(|vm| scope.spawn(|| run(vm)));

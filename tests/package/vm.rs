@@ -14,14 +14,15 @@ use pinion_testkit::cache::Cache;
 use pinion_testkit::kernel::{Flavour, Kernel, Offers, remove_others};
 use pinion_testkit::{process, tools};
 
-/// Longest silence: more than the agent's limit for a script. The agent measures by the guest's clock. On a busy
-/// computer one second of that clock takes several seconds.
-const SILENCE_MAX: Duration = Duration::from_secs(1800);
+/// Longest duration of a script without a print, by the guest's clock.
+const SCRIPT_MAX: Duration = Duration::from_secs(900);
+/// How long a second of the guest's clock may take. The computer may be busy.
+const SLOWNESS_MAX: u32 = 3;
+/// After a script with this exit status the agent reboots the VM. The next script waits for the reboot.
+const REBOOTS: i32 = 77;
 /// The guest's time. While the guest works, an instruction takes 1 ns. While it sleeps, the time is the computer's. So
 /// on a busy computer the VM is slow, but nothing in it is late. klippy and a watchdog would notice lateness.
 const TIME: [&str; 4] = ["-icount", "shift=0,sleep=on", "-rtc", "clock=vm"];
-/// After a script with this exit status the agent reboots the VM. The next script waits for the reboot.
-const REBOOTS: i32 = 77;
 
 /// Each process has a program at the same addresses. So the emulator translates it once, not for each process.
 const COMMAND_LINE: &str = "console=ttyS0 quiet mitigations=off cryptomgr.notests lsm= audit=0 norandmaps panic=-1";
@@ -90,18 +91,21 @@ pub struct Vm {
     qemu: Child,
     input: ChildStdin,
     lines: Receiver<String>,
+    script_max: Duration,
     pub boot_took: Duration,
 }
 
 impl Vm {
-    /// Boots a copy of the root in `folder`. The VM sees `share` as /share.
-    pub fn boot(root: &Root, folder: &Path, share: &Path) -> Result<Vm, String> {
+    /// Boots a copy of the root in `folder`. The VM sees `share` as /share. A script may last as long as a print, and
+    /// 15 minutes more.
+    pub fn boot(root: &Root, folder: &Path, share: &Path, print: Duration) -> Result<Vm, String> {
         // Holes in the file stay holes.
         process::run(Command::new("cp").arg("--sparse=always").arg(root.folder.join("root.img")).arg(folder))?;
         let (kernel, initrd) = (root.kernel.clone(), root.folder.join("initrd"));
         let (qemu, input, lines) = start(&kernel, &initrd, folder, share)?;
         let (folder, share) = (folder.to_owned(), share.to_owned());
-        let mut vm = Vm { kernel, initrd, folder, share, qemu, input, lines, boot_took: Duration::ZERO };
+        let (script_max, boot_took) = (SCRIPT_MAX + print, Duration::ZERO);
+        let mut vm = Vm { kernel, initrd, folder, share, qemu, input, lines, script_max, boot_took };
         vm.wait_until_up()?;
         Ok(vm)
     }
@@ -115,7 +119,7 @@ impl Vm {
 
     /// Runs a script with bash in the VM, and returns its exit status and its output.
     pub fn run(&mut self, script: &str) -> Result<(i32, String), String> {
-        let line = format!("{}\n", base64(script.as_bytes()));
+        let line = format!("{} {}\n", self.script_max.as_secs(), base64(script.as_bytes()));
         self.input.write_all(line.as_bytes()).map_err(|error| self.failed(&error.to_string()))?;
         let (output, status) = loop {
             if let Some(answer) = self.line()?.strip_prefix('=') {
@@ -129,7 +133,7 @@ impl Vm {
         }
         let began = Instant::now();
         while self.qemu.try_wait().map_err(|error| error.to_string())?.is_none() {
-            if began.elapsed() > SILENCE_MAX {
+            if began.elapsed() > self.silence_max() {
                 return Err(self.failed("it does not shut down"));
             }
             thread::sleep(Duration::from_millis(100));
@@ -139,8 +143,14 @@ impl Vm {
         Ok((0, output))
     }
 
+    fn silence_max(&self) -> Duration {
+        self.script_max * SLOWNESS_MAX
+    }
+
     fn line(&mut self) -> Result<String, String> {
-        self.lines.recv_timeout(SILENCE_MAX).map_err(|error| self.failed(&format!("the agent is silent: {error}")))
+        self.lines
+            .recv_timeout(self.silence_max())
+            .map_err(|error| self.failed(&format!("the agent is silent: {error}")))
     }
 
     fn failed(&self, cause: &str) -> String {

@@ -82,6 +82,7 @@ microsteps: 1
 rotation_distance: 40
 position_max: 50
 position_endstop: 0
+homing_retract_dist: 0
 
 [stepper_z]
 step_pin: lab/gpio10
