@@ -80,6 +80,8 @@ impl SimBoard {
             workshop.wire(part.endstop_pin.as_ref(), EndstopPin(axis.clone()));
             workshop.world.axes.push(axis);
         }
+        let extruders = printer.hot_ends().filter_map(|hot_end| workshop.axis(&hot_end.name));
+        workshop.world.extruders = extruders.collect();
         for part in &config.heaters {
             let cooling_w_per_k = printer.fan_of(&part.name).map_or(0.0, |fan| fan.cooling_w_per_k);
             let heater = Arc::new(Heater::new(part, part.thermistor()?, cooling_w_per_k, now));

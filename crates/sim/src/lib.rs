@@ -30,6 +30,7 @@ pub use description::pin::PinName;
 pub use description::thermistor::Thermistor;
 pub use engine::bed::{BedShape, Space};
 pub use engine::look::{Colour, Look};
+pub use engine::recorder::{PathPoint, Recorder};
 pub use part::ads1220::Ads1220Config;
 pub use part::adxl345::Adxl345Config;
 pub use part::angle::{AngleChip, AngleConfig};

@@ -7,6 +7,8 @@ use std::sync::Arc;
 
 use super::engine::bed::{Bed, Space};
 use super::engine::look::Look;
+use super::engine::physics::Axis;
+use super::engine::recorder::Recorder;
 use super::engine::world::World;
 use pinion_firmware::time::{Clock, TimeSource};
 
@@ -111,12 +113,17 @@ impl SimProbe {
     /// Where the steps have put the nozzle: x, y and z. klippy's place is the same if it has homed, lost no step, and
     /// uses neither a bed mesh nor another transformation.
     pub fn nozzle_mm(&self) -> [f64; 3] {
-        self.bed.nozzle_mm()
+        self.bed.head().nozzle_mm(Axis::position_mm)
     }
 
     /// The space that the nozzle can reach, over the bed. It never changes. `None` if an axis is missing or has no end.
     pub fn space(&self) -> Option<Space> {
-        self.bed.space()
+        self.bed.head().space()
+    }
+
+    /// Records the path of the nozzle from now on.
+    pub fn recorder(&self) -> Recorder {
+        Recorder::new(self.bed.clone(), &self.world.extruders, self.now())
     }
 
     /// A person's view of the other parts at this instant: the part's name, and what it looks like.

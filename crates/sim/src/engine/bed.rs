@@ -125,8 +125,21 @@ impl Head {
         }
     }
 
+    /// The nozzle's place, while the axes are at these positions.
+    pub(crate) fn nozzle_mm(&self, position_mm: impl Fn(&Axis) -> f64) -> [f64; 3] {
+        self.point_mm([0.0; 3], position_mm)
+    }
+
+    /// The axes that move the nozzle.
+    pub(crate) fn axes(&self) -> Vec<&Arc<Axis>> {
+        match self {
+            Head::Cartesian { x, y, z } => x.iter().chain(y).chain(z.motors.iter().map(|(motor, _)| motor)).collect(),
+            Head::Delta(delta) => delta.carriages.iter().collect(),
+        }
+    }
+
     /// The space that the nozzle can reach; `None` if it has no end.
-    fn space(&self) -> Option<Space> {
+    pub(crate) fn space(&self) -> Option<Space> {
         let travel = |axis: &Arc<Axis>| axis.travel_mm;
         match self {
             Head::Cartesian { x, y, z } => Some(Space {
@@ -217,14 +230,9 @@ impl Bed {
         z_mm - self.height_mm(x_mm, y_mm)
     }
 
-    /// The nozzle's place now.
-    pub fn nozzle_mm(&self) -> [f64; 3] {
-        self.head.point_mm([0.0; 3], Axis::position_mm)
-    }
-
-    /// The space that the nozzle can reach; `None` if it has no end.
-    pub fn space(&self) -> Option<Space> {
-        self.head.space()
+    /// The kinematics over it.
+    pub(crate) fn head(&self) -> &Head {
+        &self.head
     }
 }
 

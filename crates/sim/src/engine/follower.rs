@@ -24,10 +24,27 @@ pub(crate) enum Motion {
     Lost(Clock, f64),
 }
 
+impl Motion {
+    pub(crate) fn at(self) -> Clock {
+        let (Motion::Step(at, _) | Motion::Lost(at, _)) = self;
+        at
+    }
+
+    pub(crate) fn mm(self) -> f64 {
+        let (Motion::Step(_, mm) | Motion::Lost(_, mm)) = self;
+        mm
+    }
+}
+
 impl Follower {
     /// Follows from the first step that the axis makes.
     pub(crate) fn new(axis: Arc<Axis>) -> Follower {
         Follower { axis, next: 0 }
+    }
+
+    /// Follows from the next step that the axis makes.
+    pub(crate) fn from_here(axis: Arc<Axis>) -> Follower {
+        Follower { next: axis.track().next(), axis }
     }
 
     /// The next motion, if it was not later than `until`.

@@ -166,6 +166,11 @@ impl Axis {
         steps as f64 / self.steps_per_mm
     }
 
+    /// The way of one step.
+    pub fn step_mm(&self) -> f64 {
+        1.0 / self.steps_per_mm
+    }
+
     pub fn position_mm(&self) -> f64 {
         self.mm(self.position_steps())
     }

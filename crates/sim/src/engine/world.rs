@@ -26,6 +26,8 @@ pub(crate) type OpenThermometer = Box<dyn Fn() -> Box<dyn Thermometer> + Send + 
 #[derive(Default)]
 pub(crate) struct World {
     pub(crate) axes: Vec<Arc<Axis>>,
+    /// The axes that feed filament to hot ends.
+    pub(crate) extruders: Vec<Arc<Axis>>,
     pub(crate) heaters: Vec<Arc<Heater>>,
     pub(crate) fans: Vec<Arc<Fan>>,
     pub(crate) lamps: Vec<Arc<Lamp>>,
