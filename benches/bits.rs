@@ -113,16 +113,46 @@ impl Line for Fast {
 
 /// An HX711 on two lines that are written through registers: a sample every 12.5 ms, of ones only. It records how long
 /// its clock was high.
+///
+/// A thread may be interrupted between a look at the time and its edge. So the time is read before and after each edge,
+/// and each pulse has a shortest and a longest length.
 #[derive(Default)]
 struct LoadCell {
-    /// When the clock rose, in nanoseconds.
-    rose: AtomicU64,
+    is_high: AtomicBool,
+    /// Before and after the clock rose, in nanoseconds; 0 if not known yet.
+    rises: AtomicU64,
+    risen: AtomicU64,
     /// The sample that was read last, by its number.
     read: AtomicU64,
+    shortest: Lengths,
+    longest: Lengths,
+}
+
+/// Pulses over 50 us, which is the limit of the data sheet (T3), and over 60 us, which switches the chip off.
+#[derive(Default)]
+struct Lengths {
     pulses: AtomicU64,
-    /// Pulses over 50 us, which is the limit of the data sheet (T3), and over 60 us, which switches the chip off.
     long: [AtomicU64; 2],
     longest_ns: AtomicU64,
+}
+
+impl Lengths {
+    fn add(&self, ns: u64) {
+        self.pulses.fetch_add(1, Ordering::Relaxed);
+        self.longest_ns.fetch_max(ns, Ordering::Relaxed);
+        for (count, limit) in self.long.iter().zip([50_000, 60_000]) {
+            count.fetch_add(u64::from(ns > limit), Ordering::Relaxed);
+        }
+    }
+}
+
+impl std::fmt::Display for Lengths {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let load = |count: &AtomicU64| count.load(Ordering::Relaxed);
+        let Lengths { long: [over_50, over_60], longest_ns, .. } = self;
+        let longest_us = load(longest_ns) as f64 / 1e3;
+        write!(f, "{} over 50 us, {} over 60 us, at most {longest_us} us", load(over_50), load(over_60))
+    }
 }
 
 /// Nanoseconds between two samples.
@@ -142,23 +172,29 @@ impl Line for CellLine {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
         let cell = &self.cell;
         if level {
-            cell.rose.store(now_ns(), Ordering::Relaxed);
+            cell.risen.store(0, Ordering::Release);
+            cell.rises.store(now_ns(), Ordering::Release);
+            cell.is_high.store(true, Ordering::Release);
+            cell.risen.store(now_ns(), Ordering::Release);
             return Ok(());
         }
-        let (now, rose) = (now_ns(), cell.rose.swap(0, Ordering::Relaxed));
-        if rose != 0 {
-            cell.read.store(now / SAMPLE_NS, Ordering::Relaxed);
-            cell.pulses.fetch_add(1, Ordering::Relaxed);
-            cell.longest_ns.fetch_max(now - rose, Ordering::Relaxed);
-            for (count, limit) in cell.long.iter().zip([50_000, 60_000]) {
-                count.fetch_add(u64::from(now - rose > limit), Ordering::Relaxed);
-            }
+        let falls = now_ns();
+        // The first one that lowers it ends the pulse.
+        if cell.is_high.swap(false, Ordering::AcqRel) {
+            let (rises, risen) = (cell.rises.load(Ordering::Acquire), cell.risen.load(Ordering::Acquire));
+            let fallen = now_ns();
+            cell.read.store(fallen / SAMPLE_NS, Ordering::Relaxed);
+            cell.longest.add(fallen - rises);
+            cell.shortest.add(if risen == 0 { 0 } else { falls.saturating_sub(risen) });
         }
         Ok(())
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
-        Ok(self.is_clock || self.cell.read.load(Ordering::Relaxed) == now_ns() / SAMPLE_NS)
+        match self.is_clock {
+            true => Ok(self.cell.is_high.load(Ordering::Acquire)),
+            false => Ok(self.cell.read.load(Ordering::Relaxed) == now_ns() / SAMPLE_NS),
+        }
     }
 
     fn set_direction(&self, _: Direction) -> Result<(), Shutdown> {
@@ -223,17 +259,31 @@ impl Board for Wires {
     }
 }
 
-/// One worker, with the priority of Pinion's workers.
-struct Worker {
-    jobs: Sender<Job>,
+/// Workers, with the priority of Pinion's workers.
+struct Threads {
+    clock: Monotonic,
+    are_parallel: bool,
+    /// By the names of their buses.
+    workers: Vec<(String, Sender<Job>)>,
+    outbox: Sender<Completion>,
     done: Mutex<Receiver<Completion>>,
     waiting: Mutex<Option<Completion>>,
 }
 
-impl Worker {
-    fn start(clock: Monotonic) -> Worker {
-        let (jobs, inbox) = mpsc::channel::<Job>();
+impl Threads {
+    fn new(clock: Monotonic, are_parallel: bool) -> Threads {
         let (outbox, done) = mpsc::channel();
+        Threads { clock, are_parallel, workers: Vec::new(), outbox, done: Mutex::new(done), waiting: Mutex::new(None) }
+    }
+}
+
+impl Workers for Threads {
+    fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown> {
+        if let Some(worker) = self.workers.iter().position(|(name, _)| name == bus) {
+            return Ok(WorkerId(worker));
+        }
+        let (jobs, inbox) = mpsc::channel::<Job>();
+        let (clock, outbox) = (self.clock, self.outbox.clone());
         thread::spawn(move || {
             realtime::enter(Role::Worker);
             for Job { oid, mut parcel, holds } in inbox {
@@ -242,16 +292,14 @@ impl Worker {
                 let _ = outbox.send(Completion { oid, parcel, holds, began, ended: clock.now() });
             }
         });
-        Worker { jobs, done: Mutex::new(done), waiting: Mutex::new(None) }
+        self.workers.push((bus.into(), jobs));
+        Ok(WorkerId(self.workers.len() - 1))
     }
-}
-
-impl Workers for Worker {
-    fn start(&mut self, _: &str) -> Result<WorkerId, Shutdown> {
-        Ok(WorkerId(0))
+    fn are_parallel(&self) -> bool {
+        self.are_parallel
     }
-    fn submit(&mut self, _: WorkerId, job: Job) -> Result<(), Refused> {
-        self.jobs.send(job).map_err(|error| panic!("the worker ended: {error}"))
+    fn submit(&mut self, WorkerId(worker): WorkerId, job: Job) -> Result<(), Refused> {
+        self.workers[worker].1.send(job).map_err(|error| panic!("the worker ended: {error}"))
     }
     fn completion(&mut self) -> Option<Completion> {
         self.waiting.lock().unwrap().take()
@@ -336,7 +384,7 @@ struct Printer {
 }
 
 impl Printer {
-    fn new(clock: Monotonic) -> Printer {
+    fn new(clock: Monotonic, has_parallel_workers: bool) -> Printer {
         let edges = Arc::new(Mutex::new(Vec::with_capacity(100)));
         let bench = Bench::new(pinion_firmware::time::VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
         let leds = Arc::new(AtomicU32::new(0));
@@ -348,7 +396,7 @@ impl Printer {
         let id = |format: &str| dialect.dictionary().responses[format].as_i64().unwrap_or(0) as u32;
         let ids = [id("tmcuart_response oid=%c read=%*s"), id("neopixel_result oid=%c success=%c")];
         let heard = Heard { ids, last: Arc::default() };
-        let worker = Box::new(Worker::start(clock));
+        let worker = Box::new(Threads::new(clock, has_parallel_workers));
         let timing = Timing::of(Arc::new(clock));
         let mcu = Mcu::new(dialect.clone(), Box::new(board), timing, worker, Box::new(heard.clone()));
         let mut printer = Printer { mcu, dialect, edges, leds, cell, heard };
@@ -464,7 +512,7 @@ fn understood(Burst(edges, away): &Burst) -> Option<bool> {
 
 /// Sends frames to the LEDs.
 fn leds(clock: Monotonic) {
-    let mut printer = Printer::new(clock);
+    let mut printer = Printer::new(clock, true);
     let (leds, end, seen) = (printer.leds.clone(), AtomicBool::new(false), Mutex::new(Vec::new()));
     let (mut whole, mut first, mut tries) = (0, 0, 0);
     // Of the whole frames: as seen from outside.
@@ -542,7 +590,7 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
 
 /// Exchanges messages, and prints how many arrived.
 fn uart(clock: Monotonic) {
-    let mut printer = Printer::new(clock);
+    let mut printer = Printer::new(clock, true);
     let write = framed(&WRITE);
     let whole: Vec<bool> = (0..8 * write.len()).map(|n| bit_of(&write, n)).collect();
     let (mut first, mut last, mut tries) = (0, 0, 0);
@@ -566,9 +614,10 @@ fn uart(clock: Monotonic) {
     println!("  of {MESSAGES} registers {read} read, {none} not, {wrong} wrong");
 }
 
-/// Reads the load cell for a while, and prints how long its clock was high.
-fn load_cell(clock: Monotonic, lasts: Duration) {
-    let mut printer = Printer::new(clock);
+/// Reads the load cell for a while, and prints how long its clock was high. A second worker watches the pulses, unless
+/// one reads `alone`.
+fn load_cell(clock: Monotonic, lasts: Duration, alone: bool) {
+    let mut printer = Printer::new(clock, !alone);
     realtime::enter(Role::Core);
     printer.run("query_hx71x oid=%c rest_ticks=%u", &[2, Ticks::from_us(1250).0], None);
     let end = monotonic() + lasts;
@@ -579,23 +628,20 @@ fn load_cell(clock: Monotonic, lasts: Duration) {
         }
         thread::sleep(Duration::from_micros(200));
     }
-    let load = |count: &AtomicU64| count.load(Ordering::Relaxed);
-    let LoadCell { pulses, long: [over_50, over_60], longest_ns, .. } = &*printer.cell;
-    println!(
-        "HX711 for {} s: {} pulses, {} over 50 us, {} over 60 us, at most {} us",
-        lasts.as_secs(),
-        load(pulses),
-        load(over_50),
-        load(over_60),
-        load(longest_ns) as f64 / 1e3
-    );
+    let LoadCell { shortest, longest, .. } = &*printer.cell;
+    let pulses = longest.pulses.load(Ordering::Relaxed);
+    println!("HX711 for {} s: {pulses} pulses; surely {shortest}; possibly {longest}", lasts.as_secs());
 }
 
 fn main() {
-    // `cargo bench --bench bits -- hx711 3600`: only this, for so many seconds.
+    // `cargo bench --bench bits -- hx711 3600 [alone]`: only this, for so many seconds.
     let mut words = std::env::args().skip_while(|word| word != "hx711").skip(1);
     if let Some(seconds) = words.next().and_then(|word| word.parse().ok()) {
-        return load_cell(Monotonic::start(), Duration::from_secs(seconds));
+        return load_cell(
+            Monotonic::start(),
+            Duration::from_secs(seconds),
+            words.next().is_some_and(|word| word == "alone"),
+        );
     }
     let clock = Monotonic::start();
     for steppers in [0, 3] {

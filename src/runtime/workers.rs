@@ -113,6 +113,10 @@ impl Workers for Threads {
         Ok(WorkerId(self.workers.len() - 1))
     }
 
+    fn are_parallel(&self) -> bool {
+        self.may_poll
+    }
+
     fn leave_behind(&mut self, WorkerId(worker): WorkerId) {
         if let Some(worker) = self.workers.get_mut(worker) {
             worker.left_behind = true;

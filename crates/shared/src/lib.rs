@@ -7,6 +7,7 @@
 //! - [`together`]: the newest words of one writer, which belong together
 //! - [`life`]: signs of life, debts, and what workers are at
 //! - [`calls`]: wake-ups between the core and the link, and what each has done
+//! - [`watch`]: a line whose pulses one thread makes, and another one ends if the first is late
 //!
 //! A structure in memory that processes share is given its words, and is a view of them. They are zero at first.
 
@@ -16,6 +17,7 @@ pub mod calls;
 pub mod life;
 pub mod ring;
 pub mod together;
+pub mod watch;
 
 /// The atomics of loom in its models, and those of the standard library everywhere else.
 mod atomic {

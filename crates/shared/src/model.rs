@@ -10,6 +10,7 @@ use crate::calls::{Doze, Progress};
 use crate::life::{Heart, Slot};
 use crate::ring::{self, Found, Ring};
 use crate::together::Together;
+use crate::watch::Watch;
 
 /// Runs a model, and prints in how many orders. `one` and `other` share what `start` makes, and `check` sees what both
 /// return.
@@ -328,5 +329,56 @@ fn a_stop_request_in_the_ring_is_counted() {
         },
         |(progress, requests)| (requests[0].load(Ordering::Acquire), progress.stops_handed()),
         |_, (), (taken, handed)| assert!(handed >= taken, "the core has taken more than it was handed"),
+    );
+}
+
+/// The line is a word: the number of the pulse while it is high, 0 while it is low. The first thread makes a pulse that
+/// nobody watches only if the second one has not come, or watches no pulse any more.
+#[test]
+fn no_store_for_a_pulse_comes_after_it_and_the_first_thread_knows_of_it() {
+    const ALONE: u32 = 9;
+    let alone = |watch: &Watch, line: &[AtomicU32; 1]| {
+        watch.close();
+        line[0].store(ALONE, Ordering::Relaxed);
+    };
+    model(
+        "watch",
+        || (Watch::default(), words::<1>()),
+        move |(watch, line)| {
+            watch.announce(1);
+            if watch.known_before(1).is_none() {
+                alone(watch, line);
+                return None;
+            }
+            line[0].store(1, Ordering::Relaxed);
+            line[0].store(0, Ordering::Relaxed);
+            watch.announce(2);
+            let known = watch.known_before(2)?;
+            alone(watch, line);
+            Some(known)
+        },
+        |(watch, line)| {
+            let (mut watched, mut high, mut has_ended) = (0, 0, false);
+            for _ in 0..3 {
+                let announced = watch.announced();
+                if announced == 0 {
+                    continue;
+                }
+                if announced != watched {
+                    watch.begin(announced, has_ended.into());
+                    (watched, high) = (announced, 0);
+                }
+                let level = line[0].load(Ordering::Relaxed);
+                if level != 0 && high != 0 {
+                    let ended = line[0].swap(0, Ordering::Relaxed);
+                    assert!(ended == 0 || ended == high, "pulse {ended} is cut short, not {high}");
+                    assert!(ended != ALONE, "it is not watched");
+                    has_ended = true;
+                }
+                high = level;
+            }
+            has_ended
+        },
+        |_, known, has_ended| assert!(known.is_none_or(|known| known == u32::from(has_ended)), "{known:?} {has_ended}"),
     );
 }

@@ -5,28 +5,27 @@
 //! 24 pulses on the chip's clock shift out a sample. One to four more pulses choose gain and channel of the next
 //! sample. A clock that stays high for over 60 us switches the chip off. The chip starts again when the clock falls.
 //!
-//! On lines a worker drives the clock, and two system calls make a pulse. So this may happen on a slow or busy computer. The bits
-//! that follow are then all ones, and no check of the protocol would notice. So the worker measures every pulse. If one
-//! may have been too long, its sample is sent as the error "read too long". klippy then restarts the sensor.
+//! On lines (`lines.rs`) a worker drives the clock. So this may happen on a slow or busy computer. The bits that follow
+//! are then all ones, and no check of the protocol would notice. So the worker measures every pulse. If one may have been
+//! too long, its sample is sent as the error "read too long". klippy then restarts the sensor.
 
 #![forbid(unsafe_code)]
 
 use std::sync::{Arc, Mutex};
-use std::time::{Duration, Instant};
-
-use log::warn;
 
 use crate::board::{Bias, Direction, Line, Mosi, OnWorker, Pin};
 use crate::mcu::{
-    Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
+    Back, Command, Done, Errand, Feature, Generation::Kalico, Generation::Master, Generation::V0_13, Mcu, Oid, Remote,
     Settable, Slot, Turn, WorkerId, command, since,
 };
 use crate::shutdown::{Shutdown, reason, shutdowns};
-use crate::time::{Ticks, TimeSource};
+use crate::time::Ticks;
 
 use super::ready_adc::{Ready, ReadyAdc, ReadyChip, Sample};
+use lines::{Shift, Watcher};
 use spi::{Shared, Waves};
 
+mod lines;
 mod spi;
 
 pub(super) const FEATURE: Feature = Feature {
@@ -51,12 +50,10 @@ const ERROR_DESYNC: i32 = i32::MIN;
 const ERROR_READ_TOO_LONG: i32 = 1 << 30;
 
 const SAMPLE_BITS: u8 = 24;
-/// Shortest time that the clock is high, and low (T3 and T4 of the data sheet).
-const PULSE: Duration = Duration::from_nanos(200);
-/// Longest time that the clock may be high before the chip switches itself off.
-const POWER_DOWN: Ticks = Ticks::from_us(60);
 /// All of these chips share this worker.
 const WORKER: &str = "hx71x";
+/// Their watchers share this one.
+const WATCHER: &str = "hx71x watch";
 
 /// Decodes a reading: the sample's bits, then the bits of the extra pulses, the last one lowest.
 fn decode(raw: u32, gain_channel: u8) -> Result<i32, i32> {
@@ -68,62 +65,12 @@ fn decode(raw: u32, gain_channel: u8) -> Result<i32, i32> {
     Ok(((raw >> gain_channel) << 8) as i32 >> 8)
 }
 
-/// Shifts out a sample.
-struct Shift {
-    sclk: Arc<dyn Line>,
-    dout: Arc<dyn Line>,
-    /// Pulses of the sample, and for gain and channel.
-    pulses: u8,
-    time: Arc<dyn TimeSource>,
-    /// The clock line's name in the log.
-    name: String,
-    /// Whether the log already has a line about a clock that was high for too long.
-    told: bool,
-}
-
 /// The bits that were shifted out.
 #[derive(Clone, Copy)]
 struct Shifted {
     raw: u32,
-    /// Whether the chip may have switched itself off during the pulses.
+    /// Whether the chip may have switched itself off during the pulses, or did not get all of them.
     too_long: bool,
-}
-
-impl Shift {
-    fn run(&mut self) -> Result<Shifted, Shutdown> {
-        let mut raw = 0;
-        let mut longest = 0;
-        for _ in 0..self.pulses {
-            let rises = self.time.now();
-            self.sclk.write(true)?;
-            wait();
-            self.sclk.write(false)?;
-            longest = self.time.now().since(rises).max(longest);
-            raw = raw << 1 | u32::from(self.dout.read()?);
-            wait();
-        }
-        let too_long = longest > i64::from(POWER_DOWN.0);
-        if too_long && !self.told {
-            self.told = true;
-            warn!("{}", too_slow(&self.name, longest));
-        }
-        Ok(Shifted { raw, too_long })
-    }
-}
-
-/// For the log: the clock was high for too long, up to this many ticks.
-fn too_slow(name: &str, ticks: i64) -> String {
-    let us = ticks / i64::from(Ticks::from_us(1).0);
-    format!(
-        "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
-    )
-}
-
-fn wait() {
-    let start = Instant::now();
-    while start.elapsed() < PULSE {
-        std::hint::spin_loop();
-    }
 }
 
 /// Reads a sample on a worker.
@@ -166,6 +113,8 @@ struct Hx71x {
     worker: WorkerId,
     gain_channel: u8,
     power_down: Remote<PowerDown>,
+    /// Watches the pulses of a reading, with its worker.
+    watcher: Option<(WorkerId, Slot<Watcher>)>,
     /// Sent instead of samples until new measurements begin.
     last_error: Option<i32>,
 }
@@ -175,6 +124,13 @@ impl ReadyChip for Hx71x {
     type Reading = Reading;
 
     fn read(&mut self, turn: &mut Turn, reading: &mut Slot<Reading>) -> Result<(), Shutdown> {
+        if let Some((worker, watcher)) = &mut self.watcher {
+            // After a reading without its last pulses it may still watch one of them.
+            if !watcher.is_here() {
+                return Ok(());
+            }
+            watcher.send(turn, *worker)?;
+        }
         reading.send(turn, self.worker)
     }
 
@@ -198,7 +154,10 @@ impl ReadyChip for Hx71x {
         self.power_down.set(turn, !on)
     }
 
-    fn switched(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+        if let Some(Back { result, .. }) = self.watcher.as_mut().and_then(|(_, watcher)| watcher.back(done)) {
+            return result.or_else(|failure| turn.try_shut_down(failure.clone()));
+        }
         match self.power_down.back(turn, done) {
             Some(Err(failure)) => turn.try_shut_down(failure),
             _ => Ok(()),
@@ -229,7 +188,7 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
         let worker = mcu.worker(&bus)?;
         let device: Shared = Arc::new(Mutex::new(device));
         let power_down = Remote::new(worker, PowerDown::Spi(device.clone()), true);
-        let chip = Hx71x { worker, gain_channel, power_down, last_error: None };
+        let chip = Hx71x { worker, gain_channel, power_down, watcher: None, last_error: None };
         let waves = Slot::new(Reading::Spi(Waves::new(device, pulses, sclk)));
         return mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::LOOK, waves));
     }
@@ -237,16 +196,16 @@ fn configure(mcu: &mut Mcu, oid: Oid, gain_channel: u8, dout_pin: Pin, sclk_pin:
     // High is off. The chip is off until measurements begin, and when the program dies.
     let sclk = mcu.prompt_line(sclk_pin, "sclk", Direction::Output { level: true, shutdown_value: true })?;
     let worker = mcu.worker(WORKER)?;
-    let shift = Shift {
-        sclk: sclk.clone(),
-        dout: dout.clone(),
-        pulses,
-        time: mcu.clock(),
-        name: mcu.name(sclk_pin),
-        told: false,
+    // A call of the kernel takes about as long as a watcher waits.
+    let is_watched = sclk.is_fast() && mcu.has_parallel_workers();
+    let watcher = is_watched.then(|| Watcher::new(mcu, sclk.clone()));
+    let shift = Shift::new(mcu, sclk_pin, sclk.clone(), dout.clone(), pulses, watcher.as_ref());
+    let watcher = match watcher {
+        Some(watcher) => Some((mcu.worker(WATCHER)?, Slot::new(watcher))),
+        None => None,
     };
     let power_down = Remote::new(worker, PowerDown::Line(sclk), true);
-    let chip = Hx71x { worker, gain_channel, power_down, last_error: None };
+    let chip = Hx71x { worker, gain_channel, power_down, watcher, last_error: None };
     mcu.assign_on(dout_pin, oid, ReadyAdc::new(chip, Ready::Line(dout), Slot::new(Reading::Lines(shift))))
 }
 
@@ -285,12 +244,6 @@ const QUERY_HX71X_STATUS: Command =
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn the_log_says_which_clock_line_was_too_slow_and_for_how_long() {
-        let line = too_slow("gpio11", i64::from(Ticks::from_us(75).0));
-        assert!(line.contains("(gpio11)") && line.contains("up to 75 us") && line.contains("-r"), "{line}");
-    }
 
     #[test]
     fn samples_are_those_of_the_data_sheet() {

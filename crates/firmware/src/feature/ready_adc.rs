@@ -79,8 +79,8 @@ pub(super) trait ReadyChip: Send + Sized + 'static {
         Ok(())
     }
 
-    /// An errand of [`ReadyChip::switch`] may have returned.
-    fn switched(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
+    /// Another errand than a reading has returned.
+    fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         let _ = (turn, done);
         Ok(())
     }
@@ -213,7 +213,7 @@ impl<C: ReadyChip> Object for ReadyAdc<C> {
 
     fn returned(&mut self, turn: &mut Turn, done: &mut Done) -> Result<(), Shutdown> {
         let Some(Back { result, counts, ended: read_at, .. }) = self.reading.back(done) else {
-            return self.chip.switched(turn, done);
+            return self.chip.returned(turn, done);
         };
         let answer = match result {
             Ok(answer) if counts => answer,

@@ -91,6 +91,11 @@ pub trait Workers: Send {
     /// "Bus worker queue overflow" if it cannot be started.
     fn start(&mut self, bus: &str) -> Result<WorkerId, Shutdown>;
 
+    /// Whether two workers can run at the same time. Then one may wait for the other without sleeping.
+    fn are_parallel(&self) -> bool {
+        false
+    }
+
     /// Marks a worker whose devices need not be free to be opened again. [`Workers::reset`] does not wait for its work.
     fn leave_behind(&mut self, worker: WorkerId) {
         let _ = worker;
@@ -136,6 +141,11 @@ impl Mcu {
         let worker = self.workers.start(bus)?;
         self.workers.leave_behind(worker);
         Ok(worker)
+    }
+
+    /// Whether two workers can run at the same time.
+    pub fn has_parallel_workers(&self) -> bool {
+        self.workers.are_parallel()
     }
 
     /// Whether [`Mcu::run_workers`] has something to do.
