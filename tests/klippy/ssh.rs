@@ -12,6 +12,7 @@ use nix::unistd::{Pid, geteuid};
 
 use super::checkout;
 use super::klippy::{Printer, UNHOMED, WHERE_IT_STANDS, python};
+use super::links::print_a_while;
 
 /// A child that ends with its test.
 struct Running(Child);
@@ -63,11 +64,11 @@ fn far_printer(checkout: &Path, round_trip_ms: u32, jitter_ms: u32) -> (Running,
 }
 
 #[test]
-fn klippy_homes_over_ssh_and_returns_after_the_connection_was_lost() {
-    let Some(checkout) = checkout("klippy_homes_over_ssh_and_returns_after_the_connection_was_lost") else { return };
+fn klippy_prints_over_ssh_and_returns_after_the_connection_was_lost() {
+    let Some(checkout) = checkout("klippy_prints_over_ssh_and_returns_after_the_connection_was_lost") else { return };
     let (near, path, mut printer) = far_printer(&checkout, 2, 1);
     printer.until_state("ready");
-    printer.gcode("G28\nG1 X30 F6000\nM400");
+    print_a_while(&mut printer);
     printer.restart("FIRMWARE_RESTART");
     printer.gcode("G28 X");
     // The connection is cut: ssh, the child of `pinion link`, is killed.
