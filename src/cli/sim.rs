@@ -226,7 +226,7 @@ fn draw(path: &Path, report: &Report) -> Result<(), String> {
 /// The plan of a demonstration with this printer.
 fn plan(config: &SimConfig) -> Plan {
     Plan {
-        axes: config.axes.iter().filter_map(axis).collect(),
+        axes: config.axes.iter().filter(|axis| !config.is_on_belts(&axis.name)).filter_map(axis).collect(),
         heater: config.heaters.iter().find(|heater| heater.name == "heater_bed").and_then(heater),
     }
 }

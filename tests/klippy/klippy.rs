@@ -474,6 +474,9 @@ pub fn example(built_in: &str, heading: &str) -> String {
     if example.starts_with("[delta]") {
         return example.to_owned();
     }
+    if example.starts_with("corexy") {
+        return format!("{example}{built_in}");
+    }
     let rest = match built_in.split_once("[[axis]]\nname = \"z\"\n") {
         Some((before, z)) if example.contains("name = \"z\"\n") => {
             format!("{before}{}", z.split_once("\n\n").unwrap().1)

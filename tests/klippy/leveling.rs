@@ -88,6 +88,23 @@ fn klippy_probes_the_bed_of_a_delta_printer() {
 }
 
 #[test]
+fn klippy_homes_and_moves_a_corexy_printer() {
+    let Some(checkout) = checkout("klippy_homes_and_moves_a_corexy_printer") else { return };
+    let describe = |board: String, _: &Path| example(&board, "A CoreXY printer");
+    let mut printer = Printer::start_here(&checkout, describe, |config| config);
+    home(&mut printer, "");
+    for place in [[30.0, 20.0, 5.0], [200.0, 20.0, 5.0], [200.0, 190.0, 1.0], [17.5, 33.25, 60.0]] {
+        let [x, y, z] = place;
+        printer.gcode(&format!("G1 X{x} Y{y} Z{z} F9000\nM400"));
+        let nozzle = printer.probe().nozzle_mm();
+        let off = (0..2).map(|i: usize| (nozzle[i] - place[i]).abs()).fold(0.0, f64::max);
+        // A step of homing, and one of rounding.
+        assert!(off < 2.0 / 80.0, "{place:?} {nozzle:?}");
+    }
+    assert!(printer.probe().axes().all(|axis| axis.lost_steps == 0));
+}
+
+#[test]
 fn klippy_calibrates_a_delta_printer() {
     let Some(checkout) = checkout("klippy_calibrates_a_delta_printer") else { return };
     // A flat bed, and a printer.cfg with a wrong radius and wrong ends of the towers.

@@ -148,9 +148,10 @@ fn kalico_takes_each_section_without_hardware_that_is_offered() {
 /// Makes a host read the printed configuration for each example of the documentation.
 fn take_the_examples(checkout: &Path, generation: Generation) {
     let built_in = String::from_utf8(pinion(&["sim", "--print-board"])).unwrap();
-    let examples: [(&str, &[&str]); 5] = [
+    let examples: [(&str, &[&str]); 6] = [
         ("Four Z motors", &["stepper_z3", "quad_gantry_level"]),
         ("A delta printer", &["stepper_c", "delta_calibrate", "probe"]),
+        ("A CoreXY printer", &["stepper_x", "stepper_y", "bed_mesh"]),
         ("A second extruder", &["extruder1", "dual_carriage"]),
         ("A chamber with a fan", &["temperature_fan exhaust", "heater_fan heat_sink"]),
         ("An RGBW strip", &["led shelf"]),

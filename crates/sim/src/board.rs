@@ -15,6 +15,7 @@ use pinion_firmware::time::{TimeSource, Timing};
 use super::config::SimConfig;
 use super::description::check::Trouble;
 use super::description::pin::PinName;
+use super::description::printer::Kinematics;
 use super::engine::bed::Bed;
 use super::engine::i2c::{I2cBus, I2cDevice};
 use super::engine::led::ColouredLed;
@@ -72,8 +73,12 @@ impl SimBoard {
             i2c_buses: config.i2c_buses.iter().map(I2cBus::new).collect(),
             serial_wires: Vec::new(),
         };
+        let belts =
+            (printer.kinematics() == Kinematics::CoreXy).then(|| Some([printer.axis("x")?, printer.axis("y")?]));
+        let mut belts: Vec<Axis> = belts.flatten().map_or(Vec::new(), |axes| Axis::belts(axes).into());
         for part in &config.axes {
-            let axis = Arc::new(Axis::new(part));
+            let on_belts = belts.iter().position(|axis| axis.name == part.name);
+            let axis = Arc::new(on_belts.map_or_else(|| Axis::new(part), |place| belts.swap_remove(place)));
             workshop.wire(Some(&part.step_pin), StepPin(axis.clone()));
             workshop.wire(Some(&part.dir_pin), DirectionPin(axis.clone()));
             workshop.wire(part.enable_pin.as_ref(), EnablePin(axis.clone()));

@@ -31,6 +31,9 @@ pub struct SimConfig {
     /// The axes; `x`, `y`, `z` and `extruder` make a cartesian printer.
     #[serde(default, rename = "axis")]
     pub axes: Vec<AxisConfig>,
+    /// Whether the motors of x and y drive the two belts of a CoreXY printer.
+    #[serde(default)]
+    pub corexy: bool,
     /// The towers of a delta printer.
     pub delta: Option<DeltaConfig>,
     /// The heaters with their sensors.
@@ -104,12 +107,18 @@ impl SimConfig {
         Ok(config)
     }
 
+    /// Whether the motor of this axis drives a belt of a CoreXY printer. Alone it homes no axis.
+    pub fn is_on_belts(&self, axis: &str) -> bool {
+        self.corexy && ["x", "y"].contains(&axis)
+    }
+
     /// The description without its parts.
     pub(super) fn printer(&self) -> Printer<'_> {
         Printer {
             seed: self.seed,
             limits: &self.limits,
             axes: &self.axes,
+            corexy: self.corexy,
             delta: self.delta.as_ref(),
             heaters: &self.heaters,
             fans: &self.fans,

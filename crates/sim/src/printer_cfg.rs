@@ -69,6 +69,7 @@ impl Sections {
             "kinematics",
             match layout.kinematics {
                 Kinematics::Cartesian => "cartesian",
+                Kinematics::CoreXy => "corexy",
                 Kinematics::Delta(_) => "delta",
                 Kinematics::None => "none",
             },
@@ -76,7 +77,7 @@ impl Sections {
         self.key("max_velocity", limits.velocity_mm_per_s);
         self.key("max_accel", limits.accel_mm_per_s2);
         match layout.kinematics {
-            Kinematics::Cartesian => {
+            Kinematics::Cartesian | Kinematics::CoreXy => {
                 // klippy refuses a z axis that is faster than the head.
                 self.key("max_z_velocity", limits.z_velocity_mm_per_s.min(limits.velocity_mm_per_s));
                 self.key("max_z_accel", limits.z_accel_mm_per_s2.min(limits.accel_mm_per_s2));
@@ -95,7 +96,7 @@ impl Sections {
             }
         }
         match layout.kinematics {
-            Kinematics::Cartesian => self.leveling(layout),
+            Kinematics::Cartesian | Kinematics::CoreXy => self.leveling(layout),
             Kinematics::Delta(delta) => {
                 self.section("delta_calibrate");
                 self.key("radius", rounded(WITHIN_REACH * delta.bed_radius_mm));

@@ -25,7 +25,7 @@ pub struct SimProbe {
 pub struct AxisView<'a> {
     /// For example `x`.
     pub name: &'a str,
-    /// Its position.
+    /// Its position. On a CoreXY printer it is the head's place along x or y, and not the motor's.
     pub position_mm: f64,
     /// The end of its travel from 0; `None` for an axis without an end.
     pub travel_mm: Option<f64>,

@@ -25,6 +25,9 @@ pub(crate) fn example(heading: &str) -> String {
     if example.starts_with("[delta]") {
         return example.to_owned();
     }
+    if example.starts_with("corexy") {
+        return format!("{example}{DEFAULT}");
+    }
     let mut text = DEFAULT.to_owned();
     if example.contains("name = \"z\"\n") {
         let (before, z) = DEFAULT.split_once("[[axis]]\nname = \"z\"\n").unwrap();
@@ -183,6 +186,25 @@ fn the_documentation_has_every_kind_and_every_key() {
     }
     has("## Parts", "bus");
     has("## Parts", "select_pin");
+}
+
+#[test]
+fn corexy_needs_three_homed_axes_with_equal_belts() {
+    let refused =
+        |text: &str| SimConfig::parse(text, "my.toml").map_or_else(|error| error.to_string(), |_| "accepted".into());
+    let corexy = example("A CoreXY printer");
+    assert_eq!(refused(&corexy), "accepted");
+    for (from, to, part) in [
+        ("steps_per_mm = 80.0", "steps_per_mm = 81.0", "axis `y`, key `steps_per_mm`: both motors move the head"),
+        ("name = \"z\"", "name = \"w\"", "key `corexy`: there is no axis `z` with an `endstop_pin`: add it"),
+        ("endstop_pin = \"x_endstop\"\n", "", "key `corexy`: there is no axis `x` with an `endstop_pin`: add it"),
+    ] {
+        assert!(corexy.contains(from), "{from}");
+        let error = refused(&corexy.replacen(from, to, 1));
+        assert!(error.contains(part), "{error}");
+    }
+    let delta = refused(&format!("corexy = true\n{}", example("A delta printer")));
+    assert!(delta.contains("remove `[delta]`"), "{delta}");
 }
 
 #[test]

@@ -16,6 +16,7 @@ pub(crate) struct Printer<'a> {
     pub(crate) seed: u64,
     pub(crate) limits: &'a Limits,
     pub(crate) axes: &'a [AxisConfig],
+    pub(crate) corexy: bool,
     pub(crate) delta: Option<&'a DeltaConfig>,
     pub(crate) heaters: &'a [HeaterConfig],
     pub(crate) fans: &'a [FanConfig],
@@ -32,6 +33,8 @@ pub(crate) struct Printer<'a> {
 pub(crate) enum Kinematics<'a> {
     /// `x`, `y` and `z` with endstops, each independent.
     Cartesian,
+    /// As `Cartesian`, but the motors `x` and `y` drive two belts.
+    CoreXy,
     /// `a`, `b` and `c` together.
     Delta(&'a DeltaConfig),
     /// Each axis is only a motor.
@@ -39,10 +42,15 @@ pub(crate) enum Kinematics<'a> {
 }
 
 impl Kinematics<'_> {
+    /// Whether the rails are x, y and z.
+    pub(crate) fn has_gantry(&self) -> bool {
+        self.rails().contains(&"z")
+    }
+
     /// The axes of klippy's kinematics. Each may have more than one motor.
     pub(crate) fn rails(&self) -> &'static [&'static str] {
         match self {
-            Kinematics::Cartesian => &["x", "y", "z"],
+            Kinematics::Cartesian | Kinematics::CoreXy => &["x", "y", "z"],
             Kinematics::Delta(_) => &DeltaConfig::TOWERS,
             Kinematics::None => &[],
         }
@@ -59,6 +67,7 @@ impl<'a> Printer<'a> {
         let can_home = |name| self.axis(name).is_some_and(|axis| axis.endstop_pin.is_some());
         match self.delta {
             Some(delta) => Kinematics::Delta(delta),
+            None if self.corexy => Kinematics::CoreXy,
             None if ["x", "y", "z"].into_iter().all(can_home) => Kinematics::Cartesian,
             None => Kinematics::None,
         }

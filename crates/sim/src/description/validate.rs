@@ -31,6 +31,9 @@ impl Printer<'_> {
         if let Some(delta) = self.delta {
             delta.validate(self)?;
         }
+        if self.corexy {
+            self.validate_corexy()?;
+        }
         self.heaters.iter().try_for_each(|heater| heater.validate(self, pins))?;
         self.fans.iter().try_for_each(|fan| fan.validate(self, pins))?;
         self.leds.iter().try_for_each(|led| led.validate(pins))?;
@@ -49,15 +52,36 @@ impl Printer<'_> {
         self.i2c_buses.iter().try_for_each(I2cBusConfig::validate)
     }
 
+    /// Checks the axes of a CoreXY printer.
+    fn validate_corexy(&self) -> Result<(), Trouble> {
+        const WHOSE: &str = "key `corexy`";
+        if self.delta.is_some() {
+            return Err(Trouble::new("a delta printer has no belts along x and y")
+                .remedy("remove `[delta]`")
+                .of(WHOSE));
+        }
+        let homed = |name: &&str| self.axis(name).is_some_and(|axis| axis.endstop_pin.is_some());
+        if let Some(missing) = Kinematics::CoreXy.rails().iter().find(|name| !homed(name)) {
+            let trouble = Trouble::new(format!("there is no axis `{missing}` with an `endstop_pin`"));
+            return Err(trouble.remedy("add it").of(WHOSE));
+        }
+        let steps_per_mm = |name| self.axis(name).map(|axis| axis.steps_per_mm);
+        if steps_per_mm("x") != steps_per_mm("y") {
+            let cause = "both motors move the head along x";
+            return wrong("axis `y`", "steps_per_mm", cause, "give the axes x and y the same");
+        }
+        Ok(())
+    }
+
     /// Checks the places where the motors of the z axis hold the gantry or the bed.
     fn validate_places(&self) -> Result<(), Trouble> {
-        let is_cartesian = self.kinematics() == Kinematics::Cartesian;
-        let motors: Vec<&AxisConfig> = self.motors("z").filter(|_| is_cartesian).collect();
+        let has_gantry = self.kinematics().has_gantry();
+        let motors: Vec<&AxisConfig> = self.motors("z").filter(|_| has_gantry).collect();
         let whose = |axis: &AxisConfig| format!("axis `{}`", axis.name);
         if let Some(other) =
             self.axes.iter().find(|axis| axis.at_mm.is_some() && !motors.iter().any(|motor| motor.name == axis.name))
         {
-            let cause = "only a motor of the z axis of a cartesian printer has a place";
+            let cause = "only a motor of the z axis of a cartesian or CoreXY printer has a place";
             return wrong(&whose(other), "at_mm", cause, "remove it, or call the axes z, z1, z2 and so on");
         }
         let lost = motors.iter().find(|axis| axis.at_mm.is_none());

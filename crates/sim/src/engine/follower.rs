@@ -54,7 +54,7 @@ impl Follower {
             match self.axis.track().get(self.next) {
                 Recorded::Step(at, position) if at <= until => {
                     self.next += 1;
-                    let mm = self.axis.mm(position);
+                    let mm = self.axis.place_mm(position);
                     return Some(if lost { Motion::Lost(at, mm) } else { Motion::Step(at, mm) });
                 }
                 Recorded::Step(..) | Recorded::NotYet => return None,

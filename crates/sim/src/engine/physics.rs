@@ -17,16 +17,56 @@ use crate::description::heater::{FanConfig, HeaterConfig};
 use crate::description::thermistor::Thermistor;
 use pinion_firmware::time::Clock;
 
-/// A stepper motor and its axis.
+/// What motors move along an axis, between two ends. It counts the steps of each of its motors, forward or backward.
+#[derive(Debug)]
+struct Carriage {
+    motors: Vec<(Arc<AtomicI64>, i64)>,
+    counts_per_mm: f64,
+    /// The lowest and the highest count that it reaches without hitting something.
+    hard_limits: Option<(i64, i64)>,
+    /// The endstop's end, and the count where it closes.
+    endstop: Option<(End, i64)>,
+    track: Track,
+}
+
+impl Carriage {
+    fn new(config: &AxisConfig, motors: Vec<(Arc<AtomicI64>, i64)>) -> Carriage {
+        let counts_per_mm = config.steps_per_mm * motors.len() as f64;
+        let counts = |mm: f64| (mm * counts_per_mm).round() as i64;
+        Carriage {
+            motors,
+            counts_per_mm,
+            hard_limits: config.travel_mm.map(|travel_mm| {
+                let over_mm = config.overtravel_mm;
+                (counts(-over_mm), counts(travel_mm + over_mm))
+            }),
+            endstop: config.endstop_pin.as_ref().map(|_| match config.endstop_at {
+                End::Min => (End::Min, 0),
+                End::Max => (End::Max, counts(config.travel_mm.unwrap_or(0.0))),
+            }),
+            track: Track::new(),
+        }
+    }
+
+    fn counts(&self) -> i64 {
+        let count = |(motor, way): &(Arc<AtomicI64>, i64)| motor.load(Ordering::Relaxed).wrapping_mul(*way);
+        self.motors.iter().map(count).fold(0, i64::wrapping_add)
+    }
+
+    fn reaches(&self, counts: i64) -> bool {
+        self.hard_limits.is_none_or(|(min, max)| (min..=max).contains(&counts))
+    }
+}
+
+/// A stepper motor, and the axis of its name.
 #[derive(Debug)]
 pub struct Axis {
     pub name: String,
     pub travel_mm: Option<f64>,
     steps_per_mm: f64,
-    /// The lowest and the highest step that it reaches without hitting something.
-    hard_limits: Option<(i64, i64)>,
-    /// The endstop's end, and the step where it closes.
-    endstop: Option<(End, i64)>,
+    carriage: Arc<Carriage>,
+    /// What its motor moves, and which way when it goes forward.
+    moves: Vec<(Arc<Carriage>, i64)>,
     /// Whether a falling edge is also a step.
     both_edges: AtomicBool,
     /// Whether the step line is on.
@@ -35,14 +75,19 @@ pub struct Axis {
     dir_inverted: bool,
     forward: AtomicBool,
     enabled: AtomicBool,
-    position: AtomicI64,
+    /// The position of its motor.
+    position: Arc<AtomicI64>,
     /// Steps that its driver received: those with a low direction line minus those with a high one.
     turned: AtomicI64,
     lost_steps: AtomicU64,
-    track: Track,
     /// The instant of the last step, the ticks between it and the step before, and the number of lost steps in a row
     /// until then.
     stride: Together<3>,
+}
+
+/// The position of a motor at its start. The limits of the description keep it below 2^63.
+fn motor_at(start_mm: f64, config: &AxisConfig) -> Arc<AtomicI64> {
+    Arc::new(AtomicI64::new((start_mm * config.steps_per_mm).round() as i64))
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -54,30 +99,45 @@ pub struct Stride {
 }
 
 impl Axis {
+    /// An axis with a motor of its own.
     pub fn new(config: &AxisConfig) -> Axis {
-        // The limits of the description keep this below 2^63.
-        let steps = |mm: f64| (mm * config.steps_per_mm).round() as i64;
+        let motor = motor_at(config.start_mm, config);
+        let carriage = Arc::new(Carriage::new(config, vec![(motor.clone(), 1)]));
+        Axis::driven(config, motor, carriage.clone(), vec![(carriage, 1)])
+    }
+
+    /// The axes x and y of a CoreXY printer. Their motors drive two belts. The motor `x` moves the head by half of its
+    /// step along both axes. The motor `y` moves it along x too, but backward along y.
+    pub fn belts([x, y]: [&AxisConfig; 2]) -> [Axis; 2] {
+        let motors = [motor_at(x.start_mm + y.start_mm, x), motor_at(x.start_mm - y.start_mm, x)];
+        let [a, b] = &motors;
+        let along_x = Arc::new(Carriage::new(x, vec![(a.clone(), 1), (b.clone(), 1)]));
+        let along_y = Arc::new(Carriage::new(y, vec![(a.clone(), 1), (b.clone(), -1)]));
+        let [a, b] = motors;
+        let moves = |way| vec![(along_x.clone(), 1), (along_y.clone(), way)];
+        [Axis::driven(x, a, along_x.clone(), moves(1)), Axis::driven(y, b, along_y.clone(), moves(-1))]
+    }
+
+    fn driven(
+        config: &AxisConfig,
+        position: Arc<AtomicI64>,
+        carriage: Arc<Carriage>,
+        moves: Vec<(Arc<Carriage>, i64)>,
+    ) -> Axis {
         Axis {
             name: config.name.clone(),
             travel_mm: config.travel_mm,
             steps_per_mm: config.steps_per_mm,
-            hard_limits: config.travel_mm.map(|travel_mm| {
-                let over_mm = config.overtravel_mm;
-                (steps(-over_mm), steps(travel_mm + over_mm))
-            }),
-            endstop: config.endstop_pin.as_ref().map(|_| match config.endstop_at {
-                End::Min => (End::Min, 0),
-                End::Max => (End::Max, steps(config.travel_mm.unwrap_or(0.0))),
-            }),
+            carriage,
+            moves,
             both_edges: AtomicBool::new(config.step_both_edges),
             stepped: AtomicBool::new(false),
             dir_inverted: config.dir_pin.inverted,
             forward: AtomicBool::new(false),
             enabled: AtomicBool::new(config.enable_pin.is_none()),
-            position: AtomicI64::new(steps(config.start_mm)),
+            position,
             turned: AtomicI64::new(0),
             lost_steps: AtomicU64::new(0),
-            track: Track::new(),
             stride: Together::new([0, u64::MAX, 0]),
         }
     }
@@ -126,17 +186,15 @@ impl Axis {
             return true;
         }
         let way = if self.forward.load(Ordering::Relaxed) { 1 } else { -1 };
-        let next = self.position_steps().wrapping_add(way);
-        match self.hard_limits {
-            Some((min, max)) if !(min..=max).contains(&next) => {
-                let lost = self.lost_steps.load(Ordering::Relaxed);
-                self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
-                return false;
-            }
-            _ => {
-                self.position.store(next, Ordering::Relaxed);
-                self.track.push(at, next);
-            }
+        let reaches = |(carriage, its): &(Arc<Carriage>, i64)| carriage.reaches(carriage.counts() + way * its);
+        if !self.moves.iter().all(reaches) {
+            let lost = self.lost_steps.load(Ordering::Relaxed);
+            self.lost_steps.store(lost.wrapping_add(1), Ordering::Relaxed);
+            return false;
+        }
+        self.position.store(self.position_steps().wrapping_add(way), Ordering::Relaxed);
+        for (carriage, _) in &self.moves {
+            carriage.track.push(at, carriage.counts());
         }
         true
     }
@@ -148,11 +206,17 @@ impl Axis {
         Stride { ticks: ticks.max(since), lost_in_a_row }
     }
 
-    /// Its last steps with their instants.
+    /// Its last changes with their instants. Its unit is [`Axis::place_mm`]'s.
     pub fn track(&self) -> &Track {
-        &self.track
+        &self.carriage.track
     }
 
+    /// The place of an entry of its track, in mm.
+    pub fn place_mm(&self, counts: i64) -> f64 {
+        counts as f64 / self.carriage.counts_per_mm
+    }
+
+    /// The position of its motor.
     pub fn position_steps(&self) -> i64 {
         self.position.load(Ordering::Relaxed)
     }
@@ -161,7 +225,7 @@ impl Axis {
         self.turned.load(Ordering::Relaxed)
     }
 
-    /// The position of this step count, in mm.
+    /// The way of the motor in this number of steps, in mm.
     pub fn mm(&self, steps: i64) -> f64 {
         steps as f64 / self.steps_per_mm
     }
@@ -172,7 +236,7 @@ impl Axis {
     }
 
     pub fn position_mm(&self) -> f64 {
-        self.mm(self.position_steps())
+        self.place_mm(self.carriage.counts())
     }
 
     pub fn lost_steps(&self) -> u64 {
@@ -181,8 +245,8 @@ impl Axis {
 
     /// Whether the endstop is closed; `None` without an endstop.
     pub fn endstop(&self) -> Option<bool> {
-        let position = self.position_steps();
-        self.endstop.map(|(end, at)| match end {
+        let position = self.carriage.counts();
+        self.carriage.endstop.map(|(end, at)| match end {
             End::Min => position <= at,
             End::Max => position >= at,
         })

@@ -135,8 +135,8 @@ impl Merger {
                 lost |= matches!(motion, Motion::Lost(..));
             }
         }
-        // A step that comes out of order counts as happening now.
-        self.place(first.max(self.last.at));
+        // A step that comes out of order counts as the next one.
+        self.place(first.max(Clock::from_ticks(self.last.at.ticks() + 1)));
         Some((self.last, lost))
     }
 }
@@ -159,10 +159,6 @@ impl Line {
     fn extend(&mut self, to: Sample, off: &[f64; 4]) -> bool {
         let (from, values) = (self.from.values(), to.values());
         let ticks = to.at.since(self.from.at) as f64;
-        if ticks <= 0.0 {
-            // Only a first place that comes out of order.
-            return values == from;
-        }
         let fits = |i: usize| (self.least[i]..=self.most[i]).contains(&((values[i] - from[i]) / ticks));
         if !(0..4).all(fits) {
             return false;

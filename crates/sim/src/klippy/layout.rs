@@ -32,8 +32,7 @@ impl<'a> Layout<'a> {
 
     /// Whether an axis has klippy's keys for a homed axis.
     pub(crate) fn is_homed(&self, axis: &str) -> bool {
-        self.kinematics == Kinematics::Cartesian
-            && (self.kinematics.rails().contains(&axis) || self.is_dual_carriage(axis))
+        self.kinematics.has_gantry() && (self.kinematics.rails().contains(&axis) || self.is_dual_carriage(axis))
     }
 
     pub(crate) fn is_dual_carriage(&self, axis: &str) -> bool {

@@ -3,7 +3,6 @@
 
 #![forbid(unsafe_code)]
 
-use crate::description::printer::Kinematics;
 use crate::klippy::layout::{CLEAR_MM, Layout, Place, WITHIN_REACH, rounded};
 use crate::klippy::sections::Sections;
 
@@ -49,7 +48,7 @@ impl Sections {
             }
             cfg.section("sdcard_loop");
             cfg.needs("virtual_sdcard");
-            if layout.kinematics == Kinematics::Cartesian {
+            if layout.kinematics.has_gantry() {
                 cfg.screws(layout);
             }
         });

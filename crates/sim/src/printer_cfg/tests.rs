@@ -92,3 +92,10 @@ fn a_light_has_its_colours() {
     let pins = ["red_pin: shelf_red", "green_pin: shelf_green", "blue_pin: shelf_blue", "white_pin: shelf_white"];
     assert_eq!(section(&printed("An RGBW strip"), "led shelf"), pins);
 }
+
+#[test]
+fn a_corexy_printer_has_klippys_kinematics_and_the_sections_of_a_cartesian_one() {
+    let cfg = printed("A CoreXY printer");
+    assert_has(&cfg, "printer", &["kinematics: corexy", "max_z_velocity: 15"]);
+    assert_has(&cfg, "stepper_y", &["rotation_distance: 40", "endstop_pin: y_endstop", "position_max: 220"]);
+}

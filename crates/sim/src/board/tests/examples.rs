@@ -199,3 +199,32 @@ fn the_nozzle_is_over_its_bed() {
     assert!(x.hypot(y) < 90.0 && z > 0.0 && z < height_mm, "{x} {y} {z} of {height_mm}");
     assert_eq!(Bench::new(SimConfig::parse("", "empty").unwrap()).probe.space(), None, "no axis");
 }
+
+#[test]
+fn the_belts_of_a_corexy_printer_move_one_head() {
+    let mut bench = bench("A CoreXY printer");
+    let places = |bench: &Bench| ["x", "y"].map(|axis| bench.axis(axis).position_mm);
+    assert_eq!(places(&bench), [60.0, 45.0]);
+    let endstop = bench.input("y_endstop");
+    // A step of a motor moves the head by half a step along both axes: 1/160 mm. The direction line of y is inverted.
+    let mut recorder = bench.probe.recorder();
+    travel(&mut bench, "x", 1600);
+    assert_eq!(places(&bench), [70.0, 55.0]);
+    travel(&mut bench, "y", -1600);
+    assert_eq!(places(&bench), [80.0, 45.0]);
+    assert!(!endstop.read().unwrap());
+    // To the endstop of y, and into the end of its travel 2 mm behind it. The head stands then, also along x.
+    travel(&mut bench, "y", -7200);
+    assert_eq!(places(&bench), [125.0, 0.0]);
+    assert!(endstop.read().unwrap());
+    travel(&mut bench, "y", -320);
+    assert_eq!(places(&bench), [127.0, -2.0]);
+    travel(&mut bench, "y", -10);
+    assert_eq!(places(&bench), [127.0, -2.0]);
+    assert_eq!((bench.axis("x").lost_steps, bench.axis("y").lost_steps), (0, 10));
+    recorder.read(bench.probe.now());
+    bench.advance(1.0);
+    recorder.read(bench.probe.now());
+    assert_eq!(recorder.points().last().unwrap().nozzle_mm, bench.probe.nozzle_mm());
+    assert_eq!(bench.probe.nozzle_mm(), [127.0, -2.0, 12.0]);
+}
