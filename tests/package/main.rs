@@ -40,8 +40,9 @@ Options:
 const NOT_RUN: i32 = 78;
 /// The first check installs the package for all later checks.
 const INSTALLS: &str = "10-install";
-/// How long the prints of the checks last, in minutes.
+/// How long the prints of the checks last, in minutes. Without this they are short.
 const MINUTES: &str = "PINION_PRINT_MINUTES";
+const SHORT_PRINT: Duration = Duration::from_secs(10);
 /// A failed run exits with libtest's code.
 const FAILED: u8 = 101;
 
@@ -77,17 +78,18 @@ struct Check {
     script: String,
 }
 
-/// How long a print lasts.
-fn print_time() -> Result<Duration, String> {
-    let Some(minutes) = env::var_os(MINUTES) else { return Ok(Duration::from_secs(10)) };
-    let minutes = minutes.to_str().and_then(|minutes| minutes.parse().ok());
-    minutes.map(|minutes: u64| Duration::from_secs(60 * minutes)).ok_or_else(|| format!("{MINUTES} is no number"))
+/// How long a long print lasts, if one is asked for.
+fn long_print() -> Result<Option<Duration>, String> {
+    let Some(minutes) = env::var_os(MINUTES) else { return Ok(None) };
+    let minutes = minutes.to_str().and_then(|minutes| minutes.parse::<u64>().ok());
+    minutes.map(|minutes| Some(Duration::from_secs(60 * minutes))).ok_or_else(|| format!("{MINUTES} is no number"))
 }
 
 /// The scripts in the order of their numbers, each after the common script.
-fn checks(print: Duration) -> Result<Vec<Check>, String> {
+fn checks(long_print: Option<Duration>) -> Result<Vec<Check>, String> {
     let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
     let read = |path: &Path| fs::read_to_string(path).map_err(|error| format!("{}: {error}", path.display()));
+    let print_s = long_print.unwrap_or(SHORT_PRINT).as_secs();
     let shared = read(&here.join("guest/words.sh"))?;
     let folder = here.join("checks");
     let entries = fs::read_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
@@ -95,14 +97,14 @@ fn checks(print: Duration) -> Result<Vec<Check>, String> {
     paths.sort();
     let check = |path: &PathBuf| {
         let name = path.file_stem().unwrap_or_default().to_string_lossy().into_owned();
-        Ok(Check { name, script: format!("PRINT_S={}\n{shared}\n{}", print.as_secs(), read(path)?) })
+        Ok(Check { name, script: format!("PRINT_S={print_s}\n{shared}\n{}", read(path)?) })
     };
     commands::each_page(paths.iter().map(check).collect::<Result<_, String>>()?)
 }
 
 fn run(options: &Options) -> Result<bool, String> {
-    let print = print_time()?;
-    let checks = checks(print)?;
+    let long_print = long_print()?;
+    let checks = checks(long_print)?;
     if options.list {
         checks.iter().filter(|check| options.chosen(check)).for_each(|check| println!("{}: test", check.name));
         return Ok(true);
@@ -134,7 +136,7 @@ fn run(options: &Options) -> Result<bool, String> {
     let run = |(name, checks, then): (&str, Vec<Check>, _)| {
         let folder = folder.path().join(name);
         fs::create_dir(&folder).map_err(|error| format!("{}: {error}", folder.display()))?;
-        in_a_vm(|| Vm::boot(&root, &folder, &share, print), checks, &of_pages, options, then)
+        in_a_vm(|| Vm::boot(&root, &folder, &share, long_print), checks, &of_pages, options, then)
     };
     let tallies: Vec<Result<Tally, String>> = thread::scope(|scope| {
         let started = vms.map(|vm| scope.spawn(|| run(vm)));

@@ -29,7 +29,7 @@ frames=/sys/class/net/vcan0/statistics/rx_packets
 frames_before=$(cat $frames)
 end=$((SECONDS + PRINT_S))
 while [ $SECONDS -lt $end ]; do
-    # At 45 degrees both motors are busy. An emulated processor wakes 10 ms late at times, so the steps are 20 ms apart.
+    # At 45 degrees both motors are busy. On a busy computer the VM wakes 10 ms late at times: the steps are 20 ms apart.
     gcode 'G1 X30 Y30 F600\nG1 X10 Y10\nG1 X10 Y30\nG1 X30 Y10\nG1 X29 Y12\nG1 X28 Y10\nG1 X27 Y12\nG1 X26 Y10\nG1 X20.2 Y30.4'
 done
 gcode 'M400\nGET_POSITION'

@@ -2,9 +2,12 @@
 # The functions of the checks with a real klippy. A check reads them with `. /share/klippy.sh`. klippy lives in klippy's
 # home. A unit in KIAUH's form runs it.
 [ -d /share/klipper ] || { echo 'KLIPPER_DIR names no checkout of Klipper'; exit 78; }
-trap 'echo "failed: line $LINENO: $BASH_COMMAND"
+# (The command that failed may have its output in /dev/null.)
+trap '{
+    echo "failed: line $LINENO: $BASH_COMMAND"
     journalctl -n 25 --no-pager -u "pinion-mcu*" -u klipper 2>/dev/null
-    grep -v "^Stats\|^Receive\|^Sent\|: got {\|^webhooks" $LOG | tail -n 40' ERR
+    grep -v "^Stats\|^Receive\|^Sent\|: got {\|^webhooks" $LOG | tail -n 40
+} >&2' ERR
 
 DATA=/home/klippy/printer_data
 API=$DATA/comms/klippy.sock
