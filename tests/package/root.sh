@@ -13,7 +13,8 @@ busybox=$tree/bin/busybox
 
 # The packages come from the sources of this computer's apt. Pinion's dependencies wait in a folder of the VM, and its apt
 # installs from there: the VM has no network. Only libiio itself waits there. It needs ICU (by way of libxml2), and the
-# emulated processor takes half a minute to install that. The packages of Python are klippy's.
+# emulated processor takes half a minute to install that. The packages of Python are klippy's. sshd is for the link over
+# SSH.
 find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/sources.list*.sources' \
     -o -path '*/sources.list' \) -exec \
     mmdebstrap --quiet --mode=root --variant=minbase \
@@ -21,6 +22,7 @@ find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/s
     --include=systemd,systemd-sysv,udev,dbus,kmod,procps,make,libiio0- \
     --include=libavahi-client3,libserialport0,libusb-1.0-0,libxml2 \
     --include=iproute2,python3-can,python3-cffi,python3-greenlet,python3-jinja2,python3-serial \
+    --include=openssh-server \
     --dpkgopt=force-unsafe-io --dpkgopt='path-exclude=/usr/share/locale/*' --dpkgopt='path-exclude=/usr/share/doc/*' \
     --dpkgopt='path-include=/usr/share/doc/pinion-mcu/*' --dpkgopt='path-exclude=/var/lib/dpkg/available' \
     --customize-hook='chroot "$1" apt-get clean' \
@@ -36,6 +38,8 @@ rm root/etc/apt/apt.conf.d/70debconf
 chroot root useradd -m -s /bin/bash -G tty klippy
 chroot root useradd -m -s /bin/bash stranger
 echo guest >root/etc/hostname
+# Its check starts it.
+chroot root systemctl --quiet disable ssh
 mkdir -p root/var/log/journal
 
 modules=root/usr/lib/modules/$release
