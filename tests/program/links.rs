@@ -17,7 +17,7 @@ use crate::process::{Pinion, WAIT_MAX};
 
 /// A pseudo terminal in place of a serial port. The test has the host's end. The port's name is a link, so that the
 /// next one may have the same name.
-fn plug_in(folder: &TempDir) -> PtyMaster {
+pub fn plug_in(folder: &TempDir) -> PtyMaster {
     let host = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).unwrap();
     grantpt(&host).unwrap();
     unlockpt(&host).unwrap();
@@ -27,12 +27,12 @@ fn plug_in(folder: &TempDir) -> PtyMaster {
     host
 }
 
-fn client(host: impl Into<OwnedFd>) -> Client {
+pub fn client(host: impl Into<OwnedFd>) -> Client {
     let port = Port::from_fd(host.into(), "the host's end").unwrap();
     Client::new(BlockLink::new(port, WAIT_MAX).unwrap()).unwrap()
 }
 
-fn on_serial(folder: TempDir, more: &str) -> Pinion {
+pub fn on_serial(folder: TempDir, more: &str) -> Pinion {
     let link = format!("serial:{}{more}", folder.path().join("ttyPort").display());
     Pinion::start_in(folder, &["run", "--board", "sim", "--link", &link])
 }

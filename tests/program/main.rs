@@ -5,6 +5,7 @@ mod bad_input;
 mod commands;
 mod configuration;
 mod console;
+mod cut;
 mod dialects;
 mod disk;
 mod doctor;

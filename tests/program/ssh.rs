@@ -32,7 +32,7 @@ fn fake_ssh(folder: &Path, before: &str) -> PathBuf {
 }
 
 /// `pinion link` to a Pinion of this computer.
-fn near(remote: &Path, before: &str) -> Pinion {
+pub fn near(remote: &Path, before: &str) -> Pinion {
     let folder = tempfile::tempdir().unwrap();
     let ssh = fake_ssh(folder.path(), before);
     let link = ["link", "pi@toolhead", "--ssh", ssh.to_str().unwrap(), "--remote", remote.to_str().unwrap()];
@@ -44,7 +44,7 @@ fn uptime(client: &mut Client) {
 }
 
 /// The processes that carry bytes to this link.
-fn attached(remote: &Path) -> Vec<i32> {
+pub fn attached(remote: &Path) -> Vec<i32> {
     let pids = fs::read_dir("/proc").unwrap().filter_map(|entry| entry.unwrap().file_name().to_str()?.parse().ok());
     let is_it = |pid: &i32| {
         let line = fs::read(format!("/proc/{pid}/cmdline")).unwrap_or_default();

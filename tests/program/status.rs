@@ -29,13 +29,13 @@ fn ask(pinion: &Pinion, args: &[&str]) -> std::process::Output {
     Command::new(env!("CARGO_BIN_EXE_pinion")).arg("status").args(args).arg("-I").arg(link).output().unwrap()
 }
 
-fn status(pinion: &Pinion) -> Value {
+pub fn status(pinion: &Pinion) -> Value {
     let output = ask(pinion, &["--json"]);
     assert!(output.status.success(), "{output:?}\n{}", pinion.log());
     serde_json::from_slice(&output.stdout).unwrap()
 }
 
-fn line<'a>(status: &'a Value, pin: &str) -> &'a Value {
+pub fn line<'a>(status: &'a Value, pin: &str) -> &'a Value {
     let lines = status["lines"].as_array().unwrap();
     lines.iter().find(|line| line["pin"] == pin).unwrap_or_else(|| panic!("no {pin} in {lines:?}"))
 }

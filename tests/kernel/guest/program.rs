@@ -3,6 +3,8 @@
 
 use std::env;
 use std::fs::{self, DirEntry, File};
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus};
@@ -46,6 +48,14 @@ impl Program {
     pub fn on_link(link: &str) -> Program {
         let mut command = Command::new("pinion");
         command.args(["run", "-r", "--link", link]);
+        Program::spawn(command)
+    }
+
+    /// Starts it with a host on its standard input and output.
+    pub fn on_stdio(host: UnixStream) -> Program {
+        let mut command = Command::new("pinion");
+        let input = OwnedFd::from(host.try_clone().expect("a socket"));
+        command.args(["run", "-r", "--link", "stdio"]).stdin(input).stdout(OwnedFd::from(host));
         Program::spawn(command)
     }
 

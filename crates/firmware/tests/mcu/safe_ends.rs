@@ -101,3 +101,42 @@ fn a_timer_that_repeats_in_the_past_stops_the_mcu_where_the_firmware_stops() {
     assert_eq!(pulses(28_000_000).as_deref(), Some("Rescheduled timer in the past"));
     assert_eq!(pulses(14_000_000), None);
 }
+
+/// What a host leaves behind whose wire is cut at tick 0: a heater and a fan that are on, a motor that moves, and a motor
+/// that homes with an endstop of another MCU.
+#[test]
+fn without_its_host_an_mcu_ends_what_was_begun() {
+    const HEATER_PIN: u32 = 20;
+    const FAN_PIN: u32 = 21;
+    for heater_ticks in [90_000_u64, 0] {
+        let mut rig = Rig::configured(&[
+            &format!("config_digital_out oid=0 pin={HEATER_PIN} value=0 default_value=0 max_duration={heater_ticks}"),
+            &format!("config_digital_out oid=1 pin={FAN_PIN} value=0 default_value=0 max_duration=0"),
+            "config_stepper oid=2 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=100",
+            "config_stepper oid=3 step_pin=3 dir_pin=4 invert_step=0 step_pulse_ticks=100",
+            "config_trsync oid=4",
+        ]);
+        rig.send_all(&[
+            "update_digital_out oid=0 value=1",
+            "update_digital_out oid=1 value=1",
+            "trsync_start oid=4 report_clock=@0 report_ticks=0 expire_reason=4",
+            "trsync_set_timeout oid=4 clock=@20500",
+            "stepper_stop_on_trigger oid=3 trsync_oid=4",
+            "reset_step_clock oid=2 clock=@0",
+            "reset_step_clock oid=3 clock=@0",
+            "queue_step oid=2 interval=1000 count=60 add=0",
+            "queue_step oid=3 interval=1000 count=60 add=0",
+        ]);
+        rig.run_until(89_000);
+        assert_eq!((rig.bench.level(HEATER_PIN), rig.bench.level(FAN_PIN)), (true, true));
+        assert_eq!(rig.responses(), ["trsync_state oid=4 can_trigger=0 trigger_reason=4 clock=@20500"]);
+        let stands = |rig: &mut Rig, oid| rig.ask(&format!("stepper_get_position oid={oid}"));
+        assert_eq!(stands(&mut rig, 2), "stepper_position oid=2 pos=-60", "its queue is empty");
+        assert_eq!(stands(&mut rig, 3), "stepper_position oid=3 pos=-20", "the other MCU is not heard any more");
+        rig.run_until(10_000_000);
+        let is_on = heater_ticks == 0;
+        assert_eq!((rig.bench.level(HEATER_PIN), rig.bench.level(FAN_PIN)), (is_on, is_on));
+        let text = (!is_on).then(|| "Missed scheduling of next digital out event".to_owned());
+        assert_eq!(rig.shutdown(), text);
+    }
+}

@@ -2,10 +2,16 @@
 //! Outputs go to their shutdown values in every kind of stop of the MCU.
 
 use std::fs;
+use std::os::fd::OwnedFd;
+use std::os::unix::net::UnixStream;
 use std::path::Path;
+use std::time::Duration;
 
+use nix::fcntl::OFlag;
+use nix::pty::{grantpt, posix_openpt, ptsname_r, unlockpt};
 use nix::sys::signal::Signal;
 use pinion_client::Client;
+use pinion_client::serial::{BlockLink, Port};
 
 use super::outputs::Outputs;
 use crate::program::{Program, shutdown_of};
@@ -63,4 +69,42 @@ fn a_host_that_says_nothing_any_more_or_is_gone() {
     }
     program.wait_for_line(&["was not refreshed within its max_duration of 500 ms"]);
     assert!(program.is_running());
+}
+
+fn client_of(host: impl Into<OwnedFd>) -> Client {
+    let port = Port::from_fd(host.into(), "the host's end").expect("a descriptor");
+    Client::new(BlockLink::new(port, Duration::from_secs(10)).expect("a session")).expect("an MCU")
+}
+
+#[test]
+fn a_serial_port_that_is_pulled_out() {
+    let outputs = Outputs::new();
+    let host = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).expect("a port");
+    grantpt(&host).expect("a port");
+    unlockpt(&host).expect("a port");
+    let mut program = Program::on_link(&format!("serial:{}", ptsname_r(&host).expect("its name")));
+    program.wait_for_line(&["serving on"]);
+    let mut client = client_of(host);
+    outputs.switch_on(&mut client, 500);
+    let trace = Trace::start();
+    outputs.wait_until_on();
+    drop(client);
+    outputs.assert_safe(&trace);
+    program.wait_for_line(&["is gone, and the host with it"]);
+    assert!(program.is_running());
+}
+
+#[test]
+fn an_input_that_ends() {
+    let outputs = Outputs::new();
+    let (host, ours) = UnixStream::pair().expect("sockets");
+    let mut program = Program::on_stdio(ours);
+    let mut client = client_of(host);
+    // No output has a time. The program ends with its input, and leaves nothing on.
+    outputs.switch_on(&mut client, 0);
+    let trace = Trace::start();
+    outputs.wait_until_on();
+    drop(client);
+    outputs.assert_safe(&trace);
+    assert!(program.wait().success(), "{}", program.log());
 }

@@ -1,0 +1,213 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The wire is cut, with outputs on: what the MCU does without its host, and what the next host finds. (On a CAN bus:
+//! `tests/kernel/guest/pinion/can.rs`.)
+
+use std::thread;
+use std::time::{Duration, Instant};
+
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use pinion_client::Client;
+use serde_json::Value;
+
+use crate::links::{client, on_serial, plug_in};
+use crate::process::{Pinion, WAIT_MAX};
+use crate::ssh::{attached, near};
+use crate::status::{line, status};
+
+/// How long a heater stays on that the host does not refresh. klippy's is 3 seconds (`MAX_HEAT_TIME`).
+const HEAT_S: f64 = 3.0;
+/// The move that the host has queued: 150 steps, 10 ms apart.
+const STEPS: u32 = 150;
+const STEP_S: f64 = 0.01;
+/// When klippy's time for the other MCU is over, during homing. The 50th step was 5 ms before.
+const TRSYNC_S: f64 = 0.505;
+/// klippy's `MCU_trsync.REASON_COMMS_TIMEOUT`.
+const COMMS_TIMEOUT: u32 = 4;
+
+/// An MCU and its host, with a wire between them.
+struct Wire {
+    mcu: Pinion,
+    host: Client,
+    cut: Cut,
+}
+
+/// Cuts the wire.
+type Cut = Box<dyn FnOnce(&Pinion, Client) -> Whole>;
+/// Makes the wire whole again, and returns the next host. It keeps the wire.
+type Whole = Box<dyn FnMut(&Pinion) -> Client>;
+
+/// The host switches everything on and starts two motors: one moves, and one homes with an endstop of another MCU.
+fn begin(host: &mut Client, has_heater: bool) {
+    let ticks = |host: &Client, seconds| host.ticks(seconds);
+    let longest = if has_heater { ticks(host, HEAT_S) } else { 0 };
+    for command in [
+        "allocate_oids count=5",
+        &format!("config_digital_out oid=0 pin=bed_heater value=0 default_value=0 max_duration={longest}"),
+        "config_digital_out oid=1 pin=fan value=0 default_value=0 max_duration=0",
+        "config_stepper oid=2 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
+        "config_stepper oid=3 step_pin=y_step dir_pin=y_dir invert_step=0 step_pulse_ticks=100",
+        "config_trsync oid=4",
+        "finalize_config crc=1",
+    ] {
+        host.send_line(command).unwrap();
+    }
+    let start = host.clock_in(0.3).unwrap().wire();
+    let expires = start.wrapping_add(ticks(host, TRSYNC_S));
+    let interval = ticks(host, STEP_S);
+    for command in [
+        &*format!("trsync_start oid=4 report_clock={start} report_ticks=0 expire_reason={COMMS_TIMEOUT}"),
+        &format!("trsync_set_timeout oid=4 clock={expires}"),
+        "stepper_stop_on_trigger oid=3 trsync_oid=4",
+        &format!("reset_step_clock oid=2 clock={start}"),
+        &format!("reset_step_clock oid=3 clock={start}"),
+        "set_next_step_dir oid=2 dir=1",
+        "set_next_step_dir oid=3 dir=1",
+        &format!("queue_step oid=2 interval={interval} count={STEPS} add=0"),
+        &format!("queue_step oid=3 interval={interval} count={STEPS} add=0"),
+        "update_digital_out oid=0 value=1",
+        "update_digital_out oid=1 value=1",
+    ] {
+        host.send_line(command).unwrap();
+    }
+    assert!(host.status().unwrap().is_config);
+    host.check().unwrap();
+}
+
+fn steps(status: &Value, oid: usize) -> &Value {
+    &status["objects"][oid]["value"]["steps"]
+}
+
+fn levels(status: &Value) -> [&Value; 2] {
+    ["bed_heater", "fan"].map(|pin| &line(status, pin)["level"])
+}
+
+fn is_cut_with(start: &dyn Fn() -> Wire, has_heater: bool) {
+    let Wire { mcu, mut host, cut } = start();
+    begin(&mut host, has_heater);
+    let mut whole = cut(&mcu, host);
+    mcu.logged("host gone");
+    mcu.until("the end of the move", || *steps(&status(&mcu), 2) == STEPS);
+    if has_heater {
+        mcu.logged("shutdown: Missed scheduling of next digital out event");
+        let after = status(&mcu);
+        assert_eq!(after["state"], "shutdown");
+        assert_eq!(levels(&after), [0, 0], "all its outputs");
+    } else {
+        // Nothing else stops.
+        thread::sleep(Duration::from_secs_f64(HEAT_S));
+        let after = status(&mcu);
+        assert_eq!(after["state"], "configured", "{}", mcu.log());
+        assert_eq!(levels(&after), [1, 1], "they have no time");
+    }
+    // The motor that homes was stopped, because the trsync has expired. The other one has made its move.
+    let after = status(&mcu);
+    assert_eq!((steps(&after, 2), steps(&after, 3)), (&STEPS.into(), &50.into()));
+
+    let mut host = whole(&mcu);
+    let found = host.status().unwrap();
+    assert_eq!((found.is_config, found.is_shutdown), (true, has_heater), "klippy asks for this first");
+    if has_heater {
+        host.reset().unwrap();
+        assert!(!host.status().unwrap().is_config);
+    } else {
+        host.send_line("trsync_trigger oid=4 reason=2").unwrap();
+        let state = host.wait("trsync_state", Some(4), Instant::now() + WAIT_MAX).unwrap().unwrap();
+        assert_eq!(state.int("trigger_reason").unwrap(), i64::from(COMMS_TIMEOUT), "the first reason stays");
+    }
+}
+
+/// With a heater, and without one.
+fn is_cut(start: impl Fn() -> Wire + Sync) {
+    thread::scope(|scope| {
+        scope.spawn(|| is_cut_with(&start, true));
+        scope.spawn(|| is_cut_with(&start, false));
+    });
+}
+
+/// The next host over SSH. One that comes too early is carried by a connection that ends.
+fn next_over(near: &Pinion) -> Client {
+    let end = Instant::now() + WAIT_MAX;
+    loop {
+        let host = Client::connect(&near.link(), WAIT_MAX);
+        if let Ok(mut host) = host
+            && host.status().is_ok()
+        {
+            return host;
+        }
+        assert!(Instant::now() < end, "{}", near.log());
+    }
+}
+
+fn serial() -> (Pinion, Client) {
+    let folder = tempfile::tempdir().unwrap();
+    let host = plug_in(&folder);
+    let mcu = on_serial(folder, "");
+    mcu.logged("serving on");
+    (mcu, client(host))
+}
+
+#[test]
+fn a_serial_port_that_is_pulled_out() {
+    is_cut(|| {
+        let (mcu, host) = serial();
+        let cut = |mcu: &Pinion, host: Client| -> Whole {
+            // The line hangs up, and the port is gone.
+            drop(host);
+            mcu.logged("ttyPort is gone");
+            Box::new(|mcu| {
+                let host = plug_in(mcu.folder());
+                mcu.logged("ttyPort is there");
+                client(host)
+            })
+        };
+        Wire { mcu, host, cut: Box::new(cut) }
+    });
+}
+
+#[test]
+fn a_serial_line_on_which_nothing_comes_any_more() {
+    is_cut(|| {
+        let (mcu, host) = serial();
+        let cut = |_: &Pinion, host: Client| -> Whole {
+            let mut host = Some(host);
+            Box::new(move |_| host.take().unwrap())
+        };
+        Wire { mcu, host, cut: Box::new(cut) }
+    });
+}
+
+#[test]
+fn an_ssh_that_is_killed() {
+    is_cut(|| {
+        let mcu = Pinion::simulated(&[]);
+        let near = near(&mcu.link(), "");
+        let host = near.client();
+        let cut = |mcu: &Pinion, host: Client| -> Whole {
+            let [pid] = attached(&mcu.link())[..] else { panic!("no attach, or several") };
+            kill(Pid::from_raw(pid), Signal::SIGKILL).unwrap();
+            drop(host);
+            Box::new(move |_| next_over(&near))
+        };
+        Wire { mcu, host, cut: Box::new(cut) }
+    });
+}
+
+#[test]
+fn an_ssh_that_carries_nothing_any_more() {
+    is_cut(|| {
+        let mcu = Pinion::simulated(&[]);
+        let near = near(&mcu.link(), "");
+        let host = near.client();
+        let cut = |_: &Pinion, host: Client| -> Whole {
+            // The network is gone: neither side hears the other.
+            near.signal(Signal::SIGSTOP);
+            drop(host);
+            Box::new(move |_| {
+                near.signal(Signal::SIGCONT);
+                next_over(&near)
+            })
+        };
+        Wire { mcu, host, cut: Box::new(cut) }
+    });
+}
