@@ -14,6 +14,7 @@ use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
 
 mod attach;
+mod camera;
 mod check;
 mod complete;
 mod computer;

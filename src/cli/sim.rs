@@ -29,6 +29,7 @@ use pinion_linux::clock::Monotonic;
 use pinion_linux::sys;
 use pinion_sim::{AxisConfig, End, HeaterConfig, PinName, SimBoard, SimConfig, SimProbe, printer_cfg};
 
+use super::camera::{self, Camera};
 use super::page::{Page, print};
 use super::settings::sim_config;
 use super::show::Show;
@@ -53,6 +54,10 @@ pub(super) struct SimArgs {
     /// one line for each change elsewhere
     #[arg(long, conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
     show: bool,
+    /// Serve a picture of the printer as a webcam for Mainsail, Fluidd or a browser, on 127.0.0.1:8410 unless told
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = camera::ADDRESS,
+          value_parser = camera::parse, conflicts_with_all = ["print_config", "print_board"])]
+    camera: Option<String>,
     /// Draw the homing: position, endstop and step rate over time
     #[arg(long, value_name = "FILE.svg")]
     picture: Option<PathBuf>,
@@ -88,12 +93,19 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         Err(error) => return failed(error),
     };
     logging::detach();
+    let camera = match args.camera.as_ref().map(|address| Camera::open(address, &config)).transpose() {
+        Ok(camera) => camera,
+        Err(error) => return failed(error),
+    };
     let plan = plan(&config);
     let board = match SimBoard::new(config, Arc::new(clock)) {
         Ok(board) => board,
         Err(error) => return failed(error),
     };
     let probe = board.probe();
+    if let Some(Err(error)) = camera.map(|camera| camera.start(probe.clone())) {
+        return failed(error);
+    }
     let options = Options {
         link: LinkName::Pty(args.symlink.clone()),
         dialect: None,

@@ -2,6 +2,7 @@
 //! The program from outside, over a real pty, with our own client.
 
 mod bad_input;
+mod camera;
 mod commands;
 mod configuration;
 mod console;

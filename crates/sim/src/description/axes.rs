@@ -103,7 +103,7 @@ impl DeltaConfig {
     }
 
     /// The positions of the towers: x and y.
-    pub(crate) fn towers_mm(&self) -> [[f64; 2]; 3] {
+    pub fn towers_mm(&self) -> [[f64; 2]; 3] {
         self.angles_degrees.map(|degrees| {
             let (sine, cosine) = degrees.to_radians().sin_cos();
             [self.radius_mm * cosine, self.radius_mm * sine]

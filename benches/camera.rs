@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! What a picture of the simulated printer costs: `cargo bench --bench camera`. At 15 pictures a second, 1 ms for a
+//! picture is 1.5 % of a processor.
+
+use std::f64::consts::TAU;
+use std::hint::black_box;
+use std::time::{Duration, Instant};
+
+use criterion::Criterion;
+use pinion_camera::Picture;
+use pinion_camera::scene::{Bed, Display, Fan, Gantry, Heater, Laid, Lamp, Pin, Printer, Probe, Scene, Servo, Strip};
+
+/// A printer with everything that the built-in one has, at the end of a print.
+fn scene() -> Scene {
+    let named = |name: &str| name.to_owned();
+    Scene {
+        nozzle_mm: [122.0, 108.0, 30.0],
+        heaters: vec![
+            Heater { name: named("extruder"), celsius: 214.8, on: true },
+            Heater { name: named("heater_bed"), celsius: 60.1, on: false },
+        ],
+        fans: vec![Fan { name: named("fan"), rpm: 4480.0 }],
+        lamps: ["light", "beeper", "laser"]
+            .map(|name| Lamp { name: named(name), brightness: 0.5, color: [255, 240, 205] })
+            .to_vec(),
+        strips: vec![
+            Strip { name: named("strip"), lights: vec![[255, 120, 0]; 8] },
+            Strip { name: named("dots"), lights: vec![[0, 80, 255]; 4] },
+        ],
+        displays: vec![Display {
+            name: named("display"),
+            width: 128,
+            pixels: (0..128 * 64).map(|at| at % 7 < 3 && at / 128 % 9 < 6).collect(),
+        }],
+        servos: vec![Servo { name: named("arm"), degrees: 60.0 }],
+        probes: vec![
+            Probe { name: named("probe"), offset_mm: [24.0, -8.0, -1.5], pin: None },
+            Probe { name: named("bltouch"), offset_mm: [-28.0, 12.0, -2.2], pin: Some(Pin::In) },
+        ],
+        ..Scene::default()
+    }
+}
+
+/// A round wall of this many pieces.
+fn wall(count: usize) -> Vec<Laid> {
+    let point = |piece: usize| {
+        let (sin, cos) = (piece as f64 / 120.0 * TAU).sin_cos();
+        [110.0 + 40.0 * cos, 110.0 + 40.0 * sin, piece as f64 / 120.0 * 0.2].map(|mm| mm as f32)
+    };
+    let piece = |piece| Laid { from_mm: point(piece), to_mm: point(piece + 1), mm_per_s: 60.0, begins: piece == 0 };
+    (0..count).map(piece).collect()
+}
+
+fn main() {
+    let mut criterion = Criterion::default().configure_from_args();
+    let bed = Bed::Rectangle { x_mm: [0.0, 220.0], y_mm: [0.0, 220.0] };
+    let printer = Printer { bed, height_mm: 240.0, gantry: Gantry::Cartesian };
+    let Some(mut picture) = Picture::new(printer) else { return };
+    let calm = scene();
+    picture.draw(&Scene { laid: wall(20_000), ..scene() });
+    criterion.bench_function("camera/frame", |bencher| {
+        bencher.iter(|| {
+            picture.draw(&calm);
+            black_box(picture.jpeg())
+        });
+    });
+    criterion.bench_function("camera/draw", |bencher| bencher.iter(|| picture.draw(&calm)));
+    // What a piece costs, beside the frame that shows it.
+    let laid = wall(1000);
+    criterion.bench_function("camera/piece of filament", |bencher| {
+        bencher.iter_custom(|count| {
+            let mut time = Duration::ZERO;
+            for _ in 0..count.div_ceil(laid.len() as u64) {
+                let start = Instant::now();
+                picture.draw(&Scene { laid: laid.clone(), ..calm.clone() });
+                let with = start.elapsed();
+                let start = Instant::now();
+                picture.draw(&calm);
+                time += with.saturating_sub(start.elapsed());
+            }
+            time.mul_f64(count as f64 / (count.div_ceil(laid.len() as u64) * laid.len() as u64) as f64)
+        });
+    });
+    criterion.final_summary();
+}

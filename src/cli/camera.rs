@@ -1,0 +1,268 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim --camera`: the simulated printer as a webcam.
+
+#![forbid(unsafe_code)]
+
+use std::fs;
+use std::io::ErrorKind;
+use std::net::{SocketAddr, TcpListener, ToSocketAddrs};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use pinion_camera::scene::{
+    Axis, Bed, Display, Fan, Gantry, Heater, Laid, Lamp, Pin, Printer, Probe, Rgb, Scene, Servo, Strip,
+};
+use pinion_firmware::time::CLOCK_FREQ;
+use pinion_firmware::trouble::Trouble;
+use pinion_linux::{LOOK_AT_LOG, sys};
+use pinion_sim::{BedShape, Colour, Look, PartConfig, PathPoint, Recorder, SimConfig, SimProbe, Space};
+
+use crate::runtime;
+
+/// Where the camera is served unless told otherwise.
+pub(super) const ADDRESS: &str = "127.0.0.1:8410";
+/// The camera waits for everything else on this computer.
+const NICE: i32 = 10;
+/// Time between two looks at the steps: the printer keeps half a second of them.
+const READ_PERIOD: Duration = Duration::from_millis(100);
+/// A print begins after a pause of this time, with a piece that is lower than the last one by this much.
+const PAUSE_S: f64 = 20.0;
+const LAYER_MM: f64 = 0.05;
+/// Points of a path that are kept during a pause: what is drawn needs none.
+const POINTS: usize = 10_000;
+/// The color of a light that has only one.
+const WARM_WHITE: Rgb = [255, 240, 205];
+/// What is drawn of a printer without a bed.
+const NO_BED: Space = Space { bed: BedShape::Rectangle { min_mm: [0.0; 2], max_mm: [200.0; 2] }, height_mm: 200.0 };
+
+/// An address as `--camera` takes it.
+pub(super) fn parse(text: &str) -> Result<String, String> {
+    match text.rsplit_once(':') {
+        Some((host, port)) if !host.is_empty() && port.parse::<u16>().is_ok() => Ok(text.to_owned()),
+        _ => Err(format!("give ADDR:PORT, such as {ADDRESS}; a FILE.toml comes before --camera")),
+    }
+}
+
+/// A camera that nobody can look through yet.
+pub(super) struct Camera {
+    listener: TcpListener,
+    gantry: Gantry,
+    probes: Vec<Probe>,
+}
+
+impl Camera {
+    /// Takes the address, and what never changes about the printer.
+    pub(super) fn open(address: &str, config: &SimConfig) -> Result<Camera, Trouble> {
+        let listener = bind(address).map_err(|trouble| trouble.of(format_args!("--camera {address}")))?;
+        let gantry = match &config.delta {
+            Some(delta) => Gantry::Delta { towers_mm: delta.towers_mm(), arm_mm: delta.arm_mm },
+            None if config.corexy => Gantry::CoreXy,
+            None => Gantry::Cartesian,
+        };
+        Ok(Camera { listener, gantry, probes: config.parts.iter().filter_map(probe).collect() })
+    }
+
+    /// Serves the picture from now on, and says where. Call it before this thread runs in real time: the camera's
+    /// threads get its scheduling.
+    pub(super) fn start(self, sim: SimProbe) -> Result<(), Trouble> {
+        let Camera { listener, gantry, probes } = self;
+        let Space { bed, height_mm } = sim.space().unwrap_or(NO_BED);
+        let printer = Printer { bed: shape(bed), height_mm, gantry };
+        let address = listener.local_addr().map_err(|error| Trouble::new(error.to_string()).of("--camera"))?;
+        let thread = thread::Builder::new().name("camera".into()).spawn(move || {
+            if let Err(error) = sys::set_nice(NICE) {
+                log::debug!("the camera's nice value: {error}");
+            }
+            let laid = Arc::new(Mutex::new(Vec::new()));
+            let mut filament = Filament::new(sim.clone(), laid.clone());
+            let start = Instant::now();
+            let look = move || {
+                let laid = std::mem::take(&mut *laid.lock().unwrap_or_else(PoisonError::into_inner));
+                Scene { seconds: start.elapsed().as_secs_f64(), laid, ..scene(&sim, &probes) }
+            };
+            let thread = thread::Builder::new().name("camera path".into()).spawn(move || {
+                loop {
+                    filament.read();
+                    thread::sleep(READ_PERIOD);
+                }
+            });
+            let Err(error) = thread.and_then(|_| pinion_camera::serve(&listener, printer, look));
+            log::error!("the camera shows nothing: {error}: free memory, or raise ulimit -u, and start again");
+        });
+        runtime::started(thread)?;
+        let url = url(address);
+        log::info!("camera: {url}/ in a browser, {url}/stream and {url}/snapshot in Mainsail or Fluidd");
+        Ok(())
+    }
+}
+
+/// The filament that the nozzle lays. The printer keeps the last steps only, so somebody has to read them even while
+/// nobody looks.
+struct Filament {
+    sim: SimProbe,
+    recorder: Recorder,
+    /// The number of points that were read.
+    read: usize,
+    /// The last point where filament was laid.
+    last: Option<PathPoint>,
+    /// What is still to be drawn.
+    laid: Arc<Mutex<Vec<Laid>>>,
+}
+
+impl Filament {
+    fn new(sim: SimProbe, laid: Arc<Mutex<Vec<Laid>>>) -> Filament {
+        Filament { recorder: sim.recorder(), sim, read: 1, last: None, laid }
+    }
+
+    fn read(&mut self) {
+        let now = self.sim.now();
+        self.recorder.read(now);
+        let points = self.recorder.points();
+        let mut new = Vec::new();
+        for pair in points[self.read - 1..].windows(2) {
+            let (from, to) = (pair[0], pair[1]);
+            if to.laid_mm <= 0.0 || to.is_start {
+                continue;
+            }
+            let begins = self.last.is_none_or(|last| {
+                let pause_s = to.at.since(last.at) as f64 / CLOCK_FREQ as f64;
+                pause_s > PAUSE_S && to.nozzle_mm[2] < last.nozzle_mm[2] - LAYER_MM
+            });
+            self.last = Some(to);
+            new.push(piece(&from, &to, begins));
+        }
+        self.read = points.len();
+        let is_calm = points.last().is_none_or(|last| now.since(last.at) as f64 > PAUSE_S * CLOCK_FREQ as f64);
+        if self.recorder.is_full() || (is_calm && self.read > POINTS) {
+            (self.recorder, self.read) = (self.sim.recorder(), 1);
+        }
+        if !new.is_empty() {
+            self.laid.lock().unwrap_or_else(PoisonError::into_inner).extend(new);
+        }
+    }
+}
+
+fn piece(from: &PathPoint, to: &PathPoint, begins: bool) -> Laid {
+    let mm = |axis: usize| to.nozzle_mm[axis] - from.nozzle_mm[axis];
+    let length_mm = (mm(0) * mm(0) + mm(1) * mm(1) + mm(2) * mm(2)).sqrt();
+    let seconds = to.at.since(from.at) as f64 / CLOCK_FREQ as f64;
+    let [from_mm, to_mm] = [from, to].map(|point| point.nozzle_mm.map(|mm| mm as f32));
+    Laid { from_mm, to_mm, mm_per_s: (length_mm / seconds) as f32, begins }
+}
+
+/// How a browser gets to the camera.
+fn url(address: SocketAddr) -> String {
+    match fs::read_to_string("/proc/sys/kernel/hostname") {
+        Ok(name) if address.ip().is_unspecified() => format!("http://{}:{}", name.trim(), address.port()),
+        _ => format!("http://{address}"),
+    }
+}
+
+fn bind(address: &str) -> Result<TcpListener, Trouble> {
+    let unknown = |cause: String| {
+        Trouble::new(format!("the name has no address: {cause}"))
+            .remedy("use an IP address, such as 127.0.0.1 or 0.0.0.0")
+    };
+    let addresses = address.to_socket_addrs().map_err(|error| unknown(error.to_string()))?;
+    let mut refused = unknown("it is unknown".into());
+    for address in addresses {
+        match TcpListener::bind(address) {
+            Ok(listener) => return Ok(listener),
+            Err(error) => refused = refusal(&error),
+        }
+    }
+    Err(refused)
+}
+
+fn refusal(error: &std::io::Error) -> Trouble {
+    let (cause, remedy) = match error.kind() {
+        ErrorKind::AddrInUse => {
+            ("another program uses the port".to_owned(), "choose another port, or end that program (ss -ltnp)")
+        }
+        ErrorKind::AddrNotAvailable => (
+            "this computer does not have the address".to_owned(),
+            "use one that `ip address` lists, or 0.0.0.0 for all of them",
+        ),
+        ErrorKind::PermissionDenied => (format!("the port is not for everybody: {error}"), "choose a port above 1023"),
+        _ => (error.to_string(), LOOK_AT_LOG),
+    };
+    Trouble::new(cause).remedy(remedy)
+}
+
+fn shape(bed: BedShape) -> Bed {
+    match bed {
+        BedShape::Rectangle { min_mm: [x0, y0], max_mm: [x1, y1] } => Bed::Rectangle { x_mm: [x0, x1], y_mm: [y0, y1] },
+        BedShape::Disc { radius_mm } => Bed::Disc { radius_mm },
+    }
+}
+
+/// A probe with its tip. `None` for another part.
+fn probe(part: &PartConfig) -> Option<Probe> {
+    let (name, x, y, z) = match part {
+        PartConfig::Probe(probe) => ("probe", probe.x_offset_mm, probe.y_offset_mm, probe.z_offset_mm),
+        PartConfig::Bltouch(probe) => ("bltouch", probe.x_offset_mm, probe.y_offset_mm, probe.z_offset_mm),
+        _ => return None,
+    };
+    Some(Probe { name: name.into(), offset_mm: [x, y, -z], pin: None })
+}
+
+/// The printer now.
+fn scene(sim: &SimProbe, probes: &[Probe]) -> Scene {
+    let mut scene = Scene { nozzle_mm: sim.nozzle_mm(), probes: probes.to_vec(), ..Scene::default() };
+    for axis in sim.axes() {
+        let (name, position_mm, lost_steps) = (axis.name.into(), axis.position_mm, axis.lost_steps);
+        scene.axes.push(Axis { name, position_mm, lost_steps });
+    }
+    for heater in sim.heaters() {
+        scene.heaters.push(Heater { name: heater.name.into(), celsius: heater.celsius, on: heater.on });
+    }
+    scene.fans.extend(sim.fans().map(|fan| Fan { name: fan.name.into(), rpm: fan.rpm }));
+    for output in sim.outputs() {
+        let (name, brightness) = (output.name.into(), output.brightness);
+        scene.lamps.push(Lamp { name, brightness, color: WARM_WHITE });
+    }
+    for (name, look) in sim.sights() {
+        show(&mut scene, name, look);
+    }
+    scene
+}
+
+/// Adds what a part looks like.
+fn show(scene: &mut Scene, part: &str, look: Look) {
+    let name = part.to_owned();
+    match look {
+        Look::Lights { colours, .. } => match &colours[..] {
+            // Its brightness is that of its brightest part.
+            [light] => {
+                let shown = rgb(*light);
+                let most = shown.into_iter().max().unwrap_or(0);
+                let color =
+                    shown.map(|part| if most == 0 { 0 } else { (u32::from(part) * 255 / u32::from(most)) as u8 });
+                scene.lamps.push(Lamp { name, brightness: f64::from(most) / 255.0, color });
+            }
+            _ => scene.strips.push(Strip { name, lights: colours.into_iter().map(rgb).collect() }),
+        },
+        Look::Pixels { width, is_on, lit, .. } => {
+            let pixels = lit.into_iter().map(|is_lit| is_lit && is_on).collect();
+            scene.displays.push(Display { name, width, pixels });
+        }
+        Look::Angle { degrees } => scene.servos.push(Servo { name, degrees }),
+        Look::Pin { is_down, alarm } => {
+            let pin = match (alarm, is_down) {
+                (true, _) => Pin::Alarm,
+                (false, true) => Pin::Out,
+                (false, false) => Pin::In,
+            };
+            if let Some(probe) = scene.probes.iter_mut().find(|probe| probe.name == part) {
+                probe.pin = Some(pin);
+            }
+        }
+        Look::Power { share } => scene.lamps.push(Lamp { name, brightness: share, color: WARM_WHITE }),
+    }
+}
+
+/// The color that an eye sees: the white part adds to all others.
+fn rgb(Colour { red, green, blue, white }: Colour) -> Rgb {
+    [red, green, blue].map(|part| part.saturating_add(white))
+}

@@ -1,0 +1,158 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim --camera`: the simulated printer as a webcam, while a host drives it.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::io::{ErrorKind, Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+
+use nix::sys::signal::Signal;
+use pinion_client::Client;
+
+use crate::process::{Pinion, WAIT_MAX, exists, output};
+
+const X_AXIS: &[&str] = &[
+    "allocate_oids count=2",
+    "config_digital_out oid=0 pin=x_enable value=0 default_value=0 max_duration=0",
+    "config_stepper oid=1 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
+    "finalize_config crc=1",
+];
+
+/// A printer with a camera at a free port. It says where that is.
+fn start(args: &[&str]) -> (Pinion, SocketAddr) {
+    let pinion = Pinion::start(&[&["sim", "--camera", "127.0.0.1:0"], args].concat());
+    let line = pinion.logged("camera: http://");
+    let address = line.split("http://").nth(1).unwrap().split('/').next().unwrap().parse().unwrap();
+    pinion.wait_for_link();
+    (pinion, address)
+}
+
+fn request(address: SocketAddr, target: &str) -> TcpStream {
+    let mut stream = TcpStream::connect(address).unwrap();
+    stream.set_read_timeout(Some(WAIT_MAX)).unwrap();
+    stream.write_all(format!("GET {target} HTTP/1.1\r\nHost: {address}\r\n\r\n").as_bytes()).unwrap();
+    stream
+}
+
+fn snapshot(address: SocketAddr) -> Vec<u8> {
+    let mut answer = Vec::new();
+    request(address, "/snapshot").read_to_end(&mut answer).unwrap();
+    assert!(answer.starts_with(b"HTTP/1.1 200 OK\r\n"), "{}", String::from_utf8_lossy(&answer));
+    let body = answer.windows(4).position(|four| four == b"\r\n\r\n").unwrap() + 4;
+    let jpeg = answer.split_off(body);
+    assert!(jpeg.starts_with(&[0xff, 0xd8]) && jpeg.ends_with(&[0xff, 0xd9]));
+    jpeg
+}
+
+/// Moves x by 10 mm.
+fn move_x(client: &mut Client, dir: u8) {
+    let clock = client.clock_in(0.2).unwrap().wire();
+    for line in [
+        format!("reset_step_clock oid=1 clock={clock}"),
+        format!("set_next_step_dir oid=1 dir={dir}"),
+        "queue_step oid=1 interval=25000 count=800 add=0".into(),
+    ] {
+        client.send_line(&line).unwrap();
+    }
+}
+
+#[test]
+fn the_picture_changes_while_an_axis_moves_and_is_the_same_when_it_is_back() {
+    let (mut pinion, camera) = start(&["--show"]);
+    let mut client = Client::connect(&pinion.link(), WAIT_MAX).unwrap();
+    for line in X_AXIS {
+        client.send_line(line).unwrap();
+    }
+    assert!(client.status().unwrap().is_config);
+    // The push-pin of the built-in printer's probe goes up at the start.
+    pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
+    let before = snapshot(camera);
+    assert!(snapshot(camera) == before, "nothing has moved");
+    move_x(&mut client, 1);
+    pinion.until("the move", || pinion.out().contains("x: 70.00 mm"));
+    assert!(snapshot(camera) != before, "x has moved");
+    move_x(&mut client, 0);
+    pinion.until("the way back", || pinion.out().ends_with("x: 60.00 mm\n"));
+    assert!(snapshot(camera) == before, "x is back");
+    assert!(!client.status().unwrap().is_shutdown);
+    drop(client);
+    // A viewer keeps nobody.
+    let _viewer = request(camera, "/stream");
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+    assert!(!exists(&pinion.link()));
+}
+
+/// The scheduling policy and the nice value of each of the program's threads whose name begins with `camera`
+/// (proc_pid_stat(5), fields 41 and 19).
+fn camera_threads(pinion: &Pinion) -> Vec<(String, i64, i64)> {
+    let folders = fs::read_dir(format!("/proc/{}/task", pinion.pid())).unwrap().map(|entry| entry.unwrap().path());
+    let threads = folders.filter_map(|folder| {
+        let name = fs::read_to_string(folder.join("comm")).ok()?.trim().to_owned();
+        // The third field comes after the name, which is in parentheses.
+        let stat = fs::read_to_string(folder.join("stat")).ok()?;
+        let fields: Vec<i64> =
+            stat.rsplit_once(") ")?.1.split_whitespace().map(|field| field.parse().unwrap_or(0)).collect();
+        name.starts_with("camera").then(|| (name, fields[41 - 3], fields[19 - 3]))
+    });
+    threads.collect()
+}
+
+#[test]
+fn no_thread_of_the_camera_is_in_a_hurry() {
+    let (pinion, camera) = start(&["-r", "--show"]);
+    let mut viewer = request(camera, "/stream");
+    viewer.read_exact(&mut [0; 1000]).unwrap();
+    let threads = camera_threads(&pinion);
+    let names: BTreeSet<&str> = threads.iter().map(|(name, ..)| name.as_str()).collect();
+    assert_eq!(names, BTreeSet::from(["camera", "camera path", "camera pen", "camera viewer"]));
+    assert!(threads.iter().all(|(_, policy, nice)| (*policy, *nice) == (0, 10)), "SCHED_OTHER, and nice: {threads:?}");
+}
+
+#[test]
+fn it_works_with_the_demonstration() {
+    let (mut pinion, camera) = start(&[]);
+    pinion.until("the first move", || pinion.out().contains("home x"));
+    let before = snapshot(camera);
+    pinion.until("a picture of the move", || snapshot(camera) != before);
+    pinion.signal(Signal::SIGTERM);
+    assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());
+}
+
+#[test]
+fn nobody_else_reaches_it_unless_told() {
+    let (_pinion, camera) = start(&["--show"]);
+    let elsewhere = SocketAddr::from(([127, 0, 0, 2], camera.port()));
+    assert_eq!(TcpStream::connect(elsewhere).unwrap_err().kind(), ErrorKind::ConnectionRefused);
+    let open = Pinion::start(&["sim", "--show", "--camera", "0.0.0.0:0"]);
+    let line = open.logged("camera: http://");
+    let port = line.split("http://").nth(1).unwrap().split('/').next().unwrap().rsplit(':').next().unwrap();
+    snapshot(SocketAddr::from(([127, 0, 0, 2], port.parse().unwrap())));
+    // Without an address it is this computer's own.
+    let help = String::from_utf8(output(&["sim", "--help"]).stdout).unwrap();
+    let words: Vec<&str> = help.split_whitespace().collect();
+    assert!(words.join(" ").contains("on 127.0.0.1:8410 unless told"), "{help}");
+}
+
+#[test]
+fn an_address_that_cannot_be_served_is_one_line_with_a_remedy() {
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = taken.local_addr().unwrap().port();
+    for (address, cause) in [
+        (format!("127.0.0.1:{port}"), "another program uses the port: choose another port"),
+        ("192.0.2.1:8410".into(), "this computer does not have the address: use one that"),
+        ("no-such-name.invalid:8410".into(), "the name has no address: "),
+    ] {
+        let mut pinion = Pinion::start(&["sim", "--show", "--camera", &address]);
+        assert_eq!(pinion.end().code(), Some(1), "{address}");
+        let log = pinion.log();
+        assert_eq!(log.lines().count(), 1, "{log}");
+        assert!(log.contains(&format!("ERROR --camera {address}: {cause}")), "{log}");
+        assert!(!exists(&pinion.link()) && pinion.out().is_empty());
+    }
+    for text in ["printer.toml", ":8410", "localhost:http", "127.0.0.1:70000"] {
+        let refused = output(&["sim", "--camera", text]);
+        assert_eq!(refused.status.code(), Some(2), "{text}");
+        assert!(String::from_utf8_lossy(&refused.stderr).contains("give ADDR:PORT, such as 127.0.0.1:8410"));
+    }
+}
