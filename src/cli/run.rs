@@ -85,7 +85,8 @@ pub(super) fn run(args: &RunArgs, log_level: Option<LevelFilter>) -> ExitCode {
     let clock = Monotonic::start();
     // A simulated printer needs no guardian.
     let guarded = settings.board == BoardName::Linux;
-    let recording = Recording::new(clock, &settings.symlink, settings.realtime, folders());
+    let recording = Recording::new(clock, &settings.symlink, settings.realtime, folders())
+        .map(|recording| recording.over(&settings.link));
     // /dev/mem is opened later, when a line of its chip is claimed.
     let rights = sys::SERVE | if settings.fast_gpio == FastGpio::DevMem { sys::RAW_MEMORY } else { 0 };
     let helpers = recording.and_then(|recording| {

@@ -71,9 +71,9 @@ pub enum Event {
     BlockIn(u32),
     /// The link wrote this many bytes to the host.
     Out(u32),
-    /// A host opened the terminal.
+    /// A host opened the terminal. On a wire: its first bytes came.
     HostCame,
-    /// The last host closed the terminal.
+    /// The last host closed the terminal. On a wire: it was silent for too long, or the port was gone.
     HostGone,
     /// The link refused what came from the host.
     Refused(Refusal),

@@ -69,6 +69,9 @@ pub struct Head {
     pub version: String,
     /// The path of its link.
     pub link: String,
+    /// The wire to another computer, such as `can:can0`, if there is one.
+    #[serde(default)]
+    pub wire: Option<String>,
     /// What ended it.
     pub end: End,
     /// When it ended, in ticks of the MCU's clock ([`Clock::to_bits`]).
@@ -221,6 +224,7 @@ pub(crate) mod tests {
         let head = Head {
             version: "pinion-test".into(),
             link: "/tmp/klipper_host_mcu".into(),
+            wire: None,
             end,
             ended_at: last.unwrap_or(Clock::EPOCH).to_bits(),
             utc_ms: 1_795_348_800_000,

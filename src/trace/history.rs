@@ -154,6 +154,8 @@ impl<'a> History<'a> {
             Event::Scheduling { fifo: false } => "runs without real time (SCHED_OTHER)".to_owned(),
             Event::BlockIn(number) => format!("block {number} came from the host"),
             Event::Out(bytes) => format!("wrote {bytes} bytes to the host"),
+            Event::HostCame if self.head.wire.is_some() => "a host came".to_owned(),
+            Event::HostGone if self.head.wire.is_some() => "the host is gone".to_owned(),
             Event::HostCame => "a host opened the terminal".to_owned(),
             Event::HostGone => "the host closed the terminal".to_owned(),
             Event::Refused(Refusal::Garbage) => "garbage came from the host".to_owned(),

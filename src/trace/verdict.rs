@@ -47,6 +47,8 @@ pub enum Culprit {
     Nobody,
     /// The host.
     Host,
+    /// The wire to the host, or all of the computer at its other end.
+    Wire,
     /// A bus, or a device on it.
     Bus,
     /// Other programs, which had the processors.
@@ -175,10 +177,14 @@ fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
     };
     what += &resent(record, (due.min(came) - SILENCE, 0));
     what += &on_time(record);
-    with_power(record, (due, 0), Finding::new(Culprit::Host, what, HOST_REMEDY))
+    let remedy = match &record.trace.head.wire {
+        Some(wire) => format!("look at the host's load, and at the wire ({wire})"),
+        None => "look at the host's load".to_owned(),
+    };
+    with_power(record, (due, 0), Finding::new(Culprit::Host, what, remedy))
 }
 
-const HOST_REMEDY: &str = "look at the host's load";
+const WIRE_REMEDY: &str = "look at the wire, and whether the computer at its other end is on";
 
 /// The host did not refresh an output before `due`.
 fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
@@ -189,9 +195,20 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
             return found;
         }
     }
+    let wire = record.trace.head.wire.as_ref();
     if let Some(gone) = record.host_gone() {
-        let what = format!("the host closed the terminal {} before the stop", span_text(-gone));
-        return Finding::new(Culprit::Host, what, "its log tells why it ended");
+        let before = span_text(-gone);
+        return match wire {
+            Some(wire) => Finding::new(
+                Culprit::Wire,
+                format!("the host was gone from {wire} {before} before the stop"),
+                WIRE_REMEDY,
+            ),
+            None => {
+                let what = format!("the host closed the terminal {before} before the stop");
+                Finding::new(Culprit::Host, what, "its log tells why it ended")
+            }
+        };
     }
     let Some(before) = record.last_block() else {
         return Finding::new(Culprit::Unknown, format!("not known when the host sent something: {trouble}"), "");
@@ -213,7 +230,14 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
     if let Some(finding) = of_link(record, (before, 0)) {
         return finding;
     }
-    let alive = match record.signs_of_host((before + PROMPT, 0)) {
+    let span = (before + PROMPT, 0);
+    let signs = record.signs_of_host(span);
+    if let Some(wire) = wire.filter(|_| signs == (0, false)) {
+        let came = if record.has_garbage(span) { "only garbage" } else { "nothing" };
+        let what = format!("{came} came over {wire} for {}{}", span_text(-before), on_time(record));
+        return with_power(record, (before, 0), Finding::new(Culprit::Wire, what, WIRE_REMEDY));
+    }
+    let alive = match signs {
         (0, true) => ", but it still asked for the clock".to_owned(),
         _ => resent(record, (before, 0)),
     };
@@ -615,6 +639,14 @@ mod tests {
         }
 
         #[track_caller]
+        fn judged_over(self, wire: &str, culprit: Culprit, text: &str) {
+            let mut trace = self.trace(End::Shutdown { reason: MISSED_PWM.into(), trouble: TROUBLE.into() });
+            trace.head.wire = Some(wire.into());
+            let told = verdict(&trace);
+            assert_eq!((told.culprit, told.text.as_str()), (culprit, text));
+        }
+
+        #[track_caller]
         fn judged(self, reason: &str, culprit: Culprit, text: &str) {
             let end = End::Shutdown { reason: reason.into(), trouble: TROUBLE.into() };
             self.told(end, culprit, text);
@@ -980,6 +1012,35 @@ mod tests {
             MISSED_PWM,
             Culprit::Processors,
             "the link to the host waited 3.9 s for a processor: other real-time work had it: look for that (ps -eLo rtprio,comm), or give the core a processor of its own",
+        );
+    }
+
+    #[test]
+    fn a_wire_that_is_cut_is_told_by_its_name() {
+        const LOOK: &str = "look at the wire, and whether the computer at its other end is on";
+        let silent = || Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP).stop(9, STOP - 100);
+        silent().judged_over(
+            "can:can0",
+            Culprit::Wire,
+            &format!("nothing came over can:can0 for 4.4 s; the core was never later than 0.1 ms: {LOOK}"),
+        );
+        silent().and("link", STOP - 2 * SECOND, Event::Refused(Refusal::Garbage)).judged_over(
+            "serial:/dev/ttyAMA0,250000",
+            Culprit::Wire,
+            &format!(
+                "only garbage came over serial:/dev/ttyAMA0,250000 for 4.4 s; the core was never later than 0.1 ms: {LOOK}"
+            ),
+        );
+        silent().and("link", STOP - 3 * SECOND, Event::HostGone).judged_over(
+            "serial:/dev/ttyGS0",
+            Culprit::Wire,
+            &format!("the host was gone from serial:/dev/ttyGS0 3.0 s before the stop: {LOOK}"),
+        );
+        // The wire is whole: the host says something.
+        silent().and("link", STOP - SECOND, Event::Answered { id: 4 }).judged_over(
+            "can:can0",
+            Culprit::Host,
+            "the host sent no commands for 4.4 s, but it still asked for the clock; the core was never later than 0.1 ms: look at its log, and at its load",
         );
     }
 

@@ -30,6 +30,8 @@ struct Wire {
     mcu: Pinion,
     host: Client,
     cut: Cut,
+    /// What the verdict says, if it stops a heater.
+    verdict: &'static str,
 }
 
 /// Cuts the wire.
@@ -83,7 +85,7 @@ fn levels(status: &Value) -> [&Value; 2] {
 }
 
 fn is_cut_with(start: &dyn Fn() -> Wire, has_heater: bool) {
-    let Wire { mcu, mut host, cut } = start();
+    let Wire { mcu, mut host, cut, verdict } = start();
     begin(&mut host, has_heater);
     let mut whole = cut(&mcu, host);
     mcu.logged("host gone");
@@ -93,6 +95,7 @@ fn is_cut_with(start: &dyn Fn() -> Wire, has_heater: bool) {
         let after = status(&mcu);
         assert_eq!(after["state"], "shutdown");
         assert_eq!(levels(&after), [0, 0], "all its outputs");
+        mcu.logged(verdict);
     } else {
         // Nothing else stops.
         thread::sleep(Duration::from_secs_f64(HEAT_S));
@@ -161,7 +164,7 @@ fn a_serial_port_that_is_pulled_out() {
                 client(host)
             })
         };
-        Wire { mcu, host, cut: Box::new(cut) }
+        Wire { mcu, host, cut: Box::new(cut), verdict: "the host was gone from serial:" }
     });
 }
 
@@ -173,7 +176,7 @@ fn a_serial_line_on_which_nothing_comes_any_more() {
             let mut host = Some(host);
             Box::new(move |_| host.take().unwrap())
         };
-        Wire { mcu, host, cut: Box::new(cut) }
+        Wire { mcu, host, cut: Box::new(cut), verdict: "nothing came over serial:" }
     });
 }
 
@@ -189,7 +192,7 @@ fn an_ssh_that_is_killed() {
             drop(host);
             Box::new(move |_| next_over(&near))
         };
-        Wire { mcu, host, cut: Box::new(cut) }
+        Wire { mcu, host, cut: Box::new(cut), verdict: "the host closed the terminal" }
     });
 }
 
@@ -208,6 +211,6 @@ fn an_ssh_that_carries_nothing_any_more() {
                 next_over(&near)
             })
         };
-        Wire { mcu, host, cut: Box::new(cut) }
+        Wire { mcu, host, cut: Box::new(cut), verdict: "the host sent no commands for" }
     });
 }

@@ -38,6 +38,7 @@ fn late_host() -> Trace {
     let head = Head {
         version: "pinion-test".into(),
         link: "/tmp/klipper_host_mcu".into(),
+        wire: None,
         end: End::Shutdown { reason: "Timer too close".into(), trouble: "stepper oid 3: too late".into() },
         ended_at: at(0).to_bits(),
         utc_ms: UTC_MS,

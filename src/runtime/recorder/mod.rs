@@ -43,6 +43,7 @@ use crate::trace::ring::Writer;
 use crate::trace::verdict::verdict;
 use crate::{FIRMWARE, status};
 
+use super::link::LinkName;
 use super::status::Place;
 
 use computer::Computer;
@@ -69,6 +70,7 @@ pub struct Recording {
     memory: Memory,
     clock: Monotonic,
     link: PathBuf,
+    wire: Option<String>,
     realtime: bool,
     folders: Vec<PathBuf>,
 }
@@ -82,7 +84,12 @@ impl Recording {
     /// The kernel has no memory for it.
     pub fn new(clock: Monotonic, link: &Path, realtime: bool, folders: Vec<PathBuf>) -> Result<Recording, Trouble> {
         let memory = Memory::new().map_err(super::no_room)?;
-        Ok(Recording { memory, clock, link: link.to_owned(), realtime, folders })
+        Ok(Recording { memory, clock, link: link.to_owned(), wire: None, realtime, folders })
+    }
+
+    /// The recording of an instance that serves its host over this link.
+    pub fn over(self, link: &LinkName) -> Recording {
+        Recording { wire: (!link.is_local()).then(|| link.to_string()), ..self }
     }
 
     #[cfg(any(test, fuzzing))]
@@ -130,6 +137,7 @@ impl Recording {
         let head = Head {
             version: FIRMWARE.version.to_owned(),
             link: self.link.display().to_string(),
+            wire: self.wire.clone(),
             end,
             ended_at: ended_at.to_bits(),
             utc_ms: now.saturating_sub(ago).as_millis() as u64,

@@ -149,7 +149,12 @@ impl<'a> Record<'a> {
         (repeated, events().any(|event| matches!(event, Event::Answered { .. })))
     }
 
-    /// When the last host closed the terminal, if none has opened it since.
+    /// Whether garbage came from the host in a span.
+    pub(super) fn has_garbage(&self, span: Span) -> bool {
+        self.within("link", span).any(|(_, event)| event == Event::Refused(Refusal::Garbage))
+    }
+
+    /// When the last host was gone, if none has come since.
     pub(super) fn host_gone(&self) -> Option<i64> {
         let mut hosts = self.thread("link").filter(|(_, event)| matches!(event, Event::HostCame | Event::HostGone));
         hosts.rfind(|(at, _)| *at <= 0).filter(|(_, event)| *event == Event::HostGone).map(|(at, _)| at)
