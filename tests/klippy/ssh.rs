@@ -77,8 +77,8 @@ fn klippy_prints_over_ssh_and_returns_after_the_connection_was_lost() {
     kill(Pid::from_raw(ssh), Signal::SIGKILL).unwrap();
     printer.until_state("shutdown");
     printer.host_log("Lost communication with MCU 'mcu'", 1);
-    // klippy cannot reset an MCU that does not answer it, and FIRMWARE_RESTART takes this for a failure. At a RESTART it
-    // resets the MCU once it has connected.
+    // klippy cannot reset an MCU that does not answer it, and FIRMWARE_RESTART takes this for a failure. A RESTART goes on
+    // with the configuration that the MCU has.
     printer.restart("RESTART");
     printer.gcode("G28");
     let log = std::fs::read_to_string(path.with_extension("log")).unwrap();
