@@ -34,7 +34,7 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage mutants
+.PHONY: help run demo mainsail test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage mutants
 .PHONY: sanitize bench check build install install-program install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
@@ -46,6 +46,7 @@ $(PACKAGES): system-packages-%:
 help:
 	@echo 'make run           build, home and heat a simulated printer, then serve a real host until Ctrl-C'
 	@echo 'make demo          the same without serving; fails if anything shown was not right'
+	@echo 'make mainsail      the simulated printer with Klipper, Moonraker and Mainsail, until Ctrl-C (FOLDER=$(FOLDER))'
 	@echo 'make test          all tests, with those against real kernel drivers in a virtual machine'
 	@echo 'make test-kernel   only the latter'
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
@@ -73,6 +74,11 @@ run: build
 
 demo: build
 	@$(PINION) sim --demo $(REALTIME) $(ARGS)
+
+# With all that it downloads.
+FOLDER ?= $(CARGO_TARGET_DIR)/mainsail
+mainsail: build
+	@PINION='$(PINION)' scripts/mainsail '$(FOLDER)'
 
 build: system-packages-build
 	@$(CARGO) build --release --locked --quiet --bin pinion
