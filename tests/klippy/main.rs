@@ -11,6 +11,7 @@ mod hosts;
 mod klippy;
 mod leveling;
 mod links;
+mod mainsail;
 mod print;
 mod printer_cfg;
 mod probes;
