@@ -83,14 +83,16 @@ pub struct Timing {
     pub clock: Arc<dyn TimeSource>,
     /// The due time of the running timer, which the MCU stores here.
     pub due: Due,
+    /// Longest delay of a timer before the MCU stops.
+    pub late_limit: Ticks,
     /// Longest delay of a step before the MCU stops. A motor that is stepped too late loses steps.
     pub step_late_limit: Ticks,
 }
 
 impl Timing {
-    /// Timing by this clock, with steps at most 1 ms late, as in the firmware.
+    /// Timing by this clock, with timers at most 100 ms late and steps at most 1 ms, as in the firmware.
     pub fn of(clock: Arc<dyn TimeSource>) -> Timing {
-        Timing { clock, due: Due::default(), step_late_limit: Ticks::from_ms(1) }
+        Timing { clock, due: Due::default(), late_limit: Ticks::from_ms(100), step_late_limit: Ticks::from_ms(1) }
     }
 }
 

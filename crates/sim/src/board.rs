@@ -23,7 +23,7 @@ use super::engine::noise::Noise;
 use super::engine::physics::{Axis, Fan, Heater, Lamp, Switch};
 use super::engine::serial::{SerialDevice, SerialWire};
 use super::engine::spi::{MISO, SpiBus, SpiDevice};
-use super::engine::time::{PrinterTime, STEP_LATE_LIMIT};
+use super::engine::time::{LATE_LIMIT, PrinterTime};
 use super::engine::wire::{
     ControllerPin, DirectionPin, EnablePin, EndstopPin, FanPin, FixedInput, HeaterPin, Kind, LampPin, SimAdc, SimEdges,
     SimLine, SimPwm, StepPin, TachometerPin, ThermistorPin, WiredPin,
@@ -158,7 +158,8 @@ impl SimBoard {
 
     /// The time of the MCU that drives the printer.
     pub fn timing(&self) -> Timing {
-        Timing { clock: self.time.clone(), due: self.time.due(), step_late_limit: STEP_LATE_LIMIT }
+        let due = self.time.due();
+        Timing { clock: self.time.clone(), due, late_limit: LATE_LIMIT, step_late_limit: LATE_LIMIT }
     }
 
     fn pin(&self, pin: Pin, no_pin: ShutdownReason) -> Result<&WiredPin, Shutdown> {

@@ -13,8 +13,6 @@ use super::stats::Stats;
 use super::timers::Timers;
 use super::{Mcu, Next, Note, OBJECTS_MAX, Oid, TimerId, Turn, WireClock, base};
 
-/// Longest delay of a timer before the MCU stops: 100 ms, as in the firmware.
-const LATE_LIMIT: Ticks = Ticks::from_ms(100);
 /// Longest wait within a timer's event. Nothing else runs meanwhile, not even a command that stops the MCU.
 pub const SPIN_MAX: Ticks = Ticks::from_us(50);
 /// How many timers run before the MCU checks the delay and commands get a turn (`TIMER_REPEAT_COUNT` of the firmware's
@@ -157,7 +155,7 @@ impl Mcu {
     /// Runs the due timers, up to a limit, so that commands get their turn. True if more timers are due: then one
     /// command gets its turn, if there is one.
     ///
-    /// The firmware runs 20 timers and checks if they are 100 ms late. Then it lets commands run. If there are none, it
+    /// The firmware runs 20 timers and checks if they are too late. Then it lets commands run. If there are none, it
     /// runs 100 more timers before the next check. Pinion does the same, because the place of this check decides if the
     /// MCU stops. A batch counts as one timer.
     pub fn run_timers(&mut self) -> bool {
@@ -175,7 +173,7 @@ impl Mcu {
         }
         let next = self.schedule.timers.next();
         let late = next.map_or(0, |at| self.now().since(at));
-        if let Some(next) = next.filter(|_| late > i64::from(LATE_LIMIT.0))
+        if let Some(next) = next.filter(|_| late > i64::from(self.schedule.timing.late_limit.0))
             && self.stop.reason.is_none()
         {
             let cause = format!(

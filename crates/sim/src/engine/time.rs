@@ -15,9 +15,10 @@ pub fn seconds(earlier: Clock, later: Clock) -> f64 {
     later.since(earlier).max(0) as f64 / f64::from(CLOCK_FREQ)
 }
 
-/// Longest delay of a step. A simulated motor follows at any pace. Most computers that try the printer have no real
-/// time, and are late by milliseconds now and then.
-pub(crate) const STEP_LATE_LIMIT: Ticks = Ticks::from_ms(100);
+/// Longest delay of a timer or a step. A simulated motor follows at any pace. Most computers that try the printer have
+/// no real time. If they are busy, they are late by a tenth of a second now and then. After 550 ms without a sign of life
+/// the guardian ends the program.
+pub(crate) const LATE_LIMIT: Ticks = Ticks::from_ms(400);
 
 /// How far an errand may be ahead of the clock.
 const AHEAD: Ticks = Ticks::from_ms(1);

@@ -27,10 +27,9 @@ use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::noise::Noise;
 use crate::engine::spi::SpiChip;
-use crate::engine::time::STEP_LATE_LIMIT;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
-use pinion_firmware::time::{CLOCK_FREQ, Clock, TimeSource};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, Ticks, TimeSource};
 
 /// CPOL and CPHA are 1.
 const MODE: u8 = 3;
@@ -79,9 +78,9 @@ const Z_NOISE: f64 = 1.1 / 0.75;
 const NOISE_RATE_HZ: f64 = 100.0;
 const G_MM_PER_S2: f64 = 9806.65;
 
-/// How long after a step the chip feels it: the longest delay of a step by the computer. So the chip feels each step as
-/// if it had come at its due time.
-const DELAY_TICKS: u64 = STEP_LATE_LIMIT.0 as u64;
+/// How long after a step the chip feels it. A computer is rarely as late. So the chip feels a step as if it had come at
+/// its due time.
+const DELAY_TICKS: u64 = Ticks::from_ms(100).0 as u64;
 
 /// The chip's description.
 #[derive(Clone, Debug, PartialEq, Deserialize)]
