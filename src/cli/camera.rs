@@ -129,6 +129,9 @@ impl Filament {
                 let pause_s = to.at.since(last.at) as f64 / CLOCK_FREQ as f64;
                 pause_s > PAUSE_S && to.nozzle_mm[2] < last.nozzle_mm[2] - LAYER_MM
             });
+            if begins {
+                new.clear();
+            }
             self.last = Some(to);
             new.push(piece(&from, &to, begins));
         }
@@ -137,9 +140,11 @@ impl Filament {
         if self.recorder.is_full() || (is_calm && self.read > POINTS) {
             (self.recorder, self.read) = (self.sim.recorder(), 1);
         }
-        if !new.is_empty() {
-            self.laid.lock().unwrap_or_else(PoisonError::into_inner).extend(new);
+        let mut laid = self.laid.lock().unwrap_or_else(PoisonError::into_inner);
+        if new.first().is_some_and(|piece| piece.begins) {
+            laid.clear();
         }
+        laid.append(&mut new);
     }
 }
 

@@ -5,16 +5,21 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::path::Path;
+use std::process::{Command, Stdio};
 
 use nix::sys::signal::Signal;
 use pinion_client::Client;
 
 use crate::process::{Pinion, WAIT_MAX, exists, output};
 
-const X_AXIS: &[&str] = &[
-    "allocate_oids count=2",
+/// The x axis is oid 1, the extruder oid 3.
+const MOTORS: &[&str] = &[
+    "allocate_oids count=4",
     "config_digital_out oid=0 pin=x_enable value=0 default_value=0 max_duration=0",
     "config_stepper oid=1 step_pin=x_step dir_pin=x_dir invert_step=0 step_pulse_ticks=100",
+    "config_digital_out oid=2 pin=e_enable value=0 default_value=0 max_duration=0",
+    "config_stepper oid=3 step_pin=e_step dir_pin=e_dir invert_step=0 step_pulse_ticks=100",
     "finalize_config crc=1",
 ];
 
@@ -44,23 +49,25 @@ fn snapshot(address: SocketAddr) -> Vec<u8> {
     jpeg
 }
 
-/// Moves x by 10 mm.
-fn move_x(client: &mut Client, dir: u8) {
+/// 800 steps of these motors: 10 mm of x, 8 mm of filament.
+fn turn(client: &mut Client, motors: &[u8], dir: u8) {
     let clock = client.clock_in(0.2).unwrap().wire();
-    for line in [
-        format!("reset_step_clock oid=1 clock={clock}"),
-        format!("set_next_step_dir oid=1 dir={dir}"),
-        "queue_step oid=1 interval=25000 count=800 add=0".into(),
-    ] {
-        client.send_line(&line).unwrap();
+    for oid in motors {
+        for line in [
+            format!("reset_step_clock oid={oid} clock={clock}"),
+            format!("set_next_step_dir oid={oid} dir={dir}"),
+            format!("queue_step oid={oid} interval=25000 count=800 add=0"),
+        ] {
+            client.send_line(&line).unwrap();
+        }
     }
 }
 
 #[test]
-fn the_picture_changes_while_an_axis_moves_and_is_the_same_when_it_is_back() {
+fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
     let (mut pinion, camera) = start(&["--show"]);
     let mut client = Client::connect(&pinion.link(), WAIT_MAX).unwrap();
-    for line in X_AXIS {
+    for line in MOTORS {
         client.send_line(line).unwrap();
     }
     assert!(client.status().unwrap().is_config);
@@ -68,12 +75,18 @@ fn the_picture_changes_while_an_axis_moves_and_is_the_same_when_it_is_back() {
     pinion.until("the pin", || pinion.out().contains("bltouch: pin up\n"));
     let before = snapshot(camera);
     assert!(snapshot(camera) == before, "nothing has moved");
-    move_x(&mut client, 1);
+    turn(&mut client, &[1], 1);
     pinion.until("the move", || pinion.out().contains("x: 70.00 mm"));
     assert!(snapshot(camera) != before, "x has moved");
-    move_x(&mut client, 0);
+    turn(&mut client, &[1], 0);
     pinion.until("the way back", || pinion.out().ends_with("x: 60.00 mm\n"));
     assert!(snapshot(camera) == before, "x is back");
+    // With the extruder it lays filament, which stays when the head is back.
+    turn(&mut client, &[1, 3], 1);
+    pinion.until("the piece", || pinion.out().ends_with("axis extruder: 8.00 mm\n"));
+    turn(&mut client, &[1], 0);
+    pinion.until("the way back", || pinion.out().ends_with(" x: 60.00 mm\n"));
+    pinion.until("the filament", || snapshot(camera) != before);
     assert!(!client.status().unwrap().is_shutdown);
     drop(client);
     // A viewer keeps nobody.
@@ -155,4 +168,77 @@ fn an_address_that_cannot_be_served_is_one_line_with_a_remedy() {
         assert_eq!(refused.status.code(), Some(2), "{text}");
         assert!(String::from_utf8_lossy(&refused.stderr).contains("give ADDR:PORT, such as 127.0.0.1:8410"));
     }
+}
+
+/// The pixels of a PNG with 8 bits for each color: red, green and blue (PNG specification, "Filtering").
+fn png_pixels(png: &[u8]) -> Vec<[u8; 3]> {
+    let word = |at: usize| u32::from_be_bytes(png[at..at + 4].try_into().unwrap()) as usize;
+    let (width, bits, kind) = (word(16), png[24], png[25]);
+    let size = match (bits, kind) {
+        (8, 2) => 3,
+        (8, 6) => 4,
+        other => panic!("{other:?}"),
+    };
+    let (mut packed, mut at) = (Vec::new(), 8);
+    while at < png.len() {
+        let (length, kind) = (word(at), &png[at + 4..at + 8]);
+        if kind == b"IDAT" {
+            packed.extend(&png[at + 8..at + 8 + length]);
+        }
+        at += length + 12;
+    }
+    let mut rows = Vec::new();
+    flate2::read::ZlibDecoder::new(&packed[..]).read_to_end(&mut rows).unwrap();
+    let mut above = vec![0u8; width * size];
+    let mut pixels = Vec::new();
+    for row in rows.chunks_exact_mut(width * size + 1) {
+        let filter = row[0];
+        let row = &mut row[1..];
+        for i in 0..row.len() {
+            let left = if i < size { 0 } else { i16::from(row[i - size]) };
+            let up = i16::from(above[i]);
+            let corner = if i < size { 0 } else { i16::from(above[i - size]) };
+            let paeth = || {
+                let guess = left + up - corner;
+                let mut near = [left, up, corner];
+                near.sort_by_key(|value| (guess - value).abs());
+                near[0]
+            };
+            let before = match filter {
+                0 => 0,
+                1 => left,
+                2 => up,
+                3 => (left + up) / 2,
+                _ => paeth(),
+            };
+            row[i] = row[i].wrapping_add(before as u8);
+        }
+        above.copy_from_slice(row);
+        pixels.extend(row.chunks_exact(size).map(|pixel| [pixel[0], pixel[1], pixel[2]]));
+    }
+    pixels
+}
+
+#[test]
+fn a_browser_shows_it() {
+    let (_pinion, camera) = start(&["--show"]);
+    let folder = tempfile::tempdir().unwrap();
+    let picture = folder.path().join("page.png");
+    let arg = |name: &str, value: &Path| format!("--{name}={}", value.display());
+    let browser = Command::new("chromium")
+        .args(["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=800,600"])
+        .args(["--timeout=3000".into(), arg("user-data-dir", folder.path()), arg("screenshot", &picture)])
+        .arg(format!("http://{camera}/"))
+        .stderr(Stdio::null())
+        .status();
+    if browser.is_err_and(|error| error.kind() == ErrorKind::NotFound) {
+        // It bypasses the test harness, which captures the output of tests.
+        let _ = writeln!(std::io::stderr(), "\nSKIPPED a_browser_shows_it: it needs chromium (apt install chromium)");
+        return;
+    }
+    let pixels = png_pixels(&fs::read(picture).unwrap());
+    // A page without the picture has one color. The color of the cold bed is on a tenth of the picture.
+    let is_bed = |pixel: &&[u8; 3]| pixel.iter().zip([58, 64, 76]).all(|(a, b): (&u8, u8)| a.abs_diff(b) < 5);
+    let bed = pixels.iter().filter(is_bed).count();
+    assert!(bed > 20_000, "{bed} of {} pixels are the bed's", pixels.len());
 }

@@ -32,7 +32,7 @@ const HEADERS_MAX: usize = 64;
 /// How long a request may take to arrive.
 const REQUEST_TIME: Duration = Duration::from_secs(5);
 /// How long a viewer may take for an answer or a frame.
-const ANSWER_TIME: Duration = Duration::from_secs(10);
+const ANSWER_TIME: Duration = Duration::from_secs(5);
 /// How long what a client still sends is read after an answer, and how much of it.
 const FAREWELL_TIME: Duration = Duration::from_millis(500);
 const FAREWELL_MAX: usize = 256 * 1024;
