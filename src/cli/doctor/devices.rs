@@ -86,6 +86,16 @@ const CLASSES: [Class; 6] = [
     },
 ];
 
+/// The registers of GPIO chips.
+const FAST: Class = Class {
+    check: "fast_gpio",
+    name: "fast lines",
+    access: Access::READ_WRITE,
+    subsystem: "*gpiomem*",
+    enabled_by: None,
+    nodes: "/dev/gpiomem*",
+};
+
 /// Whether the users that Pinion runs as may open the devices, and these serial ports. Without a service it judges the
 /// caller.
 pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &BTreeSet<&str>) -> Vec<Finding> {
@@ -139,14 +149,6 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
     }
     let wants = |wish| instances.iter().any(|instance| instance.settings.fast_gpio == wish);
     if wants(FastGpio::On) {
-        const FAST: Class = Class {
-            check: "fast_gpio",
-            name: "fast lines",
-            access: Access::READ_WRITE,
-            subsystem: "*gpiomem*",
-            enabled_by: None,
-            nodes: "/dev/gpiomem*",
-        };
         findings.push(permission(&FAST).unwrap_or_else(|| {
             let found = "fast lines: fast_gpio is on, and there is no /dev/gpiomem: lines go through the kernel";
             let remedy = "only Raspberry Pi's own kernel has this node: install it, or set fast_gpio to auto";
@@ -352,6 +354,47 @@ pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
         Finding::warning(CHECK, found, "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0")
     });
     [Some(clock), bus].into_iter().flatten().collect()
+}
+
+/// Whether LEDs on these pins are on fast lines, and not refused. Each pin has the link to its MCU.
+pub(super) fn line_leds(computer: &Computer, instances: &[Instance], pins: &BTreeSet<(&Path, &str)>) -> Vec<Finding> {
+    let own = |link: &Path| {
+        let mut own = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
+        own.find(|instance| instance.link.as_deref() == Some(link))
+    };
+    let pins = pins.iter().filter_map(|(link, pin)| Some((own(link)?, pin)));
+    pins.map(|(instance, pin)| line_led(computer, instance, pin)).collect()
+}
+
+fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
+    const CHECK: &str = "leds";
+    let refused = |why: &str, remedy: String| Finding::error(CHECK, format!("LEDs: {pin} is refused: {why}"), remedy);
+    let set = |value: &str| format!("fast_gpio = \"{value}\" in {}, then {}", instance.config(), instance.restart());
+    let nodes = computer.matching(FAST.nodes);
+    let wish = instance.settings.fast_gpio;
+    if wish == FastGpio::Off && !nodes.is_empty() {
+        return refused("fast_gpio is off", set("auto"));
+    }
+    let Some(node) = nodes.first().filter(|_| wish != FastGpio::Off) else {
+        if wish == FastGpio::DevMem {
+            return Finding::ok(CHECK, format!("LEDs: {pin} is written through /dev/mem"));
+        }
+        let remedy = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
+        return refused("this computer has no fast lines (no /dev/gpiomem)", remedy.into());
+    };
+    let node = computer.name(node);
+    if wish == FastGpio::Auto && node != Path::new("/dev/gpiomem") {
+        return refused("fast lines of an RP1 are untested, and fast_gpio is auto", set("on"));
+    }
+    let mut about = fs::metadata(computer.path(&node)).ok().zip(instance.user(computer)).into_iter();
+    if let Some((_, user)) = about.find(|(about, user)| wish != FastGpio::DevMem && !user.may(FAST.access, about)) {
+        let why = format!("{} may not open {}", user.name, node.display());
+        return refused(&why, set("on") + ": pinion doctor then says what is missing");
+    }
+    Finding::ok(
+        CHECK,
+        format!("LEDs: {pin} is on a fast line, if it is one of the processor's own ({})", node.display()),
+    )
 }
 
 /// The holders of GPIO lines.
@@ -657,6 +700,35 @@ mod tests {
         tree.put("proc/device-tree/model", "Raspberry Pi 4");
         tree.put("boot/config.txt", "");
         assert!(leds(&tree.computer(), &BTreeSet::new()).is_empty(), "there are no LEDs");
+    }
+
+    #[test]
+    fn leds_on_a_line_need_registers() {
+        let judged = |nodes: &[(&str, u32)], settings: &str, pin: &str| {
+            let tree = Tree::new();
+            tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
+            tree.put("etc/pinion/pinion.toml", settings);
+            nodes.iter().for_each(|(node, mode)| tree.put_mode(node, "", *mode));
+            let pins = [(Path::new("/tmp/klipper_host_mcu"), pin), (Path::new("/dev/board"), "PA1")];
+            line_leds(&tree.computer(), &instances(&tree.computer()).0, &pins.into())
+        };
+        let refused = |nodes: &[(&str, u32)], settings: &str, why: &str| {
+            let findings = judged(nodes, settings, "host:gpio18");
+            assert_eq!(findings.len(), 1, "{findings:?}");
+            told(&findings, "leds", Error, &format!("host:gpio18 is refused: {why}"))
+        };
+        let (pi_4, pi_5) = (("dev/gpiomem", 0o666), ("dev/gpiomem0", 0o666));
+        told(&judged(&[pi_4], "", "host:gpio18"), "leds", Fine, "host:gpio18 is on a fast line");
+        told(&judged(&[pi_5], "fast_gpio = \"on\"\n", "host:gpio18"), "leds", Fine, "(/dev/gpiomem0)");
+        told(&judged(&[], "fast_gpio = \"/dev/mem\"\n", "host:gpio18"), "leds", Fine, "through /dev/mem");
+        assert!(refused(&[], "", "this computer has no fast lines").contains("spidev0.0"));
+        assert!(refused(&[], "fast_gpio = \"off\"\n", "this computer has no fast lines").contains("spidev0.0"));
+        assert!(
+            refused(&[pi_4], "fast_gpio = \"off\"\n", "fast_gpio is off").contains("fast_gpio = \"auto\" in /etc/")
+        );
+        assert!(refused(&[pi_5], "", "fast lines of an RP1 are untested").contains("\"on\""));
+        refused(&[("dev/gpiomem", 0o600)], "", "pinion may not open /dev/gpiomem");
+        assert!(judged(&[], "board = \"sim\"\n", "host:gpio18").is_empty(), "the simulated printer has any LEDs");
     }
 
     #[test]

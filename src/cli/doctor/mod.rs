@@ -100,6 +100,7 @@ fn examine(computer: &Computer) -> Vec<Group> {
             [
                 devices::presence(computer),
                 devices::leds(computer, &host::leds(&klippys)),
+                devices::line_leds(computer, &instances, &host::line_leds(&klippys)),
                 serial::ports(computer, &host::uarts(&klippys)),
             ]
             .concat(),

@@ -1,6 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Reads klippy's configuration: its pseudo terminals, its LEDs on SPI buses, and its
-//! drivers on serial ports.
+//! Reads klippy's configuration: its pseudo terminals, its LEDs, and its drivers on serial ports.
 
 #![forbid(unsafe_code)]
 
@@ -19,6 +18,8 @@ pub(super) struct Printer {
     pub(super) serials: BTreeSet<PathBuf>,
     /// The `pin` of each `[neopixel]` section that names an SPI device, such as `host:spidev0.0`.
     pub(super) leds: BTreeSet<String>,
+    /// The `pin` of each other `[neopixel]` section, and the `serial` of its MCU.
+    pub(super) line_leds: BTreeSet<(PathBuf, String)>,
     /// The `uart_pin` of each `[tmc...]` section that names a serial port, such as `host:ttyAMA1`.
     pub(super) uarts: BTreeSet<String>,
 }
@@ -31,11 +32,22 @@ pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
     reader.file(config, &mut Vec::new())?;
     let is_spi = |pin: &String| name_of(pin).starts_with("spidev");
     let is_port = |pin: &String| ["tty", "serial"].iter().any(|kind| name_of(pin).starts_with(kind));
+    let on_line = |pin: &String| Some((reader.serials.get(&section_of(pin))?.clone(), pin.clone()));
     Some(Printer {
+        line_leds: reader.led_pins.values().filter(|pin| !is_spi(pin)).filter_map(on_line).collect(),
         serials: reader.serials.into_values().collect(),
         leds: reader.led_pins.into_values().filter(is_spi).collect(),
         uarts: reader.uart_pins.into_values().filter(is_port).collect(),
     })
+}
+
+/// The section of a pin's MCU, as klippy reads the pin (`parse_pin` in klippy/pins.py).
+fn section_of(pin: &str) -> String {
+    let pin = pin.trim_start_matches(['^', '~', '!', ' ']);
+    match pin.split_once(':').map(|(mcu, _)| mcu.trim()) {
+        None | Some("mcu") => "mcu".into(),
+        Some(mcu) => format!("mcu {mcu}"),
+    }
 }
 
 /// A pin's name without the MCU before it.
@@ -141,6 +153,16 @@ mod tests {
         assert_eq!(leds(strip), ["host:spidev0.0"]);
         assert_eq!(leds(&format!("{strip}[neopixel strip]\npin = host: spidev0.1\n")), ["host: spidev0.1"]);
         assert!(leds("[mcu host]\npin: spidev0.0\n#[neopixel a]\n#pin: spidev0.0\n").is_empty());
+    }
+
+    #[test]
+    fn leds_on_lines() {
+        let tree = Tree::new();
+        let text = "[mcu]\nserial: /dev/board\n[mcu host]\nserial: /tmp/klipper_host_mcu\n[neopixel a]\npin: host:spidev0.0\n[neopixel b]\npin: host: gpio18\n[neopixel c]\npin: !PA1\n[neopixel d]\npin: no:PA2\n";
+        tree.put("home/pi/config/printer.cfg", text);
+        let leds = read(&tree.computer(), Path::new(CONFIG)).unwrap().line_leds;
+        let expected = [("/dev/board", "!PA1"), ("/tmp/klipper_host_mcu", "host: gpio18")];
+        assert_eq!(leds, expected.map(|(serial, pin)| (serial.into(), pin.into())).into());
     }
 
     #[test]

@@ -372,10 +372,11 @@ mod tests {
         assert_eq!([-6, -5, -2, -1, 0, 1, 2, 5, 6].map(|n| div_round(n, 4)), [-2, -1, -1, 0, 0, 0, 1, 1, 2]);
     }
 
-    /// A clock on which some waits end half a bit late. `is_late` gets the number of the wait and its length.
+    /// A clock on which some waits end late, by this time. `is_late` gets the number of the wait and its length.
     struct Late<F> {
         clock: VirtualClock,
         waits: AtomicUsize,
+        by: Ticks,
         is_late: F,
     }
 
@@ -393,7 +394,7 @@ mod tests {
             let length = end.since(self.now());
             // Looks for an interruption do not count.
             let late = length > 25 && (self.is_late)(self.waits.fetch_add(1, SeqCst), length);
-            self.clock.set(if late { end + Ticks(BIT.0 / 2) } else { end });
+            self.clock.set(if late { end + self.by } else { end });
         }
     }
 
@@ -402,8 +403,19 @@ mod tests {
         read_len: usize,
         is_late: impl Fn(usize, i64) -> bool + Send + Sync + 'static,
     ) -> (Vec<(Clock, bool)>, Vec<u8>) {
-        let clock = Late { clock: VirtualClock::at(Clock::EPOCH), waits: AtomicUsize::new(1), is_late };
+        exchange_late(&MESSAGE, read_len, Ticks(BIT.0 / 2), is_late)
+    }
+
+    /// The same with another message of this length, and other waits.
+    fn exchange_late(
+        data: &[u8; MESSAGE.len()],
+        read_len: usize,
+        by: Ticks,
+        is_late: impl Fn(usize, i64) -> bool + Send + Sync + 'static,
+    ) -> (Vec<(Clock, bool)>, Vec<u8>) {
+        let clock = Late { clock: VirtualClock::at(Clock::EPOCH), waits: AtomicUsize::new(1), by, is_late };
         let (wire, mut lines, mut message) = uart(Arc::new(clock), |_| ());
+        message.data[..data.len()].copy_from_slice(data);
         message.read_len = read_len;
         lines.exchange(&mut message).unwrap();
         let edges = wire.edges.lock().unwrap()[1..].to_vec();
@@ -444,6 +456,21 @@ mod tests {
             let level = |at: Clock| edges.iter().rev().find(|(from, _)| *from <= at).is_none_or(|(_, level)| *level);
             let bit = |n: u32| level(edges[12].0 + Ticks(n * BIT.0 + BIT.0 / 2));
             assert!((0..8).any(|n| bit(n + 1) != bit_of(&MESSAGE, 31 + n as usize)), "{edges:?}");
+        }
+    }
+
+    /// A driver reads the stop bit in its middle, more or less. If that was low for certain, it has dropped the message.
+    /// Otherwise it may have it.
+    #[test]
+    fn a_write_is_sent_again_if_its_stop_bit_was_low() {
+        // The bytes f5, 00, 06 and 3c: the last edge is that of the stop bit.
+        const WRITE: [u8; MESSAGE.len()] = [0xea, 0x03, 0xc8, 0x20, 0x9e];
+        const STOP: usize = 15;
+        for (late_percent, again) in [(20, false), (50, false), (70, false), (80, true), (300, true)] {
+            let by = Ticks(BIT.0 * late_percent / 100);
+            let (edges, _) = exchange_late(&WRITE, 0, by, |wait, _| wait == STOP);
+            assert_eq!(edges[STOP].0.since(edges[0].0), i64::from(39 * BIT.0 + by.0), "{edges:?}");
+            assert_eq!(falls(&edges), if again { 16 } else { 8 }, "{late_percent} % of a bit: {edges:?}");
         }
     }
 
