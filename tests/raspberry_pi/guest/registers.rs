@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Lines through the chip's registers: which ones are, beside the kernel's driver, and at what cost.
 
+use std::fs;
 use std::process::Command;
 
 use gpio_cdev::{Chip, LineRequestFlags};
@@ -9,7 +10,7 @@ use pinion_firmware::time::CLOCK_FREQ;
 
 use super::homing::{STEP, axis, profile};
 use super::outside::Outside;
-use super::program::{LINK, Pinion, Way};
+use super::program::{LINK, Pinion, Way, both_ways};
 
 /// A line that no test gives to Pinion.
 const OTHER: u32 = 27;
@@ -168,3 +169,80 @@ fn steps_through_registers_cost_less() {
         assert!(costs[1].instructions < costs[0].instructions);
     }
 }
+
+/// What the kernel itself writes and reads, by its tracepoint gpio_value: a "set" or a "get" for each call of any
+/// program.
+struct Calls;
+
+impl Calls {
+    const TRACE: &str = "/sys/kernel/tracing/trace";
+
+    fn count() -> Calls {
+        const ENABLE: &str = "/sys/kernel/tracing/events/gpio/gpio_value/enable";
+        if fs::metadata(ENABLE).is_err() {
+            Command::new("mount").args(["-t", "tracefs", "none", "/sys/kernel/tracing"]).status().expect("mount");
+        }
+        fs::write(ENABLE, "1").expect("the tracepoint");
+        fs::write(Calls::TRACE, "").expect("an empty trace");
+        Calls
+    }
+
+    /// How often the kernel has written lines, and read lines, since [`Calls::count`].
+    fn so_far(&self) -> (usize, usize) {
+        let trace = fs::read_to_string(Calls::TRACE).expect("the trace");
+        let events = trace.lines().filter(|line| line.contains("gpio_value:"));
+        let (set, get): (Vec<_>, Vec<_>) = events.partition(|line| line.contains(" set "));
+        (set.len(), get.len())
+    }
+}
+
+/// A software SPI reads its own bits here, an I2C bus has pull-ups and no chip, and an HX711 is always ready.
+fn bit_banged_buses_and_an_hx711_use_the_registers_by_themselves(way: Way) {
+    const CONFIG: [&str; 7] = [
+        "allocate_oids count=3",
+        "config_spi_without_cs oid=0",
+        "spi_set_sw_bus oid=0 miso_pin=gpio22 mosi_pin=gpio22 sclk_pin=gpio23 mode=0 pulse_ticks=100",
+        "config_i2c oid=1",
+        "i2c_set_sw_bus oid=1 scl_pin=gpio5 sda_pin=gpio6 pulse_ticks=250 address=60",
+        "config_hx71x oid=2 gain_channel=1 dout_pin=gpio12 sclk_pin=gpio13",
+        "finalize_config crc=1",
+    ];
+    let mut outside = Outside::new();
+    for line in [5, 6, 12] {
+        outside.drive(line, true);
+    }
+    let pinion = Pinion::start(way);
+    let mut client = pinion.client();
+    CONFIG.iter().for_each(|line| client.send_line(line).expect(line));
+    client.query("get_uptime", &[], "uptime", None).expect("a configured micro-controller");
+    let told = |(set, get): (usize, usize), name: &str| {
+        println!("{name}, {way:?}: the kernel wrote {set} times and read {get} times");
+        match way {
+            Way::Kernel => assert!(set > 30 && get > 15, "{name}"),
+            Way::Registers => assert_eq!((set, get), (0, 0), "{name}"),
+        }
+    };
+
+    let calls = Calls::count();
+    let sent = [("oid", 0u8.into()), ("data", (&[0x3a_u8, 0xc5][..]).into())];
+    let received = client.query("spi_transfer", &sent, "spi_transfer_response", Some(0)).expect("an answer");
+    assert_eq!(received.bytes("response").expect("bytes"), [0x3a, 0xc5]);
+    told(calls.so_far(), "SPI");
+
+    let calls = Calls::count();
+    let asked = [("oid", 1u8.into()), ("write", (&[0_u8][..]).into()), ("read_len", 1u8.into())];
+    client.query("i2c_transfer", &asked, "i2c_response", Some(1)).expect("an answer");
+    let (set, get) = calls.so_far();
+    println!("I2C, {way:?}: the kernel wrote {set} times and read {get} times");
+    // Only the kernel turns an open drain: at the start, at some of the address's bits, at each clock.
+    assert!(set > 20 && (get == 0) == matches!(way, Way::Registers), "I2C");
+
+    client.send_line("query_hx71x oid=2 rest_ticks=500000").expect("a query");
+    client.query("get_uptime", &[], "uptime", None).expect("it measures");
+    let before = outside.edges(13).len();
+    let calls = Calls::count();
+    outside.drive(12, false);
+    super::gpio::until("two samples are read", || outside.edges(13).len() >= before + 100);
+    told(calls.so_far(), "HX711");
+}
+both_ways!(bit_banged_buses_and_an_hx711_use_the_registers_by_themselves);
