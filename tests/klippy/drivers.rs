@@ -8,7 +8,7 @@ use crate::checkout;
 use crate::klippy::Printer;
 
 /// The registers of a driver by name, from klippy's dump.
-fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
+pub fn dump(printer: &mut Printer, stepper: &str) -> HashMap<String, u32> {
     let said = printer.answer(&format!("DUMP_TMC STEPPER={stepper}"));
     let registers = said.lines().filter_map(|line| {
         let (name, value) = line.trim_start_matches("// ").split_once(':')?;
@@ -93,7 +93,7 @@ fn klippy_sets_up_a_driver_on_a_uart_of_one_wire_or_two() {
 }
 
 /// The x axis gets a driver, too, with another address at the same port.
-fn on_a_port(board: String, _: &std::path::Path) -> String {
+pub fn on_a_port(board: String, _: &std::path::Path) -> String {
     let board = board.replace("uart_pin = \"y_uart\"", "uart_port = \"ttyAMA1\"\naddress = 3");
     board + "\n[[part]]\nkind = \"tmc2209\"\naxis = \"x\"\nuart_port = \"ttyAMA1\"\naddress = 1\n"
 }

@@ -7,7 +7,9 @@ use std::path::{Path, PathBuf};
 
 use pinion_firmware::mcu::Generation;
 
-use super::klippy::{Printer, rest};
+use super::drivers::{dump, on_a_port};
+use super::klippy::{Printer, rest, without};
+use super::probes::on_spi;
 
 /// The checkout of a generation; `None` if there is none.
 pub fn checkout(generation: Generation) -> Option<PathBuf> {
@@ -54,6 +56,31 @@ fn hosts_of_all_generations_use_the_whole_printer() {
         printer.gcode("G28 X");
         assert!(!printer.log().contains(" ERROR "), "{generation}: {}", printer.log());
     }
+}
+
+/// Names of pins that stand for a serial port and for the data lines of an SPI bus. Kalico has its own code for load
+/// cells.
+#[test]
+fn kalico_uses_a_serial_port_and_an_spi_bus_as_pins() {
+    let Some(checkout) = checkout(Generation::Kalico) else { return };
+    let describe = |board: String, trace: &Path| on_spi(on_a_port(board, trace), trace);
+    let mut printer = Printer::start_on(&checkout, describe, |config| {
+        let config = config.replace("[adxl345]\n", "[adxl345]\nrate: 400\n");
+        let config = without(&without(&config, "angle y"), "load_cell ads1220");
+        assert_eq!(config.matches("\nuart_pin: ttyAMA1\n").count(), 2, "{config}");
+        assert!(config.contains("\ndout_pin: spidev4.0/miso\nsclk_pin: spidev4.0\n"), "{config}");
+        config
+    });
+    printer.until_state("ready");
+    printer.until_logged(": dialect kalico, which has ");
+    for (stepper, address) in [("stepper_y", 3), ("stepper_x", 1)] {
+        assert_eq!(dump(&mut printer, stepper)["IOIN"] >> 2 & 3, address);
+    }
+    let said = printer.answer("LOAD_CELL_DIAGNOSTIC");
+    let rate: f64 = rest(&said, "Measured samples per second: ").split(',').next().unwrap().parse().unwrap();
+    assert!((79.0..81.0).contains(&rate), "{said}");
+    printer.gcode("G28 X Y\nG1 X50 Y40 F6000\nM400");
+    assert!(!printer.log().contains("TMC UART ttyAMA1") && !printer.log().contains("HX71x sclk"), "{}", printer.log());
 }
 
 /// Steppers, heaters and fan, hardware PWM, ADCs, thermocouple (SPI), DS18B20, accelerometer (SPI), drivers

@@ -235,7 +235,7 @@ fn klippy_calibrates_a_load_cell() {
 }
 
 /// Puts the default printer's load cell on an SPI bus of its own.
-fn on_spi(board: String, _: &std::path::Path) -> String {
+pub fn on_spi(board: String, _: &std::path::Path) -> String {
     let lines = "dout_pin = \"load_cell_dout\"\nsclk_pin = \"load_cell_sclk\"\n";
     assert!(board.contains(lines));
     board.replace(lines, "bus = \"spidev4.0\"\n") + "\n[[spi_bus]]\nname = \"spidev4.0\"\n"
@@ -262,25 +262,52 @@ fn klippy_reads_a_load_cell_on_an_spi_bus() {
     assert!((number(&said, "g (") - percent).abs() < 0.01, "{said}");
 }
 
+/// The configuration with the load cell as its probe.
+fn probed_by_the_nozzle(config: &str) -> String {
+    with(&without(&without(config, "probe"), "load_cell"), "load_cell_probe", "")
+}
+
+/// Probes by taps. Heights count from `datum_mm`.
+#[track_caller]
+fn tap(printer: &mut Printer, datum_mm: f64, depths_mm: std::ops::Range<f64>) {
+    for (x, y) in [(110.0, 110.0), (30.0, 170.0)] {
+        printer.gcode(&format!("G1 X{x} Y{y} Z2 F6000\nM400"));
+        read_in_time(printer, "PROBE PROBE_SPEED=1");
+        let position = printer.object("probe")["last_probe_position"].clone();
+        let depth_mm = bed_mm(x, y) - datum_mm - position[2].as_f64().unwrap();
+        assert!(depths_mm.contains(&depth_mm), "{depth_mm}");
+    }
+}
+
+/// The trigger is at 75 g, 0.019 mm deep. At 1 mm/s there is a sample for each 0.0125 mm. A busy computer notices it
+/// late.
+const TAP_MM: std::ops::Range<f64> = 0.010..0.060;
+
 #[test]
 fn klippy_probes_by_a_tap_of_the_nozzle_on_the_load_cell() {
     let Some(checkout) = checkout("klippy_probes_by_a_tap_of_the_nozzle_on_the_load_cell") else { return };
-    let mut printer = Printer::start_with(&checkout, |config| {
-        let config = without(&without(&config, "probe"), "load_cell");
-        with(&config, "load_cell_probe", "")
-    });
+    let mut printer = Printer::start_with(&checkout, |config| probed_by_the_nozzle(&config));
     printer.until_state("ready");
     home(&mut printer, "");
-    for (x, y) in [(110.0, 110.0), (30.0, 170.0)] {
-        printer.gcode(&format!("G1 X{x} Y{y} Z2 F6000\nM400"));
-        read_in_time(&mut printer, "PROBE PROBE_SPEED=1");
-        let position = printer.object("probe")["last_probe_position"].clone();
-        let z = position[2].as_f64().unwrap();
-        // The trigger is at 75 g, 0.019 mm deep. At 1 mm/s there is a sample for each 0.0125 mm. A busy computer
-        // notices it late.
-        let depth_mm = bed_mm(x, y) - z;
-        assert!((0.010..0.060).contains(&depth_mm), "{depth_mm}");
+    tap(&mut printer, 0.0, TAP_MM);
+}
+
+#[test]
+fn klippy_homes_and_probes_by_taps_on_a_load_cell_on_an_spi_bus() {
+    let Some(checkout) = checkout("klippy_homes_and_probes_by_taps_on_a_load_cell_on_an_spi_bus") else { return };
+    let mut printer = Printer::start_on(&checkout, on_spi, |config| {
+        let config = homed_by_probe(&probed_by_the_nozzle(&config));
+        let config = config.replace("\n[stepper_z]\n", "\n[stepper_z]\nhoming_speed: 2\nsecond_homing_speed: 1\n");
+        assert!(config.contains("\ndout_pin: spidev4.0/miso\nsclk_pin: spidev4.0\n"), "{config}");
+        config
+    });
+    printer.until_state("ready");
+    for _ in 0..2 {
+        home(&mut printer, "G1 Z5 F600\nM400");
+        // The height is 0 where the nozzle was homed: in the bed, as deep as a tap. A tap has the same depth.
+        tap(&mut printer, bed_mm(110.0, 110.0), -0.050..0.050);
     }
+    assert!(!printer.log().contains("HX71x sclk"), "{}", printer.log());
 }
 
 #[test]
