@@ -17,6 +17,7 @@ use pinion_protocol::block::{Received, Receiver, Refusal, Sequence, frame};
 
 use super::core::Payload;
 use super::link::{Heard, Link};
+use super::sooner;
 use super::status::HostBoard;
 
 /// The text that a shell writes to a pty to stop the MCU, as in Klipper's service file.
@@ -39,6 +40,8 @@ pub(super) struct HostEnd {
     is_attached: bool,
     /// When a host that is silent counts as gone (CLOCK_MONOTONIC).
     silent_until: Option<Duration>,
+    /// How long a host that is there may be silent.
+    silence_max: Option<Duration>,
     /// Shows whether a host is there.
     shown: Arc<HostBoard>,
 }
@@ -70,6 +73,7 @@ impl HostEnd {
     /// The end of a link without a host.
     pub(super) fn new(link: Box<dyn Link>, shown: Arc<HostBoard>) -> HostEnd {
         HostEnd {
+            silence_max: link.silence_max(),
             link,
             receiver: Receiver::default(),
             input: Box::new([0; INPUT_BYTES]),
@@ -90,7 +94,7 @@ impl HostEnd {
 
     /// When to call [`HostEnd::read`] although the descriptor tells nothing (CLOCK_MONOTONIC).
     pub(super) fn due(&self) -> Option<Duration> {
-        self.link.due().into_iter().chain(self.silent_until).min()
+        sooner(self.link.due(), self.silent_until)
     }
 
     /// Whether the link's descriptor would tell of room for bytes.
@@ -128,7 +132,7 @@ impl HostEnd {
             read.is_new_host = true;
             info!("host attached");
         }
-        if let Some(silence_max) = self.link.silence_max().filter(|_| self.is_attached) {
+        if let Some(silence_max) = self.silence_max.filter(|_| self.is_attached) {
             let now = monotonic();
             if bytes > 0 {
                 self.silent_until = Some(now + silence_max);

@@ -28,6 +28,7 @@ use super::ledger::is_after;
 use super::oversight::{FAREWELL, Oversight};
 use super::recorder::Recorder;
 use super::signals::Signal;
+use super::sooner;
 use super::watchdog::Watchdog;
 use crate::trace::event::Event;
 use crate::trace::ring;
@@ -141,14 +142,15 @@ impl LinkThread {
         self.oversight.ready();
         self.tell_status();
         loop {
-            if let Some(why) = self.oversight.tick() {
+            let now = monotonic();
+            if let Some(why) = self.oversight.tick(now) {
                 self.lose_guardian(why);
             }
             let before = self.core.handed();
             let stalled = self.take_in();
             self.core.await_done(before);
             self.give_out();
-            let woken = self.wait(stalled)?;
+            let woken = self.wait(stalled, now)?;
             if woken.by_oversight {
                 if self.oversight.has_lost_guardian() {
                     self.lose_guardian("somebody killed the guardian");
@@ -216,8 +218,8 @@ impl LinkThread {
         self.oversight.status(&self.host.tell());
     }
 
-    /// Sleeps until there is something to do.
-    fn wait(&mut self, stalled: bool) -> io::Result<Woken> {
+    /// Sleeps until there is something to do. `now` may be a little in the past: a look at the clock is not free.
+    fn wait(&mut self, stalled: bool, now: Duration) -> io::Result<Woken> {
         self.core.wake.sleeping();
         if self.core.has_news() && !self.host.is_full() || self.core.inlet.has_line() {
             self.core.wake.awake(false);
@@ -230,33 +232,35 @@ impl LinkThread {
         if !self.host.is_out() && self.host.tells_of_room() {
             events |= PollFlags::POLLOUT;
         }
+        // The terminal is the first. poll(2) waits for the kernel's thread that moves its bytes. An event of the core that
+        // is already listened to would interrupt this wait, for a wake-up of the link in vain.
         let (wake, event, due) = (self.core.wake.event(), self.host.event(), self.host.due());
         let mut fds = [
+            PollFd::new(event.unwrap_or(wake), events),
             PollFd::new(wake, PollFlags::POLLIN),
             PollFd::new(self.oversight.event(), PollFlags::POLLIN),
-            PollFd::new(event.unwrap_or(wake), events),
         ];
-        let count = if event.is_some() { 3 } else { 2 };
-        match poll(&mut fds[..count], self.timeout(stalled, due)) {
+        let from = if event.is_some() { 0 } else { 1 };
+        match poll(&mut fds[from..], self.timeout(stalled, due, now)) {
             Ok(_) | Err(Errno::EINTR) => {}
             Err(error) => return Err(error.into()),
         }
         let events = |fd: &PollFd<'_>| fd.revents().unwrap_or(PollFlags::empty());
         let woken = Woken {
-            by_oversight: !events(&fds[1]).is_empty(),
-            by_input: events(&fds[2]).intersects(PollFlags::POLLIN | PollFlags::POLLERR)
+            by_oversight: !events(&fds[2]).is_empty(),
+            by_input: events(&fds[0]).intersects(PollFlags::POLLIN | PollFlags::POLLERR)
                 || due.is_some_and(|due| monotonic() >= due),
-            by_hangup: events(&fds[2]).contains(PollFlags::POLLHUP),
+            by_hangup: events(&fds[0]).contains(PollFlags::POLLHUP),
         };
-        let called = !events(&fds[0]).is_empty();
+        let called = !events(&fds[1]).is_empty();
         self.core.wake.awake(called);
         Ok(woken)
     }
 
     /// `due` is the link's own time.
-    fn timeout(&self, stalled: bool, due: Option<Duration>) -> PollTimeout {
-        let due = self.oversight.due().into_iter().chain(due).min().map(|at| at.saturating_sub(monotonic()));
-        stalled.then_some(STALL).into_iter().chain(due).min().map_or(PollTimeout::NONE, poll_timeout)
+    fn timeout(&self, stalled: bool, due: Option<Duration>, now: Duration) -> PollTimeout {
+        let due = sooner(self.oversight.due(), due).map(|at| at.saturating_sub(now));
+        sooner(stalled.then_some(STALL), due).map_or(PollTimeout::NONE, poll_timeout)
     }
 
     /// The guardian is gone or of no use. This stops the MCU. The program ends when the host has had time to read why.

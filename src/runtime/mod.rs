@@ -13,6 +13,7 @@ use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
 use std::thread::JoinHandle;
+use std::time::Duration;
 
 use log::{error, info, warn};
 
@@ -240,6 +241,14 @@ fn end(
 
 /// What to do if there can be no further process or thread.
 const NO_PROCESS: &str = "raise TasksMax or ulimit -u";
+
+/// The earlier of two times, if there is one.
+fn sooner(one: Option<Duration>, other: Option<Duration>) -> Option<Duration> {
+    match (one, other) {
+        (Some(one), Some(other)) => Some(one.min(other)),
+        (one, other) => one.or(other),
+    }
+}
 
 /// That the kernel refuses something, in its words.
 fn refused(what: impl fmt::Display, error: impl fmt::Display) -> Trouble {

@@ -14,6 +14,7 @@ use pinion_linux::clock::monotonic;
 
 use super::guardian::GuardianWatch;
 use super::signals::{Signal, Signals};
+use super::sooner;
 use super::watchdog::{Vigil, Watchdog};
 
 /// How long a host has to read why the program ends.
@@ -74,16 +75,15 @@ impl Oversight {
     /// When to call [`Oversight::tick`] next, at the latest (CLOCK_MONOTONIC).
     pub(super) fn due(&self) -> Option<Duration> {
         let look = self.guardian.as_ref().and_then(GuardianWatch::due);
-        self.leave_at.into_iter().chain(self.vigil.due()).chain(look).min()
+        sooner(sooner(self.leave_at, self.vigil.due()), look)
     }
 
-    /// Feeds the watchdogs. If the guardian is of no use any more, it returns the reason.
-    pub(super) fn tick(&mut self) -> Option<&'static str> {
-        if self.vigil.due().is_some() {
-            self.vigil.tick(monotonic());
-        }
+    /// Feeds the watchdogs. `now` is the time (CLOCK_MONOTONIC). If the guardian is of no use any more, it returns the
+    /// reason.
+    pub(super) fn tick(&mut self, now: Duration) -> Option<&'static str> {
+        self.vigil.tick(now);
         let guardian = self.guardian.as_mut()?;
-        let hangs = guardian.due().is_some() && guardian.hangs(monotonic());
+        let hangs = guardian.due().is_some() && guardian.hangs(now);
         hangs.then_some("the guardian gives no sign of life: was it stopped? (a restart ends it)")
     }
 
