@@ -176,12 +176,18 @@ impl Errand for Watcher {
                 longest = now.since(low_at).max(longest);
                 self.watch.begin(announced, longest as u32);
                 (pulse, since, low_at, longest, high_at) = (announced, now, now, 0, None);
-            } else if now.since(since) > i64::from(if pulse == 0 { MEETING } else { ABSENCE_MAX }.0) {
-                return Ok(());
             }
+            let is_over = |limit: Ticks| now.since(since) > i64::from(limit.0);
             if pulse == 0 {
+                if is_over(MEETING) {
+                    return Ok(());
+                }
                 std::hint::spin_loop();
             } else if !self.sclk.read()? {
+                // Not while the clock is high: this worker may have been interrupted, too.
+                if is_over(ABSENCE_MAX) {
+                    return Ok(());
+                }
                 longest = self.time.now().since(low_at).max(longest);
                 (low_at, high_at) = (now, None);
             } else if let Some(seen_at) = high_at {
@@ -205,6 +211,7 @@ mod tests {
     use super::*;
     use crate::board::Direction;
     use crate::time::NS_PER_TICK;
+    use std::sync::Mutex;
     use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
     use std::thread;
 
@@ -234,6 +241,8 @@ mod tests {
         interrupted: Option<u32>,
         /// How often the clock was made low while it was high.
         falls: AtomicU32,
+        /// How long the first look at the clock takes, if it is high.
+        look: Mutex<Duration>,
     }
 
     const SAMPLE: u32 = 0x12_3457;
@@ -249,7 +258,7 @@ mod tests {
 
     impl Line for Wire {
         fn write(&self, level: bool) -> Result<(), Shutdown> {
-            let Chip { is_high, pulses, interrupted, falls } = &*self.chip;
+            let Chip { is_high, pulses, interrupted, falls, .. } = &*self.chip;
             let was_high = is_high.swap(level, Ordering::SeqCst);
             if !level {
                 falls.fetch_add(was_high.into(), Ordering::SeqCst);
@@ -267,6 +276,9 @@ mod tests {
 
         fn read(&self) -> Result<bool, Shutdown> {
             let pulses = self.chip.pulses.load(Ordering::SeqCst);
+            if self.is_clock && self.chip.is_high.load(Ordering::SeqCst) {
+                thread::sleep(std::mem::take(&mut *self.chip.look.lock().unwrap()));
+            }
             Ok(if self.is_clock { self.chip.is_high.load(Ordering::SeqCst) } else { SAMPLE >> (25 - pulses) & 1 != 0 })
         }
 
@@ -322,6 +334,16 @@ mod tests {
         chip.is_high.store(true, Ordering::SeqCst);
         watcher.run().unwrap();
         assert!(chip.is_high.load(Ordering::SeqCst), "the chip is to be off");
+    }
+
+    #[test]
+    fn a_second_worker_that_was_itself_away_lowers_the_clock_before_it_ends() {
+        let (_, mut watcher, chip) = workers(None, 1);
+        chip.is_high.store(true, Ordering::SeqCst);
+        *chip.look.lock().unwrap() = Duration::from_millis(10);
+        watcher.watch.announce(1);
+        watcher.run().unwrap();
+        assert_eq!(chip.falls.load(Ordering::SeqCst), 1);
     }
 
     /// The other half of the pulses would come unwatched, and a late store of the second worker might cut one short.
