@@ -16,7 +16,7 @@ trap 'systemctl stop klipper ssh
     user systemctl --user disable --now $UNIT
     loginctl disable-linger klippy
     until_true 20 not is_active user@$(id -u klippy)
-    rm -rf /run/systemd/system/user@.service.d $SSH
+    rm -rf /run/systemd/system/user@.service.d $SSH /home/klippy/.config/systemd
     pkill -u far || true
     userdel -r far
     systemctl daemon-reload' EXIT
