@@ -2,10 +2,17 @@
 //! `scripts/mainsail`: Klipper, Moonraker, Mainsail and the simulated printer by one command.
 
 use std::fs;
+use std::io::{BufRead, BufReader, Write};
 use std::net::TcpListener;
 use std::path::Path;
-use std::process::Command;
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
 
+use nix::sys::signal::{Signal, kill};
+use nix::unistd::Pid;
+use pinion_testkit::browser;
+
+use crate::checkout;
 use crate::klippy::python;
 
 /// The script in a folder of its own. On ports that no other test has.
@@ -50,4 +57,40 @@ fn mainsail_says_what_is_missing() {
     // Nothing half-done remains that a later run would take for whole.
     let left: Vec<_> = fs::read_dir(folder.path().join("stack")).unwrap().collect();
     assert!(left.is_empty(), "{left:?}");
+}
+
+/// A run of the script.
+struct Stack(Child);
+
+impl Drop for Stack {
+    fn drop(&mut self) {
+        let _ = kill(Pid::from_raw(self.0.id() as i32), Signal::SIGINT);
+        let _ = self.0.wait();
+    }
+}
+
+/// The color of the simulated printer's head in the light. Mainsail has none like it.
+const HEAD: [u8; 3] = [248, 140, 32];
+
+#[test]
+fn mainsail_shows_the_camera() {
+    const TEST: &str = "mainsail_shows_the_camera";
+    let Some(klipper) = checkout(TEST) else { return };
+    let copies = ["MOONRAKER_DIR", "MAINSAIL_DIR"].map(std::env::var_os);
+    let [Some(moonraker), Some(mainsail)] = copies else {
+        let _ = writeln!(std::io::stderr(), "\nSKIPPED {TEST}: MOONRAKER_DIR and MAINSAIL_DIR are not set");
+        return;
+    };
+    // Python's packages stay for the next run. A path that fits a socket.
+    let folder = Path::new("/tmp/pinion-test-mainsail");
+    let mut command = script(folder);
+    command.env("KLIPPER_DIR", klipper).env("MOONRAKER_DIR", moonraker).env("MAINSAIL_DIR", mainsail);
+    let mut stack = Stack(command.stdout(Stdio::piped()).spawn().unwrap());
+    let mut lines = BufReader::new(stack.0.stdout.take().unwrap()).lines().map(Result::unwrap);
+    let urls: Vec<String> = lines.by_ref().skip_while(|line| !line.starts_with("Mainsail: ")).take(2).collect();
+    assert_eq!(urls, ["Mainsail: http://127.0.0.1:18411", "Camera:   http://127.0.0.1:18410"]);
+    let Some(pixels) = browser::screenshot(TEST, "http://127.0.0.1:18411", Duration::from_secs(15)) else { return };
+    let is_head = |pixel: &&[u8; 3]| pixel.iter().zip(HEAD).all(|(a, b): (&u8, u8)| a.abs_diff(b) < 12);
+    let head = pixels.iter().filter(is_head).count();
+    assert!(head > 100, "{head} pixels are the head's");
 }

@@ -5,11 +5,11 @@ use std::collections::BTreeSet;
 use std::fs;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
-use std::path::Path;
-use std::process::{Command, Stdio};
+use std::time::Duration;
 
 use nix::sys::signal::Signal;
 use pinion_client::Client;
+use pinion_testkit::browser;
 
 use crate::process::{Pinion, WAIT_MAX, exists, output};
 
@@ -170,73 +170,11 @@ fn an_address_that_cannot_be_served_is_one_line_with_a_remedy() {
     }
 }
 
-/// The pixels of a PNG with 8 bits for each color: red, green and blue (PNG specification, "Filtering").
-fn png_pixels(png: &[u8]) -> Vec<[u8; 3]> {
-    let word = |at: usize| u32::from_be_bytes(png[at..at + 4].try_into().unwrap()) as usize;
-    let (width, bits, kind) = (word(16), png[24], png[25]);
-    let size = match (bits, kind) {
-        (8, 2) => 3,
-        (8, 6) => 4,
-        other => panic!("{other:?}"),
-    };
-    let (mut packed, mut at) = (Vec::new(), 8);
-    while at < png.len() {
-        let (length, kind) = (word(at), &png[at + 4..at + 8]);
-        if kind == b"IDAT" {
-            packed.extend(&png[at + 8..at + 8 + length]);
-        }
-        at += length + 12;
-    }
-    let mut rows = Vec::new();
-    flate2::read::ZlibDecoder::new(&packed[..]).read_to_end(&mut rows).unwrap();
-    let mut above = vec![0u8; width * size];
-    let mut pixels = Vec::new();
-    for row in rows.chunks_exact_mut(width * size + 1) {
-        let filter = row[0];
-        let row = &mut row[1..];
-        for i in 0..row.len() {
-            let left = if i < size { 0 } else { i16::from(row[i - size]) };
-            let up = i16::from(above[i]);
-            let corner = if i < size { 0 } else { i16::from(above[i - size]) };
-            let paeth = || {
-                let guess = left + up - corner;
-                let mut near = [left, up, corner];
-                near.sort_by_key(|value| (guess - value).abs());
-                near[0]
-            };
-            let before = match filter {
-                0 => 0,
-                1 => left,
-                2 => up,
-                3 => (left + up) / 2,
-                _ => paeth(),
-            };
-            row[i] = row[i].wrapping_add(before as u8);
-        }
-        above.copy_from_slice(row);
-        pixels.extend(row.chunks_exact(size).map(|pixel| [pixel[0], pixel[1], pixel[2]]));
-    }
-    pixels
-}
-
 #[test]
 fn a_browser_shows_it() {
     let (_pinion, camera) = start(&["--show"]);
-    let folder = tempfile::tempdir().unwrap();
-    let picture = folder.path().join("page.png");
-    let arg = |name: &str, value: &Path| format!("--{name}={}", value.display());
-    let browser = Command::new("chromium")
-        .args(["--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--window-size=800,600"])
-        .args(["--timeout=3000".into(), arg("user-data-dir", folder.path()), arg("screenshot", &picture)])
-        .arg(format!("http://{camera}/"))
-        .stderr(Stdio::null())
-        .status();
-    if browser.is_err_and(|error| error.kind() == ErrorKind::NotFound) {
-        // It bypasses the test harness, which captures the output of tests.
-        let _ = writeln!(std::io::stderr(), "\nSKIPPED a_browser_shows_it: it needs chromium (apt install chromium)");
-        return;
-    }
-    let pixels = png_pixels(&fs::read(picture).unwrap());
+    let page = format!("http://{camera}/");
+    let Some(pixels) = browser::screenshot("a_browser_shows_it", &page, Duration::from_secs(1)) else { return };
     // A page without the picture has one color. The color of the cold bed is on a tenth of the picture.
     let is_bed = |pixel: &&[u8; 3]| pixel.iter().zip([58, 64, 76]).all(|(a, b): (&u8, u8)| a.abs_diff(b) < 5);
     let bed = pixels.iter().filter(is_bed).count();

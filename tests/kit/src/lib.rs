@@ -4,11 +4,13 @@
 //! - [`arguments`]: the command line of a suite
 //! - [`cache`], [`tools`], [`process`]: the folder for a suite's downloads, and the programs that it runs
 //! - [`kernel`], [`initramfs`]: the boot files of a virtual machine
+//! - [`browser`]: a page as a person sees it
 //! - [`markdown`]: the pages for users, and the blocks in them
 
 #![forbid(unsafe_code)]
 
 pub mod arguments;
+pub mod browser;
 pub mod cache;
 pub mod initramfs;
 pub mod kernel;
