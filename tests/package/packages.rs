@@ -54,8 +54,9 @@ pub fn share(folder: &Path) -> Result<(), String> {
 /// klippy from the checkout in KLIPPER_DIR, if it is set. It is for klippy's own checks: see `guest/klippy.sh`. klippy
 /// compiles its C library here, because this is also a Debian 12 for x86-64.
 pub fn share_klippy(folder: &Path) -> Result<(), String> {
-    let words = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package/guest/klippy.sh");
-    process::run(Command::new("cp").arg(words).arg(folder))?;
+    let tests = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests");
+    let ours = ["package/guest/klippy.sh", "klippy/delayed_ssh.py"].map(|path| tests.join(path));
+    process::run(Command::new("cp").args(ours).arg(folder))?;
     let Some(checkout) = env::var_os("KLIPPER_DIR") else { return Ok(()) };
     let copy = folder.join("klipper");
     fs::create_dir(&copy).map_err(|error| format!("{}: {error}", copy.display()))?;
