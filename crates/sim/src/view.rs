@@ -9,6 +9,7 @@ use super::engine::bed::{Bed, Space};
 use super::engine::look::Look;
 use super::engine::physics::Axis;
 use super::engine::recorder::Recorder;
+use super::engine::ring::RingWatch;
 use super::engine::world::World;
 use pinion_firmware::time::{Clock, TimeSource};
 
@@ -124,6 +125,12 @@ impl SimProbe {
     /// Records the path of the nozzle from now on.
     pub fn recorder(&self) -> Recorder {
         Recorder::new(self.bed.clone(), &self.world.extruders, self.now())
+    }
+
+    /// Watches what rings on the axes, from now on.
+    pub fn rings(&self) -> Vec<RingWatch> {
+        let now = self.now();
+        self.world.rings.iter().map(|(axis, config)| RingWatch::new(axis.clone(), config, now)).collect()
     }
 
     /// A person's view of the other parts at this instant: the part's name, and what it looks like.

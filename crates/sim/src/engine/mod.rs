@@ -11,6 +11,7 @@ pub(crate) mod look;
 pub(crate) mod noise;
 pub(crate) mod physics;
 pub(crate) mod recorder;
+pub(crate) mod ring;
 pub(crate) mod serial;
 pub(crate) mod spi;
 pub(crate) mod time;

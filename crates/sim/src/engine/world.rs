@@ -7,6 +7,7 @@ use std::sync::Arc;
 
 use super::look::Look;
 use super::physics::{Axis, Fan, Heater, Lamp};
+use super::ring::RingConfig;
 use pinion_firmware::board::Thermometer;
 use pinion_firmware::time::Clock;
 
@@ -31,6 +32,8 @@ pub(crate) struct World {
     pub(crate) heaters: Vec<Arc<Heater>>,
     pub(crate) fans: Vec<Arc<Fan>>,
     pub(crate) lamps: Vec<Arc<Lamp>>,
+    /// What rings on an axis.
+    pub(crate) rings: Vec<(Arc<Axis>, RingConfig)>,
     pub(crate) sights: Vec<Arc<dyn Sight>>,
     /// By their serial numbers.
     pub(crate) thermometers: Vec<(String, OpenThermometer)>,

@@ -20,12 +20,12 @@ use std::sync::Arc;
 
 use serde::Deserialize;
 
-use super::ring::{Ring, RingConfig};
 use super::workshop::{Part, Socket, Workshop};
 use crate::description::check::{Bound, Trouble, check, wrong};
 use crate::description::pin::PinName;
 use crate::description::printer::Printer;
 use crate::engine::noise::Noise;
+use crate::engine::ring::{Ring, RingConfig};
 use crate::engine::spi::SpiChip;
 use crate::klippy::layout::Layout;
 use crate::klippy::sections::Sections;
@@ -143,6 +143,10 @@ impl Part for Adxl345Config {
             let ring = ring?;
             Some(Ring::new(workshop.axis(&ring.axis)?, ring, now))
         });
+        for ring in self.rings().into_iter().filter_map(|(_, ring)| ring) {
+            let axis = workshop.axis(&ring.axis);
+            workshop.world.rings.extend(axis.map(|axis| (axis, ring.clone())));
+        }
         let noise = workshop.noise(self);
         workshop.solder_spi(self, Adxl345::new(self, rings, noise, workshop.clock.clone()));
         Ok(())

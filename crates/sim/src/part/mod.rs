@@ -17,7 +17,6 @@ pub(crate) mod loopback;
 pub(crate) mod probe;
 pub(crate) mod pwm_channel;
 pub(crate) mod ready;
-pub(crate) mod ring;
 pub(crate) mod servo;
 pub(crate) mod spool;
 pub(crate) mod ssd1306;

@@ -1,0 +1,311 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! The path that a G-code file asks for, read as klippy reads it.
+
+#![forbid(unsafe_code)]
+
+use std::f64::consts::TAU;
+use std::fs;
+use std::path::Path;
+
+use crate::description::check::Trouble;
+
+/// Greatest distance of a chord from its arc.
+const CHORD_MM: f64 = 0.002;
+/// Least rise of the nozzle from one layer to the next.
+const LAYER_MM: f64 = 0.05;
+
+/// A place that a G-code file asks for.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct AskedPoint {
+    pub(crate) nozzle_mm: [f64; 3],
+    /// The layer, counted from 1 in the file's order. Moves before the first layer belong to it.
+    pub(crate) layer: u32,
+    /// The line of the file, from 1 on.
+    pub(crate) line: u32,
+    /// Whether the way to it is unknown: it begins the file, or follows a G28 or a macro.
+    pub(crate) is_start: bool,
+}
+
+/// The path that a G-code file asks for.
+#[derive(Clone, Debug, Default)]
+pub struct AskedPath {
+    pub(crate) points: Vec<AskedPoint>,
+    /// Filament that it pushes, without retractions.
+    pub(crate) filament_mm: f64,
+}
+
+impl AskedPath {
+    /// Reads a file.
+    ///
+    /// # Errors
+    ///
+    /// The file cannot be read, a number in it is none, or it never asks for a place.
+    pub fn load(path: &Path) -> Result<AskedPath, Trouble> {
+        let file = path.display().to_string();
+        let bytes = fs::read(path)
+            .map_err(|error| Trouble::new(error.to_string()).of(&file).remedy("name a readable G-code file"))?;
+        AskedPath::parse(&String::from_utf8_lossy(&bytes), &file)
+    }
+
+    /// Reads a text; `origin` is its name in an error.
+    pub(crate) fn parse(text: &str, origin: &str) -> Result<AskedPath, Trouble> {
+        let mut reader = Reader::default();
+        for (number, line) in (1..).zip(text.lines()) {
+            reader.line = number;
+            reader.read(line).map_err(|trouble| trouble.of(format_args!("{origin}:{number}")))?;
+        }
+        if reader.path.points.len() < 2 {
+            let trouble = Trouble::new("it never moves the nozzle between two known places").of(origin);
+            return Err(trouble.remedy("name a file with G1 moves along X, Y and Z"));
+        }
+        Ok(reader.path)
+    }
+}
+
+/// The words of a command: letters with numbers.
+struct Words<'a>(Vec<(char, &'a str)>);
+
+impl Words<'_> {
+    fn get(&self, letter: char) -> Result<Option<f64>, Trouble> {
+        let Some((_, text)) = self.0.iter().find(|(its, _)| *its == letter) else { return Ok(None) };
+        match text.parse::<f64>().ok().filter(|number| number.is_finite()) {
+            Some(number) => Ok(Some(number)),
+            None => Err(Trouble::new(format!("`{letter}{text}` has no number")).remedy("correct it")),
+        }
+    }
+}
+
+struct Reader {
+    path: AskedPath,
+    line: u32,
+    /// x, y, z and e of the machine; `None` until the file says where it is.
+    at: [Option<f64>; 4],
+    /// What G92 has put between the machine's places and the file's.
+    base: [f64; 4],
+    relative: bool,
+    relative_filament: bool,
+    /// Whether the next place begins anew.
+    is_start: bool,
+    layer: u32,
+    layer_z: f64,
+    pushed_mm: f64,
+}
+
+impl Default for Reader {
+    fn default() -> Reader {
+        Reader {
+            path: AskedPath::default(),
+            line: 0,
+            at: [None, None, None, Some(0.0)],
+            base: [0.0; 4],
+            relative: false,
+            relative_filament: false,
+            is_start: true,
+            layer: 0,
+            layer_z: f64::NEG_INFINITY,
+            pushed_mm: 0.0,
+        }
+    }
+}
+
+const AXES: [char; 4] = ['X', 'Y', 'Z', 'E'];
+
+impl Reader {
+    fn read(&mut self, line: &str) -> Result<(), Trouble> {
+        let line = line.split([';', '*']).next().unwrap_or_default().trim().to_ascii_uppercase();
+        let mut words = line.split_whitespace().peekable();
+        // A line number.
+        words.next_if(|word| word.strip_prefix('N').is_some_and(|rest| rest.parse::<u64>().is_ok()));
+        let Some(command) = words.next() else { return Ok(()) };
+        let is_plain = command.len() > 1 && command.as_bytes()[0].is_ascii_alphabetic() && {
+            command[1..].bytes().all(|byte| byte.is_ascii_digit() || byte == b'.')
+        };
+        if !is_plain {
+            // A macro, or a command of klippy. It may move the head, and it comes back or says where to go next.
+            self.is_start = true;
+            return Ok(());
+        }
+        let letter_and_number = |word: &'_ str| -> Option<(char, usize)> {
+            let letter = word.chars().next()?;
+            Some((letter, letter.len_utf8()))
+        };
+        let words: Vec<&str> = words.collect();
+        let words = words.iter().filter_map(|word| letter_and_number(word).map(|(c, n)| (c, &word[n..])));
+        let words = Words(words.collect());
+        match command {
+            "G0" | "G00" | "G1" | "G01" => {
+                let to = self.target(&words)?;
+                self.go(to);
+            }
+            "G2" | "G02" => self.arc(&words, true)?,
+            "G3" | "G03" => self.arc(&words, false)?,
+            "G28" => {
+                let named = |axis: usize| words.0.iter().any(|(letter, _)| *letter == AXES[axis]);
+                let all = !(0..3).any(named);
+                for axis in (0..3).filter(|axis| all || named(*axis)) {
+                    (self.at[axis], self.base[axis]) = (None, 0.0);
+                }
+                self.is_start = true;
+            }
+            "G90" => self.relative = false,
+            "G91" => self.relative = true,
+            "M82" => self.relative_filament = false,
+            "M83" => self.relative_filament = true,
+            "G92" => {
+                let any = AXES.iter().any(|axis| words.0.iter().any(|(letter, _)| letter == axis));
+                for axis in 0..4 {
+                    let given = if any { words.get(AXES[axis])? } else { Some(0.0) };
+                    if let (Some(value), Some(at)) = (given, self.at[axis]) {
+                        self.base[axis] = at - value;
+                    }
+                }
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// The place that a move asks for.
+    fn target(&self, words: &Words<'_>) -> Result<[Option<f64>; 4], Trouble> {
+        let mut to = self.at;
+        for axis in 0..4 {
+            if let Some(value) = words.get(AXES[axis])? {
+                let relative = self.relative || (axis == 3 && self.relative_filament);
+                to[axis] = if relative { self.at[axis].map(|at| at + value) } else { Some(value + self.base[axis]) };
+            }
+        }
+        Ok(to)
+    }
+
+    fn go(&mut self, to: [Option<f64>; 4]) {
+        let filament_mm = to[3].unwrap_or(0.0);
+        let is_laid = filament_mm > self.pushed_mm && to[..3] != self.at[..3];
+        self.path.filament_mm += (filament_mm - self.pushed_mm).max(0.0);
+        self.pushed_mm = self.pushed_mm.max(filament_mm);
+        self.at = to;
+        let [Some(x), Some(y), Some(z), _] = to else { return };
+        if is_laid && (z - self.layer_z).abs() > LAYER_MM {
+            self.layer += 1;
+            self.layer_z = z;
+        }
+        let nozzle_mm = [x, y, z];
+        let is_new = self.path.points.last().is_none_or(|last| last.nozzle_mm != nozzle_mm);
+        if is_new || self.is_start {
+            let (layer, line) = (self.layer.max(1), self.line);
+            self.path.points.push(AskedPoint { nozzle_mm, layer, line, is_start: self.is_start });
+            self.is_start = false;
+        }
+    }
+
+    /// An arc around a center in the plane of x and y, as klippy's `[gcode_arcs]` takes it: I and J are relative.
+    fn arc(&mut self, words: &Words<'_>, clockwise: bool) -> Result<(), Trouble> {
+        let to = self.target(words)?;
+        let offset = [words.get('I')?.unwrap_or(0.0), words.get('J')?.unwrap_or(0.0)];
+        let (from, [Some(x), Some(y), ..]) = (self.at, to) else {
+            self.go(to);
+            return Ok(());
+        };
+        let [Some(x0), Some(y0), ..] = from else {
+            self.go(to);
+            return Ok(());
+        };
+        let radius = offset[0].hypot(offset[1]);
+        if radius == 0.0 {
+            let trouble = Trouble::new("an arc has no center");
+            return Err(trouble.remedy("give I or J; klippy knows no R, and no other plane here"));
+        }
+        let center = [x0 + offset[0], y0 + offset[1]];
+        let start = (-offset[1]).atan2(-offset[0]);
+        let end = (y - center[1]).atan2(x - center[0]);
+        let turn = if clockwise { (start - end).rem_euclid(TAU) } else { (end - start).rem_euclid(TAU) };
+        // The same place means a whole turn.
+        let turn = if (x - x0).hypot(y - y0) < 1e-9 { TAU } else { turn };
+        let chord = 2.0 * (1.0 - CHORD_MM / radius.max(CHORD_MM)).acos();
+        let count = (turn / chord).ceil().clamp(1.0, 1e5);
+        for n in 1..count as u32 {
+            let share = f64::from(n) / count;
+            let angle = start + if clockwise { -turn } else { turn } * share;
+            let between = |axis: usize| Some(from[axis]? + (to[axis]? - from[axis]?) * share);
+            let (sine, cosine) = angle.sin_cos();
+            let [x, y] = [center[0] + radius * cosine, center[1] + radius * sine];
+            self.go([Some(x), Some(y), between(2), between(3)]);
+        }
+        self.go(to);
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn places(text: &str) -> Vec<[f64; 3]> {
+        AskedPath::parse(text, "a.gcode").unwrap().points.iter().map(|point| point.nozzle_mm).collect()
+    }
+
+    #[test]
+    fn absolute_and_relative_moves_and_g92() {
+        let text = "G28\nG90\nM83\nN5 G1 X10 Y20 Z0.2 F3000 ; there\nG1 X15 E1*71\nG91\nG0 Y-5 Z1\nG90\n\
+                    G92 X0\ng1 x5 y5\nG92 E0\nM82\nG1 E2\n";
+        let expected = [[10.0, 20.0, 0.2], [15.0, 20.0, 0.2], [15.0, 15.0, 1.2], [20.0, 5.0, 1.2]];
+        assert_eq!(places(text), expected);
+        assert_eq!(AskedPath::parse(text, "a").unwrap().filament_mm, 3.0);
+    }
+
+    #[test]
+    fn a_place_is_known_after_homing_when_the_file_names_it() {
+        // X and Y alone leave the height unknown.
+        let path =
+            AskedPath::parse("G28\nG1 X1 Y1\nG1 X2\nG1 Z3\nG1 X4\nG28 X\nG1 Y9\nG1 X5\nM117 X\nPARK\nG1 X6", "a");
+        let points = path.unwrap().points;
+        let found: Vec<_> = points.iter().map(|point| (point.nozzle_mm, point.is_start, point.line)).collect();
+        let expected = [
+            ([2.0, 1.0, 3.0], true, 4),
+            ([4.0, 1.0, 3.0], false, 5),
+            ([5.0, 9.0, 3.0], true, 8),
+            ([6.0, 9.0, 3.0], true, 11),
+        ];
+        assert_eq!(found, expected);
+    }
+
+    #[test]
+    fn layers_begin_where_filament_is_laid_at_a_new_height() {
+        let text =
+            "M83\nG1 X0 Y0 Z5\nG1 Z.2\nG1 X9 E1\nG1 E-1\nG1 Z.6\nG1 X0\nG1 Z.2\nG1 E1\nG1 X3 E1\nG1 Z.4\nG1 X9 E1\n";
+        let path = AskedPath::parse(text, "a").unwrap();
+        let layers: Vec<u32> = path.points.iter().map(|point| point.layer).collect();
+        assert_eq!(layers, [1, 1, 1, 1, 1, 1, 1, 1, 2]);
+        assert_eq!(path.filament_mm, 3.0);
+    }
+
+    #[test]
+    fn an_arc_stays_on_its_circle() {
+        for (command, middle) in [("G3", [10.0, 10.0]), ("G2", [10.0, -10.0])] {
+            let points = places(&format!("G1 X20 Y0 Z1\n{command} X0 Y0 I-10 J0 E1\n"));
+            let off = |point: &[f64; 3]| ((point[0] - 10.0).hypot(point[1]) - 10.0).abs();
+            assert!(points.len() > 50 && points.iter().all(|point| off(point) < 1e-9), "{}", points.len());
+            let near = |point: &&[f64; 3]| (point[0] - middle[0]).hypot(point[1] - middle[1]) < 0.3;
+            assert!(points.iter().any(|point| near(&point)), "{command} goes the other way");
+            let chords = points.windows(2).map(|two| {
+                let middle = [(two[0][0] + two[1][0]) / 2.0, (two[0][1] + two[1][1]) / 2.0, 1.0];
+                off(&middle)
+            });
+            assert!(chords.fold(0.0, f64::max) <= CHORD_MM + 1e-9);
+        }
+        let whole = places("G1 X20 Y0 Z1\nG2 I-10\n");
+        assert!(whole.len() > 100 && whole.iter().any(|point| point[0] < 0.1), "a whole turn");
+    }
+
+    #[test]
+    fn an_error_names_the_line_and_a_remedy() {
+        for (text, part) in [
+            ("G1 X1\nG1 Xone Y2", "a.gcode:2: `XONE` has no number: correct it"),
+            ("G1 X1 Y1 Z1\nG2 X3 Y3 R2", "a.gcode:2: an arc has no center: give I or J"),
+            ("; nothing", "a.gcode: it never moves the nozzle between two known places: name"),
+            ("G1 X\u{e9}", "has no number"),
+        ] {
+            let Err(error) = AskedPath::parse(text, "a.gcode") else { panic!("accepted {text}") };
+            assert!(error.to_string().contains(part), "{error}");
+        }
+    }
+}
