@@ -34,6 +34,9 @@ use super::page::{Page, print};
 use super::settings::sim_config;
 use super::show::Show;
 use super::{failed, logging};
+use toolpath::{Files, PathArgs, PathRecord};
+
+mod toolpath;
 
 /// Options of `pinion sim`.
 #[derive(Args, Clone, Debug)]
@@ -61,6 +64,8 @@ pub(super) struct SimArgs {
     /// Draw the homing: position, endstop and step rate over time
     #[arg(long, value_name = "FILE.svg")]
     picture: Option<PathBuf>,
+    #[command(flatten)]
+    path: PathArgs,
     /// Run in real time: SCHED_FIFO and locked memory
     #[arg(short = 'r')]
     realtime: bool,
@@ -85,6 +90,10 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         let printer_cfg = printer_cfg(&config, &args.symlink.to_string_lossy());
         return print(&Page::text(&printer_cfg)).map_or_else(failed, |()| ExitCode::SUCCESS);
     }
+    let files = match Files::check(&args.path) {
+        Ok(files) => files,
+        Err(error) => return failed(error),
+    };
     let clock = Monotonic::start();
     let recording = Recording::new(clock, &args.symlink, args.realtime, folders());
     let helpers = recording.and_then(|recording| Ok((Helpers::start(&recording, false, true, sys::SERVE)?, recording)));
@@ -106,6 +115,10 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     if let Some(Err(error)) = camera.map(|camera| camera.start(probe.clone())) {
         return failed(error);
     }
+    let path = match files.map(|files| PathRecord::record(files, probe.clone())).transpose() {
+        Ok(path) => path,
+        Err(error) => return failed(format!("the path cannot be recorded: {error}")),
+    };
     let options = Options {
         link: LinkName::Pty(args.symlink.clone()),
         dialect: None,
@@ -117,8 +130,8 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
         trace_edges: args.trace_edges,
         sockets: runtime::socket_paths(&args.symlink),
     };
-    if args.show {
-        return show_as_it_changes(args, board, probe, &options, recording, helpers);
+    if args.show || path.is_some() {
+        return serve(args, board, probe, &options, (recording, helpers), path);
     }
     let right = Arc::new(AtomicBool::new(false));
     // Set when the program is asked to end. A demonstration that this interrupts has not failed.
@@ -145,29 +158,34 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     }
 }
 
-/// Serves a host, and shows the effects on the printer.
-fn show_as_it_changes(
+/// Serves a host, without the demonstration. With `--show` it shows the effects on the printer.
+fn serve(
     args: &SimArgs,
     board: SimBoard,
     probe: SimProbe,
     options: &Options,
-    recording: Recording,
-    helpers: Helpers,
+    (recording, helpers): (Recording, Helpers),
+    path: Option<PathRecord>,
 ) -> ExitCode {
-    let show = match Show::prepare(probe) {
+    let show = match args.show.then(|| Show::prepare(probe)).transpose() {
         Ok(show) => show,
         Err(error) => return failed(format!("the printer cannot be shown: {error}")),
     };
     let ready = || {
         if io::stdout().is_terminal() {
-            tell_how_to_connect(args, "q or Ctrl-C");
+            tell_how_to_connect(args, if args.show { "q or Ctrl-C" } else { "Ctrl-C" });
         }
-        show.begin();
+        if let Some(show) = &show {
+            show.begin();
+        }
     };
     let timing = board.timing();
     let ended = runtime::run(options, Box::new(board), timing, recording, helpers, ready);
-    show.end();
-    ended.map_or_else(failed, |()| ExitCode::SUCCESS)
+    if let Some(show) = show {
+        show.end();
+    }
+    let written = path.map_or(ExitCode::SUCCESS, PathRecord::end);
+    ended.map_or_else(failed, |()| written)
 }
 
 /// Shows the printer at work, then ends the program or says how to use it with klippy.

@@ -21,5 +21,6 @@ mod soak;
 mod ssh;
 mod status;
 mod terminal;
+mod toolpath;
 mod trace;
 mod troubleshooting;

@@ -161,6 +161,11 @@ impl RingWatch {
         }
     }
 
+    /// Forgets what was seen so far.
+    pub fn forget(&mut self) {
+        (self.greatest_mm, self.sum_mm, self.looks) = (0.0, 0.0, 0);
+    }
+
     /// What was seen so far; `None` if the axis has not moved.
     pub fn seen(&self) -> Option<Ringing> {
         let mean_mm = self.sum_mm / self.looks as f64;

@@ -3,8 +3,8 @@
 //!
 //! The host chooses the speeds, so an instant does not say where the nozzle should be. Both paths are laid side by side
 //! in their order instead (dynamic time warping between two polylines). Each point of the motors' path is on one line of
-//! the file, and each point of the file is on one line of the motors' path. The sum of all distances is as small as it
-//! can be. The greatest distance of two lines is at an end of one of them, so the points are enough.
+//! the file, and each point of the file is on one line of the motors' path. The sum of all squared distances is as
+//! small as it can be. The greatest distance of two lines is at an end of one of them, so the points are enough.
 
 #![forbid(unsafe_code)]
 
@@ -14,19 +14,22 @@ use super::asked::{AskedPath, AskedPoint};
 use super::{distance, lines, nearest};
 use crate::engine::recorder::PathPoint;
 
-/// Cost of a millimeter of the motors' path that the file does not ask for: before the file, after it, and at a macro.
-const BEFORE: f64 = 0.05;
-const AFTER: f64 = 0.02;
-const MACRO: f64 = 0.2;
+/// A line of the motors that the file does not ask for costs as if it were off by this: before the file, after it, and
+/// at a macro.
+const BEFORE_MM: f64 = 0.05;
+const AFTER_MM: f64 = 0.02;
+const MACRO_MM: f64 = 0.2;
 /// A distance counts up to here when the paths are laid side by side.
 const FAR_MM: f64 = 20.0;
 /// How much of a height counts then. A bed mesh moves the nozzle up and down without the file.
 const HEIGHT: f64 = 0.02;
 /// Places that cost this much more than the best one are given up.
-const BEAM: f64 = 60.0;
+const BEAM: f64 = 500.0;
 /// Longest piece of a line that is laid as a whole. The cost of a way then grows step by step.
 const PIECE_MM: f64 = 2.0;
-/// The file has begun when the motors have followed it this far. Then they cost at most `BEFORE` on average.
+/// Each point stands for this length at least. Else a point between short lines could be far off at no cost.
+const LEAST_MM: f64 = 0.5;
+/// The file has begun when the motors have followed it this far, at most `BEFORE_MM` off.
 const BEGUN_MM: f64 = 50.0;
 
 /// Distances between the two paths.
@@ -84,7 +87,12 @@ pub struct Comparison {
     pub filament_mm: f64,
 }
 
-/// A distance with heights that count less.
+/// Cost of a point that is off, and stands for this length.
+fn cost(off_mm: f64, mm: f64) -> f64 {
+    off_mm.min(FAR_MM).powi(2) * mm.max(LEAST_MM)
+}
+
+/// A place with a height that counts less.
 fn flat(place: [f64; 3]) -> [f64; 3] {
     [place[0], place[1], place[2] * HEIGHT]
 }
@@ -122,21 +130,21 @@ impl States {
         self.flat.len()
     }
 
-    /// Cost of a millimeter in a state where the file asks for nothing; `None` for a line of the file.
+    /// How far off a state counts where the file asks for nothing; `None` for a line of the file.
     fn free(&self, state: usize) -> Option<f64> {
         match state {
-            0 => Some(BEFORE),
-            state if state == self.last() => Some(AFTER),
-            state => self.points[state].is_start.then_some(MACRO),
+            0 => Some(BEFORE_MM),
+            state if state == self.last() => Some(AFTER_MM),
+            state => self.points[state].is_start.then_some(MACRO_MM),
         }
     }
 
     /// Cost of a line of the motors that ends here.
     fn stay(&self, state: usize, place: [f64; 3], mm: f64) -> f64 {
-        let per_mm = self
-            .free(state)
-            .unwrap_or_else(|| distance(place, nearest(place, self.flat[state - 1], self.flat[state])).min(FAR_MM));
-        per_mm * mm
+        match self.free(state) {
+            Some(off_mm) => off_mm.powi(2) * mm,
+            None => cost(distance(place, nearest(place, self.flat[state - 1], self.flat[state])), mm),
+        }
     }
 
     /// Cost of going from a state to the next one on a line of the motors: the file's point between must be near.
@@ -146,7 +154,7 @@ impl States {
             Some(before) if !self.points[state].is_start => distance(point, self.flat[before]),
             _ => 1.0,
         };
-        distance(point, nearest(point, from, to)).min(FAR_MM) * mm
+        cost(distance(point, nearest(point, from, to)), mm)
     }
 }
 
@@ -231,7 +239,7 @@ pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Option<Comparison> {
         // Once the motors follow the file, they no longer come before it.
         let has_begun = first == 0 && state > 0 && {
             let followed_mm = went_mm - best.begun.1;
-            followed_mm >= BEGUN_MM && best.sum - best.begun.0 <= BEFORE * followed_mm
+            followed_mm >= BEGUN_MM && best.sum - best.begun.0 <= BEFORE_MM.powi(2) * followed_mm
         };
         let gone = row.iter().take_while(|cost| cost.sum > best.sum + BEAM).count().max(usize::from(has_begun));
         // The bits of the first states stay where they are.

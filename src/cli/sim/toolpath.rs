@@ -1,0 +1,240 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! `pinion sim --toolpath` and `--compare`: the path that the motors went, written and compared when the program ends.
+
+#![forbid(unsafe_code)]
+
+use std::fs::{File, OpenOptions};
+use std::io::{self, BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::mpsc::{self, RecvTimeoutError, Sender};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use clap::Args;
+
+use crate::cli::failed;
+use crate::cli::page::{Page, aligned, print};
+use pinion_firmware::time::{Clock, Ticks};
+use pinion_sim::{
+    AskedPath, Body, Comparison, Distances, PathPoint, Recorder, RingWatch, SimProbe, compare, write_gcode, write_stl,
+    write_svg,
+};
+
+/// Time between two reads of the steps.
+const READ_PERIOD: Duration = Duration::from_millis(50);
+/// How late a step may be made.
+const LATE: Ticks = Ticks::from_ms(450);
+
+/// Options about the path of the motors.
+#[derive(Args, Clone, Debug)]
+pub(in crate::cli) struct PathArgs {
+    /// At the end, write the path that the motors went: layers seen from above (.svg), the filament as a body (.stl),
+    /// or moves (.gcode). It serves a host, without the demonstration
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    toolpath: Option<PathBuf>,
+    /// At the end, print how far the motors' path was from the one that this file asks for. It serves a host,
+    /// without the demonstration
+    #[arg(long, value_name = "FILE.gcode", conflicts_with_all = ["demo", "picture", "print_config", "print_board"])]
+    compare: Option<PathBuf>,
+    /// The distance along x and y above which `--compare` ends with exit status 1
+    #[arg(long, value_name = "MM", requires = "compare", default_value_t = 0.1)]
+    within: f64,
+}
+
+/// What becomes of the path.
+#[derive(Clone, Copy)]
+enum Form {
+    Drawing,
+    Solid,
+    Moves,
+}
+
+/// The files of the options, checked before the printer starts.
+pub(in crate::cli) struct Files {
+    toolpath: Option<(PathBuf, Form)>,
+    compare: Option<(PathBuf, AskedPath)>,
+    within_mm: f64,
+}
+
+impl Files {
+    /// Checks the files; `None` without the options.
+    pub(in crate::cli) fn check(args: &PathArgs) -> Result<Option<Files>, String> {
+        if args.toolpath.is_none() && args.compare.is_none() {
+            return Ok(None);
+        }
+        let compare = match &args.compare {
+            Some(path) => Some((path.clone(), AskedPath::load(path).map_err(|error| error.to_string())?)),
+            None => None,
+        };
+        if !(args.within.is_finite() && args.within > 0.0) {
+            return Err(format!("--within {} is no distance: give millimeters above 0", args.within));
+        }
+        let toolpath = args.toolpath.as_deref().map(form).transpose()?;
+        Ok(Some(Files { toolpath, compare, within_mm: args.within }))
+    }
+}
+
+/// The form by the file's extension. The file must be writable: a long print is not lost at its end.
+fn form(path: &Path) -> Result<(PathBuf, Form), String> {
+    let extension = path.extension().and_then(|extension| extension.to_str()).unwrap_or_default();
+    let form = match extension.to_ascii_lowercase().as_str() {
+        "svg" => Form::Drawing,
+        "stl" => Form::Solid,
+        "gcode" => Form::Moves,
+        _ => return Err(format!("{}: the extension says no form: name it .svg, .stl or .gcode", path.display())),
+    };
+    OpenOptions::new().create(true).append(true).open(path).map_err(|error| unwritable(path, &error))?;
+    Ok((path.to_owned(), form))
+}
+
+fn unwritable(path: &Path, error: &io::Error) -> String {
+    format!("{} cannot be written: {error}: name a file in a folder of yours", path.display())
+}
+
+/// The thread that records the path.
+pub(in crate::cli) struct PathRecord {
+    files: Files,
+    probe: SimProbe,
+    stop: Sender<()>,
+    recorded: JoinHandle<Recorded>,
+}
+
+struct Recorded {
+    recorder: Recorder,
+    rings: Vec<RingWatch>,
+}
+
+impl PathRecord {
+    /// Records from now on. Start it before the MCU runs: a real-time thread passes its scheduling on.
+    pub(in crate::cli) fn record(files: Files, probe: SimProbe) -> io::Result<PathRecord> {
+        let (stop, stopped) = mpsc::channel::<()>();
+        let watched = probe.clone();
+        let mut recorded = Recorded { recorder: probe.recorder(), rings: probe.rings() };
+        let thread = thread::Builder::new().name("toolpath".into()).spawn(move || {
+            let mut prints = false;
+            while stopped.recv_timeout(READ_PERIOD) == Err(RecvTimeoutError::Timeout) {
+                let now = watched.now();
+                recorded.recorder.read(now);
+                let settled = Clock::from_ticks(now.ticks().saturating_sub(LATE.0.into()));
+                recorded.rings.iter_mut().for_each(|ring| ring.read(settled));
+                if !prints && recorded.recorder.points().last().is_some_and(|last| last.layer > 0) {
+                    // Homing stops abruptly, and rings more than any print.
+                    prints = true;
+                    recorded.rings.iter_mut().for_each(RingWatch::forget);
+                }
+            }
+            let now = watched.now();
+            // After a moment without a step the path ends.
+            recorded.recorder.read(Clock::from_ticks(now.ticks() + u64::from(LATE.0)));
+            recorded.rings.iter_mut().for_each(|ring| ring.read(now));
+            recorded
+        })?;
+        Ok(PathRecord { files, probe, stop, recorded: thread })
+    }
+
+    /// Writes and compares the path after the MCU has ended. The exit status is 1 if something is wrong with it.
+    pub(in crate::cli) fn end(self) -> ExitCode {
+        let PathRecord { files, probe, stop, recorded } = self;
+        drop(stop);
+        let Ok(recorded) = recorded.join() else {
+            return failed("the path was not recorded: report this with the log");
+        };
+        let points = recorded.recorder.points();
+        let mut page = Page::default();
+        let mut troubles = Vec::new();
+        if let Some((path, form)) = &files.toolpath {
+            match write(path, *form, points) {
+                Ok(said) => page.line(said),
+                Err(error) => troubles.push(unwritable(path, &error)),
+            }
+        }
+        if recorded.recorder.gaps() > 0 {
+            let gaps = recorded.recorder.gaps();
+            troubles.push(format!("the path has {gaps} gaps: the computer was busy for too long: run less beside it"));
+        }
+        if recorded.recorder.is_full() {
+            troubles.push("the path was too long, so its end is missing: print a shorter file".to_owned());
+        }
+        if let Some((path, asked)) = &files.compare {
+            let lost: Vec<_> = probe.axes().filter(|axis| axis.lost_steps > 0).collect();
+            for axis in lost {
+                let (name, count) = (axis.name, axis.lost_steps);
+                troubles
+                    .push(format!("axis {name} lost {count} steps at an end of its travel: look at the moves there"));
+            }
+            report(&mut page, &mut troubles, path, compare(points, asked), files.within_mm);
+            for ring in &recorded.rings {
+                if let Some(seen) = ring.seen() {
+                    page.line(format_args!(
+                        "the head rings along {} at {} Hz: {:.4} mm off at most, {:.4} mm on average",
+                        ring.axis(),
+                        ring.hz(),
+                        seen.greatest_mm,
+                        seen.mean_mm
+                    ));
+                }
+            }
+        }
+        if let Err(error) = print(&page) {
+            troubles.push(error);
+        }
+        troubles.iter().for_each(|trouble| log::error!("{trouble}"));
+        if troubles.is_empty() { ExitCode::SUCCESS } else { ExitCode::FAILURE }
+    }
+}
+
+/// Writes the path, and says what was written.
+fn write(path: &Path, form: Form, points: &[PathPoint]) -> io::Result<String> {
+    let mut out = BufWriter::new(File::create(path)?);
+    let (file, count) = (path.display(), points.len());
+    let said = match form {
+        Form::Drawing => {
+            write_svg(points, &mut out)?;
+            format!("drawn: {file} ({count} points)")
+        }
+        Form::Moves => {
+            write_gcode(points, &mut out)?;
+            format!("written: {file} ({count} points)")
+        }
+        Form::Solid => {
+            let Body { off_mm, left_out } = write_stl(points, &mut out)?;
+            let left_out = if left_out > 0 { format!(", {left_out} lines had no room") } else { String::new() };
+            format!("written: {file} (at most {off_mm} mm off the path{left_out})")
+        }
+    };
+    out.flush()?;
+    Ok(said)
+}
+
+/// Adds the comparison to the page.
+fn report(page: &mut Page, troubles: &mut Vec<String>, path: &Path, found: Option<Comparison>, within_mm: f64) {
+    let file = path.display();
+    let Some(found) = found else {
+        let cause = "the motors never went along the path of this file";
+        troubles.push(format!("{file}: {cause}: print it, and check position_endstop and the offsets"));
+        return;
+    };
+    let head = ["layer", "z mm", "greatest mm", "at line", "mean mm", "greatest z mm", "path mm"];
+    let mut rows = vec![head.map(str::to_owned).to_vec()];
+    let row = |layer: String, z: String, found: &Distances| {
+        let Distances { greatest_mm, line, mean_mm, greatest_z_mm, length_mm } = found;
+        let numbers = [greatest_mm, mean_mm, greatest_z_mm].map(|mm| format!("{mm:.4}"));
+        let [greatest, mean, greatest_z] = numbers;
+        vec![layer, z, greatest, line.to_string(), mean, greatest_z, format!("{length_mm:.0}")]
+    };
+    rows.extend(found.layers.iter().map(|(layer, z_mm, found)| row(layer.to_string(), format!("{z_mm:.2}"), found)));
+    rows.push(row("all".into(), String::new(), &found.all));
+    page.line(format_args!("the motors' path beside {file}:"));
+    aligned(&rows).iter().for_each(|line| page.line(line));
+    if let Some(line) = found.ends_at_line {
+        troubles.push(format!("{file}:{line}: the motors' path ends here: print the whole file"));
+    }
+    if found.all.greatest_mm > within_mm {
+        let Distances { greatest_mm, line, .. } = found.all;
+        troubles.push(format!(
+            "{file}:{line}: the motors were {greatest_mm:.3} mm off, above --within {within_mm}: look for late \
+             steps in the log, and for what printer.cfg changes here"
+        ));
+    }
+}
