@@ -92,21 +92,9 @@ impl Printer {
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
-        Printer::start_sim(checkout, &["--show"], describe, change)
-    }
-
-    /// The same, with `pinion sim` and other options. Its folder is the program's working directory.
-    pub fn start_sim(
-        checkout: &Path,
-        options: &[&str],
-        describe: impl FnOnce(String, &Path) -> String,
-        change: impl FnOnce(String) -> String,
-    ) -> Printer {
         Printer::serve(checkout, describe, change, |folder| {
             let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-                .current_dir(folder)
-                .args(["sim", "-r"])
-                .args(options)
+                .args(["sim", "-r", "--show"])
                 .arg(folder.join("board.toml"))
                 .arg("-I")
                 .arg(folder.join("tty"))
@@ -261,15 +249,6 @@ impl Printer {
                 };
             }
         }
-    }
-
-    /// Ends the host and the program, and returns the program's exit code, its output and its log.
-    pub fn ended(&mut self) -> (Option<i32>, String, String) {
-        self.kill_host();
-        let Server::Program(pinion) = &mut self.server else { panic!("not a program") };
-        nix::sys::signal::kill(nix::unistd::Pid::from_raw(pinion.id() as i32), Signal::SIGINT).unwrap();
-        let code = pinion.wait().unwrap().code();
-        (code, fs::read_to_string(self.path("shown")).unwrap(), self.log())
     }
 
     /// Runs G-code to its end.

@@ -22,7 +22,6 @@ mod seeds;
 mod servo;
 mod shown;
 mod ssh;
-mod toolpath;
 mod tools;
 
 use std::io::Write;

@@ -16,8 +16,6 @@ const MOVE: &[&str] = &[
     "config_digital_out oid=1 pin=x_enable value=0 default_value=0 max_duration=0",
     "finalize_config crc=1",
     "set_next_step_dir oid=0 dir=1",
-    "reset_step_clock oid=0 clock=@0.1",
-    "queue_step oid=0 interval=25000 count=200 add=0",
 ];
 
 #[test]
@@ -33,7 +31,10 @@ fn the_path_is_written_when_the_program_ends() {
         pinion.wait_for_link();
         let mut client = pinion.client();
         MOVE.iter().for_each(|line| client.send_line(line).unwrap());
-        thread::sleep(Duration::from_millis(600));
+        let clock = client.clock_in(0.2).unwrap().wire();
+        client.send_line(&format!("reset_step_clock oid=0 clock={}", clock.0)).unwrap();
+        client.send_line("queue_step oid=0 interval=25000 count=200 add=0").unwrap();
+        thread::sleep(Duration::from_millis(800));
         drop(client);
         pinion.signal(signal);
         assert_eq!(pinion.end().code(), Some(0), "{}", pinion.log());

@@ -167,7 +167,7 @@ impl PathRecord {
             for ring in &recorded.rings {
                 if let Some(seen) = ring.seen() {
                     page.line(format_args!(
-                        "the head rings along {} at {} Hz: {:.4} mm off at most, {:.4} mm on average",
+                        "behind a move the head rings along {} at {} Hz: {:.4} mm off at most, {:.4} mm on average",
                         ring.axis(),
                         ring.hz(),
                         seen.greatest_mm,
