@@ -32,7 +32,7 @@ fn the_path_is_written_when_the_program_ends() {
         let mut client = pinion.client();
         MOVE.iter().for_each(|line| client.send_line(line).unwrap());
         let clock = client.clock_in(0.2).unwrap().wire();
-        client.send_line(&format!("reset_step_clock oid=0 clock={}", clock.0)).unwrap();
+        client.send_line(&format!("reset_step_clock oid=0 clock={clock}")).unwrap();
         client.send_line("queue_step oid=0 interval=25000 count=200 add=0").unwrap();
         thread::sleep(Duration::from_millis(800));
         drop(client);
