@@ -153,8 +153,8 @@ impl Reader {
             "M83" => self.relative_filament = true,
             "G92" => {
                 let any = AXES.iter().any(|axis| words.0.iter().any(|(letter, _)| letter == axis));
-                for axis in 0..4 {
-                    let given = if any { words.get(AXES[axis])? } else { Some(0.0) };
+                for (axis, letter) in AXES.into_iter().enumerate() {
+                    let given = if any { words.get(letter)? } else { Some(0.0) };
                     if let (Some(value), Some(at)) = (given, self.at[axis]) {
                         self.base[axis] = at - value;
                     }

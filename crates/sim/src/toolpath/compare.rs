@@ -172,7 +172,7 @@ impl Ways {
     }
 
     fn push(&mut self, entered: bool) {
-        if self.count % 64 == 0 {
+        if self.count.is_multiple_of(64) {
             self.bits.push(0);
         }
         if let Some(word) = self.bits.last_mut() {
