@@ -10,9 +10,9 @@ use crate::panel::Panel;
 use crate::scene::{Printer, Scene};
 
 /// Pixels in a row, and rows.
-pub const WIDTH: u16 = 800;
+pub const WIDTH: u16 = 736;
 /// Rows of pixels.
-pub const HEIGHT: u16 = 600;
+pub const HEIGHT: u16 = 552;
 /// Width of the panel with texts, on the right.
 const PANEL: f64 = 272.0;
 /// Free pixels around everything.
@@ -58,7 +58,7 @@ impl Picture {
         for (turn, fan) in self.turns.iter_mut().zip(&scene.fans) {
             *turn = (*turn + fan.rpm / 60.0 / SLOW_MOTION * elapsed_s).fract();
         }
-        laid::draw(&mut self.laid, &self.lens, &scene.laid);
+        self.lay(scene);
         let canvas = &mut self.canvas;
         canvas.pixmap.data_mut().copy_from_slice(self.still.pixmap.data());
         self.printer.draw_heat(canvas, &self.lens, scene);
@@ -66,6 +66,11 @@ impl Picture {
         canvas.overlay(&self.laid);
         self.printer.draw_moving(canvas, &self.lens, scene, &self.turns);
         self.panel.draw(canvas, scene, &self.turns);
+    }
+
+    /// Draws only what was laid since the last scene. The next picture shows it.
+    pub fn lay(&mut self, scene: &Scene) {
+        laid::draw(&mut self.laid, &self.lens, &scene.laid);
     }
 
     /// The last scene: red, green, blue and 255 for each pixel, rows from the top.

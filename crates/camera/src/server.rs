@@ -60,7 +60,7 @@ const PAGE: &str = "<!doctype html>
 body { margin: 0; background: #0e1014 }
 img { display: block; width: 100%; max-height: 100vh; object-fit: contain }
 </style>
-<img src=\"stream\" width=\"800\" height=\"600\" alt=\"The simulated printer\">
+<img src=\"stream\" width=\"736\" height=\"552\" alt=\"The simulated printer\">
 </html>
 ";
 

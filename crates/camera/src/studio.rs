@@ -12,6 +12,8 @@ use crate::scene::Scene;
 pub const PERIOD: Duration = Duration::from_micros(1_000_000 / 15);
 /// Longest wait for a frame. A frame takes milliseconds.
 const WAIT_MAX: Duration = Duration::from_secs(10);
+/// While nobody looks, what was laid is drawn after this time, and nothing else. So it never becomes much.
+const LAYING_PERIOD: Duration = Duration::from_secs(60);
 
 /// A picture at one instant.
 pub struct Frame {
@@ -64,10 +66,15 @@ impl Studio {
     /// Draws each frame that somebody waits for. `look` tells what there is to draw.
     pub fn draw(&self, mut picture: Picture, mut look: impl FnMut() -> Scene) {
         for number in 1.. {
-            let waited = self.wanted.wait_while(self.state(), |state| !state.is_wanted);
-            let state = waited.unwrap_or_else(PoisonError::into_inner);
-            let next = state.last.as_ref().map(|last| last.drawn + PERIOD);
-            drop(state);
+            let next = loop {
+                let waited = self.wanted.wait_timeout_while(self.state(), LAYING_PERIOD, |state| !state.is_wanted);
+                let (state, _) = waited.unwrap_or_else(PoisonError::into_inner);
+                if state.is_wanted {
+                    break state.last.as_ref().map(|last| last.drawn + PERIOD);
+                }
+                drop(state);
+                picture.lay(&look());
+            };
             if let Some(wait) = next.and_then(|next| next.checked_duration_since(Instant::now())) {
                 thread::sleep(wait);
             }
