@@ -92,9 +92,21 @@ impl Printer {
         describe: impl FnOnce(String, &Path) -> String,
         change: impl FnOnce(String) -> String,
     ) -> Printer {
+        Printer::start_sim(checkout, &["--show"], describe, change)
+    }
+
+    /// The same, with `pinion sim` and other options. Its folder is the program's working directory.
+    pub fn start_sim(
+        checkout: &Path,
+        options: &[&str],
+        describe: impl FnOnce(String, &Path) -> String,
+        change: impl FnOnce(String) -> String,
+    ) -> Printer {
         Printer::serve(checkout, describe, change, |folder| {
             let pinion = Command::new(env!("CARGO_BIN_EXE_pinion"))
-                .args(["sim", "-r", "--show"])
+                .current_dir(folder)
+                .args(["sim", "-r"])
+                .args(options)
                 .arg(folder.join("board.toml"))
                 .arg("-I")
                 .arg(folder.join("tty"))
@@ -249,6 +261,15 @@ impl Printer {
                 };
             }
         }
+    }
+
+    /// Ends the host and the program, and returns the program's exit code, its output and its log.
+    pub fn ended(&mut self) -> (Option<i32>, String, String) {
+        self.kill_host();
+        let Server::Program(pinion) = &mut self.server else { panic!("not a program") };
+        nix::sys::signal::kill(nix::unistd::Pid::from_raw(pinion.id() as i32), Signal::SIGINT).unwrap();
+        let code = pinion.wait().unwrap().code();
+        (code, fs::read_to_string(self.path("shown")).unwrap(), self.log())
     }
 
     /// Runs G-code to its end.
@@ -466,9 +487,9 @@ impl Printer {
     }
 }
 
-/// An example of docs/guide/simulator.md: alone, or appended to the built-in description as the example says.
+/// An example of docs/guide/simulated-printer.md: alone, or appended to the built-in description as the example says.
 pub fn example(built_in: &str, heading: &str) -> String {
-    const PAGE: &str = include_str!("../../docs/guide/simulator.md");
+    const PAGE: &str = include_str!("../../docs/guide/simulated-printer.md");
     let (_, section) = PAGE.split_once(&format!("\n### {heading}\n")).unwrap();
     let (example, _) = section.split_once("\n```toml\n").unwrap().1.split_once("```\n").unwrap();
     if example.starts_with("[delta]") {

@@ -22,6 +22,7 @@ mod seeds;
 mod servo;
 mod shown;
 mod ssh;
+mod toolpath;
 mod tools;
 
 use std::io::Write;

@@ -40,10 +40,13 @@ connections() { [ "$(linked | grep -c 'connected to far@toolhead.local within')"
 until_true 30 connections 1
 configure
 sed -i "s|^serial: $LINK|serial: /tmp/klipper_host_toolhead|" $CONFIG
+for_a_print
 homes() { pull 6 up; gcode 'G28 X'; pull 6 down; is "$(of toolhead homed_axes)" x "what is homed"; }
 systemctl start klipper
 until_state ready
-homes
+home_xy
+print_a_while
+echo "printed for $PRINT_S s: the motors are at $of_mcu; $(grep -o 'bytes_retransmit=[0-9]* bytes_invalid=[0-9]*' $LOG | tail -n 1)"
 gcode 'SET_PIN PIN=light VALUE=1'
 until_true 10 is_high 14
 firmware_restart

@@ -15,7 +15,7 @@ fn error_of(from: &str, to: &str) -> String {
     }
 }
 
-const DOCUMENTATION: &str = include_str!("../../../../docs/guide/simulator.md");
+const DOCUMENTATION: &str = include_str!("../../../../docs/guide/simulated-printer.md");
 
 /// An example of the documentation: alone, or appended to the built-in description as the example says.
 pub(crate) fn example(heading: &str) -> String {
