@@ -10,7 +10,7 @@ use nix::unistd::Pid;
 use pinion_client::Client;
 use serde_json::Value;
 
-use crate::links::{client, on_serial, plug_in};
+use crate::links::{client, on_serial, plug_in, pull_out};
 use crate::process::{Pinion, WAIT_MAX};
 use crate::ssh::{attached, near};
 use crate::status::{line, status};
@@ -156,7 +156,7 @@ fn a_serial_port_that_is_pulled_out() {
         let (mcu, host) = serial();
         let cut = |mcu: &Pinion, host: Client| -> Whole {
             // The line hangs up, and the port is gone.
-            drop(host);
+            pull_out(mcu.folder(), host);
             mcu.logged("ttyPort is gone");
             Box::new(|mcu| {
                 let host = plug_in(mcu.folder());

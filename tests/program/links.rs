@@ -21,10 +21,14 @@ pub fn plug_in(folder: &TempDir) -> PtyMaster {
     let host = posix_openpt(OFlag::O_RDWR | OFlag::O_NOCTTY | OFlag::O_CLOEXEC).unwrap();
     grantpt(&host).unwrap();
     unlockpt(&host).unwrap();
-    let port = folder.path().join("ttyPort");
-    let _ = fs::remove_file(&port);
-    symlink(ptsname_r(&host).unwrap(), port).unwrap();
+    symlink(ptsname_r(&host).unwrap(), folder.path().join("ttyPort")).unwrap();
     host
+}
+
+/// Takes the port away. First its name, because the kernel gives the terminal's number to whoever opens the next one.
+pub fn pull_out(folder: &TempDir, host: Client) {
+    fs::remove_file(folder.path().join("ttyPort")).unwrap();
+    drop(host);
 }
 
 pub fn client(host: impl Into<OwnedFd>) -> Client {
@@ -71,7 +75,7 @@ fn a_serial_port_that_goes_and_comes_back_is_served_again() {
     pinion.logged("ttyPort (250000 baud)");
     let mut first = client(host);
     uptime(&mut first);
-    drop(first);
+    pull_out(pinion.folder(), first);
     pinion.logged("ttyPort is gone");
     pinion.logged("host gone");
     let host = plug_in(pinion.folder());
