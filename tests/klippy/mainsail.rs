@@ -71,6 +71,8 @@ impl Drop for Stack {
 
 /// The color of the simulated printer's head in the light. Mainsail has none like it.
 const HEAD: [u8; 3] = [248, 140, 32];
+/// The title bar of Mainsail's panel "Missing configuration" (orange darken-2 of Vuetify).
+const MISSING: [u8; 3] = [0xf5, 0x7c, 0x00];
 
 #[test]
 fn mainsail_shows_the_camera() {
@@ -93,4 +95,5 @@ fn mainsail_shows_the_camera() {
     let is_head = |pixel: &&[u8; 3]| pixel.iter().zip(HEAD).all(|(a, b): (&u8, u8)| a.abs_diff(b) < 12);
     let head = pixels.iter().filter(is_head).count();
     assert!(head > 100, "{head} pixels are the head's");
+    assert!(!pixels.contains(&MISSING), "Mainsail says that something is missing in printer.cfg");
 }
