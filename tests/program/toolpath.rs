@@ -49,13 +49,13 @@ fn the_path_is_written_when_the_program_ends() {
 fn a_wrong_file_is_one_line_before_the_printer_starts() {
     let (folder, gcode) = folder_with("part.gcode", "G1 X1 Y1 Z1\nG1 X2\n");
     let bad = folder.path().join("bad.gcode");
-    fs::write(&bad, "G1 X1 Y1 Z1\nG1 Xone\n").unwrap();
+    fs::write(&bad, "G1 X1 Y1 Z1\nG1 X1.2.3\n").unwrap();
     let [gcode, bad] = [&gcode, &bad].map(|path| path.to_str().unwrap());
     for (args, part) in [
         (&["--toolpath", "path.png"][..], "path.png: the extension says no form: name it .svg, .stl or .gcode"),
         (&["--toolpath", "/nonexistent/path.svg"], "/nonexistent/path.svg cannot be written: "),
         (&["--compare", "/nonexistent/part.gcode"], "/nonexistent/part.gcode: No such file"),
-        (&["--compare", bad], "bad.gcode:2: `XONE` has no number: correct it"),
+        (&["--compare", bad], "bad.gcode:2: `X1.2.3` has no number: correct it"),
         (&["--compare", gcode, "--within", "0"], "--within 0 is no distance: give millimeters above 0"),
     ] {
         let output = output(&[&["sim"], args].concat());

@@ -62,15 +62,34 @@ impl AskedPath {
     }
 }
 
-/// The words of a command: letters with numbers.
-struct Words<'a>(Vec<(char, &'a str)>);
+/// The words of a line as klippy divides it: names of letters, each with the text up to the next name. `G1X10Y5` has no
+/// spaces, and `XY` is one name.
+struct Words<'a>(Vec<(&'a str, &'a str)>);
 
-impl Words<'_> {
-    fn get(&self, letter: char) -> Result<Option<f64>, Trouble> {
-        let Some((_, text)) = self.0.iter().find(|(its, _)| *its == letter) else { return Ok(None) };
-        match text.parse::<f64>().ok().filter(|number| number.is_finite()) {
+impl<'a> Words<'a> {
+    fn new(mut line: &'a str) -> Words<'a> {
+        let is_name = |character: char| character.is_ascii_alphabetic() || character == '_';
+        let mut words = Vec::new();
+        while !line.is_empty() {
+            let (name, rest) = line.split_at(line.find(|c| !is_name(c)).unwrap_or(line.len()));
+            let (value, next) = rest.split_at(rest.find(is_name).unwrap_or(rest.len()));
+            words.push((name, value));
+            line = next;
+        }
+        Words(words)
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.0.iter().any(|(its, _)| *its == name)
+    }
+
+    /// The number with this name; of several the last.
+    fn get(&self, name: &str) -> Result<Option<f64>, Trouble> {
+        let Some((_, value)) = self.0.iter().rfind(|(its, _)| *its == name) else { return Ok(None) };
+        let value = value.trim();
+        match value.parse::<f64>().ok().filter(|number| number.is_finite()) {
             Some(number) => Ok(Some(number)),
-            None => Err(Trouble::new(format!("`{letter}{text}` has no number")).remedy("correct it")),
+            None => Err(Trouble::new(format!("`{name}{value}` has no number")).remedy("correct it")),
         }
     }
 }
@@ -108,53 +127,44 @@ impl Default for Reader {
     }
 }
 
-const AXES: [char; 4] = ['X', 'Y', 'Z', 'E'];
+const AXES: [&str; 4] = ["X", "Y", "Z", "E"];
 
 impl Reader {
     fn read(&mut self, line: &str) -> Result<(), Trouble> {
         let line = line.split([';', '*']).next().unwrap_or_default().trim().to_ascii_uppercase();
-        let mut words = line.split_whitespace().peekable();
-        // A line number.
-        words.next_if(|word| word.strip_prefix('N').is_some_and(|rest| rest.parse::<u64>().is_ok()));
-        let Some(command) = words.next() else { return Ok(()) };
-        let is_plain = command.len() > 1 && command.as_bytes()[0].is_ascii_alphabetic() && {
-            command[1..].bytes().all(|byte| byte.is_ascii_digit() || byte == b'.')
-        };
-        if !is_plain {
+        let words = Words::new(&line);
+        let has_number = words.0.first().is_some_and(|(name, _)| *name == "N");
+        let Some((letter, value)) = words.0.get(usize::from(has_number)) else { return Ok(()) };
+        // M117 and M118 may have a text of any characters.
+        let number = value.split(char::is_whitespace).next().unwrap_or_default();
+        let is_digit = |byte: u8| byte.is_ascii_digit() || byte == b'.';
+        if letter.len() != 1 || number.is_empty() || !number.bytes().all(is_digit) {
             // A macro, or a command of klippy. It may move the head, and it comes back or says where to go next.
             self.is_start = true;
             return Ok(());
         }
-        let letter_and_number = |word: &'_ str| -> Option<(char, usize)> {
-            let letter = word.chars().next()?;
-            Some((letter, letter.len_utf8()))
-        };
-        let words: Vec<&str> = words.collect();
-        let words = words.iter().filter_map(|word| letter_and_number(word).map(|(c, n)| (c, &word[n..])));
-        let words = Words(words.collect());
-        match command {
-            "G0" | "G00" | "G1" | "G01" => {
+        match (*letter, number) {
+            ("G", "0" | "00" | "1" | "01") => {
                 let to = self.target(&words)?;
                 self.go(to);
             }
-            "G2" | "G02" => self.arc(&words, true)?,
-            "G3" | "G03" => self.arc(&words, false)?,
-            "G28" => {
-                let named = |axis: usize| words.0.iter().any(|(letter, _)| *letter == AXES[axis]);
-                let all = !(0..3).any(named);
-                for axis in (0..3).filter(|axis| all || named(*axis)) {
+            ("G", "2" | "02") => self.arc(&words, true)?,
+            ("G", "3" | "03") => self.arc(&words, false)?,
+            ("G", "28") => {
+                let all = !AXES[..3].iter().any(|axis| words.has(axis));
+                for axis in (0..3).filter(|axis| all || words.has(AXES[*axis])) {
                     (self.at[axis], self.base[axis]) = (None, 0.0);
                 }
                 self.is_start = true;
             }
-            "G90" => self.relative = false,
-            "G91" => self.relative = true,
-            "M82" => self.relative_filament = false,
-            "M83" => self.relative_filament = true,
-            "G92" => {
-                let any = AXES.iter().any(|axis| words.0.iter().any(|(letter, _)| letter == axis));
-                for (axis, letter) in AXES.into_iter().enumerate() {
-                    let given = if any { words.get(letter)? } else { Some(0.0) };
+            ("G", "90") => self.relative = false,
+            ("G", "91") => self.relative = true,
+            ("M", "82") => self.relative_filament = false,
+            ("M", "83") => self.relative_filament = true,
+            ("G", "92") => {
+                let any = AXES.iter().any(|axis| words.has(axis));
+                for (axis, name) in AXES.into_iter().enumerate() {
+                    let given = if any { words.get(name)? } else { Some(0.0) };
                     if let (Some(value), Some(at)) = (given, self.at[axis]) {
                         self.base[axis] = at - value;
                     }
@@ -200,7 +210,7 @@ impl Reader {
     /// An arc around a center in the plane of x and y, as klippy's `[gcode_arcs]` takes it: I and J are relative.
     fn arc(&mut self, words: &Words<'_>, clockwise: bool) -> Result<(), Trouble> {
         let to = self.target(words)?;
-        let offset = [words.get('I')?.unwrap_or(0.0), words.get('J')?.unwrap_or(0.0)];
+        let offset = [words.get("I")?.unwrap_or(0.0), words.get("J")?.unwrap_or(0.0)];
         let (from, [Some(x), Some(y), ..]) = (self.at, to) else {
             self.go(to);
             return Ok(());
@@ -253,6 +263,32 @@ mod tests {
     }
 
     #[test]
+    fn a_line_is_divided_as_klippy_divides_it() {
+        // The expected numbers are those that klippy's regular expression `args_r` finds.
+        let text = "G28XY\nM83\nG1X10Y20Z0.2F3000\nN7G1X 15E1*71\nG1 Y 25 X20 X16\nG91\nG0Y-5Z+.5\nG90\nG1X1E5Y2\nG1XY9X3\n\
+                    M117 50% 3/4\nG92X0\ng01x.5\n";
+        let path = AskedPath::parse(text, "a").unwrap();
+        let found: Vec<_> = path.points.iter().map(|point| (point.nozzle_mm, point.is_start)).collect();
+        let expected = [
+            ([10.0, 20.0, 0.2], true),
+            ([15.0, 20.0, 0.2], false),
+            ([16.0, 25.0, 0.2], false),
+            ([16.0, 20.0, 0.7], false),
+            ([1.0, 2.0, 0.7], false),
+            ([3.0, 2.0, 0.7], false),
+            ([3.5, 2.0, 0.7], false),
+        ];
+        assert_eq!(found, expected);
+        assert_eq!(path.filament_mm, 6.0);
+        // A macro with a number, a macro of one letter, and what klippy refuses.
+        for line in ["PARK2 X5", "Z", "G 1 X5", "1G1 X5", "_G1 X5"] {
+            let path = AskedPath::parse(&format!("G1X1Y1Z1\n{line}\nG1X2"), "a").unwrap();
+            let last = path.points.last().map(|last| (last.nozzle_mm, last.is_start));
+            assert_eq!((path.points.len(), last), (2, Some(([2.0, 1.0, 1.0], true))), "{line}");
+        }
+    }
+
+    #[test]
     fn a_place_is_known_after_homing_when_the_file_names_it() {
         // X and Y alone leave the height unknown.
         let path =
@@ -299,7 +335,7 @@ mod tests {
     #[test]
     fn an_error_names_the_line_and_a_remedy() {
         for (text, part) in [
-            ("G1 X1\nG1 Xone Y2", "a.gcode:2: `XONE` has no number: correct it"),
+            ("G1 X1\nG1 X1.2.3Y2", "a.gcode:2: `X1.2.3` has no number: correct it"),
             ("G1 X1 Y1 Z1\nG2 X3 Y3 R2", "a.gcode:2: an arc has no center: give I or J"),
             ("; nothing", "a.gcode: it never moves the nozzle between two known places: name"),
             ("G1 X\u{e9}", "has no number"),
