@@ -7,7 +7,7 @@ CARGO_TARGET_DIR ?= target
 PINION = $(CARGO_TARGET_DIR)/release/pinion
 # Options for `pinion sim`, such as ARGS="-I /tmp/klipper_host_sim".
 ARGS ?=
-# Root may run in real time: what else the computer does then disturbs nothing.
+# Root may run in real time: what else the computer does then delays no step.
 REALTIME = $(if $(filter 0,$(shell id -u)),-r)
 
 PREFIX ?= /usr/local

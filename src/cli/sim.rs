@@ -22,7 +22,7 @@ use super::demo::heater::Goal;
 use super::demo::picture;
 use super::demo::{AxisPlan, HeaterPlan, NamedPin, Plan, ProgressLines, Report, demonstrate};
 use crate::runtime::wakeup::MarginLimits;
-use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording};
+use crate::runtime::{self, Access, Helpers, LinkName, Options, Recording, realtime};
 use crate::trace::folder::folders;
 use pinion_client::Client;
 use pinion_linux::clock::Monotonic;
@@ -144,8 +144,12 @@ pub(super) fn run(args: &SimArgs) -> ExitCode {
     let ready = {
         let (args, right) = (args.clone(), right.clone());
         move || {
-            let demo = thread::Builder::new().name("demo".into());
-            if let Err(trouble) = runtime::started(demo.spawn(move || show(&args, &plan, &probe, &right, &ended))) {
+            let demo = thread::Builder::new().name("demo".into()).spawn(move || {
+                // The link's thread starts it, and passes its real-time priority on.
+                realtime::leave();
+                show(&args, &plan, &probe, &right, &ended);
+            });
+            if let Err(trouble) = runtime::started(demo) {
                 log::error!("the demonstration cannot be started: {trouble}");
             }
         }

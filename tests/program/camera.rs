@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim --camera`: the simulated printer as a webcam, while a host drives it.
 
-use std::collections::BTreeSet;
-use std::fs;
 use std::io::{ErrorKind, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::time::Duration;
@@ -96,30 +94,14 @@ fn the_picture_follows_an_axis_and_keeps_what_was_laid() {
     assert!(!exists(&pinion.link()));
 }
 
-/// The scheduling policy and the nice value of each of the program's threads whose name begins with `camera`
-/// (proc_pid_stat(5), fields 41 and 19).
-fn camera_threads(pinion: &Pinion) -> Vec<(String, i64, i64)> {
-    let folders = fs::read_dir(format!("/proc/{}/task", pinion.pid())).unwrap().map(|entry| entry.unwrap().path());
-    let threads = folders.filter_map(|folder| {
-        let name = fs::read_to_string(folder.join("comm")).ok()?.trim().to_owned();
-        // The third field comes after the name, which is in parentheses.
-        let stat = fs::read_to_string(folder.join("stat")).ok()?;
-        let fields: Vec<i64> =
-            stat.rsplit_once(") ")?.1.split_whitespace().map(|field| field.parse().unwrap_or(0)).collect();
-        name.starts_with("camera").then(|| (name, fields[41 - 3], fields[19 - 3]))
-    });
-    threads.collect()
-}
-
 #[test]
 fn no_thread_of_the_camera_is_in_a_hurry() {
     let (pinion, camera) = start(&["-r", "--show"]);
     let mut viewer = request(camera, "/stream");
     viewer.read_exact(&mut [0; 1000]).unwrap();
-    let threads = camera_threads(&pinion);
-    let names: BTreeSet<&str> = threads.iter().map(|(name, ..)| name.as_str()).collect();
-    assert_eq!(names, BTreeSet::from(["camera", "camera path", "camera pen", "camera viewer"]));
-    assert!(threads.iter().all(|(_, policy, nice)| (*policy, *nice) == (0, 10)), "SCHED_OTHER, and nice: {threads:?}");
+    for thread in ["camera", "camera path", "camera pen", "camera viewer"] {
+        assert_eq!(pinion.scheduling(thread), [(0, 10)], "{thread}: SCHED_OTHER, and nice");
+    }
 }
 
 #[test]

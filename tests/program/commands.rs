@@ -82,8 +82,9 @@ fn the_demonstration_fails_where_something_is_wrong() {
 
 #[test]
 fn a_demonstration_that_is_interrupted_ends_without_a_complaint() {
-    let mut pinion = Pinion::start(&["sim"]);
+    let mut pinion = Pinion::start(&["sim", "-r"]);
     pinion.until("the homing", || pinion.out().contains("home x"));
+    assert!(matches!(pinion.scheduling("demo")[..], [(0, _)]), "its client is no part of the MCU (SCHED_OTHER)");
     pinion.signal(Signal::SIGINT);
     assert_eq!(pinion.end().code(), Some(0));
     assert!(!pinion.log().contains("ERROR"), "{}", pinion.log());

@@ -127,6 +127,21 @@ impl Pinion {
         self.child.id()
     }
 
+    /// The scheduling policy and the nice value of each of its threads with this name (proc_pid_stat(5), fields 41 and
+    /// 19).
+    pub fn scheduling(&self, thread: &str) -> Vec<(i64, i64)> {
+        let folders = fs::read_dir(format!("/proc/{}/task", self.pid())).unwrap().map(|entry| entry.unwrap().path());
+        let scheduling = |folder: PathBuf| {
+            let name = fs::read_to_string(folder.join("comm")).ok()?;
+            // The third field comes after the name, which is in parentheses.
+            let stat = fs::read_to_string(folder.join("stat")).ok()?;
+            let fields: Vec<&str> = stat.rsplit_once(") ")?.1.split_whitespace().collect();
+            let field = |number: usize| fields[number - 3].parse().ok();
+            (name.trim() == thread).then_some((field(41)?, field(19)?))
+        };
+        folders.filter_map(scheduling).collect()
+    }
+
     pub fn wait_for_link(&self) {
         self.until("the link", || fs::read_link(self.link()).is_ok());
     }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! `pinion sim --show`: the output while a host drives the printer.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::Write;
 use std::os::unix::process::ExitStatusExt;
 use std::path::{Path, PathBuf};
@@ -34,17 +34,6 @@ fn drive(link: &Path) -> Client {
     client
 }
 
-/// The scheduling policy of one of the program's threads (proc_pid_stat(5), field 41).
-fn policy(pinion: &Pinion, thread: &str) -> u32 {
-    let folders = fs::read_dir(format!("/proc/{}/task", pinion.pid())).unwrap();
-    let read = |folder: &Path, name: &str| fs::read_to_string(folder.join(name)).unwrap();
-    let mut folders = folders.map(|entry| entry.unwrap().path());
-    let folder = folders.find(|folder| read(folder, "comm").trim() == thread).unwrap();
-    // The third field comes after the name, which is in parentheses.
-    let stat = read(&folder, "stat");
-    stat.rsplit_once(") ").unwrap().1.split(' ').nth(41 - 3).unwrap().parse().unwrap()
-}
-
 #[test]
 fn each_change_is_a_line() {
     let mut pinion = Pinion::start(&["sim", "-r", "--show"]);
@@ -60,7 +49,7 @@ fn each_change_is_a_line() {
     ] {
         assert_eq!(first.lines().filter(|shown| shown.ends_with(&format!("] {line}"))).count(), 1, "{line}\n{first}");
     }
-    assert_eq!(policy(&pinion, "show"), 0, "to show something is no hurry (SCHED_OTHER)");
+    assert!(matches!(pinion.scheduling("show")[..], [(0, _)]), "to show something is no hurry (SCHED_OTHER)");
     let mut client = drive(&pinion.link());
     pinion.until("the light", || pinion.out().contains("] light: on\n"));
     let strip = "] strip: red#ff0000 blue#000020 off off off off off off\n";
