@@ -24,16 +24,23 @@ impl Monotonic {
     pub fn start() -> Monotonic {
         Monotonic { origin_s: monotonic().as_secs() }
     }
+
+    #[inline]
+    fn at(&self, s: u64, ns: u32) -> Clock {
+        let s = s.saturating_sub(self.origin_s);
+        Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(ns) / NS_PER_TICK)
+    }
 }
 
 impl TimeSource for Monotonic {
     fn now(&self) -> Clock {
-        self.instant_of(monotonic())
+        // Without a [`Duration`] in between, which would have to be checked.
+        let now = clock_gettime(ClockId::CLOCK_MONOTONIC);
+        now.map_or(Clock::EPOCH, |now| self.at(now.tv_sec() as u64, now.tv_nsec() as u32))
     }
 
     fn instant_of(&self, monotonic: Duration) -> Clock {
-        let s = monotonic.as_secs().saturating_sub(self.origin_s);
-        Clock::from_ticks(s * u64::from(CLOCK_FREQ) + u64::from(monotonic.subsec_nanos()) / NS_PER_TICK)
+        self.at(monotonic.as_secs(), monotonic.subsec_nanos())
     }
 
     fn duration_of(&self, clock: Clock) -> Duration {

@@ -149,6 +149,13 @@ impl HeldLine {
         Shutdown::because(reason, self.subject.lost(what, code, self.sleeping.is_some()))
     }
 
+    /// Writes a line of a chip that may block. It is apart, so that the core's writes need not save its registers.
+    #[inline(never)]
+    fn write_checked(&self, flags: u32, level: bool) -> Result<(), Shutdown> {
+        let written = sys::set_line_checked(&self.handle, flags, level);
+        written.map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default()))
+    }
+
     /// Gives the line to the guardian if it is an output now. Otherwise takes it back from the guardian.
     fn watch_over(&self, direction: Direction) -> Result<(), Shutdown> {
         match direction {
@@ -243,14 +250,11 @@ impl Line for HeldLine {
             registers.write(level);
             return Ok(());
         }
-        match &self.sleeping {
-            None => self
-                .handle
-                .set_value(level.into())
-                .map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error))),
-            Some(_) => sys::set_line_checked(&self.handle, flags, level)
-                .map_err(|error| self.lost(reason::LINE_WRITE, "written", error.raw_os_error().unwrap_or_default())),
+        if self.sleeping.is_some() {
+            return self.write_checked(flags, level);
         }
+        let written = self.handle.set_value(level.into());
+        written.map_err(|error| self.lost(reason::LINE_WRITE, "written", errno(&error)))
     }
 
     fn read(&self) -> Result<bool, Shutdown> {

@@ -64,6 +64,7 @@ struct Stepper {
     invert_step: bool,
     /// Every edge is a step. Otherwise an edge back follows each step.
     both_edges: bool,
+    /// The shortest time between two edges. Zero if it is shorter than a [`CALL`] that makes an edge.
     pulse_ticks: Ticks,
     late_limit: Ticks,
     queue: MoveQueue<Move>,
@@ -91,6 +92,10 @@ struct Stepper {
 /// A homing stepper makes its steps in order if they are this many ticks late. An MCU that runs is not 50 us late. An
 /// MCU that is 50 ms late has more steps to make than it can. Other timers must not wait for these.
 const IN_ORDER: Range<i64> = Ticks::from_us(50).0 as i64..Ticks::from_us(50_000).0 as i64;
+
+/// A call of the kernel takes longer than this, 100 ns. So a line that is not fast holds such a pulse without a look at
+/// the clock.
+const CALL: Ticks = Ticks(5);
 
 /// Keeps the position's top bit free for the direction.
 const POSITION_BIAS: u32 = 0x4000_0000;
@@ -122,9 +127,8 @@ impl Stepper {
         let early = earliest.since(self.next_step);
         if early > i64::from(self.late_limit.0) {
             let cause = format!(
-                "a step is {} us late: more steps a second are asked for than the step pulse of {} ticks and this computer allow",
-                early / i64::from(Ticks::from_us(1).0),
-                self.pulse_ticks.0
+                "a step is {} us late: more steps a second are asked for than the step pulse and this computer allow",
+                early / i64::from(Ticks::from_us(1).0)
             );
             return Err(Shutdown::because(STEPPER_PAST, cause)
                 .remedy("lower the speed, the microsteps or step_pulse_duration")
@@ -239,8 +243,12 @@ impl Object for Stepper {
         }
         if !self.step.was_batched() {
             self.step.toggle()?;
-            // Read the time after the edge was written, because a write may be slow.
-            turn.now();
+            // A pulse begins after the edge was written, because a write may be slow.
+            if self.pulse_ticks > Ticks(0) {
+                turn.now();
+            } else {
+                turn.made_edge();
+            }
         }
         let earliest = turn.last_read() + self.pulse_ticks;
         let edges = self.edges.saturating_sub(1);
@@ -254,6 +262,8 @@ impl Object for Stepper {
             self.interval = self.interval.wrapping_add_signed(i32::from(self.add));
             return Ok(self.edge_at(turn, self.next_step, earliest));
         }
+        // How late the next step is must be known well.
+        let earliest = turn.now() + self.pulse_ticks;
         self.load(turn, Some(earliest))
     }
 
@@ -289,12 +299,13 @@ const CONFIG_STEPPER: Command = command!(
         let idle = invert_step > 0;
         let step = mcu.prompt_output(step_pin, "step", idle, idle)?;
         let dir = mcu.prompt_output(dir_pin, "dir", false, false)?;
+        let pulse_ticks = if step_pulse_ticks <= CALL && !step.is_fast() { Ticks(0) } else { step_pulse_ticks };
         let stepper = Stepper {
             step,
             dir,
             invert_step: idle,
             both_edges: invert_step < 0,
-            pulse_ticks: step_pulse_ticks,
+            pulse_ticks,
             late_limit: mcu.step_late_limit(),
             queue: MoveQueue::default(),
             edges: 0,

@@ -146,6 +146,11 @@ impl PromptLine {
         self.write(!self.level)
     }
 
+    /// Whether the line is written without a call of the kernel.
+    pub fn is_fast(&self) -> bool {
+        self.line.is_fast()
+    }
+
     /// Inverts the line with a batch of edges, if the batch takes it.
     pub fn join(&mut self, batch: &mut Batch) -> bool {
         let level = !self.level;

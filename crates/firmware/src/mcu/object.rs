@@ -96,7 +96,8 @@ impl Mcu {
 
     #[inline]
     pub(super) fn put_back(&mut self, oid: Oid, object: Box<dyn Object>) {
-        if let Some(slot) = self.configuration.objects.get_mut(oid.index()) {
+        // The place is empty, so nothing has to be dropped.
+        if let Some(slot @ None) = self.configuration.objects.get_mut(oid.index()) {
             *slot = Some(object);
         }
     }

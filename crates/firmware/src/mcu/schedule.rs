@@ -20,6 +20,8 @@ pub const SPIN_MAX: Ticks = Ticks::from_us(50);
 const REPEAT_COUNT: u32 = 20;
 /// The same after a turn without a command to run (`TIMER_IDLE_REPEAT_COUNT`).
 const IDLE_REPEAT_COUNT: u32 = 100;
+/// How many edges may follow each other without a look at the clock. A look takes a tenth of an edge's time.
+const UNTIMED_MAX: u32 = 4;
 /// The time between two `stats` responses.
 const STATS_TICKS: Ticks = Ticks::from_ms(5000);
 /// Two timers for each object and three for the MCU.
@@ -30,6 +32,8 @@ pub(super) struct Schedule {
     timing: Timing,
     pub(super) timers: Timers,
     pub(super) last_read: Clock,
+    /// Untimed edges since then.
+    untimed: u32,
     /// Whether some timers were still due after the last run.
     pub(super) is_behind: bool,
     /// How late the timers were.
@@ -58,7 +62,17 @@ impl Schedule {
         let mut timers = Timers::with_capacity(TIMERS_MAX);
         timers.insert(now + STATS_TICKS, TimerId::STATS);
         let (lateness, latest, stats) = (Lateness::default(), Latest::default(), Stats::default());
-        Schedule { timing, timers, last_read: now, is_behind: false, lateness, latest, stats, has_banks: false }
+        Schedule {
+            timing,
+            timers,
+            last_read: now,
+            is_behind: false,
+            untimed: 0,
+            lateness,
+            latest,
+            stats,
+            has_banks: false,
+        }
     }
 
     /// Makes room for all timers that an MCU can have.
@@ -71,13 +85,25 @@ impl Mcu {
     /// The time now.
     #[inline]
     pub fn now(&mut self) -> Clock {
+        self.schedule.untimed = 0;
         self.schedule.last_read = self.schedule.timing.clock.now();
         self.schedule.last_read
+    }
+
+    /// Call this instead of [`Mcu::now`] after an edge that begins no timed pulse. It reads the time after every fourth
+    /// of them.
+    #[inline]
+    pub fn made_edge(&mut self) {
+        self.schedule.untimed += 1;
+        if self.schedule.untimed >= UNTIMED_MAX {
+            self.now();
+        }
     }
 
     /// Takes a time that the caller has just read.
     #[inline]
     pub fn saw(&mut self, now: Clock) {
+        self.schedule.untimed = 0;
         self.schedule.last_read = now;
     }
 
@@ -86,10 +112,15 @@ impl Mcu {
     #[inline]
     pub fn spin_until(&mut self, end: Clock) {
         if self.schedule.last_read < end {
-            let limit = self.now() + SPIN_MAX;
-            self.schedule.timing.clock.spin_until(end.min(limit));
-            self.now();
+            self.spin(end);
         }
+    }
+
+    #[inline(never)]
+    fn spin(&mut self, end: Clock) {
+        let limit = self.now() + SPIN_MAX;
+        self.schedule.timing.clock.spin_until(end.min(limit));
+        self.now();
     }
 
     /// The clock, for pacing on a worker.
@@ -187,7 +218,7 @@ impl Mcu {
         self.schedule.is_behind
     }
 
-    #[inline]
+    #[inline(always)]
     pub(super) fn run_timer(&mut self) {
         let Some((at, timer)) = self.schedule.timers.pop() else { return };
         if timer.is_exact() {

@@ -113,6 +113,43 @@ fn a_pulse_is_measured_from_when_the_pin_was_written() {
     assert_eq!(rig.edges(STEP), [(5000, 1), (5170, 0)]);
 }
 
+/// Steps on both edges, with klippy's pulse for such a driver: 100 ns.
+const SHORT: &str = "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=5";
+
+#[test]
+fn a_call_of_the_kernel_holds_a_short_pulse_and_a_register_does_not() {
+    for (is_fast, expected) in [(false, [1000, 1001, 1002, 1003]), (true, [1000, 1005, 1010, 1015])] {
+        let mut rig = Rig::new();
+        if is_fast {
+            rig.bench.state().fast.insert(STEP);
+        }
+        rig.configure(&[SHORT]);
+        rig.send_all(&[
+            "reset_step_clock oid=0 clock=@0",
+            "queue_step oid=0 interval=1000 count=1 add=0",
+            "queue_step oid=0 interval=1 count=3 add=0",
+        ]);
+        rig.run_until(100_000);
+        assert_eq!(instants(&rig.edges(STEP)), expected);
+    }
+}
+
+#[test]
+fn the_time_is_read_after_four_late_edges() {
+    let mut rig = Rig::configured(&[SHORT, "config_digital_out oid=1 pin=3 value=0 default_value=0 max_duration=0"]);
+    rig.bench.state().write_ticks = 70;
+    rig.send_all(&[
+        "reset_step_clock oid=0 clock=@0",
+        "queue_step oid=0 interval=1000 count=1 add=0",
+        "queue_step oid=0 interval=1 count=60 add=0",
+        "queue_digital_out oid=1 clock=@1100 on_ticks=1",
+    ]);
+    rig.run_until(100_000);
+    let [(at, 1)] = rig.edges(3)[..] else { panic!("{:?}", rig.edges(3)) };
+    assert!((1100..1100 + 4 * 70).contains(&at), "{at}");
+    assert_eq!(rig.edges(STEP).len(), 61);
+}
+
 #[test]
 fn a_step_more_than_a_millisecond_late_stops_the_mcu() {
     for (interval, ends) in [(50_000, false), (0, true)] {
