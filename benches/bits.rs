@@ -23,7 +23,7 @@ use pinion_firmware::mcu::{
 };
 use pinion_firmware::shutdown::Shutdown;
 use pinion_firmware::time::{Clock, Ticks, TimeSource, Timing};
-use pinion_linux::clock::{Monotonic, monotonic};
+use pinion_linux::clock::{Monotonic, monotonic, watch_tick};
 use pinion_protocol::vlq::{Reader, Writer};
 use pinion_testbench::board::{Bench, FakeBoard};
 
@@ -67,7 +67,7 @@ fn bit_of(bytes: &[u8], place: usize) -> bool {
 
 /// A wire whose other end replies a while after the last edge. It records when each edge came.
 struct Wire {
-    clock: Monotonic,
+    clock: Arc<dyn TimeSource>,
     edges: Arc<Mutex<Vec<(Clock, bool)>>>,
 }
 
@@ -215,7 +215,7 @@ const SCLK: Pin = Pin(11);
 /// The bench's board. Each of its lines is the wire, except that of the LEDs.
 struct Wires {
     rest: FakeBoard,
-    clock: Monotonic,
+    clock: Arc<dyn TimeSource>,
     edges: Arc<Mutex<Vec<(Clock, bool)>>>,
     leds: Arc<AtomicU32>,
     cell: Arc<LoadCell>,
@@ -235,7 +235,7 @@ impl Board for Wires {
         let line: Arc<dyn Line> = match pin {
             LEDS => Arc::new(Fast(self.leds.clone())),
             DOUT | SCLK => Arc::new(CellLine { cell: self.cell.clone(), is_clock: pin == SCLK }),
-            _ => Arc::new(Wire { clock: self.clock, edges: self.edges.clone() }),
+            _ => Arc::new(Wire { clock: self.clock.clone(), edges: self.edges.clone() }),
         };
         Ok(ClaimedLine { line, sleeps_on: None })
     }
@@ -261,7 +261,7 @@ impl Board for Wires {
 
 /// Workers, with the priority of Pinion's workers.
 struct Threads {
-    clock: Monotonic,
+    clock: Arc<dyn TimeSource>,
     are_parallel: bool,
     /// By the names of their buses.
     workers: Vec<(String, Sender<Job>)>,
@@ -271,7 +271,7 @@ struct Threads {
 }
 
 impl Threads {
-    fn new(clock: Monotonic, are_parallel: bool) -> Threads {
+    fn new(clock: Arc<dyn TimeSource>, are_parallel: bool) -> Threads {
         let (outbox, done) = mpsc::channel();
         Threads { clock, are_parallel, workers: Vec::new(), outbox, done: Mutex::new(done), waiting: Mutex::new(None) }
     }
@@ -283,7 +283,7 @@ impl Workers for Threads {
             return Ok(WorkerId(worker));
         }
         let (jobs, inbox) = mpsc::channel::<Job>();
-        let (clock, outbox) = (self.clock, self.outbox.clone());
+        let (clock, outbox) = (self.clock.clone(), self.outbox.clone());
         thread::spawn(move || {
             realtime::enter(Role::Worker);
             for Job { oid, mut parcel, holds } in inbox {
@@ -384,20 +384,25 @@ struct Printer {
 }
 
 impl Printer {
-    fn new(clock: Monotonic, has_parallel_workers: bool) -> Printer {
+    fn new(clock: Arc<dyn TimeSource>, has_parallel_workers: bool) -> Printer {
         let edges = Arc::new(Mutex::new(Vec::with_capacity(100)));
         let bench = Bench::new(pinion_firmware::time::VirtualClock::at(Clock::EPOCH), Clock::EPOCH);
         let leds = Arc::new(AtomicU32::new(0));
         let cell = Arc::new(LoadCell::default());
-        let board =
-            Wires { rest: FakeBoard(bench), clock, edges: edges.clone(), leds: leds.clone(), cell: cell.clone() };
+        let board = Wires {
+            rest: FakeBoard(bench),
+            clock: clock.clone(),
+            edges: edges.clone(),
+            leds: leds.clone(),
+            cell: cell.clone(),
+        };
         let dialect = Dialect::new(&FIRMWARE, &board, DialectName::Of(Generation::Master));
         let dialect = Arc::new(dialect.expect("a dialect"));
         let id = |format: &str| dialect.dictionary().responses[format].as_i64().unwrap_or(0) as u32;
         let ids = [id("tmcuart_response oid=%c read=%*s"), id("neopixel_result oid=%c success=%c")];
         let heard = Heard { ids, last: Arc::default() };
-        let worker = Box::new(Threads::new(clock, has_parallel_workers));
-        let timing = Timing::of(Arc::new(clock));
+        let worker = Box::new(Threads::new(clock.clone(), has_parallel_workers));
+        let timing = Timing::of(clock);
         let mcu = Mcu::new(dialect.clone(), Box::new(board), timing, worker, Box::new(heard.clone()));
         let mut printer = Printer { mcu, dialect, edges, leds, cell, heard };
         printer.run("allocate_oids count=%c", &[3], None);
@@ -512,7 +517,7 @@ fn understood(Burst(edges, away): &Burst) -> Option<bool> {
 
 /// Sends frames to the LEDs.
 fn leds(clock: Monotonic) {
-    let mut printer = Printer::new(clock, true);
+    let mut printer = Printer::new(Arc::new(clock), true);
     let (leds, end, seen) = (printer.leds.clone(), AtomicBool::new(false), Mutex::new(Vec::new()));
     let (mut whole, mut first, mut tries) = (0, 0, 0);
     // Of the whole frames: as seen from outside.
@@ -588,36 +593,98 @@ fn core(clock: Monotonic, steppers: u32, with_bits: bool, end: &AtomicBool) -> C
     core
 }
 
-/// Exchanges messages, and prints how many arrived.
+/// A clock that knows nothing of the kernel's ticks.
+struct Tickless(Monotonic);
+
+impl TimeSource for Tickless {
+    fn now(&self) -> Clock {
+        self.0.now()
+    }
+    fn instant_of(&self, monotonic: Duration) -> Clock {
+        self.0.instant_of(monotonic)
+    }
+    fn duration_of(&self, clock: Clock) -> Duration {
+        self.0.duration_of(clock)
+    }
+}
+
+/// Looks at the clock on a processor that has nothing else to do, until `end`. Notes when it was interrupted: from and to.
+fn stand_stills(clock: Monotonic, end: &AtomicBool, gaps: &Mutex<Vec<(Clock, Clock)>>) {
+    let mut last = clock.now();
+    while !end.load(Ordering::Relaxed) {
+        let now = clock.now();
+        if now.since(last) > i64::from(BIT.0 / 4) {
+            gaps.lock().unwrap().push((last, now));
+        }
+        last = now;
+    }
+}
+
+/// What became of messages.
+#[derive(Default)]
+struct Counts {
+    /// Messages that a driver did not understand at the first try while a processor without work was interrupted, too.
+    still: usize,
+    /// Messages that a driver understood at the first try, and in the end, and all tries.
+    first: usize,
+    last: usize,
+    tries: usize,
+    read: usize,
+    none: usize,
+    wrong: usize,
+}
+
+/// Exchanges messages that begin at any time, and between two ticks of the kernel, in turn. Prints how many arrived.
 fn uart(clock: Monotonic) {
-    let mut printer = Printer::new(clock, true);
     let write = framed(&WRITE);
     let whole: Vec<bool> = (0..8 * write.len()).map(|n| bit_of(&write, n)).collect();
-    let (mut first, mut last, mut tries) = (0, 0, 0);
-    let (mut read, mut none, mut wrong) = (0, 0, 0);
-    for _ in 0..MESSAGES {
-        let (edges, _) = printer.exchange(&write, 0);
-        // Without the first write, which only warms up.
-        let heard = messages(&edges[1..]);
-        tries += heard.len();
-        first += usize::from(heard.first() == Some(&whole));
-        last += usize::from(heard.last() == Some(&whole));
-        let count = match printer.exchange(&MESSAGE, REPLY.len()).1 {
-            Reply::Whole => &mut read,
-            Reply::None => &mut none,
-            Reply::Wrong => &mut wrong,
-        };
-        *count += 1;
-        thread::sleep(Duration::from_millis(2));
+    let clocks: [Arc<dyn TimeSource>; 2] = [Arc::new(Tickless(clock)), Arc::new(clock)];
+    let mut ways = clocks.map(|clock| (Printer::new(clock, true), Counts::default()));
+    let (end, gaps) = (AtomicBool::new(false), Mutex::new(Vec::new()));
+    thread::scope(|scope| {
+        scope.spawn(|| {
+            realtime::enter(Role::Worker);
+            stand_stills(clock, &end, &gaps);
+        });
+        for n in 0..2 * MESSAGES {
+            let (printer, counts) = &mut ways[n as usize % 2];
+            let (edges, _) = printer.exchange(&write, 0);
+            // Without the first write, which only warms up.
+            let heard = messages(&edges[1..]);
+            counts.tries += heard.len();
+            if heard.first() == Some(&whole) {
+                counts.first += 1;
+            } else if let Some((from, _)) = edges.get(1) {
+                let to = *from + Ticks(BIT.0 * whole.len() as u32);
+                // The watching thread may have been interrupted until now.
+                thread::sleep(Duration::from_millis(1));
+                let is_within = |(last, now): &(Clock, Clock)| *last < to && *now > *from;
+                counts.still += usize::from(gaps.lock().unwrap().iter().any(is_within));
+            }
+            counts.last += usize::from(heard.last() == Some(&whole));
+            let count = match printer.exchange(&MESSAGE, REPLY.len()).1 {
+                Reply::Whole => &mut counts.read,
+                Reply::None => &mut counts.none,
+                Reply::Wrong => &mut counts.wrong,
+            };
+            *count += 1;
+            gaps.lock().unwrap().clear();
+            thread::sleep(Duration::from_millis(2));
+        }
+        end.store(true, Ordering::Relaxed);
+    });
+    for ((_, counts), begins) in ways.iter().zip(["at any time", "between two ticks"]) {
+        let Counts { still, first, last, tries, read, none, wrong } = counts;
+        println!("  UART, {begins}: of {MESSAGES} messages {last} whole, {first} at the first try; {tries} tries");
+        println!("  {still} first tries were spoilt while an idle processor stood still, too");
+        println!("  of {MESSAGES} registers {read} read, {none} not, {wrong} wrong");
     }
-    println!("  UART: of {MESSAGES} messages {last} whole, {first} at the first try; {tries} tries");
-    println!("  of {MESSAGES} registers {read} read, {none} not, {wrong} wrong");
 }
 
 /// Reads the load cell for a while, and prints how long its clock was high. A second worker watches the pulses, unless
 /// one reads `alone`.
 fn load_cell(clock: Monotonic, lasts: Duration, alone: bool) {
-    let mut printer = Printer::new(clock, !alone);
+    let mut printer = Printer::new(Arc::new(clock), !alone);
     realtime::enter(Role::Core);
     printer.run("query_hx71x oid=%c rest_ticks=%u", &[2, Ticks::from_us(1250).0], None);
     let end = monotonic() + lasts;
@@ -634,6 +701,7 @@ fn load_cell(clock: Monotonic, lasts: Duration, alone: bool) {
 }
 
 fn main() {
+    watch_tick().map(thread::JoinHandle::join).expect("a thread").expect("no panic");
     // `cargo bench --bench bits -- hx711 3600 [alone]`: only this, for so many seconds.
     let mut words = std::env::args().skip_while(|word| word != "hx711").skip(1);
     if let Some(seconds) = words.next().and_then(|word| word.parse().ok()) {
@@ -643,13 +711,17 @@ fn main() {
             words.next().is_some_and(|word| word == "alone"),
         );
     }
+    // `-- uart`: without LEDs.
+    let only_uart = std::env::args().any(|word| word == "uart");
     let clock = Monotonic::start();
     for steppers in [0, 3] {
         let end = AtomicBool::new(false);
         thread::scope(|scope| {
             let beside = scope.spawn(|| core(clock, steppers, false, &end));
             println!("worker, {steppers} steppers in the core:");
-            leds(clock);
+            if !only_uart {
+                leds(clock);
+            }
             uart(clock);
             end.store(true, Ordering::Relaxed);
             if let Ok(core) = beside.join() {

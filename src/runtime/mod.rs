@@ -169,6 +169,8 @@ pub fn run(
         warn!("pinion trace --live will not be answered: {errors}");
     });
     let (realtime, margin) = (options.realtime, options.margin);
+    // Later threads are in real time.
+    started(pinion_linux::clock::watch_tick())?;
     if realtime {
         realtime::lock_memory();
     }

@@ -50,6 +50,15 @@ impl Sub<Ticks> for Clock {
     }
 }
 
+/// An interruption of all processors at once, at equal distances.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Tick {
+    /// When it begins.
+    pub at: Clock,
+    /// From one to the next.
+    pub every: Ticks,
+}
+
 /// The clock of an MCU.
 pub trait TimeSource: Send + Sync {
     /// The time now; never earlier than a time that it returned before.
@@ -73,6 +82,12 @@ pub trait TimeSource: Send + Sync {
         while self.now() < end {
             std::hint::spin_loop();
         }
+    }
+
+    /// The first tick of the kernel after this instant. `None` if nothing is known of it.
+    fn tick_after(&self, at: Clock) -> Option<Tick> {
+        let _ = at;
+        None
     }
 }
 

@@ -3,13 +3,15 @@
 
 #![forbid(unsafe_code)]
 
+use std::io;
+use std::sync::OnceLock;
 use std::thread;
 use std::time::Duration;
 
 use nix::poll::PollTimeout;
-use nix::time::{ClockId, clock_gettime};
+use nix::time::{ClockId, clock_getres, clock_gettime};
 
-use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, TimeSource};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Tick, Ticks, TimeSource};
 
 /// CLOCK_MONOTONIC in ticks. Tick 0 is at a whole second, so that the lateness of an edge can be measured from outside.
 #[derive(Clone, Copy, Debug)]
@@ -46,12 +48,100 @@ impl TimeSource for Monotonic {
     fn duration_of(&self, clock: Clock) -> Duration {
         Duration::from_secs(self.origin_s) + Duration::from_nanos(clock.ticks() * NS_PER_TICK)
     }
+
+    fn tick_after(&self, at: Clock) -> Option<Tick> {
+        let tick = TICK.get()?;
+        let every = Ticks((tick.every_ns / NS_PER_TICK) as u32);
+        Some(Tick { at: self.instant_of(tick.after(self.duration_of(at))), every })
+    }
+}
+
+/// The kernel's tick, when [`watch_tick`] has found it.
+static TICK: OnceLock<KernelTick> = OnceLock::new();
+
+/// Starts a thread that looks for the kernel's tick, for [`TimeSource::tick_after`]. It takes some ten ticks.
+///
+/// # Errors
+///
+/// The kernel's refusal of a thread.
+pub fn watch_tick() -> io::Result<thread::JoinHandle<()>> {
+    thread::Builder::new().name("tick".into()).spawn(|| {
+        if let Some(tick) = KernelTick::measure() {
+            let _ = TICK.set(tick);
+        }
+    })
 }
 
 /// CLOCK_MONOTONIC as the time since the kernel's start.
 pub fn monotonic() -> Duration {
     // clock_gettime(2) fails only for an unknown clock or a bad pointer.
     clock_gettime(ClockId::CLOCK_MONOTONIC).map_or(Duration::ZERO, Duration::from)
+}
+
+/// The kernel's tick. It comes to all processors at once, at equal distances on CLOCK_MONOTONIC (`TICK_NSEC`, 4 ms at 250
+/// Hz), unless the kernel was started with `skew_tick=1`. A processor that sleeps leaves ticks out.
+#[derive(Clone, Copy, Debug)]
+struct KernelTick {
+    /// One of them, since the kernel's start.
+    at_ns: u64,
+    every_ns: u64,
+}
+
+impl KernelTick {
+    /// How many ticks must have been seen, and how many are watched for that.
+    const SEEN: usize = 7;
+    const WATCHED: usize = 50;
+    /// How long a tick may keep the watching thread from its looks. After a longer time it was something else.
+    const LONGEST: Duration = Duration::from_micros(100);
+
+    /// Watches ticks. A tick sets CLOCK_MONOTONIC_COARSE, whose resolution is the time between two ticks.
+    fn measure() -> Option<KernelTick> {
+        let coarse = ClockId::CLOCK_MONOTONIC_COARSE;
+        let every_ns = clock_getres(coarse).map_or(0, |every| Duration::from(every).as_nanos() as u64);
+        if every_ns == 0 {
+            return None;
+        }
+        let mut seen_ns = Vec::new();
+        for _ in 0..KernelTick::WATCHED {
+            let first = clock_gettime(coarse).ok()?;
+            let mut last = monotonic();
+            // The time after which it came, and by which it had come.
+            let (after, by) = loop {
+                let has_come = clock_gettime(coarse).ok()? != first;
+                let now = monotonic();
+                if has_come {
+                    break (last, now);
+                }
+                last = now;
+            };
+            if by - after <= KernelTick::LONGEST {
+                seen_ns.push(after.as_nanos() as u64);
+            }
+            if let Ok(seen_ns) = <[u64; KernelTick::SEEN]>::try_from(&*seen_ns) {
+                return KernelTick::of(seen_ns, every_ns);
+            }
+        }
+        None
+    }
+
+    /// The tick that began at these times. Another processor may see it later, and one look may have been too early.
+    /// `None` if they are not times of one tick.
+    fn of(mut seen_ns: [u64; KernelTick::SEEN], every_ns: u64) -> Option<KernelTick> {
+        let after = |from: u64, to: u64| (to % every_ns + every_ns - from % every_ns) % every_ns;
+        // From the earliest one on, all come soon.
+        let spread = |from: u64| seen_ns.iter().map(|to| after(from, *to)).max().unwrap_or_default();
+        let earliest = seen_ns.into_iter().min_by_key(|from| spread(*from))?;
+        let is_regular = spread(earliest) < every_ns / 4;
+        seen_ns.sort_by_key(|seen| after(earliest, *seen));
+        is_regular.then_some(KernelTick { at_ns: seen_ns[1], every_ns })
+    }
+
+    /// The first tick after this time.
+    fn after(&self, time: Duration) -> Duration {
+        let phase_ns = self.at_ns % self.every_ns;
+        let since_ns = (time.as_nanos() as u64 + self.every_ns).saturating_sub(phase_ns);
+        Duration::from_nanos(phase_ns + since_ns / self.every_ns * self.every_ns)
+    }
 }
 
 /// Looks every millisecond whether something is done, until `deadline` (CLOCK_MONOTONIC). Returns whether it is done.
@@ -76,6 +166,42 @@ pub fn poll_timeout(timeout: Duration) -> PollTimeout {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    const MS: u64 = 1_000_000;
+
+    #[test]
+    fn a_tick_begins_when_it_was_seen_first_but_once() {
+        let tick = |seen_us: [u64; KernelTick::SEEN]| {
+            KernelTick::of(seen_us.map(|us| 1000 * us), 4 * MS).map(|tick| tick.at_ns / 1000 % 4000)
+        };
+        assert_eq!(tick([3998, 7999, 12_040, 15_998, 19_999, 24_024, 27_999]), Some(3998));
+        // The third look was too early.
+        assert_eq!(tick([3998, 7999, 11_925, 15_997, 19_999, 24_024, 27_999]), Some(3997));
+        assert_eq!(tick([40, 7998, 11_999, 16_000, 20_001, 24_000, 27_998]), Some(3998));
+        assert_eq!(tick([1000, 6500, 8000, 13_700, 16_000, 20_000, 24_000]), None);
+    }
+
+    #[test]
+    fn ticks_come_at_equal_distances() {
+        let tick = KernelTick { at_ns: 9_998_000, every_ns: 4 * MS };
+        let after = |ns| tick.after(Duration::from_nanos(ns)).as_nanos();
+        assert_eq!([after(9_998_000), after(13_997_999), after(13_998_000)], [13_998_000, 13_998_000, 17_998_000]);
+        assert_eq!([after(0), after(1_998_000), after(5_997_999)], [1_998_000, 5_998_000, 5_998_000]);
+    }
+
+    #[test]
+    fn the_kernel_s_next_tick_is_soon() {
+        let clock = Monotonic::start();
+        watch_tick().unwrap().join().unwrap();
+        let Some(Tick { at, every }) = clock.tick_after(clock.now()) else {
+            return println!("NOT RUN: this computer is too busy to see ticks");
+        };
+        assert!((CLOCK_FREQ / 2000..=CLOCK_FREQ / 50).contains(&every.0), "{every:?}");
+        let next = clock.tick_after(at + Ticks(1)).unwrap().at;
+        assert!((next.since(at) - i64::from(every.0)).abs() <= 1, "{at:?} {next:?}");
+        let now = clock.now();
+        assert!((1..=i64::from(every.0) + 1).contains(&clock.tick_after(now).unwrap().at.since(now)));
+    }
 
     #[test]
     fn a_wait_ends_when_it_is_done_or_at_its_deadline() {

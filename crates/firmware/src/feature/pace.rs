@@ -14,12 +14,19 @@ use crate::time::{Clock, Ticks, TimeSource};
 
 /// Longest time that a wait continues after a stop.
 const SLICE: Ticks = Ticks::from_us(1000);
-/// How long [`Pace::until_interrupted`] waits: a little longer than the kernel's tick at 250 Hz.
-const TICK_MAX: Ticks = Ticks::from_us(4100);
-/// How often it looks at the clock.
-const LOOK: Ticks = Ticks(25);
-/// Shortest time without the processor that counts as an interruption: 1 us.
-const INTERRUPTION: i64 = 50;
+/// How long before and after its beginning a tick of the kernel may disturb.
+const TICK_BEGINS: Ticks = Ticks::from_us(20);
+const TICK_LASTS: Ticks = Ticks::from_us(50);
+
+/// When to begin work of this length, so that the kernel's next tick does not interrupt it. The tick comes to all
+/// processors at once. Work that is longer than the time between two ticks begins after one.
+pub(super) fn between_ticks(clock: &dyn TimeSource, length: Ticks) -> Clock {
+    let now = clock.now();
+    match clock.tick_after(now - TICK_LASTS) {
+        Some(tick) if tick.at < now + Ticks(length.0.saturating_add(TICK_BEGINS.0)) => tick.at + TICK_LASTS,
+        _ => now,
+    }
+}
 
 /// Keeps time on a worker, until the core stops it. The errand and its object have a copy each.
 #[derive(Clone)]
@@ -63,19 +70,9 @@ impl Pace {
         self.clock.spin_until(at);
     }
 
-    /// Waits until this thread has been interrupted, at most [`TICK_MAX`]. Most interruptions are ticks of the kernel, at
-    /// equal distances. So it has the processor for itself for a while now.
-    pub(super) fn until_interrupted(&self) {
-        let mut last = self.clock.now();
-        let limit = last + TICK_MAX;
-        while last < limit && !self.stopped.load(Ordering::Relaxed) {
-            let look = last + LOOK;
-            self.clock.spin_until(look);
-            last = self.clock.now();
-            if last.since(look) > INTERRUPTION {
-                return;
-            }
-        }
+    /// Waits until the kernel's tick leaves this much time, if it ever does.
+    pub(super) fn until_between_ticks(&self, length: Ticks) {
+        self.until(between_ticks(&*self.clock, length));
     }
 
     /// Makes the errand under way end soon. No wait succeeds until [`Pace::resume`].
@@ -86,5 +83,55 @@ impl Pace {
     /// Lets errands wait again.
     pub(super) fn resume(&self) {
         self.stopped.store(false, Ordering::Relaxed);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::time::Tick;
+    use std::time::Duration;
+
+    /// A clock that stands, with ticks every 4 ms or never.
+    struct Standing(u64, Option<u32>);
+
+    impl TimeSource for Standing {
+        fn now(&self) -> Clock {
+            Clock::from_ticks(self.0)
+        }
+        fn instant_of(&self, _: Duration) -> Clock {
+            self.now()
+        }
+        fn duration_of(&self, _: Clock) -> Duration {
+            Duration::ZERO
+        }
+        fn tick_after(&self, at: Clock) -> Option<Tick> {
+            let every = self.1?;
+            let next = (at.ticks() / u64::from(every) + 1) * u64::from(every);
+            Some(Tick { at: Clock::from_ticks(next), every: Ticks(every) })
+        }
+    }
+
+    #[test]
+    fn work_begins_after_a_tick_that_would_interrupt_it() {
+        // 4 ms.
+        const EVERY: u64 = 200_000;
+        for (now, length, begins) in [
+            // There is time enough until the next one.
+            (EVERY + 10_000, 150_000, EVERY + 10_000),
+            (EVERY + 10_000, 188_999, EVERY + 10_000),
+            (EVERY + 10_000, 189_001, 2 * EVERY + 2500),
+            (2 * EVERY - 1000, 1, 2 * EVERY + 2500),
+            // The last one may still last.
+            (EVERY + 1000, 100, EVERY + 2500),
+            (EVERY + 2501, 100, EVERY + 2501),
+            // It is interrupted whenever it begins.
+            (EVERY + 10_000, 199_000, 2 * EVERY + 2500),
+            (EVERY + 10_000, u64::from(u32::MAX), 2 * EVERY + 2500),
+        ] {
+            let clock = Standing(now, Some(EVERY as u32));
+            assert_eq!(between_ticks(&clock, Ticks(length as u32)).ticks(), begins, "{now} {length}");
+        }
+        assert_eq!(between_ticks(&Standing(EVERY - 1, None), Ticks(100)).ticks(), EVERY - 1);
     }
 }

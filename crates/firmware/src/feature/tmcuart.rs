@@ -51,6 +51,8 @@ const QUIET: Ticks = Ticks::from_us(200);
 const TURN_BITS: u32 = 4;
 /// How long to look for the reply, in bits.
 const REPLY_BITS: u32 = 65;
+/// Pause of a driver before its reply: 24 bits with klippy's SENDDELAY of 2 (TMC2209 data sheet, section 5.1), and some.
+const REPLY_PAUSE: u32 = 28;
 /// A byte with its start and its stop bit.
 const FRAME_BITS: usize = 10;
 const TIMER: Timer = Timer::exact(0);
@@ -70,6 +72,12 @@ impl Message {
     /// The bits to send.
     fn bits(&self) -> &[u8] {
         &self.data[..self.write_len]
+    }
+
+    /// How many bits the message and its reply take together.
+    fn bits_max(&self) -> u32 {
+        let pause = if self.read_len > 0 { REPLY_PAUSE } else { 0 };
+        8 * (self.write_len + self.read_len) as u32 + pause
     }
 
     fn reply(&self) -> &[u8] {

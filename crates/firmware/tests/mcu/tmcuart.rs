@@ -12,10 +12,8 @@ const TX: u32 = 10;
 const RX: u32 = 11;
 /// 40 kbaud.
 const BIT: u64 = 1250;
-/// Quiet time from the command to the first byte of a port: 200 us.
-const PORT_QUIET: u64 = 10_000;
-/// Quiet time to the first edge of a line: another 4.1 ms, in which no interruption comes.
-const QUIET: u64 = PORT_QUIET + 205_000;
+/// Quiet time from the command to the first bit: 200 us.
+const QUIET: u64 = 10_000;
 
 const ONE_WIRE: &str = "config_tmcuart oid=0 rx_pin=10 pull_up=1 tx_pin=10 bit_time=1250";
 const TWO_WIRES: &str = "config_tmcuart oid=0 rx_pin=11 pull_up=0 tx_pin=10 bit_time=1250";
@@ -349,7 +347,7 @@ fn a_port_has_its_answer_as_soon_as_the_last_byte_came() {
     let (mut rig, _) = port(|bytes| [bytes, IFCNT].concat());
     rig.send(&send(READ_IFCNT, 10));
     // Four bytes, their echo, and eight bytes.
-    let end = PORT_QUIET + (4 + 4 + 8) * 10 * BIT;
+    let end = QUIET + (4 + 4 + 8) * 10 * BIT;
     rig.run_until(end - 1);
     assert_eq!(rig.responses(), [""; 0]);
     rig.run_until(end);
@@ -357,7 +355,7 @@ fn a_port_has_its_answer_as_soon_as_the_last_byte_came() {
     // A message without a reply has its answer with its echo.
     let (mut rig, _) = port(<[u8]>::to_vec);
     rig.send(&send(READ_IFCNT, 0));
-    rig.run_until(PORT_QUIET + (4 + 4) * 10 * BIT);
+    rig.run_until(QUIET + (4 + 4) * 10 * BIT);
     assert_eq!(rig.responses(), [response(&[])]);
 }
 
@@ -368,9 +366,9 @@ fn without_a_whole_reply_a_port_answers_nothing() {
         let mut next = [comes.to_vec(), [READ_IFCNT, IFCNT].concat()].into_iter();
         let (mut rig, _) = port(move |_| next.next().unwrap());
         rig.send(&send(READ_IFCNT, 10));
-        rig.run_until(PORT_QUIET + PORT_LIMIT);
+        rig.run_until(QUIET + PORT_LIMIT);
         assert_eq!(rig.responses(), [""; 0]);
-        rig.run_until(PORT_QUIET + 2 * PORT_LIMIT + 600 * BIT);
+        rig.run_until(QUIET + 2 * PORT_LIMIT + 600 * BIT);
         assert_eq!(rig.responses(), [response(&[])], "{comes:x?}");
         rig.send(&send(READ_IFCNT, 10));
         rig.run_until(20_000_000);
@@ -408,7 +406,7 @@ fn a_port_that_is_gone_does_not_answer_and_stops_nothing() {
 fn a_shutdown_amid_a_message_of_a_port_says_nothing_more() {
     let (mut rig, _) = port(|bytes| [bytes, IFCNT].concat());
     rig.send(&send(READ_IFCNT, 10));
-    rig.run_until(PORT_QUIET + 5 * BIT);
+    rig.run_until(QUIET + 5 * BIT);
     rig.send("emergency_stop");
     assert_eq!(rig.shutdown().as_deref(), Some("Command request"));
     rig.run_until(10_000_000);

@@ -17,6 +17,7 @@ use log::warn;
 use pinion_shared::watch::Watch;
 
 use crate::board::{Line, Pin};
+use crate::feature::pace::between_ticks;
 use crate::mcu::{Errand, Mcu};
 use crate::shutdown::Shutdown;
 use crate::time::{Clock, Ticks, TimeSource};
@@ -30,6 +31,8 @@ const POWER_DOWN: Ticks = Ticks::from_us(60);
 /// How long the second worker sees the clock high before it lowers it. A pulse without an interruption takes less than
 /// a microsecond.
 const PULSE_MAX: Ticks = Ticks::from_us(5);
+/// How long a reading takes at most, unless a worker is interrupted.
+const READING: Ticks = Ticks::from_us(100);
 /// How long the two workers wait for each other before a reading. Then the first one reads alone.
 const MEETING: Ticks = Ticks::from_ms(1);
 /// How long they wait for each other during a reading. Then the reading fails.
@@ -65,6 +68,8 @@ impl Shift {
     }
 
     pub(super) fn run(&mut self) -> Result<Shifted, Shutdown> {
+        let begin = between_ticks(&*self.time, READING);
+        self.time.spin_until(begin);
         let shifted = match self.watch.clone() {
             Some(watch) => {
                 let is_watched = self.announce(&watch, MEETING).is_some();

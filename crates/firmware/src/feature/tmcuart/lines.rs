@@ -9,7 +9,7 @@
 //! byte is found, and bits are read in their middle. So half a bit of lateness does no harm. A start bit that is high
 //! again in its middle is a glitch and does not count.
 //!
-//! A message begins after an interruption, because the next one is probably the kernel's next tick, in 4 ms.
+//! A message begins between two ticks of the kernel, if there is time enough. They are 4 ms apart on most computers.
 //!
 //! The bits of a message count from the start bit of their byte, as the driver counts them. So a late start bit does no
 //! harm. If another bit is late, the message is broken off. A driver forgets a message after a pause of 63 bits. It
@@ -87,7 +87,7 @@ impl Lines {
     fn converse(&mut self, message: &mut Message) -> Result<(), Shutdown> {
         for _ in 0..TRIES {
             self.spoilt = false;
-            self.pace.until_interrupted();
+            self.pace.until_between_ticks(bits(self.bit, message.bits_max()));
             // The first call is slower than the others. Without this one, the first bit would be longer.
             self.tx.write(true)?;
             let pause = match self.send(message.bits(), self.pace.now())? {
@@ -392,8 +392,7 @@ mod tests {
         }
         fn spin_until(&self, end: Clock) {
             let length = end.since(self.now());
-            // Looks for an interruption do not count.
-            let late = length > 25 && (self.is_late)(self.waits.fetch_add(1, SeqCst), length);
+            let late = (self.is_late)(self.waits.fetch_add(1, SeqCst), length);
             self.clock.set(if late { end + self.by } else { end });
         }
     }
