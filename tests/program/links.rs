@@ -25,7 +25,7 @@ pub fn plug_in(folder: &TempDir) -> PtyMaster {
     host
 }
 
-/// Takes the port away. First its name, because the kernel gives the terminal's number to whoever opens the next one.
+/// Takes the port away. First its name, because the kernel gives the terminal's number to the next one that is opened.
 pub fn pull_out(folder: &TempDir, host: Client) {
     fs::remove_file(folder.path().join("ttyPort")).unwrap();
     drop(host);

@@ -50,15 +50,6 @@ impl Sub<Ticks> for Clock {
     }
 }
 
-/// An interruption of all processors at once, at equal distances.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Tick {
-    /// When it begins.
-    pub at: Clock,
-    /// From one to the next.
-    pub every: Ticks,
-}
-
 /// The clock of an MCU.
 pub trait TimeSource: Send + Sync {
     /// The time now; never earlier than a time that it returned before.
@@ -84,8 +75,9 @@ pub trait TimeSource: Send + Sync {
         }
     }
 
-    /// The first tick of the kernel after this instant. `None` if nothing is known of it.
-    fn tick_after(&self, at: Clock) -> Option<Tick> {
+    /// When the first tick of the kernel after this instant begins. It interrupts all processors at once. `None` if
+    /// nothing is known of it.
+    fn tick_after(&self, at: Clock) -> Option<Clock> {
         let _ = at;
         None
     }

@@ -11,7 +11,7 @@ use std::time::Duration;
 use nix::poll::PollTimeout;
 use nix::time::{ClockId, clock_getres, clock_gettime};
 
-use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, Tick, Ticks, TimeSource};
+use pinion_firmware::time::{CLOCK_FREQ, Clock, NS_PER_TICK, TimeSource};
 
 /// CLOCK_MONOTONIC in ticks. Tick 0 is at a whole second, so that the lateness of an edge can be measured from outside.
 #[derive(Clone, Copy, Debug)]
@@ -49,10 +49,8 @@ impl TimeSource for Monotonic {
         Duration::from_secs(self.origin_s) + Duration::from_nanos(clock.ticks() * NS_PER_TICK)
     }
 
-    fn tick_after(&self, at: Clock) -> Option<Tick> {
-        let tick = TICK.get()?;
-        let every = Ticks((tick.every_ns / NS_PER_TICK) as u32);
-        Some(Tick { at: self.instant_of(tick.after(self.duration_of(at))), every })
+    fn tick_after(&self, at: Clock) -> Option<Clock> {
+        Some(self.instant_of(TICK.get()?.after(self.duration_of(at))))
     }
 }
 
@@ -166,6 +164,7 @@ pub fn poll_timeout(timeout: Duration) -> PollTimeout {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use pinion_firmware::time::Ticks;
 
     const MS: u64 = 1_000_000;
 
@@ -193,14 +192,15 @@ mod tests {
     fn the_kernel_s_next_tick_is_soon() {
         let clock = Monotonic::start();
         watch_tick().unwrap().join().unwrap();
-        let Some(Tick { at, every }) = clock.tick_after(clock.now()) else {
+        let Some(at) = clock.tick_after(clock.now()) else {
             return println!("NOT RUN: this computer is too busy to see ticks");
         };
-        assert!((CLOCK_FREQ / 2000..=CLOCK_FREQ / 50).contains(&every.0), "{every:?}");
-        let next = clock.tick_after(at + Ticks(1)).unwrap().at;
-        assert!((next.since(at) - i64::from(every.0)).abs() <= 1, "{at:?} {next:?}");
+        let every = i64::from((TICK.get().unwrap().every_ns / NS_PER_TICK) as u32);
+        assert!((i64::from(CLOCK_FREQ / 2000)..=i64::from(CLOCK_FREQ / 50)).contains(&every), "{every}");
+        let next = clock.tick_after(at + Ticks(1)).unwrap();
+        assert!((next.since(at) - every).abs() <= 1, "{at:?} {next:?}");
         let now = clock.now();
-        assert!((1..=i64::from(every.0) + 1).contains(&clock.tick_after(now).unwrap().at.since(now)));
+        assert!((1..=every + 1).contains(&clock.tick_after(now).unwrap().since(now)));
     }
 
     #[test]

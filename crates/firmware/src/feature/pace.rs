@@ -23,7 +23,7 @@ const TICK_LASTS: Ticks = Ticks::from_us(50);
 pub(super) fn between_ticks(clock: &dyn TimeSource, length: Ticks) -> Clock {
     let now = clock.now();
     match clock.tick_after(now - TICK_LASTS) {
-        Some(tick) if tick.at < now + Ticks(length.0.saturating_add(TICK_BEGINS.0)) => tick.at + TICK_LASTS,
+        Some(tick) if tick < now + Ticks(length.0.saturating_add(TICK_BEGINS.0)) => tick + TICK_LASTS,
         _ => now,
     }
 }
@@ -89,7 +89,6 @@ impl Pace {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::time::Tick;
     use std::time::Duration;
 
     /// A clock that stands, with ticks every 4 ms or never.
@@ -105,10 +104,9 @@ mod tests {
         fn duration_of(&self, _: Clock) -> Duration {
             Duration::ZERO
         }
-        fn tick_after(&self, at: Clock) -> Option<Tick> {
-            let every = self.1?;
-            let next = (at.ticks() / u64::from(every) + 1) * u64::from(every);
-            Some(Tick { at: Clock::from_ticks(next), every: Ticks(every) })
+        fn tick_after(&self, at: Clock) -> Option<Clock> {
+            let every = u64::from(self.1?);
+            Some(Clock::from_ticks((at.ticks() / every + 1) * every))
         }
     }
 

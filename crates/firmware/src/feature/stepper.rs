@@ -93,8 +93,8 @@ struct Stepper {
 /// MCU that is 50 ms late has more steps to make than it can. Other timers must not wait for these.
 const IN_ORDER: Range<i64> = Ticks::from_us(50).0 as i64..Ticks::from_us(50_000).0 as i64;
 
-/// A call of the kernel takes longer than this, 100 ns. So a line that is not fast holds such a pulse without a look at
-/// the clock.
+/// A call of the kernel takes longer than this, 100 ns. So a line that is not fast holds a pulse of 100 ns without
+/// a look at the clock.
 const CALL: Ticks = Ticks(5);
 
 /// Keeps the position's top bit free for the direction.

@@ -262,11 +262,11 @@ pub fn compare(points: &[PathPoint], asked: &AskedPath) -> Option<Comparison> {
         layers.entry(goal.layer).or_default().add(goal.nozzle_mm, *place, goal.line, 0.0);
         ends_at_line = None;
     }
-    let height_mm = |layer: u32| {
-        let points = asked.points.iter().filter(|point| point.layer == layer);
-        points.map(|point| point.nozzle_mm[2]).fold(f64::INFINITY, f64::min)
-    };
-    let heights: BTreeMap<u32, f64> = layers.keys().map(|layer| (*layer, height_mm(*layer))).collect();
+    let mut heights: BTreeMap<u32, f64> = BTreeMap::new();
+    for point in &asked.points {
+        let height_mm = heights.entry(point.layer).or_insert(f64::INFINITY);
+        *height_mm = height_mm.min(point.nozzle_mm[2]);
+    }
     Some(Comparison {
         all: layers.values().copied().fold(Distances::default(), Distances::join),
         layers: layers.into_iter().map(|(layer, found)| (layer, heights[&layer], found)).collect(),

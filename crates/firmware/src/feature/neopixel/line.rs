@@ -93,6 +93,7 @@ impl Pulses {
     pub(super) fn send(&mut self, colors: &[u8]) -> Result<bool, Shutdown> {
         for _ in 0..TRIES {
             self.pace.until(self.free_at);
+            // A byte takes eight bits, and some.
             self.pace.until_between_ticks(Ticks(10 * BIT_MIN.0 * colors.len() as u32));
             let sent = self.frame(colors);
             self.line.write(false)?;
