@@ -2,22 +2,19 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # Makes the VM that the package is installed in: a Debian 12 with systemd.
 #
-#   root.sh FOLDER TREE INITRAMFS RELEASE HERE
+#   root.sh FOLDER TREE INITRAMFS RELEASE HERE SOURCES
 #
 # FOLDER gets root.img and initrd. TREE and INITRAMFS are of tests/kit: parts of Debian's kernel package, and
-# the modules that it has built. HERE is the folder of this file.
+# the modules that it has built. HERE is the folder of this file. SOURCES is a sources.list of Debian 12.
 set -eu
 cd "$1"
-tree=$2 initramfs=$3 release=$4 here=$5
+tree=$2 initramfs=$3 release=$4 here=$5 sources=$6
 busybox=$tree/bin/busybox
 
-# The packages come from the sources of this computer's apt. Pinion's dependencies wait in a folder of the VM, and its apt
-# installs from there: the VM has no network. Only libiio itself waits there. It needs ICU (by way of libxml2), and the
-# emulated processor takes half a minute to install that. The packages of Python are klippy's. sshd is for the link over
-# SSH.
-find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/sources.list*.sources' \
-    -o -path '*/sources.list' \) -exec \
-    mmdebstrap --quiet --mode=root --variant=minbase \
+# Pinion's dependencies wait in a folder of the VM, and its apt installs from there: the VM has no network. Only libiio
+# itself waits there. It needs ICU (by way of libxml2), and the emulated processor takes half a minute to install that.
+# The packages of Python are klippy's. sshd is for the link over SSH.
+mmdebstrap --quiet --mode=root --variant=minbase \
     --include=sudo,apt-utils \
     --include=systemd,systemd-sysv,udev,dbus,kmod,procps,make,libiio0- \
     --include=libavahi-client3,libserialport0,libusb-1.0-0,libxml2 \
@@ -30,7 +27,7 @@ find /etc/apt/ -maxdepth 2 -type f \( -path '*/sources.list*.list' -o -path '*/s
     --customize-hook='mkdir "$1/opt/packages" && mv "$1"/var/cache/apt/archives/*.deb "$1/opt/packages"' \
     --customize-hook='cd "$1/opt/packages" && dpkg-scanpackages -m . >Packages 2>/dev/null' \
     --customize-hook='rm -rf "$1"/etc/apt/sources.list*' \
-    bookworm root {} +
+    bookworm root "$sources"
 echo 'deb [trusted=yes] file:/opt/packages ./' >root/etc/apt/sources.list
 # apt would look for questions in each package, with Perl. No package here has any.
 rm root/etc/apt/apt.conf.d/70debconf
