@@ -96,7 +96,7 @@ impl Apt {
     /// One of apt's programs, such as `apt-get`.
     pub fn command(&self, program: &str) -> Command {
         let mut command = Command::new(program);
-        command.env("APT_CONFIG", &self.config).env("LC_ALL", "C");
+        command.env("APT_CONFIG", &self.config);
         command
     }
 }
@@ -105,7 +105,7 @@ impl Apt {
 fn sources_of(release: &str) -> Result<String, String> {
     let mut ask = Command::new("apt-get");
     ask.args(["indextargets", "--format", "$(REPO_URI) $(RELEASE) $(COMPONENT)", "Created-By: Packages"]);
-    let targets = process::output(ask.env("LC_ALL", "C"))?;
+    let targets = process::output(&mut ask)?;
     let mut lines: Vec<String> = targets.lines().filter_map(|target| source_of(target, release)).collect();
     lines.sort();
     lines.dedup();
