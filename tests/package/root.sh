@@ -10,6 +10,8 @@ set -eu
 cd "$1"
 tree=$2 initramfs=$3 release=$4 here=$5 sources=$6
 busybox=$tree/bin/busybox
+# The computer's PATH may mean nothing there.
+in_root() { chroot root /usr/bin/env PATH=/usr/sbin:/usr/bin:/sbin:/bin "$@"; }
 
 # Pinion's dependencies wait in a folder of the VM, and its apt installs from there: the VM has no network. Only libiio
 # itself waits there. It needs ICU (by way of libxml2), and the emulated processor takes half a minute to install that.
@@ -32,11 +34,11 @@ echo 'deb [trusted=yes] file:/opt/packages ./' >root/etc/apt/sources.list
 # apt would look for questions in each package, with Perl. No package here has any.
 rm root/etc/apt/apt.conf.d/70debconf
 # klippy's user, who is in the group that the README tells, and somebody else.
-chroot root useradd -m -s /bin/bash -G tty klippy
-chroot root useradd -m -s /bin/bash stranger
+in_root useradd -m -s /bin/bash -G tty klippy
+in_root useradd -m -s /bin/bash stranger
 echo guest >root/etc/hostname
 # Its check starts it.
-chroot root systemctl --quiet disable ssh
+in_root systemctl --quiet disable ssh
 mkdir -p root/var/log/journal
 
 modules=root/usr/lib/modules/$release
@@ -48,13 +50,13 @@ for module in gpio-sim irq_sim mock_adc mock_pwm mock_spi mock_i2c mock_w1; do
     cp "unpacked/tests/modules.d/$module.ko" "$modules/updates/"
 done
 : >"$modules/modules.order"
-chroot root depmod "$release"
+in_root depmod "$release"
 
 install -m 755 "$here/guest/agent" "$here/guest/chips" root/usr/local/sbin/
 install -m 644 "$here"/guest/*.service root/etc/systemd/system/
 mkdir -p root/etc/systemd/system/multi-user.target.wants
 for unit in "$here"/guest/*.service; do
-    chroot root systemctl --quiet enable "$(basename "$unit")"
+    in_root systemctl --quiet enable "$(basename "$unit")"
 done
 printf 'virtio_console\nconfigfs\n9pnet_virtio\n' >root/etc/modules-load.d/tests.conf
 # It has no console that anybody logs in at, and nothing to tidy up. systemd reads all units at each daemon-reload,
@@ -75,7 +77,7 @@ mke2fs -q -t ext4 -O '^metadata_csum,^has_journal' -d root root.img
 mkdir -p first/bin first/modules first/dev first/proc first/root
 cp "$busybox" first/bin/busybox
 for module in virtio_pci virtio_blk ext4 crc32c_generic; do
-    chroot root modprobe -S "$release" --show-depends "$module"
+    in_root modprobe -S "$release" --show-depends "$module"
 done | awk '/^insmod/ && !seen[$2]++ { print $2 }' >loads
 while read -r module; do
     cp "root$module" first/modules/
