@@ -194,6 +194,8 @@ struct PwmLine {
     consumer: Option<String>,
     /// `None` if it is beyond the channels that have names.
     pin: Option<String>,
+    /// How printer.cfg may write it: the name by the chip's device first.
+    pins: Vec<String>,
 }
 
 #[derive(Debug, Serialize)]
@@ -248,7 +250,7 @@ impl List {
             gpio: inventory
                 .chips
                 .iter()
-                .map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, sysfs, &names, args) })
+                .map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, inventory, sysfs, &names, args) })
                 .collect(),
             adc: vec![],
             pwm: vec![],
@@ -260,7 +262,7 @@ impl List {
         };
         if !args.free {
             list.adc = inventory.adcs.iter().map(|device| adc(device, &names, args, reading)).collect();
-            list.pwm = sysfs.pwm.iter().map(|chip| pwm(chip, args)).collect();
+            list.pwm = sysfs.pwm.iter().map(|chip| pwm(chip, &names, args)).collect();
             list.spi = inventory.spi.iter().filter_map(|node| spi(*node, args)).collect();
             list.i2c = sysfs.i2c.iter().filter_map(|bus| i2c(bus, args)).collect();
             let sensors = sysfs.thermometers.iter().filter(|serial| wanted(args, [serial.as_str(), "w1", "ds18b20"]));
@@ -306,7 +308,7 @@ fn wanted<'a>(args: &PinsArgs, names: impl IntoIterator<Item = &'a str>) -> bool
     names.into_iter().any(|name| name.to_lowercase().contains(&filter))
 }
 
-fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip {
+fn gpio(chip: &Chip, inventory: &Inventory, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip {
     let path = format!("gpiochip{}", chip.number);
     let mut lines = Vec::new();
     for (offset, line) in (0..).zip(&chip.lines) {
@@ -322,6 +324,7 @@ fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip 
         let mut pins: Vec<String> = pins.into_iter().map(str::to_owned).collect();
         // The numeric name comes second. The first name is the line's own, if it has one.
         pins.insert(pins.len().min(1), numbered);
+        pins.extend(inventory.former_names(chip, offset));
         let line = GpioLine {
             line: offset,
             name: line.name.clone(),
@@ -380,17 +383,25 @@ fn adc(device: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32,
     }
 }
 
-fn pwm(chip: &PwmChip, args: &PinsArgs) -> PwmEntry {
+fn pwm(chip: &PwmChip, names: &Names, args: &PinsArgs) -> PwmEntry {
     let name = format!("pwmchip{}", chip.number);
     let mut channels = Vec::new();
     for (channel, found) in (0..).zip(&chip.channels) {
         let full = format!("{name}/pwm{channel}");
-        if wanted(args, [full.as_str()].into_iter().chain(chip.device.as_deref())) {
+        let number = pwm_number(chip.number, channel);
+        let mut pins: Vec<String> =
+            number.map_or_else(Vec::new, |n| names.of_pin(n)).into_iter().map(str::to_owned).collect();
+        pins.extend(number.map(|_| full.clone()));
+        if wanted(
+            args,
+            [full.as_str()].into_iter().chain(chip.device.as_deref()).chain(pins.iter().map(String::as_str)),
+        ) {
             channels.push(PwmLine {
                 channel,
                 exported: found.exported,
                 consumer: found.consumer.clone(),
-                pin: pwm_number(chip.number, channel).map(|_| full),
+                pin: number.map(|_| full),
+                pins,
             });
         }
     }
@@ -492,8 +503,11 @@ fn pwm_section(chip: &PwmEntry) -> Page {
             (None, true) => "exported",
             (None, false) => "free",
         };
-        let pin = line.pin.as_ref().map(|pin| format!("pin: {pin}, with hardware_pwm: True"));
-        vec![line.channel.to_string(), cut(used_by), pin.unwrap_or_else(|| "-".into())]
+        let pin = match line.pins.is_empty() {
+            true => "-".to_owned(),
+            false => format!("pin: {}, with hardware_pwm: True", line.pins.join(" or ")),
+        };
+        vec![line.channel.to_string(), cut(used_by), pin]
     };
     let rows: Vec<Vec<String>> = chip.channels.iter().map(row).collect();
     let heading = format!("{}{}", chip.chip, chip.device.as_ref().map_or(String::new(), |device| format!(" {device}")));

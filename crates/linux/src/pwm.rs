@@ -13,14 +13,41 @@ use std::thread;
 use std::time::Duration;
 
 use super::guard::SharedGuard;
+use super::sysfs::{names, target, text};
 use pinion_firmware::board::{self, PWM_MAX, PwmConfig};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{NS_PER_TICK, Ticks};
 use pinion_firmware::trouble::Trouble;
 
+/// Highest number of channels of a chip. No chip has as many.
+const CHANNELS_MAX: u32 = 256;
 /// The files of a newly exported channel belong to root until udev has given them to the group.
 const UDEV_TRIES: u32 = 50;
 const UDEV_PAUSE: Duration = Duration::from_millis(10);
+
+/// A PWM chip as it was found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Chip {
+    /// The number of `pwmchip<n>`.
+    pub number: u32,
+    /// The device, such as `fe20c000.pwm`. Its name stays where a kernel numbers the chips differently.
+    pub device: Option<String>,
+    /// How many channels it has.
+    pub channels: u32,
+}
+
+/// The chips of this computer by number. `class` is `/sys/class/pwm`.
+pub(super) fn scan(class: &Path) -> Vec<Chip> {
+    let chip = |name: &String| {
+        let number = name.strip_prefix("pwmchip")?.parse().ok()?;
+        let folder = class.join(name);
+        let channels = text(&folder.join("npwm")).and_then(|count| count.parse().ok()).unwrap_or(0);
+        Some(Chip { number, device: target(&folder.join("device")), channels: CHANNELS_MAX.min(channels) })
+    };
+    let mut chips: Vec<Chip> = names(class).iter().filter_map(chip).collect();
+    chips.sort_by_key(|chip| chip.number);
+    chips
+}
 
 /// A channel: `pwmchip<chip>/pwm<channel>`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
