@@ -75,11 +75,8 @@ pub struct Inventory {
 impl Inventory {
     /// Looks for chips, ADCs and buses. A computer without any of them is no error.
     pub fn scan() -> Inventory {
-        let dev = Path::new(DEV);
-        let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
-        let (vacant, pwm) = (gpio::vacant(dev), pwm::scan(Path::new(PWM)));
-        let (spi, i2c, uarts) = (spi::scan(dev), i2c::scan(dev), uart::scan(dev, Path::new(TTY)));
-        let mut inventory = Inventory { chips, vacant, pwm, spi, i2c, uarts, problems, ..Inventory::default() };
+        let (chips, problems) = gpio::scan(Path::new(DEV), Path::new(GPIO));
+        let mut inventory = Inventory { problems, ..Inventory::around(Path::new("/"), chips) };
         match adc::context(Path::new(IIO)) {
             Ok(context) => {
                 inventory.adcs = context.as_ref().map(adc::scan).unwrap_or_default();
@@ -88,6 +85,21 @@ impl Inventory {
             Err(problem) => inventory.problems.push(problem),
         }
         inventory
+    }
+
+    /// These chips, and everything else that the files below `root` tell. They tell nothing of ADCs.
+    pub fn around(root: &Path, chips: Vec<gpio::Chip>) -> Inventory {
+        let below = |path: &str| root.join(path.trim_start_matches('/'));
+        let (dev, pwm, tty) = (below(DEV), below(PWM), below(TTY));
+        Inventory {
+            chips,
+            vacant: gpio::vacant(&dev),
+            pwm: pwm::scan(&pwm),
+            spi: spi::scan(&dev),
+            i2c: i2c::scan(&dev),
+            uarts: uart::scan(&dev, &tty),
+            ..Inventory::default()
+        }
     }
 
     /// Opens the channel that the driver of `iio:device<device>` calls `id`, if it exists.

@@ -758,6 +758,10 @@ mod tests {
             (PI4, Some(Layout::Bcm2835)),
             (PI5, Some(Layout::Rp1)),
             ("brcm,bcm7445-gpio\0brcm,brcmstb-gpio\0", None),
+            ("brcm,bcm2711-gpio\0", Some(Layout::Bcm2835)),
+            ("raspberrypi,firmware-gpio\0", None),
+            ("allwinner,sun50i-h616-pinctrl\0", None),
+            ("rockchip,gpio-bank\0", None),
             ("brcm,bcm2835-gpio-and-more\0", None),
             ("", None),
         ] {
