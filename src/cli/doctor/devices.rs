@@ -276,6 +276,12 @@ pub(super) fn is_pi(computer: &Computer) -> bool {
     model(computer).contains("Raspberry Pi")
 }
 
+/// Whether this is a Raspberry Pi 5, 500 or Compute Module 5.
+pub(super) fn is_pi5(computer: &Computer) -> bool {
+    let model = model(computer);
+    ["Raspberry Pi 5", "Raspberry Pi Compute Module 5"].iter().any(|name| model.starts_with(name))
+}
+
 /// A Raspberry Pi's config.txt.
 pub(super) fn pi_config(computer: &Computer) -> Option<&'static str> {
     computer.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
