@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! For tests: boards that people own, as folders of a computer and as what Pinion finds there.
 //!
-//! `compatible` and the names of lines are those of the device trees in Debian 13 (Linux 6.12.107), in its backports
-//! (7.3.4), and in Raspberry Pi OS. The drivers choose labels, numbers of lines, and the order of the chips.
+//! Models and names of lines are those of the device trees in Debian 13 (Linux 6.12.107), in its backports (7.3.4), and in
+//! Raspberry Pi OS. The drivers choose labels, numbers of lines, and the order of the chips.
 
 use std::fs;
 
@@ -17,7 +17,6 @@ struct BoardChip {
     label: &'static str,
     /// Its device below /sys/devices/platform.
     device: &'static str,
-    compatible: &'static str,
     line_count: usize,
     /// The names of its first lines.
     names: Vec<&'static str>,
@@ -41,7 +40,6 @@ impl Board {
         for chip in &self.chips {
             let (number, device) = (chip.number, format!("sys/devices/platform/{}", chip.device));
             tree.put(&format!("dev/gpiochip{number}"), "");
-            tree.put(&format!("{device}/of_node/compatible"), &format!("{}\0", chip.compatible));
             if !chip.names.is_empty() {
                 tree.put(&format!("{device}/of_node/gpio-line-names"), &(chip.names.join("\0") + "\0"));
             }
@@ -101,7 +99,6 @@ pub(super) fn pi4() -> Board {
                 number: 0,
                 label: "pinctrl-bcm2711",
                 device: "soc/fe200000.gpio",
-                compatible: "brcm,bcm2711-gpio",
                 line_count: 58,
                 names: named(names),
             },
@@ -109,7 +106,6 @@ pub(super) fn pi4() -> Board {
                 number: 1,
                 label: EXPANDER,
                 device: "soc/soc:firmware/soc:firmware:gpio",
-                compatible: "raspberrypi,firmware-gpio",
                 line_count: 8,
                 names: named("BT_ON WL_ON PWR_LED_OFF GLOBAL_RESET VDD_SD_IO_SEL CAM_GPIO SD_PWR_ON"),
             },
@@ -131,7 +127,6 @@ pub(super) fn zero2() -> Board {
             number: 0,
             label: "pinctrl-bcm2835",
             device: "soc/3f200000.gpio",
-            compatible: "brcm,bcm2835-gpio",
             line_count: 54,
             names: named(names),
         }],
@@ -146,7 +141,6 @@ fn brcmstb(chips: &[(u32, &'static str, &'static str, usize)]) -> Vec<BoardChip>
         number: *number,
         label,
         device,
-        compatible: "brcm,bcm7445-gpio\0brcm,brcmstb-gpio",
         line_count: *line_count,
         names: vec![],
     };
@@ -158,7 +152,6 @@ fn rp1(number: u32, names: Vec<&'static str>) -> BoardChip {
         number,
         label: "pinctrl-rp1",
         device: "axi/1000120000.pcie/pci0002:00/0002:00:00.0/0002:01:00.0/1f000d0000.gpio",
-        compatible: "raspberrypi,rp1-gpio",
         line_count: 54,
         names,
     }
@@ -209,19 +202,12 @@ pub(super) fn pi5_without_header() -> Board {
 
 /// A BigTreeTech CB1 (Allwinner H616) with Debian. No line has a name.
 pub(super) fn cb1() -> Board {
-    let chip = |number, label, device, compatible, line_count| BoardChip {
-        number,
-        label,
-        device,
-        compatible,
-        line_count,
-        names: vec![],
-    };
+    let chip = |number, label, device, line_count| BoardChip { number, label, device, line_count, names: vec![] };
     Board {
         model: "BigTreeTech CB1",
         chips: vec![
-            chip(0, "300b000.pinctrl", "soc/300b000.pinctrl", "allwinner,sun50i-h616-pinctrl", 288),
-            chip(1, "7022000.pinctrl", "soc/7022000.pinctrl", "allwinner,sun50i-h616-r-pinctrl", 32),
+            chip(0, "300b000.pinctrl", "soc/300b000.pinctrl", 288),
+            chip(1, "7022000.pinctrl", "soc/7022000.pinctrl", 32),
         ],
         dev: &["i2c-0", "spidev1.0"],
         pwm: &[],
@@ -233,7 +219,7 @@ pub(super) fn rk3566() -> Board {
     let chip = |number, label, device, names: &[(usize, &'static str)]| {
         let mut all = vec![""; 32];
         names.iter().for_each(|(line, name)| all[*line] = name);
-        BoardChip { number, label, device, compatible: "rockchip,gpio-bank", line_count: 32, names: all }
+        BoardChip { number, label, device, line_count: 32, names: all }
     };
     Board {
         model: "Radxa ZERO 3W",

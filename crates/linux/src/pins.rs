@@ -21,7 +21,6 @@
 
 use std::collections::HashMap;
 use std::fmt;
-use std::iter;
 
 use super::Inventory;
 use super::spi::Node;
@@ -218,9 +217,9 @@ impl Names {
             }
         }
         for chip in &inventory.pwm {
-            for (channel, device) in (0..chip.channels).zip(iter::repeat(&chip.device)) {
-                let number = pwm_number(chip.number, channel);
-                own.extend(device.as_ref().zip(number).map(|(device, n)| (format!("{device}/pwm{channel}"), n)));
+            let Some(device) = &chip.device else { continue };
+            for channel in 0..chip.channels {
+                own.extend(pwm_number(chip.number, channel).map(|n| (format!("{device}/pwm{channel}"), n)));
             }
         }
         for node in &inventory.spi {

@@ -430,9 +430,12 @@ pub(super) fn header(computer: &Computer, inventory: &Inventory, pins: &BTreeSet
         let number = line_number(header.number, offset)?;
         names.of_pin(number).first().map(|name| (*name).to_owned())
     };
-    // The host has its own chips on a Pi 5. Other chips were connected on purpose.
-    let is_other =
-        |number: u32| chips.iter().any(|chip| chip.number == number && chip.label.starts_with("gpio-brcmstb"));
+    // The header has had these numbers. On a Pi 5 a chip of the processor may have them. Any other chip was connected on
+    // purpose.
+    let is_other = |number: u32| {
+        let chip = chips.iter().find(|chip| chip.number == number && [0, 4].contains(&number));
+        chip.is_some_and(|chip| chip.label.starts_with("gpio-brcmstb"))
+    };
     let (mut former, mut other) = (Vec::new(), Vec::new());
     for pin in pins {
         let Some((chip, offset)) = line_of(pin) else { continue };

@@ -41,7 +41,7 @@ pub struct Chip {
 
 impl Chip {
     /// Whether it has the 40-pin header of a Raspberry Pi.
-    pub fn is_header(&self) -> bool {
+    pub(crate) fn is_header(&self) -> bool {
         HEADERS.contains(&self.label.as_str())
     }
 
