@@ -696,7 +696,7 @@ Serial ports
     fn boards_that_people_own() {
         let lines = |board: Board, filter: &str| on_board(&board, filter);
         assert_eq!(lines(boards::pi4(), "gpio17"), ["17 GPIO17 in free GPIO17, gpio17"]);
-        assert_eq!(lines(boards::pi4(), "txd1"), ["14 TXD1 in free TXD1, gpio14"]);
+        assert_eq!(lines(boards::pi4(), "gpio14"), ["14 TXD1 in free TXD1, gpio14"]);
         assert_eq!(
             lines(boards::pi4(), "gpiochip1/gpio7"),
             ["7 - in free raspberrypi-exp-gpio/gpio7, gpiochip1/gpio7"]
