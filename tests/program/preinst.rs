@@ -14,8 +14,8 @@ fn preinst(architecture: &str, machine: &str) -> Output {
     fs::set_permissions(&uname, fs::Permissions::from_mode(0o755)).unwrap();
     let path = format!("{}:{}", folder.path().display(), std::env::var("PATH").unwrap());
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("debian/preinst");
-    let run =
-        Command::new("sh").arg(script).arg("install").env("PATH", path).env("DPKG_MAINTSCRIPT_ARCH", architecture);
+    let mut run = Command::new("sh");
+    run.arg(script).arg("install").env("PATH", path).env("DPKG_MAINTSCRIPT_ARCH", architecture);
     run.output().unwrap()
 }
 
