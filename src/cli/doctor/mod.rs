@@ -110,7 +110,13 @@ fn examine(computer: &Computer) -> Vec<Group> {
     ];
     if computer.is_this() {
         let is_serving = instances.iter().any(|instance| instance.pid.is_some());
-        groups.insert(7, Group::new("lines", devices::holders(computer, &Inventory::scan().chips)));
+        let inventory = Inventory::scan();
+        let pins = host::numbered_pins(&klippys);
+        let lines = [
+            devices::header(computer, &inventory, &devices::of_instances(&instances, &pins)),
+            devices::holders(computer, &inventory.chips),
+        ];
+        groups.insert(7, Group::new("lines", lines.concat()));
         groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
     }
     groups
