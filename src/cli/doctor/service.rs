@@ -318,7 +318,7 @@ mod tests {
         told(&look(), "watchdog_device", Ok, "is there");
         tree.put("etc/systemd/system.conf.d/a.conf", "[Manager]\nRuntimeWatchdogSec=20\n");
         let remedy = told(&look(), "watchdog_device", Error, "/etc/systemd/system.conf.d/a.conf");
-        assert!(remedy.contains("/etc/systemd/system.conf.d/99-pinion.conf"), "{remedy}");
+        assert!(remedy.contains("/etc/systemd/system.conf.d/a.pinion.conf"), "{remedy}");
         for unit in ["pinion-mcu", "pinion-mcu@b"] {
             tree.link(&format!("etc/systemd/system/multi-user.target.wants/{unit}.service"), "x");
         }
