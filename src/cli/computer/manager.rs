@@ -62,12 +62,12 @@ fn runtime_watchdog(computer: &Computer) -> Option<(String, String)> {
         }
     }
     let files = main.into_iter().chain(drop_ins.into_values());
-    let set = files.filter_map(|file| {
+    let mut set = files.filter_map(|file| {
         let text = computer.text(&file)?;
         let value = setting(&text, "RuntimeWatchdogSec")?.to_owned();
         Some((file, value))
     });
-    set.last()
+    set.next_back()
 }
 
 /// The name of a drop-in that counts more than this file.
