@@ -6,14 +6,11 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::io::Read;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::process::Command;
 
-use crate::cli::computer::{Access, Computer, Who};
+use crate::cli::computer::{Access, Computer, Who, output};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use crate::throttled;
@@ -553,28 +550,6 @@ fn throttled_bits(computer: &Computer, vcgencmd: Option<&Path>) -> Option<u32> {
     throttled::bits(told.trim().strip_prefix("throttled=")?)
 }
 
-/// The output of a program. `None` if the program does not end within two seconds.
-fn output(command: &mut Command) -> Option<String> {
-    const OUTPUT_TIMEOUT: Duration = Duration::from_secs(2);
-    let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
-    let mut child = command.spawn().ok()?;
-    let end = Instant::now() + OUTPUT_TIMEOUT;
-    loop {
-        match child.try_wait() {
-            Ok(None) if Instant::now() < end => thread::sleep(Duration::from_millis(10)),
-            Ok(Some(_)) => break,
-            // It hangs. It is killed, and left alone if it does not end.
-            _ => {
-                let _ = child.kill();
-                return None;
-            }
-        }
-    }
-    let mut text = String::new();
-    child.stdout.take()?.take(4096).read_to_string(&mut text).ok()?;
-    Some(text)
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
@@ -916,30 +891,10 @@ mod tests {
         assert_eq!(findings.len(), 2);
     }
 
-    /// A program made from this script.
-    fn program(tree: &Tree, script: &str) -> PathBuf {
-        tree.put_mode("vcgencmd", script, 0o755);
-        let path = tree.computer().path("/vcgencmd");
-        // A process that another test forked meanwhile may have it open for writing, until it becomes another program.
-        loop {
-            match Command::new(&path).stdout(Stdio::null()).spawn() {
-                Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy => {
-                    thread::sleep(Duration::from_millis(1))
-                }
-                Result::Ok(mut child) => {
-                    let _ = child.kill();
-                    let _ = child.wait();
-                    return path;
-                }
-                Err(_) => return path,
-            }
-        }
-    }
-
     #[test]
     fn a_pi_s_program_is_asked_where_the_kernel_does_not_tell_and_not_waited_for() {
         let tree = Tree::new();
-        let told_by = |script: &str| power(&tree.computer(), Some(&program(&tree, script)));
+        let told_by = |script: &str| power(&tree.computer(), Some(&tree.program("vcgencmd", script)));
         let good = told_by("#!/bin/sh\necho throttled=0x80000\n");
         told(&good, "power", Warning, "at times the processors are at their temperature limit");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");
