@@ -162,10 +162,10 @@ fn pins_that_can_not_be_are_refused_and_the_log_says_why() {
     assert_eq!(refusal(client, 1, &[input(0, "pwmchip0/pwm1", 0)]), "Not an input pin");
     program.wait_for_line(&["pwmchip0/pwm1 (hardware PWM) cannot be an input"]);
     assert_eq!(
-        refusal(client, 1, &["config_digital_out oid=0 pin=3000 value=0 default_value=0 max_duration=0"]),
+        refusal(client, 1, &["config_digital_out oid=0 pin=5000 value=0 default_value=0 max_duration=0"]),
         "Not an output pin"
     );
-    program.wait_for_line(&["pin number 3000 (no pin has it)"]);
+    program.wait_for_line(&["pin number 5000 (no pin has it)"]);
 
     configure(client, 2, &[output(0, "FAN"), input(1, "lab/gpio2", 1)]);
 }
