@@ -176,6 +176,7 @@ impl Stepper {
     /// Changes the direction. The next step waits for the setup time.
     fn reverse(&mut self, turn: &mut Turn) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
+        self.dir.flush();
         let earliest = turn.now() + self.pulse_ticks;
         Ok(self.edge_at(turn, self.next_step, earliest))
     }
@@ -243,8 +244,9 @@ impl Object for Stepper {
         }
         if !self.step.was_batched() {
             self.step.toggle()?;
-            // A pulse begins after the edge was written, because a write may be slow.
+            // A pulse begins when its edge has reached the line: a write may be slow, and a bus may hold it back.
             if self.pulse_ticks > Ticks(0) {
+                self.step.flush();
                 turn.now();
             } else {
                 turn.made_edge();
