@@ -34,7 +34,7 @@ pub(super) use refusal::not_permitted;
 pub use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
 use refusal::{Subject, cannot_open, errno};
 pub(super) use registers::FastChips;
-pub use registers::{ChipRegisters, FastGpio, never_sleeps};
+pub use registers::{ChipRegisters, FastGpio, LINK_REMEDY, never_sleeps};
 use registers::{LineRegisters, RegisterBank};
 
 /// The name that the kernel shows as the consumer of our lines.

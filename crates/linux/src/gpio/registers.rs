@@ -382,11 +382,15 @@ pub fn never_sleeps(aspm_policy: &Path) -> bool {
     fs::read_to_string(aspm_policy).is_ok_and(|policies| policies.split_whitespace().any(|name| name == "[performance]"))
 }
 
+/// The remedy for a link that may sleep. `pcie_aspm=off` leaves each link as the firmware has set it.
+pub const LINK_REMEDY: &str =
+    "write pcie_aspm.policy=performance, and not pcie_aspm=off, into /boot/firmware/cmdline.txt, and reboot";
+
 fn may_sleep(aspm_policy: &Path) -> Trouble {
     let chosen = fs::read_to_string(aspm_policy).unwrap_or_else(|error| error.to_string());
     Trouble::new(format!("the PCIe link of the RP1 may sleep, which delays edges ({})", chosen.trim()))
         .of(aspm_policy.display())
-        .remedy("add pcie_aspm.policy=performance to /boot/firmware/cmdline.txt, and reboot")
+        .remedy(LINK_REMEDY)
 }
 
 /// Why a node cannot be opened or mapped.
@@ -910,7 +914,7 @@ mod tests {
             computer.has_policy(policies);
             let why = computer.open(FastGpio::On).err().unwrap();
             let told = format!("may sleep, which delays edges ({})", policies.trim());
-            assert!(why.contains(&told) && why.contains("add pcie_aspm.policy=performance to"), "{why}");
+            assert!(why.contains(&told) && why.ends_with(LINK_REMEDY), "{why}");
         }
         fs::remove_file(computer.dev("policy")).unwrap();
         assert!(computer.open(FastGpio::On).err().unwrap().contains("No such file"));
