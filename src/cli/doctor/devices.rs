@@ -587,7 +587,8 @@ mod tests {
             tree.put("sys/module/pcie_aspm/parameters/policy", policies);
             permitted(&tree, &stranger(vec![]))
         };
-        let remedy = told(&with_policy("[default] performance\n"), "fast_gpio", Warning, "the PCIe link of the RP1 may");
+        let remedy =
+            told(&with_policy("[default] performance\n"), "fast_gpio", Warning, "the PCIe link of the RP1 may");
         assert!(remedy.contains("pcie_aspm.policy=performance, and not pcie_aspm=off"), "{remedy}");
         let findings = with_policy("default [performance] powersave\n");
         told(&findings, "fast_gpio", Fine, "may open /dev/gpiomem0");

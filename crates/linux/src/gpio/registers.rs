@@ -379,7 +379,8 @@ pub(super) struct Places<'a> {
 /// Whether the kernel never lets a PCIe link sleep. The file lists the policies, with the chosen one in brackets
 /// (drivers/pci/pcie/aspm.c, `pcie_aspm_get_policy`).
 pub fn never_sleeps(aspm_policy: &Path) -> bool {
-    fs::read_to_string(aspm_policy).is_ok_and(|policies| policies.split_whitespace().any(|name| name == "[performance]"))
+    fs::read_to_string(aspm_policy)
+        .is_ok_and(|policies| policies.split_whitespace().any(|name| name == "[performance]"))
 }
 
 /// The remedy for a link that may sleep. `pcie_aspm=off` leaves each link as the firmware has set it.
@@ -957,8 +958,7 @@ mod tests {
     #[test]
     fn a_chip_is_looked_at_once() {
         let computer = Computer::new(PI3);
-        let are_there =
-            |chips: &mut FastChips| computer.with_places(|places| chips.of(places, "gpiochip0").is_some());
+        let are_there = |chips: &mut FastChips| computer.with_places(|places| chips.of(places, "gpiochip0").is_some());
         let mut chips = FastChips::new(FastGpio::Auto);
         assert!(!are_there(&mut chips));
         fs::File::create(computer.dev("gpiomem")).unwrap().set_len(0x1000).unwrap();

@@ -230,7 +230,8 @@ mod tests {
     impl Wire {
         fn interrupt(&self, edge: usize, when: When) {
             let late = self.late.lock().unwrap();
-            let ticks: u32 = late.iter().filter(|(at, is, _)| *at == edge && *is == when).map(|(.., ticks)| *ticks).sum();
+            let ticks: u32 =
+                late.iter().filter(|(at, is, _)| *at == edge && *is == when).map(|(.., ticks)| *ticks).sum();
             self.clock.real_ns.fetch_add(NS_PER_TICK * u64::from(ticks), SeqCst);
         }
     }
