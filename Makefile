@@ -34,11 +34,11 @@ SMALL = armv7-unknown-linux-gnueabihf
 export CARGO_TARGET_DIR
 
 .DEFAULT_GOAL = help
-.PHONY: help run demo mainsail test test-kernel test-raspberry-pi test-package soak soak-real fuzz coverage mutants
+.PHONY: help run demo mainsail test test-kernel test-raspberry-pi test-package test-bare soak soak-real fuzz coverage mutants
 .PHONY: sanitize bench check build install install-program install-system uninstall deb release clean
 
 # They install what is missing, Rust too.
-PACKAGES = $(addprefix system-packages-,build vm deb system stress check fuzz coverage)
+PACKAGES = $(addprefix system-packages-,build mainsail vm deb system stress check fuzz coverage)
 .PHONY: $(PACKAGES)
 $(PACKAGES): system-packages-%:
 	@CARGO='$(CARGO)' scripts/system-packages $*
@@ -50,6 +50,7 @@ help:
 	@echo 'make test          all tests, with those against real kernel drivers in a virtual machine'
 	@echo 'make test-kernel   only the latter'
 	@echo 'make test-package  the package installed in a booted Debian 12 with systemd (as root)'
+	@echo 'make test-bare     make run and make test in bare root folders of Debian 12 and 13 (as root; hours)'
 	@echo 'make test-raspberry-pi'
 	@echo '                   a smoke test on an emulated Raspberry Pi 3 (installs a cross compiler and QEMU)'
 	@echo 'make soak          a day of printing with faults, in virtual time: 10 to 20 minutes (SECONDS=86400 SEED=)'
@@ -70,24 +71,24 @@ help:
 	@echo 'make clean         remove what was built'
 
 run: build
-	@$(PINION) sim $(REALTIME) $(ARGS)
+	@'$(PINION)' sim $(REALTIME) $(ARGS)
 
 demo: build
-	@$(PINION) sim --demo $(REALTIME) $(ARGS)
+	@'$(PINION)' sim --demo $(REALTIME) $(ARGS)
 
 # With all that it downloads.
 FOLDER ?= $(CARGO_TARGET_DIR)/mainsail
-mainsail: build
+mainsail: system-packages-mainsail build
 	@PINION='$(PINION)' scripts/mainsail '$(FOLDER)'
 
 build: system-packages-build
-	@$(CARGO) build --release --locked --quiet --bin pinion
+	@'$(CARGO)' build --release --locked --quiet --bin pinion
 
 # Time in the virtual machines counts instructions, so whatever else the computer does may go first.
-TEST_KERNEL = nice -n 19 $(CARGO) test --locked --test kernel
+TEST_KERNEL = nice -n 19 '$(CARGO)' test --locked --test kernel
 
 test: system-packages-vm
-	$(CARGO) test --locked
+	'$(CARGO)' test --locked
 ifeq ($(shell uname -m),x86_64)
 	$(TEST_KERNEL)
 else
@@ -98,23 +99,27 @@ test-kernel: system-packages-vm
 	$(TEST_KERNEL)
 
 test-raspberry-pi: system-packages-build
-	$(CARGO) test --locked --test raspberry_pi
+	'$(CARGO)' test --locked --test raspberry_pi
+
+SUITES ?= bookworm trixie
+test-bare:
+	@for suite in $(SUITES); do scripts/bare $$suite || exit 1; done
 
 test-package: system-packages-system
-	$(CARGO) test --locked --test package
+	'$(CARGO)' test --locked --test package
 
 SECONDS ?= 86400
 # Each run has its own faults. The test prints its seed if it fails.
 SEED ?= $(shell date +%s)
 soak: system-packages-build
-	PINION_SOAK_SECONDS=$(SECONDS) PINION_SOAK_SEED=$(SEED) $(CARGO) test --locked --test soak -- --nocapture
+	PINION_SOAK_SECONDS=$(SECONDS) PINION_SOAK_SEED=$(SEED) '$(CARGO)' test --locked --test soak -- --nocapture
 
 MINUTES ?= 60
 # Workers of stress-ng for each kind of load.
 WORKERS ?= 1
 soak-real: system-packages-stress
 	PINION_SOAK_MINUTES=$(MINUTES) PINION_SOAK_WORKERS=$(WORKERS) \
-	    $(CARGO) test --locked --test program soak:: -- --ignored --nocapture
+	    '$(CARGO)' test --locked --test program soak:: -- --ignored --nocapture
 
 # Seconds for each target, unless TOTAL says how long all targets together may take.
 fuzz: SECONDS = 60
@@ -136,51 +141,51 @@ MUTANTS ?=
 TESTS ?= -- --skip any_commands
 # Random tests have the same few cases for each mutant, and leave no files.
 mutants: system-packages-build
-	@$(CARGO) mutants --version >/dev/null 2>&1 || \
+	@'$(CARGO)' mutants --version >/dev/null 2>&1 || \
 	    { echo 'There is no cargo-mutants. Install it: cargo install --locked cargo-mutants' >&2; exit 1; }
-	@mkdir -p $(CARGO_TARGET_DIR)
+	@mkdir -p '$(CARGO_TARGET_DIR)'
 	env -u CARGO_TARGET_DIR PROPTEST_CASES=16 PROPTEST_RNG_SEED=1 PROPTEST_MAX_SHRINK_ITERS=0 \
-	    PROPTEST_DISABLE_FAILURE_PERSISTENCE=1 $(CARGO) mutants --package $(PACKAGE) --output $(CARGO_TARGET_DIR) \
+	    PROPTEST_DISABLE_FAILURE_PERSISTENCE=1 '$(CARGO)' mutants --package $(PACKAGE) --output '$(CARGO_TARGET_DIR)' \
 	    $(if $(SHARD),--sharding round-robin --shard $(SHARD)) $(MUTANTS) -- $(TESTS)
 
 sanitize: system-packages-build
 	@CARGO='$(CARGO)' scripts/sanitize
 
 bench: system-packages-build
-	$(CARGO) bench --locked
+	'$(CARGO)' bench --locked
 
 check: system-packages-check
-	$(CARGO) fmt --all --check
+	'$(CARGO)' fmt --all --check
 	@# With the parts of the fuzz targets in the program. For 32 bits, if Rust can compile for them: the tests compile
 	@# everything for 64 bits anyway. Nothing is linked, so there may be no libFuzzer. What is a cast on one may be
 	@# none on the other.
 	@small= && casts= && if rustup target list --installed 2>/dev/null | grep -qx $(SMALL); then \
 	    small='--target $(SMALL)' && casts='-A clippy::unnecessary_cast' && export CUSTOM_LIBFUZZER_PATH=/none/libfuzzer.a; \
 	else echo 'NOT RUN: the check for 32 bits, which needs: rustup target add $(SMALL)' >&2; fi; \
-	set -ex; $(CARGO) clippy --locked --workspace --all-targets $$small -- -D warnings --cfg fuzzing $$casts; \
+	set -ex; '$(CARGO)' clippy --locked --workspace --all-targets $$small -- -D warnings --cfg fuzzing $$casts; \
 	export RUSTDOCFLAGS='-D warnings -A rustdoc::private_intra_doc_links'; \
-	$(CARGO) doc --locked --no-deps --document-private-items --quiet $$small
+	'$(CARGO)' doc --locked --no-deps --document-private-items --quiet $$small
 	@# The program of the tests: one built for itself would have other features of some crates.
-	$(CARGO) test --locked --quiet --no-run
+	'$(CARGO)' test --locked --quiet --no-run
 	CARGO='$(CARGO)' scripts/check-dependencies
-	scripts/check-man $(CARGO_TARGET_DIR)/debug/pinion
-	scripts/check-deb $(CARGO_TARGET_DIR)/debug/pinion
+	scripts/check-man '$(CARGO_TARGET_DIR)/debug/pinion'
+	scripts/check-deb '$(CARGO_TARGET_DIR)/debug/pinion'
 
 # Root installs what was built before: no compiler runs as root.
 install: install-program install-system
 
 install-program:
-	@test -x $(PINION) || { echo 'There is nothing to install yet: run make build first.' >&2; exit 1; }
-	install -D -m 755 $(PINION) $(DESTDIR)$(PREFIX)/bin/pinion
+	@test -x '$(PINION)' || { echo 'There is nothing to install yet: run make build first.' >&2; exit 1; }
+	install -D -m 755 '$(PINION)' $(DESTDIR)$(PREFIX)/bin/pinion
 	install -D -m 644 man/pinion.1 $(DESTDIR)$(MANDIR)/man1/pinion.1
 	install -D -m 644 man/pinion-mcu.service.8 $(DESTDIR)$(MANDIR)/man8/pinion-mcu.service.8
 	install -D -m 755 systemd/link $(DESTDIR)$(LIBDIR)/link
 	install -D -m 755 systemd/usb-gadget $(DESTDIR)$(LIBDIR)/usb-gadget
 	install -D -m 644 systemd/can.conf $(DESTDIR)$(PREFIX)/share/pinion-mcu/can.conf
 	install -d $(DESTDIR)$(BASHDIR) $(DESTDIR)$(ZSHDIR) $(DESTDIR)$(FISHDIR)
-	$(COMPLETER) completions bash >$(DESTDIR)$(BASHDIR)/pinion
-	$(COMPLETER) completions zsh >$(DESTDIR)$(ZSHDIR)/_pinion
-	$(COMPLETER) completions fish >$(DESTDIR)$(FISHDIR)/pinion.fish
+	'$(COMPLETER)' completions bash >$(DESTDIR)$(BASHDIR)/pinion
+	'$(COMPLETER)' completions zsh >$(DESTDIR)$(ZSHDIR)/_pinion
+	'$(COMPLETER)' completions fish >$(DESTDIR)$(FISHDIR)/pinion.fish
 	chmod 644 $(DESTDIR)$(BASHDIR)/pinion $(DESTDIR)$(ZSHDIR)/_pinion $(DESTDIR)$(FISHDIR)/pinion.fish
 
 install-system:
@@ -234,10 +239,10 @@ endif
 ARCH ?=
 # Rust is rustup's, of which dpkg knows nothing: -d leaves the build dependencies to us.
 deb: system-packages-deb
-	@scripts/build-deb $(DEB_FOLDER) $(ARCH)
+	@scripts/build-deb '$(DEB_FOLDER)' $(ARCH)
 
 release: system-packages-deb
-	@scripts/release $(RELEASE_FOLDER)
+	@scripts/release '$(RELEASE_FOLDER)'
 
 clean:
-	$(CARGO) clean
+	'$(CARGO)' clean

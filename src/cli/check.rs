@@ -17,11 +17,14 @@ use crate::FIRMWARE;
 use crate::runtime::realtime::{self, Processors};
 use crate::runtime::{self, CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_uuid};
 use pinion_firmware::mcu::{Dialect, DialectName};
+use pinion_firmware::trouble::Trouble;
 use pinion_linux::Inventory;
 use pinion_linux::can;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::gpio::{Chip, FastGpio};
 
+use super::computer::Computer;
+use super::computer::manager::{SYSTEMCTL, watchdog_of_systemd};
 use super::finding::{self, Finding, Group, Level};
 use super::quietly;
 use super::settings::{BoardName, Settings, WATCHDOG, WATCHDOG_REMEDY};
@@ -42,7 +45,8 @@ pub(super) fn run(settings: &Settings, file: Option<&Path>) -> ExitCode {
     }
     findings.extend(real_time(settings));
     if settings.watchdog {
-        findings.push(watchdog(Path::new(WATCHDOG)));
+        let taken = watchdog_of_systemd(&Computer::at(Path::new("/")), Some(Path::new(SYSTEMCTL)));
+        findings.push(watchdog(Path::new(WATCHDOG), taken));
     }
     let groups = [Group::new("configuration", findings)];
     finding::finish(&finding::text(&groups), &groups)
@@ -226,11 +230,14 @@ fn real_time(settings: &Settings) -> Vec<Finding> {
     findings
 }
 
-/// Whether the watchdog is there and may be opened.
-fn watchdog(device: &Path) -> Finding {
+/// Whether the watchdog is there and may be opened. `taken`: why systemd has it.
+fn watchdog(device: &Path, taken: Option<Trouble>) -> Finding {
     let path = device.display();
     if !device.exists() {
         return Finding::error("watchdog", format!("there is no {path}"), WATCHDOG_REMEDY);
+    }
+    if let Some(taken) = taken {
+        return Finding::of("watchdog", Level::Error, taken);
     }
     match access(device, AccessFlags::W_OK) {
         Ok(()) => Finding::ok("watchdog", format!("{path} is there")),
@@ -290,8 +297,9 @@ mod tests {
         assert_eq!(group(Some(&getegid().to_string())).status, Level::Ok);
         let folder = tempfile::tempdir().unwrap();
         let device = folder.path().join("watchdog");
-        assert_eq!(watchdog(&device).status, Level::Error);
+        assert_eq!(watchdog(&device, None).status, Level::Error);
         fs::write(&device, "").unwrap();
-        assert_eq!(watchdog(&device).status, Level::Ok);
+        assert_eq!(watchdog(&device, None).status, Level::Ok);
+        assert_eq!(watchdog(&device, Some(Trouble::new("systemd has it"))).status, Level::Error);
     }
 }

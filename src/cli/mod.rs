@@ -14,6 +14,8 @@ use complete::{LEVELS, offering};
 use pinion_linux::gpio::Opener;
 
 mod attach;
+#[cfg(test)]
+mod boards;
 mod camera;
 mod check;
 mod complete;

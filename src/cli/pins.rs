@@ -194,6 +194,8 @@ struct PwmLine {
     consumer: Option<String>,
     /// `None` if it is beyond the channels that have names.
     pin: Option<String>,
+    /// How printer.cfg may write it: the name by the chip's device first.
+    pins: Vec<String>,
 }
 
 #[derive(Debug, Serialize)]
@@ -248,7 +250,7 @@ impl List {
             gpio: inventory
                 .chips
                 .iter()
-                .map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, sysfs, &names, args) })
+                .map(|chip| GpioChip { fast: fast(chip), ..gpio(chip, inventory, sysfs, &names, args) })
                 .collect(),
             adc: vec![],
             pwm: vec![],
@@ -260,7 +262,7 @@ impl List {
         };
         if !args.free {
             list.adc = inventory.adcs.iter().map(|device| adc(device, &names, args, reading)).collect();
-            list.pwm = sysfs.pwm.iter().map(|chip| pwm(chip, args)).collect();
+            list.pwm = sysfs.pwm.iter().map(|chip| pwm(chip, &names, args)).collect();
             list.spi = inventory.spi.iter().filter_map(|node| spi(*node, args)).collect();
             list.i2c = sysfs.i2c.iter().filter_map(|bus| i2c(bus, args)).collect();
             let sensors = sysfs.thermometers.iter().filter(|serial| wanted(args, [serial.as_str(), "w1", "ds18b20"]));
@@ -306,7 +308,7 @@ fn wanted<'a>(args: &PinsArgs, names: impl IntoIterator<Item = &'a str>) -> bool
     names.into_iter().any(|name| name.to_lowercase().contains(&filter))
 }
 
-fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip {
+fn gpio(chip: &Chip, inventory: &Inventory, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip {
     let path = format!("gpiochip{}", chip.number);
     let mut lines = Vec::new();
     for (offset, line) in (0..).zip(&chip.lines) {
@@ -322,6 +324,7 @@ fn gpio(chip: &Chip, sysfs: &Sysfs, names: &Names, args: &PinsArgs) -> GpioChip 
         let mut pins: Vec<String> = pins.into_iter().map(str::to_owned).collect();
         // The numeric name comes second. The first name is the line's own, if it has one.
         pins.insert(pins.len().min(1), numbered);
+        pins.extend(inventory.former_names(chip, offset));
         let line = GpioLine {
             line: offset,
             name: line.name.clone(),
@@ -380,17 +383,25 @@ fn adc(device: &IioDevice, names: &Names, args: &PinsArgs, reading: &dyn Fn(u32,
     }
 }
 
-fn pwm(chip: &PwmChip, args: &PinsArgs) -> PwmEntry {
+fn pwm(chip: &PwmChip, names: &Names, args: &PinsArgs) -> PwmEntry {
     let name = format!("pwmchip{}", chip.number);
     let mut channels = Vec::new();
     for (channel, found) in (0..).zip(&chip.channels) {
         let full = format!("{name}/pwm{channel}");
-        if wanted(args, [full.as_str()].into_iter().chain(chip.device.as_deref())) {
+        let number = pwm_number(chip.number, channel);
+        let mut pins: Vec<String> =
+            number.map_or_else(Vec::new, |n| names.of_pin(n)).into_iter().map(str::to_owned).collect();
+        pins.extend(number.map(|_| full.clone()));
+        if wanted(
+            args,
+            [full.as_str()].into_iter().chain(chip.device.as_deref()).chain(pins.iter().map(String::as_str)),
+        ) {
             channels.push(PwmLine {
                 channel,
                 exported: found.exported,
                 consumer: found.consumer.clone(),
-                pin: pwm_number(chip.number, channel).map(|_| full),
+                pin: number.map(|_| full),
+                pins,
             });
         }
     }
@@ -492,8 +503,11 @@ fn pwm_section(chip: &PwmEntry) -> Page {
             (None, true) => "exported",
             (None, false) => "free",
         };
-        let pin = line.pin.as_ref().map(|pin| format!("pin: {pin}, with hardware_pwm: True"));
-        vec![line.channel.to_string(), cut(used_by), pin.unwrap_or_else(|| "-".into())]
+        let pin = match line.pins.is_empty() {
+            true => "-".to_owned(),
+            false => format!("pin: {}, with hardware_pwm: True", line.pins.join(" or ")),
+        };
+        vec![line.channel.to_string(), cut(used_by), pin]
     };
     let rows: Vec<Vec<String>> = chip.channels.iter().map(row).collect();
     let heading = format!("{}{}", chip.chip, chip.device.as_ref().map_or(String::new(), |device| format!(" {device}")));
@@ -548,10 +562,12 @@ fn serial_section(ports: &[SerialEntry]) -> Page {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::cli::boards::{self, Board};
     use crate::cli::page::tests::assert_plain;
     use crate::foreign::tests::any_name;
     use pinion_linux::adc::{Channel, Format};
     use pinion_linux::gpio::LineInfo;
+    use pinion_linux::pwm;
     use pinion_linux::sysfs::PwmChannel;
     use proptest::prelude::*;
     use serde_json::{Value, json};
@@ -583,6 +599,7 @@ mod tests {
                     Channel { id: "voltage0-voltage1".into(), format: None },
                 ],
             }],
+            pwm: vec![pwm::Chip { number: 0, device: Some("fe20c000.pwm".into()), channels: 2 }],
             spi: vec![Node::of(1)],
             uarts: vec![
                 Uart { name: "ttyAMA1".into(), device: (204, 65), links: vec!["serial0".into()], is_console: false },
@@ -641,8 +658,8 @@ iio:device0 ads1115, 2 channels
 
 pwmchip0 fe20c000.pwm
   channel  used by  in printer.cfg
-  0        free     pin: pwmchip0/pwm0, with hardware_pwm: True
-  1        pwm-fan  pin: pwmchip0/pwm1, with hardware_pwm: True
+  0        free     pin: fe20c000.pwm/pwm0 or pwmchip0/pwm0, with hardware_pwm: True
+  1        pwm-fan  pin: fe20c000.pwm/pwm1 or pwmchip0/pwm1, with hardware_pwm: True
 
 SPI
   device          in printer.cfg
@@ -664,6 +681,69 @@ Serial ports
         );
     }
 
+    /// The lines of `pinion pins` on a board, for this filter, without their headings.
+    fn on_board(board: &Board, filter: &str) -> Vec<String> {
+        let tree = board.tree();
+        let (inventory, sysfs) = (board.inventory(&tree), Sysfs::scan(&tree.computer().path("/")));
+        let args = PinsArgs { filter: Some(filter.into()), ..PinsArgs::default() };
+        let none = |_: u32, _: &str| Reading::Failed { error: "there are no ADCs".into() };
+        let page = List::new(&inventory, &sysfs, &args, &none, &|_| None).page().to_string();
+        let rows = page.lines().filter(|line| line.starts_with("  ") && !line.contains("in printer.cfg"));
+        rows.map(|row| row.split_whitespace().collect::<Vec<_>>().join(" ")).collect()
+    }
+
+    #[test]
+    fn boards_that_people_own() {
+        let lines = |board: Board, filter: &str| on_board(&board, filter);
+        assert_eq!(lines(boards::pi4(), "gpio17"), ["17 GPIO17 in free GPIO17, gpio17"]);
+        assert_eq!(lines(boards::pi4(), "gpio14"), ["14 TXD1 in free TXD1, gpio14"]);
+        assert_eq!(
+            lines(boards::pi4(), "gpiochip1/gpio7"),
+            ["7 - in free raspberrypi-exp-gpio/gpio7, gpiochip1/gpio7"]
+        );
+        assert_eq!(
+            lines(boards::pi4(), "pwm1"),
+            [
+                "41 PWM1_MOSI in free PWM1_MOSI, gpio41",
+                "1 free pin: fe20c000.pwm/pwm1 or pwmchip0/pwm1, with hardware_pwm: True"
+            ]
+        );
+        assert_eq!(lines(boards::zero2(), "gpio17"), ["17 GPIO17 in free GPIO17, gpio17"]);
+        assert_eq!(lines(boards::zero2(), "gpio31"), ["31 NC in free pinctrl-bcm2835/gpio31, gpio31"], "many are NC");
+        let renumbered = "17 GPIO17 in free GPIO17, gpiochip15/gpio17";
+        assert!(lines(boards::pi5(), "gpio17").contains(&renumbered.into()));
+        assert_eq!(lines(boards::pi5(), "gpiochip4/gpio17"), [renumbered], "it is found by its former numbers");
+        assert_eq!(lines(boards::pi5(), "GPIO33"), ["33 - in free pinctrl-rp1/gpio33, gpiochip15/gpio33"]);
+        assert_eq!(
+            lines(boards::pi5(), "1f00098000.pwm/pwm2"),
+            ["2 free pin: 1f00098000.pwm/pwm2 or pwmchip0/pwm2, with hardware_pwm: True"]
+        );
+        assert_eq!(lines(boards::pi5_debian(), "rp1/gpio17"), ["17 - in free pinctrl-rp1/gpio17, gpiochip4/gpio17"]);
+        assert_eq!(lines(boards::cb1(), "gpio79"), ["79 - in free 300b000.pinctrl/gpio79, gpio79"]);
+        assert_eq!(lines(boards::cb1(), "chip1/gpio31"), ["31 - in free 7022000.pinctrl/gpio31, gpiochip1/gpio31"]);
+        assert_eq!(lines(boards::rk3566(), "gpio3_a1"), ["1 pin-11 [GPIO3_A1] in free gpio3/gpio1, gpiochip3/gpio1"]);
+    }
+
+    /// No board has a line without a name, or a name for two lines.
+    #[test]
+    fn each_line_of_a_board_has_names_of_its_own() {
+        for board in boards::all() {
+            let inventory = board.inventory(&board.tree());
+            let names = Names::of(&inventory);
+            let mut seen = std::collections::HashSet::new();
+            for chip in &inventory.chips {
+                for offset in (0..).take(chip.lines.len()) {
+                    let own = names.of_pin(line_number(chip.number, offset).unwrap());
+                    assert!(!own.is_empty(), "{} {offset}", chip.label);
+                    own.iter().for_each(|name| assert!(seen.insert((*name).to_owned()), "{name}"));
+                    for former in inventory.former_names(chip, offset) {
+                        assert!(seen.insert(former.clone()), "{former}");
+                    }
+                }
+            }
+        }
+    }
+
     proptest! {
         #[test]
         fn whatever_a_device_is_called_stays_in_its_line(name in any_name()) {
@@ -677,6 +757,7 @@ Serial ports
                 }
                 inventory.adcs[0].name = name.to_owned();
                 inventory.adcs[0].channels[0].id = name.to_owned();
+                inventory.pwm[0].device = Some(name.to_owned());
                 (sysfs.pwm[0].device, sysfs.i2c[0].adapter) = (Some(name.to_owned()), Some(name.to_owned()));
                 sysfs.pwm[0].channels[1].consumer = Some(name.to_owned());
                 let chip = &mut sysfs.i2c[0].chips[0];
@@ -747,7 +828,10 @@ Serial ports
         );
         assert_eq!(
             value["pwm"][0]["channels"][1],
-            json!({ "channel": 1, "exported": false, "consumer": "pwm-fan", "pin": "pwmchip0/pwm1" })
+            json!({
+                "channel": 1, "exported": false, "consumer": "pwm-fan", "pin": "pwmchip0/pwm1",
+                "pins": ["fe20c000.pwm/pwm1", "pwmchip0/pwm1"]
+            })
         );
         assert_eq!(value["spi"], json!([{ "device": "/dev/spidev0.1", "spi_bus": "spidev0.1" }]));
         assert_eq!(

@@ -72,7 +72,7 @@ fn cannot_open(path: &Path, error: &io::Error) -> Trouble {
             "this computer has no watchdog, or its driver is not loaded: on a Raspberry Pi set \"dtparam=watchdog=on\" in config.txt, elsewhere modprobe softdog, or leave out -w"
         }
         Some(libc::EBUSY) => {
-            "another program feeds it: unset RuntimeWatchdogSec in /etc/systemd/system.conf or stop the watchdog daemon, or leave out -w"
+            "another program feeds it, on Raspberry Pi OS systemd: \"sudo pinion doctor\" has the command that stops systemd's feeding; or stop the watchdog daemon, or leave out -w"
         }
         Some(libc::EACCES | libc::EPERM) => {
             "run as root, or let a udev rule give the device to Pinion's user or group, or leave out -w"
@@ -258,7 +258,7 @@ mod tests {
         assert!(error.to_string().starts_with("-w: /nowhere/watchdog cannot be opened:"), "{error}");
         let text = |code| cannot_open(path, &io::Error::from_raw_os_error(code)).to_string();
         assert!(text(libc::ENOENT).contains("modprobe softdog"));
-        assert!(text(libc::EBUSY).contains("RuntimeWatchdogSec"));
+        assert!(text(libc::EBUSY).contains("on Raspberry Pi OS systemd: \"sudo pinion doctor\""));
         assert!(text(libc::EACCES).contains("udev rule"));
     }
 }

@@ -106,11 +106,11 @@ fn plan(options: &Options, tests: Vec<String>) -> (Vec<Run<'_>>, usize) {
 fn boot_all(runs: &[Run<'_>], program: &GuestProgram<'_>, report: &mut Report) -> Result<(), String> {
     pinion_testkit::tools::ensure()?;
     let cache = Cache::open()?;
-    let offers = Offers::ask()?;
     let flavours: Vec<Flavour> =
         Flavour::ALL.into_iter().filter(|flavour| runs.iter().any(|run| run.flavour == *flavour)).collect();
     let snapshots = {
         let _lock = cache.lock()?;
+        let offers = Offers::ask(&cache)?;
         let mut kernels = Vec::new();
         for &flavour in &flavours {
             let kernel = Kernel::prepare(flavour, &offers, &cache)?;
@@ -181,7 +181,7 @@ fn shell(options: &Options, program: &GuestProgram<'_>) -> Result<bool, String> 
     let flavour = options.flavour.unwrap_or(Flavour::Stock);
     let kernel = {
         let _lock = cache.lock()?;
-        Kernel::prepare(flavour, &Offers::ask()?, &cache)?
+        Kernel::prepare(flavour, &Offers::ask(&cache)?, &cache)?
     };
     vm::shell(&kernel, &program.payload()?, &cache)?;
     Ok(true)

@@ -10,7 +10,7 @@ use std::time::Duration;
 
 use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
-use pinion_testkit::browser;
+use pinion_testkit::{browser, here};
 
 use crate::checkout;
 use crate::klippy::python;
@@ -28,6 +28,10 @@ fn script(folder: &Path) -> Command {
 
 #[test]
 fn mainsail_says_what_is_missing() {
+    let has_venv = Command::new(python()).args(["-c", "import ensurepip"]).stderr(Stdio::null()).status();
+    if !has_venv.is_ok_and(|ended| ended.success()) {
+        return here::not_run("it needs python3 with venv (apt install python3-venv)");
+    }
     let folder = tempfile::tempdir().unwrap();
     // Nothing is downloaded here: git finds no network.
     let says = |name: &str, value: &str| {

@@ -14,7 +14,7 @@ use pinion_testkit::markdown::{Page, pages};
 /// The other sections that a printer needs.
 const PRINTER: &str = "[mcu]\nserial: /dev/null\n[printer]\nkinematics: none\nmax_velocity: 1\nmax_accel: 1\n";
 /// The pages' names of a computer's pins. This computer does not have them.
-const PINS: [(&str, u32); 18] = [
+const PINS: [(&str, u32); 19] = [
     ("GPIO5", 5),
     ("GPIO6", 6),
     ("GPIO12", 12),
@@ -33,6 +33,7 @@ const PINS: [(&str, u32); 18] = [
     ("spidev0.1", (1 << 26) + 1),
     ("spidev0.1/miso", (1 << 26) + (1 << 16) + 1),
     ("ttyAMA3", 1 << 27),
+    ("fe20c000.pwm/pwm0", 1 << 16),
 ];
 
 /// A configuration and its place in the pages.

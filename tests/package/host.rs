@@ -4,6 +4,7 @@
 //! ```text
 //! host identify LINK [PIN]   prints the version, and fails if there is no such pin
 //! host light LINK PIN        switches a heater on, prints "lit" and refreshes it until it is killed
+//! host open LINK BUS         has the MCU open this I2C bus
 //! host home LINK             homes an axis until the endstop, which the check closes, triggers
 //! host ask SOCKET METHOD PARAMS POINTER
 //!                            asks klippy over its API socket (docs/API_Server.md of Klipper), and prints
@@ -36,6 +37,7 @@ fn main() -> ExitCode {
         ["identify", link] => identify(link, None),
         ["identify", link, pin] => identify(link, Some(pin)),
         ["light", link, pin] => light(link, pin),
+        ["open", link, bus] => open(link, bus),
         ["home", link] => home(link),
         ["ask", socket, method, params, pointer] => return asked(ask(socket, method, params, pointer)),
         // cargo and similar programs may start it in this way.
@@ -82,6 +84,16 @@ fn light(link: &str, pin: &str) -> Result<(), Error> {
         }
         client.listen(Instant::now() + REFRESH)?;
     }
+    Ok(())
+}
+
+fn open(link: &str, bus: &str) -> Result<(), Error> {
+    let mut client = connect(link)?;
+    let mut config = Config::default();
+    let oid = config.oid()?;
+    config.add(format!("config_i2c oid={oid}"));
+    config.add(format!("i2c_set_bus oid={oid} i2c_bus={bus} rate=100000 address=80"));
+    config.apply(&mut client)?;
     Ok(())
 }
 

@@ -46,7 +46,8 @@ impl Root {
         tools::ensure()?;
         tools::install(&TOOLS)?;
         let _lock = cache.lock()?;
-        let kernel = Kernel::prepare(Flavour::Stock, &Offers::ask()?, cache)?;
+        let offers = Offers::ask(cache)?;
+        let kernel = Kernel::prepare(Flavour::Stock, &offers, cache)?;
         let here = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/package");
         let folder = cache.root().join(format!("system-{:016x}", key(&kernel)));
         if !folder.exists() {
@@ -61,7 +62,8 @@ impl Root {
                     .arg(here.join("root.sh"))
                     .args([&partial, &tree, &kernel.initramfs])
                     .arg(&kernel.release)
-                    .arg(&here),
+                    .arg(&here)
+                    .arg(offers.sources()),
             )?;
             fs::rename(&partial, &folder).map_err(|error| format!("{}: {error}", folder.display()))?;
         }

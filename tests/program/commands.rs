@@ -4,9 +4,9 @@
 use std::collections::HashMap;
 use std::fs;
 use std::process::{Command, Stdio};
-use std::sync::{Mutex, PoisonError};
 
 use nix::sys::signal::Signal;
+use pinion_testkit::here;
 use serde_json::Value;
 
 use crate::process::{Pinion, closed_pipe, folder_with, output};
@@ -311,66 +311,66 @@ fn a_board_that_is_none_is_explained() {
     assert!(String::from_utf8_lossy(&refused.stderr).contains("linux, sim and sim:FILE.toml"));
 }
 
-/// Held by tests that measure the latency, or that disturb it for others.
-static LATENCY: Mutex<()> = Mutex::new(());
-
 #[test]
 fn the_latency_is_not_measured_while_a_host_may_print() {
-    let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
-    // Not a simulated printer, even if this computer has no pins.
-    let pinion = Pinion::start(&["run", "--dialect", "master"]);
-    pinion.wait_for_link();
-    let client = pinion.client();
-    let refused = output(&["latency", "--seconds", "2"]);
-    let text = String::from_utf8(refused.stderr).unwrap();
-    assert_eq!((refused.status.code(), refused.stdout.len()), (Some(1), 0), "{text}");
-    for part in [
-        format!("a host (process {}) is attached to Pinion (process {}", std::process::id(), pinion.pid()),
-        format!("wait until the print is done, then end process {}", std::process::id()),
-    ] {
-        assert!(text.contains(&part), "no \"{part}\" in: {text}");
-    }
-    drop(client);
-    let measured = output(&["latency", "--seconds", "2"]);
-    assert!(measured.status.success(), "{}", String::from_utf8_lossy(&measured.stderr));
+    here::among_own_processes("commands::the_latency_is_not_measured_while_a_host_may_print", || {
+        // Not a simulated printer, even if this computer has no pins.
+        let pinion = Pinion::start(&["run", "--dialect", "master"]);
+        pinion.wait_for_link();
+        let client = pinion.client();
+        let refused = output(&["latency", "--seconds", "2"]);
+        let text = String::from_utf8(refused.stderr).unwrap();
+        assert_eq!((refused.status.code(), refused.stdout.len()), (Some(1), 0), "{text}");
+        for part in [
+            format!("a host (process {}) is attached to Pinion (process {}", std::process::id(), pinion.pid()),
+            format!("wait until the print is done, then end process {}", std::process::id()),
+        ] {
+            assert!(text.contains(&part), "no \"{part}\" in: {text}");
+        }
+        drop(client);
+        let measured = output(&["latency", "--seconds", "2"]);
+        assert!(measured.status.success(), "{}", String::from_utf8_lossy(&measured.stderr));
+    });
 }
 
 #[test]
 fn latency_judges_the_computer() {
-    let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
-    let (_folder, svg) = folder_with("latency.svg", "");
-    let measured = output(&["latency", "--seconds", "2", "--svg", svg.to_str().unwrap()]);
-    let text = String::from_utf8(measured.stdout).unwrap();
-    assert!(measured.status.success(), "{text}");
-    for part in ["idle:", "under load:", "wake-ups", "edges", "verdict: "] {
-        assert!(text.contains(part), "no \"{part}\" in:\n{text}");
-    }
-    assert!(fs::read_to_string(svg).unwrap().ends_with("</svg>\n"));
+    here::among_own_processes("commands::latency_judges_the_computer", || {
+        let (_folder, svg) = folder_with("latency.svg", "");
+        let measured = output(&["latency", "--seconds", "2", "--svg", svg.to_str().unwrap()]);
+        let text = String::from_utf8(measured.stdout).unwrap();
+        assert!(measured.status.success(), "{text}");
+        for part in ["idle:", "under load:", "wake-ups", "edges", "verdict: "] {
+            assert!(text.contains(part), "no \"{part}\" in:\n{text}");
+        }
+        assert!(fs::read_to_string(svg).unwrap().ends_with("</svg>\n"));
+    });
 }
 
 #[test]
 fn a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed() {
-    let _alone = LATENCY.lock().unwrap_or_else(PoisonError::into_inner);
-    for args in [
-        &["sim", "--print-config"][..],
-        &["sim", "--print-board"],
-        &["dict", "--board", "sim"],
-        &["pins"],
-        &["latency", "--seconds", "2"],
-    ] {
-        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
-            .args(args)
-            .stdout(closed_pipe())
-            .stderr(Stdio::piped())
-            .spawn()
-            .unwrap();
-        let closed = child.wait_with_output().unwrap();
-        let log = String::from_utf8(closed.stderr).unwrap();
-        assert!(!log.contains("panicked"), "{args:?}: {log}");
-        // A computer without pins cannot list any.
-        let expected = if args == ["pins"] { output(args).status.code() } else { Some(0) };
-        assert_eq!(closed.status.code(), expected, "{args:?}: {log}");
-    }
+    here::among_own_processes("commands::a_reader_that_has_seen_enough_changes_nothing_but_what_is_printed", || {
+        for args in [
+            &["sim", "--print-config"][..],
+            &["sim", "--print-board"],
+            &["dict", "--board", "sim"],
+            &["pins"],
+            &["latency", "--seconds", "2"],
+        ] {
+            let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+                .args(args)
+                .stdout(closed_pipe())
+                .stderr(Stdio::piped())
+                .spawn()
+                .unwrap();
+            let closed = child.wait_with_output().unwrap();
+            let log = String::from_utf8(closed.stderr).unwrap();
+            assert!(!log.contains("panicked"), "{args:?}: {log}");
+            // A computer without pins cannot list any.
+            let expected = if args == ["pins"] { output(args).status.code() } else { Some(0) };
+            assert_eq!(closed.status.code(), expected, "{args:?}: {log}");
+        }
+    });
 }
 
 #[test]

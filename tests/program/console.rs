@@ -12,7 +12,7 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::config::Config;
 
-use crate::process::{Pinion, folder_with};
+use crate::process::{Pinion, folder_with, program};
 use crate::terminal::AtTerminal;
 
 fn console(args: &[&str], script: &str) -> Output {
@@ -136,7 +136,7 @@ fn what_is_no_terminal_is_left_as_it_is() {
 
 /// A console at a terminal.
 fn person(args: &[&str], state: &Path) -> AtTerminal {
-    let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+    let mut command = program();
     command.arg("console").args(args).env("XDG_STATE_HOME", state).env("TERM", "xterm");
     AtTerminal::start(&mut command, 40, None)
 }
@@ -197,7 +197,7 @@ fn a_signal_ends_it_and_the_terminal_is_as_it_was() {
 
 /// The exit status of a console that gets a signal during a script.
 fn console_ended_by(signal: Signal) -> ExitStatus {
-    let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+    let mut child = program()
         .args(["console", "--board", "sim"])
         .stdin(Stdio::piped())
         .stdout(Stdio::piped())

@@ -7,14 +7,14 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use pinion_client::Client;
+use pinion_testkit::here;
 
 use crate::process::{Pinion, WAIT_MAX, folder_with, output};
 
 /// Starts the program on the simulated printer, with a link at `disk/tty`. `prepare` makes the disk. `None` without
 /// root.
 fn on_a_disk(prepare: &str) -> Option<Pinion> {
-    if !nix::unistd::geteuid().is_root() {
-        eprintln!("NOT RUN: this test mounts a disk, and needs root");
+    if !here::may_mount() {
         return None;
     }
     let folder = tempfile::tempdir().unwrap();
@@ -60,13 +60,14 @@ fn a_disk_without_room_for_another_file_has_room_for_the_link_in_place_of_a_stal
 /// The service's own link in /tmp, which root makes before the program starts.
 #[test]
 fn a_full_disk_has_room_for_the_link_of_the_service_in_place_of_a_stale_one() {
-    if !nix::unistd::geteuid().is_root() {
-        eprintln!("NOT RUN: this test mounts a disk, and needs root");
+    if !here::may_mount() {
         return;
     }
     let link = concat!(env!("CARGO_MANIFEST_DIR"), "/systemd/link");
-    let script = "mount -t tmpfs -o nr_inodes=2 full /tmp; ln -s /dev/pts/no-longer-there /tmp/klipper_host_full; \
-                  sh \"$1\" place full; readlink /tmp/klipper_host_full";
+    // The sources may be below /tmp, so the script is opened first.
+    let script = "exec 3<\"$1\"; mount -t tmpfs -o nr_inodes=2 full /tmp; \
+                  ln -s /dev/pts/no-longer-there /tmp/klipper_host_full; \
+                  sh /proc/self/fd/3 place full; readlink /tmp/klipper_host_full";
     let ended = Command::new("unshare").args(["--mount", "sh", "-ec", script, "sh", link]).output().unwrap();
     let (out, log) = (String::from_utf8_lossy(&ended.stdout), String::from_utf8_lossy(&ended.stderr));
     assert_eq!(out, "/run/pinion/klipper_host_full\n", "{log}");
@@ -91,7 +92,9 @@ fn a_disk_that_can_only_be_read_is_told() {
 
 #[test]
 fn the_usual_folders_may_be_read_only_if_the_link_is_elsewhere() {
-    let make = "mount -t tmpfs disk disk; for usual in /run /var; do mount -t tmpfs -o ro usual $usual; done";
+    // The sources may be in one of them, so their contents stay.
+    let make = "for usual in /run /var; do mount --bind $usual $usual; mount -o remount,bind,ro $usual; done; \
+                cd \"$PWD\"; mount -t tmpfs disk disk";
     let Some(pinion) = on_a_disk(make) else { return };
     serves(&pinion);
 }

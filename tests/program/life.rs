@@ -16,7 +16,7 @@ use nix::sys::signal::Signal;
 use nix::sys::stat::{UtimensatFlags, utimensat};
 use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
 use nix::sys::time::{TimeSpec, TimeValLike as _};
-use nix::unistd::ttyname;
+use nix::unistd::{getegid, ttyname};
 use pinion_client::config::Config;
 use pinion_client::serial::Received;
 use pinion_protocol::block::{PAYLOAD_MAX, Sequence, frame};
@@ -364,7 +364,8 @@ fn hosts_that_come_and_go_by_the_thousand_do_not_hide_the_one_that_leaves() {
 
 #[test]
 fn what_the_host_and_the_service_manager_ask_for_is_no_warning() {
-    let mut pinion = Pinion::simulated(&[]);
+    // A user outside the group tty would be warned of that.
+    let mut pinion = Pinion::simulated(&["-g", &getegid().to_string()]);
     let mut client = pinion.client();
     Config::default().apply(&mut client).unwrap();
     client.reset().unwrap();

@@ -13,6 +13,7 @@ mod doctor;
 mod life;
 mod links;
 mod one_order;
+mod preinst;
 mod process;
 mod recorder;
 mod search;

@@ -15,8 +15,8 @@ use pinion_client::Client;
 use pinion_client::serial::Port;
 use tempfile::TempDir;
 
-/// Timeout of a test: long enough for any computer, because no test here measures speed.
-pub const WAIT_MAX: Duration = Duration::from_secs(30);
+/// Timeout of a test: long enough for any busy computer, because no test here measures speed.
+pub const WAIT_MAX: Duration = Duration::from_secs(120);
 
 /// A running `pinion`, ended on drop.
 pub struct Pinion {
@@ -47,7 +47,7 @@ impl Pinion {
 
     /// The same, with the test's own stdout and stderr.
     pub fn start_to(folder: TempDir, args: &[&str], out: impl Into<Stdio>, log: impl Into<Stdio>) -> Pinion {
-        let child = Command::new(env!("CARGO_BIN_EXE_pinion"))
+        let child = program()
             .args(args)
             .arg("-I")
             .arg(folder.path().join("tty"))
@@ -177,7 +177,7 @@ impl Pinion {
 
     /// Waits for the program's end.
     pub fn end(&mut self) -> ExitStatus {
-        let end = Instant::now() + 4 * WAIT_MAX;
+        let end = Instant::now() + WAIT_MAX;
         loop {
             if let Some(status) = self.child.try_wait().unwrap() {
                 return status;
@@ -202,6 +202,13 @@ impl Drop for Pinion {
         let _ = self.child.kill();
         let _ = self.child.wait();
     }
+}
+
+/// The program, with each signal at its default: `nohup make test &` would have it ignore some.
+pub fn program() -> Command {
+    let mut program = Command::new("env");
+    program.args(["--default-signal", env!("CARGO_BIN_EXE_pinion")]);
+    program
 }
 
 /// A copy of the program in this folder, because nobody else may read cargo's. Another process copies it. A test that

@@ -2,16 +2,14 @@
 //! Debian's arm64: libraries to build against, busybox, and the kernel with the
 //! description of the Raspberry Pi 3.
 //!
-//! apt works here with a state of its own, below the cache, in which arm64 is the
-//! only architecture. So the host's dpkg learns nothing of arm64; it only gets the
-//! compilers and the emulator, which are ordinary packages.
+//! The computer's dpkg learns nothing of arm64. It only gets the compilers and the emulator, which are ordinary packages.
 
-use std::fs::{self, File};
+use std::fs;
 use std::hash::{DefaultHasher, Hash, Hasher};
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Duration;
 
+use pinion_testkit::apt::{self, Apt};
 use pinion_testkit::cache::Cache;
 use pinion_testkit::{process, tools};
 
@@ -34,9 +32,6 @@ const BUSYBOX: &str = "busybox-static";
 const KERNEL: &str = "linux-image-arm64";
 const DEVICE_TREE: &str = "broadcom/bcm2837-rpi-3-b.dtb";
 
-/// apt is asked for newer packages when what it knows is older than this.
-const LISTS_AGE_MAX: Duration = Duration::from_secs(24 * 3600);
-
 /// The unpacked packages.
 pub struct Sysroot {
     /// As `uname -r` will print it.
@@ -50,8 +45,8 @@ impl Sysroot {
         install_tools()?;
         let _lock = cache.lock()?;
         let root = cache.root().join("arm64");
-        let apt = Apt::new(&root)?;
-        let release = apt.kernel_release()?;
+        let apt = Apt::open(&root.join("apt"), "arm64", None)?;
+        let release = kernel_release(&apt)?;
         let packages = Packages::of(&apt, &release)?;
         let folder = root.join(format!("sysroot-{:016x}", packages.key()));
         if !folder.exists() {
@@ -118,82 +113,20 @@ fn installed_version(package: &str) -> Result<String, String> {
     }
 }
 
-/// apt with a state of its own. It takes the archives and their keys from the host's
-/// configuration.
-struct Apt {
-    config: PathBuf,
-    folder: PathBuf,
-}
-
-impl Apt {
-    fn new(root: &Path) -> Result<Apt, String> {
-        let folder = root.join("apt");
-        for part in ["lists/partial", "archives/partial"] {
-            let part = folder.join(part);
-            fs::create_dir_all(&part).map_err(|error| describe("create", &part, &error))?;
-        }
-        let config = folder.join("apt.conf");
-        let path = folder.to_str().ok_or_else(|| format!("{} is not UTF-8", folder.display()))?;
-        // As root, apt downloads as a user of its own, who may not reach the cache.
-        let text = format!(
-            r#"APT::Architecture "arm64";
-               APT::Architectures {{ "arm64"; }};
-               APT::Sandbox::User "";
-               APT::Install-Recommends "false";
-               Acquire::Languages "none";
-               Acquire::IndexTargets::deb::DEP-11::DefaultEnabled "false";
-               Dir::State "{path}";
-               Dir::State::status "{path}/status";
-               Dir::Cache "{path}";
-            "#
-        );
-        let status = folder.join("status");
-        for (file, content) in [(&config, text.as_str()), (&status, "")] {
-            fs::write(file, content).map_err(|error| describe("write", file, &error))?;
-        }
-        let apt = Apt { config, folder };
-        apt.update()?;
-        Ok(apt)
-    }
-
-    /// Asks the archives, unless that was done lately. What is known serves without them.
-    fn update(&self) -> Result<(), String> {
-        let stamp = self.folder.join("updated");
-        let age = fs::metadata(&stamp).and_then(|stamp| stamp.modified()).map(|time| time.elapsed());
-        if matches!(age, Ok(Ok(age)) if age < LISTS_AGE_MAX) {
-            return Ok(());
-        }
-        let mut update = self.command("apt-get");
-        // By itself, apt finds it enough to warn of archives that it cannot reach.
-        match process::run(update.args(["update", "-qq", "-o", "APT::Update::Error-Mode=any"])) {
-            Ok(()) => File::create(&stamp).map(drop).map_err(|error| describe("create", &stamp, &error)),
-            Err(cause) => {
-                eprintln!("going on with what is known of arm64 packages: {cause}");
-                Ok(())
-            }
-        }
-    }
-
-    fn command(&self, program: &str) -> Command {
-        let mut command = Command::new(program);
-        command.env("APT_CONFIG", &self.config);
-        command
-    }
-
-    fn kernel_release(&self) -> Result<String, String> {
-        let mut show = self.command("apt-cache");
-        let shown = process::output(show.args(["show", "--no-all-versions", KERNEL])).map_err(|cause| {
-            format!(
-                "apt offers no {KERNEL} for arm64: is there a network, and one of Debian's archives among apt's \
-                 sources? {cause}"
-            )
-        })?;
-        shown
-            .lines()
-            .find_map(|line| line.strip_prefix("Depends: linux-image-")?.split(' ').next())
-            .map(str::to_owned)
-            .ok_or_else(|| format!("{KERNEL} depends on no kernel that this suite can tell:\n{shown}"))
-    }
+/// The release of its newest kernel, as `uname -r` prints it.
+fn kernel_release(apt: &Apt) -> Result<String, String> {
+    let mut show = apt.command("apt-cache");
+    let shown = process::output(show.args(["show", "--no-all-versions", KERNEL])).map_err(|cause| {
+        format!(
+            "apt offers no {KERNEL} for arm64: is there a network, and one of Debian's archives among apt's sources? \
+             {cause}"
+        )
+    })?;
+    shown
+        .lines()
+        .find_map(|line| line.strip_prefix("Depends: linux-image-")?.split(' ').next())
+        .map(str::to_owned)
+        .ok_or_else(|| format!("{KERNEL} depends on no kernel that this suite knows:\n{shown}"))
 }
 
 /// What is unpacked.
@@ -239,12 +172,10 @@ impl Packages {
             remove(path)?;
             fs::create_dir_all(path).map_err(|error| describe("create", path, &error))?;
         }
-        let mut to_archives = std::ffi::OsString::from("Dir::Cache::archives=");
-        to_archives.push(&archives);
         process::run(
             apt.command("apt-get")
                 .args(["install", "-qq", "-y", "--download-only", "-o"])
-                .arg(to_archives)
+                .arg(apt::option("Dir::Cache::archives", &archives))
                 .arg(LIBRARY),
         )?;
         process::run(apt.command("apt-get").args(["download", "-qq"]).args(&self.alone).current_dir(&archives))?;

@@ -29,7 +29,7 @@ mod registers;
 
 pub use chip::{Chip, LineInfo};
 use chip::{look_at, missing, node};
-pub(super) use chip::{may_sleep, number_behind, scan};
+pub(super) use chip::{may_sleep, number_behind, scan, vacant};
 pub(super) use refusal::not_permitted;
 pub use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
 use refusal::{Subject, cannot_open, errno};

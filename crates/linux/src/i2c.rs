@@ -124,7 +124,7 @@ fn cannot_open(path: &Path, name: &str, error: &io::Error, buses: &[u32]) -> Tro
                  i2c-dev\"), or change i2c_bus",
             )
         }
-        libc::EACCES | libc::EPERM => not_permitted(path),
+        code @ (libc::EACCES | libc::EPERM) => not_permitted(path, code),
         libc::EBUSY => Trouble::new(format!("{name} is in use by a driver of the kernel"))
             .remedy("remove its overlay from the device tree, or choose another chip"),
         _ => Trouble::new(format!("{name} cannot be opened: {error}")).remedy(LOOK_AT_LOG),

@@ -6,6 +6,7 @@
 
 use std::collections::{BTreeSet, HashMap};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use industrial_io::Context;
@@ -28,7 +29,7 @@ pub mod gpio;
 mod guard;
 pub mod i2c;
 pub mod pins;
-mod pwm;
+pub mod pwm;
 pub mod spi;
 #[allow(unsafe_code)]
 pub mod sys;
@@ -55,8 +56,12 @@ const IIO: &str = "/sys/bus/iio/devices";
 pub struct Inventory {
     /// GPIO chips.
     pub chips: Vec<gpio::Chip>,
+    /// Numbers that a Raspberry Pi's header has had, and that no chip has now.
+    pub vacant: Vec<u32>,
     /// ADCs.
     pub adcs: Vec<adc::IioDevice>,
+    /// PWM chips.
+    pub pwm: Vec<pwm::Chip>,
     /// SPI device nodes.
     pub spi: Vec<spi::Node>,
     /// Numbers of I2C buses.
@@ -72,10 +77,8 @@ pub struct Inventory {
 impl Inventory {
     /// Looks for chips, ADCs and buses. A computer without any of them is no error.
     pub fn scan() -> Inventory {
-        let dev = Path::new(DEV);
-        let (chips, problems) = gpio::scan(dev, Path::new(GPIO));
-        let (spi, i2c, uarts) = (spi::scan(dev), i2c::scan(dev), uart::scan(dev, Path::new(TTY)));
-        let mut inventory = Inventory { chips, spi, i2c, uarts, problems, ..Inventory::default() };
+        let (chips, problems) = gpio::scan(Path::new(DEV), Path::new(GPIO));
+        let mut inventory = Inventory { problems, ..Inventory::around(Path::new("/"), chips) };
         match adc::context(Path::new(IIO)) {
             Ok(context) => {
                 inventory.adcs = context.as_ref().map(adc::scan).unwrap_or_default();
@@ -86,9 +89,47 @@ impl Inventory {
         inventory
     }
 
+    /// These chips, and everything else that the files below `root` tell. They tell nothing of ADCs.
+    pub fn around(root: &Path, chips: Vec<gpio::Chip>) -> Inventory {
+        let below = |path: &str| root.join(path.trim_start_matches('/'));
+        let (dev, pwm, tty) = (below(DEV), below(PWM), below(TTY));
+        Inventory {
+            chips,
+            vacant: gpio::vacant(&dev),
+            pwm: pwm::scan(&pwm),
+            spi: spi::scan(&dev),
+            i2c: i2c::scan(&dev),
+            uarts: uart::scan(&dev, &tty),
+            ..Inventory::default()
+        }
+    }
+
     /// Opens the channel that the driver of `iio:device<device>` calls `id`, if it exists.
     pub fn adc(&self, device: u32, id: &str) -> Option<adc::ChannelReader> {
         adc::ChannelReader::open(self.context.as_ref()?, device, id)
+    }
+
+    /// The chip with the 40-pin header of a Raspberry Pi.
+    pub fn header(&self) -> Option<&gpio::Chip> {
+        let mut headers = self.chips.iter().filter(|chip| chip.is_header());
+        headers.next().filter(|_| headers.next().is_none())
+    }
+
+    /// The header's chip, if `/dev/gpiochip<number>` is missing and some kernel gives the header this number. A pin with
+    /// this number then means a line of the header.
+    pub fn renumbered(&self, number: u32) -> Option<&gpio::Chip> {
+        self.header().filter(|chip| chip.may_have_been(number) && self.vacant.contains(&number))
+    }
+
+    /// The names of a line by the [former](Inventory::renumbered) numbers of its chip.
+    pub fn former_names(&self, chip: &gpio::Chip, offset: u32) -> Vec<String> {
+        let former =
+            self.vacant.iter().filter(|number| self.renumbered(**number).is_some_and(|it| it.number == chip.number));
+        let names = former.flat_map(|number| {
+            let full = format!("gpiochip{number}/gpio{offset}");
+            if *number == 0 { vec![format!("gpio{offset}"), full] } else { vec![full] }
+        });
+        names.collect()
     }
 
     /// One line for people: each chip and ADC with the number of its lines or channels.
@@ -130,10 +171,30 @@ impl Seen {
         Seen { names: Names::of(&inventory), inventory }
     }
 
-    /// Everything that a host learns from it.
-    fn told(&self) -> (String, [Vec<Range>; 3]) {
+    /// Everything that a host learns from it, and the numbers that stand for the header.
+    fn told(&self) -> (String, [Vec<Range>; 3], &[u32]) {
         let Seen { inventory, names } = self;
-        (inventory.describe(), [names.ranges(), spi::ranges(&inventory.spi), i2c::ranges(&inventory.i2c)])
+        let ranges = [names.ranges(), spi::ranges(&inventory.spi), i2c::ranges(&inventory.i2c)];
+        (inventory.describe(), ranges, &inventory.vacant)
+    }
+
+    /// The header's line that a pin with a [former](Inventory::renumbered) number means.
+    fn renumbered(&self, chip: u32, offset: u32) -> Option<u32> {
+        pins::line_number(self.inventory.renumbered(chip)?.number, offset)
+    }
+
+    /// Which line is taken for a pin with a former number, and what to write. `number` is the line's own.
+    fn about_renumbered(&self, chip: u32, offset: u32, number: u32) -> Option<Trouble> {
+        let header = self.inventory.renumbered(chip)?;
+        let pin = if chip == 0 { format!("gpio{offset}") } else { format!("gpiochip{chip}/gpio{offset}") };
+        let own = self.names.of_pin(number).first().map(ToString::to_string);
+        let name = own.unwrap_or_else(|| format!("gpiochip{}/gpio{offset}", header.number));
+        let cause = format!(
+            "this kernel has no gpiochip{chip}, so this is line {offset} of the 40-pin header (gpiochip{}, {})",
+            header.number, header.label
+        );
+        let remedy = format!("write {name} in printer.cfg, and each pin like it by its name (pinion pins lists them)");
+        Some(Trouble::new(cause).remedy(remedy).of(pin))
     }
 }
 
@@ -148,6 +209,8 @@ pub struct LinuxBoard {
     spi_controllers: HashMap<u32, Arc<Mutex<spi::Controller>>>,
     /// The numbers of IIO devices that do not report a resolution, and that the log has already named.
     assumed: BTreeSet<u32>,
+    /// Whether the log has named a pin with a former number.
+    told_renumbered: AtomicBool,
     dev: PathBuf,
     gpio: PathBuf,
     pwm: PathBuf,
@@ -173,6 +236,7 @@ impl LinuxBoard {
             fast: FastChips::new(FastGpio::Off),
             spi_controllers: HashMap::new(),
             assumed: BTreeSet::new(),
+            told_renumbered: AtomicBool::new(false),
             dev: DEV.into(),
             gpio: GPIO.into(),
             pwm: PWM.into(),
@@ -252,9 +316,19 @@ impl Board for LinuxBoard {
         true
     }
 
-    /// A chip may have several nodes in /dev: on a Raspberry Pi 5, `gpiochip4` is a link to `gpiochip0`.
+    /// A chip may have several nodes in /dev: with some kernels of a Raspberry Pi 5, `gpiochip4` is a link to `gpiochip0`.
+    /// With others it has neither number, and what was found says so until the next host: the line stays the same.
     fn canonical(&self, pin: Pin) -> Pin {
         let Target::Line { chip, offset } = Target::of(pin) else { return pin };
+        let seen = self.seen();
+        if let Some(number) = seen.renumbered(chip, offset) {
+            if !self.told_renumbered.swap(true, Ordering::Relaxed)
+                && let Some(about) = seen.about_renumbered(chip, offset, number)
+            {
+                log::warn!("{about}");
+            }
+            return Pin(number);
+        }
         gpio::number_behind(&self.dev, chip).and_then(|chip| pins::line_number(chip, offset)).map_or(pin, Pin)
     }
 
@@ -378,6 +452,7 @@ impl Board for LinuxBoard {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::fs;
 
     const ON: Direction = Direction::Output { level: true, shutdown_value: false };
 
@@ -400,7 +475,7 @@ mod tests {
             "Not an output pin: analog1 (an ADC channel) cannot be an output: choose a GPIO pin \
              (pinion pins lists them)"
         );
-        let error = board.line(Pin(3000), Direction::Input(Bias::None)).err().unwrap();
+        let error = board.line(Pin(5000), Direction::Input(Bias::None)).err().unwrap();
         assert_eq!(error.reason, reason::NOT_INPUT);
         let error = board.adc(Pin(17)).err().unwrap();
         assert_eq!(error.reason, reason::ADC_OPEN);
@@ -433,10 +508,92 @@ mod tests {
         let error = board.line(Pin(5 * 288), ON).err().unwrap();
         assert_eq!(error.reason, reason::CHIP_MISSING);
         assert!(error.to_string().contains("gpiochip5: this computer has no GPIO chip"), "{error}");
-        assert_eq!(board.pins().len(), 19);
+        assert_eq!(board.pins().len(), 28);
         assert_eq!(board.spi_buses().len(), 8);
         assert_eq!(board.i2c_buses().len(), 1);
         assert!(board.describe().starts_with("linux: no GPIO"));
+    }
+
+    /// A Raspberry Pi whose header and first other chip have these numbers. /dev has nodes with the numbers in `nodes`.
+    fn pi(header: (u32, &str), other: (u32, &str), nodes: &[u32]) -> (tempfile::TempDir, LinuxBoard) {
+        let dev = tempfile::tempdir().unwrap();
+        nodes.iter().for_each(|node| fs::write(dev.path().join(format!("gpiochip{node}")), "").unwrap());
+        let chip = |(number, label): (u32, &str), name: &str| gpio::Chip {
+            number,
+            label: label.into(),
+            sleeps: false,
+            lines: (0..54).map(|n| gpio::LineInfo { name: Some(format!("{name}{n}")), ..Default::default() }).collect(),
+        };
+        let chips = vec![chip(header, "GPIO"), chip(other, "OTHER")];
+        let inventory = Inventory { chips, vacant: gpio::vacant(dev.path()), ..Inventory::default() };
+        let mut board = board(dev.path());
+        board.seen = Arc::new(Mutex::new(Seen::of(inventory)));
+        (dev, board)
+    }
+
+    /// The line that a host's name leads to.
+    fn meant(board: &LinuxBoard, name: &str) -> Target {
+        let root = name.trim_end_matches(|c: char| c.is_ascii_digit());
+        let number: u32 = name[root.len()..].parse().unwrap();
+        let first = board.pins().into_iter().find(|range| range.name == format!("{root}0")).unwrap().first;
+        Target::of(board.canonical(Pin(first + number)))
+    }
+
+    const BRCMSTB: &str = "gpio-brcmstb@107d508500";
+
+    /// Raspberry Pi OS since Linux 6.12.96.
+    #[test]
+    fn numbers_that_no_chip_has_mean_the_header() {
+        let (_dev, pi5) = pi((15, "pinctrl-rp1"), (11, BRCMSTB), &[11, 15]);
+        for name in ["gpio17", "gpiochip0/gpio17", "gpiochip4/gpio17", "gpiochip15/gpio17"] {
+            assert_eq!(meant(&pi5, name), Target::Line { chip: 15, offset: 17 }, "{name}");
+        }
+        assert_eq!(meant(&pi5, "gpiochip11/gpio17"), Target::Line { chip: 11, offset: 17 });
+        assert_eq!(meant(&pi5, "gpiochip1/gpio17"), Target::Line { chip: 1, offset: 17 }, "it was never the header");
+        // Only the header of a Pi 5 was ever gpiochip4.
+        let (_dev, pi4) = pi((11, "pinctrl-bcm2711"), (12, "raspberrypi-exp-gpio"), &[11, 12]);
+        assert_eq!(meant(&pi4, "gpio17"), Target::Line { chip: 11, offset: 17 });
+        assert_eq!(meant(&pi4, "gpiochip4/gpio17"), Target::Line { chip: 4, offset: 17 });
+        let (_dev, other) = pi((11, "300b000.pinctrl"), (12, "7022000.pinctrl"), &[11, 12]);
+        assert_eq!(meant(&other, "gpio17"), Target::Line { chip: 0, offset: 17 }, "there is no header");
+        let about = pi5.seen().about_renumbered(0, 17, 15 * 288 + 17).unwrap().to_string();
+        assert_eq!(
+            about,
+            "gpio17: this kernel has no gpiochip0, so this is line 17 of the 40-pin header (gpiochip15, pinctrl-rp1): \
+             write GPIO17 in printer.cfg, and each pin like it by its name (pinion pins lists them)"
+        );
+    }
+
+    /// Raspberry Pi OS before. A chip that cannot be opened has its number, too.
+    #[test]
+    fn numbers_that_a_chip_has_mean_that_chip() {
+        let (_dev, first_year) = pi((4, "pinctrl-rp1"), (0, BRCMSTB), &[0, 4]);
+        assert_eq!(meant(&first_year, "gpio17"), Target::Line { chip: 0, offset: 17 });
+        assert_eq!(meant(&first_year, "gpiochip4/gpio17"), Target::Line { chip: 4, offset: 17 });
+        let (dev, later) = pi((0, "pinctrl-rp1"), (10, BRCMSTB), &[0, 10]);
+        assert_eq!(meant(&later, "gpio17"), Target::Line { chip: 0, offset: 17 });
+        std::os::unix::fs::symlink("gpiochip0", dev.path().join("gpiochip4")).unwrap();
+        assert_eq!(meant(&later, "gpiochip4/gpio17"), Target::Line { chip: 0, offset: 17 });
+        let (_dev, hidden) = pi((15, "pinctrl-rp1"), (11, BRCMSTB), &[0, 11, 15]);
+        assert_eq!(meant(&hidden, "gpio17"), Target::Line { chip: 0, offset: 17 });
+        assert_eq!(meant(&hidden, "gpiochip4/gpio17"), Target::Line { chip: 15, offset: 17 });
+    }
+
+    /// A line that is in use must not become another one because a chip comes.
+    #[test]
+    fn a_chip_that_comes_later_changes_nothing_for_this_host() {
+        let (dev, board) = pi((15, "pinctrl-rp1"), (11, BRCMSTB), &[11, 15]);
+        fs::write(dev.path().join("gpiochip0"), "").unwrap();
+        assert_eq!(meant(&board, "gpio17"), Target::Line { chip: 15, offset: 17 });
+    }
+
+    #[test]
+    fn a_line_of_the_header_has_its_former_names() {
+        let (_dev, pi5) = pi((15, "pinctrl-rp1"), (11, BRCMSTB), &[11, 15]);
+        let seen = pi5.seen();
+        let former = |chip: usize| seen.inventory.former_names(&seen.inventory.chips[chip], 17);
+        assert_eq!(former(0), ["gpio17", "gpiochip0/gpio17", "gpiochip4/gpio17"]);
+        assert!(former(1).is_empty());
     }
 
     #[test]

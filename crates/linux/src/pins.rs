@@ -3,20 +3,19 @@
 //!
 //! | number | what | names |
 //! |---|---|---|
-//! | 0..2592 | 288 lines of each of gpiochip0 to 8, as the C program | `gpiochip0/gpio17` |
-//! | 4096..4104 | voltage0 to voltage7 of iio:device0, as the C program | `analog3` |
+//! | 0..4608 | 288 lines of each of gpiochip0 to 15, as the C program | `gpiochip0/gpio17` |
+//! | 4096..4104 | voltage0 to voltage7 of iio:device0, as the C program; not lines 64 to 71 of gpiochip14 | `analog3` |
 //! | 65536..65664 | 16 channels of each of pwmchip0 to 7, as the C program | `pwmchip0/pwm1` |
-//! | 2^24.. | every other line: 4096 numbers for each chip | `gpiochip9/gpio0` |
+//! | 2^24.. | every other line: 4096 numbers for each chip | `gpiochip16/gpio0` |
 //! | 2^25.. | every other ADC channel: 256 numbers for each device | |
 //! | 2^26.. | the data outputs (MOSI) of SPI devices, for chips without SPI: LEDs, HX711 | `spidev0.0` |
 //! | 2^26 + 2^16.. | the data inputs (MISO) of the same devices | `spidev0.0/miso` |
 //! | 2^27.. | serial ports, for drivers with a UART: 2^15 numbers for each driver of ports | `ttyAMA1` |
 //!
 //! `gpio17` stands for `gpiochip0/gpio17`. The computer's own names are also published: `GPIO17` (the device tree's
-//! name for a line), `pinctrl-rp1/gpio17` (with the chip's label) and `mcp3208/voltage3`. So are the
-//! links to serial ports: `serial0`. A name is left out if two
-//! things share it, or if it looks like a numeric name. A name that klippy cannot read from a configuration is also
-//! left out.
+//! name for a line), `pinctrl-rp1/gpio17` (with the chip's label), `mcp3208/voltage3` and `fe20c000.pwm/pwm0` (with the
+//! chip's device). So are the links to serial ports: `serial0`. A name is left out if two things share it, or if it looks
+//! like a numeric name. A name that klippy cannot read from a configuration is also left out.
 
 #![forbid(unsafe_code)]
 
@@ -27,14 +26,17 @@ use super::Inventory;
 use super::spi::Node;
 use pinion_firmware::board::{Pin, Range};
 
-/// How many chips have pin numbers in the C program.
-const CHIPS: u32 = 9;
+/// How many chips have pin numbers in the C program. Before August 2026 it had 9.
+const CHIPS: u32 = 16;
 /// How many numbers each of these chips has (`MAX_GPIO_LINES`).
 const CHIP_LINES: u32 = 288;
 /// The number of the first ADC channel (`ANALOG_START`).
 const ANALOG: u32 = 1 << 12;
 /// How many ADC channels the C program has.
 const ANALOG_CHANNELS: u32 = 8;
+/// The chip and the line that would have the numbers of the first ADC channel. In the C program they share them.
+const ANALOG_CHIP: u32 = ANALOG / CHIP_LINES;
+const ANALOG_LINE: u32 = ANALOG % CHIP_LINES;
 /// The number of the first hardware PWM channel (`HARD_PWM_START`).
 const PWM: u32 = 1 << 16;
 const PWM_CHIPS: u32 = 8;
@@ -98,10 +100,10 @@ impl Target {
     /// What `pin` stands for.
     pub fn of(pin: Pin) -> Target {
         let within = |base: u32, count: u32| pin.0.checked_sub(base).filter(|at| *at < count);
-        if let Some(at) = within(0, CHIPS * CHIP_LINES) {
-            Target::Line { chip: at / CHIP_LINES, offset: at % CHIP_LINES }
-        } else if let Some(at) = within(ANALOG, ANALOG_CHANNELS) {
+        if let Some(at) = within(ANALOG, ANALOG_CHANNELS) {
             Target::Analog(at)
+        } else if let Some(at) = within(0, CHIPS * CHIP_LINES) {
+            Target::Line { chip: at / CHIP_LINES, offset: at % CHIP_LINES }
         } else if let Some(at) = within(PWM, PWM_CHIPS * PWM_CHIP_CHANNELS) {
             Target::Pwm { chip: at / PWM_CHIP_CHANNELS, channel: at % PWM_CHIP_CHANNELS }
         } else if let Some(at) = within(FURTHER_LINES, FURTHER_CHIPS * FURTHER_CHIP_LINES) {
@@ -139,7 +141,8 @@ impl fmt::Display for Target {
 
 /// The number of a line, if it has one.
 pub fn line_number(chip: u32, offset: u32) -> Option<u32> {
-    if chip < CHIPS && offset < CHIP_LINES {
+    let is_analog = chip == ANALOG_CHIP && (ANALOG_LINE..ANALOG_LINE + ANALOG_CHANNELS).contains(&offset);
+    if chip < CHIPS && offset < CHIP_LINES && !is_analog {
         Some(chip * CHIP_LINES + offset)
     } else if chip < FURTHER_CHIPS && offset < FURTHER_CHIP_LINES {
         Some(FURTHER_LINES + chip * FURTHER_CHIP_LINES + offset)
@@ -193,7 +196,7 @@ impl Names {
                 let Some(number) = line_number(chip.number, offset) else {
                     continue;
                 };
-                if number >= FURTHER_LINES {
+                if chip.number >= CHIPS || offset >= CHIP_LINES {
                     numeric.push((format!("gpiochip{}/gpio{offset}", chip.number), number));
                 }
                 own.push((format!("{}/gpio{offset}", chip.label), number));
@@ -211,6 +214,12 @@ impl Names {
                 }
                 // The driver's name alone does not distinguish two devices of one type.
                 own.push((format!("iio{}/{}", adc.number, channel.id), number));
+            }
+        }
+        for chip in &inventory.pwm {
+            let Some(device) = &chip.device else { continue };
+            for channel in 0..chip.channels {
+                own.extend(pwm_number(chip.number, channel).map(|n| (format!("{device}/pwm{channel}"), n)));
             }
         }
         for node in &inventory.spi {
@@ -245,8 +254,12 @@ impl Names {
         let range = |name: String, first, count| Range { name, first, count };
         let mut ranges = vec![range("gpio0".into(), 0, CHIP_LINES)];
         for chip in 0..CHIPS {
-            let name = format!("gpiochip{chip}/gpio0");
-            ranges.push(range(name, chip * CHIP_LINES, CHIP_LINES));
+            let (from, to) = (ANALOG_LINE, ANALOG_LINE + ANALOG_CHANNELS);
+            let parts = if chip == ANALOG_CHIP { &[0, from, to, CHIP_LINES][..] } else { &[0, CHIP_LINES] };
+            for part in parts.windows(2) {
+                let first = line_number(chip, part[0]);
+                ranges.extend(first.map(|n| range(format!("gpiochip{chip}/gpio{}", part[0]), n, part[1] - part[0])));
+            }
         }
         ranges.push(range("analog0".into(), ANALOG, ANALOG_CHANNELS));
         for chip in 0..PWM_CHIPS {
@@ -320,6 +333,7 @@ fn runs(names: &[(String, u32)]) -> Vec<Range> {
 mod tests {
     use super::super::adc::{Channel, IioDevice};
     use super::super::gpio::{Chip, LineInfo};
+    use super::super::pwm;
     use super::super::uart::Uart;
     use super::*;
     use proptest::prelude::*;
@@ -360,20 +374,63 @@ mod tests {
     fn the_c_program_s_numbers() {
         assert_eq!(line_number(0, 17), Some(17));
         assert_eq!(line_number(8, 287), Some(2591));
+        assert_eq!(line_number(15, 17), Some(15 * 288 + 17));
         assert_eq!(channel_number(0, 5, "voltage2"), Some(4098));
         let ranges = Names::default().ranges();
-        assert_eq!(ranges.len(), 19);
+        assert_eq!(ranges.len(), 28);
         let has = |name: &str, first, count| ranges.contains(&Range { name: name.into(), first, count });
         assert!(has("gpio0", 0, 288));
         assert!(has("gpiochip8/gpio0", 2304, 288));
+        assert!(has("gpiochip15/gpio0", 4320, 288));
         assert!(has("analog0", 4096, 8));
+    }
+
+    /// In the C program a number of gpiochip14 is also that of an ADC channel.
+    #[test]
+    fn no_line_has_the_number_of_a_channel() {
+        let published = Names::default().ranges();
+        let names = expanded(&published);
+        for chip in 0..16 {
+            for offset in 0..288 {
+                let name = format!("gpiochip{chip}/gpio{offset}");
+                let numbers: Vec<u32> = names.iter().filter(|(n, _)| *n == name).map(|(_, number)| *number).collect();
+                assert_eq!(numbers.len(), 1, "{name}");
+                assert_eq!(Target::of(Pin(numbers[0])), Target::Line { chip, offset }, "{name}");
+                let same = numbers[0] == chip * 288 + offset;
+                assert_eq!(same, !(4096..4104).contains(&(chip * 288 + offset)), "{name}");
+            }
+        }
+        // A chip with as many lines has each name once.
+        let chips = vec![chip(14, "big", &[""; 290])];
+        let names: Vec<String> = names_of(chips).into_iter().filter(|name| name.starts_with("gpiochip14/")).collect();
+        assert_eq!(names.len(), 290);
+        assert_eq!(names.iter().collect::<std::collections::HashSet<_>>().len(), 290);
+    }
+
+    /// All names that a host learns.
+    fn names_of(chips: Vec<Chip>) -> Vec<String> {
+        let names = Names::of(&Inventory { chips, ..Inventory::default() });
+        expanded(&names.ranges()).into_iter().map(|(name, _)| name).collect()
+    }
+
+    #[test]
+    fn a_pwm_channel_has_the_name_of_its_device() {
+        let chip =
+            |number, device: Option<&str>, channels| pwm::Chip { number, device: device.map(Into::into), channels };
+        let names = |pwm: Vec<pwm::Chip>| Names::of(&Inventory { pwm, ..Inventory::default() });
+        let pi5 = names(vec![chip(0, Some("1f00098000.pwm"), 4), chip(1, None, 2)]);
+        assert_eq!(pi5.of_pin(65536 + 2), ["1f00098000.pwm/pwm2"]);
+        assert_eq!(pi5.0.len(), 4);
+        assert!(pi5.ranges().contains(&Range { name: "1f00098000.pwm/pwm0".into(), first: 65536, count: 4 }));
+        assert!(names(vec![chip(0, Some("a"), 2), chip(1, Some("a"), 2)]).0.is_empty(), "two chips of one device");
+        assert!(names(vec![chip(8, Some("a"), 2)]).0.is_empty(), "it has no number");
     }
 
     #[test]
     fn what_a_range_has_no_room_for_has_another_number_or_none() {
         assert_eq!(
-            [line_number(8, 288), line_number(9, 0)],
-            [Some((1 << 24) + 8 * 4096 + 288), Some((1 << 24) + 9 * 4096)]
+            [line_number(15, 288), line_number(16, 0)],
+            [Some((1 << 24) + 15 * 4096 + 288), Some((1 << 24) + 16 * 4096)]
         );
         assert_eq!(
             [line_number(4095, 4095), line_number(4096, 0), line_number(0, 4096)],
@@ -449,13 +506,13 @@ mod tests {
 
     #[test]
     fn chips_and_channels_beyond_the_c_ranges_have_numbers_of_their_own() {
-        let chips = vec![chip(12, "usb", &["a", "b"]), chip(0, "big", &[""; 290])];
+        let chips = vec![chip(16, "usb", &["a", "b"]), chip(0, "big", &[""; 290])];
         let adcs =
             vec![adc(0, "ads1115", &["voltage0-voltage1", "voltage0"]), adc(3, "mcp3008", &["voltage0", "voltage1"])];
         let found = names(chips, adcs);
         let number = |name: &str| found.iter().find(|(n, _)| n == name).map(|n| Pin(n.1));
         let target = |name: &str| number(name).map(Target::of);
-        assert_eq!(target("gpiochip12/gpio1"), Some(Target::Line { chip: 12, offset: 1 }));
+        assert_eq!(target("gpiochip16/gpio1"), Some(Target::Line { chip: 16, offset: 1 }));
         assert_eq!(target("usb/gpio1"), target("b"));
         assert_eq!(target("gpiochip0/gpio289"), Some(Target::Line { chip: 0, offset: 289 }));
         assert_eq!(target("gpiochip0/gpio287"), None, "the range has it");
@@ -493,7 +550,7 @@ mod tests {
     fn hardware_pwm_keeps_its_numbers() {
         assert_eq!(Target::of(Pin(65536)), Target::Pwm { chip: 0, channel: 0 });
         assert_eq!(Target::of(Pin(65663)), Target::Pwm { chip: 7, channel: 15 });
-        for nothing in [65664, 66000, 2592, 4095, 4104] {
+        for nothing in [65664, 66000, 4608, 65535] {
             assert_eq!(Target::of(Pin(nothing)), Target::Nothing(nothing));
         }
     }

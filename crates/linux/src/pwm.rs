@@ -13,14 +13,41 @@ use std::thread;
 use std::time::Duration;
 
 use super::guard::SharedGuard;
+use super::sysfs::{names, target, text};
 use pinion_firmware::board::{self, PWM_MAX, PwmConfig};
 use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::{NS_PER_TICK, Ticks};
 use pinion_firmware::trouble::Trouble;
 
+/// Highest number of channels of a chip. No chip has as many.
+const CHANNELS_MAX: u32 = 256;
 /// The files of a newly exported channel belong to root until udev has given them to the group.
 const UDEV_TRIES: u32 = 50;
 const UDEV_PAUSE: Duration = Duration::from_millis(10);
+
+/// A PWM chip as it was found.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Chip {
+    /// The number of `pwmchip<n>`.
+    pub number: u32,
+    /// The device, such as `fe20c000.pwm`. Its name stays where a kernel numbers the chips differently.
+    pub device: Option<String>,
+    /// How many channels it has.
+    pub channels: u32,
+}
+
+/// The chips of this computer by number. `class` is `/sys/class/pwm`.
+pub(super) fn scan(class: &Path) -> Vec<Chip> {
+    let chip = |name: &String| {
+        let number = name.strip_prefix("pwmchip")?.parse().ok()?;
+        let folder = class.join(name);
+        let channels = text(&folder.join("npwm")).and_then(|count| count.parse().ok()).unwrap_or(0);
+        Some(Chip { number, device: target(&folder.join("device")), channels: CHANNELS_MAX.min(channels) })
+    };
+    let mut chips: Vec<Chip> = names(class).iter().filter_map(chip).collect();
+    chips.sort_by_key(|chip| chip.number);
+    chips
+}
 
 /// A channel: `pwmchip<chip>/pwm<channel>`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,6 +88,9 @@ impl Pwm {
         let refused = |what: &str, error: io::Error| {
             Shutdown::because(reason::PWM_CONFIG, trouble(&error, format!("{what}: {error}")).of(channel))
         };
+        if let Some(missing) = missing(class, channel) {
+            return Err(Shutdown::because(reason::PWM_CONFIG, missing.of(channel)));
+        }
         let folder = export(class, channel).map_err(|error| refused("exporting it", error))?;
         let open = |name: &str| {
             let file = OpenOptions::new().read(name == "period").write(true).open(folder.join(name));
@@ -142,11 +172,16 @@ impl board::Pwm for Pwm {
     }
 }
 
-/// The channel's folder. It is made if it is missing. BeagleBone kernels call it `pwm-C:N`.
+/// The folder of a channel that BeagleBone kernels have exported.
+fn beaglebone(class: &Path, channel: Channel) -> PathBuf {
+    class.join(format!("pwm-{}:{}", channel.chip, channel.channel))
+}
+
+/// The channel's folder. It is made if it is missing.
 fn export(class: &Path, channel: Channel) -> io::Result<PathBuf> {
     let chip = class.join(format!("pwmchip{}", channel.chip));
     let folder = chip.join(format!("pwm{}", channel.channel));
-    let other = class.join(format!("pwm-{}:{}", channel.chip, channel.channel));
+    let other = beaglebone(class, channel);
     if other.exists() {
         return Ok(other);
     }
@@ -160,6 +195,23 @@ fn export(class: &Path, channel: Channel) -> io::Result<PathBuf> {
         }
     }
     Ok(folder)
+}
+
+/// Says that the chip is missing, and names those that exist. A kernel update may have given them other numbers.
+fn missing(class: &Path, channel: Channel) -> Option<Trouble> {
+    let chips = scan(class);
+    let (first, number) = (chips.first()?, channel.chip);
+    if chips.iter().any(|chip| chip.number == number) || beaglebone(class, channel).exists() {
+        return None;
+    }
+    let chip = |chip: &Chip| format!("pwmchip{} ({})", chip.number, chip.device.as_deref().unwrap_or("no device"));
+    let known: Vec<String> = chips.iter().map(chip).collect();
+    let cause = format!("there is no pwmchip{number}: this computer has {}", known.join(", "));
+    let name = first.device.clone().unwrap_or_else(|| format!("pwmchip{}", first.number));
+    Some(
+        Trouble::new(cause)
+            .remedy(format!("write the chip by its device, such as {name}/pwm0 (pinion pins lists them)")),
+    )
 }
 
 /// The meaning of an error beyond `cause`, and the remedy.
@@ -257,5 +309,26 @@ mod tests {
         assert_eq!(fs::read_to_string(class.path().join("pwmchip0/export")).unwrap(), "1");
         let text = error.to_string();
         assert!(text.contains("pwmchip0/pwm1") && text.contains("device tree"), "{text}");
+    }
+
+    /// A Raspberry Pi 5 whose header's PWM was pwmchip2 before Linux 6.12.
+    #[test]
+    fn a_chip_that_is_not_there_names_those_that_are() {
+        let class = tempfile::tempdir().unwrap();
+        let open = |chip| {
+            let channel = Channel { chip, channel: 2 };
+            Pwm::open(class.path(), channel, &config(0), SharedGuard::new(None)).err().unwrap().to_string()
+        };
+        assert!(open(2).contains("dtoverlay=pwm"), "there is none");
+        fs::create_dir_all(class.path().join("pwmchip0")).unwrap();
+        fs::write(class.path().join("pwmchip0/npwm"), "4\n").unwrap();
+        std::os::unix::fs::symlink("../../../1f00098000.pwm", class.path().join("pwmchip0/device")).unwrap();
+        assert_eq!(
+            open(2),
+            "Unable to config pwm device: pwmchip2/pwm2: there is no pwmchip2: this computer has pwmchip0 \
+             (1f00098000.pwm): write the chip by its device, such as 1f00098000.pwm/pwm0 (pinion pins lists them)"
+        );
+        let found = scan(class.path());
+        assert_eq!(found, [Chip { number: 0, device: Some("1f00098000.pwm".into()), channels: 4 }]);
     }
 }

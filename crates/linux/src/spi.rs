@@ -283,7 +283,7 @@ fn cannot_open(path: &Path, error: &io::Error, nodes: &[Node]) -> Trouble {
             Trouble::new(format!("there is no {shown}: {known}"))
                 .remedy("enable the bus (on a Raspberry Pi \"dtparam=spi=on\" in config.txt), or change spi_bus")
         }
-        io::ErrorKind::PermissionDenied => not_permitted(path),
+        io::ErrorKind::PermissionDenied => not_permitted(path, error.raw_os_error().unwrap_or(libc::EACCES)),
         _ => Trouble::new(format!("{shown} cannot be opened: {error}")).remedy(LOOK_AT_LOG),
     }
 }

@@ -97,24 +97,18 @@ pub(super) fn names(folder: &Path) -> Vec<String> {
 }
 
 fn pwm(class: &Path, debug: &Path) -> Vec<PwmChip> {
-    /// More channels than any chip has.
-    const CHANNELS_MAX: usize = 256;
     let users = text(debug).map_or_else(HashMap::new, |text| pwm_users(&text));
-    let chip = |name: &String| {
-        let number: u32 = name.strip_prefix("pwmchip")?.parse().ok()?;
-        let folder = class.join(name);
-        let device = target(&folder.join("device"));
-        let count: usize = text(&folder.join("npwm")).and_then(|count| count.parse().ok()).unwrap_or(0);
-        let channel = |n: usize| PwmChannel {
+    let chip = |found: super::pwm::Chip| {
+        let super::pwm::Chip { number, device, channels } = found;
+        let folder = class.join(format!("pwmchip{number}"));
+        let channel = |n: u32| PwmChannel {
             exported: folder.join(format!("pwm{n}")).exists() || class.join(format!("pwm-{number}:{n}")).exists(),
             consumer: device.as_ref().and_then(|device| users.get(&(device.clone(), n))).cloned(),
         };
-        let channels = (0..count.min(CHANNELS_MAX)).map(channel).collect();
-        Some(PwmChip { number, device, channels })
+        let channels = (0..channels).map(channel).collect();
+        PwmChip { number, device, channels }
     };
-    let mut chips: Vec<PwmChip> = names(class).iter().filter_map(chip).collect();
-    chips.sort_by_key(|chip| chip.number);
-    chips
+    super::pwm::scan(class).into_iter().map(chip).collect()
 }
 
 /// The users of channels by device and number, from a text like this (drivers/pwm/core.c)
@@ -124,7 +118,7 @@ fn pwm(class: &Path, debug: &Path) -> Vec<PwmChip> {
 ///  pwm-0   (pwm-fan             ): requested enabled period: 40000 ns duty: 0 ns polarity: normal
 ///  pwm-1   ((null)              ): period: 0 ns duty: 0 ns polarity: normal
 /// ```
-fn pwm_users(text: &str) -> HashMap<(String, usize), String> {
+fn pwm_users(text: &str) -> HashMap<(String, u32), String> {
     let mut users = HashMap::new();
     let mut device = "";
     for line in text.lines() {

@@ -263,7 +263,7 @@ fn no_port(error: impl Into<io::Error>) -> Trouble {
 fn cannot_open(path: &Path, error: &io::Error) -> Trouble {
     match error.kind() {
         ErrorKind::NotFound => Trouble::new("it is gone").remedy("plug its adapter in, then FIRMWARE_RESTART"),
-        ErrorKind::PermissionDenied => not_permitted(path),
+        ErrorKind::PermissionDenied => not_permitted(path, error.raw_os_error().unwrap_or(libc::EACCES)),
         ErrorKind::ResourceBusy => in_use(),
         _ => Trouble::new(format!("it cannot be opened: {error}")).remedy(LOOK_AT_LOG),
     }

@@ -1,19 +1,23 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! The computer that `pinion doctor` looks at: its files below a root, and its users. `units.rs` adds its units, and
-//! `running.rs` its processes.
+//! The computer that `pinion doctor` looks at: its files below a root, and its users. `units.rs` adds its units,
+//! `manager.rs` the settings of systemd itself, and `running.rs` its processes.
 
 #![forbid(unsafe_code)]
 
 use std::fs;
-use std::io;
+use std::io::{self, Read};
 use std::os::unix::fs::MetadataExt;
 use std::path::{Component, Path, PathBuf};
+use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use glob::{MatchOptions, Pattern};
 use nix::unistd::{User, getegid, geteuid, getgroups};
 
 use crate::foreign;
 
+pub(super) mod manager;
 pub(super) mod running;
 pub(super) mod units;
 
@@ -221,6 +225,28 @@ impl Computer {
     }
 }
 
+/// The output of a program. `None` if the program does not end within two seconds.
+pub(in crate::cli) fn output(command: &mut Command) -> Option<String> {
+    const OUTPUT_TIMEOUT: Duration = Duration::from_secs(2);
+    let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
+    let mut child = command.spawn().ok()?;
+    let end = Instant::now() + OUTPUT_TIMEOUT;
+    loop {
+        match child.try_wait() {
+            Ok(None) if Instant::now() < end => thread::sleep(Duration::from_millis(10)),
+            Ok(Some(_)) => break,
+            // It hangs. It is killed, and left alone if it does not end.
+            _ => {
+                let _ = child.kill();
+                return None;
+            }
+        }
+    }
+    let mut text = String::new();
+    child.stdout.take()?.take(4096).read_to_string(&mut text).ok()?;
+    Some(text)
+}
+
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
@@ -252,6 +278,27 @@ pub(super) mod tests {
         pub(in crate::cli) fn put_mode(&self, path: &str, text: &str, mode: u32) {
             self.put(path, text);
             self.mode(path, mode);
+        }
+
+        /// A program made from this script.
+        pub(in crate::cli) fn program(&self, path: &str, script: &str) -> PathBuf {
+            self.put_mode(path, script, 0o755);
+            let path = self.0.path().join(path);
+            // A process that another test forked meanwhile may have it open for writing, until it becomes another
+            // program.
+            loop {
+                match Command::new(&path).stdout(Stdio::null()).spawn() {
+                    Err(error) if error.kind() == io::ErrorKind::ExecutableFileBusy => {
+                        thread::sleep(Duration::from_millis(1))
+                    }
+                    Ok(mut child) => {
+                        let _ = child.kill();
+                        let _ = child.wait();
+                        return path;
+                    }
+                    Err(_) => return path,
+                }
+            }
         }
 
         pub(in crate::cli) fn link(&self, path: &str, target: &str) {

@@ -6,20 +6,20 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::io::Read;
 use std::os::unix::fs::{FileTypeExt, MetadataExt};
 use std::path::{Path, PathBuf};
-use std::process::{Command, Stdio};
-use std::thread;
-use std::time::{Duration, Instant};
+use std::process::Command;
 
-use crate::cli::computer::{Access, Computer, Who};
+use crate::cli::computer::{Access, Computer, Who, output};
 use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use crate::throttled;
+use pinion_linux::Inventory;
 use pinion_linux::gpio::{Chip, FastGpio, LINK_REMEDY, never_sleeps};
+use pinion_linux::pins::{Names, line_number};
 
 use super::instance::Instance;
+use super::printer::line_of;
 use super::{INSTALL, REINSTALL};
 
 /// A kind of devices.
@@ -280,6 +280,12 @@ pub(super) fn is_pi(computer: &Computer) -> bool {
     model(computer).contains("Raspberry Pi")
 }
 
+/// Whether this is a Raspberry Pi 5, 500 or Compute Module 5.
+pub(super) fn is_pi5(computer: &Computer) -> bool {
+    let model = model(computer);
+    ["Raspberry Pi 5", "Raspberry Pi Compute Module 5"].iter().any(|name| model.starts_with(name))
+}
+
 /// A Raspberry Pi's config.txt.
 pub(super) fn pi_config(computer: &Computer) -> Option<&'static str> {
     computer.first(&["/boot/firmware/config.txt", "/boot/config.txt"])
@@ -409,6 +415,70 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
     )
 }
 
+/// The pins whose MCU is one of these instances, and has this computer's lines.
+pub(super) fn of_instances<'a>(instances: &[Instance], pins: &BTreeSet<(&Path, &'a str)>) -> BTreeSet<&'a str> {
+    let links = instances.iter().filter(|instance| instance.settings.board == BoardName::Linux);
+    let links: Vec<&Path> = links.filter_map(|instance| instance.link.as_deref()).collect();
+    pins.iter().filter(|(link, _)| links.contains(link)).map(|(_, pin)| *pin).collect()
+}
+
+/// Whether these pins, which name the number of their chip, mean lines of the 40-pin header of a Raspberry Pi. Kernels
+/// have numbered its chip differently.
+pub(super) fn header(computer: &Computer, inventory: &Inventory, pins: &BTreeSet<&str>) -> Vec<Finding> {
+    const CHECK: &str = "gpio_numbers";
+    let chips = &inventory.chips;
+    let Some(header) = inventory.header() else {
+        if !is_pi(computer) || chips.is_empty() {
+            return Vec::new();
+        }
+        let found = "this kernel has no driver for the lines of the 40-pin header";
+        return vec![Finding::warning(CHECK, found, "boot the kernel of Raspberry Pi OS")];
+    };
+    let names = Names::of(inventory);
+    let own_name = |offset: u32| {
+        let number = line_number(header.number, offset)?;
+        names.of_pin(number).first().map(|name| (*name).to_owned())
+    };
+    // The header has had these numbers. On a Pi 5 a chip of the processor may have them. Any other chip was connected on
+    // purpose.
+    let is_other = |number: u32| {
+        let chip = chips.iter().find(|chip| chip.number == number && [0, 4].contains(&number));
+        chip.is_some_and(|chip| chip.label.starts_with("gpio-brcmstb"))
+    };
+    let (mut former, mut other) = (Vec::new(), Vec::new());
+    for pin in pins {
+        let Some((chip, offset)) = line_of(pin) else { continue };
+        let Some(name) = own_name(offset) else { continue };
+        match () {
+            () if inventory.renumbered(chip).is_some() => former.push((*pin, name)),
+            () if is_other(chip) => other.push((*pin, name)),
+            () => {}
+        }
+    }
+    let write = |pins: &[(&str, String)]| {
+        let pins: Vec<String> = pins.iter().map(|(pin, name)| format!("{name} for {pin}")).collect();
+        format!("in printer.cfg write {}", pins.join(", "))
+    };
+    let shown = format!("gpiochip{} ({})", header.number, header.label);
+    let list = |pins: &[(&str, String)]| pins.iter().map(|(pin, _)| *pin).collect::<Vec<_>>().join(", ");
+    let mut findings = Vec::new();
+    if !former.is_empty() {
+        let found = format!(
+            "the header is {shown}, and the numbers in printer.cfg are those of another kernel: Pinion takes {} for its lines",
+            list(&former)
+        );
+        findings.push(Finding::warning(CHECK, found, write(&former)));
+    }
+    if !other.is_empty() {
+        let found = format!("the header is {shown}, and these pins are lines of another chip: {}", list(&other));
+        findings.push(Finding::warning(CHECK, found, write(&other) + ", if you mean lines of the header"));
+    }
+    if findings.is_empty() {
+        findings.push(Finding::ok(CHECK, format!("the 40-pin header is {shown}")));
+    }
+    findings
+}
+
 /// The holders of GPIO lines.
 pub(super) fn holders(computer: &Computer, chips: &[Chip]) -> Vec<Finding> {
     const CHECK: &str = "gpio_lines";
@@ -492,33 +562,12 @@ fn throttled_bits(computer: &Computer, vcgencmd: Option<&Path>) -> Option<u32> {
     throttled::bits(told.trim().strip_prefix("throttled=")?)
 }
 
-/// The output of a program. `None` if the program does not end within two seconds.
-fn output(command: &mut Command) -> Option<String> {
-    const OUTPUT_TIMEOUT: Duration = Duration::from_secs(2);
-    let command = command.stdin(Stdio::null()).stdout(Stdio::piped()).stderr(Stdio::null());
-    let mut child = command.spawn().ok()?;
-    let end = Instant::now() + OUTPUT_TIMEOUT;
-    loop {
-        match child.try_wait() {
-            Ok(None) if Instant::now() < end => thread::sleep(Duration::from_millis(10)),
-            Ok(Some(_)) => break,
-            // It hangs. It is killed, and left alone if it does not end.
-            _ => {
-                let _ = child.kill();
-                return None;
-            }
-        }
-    }
-    let mut text = String::new();
-    child.stdout.take()?.take(4096).read_to_string(&mut text).ok()?;
-    Some(text)
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::instance::instances;
     use super::super::tests::told;
     use super::*;
+    use crate::cli::boards::{self, Board};
     use crate::cli::computer::tests::Tree;
     use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
     use pinion_linux::gpio::LineInfo;
@@ -761,6 +810,70 @@ mod tests {
         assert!(judged(&[], "board = \"sim\"\n", "host:gpio18").is_empty(), "the simulated printer has any LEDs");
     }
 
+    /// The findings about the header of a board, with these pins in printer.cfg.
+    fn about_header(board: &Board, pins: &[&str]) -> Vec<Finding> {
+        let tree = board.tree();
+        header(&tree.computer(), &board.inventory(&tree), &pins.iter().copied().collect())
+    }
+
+    #[test]
+    fn a_header_whose_chip_has_another_number() {
+        let numbered = ["gpio17", "gpiochip4/gpio33"];
+        let remedy = told(
+            &about_header(&boards::pi5(), &numbered),
+            "gpio_numbers",
+            Warning,
+            "the header is gpiochip15 (pinctrl-rp1), and the numbers in printer.cfg are those of another kernel: Pinion \
+             takes gpio17, gpiochip4/gpio33 for its lines",
+        );
+        assert_eq!(remedy, "in printer.cfg write GPIO17 for gpio17, pinctrl-rp1/gpio33 for gpiochip4/gpio33");
+        for pins in [&[][..], &["gpiochip15/gpio17"], &["gpiochip11/gpio1"], &["gpio99"]] {
+            let findings = about_header(&boards::pi5(), pins);
+            assert!(findings.len() == 1 && findings[0].told.remedy.is_none(), "{findings:?}");
+            told(&findings, "gpio_numbers", Fine, "the 40-pin header is gpiochip15 (pinctrl-rp1)");
+        }
+        // gpio17 is a line of the processor's own chip there.
+        let findings = about_header(&boards::pi5_debian(), &numbered);
+        let remedy = told(&findings, "gpio_numbers", Warning, "these pins are lines of another chip: gpio17");
+        assert_eq!(remedy, "in printer.cfg write pinctrl-rp1/gpio17 for gpio17, if you mean lines of the header");
+        assert_eq!(findings.len(), 1, "gpiochip4 is the header");
+        let findings = about_header(&boards::pi5_without_header(), &[]);
+        assert!(told(&findings, "gpio_numbers", Warning, "no driver for the lines").contains("Raspberry Pi OS"));
+        told(&about_header(&boards::pi4(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2711)");
+        told(&about_header(&boards::zero2(), &["gpio17"]), "gpio_numbers", Fine, "gpiochip0 (pinctrl-bcm2835)");
+        for board in [boards::cb1(), boards::rk3566()] {
+            assert_eq!(about_header(&board, &["gpio17"]), [], "it has no header of a Raspberry Pi");
+        }
+    }
+
+    #[test]
+    fn only_a_raspberry_pi_has_a_config_txt() {
+        for board in [boards::cb1(), boards::rk3566()] {
+            let findings = presence(&board.tree().computer());
+            told(&findings, "gpio", Fine, "GPIO: /dev/gpiochip0 and ");
+            for finding in findings {
+                assert_eq!(finding.status, Fine, "{finding:?}");
+                let text = format!("{finding:?}");
+                assert!(!["config.txt", "raspi-config", "dtparam"].iter().any(|word| text.contains(word)), "{text}");
+            }
+        }
+        for board in boards::all() {
+            told(&presence(&board.tree().computer()), "gpio", Fine, "GPIO: /dev/gpiochip");
+        }
+    }
+
+    /// Only pins of an MCU that has this computer's lines count.
+    #[test]
+    fn pins_of_another_micro_controller() {
+        let tree = Tree::new();
+        tree.put("etc/passwd", "pinion:x:54321:54321::/:/bin/sh\n");
+        let (host, board) = (Path::new("/tmp/klipper_host_mcu"), Path::new("/dev/board"));
+        let pins = || of_instances(&instances(&tree.computer()).0, &[(host, "gpio17"), (board, "gpio18")].into());
+        assert_eq!(pins(), ["gpio17"].into());
+        tree.put("etc/pinion/pinion.toml", "board = \"sim\"\n");
+        assert!(pins().is_empty());
+    }
+
     #[test]
     fn who_holds_which_line() {
         let tree = Tree::new();
@@ -808,30 +921,10 @@ mod tests {
         assert_eq!(findings.len(), 2);
     }
 
-    /// A program made from this script.
-    fn program(tree: &Tree, script: &str) -> PathBuf {
-        tree.put_mode("vcgencmd", script, 0o755);
-        let path = tree.computer().path("/vcgencmd");
-        // A process that another test forked meanwhile may have it open for writing, until it becomes another program.
-        loop {
-            match Command::new(&path).stdout(Stdio::null()).spawn() {
-                Err(error) if error.kind() == std::io::ErrorKind::ExecutableFileBusy => {
-                    thread::sleep(Duration::from_millis(1))
-                }
-                Result::Ok(mut child) => {
-                    let _ = child.kill();
-                    let _ = child.wait();
-                    return path;
-                }
-                Err(_) => return path,
-            }
-        }
-    }
-
     #[test]
     fn a_pi_s_program_is_asked_where_the_kernel_does_not_tell_and_not_waited_for() {
         let tree = Tree::new();
-        let told_by = |script: &str| power(&tree.computer(), Some(&program(&tree, script)));
+        let told_by = |script: &str| power(&tree.computer(), Some(&tree.program("vcgencmd", script)));
         let good = told_by("#!/bin/sh\necho throttled=0x80000\n");
         told(&good, "power", Warning, "at times the processors are at their temperature limit");
         tree.put("proc/device-tree/model", "Raspberry Pi 3");

@@ -121,6 +121,11 @@ pub(super) fn line_leds(klippys: &[Klippy]) -> BTreeSet<(&Path, &str)> {
     printers(klippys).flat_map(|printer| &printer.line_leds).map(|(link, pin)| (link.as_path(), pin.as_str())).collect()
 }
 
+/// The pins by the number of their chip in the klippys' configurations, with the link to their MCU.
+pub(super) fn numbered_pins(klippys: &[Klippy]) -> BTreeSet<(&Path, &str)> {
+    printers(klippys).flat_map(|printer| &printer.numbered).map(|(link, pin)| (link.as_path(), pin.as_str())).collect()
+}
+
 /// The serial ports of drivers in the klippys' configurations.
 pub(super) fn uarts(klippys: &[Klippy]) -> BTreeSet<&str> {
     printers(klippys).flat_map(|printer| &printer.uarts).map(|pin| printer::name_of(pin)).collect()

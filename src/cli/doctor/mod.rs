@@ -16,6 +16,7 @@ use crate::runtime::latency::{self, Fitness, Verdict};
 use pinion_linux::Inventory;
 
 use super::computer::Computer;
+use super::computer::manager::SYSTEMCTL;
 use super::finding::{self, Finding, Group};
 use super::page::Page;
 use super::{failed, quietly};
@@ -26,6 +27,7 @@ mod instance;
 mod kernel;
 mod klipper;
 mod last_stop;
+mod outputs;
 mod printer;
 mod serial;
 mod service;
@@ -88,17 +90,19 @@ pub(super) fn run(args: &DoctorArgs) -> ExitCode {
 fn examine(computer: &Computer) -> Vec<Group> {
     let (instances, configurations) = instance::instances(computer);
     let klippys = host::klippys(computer);
+    let program = |path: &'static str| computer.is_this().then_some(Path::new(path));
     let mut groups = vec![
         Group::new("last stop", vec![last_stop::finding(computer, SystemTime::now())]),
         Group::new("kernel", kernel::findings(computer, &instances)),
         Group::new("service", [configurations, service::findings(computer, &instances)].concat()),
-        Group::new("watchdog", service::watchdog(computer, &instances)),
+        Group::new("watchdog", service::watchdog(computer, &instances, program(SYSTEMCTL))),
         Group::new("terminal", terminal::terminals(computer, &instances, &klippys)),
         Group::new("host", host::dialects(computer, &instances, &klippys)),
         Group::new(
             "pins and buses",
             [
                 devices::presence(computer),
+                outputs::released(computer),
                 devices::leds(computer, &host::leds(&klippys)),
                 devices::line_leds(computer, &instances, &host::line_leds(&klippys)),
                 serial::ports(computer, &host::uarts(&klippys)),
@@ -106,11 +110,17 @@ fn examine(computer: &Computer) -> Vec<Group> {
             .concat(),
         ),
         Group::new("permissions", devices::permissions(computer, &instances, &host::uarts(&klippys))),
-        Group::new("power", devices::power(computer, computer.is_this().then_some(Path::new("/usr/bin/vcgencmd")))),
+        Group::new("power", devices::power(computer, program("/usr/bin/vcgencmd"))),
     ];
     if computer.is_this() {
         let is_serving = instances.iter().any(|instance| instance.pid.is_some());
-        groups.insert(7, Group::new("lines", devices::holders(computer, &Inventory::scan().chips)));
+        let inventory = Inventory::scan();
+        let pins = host::numbered_pins(&klippys);
+        let lines = [
+            devices::header(computer, &inventory, &devices::of_instances(&instances, &pins)),
+            devices::holders(computer, &inventory.chips),
+        ];
+        groups.insert(7, Group::new("lines", lines.concat()));
         groups.push(Group::new("latency", vec![latency(latency::sample(is_serving))]));
     }
     groups

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Reads klippy's configuration: its pseudo terminals, its LEDs, and its drivers on serial ports.
+//! Reads klippy's configuration: its pseudo terminals, its LEDs, its drivers on serial ports, and pins by their numbers.
 
 #![forbid(unsafe_code)]
 
@@ -22,18 +22,31 @@ pub(super) struct Printer {
     pub(super) line_leds: BTreeSet<(PathBuf, String)>,
     /// The `uart_pin` of each `[tmc...]` section that names a serial port, such as `host:ttyAMA1`.
     pub(super) uarts: BTreeSet<String>,
+    /// The pins that name a line by the number of its chip, such as `gpio17`, without their MCU and `!`, and the
+    /// `serial` of their MCU.
+    pub(super) numbered: BTreeSet<(PathBuf, String)>,
 }
 
 /// Reads a configuration, with the files that it includes. `None` if one of them cannot be read. As in
 /// klippy/configfile.py the last entry of a section counts.
 pub(super) fn read(computer: &Computer, config: &Path) -> Option<Printer> {
-    let mut reader =
-        Reader { computer, serials: BTreeMap::new(), led_pins: BTreeMap::new(), uart_pins: BTreeMap::new(), files: 0 };
+    let mut reader = Reader {
+        computer,
+        serials: BTreeMap::new(),
+        led_pins: BTreeMap::new(),
+        uart_pins: BTreeMap::new(),
+        pins: BTreeMap::new(),
+        files: 0,
+    };
     reader.file(config, &mut Vec::new())?;
     let is_spi = |pin: &String| name_of(pin).starts_with("spidev");
     let is_port = |pin: &String| ["tty", "serial"].iter().any(|kind| name_of(pin).starts_with(kind));
     let on_line = |pin: &String| Some((reader.serials.get(&section_of(pin))?.clone(), pin.clone()));
+    let numbered = reader.pins.values().flat_map(|pins| pins.split(',')).filter(|pin| line_of(name_of(pin)).is_some());
+    let numbered =
+        numbered.filter_map(|pin| Some((reader.serials.get(&section_of(pin))?.clone(), name_of(pin).to_owned())));
     Some(Printer {
+        numbered: numbered.collect(),
         line_leds: reader.led_pins.values().filter(|pin| !is_spi(pin)).filter_map(on_line).collect(),
         serials: reader.serials.into_values().collect(),
         leds: reader.led_pins.into_values().filter(is_spi).collect(),
@@ -52,7 +65,13 @@ fn section_of(pin: &str) -> String {
 
 /// A pin's name without the MCU before it.
 pub(super) fn name_of(pin: &str) -> &str {
-    pin.rsplit(':').next().unwrap_or_default().trim()
+    pin.rsplit(':').next().unwrap_or_default().trim_start_matches(['^', '~', '!', ' ']).trim()
+}
+
+/// The chip and the line that a numeric name means: `gpio17` and `gpiochip0/gpio17`.
+pub(super) fn line_of(name: &str) -> Option<(u32, u32)> {
+    let (chip, line) = name.split_once('/').unwrap_or(("gpiochip0", name));
+    Some((chip.strip_prefix("gpiochip")?.parse().ok()?, line.strip_prefix("gpio")?.parse().ok()?))
 }
 
 struct Reader<'a> {
@@ -61,6 +80,8 @@ struct Reader<'a> {
     serials: BTreeMap<String, PathBuf>,
     led_pins: BTreeMap<String, String>,
     uart_pins: BTreeMap<String, String>,
+    /// All pins, indexed by section and key.
+    pins: BTreeMap<(String, String), String>,
     files: usize,
 }
 
@@ -90,6 +111,10 @@ impl Reader<'_> {
             }
             let Some((key, value)) = line.split_once([':', '=']) else { continue };
             let value = value.trim();
+            // An indented line belongs to the value before it: text of a macro.
+            if key.contains("pin") && !key.starts_with(char::is_whitespace) {
+                self.pins.insert((section.clone(), key.trim_end().to_owned()), value.to_owned());
+            }
             match (section.split(' ').next(), key.trim_end()) {
                 (Some("mcu"), "serial") => drop(self.serials.insert(section.clone(), value.into())),
                 (Some("neopixel"), "pin") => drop(self.led_pins.insert(section.clone(), value.into())),
@@ -172,6 +197,19 @@ mod tests {
         tree.put("home/pi/config/printer.cfg", text);
         let uarts = read(&tree.computer(), Path::new(CONFIG)).unwrap().uarts;
         assert_eq!(uarts.iter().map(|pin| name_of(pin)).collect::<Vec<_>>(), ["ttyAMA1", "serial0"]);
+    }
+
+    #[test]
+    fn pins_by_the_number_of_their_chip() {
+        let tree = Tree::new();
+        let text = "[mcu]\nserial: /dev/board\n[mcu host]\nserial: /tmp/klipper_host_mcu\n[stepper_x]\nstep_pin: host:gpio5\ndir_pin: !host:gpiochip4/gpio6\nenable_pin: PA1\nendstop_pin: ^ !host: gpio7\n[multi_pin a]\npins: host:gpio8, host:GPIO9\n[output_pin b]\npin: gpio10\n[output_pin c]\npin: host:gpio11\n[output_pin c]\npin: host:spidev0.0\n[gcode_macro d]\ngcode:\n  PIN_pin=host:gpio12\n[e]\npin: no:gpio13\n";
+        tree.put("home/pi/config/printer.cfg", text);
+        let pins = read(&tree.computer(), Path::new(CONFIG)).unwrap().numbered;
+        let host = ["gpio5", "gpio7", "gpio8", "gpiochip4/gpio6"].map(|pin| ("/tmp/klipper_host_mcu", pin));
+        let expected = [("/dev/board", "gpio10")].into_iter().chain(host);
+        assert_eq!(pins, expected.map(|(serial, pin)| (serial.into(), pin.into())).collect());
+        assert_eq!([line_of("gpio17"), line_of("gpiochip15/gpio3")], [Some((0, 17)), Some((15, 3))]);
+        assert_eq!([line_of("GPIO17"), line_of("pinctrl-rp1/gpio17"), line_of("gpiochip0")], [None; 3]);
     }
 
     #[test]

@@ -9,7 +9,7 @@ use std::path::Path;
 use crate::cli::computer::{Computer, units};
 use crate::cli::finding::Finding;
 
-use super::devices::{is_pi, pi_config};
+use super::devices::{is_pi, is_pi5, pi_config};
 
 const CHECK: &str = "serial";
 /// Programs that set up a Bluetooth chip on a serial port.
@@ -60,6 +60,15 @@ fn port(computer: &Computer, named: &str) -> Vec<Finding> {
             findings.push(Finding::error(CHECK, found, remedy));
         }
     }
+    // serial0 often leads to one of these.
+    if is_pi5(computer) && name == "ttyAMA10" {
+        let found = format!("TMC UART: {node} is the connector for debugging, not pins 8 and 10 of the header");
+        findings.push(Finding::warning(CHECK, found, header_of_pi5(computer) + ", and uart_pin: host:ttyAMA0"));
+    } else if is_pi(computer) && name == "ttyS0" {
+        let found =
+            format!("TMC UART: {node} is the mini-UART, whose rate follows the clock of the graphics processor");
+        findings.push(Finding::warning(CHECK, found, no_bluetooth(computer) + ", and uart_pin: host:ttyAMA0"));
+    }
     if let Some(login) = login {
         let found = format!("TMC UART: {node} offers a login, which takes the drivers' answers: {login}");
         findings.push(Finding::error(CHECK, found, format!("sudo systemctl disable --now {getty}.service")));
@@ -84,6 +93,7 @@ fn missing(computer: &Computer, named: &str) -> String {
     // A Bluetooth chip that the device tree describes takes its port away: there is no terminal then.
     let is_taken = !computer.matching("/sys/bus/serial/devices/serial*-*").is_empty();
     match is_pi(computer) {
+        true if is_pi5(computer) && ["ttyAMA0", "serial0"].contains(&named) => header_of_pi5(computer),
         true if is_taken && ["ttyAMA0", "serial0", "serial1"].contains(&named) => no_bluetooth(computer),
         true => {
             let config = pi_config(computer).unwrap_or("config.txt");
@@ -91,6 +101,12 @@ fn missing(computer: &Computer, named: &str) -> String {
         }
         false => "plug its adapter in, or enable it in the device tree (pinion pins lists the ports)".to_owned(),
     }
+}
+
+/// How a Raspberry Pi 5 gets the port of pins 8 and 10.
+fn header_of_pi5(computer: &Computer) -> String {
+    let config = pi_config(computer).unwrap_or("config.txt");
+    format!("printf '[all]\\ndtoverlay=uart0-pi5\\n' | sudo tee -a {config}, reboot")
 }
 
 fn no_bluetooth(computer: &Computer) -> String {
@@ -105,7 +121,7 @@ mod tests {
     use super::super::tests::told;
     use super::*;
     use crate::cli::computer::tests::Tree;
-    use crate::cli::finding::Level::{Error, Ok as Fine};
+    use crate::cli::finding::Level::{Error, Ok as Fine, Warning};
 
     fn judged(tree: &Tree, name: &str) -> Vec<Finding> {
         ports(&tree.computer(), &[name].into())
@@ -135,6 +151,32 @@ mod tests {
         assert!(told(&judged(&tree, "serial1"), "serial", Error, "there is no").contains("disable-bt"));
         assert!(told(&judged(&self::tree(false), "ttyUSB0"), "serial", Error, "there is no").contains("adapter"));
         assert!(ports(&tree.computer(), &BTreeSet::new()).is_empty(), "nothing is said of what is not used");
+    }
+
+    #[test]
+    fn serial0_is_not_always_the_good_port_of_the_header() {
+        let tree = Tree::new();
+        tree.put("boot/firmware/config.txt", "");
+        tree.put("dev/ttyAMA10", "");
+        tree.link("dev/serial0", "ttyAMA10");
+        for model in
+            ["Raspberry Pi 5 Model B Rev 1.0", "Raspberry Pi Compute Module 5 Rev 1.0", "Raspberry Pi 500 Rev 1.0"]
+        {
+            tree.put("proc/device-tree/model", model);
+            let remedy =
+                told(&judged(&tree, "serial0"), "serial", Warning, "/dev/serial0 is the connector for debugging");
+            assert!(remedy.contains("dtoverlay=uart0-pi5") && remedy.ends_with("uart_pin: host:ttyAMA0"), "{remedy}");
+            assert!(told(&judged(&tree, "ttyAMA0"), "serial", Error, "there is no").contains("dtoverlay=uart0-pi5"));
+        }
+        tree.put("dev/ttyAMA0", "");
+        told(&judged(&tree, "ttyAMA0"), "serial", Fine, "/dev/ttyAMA0");
+        let tree = self::tree(true);
+        tree.put("dev/ttyS0", "");
+        let remedy = told(&judged(&tree, "ttyS0"), "serial", Warning, "/dev/ttyS0 is the mini-UART");
+        assert!(remedy.contains("dtoverlay=disable-bt") && remedy.ends_with("uart_pin: host:ttyAMA0"), "{remedy}");
+        let pc = self::tree(false);
+        pc.put("dev/ttyS0", "");
+        told(&judged(&pc, "ttyS0"), "serial", Fine, "/dev/ttyS0");
     }
 
     #[test]

@@ -3,8 +3,11 @@
 
 #![forbid(unsafe_code)]
 
+use std::path::Path;
+
+use crate::cli::computer::manager::watchdog_of_systemd;
 use crate::cli::computer::{Computer, units};
-use crate::cli::finding::Finding;
+use crate::cli::finding::{Finding, Level};
 use crate::cli::settings::{BoardName, WATCHDOG, WATCHDOG_REMEDY};
 use crate::proc::stat_field;
 
@@ -146,8 +149,9 @@ fn c_program(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
     findings
 }
 
-/// The hardware watchdog, except for its permissions.
-pub(super) fn watchdog(computer: &Computer, instances: &[Instance]) -> Vec<Finding> {
+/// The hardware watchdog, except for its permissions. `systemctl` is the program that asks the running systemd, if it
+/// may be started.
+pub(super) fn watchdog(computer: &Computer, instances: &[Instance], systemctl: Option<&Path>) -> Vec<Finding> {
     const CHECK: &str = "watchdog_device";
     let is_there = computer.path(WATCHDOG).exists();
     let feeding: Vec<&Instance> = instances.iter().filter(|instance| instance.settings.watchdog).collect();
@@ -171,19 +175,8 @@ pub(super) fn watchdog(computer: &Computer, instances: &[Instance]) -> Vec<Findi
         let remedy = format!("watchdog = false in {}, then {}", second.config(), second.restart());
         return vec![Finding::error(CHECK, found, remedy)];
     }
-    let drop_ins = computer.matching("/etc/systemd/system.conf.d/*.conf").into_iter();
-    let files = drop_ins.map(|file| computer.name(&file).display().to_string());
-    let other = std::iter::once("/etc/systemd/system.conf".to_owned()).chain(files).find(|file| {
-        let text = computer.text(file).unwrap_or_default();
-        let mut values = text.lines().filter_map(|line| line.trim().strip_prefix("RuntimeWatchdogSec="));
-        values.next_back().is_some_and(|value| !["", "0", "off"].contains(&value.trim()))
-    });
-    vec![match other {
-        Some(file) => Finding::error(
-            CHECK,
-            format!("{file} has systemd feed {WATCHDOG}, which only one program can do"),
-            format!("sudo nano {file}: RuntimeWatchdogSec=off, and reboot"),
-        ),
+    vec![match watchdog_of_systemd(computer, systemctl) {
+        Some(taken) => Finding::of(CHECK, Level::Error, taken),
         None => Finding::ok(CHECK, format!("{WATCHDOG} is there")),
     }]
 }
@@ -312,7 +305,7 @@ mod tests {
     #[test]
     fn a_watchdog_that_is_fed() {
         let tree = Tree::new();
-        let look = || watchdog(&tree.computer(), &instances(&tree.computer()).0);
+        let look = || watchdog(&tree.computer(), &instances(&tree.computer()).0, None);
         told(&look(), "watchdog_device", Ok, "there is none");
         tree.put("etc/pinion/pinion.toml", "watchdog = true\n");
         told(&look(), "watchdog_device", Error, "there is no /dev/watchdog");
@@ -324,7 +317,8 @@ mod tests {
         tree.put("etc/systemd/system.conf", "#RuntimeWatchdogSec=20\n");
         told(&look(), "watchdog_device", Ok, "is there");
         tree.put("etc/systemd/system.conf.d/a.conf", "[Manager]\nRuntimeWatchdogSec=20\n");
-        told(&look(), "watchdog_device", Error, "/etc/systemd/system.conf.d/a.conf");
+        let remedy = told(&look(), "watchdog_device", Error, "/etc/systemd/system.conf.d/a.conf");
+        assert!(remedy.contains("/etc/systemd/system.conf.d/a.pinion.conf"), "{remedy}");
         for unit in ["pinion-mcu", "pinion-mcu@b"] {
             tree.link(&format!("etc/systemd/system/multi-user.target.wants/{unit}.service"), "x");
         }

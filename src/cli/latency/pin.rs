@@ -8,7 +8,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use pinion_firmware::board::{Bias, Board, Direction, Line, Pin};
-use pinion_linux::gpio::FastGpio;
+use pinion_linux::gpio::{Chip, FastGpio};
 use pinion_linux::pins::{Names, line_number};
 use pinion_linux::sysfs::Sysfs;
 use pinion_linux::{Inventory, LinuxBoard};
@@ -74,14 +74,15 @@ fn find(name: &str) -> Result<Pin, String> {
     let (names, sysfs) = (Names::of(&inventory), Sysfs::scan(Path::new("/")));
     let lines =
         inventory.chips.iter().flat_map(|chip| (0..).zip(&chip.lines).map(move |(offset, line)| (chip, offset, line)));
-    let is_it = |number: u32, chip: u32, offset: u32| {
+    let is_it = |number: u32, chip: &Chip, offset: u32| {
         names.of_pin(number).contains(&name)
-            || name == format!("gpiochip{chip}/gpio{offset}")
-            || chip == 0 && name == format!("gpio{offset}")
+            || name == format!("gpiochip{}/gpio{offset}", chip.number)
+            || chip.number == 0 && name == format!("gpio{offset}")
+            || inventory.former_names(chip, offset).iter().any(|former| former == name)
     };
     let found = lines.filter_map(|(chip, offset, line)| Some((line_number(chip.number, offset)?, chip, offset, line)));
     let Some((number, chip, offset, line)) =
-        found.into_iter().find(|(number, chip, offset, _)| is_it(*number, chip.number, *offset))
+        found.into_iter().find(|(number, chip, offset, _)| is_it(*number, chip, *offset))
     else {
         return Err(format!("there is no line {name}: choose a free one (pinion pins --free lists them)"));
     };

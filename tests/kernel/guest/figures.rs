@@ -131,6 +131,9 @@ impl Session {
         config.add(format!("config_spi_without_cs oid={spi_oid}"));
         config.add(format!("spi_set_bus oid={spi_oid} spi_bus=spidev0.0 mode=0 rate=4000000"));
         config.apply(&mut client).expect("a configuration that it takes");
+        if registers.is_some() {
+            program.wait_for_line(&["lines are written and read through /dev/gpiomem"]);
+        }
         let log = if is_pinion() { program.log() } else { String::new() };
         assert_eq!(log.contains("lines are written and read through /dev/gpiomem"), registers.is_some(), "{log}");
         assert!(!log.contains("through the kernel, not through registers: line"), "{log}");

@@ -12,9 +12,14 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::str::FromStr;
 
+use super::apt::Apt;
 use super::cache::Cache;
 use super::initramfs::Archive;
 use super::{process, tools};
+
+/// The kernels come from this release of Debian on every computer. The mocks are written for its kernel, and figures of two
+/// computers can be compared.
+const RELEASE: &str = "bookworm";
 
 /// Debian's kernels on which Pinion runs.
 #[derive(Clone, Copy, PartialEq, Eq)]
@@ -166,7 +171,7 @@ impl Kernel {
         let folder = of_version.join(format!("{}-{:016x}", flavour.name(), key(&sources)?));
         if !folder.exists() {
             eprintln!("building Linux {release}, version {version}");
-            build(&release, &of_version.join("tree"), &sources, &folder)?;
+            build(&offers.apt, &release, &of_version.join("tree"), &sources, &folder)?;
             remove_others(cache.root(), "linux-", &of_version)?;
             remove_others(&of_version, &format!("{}-", flavour.name()), &folder)?;
         }
@@ -174,20 +179,23 @@ impl Kernel {
     }
 }
 
-/// The newest kernels in apt.
+/// The newest kernels of Debian 12.
 pub struct Offers {
+    apt: Apt,
     packages: Vec<Fields>,
 }
 
 impl Offers {
-    /// Queries apt's kernels.
-    pub fn ask() -> Result<Offers, String> {
-        let names = Flavour::ALL.map(Flavour::package);
-        let packages = Fields::of(&names).or_else(|_| {
-            tools::update_package_lists()?;
-            Fields::of(&names)
-        })?;
-        Ok(Offers { packages })
+    /// Asks apt for them. The caller has the cache's lock.
+    pub fn ask(cache: &Cache) -> Result<Offers, String> {
+        let apt = Apt::open(&cache.root().join("apt"), "amd64", Some(RELEASE))?;
+        let packages = Fields::of(&apt, &Flavour::ALL.map(Flavour::package))?;
+        Ok(Offers { apt, packages })
+    }
+
+    /// Debian 12's archives, as a sources.list.
+    pub fn sources(&self) -> PathBuf {
+        self.apt.sources()
     }
 
     fn newest(&self, flavour: Flavour) -> Result<&Fields, String> {
@@ -209,9 +217,9 @@ struct Packages {
 }
 
 impl Packages {
-    fn of(release: &str) -> Result<Packages, String> {
+    fn of(apt: &Apt, release: &str) -> Result<Packages, String> {
         let headers = format!("linux-headers-{release}");
-        let fields = Fields::of(&[&headers])?.pop().ok_or_else(|| format!("apt offers no {headers}"))?;
+        let fields = Fields::of(apt, &[&headers])?.pop().ok_or_else(|| format!("apt offers no {headers}"))?;
         let kbuild = fields.dependency("linux-kbuild-")?;
         // linux-compiler-gcc-12-x86 means gcc-12.
         let compiler = fields.dependency("linux-compiler-")?;
@@ -231,8 +239,8 @@ impl Packages {
 struct Fields(String);
 
 impl Fields {
-    fn of(packages: &[&str]) -> Result<Vec<Fields>, String> {
-        let mut show = Command::new("apt-cache");
+    fn of(apt: &Apt, packages: &[&str]) -> Result<Vec<Fields>, String> {
+        let mut show = apt.command("apt-cache");
         show.args(["show", "--no-all-versions"]).args(packages);
         let text =
             process::output(&mut show).map_err(|cause| format!("apt offers no {}: {cause}", packages.join(" or ")))?;
@@ -271,17 +279,30 @@ fn key(sources: &Path) -> Result<u64, String> {
     Ok(hasher.finish())
 }
 
-fn build(release: &str, tree: &Path, sources: &Path, folder: &Path) -> Result<(), String> {
-    let packages = Packages::of(release)?;
+fn build(apt: &Apt, release: &str, tree: &Path, sources: &Path, folder: &Path) -> Result<(), String> {
+    let packages = Packages::of(apt, release)?;
     tools::install(&[(&packages.compiler, &packages.compiler)])?;
-    unpack(&packages, tree)?;
+    unpack(apt, &packages, tree)?;
 
     let partial = folder.with_extension("partial");
-    let modules = partial.join("modules");
     remove(&partial)?;
+    create(&partial)?;
+    // The kernel's makefiles refuse a path with a space or a colon.
+    let elsewhere = match path_str(tree)?.contains([' ', ':']) {
+        true => {
+            Some(tempfile::tempdir_in("/var/tmp").map_err(|error| describe("write", Path::new("/var/tmp"), &error))?)
+        }
+        false => None,
+    };
+    let (headers, modules) = match &elsewhere {
+        Some(elsewhere) => {
+            process::run(Command::new("cp").arg("-a").arg(tree.join("usr")).arg(elsewhere.path()))?;
+            (elsewhere.path().join("usr/src"), elsewhere.path().join("modules"))
+        }
+        None => (tree.join("usr/src"), partial.join("modules")),
+    };
     copy_files(sources, &modules)?;
     copy_files(&tree.join("upstream"), &modules.join("upstream"))?;
-    let headers = tree.join("usr/src");
     process::run(
         Command::new("make")
             .arg("-C")
@@ -302,7 +323,7 @@ fn build(release: &str, tree: &Path, sources: &Path, folder: &Path) -> Result<()
 }
 
 /// Downloads and unpacks the parts that the tree lacks. Flavors share most parts.
-fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
+fn unpack(apt: &Apt, packages: &Packages, tree: &Path) -> Result<(), String> {
     let stamps = tree.join("unpacked");
     let archives = tree.join("archives");
     create(&stamps)?;
@@ -329,14 +350,14 @@ fn unpack(packages: &Packages, tree: &Path) -> Result<(), String> {
     }
     let download = || {
         process::run(
-            Command::new("apt-get")
+            apt.command("apt-get")
                 .args(["download", "-qq"])
                 .args(missing.iter().map(|(package, _)| package))
                 .current_dir(&archives),
         )
     };
     // The archives drop a version soon after a newer one is published.
-    download().or_else(|_| tools::update_package_lists().and_then(|()| download()))?;
+    download().or_else(|_| apt.update().and_then(|()| download()))?;
 
     for (package, parts) in missing {
         let archive = files(&archives)?

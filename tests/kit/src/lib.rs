@@ -2,16 +2,19 @@
 //! The code that several test suites share.
 //!
 //! - [`arguments`]: the command line of a suite
-//! - [`cache`], [`tools`], [`process`]: the folder for a suite's downloads, and the programs that it runs
+//! - [`cache`], [`apt`], [`tools`], [`process`]: the folder for a suite's downloads, and the programs that it runs
+//! - [`here`]: whether this computer lets a test run
 //! - [`kernel`], [`initramfs`]: the boot files of a virtual machine
 //! - [`browser`]: a page as a person sees it
 //! - [`markdown`]: the pages for users, and the blocks in them
 
 #![forbid(unsafe_code)]
 
+pub mod apt;
 pub mod arguments;
 pub mod browser;
 pub mod cache;
+pub mod here;
 pub mod initramfs;
 pub mod kernel;
 pub mod markdown;

@@ -16,8 +16,13 @@ pub fn run(command: &mut Command) -> Result<(), String> {
     finished(command).map(drop)
 }
 
+/// The program writes in no language but English, as its output may be read.
 fn finished(command: &mut Command) -> Result<Output, String> {
-    let output = command.stdin(Stdio::null()).output().map_err(|error| format!("cannot run {command:?}: {error}"))?;
+    let output = command
+        .env("LC_ALL", "C.UTF-8")
+        .stdin(Stdio::null())
+        .output()
+        .map_err(|error| format!("cannot run {command:?}: {error}"))?;
     if output.status.success() {
         return Ok(output);
     }

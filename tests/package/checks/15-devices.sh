@@ -19,7 +19,8 @@ gpasswd -d klippy gpio
 # A chip that is plugged in later.
 chips later
 until_true 5 test -c /dev/gpiochip1
-until_true 5 [ "$(owner /dev/gpiochip1)" = "gpio 660" ]
+udevadm settle
+is "$(owner /dev/gpiochip1)" "gpio 660" gpiochip1
 echo 0 >/sys/kernel/config/gpio-sim/later/live
 udevadm test --action=add /sys/class/misc/watchdog 2>&1 | grep -i 'pinion-mcu.rules'
 if udevadm test --action=add /sys/class/misc/watchdog 2>&1 | grep -i 'pinion-mcu.rules.*\(invalid\|unknown\|error\)'; then false; fi

@@ -10,6 +10,8 @@ use nix::sys::signal::{Signal, kill};
 use nix::unistd::Pid;
 use pinion_client::Client;
 
+use super::gpio::until;
+
 /// The link to its terminal.
 pub const LINK: &str = "/tmp/tty";
 const LOG: &str = "/tmp/log";
@@ -64,8 +66,14 @@ impl Pinion {
         Pinion(child.expect("pinion on the path"))
     }
 
-    pub fn log(&self) -> String {
-        fs::read_to_string(LOG).expect("the log")
+    /// Waits until a line of the log contains this, and returns the line. A thread of its own writes the log.
+    pub fn wait_for_line(&self, part: &str) -> String {
+        let find = || {
+            let log = fs::read_to_string(LOG).expect("the log");
+            log.lines().find(|line| line.contains(part)).map(str::to_owned)
+        };
+        until(part, || find().is_some());
+        find().expect("a line that was there")
     }
 
     pub fn signal(&self, signal: Signal) {

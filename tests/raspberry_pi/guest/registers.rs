@@ -35,8 +35,7 @@ fn printed(words: &[&str]) -> String {
 fn the_log_and_the_status_say_which_lines_are_fast() {
     let pinion = Pinion::start(Way::Registers);
     configure(&pinion);
-    let log = pinion.log();
-    assert!(log.contains("gpiochip0: lines are written and read through /dev/mem"), "{log}");
+    pinion.wait_for_line("gpiochip0: lines are written and read through /dev/mem");
     let status = printed(&["status", "-I", LINK]);
     assert!(status.lines().any(|line| line.contains("gpio22") && line.ends_with("fast")), "{status}");
 }
@@ -46,8 +45,7 @@ fn without_the_node_lines_go_through_the_kernel_and_the_log_says_why() {
     for (wish, level) in [("auto", "INFO"), ("on", "WARN")] {
         let pinion = Pinion::with(wish);
         configure(&pinion);
-        let log = pinion.log();
-        let line = log.lines().find(|line| line.contains("gpiochip0: lines are written through the kernel")).unwrap();
+        let line = pinion.wait_for_line("gpiochip0: lines are written through the kernel");
         assert!(line.contains("/dev/gpiomem: No such file or directory"), "{line}");
         assert!(line.ends_with("only Raspberry Pi's own kernel has this node: install it"), "{line}");
         assert!(line.contains(level), "{line}");

@@ -20,6 +20,13 @@ const SLEEPING_BUSES: [&str; 7] = ["i2c", "spi", "usb", "hid", "serial", "virtio
 /// asks the firmware (drivers/gpio/gpio-raspberrypi-exp.c, `can_sleep`).
 const SLEEPING_LABELS: [&str; 1] = ["raspberrypi-exp-gpio"];
 
+/// Labels of the chips with the 40-pin header of a Raspberry Pi: up to the 3, of the 4, and of the 5.
+const HEADERS: [&str; 3] = ["pinctrl-bcm2835", "pinctrl-bcm2711", RP1];
+const RP1: &str = "pinctrl-rp1";
+/// The numbers that kernels have given the header's chip. Only an RP1 was ever number 4. Linux 6.12.96 of Raspberry Pi OS
+/// gives it none of them.
+const HEADER_NUMBERS: [u32; 2] = [0, 4];
+
 /// A GPIO chip as it was found.
 #[derive(Clone, Debug)]
 pub struct Chip {
@@ -34,6 +41,16 @@ pub struct Chip {
 }
 
 impl Chip {
+    /// Whether it has the 40-pin header of a Raspberry Pi.
+    pub(crate) fn is_header(&self) -> bool {
+        HEADERS.contains(&self.label.as_str())
+    }
+
+    /// Whether some kernel gives this chip of the header this number.
+    pub(crate) fn may_have_been(&self, number: u32) -> bool {
+        number == 0 || self.label == RP1 && HEADER_NUMBERS.contains(&number)
+    }
+
     /// The registers of this chip, mapped as the program would do it.
     ///
     /// # Errors
@@ -82,6 +99,11 @@ pub(crate) fn scan(dev: &Path, devices: &Path) -> (Vec<Chip>, Vec<Trouble>) {
         chips.push(Chip { number, label: chip.label().to_owned(), sleeps, lines });
     }
     (chips, problems)
+}
+
+/// The numbers of a Raspberry Pi's header that no chip has, and no link in `dev`.
+pub(crate) fn vacant(dev: &Path) -> Vec<u32> {
+    HEADER_NUMBERS.into_iter().filter(|number| !node(dev, *number).exists()).collect()
 }
 
 /// Says that a chip is missing, and lists those that exist.

@@ -127,7 +127,7 @@ pub fn is_before(release: &str, version: (u32, u32)) -> bool {
 pub(super) fn cannot_open(path: &Path, code: i32) -> Trouble {
     let shown = path.display();
     match code {
-        libc::EACCES | libc::EPERM => not_permitted(path),
+        libc::EACCES | libc::EPERM => not_permitted(path, code),
         libc::ENOTTY => {
             Trouble::new(format!("{shown} is not a GPIO chip")).remedy("remove it and let the kernel make the node")
         }
@@ -135,9 +135,12 @@ pub(super) fn cannot_open(path: &Path, code: i32) -> Trouble {
     }
 }
 
-/// The owner of a device node, and how to get permission to open it.
-pub(crate) fn not_permitted(path: &Path) -> Trouble {
-    forbidden(path, &Opener::of(path))
+/// Who forbids to open a device node, and how to get permission. `code` is the error number, EACCES or EPERM.
+pub(crate) fn not_permitted(path: &Path, code: i32) -> Trouble {
+    match code {
+        libc::EPERM => forbidden_by_service(path, &Opener::of(path)),
+        _ => forbidden(path, &Opener::of(path)),
+    }
 }
 
 /// The user that opens a file, and the group whose members may open it, if there is one.
@@ -179,6 +182,16 @@ fn forbidden(path: &Path, opener: &Opener) -> Trouble {
              Pinion as root",
         ),
     }
+}
+
+/// The owner and the mode let the user in, and the device filter of the service's control group does not. systemd makes
+/// this filter when it starts the service, from the drivers that it finds then.
+fn forbidden_by_service(path: &Path, opener: &Opener) -> Trouble {
+    let (path, who) = (path.display(), &opener.who);
+    Trouble::new(format!("{who} may not open {path}, which the service's DeviceAllow= leaves out")).remedy(format!(
+        "restart the service, because its driver may have come later; if that does not help, add [Service] and \
+         DeviceAllow={path} rw with \"sudo systemctl edit\""
+    ))
 }
 
 /// The error number of a call that has just failed.
@@ -267,6 +280,19 @@ mod tests {
              anew and start Pinion again"
         );
         assert!(text(None).contains("udev"));
+    }
+
+    /// No group helps there.
+    #[test]
+    fn a_node_that_the_service_forbids_is_not_a_matter_of_groups() {
+        let text = |code| not_permitted(Path::new("/dev/spidev0.0"), code).to_string();
+        assert!(text(libc::EACCES).contains("udev"));
+        let forbidden = text(libc::EPERM);
+        assert!(
+            forbidden.contains("may not open /dev/spidev0.0, which the service's DeviceAllow= leaves out: restart")
+        );
+        assert!(forbidden.ends_with("DeviceAllow=/dev/spidev0.0 rw with \"sudo systemctl edit\""), "{forbidden}");
+        assert!(!forbidden.contains("usermod") && !forbidden.contains("udev"), "{forbidden}");
     }
 
     #[test]

@@ -398,9 +398,8 @@ fn may_sleep(aspm_policy: &Path) -> Trouble {
 fn refused(node: &Path, wish: FastGpio, error: &io::Error) -> Trouble {
     let remedy = match (wish, error.raw_os_error()) {
         (FastGpio::DevMem, _) => "run Pinion as root, on a kernel with iomem=relaxed on its command line",
-        (_, Some(libc::EACCES)) => return not_permitted(node),
+        (_, Some(code @ (libc::EACCES | libc::EPERM))) => return not_permitted(node, code),
         (_, Some(libc::ENOENT)) => "only Raspberry Pi's own kernel has this node: install it",
-        (_, Some(libc::EPERM)) => "add DeviceAllow=char-gpiomem rw to the service",
         _ => LOOK_AT_LOG,
     };
     Trouble::new(error.to_string()).of(node.display()).remedy(remedy)
@@ -868,6 +867,10 @@ mod tests {
             (PI4, Some(Layout::Bcm2835)),
             (PI5, Some(Layout::Rp1)),
             ("brcm,bcm7445-gpio\0brcm,brcmstb-gpio\0", None),
+            ("brcm,bcm2711-gpio\0", Some(Layout::Bcm2835)),
+            ("raspberrypi,firmware-gpio\0", None),
+            ("allwinner,sun50i-h616-pinctrl\0", None),
+            ("rockchip,gpio-bank\0", None),
             ("brcm,bcm2835-gpio-and-more\0", None),
             ("", None),
         ] {
@@ -901,7 +904,7 @@ mod tests {
         let denied =
             |code, wish| refused(Path::new("/dev/gpiomem"), wish, &io::Error::from_raw_os_error(code)).to_string();
         assert!(denied(libc::EACCES, FastGpio::Auto).contains(" may not open /dev/gpiomem"));
-        assert!(denied(libc::EPERM, FastGpio::On).ends_with("add DeviceAllow=char-gpiomem rw to the service"));
+        assert!(denied(libc::EPERM, FastGpio::On).contains("DeviceAllow=/dev/gpiomem rw"));
         assert!(denied(libc::EPERM, FastGpio::DevMem).contains("run Pinion as root"));
     }
 

@@ -106,6 +106,7 @@ fn a_fan_of_20_000_rpm_is_measured() {
     for pair in told[1..].windows(2) {
         let (count, ticks) = (pair[1].0 - pair[0].0, pair[1].1 - pair[0].1);
         let rpm = f64::from(count) / 4.0 * 60.0 * 50e6 / f64::from(ticks);
+        println!("{rpm:.0} rpm");
         // As exact as the test's own sleep.
         assert!((rpm - 20_000.0).abs() < 400.0, "{rpm}: {told:?}");
     }
@@ -134,6 +135,7 @@ fn glitches_are_not_counted_and_pulses_are_exactly() {
         }
     }
     thread::sleep(Duration::from_millis(80));
+    println!("the longest glitch takes {longest:?}");
     assert!(longest < Duration::from_millis(50), "{longest:?} is no glitch");
     assert_eq!(settled(client).0 - before, 5);
 }

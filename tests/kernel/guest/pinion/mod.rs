@@ -22,6 +22,7 @@ mod neopixel;
 mod pca9685;
 mod pins;
 mod power;
+mod renumbered;
 mod safe_state;
 mod serial;
 mod spi;

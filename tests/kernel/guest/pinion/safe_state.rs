@@ -5,7 +5,7 @@ use std::fs;
 use std::os::fd::OwnedFd;
 use std::os::unix::net::UnixStream;
 use std::path::Path;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use nix::fcntl::OFlag;
 use nix::pty::{grantpt, posix_openpt, ptsname_r, unlockpt};
@@ -61,9 +61,11 @@ fn a_host_that_says_nothing_any_more_or_is_gone() {
     };
     for host in [silent, &drop] {
         let mut client = program.connect();
+        let began = Instant::now();
         outputs.switch_on(&mut client, 500);
         let trace = Trace::start();
         outputs.wait_until_on();
+        println!("all on after {:?}", began.elapsed());
         host(client);
         outputs.assert_safe(&trace);
     }

@@ -21,8 +21,9 @@ fn spin(rounds: u32) -> Duration {
 
 #[test]
 fn the_clock_counts_instructions() {
-    spin(1000);
-    let (once, tenfold) = (spin(100_000), spin(1_000_000));
+    // The least of several: an interruption lengthens a measurement.
+    let least = |rounds| (0..5).map(|_| spin(rounds)).min().expect("five measurements");
+    let (once, tenfold) = (least(100_000), least(1_000_000));
     println!("100,000 rounds {once:?}, 1,000,000 rounds {tenfold:?}");
     let ratio = tenfold.as_secs_f64() / once.as_secs_f64();
     assert!((9.5..10.5).contains(&ratio), "time is not that of instructions: {ratio}");

@@ -1,0 +1,241 @@
+// SPDX-License-Identifier: GPL-3.0-or-later
+//! For tests: boards that people own, as folders of a computer and as what Pinion finds there.
+//!
+//! Models and names of lines are those of the device trees in Debian 13 (Linux 6.12.107), in its backports (7.3.4), and in
+//! Raspberry Pi OS. The drivers choose labels, numbers of lines, and the order of the chips.
+
+use std::fs;
+
+use pinion_linux::Inventory;
+use pinion_linux::gpio::{Chip, LineInfo};
+
+use super::computer::tests::Tree;
+
+/// A GPIO chip of a board.
+struct BoardChip {
+    number: u32,
+    label: &'static str,
+    /// Its device below /sys/devices/platform.
+    device: &'static str,
+    line_count: usize,
+    /// The names of its first lines.
+    names: Vec<&'static str>,
+}
+
+/// A board.
+pub(super) struct Board {
+    model: &'static str,
+    chips: Vec<BoardChip>,
+    /// Links and nodes in /dev besides its chips. A link has its target behind an arrow.
+    dev: &'static [&'static str],
+    /// Its PWM chips, with their devices and numbers of channels.
+    pwm: &'static [(u32, &'static str, u32)],
+}
+
+impl Board {
+    /// The files by which Linux describes the board.
+    pub(super) fn tree(&self) -> Tree {
+        let tree = Tree::new();
+        tree.put("proc/device-tree/model", &format!("{}\0", self.model));
+        for chip in &self.chips {
+            let (number, device) = (chip.number, format!("sys/devices/platform/{}", chip.device));
+            tree.put(&format!("dev/gpiochip{number}"), "");
+            if !chip.names.is_empty() {
+                tree.put(&format!("{device}/of_node/gpio-line-names"), &(chip.names.join("\0") + "\0"));
+            }
+            tree.put(&format!("{device}/gpiochip{number}/dev"), &format!("254:{number}\n"));
+            let link = format!("sys/bus/gpio/devices/gpiochip{number}");
+            tree.link(&link, &format!("../../../devices/platform/{}/gpiochip{number}", chip.device));
+        }
+        for node in self.dev {
+            match node.split_once(" -> ") {
+                Some((link, target)) => tree.link(&format!("dev/{link}"), target),
+                None => tree.put(&format!("dev/{node}"), ""),
+            }
+        }
+        for (number, device, channels) in self.pwm {
+            let chip = format!("sys/class/pwm/pwmchip{number}");
+            tree.put(&format!("{chip}/npwm"), &format!("{channels}\n"));
+            tree.put(&format!("{chip}/export"), "");
+            tree.link(&format!("{chip}/device"), &format!("../../../{device}"));
+        }
+        tree
+    }
+
+    /// What Pinion finds there. Only the kernel tells a chip's label and number of lines, so they are not read.
+    pub(super) fn inventory(&self, tree: &Tree) -> Inventory {
+        let computer = tree.computer();
+        let chip = |chip: &BoardChip| {
+            let property =
+                computer.path(format!("/sys/bus/gpio/devices/gpiochip{}/../of_node/gpio-line-names", chip.number));
+            let names = fs::read_to_string(property).unwrap_or_default();
+            let names = names.split('\0').map(|name| (!name.is_empty()).then(|| name.to_owned()));
+            let lines = names.chain(std::iter::repeat(None)).take(chip.line_count);
+            let lines = lines.map(|name| LineInfo { name, ..LineInfo::default() }).collect();
+            Chip { number: chip.number, label: chip.label.into(), sleeps: chip.label == EXPANDER, lines }
+        };
+        Inventory::around(&computer.path("/"), self.chips.iter().map(chip).collect())
+    }
+}
+
+/// The chip that the firmware of a Raspberry Pi drives.
+const EXPANDER: &str = "raspberrypi-exp-gpio";
+
+fn named(names: &'static str) -> Vec<&'static str> {
+    names.split(' ').collect()
+}
+
+/// A Raspberry Pi 4 with Debian.
+pub(super) fn pi4() -> Board {
+    let names = "ID_SDA ID_SCL SDA1 SCL1 GPIO_GCLK GPIO5 GPIO6 SPI_CE1_N SPI_CE0_N SPI_MISO SPI_MOSI SPI_SCLK GPIO12 \
+                 GPIO13 TXD1 RXD1 GPIO16 GPIO17 GPIO18 GPIO19 GPIO20 GPIO21 GPIO22 GPIO23 GPIO24 GPIO25 GPIO26 GPIO27 \
+                 RGMII_MDIO RGMIO_MDC CTS0 RTS0 TXD0 RXD0 SD1_CLK SD1_CMD SD1_DATA0 SD1_DATA1 SD1_DATA2 SD1_DATA3 \
+                 PWM0_MISO PWM1_MOSI STATUS_LED_G_CLK SPIFLASH_CE_N SDA0 SCL0 RGMII_RXCLK RGMII_RXCTL RGMII_RXD0 \
+                 RGMII_RXD1 RGMII_RXD2 RGMII_RXD3 RGMII_TXCLK RGMII_TXCTL RGMII_TXD0 RGMII_TXD1 RGMII_TXD2 RGMII_TXD3";
+    Board {
+        model: "Raspberry Pi 4 Model B",
+        chips: vec![
+            BoardChip {
+                number: 0,
+                label: "pinctrl-bcm2711",
+                device: "soc/fe200000.gpio",
+                line_count: 58,
+                names: named(names),
+            },
+            BoardChip {
+                number: 1,
+                label: EXPANDER,
+                device: "soc/soc:firmware/soc:firmware:gpio",
+                line_count: 8,
+                names: named("BT_ON WL_ON PWR_LED_OFF GLOBAL_RESET VDD_SD_IO_SEL CAM_GPIO SD_PWR_ON"),
+            },
+        ],
+        dev: &["i2c-1", "spidev0.0", "spidev0.1"],
+        pwm: &[(0, "fe20c000.pwm", 2)],
+    }
+}
+
+/// A Raspberry Pi Zero 2 with Debian.
+pub(super) fn zero2() -> Board {
+    let names = "ID_SDA ID_SCL SDA1 SCL1 GPIO_GCLK GPIO5 GPIO6 SPI_CE1_N SPI_CE0_N SPI_MISO SPI_MOSI SPI_SCLK GPIO12 \
+                 GPIO13 TXD0 RXD0 GPIO16 GPIO17 GPIO18 GPIO19 GPIO20 GPIO21 GPIO22 GPIO23 GPIO24 GPIO25 GPIO26 GPIO27 \
+                 HDMI_HPD_N STATUS_LED_N NC NC NC NC NC NC NC NC NC NC CAM_GPIO0 WL_ON BT_ON WIFI_CLK SDA0 SCL0 \
+                 SMPS_SCL SMPS_SDA SD_CLK_R SD_CMD_R SD_DATA0_R SD_DATA1_R SD_DATA2_R SD_DATA3_R";
+    Board {
+        model: "Raspberry Pi Zero 2 W",
+        chips: vec![BoardChip {
+            number: 0,
+            label: "pinctrl-bcm2835",
+            device: "soc/3f200000.gpio",
+            line_count: 54,
+            names: named(names),
+        }],
+        dev: &["i2c-1"],
+        pwm: &[(0, "3f20c000.pwm", 2)],
+    }
+}
+
+/// The chips of a Raspberry Pi 5's processor, in the kernel's order, with these numbers and line counts.
+fn brcmstb(chips: &[(u32, &'static str, &'static str, usize)]) -> Vec<BoardChip> {
+    let chip = |(number, label, device, line_count): &(u32, &'static str, &'static str, usize)| BoardChip {
+        number: *number,
+        label,
+        device,
+        line_count: *line_count,
+        names: vec![],
+    };
+    chips.iter().map(chip).collect()
+}
+
+fn rp1(number: u32, names: Vec<&'static str>) -> BoardChip {
+    BoardChip {
+        number,
+        label: "pinctrl-rp1",
+        device: "axi/1000120000.pcie/pci0002:00/0002:00:00.0/0002:01:00.0/1f000d0000.gpio",
+        line_count: 54,
+        names,
+    }
+}
+
+/// A Raspberry Pi 5 with Raspberry Pi OS since July 2026.
+pub(super) fn pi5() -> Board {
+    let names = "ID_SDA ID_SCL GPIO2 GPIO3 GPIO4 GPIO5 GPIO6 GPIO7 GPIO8 GPIO9 GPIO10 GPIO11 GPIO12 GPIO13 GPIO14 \
+                 GPIO15 GPIO16 GPIO17 GPIO18 GPIO19 GPIO20 GPIO21 GPIO22 GPIO23 GPIO24 GPIO25 GPIO26 GPIO27 \
+                 PCIE_RP1_WAKE FAN_TACH HOST_SDA HOST_SCL ETH_RST_N - CD0_IO0_MICCLK CD0_IO0_MICDAT0 \
+                 RP1_PCIE_CLKREQ_N - CD0_SDA CD0_SCL CD1_SDA CD1_SCL USB_VBUS_EN USB_OC_N RP1_STAT_LED FAN_PWM \
+                 CD1_IO0_MICCLK 2712_WAKE CD1_IO1_MICDAT1 EN_MAX_USB_CUR - - - -";
+    let mut chips = brcmstb(&[
+        (11, "gpio-brcmstb@107d508500", "soc/107d508500.gpio", 32),
+        (12, "gpio-brcmstb@107d508520", "soc/107d508500.gpio", 4),
+        (13, "gpio-brcmstb@107d517c00", "soc/107d517c00.gpio", 17),
+        (14, "gpio-brcmstb@107d517c20", "soc/107d517c00.gpio", 6),
+    ]);
+    chips.push(rp1(15, named(names)));
+    Board {
+        model: "Raspberry Pi 5 Model B Rev 1.0",
+        chips,
+        dev: &["i2c-1", "gpiomem0"],
+        pwm: &[(0, "1f00098000.pwm", 4), (1, "107d517a80.pwm", 2)],
+    }
+}
+
+/// A Raspberry Pi 5 with Debian's backports. Its kernel gives the header's lines no names.
+pub(super) fn pi5_debian() -> Board {
+    let mut chips = brcmstb(&[
+        (0, "gpio-brcmstb@107d508500", "soc@107c000000/107d508500.gpio", 32),
+        (1, "gpio-brcmstb@107d508520", "soc@107c000000/107d508500.gpio", 22),
+        (2, "gpio-brcmstb@107d517c00", "soc@107c000000/107d517c00.gpio", 17),
+        (3, "gpio-brcmstb@107d517c20", "soc@107c000000/107d517c00.gpio", 6),
+    ]);
+    chips.push(rp1(4, vec![]));
+    Board { model: "Raspberry Pi 5 Model B Rev 1.0", chips, dev: &[], pwm: &[] }
+}
+
+/// A Raspberry Pi 5 with Debian 13. Its kernel has no driver for the header.
+pub(super) fn pi5_without_header() -> Board {
+    let chips = brcmstb(&[
+        (0, "gpio-brcmstb@107d517c00", "soc@107c000000/107d517c00.gpio", 17),
+        (1, "gpio-brcmstb@107d517c20", "soc@107c000000/107d517c00.gpio", 6),
+    ]);
+    Board { model: "Raspberry Pi 5 Model B Rev 1.0", chips, dev: &[], pwm: &[] }
+}
+
+/// A BigTreeTech CB1 (Allwinner H616) with Debian. No line has a name.
+pub(super) fn cb1() -> Board {
+    let chip = |number, label, device, line_count| BoardChip { number, label, device, line_count, names: vec![] };
+    Board {
+        model: "BigTreeTech CB1",
+        chips: vec![
+            chip(0, "300b000.pinctrl", "soc/300b000.pinctrl", 288),
+            chip(1, "7022000.pinctrl", "soc/7022000.pinctrl", 32),
+        ],
+        dev: &["i2c-0", "spidev1.0"],
+        pwm: &[],
+    }
+}
+
+/// A Radxa ZERO 3W (Rockchip RK3566) with Debian. The names of its lines are not for klippy: they have a space.
+pub(super) fn rk3566() -> Board {
+    let chip = |number, label, device, names: &[(usize, &'static str)]| {
+        let mut all = vec![""; 32];
+        names.iter().for_each(|(line, name)| all[*line] = name);
+        BoardChip { number, label, device, line_count: 32, names: all }
+    };
+    Board {
+        model: "Radxa ZERO 3W",
+        chips: vec![
+            chip(0, "gpio0", "pinctrl/fdd60000.gpio", &[(24, "pin-10 [GPIO0_D0]"), (25, "pin-08 [GPIO0_D1]")]),
+            chip(1, "gpio1", "pinctrl/fe740000.gpio", &[(0, "pin-03 [GPIO1_A0]"), (4, "pin-37 [GPIO1_A4]")]),
+            chip(2, "gpio2", "pinctrl/fe750000.gpio", &[]),
+            chip(3, "gpio3", "pinctrl/fe760000.gpio", &[(1, "pin-11 [GPIO3_A1]"), (17, "pin-22 [GPIO3_C1]")]),
+            chip(4, "gpio4", "pinctrl/fe770000.gpio", &[(10, "pin-27 [GPIO4_B2]"), (18, "pin-23 [GPIO4_C2]")]),
+        ],
+        dev: &["i2c-3"],
+        pwm: &[(0, "fe700000.pwm", 1)],
+    }
+}
+
+/// All of them.
+pub(super) fn all() -> Vec<Board> {
+    vec![pi4(), zero2(), pi5(), pi5_debian(), pi5_without_header(), cb1(), rk3566()]
+}
