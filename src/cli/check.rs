@@ -89,7 +89,8 @@ fn fast_gpio(wish: FastGpio, chips: &[Chip]) -> Vec<Finding> {
         (FastGpio::Off, _) | (FastGpio::Auto, Err(_)) => None,
         (_, Ok(registers)) => {
             let node = registers.node();
-            Some(Finding::ok("fast_gpio", format!("gpiochip{}: fast lines, through {node}, for LEDs too", chip.number)))
+            let leds = if registers.is_posted() { "but not for LEDs" } else { "for LEDs too" };
+            Some(Finding::ok("fast_gpio", format!("gpiochip{}: fast lines, through {node}, {leds}", chip.number)))
         }
         (_, Err(why)) => {
             Some(Finding::of("fast_gpio", Level::Warning, why.of(format_args!("gpiochip{}", chip.number))))

@@ -75,6 +75,28 @@ pub trait TimeSource: Send + Sync {
         }
     }
 
+    /// How far apart two successive values of the clock are, in nanoseconds, before they are rounded down to ticks.
+    fn step_ns(&self) -> u32 {
+        1
+    }
+
+    /// The span to measure for work that must last at least `ns`. A measured span may be longer than the real one, by a
+    /// step of the clock and a part of a tick.
+    fn at_least(&self, ns: u32) -> Ticks {
+        Ticks((ns + self.span_error_ns()).div_ceil(NS_PER_TICK as u32))
+    }
+
+    /// The longest measured span of work that may last `ns` at most. A measured span may be shorter than the real one,
+    /// by as much.
+    fn at_most(&self, ns: u32) -> Ticks {
+        Ticks(ns.saturating_sub(self.span_error_ns()) / NS_PER_TICK as u32)
+    }
+
+    /// Largest difference between a measured span and the real one, in nanoseconds.
+    fn span_error_ns(&self) -> u32 {
+        NS_PER_TICK as u32 - 1 + self.step_ns()
+    }
+
     /// When the first tick of the kernel after this instant begins. It interrupts all processors at once. `None` if
     /// nothing is known of it.
     fn tick_after(&self, at: Clock) -> Option<Clock> {

@@ -3,7 +3,9 @@
 
 #![forbid(unsafe_code)]
 
+use std::collections::BTreeSet;
 use std::io;
+use std::mem;
 use std::sync::OnceLock;
 use std::thread;
 use std::time::Duration;
@@ -49,6 +51,11 @@ impl TimeSource for Monotonic {
         Duration::from_secs(self.origin_s) + Duration::from_nanos(clock.ticks() * NS_PER_TICK)
     }
 
+    fn step_ns(&self) -> u32 {
+        static STEP_NS: OnceLock<u32> = OnceLock::new();
+        *STEP_NS.get_or_init(|| step_of((0..10_000).map(|_| monotonic().as_nanos() as u64)))
+    }
+
     fn tick_after(&self, at: Clock) -> Option<Clock> {
         Some(self.instant_of(TICK.get()?.after(self.duration_of(at))))
     }
@@ -68,6 +75,26 @@ pub fn watch_tick() -> io::Result<thread::JoinHandle<()>> {
             let _ = TICK.set(tick);
         }
     })
+}
+
+/// The step of a clock that was read at once after each reading. All spans between readings are multiples of the step,
+/// rounded to nanoseconds. So the smallest difference of two spans is the step, or a multiple if all readings took
+/// equally long.
+fn step_of(mut readings_ns: impl Iterator<Item = u64>) -> u32 {
+    /// An interruption takes longer.
+    const LONGEST_NS: u64 = 10_000;
+    let mut last = readings_ns.next().unwrap_or_default();
+    let mut spans = BTreeSet::from([0]);
+    spans.extend(readings_ns.map(|at| at - mem::replace(&mut last, at)).filter(|span| *span < LONGEST_NS));
+    // A multiple is rounded to one of two values. Three in a row are those of a step below that.
+    let is_fine = spans.iter().any(|span| *span > 0 && spans.contains(&(span + 1)) && spans.contains(&(span + 2)));
+    let gaps = spans.iter().zip(spans.iter().skip(1)).map(|(from, to)| to - from).filter(|gap| *gap > 1);
+    match gaps.min() {
+        _ if is_fine => 2,
+        // Both ends may be rounded.
+        Some(gap) => gap as u32 + 2,
+        None => LONGEST_NS as u32,
+    }
 }
 
 /// CLOCK_MONOTONIC as the time since the kernel's start.
@@ -201,6 +228,36 @@ mod tests {
         assert!((next.since(at) - every).abs() <= 1, "{at:?} {next:?}");
         let now = clock.now();
         assert!((1..=every + 1).contains(&clock.tick_after(now).unwrap().since(now)));
+    }
+
+    /// What a clock of this frequency shows, if readings take these times.
+    fn shown(hz: u64, takes_ns: &[u64]) -> impl Iterator<Item = u64> {
+        let takes_ns: Vec<u64> = (0..100).flat_map(|_| takes_ns.to_vec()).collect();
+        let mut at_ns = 0;
+        takes_ns.into_iter().map(move |takes| {
+            at_ns += takes;
+            let cycles = u128::from(at_ns) * u128::from(hz) / 1_000_000_000;
+            (cycles * 1_000_000_000 / u128::from(hz)) as u64
+        })
+    }
+
+    #[test]
+    fn the_step_of_a_clock_is_measured() {
+        // A Raspberry Pi 2 or 3, whatever a reading takes.
+        for takes_ns in [&[70][..], &[40], &[70, 71, 90, 4000], &[230, 240, 90_000]] {
+            let step = step_of(shown(19_200_000, takes_ns));
+            assert!((53..=55).contains(&step), "{takes_ns:?}: {step}");
+        }
+        // A Raspberry Pi 4 or 5.
+        let step = step_of(shown(54_000_000, &[40, 45, 60]));
+        assert!((19..=21).contains(&step), "{step}");
+        // A PC's TSC, and one of its slow timers.
+        assert_eq!(step_of(shown(3_000_000_000, &[20, 21, 22, 23, 30])), 2);
+        let step = step_of(shown(3_579_545, &[1100, 1300]));
+        assert!((280..=283).contains(&step), "{step}");
+        assert_eq!(step_of([5; 1000].into_iter()), 10_000, "it stands still");
+        assert_eq!(step_of([].into_iter()), 10_000);
+        assert!(Monotonic::start().step_ns() >= 2);
     }
 
     #[test]

@@ -34,7 +34,7 @@ pub(super) use refusal::not_permitted;
 pub use refusal::{BIAS_SINCE, EDGES_SINCE, Opener, is_before};
 use refusal::{Subject, cannot_open, errno};
 pub(super) use registers::FastChips;
-pub use registers::{ChipRegisters, FastGpio};
+pub use registers::{ChipRegisters, FastGpio, LINK_REMEDY, never_sleeps};
 use registers::{LineRegisters, RegisterBank};
 
 /// The name that the kernel shows as the consumer of our lines.
@@ -274,6 +274,16 @@ impl Line for HeldLine {
 
     fn is_fast(&self) -> bool {
         self.registers(self.flags.load(Ordering::Relaxed)).is_some()
+    }
+
+    fn flush(&self) {
+        if let Some(registers) = self.registers(self.flags.load(Ordering::Relaxed)) {
+            registers.flush();
+        }
+    }
+
+    fn is_posted(&self) -> bool {
+        self.registers.as_ref().is_some_and(|(registers, _)| registers.is_posted())
     }
 
     fn bank(&self) -> Option<(&'static dyn Bank, u32)> {

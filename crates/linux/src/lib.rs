@@ -41,6 +41,8 @@ const DEV: &str = "/dev";
 /// The remedy if only the kernel knows more.
 pub const LOOK_AT_LOG: &str = "look at the kernel's log (dmesg)";
 const GPIO: &str = "/sys/bus/gpio/devices";
+/// The kernel's policy for the sleep of PCIe links.
+const ASPM_POLICY: &str = "/sys/module/pcie_aspm/parameters/policy";
 const PWM: &str = "/sys/class/pwm";
 const SPI_MASTERS: &str = "/sys/class/spi_master";
 const TTY: &str = "/sys/class/tty";

@@ -139,6 +139,8 @@ pub struct State {
     pub stores: Vec<(u32, u32)>,
     /// How long a write to a line takes.
     pub write_ticks: u32,
+    /// The bus between the processor and all lines, if there is one that holds writes back.
+    pub link: Option<SleepyLink>,
     /// How long a device on a worker takes to answer; 0 by default.
     pub answer_ticks: u32,
     /// Whether the workers' queues are full and refuse errands.
@@ -148,6 +150,34 @@ pub struct State {
     pub byte_ticks: u32,
     /// The time that the running errand has reached, if [`State::byte_ticks`] is not 0.
     bus_now: Option<Clock>,
+}
+
+/// A bus that sleeps when it is idle, as PCIe does. A write returns at once. The bus holds it back until it is awake.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct SleepyLink {
+    /// How long the bus takes to wake up.
+    pub wake_ticks: u64,
+    /// How long it stays awake without work.
+    pub idle_ticks: u64,
+    awake_at: u64,
+    last: Option<u64>,
+}
+
+impl SleepyLink {
+    /// A bus that sleeps.
+    pub fn new(wake_ticks: u64, idle_ticks: u64) -> SleepyLink {
+        SleepyLink { wake_ticks, idle_ticks, awake_at: 0, last: None }
+    }
+
+    /// When something that is sent now arrives.
+    fn arrival(&mut self, now: u64) -> u64 {
+        if self.last.is_none_or(|last| now > last + self.idle_ticks) {
+            self.awake_at = now + self.wake_ticks;
+        }
+        let arrival = now.max(self.awake_at);
+        self.last = Some(arrival);
+        arrival
+    }
 }
 
 /// Shared by the board, its lines, its devices and the test.
@@ -208,6 +238,18 @@ impl Bench {
     /// The clock.
     pub fn clock(&self) -> VirtualClock {
         self.clock.clone()
+    }
+
+    /// When a write arrives that is sent now.
+    fn arrival(&self) -> u64 {
+        let now = self.ticks();
+        self.state().link.as_mut().map_or(now, |link| link.arrival(now))
+    }
+
+    /// Waits until all writes have arrived.
+    fn flush(&self) {
+        let wait = self.arrival() - self.ticks();
+        self.clock.set(self.clock.now() + Ticks(wait as u32));
     }
 
     fn ticks(&self) -> u64 {
@@ -567,9 +609,9 @@ impl Drop for FakeLine {
 
 impl FakeLine {
     fn drive(bench: &Bench, pin: u32, level: bool) {
+        let at = bench.arrival();
         let mut state = bench.state();
         if state.levels.insert(pin, level) != Some(level) {
-            let at = bench.ticks();
             uncounted(|| state.edges.push((pin, (at, level.into()))));
             for chip in state.line_chips.values_mut() {
                 chip(at, Some((pin, level)));
@@ -628,6 +670,14 @@ impl Line for FakeLine {
         self.bench.state().fast.contains(&self.pin)
     }
 
+    fn flush(&self) {
+        self.bench.flush();
+    }
+
+    fn is_posted(&self) -> bool {
+        self.bench.state().link.is_some()
+    }
+
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.bench.may_call(self.pin);
         self.bench.broken(self.pin, reason::LINE_WRITE)?;
@@ -646,6 +696,10 @@ impl Bank for FakeBank {
             (0..u32::BITS).filter(|pin| lines >> pin & 1 != 0).for_each(|pin| FakeLine::drive(&self.0, pin, level));
         }
         self.0.clock.set(self.0.clock.now() + Ticks(self.0.state().write_ticks));
+    }
+
+    fn flush(&self) {
+        self.0.flush();
     }
 }
 

@@ -237,6 +237,9 @@ impl Book {
             (name, _) if name.ends_with("_oid") => Value::Number(dice.of(&self.oids(name.trim_end_matches("_oid")))),
             (name, _) if is_pin(name) && dice.below(2) == 0 => Value::Number(dice.roll() % GPIOS),
             (name, _) if is_pin(name) => Value::Number(dice.of(PINS)),
+            // Without a button, no button can be added.
+            ("button_count", _) => Value::Number(1 + dice.roll() % 8),
+            ("pos", _) => Value::Number(dice.roll() % 2),
             (name, _) if name.ends_with("clock") => Value::Soon(dice.roll() % 100_000),
             _ => Value::Number(match dice.below(4) {
                 0 | 1 => dice.roll() % 5,

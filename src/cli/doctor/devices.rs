@@ -15,7 +15,7 @@ use crate::cli::finding::Finding;
 use crate::cli::settings::BoardName;
 use crate::throttled;
 use pinion_linux::Inventory;
-use pinion_linux::gpio::{Chip, FastGpio};
+use pinion_linux::gpio::{Chip, FastGpio, LINK_REMEDY, never_sleeps};
 use pinion_linux::pins::{Names, line_number};
 
 use super::instance::Instance;
@@ -96,6 +96,9 @@ const FAST: Class = Class {
     nodes: "/dev/gpiomem*",
 };
 
+/// The kernel's policy for the sleep of PCIe links.
+const ASPM_POLICY: &str = "/sys/module/pcie_aspm/parameters/policy";
+
 /// Whether the users that Pinion runs as may open the devices, and these serial ports. Without a service it judges the
 /// caller.
 pub(super) fn permissions(computer: &Computer, instances: &[Instance], ports: &BTreeSet<&str>) -> Vec<Finding> {
@@ -154,6 +157,10 @@ fn permissions_of(computer: &Computer, instances: &[&Instance], user: &Who, port
             let remedy = "only Raspberry Pi's own kernel has this node: install it, or set fast_gpio to auto";
             Finding::warning("fast_gpio", found, remedy)
         }));
+        if is_rp1(computer) && !never_sleeps(&computer.path(ASPM_POLICY)) {
+            let found = "fast lines: the PCIe link of the RP1 may sleep: lines go through the kernel";
+            findings.push(Finding::warning("fast_gpio", found, LINK_REMEDY));
+        }
     }
     if wants(FastGpio::DevMem) && user.uid != 0 {
         let found = format!("fast lines: {} may not open /dev/mem: lines go through the kernel", user.name);
@@ -362,6 +369,11 @@ pub(super) fn leds(computer: &Computer, pins: &BTreeSet<&str>) -> Vec<Finding> {
     [Some(clock), bus].into_iter().flatten().collect()
 }
 
+/// Whether the GPIO chip is a Raspberry Pi 5's: its registers have a node with a number.
+fn is_rp1(computer: &Computer) -> bool {
+    computer.path("/dev/gpiomem0").exists()
+}
+
 /// Whether LEDs on these pins are on fast lines, and not refused. Each pin has the link to its MCU.
 pub(super) fn line_leds(computer: &Computer, instances: &[Instance], pins: &BTreeSet<(&Path, &str)>) -> Vec<Finding> {
     let own = |link: &Path| {
@@ -376,6 +388,10 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
     const CHECK: &str = "leds";
     let refused = |why: &str, remedy: String| Finding::error(CHECK, format!("LEDs: {pin} is refused: {why}"), remedy);
     let set = |value: &str| format!("fast_gpio = \"{value}\" in {}, then {}", instance.config(), instance.restart());
+    const TO_SPI: &str = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
+    if is_rp1(computer) {
+        return refused("the RP1 is behind PCIe, which may shorten or join their pulses", TO_SPI.into());
+    }
     let nodes = computer.matching(FAST.nodes);
     let wish = instance.settings.fast_gpio;
     if wish == FastGpio::Off && !nodes.is_empty() {
@@ -385,13 +401,9 @@ fn line_led(computer: &Computer, instance: &Instance, pin: &str) -> Finding {
         if wish == FastGpio::DevMem {
             return Finding::ok(CHECK, format!("LEDs: {pin} is written through /dev/mem"));
         }
-        let remedy = "connect them to the data output of SPI0 (pin 19), and pin: host:spidev0.0";
-        return refused("this computer has no fast lines (no /dev/gpiomem)", remedy.into());
+        return refused("this computer has no fast lines (no /dev/gpiomem)", TO_SPI.into());
     };
     let node = computer.name(node);
-    if wish == FastGpio::Auto && node != Path::new("/dev/gpiomem") {
-        return refused("fast lines of an RP1 are untested, and fast_gpio is auto", set("on"));
-    }
     let mut about = fs::metadata(computer.path(&node)).ok().zip(instance.user(computer)).into_iter();
     if let Some((_, user)) = about.find(|(about, user)| wish != FastGpio::DevMem && !user.may(FAST.access, about)) {
         let why = format!("{} may not open {}", user.name, node.display());
@@ -616,6 +628,23 @@ mod tests {
     }
 
     #[test]
+    fn fast_lines_of_an_rp1_need_a_link_that_never_sleeps() {
+        let tree = Tree::new();
+        tree.put("etc/pinion/pinion.toml", "fast_gpio = \"on\"\n");
+        tree.put_mode("dev/gpiomem0", "", 0o666);
+        let with_policy = |policies: &str| {
+            tree.put("sys/module/pcie_aspm/parameters/policy", policies);
+            permitted(&tree, &stranger(vec![]))
+        };
+        let remedy =
+            told(&with_policy("[default] performance\n"), "fast_gpio", Warning, "the PCIe link of the RP1 may");
+        assert!(remedy.contains("pcie_aspm.policy=performance, and not pcie_aspm=off"), "{remedy}");
+        let findings = with_policy("default [performance] powersave\n");
+        told(&findings, "fast_gpio", Fine, "may open /dev/gpiomem0");
+        assert_eq!(findings.len(), 1, "{findings:?}");
+    }
+
+    #[test]
     fn the_users_are_judged_that_pinion_runs_as() {
         let tree = Tree::new();
         let look = || permissions(&tree.computer(), &instances(&tree.computer()).0, &BTreeSet::new());
@@ -768,14 +797,15 @@ mod tests {
         };
         let (pi_4, pi_5) = (("dev/gpiomem", 0o666), ("dev/gpiomem0", 0o666));
         told(&judged(&[pi_4], "", "host:gpio18"), "leds", Fine, "host:gpio18 is on a fast line");
-        told(&judged(&[pi_5], "fast_gpio = \"on\"\n", "host:gpio18"), "leds", Fine, "(/dev/gpiomem0)");
         told(&judged(&[], "fast_gpio = \"/dev/mem\"\n", "host:gpio18"), "leds", Fine, "through /dev/mem");
         assert!(refused(&[], "", "this computer has no fast lines").contains("spidev0.0"));
         assert!(refused(&[], "fast_gpio = \"off\"\n", "this computer has no fast lines").contains("spidev0.0"));
         assert!(
             refused(&[pi_4], "fast_gpio = \"off\"\n", "fast_gpio is off").contains("fast_gpio = \"auto\" in /etc/")
         );
-        assert!(refused(&[pi_5], "", "fast lines of an RP1 are untested").contains("\"on\""));
+        for settings in ["", "fast_gpio = \"on\"\n", "fast_gpio = \"off\"\n", "fast_gpio = \"/dev/mem\"\n"] {
+            assert!(refused(&[pi_5], settings, "the RP1 is behind PCIe").contains("spidev0.0"));
+        }
         refused(&[("dev/gpiomem", 0o600)], "", "pinion may not open /dev/gpiomem");
         assert!(judged(&[], "board = \"sim\"\n", "host:gpio18").is_empty(), "the simulated printer has any LEDs");
     }

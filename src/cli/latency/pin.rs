@@ -45,10 +45,21 @@ pub(super) fn measure(name: &str, wish: FastGpio) -> Result<String, String> {
         // A line that nobody uses is an input.
         let _ = claimed.line.set_direction(Direction::Input(Bias::None));
         text += &format!("  {way:<9}  {}\n", cost?);
+        text += hidden(&*claimed.line);
     }
     let model = fs::read_to_string("/proc/device-tree/model").unwrap_or_else(|_| "no device tree".to_owned());
     let kernel = fs::read_to_string("/proc/sys/kernel/osrelease").unwrap_or_default();
     Ok(text + &format!("on {}, Linux {}\n", model.trim_end_matches('\0'), kernel.trim()))
+}
+
+/// What the measurement of this line cannot show.
+fn hidden(line: &dyn Line) -> &'static str {
+    match line.is_posted() {
+        true => {
+            "             this keeps the PCIe link awake: it cannot show edges that a sleeping link delays and joins\n"
+        }
+        false => "",
+    }
 }
 
 impl std::fmt::Display for Cost {
@@ -99,4 +110,37 @@ fn cost(line: &dyn Line) -> Result<Cost, String> {
     means.sort_by(f64::total_cmp);
     let quantile = |share: f64| means[((means.len() - 1) as f64 * share) as usize];
     Ok(Cost { edges: means.len() as u64 * u64::from(BATCH), p50: quantile(0.5), p99: quantile(0.99) })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use pinion_firmware::shutdown::Shutdown;
+
+    /// A line behind PCIe, or not.
+    struct Wire(bool);
+
+    impl Line for Wire {
+        fn write(&self, _: bool) -> Result<(), Shutdown> {
+            Ok(())
+        }
+
+        fn read(&self) -> Result<bool, Shutdown> {
+            Ok(false)
+        }
+
+        fn set_direction(&self, _: Direction) -> Result<(), Shutdown> {
+            Ok(())
+        }
+
+        fn is_posted(&self) -> bool {
+            self.0
+        }
+    }
+
+    #[test]
+    fn a_measurement_behind_pcie_says_what_it_cannot_show() {
+        assert!(hidden(&Wire(true)).contains("keeps the PCIe link awake"));
+        assert_eq!(hidden(&Wire(false)), "");
+    }
 }

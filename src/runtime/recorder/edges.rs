@@ -84,6 +84,14 @@ impl Line for EdgeLine {
         self.line.is_fast()
     }
 
+    fn flush(&self) {
+        self.line.flush();
+    }
+
+    fn is_posted(&self) -> bool {
+        self.line.is_posted()
+    }
+
     fn turn(&self, direction: Direction) -> Result<(), Shutdown> {
         self.line.turn(direction)?;
         self.turned(direction);

@@ -88,6 +88,9 @@ pub enum Direction {
 pub trait Bank: Sync {
     /// Drives the lines of these bits: first those of `high`, then those of `low`.
     fn change(&self, high: u32, low: u32);
+
+    /// Returns when the changes have reached the lines ([`Line::flush`]).
+    fn flush(&self) {}
 }
 
 /// A claimed GPIO line. The objects and workers that share a line all hold this one value.
@@ -132,6 +135,15 @@ pub trait Line: Send + Sync {
 
     /// Whether the line is written and read without a call of the kernel.
     fn is_fast(&self) -> bool {
+        false
+    }
+
+    /// Returns when the last write has reached the line. A clock that is read afterwards shows a time after the edge.
+    fn flush(&self) {}
+
+    /// Whether a write may reach the line after it returned, because a bus holds it back. Each edge then needs a
+    /// [flush](Line::flush), which takes longer than a short pulse.
+    fn is_posted(&self) -> bool {
         false
     }
 }

@@ -8,8 +8,8 @@ use std::ops::Range;
 
 use crate::board::Pin;
 use crate::mcu::{
-    Batch, Command, Constant, Feature, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid, Present, PromptLine,
-    Report, Response, SPIN_MAX, Safe, Timer, Turn, WireClock, command, response, since,
+    Batch, Command, Constant, Feature, Generation::Kalico, Generation::V0_13, Mcu, MoveQueue, Next, Object, Oid,
+    Present, PromptLine, Report, Response, SPIN_MAX, Safe, Timer, Turn, WireClock, command, response, since,
 };
 use crate::shutdown::{Shutdown, shutdowns};
 use crate::time::{Clock, Ticks};
@@ -20,6 +20,7 @@ pub(super) const FEATURE: Feature = Feature {
     commands: &[
         CONFIG_STEPPER,
         QUEUE_STEP,
+        QUEUE_STEP_HP,
         SET_NEXT_STEP_DIR,
         RESET_STEP_CLOCK,
         STEPPER_GET_POSITION,
@@ -34,7 +35,7 @@ pub(super) const FEATURE: Feature = Feature {
 shutdowns! {
     /// `reset_step_clock` while steps are queued.
     RESET_WHILE_STEPPING = "Can't reset time when stepper active";
-    /// `queue_step` with a count of zero.
+    /// `queue_step` or `queue_step_hp` with a count of zero, or `queue_step_hp` with a number that is out of range.
     INVALID_COUNT = "Invalid count parameter";
     /// A step is over a millisecond late.
     STEPPER_PAST = "Stepper too far in past";
@@ -48,13 +49,60 @@ response! {
 
 const TIMER: Timer = Timer::exact(0);
 
-/// `count` steps. The first one comes `interval` ticks after the step before. Each interval is longer by `add` than the
-/// one before.
+/// `count` steps. The first one comes `interval` after the step before. Each interval is longer by `add` than the one
+/// before, and `add` grows by `add2` with each. All three are in units of 2 to the power of `-shift` ticks.
 struct Move {
     interval: u32,
     count: u16,
     add: i16,
+    add2: i16,
+    shift: i8,
     reverses: bool,
+}
+
+/// The intervals of a move, in 32 bits as in the firmware. A part of a tick that an interval has left over goes into the
+/// next one.
+#[derive(Default)]
+struct Intervals {
+    /// The next interval.
+    interval: u32,
+    add: i32,
+    add2: i32,
+    /// An interval has 2 to the power of `shift` units to a tick.
+    shift: u8,
+    /// The units that are left over. The firmware has 16 bits for them.
+    left: u16,
+}
+
+impl Intervals {
+    /// Highest number of bits to shift a 32-bit number by.
+    const SHIFT_MAX: i8 = 31;
+
+    fn of(&Move { interval, add, add2, shift, .. }: &Move) -> Intervals {
+        let (add, add2) = (i32::from(add), i32::from(add2));
+        match u8::try_from(shift) {
+            // The times are rounded to the nearest tick.
+            Ok(shift) => {
+                let half = (1u32 << shift >> 1) as u16;
+                Intervals { interval, add, add2, shift, left: half }
+            }
+            Err(_) => {
+                let coarse = u32::from(shift.unsigned_abs());
+                Intervals { interval: interval << coarse, add: add << coarse, add2: add2 << coarse, shift: 0, left: 0 }
+            }
+        }
+    }
+
+    /// Takes the next interval, in ticks.
+    #[inline]
+    fn next(&mut self) -> u32 {
+        let units = self.interval.wrapping_add(u32::from(self.left));
+        let ticks = units >> self.shift;
+        self.left = (units - (ticks << self.shift)) as u16;
+        self.interval = self.interval.wrapping_add_signed(self.add);
+        self.add = self.add.wrapping_add(self.add2);
+        ticks
+    }
 }
 
 struct Stepper {
@@ -70,8 +118,7 @@ struct Stepper {
     queue: MoveQueue<Move>,
     /// Edges of the current move that are still to come. Zero while idle.
     edges: u32,
-    interval: u32,
-    add: i16,
+    intervals: Intervals,
     /// When the current or last step is due.
     next_step: Clock,
     /// Earliest time of the next edge. The pulse before it ends then, or the direction has had its setup time.
@@ -103,14 +150,15 @@ const POSITION_BIAS: u32 = 0x4000_0000;
 impl Stepper {
     /// Takes the next move. `earliest` is the earliest time of its first edge. `None`: the stepper is idle.
     fn load(&mut self, turn: &mut Turn, earliest: Option<Clock>) -> Result<Next, Shutdown> {
-        let Some(Move { interval, count, add, reverses }) = self.queue.pop(&mut turn.moves) else {
+        let Some(item) = self.queue.pop(&mut turn.moves) else {
             self.edges = 0;
             return Ok(Next::Done);
         };
+        let Move { count, reverses, .. } = item;
+        self.intervals = Intervals::of(&item);
+        let interval = self.intervals.next();
         self.position = if reverses { self.position.wrapping_neg() } else { self.position };
         self.position = self.position.wrapping_add(u32::from(count));
-        self.add = add;
-        self.interval = interval.wrapping_add_signed(i32::from(add));
         self.edges = u32::from(count) << u32::from(!self.both_edges);
         let Some(earliest) = earliest else {
             // After a long pause the interval has wrapped, but the step's 32-bit clock is right.
@@ -176,6 +224,7 @@ impl Stepper {
     /// Changes the direction. The next step waits for the setup time.
     fn reverse(&mut self, turn: &mut Turn) -> Result<Next, Shutdown> {
         self.dir.toggle()?;
+        self.dir.flush();
         let earliest = turn.now() + self.pulse_ticks;
         Ok(self.edge_at(turn, self.next_step, earliest))
     }
@@ -211,7 +260,7 @@ impl Stepper {
 
     fn queue(&mut self, turn: &mut Turn, mut item: Move) -> Result<(), Shutdown> {
         if item.count == 0 {
-            return Err(Shutdown::by_host(INVALID_COUNT, "queue_step asks for no steps"));
+            return Err(Shutdown::by_host(INVALID_COUNT, "a move has no steps"));
         }
         if self.edges == 0 && self.need_reset {
             return Ok(());
@@ -243,8 +292,9 @@ impl Object for Stepper {
         }
         if !self.step.was_batched() {
             self.step.toggle()?;
-            // A pulse begins after the edge was written, because a write may be slow.
+            // A pulse begins when its edge has reached the line: a write may be slow, and a bus may hold it back.
             if self.pulse_ticks > Ticks(0) {
+                self.step.flush();
                 turn.now();
             } else {
                 turn.made_edge();
@@ -258,8 +308,8 @@ impl Object for Stepper {
         }
         if edges > 0 {
             self.edges = edges;
-            self.advance(self.interval, earliest);
-            self.interval = self.interval.wrapping_add_signed(i32::from(self.add));
+            let interval = self.intervals.next();
+            self.advance(interval, earliest);
             return Ok(self.edge_at(turn, self.next_step, earliest));
         }
         // How late the next step is must be known well.
@@ -309,8 +359,7 @@ const CONFIG_STEPPER: Command = command!(
             late_limit: mcu.step_late_limit(),
             queue: MoveQueue::default(),
             edges: 0,
-            interval: 0,
-            add: 0,
+            intervals: Intervals::default(),
             next_step: Clock::EPOCH,
             earliest: Clock::EPOCH,
             reverse_pending: false,
@@ -328,10 +377,26 @@ const QUEUE_STEP: Command = command!(
     "queue_step oid=%c interval=%u count=%hu add=%hi",
     Stepper,
     |stepper, turn, interval: u32, count: u16, add: i16| {
-        let item = Move { interval, count, add, reverses: false };
+        let item = Move { interval, count, add, add2: 0, shift: 0, reverses: false };
         stepper.queue(turn, item)
     }
 );
+
+/// `high_precision_step_compress` of Kalico's branch bleeding-edge-v2. Its firmware has this only if it was built with
+/// CONFIG_HIGH_PREC_STEP. A host that does not use it ignores it.
+const QUEUE_STEP_HP: Command = command!(
+    "queue_step_hp oid=%c interval=%u count=%hu add=%hi add2=%hi shift=%hi",
+    Stepper,
+    |stepper, turn, interval: u32, count: u16, add: i16, add2: i16, shift: i16| {
+        let limits = -i16::from(Intervals::SHIFT_MAX)..=i16::from(Intervals::SHIFT_MAX);
+        if i16::try_from(count).is_err() || !limits.contains(&shift) {
+            let what = format_args!("queue_step_hp has a count of {count} and a shift of {shift}");
+            return Err(Shutdown::by_host(INVALID_COUNT, what));
+        }
+        stepper.queue(turn, Move { interval, count, add, add2, shift: shift as i8, reverses: false })
+    }
+)
+.of(since(Kalico));
 
 const SET_NEXT_STEP_DIR: Command = command!("set_next_step_dir oid=%c dir=%c", Stepper, |stepper, _, dir: bool| {
     stepper.next_dir = dir;

@@ -55,7 +55,8 @@ impl Mcu {
         let count = joining.count();
         if let Some(bank) = batch.bank {
             bank.change(batch.high, batch.low);
-            // Read the time after the edges were written: their pulses begin now.
+            // Read the time after the edges have reached the lines: their pulses begin now.
+            bank.flush();
             self.now();
         }
         for _ in 0..count.max(1) {

@@ -58,7 +58,8 @@ impl Claim {
     }
 }
 
-/// A line that records its level for the status when an errand drives or reads it.
+/// A line that records its level for the status when an errand drives or reads it. Errands measure the time between
+/// edges, so a write returns when it has reached the line.
 struct Watched {
     line: Arc<dyn Line>,
     shown: Arc<Level>,
@@ -67,7 +68,9 @@ struct Watched {
 impl Line for Watched {
     fn write(&self, level: bool) -> Result<(), Shutdown> {
         self.shown.set(level);
-        self.line.write(level)
+        self.line.write(level)?;
+        self.line.flush();
+        Ok(())
     }
 
     fn read(&self) -> Result<bool, Shutdown> {
@@ -86,6 +89,10 @@ impl Line for Watched {
 
     fn is_fast(&self) -> bool {
         self.line.is_fast()
+    }
+
+    fn is_posted(&self) -> bool {
+        self.line.is_posted()
     }
 }
 
@@ -144,6 +151,12 @@ impl PromptLine {
     #[inline]
     pub fn toggle(&mut self) -> Result<(), Shutdown> {
         self.write(!self.level)
+    }
+
+    /// Returns when the last write has reached the line ([`Line::flush`]).
+    #[inline]
+    pub fn flush(&self) {
+        self.line.flush();
     }
 
     /// Whether the line is written without a call of the kernel.

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Edges of several steppers at one instant, on lines of one bank.
 
-use pinion_testbench::board::Edge;
+use pinion_testbench::board::{Edge, SleepyLink};
 use pinion_testbench::rig::Rig;
 use proptest::prelude::*;
 
@@ -49,6 +49,19 @@ fn edges_of_one_instant_are_one_store() {
     assert_eq!(rig.bench.state().stores, [(all, 0), (0, all), (all, 0), (0, all)]);
     for n in 0..STEPPERS {
         assert_eq!(rig.edges(step_pin(n)), [(5000, 1), (5100, 0), (10_000, 1), (10_100, 0)]);
+    }
+}
+
+/// Each store waits until it has reached the pins, before the pulses are measured.
+#[test]
+fn pulses_behind_a_bus_that_holds_stores_back_are_as_long_as_they_are_measured() {
+    let mut rig = rig(true, 0);
+    rig.bench.state().link = Some(SleepyLink::new(90, 1000));
+    start(&mut rig);
+    (0..STEPPERS).for_each(|n| step(&mut rig, n, 5000, 2));
+    rig.run_until(20_000);
+    for n in 0..STEPPERS {
+        assert_eq!(rig.edges(step_pin(n)), [(5090, 1), (5190, 0), (10_090, 1), (10_190, 0)]);
     }
 }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
-//! Features that only Kalico has: ignored limits, and probing by load cells.
+//! Features that only Kalico has: ignored limits, probing by load cells, and moves of high precision.
 
 use std::sync::{Arc, Mutex};
 
@@ -7,6 +7,7 @@ use pinion_firmware::mcu::Generation::{Kalico, Master, V0_13};
 
 use pinion_testbench::board::ANALOG;
 use pinion_testbench::rig::{Rig, hex};
+use proptest::prelude::*;
 
 const MS: u64 = 50_000;
 
@@ -294,5 +295,124 @@ fn an_ads131m0x_with_channels_that_it_does_not_have_is_refused() {
             "config_ads131m0x oid=1 spi_oid=0 data_ready_pin=10 sensor_channel_count={count} channel_mask={mask}"
         ));
         assert_eq!(rig.shutdown().as_deref(), Some(text));
+    }
+}
+
+/// A move of `queue_step_hp`: interval, count, add, add2, shift.
+type Move = (u32, u16, i16, i16, i8);
+
+/// Each edge is a step, and has no shortest time.
+const EDGES: &str = "config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=-1 step_pulse_ticks=0";
+
+fn queue(rig: &mut Rig, (interval, count, add, add2, shift): Move) {
+    rig.send(&format!("queue_step_hp oid=0 interval={interval} count={count} add={add} add2={add2} shift={shift}"));
+}
+
+fn steps_of(moves: &[Move], until: u64) -> Vec<u64> {
+    let mut rig = Rig::of(Kalico);
+    rig.configure(&[EDGES]);
+    rig.send("reset_step_clock oid=0 clock=@0");
+    moves.iter().for_each(|item| queue(&mut rig, *item));
+    rig.run_until(until);
+    assert_eq!(rig.shutdown(), None);
+    rig.edges(1).into_iter().map(|(at, _)| at).collect()
+}
+
+/// The steps of a move, in ticks after the step before it. The n-th interval is `interval + n add + n (n - 1) / 2 add2`.
+/// The sum of the intervals is rounded to ticks, half a tick up.
+fn exact((interval, count, add, add2, shift): Move) -> Vec<u64> {
+    let (interval, add, add2) = (i128::from(interval), i128::from(add), i128::from(add2));
+    let intervals = (0..i128::from(count)).map(|n| interval + n * add + n * (n - 1) / 2 * add2);
+    let sums = intervals.scan(0, |sum, interval| {
+        *sum += interval;
+        Some(*sum)
+    });
+    let ticks = sums.map(|sum| if shift > 0 { (sum + (1 << (shift - 1))) >> shift } else { sum << -shift });
+    ticks.map(|ticks| ticks as u64).collect()
+}
+
+/// Moves as klippy may send them (klippy/chelper/stepcompress_hp.c). They have no negative interval.
+fn a_move() -> impl Strategy<Value = Move> {
+    (-8i8..=16, 1u16..200, 20u32..100_000, -1000i64..=1000, -1000i64..=1000).prop_map(
+        |(shift, count, ticks, add, add2)| {
+            let units = if shift > 0 { u64::from(ticks) << shift } else { u64::from(ticks) >> -shift };
+            let interval = units.clamp(1, 0x3ff_ffff) as i64;
+            let part = |of: i64, thousandths: i64, most: i64| (interval / of).min(most) * thousandths / 1000;
+            let count_ = i64::from(count);
+            let add = part(4 * count_, add, i16::MAX.into()) as i16;
+            (interval as u32, count, add, part(2 * count_ * count_, add2, 0xfff) as i16, shift)
+        },
+    )
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+    #[test]
+    fn moves_of_high_precision_are_exact_to_the_tick(moves in prop::collection::vec(a_move(), 1..4)) {
+        let mut expected = Vec::new();
+        for item in &moves {
+            let before = expected.last().copied().unwrap_or(0);
+            expected.extend(exact(*item).into_iter().map(|ticks| before + ticks));
+        }
+        let end = expected.last().copied().unwrap_or(0) + 1;
+        prop_assert_eq!(steps_of(&moves, end), expected);
+    }
+}
+
+/// The times are those of the firmware's own code (src/stepper.c of bleeding-edge-v2), compiled for this computer. The
+/// intervals overflow 32 bits, and what is left over overflows 16 bits.
+#[test]
+fn numbers_that_overflow_do_so_as_in_the_firmware() {
+    let moves = [(3_510_139_707, 5, 26_700, -7539, 24), (13_043, 7, 22_714, -8570, -9)];
+    let expected = [
+        209,
+        418,
+        627,
+        836,
+        1045,
+        6_679_061,
+        24_986_645,
+        50_535_957,
+        78_939_157,
+        105_808_405,
+        126_755_861,
+        137_393_685,
+    ];
+    assert_eq!(steps_of(&moves, 140_000_000), expected);
+    let moves = [(7176, 1, -10_357, 23_610, -22), (89_119, 5, -3808, -16_340, 9), (4_230_905_078, 2, 16_239, 6726, 17)];
+    let expected = [33_554_432, 33_554_606, 33_554_773, 33_554_900, 33_554_956, 41_943_517, 41_975_796, 42_008_075];
+    assert_eq!(steps_of(&moves, 50_000_000), expected);
+}
+
+#[test]
+fn a_move_of_high_precision_may_follow_an_ordinary_one_and_counts_alike() {
+    let mut rig = Rig::of(Kalico);
+    rig.configure(&["config_stepper oid=0 step_pin=1 dir_pin=2 invert_step=0 step_pulse_ticks=100"]);
+    rig.send_all(&["reset_step_clock oid=0 clock=@0", "set_next_step_dir oid=0 dir=1"]);
+    rig.send("queue_step oid=0 interval=5000 count=2 add=100");
+    // 1000.5 ticks, then 0.25 more each time.
+    queue(&mut rig, (4002, 4, 1, 0, 2));
+    rig.send("queue_step oid=0 interval=3000 count=2 add=0");
+    rig.run_until(100_000);
+    let rising: Vec<u64> = rig.edges(1).into_iter().filter(|(_, level)| *level == 1).map(|(at, _)| at).collect();
+    assert_eq!(rising, [5000, 10_100, 11_101, 12_101, 13_102, 14_104, 17_104, 20_104]);
+    assert_eq!(rig.ask("stepper_get_position oid=0"), "stepper_position oid=0 pos=8");
+}
+
+#[test]
+fn a_move_of_high_precision_that_has_no_meaning_stops_the_mcu() {
+    for (item, stops) in [
+        ((1000, 0, 0, 0, 0), true),
+        ((1000, 0x8000, 0, 0, 0), true),
+        ((1000, 0x7fff, 0, 0, 0), false),
+        ((1000, 1, 0, 0, 32), true),
+        ((1000, 1, 0, 0, -32), true),
+        ((1000, 1, 0, 0, -31), false),
+    ] {
+        let mut rig = Rig::of(Kalico);
+        rig.configure(&[EDGES]);
+        rig.send("reset_step_clock oid=0 clock=@0");
+        queue(&mut rig, item);
+        assert_eq!(rig.shutdown().as_deref(), stops.then_some("Invalid count parameter"), "{item:?}");
     }
 }

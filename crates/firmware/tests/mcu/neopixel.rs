@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //! Chains of WS2812 LEDs on an SPI controller's data output.
 
-use pinion_testbench::board::{MESSAGE_MAX, MOSI, SPI_CHIPS, Transfer};
+use pinion_testbench::board::{MESSAGE_MAX, MOSI, SPI_CHIPS, SleepyLink, Transfer};
 use pinion_testbench::rig::Rig;
 
 /// 300 us at 3.2 MHz.
@@ -138,6 +138,21 @@ fn a_fast_line_drives_leds_without_an_spi_controller() {
     rig.bench.state().write_ticks = 0;
     assert_eq!(rig.ask("neopixel_send oid=0"), "neopixel_result oid=0 success=1");
     assert!(!rig.mcu.is_shutdown());
+}
+
+/// Behind PCIe a measured pulse is no promise about the pin.
+#[test]
+fn a_fast_line_behind_a_bus_that_holds_writes_back_is_refused_with_other_ways() {
+    let mut rig = Rig::new();
+    rig.bench.state().fast.insert(FAST);
+    rig.bench.state().link = Some(SleepyLink::new(90, 1000));
+    rig.send("allocate_oids count=1");
+    rig.send(CHAIN_ON_A_LINE);
+    assert_eq!(rig.shutdown().as_deref(), Some("Not an output pin"));
+    let notes = rig.notes().join(" ");
+    for words in ["gpio18 cannot drive LEDs: its chip is behind PCIe", "spidev0.0", "ws2812-pio"] {
+        assert!(notes.contains(words), "{notes}");
+    }
 }
 
 #[test]

@@ -4,6 +4,7 @@
 
 use pinion_firmware::board::{Bias, Direction};
 
+use pinion_testbench::board::SleepyLink;
 use pinion_testbench::rig::Rig;
 
 const MISO: u32 = 30;
@@ -31,6 +32,19 @@ fn spi_lines_are_driven_at_the_hosts_pace() {
     // 1010 0101, each bit at its beginning.
     assert_eq!(rig.edges(MOSI), [(150, 1), (250, 0), (350, 1), (450, 0), (650, 1), (750, 0), (850, 1)]);
     assert_eq!(rig.edges(CS), [(100, 0), (900, 1)]);
+}
+
+/// Behind PCIe an edge may come later than its write. A bit still has its times.
+#[test]
+fn spi_lines_wait_for_a_bus_that_holds_writes_back() {
+    let mut rig = Rig::new();
+    rig.bench.state().link = Some(SleepyLink::new(40, 45));
+    rig.configure(SPI);
+    rig.bench.script_input(MISO, &[(0, 1)]);
+    assert_eq!(rig.ask("spi_transfer oid=0 data=a5"), "spi_transfer_response oid=0 response=ff");
+    let clock = rig.edges(SCLK);
+    assert_eq!(clock.len(), 16);
+    assert!(clock.windows(2).all(|two| two[1].0 - two[0].0 >= 50), "{clock:?}");
 }
 
 #[test]

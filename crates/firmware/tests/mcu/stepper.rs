@@ -4,7 +4,7 @@
 use pinion_firmware::mcu::SPIN_MAX;
 use pinion_firmware::time::Ticks;
 
-use pinion_testbench::board::Edge;
+use pinion_testbench::board::{Edge, SleepyLink};
 use pinion_testbench::rig::Rig;
 
 const STEP: u32 = 1;
@@ -111,6 +111,33 @@ fn a_pulse_is_measured_from_when_the_pin_was_written() {
     rig.send_all(&["reset_step_clock oid=0 clock=@0", "queue_step oid=0 interval=5000 count=1 add=0"]);
     rig.run_until(100_000);
     assert_eq!(rig.edges(STEP), [(5000, 1), (5170, 0)]);
+}
+
+/// Behind PCIe a write returns before its edge is at the pin. Without a read back, the edges of a pulse come together.
+#[test]
+fn a_pulse_is_measured_from_when_its_edge_has_reached_the_pin() {
+    for (config, idle_ticks) in [(PULSED, 40), (PULSED, 1000), (BOTH_EDGES, 40), (BOTH_EDGES, 1000)] {
+        for interval in [1, 100, 150, 230, 300, 2000] {
+            let mut rig = Rig::new();
+            rig.bench.state().link = Some(SleepyLink::new(90, idle_ticks));
+            rig.configure(&[config]);
+            rig.send_all(&[
+                "reset_step_clock oid=0 clock=@0",
+                "queue_step oid=0 interval=5000 count=1 add=0",
+                &format!("queue_step oid=0 interval={interval} count=3 add=0"),
+                "set_next_step_dir oid=0 dir=1",
+                &format!("queue_step oid=0 interval={interval} count=2 add=0"),
+            ]);
+            rig.run_until(100_000);
+            let (steps, dirs) = (instants(&rig.edges(STEP)), instants(&rig.edges(DIR)));
+            assert_eq!((steps.len(), dirs.len()), (if config == PULSED { 12 } else { 6 }, 1));
+            let spans = steps.windows(2).map(|two| two[1] - two[0]);
+            assert!(spans.min().unwrap() >= 100, "{interval}: {steps:?}");
+            let [dir] = dirs[..] else { panic!("{dirs:?}") };
+            let (before, after) = steps.split_at(if config == PULSED { 8 } else { 4 });
+            assert!(dir >= before[before.len() - 1] && after[0] >= dir + 100, "{interval}: {steps:?} {dir}");
+        }
+    }
 }
 
 /// Steps on both edges, with klippy's pulse for such a driver: 100 ns.

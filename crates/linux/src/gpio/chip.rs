@@ -9,8 +9,9 @@ use std::path::{Path, PathBuf};
 use gpio_cdev::LineDirection;
 
 use super::refusal::{cannot_open, errno};
+use super::registers::Places;
 use super::{ChipRegisters, FastGpio};
-use crate::{DEV, GPIO};
+use crate::{ASPM_POLICY, DEV, GPIO};
 use pinion_firmware::trouble::Trouble;
 
 /// Subsystems whose drivers send messages to their devices and sleep until the answer comes.
@@ -56,7 +57,8 @@ impl Chip {
     ///
     /// Why it has none, or they cannot be used, and what to do.
     pub fn registers(&self, wish: FastGpio) -> Result<ChipRegisters, Trouble> {
-        ChipRegisters::open(Path::new(DEV), Path::new(GPIO), &format!("gpiochip{}", self.number), wish)
+        let places = Places { dev: Path::new(DEV), devices: Path::new(GPIO), aspm_policy: Path::new(ASPM_POLICY) };
+        ChipRegisters::open(&places, &format!("gpiochip{}", self.number), wish)
     }
 }
 

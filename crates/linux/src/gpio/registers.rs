@@ -5,6 +5,10 @@
 //! read the level of a claimed line. They are used after a check ([`LineRegisters::check`]): what they say about the
 //! line must be what the kernel says.
 //!
+//! The RP1 of a Raspberry Pi 5 is behind PCIe, which takes a store and delivers it later. If the link sleeps, that may be
+//! microseconds later, and several stores come together (raspberrypi/linux pull request 6279). So its registers are used
+//! only if the kernel never lets the link sleep, and each edge with a time is read back ([`RegisterBank::flush`]).
+//!
 //! The device tree names the chip. A chip that is not listed here has no registers.
 
 #![forbid(unsafe_code)]
@@ -18,7 +22,7 @@ use std::str::FromStr;
 
 use super::HeldLine;
 use super::refusal::{Subject, not_permitted};
-use crate::{LOOK_AT_LOG, sys};
+use crate::{ASPM_POLICY, LOOK_AT_LOG, sys};
 use pinion_firmware::board::{Bank, Direction};
 use pinion_firmware::trouble::Trouble;
 
@@ -91,6 +95,11 @@ impl Layout {
         }
     }
 
+    /// Whether the chip is behind a bus that holds stores back.
+    fn is_posted(self) -> bool {
+        self == Layout::Rp1
+    }
+
     /// Whether an emulated computer has tested it (tests/raspberry_pi). No emulator has an RP1.
     fn is_tested(self) -> bool {
         self == Layout::Bcm2835
@@ -107,7 +116,7 @@ impl Layout {
                 (offset < 58).then_some(())?;
                 Some(LineRegisters {
                     mask: 1 << (offset % 32),
-                    bank: RegisterBank { set: word(0x1c, 32)?, clear: word(0x28, 32)? },
+                    bank: RegisterBank { set: word(0x1c, 32)?, clear: word(0x28, 32)?, posted: None },
                     level: word(0x34, 32)?,
                     direction: vec![function],
                 })
@@ -128,7 +137,7 @@ impl Layout {
                 Some(LineRegisters {
                     mask,
                     // RIO_OUT, by the addresses that set and clear bits, and RIO_IN.
-                    bank: RegisterBank { set: rio(0x2000)?, clear: rio(0x3000)? },
+                    bank: RegisterBank { set: rio(0x2000)?, clear: rio(0x3000)?, posted: Some(rio(0x08)?) },
                     level: rio(0x08)?,
                     direction: vec![control, enable],
                 })
@@ -141,6 +150,8 @@ impl Layout {
 pub(super) trait Register: Copy {
     fn load(self) -> u32;
     fn store(self, value: u32);
+    /// Returns when the loads and stores before have reached their device.
+    fn wait();
 }
 
 impl Register for sys::Register {
@@ -152,6 +163,11 @@ impl Register for sys::Register {
     #[inline]
     fn store(self, value: u32) {
         sys::Register::store(self, value);
+    }
+
+    #[inline]
+    fn wait() {
+        sys::Register::wait();
     }
 }
 
@@ -170,6 +186,8 @@ pub(super) struct RegisterBank<R = sys::Register> {
     set: R,
     /// A 1 makes its line low. A 0 changes nothing.
     clear: R,
+    /// A register to read back, if the bus holds stores back. A load does not overtake them.
+    posted: Option<R>,
 }
 
 impl<R: Register + Sync> Bank for RegisterBank<R> {
@@ -181,6 +199,14 @@ impl<R: Register + Sync> Bank for RegisterBank<R> {
         if low != 0 {
             self.clear.store(low);
         }
+    }
+
+    #[inline]
+    fn flush(&self) {
+        if let Some(register) = self.posted {
+            register.load();
+        }
+        R::wait();
     }
 }
 
@@ -203,6 +229,20 @@ impl<R: Register> LineRegisters<R> {
     #[inline]
     pub(super) fn write(&self, level: bool) {
         if level { self.bank.set.store(self.mask) } else { self.bank.clear.store(self.mask) }
+    }
+
+    /// Whether a bus holds stores back on their way to the line.
+    pub(super) fn is_posted(&self) -> bool {
+        self.bank.posted.is_some()
+    }
+
+    /// Returns when the last store has reached the line.
+    #[inline]
+    pub(super) fn flush(&self)
+    where
+        R: Sync,
+    {
+        self.bank.flush();
     }
 
     /// The line's level, whoever drives it.
@@ -266,12 +306,13 @@ pub struct ChipRegisters {
 }
 
 impl ChipRegisters {
-    /// Maps the registers of a chip such as `gpiochip0`. `devices` is `/sys/bus/gpio/devices`.
+    /// Maps the registers of a chip such as `gpiochip0`.
     ///
     /// # Errors
     ///
     /// Why it is not possible, and what to do.
-    pub(super) fn open(dev: &Path, devices: &Path, chip: &str, wish: FastGpio) -> Result<ChipRegisters, Trouble> {
+    pub(super) fn open(places: &Places, chip: &str, wish: FastGpio) -> Result<ChipRegisters, Trouble> {
+        let Places { dev, devices, aspm_policy } = *places;
         let unknown = || Trouble::new("no registers of this chip are known").remedy("--fast-gpio off hides this line");
         let device = devices.join(chip).canonicalize().map_err(|_| unknown())?;
         // The chip's own link to the device tree. Older kernels have only that of its device.
@@ -287,6 +328,7 @@ impl ChipRegisters {
             FastGpio::DevMem if layout == Layout::Rp1 => {
                 return Err(Trouble::new("/dev/mem is not for an RP1").remedy("choose --fast-gpio on"));
             }
+            _ if layout.is_posted() && !never_sleeps(aspm_policy) => return Err(may_sleep(aspm_policy)),
             FastGpio::DevMem => (dev.join("mem"), physical_address(&device).ok_or_else(unknown)?),
             _ => (dev.join(name), 0),
         };
@@ -300,6 +342,12 @@ impl ChipRegisters {
     /// The node that they are mapped from, such as `/dev/gpiomem`.
     pub fn node(&self) -> &str {
         &self.node
+    }
+
+    /// Whether the chip is behind a bus that holds stores back. Its lines are not for pulses with a meaning of their
+    /// width, as LEDs need them.
+    pub fn is_posted(&self) -> bool {
+        self.layout.is_posted()
     }
 
     /// The registers of one line.
@@ -316,6 +364,34 @@ impl ChipRegisters {
         self.banks.push(bank);
         bank
     }
+}
+
+/// The parts of a computer that are needed to find registers.
+pub(super) struct Places<'a> {
+    /// `/dev`
+    pub(super) dev: &'a Path,
+    /// `/sys/bus/gpio/devices`
+    pub(super) devices: &'a Path,
+    /// `/sys/module/pcie_aspm/parameters/policy`
+    pub(super) aspm_policy: &'a Path,
+}
+
+/// Whether the kernel never lets a PCIe link sleep. The file lists the policies, with the chosen one in brackets
+/// (drivers/pci/pcie/aspm.c, `pcie_aspm_get_policy`).
+pub fn never_sleeps(aspm_policy: &Path) -> bool {
+    fs::read_to_string(aspm_policy)
+        .is_ok_and(|policies| policies.split_whitespace().any(|name| name == "[performance]"))
+}
+
+/// The remedy for a link that may sleep. `pcie_aspm=off` leaves each link as the firmware has set it.
+pub const LINK_REMEDY: &str =
+    "write pcie_aspm.policy=performance, and not pcie_aspm=off, into /boot/firmware/cmdline.txt, and reboot";
+
+fn may_sleep(aspm_policy: &Path) -> Trouble {
+    let chosen = fs::read_to_string(aspm_policy).unwrap_or_else(|error| error.to_string());
+    Trouble::new(format!("the PCIe link of the RP1 may sleep, which delays edges ({})", chosen.trim()))
+        .of(aspm_policy.display())
+        .remedy(LINK_REMEDY)
 }
 
 /// Why a node cannot be opened or mapped.
@@ -359,9 +435,10 @@ impl FastChips {
 
     /// Gives a line of a chip that never sleeps its registers, if it may use them. The line has just been requested.
     pub(crate) fn equip(&mut self, line: &mut HeldLine, direction: Direction, dev: &Path, devices: &Path) {
+        let places = Places { dev, devices, aspm_policy: Path::new(ASPM_POLICY) };
         let Subject { chip, offset, .. } = &line.subject;
         let (chip, offset) = (chip.clone(), *offset);
-        let Some(registers) = self.of(dev, devices, &chip) else { return };
+        let Some(registers) = self.of(&places, &chip) else { return };
         let Some(line_registers) = registers.line(offset) else { return };
         let bank = registers.bank(&line_registers);
         if let Err(why) = line.trust(line_registers, bank, direction) {
@@ -370,13 +447,13 @@ impl FastChips {
     }
 
     /// The registers of a chip. A chip without them is named in the log, with the reason.
-    fn of(&mut self, dev: &Path, devices: &Path, chip: &str) -> Option<&mut ChipRegisters> {
+    fn of(&mut self, places: &Places, chip: &str) -> Option<&mut ChipRegisters> {
         let wish = self.wish;
         if wish == FastGpio::Off {
             return None;
         }
         let opened =
-            self.chips.entry(chip.to_owned()).or_insert_with(|| match ChipRegisters::open(dev, devices, chip, wish) {
+            self.chips.entry(chip.to_owned()).or_insert_with(|| match ChipRegisters::open(places, chip, wish) {
                 Ok(registers) => {
                     log::info!("{chip}: lines are written and read through {}", registers.node());
                     Some(registers)
@@ -422,6 +499,8 @@ mod tests {
         outside: [AtomicU32; 3],
         /// As the kernel's driver has one for the directions.
         lock: Mutex<()>,
+        /// The register that was read last.
+        last_load: AtomicU32,
     }
 
     #[derive(Clone, Copy)]
@@ -435,18 +514,21 @@ mod tests {
 
     impl Register for ModelRegister<'_> {
         fn load(self) -> u32 {
+            self.0.last_load.store(self.1 as u32, SeqCst);
             self.0.load(self.1)
         }
 
         fn store(self, value: u32) {
             self.0.store(self.1, value);
         }
+
+        fn wait() {}
     }
 
     impl Model {
         fn new(layout: Layout) -> Model {
             let words = (0..layout.node().1 / 4).map(|_| AtomicU32::new(0)).collect();
-            Model { layout, words, outside: Default::default(), lock: Mutex::new(()) }
+            Model { layout, words, outside: Default::default(), lock: Mutex::new(()), last_load: AtomicU32::new(0) }
         }
 
         fn line(&self, offset: u32) -> LineRegisters<ModelRegister<'_>> {
@@ -665,6 +747,24 @@ mod tests {
     }
 
     #[test]
+    fn a_store_behind_a_bus_that_holds_it_back_is_read_back() {
+        for (layout, line, read_back) in [
+            (Layout::Bcm2835, 17, None),
+            (Layout::Rp1, 17, Some(0x10008)),
+            (Layout::Rp1, 30, Some(0x14008)),
+            (Layout::Rp1, 40, Some(0x18008)),
+        ] {
+            let model = Model::new(layout);
+            let registers = model.line(line);
+            assert_eq!(registers.is_posted(), read_back.is_some());
+            registers.write(true);
+            model.last_load.store(0, SeqCst);
+            registers.flush();
+            assert_eq!(model.last_load.load(SeqCst), read_back.unwrap_or(0), "{layout:?} {line}");
+        }
+    }
+
+    #[test]
     fn registers_that_agree_with_the_kernel_are_trusted() {
         for layout in LAYOUTS {
             let model = Model::new(layout);
@@ -732,6 +832,7 @@ mod tests {
             symlink("../of_node", device.join("gpiochip0/of_node")).unwrap();
             fs::create_dir_all(computer.0.path().join("devices")).unwrap();
             symlink(device.join("gpiochip0"), computer.0.path().join("devices/gpiochip0")).unwrap();
+            computer.has_policy("default [performance] powersave powersupersave \n");
             computer
         }
 
@@ -739,9 +840,18 @@ mod tests {
             self.0.path().join(name)
         }
 
+        fn has_policy(&self, policies: &str) {
+            fs::write(self.dev("policy"), policies).unwrap();
+        }
+
+        fn with_places<T>(&self, use_: impl FnOnce(&Places) -> T) -> T {
+            let dev = self.0.path();
+            use_(&Places { dev, devices: &dev.join("devices"), aspm_policy: &dev.join("policy") })
+        }
+
         fn open(&self, wish: FastGpio) -> Result<ChipRegisters, String> {
             let dev = self.0.path();
-            ChipRegisters::open(dev, &dev.join("devices"), "gpiochip0", wish)
+            self.with_places(|places| ChipRegisters::open(places, "gpiochip0", wish))
                 .map_err(|why| why.to_string().replace(&format!("{}/", dev.display()), "/dev/"))
         }
     }
@@ -798,6 +908,27 @@ mod tests {
         assert!(denied(libc::EPERM, FastGpio::DevMem).contains("run Pinion as root"));
     }
 
+    /// `pcie_aspm=off` leaves the links as the firmware has set them, and the policy is then `default`.
+    #[test]
+    fn an_rp1_needs_a_link_that_never_sleeps() {
+        let computer = Computer::new(PI5);
+        fs::File::create(computer.dev("gpiomem0")).unwrap().set_len(0x30000).unwrap();
+        assert!(computer.open(FastGpio::On).unwrap().is_posted());
+        for policies in ["[default] performance powersave powersupersave \n", "default performance [powersave]", ""] {
+            computer.has_policy(policies);
+            let why = computer.open(FastGpio::On).err().unwrap();
+            let told = format!("may sleep, which delays edges ({})", policies.trim());
+            assert!(why.contains(&told) && why.ends_with(LINK_REMEDY), "{why}");
+        }
+        fs::remove_file(computer.dev("policy")).unwrap();
+        assert!(computer.open(FastGpio::On).err().unwrap().contains("No such file"));
+        // The older chips are on the processor's own bus.
+        let computer = Computer::new(PI4);
+        computer.has_policy("[default] performance");
+        fs::File::create(computer.dev("gpiomem")).unwrap().set_len(0x1000).unwrap();
+        assert!(!computer.open(FastGpio::Auto).unwrap().is_posted());
+    }
+
     #[test]
     fn the_node_of_the_chip_is_mapped_and_never_dev_mem_unless_it_is_named() {
         let computer = Computer::new(PI4);
@@ -830,15 +961,15 @@ mod tests {
     #[test]
     fn a_chip_is_looked_at_once() {
         let computer = Computer::new(PI3);
-        let (dev, devices) = (computer.0.path(), computer.dev("devices"));
+        let are_there = |chips: &mut FastChips| computer.with_places(|places| chips.of(places, "gpiochip0").is_some());
         let mut chips = FastChips::new(FastGpio::Auto);
-        assert!(chips.of(dev, &devices, "gpiochip0").is_none());
+        assert!(!are_there(&mut chips));
         fs::File::create(computer.dev("gpiomem")).unwrap().set_len(0x1000).unwrap();
-        assert!(chips.of(dev, &devices, "gpiochip0").is_none(), "it has been looked at");
+        assert!(!are_there(&mut chips), "it has been looked at");
         let mut chips = FastChips::new(FastGpio::Auto);
-        assert!(chips.of(dev, &devices, "gpiochip0").is_some());
+        assert!(are_there(&mut chips));
         chips.distrust("gpiochip0", 17, "the level in its registers is not the kernel's");
-        assert!(chips.of(dev, &devices, "gpiochip0").is_none());
-        assert!(FastChips::new(FastGpio::Off).of(dev, &devices, "gpiochip0").is_none());
+        assert!(!are_there(&mut chips));
+        assert!(!are_there(&mut FastChips::new(FastGpio::Off)));
     }
 }

@@ -75,6 +75,19 @@ impl Register {
         // SAFETY: as above.
         unsafe { self.0.write_volatile(value) };
     }
+
+    /// Returns when the loads and stores before have reached their device. A read of the clock is no access to memory:
+    /// without this the processor may read it before it stores.
+    #[inline]
+    pub fn wait() {
+        #[cfg(any(target_arch = "aarch64", target_arch = "arm"))]
+        // SAFETY: the instruction changes neither a register nor memory.
+        unsafe {
+            std::arch::asm!("dsb sy", options(nostack, preserves_flags));
+        }
+        #[cfg(not(any(target_arch = "aarch64", target_arch = "arm")))]
+        fence(Ordering::SeqCst);
+    }
 }
 
 #[cfg(test)]

@@ -24,10 +24,10 @@ use crate::time::{Clock, Ticks, TimeSource};
 
 use super::Shifted;
 
-/// Shortest time that the clock is high, and low (T3 and T4 of the data sheet).
-const PULSE: Duration = Duration::from_nanos(200);
-/// Longest time that the clock may be high before the chip switches itself off.
-const POWER_DOWN: Ticks = Ticks::from_us(60);
+/// Shortest time that the clock is high, and low: 200 ns (T3 and T4 of the data sheet).
+const PULSE_NS: u32 = 200;
+/// Longest time that the clock may be high before the chip switches itself off: 60 us.
+const POWER_DOWN_NS: u32 = 60_000;
 /// How long the second worker sees the clock high before it lowers it. A pulse without an interruption takes less than
 /// a microsecond.
 const PULSE_MAX: Ticks = Ticks::from_us(5);
@@ -84,7 +84,7 @@ impl Shift {
         };
         let (raw, longest) = shifted?;
         let Some(longest) = longest else { return Ok(Shifted { raw, too_long: true }) };
-        let too_long = longest > i64::from(POWER_DOWN.0);
+        let too_long = longest > i64::from(self.time.at_most(POWER_DOWN_NS).0);
         if too_long && !self.told {
             self.told = true;
             warn!("{}", too_slow(&self.name, longest));
@@ -100,11 +100,11 @@ impl Shift {
         for _ in 0..self.pulses {
             let rises = self.time.now();
             self.sclk.write(true)?;
-            wait();
+            self.wait();
             self.sclk.write(false)?;
             let mut high = self.time.now().since(rises);
             raw = raw << 1 | u32::from(self.dout.read()?);
-            wait();
+            self.wait();
             if let Some(watch) = watch {
                 match self.announce(watch, ABSENCE_MAX) {
                     Some(known) => high = high.min(known.into()),
@@ -114,6 +114,14 @@ impl Shift {
             longest = high.max(longest);
         }
         Ok((raw, Some(longest)))
+    }
+
+    /// Waits for the rest of a pulse, on the computer's clock. It may show a span that is too long by one of its steps.
+    fn wait(&self) {
+        let (start, pulse) = (Instant::now(), Duration::from_nanos((PULSE_NS + self.time.step_ns()).into()));
+        while start.elapsed() < pulse {
+            std::hint::spin_loop();
+        }
     }
 
     /// Announces the next pulse to the second worker. Returns when it watches this pulse, and for how many ticks the clock
@@ -138,13 +146,6 @@ fn too_slow(name: &str, ticks: i64) -> String {
     format!(
         "HX71x sclk ({name}): the clock was high for up to {us} us, and from 60 us on the chip switches itself off: this computer is too slow or too busy for it: run Pinion with -r, or connect it to an SPI controller (docs/guide/pins.md); said once"
     )
-}
-
-fn wait() {
-    let start = Instant::now();
-    while start.elapsed() < PULSE {
-        std::hint::spin_loop();
-    }
 }
 
 /// Watches the pulses of one reading, on the second worker.
@@ -198,8 +199,6 @@ impl Errand for Watcher {
             } else if let Some(seen_at) = high_at {
                 if now.since(seen_at) >= i64::from(PULSE_MAX.0) {
                     self.sclk.write(false)?;
-                    // A store may take a while on its way to the chip. A load from there comes after it.
-                    self.sclk.read()?;
                     let low = self.time.now();
                     longest = low.since(low_at).max(longest);
                     (low_at, high_at) = (low, None);

@@ -4,11 +4,12 @@
 //! The times are those of the firmware's src/neopixel.c, which says what chips really need: a short pulse below 500 ns,
 //! a long one above 650 ns, 5 us from pulse to pulse at most, 1.25 us on average, 200 ns between two edges. The firmware
 //! shuts out interrupts during a pulse. A program on Linux cannot. So each pulse is measured by the clock. The clock is
-//! read before and after each edge. So a pulse is surely longer than its shortest time and shorter than its longest. If a
-//! pulse missed its times, the frame is broken off, and sent again after the reset time. Until
-//! then the LEDs may show wrong colors.
+//! read before and after each edge, and its step is part of the limits. So a pulse is surely longer than its shortest
+//! time and shorter than its longest. If a pulse missed its times, the frame is broken off, and sent again after the
+//! reset time. Until then the LEDs may show wrong colors.
 //!
-//! A call of the kernel takes longer than a short pulse. So a line without registers is refused.
+//! A call of the kernel takes longer than a short pulse. So a line without registers is refused. A line behind a bus that
+//! holds writes back is refused, too: the pulse at the line is not the pulse that was measured.
 
 #![forbid(unsafe_code)]
 
@@ -20,37 +21,61 @@ use crate::board::{Line, Pin};
 use crate::feature::pace::Pace;
 use crate::mcu::Mcu;
 use crate::shutdown::{Shutdown, reason};
-use crate::time::{Clock, Ticks};
+use crate::time::{Clock, NS_PER_TICK, Ticks, TimeSource};
 
 use super::INVALID_SIZE;
+
+/// The remedies.
+const TO_SPI: &str =
+    "connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\"";
+const OR_TO_FAST_LINE: &str = ", or to a line that is written through registers (pinion pins lists them)";
+const OR_BY_THE_KERNEL: &str = "; for LEDs without the host there is the kernel's overlay ws2812-pio";
 
 /// All chains on lines share this worker.
 pub(super) const WORKER: &str = "neopixel";
 /// Highest number of bytes in a chain: klippy's limit (`MAX_MCU_SIZE` of neopixel.py). A frame takes 5 ms, and 20 ms at
 /// most. For this long the worker keeps its processor busy.
 const SIZE_MAX: usize = 500;
-/// Shortest time that the line is high for a 0: 220 ns (Worldsemi WS2812B-V5, "Data transfer time": T0H). The clock
-/// counts full ticks, so that the real time may be one tick shorter.
-const SHORT: Ticks = Ticks(12);
-/// Longest time that the line may be high for a 0: 500 ns. The real time may be one tick longer.
-const SHORT_MAX: Ticks = Ticks(24);
-/// Shortest time that the line is high for a 1: 780 ns.
-const LONG: Ticks = Ticks(40);
-/// Shortest time from pulse to pulse: 1.26 us.
-const BIT_MIN: Ticks = Ticks(63);
-/// Shortest time that the line is low between two pulses: 200 ns.
-const LOW_MIN: Ticks = Ticks(11);
-/// Longest time from pulse to pulse, whatever the host allows: 4.9 us.
-const BIT_MAX: Ticks = Ticks(245);
+/// Time from pulse to pulse unless one is late. The 1.25 us of the data sheet are reached on average.
+const BIT: Ticks = Ticks(63);
 /// How often a frame is sent if pulses missed their times. klippy itself sends it eight times.
 const TRIES: u32 = 3;
+
+/// The limits of measured times. The real ones are surely within the data sheet (Worldsemi WS2812B-V5, "Data transfer
+/// time").
+struct Limits {
+    /// Shortest time that the line is high for a 0: 220 ns (T0H).
+    short: Ticks,
+    /// Longest time that the line may be high for a 0: 500 ns.
+    short_max: Ticks,
+    /// Shortest time that the line is high for a 1: 780 ns.
+    long: Ticks,
+    /// Shortest time that the line is low between two pulses: 200 ns.
+    low: Ticks,
+    /// Longest time from pulse to pulse: the host's limit, 5 us at most.
+    bit_max: Ticks,
+}
+
+impl Limits {
+    /// The limits on this clock. `bit_max` is the host's limit. `None` if the clock is too coarse for a short pulse.
+    fn of(clock: &dyn TimeSource, bit_max: Ticks) -> Option<Limits> {
+        let bit_max_ns = bit_max.0.saturating_mul(NS_PER_TICK as u32).min(5000);
+        let limits = Limits {
+            short: clock.at_least(220),
+            short_max: clock.at_most(500),
+            long: clock.at_least(780),
+            low: clock.at_least(200),
+            bit_max: clock.at_most(bit_max_ns),
+        };
+        (limits.short < limits.short_max).then_some(limits)
+    }
+}
 
 /// Sends frames.
 pub(super) struct Pulses {
     line: Arc<dyn Line>,
     pace: Pace,
-    /// Longest time from pulse to pulse.
-    bit_max: Ticks,
+    limits: Limits,
     /// How long the line is low between two frames.
     reset: Ticks,
     /// When the LEDs have taken the last frame.
@@ -64,7 +89,7 @@ pub(super) struct Pulses {
 impl Pulses {
     /// # Errors
     ///
-    /// "Not an output pin" if the line has no registers, "Invalid neopixel data_size".
+    /// "Not an output pin" if the line has no registers or the clock is too coarse, "Invalid neopixel data_size".
     pub(super) fn new(
         mcu: &Mcu,
         pin: Pin,
@@ -74,19 +99,30 @@ impl Pulses {
         reset: Ticks,
     ) -> Result<Pulses, Shutdown> {
         let name = mcu.name(pin);
-        if !line.is_fast() {
-            let cause = format!("{name} cannot drive LEDs: their pulses are too short for a program on Linux");
-            return Err(Shutdown::because(reason::NOT_OUTPUT, cause).remedy(
-                "connect them to the data output (MOSI) of an SPI controller and name its device, such as \"pin: spidev0.0\", or to a line that is written through registers (pinion pins lists them)",
-            ));
+        let refused = |why: &str, or: &str| {
+            let cause = format!("{name} cannot drive LEDs: {why}");
+            Shutdown::because(reason::NOT_OUTPUT, cause).remedy(format!("{TO_SPI}{or}"))
+        };
+        if line.is_posted() {
+            let why = "its chip is behind PCIe, which may shorten or join their pulses";
+            return Err(refused(why, OR_BY_THE_KERNEL));
         }
+        if !line.is_fast() {
+            let why = "their pulses are too short for a program on Linux";
+            return Err(refused(why, OR_TO_FAST_LINE));
+        }
+        let clock = mcu.clock();
+        let Some(limits) = Limits::of(&*clock, bit_max) else {
+            let why = format!("the computer's clock has steps of {} ns, too long for their pulses", clock.step_ns());
+            return Err(refused(&why, ""));
+        };
         if size > SIZE_MAX {
             let cause = format!("a chain of {size} bytes is too long for a line, which takes {SIZE_MAX}");
             return Err(Shutdown::because(INVALID_SIZE, cause).remedy("lower chain_count").of(&name));
         }
         let pace = Pace::new(mcu);
         let free_at = pace.now() + reset;
-        Ok(Pulses { line, pace, bit_max: bit_max.min(BIT_MAX), reset, free_at, name, told: false })
+        Ok(Pulses { line, pace, limits, reset, free_at, name, told: false })
     }
 
     /// Sends the colors. False if no try had its times.
@@ -94,7 +130,7 @@ impl Pulses {
         for _ in 0..TRIES {
             self.pace.until(self.free_at);
             // A byte takes eight bits, and some.
-            self.pace.until_between_ticks(Ticks(10 * BIT_MIN.0 * colors.len() as u32));
+            self.pace.until_between_ticks(Ticks(10 * BIT.0 * colors.len() as u32));
             let sent = self.frame(colors);
             self.line.write(false)?;
             self.free_at = self.pace.now() + self.reset;
@@ -116,6 +152,7 @@ impl Pulses {
         let bits = colors.iter().flat_map(|byte| (0..8).rev().map(move |bit| byte >> bit & 1 == 1));
         // The first call is slower than the others. Without this one, the first pulse would be longer.
         self.line.write(false)?;
+        let Limits { short, short_max, long, low, bit_max } = self.limits;
         let mut next = self.pace.now();
         let mut last = None;
         for one in bits {
@@ -123,15 +160,15 @@ impl Pulses {
             let rises = self.pace.now();
             self.line.write(true)?;
             let risen = self.pace.now();
-            self.pace.spin_until(risen + if one { LONG } else { SHORT });
+            self.pace.spin_until(risen + if one { long } else { short });
             self.line.write(false)?;
             let fallen = self.pace.now();
             let late = |from: Clock, to: Clock, limit: Ticks| to.since(from) > i64::from(limit.0);
-            let high_max = if one { self.bit_max } else { SHORT_MAX };
-            if late(rises, fallen, high_max) || last.is_some_and(|last| late(last, risen, self.bit_max)) {
+            let high_max = if one { bit_max } else { short_max };
+            if late(rises, fallen, high_max) || last.is_some_and(|last| late(last, risen, bit_max)) {
                 return Ok(false);
             }
-            next = (rises + BIT_MIN).max(fallen + LOW_MIN);
+            next = (rises + BIT).max(fallen + low);
             last = Some(rises);
         }
         Ok(true)
@@ -142,14 +179,44 @@ impl Pulses {
 mod tests {
     use super::*;
     use std::sync::Mutex;
+    use std::sync::atomic::{AtomicU64, Ordering::SeqCst};
+    use std::time::Duration;
 
     use crate::board::Direction;
-    use crate::time::{TimeSource, VirtualClock};
 
-    /// A line that records its edges in nanoseconds. Each takes a tick. `late` has the edges at which the program is
+    /// A clock with steps of a 64th of this many nanoseconds. Each look at it takes 10 ns of the real time.
+    struct Stepped {
+        real_ns: AtomicU64,
+        step: u64,
+    }
+
+    /// Steps of 1 ns, and those of a clock of 19.2 MHz.
+    const FINE: u64 = 64;
+    const COARSE: u64 = 64 * 10_000 / 192;
+
+    impl TimeSource for Stepped {
+        fn now(&self) -> Clock {
+            let steps = 64 * self.real_ns.fetch_add(10, SeqCst) / self.step;
+            Clock::from_ticks(steps * self.step / 64 / NS_PER_TICK)
+        }
+
+        fn instant_of(&self, _: Duration) -> Clock {
+            Clock::EPOCH
+        }
+
+        fn duration_of(&self, _: Clock) -> Duration {
+            Duration::ZERO
+        }
+
+        fn step_ns(&self) -> u32 {
+            self.step.div_ceil(64) as u32
+        }
+    }
+
+    /// A line that records its edges in nanoseconds. Each takes 20 ns. `late` has the edges at which the program is
     /// interrupted before or after the edge, and for how many ticks.
     struct Wire {
-        clock: VirtualClock,
+        clock: Arc<Stepped>,
         edges: Mutex<Vec<(u64, bool)>>,
         late: Mutex<Vec<(usize, When, u32)>>,
     }
@@ -163,8 +230,9 @@ mod tests {
     impl Wire {
         fn interrupt(&self, edge: usize, when: When) {
             let late = self.late.lock().unwrap();
-            let ticks = late.iter().filter(|(at, is, _)| *at == edge && *is == when).map(|(.., ticks)| *ticks).sum();
-            self.clock.set(self.clock.now() + Ticks(ticks));
+            let ticks: u32 =
+                late.iter().filter(|(at, is, _)| *at == edge && *is == when).map(|(.., ticks)| *ticks).sum();
+            self.clock.real_ns.fetch_add(NS_PER_TICK * u64::from(ticks), SeqCst);
         }
     }
 
@@ -173,8 +241,7 @@ mod tests {
             let edge = self.edges.lock().unwrap().len();
             if self.edges.lock().unwrap().last().is_none_or(|(_, was)| *was != level) && (level || edge > 0) {
                 self.interrupt(edge, When::Before);
-                self.edges.lock().unwrap().push((20 * self.clock.now().ticks(), level));
-                self.clock.set(self.clock.now() + Ticks(1));
+                self.edges.lock().unwrap().push((self.clock.real_ns.fetch_add(20, SeqCst), level));
                 self.interrupt(edge, When::After);
             }
             Ok(())
@@ -190,12 +257,16 @@ mod tests {
     }
 
     fn pulses(late: Vec<(usize, When, u32)>) -> (Arc<Wire>, Pulses) {
-        let clock = VirtualClock::at(Clock::EPOCH);
+        pulses_on(Stepped { real_ns: AtomicU64::new(0), step: FINE }, late)
+    }
+
+    fn pulses_on(clock: Stepped, late: Vec<(usize, When, u32)>) -> (Arc<Wire>, Pulses) {
+        let clock = Arc::new(clock);
         let wire = Arc::new(Wire { clock: clock.clone(), edges: Mutex::default(), late: Mutex::new(late) });
         let pulses = Pulses {
             line: wire.clone(),
-            pace: Pace::of(Arc::new(clock)),
-            bit_max: Ticks::from_us(4),
+            limits: Limits::of(&*clock, Ticks::from_us(4)).unwrap(),
+            pace: Pace::of(clock),
             reset: Ticks::from_us(300),
             free_at: Clock::EPOCH,
             name: "gpio18".into(),
@@ -270,6 +341,33 @@ mod tests {
             }
         }
         assert!((500..2000).contains(&again), "{again} of 2304 frames");
+    }
+
+    /// A clock of 19.2 MHz shows 250 ns for a pulse of 199 ns, and for one of 300 ns.
+    #[test]
+    fn pulses_are_surely_within_their_times_on_a_coarse_clock() {
+        let mut sent = 0;
+        for phase in 0..60 {
+            for ticks in [0, 1, 2, 3, 4, 5, 6, 7, 8] {
+                for edge in [40, 41] {
+                    let clock = Stepped { real_ns: AtomicU64::new(7 * phase), step: COARSE };
+                    let (wire, mut pulses) = pulses_on(clock, vec![(edge, When::After, ticks)]);
+                    if pulses.send(&COLORS).unwrap() {
+                        let last = understood(&wire.edges.lock().unwrap()).pop().unwrap();
+                        assert_eq!(last, Some(bits(&COLORS)), "phase {phase}, edge {edge}, {ticks}");
+                        sent += 1;
+                    }
+                }
+            }
+        }
+        assert!(sent > 500, "{sent} of 1080 frames");
+        let limits = |step| {
+            let clock = Stepped { real_ns: AtomicU64::new(0), step };
+            Limits::of(&clock, Ticks::from_us(4)).map(|limits| (limits.short, limits.short_max))
+        };
+        assert_eq!(limits(FINE), Some((Ticks(12), Ticks(24))));
+        assert_eq!(limits(COARSE), Some((Ticks(15), Ticks(21))));
+        assert_eq!(limits(64 * 150), None);
     }
 
     #[test]
