@@ -16,7 +16,7 @@ use pinion_linux::clock::monotonic;
 use pinion_protocol::block::{Received, Receiver, Refusal, Sequence, frame};
 
 use super::core::Payload;
-use super::link::{Heard, Link};
+use super::link::{Heard, Link, serving};
 use super::sooner;
 use super::status::HostBoard;
 
@@ -102,6 +102,11 @@ impl HostEnd {
         self.link.due().is_none()
     }
 
+    /// Whether the link is there. A port or an interface may come later.
+    pub(super) fn is_open(&self) -> bool {
+        self.link.event().is_some()
+    }
+
     pub(super) fn is_attached(&self) -> bool {
         self.is_attached
     }
@@ -110,7 +115,7 @@ impl HostEnd {
     pub(super) fn tell(&self) -> String {
         self.shown.attach(self.is_attached);
         let host = if self.is_attached { "a host is attached" } else { "no host is attached" };
-        format!("serving on {}, {host}", self.link.place())
+        format!("{} {}, {host}", serving(self.is_open()), self.link.place())
     }
 
     /// Reads the host's bytes. `hung_up`: the descriptor has hung up.

@@ -273,17 +273,19 @@ impl LinkThread {
 
     /// Reads what has come. True if no host can come any more.
     fn read(&mut self, hung_up: bool) -> io::Result<bool> {
+        let was_open = self.host.is_open();
         let read = self.host.read(hung_up)?;
         if read.is_gone {
             self.introduction.end();
-            self.tell_status();
             self.record(Event::HostGone);
         }
         if let Some(stop) = self.host.intrusion() {
             self.request(Request::Shutdown(stop));
         }
-        if read.is_new_host {
+        if read.is_gone || read.is_new_host || self.host.is_open() != was_open {
             self.tell_status();
+        }
+        if read.is_new_host {
             self.introduction.begin();
             self.record(Event::HostCame);
         }

@@ -70,7 +70,7 @@ pub use guardian::Guardian;
 pub use helpers::Helpers;
 pub use host::HostSearch;
 pub use link::LinkName;
-pub use link::can::{CanbusUuid, uuid as can_uuid};
+pub use link::can::{CanbusUuid, can_open, uuid as can_uuid};
 pub use link::pty::Access;
 pub use place::Place;
 pub use recorder::Recording;
@@ -180,7 +180,7 @@ pub fn run(
     let (core, core_end) = core.start()?;
     started(recorder.start(trace_socket))?;
 
-    info!("serving on {} ({})", link.place(), link.detail());
+    info!("{} {} ({})", link::serving(link.event().is_some()), link.place(), link.detail());
     let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
     let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil).map_err(no_room)?;
     let mut link = LinkThread::new(HostEnd::new(link, shown), core_end, introduction, oversight, clock, recorder);

@@ -4,16 +4,22 @@
 use std::fs;
 use std::io::Read;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::os::unix::process::CommandExt;
 use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use nix::fcntl::OFlag;
 use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
+use nix::sys::signal::Signal;
+use nix::unistd::geteuid;
 use pinion_client::Client;
 use pinion_client::serial::{BlockLink, Port};
 use tempfile::TempDir;
 
 use crate::process::{Pinion, WAIT_MAX};
+use crate::terminal::AtTerminal;
 
 /// A pseudo terminal in place of a serial port. The test has the host's end. The port's name is a link, so that the
 /// next one may have the same name.
@@ -103,9 +109,53 @@ fn a_serial_port_that_is_not_there_yet_is_waited_for() {
     let folder = tempfile::tempdir().unwrap();
     let pinion = on_serial(folder, "");
     pinion.logged("there is no ");
+    pinion.logged("waiting for ");
+    assert!(!pinion.log().contains("serving on"), "{}", pinion.log());
     let host = plug_in(pinion.folder());
     pinion.logged("ttyPort is there");
     uptime(&mut client(host));
+}
+
+#[test]
+fn a_link_that_run_refuses_is_an_error_of_the_check() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("ttyPort");
+    fs::write(&file, "").unwrap();
+    let folder_itself = format!("serial:{}", folder.path().display());
+    // No kernel has CAN on `lo`.
+    for link in [&*format!("serial:{}", file.display()), &folder_itself, "can:lo,0123456789ab"] {
+        let run = |more: &[&str]| {
+            let args = [&["run", "--board", "sim", "--link", link, "-I", "/tmp/klipper_host_refused"], more].concat();
+            Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).stdin(Stdio::null()).output().unwrap()
+        };
+        let (refused, checked) = (run(&[]), run(&["--check"]));
+        let log = String::from_utf8(refused.stderr).unwrap();
+        let page = String::from_utf8(checked.stdout).unwrap();
+        assert_eq!((refused.status.code(), checked.status.code()), (Some(1), Some(1)), "{link}: {log}{page}");
+        // With the same words.
+        let found = page.lines().find_map(|line| line.trim().strip_prefix("error")).unwrap().trim();
+        assert!(log.contains(found), "{log}{page}");
+    }
+}
+
+#[test]
+fn a_port_whose_other_end_stays_is_free_after_a_kill() {
+    let folder = tempfile::tempdir().unwrap();
+    let host = plug_in(&folder);
+    let port = fs::canonicalize(folder.path().join("ttyPort")).unwrap();
+    let mut pinion = on_serial(folder, "");
+    pinion.logged("serving on");
+    pinion.signal(Signal::SIGKILL);
+    pinion.end();
+    // For root the kernel would make an exception.
+    let mut command = Command::new("sh");
+    command.args(["-c", ": <>\"$0\""]).arg(&port);
+    if geteuid().is_root() {
+        fs::set_permissions(&port, fs::Permissions::from_mode(0o666)).unwrap();
+        command.uid(65534);
+    }
+    assert!(command.status().unwrap().success());
+    drop(host);
 }
 
 #[test]
@@ -140,6 +190,28 @@ fn standard_input_and_output_carry_a_host_until_they_end() {
     child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0), "{log}");
     assert!(log.contains("host gone"), "{log}");
+}
+
+#[test]
+fn a_person_s_terminal_is_no_wire_and_a_program_s_may_be() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        command.args(["run", "--board", "sim", "--link", "stdio", "-I"]).arg(folder.path().join("tty"));
+        command
+    };
+    let mut person = AtTerminal::start(&mut run(), 24, None);
+    assert_eq!(person.ended().code(), Some(1));
+    assert!(person.shown().contains("--link stdio: this terminal shows the log"), "{}", person.shown());
+    assert!(person.is_given_back());
+    // socat with its option `pty`: the log is not there.
+    let log = folder.path().join("log");
+    let _program = AtTerminal::start(&mut run(), 24, Some(fs::File::create(&log).unwrap().into()));
+    let end = Instant::now() + WAIT_MAX;
+    while !fs::read_to_string(&log).unwrap().contains("serving on standard input") {
+        assert!(Instant::now() < end, "{}", fs::read_to_string(&log).unwrap());
+        thread::sleep(Duration::from_millis(10));
+    }
 }
 
 #[test]
