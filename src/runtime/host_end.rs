@@ -13,7 +13,7 @@ use log::{info, warn};
 use pinion_firmware::shutdown::Shutdown;
 use pinion_linux::LOOK_AT_LOG;
 use pinion_linux::clock::monotonic;
-use pinion_protocol::block::{Received, Receiver, Refusal, Sequence, frame};
+use pinion_protocol::block::{Received, Receiver, Refusal, SYNC, Sequence, frame};
 
 use super::core::Payload;
 use super::link::{Heard, Link, serving};
@@ -57,6 +57,8 @@ pub(super) struct Read {
     pub(super) is_over: bool,
     /// Somebody wrote `FORCE_SHUTDOWN`.
     pub(super) is_forced: bool,
+    /// Only sync bytes came, between blocks. `pinion link` sends one while its host is silent.
+    pub(super) is_sign: bool,
 }
 
 /// The next item of the input.
@@ -107,6 +109,11 @@ impl HostEnd {
         self.link.event().is_some()
     }
 
+    /// Whether the host is on another computer, as far as was found out: `pinion attach` has the terminal open.
+    pub(super) fn is_carried(&self) -> bool {
+        self.shown.is_carried()
+    }
+
     pub(super) fn is_attached(&self) -> bool {
         self.is_attached
     }
@@ -146,6 +153,7 @@ impl HostEnd {
                 self.part()?;
             }
         }
+        read.is_sign = bytes > 0 && self.input[..self.filled].iter().all(|byte| *byte == SYNC);
         if self.input[fresh.clone()] == *FORCE_SHUTDOWN {
             self.filled = fresh.start;
             read.is_forced = true;

@@ -111,8 +111,10 @@ struct Woken {
 /// Why the link ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum End {
-    /// A signal asked for it, or no host can come any more.
+    /// A signal asked for it.
     Asked,
+    /// The host is gone, and no other can come.
+    HostOver,
     /// The guardian is gone. The program has to be started again.
     GuardianLost,
 }
@@ -167,7 +169,7 @@ impl LinkThread {
                 return Ok(End::GuardianLost);
             }
             if (woken.by_hangup || woken.by_input) && self.read(woken.by_hangup)? {
-                return Ok(End::Asked);
+                return Ok(End::HostOver);
             }
         }
     }
@@ -289,6 +291,9 @@ impl LinkThread {
             self.introduction.begin();
             self.record(Event::HostCame);
         }
+        if read.is_sign {
+            self.record(Event::Alive);
+        }
         if read.is_forced {
             let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
             self.request(Request::Shutdown(stop.remedy("FIRMWARE_RESTART starts anew")));
@@ -309,6 +314,8 @@ impl LinkThread {
 
     /// Speaks this dialect from now on.
     fn speak(&mut self, dialect: Arc<Dialect>) {
+        // The search for the host has told that, too.
+        self.recorder.carry(self.host.is_carried());
         if Arc::ptr_eq(&dialect, &self.known.dialect) {
             return;
         }

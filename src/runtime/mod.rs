@@ -19,6 +19,7 @@ use log::{error, info, warn};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
+use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
@@ -208,7 +209,13 @@ fn end(
     served: Result<End, Trouble>,
 ) -> Result<(), Trouble> {
     link.stopping();
-    link.request(Request::Quit);
+    link.request(Request::Quit(match served {
+        Ok(End::HostOver) => Some(
+            Shutdown::because(reason::HOST_LOST, "standard input has ended")
+                .remedy("find out why the program that started Pinion closed it (ssh, socat)"),
+        ),
+        _ => None,
+    }));
     let left = core.join();
     link.finish();
     let failure = match left {
@@ -233,7 +240,7 @@ fn end(
     }
     link.close();
     match served? {
-        End::Asked => Ok(()),
+        End::Asked | End::HostOver => Ok(()),
         End::GuardianLost => {
             Err(Trouble::new("the guardian is gone, so Pinion ends")
                 .remedy("start it anew, as the service does by itself"))

@@ -18,6 +18,7 @@ use pinion_client::Client;
 use pinion_client::serial::{BlockLink, Port};
 use tempfile::TempDir;
 
+use crate::cut::begin;
 use crate::process::{Pinion, WAIT_MAX};
 use crate::terminal::AtTerminal;
 
@@ -170,13 +171,15 @@ fn a_serial_port_that_another_program_uses_is_an_error_of_one_line() {
     assert!(log.contains("another program uses it"), "{log}");
 }
 
-#[test]
-fn standard_input_and_output_carry_a_host_until_they_end() {
+/// A host comes over standard input and leaves. `is_in_use`: it configures the MCU and switches everything on. Returns
+/// the log.
+fn log_of_stdio(is_in_use: bool) -> String {
     let folder = tempfile::tempdir().unwrap();
     let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
         .args(["run", "--board", "sim", "--link", "stdio", "-I"])
         .arg(folder.path().join("tty"))
+        .env("STATE_DIRECTORY", folder.path())
         .stdin(OwnedFd::from(theirs.try_clone().unwrap()))
         .stdout(OwnedFd::from(theirs))
         .stderr(Stdio::piped())
@@ -184,12 +187,32 @@ fn standard_input_and_output_carry_a_host_until_they_end() {
         .unwrap();
     let mut client = client(ours);
     uptime(&mut client);
+    if is_in_use {
+        begin(&mut client, 0.0);
+    }
     drop(client);
     // The input has ended: so does the program, in order.
     let mut log = String::new();
     child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0), "{log}");
     assert!(log.contains("host gone"), "{log}");
+    log
+}
+
+#[test]
+fn standard_input_and_output_carry_a_host_until_they_end() {
+    // A host that only looks at the MCU is not missed.
+    let log = log_of_stdio(false);
+    assert!(log.contains("the program ends") && !log.contains("ERROR") && !log.contains(".trace"), "{log}");
+}
+
+#[test]
+fn the_end_of_standard_input_stops_an_mcu_that_is_in_use_with_a_verdict() {
+    let log = log_of_stdio(true);
+    assert!(log.contains("shutdown: Lost communication with host: standard input has ended: find out why"), "{log}");
+    assert!(!log.contains("Force shutdown command"), "{log}");
+    let verdict = log.lines().find(|line| line.contains("closed standard input")).expect(&log);
+    assert!(verdict.contains("(pinion trace "), "{verdict}");
 }
 
 #[test]
