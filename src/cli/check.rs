@@ -15,13 +15,14 @@ use nix::unistd::{AccessFlags, access, geteuid};
 
 use crate::FIRMWARE;
 use crate::runtime::realtime::{self, Processors};
-use crate::runtime::{self, CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_uuid};
+use crate::runtime::{self, CLOSED, CanbusUuid, LinkName, Place, TerminalGroup, can_open, can_uuid};
 use pinion_firmware::mcu::{Dialect, DialectName};
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::Inventory;
 use pinion_linux::can;
 use pinion_linux::clock::Monotonic;
 use pinion_linux::gpio::{Chip, FastGpio};
+use pinion_linux::uart;
 
 use super::computer::Computer;
 use super::computer::manager::{SYSTEMCTL, watchdog_of_systemd};
@@ -105,7 +106,11 @@ pub(super) fn wire(link: &LinkName) -> Finding {
         LinkName::Serial(port, _) => {
             let path = port.display();
             if !port.exists() {
-                Finding::warning("link", format!("there is no {path}"), "plug it in, or load its driver")
+                let remedy = "plug it in, load its driver, or name another (pinion pins lists them)";
+                return Finding::warning("link", format!("there is no {path}, so Pinion waits for it"), remedy);
+            }
+            if let Err(trouble) = uart::find_line(port) {
+                Finding::of("link", Level::Error, trouble)
             } else if access(port.as_path(), AccessFlags::R_OK | AccessFlags::W_OK).is_err() {
                 let remedy = "run Pinion as another user, or add this one to the port's group (ls -l /dev tells it)";
                 Finding::error("link", format!("{path} may not be opened by this user"), remedy)
@@ -120,7 +125,7 @@ pub(super) fn wire(link: &LinkName) -> Finding {
 
 /// Whether a CAN interface is up, and what a host calls the node.
 fn can_bus(interface: &str, uuid: Option<CanbusUuid>) -> Finding {
-    let uuid = match uuid.map_or_else(can_uuid, Ok) {
+    let uuid = match can_open(interface).and_then(|()| uuid.map_or_else(can_uuid, Ok)) {
         Ok(uuid) => uuid,
         Err(trouble) => return Finding::of("link", Level::Error, trouble),
     };
@@ -128,7 +133,7 @@ fn can_bus(interface: &str, uuid: Option<CanbusUuid>) -> Finding {
     match can::interface(interface) {
         Err(error) if error.kind() == ErrorKind::NotFound => {
             let remedy = "plug in its adapter, or load its overlay";
-            Finding::warning("link", format!("there is no CAN interface {interface}"), remedy)
+            Finding::warning("link", format!("there is no CAN interface {interface}, so Pinion waits for it"), remedy)
         }
         Err(error) => Finding::warning("link", format!("{interface}: {error}"), "look at ip -details link"),
         Ok(found) if !found.is_up => Finding::warning("link", format!("{interface} is down"), up),
@@ -278,16 +283,14 @@ mod tests {
     #[test]
     fn a_wire_that_is_not_there_yet_is_a_warning() {
         let told = |link: &str| wire(&link.parse().unwrap());
-        for (link, cause) in
-            [("serial:/dev/none", "there is no /dev/none"), ("can:none,0123456789ab", "there is no CAN interface none")]
-        {
-            let found = told(link);
-            assert!(found.status == Level::Warning && found.told.cause.contains(cause), "{found:?}");
+        let port = told("serial:/dev/none");
+        assert!(port.status == Level::Warning && port.told.cause.contains("there is no /dev/none"), "{port:?}");
+        let bus = told("can:none,0123456789ab");
+        match can_open("none") {
+            Ok(()) => assert!(bus.told.cause.contains("there is no CAN interface none"), "{bus:?}"),
+            // This kernel has no CAN.
+            Err(trouble) => assert_eq!((bus.status, bus.told), (Level::Error, trouble)),
         }
-        let folder = tempfile::tempdir().unwrap();
-        let port = folder.path().join("tty");
-        fs::write(&port, "").unwrap();
-        assert_eq!(told(&format!("serial:{}", port.display())).status, Level::Ok);
         assert_eq!(told("stdio").status, Level::Ok);
     }
 

@@ -55,8 +55,8 @@ pub(super) enum Request {
     Speak(Arc<Dialect>),
     /// Report how late timers were.
     Report,
-    /// Stop the MCU and end.
-    Quit,
+    /// Stop the MCU and end. A running MCU stops for this reason, if there is one. Otherwise somebody asked for it.
+    Quit(Option<Shutdown>),
     /// Hang forever, for a test.
     Hang,
 }
@@ -320,7 +320,7 @@ impl Core {
                 first.iter().chain(second).find_map(|request| match request {
                     Request::Run(payload) => heard.is_emergency(payload.as_slice()).then(base::emergency),
                     Request::Shutdown(shutdown) => Some(shutdown.clone()),
-                    Request::Quit => Some(program_ends()),
+                    Request::Quit(why) => Some(why.clone().unwrap_or_else(program_ends)),
                     Request::Speak(dialect) => {
                         heard = dialect;
                         None
@@ -401,8 +401,14 @@ impl Core {
             }
             Request::Speak(dialect) => self.mcu.speak(dialect),
             Request::Report => self.mcu.report_lateness(self.waiter.margin()),
-            Request::Quit => {
-                self.mcu.shut_down(program_ends());
+            Request::Quit(why) => {
+                let is_last = |why: &Shutdown| self.mcu.last_stop().is_some_and(|(stop, _)| stop.reason == why.reason);
+                let why = why.filter(|why| self.mcu.is_running() || is_last(why));
+                let is_news = why.is_some();
+                self.mcu.shut_down(why.unwrap_or_else(program_ends));
+                if is_news {
+                    self.record();
+                }
                 return Turn::Quit;
             }
             Request::Hang => loop {
@@ -619,7 +625,7 @@ mod tests {
 
         fn quit(mut self) -> Left {
             self.bench.hang(false);
-            self.stop(Request::Quit);
+            self.stop(Request::Quit(None));
             self.thread.join().unwrap()
         }
 
@@ -793,7 +799,7 @@ mod tests {
             let mut blocks = CONFIGURATION + 2;
             match which {
                 0 => rig.stop(Request::Shutdown(shutdown())),
-                1 => rig.stop(Request::Quit),
+                1 => rig.stop(Request::Quit(None)),
                 _ => {
                     blocks += 1;
                     let mut payload = rig.encode("emergency_stop", &[]);
@@ -810,7 +816,7 @@ mod tests {
             assert!(!rig.bench.level(30), "a command that waited has not run");
             rig.bench.hang(false);
             if which != 1 {
-                rig.stop(Request::Quit);
+                rig.stop(Request::Quit(None));
             }
             rig.thread.join().unwrap();
         }
@@ -835,7 +841,7 @@ mod tests {
         rig.stop(Request::Run(block));
         rig.wait_until("the MCU stops", Rig::is_stopped);
         rig.bench.hang(false);
-        rig.stop(Request::Quit);
+        rig.stop(Request::Quit(None));
         rig.thread.join().unwrap();
     }
 

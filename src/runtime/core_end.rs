@@ -50,7 +50,7 @@ pub(super) struct Handed {
 impl CoreEnd {
     /// Passes a request to the core. The core takes requests faster than a person or a signal makes them.
     pub(super) fn request(&mut self, request: Request) {
-        if matches!(request, Request::Shutdown(_) | Request::Quit) {
+        if matches!(request, Request::Shutdown(_) | Request::Quit(_)) {
             self.progress.stop_handed();
         }
         let mut request = request;

@@ -13,10 +13,10 @@ use log::{info, warn};
 use pinion_firmware::shutdown::Shutdown;
 use pinion_linux::LOOK_AT_LOG;
 use pinion_linux::clock::monotonic;
-use pinion_protocol::block::{Received, Receiver, Refusal, Sequence, frame};
+use pinion_protocol::block::{Received, Receiver, Refusal, SYNC, Sequence, frame};
 
 use super::core::Payload;
-use super::link::{Heard, Link};
+use super::link::{Heard, Link, serving};
 use super::sooner;
 use super::status::HostBoard;
 
@@ -57,6 +57,8 @@ pub(super) struct Read {
     pub(super) is_over: bool,
     /// Somebody wrote `FORCE_SHUTDOWN`.
     pub(super) is_forced: bool,
+    /// Only sync bytes came, between blocks. `pinion link` sends one while its host is silent.
+    pub(super) is_sign: bool,
 }
 
 /// The next item of the input.
@@ -102,6 +104,16 @@ impl HostEnd {
         self.link.due().is_none()
     }
 
+    /// Whether the link is there. A port or an interface may come later.
+    pub(super) fn is_open(&self) -> bool {
+        self.link.event().is_some()
+    }
+
+    /// Whether the host is on another computer, as far as was found out: `pinion attach` has the terminal open.
+    pub(super) fn is_carried(&self) -> bool {
+        self.shown.is_carried()
+    }
+
     pub(super) fn is_attached(&self) -> bool {
         self.is_attached
     }
@@ -110,7 +122,7 @@ impl HostEnd {
     pub(super) fn tell(&self) -> String {
         self.shown.attach(self.is_attached);
         let host = if self.is_attached { "a host is attached" } else { "no host is attached" };
-        format!("serving on {}, {host}", self.link.place())
+        format!("{} {}, {host}", serving(self.is_open()), self.link.place())
     }
 
     /// Reads the host's bytes. `hung_up`: the descriptor has hung up.
@@ -141,6 +153,7 @@ impl HostEnd {
                 self.part()?;
             }
         }
+        read.is_sign = bytes > 0 && self.input[..self.filled].iter().all(|byte| *byte == SYNC);
         if self.input[fresh.clone()] == *FORCE_SHUTDOWN {
             self.filled = fresh.start;
             read.is_forced = true;

@@ -111,8 +111,10 @@ struct Woken {
 /// Why the link ends.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum End {
-    /// A signal asked for it, or no host can come any more.
+    /// A signal asked for it.
     Asked,
+    /// The host is gone, and no other can come.
+    HostOver,
     /// The guardian is gone. The program has to be started again.
     GuardianLost,
 }
@@ -167,7 +169,7 @@ impl LinkThread {
                 return Ok(End::GuardianLost);
             }
             if (woken.by_hangup || woken.by_input) && self.read(woken.by_hangup)? {
-                return Ok(End::Asked);
+                return Ok(End::HostOver);
             }
         }
     }
@@ -273,19 +275,24 @@ impl LinkThread {
 
     /// Reads what has come. True if no host can come any more.
     fn read(&mut self, hung_up: bool) -> io::Result<bool> {
+        let was_open = self.host.is_open();
         let read = self.host.read(hung_up)?;
         if read.is_gone {
             self.introduction.end();
-            self.tell_status();
             self.record(Event::HostGone);
         }
         if let Some(stop) = self.host.intrusion() {
             self.request(Request::Shutdown(stop));
         }
-        if read.is_new_host {
+        if read.is_gone || read.is_new_host || self.host.is_open() != was_open {
             self.tell_status();
+        }
+        if read.is_new_host {
             self.introduction.begin();
             self.record(Event::HostCame);
+        }
+        if read.is_sign {
+            self.record(Event::Alive);
         }
         if read.is_forced {
             let stop = Shutdown::because(reason::FORCE_SHUTDOWN, "somebody wrote FORCE_SHUTDOWN to the pty");
@@ -307,6 +314,8 @@ impl LinkThread {
 
     /// Speaks this dialect from now on.
     fn speak(&mut self, dialect: Arc<Dialect>) {
+        // The search for the host has told that, too.
+        self.recorder.carry(self.host.is_carried());
         if Arc::ptr_eq(&dialect, &self.known.dialect) {
             return;
         }

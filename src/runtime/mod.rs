@@ -19,6 +19,7 @@ use log::{error, info, warn};
 
 use pinion_firmware::board::Board;
 use pinion_firmware::mcu::DialectName;
+use pinion_firmware::shutdown::{Shutdown, reason};
 use pinion_firmware::time::Timing;
 use pinion_firmware::trouble::Trouble;
 use pinion_linux::{LOOK_AT_LOG, sys};
@@ -70,7 +71,7 @@ pub use guardian::Guardian;
 pub use helpers::Helpers;
 pub use host::HostSearch;
 pub use link::LinkName;
-pub use link::can::{CanbusUuid, uuid as can_uuid};
+pub use link::can::{CanbusUuid, can_open, uuid as can_uuid};
 pub use link::pty::Access;
 pub use place::Place;
 pub use recorder::Recording;
@@ -180,7 +181,7 @@ pub fn run(
     let (core, core_end) = core.start()?;
     started(recorder.start(trace_socket))?;
 
-    info!("serving on {} ({})", link.place(), link.detail());
+    info!("{} {} ({})", link::serving(link.event().is_some()), link.place(), link.detail());
     let vigil = Vigil::new(notify, notify::watchdog_interval(), pulse);
     let oversight = Oversight::new(signals, guardian.as_ref().map(Guardian::watch), vigil).map_err(no_room)?;
     let mut link = LinkThread::new(HostEnd::new(link, shown), core_end, introduction, oversight, clock, recorder);
@@ -208,7 +209,13 @@ fn end(
     served: Result<End, Trouble>,
 ) -> Result<(), Trouble> {
     link.stopping();
-    link.request(Request::Quit);
+    link.request(Request::Quit(match served {
+        Ok(End::HostOver) => Some(
+            Shutdown::because(reason::HOST_LOST, "standard input has ended")
+                .remedy("find out why the program that started Pinion closed it (ssh, socat)"),
+        ),
+        _ => None,
+    }));
     let left = core.join();
     link.finish();
     let failure = match left {
@@ -233,7 +240,7 @@ fn end(
     }
     link.close();
     match served? {
-        End::Asked => Ok(()),
+        End::Asked | End::HostOver => Ok(()),
         End::GuardianLost => {
             Err(Trouble::new("the guardian is gone, so Pinion ends")
                 .remedy("start it anew, as the service does by itself"))

@@ -86,6 +86,8 @@ pub enum Event {
     },
     /// The core has no room for the host's blocks.
     Full,
+    /// A sync byte came between blocks: the host's computer is there, and its host says nothing.
+    Alive,
 
     /// A worker began an errand.
     ErrandBegan {
@@ -203,6 +205,7 @@ impl Event {
             Event::Full => (25, 0),
             Event::Nak => (26, 0),
             Event::Answered { id } => (27, id.into()),
+            Event::Alive => (28, 0),
             Event::ErrandBegan { oid, waited } => (30, pair(waited.0, number(oid))),
             Event::ErrandEnded { oid, took } => (31, pair(took.0, number(oid))),
             Event::Processor { thread: Watched::Core, ran, waited } => (40, pair(ran.0, waited.0)),
@@ -248,6 +251,7 @@ impl Event {
             25 => Event::Full,
             26 => Event::Nak,
             27 => Event::Answered { id: low as u16 },
+            28 => Event::Alive,
             30 => Event::ErrandBegan { oid: u8::try_from(high).ok(), waited: Ticks(low) },
             31 => Event::ErrandEnded { oid: u8::try_from(high).ok(), took: Ticks(low) },
             40 => Event::Processor { thread: Watched::Core, ran: Ticks(low), waited: Ticks(high) },

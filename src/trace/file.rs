@@ -29,6 +29,9 @@ const EVENTS_MAX: usize = 1 << 20;
 /// Highest number of threads.
 const THREADS_MAX: usize = 64;
 
+/// The wire of a host that `pinion attach` carries.
+pub const SSH: &str = "SSH";
+
 /// What ended a recording.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -60,6 +63,9 @@ pub struct Names {
     pub objects: BTreeMap<u8, String>,
     /// The lines by their numbers on the wire.
     pub pins: BTreeMap<u32, String>,
+    /// Whether the last host was on another computer, and `pinion attach` carried it.
+    #[serde(default)]
+    pub is_carried: bool,
 }
 
 /// The facts about a recording.
@@ -69,7 +75,7 @@ pub struct Head {
     pub version: String,
     /// The path of its link.
     pub link: String,
-    /// The wire to another computer, such as `can:can0`, if there is one.
+    /// The wire to another computer, such as `can:can0` or [`SSH`], if there is one.
     #[serde(default)]
     pub wire: Option<String>,
     /// What ended it.
@@ -235,6 +241,7 @@ pub(crate) mod tests {
                 commands: [(5, "queue_step".to_owned())].into(),
                 objects: [(3, "stepper oid 3".to_owned())].into(),
                 pins: [(17, "gpio17".to_owned())].into(),
+                is_carried: true,
             },
         };
         Trace { head, threads }

@@ -101,6 +101,7 @@ fn weight(deed: &Deed) -> u64 {
         | Event::Out(_)
         | Event::Nak
         | Event::Answered { .. }
+        | Event::Alive
         | Event::Looked { .. }
         | Event::Frequency { .. }
         | Event::Listened
@@ -175,6 +176,7 @@ enum Kind {
     Waits,
     Came,
     Answered,
+    Alive,
     Refused,
     Naks,
     Wrote,
@@ -216,6 +218,7 @@ impl Fold {
             Event::Held | Event::Released => (Kind::Waits, deed.ticks()),
             Event::BlockIn(_) => (Kind::Came, 0),
             Event::Answered { .. } => (Kind::Answered, 0),
+            Event::Alive => (Kind::Alive, 0),
             Event::Refused(_) => (Kind::Refused, 0),
             Event::Nak => (Kind::Naks, 0),
             Event::Out(bytes) => (Kind::Wrote, bytes.into()),
@@ -254,6 +257,7 @@ impl Fold {
                 Kind::Waits => format!("{} for a bus, longest {most} ms", count(sum.count, "wait")),
                 Kind::Came => format!("{} from the host", count(sum.count, "block")),
                 Kind::Answered => format!("{} answered without the core", count(sum.count, "block")),
+                Kind::Alive => format!("{} of life of the host's computer", count(sum.count, "sign")),
                 Kind::Refused => format!("{} of garbage or of blocks sent again", count(sum.count, "refusal")),
                 Kind::Naks => count(sum.count, "NAK"),
                 Kind::Wrote => format!("{} to the host", count(sum.all, "byte")),

@@ -13,7 +13,7 @@ use pinion_firmware::time::Ticks;
 use evidence::{Arrival, Errand, MS, QUIET, Record, Scheduling, Span};
 
 use super::event::{PowerFault, Watched};
-use super::file::{End, Trace};
+use super::file::{End, SSH, Trace};
 
 mod evidence;
 
@@ -23,6 +23,8 @@ const REACTION: i64 = 20 * MS;
 const PROMPT: i64 = MS;
 /// Shortest time without commands of a host that is worth telling.
 const SILENCE: i64 = 1500 * MS;
+/// Shortest time without a sign of life of a silent host's computer that is worth telling.
+const SIGN: i64 = 2500 * MS;
 /// Shortest errand under way that is worth telling while the program works.
 const HANGS: i64 = 1000 * MS;
 /// How late a timer may be while nobody complains.
@@ -107,6 +109,9 @@ fn stopped(record: &Record, text: &str, trouble: &str) -> Finding {
         return of_hanging(record)
             .unwrap_or_else(|| Finding::new(Culprit::Bus, format!("a bus did not answer: {trouble}"), ""));
     }
+    if text == reason::HOST_LOST.text() {
+        return host_lost(record);
+    }
     let Some(due) = record.stop.due.filter(|due| *due <= 0) else {
         return match text {
             _ if text == reason::TIMER_PAST.text() => stood_still(record, trouble),
@@ -136,6 +141,16 @@ fn other_reason(record: &Record, trouble: &str) -> Finding {
         }
         None => Finding::new(Culprit::Nobody, format!("nobody was late: {trouble}"), ""),
     }
+}
+
+/// The program's input has ended.
+fn host_lost(record: &Record) -> Finding {
+    let silent = record.last_heard(0).map_or(0, |at| -at);
+    let what = match silent {
+        SILENCE.. => format!("nothing came over standard input for {}, and then it ended", span_text(silent)),
+        _ => "the program that carries the host's bytes closed standard input".to_owned(),
+    };
+    Finding::new(Culprit::Wire, what + &on_time(record), "look at its log, and at the network")
 }
 
 /// The host asked for an event whose time had passed.
@@ -171,6 +186,16 @@ fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
         }
     }
     let event = if trouble.starts_with("stepper ") { "step" } else { "event" };
+    let silent = record.last_heard(came).filter(|heard| *heard < due && late > 0 && came - heard > SILENCE);
+    if let (Some(wire), Some(heard)) = (&record.trace.head.wire, silent) {
+        let what = format!(
+            "nothing came over {wire} for {}, and then a block {} after the {event} it was for{}",
+            span_text(came - heard),
+            span_text(late),
+            on_time(record)
+        );
+        return with_power(record, (heard, 0), Finding::new(Culprit::Wire, what, wire_remedy(wire)));
+    }
     let mut what = match late {
         0.. => format!("the host's block came {} after the {event} it was for", span_text(late)),
         _ => format!("the host's block came only {} before the {event} it was for", span_text(-late)),
@@ -184,7 +209,12 @@ fn too_close(record: &Record, due: i64, trouble: &str) -> Finding {
     with_power(record, (due, 0), Finding::new(Culprit::Host, what, remedy))
 }
 
-const WIRE_REMEDY: &str = "look at the wire, and whether the computer at its other end is on";
+fn wire_remedy(wire: &str) -> &'static str {
+    match wire {
+        SSH => "look at the network, and at the log of pinion link on the host's computer",
+        _ => "look at the wire, and whether the computer at its other end is on",
+    }
+}
 
 /// The host did not refresh an output before `due`.
 fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
@@ -202,7 +232,7 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
             Some(wire) => Finding::new(
                 Culprit::Wire,
                 format!("the host was gone from {wire} {before} before the stop"),
-                WIRE_REMEDY,
+                wire_remedy(wire),
             ),
             None => {
                 let what = format!("the host closed the terminal {before} before the stop");
@@ -232,13 +262,18 @@ fn not_refreshed(record: &Record, due: i64, trouble: &str) -> Finding {
     }
     let span = (before + PROMPT, 0);
     let signs = record.signs_of_host(span);
-    if let Some(wire) = wire.filter(|_| signs == (0, false)) {
-        let came = if record.has_garbage(span) { "only garbage" } else { "nothing" };
-        let what = format!("{came} came over {wire} for {}{}", span_text(-before), on_time(record));
-        return with_power(record, (before, 0), Finding::new(Culprit::Wire, what, WIRE_REMEDY));
+    let heard = record.last_heard(0).unwrap_or(before);
+    let was_alive = record.was_alive((heard, 0));
+    // While its host says nothing, `pinion link` gives a sign of life every two seconds.
+    let longest = if was_alive { SIGN } else { SILENCE };
+    if let Some(wire) = wire.filter(|_| -heard > longest) {
+        let came = if record.has_garbage((heard, 0)) { "only garbage" } else { "nothing" };
+        let what = format!("{came} came over {wire} for {}{}", span_text(-heard), on_time(record));
+        return with_power(record, (before, 0), Finding::new(Culprit::Wire, what, wire_remedy(wire)));
     }
     let alive = match signs {
         (0, true) => ", but it still asked for the clock".to_owned(),
+        (0, false) if was_alive => ", but its computer gave a sign of life".to_owned(),
         _ => resent(record, (before, 0)),
     };
     let what = format!("the host sent no commands for {}{alive}{}", span_text(-before), on_time(record));
@@ -640,7 +675,12 @@ mod tests {
 
         #[track_caller]
         fn judged_over(self, wire: &str, culprit: Culprit, text: &str) {
-            let mut trace = self.trace(End::Shutdown { reason: MISSED_PWM.into(), trouble: TROUBLE.into() });
+            self.judged_for_over(MISSED_PWM, wire, culprit, text);
+        }
+
+        #[track_caller]
+        fn judged_for_over(self, reason: &str, wire: &str, culprit: Culprit, text: &str) {
+            let mut trace = self.trace(End::Shutdown { reason: reason.into(), trouble: TROUBLE.into() });
             trace.head.wire = Some(wire.into());
             let told = verdict(&trace);
             assert_eq!((told.culprit, told.text.as_str()), (culprit, text));
@@ -1041,6 +1081,68 @@ mod tests {
             "can:can0",
             Culprit::Host,
             "the host sent no commands for 4.4 s, but it still asked for the clock; the core was never later than 0.1 ms: look at its log, and at its load",
+        );
+    }
+
+    #[test]
+    fn a_network_that_is_gone_is_told_from_a_host_that_hangs() {
+        const LOOK: &str = "look at the network, and at the log of pinion link on the host's computer";
+        let silent = || Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP).stop(9, STOP - 100);
+        silent().judged_over(
+            SSH,
+            Culprit::Wire,
+            &format!("nothing came over SSH for 4.4 s; the core was never later than 0.1 ms: {LOOK}"),
+        );
+        silent().and("link", STOP - 3 * SECOND, Event::HostGone).judged_over(
+            SSH,
+            Culprit::Wire,
+            &format!("the host was gone from SSH 3.0 s before the stop: {LOOK}"),
+        );
+        silent().and("link", STOP - SECOND, Event::Alive).judged_over(
+            SSH,
+            Culprit::Host,
+            "the host sent no commands for 4.4 s, but its computer gave a sign of life; the core was never later than 0.1 ms: look at its log, and at its load",
+        );
+    }
+
+    #[test]
+    fn a_wire_that_was_silent_makes_a_block_late() {
+        let came = |scene: Scene| scene.block(STOP - 200, STOP - 100).stop(BLOCK, STOP - 38_200);
+        let silent = || came(Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP));
+        silent().judged_for_over(
+            TOO_CLOSE,
+            "can:can0",
+            Culprit::Wire,
+            "nothing came over can:can0 for 4.4 s, and then a block 38.0 ms after the step it was for; the core was never later than 0.1 ms: look at the wire, and whether the computer at its other end is on",
+        );
+        let late = "the host's block came 38.0 ms after the step it was for; the core was never later than 0.1 ms";
+        let remedy = "look at the host's load, and at the wire (can:can0)";
+        // The silence was short, or over before the step's time.
+        for heard in [SECOND, 10_000] {
+            silent().and("link", STOP - heard, Event::Answered { id: 4 }).judged_for_over(
+                TOO_CLOSE,
+                "can:can0",
+                Culprit::Host,
+                &format!("{late}: {remedy}"),
+            );
+        }
+        // A host on this computer has no wire.
+        silent().judged(TOO_CLOSE, Culprit::Host, &format!("{late}: look at the host's load"));
+    }
+
+    #[test]
+    fn an_input_that_ends_tells_whether_anything_came_before() {
+        let lost = |scene: Scene, text: &str| {
+            let scene = scene.and("core", STOP, Event::Stopped { block: 9 });
+            scene.judged_for_over(reason::HOST_LOST.text(), "stdio", Culprit::Wire, text);
+        };
+        lost(
+            Scene::calm().and("link", STOP - 1000, Event::BlockIn(10)),
+            "the program that carries the host's bytes closed standard input; the core was never later than 0.1 ms: look at its log, and at the network",
+        );
+        lost(
+            Scene::calm().silent(&["link"], STOP - 4 * SECOND..STOP),
+            "nothing came over standard input for 4.4 s, and then it ended; the core was never later than 0.1 ms: look at its log, and at the network",
         );
     }
 

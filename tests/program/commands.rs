@@ -3,13 +3,16 @@
 
 use std::collections::HashMap;
 use std::fs;
+use std::path::Path;
 use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use nix::sys::signal::Signal;
 use pinion_testkit::here;
 use serde_json::Value;
 
-use crate::process::{Pinion, closed_pipe, folder_with, output};
+use crate::process::{Pinion, WAIT_MAX, closed_pipe, folder_with, output};
 
 /// The built-in printer with a bed that warms up within seconds.
 fn quick_printer() -> String {
@@ -438,4 +441,36 @@ fn shells_get_completions_with_every_subcommand_and_option() {
         let bash = Command::new("bash").args(["--norc", "-c", &format!("{script}\n{ask}")]).output().unwrap();
         assert_eq!(String::from_utf8_lossy(&bash.stdout).trim(), offered, "{words}");
     }
+}
+
+#[test]
+fn the_recipe_for_ci_ends_if_the_simulated_printer_cannot_start() {
+    const PAGE: &str = include_str!("../../docs/guide/simulated-printer.md");
+    let mut blocks = PAGE.split("```sh\n").skip(1).filter_map(|block| block.split("```").next());
+    let recipe = blocks.find(|block| block.contains("--compare part.gcode -I")).unwrap();
+    let (folder, _) = folder_with("printer.toml", "no_such_key = 1\n");
+    let recipe = recipe.replace("/tmp/printer", folder.path().join("tty").to_str().unwrap());
+    let program = Path::new(env!("CARGO_BIN_EXE_pinion")).parent().unwrap();
+    let log = folder.path().join("log");
+    let mut shell = Command::new("sh")
+        .args(["-c", &recipe])
+        .current_dir(&folder)
+        .env("PATH", format!("{}:{}", program.display(), std::env::var("PATH").unwrap()))
+        .stderr(fs::File::create(&log).unwrap())
+        .spawn()
+        .unwrap();
+    let end = Instant::now() + WAIT_MAX;
+    let status = loop {
+        if let Some(status) = shell.try_wait().unwrap() {
+            break status;
+        }
+        if Instant::now() >= end {
+            shell.kill().unwrap();
+            panic!("it does not end");
+        }
+        thread::sleep(Duration::from_millis(10));
+    };
+    let log = fs::read_to_string(log).unwrap();
+    assert_eq!(status.code(), Some(1), "{log}");
+    assert!(log.contains("no_such_key"), "{log}");
 }

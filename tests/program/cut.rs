@@ -39,10 +39,11 @@ type Cut = Box<dyn FnOnce(&Pinion, Client) -> Whole>;
 /// Makes the wire whole again, and returns the next host. It keeps the wire.
 type Whole = Box<dyn FnMut(&Pinion) -> Client>;
 
-/// The host switches everything on and starts two motors: one moves, and one homes with an endstop of another MCU.
-fn begin(host: &mut Client, has_heater: bool) {
+/// The host switches everything on and starts two motors: one moves, and one homes with an endstop of another MCU. The
+/// heater may stay on for `heat_s` without its host; zero is for ever.
+pub fn begin(host: &mut Client, heat_s: f64) {
     let ticks = |host: &Client, seconds| host.ticks(seconds);
-    let longest = if has_heater { ticks(host, HEAT_S) } else { 0 };
+    let longest = ticks(host, heat_s);
     for command in [
         "allocate_oids count=5",
         &format!("config_digital_out oid=0 pin=bed_heater value=0 default_value=0 max_duration={longest}"),
@@ -86,7 +87,7 @@ fn levels(status: &Value) -> [&Value; 2] {
 
 fn is_cut_with(start: &dyn Fn() -> Wire, has_heater: bool) {
     let Wire { mcu, mut host, cut, verdict } = start();
-    begin(&mut host, has_heater);
+    begin(&mut host, if has_heater { HEAT_S } else { 0.0 });
     let mut whole = cut(&mcu, host);
     mcu.logged("host gone");
     mcu.until("the end of the move", || *steps(&status(&mcu), 2) == STEPS);
@@ -192,7 +193,7 @@ fn an_ssh_that_is_killed() {
             drop(host);
             Box::new(move |_| next_over(&near))
         };
-        Wire { mcu, host, cut: Box::new(cut), verdict: "the host closed the terminal" }
+        Wire { mcu, host, cut: Box::new(cut), verdict: "the host was gone from SSH" }
     });
 }
 
@@ -211,6 +212,18 @@ fn an_ssh_that_carries_nothing_any_more() {
                 next_over(&near)
             })
         };
-        Wire { mcu, host, cut: Box::new(cut), verdict: "the host sent no commands for" }
+        Wire { mcu, host, cut: Box::new(cut), verdict: "nothing came over SSH for" }
     });
+}
+
+#[test]
+fn a_host_that_hangs_behind_ssh_is_no_cut() {
+    let mcu = Pinion::simulated(&[]);
+    let near = near(&mcu.link(), "");
+    let mut host = near.client();
+    // `pinion link` gives a sign of life after two seconds of silence.
+    begin(&mut host, 3.0 * HEAT_S);
+    mcu.logged("shutdown: Missed scheduling of next digital out event");
+    let verdict = mcu.logged("the host sent no commands for");
+    assert!(verdict.contains("but its computer gave a sign of life"), "{verdict}");
 }

@@ -4,16 +4,23 @@
 use std::fs;
 use std::io::Read;
 use std::os::fd::OwnedFd;
-use std::os::unix::fs::symlink;
+use std::os::unix::fs::{PermissionsExt, symlink};
+use std::os::unix::process::CommandExt;
 use std::process::{Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
 
 use nix::fcntl::OFlag;
 use nix::pty::{PtyMaster, grantpt, posix_openpt, ptsname_r, unlockpt};
+use nix::sys::signal::Signal;
+use nix::unistd::geteuid;
 use pinion_client::Client;
 use pinion_client::serial::{BlockLink, Port};
 use tempfile::TempDir;
 
+use crate::cut::begin;
 use crate::process::{Pinion, WAIT_MAX};
+use crate::terminal::AtTerminal;
 
 /// A pseudo terminal in place of a serial port. The test has the host's end. The port's name is a link, so that the
 /// next one may have the same name.
@@ -103,9 +110,53 @@ fn a_serial_port_that_is_not_there_yet_is_waited_for() {
     let folder = tempfile::tempdir().unwrap();
     let pinion = on_serial(folder, "");
     pinion.logged("there is no ");
+    pinion.logged("waiting for ");
+    assert!(!pinion.log().contains("serving on"), "{}", pinion.log());
     let host = plug_in(pinion.folder());
     pinion.logged("ttyPort is there");
     uptime(&mut client(host));
+}
+
+#[test]
+fn a_link_that_run_refuses_is_an_error_of_the_check() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("ttyPort");
+    fs::write(&file, "").unwrap();
+    let folder_itself = format!("serial:{}", folder.path().display());
+    // No kernel has CAN on `lo`.
+    for link in [&*format!("serial:{}", file.display()), &folder_itself, "can:lo,0123456789ab"] {
+        let run = |more: &[&str]| {
+            let args = [&["run", "--board", "sim", "--link", link, "-I", "/tmp/klipper_host_refused"], more].concat();
+            Command::new(env!("CARGO_BIN_EXE_pinion")).args(args).stdin(Stdio::null()).output().unwrap()
+        };
+        let (refused, checked) = (run(&[]), run(&["--check"]));
+        let log = String::from_utf8(refused.stderr).unwrap();
+        let page = String::from_utf8(checked.stdout).unwrap();
+        assert_eq!((refused.status.code(), checked.status.code()), (Some(1), Some(1)), "{link}: {log}{page}");
+        // With the same words.
+        let found = page.lines().find_map(|line| line.trim().strip_prefix("error")).unwrap().trim();
+        assert!(log.contains(found), "{log}{page}");
+    }
+}
+
+#[test]
+fn a_port_whose_other_end_stays_is_free_after_a_kill() {
+    let folder = tempfile::tempdir().unwrap();
+    let host = plug_in(&folder);
+    let port = fs::canonicalize(folder.path().join("ttyPort")).unwrap();
+    let mut pinion = on_serial(folder, "");
+    pinion.logged("serving on");
+    pinion.signal(Signal::SIGKILL);
+    pinion.end();
+    // For root the kernel would make an exception.
+    let mut command = Command::new("sh");
+    command.args(["-c", ": <>\"$0\""]).arg(&port);
+    if geteuid().is_root() {
+        fs::set_permissions(&port, fs::Permissions::from_mode(0o666)).unwrap();
+        command.uid(65534);
+    }
+    assert!(command.status().unwrap().success());
+    drop(host);
 }
 
 #[test]
@@ -120,13 +171,15 @@ fn a_serial_port_that_another_program_uses_is_an_error_of_one_line() {
     assert!(log.contains("another program uses it"), "{log}");
 }
 
-#[test]
-fn standard_input_and_output_carry_a_host_until_they_end() {
+/// A host comes over standard input and leaves. `is_in_use`: it configures the MCU and switches everything on. Returns
+/// the log.
+fn log_of_stdio(is_in_use: bool) -> String {
     let folder = tempfile::tempdir().unwrap();
     let (ours, theirs) = std::os::unix::net::UnixStream::pair().unwrap();
     let mut child = Command::new(env!("CARGO_BIN_EXE_pinion"))
         .args(["run", "--board", "sim", "--link", "stdio", "-I"])
         .arg(folder.path().join("tty"))
+        .env("STATE_DIRECTORY", folder.path())
         .stdin(OwnedFd::from(theirs.try_clone().unwrap()))
         .stdout(OwnedFd::from(theirs))
         .stderr(Stdio::piped())
@@ -134,12 +187,54 @@ fn standard_input_and_output_carry_a_host_until_they_end() {
         .unwrap();
     let mut client = client(ours);
     uptime(&mut client);
+    if is_in_use {
+        begin(&mut client, 0.0);
+    }
     drop(client);
     // The input has ended: so does the program, in order.
     let mut log = String::new();
     child.stderr.take().unwrap().read_to_string(&mut log).unwrap();
     assert_eq!(child.wait().unwrap().code(), Some(0), "{log}");
     assert!(log.contains("host gone"), "{log}");
+    log
+}
+
+#[test]
+fn standard_input_and_output_carry_a_host_until_they_end() {
+    // A host that only looks at the MCU is not missed.
+    let log = log_of_stdio(false);
+    assert!(log.contains("the program ends") && !log.contains("ERROR") && !log.contains(".trace"), "{log}");
+}
+
+#[test]
+fn the_end_of_standard_input_stops_an_mcu_that_is_in_use_with_a_verdict() {
+    let log = log_of_stdio(true);
+    assert!(log.contains("shutdown: Lost communication with host: standard input has ended: find out why"), "{log}");
+    assert!(!log.contains("Force shutdown command"), "{log}");
+    let verdict = log.lines().find(|line| line.contains("closed standard input")).expect(&log);
+    assert!(verdict.contains("(pinion trace "), "{verdict}");
+}
+
+#[test]
+fn a_person_s_terminal_is_no_wire_and_a_program_s_may_be() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = || {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_pinion"));
+        command.args(["run", "--board", "sim", "--link", "stdio", "-I"]).arg(folder.path().join("tty"));
+        command
+    };
+    let mut person = AtTerminal::start(&mut run(), 24, None);
+    assert_eq!(person.ended().code(), Some(1));
+    assert!(person.shown().contains("--link stdio: this terminal shows the log"), "{}", person.shown());
+    assert!(person.is_given_back());
+    // socat with its option `pty`: the log is not there.
+    let log = folder.path().join("log");
+    let _program = AtTerminal::start(&mut run(), 24, Some(fs::File::create(&log).unwrap().into()));
+    let end = Instant::now() + WAIT_MAX;
+    while !fs::read_to_string(&log).unwrap().contains("serving on standard input") {
+        assert!(Instant::now() < end, "{}", fs::read_to_string(&log).unwrap());
+        thread::sleep(Duration::from_millis(10));
+    }
 }
 
 #[test]

@@ -112,6 +112,8 @@ pub mod reason {
         pub WORKER_OVERFLOW = "Bus worker queue overflow";
         /// A bus conversation that a command began does not end (Pinion's own text).
         pub BUS_HANGS = "Bus does not answer";
+        /// No host can come any more: the program's input has ended (Pinion's own text).
+        pub HOST_LOST = "Lost communication with host";
         /// The guardian process is gone (Pinion's own text).
         pub GUARDIAN_LOST = "Guardian process lost";
     }

@@ -58,6 +58,11 @@ pub fn interfaces() -> Vec<String> {
     sysfs::names(Path::new(NET)).into_iter().filter(is_can).collect()
 }
 
+/// Whether there is a network interface of this name that is no CAN interface.
+pub fn is_other(name: &str) -> bool {
+    sysfs::text(&Path::new(NET).join(name).join("type")).is_some_and(|type_| type_ != ARPHRD_CAN)
+}
+
 /// Asks the kernel about an interface.
 ///
 /// # Errors

@@ -6,13 +6,14 @@
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
 use std::os::fd::AsFd;
-use std::os::unix::fs::OpenOptionsExt;
-use std::path::Path;
+use std::os::unix::fs::{FileTypeExt as _, MetadataExt as _, OpenOptionsExt};
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use nix::errno::Errno;
 use nix::fcntl::{Flock, FlockArg};
 use nix::poll::{PollFd, PollFlags, PollTimeout, poll};
+use nix::sys::stat::major;
 use nix::sys::termios::{ControlFlags, FlushArg, SetArg, cfmakeraw, tcdrain, tcflush, tcgetattr, tcsetattr};
 
 use pinion_firmware::board::SerialPort;
@@ -71,6 +72,11 @@ pub(super) fn scan(dev: &Path, class: &Path) -> Vec<Uart> {
     sysfs::names(class).into_iter().filter_map(port).collect()
 }
 
+/// Whether this is the kernel's end of a pseudo terminal (devices.txt: the majors of Unix98 PTY slaves).
+fn is_pseudo(terminal: &File) -> bool {
+    terminal.metadata().is_ok_and(|about| (136..=143).contains(&major(about.rdev())))
+}
+
 /// Opens the terminal at this path: raw, with eight data bits, no parity and one stop bit. No other program may open it
 /// meanwhile. The lock keeps out programs that ask for it, even those of root.
 fn open_raw(path: &Path) -> Result<Flock<File>, Trouble> {
@@ -85,8 +91,12 @@ fn open_raw(path: &Path) -> Result<Flock<File>, Trouble> {
         Errno::EWOULDBLOCK => in_use(),
         errno => Trouble::new(format!("it cannot be locked: {errno}")).remedy(LOOK_AT_LOG),
     })?;
-    sys::make_exclusive(&*file).map_err(no_port)?;
     let mut settings = tcgetattr(&*file).map_err(no_port)?;
+    // The kernel forgets this when the port is closed, however Pinion ends. But a pseudo terminal lives as long as the
+    // program at its other end, for example socat, and would refuse the next Pinion.
+    if !is_pseudo(&file) {
+        sys::make_exclusive(&*file).map_err(no_port)?;
+    }
     cfmakeraw(&mut settings);
     settings.control_flags.remove(ControlFlags::CSTOPB | ControlFlags::CRTSCTS);
     // No modem line matters.
@@ -98,19 +108,35 @@ fn open_raw(path: &Path) -> Result<Flock<File>, Trouble> {
 /// How far a port's real rate may be from the wanted one: a receiver still finds the tenth bit of a byte.
 const RATE_ERROR_MAX: f64 = 0.025;
 
-/// Opens a port as the line to a host, at this rate in baud. Without one it keeps its rate.
+/// Finds the port that a path leads to, as far as that is possible without opening it.
 ///
 /// # Errors
 ///
-/// It is gone, another program's or the kernel's console, or it does not have the rate.
-pub fn open_line(path: &Path, baud: Option<u32>) -> Result<Flock<File>, Trouble> {
-    let opened = || {
+/// It is gone, no port, or the kernel's console.
+pub fn find_line(path: &Path) -> Result<PathBuf, Trouble> {
+    let found = || {
         let target = fs::canonicalize(path).map_err(|error| cannot_open(path, &error))?;
+        if !fs::metadata(&target).is_ok_and(|about| about.file_type().is_char_device()) {
+            return Err(no_port(Errno::ENOTTY));
+        }
         let name = target.file_name().unwrap_or_default().to_string_lossy();
         let consoles = sysfs::text(&Path::new(crate::TTY).join("console/active")).unwrap_or_default();
         if consoles.split_whitespace().any(|console| console == name) {
             return Err(console());
         }
+        Ok(target)
+    };
+    found().map_err(|trouble| trouble.of(path.display()))
+}
+
+/// Opens a port as the line to a host, at this rate in baud. Without one it keeps its rate.
+///
+/// # Errors
+///
+/// It is gone, another program's, no port or the kernel's console, or it does not have the rate.
+pub fn open_line(path: &Path, baud: Option<u32>) -> Result<Flock<File>, Trouble> {
+    let target = find_line(path)?;
+    let opened = || {
         let file = open_raw(&target)?;
         let Some(baud) = baud else { return Ok(file) };
         let real = sys::set_rate(&*file, baud).map_err(|error| {

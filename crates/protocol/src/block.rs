@@ -14,7 +14,8 @@ pub const PAYLOAD_MAX: usize = BLOCK_MAX - BLOCK_MIN;
 
 const HEADER_BYTES: usize = 2;
 const TRAILER_BYTES: usize = 3;
-const SYNC: u8 = 0x7e;
+/// The last byte of each block. More of them may come between blocks.
+pub const SYNC: u8 = 0x7e;
 /// The high half of the sequence byte, both ways.
 const DESTINATION: u8 = 0x10;
 const SEQUENCE_MASK: u8 = 0x0f;

@@ -26,6 +26,7 @@ use nix::poll::PollFlags;
 use nix::unistd::{read, write};
 
 use pinion_linux::clock::monotonic;
+use pinion_protocol::block::SYNC;
 
 /// How long an end may be silent before it sends a sync byte. klippy asks for the time each second.
 const SIGN_EVERY: Duration = Duration::from_secs(2);
@@ -33,7 +34,6 @@ const SIGN_EVERY: Duration = Duration::from_secs(2);
 const SILENCE_MAX: Duration = Duration::from_secs(5);
 /// Highest number of bytes on their way from one descriptor to another. Then the sender has to wait.
 const FLOW_BYTES: usize = 4096;
-const SYNC: u8 = 0x7e;
 
 /// The result of a read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -59,7 +59,37 @@ pub(crate) struct Target {
     pub(crate) remote: PathBuf,
 }
 
+/// The options of ssh that ssh-copy-id has too, each with a value (ssh-copy-id(1)).
+const COPY_ID_OPTIONS: [&str; 4] = ["-p", "-i", "-o", "-F"];
+
 impl Target {
+    /// The command by which a person logs in there in the same way.
+    fn by_hand(&self) -> String {
+        let ssh = if self.ssh.is_empty() { "ssh".to_owned() } else { self.ssh.join(" ") };
+        format!("{ssh} {}", self.host)
+    }
+
+    /// How to put the user's key there.
+    fn copy_id(&self) -> String {
+        let mut command = "ssh-copy-id".to_owned();
+        let mut words = self.ssh.iter().skip(1);
+        while let Some(word) = words.next() {
+            let is_known = word.get(..2).is_some_and(|option| COPY_ID_OPTIONS.contains(&option));
+            let value = if word.len() == 2 { words.next() } else { None };
+            if !is_known {
+                return format!(
+                    "add this user's key (~/.ssh/*.pub) to ~/.ssh/authorized_keys there, by {}",
+                    self.by_hand()
+                );
+            }
+            for word in [Some(word), value].into_iter().flatten() {
+                command += " ";
+                command += word;
+            }
+        }
+        format!("{command} {}, as this user", self.host)
+    }
+
     fn command(&self) -> Command {
         let (program, options) = self.ssh.split_first().map_or(("ssh", &[][..]), |(first, rest)| (first, rest));
         let mut command = Command::new(program);
@@ -154,7 +184,7 @@ impl Ssh {
             let cause = format!("it has said nothing for {} s", SILENCE_MAX.as_secs());
             return Trouble::new(cause).of(host).remedy("look at its network and at its power");
         }
-        judge(&String::from_utf8_lossy(&self.messages.text), status, host)
+        judge(&String::from_utf8_lossy(&self.messages.text), status, target)
     }
 
     /// Its exit status, if it ends in time.
@@ -183,7 +213,8 @@ impl Drop for Ssh {
 }
 
 /// Makes one line of the messages and the exit status.
-fn judge(messages: &str, status: Option<ExitStatus>, host: &str) -> Trouble {
+fn judge(messages: &str, status: Option<ExitStatus>, target: &Target) -> Trouble {
+    let host = target.host.as_str();
     let last = messages.lines().map(|line| line.trim().trim_end_matches('.')).rfind(|line| !line.is_empty());
     let last = last.map(|line| line.strip_prefix(host).and_then(|line| line.strip_prefix(": ")).unwrap_or(line));
     // The other end's log line begins with the time and the level.
@@ -198,11 +229,11 @@ fn judge(messages: &str, status: Option<ExitStatus>, host: &str) -> Trouble {
     let remedy = match code {
         Some(NOT_FOUND) => "install the package pinion-mcu there".to_owned(),
         Some(SSH_FAILED) if cause.contains("Host key verification failed") => {
-            format!("ssh {host} once by hand, as this user, and compare its key")
+            format!("{} once by hand, as this user, and compare its key", target.by_hand())
         }
-        Some(SSH_FAILED) if cause.contains("Permission denied") => format!("ssh-copy-id {host}, as this user"),
+        Some(SSH_FAILED) if cause.contains("Permission denied") => target.copy_id(),
         Some(SSH_FAILED) if cause.contains("Could not resolve") => "correct the name, or use its address".to_owned(),
-        _ => format!("try ssh {host} by hand, as this user"),
+        _ => format!("try {} by hand, as this user", target.by_hand()),
     };
     Trouble::new(cause).of(host).remedy(remedy)
 }
@@ -212,10 +243,14 @@ mod tests {
     use super::*;
     use std::os::unix::process::ExitStatusExt;
 
+    fn target(ssh: &str) -> Target {
+        let ssh = ssh.split_whitespace().map(str::to_owned).collect();
+        Target { ssh, host: "pi@toolhead".into(), remote: "/tmp/it's".into() }
+    }
+
     #[test]
     fn ssh_gets_its_options_the_user_s_and_a_quoted_command() {
-        let ssh = ["ssh", "-p", "2222"].map(str::to_owned).into();
-        let command = Target { ssh, host: "pi@toolhead".into(), remote: "/tmp/it's".into() }.command();
+        let command = target("ssh -p 2222").command();
         let words: Vec<_> = command.get_args().map(|word| word.to_string_lossy()).collect();
         // ssh takes the first value of an option, so the user's come first.
         assert_eq!(words[..5], ["-p", "2222", "-T", "-o", "BatchMode=yes"]);
@@ -225,7 +260,7 @@ mod tests {
     #[test]
     fn a_failure_is_one_line_with_its_remedy() {
         let told = |messages: &str, code: i32| {
-            judge(messages, Some(ExitStatus::from_raw(code << 8)), "pi@toolhead").to_string()
+            judge(messages, Some(ExitStatus::from_raw(code << 8)), &target("ssh")).to_string()
         };
         for (messages, code, line) in [
             (
@@ -247,6 +282,32 @@ mod tests {
             ("", 255, "pi@toolhead: ssh ended (exit status: 255): try ssh pi@toolhead by hand, as this user"),
         ] {
             assert_eq!(told(messages, code), line);
+        }
+    }
+
+    #[test]
+    fn a_remedy_has_the_options_of_ssh() {
+        let told = |ssh: &str, messages: &str| {
+            let trouble = judge(messages, Some(ExitStatus::from_raw(SSH_FAILED << 8)), &target(ssh));
+            trouble.remedy.unwrap().into_string()
+        };
+        let unknown_key = "Host key verification failed.";
+        let denied = "pi@toolhead: Permission denied (publickey).";
+        assert_eq!(told("ssh -p 2222", ""), "try ssh -p 2222 pi@toolhead by hand, as this user");
+        assert_eq!(
+            told("/opt/ssh -p2222", unknown_key),
+            "/opt/ssh -p2222 pi@toolhead once by hand, as this user, and compare its key"
+        );
+        let options = "-p 2222 -i /home/pi/key -oProxyJump=gate";
+        assert_eq!(told(&format!("ssh {options}"), denied), format!("ssh-copy-id {options} pi@toolhead, as this user"));
+        // ssh-copy-id does not have these.
+        for options in ["-J gate", "-4", "-v -p 2222"] {
+            assert_eq!(
+                told(&format!("ssh {options}"), denied),
+                format!(
+                    "add this user's key (~/.ssh/*.pub) to ~/.ssh/authorized_keys there, by ssh {options} pi@toolhead"
+                )
+            );
         }
     }
 }

@@ -151,7 +151,8 @@ impl Looker {
             say.info(format!("the host is the one of before, process {}: dialect {dialect}", process.pid));
             return (*dialect, self.host.clone());
         }
-        let mut host = FoundHost { pid: process.pid, is_sure, checkout: None, commit: None };
+        let mut host =
+            FoundHost { pid: process.pid, is_sure, is_attach: process.is_attach(), checkout: None, commit: None };
         let found = tell(&process, &mut host, began, say);
         self.host = Some(host);
         self.last = found.map(|dialect| (process, dialect));

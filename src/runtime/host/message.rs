@@ -130,7 +130,7 @@ mod tests {
             name in any_name(), repeat in 1..2000usize, pid: u32, is_sure: bool, lines in 0..20usize,
         ) {
             let text = name.repeat(repeat);
-            let host = FoundHost { pid, is_sure, checkout: Some(text.clone()), commit: Some(name.clone()) };
+            let host = FoundHost { pid, is_sure, is_attach: is_sure, checkout: Some(text.clone()), commit: Some(name.clone()) };
             let line = || Line { is_warning: is_sure, text: text.clone() };
             let lines = (0..lines).map(|_| line()).collect();
             let told = Answer { number: pid, dialect: name.clone(), host: Some(host), lines };

@@ -25,6 +25,8 @@ use stdio::Stdio;
 
 /// The rate of a serial line if none is named: klippy's own default (`baud` in `[mcu]`).
 const BAUD: u32 = 250_000;
+/// The lowest rate that klippy accepts (`baud` in `[mcu]`).
+const BAUD_MIN: u32 = 2400;
 /// Terminals of a USB gadget are named so. Their rate means nothing.
 const GADGET: &str = "ttyGS";
 
@@ -90,6 +92,11 @@ pub(super) trait Link {
     }
 }
 
+/// What the program does at the link's place. `is_open`: the link is not waiting for its port or interface.
+pub(super) fn serving(is_open: bool) -> &'static str {
+    if is_open { "serving on" } else { "waiting for" }
+}
+
 /// The result of a read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Heard {
@@ -149,14 +156,18 @@ impl FromStr for LinkName {
         match (kind, place, more) {
             // A path may contain a comma.
             ("pty", _, _) if !rest.is_empty() => Ok(LinkName::Pty(rest.into())),
+            ("serial", port, _) if !port.is_empty() && !port.starts_with('/') => {
+                Err(format!("{port} is no path of a port, such as /dev/ttyAMA0"))
+            }
             ("serial", port, None) if !port.is_empty() => {
                 let is_gadget =
                     Path::new(port).file_name().is_some_and(|name| name.to_string_lossy().starts_with(GADGET));
                 Ok(LinkName::Serial(port.into(), (!is_gadget).then_some(BAUD)))
             }
             ("serial", port, Some(baud)) if !port.is_empty() => match baud.parse() {
-                Ok(baud) if baud > 0 => Ok(LinkName::Serial(port.into(), Some(baud))),
-                _ => Err(format!("{baud} is no rate in baud, such as 250000")),
+                Ok(baud) if baud >= BAUD_MIN => Ok(LinkName::Serial(port.into(), Some(baud))),
+                Ok(baud) => Err(format!("klippy does not accept {baud} baud: name {BAUD_MIN} or more, such as {BAUD}")),
+                Err(_) => Err(format!("{baud} is no rate in baud, such as {BAUD}")),
             },
             ("can", interface, uuid) if is_interface(interface) => {
                 Ok(LinkName::Can(interface.into(), uuid.map(str::parse).transpose()?))
@@ -190,6 +201,7 @@ mod tests {
             ("pty:/tmp/a,b", "pty:/tmp/a,b"),
             ("serial:/dev/ttyAMA0", "serial:/dev/ttyAMA0,250000"),
             ("serial:/dev/ttyAMA0,115200", "serial:/dev/ttyAMA0,115200"),
+            ("serial:/dev/ttyAMA0,2400", "serial:/dev/ttyAMA0,2400"),
             ("serial:/dev/ttyGS0", "serial:/dev/ttyGS0"),
             ("can:can0", "can:can0"),
             ("can:can0,0123456789AB", "can:can0,0123456789ab"),
@@ -211,6 +223,12 @@ mod tests {
             "can:can0,1",
             "stdio:x",
             "serial:/dev/ttyAMA0,fast",
+            "serial:/dev/ttyAMA0,9",
+            "serial:/dev/ttyAMA0,2399",
+            "serial:/dev/ttyAMA0,-250000",
+            "serial:/dev/ttyAMA0,99999999999",
+            "serial:ttyS0",
+            "serial:ttyS0,250000",
         ] {
             assert!(name.parse::<LinkName>().is_err(), "{name}");
         }

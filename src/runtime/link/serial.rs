@@ -46,7 +46,10 @@ impl SerialLine {
         let state = if path.exists() {
             State::Open(uart::open_line(path, baud)?)
         } else {
-            warn!("there is no {}: plug it in, or load its driver (Pinion opens it when it is there)", path.display());
+            warn!(
+                "there is no {}: plug it in, load its driver, or name another (pinion pins lists them; Pinion opens it when it is there)",
+                path.display()
+            );
             State::Gone(monotonic() + REOPEN)
         };
         Ok(SerialLine { path: path.to_owned(), baud, state })

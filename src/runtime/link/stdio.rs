@@ -3,12 +3,13 @@
 
 #![forbid(unsafe_code)]
 
-use std::io;
+use std::io::{self, IsTerminal};
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::Duration;
 
 use nix::errno::Errno;
 use nix::fcntl::{FcntlArg, OFlag, fcntl};
+use nix::sys::stat::fstat;
 use nix::sys::termios::{SetArg, cfmakeraw, tcgetattr, tcsetattr};
 use nix::unistd::{read, write};
 
@@ -31,7 +32,16 @@ pub(super) struct Stdio {
 
 impl Stdio {
     /// Takes both over.
+    ///
+    /// # Errors
+    ///
+    /// They are the terminal that shows the log, or the kernel refuses them.
     pub(super) fn open() -> Result<Stdio, Trouble> {
+        if shows_log(io::stdin()) || shows_log(io::stdout()) {
+            return Err(Trouble::new("this terminal shows the log, and a host's bytes are no text")
+                .of("--link stdio")
+                .remedy("let socat or ssh start Pinion so, or leave out --link for a host on this computer"));
+        }
         let opened = || -> io::Result<Stdio> {
             Ok(Stdio {
                 input: io::stdin().as_fd().try_clone_to_owned()?,
@@ -56,6 +66,14 @@ impl Stdio {
         }
         Ok(())
     }
+}
+
+/// Whether this is a person's terminal. A program may use a terminal too (the option `pty` of socat), but its log goes
+/// elsewhere: in the same terminal the log would spoil the bytes.
+fn shows_log(fd: impl AsFd + IsTerminal) -> bool {
+    let device = |fd: BorrowedFd<'_>| fstat(fd).map(|about| about.st_rdev);
+    let log = io::stderr();
+    fd.is_terminal() && log.is_terminal() && device(fd.as_fd()) == device(log.as_fd())
 }
 
 impl Link for Stdio {

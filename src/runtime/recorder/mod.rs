@@ -37,7 +37,7 @@ use pinion_protocol::format;
 use pinion_shared::ring::Ring;
 
 use crate::trace::event::{Event, Watched};
-use crate::trace::file::{End, Head, Names, Thread, Trace};
+use crate::trace::file::{End, Head, Names, SSH, Thread, Trace};
 use crate::trace::folder;
 use crate::trace::ring::Writer;
 use crate::trace::verdict::verdict;
@@ -134,17 +134,18 @@ impl Recording {
         };
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let ago = Duration::from_nanos(self.clock.now().since(ended_at).max(0).unsigned_abs() * NS_PER_TICK);
+        let names = self.memory.names();
         let head = Head {
             version: FIRMWARE.version.to_owned(),
             link: self.link.display().to_string(),
-            wire: self.wire.clone(),
+            wire: self.wire.clone().or_else(|| names.is_carried.then(|| SSH.to_owned())),
             end,
             ended_at: ended_at.to_bits(),
             utc_ms: now.saturating_sub(ago).as_millis() as u64,
             realtime: self.realtime,
             processors: thread::available_parallelism().map_or(1, usize::from),
             kernel: uname().map(|name| name.release().to_string_lossy().into_owned()).unwrap_or_default(),
-            names: self.memory.names(),
+            names,
         };
         Trace { head, threads: self.memory.rings().map(thread).collect() }
     }
@@ -246,6 +247,13 @@ impl Recorder {
     pub(super) fn speak(&self, dialect: &Dialect) {
         locked(&self.names).commands = commands(dialect);
         let _ = self.wake.write(1);
+    }
+
+    /// Notes whether the present host is on another computer, and `pinion attach` carries it.
+    pub(super) fn carry(&self, is_carried: bool) {
+        if std::mem::replace(&mut locked(&self.names).is_carried, is_carried) != is_carried {
+            let _ = self.wake.write(1);
+        }
     }
 
     /// The same board, which also records the edges of its outputs.

@@ -31,6 +31,8 @@ pub(in crate::runtime) struct FoundHost {
     pub(in crate::runtime) pid: u32,
     /// Whether this process is the host for certain.
     pub(in crate::runtime) is_sure: bool,
+    /// Whether it is `pinion attach`, and the host is on another computer.
+    pub(in crate::runtime) is_attach: bool,
     /// The checkout that it runs from, if it is a klippy whose sources can be read.
     pub(in crate::runtime) checkout: Option<String>,
     pub(in crate::runtime) commit: Option<String>,
@@ -45,12 +47,17 @@ impl HostBoard {
         *self.found.lock().unwrap_or_else(PoisonError::into_inner) = host;
     }
 
+    /// Whether the host is on another computer, as far as was found out.
+    pub(in crate::runtime) fn is_carried(&self) -> bool {
+        self.found.lock().unwrap_or_else(PoisonError::into_inner).as_ref().is_some_and(|host| host.is_attach)
+    }
+
     fn host(&self) -> Host {
         if !self.attached.load(Ordering::Relaxed) {
             return Host::default();
         }
         match self.found.lock().unwrap_or_else(PoisonError::into_inner).clone() {
-            Some(FoundHost { pid, is_sure, checkout, commit }) => {
+            Some(FoundHost { pid, is_sure, is_attach: _, checkout, commit }) => {
                 Host { attached: true, pid: Some(pid), sure: Some(is_sure), checkout, commit }
             }
             None => Host { attached: true, ..Host::default() },

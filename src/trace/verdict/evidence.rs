@@ -142,6 +142,17 @@ impl<'a> Record<'a> {
         blocks.rfind(|(_, event)| matches!(event, Event::BlockIn(_))).map(|(at, _)| at)
     }
 
+    /// When something came from the host or its computer last before a time.
+    pub(super) fn last_heard(&self, until: i64) -> Option<i64> {
+        let mut heard = self.within("link", (-FAR, until - 1));
+        heard.rfind(|(_, event)| is_heard(event)).map(|(at, _)| at)
+    }
+
+    /// Whether the host's computer gave a sign of life in a span, for a host that was silent.
+    pub(super) fn was_alive(&self, span: Span) -> bool {
+        self.within("link", span).any(|(_, event)| event == Event::Alive)
+    }
+
     /// How many blocks the host sent again within a span, and whether it asked for something that the link answers.
     pub(super) fn signs_of_host(&self, span: Span) -> (usize, bool) {
         let events = || self.within("link", span).map(|(_, event)| event);
@@ -412,6 +423,14 @@ impl<'a> Record<'a> {
             _ => None,
         });
         frequency.filter(|(mhz, max_mhz)| *mhz > 0 && *mhz < max_mhz / 2)
+    }
+}
+
+/// Whether the link records this when something comes from the host, and no garbage.
+fn is_heard(event: &Event) -> bool {
+    match event {
+        Event::Refused(why) => *why != Refusal::Garbage,
+        event => matches!(event, Event::BlockIn(_) | Event::Answered { .. } | Event::Alive),
     }
 }
 

@@ -38,6 +38,7 @@ const MACHINE_ID: &str = "/etc/machine-id";
 const FULL_PAUSE: Duration = Duration::from_millis(1);
 /// How long to wait before an interface that is gone is looked for again.
 const REOPEN: Duration = Duration::from_secs(1);
+const NAME_ONE: &str = "name a CAN interface (ip link show type can)";
 /// A frame of another kind than 11-bit data never fits this.
 const FILTER_MASK: u32 = libc::CAN_SFF_MASK | libc::CAN_EFF_FLAG | libc::CAN_RTR_FLAG;
 /// Which errors the interface shall tell.
@@ -87,24 +88,36 @@ pub fn uuid() -> Result<CanbusUuid, Trouble> {
     id.map_err(|trouble| trouble.remedy("sudo systemd-machine-id-setup, or name a UUID: can:can0,0123456789ab"))
 }
 
+/// Whether an interface can be opened, now or when its adapter is there.
+///
+/// # Errors
+///
+/// The kernel has no CAN, this program may not use it, or the interface is of another kind.
+pub fn can_open(interface: &str) -> Result<(), Trouble> {
+    // In the service without its drop-in there are no interfaces either. This error tells more.
+    let opened = socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, SockProtocol::CanRaw);
+    opened.map_err(|error| refusal(interface, error.into()))?;
+    if can::is_other(interface) {
+        return Err(Trouble::new("it is no CAN interface").of(interface).remedy(NAME_ONE));
+    }
+    Ok(())
+}
+
+fn refusal(interface: &str, error: io::Error) -> Trouble {
+    let remedy = match error.raw_os_error() {
+        Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
+            "load the module can_raw; in the service install its drop-in for CAN (docs/guide/another-computer.md)"
+        }
+        _ => NAME_ONE,
+    };
+    refused(format_args!("the CAN interface {interface} cannot be opened"), error).remedy(remedy)
+}
+
 impl CanBus {
     /// Opens an interface. One that is not there is opened later. Without a `uuid` the node has this computer's.
     pub(super) fn open(interface: &str, uuid: Option<CanbusUuid>) -> Result<CanBus, Trouble> {
         let CanbusUuid(uuid) = uuid.map_or_else(self::uuid, Ok)?;
-        let refusal = |error: io::Error| {
-            let remedy = match error.raw_os_error() {
-                Some(libc::EAFNOSUPPORT | libc::EPROTONOSUPPORT) => {
-                    "load the module can_raw; in the service install its drop-in for CAN (docs/guide/another-computer.md)"
-                }
-                _ => "name a CAN interface (ip link show type can)",
-            };
-            refused(format_args!("the CAN interface {interface} cannot be opened"), error).remedy(remedy)
-        };
-        // In the service without its drop-in there are no interfaces either. This error tells more.
-        drop(
-            socket(AddressFamily::Can, SockType::Raw, SockFlag::SOCK_CLOEXEC, SockProtocol::CanRaw)
-                .map_err(|error| refusal(error.into()))?,
-        );
+        can_open(interface)?;
         let mut bus = CanBus {
             interface: interface.to_owned(),
             node: Node::new(Arc::new(CanNode::new(uuid, bitrate(interface)))),
@@ -124,7 +137,7 @@ impl CanBus {
                 );
                 bus.state = State::Gone(monotonic() + REOPEN);
             }
-            Err(error) => return Err(refusal(error)),
+            Err(error) => return Err(refusal(interface, error)),
         }
         Ok(bus)
     }
